@@ -1,0 +1,1 @@
+"""Where samples come from: drivers for real PLCs, and the simulated PLC."""

@@ -1,0 +1,13 @@
+#!/bin/sh
+# Writes the two lock files from pyproject.toml: what runs the twin, and what develops it.
+# Hashes are kept and no index is named, so a mirror or a folder of wheels serves as well.
+set -eu
+cd "$(dirname "$0")/.."
+lock() {
+    out=$1
+    shift
+    uv pip compile pyproject.toml --universal --python-version 3.11 --generate-hashes \
+        --no-emit-index-url --no-annotate --no-header --quiet --output-file "$out" "$@"
+}
+lock requirements.lock --group build
+lock requirements-dev.lock --extra view --group build --group dev --constraint requirements.lock

@@ -1,0 +1,1 @@
+"""A live digital twin of pneumatic vacuum ejectors."""

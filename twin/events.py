@@ -1,0 +1,56 @@
+"""Everything the twin says happens: one record, and one table of kinds."""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+
+class Severity(StrEnum):
+    """How much it concerns a person."""
+
+    INFO = "info"
+    WARNING = "warning"
+    ALARM = "alarm"
+
+
+class Kind(StrEnum):
+    """What can happen. The value is the name in logs; SEVERITY says how much it matters."""
+
+    GAP = "gap"
+    PLC_RESTARTED = "plc_restarted"
+    CLOCK_JUMPED = "clock_jumped"
+    PLC_STALE = "plc_stale"
+    PLC_BACK = "plc_back"
+    SIGNAL_BAD = "signal_bad"
+    SIGNAL_GOOD = "signal_good"
+    CYCLE = "cycle"
+    DEVIATION = "deviation"
+    DEVIATION_CLEARED = "deviation_cleared"
+
+
+SEVERITY: dict[Kind, Severity] = {
+    Kind.GAP: Severity.WARNING,
+    Kind.PLC_RESTARTED: Severity.WARNING,
+    Kind.CLOCK_JUMPED: Severity.WARNING,
+    Kind.PLC_STALE: Severity.ALARM,
+    Kind.PLC_BACK: Severity.INFO,
+    Kind.SIGNAL_BAD: Severity.WARNING,
+    Kind.SIGNAL_GOOD: Severity.INFO,
+    Kind.CYCLE: Severity.INFO,
+    Kind.DEVIATION: Severity.ALARM,
+    Kind.DEVIATION_CLEARED: Severity.INFO,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One thing that happened, in PLC time, with its numbers in the field's units."""
+
+    time_ns: int
+    kind: Kind
+    text: str
+    data: dict[str, float | int | str] = field(default_factory=dict)
+
+    @property
+    def severity(self) -> Severity:
+        """As the table of kinds has it."""
+        return SEVERITY[self.kind]

@@ -1,0 +1,1 @@
+"""The physics: pure functions and tables, no files, no clocks, no network."""

@@ -1,0 +1,1 @@
+"""What the measured and the expected pressure say while the loop runs."""

@@ -1,0 +1,92 @@
+"""TOML documents and checked, frozen settings; an unknown key is refused with its place.
+
+Each part of the program declares the settings it takes as a ``Settings`` class in the field's
+units, with bounds; a ``Document`` hands each part its table, checked.
+"""
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from twin.errors import ConfigError, SourceError
+
+
+class Settings(BaseModel):
+    """A table of the configuration: immutable, checked, without unknown keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+S = TypeVar("S", bound=Settings)
+
+
+@dataclass(frozen=True)
+class Document:
+    """A configuration as it was written: its name for messages, its text, its tables."""
+
+    name: str
+    text: str
+    tables: Mapping[str, Any]
+
+    @classmethod
+    def read(cls, path: Path) -> "Document":
+        """Read a TOML file; SourceError if it cannot be read, ConfigError if it is not TOML."""
+        try:
+            return cls.parse(path.read_text(encoding="utf-8"), str(path))
+        except (OSError, UnicodeDecodeError) as error:
+            raise SourceError(f"{path}: cannot be read: {error}", "check the path") from error
+
+    @classmethod
+    def parse(cls, text: str, name: str) -> "Document":
+        """Take TOML text that stands elsewhere, for example in a log."""
+        try:
+            return cls(name, text, tomllib.loads(text))
+        except tomllib.TOMLDecodeError as error:
+            raise ConfigError(f"{name}: not valid TOML: {error}") from error
+
+    def refuse_unknown_tables(self, known: set[str]) -> None:
+        """ConfigError if a top-level table is none of ``known``."""
+        for key in self.tables:
+            if key not in known:
+                raise ConfigError(
+                    f"{self.name}:{self._line((key,))}: unknown table [{key}]",
+                    f"known tables: {', '.join(sorted(known))}",
+                )
+
+    def section(self, kind: type[S], *path: str) -> S:
+        """Check the table at ``path`` (missing means all defaults) against its settings class."""
+        table: Any = self.tables
+        for key in path:
+            table = table.get(key, {}) if isinstance(table, Mapping) else table
+        try:
+            return kind.model_validate(table)
+        except ValidationError as error:
+            raise ConfigError(self._explain(path, error), "see the comments in configs/") from error
+
+    def _explain(self, path: tuple[str, ...], error: ValidationError) -> str:
+        lines = []
+        for problem in error.errors(include_url=False):
+            keys = (*path, *(str(part) for part in problem["loc"]))
+            what = "unknown key" if problem["type"] == "extra_forbidden" else problem["msg"]
+            given = "" if problem["type"] == "missing" else f" (is {problem['input']!r})"
+            lines.append(f"{self.name}:{self._line(keys)}: {'.'.join(keys)}: {what}{given}")
+        return "\n".join(lines)
+
+    def _line(self, keys: tuple[str, ...]) -> int:
+        """Line of the deepest of ``keys`` that can be found; TOML parsers do not keep it."""
+        table, best = "", 1
+        for number, line in enumerate(self.text.splitlines(), 1):
+            if header := re.match(r"\s*\[+\s*([^\]]+?)\s*\]", line):
+                table = header[1].replace(" ", "").replace('"', "")
+            key = re.match(r"""\s*["']?([\w.-]+)["']?\s*=""", line)
+            here = f"{table}.{key[1]}".lstrip(".") if key else table
+            if here and ".".join(keys).startswith(here) and not line.lstrip().startswith("#"):
+                best = number
+                if here == ".".join(keys):
+                    break
+        return best

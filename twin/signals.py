@@ -1,0 +1,81 @@
+"""The vocabulary of the path: samples in, ticks beside them, and units at the edges.
+
+Everything flows in blocks: structured arrays of ``SAMPLE`` (what was measured) with, row for row,
+``TICK`` (what the twin says to it). A live block has 10 to 100 rows, a replayed one thousands.
+"""
+
+from enum import IntEnum, IntFlag
+
+import numpy as np
+import numpy.typing as npt
+
+# Units at the edges. Inside everything is SI and pressures are absolute.
+MBAR = 100.0  # Pa
+BAR = 1e5  # Pa
+MS = 1e-3  # s
+NS = 1e-9  # s
+ML = 1e-6  # m³
+STANDARD_DENSITY = 1.185  # kg/m³ at 100 kPa, 20 °C, 65 % relative humidity (ISO 8778)
+SL_MIN = STANDARD_DENSITY * 1e-3 / 60.0  # kg/s in one standard litre per minute
+
+SAMPLE = np.dtype(
+    [
+        ("sequence", "<i8"),  # the PLC's scan counter; a missing number is a missing sample
+        ("time_ns", "<i8"),  # PLC time; where the PLC has none, the time of the poll here
+        ("host_ns", "<i8"),  # when it was received here
+        ("pressure", "<f4"),  # Pa, absolute, as read; NaN where nothing readable came
+        ("supply", "<f4"),  # Pa, gauge, as read; NaN where it is not measured
+        ("commands", "u1"),  # Command bits
+        ("quality", "u1"),  # Quality bits
+    ]
+)
+
+TICK = np.dtype(
+    [
+        ("expected", "<f4"),  # Pa, absolute, what the sensor should read; NaN before the first sync
+        ("phase", "u1"),  # Phase
+        ("sync", "u1"),  # 1 where the model was set anew from the measurement
+    ]
+)
+
+Samples = npt.NDArray[np.void]  # of SAMPLE
+Ticks = npt.NDArray[np.void]  # of TICK
+
+
+class Command(IntFlag):
+    """What the PLC commands."""
+
+    SUCTION = 1
+    BLOW_OFF = 2
+
+
+class Quality(IntFlag):
+    """What is wrong with a sample, or with the stream just before it; 0 is good."""
+
+    GAP = 1  # samples are missing before this one
+    RESTART = 2  # the PLC restarted before this one
+    CLOCK = 4  # PLC time jumped before this one
+    OUT_OF_RANGE = 8  # outside the range the tag declares
+    OVERFLOW = 16  # the input is beyond what it can measure: not a pressure
+    STALE = 32  # the PLC answers, but its value is no longer fresh
+    BAD = 64  # the PLC or the server says itself that the value is bad
+
+
+UNUSABLE = Quality.OVERFLOW | Quality.STALE | Quality.BAD  # no pressure to compare with
+BREAK = Quality.GAP | Quality.RESTART | Quality.CLOCK  # time does not run on from the row before
+
+
+class Phase(IntEnum):
+    """Where in its cycle the ejector is, whatever commanded it."""
+
+    IDLE = 0  # no command
+    SUCTION = 1  # commanded, nozzle on
+    HOLD = 2  # suction commanded, nozzle switched off by the air saving
+    BLOW_OFF = 3
+
+
+def deviation(samples: Samples, ticks: Ticks) -> npt.NDArray[np.float64]:
+    """Measured minus expected pressure in Pa, row by row; NaN where either cannot be used."""
+    difference = samples["pressure"].astype(np.float64) - ticks["expected"]
+    difference[(samples["quality"] & UNUSABLE) != 0] = np.nan
+    return difference
