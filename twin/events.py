@@ -1,5 +1,6 @@
 """Everything the twin says happens: one record, and one table of kinds."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -48,7 +49,7 @@ class Event:
     time_ns: int
     kind: Kind
     text: str
-    data: dict[str, float | int | str] = field(default_factory=dict)
+    data: Mapping[str, float | int | str] = field(default_factory=dict)
 
     @property
     def severity(self) -> Severity:

@@ -33,8 +33,8 @@ SAMPLE = np.dtype(
 TICK = np.dtype(
     [
         ("expected", "<f4"),  # Pa, absolute, what the sensor should read; NaN before the first sync
+        ("level", "<f4"),  # Pa, what the model was synchronised on at this row; NaN for most
         ("phase", "u1"),  # Phase
-        ("sync", "u1"),  # 1 where the model was set anew from the measurement
     ]
 )
 
@@ -76,6 +76,6 @@ class Phase(IntEnum):
 
 def deviation(samples: Samples, ticks: Ticks) -> npt.NDArray[np.float64]:
     """Measured minus expected pressure in Pa, row by row; NaN where either cannot be used."""
-    difference = samples["pressure"].astype(np.float64) - ticks["expected"]
+    difference: npt.NDArray[np.float64] = samples["pressure"] - ticks["expected"].astype(np.float64)
     difference[(samples["quality"] & UNUSABLE) != 0] = np.nan
     return difference

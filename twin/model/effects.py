@@ -1,0 +1,278 @@
+"""Every way a real ejector can differ from its data set: one table, one entry each.
+
+Every effect is always compiled in; at neutral it changes nothing to the last bit. The monitor names
+them by their signatures, the diagnosis searches their parameters, an extended model sets them.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from twin.errors import ConfigError
+from twin.model import dataset as c
+from twin.model.dataset import Theta
+from twin.signals import BAR, MBAR, ML, MS, SL_MIN
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of an effect, in the field's unit.
+
+    ``typical`` is a change worth an alarm. Neutral is zero, or the data set's own value where the
+    parameter replaces a ``coefficient`` rather than adding to it.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    typical: float
+    coefficient: int | None = None
+
+    def neutral(self, theta: Theta) -> float:
+        """Return the value at which the effect changes nothing."""
+        return 0.0 if self.coefficient is None else float(theta[self.coefficient])
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What differs: a sentence a maintenance person understands, and where it acts."""
+
+    name: str
+    sentence: str
+    parameters: tuple[Parameter, ...]
+    act: Callable[..., None]  # (theta, one value per parameter) -> changes theta in place
+
+
+def _leakage(theta: Theta, flow: float) -> None:
+    theta[c.LEAK] += flow * SL_MIN
+
+
+def _porous_leakage(theta: Theta, flow: float) -> None:
+    theta[c.LAMINAR_LEAK] += flow * SL_MIN / (600.0 * MBAR)
+
+
+def _check_valve_leak(theta: Theta, flow: float) -> None:
+    theta[c.BACK_FLOW] += flow * SL_MIN
+
+
+def _suction_loss(theta: Theta, percent: float) -> None:
+    theta[c.SUCTION] *= 1.0 - percent / 100.0
+
+
+def _end_vacuum_loss(theta: Theta, rise: float) -> None:
+    theta[c.END_RATIO] += rise * MBAR / theta[c.AMBIENT_NOMINAL]
+
+
+def _supply_pressure_drop(theta: Theta, drop: float) -> None:
+    theta[c.SUPPLY] -= drop * BAR
+
+
+def _filter_clogging(theta: Theta, drop: float) -> None:
+    theta[c.RESISTANCE] += c.resistance(theta, drop * MBAR)
+
+
+def _added_volume(theta: Theta, volume: float) -> None:
+    theta[c.VOLUME] += volume * ML
+
+
+def _cup_compliance(theta: Theta, volume: float) -> None:
+    theta[c.COMPLIANCE] += volume * ML
+
+
+def _heat_exchange(theta: Theta, film_coefficient: float) -> None:
+    theta[c.FILM] = film_coefficient
+
+
+def _response_delay(theta: Theta, delay: float) -> None:
+    theta[c.RESPONSE] += delay * MS
+
+
+def _slow_ramp_up(theta: Theta, time_constant: float) -> None:
+    theta[c.RAMP_UP] += time_constant * MS
+
+
+def _threshold_drift(theta: Theta, h1_shift: float, h2_shift: float) -> None:
+    theta[c.H1] += h1_shift * MBAR
+    theta[c.H1_LOW] += h2_shift * MBAR
+
+
+def _weak_blow_off(theta: Theta, percent: float) -> None:
+    theta[c.BLOW_OFF] *= 1.0 - percent / 100.0
+
+
+def _blow_off_delay(theta: Theta, delay: float) -> None:
+    theta[c.BLOW_OFF_RESPONSE] += delay * MS
+
+
+def _sensor_offset(theta: Theta, offset: float) -> None:
+    theta[c.SENSOR_OFFSET] += offset * MBAR
+
+
+def _sensor_gain(theta: Theta, percent: float) -> None:
+    theta[c.SENSOR_GAIN] += percent / 100.0
+
+
+def _sensor_lag(theta: Theta, time_constant: float) -> None:
+    theta[c.SENSOR_LAG] += time_constant * MS
+
+
+def _ambient_pressure(theta: Theta, shift: float) -> None:
+    theta[c.AMBIENT] += shift * MBAR
+
+
+_P = Parameter
+_TABLE = (
+    Effect(
+        "leakage",
+        "Air leaks in through an opening on the vacuum side",
+        (_P("sonic_flow", "sl/min", 0.0, 60.0, 1.0),),
+        _leakage,
+    ),
+    Effect(
+        "porous_leakage",
+        "Air seeps in through a porous part or seal, the more the higher the vacuum",
+        (_P("flow_at_600mbar", "sl/min", 0.0, 60.0, 1.0),),
+        _porous_leakage,
+    ),
+    Effect(
+        "check_valve_leak",
+        "Air flows back through the ejector while its nozzle is off",
+        (_P("sonic_flow", "sl/min", 0.0, 60.0, 1.0),),
+        _check_valve_leak,
+    ),
+    Effect(
+        "suction_loss",
+        "The ejector moves less air at every vacuum: worn or dirty nozzle",
+        (_P("loss", "%", 0.0, 90.0, 10.0),),
+        _suction_loss,
+    ),
+    Effect(
+        "end_vacuum_loss",
+        "The highest vacuum it can reach is lower: worn receiver nozzle or clogged silencer",
+        (_P("end_pressure_rise", "mbar", 0.0, 600.0, 20.0),),
+        _end_vacuum_loss,
+    ),
+    Effect(
+        "supply_pressure_drop",
+        "The operating pressure is too low: suction, end vacuum and blow-off weaken together",
+        (_P("drop", "bar", 0.0, 4.0, 0.4),),
+        _supply_pressure_drop,
+    ),
+    Effect(
+        "filter_clogging",
+        "A clogged filter throttles the flow between vessel and ejector",
+        (_P("pressure_drop_at_nominal", "mbar", 0.0, 800.0, 40.0),),
+        _filter_clogging,
+    ),
+    Effect(
+        "added_volume",
+        "More volume than configured: a longer hose or a bigger cup",
+        (_P("volume", "ml", 0.0, 5000.0, 20.0),),
+        _added_volume,
+    ),
+    Effect(
+        "cup_compliance",
+        "The cups give way: their volume shrinks as vacuum rises",
+        (_P("volume_at_full_vacuum", "ml", 0.0, 100.0, 10.0),),
+        _cup_compliance,
+    ),
+    Effect(
+        "heat_exchange",
+        "Heat passes between gas and wall at another rate than the data set says",
+        (_P("film_coefficient", "W/(m²·K)", 0.0, 500.0, 5.0, coefficient=c.FILM),),
+        _heat_exchange,
+    ),
+    Effect(
+        "response_delay",
+        "The suction valve acts later",
+        (_P("delay", "ms", 0.0, 400.0, 10.0),),
+        _response_delay,
+    ),
+    Effect(
+        "slow_ramp_up",
+        "The jet takes longer to reach full suction",
+        (_P("time_constant", "ms", 0.0, 400.0, 20.0),),
+        _slow_ramp_up,
+    ),
+    Effect(
+        "threshold_drift",
+        "The switching points of the air saving moved",
+        (
+            _P("h1_shift", "mbar", -200.0, 200.0, 20.0),
+            _P("h2_shift", "mbar", -200.0, 200.0, 20.0),
+        ),
+        _threshold_drift,
+    ),
+    Effect(
+        "weak_blow_off",
+        "The blow-off flow is too small",
+        (_P("loss", "%", 0.0, 95.0, 20.0),),
+        _weak_blow_off,
+    ),
+    Effect(
+        "blow_off_delay",
+        "The blow-off valve acts later",
+        (_P("delay", "ms", 0.0, 400.0, 10.0),),
+        _blow_off_delay,
+    ),
+    Effect(
+        "sensor_offset",
+        "The pressure sensor reads a constant amount off (positive: too much absolute pressure)",
+        (_P("offset", "mbar", -200.0, 200.0, 8.0),),
+        _sensor_offset,
+    ),
+    Effect(
+        "sensor_gain",
+        "The span of the pressure sensor is off (positive: it reads too much vacuum)",
+        (_P("error", "%", -30.0, 30.0, 2.0),),
+        _sensor_gain,
+    ),
+    Effect(
+        "sensor_lag",
+        "The pressure sensor is slow, or its tube is long",
+        (_P("time_constant", "ms", 0.0, 400.0, 20.0),),
+        _sensor_lag,
+    ),
+    Effect(
+        "ambient_pressure",
+        "Ambient pressure differs from the data set: weather or altitude",
+        (_P("shift", "mbar", -300.0, 100.0, 15.0),),
+        _ambient_pressure,
+    ),
+)
+
+EFFECTS: Mapping[str, Effect] = {effect.name: effect for effect in _TABLE}
+
+
+def apply(theta: Theta, name: str, values: Mapping[str, float]) -> Theta:
+    """Return ``theta`` with an effect at the given parameter values (missing ones neutral).
+
+    Raises ConfigError for an unknown effect or parameter and for a value out of bounds.
+    """
+    effect = EFFECTS.get(name)
+    if effect is None:
+        raise ConfigError(f"unknown effect {name!r}", "twin effects lists them")
+    known = {parameter.name for parameter in effect.parameters}
+    if unknown := set(values) - known:
+        raise ConfigError(f"{name} has no parameter {', '.join(sorted(unknown))}", f"has {known}")
+    for parameter in effect.parameters:
+        value = values.get(parameter.name, parameter.neutral(theta))
+        if not parameter.low <= value <= parameter.high:
+            raise ConfigError(
+                f"{name}.{parameter.name} = {value} {parameter.unit} is out of bounds",
+                f"between {parameter.low} and {parameter.high}",
+            )
+    changed = theta.copy()
+    effect.act(changed, *(values.get(p.name, p.neutral(theta)) for p in effect.parameters))
+    return changed
+
+
+def table() -> str:
+    """The table of effects in Markdown, as the README has it and ``twin effects`` prints it."""
+    lines = ["| effect | what it means | parameters |", "| --- | --- | --- |"]
+    for effect in EFFECTS.values():
+        numbers = "<br>".join(
+            f"`{p.name}` {p.low:g} to {p.high:g} {p.unit}" for p in effect.parameters
+        )
+        lines.append(f"| `{effect.name}` | {effect.sentence} | {numbers} |")
+    return "\n".join(lines)
