@@ -1,0 +1,108 @@
+"""Modbus TCP over the trace: pymodbus answers, the registers are filled in at each request."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import cast
+
+from pymodbus.constants import ExcCodes
+from pymodbus.server import ModbusTcpServer
+from pymodbus.simulator import DataType, SimData, SimDevice
+
+from drivers.plc import registers
+from drivers.plc.registers import Registers
+from twin.errors import SourceError
+
+READ_COILS, READ_HOLDING, READ_INPUTS, WRITE_COIL, WRITE_COILS = 1, 3, 4, 5, 15
+
+
+@asynccontextmanager
+async def listening(memory: Registers, catch_up: Callable[[], None]) -> AsyncIterator[int]:
+    """Serve ``memory`` while the context lasts; gives the port.
+
+    ``catch_up`` is called before each answer, so that it shows the scans up to now. Raises
+    SourceError where the address cannot be had.
+    """
+    wanted = memory.task.settings.server
+    devices = [_device(wanted.unit, Answers(memory, catch_up)), _nobody()]
+    server = ModbusTcpServer(devices, address=(wanted.host, wanted.port))
+    try:
+        await server.serve_forever(background=True)
+    except RuntimeError as error:
+        raise SourceError(
+            f"cannot listen on {wanted.host}:{wanted.port}",
+            "take another port, or 0 for any free one",
+        ) from error
+    try:
+        yield cast(asyncio.Server, server.transport).sockets[0].getsockname()[1]
+    finally:
+        await server.shutdown()  # type: ignore[no-untyped-call]
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What pymodbus asks before it answers a request that lies inside the map."""
+
+    memory: Registers
+    catch_up: Callable[[], None]
+
+    async def answer(
+        self,
+        function: int,
+        start: int,  # of ``current``
+        address: int,
+        count: int,
+        current: list[int],
+        values: list[int] | list[bool] | None,
+    ) -> ExcCodes | None:
+        """Fill the words asked for into ``current``, or refuse."""
+        self.catch_up()
+        if function in (READ_COILS, WRITE_COIL, WRITE_COILS):
+            return self._coils(address, current, values)
+        if function == READ_INPUTS:
+            words = self.memory.inputs()[address : address + count]
+        elif function == READ_HOLDING:
+            words = self.memory.holding(address, count)
+        else:
+            return ExcCodes.ILLEGAL_FUNCTION
+        current[address - start : address - start + count] = words
+        return None
+
+    def _coils(
+        self, address: int, current: list[int], values: list[int] | list[bool] | None
+    ) -> ExcCodes | None:
+        if address + len(values or [0]) > registers.COILS:
+            return ExcCodes.ILLEGAL_ADDRESS
+        if values and not self.memory.write_coils(address, values):
+            return ExcCodes.ILLEGAL_FUNCTION  # "the server is in the wrong state", says the norm
+        current[0] = self.memory.coils()
+        return None
+
+
+def _words(address: int, count: int) -> SimData:
+    return SimData(address, count=count, datatype=DataType.REGISTERS)
+
+
+def _bits() -> list[SimData]:
+    return [SimData(0, values=[False] * registers.COILS, datatype=DataType.BITS)]
+
+
+def _device(unit: int, answers: Answers) -> SimDevice:
+    """Lay the map out; pymodbus wants discrete inputs too, but nothing answers for them."""
+    holding = [
+        _words(0, registers.TEST_SIZE),
+        _words(registers.HEADER, registers.HEADER_SIZE),
+        _words(registers.RING, registers.RING_SIZE),
+    ]
+    inputs = [_words(0, registers.INPUT_SIZE)]
+    return SimDevice(unit, simdata=(_bits(), _bits(), holding, inputs), action=answers.answer)
+
+
+def _nobody() -> SimDevice:
+    """Say for every other unit that nobody is there."""
+
+    async def answer(*_: object) -> ExcCodes:
+        return ExcCodes.GATEWAY_NO_RESPONSE
+
+    return SimDevice(0, simdata=_words(0, 65536), action=answer)

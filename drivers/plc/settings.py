@@ -1,0 +1,125 @@
+"""The ``[plc]`` table: the simulated PLC, its program and the rig behind it, in field units."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from twin.errors import ConfigError
+from twin.settings import Settings
+
+
+class Rig(Settings):
+    """Surroundings, gas volumes and the lines between port and vessel."""
+
+    ambient_mbar: float = Field(default=1013.0, ge=600, le=1100)
+    temperature_c: float = Field(default=20.0, ge=-20, le=80)
+    port_ml: float = Field(default=2.0, ge=0.5, le=100)
+    line_ml: float = Field(default=3.0, ge=0.5, le=500)
+    vessel_ml: float = Field(default=750.0, ge=5, le=100_000)
+    line_length_m: float = Field(default=0.1, ge=0.02, le=20)
+    line_diameter_mm: float = Field(default=6.0, ge=1, le=50)
+    vessel_area_m2: float = Field(default=0.047, ge=0, le=10)
+    vessel_film: float = Field(default=10.0, ge=0, le=500)  # W/(m²·K)
+    tube_film: float = Field(default=60.0, ge=0, le=500)  # W/(m²·K), port and line
+    seal_leak_sl_min: float = Field(default=0.3, ge=0, le=50)
+    opens: bool = False  # after blow-off the part leaves and the cup is open to ambient
+    opening_sl_min: float = Field(default=600.0, gt=0, le=2000)  # sonic, through the open cup
+    release_mbar: float = Field(default=20.0, ge=1, le=200)  # vacuum below which the part leaves
+
+
+class Ejector(Settings):
+    """Nozzle, supply line, exhaust and blow-off of this instance."""
+
+    suction_capacity_sl_min: float = Field(default=35.0, gt=0, le=1000)  # at optimum supply
+    end_pressure_mbar: float = Field(default=150.0, ge=10, le=900)  # at optimum supply
+    optimum_supply_bar: float = Field(default=4.8, ge=1, le=8)  # gauge
+    bulge: float = Field(default=1.25, ge=0.1, le=5)  # curvature of the characteristic
+    second_stage: float = Field(default=0.0, ge=0, le=0.6)  # share of capacity that ends early
+    second_stage_depth: float = Field(default=0.5, gt=0, le=1)  # end vacuum over the first's
+    build_up_ms: float = Field(default=6.0, ge=0.5, le=200)
+    collapse_ms: float = Field(default=2.0, ge=0.5, le=200)
+    supply_bar: float = Field(default=5.0, ge=0, le=10)  # gauge, at the regulator
+    supply_droop_bar: float = Field(default=0.2, ge=0, le=2)  # while the nozzle is on
+    supply_lag_ms: float = Field(default=20.0, ge=1, le=1000)
+    blow_off_sl_min: float = Field(default=130.0, gt=0, le=2000)  # sonic, at optimum supply
+    relief_mbar: float = Field(default=100.0, gt=0, le=1000)  # above ambient, at blow-off flow
+
+
+class Valves(Settings):
+    """From the command to the moved spool; both directions of the suction valve differ."""
+
+    suction_on_ms: float = Field(default=12.0, ge=0, le=200)
+    suction_off_ms: float = Field(default=9.0, ge=0, le=200)
+    blow_off_on_ms: float = Field(default=11.0, ge=0, le=200)
+    blow_off_off_ms: float = Field(default=9.0, ge=0, le=200)
+    blow_off_opening_ms: float = Field(default=3.0, ge=0.5, le=100)
+
+
+class Sensor(Settings):
+    """The sensor at the port that the PLC reads."""
+
+    lag_ms: float = Field(default=1.5, ge=0, le=100)  # of each of its two stages
+    noise_mbar: float = Field(default=0.3, ge=0, le=20)  # one standard deviation
+    step_mbar: float = Field(default=0.1, gt=0, le=20)
+    full_scale_mbar: float = Field(default=2000.0, ge=1000, le=3200)  # absolute; overflow beyond
+    supply_noise_mbar: float = Field(default=3.0, ge=0, le=200)
+
+
+class Control(Settings):
+    """The compact ejector's two-point air saving on its own sensor, unseen by the PLC."""
+
+    air_saving: bool = True
+    h1_mbar: float = Field(default=750.0, ge=10, le=998)  # vacuum; nozzle off from here
+    h1_hysteresis_mbar: float = Field(default=150.0, ge=1, le=900)
+    h2_mbar: float = Field(default=550.0, ge=5, le=998)  # vacuum; part present from here
+    h2_hysteresis_mbar: float = Field(default=10.0, ge=1, le=900)
+    noise_mbar: float = Field(default=0.5, ge=0, le=20)
+
+
+class Program(Settings):
+    """What the PLC commands: a pick-and-place cycle, or coils that a client writes."""
+
+    commands: Literal["program", "coils"] = "program"
+    start_ms: float = Field(default=500.0, ge=0, le=60_000)  # idle before the first cycle
+    suction_ms: float = Field(default=2300.0, ge=1, le=3.6e6)
+    blow_off_ms: float = Field(default=300.0, ge=0, le=3.6e6)
+    idle_ms: float = Field(default=600.0, ge=0, le=3.6e6)
+    jitter_ms: float = Field(default=5.0, ge=0, le=1000)  # one standard deviation per duration
+
+
+class Scatter(Settings):
+    """What differs from cycle to cycle, one standard deviation each."""
+
+    supply_bar: float = Field(default=0.02, ge=0, le=1)
+    seal_leak_sl_min: float = Field(default=0.03, ge=0, le=5)
+    valve_ms: float = Field(default=0.5, ge=0, le=20)
+
+
+class Server(Settings):
+    """Where the PLC listens and how it lays out 32-bit and 64-bit values."""
+
+    host: str = "127.0.0.1"
+    port: int = Field(default=5020, ge=0, le=65535)  # 0 takes any free one
+    unit: int = Field(default=1, ge=1, le=247)
+    word_order: Literal["big", "little"] = "big"
+
+
+class PlcSettings(Settings):
+    """The table ``[plc]``."""
+
+    rig: Rig = Rig()
+    ejector: Ejector = Ejector()
+    valves: Valves = Valves()
+    sensor: Sensor = Sensor()
+    control: Control = Control()
+    program: Program = Program()
+    scatter: Scatter = Scatter()
+    server: Server = Server()
+
+    def on_port(self, port: int | None) -> "PlcSettings":
+        """Give the same on another port (None: the configured one); ConfigError if it is none."""
+        if port is None:
+            return self
+        if not 0 <= port <= 65535:
+            raise ConfigError(f"{port} is not a port", "0 (any free one) to 65535")
+        return self.model_copy(update={"server": self.server.model_copy(update={"port": port})})
