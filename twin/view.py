@@ -1,0 +1,332 @@
+"""The view: measured beside expected in Rerun, live on this machine or as a ``.rrd`` file.
+
+Rerun is the optional extra ``[view]``; it is imported when a view is opened, not before.
+The viewer is started here instead of by Rerun's own ``spawn`` and ``serve_*`` calls: those listen
+on all interfaces, and this one is bound to loopback. Its usage statistics are switched off for
+that process alone; the user's own Rerun settings are neither read nor changed.
+"""
+
+import contextlib
+import importlib
+import logging
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+import numpy.typing as npt
+
+from twin.errors import ConfigError, SourceError
+from twin.events import Event, Severity
+from twin.signals import (
+    BREAK,
+    MBAR,
+    SAMPLE,
+    TICK,
+    UNUSABLE,
+    Command,
+    Phase,
+    Samples,
+    Ticks,
+    deviation,
+)
+
+TIMELINE = "PLC time of the sample"  # as long as a time: the event list's column is as wide
+# PLC time that goes to Rerun at once: a row costs 8 µs in batches of 100 and 2 µs in those of 1000.
+LIVE_BATCH_NS = 100_000_000
+FILE_BATCH_NS = 1_000_000_000
+WINDOW_S = 20.0  # what a live plot shows
+MEMORY = "1GB"  # the viewer then forgets the oldest: hours of 1 kHz
+START_S = 20.0  # a cold viewer on a busy machine takes some seconds
+PATIENCE_S = 0.05  # longest wait for the viewer in one write: well below what a PLC buffers
+MISSES = 60  # writes in a row it may leave unread before it counts as hung
+
+# Entity, name in the legend, colour, line width, how it runs from sample to sample. The expected
+# line is wide: where the two agree, it shows as the measured line's rim.
+_SERIES = (
+    ("vacuum/measured", "measured", 0x4FB3FFFF, 1.5, "Linear"),
+    ("vacuum/expected", "expected", 0xE08A1EFF, 4.0, "Linear"),
+    ("deviation", "measured − expected pressure", 0xFF6B6BFF, 1.5, "Linear"),
+    ("commands/suction", "suction", 0x4FB3FFFF, 2.0, "StepAfter"),
+    ("commands/blow_off", "blow-off", 0xC792EAFF, 2.0, "StepAfter"),
+)
+_PHASES = {
+    Phase.IDLE: ("idle", 0x5C6370FF),
+    Phase.SUCTION: ("suction", 0x2F7FC1FF),
+    Phase.HOLD: ("hold (air saving)", 0x3C9D6BFF),
+    Phase.BLOW_OFF: ("blow-off", 0x8E5BB5FF),
+}
+_LEVELS = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ALARM: "ERROR"}
+
+_log = logging.getLogger(__name__)
+
+
+class View:
+    """A sink that draws what it is given; ``url`` is the page to open where there is no window."""
+
+    def __init__(self, title: str, target: Path | None, ambient_pa: float) -> None:
+        """Write to the file ``target``, or start a viewer on this machine where it is None.
+
+        Vacuum is drawn in mbar below ``ambient_pa`` (Pa, absolute). ConfigError if Rerun is not
+        installed; SourceError if the file cannot be written or no viewer starts.
+        """
+        self._rr = _rerun()
+        self._ambient_pa = ambient_pa
+        self._waiting: list[tuple[Samples, Ticks]] = []
+        self._phase = -1
+        self._last_ns: int | None = None
+        self._misses = 0
+        self._batch_ns = FILE_BATCH_NS if target else LIVE_BATCH_NS
+        self._viewer = None if target else _Viewer()
+        self.url = self._viewer.url if self._viewer else ""
+        self._stream: Any = self._rr.RecordingStream("ejector-twin")
+        self._connect(target)
+        self._stream.send_recording_name(title)
+        self._style()
+
+    def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
+        """Take row-aligned blocks of SAMPLE and TICK and what happened in them.
+
+        A viewer that is closed, or hangs for some seconds, ends the view and nothing else.
+        """
+        if self._stream is None:
+            return
+        for event in events:
+            self._send_event(event)
+        if len(samples):
+            self._waiting.append((samples, ticks))
+        if self._waiting and (not len(samples) or self._span_ns() >= self._batch_ns):
+            self._send_waiting()
+            if self._viewer and not self._follows(self._viewer):
+                _log.warning("the Rerun viewer was closed or hangs: going on without it")
+                self.close()
+
+    def close(self) -> None:
+        """Send the rest; end the viewer if one was started, else complete the file."""
+        if self._stream is None:
+            return
+        if self._waiting:
+            self._send_waiting()
+        if self._viewer and not self._delivered():
+            self._viewer.close()  # while it hangs, disconnecting would wait for it for ever
+        self._stream.disconnect()
+        self._stream = None
+        if self._viewer:
+            self._viewer.close()
+
+    def _connect(self, target: Path | None) -> None:
+        plan = _blueprint(self._rr, live=target is None)
+        if self._viewer:
+            self._stream.connect_grpc(self._viewer.address, default_blueprint=plan)
+            return
+        try:
+            self._stream.save(target, default_blueprint=plan)
+        except RuntimeError as error:
+            raise SourceError(
+                f"{target}: cannot be written: {error}", "check the folder and its rights"
+            ) from error
+
+    def _style(self) -> None:
+        """Say once how each entity is drawn."""
+        for path, name, colour, width, mode in _SERIES:
+            style = self._rr.SeriesLines(
+                names=name, colors=colour, widths=width, interpolation_mode=mode
+            )
+            self._stream.log(path, style, static=True, strict=True)
+        labels, colours = zip(*_PHASES.values(), strict=True)
+        phases = self._rr.StateConfiguration(values=labels, colors=np.array(colours, np.uint32))
+        self._stream.log("phase", phases, static=True, strict=True)
+
+    def _span_ns(self) -> int:
+        first, last = self._waiting[0][0]["time_ns"][0], self._waiting[-1][0]["time_ns"][-1]
+        return abs(int(last) - int(first))  # PLC time may have jumped back
+
+    def _send_waiting(self) -> None:
+        blocks, self._waiting = self._waiting, []
+        samples = np.concatenate([block for block, _ in blocks], dtype=SAMPLE)
+        ticks = np.concatenate([block for _, block in blocks], dtype=TICK)
+        self._lift_pen(samples)
+        column = self._column(samples["time_ns"])
+        for path, values in self._series(samples, ticks).items():
+            self._send(path, column, self._rr.Scalars.columns(scalars=values))
+        self._send_phases(samples, ticks)
+        self._last_ns = int(samples["time_ns"][-1])
+
+    def _lift_pen(self, samples: Samples) -> None:
+        """Blank all lines right after the row before a break: nothing was measured in between."""
+        breaks = np.flatnonzero(samples["quality"] & BREAK)
+        if self._last_ns is None:
+            breaks = breaks[breaks > 0]  # before the very first row nothing is drawn
+        if len(breaks):
+            before = np.concatenate(([self._last_ns or 0], samples["time_ns"]))[breaks]
+            column, blanks = self._column(before + 1), len(breaks)
+            for path, *_ in _SERIES:
+                self._send(path, column, self._rr.Scalars.columns(scalars=[np.nan] * blanks))
+            self._send("phase", column, self._rr.StateChange.columns(state=[""] * blanks))
+
+    def _series(self, samples: Samples, ticks: Ticks) -> Mapping[str, npt.NDArray[np.float64]]:
+        usable = (samples["quality"] & UNUSABLE) == 0
+        pressure = np.where(usable, samples["pressure"].astype(np.float64), np.nan)
+        return {
+            "vacuum/measured": (self._ambient_pa - pressure) / MBAR,
+            "vacuum/expected": (self._ambient_pa - ticks["expected"].astype(np.float64)) / MBAR,
+            "deviation": deviation(samples, ticks) / MBAR,
+            "commands/suction": (samples["commands"] & Command.SUCTION > 0).astype(np.float64),
+            "commands/blow_off": (samples["commands"] & Command.BLOW_OFF > 0).astype(np.float64),
+        }
+
+    def _send_phases(self, samples: Samples, ticks: Ticks) -> None:
+        """Send only where the phase changes, or is known again after a break."""
+        phases = ticks["phase"].astype(np.int64)
+        changed = np.diff(phases, prepend=self._phase) != 0
+        rows = np.flatnonzero(changed | (samples["quality"] & BREAK != 0))
+        self._phase = int(phases[-1])
+        if len(rows):
+            names = [_PHASES[Phase(phase)][0] for phase in phases[rows]]
+            column = self._column(samples["time_ns"][rows])
+            self._send("phase", column, self._rr.StateChange.columns(state=names))
+
+    def _send_event(self, event: Event) -> None:
+        text = self._rr.TextLog.columns(text=[event.text], level=[_LEVELS[event.severity]])
+        self._send(f"events/{event.kind}", self._column(np.array([event.time_ns])), text)
+
+    def _column(self, time_ns: npt.NDArray[np.int64]) -> Any:
+        return self._rr.TimeColumn(TIMELINE, timestamp=time_ns.astype("datetime64[ns]"))
+
+    def _send(self, path: str, column: Any, values: Any) -> None:
+        self._stream.send_columns(path, [column], values, strict=True)
+
+    def _follows(self, viewer: "_Viewer") -> bool:
+        """Say whether the viewer still reads; asking bounds what can pile up in memory for it."""
+        if not viewer.running():
+            return False
+        self._misses = 0 if self._delivered() else self._misses + 1
+        return self._misses < MISSES
+
+    def _delivered(self) -> bool:
+        try:
+            self._stream.flush(timeout_sec=PATIENCE_S)
+        except RuntimeError:
+            return False
+        return True
+
+
+class _Viewer:
+    """A viewer process on loopback: a window, or a page for the browser where there is none."""
+
+    def __init__(self) -> None:
+        port, page = _free_port(), _free_port()
+        self.address = f"rerun+http://127.0.0.1:{port}/proxy"
+        self.url = ""
+        command = [_executable(), "--bind", "127.0.0.1", "--port", str(port)]
+        command += ["--hide-welcome-screen", "--memory-limit", MEMORY]
+        if not _has_display():
+            command += ["--serve-web", "--web-viewer-port", str(page)]
+            command += ["--server-memory-limit", MEMORY]
+            self.url = f"http://127.0.0.1:{page}?url={quote(self.address, safe='')}"
+        # Where CI is set Rerun sends no usage statistics; a session of its own keeps Ctrl-C here.
+        quiet = {**os.environ, "CI": "1", "RUST_LOG": "error"}
+        self._process = subprocess.Popen(command, env=quiet, start_new_session=True)  # noqa: S603
+        self._wait_for(port)
+
+    def running(self) -> bool:
+        """Say whether the process lives; the user may have closed its window."""
+        return self._process.poll() is None
+
+    def close(self) -> None:
+        """End the process at once: it keeps nothing, and while it hangs it would not listen."""
+        self._process.kill()
+        self._process.wait()
+
+    def _wait_for(self, port: int) -> None:
+        end = time.monotonic() + START_S
+        while self.running() and time.monotonic() < end:
+            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 0.5):
+                return
+            time.sleep(0.05)
+        self.close()
+        raise SourceError(
+            "the Rerun viewer did not start; what it said stands above",
+            "write the view to a .rrd file and open it on another machine",
+        )
+
+
+def _rerun() -> Any:
+    try:
+        return importlib.import_module("rerun")
+    except ImportError as error:
+        raise ConfigError(
+            f"the view needs Rerun, which is not installed: {error}",
+            "pip install 'ejector-twin[view]'",
+        ) from error
+
+
+def _executable() -> str:
+    """Path of the viewer itself: the ``rerun`` script would leave it behind when terminated."""
+    folder = Path(str(importlib.import_module("rerun_cli").__file__)).parent
+    found = shutil.which("rerun", path=folder)
+    if not found:
+        raise ConfigError(f"no Rerun viewer in {folder}", "pip install 'ejector-twin[view]'")
+    return found
+
+
+def _has_display() -> bool:
+    windowed = sys.platform in ("win32", "darwin")
+    return windowed or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
+
+
+def _blueprint(rr: Any, *, live: bool) -> Any:
+    """Lay the views out one under the other; a live one follows the newest."""
+    plan = rr.blueprint
+    # Rerun has no linked time axis that also moves on, so the live ones are not linked.
+    axis = plan.archetypes.TimeAxis(
+        link=None if live else "LinkToGlobal", view_range=_window(rr) if live else None
+    )
+    return plan.Blueprint(
+        plan.Vertical(*_views(plan, axis), row_shares=[4.3, 2.9, 1.3, 1.4, 2.2]),
+        plan.TimePanel(
+            state="collapsed", timeline=TIMELINE, play_state="following" if live else None
+        ),
+        plan.BlueprintPanel(state="hidden"),
+        plan.SelectionPanel(state="hidden"),
+    )
+
+
+def _views(plan: Any, axis: Any) -> Sequence[Any]:
+    legend = {"axis_x": axis, "plot_legend": plan.PlotLegend(plan.Corner2D.LeftTop)}
+    return (
+        plan.TimeSeriesView(origin="vacuum", name="Vacuum, mbar below ambient", **legend),
+        plan.TimeSeriesView(origin="deviation", name="Deviation, mbar", **legend),
+        plan.TimeSeriesView(
+            origin="commands",
+            name="Commands: suction (blue), blow-off (violet)",
+            axis_x=axis,
+            axis_y=plan.ScalarAxis(range=(-0.15, 1.15), zoom_lock=True),
+            plot_legend=plan.PlotLegend(visible=False),  # it would hide the steps
+        ),
+        plan.StateTimelineView(origin="phase", name="Phase", time_view=axis),
+        plan.TextLogView(
+            origin="events",
+            name="Events",
+            columns=plan.TextLogColumns(
+                timeline_columns=[TIMELINE], text_log_columns=["loglevel", "body"]
+            ),
+        ),
+    )
+
+
+def _window(rr: Any) -> Any:
+    edge = rr.blueprint.TimeRangeBoundary.cursor_relative
+    return rr.blueprint.TimeRange(start=edge(seconds=-WINDOW_S), end=edge(seconds=0.0))
