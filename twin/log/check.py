@@ -1,0 +1,113 @@
+"""What is in a log, what is wrong with it, and saving what can be read."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from twin.events import Event
+from twin.log.columns import Tray
+from twin.log.reader import Log, decode_happening, decode_rows, open_log
+from twin.log.recorder import Recorder
+from twin.log.records import Damage, messages
+from twin.log.schema import EVENTS, SAMPLES
+from twin.signals import NS, SAMPLE, Quality, Samples, Ticks
+
+Piece = tuple[Samples, Ticks, list[Event]]
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a log holds; counts are of what can be read."""
+
+    path: Path
+    parts: int
+    complete: bool  # its writer came to the end
+    damage: tuple[Damage, ...]  # each place that cannot be read
+    samples: int
+    events: int
+    duration_s: float  # PLC time, without jumps of the clock and restarts
+    gaps: int  # places where sequence numbers are missing
+    missing: int  # samples missing there
+    time_back: int  # places where PLC time does not go forward
+    bytes_per_sample: float  # of the files
+
+    @property
+    def sound(self) -> bool:
+        """Complete and without damage."""
+        return self.complete and not self.damage
+
+
+class _Tally:
+    """Adds up the rows of a stream, however it is cut."""
+
+    def __init__(self) -> None:
+        self.samples = self.events = self.gaps = self.missing = self.time_back = 0
+        self.duration_s = 0.0
+        self._last = np.empty(0, SAMPLE)
+
+    def add(self, samples: Samples) -> None:
+        self.samples += len(samples)
+        rows = np.concatenate((self._last, samples))
+        self._last = rows[-1:]
+        skipped = np.diff(rows["sequence"]) - 1
+        self.gaps += int((skipped > 0).sum())
+        self.missing += int(skipped[skipped > 0].sum())
+        steps = np.diff(rows["time_ns"])
+        self.time_back += int((steps <= 0).sum())
+        jumps = (rows["quality"][1:] & (Quality.CLOCK | Quality.RESTART)) != 0
+        self.duration_s += float(steps[(steps > 0) & ~jumps].sum() * NS)
+
+
+def check(path: Path) -> Report:
+    """Read all of a log and say what is in it; SourceError if it is none."""
+    return _go_through(open_log(path), lambda *_: None)
+
+
+def recover(path: Path, out: Path) -> Report:
+    """Write what can be read of a log to a complete new one; the report is of the old one.
+
+    SourceError if it is no log, or if ``out`` exists or cannot be written.
+    """
+    log = open_log(path)
+    origin = log.header.metadata | {"recovered_from": path.name}
+    with Recorder(out, replace(log.header, metadata=origin)) as recorder:
+        return _go_through(log, recorder.write)
+
+
+def _go_through(log: Log, take: Callable[[Samples, Ticks, Sequence[Event]], None]) -> Report:
+    damage: list[Damage] = []
+    tally = _Tally()
+    for samples, ticks, events in _pieces(log, damage):
+        tally.add(samples)
+        tally.events += len(events)
+        take(samples, ticks, events)
+    size = sum(part.stat().st_size for part in log.parts)
+    return Report(
+        path=log.path,
+        parts=len(log.parts),
+        complete=log.complete,
+        damage=tuple(damage),
+        samples=tally.samples,
+        events=tally.events,
+        duration_s=tally.duration_s,
+        gaps=tally.gaps,
+        missing=tally.missing,
+        time_back=tally.time_back,
+        bytes_per_sample=size / max(tally.samples, 1),
+    )
+
+
+def _pieces(log: Log, damage: list[Damage]) -> Iterator[Piece]:
+    """Each message of rows with the events after it: those that happened in it."""
+    samples, ticks = Tray(0).take()
+    events: list[Event] = []
+    for part in log.parts:
+        for topic, packed in messages(part, (SAMPLES.topic, EVENTS.topic), damage.append):
+            if topic == EVENTS.topic:
+                events.append(decode_happening(part, packed))
+                continue
+            yield samples, ticks, events
+            (samples, ticks), events = decode_rows(part, packed), []
+    yield samples, ticks, events

@@ -1,0 +1,55 @@
+"""What a log says about itself, so that it replays alone."""
+
+from dataclasses import dataclass, field
+
+FORMAT = "ejector-twin-log/1"
+
+
+@dataclass(frozen=True)
+class LogHeader:
+    """Whose log it is and the configuration it was made with."""
+
+    asset_type: str
+    asset_id: str
+    config_name: str
+    config_text: str  # TOML, kept as an attachment
+    metadata: dict[str, str] = field(default_factory=dict)  # hash of the data set, version, ...
+    ambient: float = 101_325.0  # Pa, from which the vacuum in /scalars is counted
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Which piece of which recording a file is."""
+
+    series: str  # the same in all parts of one recording, different in any other
+    part: int  # 0 is the file named by the user
+
+
+def to_metadata(header: LogHeader, identity: Identity) -> dict[str, str]:
+    """All but the configuration's text and the free metadata, as MCAP stores it."""
+    return {
+        "format": FORMAT,
+        "series": identity.series,
+        "part": str(identity.part),
+        "asset_type": header.asset_type,
+        "asset_id": header.asset_id,
+        "config_name": header.config_name,
+        "ambient_pa": repr(header.ambient),
+    }
+
+
+def from_metadata(
+    stored: dict[str, str], config_text: str, metadata: dict[str, str]
+) -> tuple[LogHeader, Identity]:
+    """Reverse ``to_metadata``; KeyError or ValueError where it was not written by it."""
+    if stored["format"] != FORMAT:
+        raise ValueError(f"its format is {stored['format']!r}, not {FORMAT!r}")
+    header = LogHeader(
+        asset_type=stored["asset_type"],
+        asset_id=stored["asset_id"],
+        config_name=stored["config_name"],
+        config_text=config_text,
+        metadata=metadata,
+        ambient=float(stored["ambient_pa"]),
+    )
+    return header, Identity(stored["series"], int(stored["part"]))

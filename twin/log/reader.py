@@ -1,0 +1,151 @@
+"""A log from disk: its header, and its rows as the blocks they were."""
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from google.protobuf.message import DecodeError
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC as MAGIC
+
+from twin.errors import SourceError
+from twin.events import Event
+from twin.log.columns import Tray, decode
+from twin.log.header import Identity, LogHeader, from_metadata
+from twin.log.messages import decode_event
+from twin.log.part import FREE_METADATA, OWN_METADATA, part_path
+from twin.log.records import Damage, attachment, is_complete, messages, metadata, records
+from twin.log.schema import EVENTS, SAMPLES
+from twin.signals import Samples, Ticks
+
+_UNDECODABLE = (ValueError, struct.error, DecodeError)
+
+
+@dataclass(frozen=True)
+class Log:
+    """A log with all its parts; each iteration reads the files anew, a chunk at a time.
+
+    Iterating raises SourceError where a file is damaged. What a killed writer left unfinished at
+    the end is no damage: it ends there, and ``complete`` is False.
+    """
+
+    path: Path
+    header: LogHeader
+    parts: tuple[Path, ...]
+    complete: bool  # every part was finished by its writer
+
+    def blocks(self, size: int = 10_000) -> Iterator[tuple[Samples, Ticks]]:
+        """Rows of SAMPLE and TICK in written order, ``size`` at a time and the rest at the end."""
+        tray = Tray(size)
+        for part in self.parts:
+            for _, packed in messages(part, (SAMPLES.topic,), _refuse):
+                yield from tray.add(*decode_rows(part, packed))
+        samples, ticks = tray.take()
+        if len(samples):
+            yield samples, ticks
+
+    def events(self) -> Iterator[Event]:
+        """What happened, in written order."""
+        for part in self.parts:
+            for _, packed in messages(part, (EVENTS.topic,), _refuse):
+                yield decode_happening(part, packed)
+
+
+def _refuse(damage: Damage) -> None:
+    if not damage.torn:
+        hint = f"'twin log recover {damage.path} -o OUT.mcap' writes a new log of what is readable"
+        raise SourceError(str(damage), hint)
+
+
+def decode_rows(part: Path, packed: bytes) -> tuple[Samples, Ticks]:
+    """Rows of a message of /samples; SourceError if it is not of this format."""
+    try:
+        return decode(packed)
+    except _UNDECODABLE as error:
+        raise _other_version(part, error) from error
+
+
+def decode_happening(part: Path, packed: bytes) -> Event:
+    """Event of a message of /events; SourceError if it is not of this format."""
+    try:
+        return decode_event(packed)
+    except _UNDECODABLE as error:
+        raise _other_version(part, error) from error
+
+
+def _other_version(part: Path, error: Exception) -> SourceError:
+    hint = "it was written by another version of the program: read it with that one"
+    return SourceError(f"{part}: cannot be decoded: {error}", hint)
+
+
+def open_log(path: Path) -> Log:
+    """Open a log at its first part; SourceError if it is none."""
+    header, identity = _head(path)
+    parts = [path]
+    complete = is_complete(path)
+    while identity.part == 0 and (following := part_path(path, len(parts))).exists():
+        try:
+            _, other = _head(following)
+        except SourceError:  # its writer was stopped before it could say anything
+            complete = False
+            break
+        if other != Identity(identity.series, len(parts)):
+            break  # left from another log of that name
+        parts.append(following)
+        complete &= is_complete(following)
+    return Log(path, header, tuple(parts), complete)
+
+
+def _head(path: Path) -> tuple[LogHeader, Identity]:
+    try:
+        _check_magic(path)
+        return _read_head(path)
+    except OSError as error:
+        message = f"{path}: cannot be read: {error.strerror}"
+        raise SourceError(message, "check the path") from error
+
+
+def _check_magic(path: Path) -> None:
+    with path.open("rb") as file:
+        magic = file.read(len(MAGIC))
+    if not magic:
+        raise SourceError(f"{path}: the file is empty", "nothing was recorded; take another log")
+    if magic != MAGIC:
+        raise SourceError(
+            f"{path}: not an MCAP file", "a log of 'twin run', 'twin replay' or 'twin import' is"
+        )
+
+
+def _read_head(path: Path) -> tuple[LogHeader, Identity]:
+    """From the records before the first chunk; only other tools put them behind."""
+    stored: dict[str, dict[str, str]] = {}
+    text: str | None = None
+    try:
+        for opcode, _, body in records(path, (Opcode.METADATA, Opcode.ATTACHMENT), _ignore):
+            if opcode == Opcode.METADATA:
+                record = metadata(body)
+                stored[record.name] = record.metadata
+            else:
+                text = attachment(body).data.decode()
+            if text is not None and {OWN_METADATA, FREE_METADATA} <= stored.keys():
+                return from_metadata(stored[OWN_METADATA], text, stored[FREE_METADATA])
+    except (ValueError, KeyError) as error:
+        raise SourceError(f"{path}: the head of the log is damaged: {error}", _HEAD_LOST) from error
+    raise _no_head(path, OWN_METADATA in stored)
+
+
+_HEAD_LOST = "there is no way to read it without; take another log or a copy"
+
+
+def _ignore(damage: Damage) -> None:
+    """The head may be fine all the same."""
+
+
+def _no_head(path: Path, begun: bool) -> SourceError:
+    if begun or not is_complete(path):
+        return SourceError(f"{path}: the head of the log is missing", _HEAD_LOST)
+    return SourceError(
+        f"{path}: an MCAP file of another program: it has no {SAMPLES.topic} of an ejector",
+        "take a log of 'twin run', 'twin replay' or 'twin import'",
+    )

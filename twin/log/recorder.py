@@ -1,0 +1,178 @@
+"""The log as one more sink of the loop."""
+
+import time
+import uuid
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from twin.errors import SourceError
+from twin.events import Event
+from twin.log.columns import Tray, encode
+from twin.log.header import Identity, LogHeader
+from twin.log.messages import Scalars, encode_event, encode_log
+from twin.log.output import Output
+from twin.log.part import part_path, write_head
+from twin.log.schema import CHANNELS
+from twin.signals import Samples, Ticks
+
+FLUSH_S = 0.25  # after this much a chunk is completed; a killed process loses no more than it
+SYNC_S = 1.0  # after this much the disk is asked to keep it
+BATCH = 10_000  # rows in a message where they come fast
+
+_SAMPLES, _SCALARS, _EVENTS, _LOG = CHANNELS
+
+
+class Recorder:
+    """Writes a new log, in parts where ``rotate_bytes`` is given.
+
+    A part is closed once it is that long, so it may be longer by a chunk (1 MiB). Every method
+    raises SourceError where the file cannot be written; what was written until then can be read,
+    and ``close`` is then quiet.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        header: LogHeader,
+        rotate_bytes: int | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._path = path
+        self._header = header
+        self._rotate_bytes = rotate_bytes
+        self._clock = clock
+        self._flushed = self._synced = clock()
+        self._tray = Tray(BATCH)
+        self._scalars = Scalars(header.ambient)
+        self._events: list[tuple[int, Event]] = []  # with ns of receipt
+        self._host_ns: int | None = None  # of the last row
+        self._failure: SourceError | None = None
+        self._closed = False
+        self._series = uuid.uuid4().hex
+        self._number = 0
+        self._begin()
+
+    def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event] = ()) -> None:
+        """Take row-aligned SAMPLE and TICK rows, maybe none, and what happened with them."""
+        if len(samples) != len(ticks):
+            raise ValueError(f"{len(samples)} samples but {len(ticks)} ticks")
+        if self._failure:
+            raise self._failure
+        try:
+            self._take(samples, ticks, events)
+        except OSError as error:
+            raise self._fail(error) from error
+
+    def close(self) -> None:
+        """Write what is held back and the summary; further calls do nothing."""
+        if self._closed or self._failure:
+            return
+        self._closed = True
+        try:
+            self._add_rows(*self._tray.take())
+            self._add_events()
+            self._finish()
+        except OSError as error:
+            raise self._fail(error) from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _take(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
+        if len(samples):
+            self._host_ns = int(samples["host_ns"][-1])
+        self._events.extend((self._received(event, samples), event) for event in events)
+        for block in self._tray.add(samples, ticks):
+            self._add_rows(*block)
+        now = self._clock()
+        # An empty block says that nothing comes just now: nothing to wait for.
+        if now - self._flushed >= FLUSH_S or not len(samples):
+            self._flush(now)
+
+    def _flush(self, now: float) -> None:
+        self._add_rows(*self._tray.take())
+        self._add_events()
+        self._file.flush()
+        self._flushed = now
+        if now - self._synced >= SYNC_S:
+            self._output.sync()
+            self._synced = now
+
+    def _add_rows(self, samples: Samples, ticks: Ticks) -> None:
+        if not len(samples):
+            return
+        host, plc = int(samples["host_ns"][0]), int(samples["time_ns"][0])
+        self._add(_SAMPLES, host, plc, encode(samples, ticks))
+        for host, plc, message in self._scalars.messages(samples, ticks):
+            self._add(_SCALARS, host, plc, message)
+        if self._rotate_bytes is not None and self._output.position >= self._rotate_bytes:
+            self._finish()
+            self._number += 1
+            self._begin()
+
+    def _add_events(self) -> None:
+        for host_ns, event in self._events:
+            self._add(_EVENTS, host_ns, event.time_ns, encode_event(event))
+            self._add(_LOG, host_ns, event.time_ns, encode_log(event))
+        self._events.clear()
+
+    def _add(self, channel: int, host_ns: int, plc_ns: int, message: bytes) -> None:
+        # MCAP has no times before 1970; the messages themselves keep them.
+        self._file.add(channel, max(host_ns, 0), max(plc_ns, 0), message)
+
+    def _received(self, event: Event, samples: Samples) -> int:
+        """When the row was received with which it happened: in a long block not the last one."""
+        rows = np.flatnonzero(samples["time_ns"] <= event.time_ns)
+        if len(rows):
+            return int(samples["host_ns"][rows[-1]])
+        return event.time_ns if self._host_ns is None else self._host_ns
+
+    def _begin(self) -> None:
+        path = part_path(self._path, self._number)
+        try:
+            if self._number == 0 and part_path(path, 1).exists():
+                raise FileExistsError
+            self._output = Output(path)
+        except OSError as error:
+            self._failure = _refused(path, error)
+            raise self._failure from error
+        try:
+            identity = Identity(self._series, self._number)
+            self._file = write_head(self._output, self._header, identity)
+        except OSError as error:
+            raise self._fail(error) from error
+
+    def _finish(self) -> None:
+        self._file.finish()
+        self._output.finish()
+
+    def _fail(self, error: OSError) -> SourceError:
+        self._output.abandon()
+        path = part_path(self._path, self._number)
+        self._failure = SourceError(
+            f"{path}: cannot be written: {error.strerror}",
+            "make space or choose another disk; what was logged until then can be read",
+        )
+        return self._failure
+
+
+def _refused(path: Path, error: OSError) -> SourceError:
+    if isinstance(error, FileExistsError):
+        return SourceError(
+            f"{path}: there is already a log of that name",
+            "a log is never overwritten: choose another name, or remove the old one with its parts",
+        )
+    hint = "check that the folder exists, may be written to and has space"
+    return SourceError(f"{path}: cannot be written: {error.strerror}", hint)
