@@ -1,0 +1,169 @@
+"""What a Modbus PLC shows of itself, line by line: for the first hour with an unknown PLC."""
+
+import statistics
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from drivers.link import Clock, Link, ModbusSettings
+from drivers.modbus import REAL
+from drivers.poll import plan
+from drivers.ring import RECORDS_AT_ONCE, Header, Trace
+from drivers.tags import Address, Pressure, Tag, WordOrder, Words, numbers
+from twin.errors import SourceError
+
+TEST_REGISTERS = Address("holding", 0)
+ORDERS: tuple[WordOrder, ...] = ("big", "little")
+TIMES = 20  # requests to measure the round trip with
+WATCHED_S = 0.5  # to measure the scan rate
+
+
+@dataclass(frozen=True)
+class Line:
+    """One thing that was looked at."""
+
+    what: str
+    text: str
+    good: bool = True
+
+
+def probe(settings: ModbusSettings, clock: Clock = REAL) -> list[Line]:
+    """Connect, read everything the settings name, and say what came; never raises SourceError."""
+    link = Link(settings)
+    try:
+        connected = _line("connection", lambda: _connect(link, settings, clock))
+        return [connected, *_look(link, settings, clock)] if connected.good else [connected]
+    finally:
+        link.close()
+
+
+def _look(link: Link, settings: ModbusSettings, clock: Clock) -> list[Line]:
+    lines = [_line("round trip", lambda: _round_trip(link, settings, clock))]
+    for name, tag in settings.tags:
+        if tag is not None:
+            lines.append(_line(name, partial(_show, link, tag, settings)))
+    lines.append(_word_order(link, settings))
+    if settings.mode == "block":
+        trace = Trace(settings, clock)
+        lines.append(_line("trace header", lambda: _header(link, trace)))
+        lines.append(_line("trace records", lambda: _records(link, trace)))
+        lines.append(_line("scan rate", lambda: _rate(link, trace, clock)))
+    return lines
+
+
+def _line(what: str, look: Callable[[], str]) -> Line:
+    try:
+        return Line(what, look())
+    except SourceError as error:
+        return Line(what, f"{error}; {error.hint}" if error.hint else str(error), good=False)
+
+
+def _connect(link: Link, settings: ModbusSettings, clock: Clock) -> str:
+    started = clock.now_ns()
+    link.open()
+    return f"{settings.where}: connected in {(clock.now_ns() - started) * 1e-6:.1f} ms"
+
+
+def _round_trip(link: Link, settings: ModbusSettings, clock: Clock) -> str:
+    """Median time of one request; SourceError if that is too slow for the mode."""
+    tags = [tag for _, tag in settings.tags if tag is not None]
+    requests = 1 if settings.mode == "block" else len(plan(tags))
+    took_ms = []
+    for _ in range(TIMES):
+        started = clock.now_ns()
+        link.read(tags[0].address, tags[0].size)
+        took_ms.append((clock.now_ns() - started) * 1e-6)
+    median, worst = statistics.median(took_ms), max(took_ms)
+    text = f"{median:.2f} ms in the median, {worst:.2f} ms at worst, of {TIMES} requests"
+    if settings.mode == "block" and median > 0.8 * RECORDS_AT_ONCE:
+        raise SourceError(text, "too slow to follow 1 ms scans with 31 records per request")
+    if settings.mode == "poll" and median * requests > 1.0:
+        rate = 1e3 / (median * requests)
+        raise SourceError(text, f"polling will reach {rate:.0f} samples a second instead of 1000")
+    return text
+
+
+def _show(link: Link, tag: Tag, settings: ModbusSettings) -> str:
+    link.open()
+    words = link.read(tag.address, tag.size).reshape(1, tag.size)
+    hexadecimal = " ".join(f"0x{word:04X}" for word in words[0])
+    orders = ORDERS if tag.size > 1 else (settings.word_order,)
+    values = [_value(tag, words, order, settings) for order in orders]
+    if len(orders) > 1:
+        values = [f"{order} {value}" for order, value in zip(orders, values, strict=True)]
+        values.append(f"configured {settings.word_order}")
+    return f"{tag.address}: {hexadecimal} = {', '.join(values)}"
+
+
+def _value(tag: Tag, words: Words, order: WordOrder, settings: ModbusSettings) -> str:
+    raw = tag.raw(words, order)[0]
+    if not isinstance(tag, Pressure):
+        return f"{raw}"
+    pascal, quality = tag.decode(words, order, settings.ambient_mbar * 100.0)
+    flags = " flagged" if quality[0] else ""
+    return f"{raw:.6g} → {pascal[0] / 100.0:.5g} mbar absolute{flags}"
+
+
+def word_order_of(words: Words) -> WordOrder | None:
+    """Which word order the test registers show; None if they are none. ``words``: 6 words."""
+    if words[0] != 0x1234 or words[1] != 0x10000 - 12345:
+        return None
+    for order in ORDERS:
+        whole, real = numbers(words[2:4], ">u4", order), numbers(words[4:6], ">f4", order)
+        if whole == 0x12345678 and real == np.float32(123.456):
+            return order
+    return None
+
+
+def _word_order(link: Link, settings: ModbusSettings) -> Line:
+    """Test registers are a courtesy of the PLC: having none is no fault."""
+    try:
+        link.open()
+        order = word_order_of(link.read(TEST_REGISTERS, 6))
+    except SourceError as error:
+        return Line("word order", f"no test registers ({error})")
+    if order is None:
+        return Line("word order", f"no test registers at {TEST_REGISTERS}: compare both orders")
+    text = f"{order}, by the test registers at {TEST_REGISTERS}"
+    if order == settings.word_order:
+        return Line("word order", text)
+    return Line("word order", f'{text}; set word_order = "{order}" in [driver]', good=False)
+
+
+def _header(link: Link, trace: Trace) -> str:
+    link.open()
+    header = trace.header(link)
+    trace.refuse_other(header)
+    return (
+        f"{header.depth} records, one every {header.period_ns // 1000} µs; boot {header.boot}, "
+        f"sequence {header.sequence}, PLC time {header.time_ns * 1e-9:.3f} s"
+    )
+
+
+def _records(link: Link, trace: Trace) -> str:
+    link.open()
+    header = trace.start(link)
+    return f"the newest carry the header's sequence ({header.sequence})"
+
+
+def _rate(link: Link, trace: Trace, clock: Clock) -> str:
+    """Scans per second by the clock here; SourceError if the sequence stands still."""
+    link.open()
+    first, first_ns = _timed_header(link, trace, clock)
+    clock.sleep(WATCHED_S)
+    last, last_ns = _timed_header(link, trace, clock)
+    scans = last.advance(first)
+    if not scans:
+        raise SourceError(
+            f"the sequence went from {first.sequence} to {last.sequence} in {WATCHED_S} s",
+            "does the PLC's program run, or did it restart just now?",
+        )
+    nominal = 1e9 / first.period_ns
+    return f"{scans / (last_ns - first_ns) * 1e9:.1f} scans/s, nominal {nominal:.1f}"
+
+
+def _timed_header(link: Link, trace: Trace, clock: Clock) -> tuple[Header, int]:
+    header = trace.header(link)
+    return header, clock.now_ns()

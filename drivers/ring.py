@@ -1,0 +1,253 @@
+"""Block mode: follow the PLC's ring of scans without losing one.
+
+The PLC writes a record per scan into a ring and counts them in a header. Here the header is read,
+then what is new. A record proves itself by the low 16 bits of its sequence; whatever is missing
+shows as a missing number and as a flag on the sample after it.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.link import Clock, Link, ModbusSettings, span
+from drivers.tags import WordOrder, Words, numbers
+from twin.errors import SourceError
+from twin.signals import MBAR, SAMPLE, Quality, Samples
+
+HEADER_WORDS = 12
+RECORD_WORDS = 4
+RECORDS_AT_ONCE = 31  # 124 of the 125 words that a request may carry
+COMMANDS = 0b11  # in the status word, as in Command
+OVERFLOW_BIT = 8  # in the status word
+RESERVE = 64  # records at the old end of the ring that the PLC may overwrite while they are read
+LONGEST_FETCH_NS = 100_000_000  # then yield what came; no interval is longer
+CLOCK_TOLERANCE_NS = 50_000_000  # PLC time against sequence
+WRAP = 1 << 32  # the PLC counts with 32 bits
+
+EMPTY: Samples = np.empty(0, SAMPLE)
+
+
+@dataclass(frozen=True)
+class Header:
+    """What the PLC says about its ring."""
+
+    sequence: int  # of the newest complete record, 32 bits
+    time_ns: int  # of that record
+    boot: int  # differs after every restart
+    period_ns: int
+    depth: int  # records
+    record_words: int
+    supply: Words  # (1, 1), as its tag declares
+
+    @classmethod
+    def parse(cls, words: Words, order: WordOrder) -> "Header":
+        """Take the header's 12 words."""
+        return cls(
+            sequence=int(numbers(words[0:2], ">u4", order)),
+            time_ns=int(numbers(words[2:6], ">i8", order)),
+            boot=int(words[6]),
+            period_ns=int(words[7]) * 1000,
+            depth=int(words[8]),
+            record_words=int(words[9]),
+            supply=words[10:11].reshape(1, 1),
+        )
+
+    @property
+    def ready(self) -> bool:
+        """Whether it describes a ring; a PLC that just starts may show zeros."""
+        return self.record_words == RECORD_WORDS and self.depth > 2 * RESERVE and self.period_ns > 0
+
+    def advance(self, earlier: "Header") -> int | None:
+        """Scans since ``earlier``; None if the PLC restarted in between."""
+        scans = (self.sequence - earlier.sequence) % WRAP
+        return None if self.boot != earlier.boot or scans >= WRAP // 2 else scans
+
+    def clock_jumped(self, earlier: "Header", scans: int) -> bool:
+        """Whether PLC time did not run with the sequence."""
+        ran = self.time_ns - earlier.time_ns - scans * self.period_ns
+        return abs(ran) > CLOCK_TOLERANCE_NS
+
+    def follows(self, earlier: "Header") -> bool:
+        """Whether nothing happened but a few more scans."""
+        scans = self.advance(earlier)
+        return (
+            self.ready
+            and scans is not None
+            and scans < self.depth
+            and not self.clock_jumped(earlier, scans)
+        )
+
+
+class Trace:
+    """Where we are in the ring of one PLC; it outlives connections."""
+
+    def __init__(self, settings: ModbusSettings, clock: Clock) -> None:
+        self._settings = settings
+        self._clock = clock
+        self._header: Header | None = None
+        self._newest = -1  # sequence of the header, beyond 32 bits
+        self._next = 0  # sequence to fetch next
+        self._last = -1  # sequence of the last sample given
+        self._last_ns = 0  # and its PLC time
+        self._break = 0  # Quality bits for the next sample
+
+    def samples(self, link: Link) -> Iterator[Samples]:
+        """Blocks of what is new, one every interval; ends only by an exception."""
+        interval_ns = round(self._settings.interval_ms * 1e6)
+        if self._header is None:
+            self._header = self.start(link)
+        while True:
+            started = self._clock.now_ns()
+            yield self._read(link)
+            rest = started + interval_ns - self._clock.now_ns()
+            if rest > 0:
+                self._clock.sleep(rest * 1e-9)
+
+    def start(self, link: Link) -> Header:
+        """Begin at the newest record; SourceError if there is no ring as configured."""
+        ring = self._settings.ring
+        header = self.header(link)
+        for _ in range(3):  # some PLCs announce a record a little before it can be read
+            self.refuse_other(header)
+            if self._announced(link, header):
+                self._newest = header.sequence
+                self._next, self._last = header.sequence, header.sequence - 1
+                self._last_ns = header.time_ns - header.period_ns
+                return header
+            header = self.header(link)
+        raise SourceError(
+            f"{self._settings.where}: the records at {ring.records} do not carry the sequence "
+            f"numbers that the header at {ring.header} announces ({header.sequence})",
+            f'check [driver.ring] and word_order (is "{self._settings.word_order}"); '
+            "twin probe shows both orders",
+        )
+
+    def refuse_other(self, header: Header) -> None:
+        """SourceError if ``header`` does not describe a ring that can be followed."""
+        ring = self._settings.ring
+        end = ring.records.offset + header.depth * RECORD_WORDS
+        if not header.ready or end > 0x10000:
+            raise SourceError(
+                f"{self._settings.where}: no trace header at {span(ring.header, HEADER_WORDS)}: "
+                f"it says {header.depth} records of {header.record_words} words, one every "
+                f"{header.period_ns // 1000} µs; expected are words of {RECORD_WORDS} and more "
+                f"than {2 * RESERVE} records",
+                "check [driver.ring] header against the PLC's trace block; is its program running?",
+            )
+
+    def header(self, link: Link) -> Header:
+        """Read the header."""
+        words = link.read(self._settings.ring.header, HEADER_WORDS)
+        return Header.parse(words, self._settings.word_order)
+
+    def _announced(self, link: Link, header: Header) -> bool:
+        """Whether the two newest records are those that the header announces."""
+        for sequence in range(max(0, header.sequence - 1), header.sequence + 1):
+            if not self._fetch(link, header, sequence, sequence + 1)[1].all():
+                return False
+        return True
+
+    def _read(self, link: Link) -> Samples:
+        """Whatever is new, as far as the time for one block goes."""
+        started = self._clock.now_ns()
+        header = self._next_header(link)
+        if not header.ready:
+            return EMPTY
+        self._place(header)
+        first = self._next
+        records, valid = self._fetch(link, header, first, self._newest + 1)
+        end = first + len(valid)
+        took_ns = self._clock.now_ns() - started
+        if took_ns > header.period_ns * (first - self._newest + header.depth) // 2:
+            overwritten = self._overwritten(link, header)
+            valid &= np.arange(first, end) > overwritten
+        return self._take(header, records, first, valid)
+
+    def _next_header(self, link: Link) -> Header:
+        """Read the header; twice where it surprises, since it may have been torn."""
+        assert self._header is not None
+        header = self.header(link)
+        return header if header.follows(self._header) else self.header(link)
+
+    def _place(self, header: Header) -> None:
+        """Say where ``header`` is and what broke on the way there."""
+        assert self._header is not None
+        scans = header.advance(self._header)
+        if scans is None:
+            self.refuse_other(header)
+            self._break |= Quality.RESTART
+            self._newest, self._next, self._last = header.sequence, 0, -1
+        else:
+            self._newest += scans
+            if header.clock_jumped(self._header, scans):
+                self._break |= Quality.CLOCK
+        self._header = header
+        self._next = max(self._next, self._newest - header.depth + RESERVE)
+
+    def _fetch(
+        self, link: Link, header: Header, first: int, end: int
+    ) -> tuple[Words, npt.NDArray[np.bool_]]:
+        """Records (rows, 4) from sequence ``first`` on, at most to ``end``, and which are valid."""
+        deadline = self._clock.now_ns() + LONGEST_FETCH_NS
+        chunks = [np.empty((0, RECORD_WORDS), np.uint16)]
+        sequence = first
+        while sequence < end and self._clock.now_ns() < deadline:
+            slot = sequence % WRAP % header.depth
+            to_wrap = min(header.depth - slot, WRAP - sequence % WRAP)
+            count = min(RECORDS_AT_ONCE, end - sequence, to_wrap)
+            address = self._settings.ring.records + RECORD_WORDS * slot
+            words = link.read(address, RECORD_WORDS * count)
+            chunks.append(words.reshape(count, RECORD_WORDS))
+            sequence += count
+        records = np.concatenate(chunks)
+        expected = np.arange(first, sequence).astype(np.uint16)  # the low 16 bits
+        return records, records[:, 0] == expected
+
+    def _overwritten(self, link: Link, header: Header) -> int:
+        """Sequence up to which the PLC may have overwritten records since ``header``."""
+        scans = self.header(link).advance(header)
+        if scans is None:  # it restarted: nothing of what was read can be trusted
+            return self._newest
+        return self._newest + scans - header.depth + 1  # one is being written
+
+    def _take(
+        self, header: Header, records: Words, first: int, valid: npt.NDArray[np.bool_]
+    ) -> Samples:
+        """Make samples of the valid records and go on after them."""
+        sequence = first + np.flatnonzero(valid)
+        # Records behind the last valid one may only be late; without any there is no use waiting.
+        self._next = int(sequence[-1]) + 1 if len(sequence) else first + len(valid)
+        if not len(sequence):
+            return EMPTY
+        block = self._decode(header, records[valid])
+        block["sequence"] = sequence
+        block["time_ns"] = header.time_ns - (self._newest - sequence) * header.period_ns
+        block["host_ns"] = self._clock.wall_ns()
+        self._mark_breaks(block)
+        return block
+
+    def _decode(self, header: Header, records: Words) -> Samples:
+        tags, order = self._settings.tags, self._settings.word_order
+        ambient = self._settings.ambient_mbar * MBAR
+        block = np.zeros(len(records), SAMPLE)
+        status = records[:, 1]
+        block["commands"] = status & COMMANDS
+        block["pressure"], quality = tags.pressure.decode(records[:, 2:4], order, ambient)
+        overflow = ((status >> OVERFLOW_BIT) & 1).astype(np.uint8) * Quality.OVERFLOW.value
+        block["quality"] = quality | overflow
+        block["supply"] = np.nan
+        if tags.supply is not None:
+            block["supply"] = tags.supply.supply(header.supply, order, ambient)
+        return block
+
+    def _mark_breaks(self, block: Samples) -> None:
+        gaps = np.diff(block["sequence"], prepend=self._last) != 1
+        block["quality"][gaps] |= Quality.GAP.value
+        if block["time_ns"][0] <= self._last_ns:
+            self._break |= Quality.CLOCK
+        block["quality"][0] |= self._break
+        self._break = 0
+        self._last = int(block["sequence"][-1])
+        self._last_ns = int(block["time_ns"][-1])

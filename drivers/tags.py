@@ -1,0 +1,189 @@
+"""Tags: where a value lies in a Modbus PLC, how it is coded, and what it means.
+
+Registers arrive as ``uint16`` arrays of shape (rows, registers of one value) and leave as columns
+of ``SAMPLE``: values in Pa and ``Quality`` bits. Everything is vectorised over the rows.
+"""
+
+import re
+from dataclasses import dataclass
+from typing import Annotated, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BeforeValidator, Field, model_validator
+
+from twin.settings import Settings
+from twin.signals import BAR, MBAR, UNUSABLE, Quality
+
+Words = npt.NDArray[np.uint16]
+Floats = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.uint8]
+
+Area = Literal["coil", "discrete", "input", "holding"]
+Type = Literal["bit", "int16", "uint16", "int32", "uint32", "float32"]
+WordOrder = Literal["big", "little"]
+Reference = Literal["absolute", "gauge", "vacuum"]
+
+REFERENCE_DIGIT: dict[Area, str] = {"coil": "0", "discrete": "1", "input": "3", "holding": "4"}
+CODE: dict[Type, str] = {  # as NumPy reads it once the high word stands first
+    "bit": ">u2",
+    "int16": ">i2",
+    "uint16": ">u2",
+    "int32": ">i4",
+    "uint32": ">u4",
+    "float32": ">f4",
+}
+PASCAL = {"Pa": 1.0, "mbar": MBAR, "kPa": 1000.0, "bar": BAR, "psi": 6894.757293168}
+
+
+@dataclass(frozen=True)
+class Address:
+    """A place in a PLC: 0-based in the protocol, 1-based with the area's digit in manuals."""
+
+    area: Area
+    offset: int
+
+    @classmethod
+    def parse(cls, text: object) -> "Address":
+        """Take ``"holding:100"`` (0-based) or ``"40101"`` (manual, 1-based); else ValueError."""
+        if isinstance(text, cls):
+            return text
+        text = str(text)
+        for area, digit in REFERENCE_DIGIT.items():
+            if match := re.fullmatch(rf"{area}:(\d+)", text):
+                return cls._checked(area, int(match[1]), text)
+            if match := re.fullmatch(rf"{digit}(\d{{4,5}})", text):
+                return cls._checked(area, int(match[1]) - 1, text)
+        raise ValueError(
+            f'"{text}" is no address: write "holding:0" (also input, discrete, coil; counted '
+            'from 0) or, in quotes, the manual\'s "40001" (3…, 1…, 0…; counted from 1)'
+        )
+
+    @classmethod
+    def _checked(cls, area: Area, offset: int, text: str) -> "Address":
+        if not 0 <= offset <= 0xFFFF:
+            raise ValueError(
+                f'"{text}" is no address: offsets are 0…65535 (manual: …00001 to …65536)'
+            )
+        return cls(area, offset)
+
+    def __add__(self, count: int) -> "Address":
+        return Address(self.area, self.offset + count)
+
+    def __str__(self) -> str:
+        return f"{self.area}:{self.offset} [{self.manual}]"
+
+    @property
+    def manual(self) -> str:
+        """As manuals write it: five digits where they suffice, else six."""
+        width = 4 if self.offset < 9999 else 5
+        return f"{REFERENCE_DIGIT[self.area]}{self.offset + 1:0{width}}"
+
+    @property
+    def of_words(self) -> bool:
+        """Whether registers lie there, and not single bits."""
+        return self.area in ("input", "holding")
+
+
+Place = Annotated[Address, BeforeValidator(Address.parse)]
+
+
+def numbers(words: Words, code: str, order: WordOrder) -> npt.NDArray[np.generic]:
+    """Numbers of NumPy type ``code`` (big-endian) from words (..., registers of one number)."""
+    ordered = words if order == "big" else words[..., ::-1]
+    view = np.ascontiguousarray(ordered, dtype=">u2").view(code)
+    return view[..., 0]
+
+
+class Tag(Settings):
+    """A bit or a number in the PLC."""
+
+    address: Place
+    type: Type = "bit"
+    bit: int | None = Field(default=None, ge=0, le=15)  # of a word, 0 the lowest
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        word_bit = self.address.of_words and self.type == "bit"
+        if word_bit and self.bit is None:
+            raise ValueError(
+                f"{self.address} is a 16-bit word: say which bit = 0…15 is meant, or its type"
+            )
+        if self.bit is not None and not word_bit:
+            raise ValueError(f'bit belongs to type "bit" in a word, not to {self.address}')
+        if not self.address.of_words and self.type != "bit":
+            raise ValueError(f'{self.address} holds one bit: type must be "bit"')
+        return self
+
+    @property
+    def size(self) -> int:
+        """How many registers (or coils) it takes."""
+        return np.dtype(CODE[self.type]).itemsize // 2
+
+    def raw(self, words: Words, order: WordOrder) -> npt.NDArray[np.generic]:
+        """Numbers as they stand in the PLC (bits as 0 or 1) from words (rows, size)."""
+        values = numbers(words, CODE[self.type], order)
+        return values if self.bit is None else (values.astype(np.uint16) >> self.bit) & 1
+
+
+class Pressure(Tag):
+    """A pressure: value = raw · scale + offset in ``unit``, counted from ``reference``."""
+
+    type: Type
+    scale: float = 1.0
+    offset: float = 0.0
+    unit: Literal["mbar", "bar", "kPa", "Pa", "psi"]
+    reference: Reference  # vacuum: positive below ambient
+    range: tuple[float, float] | None = None  # in unit; beyond it a value is flagged, and kept
+    overflow_above: int | None = Field(default=None, ge=0)  # raw; Siemens 32511; both signs
+
+    @model_validator(mode="after")
+    def _means_a_pressure(self) -> Self:
+        if self.type == "bit":
+            raise ValueError("a pressure is a number, not a bit")
+        if self.scale == 0:
+            raise ValueError("scale must not be 0")
+        if self.range is not None and not self.range[0] < self.range[1]:
+            raise ValueError("range must be [low, high] with low < high")
+        return self
+
+    def decode(
+        self, words: Words, order: WordOrder, ambient: float, onto: Reference = "absolute"
+    ) -> tuple[npt.NDArray[np.float32], Flags]:
+        """Pressures in Pa, counted from ``onto``, and quality bits, from words (rows, size).
+
+        ``ambient`` is in Pa. NaN and infinite values become NaN and BAD.
+        """
+        with np.errstate(invalid="ignore", over="ignore"):  # whatever bits come, they are judged
+            raw = self.raw(words, order).astype(np.float64)
+            value = raw * self.scale + self.offset
+            pascal = _counted(value * PASCAL[self.unit], self.reference, onto, ambient)
+            column = pascal.astype(np.float32)
+            quality = self._judge(raw, value)
+        unreadable = ~np.isfinite(column)
+        column[unreadable] = np.nan
+        quality[unreadable] |= Quality.BAD.value
+        return column, quality
+
+    def _judge(self, raw: Floats, value: Floats) -> Flags:
+        quality = np.zeros(len(raw), np.uint8)
+        if self.range is not None:
+            low, high = self.range
+            quality[(value < low) | (value > high)] |= Quality.OUT_OF_RANGE.value
+        if self.overflow_above is not None:  # two's complement reaches one further down
+            above = self.overflow_above
+            quality[(raw > above) | (raw < -above - 1)] |= Quality.OVERFLOW.value
+        return quality
+
+    def supply(self, words: Words, order: WordOrder, ambient: float) -> npt.NDArray[np.float32]:
+        """Supply pressures in Pa gauge from words (rows, size); NaN where they are none."""
+        pascal, quality = self.decode(words, order, ambient, onto="gauge")
+        pascal[(quality & UNUSABLE) != 0] = np.nan
+        return pascal
+
+
+def _counted(pascal: Floats, reference: Reference, onto: Reference, ambient: float) -> Floats:
+    """Pressures counted from ``reference`` as counted from ``onto``; ambient cancels exactly."""
+    zero = {"absolute": 0.0, "gauge": ambient, "vacuum": ambient}
+    sign = {"absolute": 1.0, "gauge": 1.0, "vacuum": -1.0}
+    return sign[onto] * (sign[reference] * pascal + (zero[reference] - zero[onto]))

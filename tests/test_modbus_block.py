@@ -1,0 +1,512 @@
+"""The PLC's ring, followed over a real socket; the PLC's time and ours pass only when told."""
+
+import itertools
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.link import Clock
+from drivers.modbus import ModbusSettings, blocks
+from tests.modbus_server import CUT, HALF, SILENT, ModbusServer, PlcTime, TracePlc
+from twin.errors import SourceError
+from twin.signals import SAMPLE, Quality, Samples
+
+TAGS = {
+    "pressure": {
+        "address": "input:1",
+        "type": "float32",
+        "unit": "mbar",
+        "reference": "absolute",
+        "range": [0, 1300],
+    },
+    "supply": {"address": "input:3", "type": "int16", "unit": "mbar", "reference": "gauge"},
+}
+
+
+def settings_for(server: ModbusServer, **changes: Any) -> ModbusSettings:
+    table = {"host": "127.0.0.1", "port": server.port, "timeout_ms": 60, "tags": TAGS}
+    return ModbusSettings.model_validate(table | changes)
+
+
+def clock_of(time: PlcTime) -> Clock:
+    return Clock(time.wall_ns, time.now_ns, time.sleep)
+
+
+class Rig:
+    """Server, PLC, time and the stream of one test."""
+
+    def __init__(self, server: ModbusServer, plc: TracePlc, **changes: Any) -> None:
+        self.server = server
+        self.plc = plc
+        self.time = PlcTime(lambda scans: self.plc.scan(scans))  # noqa: PLW0108 - tests replace scan
+        self.stream = blocks(settings_for(server, **changes), clock_of(self.time))
+
+    def take(self, count: int) -> Samples:
+        return np.concatenate([np.empty(0, SAMPLE), *itertools.islice(self.stream, count)])
+
+    def at_work(self) -> "Rig":
+        assert len(self.take(3))
+        return self
+
+
+@pytest.fixture
+def server() -> Iterator[ModbusServer]:
+    with ModbusServer() as server:
+        yield server
+
+
+@pytest.fixture
+def rig(server: ModbusServer) -> Iterator[Rig]:
+    rig = Rig(server, TracePlc(server))
+    with closing(rig.stream):
+        yield rig
+
+
+def flags(samples: Samples, quality: Quality) -> list[int]:
+    """Rows that carry it."""
+    return [int(row) for row in np.flatnonzero(samples["quality"] & quality.value)]
+
+
+def assert_whole(samples: Samples) -> None:
+    """Nothing missing, nothing twice, nothing flagged, PLC time as the PLC's."""
+    assert (np.diff(samples["sequence"]) == 1).all()
+    assert (np.diff(samples["time_ns"]) == 1_000_000).all()
+    assert not samples["quality"].any()
+
+
+def test_every_scan_comes_once_with_its_values_and_times(rig: Rig) -> None:
+    rig.plc.status = 0b10
+    samples = rig.take(20)
+    assert_whole(samples)
+    assert samples["sequence"][0] == 10  # the newest when we came, and no flag
+    assert samples["sequence"][-1] == rig.plc.sequence
+    assert samples["time_ns"][-1] == rig.plc.time_ns
+    expected = (200.0 + samples["sequence"] % 512) * 100.0
+    np.testing.assert_array_equal(samples["pressure"], expected.astype(np.float32))
+    assert (samples["supply"] == 500_000.0).all()
+    assert set(samples["commands"][1:]) == {0b10}
+    assert (np.diff(samples["host_ns"]) >= 0).all()
+    assert samples["host_ns"][-1] <= rig.time.wall_ns()
+
+
+def test_reading_takes_few_requests(rig: Rig) -> None:
+    rig.take(21)
+    assert len(rig.server.requests) == 3 + 2 * 21  # to begin; then header and records
+    assert max(count for _, _, count in rig.server.requests) <= 125
+
+
+def test_little_word_order(server: ModbusServer) -> None:
+    rig = Rig(server, TracePlc(server, little=True), word_order="little")
+    with closing(rig.stream):
+        samples = rig.take(5)
+    assert_whole(samples)
+    assert samples["pressure"][0] == 21_000.0
+
+
+@pytest.mark.parametrize("order", ["big", "little"])
+@pytest.mark.parametrize("sequence", [5, 70_000])
+def test_the_wrong_word_order_is_told_at_once(
+    server: ModbusServer, order: str, sequence: int
+) -> None:
+    plc = TracePlc(server, little=order == "big")
+    plc.scan(sequence)
+    with pytest.raises(SourceError) as caught:
+        next(Rig(server, plc, word_order=order).stream)
+    assert "word_order" in caught.value.hint
+
+
+def test_supply_is_missing_where_no_tag_declares_it(server: ModbusServer) -> None:
+    rig = Rig(server, TracePlc(server), tags={"pressure": TAGS["pressure"]})
+    with closing(rig.stream):
+        assert np.isnan(rig.take(3)["supply"]).all()
+
+
+def test_values_that_are_none_are_flagged(rig: Rig) -> None:
+    values = {40: float("nan"), 41: 1400.0, 42: float("inf")}
+    rig.plc.pressure = lambda sequence: values.get(sequence, 500.0)
+    samples = rig.take(3)
+    assert list(samples["sequence"][flags(samples, Quality.BAD)]) == [40, 42]
+    assert list(samples["sequence"][flags(samples, Quality.OUT_OF_RANGE)]) == [41, 42]
+    assert np.isnan(samples["pressure"][flags(samples, Quality.BAD)]).all()
+    rig.plc.status = 1 << 8
+    assert (rig.take(2)["quality"] == Quality.OVERFLOW).all()
+
+
+def test_a_stall_of_four_seconds_loses_nothing_and_blocks_stay_bounded(rig: Rig) -> None:
+    before = rig.take(3)
+    rig.time.sleep(4.0)
+    assert_whole(np.concatenate([before, rig.take(5)]))
+
+
+def test_a_slow_link_yields_a_block_in_time_and_still_loses_nothing(rig: Rig) -> None:
+    rig.at_work()
+    rig.time.sleep(2.0)
+    rig.server.hook = lambda function, address, count: rig.time.sleep(0.02)
+    sizes = [len(next(rig.stream)) for _ in range(60)]
+    assert max(sizes) <= 7 * 31  # 0.1 s at 20 ms a request
+    rest = rig.take(300)
+    assert_whole(rest)
+    assert rig.plc.sequence - rest["sequence"][-1] < 200
+
+
+def test_too_slow_for_the_ring_takes_what_is_left_and_flags_the_gap(rig: Rig) -> None:
+    last = rig.take(3)["sequence"][-1]
+    rig.time.sleep(10.0)
+    samples = rig.take(3)
+    assert flags(samples, Quality.GAP) == [0]
+    assert last + 5000 < samples["sequence"][0] < rig.plc.sequence - 3900
+    assert_whole(samples[1:])
+    np.testing.assert_array_equal(samples["pressure"], pressures(samples))
+
+
+def pressures(samples: Samples) -> np.ndarray:
+    return ((200.0 + samples["sequence"] % 512) * 100.0).astype(np.float32)
+
+
+def test_a_record_that_is_just_being_overwritten_is_not_read(rig: Rig) -> None:
+    rig.at_work()
+    rig.time.sleep(6.0)
+
+    def half_written(function: int, address: int, count: int) -> None:  # the sequence still old
+        oldest = 1000 + 4 * ((rig.plc.sequence + 1) % rig.plc.depth)
+        rig.plc.put(3, oldest + 2, rig.plc.words(">f", 999.0))
+
+    rig.server.hook = half_written
+    samples = rig.take(1)
+    np.testing.assert_array_equal(samples["pressure"], pressures(samples))
+
+
+def test_records_overwritten_while_they_are_read_are_not_believed(rig: Rig) -> None:
+    rig.at_work()
+    rig.time.sleep(4.0)  # the oldest are about to be overwritten
+
+    def lap_exactly(function: int, address: int, count: int) -> None:
+        if address >= 1000:  # 65536 scans on, the low words would fit again
+            rig.server.hook = lambda function, address, count: None
+            rig.plc.scan(65536)
+            rig.time.ns += 3_000_000_000
+
+    rig.server.hook = lap_exactly
+    samples = rig.take(4)
+    assert flags(samples, Quality.GAP) == [0]
+    np.testing.assert_array_equal(samples["pressure"], pressures(samples))
+    assert samples["sequence"][0] > 60_000
+
+
+def test_a_restart_while_records_are_read_discards_them(rig: Rig) -> None:
+    rig.at_work()
+    rig.time.sleep(4.0)
+
+    def restart(function: int, address: int, count: int) -> None:
+        if address >= 1000:
+            rig.server.hook = lambda function, address, count: None
+            rig.plc.restart()
+            rig.time.ns += 3_000_000_000
+
+    rig.server.hook = restart
+    samples = rig.take(3)
+    assert samples["quality"][0] == Quality.RESTART
+    assert samples["sequence"][0] == 0
+    assert_whole(samples[1:])
+
+
+def test_torn_records_are_missing_and_flagged_behind(rig: Rig) -> None:
+    rig.at_work()
+    scan = rig.plc.scan
+
+    def scan_torn(scans: int) -> None:
+        scan(scans)
+        rig.plc.put(3, 1000 + 4 * 80, [79])
+        rig.plc.put(3, 1000 + 4 * 83, [0xFFFF])
+
+    rig.plc.scan = scan_torn  # type: ignore[method-assign]
+    samples = rig.take(3)
+    assert not {80, 83} & set(samples["sequence"])
+    assert list(samples["sequence"][flags(samples, Quality.GAP)]) == [81, 84]
+    assert len(samples) > 50
+
+
+def test_records_that_come_after_their_header_are_waited_for(rig: Rig) -> None:
+    before = rig.take(3)
+    publish = rig.plc.publish
+
+    def publish_early() -> None:
+        rig.plc.sequence += 2
+        rig.plc.time_ns += 2_000_000
+        publish()
+        rig.plc.sequence -= 2
+        rig.plc.time_ns -= 2_000_000
+
+    rig.plc.publish = publish_early  # type: ignore[method-assign]
+    samples = rig.take(5)
+    assert_whole(np.concatenate([before, samples]))
+    assert samples["sequence"][-1] == rig.plc.sequence
+
+
+def test_a_ring_that_carries_other_records_is_told_at_the_start(server: ModbusServer) -> None:
+    rig = Rig(server, TracePlc(server), ring={"records": "holding:30000"})
+    with pytest.raises(SourceError, match=r"records at holding:30000 \[430001\]"):
+        next(rig.stream)
+
+
+def test_no_trace_at_all_is_told_at_the_start(server: ModbusServer) -> None:
+    rig = Rig(server, TracePlc(server), ring={"header": "40301"})
+    with pytest.raises(SourceError, match=r"no trace header at holding:300–311 \[40301–40312\]"):
+        next(rig.stream)
+
+
+def test_a_torn_header_is_read_again(rig: Rig) -> None:
+    before = rig.at_work().take(1)
+
+    def tear(function: int, address: int, count: int) -> None:
+        if address == 100:
+            rig.plc.put(3, 100, [5])  # the high word of the sequence
+            rig.server.hook = repair
+
+    def repair(function: int, address: int, count: int) -> None:
+        rig.plc.publish()
+
+    rig.server.hook = tear
+    assert_whole(np.concatenate([before, rig.take(3)]))
+
+
+@pytest.mark.parametrize("boot", [None, 7], ids=["boot counter", "sequence only"])
+def test_a_restart_is_flagged_and_goes_on_from_zero(rig: Rig, boot: int | None) -> None:
+    rig.plc.scan(500)
+    rig.at_work()
+    rig.plc.restart(boot=boot)
+    samples = rig.take(3)
+    assert samples["sequence"][0] == 0
+    assert samples["quality"][0] == Quality.RESTART
+    assert_whole(samples[1:])
+
+
+def test_a_restart_that_sets_the_clock_back_is_flagged_as_both(rig: Rig) -> None:
+    rig.at_work()
+    rig.plc.time_ns = 0
+    rig.plc.restart()
+    samples = rig.take(3)
+    assert samples["quality"][0] == Quality.RESTART | Quality.CLOCK
+    assert_whole(samples[1:])
+
+
+def test_a_restart_behind_our_back_is_flagged_with_what_is_missing(rig: Rig) -> None:
+    rig.at_work()
+    rig.plc.restart()
+    rig.time.sleep(9.0)
+    samples = rig.take(2)
+    assert samples["quality"][0] == Quality.RESTART | Quality.GAP
+    assert_whole(samples[1:])
+
+
+@pytest.mark.parametrize("jump_ms", [-3_600_000, -1000, 51, 3_600_000])
+def test_a_jump_of_the_plcs_clock_is_flagged_and_followed(rig: Rig, jump_ms: int) -> None:
+    last = rig.take(3)[-1]
+    rig.plc.time_ns += jump_ms * 1_000_000
+    rig.time.sleep(0.03)
+    samples = rig.take(3)
+    assert flags(samples, Quality.CLOCK) == [0]
+    assert_whole(samples[1:])
+    assert samples["time_ns"][0] == last["time_ns"] + (jump_ms + 1) * 1_000_000
+
+
+def test_a_small_correction_of_the_plcs_clock_is_no_jump(rig: Rig) -> None:
+    rig.at_work()
+    rig.plc.time_ns += 2_000_000
+    assert not rig.take(3)["quality"].any()
+
+
+def test_a_small_step_back_of_the_plcs_clock_is_flagged(rig: Rig) -> None:
+    last = rig.take(3)[-1]
+    rig.plc.time_ns -= 10_000_000
+    rig.time.sleep(0.005)
+    samples = rig.take(2)
+    assert flags(samples, Quality.CLOCK) == [0]
+    assert samples["time_ns"][0] < last["time_ns"]
+
+
+def test_a_plc_that_stands_still_gives_empty_blocks_and_then_goes_on(rig: Rig) -> None:
+    before = rig.take(3)
+    scan, rig.plc.scan = rig.plc.scan, lambda scans: None  # type: ignore[method-assign]
+    assert not len(rig.take(20)[30:])
+    rig.plc.scan = scan  # type: ignore[method-assign]
+    samples = rig.take(4)
+    assert samples["sequence"][0] > before["sequence"][-1]
+    assert_whole(samples)
+
+
+@pytest.mark.parametrize("depth", [4096, 4000])
+def test_the_sequence_goes_on_beyond_32_bits(server: ModbusServer, depth: int) -> None:
+    plc = TracePlc(server, depth)
+    plc.sequence = 2**32 - 200
+    plc.scan(100)
+    rig = Rig(server, plc)
+    with closing(rig.stream):
+        samples = rig.take(10)
+    assert_whole(samples)
+    assert samples["sequence"][-1] > 2**32
+    np.testing.assert_array_equal(samples["pressure"], pressures(samples))
+
+
+@pytest.mark.parametrize("how", [CUT, HALF, SILENT, 6, 11])
+def test_a_lost_connection_comes_back_and_the_ring_fills_the_gap(rig: Rig, how: str | int) -> None:
+    before = rig.at_work().take(1)
+    broken = iter([None, how])  # in the middle of a block: after its header
+    rig.server.hook = lambda function, address, count: next(broken, None)
+    rig.time.sleep(0.2)
+    samples = [next(rig.stream) for _ in range(8)]
+    assert [len(block) for block in samples[:3]] == [0, 0, 0]
+    assert_whole(np.concatenate([before, *samples]))
+
+
+def test_a_connection_that_left_a_request_unanswered_is_given_up(rig: Rig) -> None:
+    rig.at_work()
+    told = iter([SILENT])  # its answer might come late, for the next request
+    rig.server.hook = lambda function, address, count: next(told, None)
+    rig.take(8)
+    assert rig.server.accepted == 2
+
+
+def test_away_for_longer_than_the_ring_is_a_gap(rig: Rig) -> None:
+    rig.at_work()
+    port = rig.server.port
+    rig.server.stop()
+    assert not len(rig.take(50))  # 10 s of trying
+    with ModbusServer(port=port) as server:
+        rig.plc.server = server
+        rig.plc.scan(4096)
+        samples = rig.take(6)
+    assert samples["quality"][0] == Quality.GAP
+    assert_whole(samples[1:])
+
+
+def test_while_the_plc_is_away_a_block_comes_every_quarter_second(rig: Rig) -> None:
+    rig.at_work()
+    rig.server.hook = lambda function, address, count: CUT
+    next(rig.stream)
+    for _ in range(20):
+        before = rig.time.ns
+        assert len(next(rig.stream)) == 0
+        assert rig.time.ns - before <= 250_000_000
+    rig.server.hook = lambda function, address, count: None
+    before = rig.time.ns
+    assert any(len(next(rig.stream)) for _ in range(8))
+    assert rig.time.ns - before <= 2_000_000_000
+
+
+def test_a_plc_that_starts_with_an_empty_header_is_waited_for(rig: Rig) -> None:
+    rig.at_work()
+    scan, rig.plc.scan = rig.plc.scan, lambda scans: None  # type: ignore[method-assign]
+    rig.plc.put(3, 100, [0] * 12)
+    assert not len(rig.take(5))
+    rig.plc.scan = scan  # type: ignore[method-assign]
+    rig.plc.restart()
+    assert rig.take(2)["quality"][0] == Quality.RESTART
+
+
+def test_an_address_refused_later_is_an_error_and_not_retried(rig: Rig) -> None:
+    rig.at_work()
+    rig.server.refused = [range(100, 112)]
+    with pytest.raises(SourceError, match=r"holding:100–111 \[40101–40112\]: illegal data addr"):
+        rig.take(2)
+
+
+def refuse_to_start(server: ModbusServer, **changes: Any) -> SourceError:
+    TracePlc(server)
+    with pytest.raises(SourceError) as caught:
+        next(blocks(settings_for(server, **changes)))
+    assert f"127.0.0.1:{changes.get('port', server.port)}" in str(caught.value)
+    assert caught.value.hint
+    return caught.value
+
+
+def test_no_plc_at_the_port(server: ModbusServer) -> None:
+    with ModbusServer() as gone:
+        pass
+    assert "no connection" in str(refuse_to_start(server, port=gone.port))
+
+
+def test_a_wrong_unit_id_gets_no_answer(server: ModbusServer) -> None:
+    error = refuse_to_start(server, unit=9)
+    assert "unit 9: holding:100–111 [40101–40112]: no answer" in str(error)
+    assert "unit id" in error.hint
+
+
+def test_a_wrong_unit_id_behind_a_gateway(server: ModbusServer) -> None:
+    server.hook = lambda function, address, count: 11
+    assert "the unit does not answer (Modbus exception 11)" in str(refuse_to_start(server))
+
+
+def test_a_register_out_of_range(server: ModbusServer) -> None:
+    server.refused = [range(4000, 65536)]
+    error = refuse_to_start(server, ring={"header": "44096"})
+    assert "holding:4095–4106 [44096–44107]: illegal data address" in str(error)
+    assert "40001" in error.hint
+
+
+def test_a_server_of_another_kind_at_the_port(server: ModbusServer) -> None:
+    server._answer = lambda connection, request: (  # type: ignore[method-assign]
+        connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n") or True
+    )
+    assert "no answer" in str(refuse_to_start(server))
+
+
+def test_an_answer_of_the_wrong_length(server: ModbusServer) -> None:
+    server._pdu = lambda function, address, count, told: bytes([function, 2, 0, 0])  # type: ignore[method-assign]
+    assert "wrong length" in str(refuse_to_start(server))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mode": "poll"}, "polling needs the tags suction and blow_off"),
+        ({"tags": {"pressure": TAGS["supply"]}}, "32-bit"),
+        ({"ring": {"header": "coil:0"}}, "holding or input"),
+        ({"tags": TAGS | {"suction": TAGS["supply"] | {"unit": "mbar"}}}, "suction"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(
+    server: ModbusServer, changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        settings_for(server, **changes)
+
+
+Act = Callable[[Rig], None]
+ACTS: dict[str, Act] = {
+    "run": lambda rig: rig.time.sleep(0.05),
+    "stall": lambda rig: rig.time.sleep(3.9),
+    "overrun": lambda rig: rig.time.sleep(6.0),
+    "restart": lambda rig: rig.plc.restart(),
+    "hang up": lambda rig: rig.server.hang_up(),
+    "clock": lambda rig: setattr(rig.plc, "time_ns", rig.plc.time_ns + 500_000_000),
+}
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.sampled_from(sorted(ACTS)), max_size=8))
+def test_whatever_happens_rows_are_true_and_breaks_are_flagged(acts: list[str]) -> None:
+    with ModbusServer() as server:
+        rig = Rig(server, TracePlc(server))
+        with closing(rig.stream):
+            taken = [rig.take(2)]
+            for act in acts:
+                ACTS[act](rig)
+                taken.append(rig.take(7))
+            rig.time.sleep(0.05)
+            taken.append(rig.take(12))
+    samples = np.concatenate(taken)
+    np.testing.assert_array_equal(samples["pressure"], pressures(samples))
+    assert samples["sequence"][-1] >= rig.plc.sequence - 31
+    after, steps = samples["quality"][1:], np.diff(samples["sequence"])
+    restarted, lost = (after & Quality.RESTART) != 0, (after & Quality.GAP) != 0
+    assert ((steps == 1) | restarted | lost).all()
+    assert ((steps > 0) | restarted).all()
+    assert restarted.sum() <= acts.count("restart")
+    even = np.diff(samples["time_ns"]) == steps * 1_000_000
+    assert (even | restarted | ((after & Quality.CLOCK) != 0)).all()
