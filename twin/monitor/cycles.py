@@ -1,0 +1,138 @@
+"""Cycles cut out of the stream, and the figures each one gives."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from twin.signals import (
+    BREAK,
+    MBAR,
+    NS,
+    SAMPLE,
+    TICK,
+    UNUSABLE,
+    Phase,
+    Samples,
+    Ticks,
+    deviation,
+)
+
+LONGEST_PIECE = 10_000  # rows; a longer cycle is judged in pieces so that alarms do not wait
+FEWEST_ROWS = 20  # of a phase, to judge it
+H2 = 550.0 * MBAR  # Pa below ambient: part present, the field's default
+PAPER_VACUUM = 600.0 * MBAR  # Pa below ambient: what the founding paper times evacuation to
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """One pick: from the suction edge to the next one, or a piece of a long one.
+
+    ``complete`` is a whole cycle that began with a suction edge and was seen to its idle end.
+    """
+
+    index: int
+    samples: Samples
+    ticks: Ticks
+    complete: bool
+
+    @property
+    def end_ns(self) -> int:
+        """PLC time of the last row."""
+        return int(self.samples["time_ns"][-1])
+
+
+@dataclass
+class CycleCutter:
+    """Takes rows in, gives cycles out as soon as they have ended."""
+
+    _samples: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))
+    _ticks: Ticks = field(default_factory=lambda: np.empty(0, TICK))
+    _index: int = -1  # of the cycle that is being collected; −1 before the first suction edge
+    _at_edge: bool = False  # what is collected begins with a suction edge
+
+    def push(self, samples: Samples, ticks: Ticks) -> Iterator[Cycle]:
+        """Give every cycle that these rows end."""
+        self._samples = np.concatenate([self._samples, samples])
+        self._ticks = np.concatenate([self._ticks, ticks])
+        while (end := self._next_end()) is not None:
+            yield self._cut(end)
+
+    def flush(self) -> Iterator[Cycle]:
+        """Give what is left; it is complete if it had come to idle."""
+        if len(self._samples):
+            yield self._cut(len(self._samples))
+
+    def _edges(self, last: int) -> npt.NDArray[np.bool_]:
+        """Mark the rows 1..last−1 at which suction begins."""
+        phase = self._ticks["phase"][:last]
+        edges: npt.NDArray[np.bool_] = phase[1:] == Phase.SUCTION
+        edges &= np.isin(phase[:-1], (Phase.IDLE, Phase.BLOW_OFF))
+        return edges
+
+    def _next_end(self) -> int | None:
+        breaks = (self._samples["quality"][1:LONGEST_PIECE] & BREAK) != 0
+        found = np.flatnonzero(self._edges(LONGEST_PIECE) | breaks)
+        if len(found):
+            return int(found[0]) + 1
+        return LONGEST_PIECE if len(self._samples) > LONGEST_PIECE else None
+
+    def _cut(self, end: int) -> Cycle:
+        begins, self._at_edge = self._at_edge, bool(self._edges(end + 1)[end - 1 : end].any())
+        samples, self._samples = self._samples[:end], self._samples[end:]
+        ticks, self._ticks = self._ticks[:end], self._ticks[end:]
+        self._index += begins
+        whole = begins and ticks["phase"][-1] in (Phase.IDLE, Phase.BLOW_OFF)
+        return Cycle(self._index, samples, ticks, bool(whole))
+
+
+def time_to(
+    vacuum: float, pressure: npt.NDArray[np.float64], cycle: Cycle, ambient: float
+) -> float:
+    """Time (s) from the suction edge until ``pressure`` first is ``vacuum`` Pa below ambient."""
+    reached = np.flatnonzero(ambient - pressure >= vacuum)
+    if not len(reached):
+        return float("nan")
+    times = cycle.samples["time_ns"]
+    return float(times[reached[0]] - times[0]) * NS
+
+
+def figures(cycle: Cycle, ambient: float) -> dict[str, float]:
+    """Return what a cycle says in one number each, pressures in mbar and times in ms.
+
+    Deviation per phase as mean and rms; the vacuum at which the air saving switched; evacuation
+    times to H2 measured and expected; the highest vacuum. What a cycle cannot say is left out.
+    """
+    off = deviation(cycle.samples, cycle.ticks) / MBAR
+    result: dict[str, float] = {}
+    for phase in Phase:
+        there = off[(cycle.ticks["phase"] == phase) & np.isfinite(off)]
+        if len(there) >= FEWEST_ROWS:
+            name = phase.name.lower()
+            result[f"{name}_mean"] = float(np.mean(there))
+            result[f"{name}_rms"] = float(np.sqrt(np.mean(there**2)))
+    result |= _switching(cycle, ambient)
+    if cycle.complete:
+        usable = (cycle.samples["quality"] & UNUSABLE) == 0
+        measured = np.where(usable, cycle.samples["pressure"], np.nan).astype(np.float64)
+        expected = cycle.ticks["expected"].astype(np.float64)
+        result["max_vacuum"] = float((ambient - np.nanmin(measured)) / MBAR)
+        result["t0_measured"] = time_to(H2, measured, cycle, ambient) * 1e3
+        result["t0_expected"] = time_to(H2, expected, cycle, ambient) * 1e3
+    return {name: value for name, value in result.items() if np.isfinite(value)}
+
+
+def _switching(cycle: Cycle, ambient: float) -> dict[str, float]:
+    """Mean vacuum (mbar) at the knees: where the nozzle went off (H1) and on again."""
+    rows = np.flatnonzero(np.isfinite(cycle.ticks["level"]))
+    rows = rows[rows > 0]
+    vacuum = (ambient - cycle.ticks["level"][rows].astype(np.float64)) / MBAR
+    off = cycle.ticks["phase"][rows] == Phase.HOLD
+    on = (cycle.ticks["phase"][rows] == Phase.SUCTION) & ~off
+    levels = {}
+    if off.any():
+        levels["h1_level"] = float(vacuum[off].mean())
+    if on.any():
+        levels["h1_low_level"] = float(vacuum[on].mean())
+    return levels

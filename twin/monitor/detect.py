@@ -1,0 +1,227 @@
+"""The monitor: what happens in the stream, and when measurement and model part.
+
+Each cycle is boiled down to its figures; a figure is judged in sigmas of what healthy cycles
+scatter. An alarm is raised when one figure is far out and cleared, with hysteresis, when all are
+back for some cycles.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydantic import Field
+
+from twin.events import Event, Kind
+from twin.model import dataset as c
+from twin.model.dataset import Theta
+from twin.monitor.cycles import Cycle, CycleCutter, figures
+from twin.monitor.signatures import Likeness, likenesses, look_alikes
+from twin.settings import Settings
+from twin.signals import NS, SAMPLE, Quality, Samples, Ticks
+
+_UNFIT = Quality.OUT_OF_RANGE | Quality.OVERFLOW | Quality.STALE | Quality.BAD
+
+
+class Scatter(Settings):
+    """What one figure is in healthy cycles: mean and one standard deviation, its unit in mbar."""
+
+    mean: float
+    sigma: float = Field(gt=0.0)
+
+
+class MonitorSettings(Settings):
+    """When a deviation is an alarm."""
+
+    raise_sigma: float = Field(6.0, gt=0.0)
+    clear_sigma: float = Field(4.0, gt=0.0)
+    clear_cycles: int = Field(2, ge=1)
+    smallest_mbar: float = Field(0.5, ge=0.0)  # deviations below are never worth an alarm
+    stale_ms: float = Field(500.0, gt=0.0)
+    healthy: Mapping[str, Scatter] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """The figure of a cycle that is farthest from healthy."""
+
+    figure: str
+    excess: float  # mbar
+    sigmas: float
+
+
+@dataclass
+class Monitor:
+    """Takes rows in, gives events out; all of it in PLC time, so a replay gives the same."""
+
+    settings: MonitorSettings
+    theta: Theta
+    active: str = ""  # the effect named by the standing alarm; empty while there is none
+    _cutter: CycleCutter = field(default_factory=CycleCutter)
+    _before: Cycle | None = None
+    _quiet_cycles: int = 0
+    _last: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # row of the stream
+    _stale_since: int | None = None  # PLC time of the row after which the PLC fell silent
+    _unfit: int = 0  # quality bits that stand
+
+    def update(self, samples: Samples, ticks: Ticks) -> list[Event]:
+        """Take rows with the twin's ticks; give what they make happen."""
+        events = list(self._stream_events(samples))
+        for cycle in self._cutter.push(samples, ticks):
+            events += self._judge(cycle)
+        return events
+
+    def silent(self, last: np.void, now_ns: int) -> list[Event]:
+        """Nothing arrived: give PLC_STALE once it is too long after the ``last`` row received."""
+        time_ns = int(last["time_ns"])
+        silence_ns = now_ns - int(last["host_ns"])
+        if self._stale_since == time_ns or silence_ns * NS * 1e3 <= self.settings.stale_ms:
+            return []
+        return [self._stale(time_ns)]
+
+    def close(self) -> list[Event]:
+        """Judge the cycle that the end cut off."""
+        return [event for cycle in self._cutter.flush() for event in self._judge(cycle)]
+
+    # --- the stream -----------------------------------------------------------------------------
+
+    def _stream_events(self, samples: Samples) -> Iterator[Event]:
+        """Find the rows at which something happened to the stream; most blocks have none."""
+        if not len(samples):
+            return
+        rows = np.concatenate([self._last, samples])
+        first = len(rows) - len(samples)
+        quality = rows["quality"]
+        silence_ms = np.diff(rows["host_ns"], prepend=rows["host_ns"][:1]) * NS * 1e3
+        changes = np.diff(quality & _UNFIT, prepend=np.uint8(self._unfit)) != 0
+        changes |= (quality & (Quality.GAP | Quality.RESTART | Quality.CLOCK)) != 0
+        changes |= silence_ms > self.settings.stale_ms
+        for row in np.flatnonzero(changes):
+            if row >= first:
+                before = rows[row - 1] if row else None
+                yield from self._row_events(before, rows[row], float(silence_ms[row]))
+        self._last = rows[-1:].copy()
+
+    def _row_events(self, before: np.void | None, row: np.void, silence_ms: float) -> list[Event]:
+        time_ns, quality = int(row["time_ns"]), int(row["quality"])
+        events = []
+        if before is not None and silence_ms > self.settings.stale_ms:
+            if self._stale_since != int(before["time_ns"]):
+                events.append(self._stale(int(before["time_ns"])))
+            text = f"the PLC is back after {silence_ms / 1e3:.2f} s"
+            events.append(Event(time_ns, Kind.PLC_BACK, text, {"silence_ms": silence_ms}))
+        if quality & Quality.RESTART:
+            text = f"the PLC restarted; its sequence goes on at {int(row['sequence'])}"
+            events.append(Event(time_ns, Kind.PLC_RESTARTED, text))
+        if quality & Quality.CLOCK and before is not None:
+            jump = (time_ns - int(before["time_ns"])) * NS
+            text = f"PLC time jumped by {jump:+.3f} s"
+            events.append(Event(time_ns, Kind.CLOCK_JUMPED, text, {"jump_s": jump}))
+        if quality & Quality.GAP and before is not None:
+            events.append(_gap(before, row))
+        if (quality ^ self._unfit) & _UNFIT:
+            self._unfit = quality & _UNFIT
+            what = str(Quality(self._unfit).name).lower().replace("_", " ").replace("|", ", ")
+            kind = Kind.SIGNAL_BAD if self._unfit else Kind.SIGNAL_GOOD
+            text = f"pressure signal: {what}" if self._unfit else "pressure signal is good again"
+            events.append(Event(time_ns, kind, text, {"quality": self._unfit}))
+        return events
+
+    def _stale(self, last_time_ns: int) -> Event:
+        self._stale_since = last_time_ns
+        after_ns = int(self.settings.stale_ms * 1e6)
+        text = f"no fresh sample for {self.settings.stale_ms:.0f} ms: check PLC and network"
+        return Event(last_time_ns + after_ns, Kind.PLC_STALE, text)
+
+    # --- the cycles -----------------------------------------------------------------------------
+
+    def _judge(self, cycle: Cycle) -> list[Event]:
+        before, self._before = self._before, cycle
+        found = figures(cycle, self.theta[c.AMBIENT])
+        events = [_summary(cycle, found)] if cycle.complete else []
+        whole = cycle.complete or len(cycle.samples) >= 10_000
+        if not whole or (worst := self._worst(found)) is None:
+            return events
+        if abs(worst.sigmas) >= self.settings.raise_sigma:
+            self._quiet_cycles = 0
+            if (raised := self._deviation(worst, before, cycle)) is not None:
+                events.append(raised)
+        elif self.active and abs(worst.sigmas) < self.settings.clear_sigma:
+            self._quiet_cycles += 1
+            if self._quiet_cycles >= self.settings.clear_cycles:
+                text = f"measurement and model agree again; it had looked like {self.active}"
+                events.append(
+                    Event(cycle.end_ns, Kind.DEVIATION_CLEARED, text, {"effect": self.active})
+                )
+                self.active = ""
+        else:
+            self._quiet_cycles = 0
+        return events
+
+    def _worst(self, found: Mapping[str, float]) -> Outlier | None:
+        outliers = []
+        for figure, healthy in self.settings.healthy.items():
+            if figure in found:
+                excess = found[figure] - healthy.mean
+                beyond = max(abs(excess) - self.settings.smallest_mbar, 0.0)
+                sigmas = float(np.copysign(beyond / healthy.sigma, excess))
+                outliers.append(Outlier(figure, excess, sigmas))
+        return max(outliers, key=lambda outlier: abs(outlier.sigmas), default=None)
+
+    def _deviation(self, worst: Outlier, before: Cycle | None, cycle: Cycle) -> Event | None:
+        """Raise the alarm, or raise it anew when another cause than the standing one fits."""
+        ranking = self._name(worst, before, cycle)
+        best = ranking[0]
+        also = look_alikes(ranking)
+        if self.active == best.effect or self.active in also:
+            return None
+        self.active = best.effect
+        where = worst.figure.rsplit("_", 1)[0].replace("_", "-")
+        text = (
+            f"{where}: {worst.excess:+.1f} mbar from healthy ({worst.sigmas:+.0f} sigma); "
+            f"fits {best.effect} {best.size:.3g} {best.unit}"
+        )
+        if also:
+            text += f", or {', '.join(also)}"
+        data: dict[str, float | int | str] = {
+            "cycle": cycle.index,
+            "figure": worst.figure,
+            "excess_mbar": worst.excess,
+            "sigma": worst.sigmas,
+            "effect": best.effect,
+            "size": best.size,
+            "unit": best.unit,
+            "share": best.share,
+            "also": ",".join(also),
+        }
+        return Event(cycle.end_ns, Kind.DEVIATION, text, data)
+
+    def _name(self, worst: Outlier, before: Cycle | None, cycle: Cycle) -> list[Likeness]:
+        """Rank the causes of a cycle's deviation; the cycle before lets the model swing in."""
+        if worst.figure.endswith("_level"):  # only the thresholds act on the switching levels
+            return [Likeness("threshold_drift", worst.excess, "mbar", 1.0)]
+        parts = [cycle] if before is None else [before, cycle]
+        samples = np.concatenate([part.samples for part in parts])
+        ticks = np.concatenate([part.ticks for part in parts])
+        begin = len(samples) - len(cycle.samples)
+        return likenesses(self.theta, samples, ticks, begin)
+
+
+def _gap(before: np.void, row: np.void) -> Event:
+    missing = int(row["sequence"]) - int(before["sequence"]) - 1
+    seconds = (int(row["time_ns"]) - int(before["time_ns"])) * NS
+    text = f"{missing} samples are missing ({seconds:.3f} s)"
+    if missing < 0:
+        missing, text = 0, "samples are missing; how many is not known"
+    data: dict[str, float | int | str] = {"missing": missing, "seconds": seconds}
+    return Event(int(row["time_ns"]), Kind.GAP, text, data)
+
+
+def _summary(cycle: Cycle, found: Mapping[str, float]) -> Event:
+    text = f"cycle {cycle.index}"
+    if "t0_measured" in found and "t0_expected" in found:
+        text += (
+            f": evacuated to H2 in {found['t0_measured']:.0f} ms"
+            f" (expected {found['t0_expected']:.0f} ms)"
+        )
+    data = {"cycle": cycle.index} | {name: round(value, 3) for name, value in found.items()}
+    return Event(cycle.end_ns, Kind.CYCLE, text, data)

@@ -1,0 +1,241 @@
+"""Phases found from commands and pressure, with the air-saving switches nobody tells us about.
+
+A compact ejector switches its nozzle off at H1 and on again below it by itself; the PLC does not
+see it. It shows as a knee in the pressure: the slope breaks. The finder looks for knees with a
+straight line on each side, so it is a fixed lag behind the measurement; behind it everything is
+known when the model steps, and the model is synchronised on the measured level at each knee.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from twin.model import dataset as c
+from twin.model import kernel
+from twin.model.compiled import compiled
+from twin.model.dataset import Theta
+from twin.model.plant import ORDER, at_supply, rates
+from twin.signals import BREAK, MS, SAMPLE, UNUSABLE, Command, Phase, Samples
+
+IDLE_ROWS = 20  # rows of idle whose mean is the level before a cycle
+FEWEST_IDLE_ROWS = 5
+SIGNIFICANT = 7.0  # sigmas of slope difference that make a knee
+SHORTEST_WINDOW, LONGEST_WINDOW = 8, 60  # rows
+SETTLED = 20e-3  # s after the valve's response before a knee can be one
+
+# What the finder remembers from row to row.
+# Ages are in rows; suction's runs anew from a knee, and is −1 while suction is not commanded.
+_NOZZLE, _AGE, _BEST, _BEST_AGE, _BEST_LEVEL, _IDLE_AGE, _IDLE_SUM, _ANCHORED = range(8)
+_BEGINNING = (0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+_IDLE, _SUCTION, _HOLD, _BLOW_OFF = (int(phase) for phase in Phase)
+
+
+@dataclass(frozen=True)
+class Knees:
+    """How knees look in this system: rows of the window, noise (Pa), rows from valve to knee."""
+
+    window: int
+    noise: float
+    off_shift: int
+    on_shift: int
+    settled: int
+
+    @property
+    def lag(self) -> int:
+        """Rows the finder stays behind: half a window to see the peak, and the way back."""
+        return self.window + self.window // 2 + max(self.off_shift, self.on_shift) + 1
+
+
+def expected_knees(theta: Theta, noise: float) -> Knees:
+    """Derive the knees' window from how sharply the slope breaks at H1 in this system.
+
+    The slope of a straight line over n rows of noise s has the deviation s √(12/n³); the window is
+    chosen so that the break is SIGNIFICANT against the difference of two such slopes.
+    """
+    state = kernel.at_rest(theta)[:ORDER]
+    state[kernel.PRESSURE] = theta[c.AMBIENT] - theta[c.H1]
+    slopes = []
+    for jet in (1.0, 0.0):
+        state[kernel.JET] = jet
+        change = np.empty(ORDER)
+        rates(state, 0.0, jet, 0.0, theta, at_supply(theta), change)
+        slopes.append(change[kernel.PRESSURE] * MS)
+    bend = max(abs(slopes[1] - slopes[0]), 1e-3)
+    rows = (24.0 * (1.5 * SIGNIFICANT * noise / bend) ** 2) ** (1.0 / 3.0)
+    return Knees(
+        window=int(min(max(math.ceil(rows), SHORTEST_WINDOW), LONGEST_WINDOW)),
+        noise=noise,
+        off_shift=round((theta[c.RAMP_DOWN] + theta[c.SENSOR_LAG]) / MS),
+        on_shift=round((theta[c.RAMP_UP] + theta[c.SENSOR_LAG]) / MS),
+        settled=round((theta[c.RESPONSE] + SETTLED) / MS),
+    )
+
+
+@compiled
+def _line(pressure, start, rows):  # type: ignore[no-untyped-def]
+    """Slope (Pa per row) and mean of a straight line through ``rows`` values from ``start``."""
+    mean, moment = 0.0, 0.0
+    middle = 0.5 * (rows - 1)
+    for i in range(rows):
+        mean += pressure[start + i]
+        moment += (i - middle) * pressure[start + i]
+    return moment * 12.0 / (rows * (rows * rows - 1.0)), mean / rows
+
+
+@compiled
+def _break_at(pressure, row, window, noise, nozzle_on):  # type: ignore[no-untyped-def]
+    """Significance of the slope's break at ``row`` and the level there; 0 where it is no knee.
+
+    Nozzle off: pressure fell and now does not fall any more. Nozzle on: it did not fall, now does.
+    """
+    left, left_mean = _line(pressure, row - window, window + 1)
+    right, right_mean = _line(pressure, row, window + 1)
+    sigma = noise * math.sqrt(12.0 / float(window + 1) ** 3)
+    significance = (right - left) / (math.sqrt(2.0) * sigma)
+    if nozzle_on:
+        is_knee = left < -3.0 * sigma and right > -3.0 * sigma
+    else:
+        significance = -significance
+        is_knee = left > -3.0 * sigma and right < -3.0 * sigma
+    level = 0.5 * (left_mean + left * window / 2.0 + right_mean - right * window / 2.0)
+    return (significance if is_knee else 0.0), level
+
+
+@compiled
+def _find(state, pressure, commands, first, last, look, phase, level):  # type: ignore[no-untyped-def]
+    """Fill ``phase`` and ``level`` for rows first..last−1; a knee reaches back by its shift.
+
+    ``look`` = window, noise, off shift, on shift, settled; window 0 looks for no knees (at the end
+    of a stretch, where the rows after are missing).
+    """
+    for row in range(first, last):
+        suction = commands[row] & 1 and not commands[row] & 2
+        starts = suction and state[_AGE] < 0.0
+        if suction:
+            state[_AGE] = 0.0 if starts else state[_AGE] + 1.0
+        else:
+            state[_AGE] = -1.0
+        if starts:
+            state[_NOZZLE], state[_BEST] = 1.0, 0.0
+            if state[_IDLE_AGE] >= FEWEST_IDLE_ROWS:
+                level[row] = state[_IDLE_SUM] / state[_IDLE_AGE]
+                state[_ANCHORED] = 1.0
+        if commands[row] == 0:
+            _idle(state, pressure, row, level)
+            phase[row] = _IDLE
+        else:
+            state[_IDLE_AGE] = state[_IDLE_SUM] = 0.0
+            phase[row] = _BLOW_OFF if commands[row] & 2 else _HOLD
+            if suction and state[_NOZZLE] > 0.0:
+                phase[row] = _SUCTION
+        if suction and look[0] > 0.0:
+            _look(state, pressure, commands, row, look, phase, level)
+
+
+@compiled
+def _idle(state, pressure, row, level):  # type: ignore[no-untyped-def]
+    """Keep the mean of the last idle rows; the first of a stretch anchors the model."""
+    if math.isnan(pressure[row]):
+        return
+    if state[_IDLE_AGE] >= IDLE_ROWS:  # let the oldest go
+        state[_IDLE_SUM] -= state[_IDLE_SUM] / state[_IDLE_AGE]
+        state[_IDLE_AGE] -= 1.0
+    state[_IDLE_SUM] += pressure[row]
+    state[_IDLE_AGE] += 1.0
+    if state[_ANCHORED] == 0.0 and state[_IDLE_AGE] >= IDLE_ROWS:
+        level[row] = state[_IDLE_SUM] / state[_IDLE_AGE]
+        state[_ANCHORED] = 1.0
+
+
+@compiled
+def _look(state, pressure, commands, row, look, phase, level):  # type: ignore[no-untyped-def]
+    """Follow the break's significance over the rows and settle on its peak."""
+    window, noise, nozzle_on = int(look[0]), look[1], state[_NOZZLE] > 0.0
+    significance, here = 0.0, 0.0
+    if state[_AGE] > look[4] + window and commands[row + window] == commands[row]:
+        significance, here = _break_at(pressure, row, window, noise, nozzle_on)
+    if significance > max(state[_BEST], SIGNIFICANT):
+        state[_BEST], state[_BEST_AGE], state[_BEST_LEVEL] = significance, 0.0, here
+        return
+    if state[_BEST] == 0.0:
+        return
+    state[_BEST_AGE] += 1.0
+    if state[_BEST_AGE] >= window // 2:
+        knee = row - int(state[_BEST_AGE])
+        shift = int(look[2] if nozzle_on else look[3])
+        level[knee] = state[_BEST_LEVEL]
+        phase[knee - shift : row + 1] = _HOLD if nozzle_on else _SUCTION
+        state[_NOZZLE], state[_BEST] = 0.0 if nozzle_on else 1.0, 0.0
+        state[_AGE] = state[_BEST_AGE]
+
+
+Found = tuple[Samples, npt.NDArray[np.uint8], npt.NDArray[np.float64]]
+
+
+@dataclass
+class PhaseFinder:
+    """Takes blocks in, gives them out a little later with phase and synchronisation level."""
+
+    knees: Knees
+    _state: npt.NDArray[np.float64] = field(default_factory=lambda: np.array(_BEGINNING))
+    _rows: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))
+    _phase: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, "u1"))
+    _level: npt.NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    _seen: int = 0  # rows of _rows that are through the search
+    _given: int = 0  # rows of _rows that were given out and stay as context
+
+    def push(self, block: Samples) -> Found:
+        """Take a block; give the rows that are settled, their phases and their levels (Pa)."""
+        breaks = np.flatnonzero(block["quality"] & BREAK)
+        parts = []
+        for stretch in np.split(block, breaks):
+            if len(stretch) and stretch["quality"][0] & BREAK:
+                parts.append(self.flush())
+            parts.append(self._search(stretch))
+        samples, phase, level = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return samples, phase, level
+
+    def flush(self) -> Found:
+        """Give all rows that are left, and begin anew: what follows does not belong to them."""
+        self._run(len(self._rows), window=0)
+        rest = slice(self._given, None)
+        given = self._rows[rest], self._phase[rest], self._level[rest]
+        self._state, self._rows = np.array(_BEGINNING), np.empty(0, SAMPLE)
+        self._phase, self._level = np.empty(0, "u1"), np.empty(0)
+        self._seen = self._given = 0
+        return given
+
+    def _search(self, stretch: Samples) -> Found:
+        self._rows = np.concatenate([self._rows, stretch])
+        self._phase = np.concatenate([self._phase, np.zeros(len(stretch), "u1")])
+        self._level = np.concatenate([self._level, np.full(len(stretch), np.nan)])
+        window, lag = self.knees.window, self.knees.lag
+        self._run(max(len(self._rows) - window, self._seen), window)
+        ready = slice(self._given, max(len(self._rows) - lag, self._given))
+        given = self._rows[ready], self._phase[ready], self._level[ready]
+        self._given = ready.stop
+        drop = max(self._seen - window - lag, 0)  # what no later row will look back on
+        drop = min(drop, self._given)
+        self._rows, self._phase = self._rows[drop:], self._phase[drop:]
+        self._level = self._level[drop:]
+        self._seen -= drop
+        self._given -= drop
+        return given
+
+    def _run(self, last: int, window: int) -> None:
+        pressure = self._rows["pressure"].astype(np.float64)
+        pressure[(self._rows["quality"] & UNUSABLE) != 0] = np.nan
+        look = np.array(
+            [
+                window,
+                self.knees.noise,
+                self.knees.off_shift,
+                self.knees.on_shift,
+                self.knees.settled,
+            ]
+        )
+        commands = self._rows["commands"] & (Command.SUCTION | Command.BLOW_OFF)
+        _find(self._state, pressure, commands, self._seen, last, look, self._phase, self._level)
+        self._seen = last
