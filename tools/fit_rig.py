@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from drivers.plc.settings import PlcSettings
 from drivers.plc.simulate import blocks
 from twin.config import Asset, Config, LogSettings
-from twin.diagnosis.evidence import collect
+from twin.diagnosis.evidence import Evidence, collect
 from twin.live import Twin
 from twin.model.dataset import AMBIENT, DataSet, coefficients
 from twin.monitor.cycles import CycleCutter, figures
@@ -64,16 +64,17 @@ def main() -> None:
     for weights, free in STAGES:
         tables = fit(tables, samples, np.array(weights), free)
     data = DataSet.model_validate(tables)
+    evidence = healthy_evidence(document, data, rig, seed=9)
     print_tables(data)
-    healthy = healthy_figures(data, np.concatenate(list(blocks(rig, duration_s=300.0, seed=8))))
+    print_healthy(evidence)
+
+
+def healthy_evidence(document: Document, data: DataSet, rig: PlcSettings, seed: int) -> Evidence:
+    """Healthy cycles of the rig, judged by the scatter of others."""
+    cycles = np.concatenate(list(blocks(rig, duration_s=300.0, seed=seed + 100)))
+    healthy = healthy_figures(data, cycles)
     config = Config(document, Asset(), data, MonitorSettings(healthy=healthy), LogSettings())
-    evidence = collect(config, blocks(rig, duration_s=300.0, seed=9))
-    off = evidence.off(evidence.expect([(0, evidence.theta)]))
-    left = [np.sqrt(np.mean(evidence.whitened(off, [cycle]) ** 2)) for cycle in evidence.judged]
-    healthy["leftover"] = Scatter(mean=float(np.mean(left)), sigma=float(np.std(left)))
-    print("\n[monitor.healthy]")
-    for name, one in healthy.items():
-        print(f"{name} = {{ mean = {one.mean:.3f}, sigma = {one.sigma:.3f} }}")
+    return collect(config, blocks(rig, duration_s=60.0, seed=seed))
 
 
 def fit(
@@ -125,6 +126,16 @@ def print_tables(data: DataSet) -> None:
         for key, value in table.items():
             if value is not None:
                 print(f"{key} = {round(value, 3)}")
+
+
+def print_healthy(evidence: Evidence) -> None:
+    """Print what healthy cycles scatter, and what the whitened residuals have left."""
+    off = evidence.off(evidence.expect([(0, evidence.theta)]))
+    left = [float(np.sqrt(np.mean(evidence.whitened(off, one) ** 2))) for one in evidence.judged]
+    healthy = dict(evidence.healthy) | {"leftover": (float(np.mean(left)), float(np.std(left)))}
+    print("\n[monitor.healthy]")
+    for name, (mean, sigma) in healthy.items():
+        print(f"{name} = {{ mean = {mean:.3f}, sigma = {sigma:.3f} }}")
 
 
 def healthy_figures(data: DataSet, samples: Samples) -> dict[str, Scatter]:

@@ -87,15 +87,15 @@ class CycleCutter:
         return Cycle(self._index, samples, ticks, bool(whole))
 
 
-def time_to(
-    vacuum: float, pressure: npt.NDArray[np.float64], cycle: Cycle, ambient: float
+def time_to_vacuum(
+    vacuum: float,
+    pressure: npt.NDArray[np.float64],
+    times: npt.NDArray[np.int64],
+    ambient: float,
 ) -> float:
-    """Time (s) from the suction edge until ``pressure`` first is ``vacuum`` Pa below ambient."""
+    """Time (s) from the first row until ``pressure`` is ``vacuum`` Pa below ambient; or NaN."""
     reached = np.flatnonzero(ambient - pressure >= vacuum)
-    if not len(reached):
-        return float("nan")
-    times = cycle.samples["time_ns"]
-    return float(times[reached[0]] - times[0]) * NS
+    return float(times[reached[0]] - times[0]) * NS if len(reached) else float("nan")
 
 
 def figures(cycle: Cycle, ambient: float) -> dict[str, float]:
@@ -117,9 +117,10 @@ def figures(cycle: Cycle, ambient: float) -> dict[str, float]:
         usable = (cycle.samples["quality"] & UNUSABLE) == 0
         measured = np.where(usable, cycle.samples["pressure"], np.nan).astype(np.float64)
         expected = cycle.ticks["expected"].astype(np.float64)
+        times = cycle.samples["time_ns"]
         result["max_vacuum"] = float((ambient - np.nanmin(measured)) / MBAR)
-        result["t0_measured"] = time_to(H2, measured, cycle, ambient) * 1e3
-        result["t0_expected"] = time_to(H2, expected, cycle, ambient) * 1e3
+        result["t0_measured"] = time_to_vacuum(H2, measured, times, ambient) * 1e3
+        result["t0_expected"] = time_to_vacuum(H2, expected, times, ambient) * 1e3
     return {name: value for name, value in result.items() if np.isfinite(value)}
 
 
