@@ -224,6 +224,16 @@ def test_a_damaged_chunk_is_named_and_the_rest_is_saved(file: Path, written: Wri
     assert check(out).sound
 
 
+def test_a_wrong_length_takes_no_other_chunk_along(file: Path, written: Written) -> None:
+    chunk = written.flushed[1][0]
+    index = chunk + 9 + int.from_bytes(written.raw[chunk + 1 : chunk + 9], "little")
+    for position in (*range(chunk, chunk + 53), *range(index, index + 15)):
+        for flip in (2, 255):
+            file.write_bytes(written.raw)
+            spoil(file, position, bytes([written.raw[position] ^ flip]))
+            assert check(file).samples >= len(SAMPLES) - BLOCK, (position - chunk, flip)
+
+
 def test_a_lost_place_is_found_again(file: Path, written: Written) -> None:
     second = written.flushed[1][0]
     spoil(file, second, bytes(40))  # the head of a chunk
@@ -282,6 +292,7 @@ def foreign(path: Path) -> None:
         writer.start()
         channel = writer.register_channel("/imu", "json", 0)
         writer.add_message(channel, 1, b"{}", 1)
+        writer.add_attachment(0, 0, "a.png", "image/png", b"\xff")
         writer.finish()
 
 
@@ -316,6 +327,17 @@ def test_a_log_that_went_through_another_tool(file: Path) -> None:
     assert check(log.path).sound
 
 
+def test_damage_in_a_log_that_went_through_another_tool(file: Path) -> None:
+    other = file.with_name("b.mcap")
+    rewrite(file, other)
+    second = other.read_bytes().index(b"lz4", other.read_bytes().index(b"lz4") + 3)
+    spoil(other, second + 200)
+    report = check(other)
+    assert 0 < report.samples < len(SAMPLES)
+    assert len(report.damage) == 1
+    assert not report.sound
+
+
 def test_a_log_of_another_program(tmp_path: Path) -> None:
     foreign(tmp_path / "a.mcap")
     with pytest.raises(SourceError, match=r"another program: it has no /samples") as caught:
@@ -347,6 +369,23 @@ def test_a_sound_log(file: Path) -> None:
         bytes_per_sample=file.stat().st_size / 2000,
     )
     assert report.sound
+
+
+def test_a_report_is_for_people(file: Path, written: Written) -> None:
+    assert str(check(file)).splitlines() == [
+        f"{file}: 2000 rows, 2.0 s, 3 events",
+        "gaps: 0, 0 rows missing",
+        f"size: {len(written.raw) / 2000:.1f} bytes a row, parts: 1",
+        "state: complete",
+    ]
+    end = written.flushed[-1][0]
+    file.write_bytes(written.raw[: end - 1])
+    assert "state: unfinished" in str(check(file))
+    spoil(file, written.flushed[2][0] + 300)
+    said = str(check(file))
+    assert "gaps: 1, 250 rows missing" in said
+    assert "state: damaged" in said
+    assert f"unreadable: {file}: byte {written.flushed[2][0]}: a chunk is damaged" in said
 
 
 def test_what_is_in_the_stream_is_counted(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ class Asset(Settings):
 class LogSettings(Settings):
     """How logs are kept."""
 
-    rotate_mb: float = Field(512.0, gt=0.0)  # a new part begins beyond this size
+    rotate_mb: float = Field(64.0, gt=0.0)  # a new part begins beyond this size
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,23 @@ class Report:
         """Complete and without damage."""
         return self.complete and not self.damage
 
+    def __str__(self) -> str:
+        """Several lines for people."""
+        lines = [
+            f"{self.path}: {self.samples} rows, {self.duration_s:.1f} s, {self.events} events",
+            f"gaps: {self.gaps}, {self.missing} rows missing",
+            f"size: {self.bytes_per_sample:.1f} bytes a row, parts: {self.parts}",
+            f"state: {self._state()}",
+        ]
+        if self.time_back:
+            lines.insert(2, f"PLC time does not go forward at {self.time_back} places")
+        return "\n".join([*lines, *(f"unreadable: {damage}" for damage in self.damage)])
+
+    def _state(self) -> str:
+        if any(not damage.torn for damage in self.damage):
+            return "damaged"
+        return "complete" if self.complete else "unfinished, its writer was stopped"
+
 
 class _Tally:
     """Adds up the rows of a stream, however it is cut."""

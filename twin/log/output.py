@@ -15,7 +15,6 @@ class Output:
 
     def __init__(self, path: Path) -> None:
         self._raw = path.open("xb", buffering=0)
-        self.position = 0  # bytes written
         # The disk may take its time, hundreds of milliseconds on flash; the live loop has none.
         self._thread = ThreadPoolExecutor(1, "log-sync")
         self._syncing: Future[None] | None = None
@@ -24,9 +23,14 @@ class Output:
         """Write all of it."""
         left = memoryview(data)
         while left:
-            written = self._raw.write(left)
-            self.position += written
-            left = left[written:]
+            left = left[self._raw.write(left) :]
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def tell(self) -> int:
+        """Bytes written."""
+        return self._raw.tell()
 
     def sync(self) -> None:
         """Start bringing everything to the disk, unless that is still under way."""

@@ -1,11 +1,13 @@
 """The files of one log: their names, and what stands at the head of each."""
 
 from pathlib import Path
+from typing import IO, cast
+
+from mcap.writer import Writer
 
 from twin.log.header import Identity, LogHeader, to_metadata
-from twin.log.mcap_file import McapFile
 from twin.log.output import Output
-from twin.log.schema import CHANNELS
+from twin.log.schema import CHANNELS, LIBRARY
 
 OWN_METADATA = "ejector-twin"
 FREE_METADATA = "run"
@@ -16,12 +18,15 @@ def part_path(path: Path, number: int) -> Path:
     return path if number == 0 else path.with_name(f"{path.stem}.{number:04d}{path.suffix}")
 
 
-def write_head(output: Output, header: LogHeader, identity: Identity) -> McapFile:
+def write_head(output: Output, header: LogHeader, identity: Identity) -> Writer:
     """Begin a file that says all about itself before its first chunk."""
-    file = McapFile(output)
-    file.add_metadata(OWN_METADATA, to_metadata(header, identity))
-    file.add_metadata(FREE_METADATA, header.metadata)
-    file.add_attachment(header.config_name, "application/toml", header.config_text.encode())
-    for number, channel in CHANNELS.items():
-        file.add_channel(number, channel.topic, channel.schema, channel.files)
-    return file
+    writer = Writer(cast(IO[bytes], output))  # it uses no more of a file than Output has
+    writer.start(library=LIBRARY)
+    writer.add_metadata(OWN_METADATA, to_metadata(header, identity))
+    writer.add_metadata(FREE_METADATA, header.metadata)
+    config = header.config_text.encode()
+    writer.add_attachment(0, 0, header.config_name, "application/toml", config)
+    for channel in CHANNELS.values():  # numbered from 1
+        schema = writer.register_schema(channel.schema, "protobuf", channel.files)
+        writer.register_channel(channel.topic, "protobuf", schema)
+    return writer

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from google.protobuf.message import DecodeError
-from mcap.opcode import Opcode
+from mcap.records import Attachment, Metadata
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from twin.errors import SourceError
@@ -15,7 +15,7 @@ from twin.log.columns import Tray, decode
 from twin.log.header import Identity, LogHeader, from_metadata
 from twin.log.messages import decode_event
 from twin.log.part import FREE_METADATA, OWN_METADATA, part_path
-from twin.log.records import Damage, attachment, is_complete, messages, metadata, records
+from twin.log.records import Damage, is_complete, messages, records
 from twin.log.schema import EVENTS, SAMPLES
 from twin.signals import Samples, Ticks
 
@@ -120,32 +120,28 @@ def _check_magic(path: Path) -> None:
 def _read_head(path: Path) -> tuple[LogHeader, Identity]:
     """From the records before the first chunk; only other tools put them behind."""
     stored: dict[str, dict[str, str]] = {}
-    text: str | None = None
-    try:
-        for opcode, _, body in records(path, (Opcode.METADATA, Opcode.ATTACHMENT), _ignore):
-            if opcode == Opcode.METADATA:
-                record = metadata(body)
-                stored[record.name] = record.metadata
-            else:
-                text = attachment(body).data.decode()
-            if text is not None and {OWN_METADATA, FREE_METADATA} <= stored.keys():
-                return from_metadata(stored[OWN_METADATA], text, stored[FREE_METADATA])
-    except (ValueError, KeyError) as error:
-        raise SourceError(f"{path}: the head of the log is damaged: {error}", _HEAD_LOST) from error
-    raise _no_head(path, OWN_METADATA in stored)
-
-
-_HEAD_LOST = "there is no way to read it without; take another log or a copy"
-
-
-def _ignore(damage: Damage) -> None:
-    """The head may be fine all the same."""
-
-
-def _no_head(path: Path, begun: bool) -> SourceError:
-    if begun or not is_complete(path):
-        return SourceError(f"{path}: the head of the log is missing", _HEAD_LOST)
-    return SourceError(
+    config: bytes | None = None
+    damage: list[Damage] = []
+    for record in records(path, damage.append):
+        if isinstance(record, Metadata):
+            stored[record.name] = record.metadata
+        elif isinstance(record, Attachment):
+            config = record.data
+        if config is not None and {OWN_METADATA, FREE_METADATA} <= stored.keys():
+            try:
+                return from_metadata(stored[OWN_METADATA], config.decode(), stored[FREE_METADATA])
+            except (ValueError, KeyError) as error:
+                raise _head_lost(path, f"damaged: {error}") from error
+    if damage:
+        raise _head_lost(path, f"damaged: {damage[0].what}")
+    if OWN_METADATA in stored or not is_complete(path):
+        raise _head_lost(path, "missing")
+    raise SourceError(
         f"{path}: an MCAP file of another program: it has no {SAMPLES.topic} of an ejector",
         "take a log of 'twin run', 'twin replay' or 'twin import'",
     )
+
+
+def _head_lost(path: Path, how: str) -> SourceError:
+    hint = "there is no way to read it without; take another log or a copy"
+    return SourceError(f"{path}: the head of the log is {how}", hint)

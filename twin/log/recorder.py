@@ -104,7 +104,7 @@ class Recorder:
     def _flush(self, now: float) -> None:
         self._add_rows(*self._tray.take())
         self._add_events()
-        self._file.flush()
+        self._writer.flush()  # type: ignore[no-untyped-call]
         self._flushed = now
         if now - self._synced >= SYNC_S:
             self._output.sync()
@@ -117,7 +117,7 @@ class Recorder:
         self._add(_SAMPLES, host, plc, encode(samples, ticks))
         for host, plc, message in self._scalars.messages(samples, ticks):
             self._add(_SCALARS, host, plc, message)
-        if self._rotate_bytes is not None and self._output.position >= self._rotate_bytes:
+        if self._rotate_bytes is not None and self._output.tell() >= self._rotate_bytes:
             self._finish()
             self._number += 1
             self._begin()
@@ -130,7 +130,7 @@ class Recorder:
 
     def _add(self, channel: int, host_ns: int, plc_ns: int, message: bytes) -> None:
         # MCAP has no times before 1970; the messages themselves keep them.
-        self._file.add(channel, max(host_ns, 0), max(plc_ns, 0), message)
+        self._writer.add_message(channel, max(host_ns, 0), message, max(plc_ns, 0))
 
     def _received(self, event: Event, samples: Samples) -> int:
         """When the row was received with which it happened: in a long block not the last one."""
@@ -150,12 +150,12 @@ class Recorder:
             raise self._failure from error
         try:
             identity = Identity(self._series, self._number)
-            self._file = write_head(self._output, self._header, identity)
+            self._writer = write_head(self._output, self._header, identity)
         except OSError as error:
             raise self._fail(error) from error
 
     def _finish(self) -> None:
-        self._file.finish()
+        self._writer.finish()  # type: ignore[no-untyped-call]
         self._output.finish()
 
     def _fail(self, error: OSError) -> SourceError:

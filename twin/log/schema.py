@@ -149,6 +149,7 @@ SCALARS = _channel("/scalars", "ejector_twin.Scalars")
 EVENTS = _channel("/events", "ejector_twin.Event")
 LOG = _channel("/log", "foxglove.Log")
 
-# Channel ids count from 1 in this order, so that a log is readable without its first chunk, the
-# only one that names them.
+# Channel ids count from 1 in this order where a file's header names LIBRARY, so that it is readable
+# without its first chunk, the only one that names them.
 CHANNELS = {1: SAMPLES, 2: SCALARS, 3: EVENTS, 4: LOG}
+LIBRARY = "ejector-twin"
