@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 .PHONY: demo test check format bench clean
 
 demo: .venv/run
-	$(BIN)/twin demo
+	$(BIN)/python tools/demo.py
 
 test: .venv/dev
 	$(BIN)/python -m pytest

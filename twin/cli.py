@@ -147,6 +147,31 @@ def probe(config: ConfigFile, address: Address = "") -> None:
 
 
 @app.command()
+def diagnose(
+    log: LogFile,
+    config: Annotated[Path | None, typer.Option(help="Instead of the one in the log.")] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="F", help="The answer.")
+    ] = None,
+    report: Annotated[Path | None, typer.Option(metavar="F.html", help="With pictures.")] = None,
+) -> None:
+    """Say what the simulation gets wrong on a log, why, and what knowing it gains."""
+    from twin.diagnosis.answer import diagnose as find_cause
+    from twin.diagnosis.report import in_words, write_report
+    from twin.log.reader import open_log
+
+    recorded = open_log(log)
+    settings = _settings_of(recorded.header, config)
+    with _status() as say:
+        diagnosis = find_cause(settings, (rows for rows, _ in recorded.blocks()), str(log), say)
+    print(in_words(diagnosis))
+    if json_file is not None:
+        json_file.write_text(json.dumps(diagnosis.json, indent=1, ensure_ascii=False))
+    if report is not None:
+        write_report(diagnosis, report)
+
+
+@app.command()
 def effects() -> None:
     """List the effects: every way a real ejector can differ from its data set."""
     from twin.model.effects import table
@@ -210,19 +235,15 @@ class Console:
 
 def _pair(settings: "Config") -> tuple["Twin", "Monitor"]:
     """The twin of a configuration and its monitor."""
-    import numpy as np
-
-    from twin.live import Twin
+    from twin.live import compiled
     from twin.model.dataset import coefficients
     from twin.monitor.detect import Monitor
     from twin.monitor.phases import expected_knees
-    from twin.signals import MBAR, SAMPLE
+    from twin.signals import MBAR
 
     theta = coefficients(settings.data)
     knees = expected_knees(theta, settings.data.sensor.noise_mbar * MBAR)
-    # Compiling takes seconds where nothing is cached yet; it must not fall into the first block.
-    Twin(theta, knees).advance(np.zeros(3 * knees.lag, SAMPLE))
-    return Twin(theta, knees), Monitor(settings.monitor, theta)
+    return compiled(theta, knees), Monitor(settings.monitor, theta)
 
 
 def _header(settings: "Config") -> "LogHeader":
@@ -324,6 +345,18 @@ def _progress(source: "Iterable[Samples]", what: str) -> "Iterator[Samples]":
         for block in source:
             progress.advance(task, len(block))
             yield block
+
+
+@contextmanager
+def _status() -> Iterator[Callable[[str], None]]:
+    """Give a function that says what is being done: on a terminal, and nothing in a pipe."""
+    if not sys.stderr.isatty():
+        yield lambda _what: None
+        return
+    from rich.console import Console as Terminal
+
+    with Terminal(stderr=True).status("") as status:
+        yield status.update
 
 
 def _leave(console: Console, fail_on_alarm: bool, *, interrupted: bool) -> None:

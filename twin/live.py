@@ -14,7 +14,7 @@ from twin.model.dataset import Theta
 from twin.monitor.detect import Monitor
 from twin.monitor.phases import Found, Knees, PhaseFinder
 from twin.monitor.signatures import steps
-from twin.signals import TICK, Samples, Ticks
+from twin.signals import SAMPLE, TICK, Samples, Ticks
 
 
 class Sink(Protocol):
@@ -51,13 +51,19 @@ class Twin:
         samples, phase, level = found
         ticks = np.empty(len(samples), TICK)
         ticks["phase"], ticks["level"] = phase, level
-        expected = np.empty(len(samples), "f4")
+        expected = np.empty(len(samples))
         dt = steps(samples, self._last_ns)
         kernel.advance(self._state, self.theta, dt, phase, ticks["level"].astype("f8"), expected)
         ticks["expected"] = expected
         if len(samples):
             self._last_ns = int(samples["time_ns"][-1])
         return samples, ticks
+
+
+def compiled(theta: Theta, knees: Knees) -> Twin:
+    """A twin whose path is compiled: seconds where nothing is cached, not to fall into a block."""
+    Twin(theta, knees).advance(np.zeros(3 * knees.lag, SAMPLE))
+    return Twin(theta, knees)
 
 
 def run(

@@ -6,6 +6,7 @@ Addresses are 0-based protocol offsets. A 64-bit or 32-bit value has its high wo
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +19,59 @@ HEADER_SIZE, TEST_SIZE, INPUT_SIZE, COILS = 12, 6, 7, 2
 RING_SIZE = RECORD * DEPTH
 
 Words = list[int]
+
+
+class Place(NamedTuple):
+    """One line of the register map: ``first`` is the 0-based offset in its area."""
+
+    area: str
+    first: int
+    size: int
+    type: str
+    meaning: str
+
+
+MAP = (
+    Place("coil", 0, 1, "bit", "suction command"),
+    Place("coil", 1, 1, "bit", "blow-off command"),
+    Place("input", 0, 1, "int16", "pressure, 0.1 mbar absolute"),
+    Place("input", 1, 2, "float32", "pressure, mbar absolute"),
+    Place("input", 3, 1, "int16", "supply, mbar gauge"),
+    Place("input", 4, 1, "bits", "status: bit 0 suction, bit 1 blow-off, bit 8 input overflow"),
+    Place("input", 5, 2, "uint32", "sequence number of the newest scan"),
+    Place("holding", 0, 1, "uint16", "test of the word order: 0x1234"),
+    Place("holding", 1, 1, "int16", "test: -12345"),
+    Place("holding", 2, 2, "uint32", "test: 0x12345678"),
+    Place("holding", 4, 2, "float32", "test: 123.456"),
+    Place("holding", HEADER, 2, "uint32", "trace: sequence number of the newest complete record"),
+    Place("holding", HEADER + 2, 4, "uint64", "trace: PLC time of that record, ns"),
+    Place("holding", HEADER + 6, 1, "uint16", "trace: boot counter, other after every restart"),
+    Place("holding", HEADER + 7, 1, "uint16", "trace: scan period, µs"),
+    Place("holding", HEADER + 8, 1, "uint16", "trace: depth of the ring, records"),
+    Place("holding", HEADER + 9, 1, "uint16", "trace: registers in a record (4)"),
+    Place("holding", HEADER + 10, 1, "int16", "trace: supply, mbar gauge"),
+    Place("holding", HEADER + 11, 1, "-", "reserved, 0"),
+    Place(
+        "holding",
+        RING,
+        RING_SIZE,
+        "records",
+        "ring: scan s at 1000 + 4·(s mod depth): low word of s, status, pressure float32 mbar",
+    ),
+)
+_REFERENCE = {"coil": 1, "input": 30001, "holding": 40001}  # how manuals count, from 1
+
+
+def table() -> str:
+    """The register map in Markdown, with offsets as sent and references as manuals have them."""
+    lines = ["| area | offset | reference | type | what |", "| --- | --- | --- | --- | --- |"]
+    for place in MAP:
+        ends = (place.first, place.first + place.size - 1)
+        offset = "–".join(str(end) for end in dict.fromkeys(ends))
+        reference = "–".join(f"{_REFERENCE[place.area] + end:05d}" for end in dict.fromkeys(ends))
+        row = (place.area, offset, reference, place.type, place.meaning)
+        lines.append(f"| {' | '.join(row)} |")
+    return "\n".join(lines)
 
 
 @dataclass(frozen=True)

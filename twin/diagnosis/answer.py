@@ -16,12 +16,13 @@ from twin.monitor.cycles import PAPER_VACUUM, time_to_vacuum
 from twin.signals import MBAR, MS, NS, Phase, Quality, Samples
 
 FORMAT = "ejector-twin-diagnosis/1"
-FEWEST_CYCLES = 4  # judged ones: two to fit on, two to judge by
+FEWEST_CYCLES = 3  # judged ones: two to fit on, one to judge by
 SIGNIFICANT = 40.0  # chi-square a cause must gain before it is named
 SMALLEST = 0.25  # of an effect's typical size: less is within what calibration leaves
 EXPLAINED = 1.6  # sigmas left up to which a cause explains a deviation
 MOST_SATURATED = 0.05  # share of samples
 RESAMPLES = 2000
+MISMATCH = 0.05  # of what a cause explains may be the model's own error in its signature
 
 # The cheapest recordings that part look-alikes: the first whose effects hold the best cause and
 # one that cannot be told from it.
@@ -59,6 +60,7 @@ class Diagnosis:
     """The answer with all that a report draws; ``json`` is the contract's form of it."""
 
     evidence: Evidence
+    data_set: str  # content hash of the calibrated twin's
     ranking: list[Finding]
     cause: Finding | None
     held_out: list[int]
@@ -77,7 +79,9 @@ def diagnose(
         "asset": {"type": config.asset.type, "id": config.asset.id},
     }
     if reason := insufficient(evidence):
-        return Diagnosis(evidence, [], None, [], head | _insufficient(evidence, reason))
+        return Diagnosis(
+            evidence, config.data.hash, [], None, [], head | _insufficient(evidence, reason)
+        )
     fitted, held_out = split(evidence, None)
     ranking = search(evidence, fitted, progress)
     if ranking and ranking[0].onset is not None:  # the cycle it began in cannot judge
@@ -92,10 +96,10 @@ def diagnose(
     verdict = "consistent"
     if best or before["leftover_sigma"] > EXPLAINED:
         verdict = "explained" if after["leftover_sigma"] <= EXPLAINED else "unlisted"
-    twins = _not_separable(best, ranking)
+    twins = _not_separable(best, ranking, unexplained)
     answer = head | {
         "verdict": verdict,
-        "causes": [_cause(evidence, best, ranking, before)] if best else [],
+        "causes": [_cause(evidence, best, ranking, twins, before)] if best else [],
         "runners_up": [
             {"effect": f.effect, "course": _course_name(f), "leftover_sigma": _round(f.leftover)}
             for f in ranking[1:6]
@@ -109,7 +113,7 @@ def diagnose(
         "gain": gain(evidence, baseline, extended, held_out),
         "next_experiment": next_experiment(best, twins),
     }
-    return Diagnosis(evidence, ranking, best, held_out, answer)
+    return Diagnosis(evidence, config.data.hash, ranking, best, held_out, answer)
 
 
 def insufficient(evidence: Evidence) -> str:
@@ -124,8 +128,8 @@ def insufficient(evidence: Evidence) -> str:
         )
     if len(evidence.judged) < FEWEST_CYCLES:
         return (
-            f"only {len(evidence.judged)} cycles can be judged: record at least"
-            f" {FEWEST_CYCLES + 1} complete cycles"
+            f"only {len(evidence.judged)} cycle{'s' * (len(evidence.judged) != 1)} can be judged:"
+            f" record at least {FEWEST_CYCLES + 1} complete ones in a row"
         )
     if not len(evidence.bins) or evidence.bins.max() < 0:
         return "no row can be compared: the twin never found a state to start from"
@@ -197,16 +201,20 @@ def next_experiment(best: Finding | None, twins: list[str]) -> str | None:
     return f"record cycles of another length, to part {best.effect} from {', '.join(twins)}"
 
 
-def _not_separable(best: Finding | None, ranking: list[Finding]) -> list[str]:
-    """Causes that, fitted again, this log cannot reject."""
+def _not_separable(best: Finding | None, ranking: list[Finding], unexplained: float) -> list[str]:
+    """Causes that, fitted again, this log cannot reject: by noise, or by the model's own error."""
     if best is None:
         return []
-    margin = SAME * max(best.leftover, 1.0) ** 2
+    margin = SAME * max(best.leftover, 1.0) ** 2 + MISMATCH * (unexplained - best.chi2)
     return [f.effect for f in ranking if f is not best and f.chi2 - best.chi2 < margin]
 
 
 def _cause(
-    evidence: Evidence, best: Finding, ranking: list[Finding], before: dict[str, float]
+    evidence: Evidence,
+    best: Finding,
+    ranking: list[Finding],
+    twins: list[str],
+    before: dict[str, float],
 ) -> dict[str, Any]:
     temper = 2.0 * max(best.leftover, 1.0) ** 2
     weights = [math.exp(-(finding.chi2 - best.chi2) / temper) for finding in ranking]
@@ -230,7 +238,7 @@ def _cause(
             if p.name in best.values
         },
         "probability": round(1.0 / sum(weights), 3),
-        "not_separable_from": _not_separable(best, ranking),
+        "not_separable_from": twins,
         "why": _why(best, onset_s, before),
     }
 

@@ -6,7 +6,7 @@ cycle's residual is whitened with their covariance, so that its squares add up t
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -49,6 +49,7 @@ class Evidence:
     samples: Samples
     ticks: Ticks
     starts: npt.NDArray[np.int64]  # first row of each cycle, and the row after the last one
+    judged: list[int]  # the cycles that count; in the others the model still swings in
     figures: list[dict[str, float]]  # of each cycle
     healthy: Mapping[str, tuple[float, float]]  # mean and sigma of each figure
     bins: npt.NDArray[np.int64]  # of each row, ascending; -1 where nothing can be compared
@@ -59,11 +60,6 @@ class Evidence:
     def cycles(self) -> int:
         """How many complete cycles there are."""
         return len(self.starts) - 1
-
-    @property
-    def judged(self) -> range:
-        """The cycles that count; in the first one the model still swings in."""
-        return range(1, self.cycles)
 
     def expect(self, course: Course) -> Floats:
         """Pressure (Pa) that the sensor should read if the coefficients ran like ``course``."""
@@ -157,18 +153,27 @@ def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
         raise ConfigError(f"{config.document.name}: the twin is not calibrated", hint)
     theta = coefficients(config.data)
     cycles, begin_ns = complete_cycles(config, theta, blocks)
-    samples = np.concatenate([cycle.samples for cycle in cycles] or [np.empty(0, SAMPLE)])
-    ticks = np.concatenate([cycle.ticks for cycle in cycles] or [np.empty(0, TICK)])
-    lengths = [len(cycle.samples) for cycle in cycles]
-    starts = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
-    bins, bin_starts = _bins(samples, ticks, starts)
-    healthy = {name: (one.mean, one.sigma) for name, one in config.monitor.healthy.items()}
-    found = [figures(cycle, theta[c.AMBIENT]) for cycle in cycles]
-    bare = Evidence(theta, begin_ns, samples, ticks, starts, found, healthy, bins, bin_starts, [])
-    whitening = _whitening(bare, config.data.sensor.noise_mbar)
-    return Evidence(
-        theta, begin_ns, samples, ticks, starts, found, healthy, bins, bin_starts, whitening
+    samples = np.concatenate([np.empty(0, SAMPLE), *(cycle.samples for cycle in cycles)])
+    ticks = np.concatenate([np.empty(0, TICK), *(cycle.ticks for cycle in cycles)])
+    starts = np.cumsum([0, *(len(cycle.samples) for cycle in cycles)])
+    judged = [number for number, cycle in enumerate(cycles) if cycle.settled]
+    bins, bin_starts = _bins(samples, ticks, starts, judged)
+    evidence = Evidence(
+        theta=theta,
+        begin_ns=begin_ns,
+        samples=samples,
+        ticks=ticks,
+        starts=starts,
+        judged=judged,
+        figures=[figures(cycle, theta[c.AMBIENT]) for cycle in cycles],
+        healthy={name: (one.mean, one.sigma) for name, one in config.monitor.healthy.items()},
+        bins=bins,
+        bin_starts=bin_starts,
+        whitening=[],
     )
+    if not judged:
+        return evidence
+    return replace(evidence, whitening=_whitening(evidence, config.data.sensor.noise_mbar))
 
 
 def complete_cycles(
@@ -188,31 +193,29 @@ def complete_cycles(
 
 
 def _bins(
-    samples: Samples, ticks: Ticks, starts: npt.NDArray[np.int64]
+    samples: Samples, ticks: Ticks, starts: npt.NDArray[np.int64], judged: Sequence[int]
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Number the bins: BIN_ROWS rows of one phase of one cycle each."""
     rows = np.arange(len(samples))
     usable = ((samples["quality"] & UNUSABLE) == 0) & np.isfinite(samples["pressure"])
     usable &= np.isfinite(ticks["expected"])
-    usable[: starts[:2][-1]] = False  # the first cycle is not judged
+    usable &= np.isin(np.searchsorted(starts, rows, "right") - 1, judged)
     run = np.zeros(len(samples), bool)
     run[starts[:-1]] = True
     run[1:] |= ticks["phase"][1:] != ticks["phase"][:-1]
     first = np.maximum.accumulate(np.where(run, rows, 0))
     edge = run | ((rows - first) % BIN_ROWS == 0)
-    label = np.cumsum(edge)
+    label = np.cumsum(edge)  # every cycle begins with a new one
+    labels, inverse = np.unique(label[usable], return_inverse=True)
     bins = np.full(len(samples), -1)
-    _, bins[usable] = np.unique(label[usable], return_inverse=True)
-    bin_starts = [
-        int(bins[usable & (rows >= start)].min(initial=bins.max() + 1)) for start in starts
-    ]
-    return bins, np.array(bin_starts, np.int64)
+    bins[usable] = inverse
+    after_all = len(label) and label[-1] + 1
+    bin_starts = np.searchsorted(labels, np.append(label, after_all)[starts])
+    return bins, bin_starts
 
 
 def _whitening(evidence: Evidence, noise: float) -> list[Floats]:
     """Cholesky factors of each cycle's covariance: noise, scatter, and the model's own error."""
-    if not evidence.cycles:
-        return []
     base = evidence.off(evidence.expect([(0, evidence.theta)]))
     moves = []
     for name, sizes in SCATTER:

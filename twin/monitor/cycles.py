@@ -29,13 +29,22 @@ PAPER_VACUUM = 600.0 * MBAR  # Pa below ambient: what the founding paper times e
 class Cycle:
     """One pick: from the suction edge to the next one, or a piece of a long one.
 
-    ``complete`` is a whole cycle that began with a suction edge and was seen to its idle end.
+    ``complete`` is a whole cycle that began with a suction edge and was seen to its idle end;
+    ``cut_short`` one whose last phase may have gone on, as far as anybody knows.
     """
 
     index: int
     samples: Samples
     ticks: Ticks
     complete: bool
+    cut_short: bool = False
+    settled: bool = True  # a whole cycle came before without a break: the model has swung in
+
+    @property
+    def coverage(self) -> float:
+        """Share of its samples that are there."""
+        sequence = self.samples["sequence"]
+        return len(sequence) / max(int(sequence[-1] - sequence[0]) + 1, 1)
 
     @property
     def end_ns(self) -> int:
@@ -51,6 +60,7 @@ class CycleCutter:
     _ticks: Ticks = field(default_factory=lambda: np.empty(0, TICK))
     _index: int = -1  # of the cycle that is being collected; −1 before the first suction edge
     _at_edge: bool = False  # what is collected begins with a suction edge
+    _edges_on_end: int = 0  # suction edges since the start or the last break
 
     def push(self, samples: Samples, ticks: Ticks) -> Iterator[Cycle]:
         """Give every cycle that these rows end."""
@@ -80,11 +90,16 @@ class CycleCutter:
 
     def _cut(self, end: int) -> Cycle:
         begins, self._at_edge = self._at_edge, bool(self._edges(end + 1)[end - 1 : end].any())
+        self._edges_on_end += begins
+        settled = self._edges_on_end >= 2
+        if len(self._samples) > end and self._samples["quality"][end] & BREAK:
+            self._at_edge, self._edges_on_end = False, 0
         samples, self._samples = self._samples[:end], self._samples[end:]
         ticks, self._ticks = self._ticks[:end], self._ticks[end:]
         self._index += begins
         whole = begins and ticks["phase"][-1] in (Phase.IDLE, Phase.BLOW_OFF)
-        return Cycle(self._index, samples, ticks, bool(whole))
+        cut_short = not self._at_edge and end < LONGEST_PIECE
+        return Cycle(self._index, samples, ticks, bool(whole), cut_short, settled)
 
 
 def time_to_vacuum(
@@ -106,8 +121,11 @@ def figures(cycle: Cycle, ambient: float) -> dict[str, float]:
     """
     off = deviation(cycle.samples, cycle.ticks) / MBAR
     result: dict[str, float] = {}
+    broken_off = cycle.ticks["phase"][-1] if cycle.cut_short else None
     for phase in Phase:
         there = off[(cycle.ticks["phase"] == phase) & np.isfinite(off)]
+        if phase == broken_off:  # its beginning is no measure of all of it
+            continue
         if len(there) >= FEWEST_ROWS:
             name = phase.name.lower()
             result[f"{name}_mean"] = float(np.mean(there))
@@ -118,7 +136,7 @@ def figures(cycle: Cycle, ambient: float) -> dict[str, float]:
         measured = np.where(usable, cycle.samples["pressure"], np.nan).astype(np.float64)
         expected = cycle.ticks["expected"].astype(np.float64)
         times = cycle.samples["time_ns"]
-        result["max_vacuum"] = float((ambient - np.nanmin(measured)) / MBAR)
+        result["max_vacuum"] = float((ambient - np.fmin.reduce(measured)) / MBAR)
         result["t0_measured"] = time_to_vacuum(H2, measured, times, ambient) * 1e3
         result["t0_expected"] = time_to_vacuum(H2, expected, times, ambient) * 1e3
     return {name: value for name, value in result.items() if np.isfinite(value)}

@@ -14,12 +14,14 @@ from pydantic import Field
 from twin.events import Event, Kind
 from twin.model import dataset as c
 from twin.model.dataset import Theta
-from twin.monitor.cycles import Cycle, CycleCutter, figures
+from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, figures
 from twin.monitor.signatures import Likeness, likenesses, look_alikes
 from twin.settings import Settings
 from twin.signals import NS, SAMPLE, Quality, Samples, Ticks
 
 _UNFIT = Quality.OUT_OF_RANGE | Quality.OVERFLOW | Quality.STALE | Quality.BAD
+FEWEST_SHARE = 0.95  # of a cycle's samples, to judge it: commands seen late look like a deviation
+STANDING = 0.8  # of the best fit's gain: then the name of a standing alarm still holds
 
 
 class Scatter(Settings):
@@ -138,8 +140,9 @@ class Monitor:
         before, self._before = self._before, cycle
         found = figures(cycle, self.theta[c.AMBIENT])
         events = [_summary(cycle, found)] if cycle.complete else []
-        whole = cycle.complete or len(cycle.samples) >= 10_000
-        if not whole or (worst := self._worst(found)) is None:
+        whole = cycle.complete or len(cycle.samples) >= LONGEST_PIECE
+        judged = whole and cycle.settled and cycle.coverage >= FEWEST_SHARE
+        if not judged or (worst := self._worst(found)) is None:
             return events
         if abs(worst.sigmas) >= self.settings.raise_sigma:
             self._quiet_cycles = 0
@@ -162,17 +165,26 @@ class Monitor:
         for figure, healthy in self.settings.healthy.items():
             if figure in found:
                 excess = found[figure] - healthy.mean
+                if figure.endswith("_rms"):
+                    excess = max(excess, 0.0)  # less than usual is no deviation
                 beyond = max(abs(excess) - self.settings.smallest_mbar, 0.0)
                 sigmas = float(np.copysign(beyond / healthy.sigma, excess))
                 outliers.append(Outlier(figure, excess, sigmas))
-        return max(outliers, key=lambda outlier: abs(outlier.sigmas), default=None)
+        return max(outliers, key=self._weight, default=None)
+
+    def _weight(self, outlier: Outlier) -> tuple[bool, float]:
+        """Sensors move the levels too, and say more about themselves in the course."""
+        far = abs(outlier.sigmas)
+        level = outlier.figure.endswith("_level")
+        return far >= self.settings.raise_sigma, far / 3.0 if level else far
 
     def _deviation(self, worst: Outlier, before: Cycle | None, cycle: Cycle) -> Event | None:
         """Raise the alarm, or raise it anew when another cause than the standing one fits."""
         ranking = self._name(worst, before, cycle)
         best = ranking[0]
         also = look_alikes(ranking)
-        if self.active == best.effect or self.active in also:
+        standing = max((one.share for one in ranking if one.effect == self.active), default=0.0)
+        if self.active and (cycle.cut_short or standing >= STANDING * best.share):
             return None
         self.active = best.effect
         where = worst.figure.rsplit("_", 1)[0].replace("_", "-")
@@ -197,13 +209,14 @@ class Monitor:
 
     def _name(self, worst: Outlier, before: Cycle | None, cycle: Cycle) -> list[Likeness]:
         """Rank the causes of a cycle's deviation; the cycle before lets the model swing in."""
-        if worst.figure.endswith("_level"):  # only the thresholds act on the switching levels
+        if worst.figure.endswith("_level"):  # and nothing else: only the thresholds moved
             return [Likeness("threshold_drift", worst.excess, "mbar", 1.0)]
         parts = [cycle] if before is None else [before, cycle]
         samples = np.concatenate([part.samples for part in parts])
         ticks = np.concatenate([part.ticks for part in parts])
         begin = len(samples) - len(cycle.samples)
-        return likenesses(self.theta, samples, ticks, begin)
+        ranking = likenesses(self.theta, samples, ticks, begin)
+        return ranking or [Likeness("unknown", 0.0, "", 0.0)]  # not one sync in a long piece
 
 
 def _gap(before: np.void, row: np.void) -> Event:

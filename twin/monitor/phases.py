@@ -63,7 +63,7 @@ def expected_knees(theta: Theta, noise: float) -> Knees:
         rates(state, 0.0, jet, 0.0, theta, at_supply(theta), change)
         slopes.append(change[kernel.PRESSURE] * MS)
     bend = max(abs(slopes[1] - slopes[0]), 1e-3)
-    rows = (24.0 * (1.5 * SIGNIFICANT * noise / bend) ** 2) ** (1.0 / 3.0)
+    rows = (24.0 * (2.5 * SIGNIFICANT * noise / bend) ** 2) ** (1.0 / 3.0)
     return Knees(
         window=int(min(max(math.ceil(rows), SHORTEST_WINDOW), LONGEST_WINDOW)),
         noise=noise,
@@ -95,7 +95,7 @@ def _break_at(pressure, row, window, noise, nozzle_on):  # type: ignore[no-untyp
     sigma = noise * math.sqrt(12.0 / float(window + 1) ** 3)
     significance = (right - left) / (math.sqrt(2.0) * sigma)
     if nozzle_on:
-        is_knee = left < -3.0 * sigma and right > -3.0 * sigma
+        is_knee = left < 3.0 * sigma and right > -3.0 * sigma
     else:
         significance = -significance
         is_knee = left > -3.0 * sigma and right < -3.0 * sigma

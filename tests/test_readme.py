@@ -1,0 +1,28 @@
+"""The README says what the code does: its tables, commands and pictures."""
+
+import re
+from pathlib import Path
+
+from typer.main import get_command
+
+from tools.readme import filled
+from twin.cli import app
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+
+
+def test_generated_tables_are_those_of_the_code() -> None:
+    assert filled(README) == README, "run: python tools/readme.py"
+
+
+def test_every_command_is_described_and_every_described_command_exists() -> None:
+    commands = get_command(app).commands
+    known = set(commands) - {"log"} | {f"log {name}" for name in commands["log"].commands}
+    described = set(re.findall(r"`twin ((?:log )?[a-z]+) ?[A-Z`]", README))
+    assert described - {"COMMAND"} == known
+
+
+def test_links_lead_somewhere() -> None:
+    for link in re.findall(r"\]\(([^)#]+)\)", README):
+        assert (ROOT / link).exists(), link
