@@ -23,7 +23,7 @@ from twin.diagnosis.pictures import (
     worst_cycle,
     worst_phase,
 )
-from twin.diagnosis.report import LOOK_AT, in_words, write_report
+from twin.diagnosis.report import in_words, write_report
 from twin.diagnosis.search import Finding
 from twin.errors import SourceError
 from twin.model.effects import EFFECTS
@@ -351,8 +351,8 @@ def test_words_for_a_cause() -> None:
         "  cause          leakage, sonic flow 1.98 sl/min (95 %: 1.93 to 2.04), since 10.0 s into"
         " the log",
         "  how sure       83 %; this log cannot tell it from porous leakage",
-        f"  look at        {LOOK_AT['leakage']}",
-        f"  or it may be   porous leakage; then look at {LOOK_AT['porous_leakage']}",
+        f"  look at        {EFFECTS['leakage'].look_at}",
+        f"  or it may be   porous leakage; then look at {EFFECTS['porous_leakage'].look_at}",
         "  next recording hold for 10 s with the nozzle off",
         "  unseen cycles  rms 21.3 → 1.13 mbar, max 34.8 → 9.04 mbar, evacuation time error"
         " 9.37 → 0.157 %, leftover 2.99 → 1.16 sigma",
@@ -382,7 +382,3 @@ def test_words_for_a_log_that_cannot_answer() -> None:
 def test_words_stay_short_for_a_long_log() -> None:
     cycles = {"total": 400, "fitted": list(range(1, 400, 2)), "held_out": list(range(2, 400, 2))}
     assert "held out: 2, 4, 6 … 398 (199 cycles)" in in_words(explained(cycles=cycles))
-
-
-def test_every_effect_says_what_to_look_at() -> None:
-    assert LOOK_AT.keys() == EFFECTS.keys()

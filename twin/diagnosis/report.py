@@ -28,29 +28,6 @@ from twin.signals import BAR, MBAR, ML, SL_MIN, Phase
 
 MOST_LISTED = 12  # cycles named one by one
 
-# What a technician should look at first, for each effect.
-LOOK_AT = {
-    "leakage": "hoses, fittings and cups: a cut, or a loose connection",
-    "porous_leakage": "the part's surface and the sealing lips; try a dense part",
-    "check_valve_leak": "the ejector's check valve: dirt on its seat",
-    "suction_loss": "the nozzles and the silencer: clean or replace them",
-    "end_vacuum_loss": "the receiver nozzle for wear, the silencer for dirt",
-    "supply_pressure_drop": "the supply pressure at the ejector while its nozzle is on",
-    "filter_clogging": "the vacuum filter: clean or replace it",
-    "added_volume": "hose length and cups against what is configured",
-    "cup_compliance": "the cups: worn, soft, or of another kind",
-    "heat_exchange": "what changed about the vessel; if nothing did, calibrate again",
-    "response_delay": "the suction valve and the output that drives it",
-    "slow_ramp_up": "the suction valve and the supply hose: something opens slowly",
-    "threshold_drift": "the air saving's settings H1 and H2 in the ejector",
-    "weak_blow_off": "the blow-off valve and its throttle screw",
-    "blow_off_delay": "the blow-off valve and the output that drives it",
-    "sensor_offset": "the sensor's zero: what it reads while open to ambient",
-    "sensor_gain": "the sensor's span: compare it with a gauge at high vacuum",
-    "sensor_lag": "the sensor's tube for length, water and dirt, and its filter setting",
-    "ambient_pressure": "today's air pressure against that of the data set",
-}
-
 # Key in the answer, what it is, unit.
 FIGURES = (
     ("rms_mbar", "rms deviation", "mbar"),
@@ -176,9 +153,9 @@ def _to_do(answer: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """What to look at and to record next."""
     sure = answer["verdict"] == "explained"
     for cause in answer["causes"]:
-        yield ("look at" if sure else "perhaps"), LOOK_AT[cause["effect"]]
+        yield ("look at" if sure else "perhaps"), EFFECTS[cause["effect"]].look_at
         for name in cause["not_separable_from"]:
-            yield "or it may be", f"{spoken(name)}; then look at {LOOK_AT[name]}"
+            yield "or it may be", f"{spoken(name)}; then look at {EFFECTS[name].look_at}"
     if answer["verdict"] == "unlisted":
         where = spoken(answer["unlisted"]["where"])
         yield "find out", f"what in {where} differs from when the twin was calibrated"

@@ -35,10 +35,14 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Effect:
-    """What differs: a sentence a maintenance person understands, and where it acts."""
+    """What differs, in words a maintenance person understands, and where it acts.
+
+    ``sentence`` says what it is, ``look_at`` what to look at first.
+    """
 
     name: str
     sentence: str
+    look_at: str
     parameters: tuple[Parameter, ...]
     act: Callable[..., None]  # (theta, one value per parameter) -> changes theta in place
 
@@ -125,78 +129,91 @@ _TABLE = (
     Effect(
         "leakage",
         "Air leaks in through an opening on the vacuum side",
+        "hoses, fittings and cups: a cut, or a loose connection",
         (_P("sonic_flow", "sl/min", 0.0, 60.0, 1.0),),
         _leakage,
     ),
     Effect(
         "porous_leakage",
         "Air seeps in through a porous part or seal, the more the higher the vacuum",
+        "the part's surface and the sealing lips; try a dense part",
         (_P("flow_at_600mbar", "sl/min", 0.0, 60.0, 1.0),),
         _porous_leakage,
     ),
     Effect(
         "check_valve_leak",
         "Air flows back through the ejector while its nozzle is off",
+        "the ejector's check valve: dirt on its seat",
         (_P("sonic_flow", "sl/min", 0.0, 60.0, 1.0),),
         _check_valve_leak,
     ),
     Effect(
         "suction_loss",
         "The ejector moves less air at every vacuum: worn or dirty nozzle",
+        "the nozzles and the silencer: clean or replace them",
         (_P("loss", "%", 0.0, 90.0, 10.0),),
         _suction_loss,
     ),
     Effect(
         "end_vacuum_loss",
         "The highest vacuum it can reach is lower: worn receiver nozzle or clogged silencer",
+        "the receiver nozzle for wear, the silencer for dirt",
         (_P("end_pressure_rise", "mbar", 0.0, 600.0, 20.0),),
         _end_vacuum_loss,
     ),
     Effect(
         "supply_pressure_drop",
         "The operating pressure is too low: suction, end vacuum and blow-off weaken together",
+        "the supply pressure at the ejector while its nozzle is on",
         (_P("drop", "bar", 0.0, 4.0, 0.4),),
         _supply_pressure_drop,
     ),
     Effect(
         "filter_clogging",
         "A clogged filter throttles the flow between vessel and ejector",
+        "the vacuum filter: clean or replace it",
         (_P("pressure_drop_at_nominal", "mbar", 0.0, 800.0, 40.0),),
         _filter_clogging,
     ),
     Effect(
         "added_volume",
         "More volume than configured: a longer hose or a bigger cup",
+        "hose length and cups against what is configured",
         (_P("volume", "ml", 0.0, 5000.0, 20.0),),
         _added_volume,
     ),
     Effect(
         "cup_compliance",
         "The cups give way: their volume shrinks as vacuum rises",
+        "the cups: worn, soft, or of another kind",
         (_P("volume_at_full_vacuum", "ml", 0.0, 100.0, 10.0),),
         _cup_compliance,
     ),
     Effect(
         "heat_exchange",
         "Heat passes between gas and wall at another rate than the data set says",
+        "what changed about the vessel; if nothing did, calibrate again",
         (_P("film_coefficient", "W/(m²·K)", 0.0, 500.0, 5.0, coefficient=c.FILM),),
         _heat_exchange,
     ),
     Effect(
         "response_delay",
         "The suction valve acts later",
+        "the suction valve and the output that drives it",
         (_P("delay", "ms", 0.0, 400.0, 10.0),),
         _response_delay,
     ),
     Effect(
         "slow_ramp_up",
         "The jet takes longer to reach full suction",
+        "the suction valve and the supply hose: something opens slowly",
         (_P("time_constant", "ms", 0.0, 400.0, 20.0),),
         _slow_ramp_up,
     ),
     Effect(
         "threshold_drift",
         "The switching points of the air saving moved",
+        "the air saving's settings H1 and H2 in the ejector",
         (
             _P("h1_shift", "mbar", -200.0, 200.0, 20.0),
             _P("h2_shift", "mbar", -200.0, 200.0, 20.0),
@@ -206,36 +223,42 @@ _TABLE = (
     Effect(
         "weak_blow_off",
         "The blow-off flow is too small",
+        "the blow-off valve and its throttle screw",
         (_P("loss", "%", 0.0, 95.0, 20.0),),
         _weak_blow_off,
     ),
     Effect(
         "blow_off_delay",
         "The blow-off valve acts later",
+        "the blow-off valve and the output that drives it",
         (_P("delay", "ms", 0.0, 400.0, 10.0),),
         _blow_off_delay,
     ),
     Effect(
         "sensor_offset",
         "The pressure sensor reads a constant amount off (positive: too much absolute pressure)",
+        "the sensor's zero: what it reads while open to ambient",
         (_P("offset", "mbar", -200.0, 200.0, 8.0),),
         _sensor_offset,
     ),
     Effect(
         "sensor_gain",
         "The span of the pressure sensor is off (positive: it reads too much vacuum)",
+        "the sensor's span: compare it with a gauge at high vacuum",
         (_P("error", "%", -30.0, 30.0, 2.0),),
         _sensor_gain,
     ),
     Effect(
         "sensor_lag",
         "The pressure sensor is slow, or its tube is long",
+        "the sensor's tube for length, water and dirt, and its filter setting",
         (_P("time_constant", "ms", 0.0, 400.0, 20.0),),
         _sensor_lag,
     ),
     Effect(
         "ambient_pressure",
         "Ambient pressure differs from the data set: weather or altitude",
+        "today's air pressure against that of the data set",
         (_P("shift", "mbar", -300.0, 100.0, 15.0),),
         _ambient_pressure,
     ),
