@@ -139,8 +139,9 @@ def insufficient(evidence: Evidence) -> str:
 def split(evidence: Evidence, onset: int | None) -> tuple[list[int], list[int]]:
     """Cycles to fit on and to judge by, in turn; the one in which an effect began is fitted."""
     began = -1 if onset is None else int(np.searchsorted(evidence.starts, onset, "right")) - 1
-    fitted = [cycle for cycle in evidence.judged if cycle % 2 == 1 or cycle == began]
-    return fitted, [cycle for cycle in evidence.judged if cycle not in fitted]
+    others = [cycle for cycle in evidence.judged if cycle != began]
+    held_out = others[1::2]
+    return [cycle for cycle in evidence.judged if cycle not in held_out], held_out
 
 
 def worth_naming(evidence: Evidence, finding: Finding, unexplained: float) -> bool:

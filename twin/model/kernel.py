@@ -76,7 +76,7 @@ def _command(state, position, value):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _enter(state, phase):  # type: ignore[no-untyped-def]
+def _enter(state, phase, theta):  # type: ignore[no-untyped-def]
     """Take over the phase of a sample: what it commands, and what was measured of the nozzle."""
     before = int(state[PHASE])
     if phase == before:
@@ -88,6 +88,8 @@ def _enter(state, phase):  # type: ignore[no-untyped-def]
         state[NOZZLE_AGE] = NEVER  # seen in the pressure: the valve has already acted
     if phase == _SUCTION and before != _HOLD:
         state[OPEN] = 0.0  # the next part is there
+    if phase == _IDLE and before == _BLOW_OFF and theta[c.RELEASE] >= 0.0:
+        state[OPEN] = 1.0  # blow-off has let the part go, early or late
 
 
 @compiled
@@ -126,7 +128,7 @@ def advance(state, theta, dt, phase, level, expected):  # type: ignore[no-untype
             state[VALID] = 0.0
         elif state[VALID] > 0.0 and dt[row] > 0.0:
             _step(state, dt[row], theta, supplied, work)
-        _enter(state, phase[row])
+        _enter(state, phase[row], theta)
         if not math.isnan(level[row]):
             _synchronise(state, level[row], theta)
         expected[row] = reading(state[SENSED], theta) if state[VALID] > 0.0 else math.nan
@@ -155,7 +157,7 @@ def simulate(state, theta, dt, commands, phase, expected):  # type: ignore[no-un
             elif now == _HOLD and vacuum < theta[c.H1_LOW]:
                 now = _SUCTION
         switched = now + int(state[PHASE]) == _SUCTION + _HOLD and now != state[PHASE]
-        _enter(state, now)
+        _enter(state, now, theta)
         if switched:
             state[NOZZLE_AGE] = 0.0  # nothing was measured yet: the valve takes its response
         phase[row] = now
