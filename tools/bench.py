@@ -1,0 +1,187 @@
+"""Measure what the twin costs, each figure beside its floor in the same run.
+
+    python tools/bench.py [--long] [--only NAME ...]
+
+Prints a table and writes docs/bench.json and docs/bench.md; with --only it prints only. The short
+run takes some minutes, --long acquires for ten minutes.
+"""
+
+import argparse
+import json
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+
+from benchmarks import acquisition, kernel, log, machine, polling, replay
+from benchmarks.figures import Benchmark, Figure, Measured, Run, kept
+from benchmarks.processes import ROOT
+
+INTERRUPTED, TERMINATED = 130, 143
+BARE_FETCH = "bare socket that fetches the same registers"
+STARTED = "Python that imports numba, numpy, pydantic, typer"
+
+BENCHMARKS = (
+    Benchmark(
+        "acquisition",
+        acquisition.steady,
+        "`twin run` with its log beside the simulated PLC in another process; slices of 10 s; "
+        "lost samples are numbers missing in the log.",
+        (
+            Figure("block mode: lost samples", "", limit=0),
+            Figure("block mode: CPU of the live process", "% of a core", BARE_FETCH, 8.0),
+            Figure("block mode: log of the live process", "bytes/sample"),
+        ),
+    ),
+    Benchmark(
+        "stops",
+        acquisition.stopped,
+        "The same while the live process gets SIGSTOP for 300 ms in every slice; ten minutes "
+        "with --long.",
+        (
+            Figure("stopped for 300 ms every 10 s: lost samples", "", limit=0),
+            Figure("stopped for 300 ms every 10 s: CPU", "% of a core", BARE_FETCH, 8.0),
+        ),
+    ),
+    Benchmark(
+        "polling",
+        polling.missed,
+        "The driver alone and two bare sockets take short turns at the same PLC, one request a "
+        "millisecond, the same sleep and spin before it.",
+        (
+            Figure("poll mode: missed slots", "%", "bare poller in Python", 1.5, limits_ratio=True),
+            Figure("poll mode: missed slots", "%", "bare poller in C", 1.5, limits_ratio=True),
+        ),
+    ),
+    Benchmark(
+        "kernel",
+        kernel.step,
+        "100 000 rows of the rig's cycles through `kernel.advance` and through "
+        "tools/benchmarks/kernel.c by turns, in processor time.",
+        (Figure("model: one step of 1 ms", "ns", "the same in C, -O2", 1.5, limits_ratio=True),),
+    ),
+    Benchmark(
+        "log",
+        log.files,
+        "An hour of the simulated rig (3.6 million samples with model values), received in "
+        "blocks of 30 as from a PLC; disk and fdatasync included.",
+        (
+            Figure("log: size with model values", "bytes/sample", "the rows through zstd"),
+            Figure("log: an hour written", "s", "the rows through zstd into a file", 5.0),
+            Figure("log: an hour read", "s", "decompression alone", 3.0),
+        ),
+    ),
+    Benchmark(
+        "replay",
+        replay.end_to_end,
+        "`twin replay` over that log in a process of its own, start included; then its parts in "
+        "this process.",
+        (
+            Figure("replay: an hour, start to end", "s", "decompression and the model in C"),
+            Figure("replay: speed", "× real time"),
+            Figure("replay: phases and model", "s", "the model in C"),
+            Figure("replay: monitor", "s"),
+        ),
+    ),
+    Benchmark(
+        "starts",
+        replay.starts,
+        "Whole processes, by turns with their floors, everything in the page cache.",
+        (
+            Figure("start: twin --help", "ms", "Python that does nothing"),
+            Figure("start: twin replay, a log of 10 s", "ms", STARTED),
+        ),
+    ),
+)
+
+Result = tuple[Figure, Measured]
+
+
+def main() -> int:
+    """Measure, print, write; gives the exit code."""
+    given = _arguments()
+    before, load = machine.noise(), machine.Load.now()
+    results = []
+    with tempfile.TemporaryDirectory(prefix="ejector-twin-bench-") as folder:
+        run = Run(given.long, Path(folder), _tell)
+        for benchmark in BENCHMARKS:
+            if not given.only or benchmark.name in given.only:
+                results += zip(benchmark.figures, benchmark.measure(run), strict=True)
+    _tell("")
+    notes = [
+        _kind(given.long),
+        f"Machine: {machine.description()}; {machine.Load.now().since(load)}.",
+        f"Noise: {before}; after the run {machine.noise()}.",
+    ]
+    print(_page(results, notes))
+    if not given.only:
+        _write(results, notes)
+    return 0
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--long", action="store_true", help="acquire for ten minutes")
+    names = [benchmark.name for benchmark in BENCHMARKS]
+    parser.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=", ".join(names))
+    return parser.parse_args()
+
+
+def _tell(text: str) -> None:
+    """Say on a terminal what is going on; a thread that draws would disturb what is measured."""
+    if sys.stderr.isatty():
+        print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
+
+
+def _kind(long: bool) -> str:
+    pinned = "PLC and twin each on its own core" if machine.can_pin() else "not pinned to cores"
+    return f"{'Long' if long else 'Short'} run of {time.strftime('%Y-%m-%d')}; {pinned}."
+
+
+def _page(results: list[Result], notes: list[str]) -> str:
+    rows = ["| figure | measured | floor | ratio | limit | kept |", "|" + " --- |" * 6]
+    rows += [_row(figure, measured) for figure, measured in results]
+    return "\n".join([*(f"- {note}" for note in notes), "", *rows])
+
+
+def _row(figure: Figure, measured: Measured) -> str:
+    floor = f"{_spread(measured.floors, figure.unit)}: {figure.floor}" if measured.floors else ""
+    ratio = "" if measured.ratio is None else f"{measured.ratio:.2f}"
+    limit = "" if figure.limit is None else f"{figure.limit:g} {figure.unit}".strip()
+    if figure.limits_ratio:
+        limit = f"ratio {figure.limit:g}"
+    verdict = {None: "", True: "yes", False: "**no**"}[kept(figure, measured)]
+    value = " ".join(filter(None, (_spread(measured.values, figure.unit), measured.note)))
+    return f"| {figure.name} | {value} | {floor} | {ratio} | {limit} | {verdict} |"
+
+
+def _spread(values: Sequence[float], unit: str) -> str:
+    """Median, and from least to most where there are several."""
+    spread = f" ({_number(min(values))}–{_number(max(values))})" if len(values) > 1 else ""
+    return f"{_number(median(values))}{spread} {unit}".strip()
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}" if abs(value) < 999.5 else f"{value:,.0f}"
+
+
+def _write(results: list[Result], notes: list[str]) -> None:
+    page = ["# Benchmarks", "", "Written by `make bench` (tools/bench.py). Every figure stands"]
+    page += ["beside its floor, measured in the same run on the same machine: use the ratios."]
+    page += ["Median of the repetitions, least to most in brackets.", "", _page(results, notes), ""]
+    page += [*(f"- **{one.name}**: {one.how}" for one in BENCHMARKS), ""]
+    (ROOT / "docs" / "bench.md").write_text("\n".join(page), encoding="utf-8")
+    figures = [vars(figure) | vars(measured) for figure, measured in results]
+    text = json.dumps({"circumstances": notes, "figures": figures}, indent=1, ensure_ascii=False)
+    (ROOT / "docs" / "bench.json").write_text(text + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))  # ends what was started
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)

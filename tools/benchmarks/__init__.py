@@ -1,0 +1,1 @@
+"""What ``tools/bench.py`` measures, and the floors it measures beside it."""

@@ -1,0 +1,106 @@
+"""Block mode: what the live twin loses and costs beside a PLC in another process."""
+
+import signal
+import socket
+import struct
+import subprocess
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from benchmarks.figures import Measured, Run
+from benchmarks.machine import TWIN_CORE, on_core
+from benchmarks.processes import live, plc
+from twin.log.reader import open_log
+
+SLICE_S = 10.0
+STOP_S = 0.3  # SIGSTOP at the beginning of each slice: a client that does not get to run
+INTERVAL_S = 0.03  # between blocks, as configs/test_rig.toml has it
+HEADER, RING, DEPTH = (100, 12), 1000, 4096  # of the PLC's trace; a record has 4 words
+RECORDS_AT_ONCE = 31
+
+
+def steady(run: Run) -> Sequence[Measured]:
+    """Lost samples, CPU share and bytes per sample, nobody in the way."""
+    return _acquire(run, "acquisition", slices=3, stop_s=0.0)
+
+
+def stopped(run: Run) -> Sequence[Measured]:
+    """Lost samples and CPU share with a stop of 300 ms every 10 s; ``--long``: ten minutes."""
+    return _acquire(run, "acquisition with stops", 60 if run.long else 3, STOP_S)[:2]
+
+
+def _acquire(run: Run, what: str, slices: int, stop_s: float) -> Sequence[Measured]:
+    log = run.folder / f"{what}.mcap"
+    with plc() as port:
+        run.tell(f"{what}: the floor")
+        with on_core(TWIN_CORE):
+            floors = [_bare_share(port) for _ in range(3)]
+        with live(port, log) as process:
+            shares = []
+            for number in range(slices):
+                run.tell(f"{what}: slice {number + 1} of {slices}")
+                shares.append(_share(process, stop_s))
+    lost, rows = _lost(log)
+    note = f"of {rows:,} samples"
+    return (
+        Measured([lost], note=note),
+        Measured(shares, floors),
+        Measured([log.stat().st_size / rows]),
+    )
+
+
+def _share(process: "subprocess.Popen[bytes]", stop_s: float) -> float:
+    """CPU time (% of a core) over one slice."""
+    times = psutil.Process(process.pid).cpu_times()
+    begin = time.monotonic()
+    if stop_s:
+        process.send_signal(signal.SIGSTOP)
+        try:
+            time.sleep(stop_s)
+        finally:
+            process.send_signal(signal.SIGCONT)
+    time.sleep(SLICE_S - stop_s)
+    wall = time.monotonic() - begin
+    after = psutil.Process(process.pid).cpu_times()
+    return 100.0 * (after.user + after.system - times.user - times.system) / wall
+
+
+def _lost(log: Path) -> tuple[int, int]:
+    """Sequence numbers that are missing in the log, and its rows; a repeated one is an error."""
+    sequence = np.concatenate([samples["sequence"] for samples, _ in open_log(log).blocks()])
+    steps = np.diff(sequence)
+    assert (steps > 0).all(), "the log has a sample twice"
+    return int((steps - 1).sum()), len(sequence)
+
+
+def _bare_share(port: int) -> float:
+    """CPU time (% of a core) of a bare socket that fetches the same registers as often."""
+    with socket.create_connection(("127.0.0.1", port)) as connection:
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        seen = _newest(connection)
+        begin, cpu = time.monotonic(), time.process_time()
+        while time.monotonic() - begin < 3.0:
+            time.sleep(INTERVAL_S)
+            newest = _newest(connection)
+            while seen < newest:
+                first = (seen + 1) % DEPTH
+                count = min(newest - seen, RECORDS_AT_ONCE, DEPTH - first)
+                _read(connection, RING + 4 * first, 4 * count)
+                seen += count
+        return 100.0 * (time.process_time() - cpu) / (time.monotonic() - begin)
+
+
+def _newest(connection: socket.socket) -> int:
+    return int.from_bytes(_read(connection, *HEADER)[:4], "big")
+
+
+def _read(connection: socket.socket, address: int, words: int) -> bytes:
+    """Words of holding registers, as they come."""
+    connection.sendall(struct.pack(">HHHBBHH", 1, 0, 6, 1, 3, address, words))
+    answer = connection.recv(9 + 2 * words, socket.MSG_WAITALL)
+    assert answer[7] == 3, "the PLC refused the request"
+    return answer[9:]

@@ -1,0 +1,64 @@
+"""The processes that the benchmarks start: simulated PLC and live twin, each on its own core."""
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from benchmarks.machine import PLC_CORE, TWIN_CORE, on_core
+
+ROOT = Path(__file__).parents[2]
+CONFIG = ROOT / "configs" / "test_rig.toml"
+TWIN = Path(sys.executable).with_name("twin")
+
+INTERRUPTED = 130
+START_S = 60.0  # the kernels may have to be compiled
+
+
+@contextmanager
+def plc() -> Iterator[int]:
+    """Run the simulated PLC; gives its port on 127.0.0.1."""
+    command = [sys.executable, "-m", "drivers.plc", CONFIG, "--port", "0"]
+    with on_core(PLC_CORE):
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    with process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            if not line.startswith("listening on "):
+                sys.exit("the PLC did not start")
+            yield int(line.rsplit(":", 1)[1])
+        finally:
+            process.terminate()
+
+
+@contextmanager
+def live(port: int, log: Path, config: Path = CONFIG) -> Iterator["subprocess.Popen[bytes]"]:
+    """Run ``twin run`` beside the PLC at ``port``, logging; given once samples are logged."""
+    address = ["--address", f"127.0.0.1:{port}"]
+    command = [TWIN, "run", config, *address, "--log", log]
+    with on_core(TWIN_CORE):
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    with process:
+        try:
+            _wait_for_samples(process, log)
+            yield process
+        finally:
+            process.send_signal(signal.SIGINT)
+    if process.returncode != INTERRUPTED:
+        sys.exit(f"twin run ended with exit code {process.returncode}")
+
+
+def _wait_for_samples(process: "subprocess.Popen[bytes]", log: Path) -> None:
+    """Return when the log grows; a log's head alone comes in one go."""
+    end = time.monotonic() + START_S
+    sizes: set[int] = set()
+    while len(sizes) < 3:
+        if process.poll() is not None or time.monotonic() > end:
+            sys.exit("twin run did not start")
+        time.sleep(0.1)
+        if log.exists():
+            sizes.add(log.stat().st_size)

@@ -1,0 +1,73 @@
+"""An hour of the test rig, simulated, with what the twin says to it: made once, used by many."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from benchmarks.processes import CONFIG
+from drivers.plc.settings import PlcSettings
+from drivers.plc.simulate import blocks
+from twin.config import Config
+from twin.live import Twin
+from twin.log.header import LogHeader
+from twin.model.dataset import Theta, coefficients
+from twin.monitor.phases import expected_knees
+from twin.settings import Document
+from twin.signals import MBAR, MS, NS, Samples, Ticks
+
+HOUR_S = 3600.0
+BLOCK = 10_000  # rows, as a replay takes them
+LIVE_BLOCK = 30  # rows that a live driver receives at once
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Rows of SAMPLE and TICK, and what they were made with."""
+
+    config: Config
+    theta: Theta
+    samples: Samples
+    ticks: Ticks
+
+    def blocks(self) -> list[tuple[Samples, Ticks]]:
+        """Views of the rows, ``BLOCK`` at a time."""
+        starts = range(0, len(self.samples), BLOCK)
+        return [(self.samples[at : at + BLOCK], self.ticks[at : at + BLOCK]) for at in starts]
+
+    def header(self) -> LogHeader:
+        """What a log of it says about itself."""
+        asset, document = self.config.asset, self.config.document
+        ambient = self.config.data.ambient.pressure_mbar * MBAR
+        return LogHeader(asset.type, asset.id, "test_rig.toml", document.text, {}, ambient=ambient)
+
+
+def new_twin(config: Config) -> Twin:
+    """The twin of the rig as the command line makes it."""
+    theta = coefficients(config.data)
+    return Twin(theta, expected_knees(theta, config.data.sensor.noise_mbar * MBAR))
+
+
+@cache
+def hour() -> Recording:
+    """3.6 million rows, received as a live driver would: in blocks, a little late."""
+    document = Document.read(CONFIG)
+    config = Config.of(document)
+    rig = document.section(PlcSettings, "plc")
+    simulated = np.concatenate(list(blocks(rig, HOUR_S, seed=1, block=BLOCK)))
+    simulated["host_ns"] = _received(simulated["time_ns"])
+    twin = new_twin(config)
+    starts = range(0, len(simulated), BLOCK)
+    parts = [twin.advance(simulated[at : at + BLOCK]) for at in starts] + [twin.flush()]
+    samples, ticks = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Recording(config, twin.theta, samples, ticks)
+
+
+def _received(
+    time_ns: np.ndarray[tuple[int], np.dtype[np.int64]],
+) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    """When a live driver has the rows: all of a block at once, some 0.2 to 3 ms after its last."""
+    last = np.arange(len(time_ns)) // LIVE_BLOCK * LIVE_BLOCK + LIVE_BLOCK - 1
+    random = np.random.default_rng(1)
+    late = random.uniform(0.2 * MS, 3.0 * MS, len(time_ns) // LIVE_BLOCK + 1) / NS
+    return time_ns[np.minimum(last, len(time_ns) - 1)] + late.astype(np.int64)[last // LIVE_BLOCK]
