@@ -1,4 +1,7 @@
-"""What every test stands under: it must leave no task, thread, socket or process behind."""
+"""What every test stands under: it must leave no task, thread, socket or process behind.
+
+And what takes long to come by and is shared: a simulated PLC beside the tests of a module.
+"""
 
 import asyncio
 import gc
@@ -8,6 +11,8 @@ from collections.abc import Iterator
 
 import psutil
 import pytest
+import rigs
+from plc_process import PlcProcess, start_plc
 
 _ME = psutil.Process()
 
@@ -30,8 +35,15 @@ def nothing_left_behind() -> Iterator[None]:
     yield
     for patience in (0.0, 0.05, 0.2, 0.5, 1.0):  # closing is not instant; give it a moment
         time.sleep(patience)
-        gc.collect()
         left = _alive() - before
         if not left:
             return
+        gc.collect()
     pytest.fail(f"left behind: {', '.join(sorted(left))}")
+
+
+@pytest.fixture(scope="module")
+def plc() -> Iterator[PlcProcess]:
+    """The gripper's PLC in a process of its own; nobody may write to it or stop it."""
+    with start_plc(rigs.path_of("gripper")) as running:
+        yield running

@@ -57,7 +57,8 @@ def recorded(
     """Simulate the rig of a configuration: samples and ``TRUTH`` row for row, for reading only."""
     rig = config(name).document.section(PlcSettings, "plc")
     control = rig.control.model_copy(update={"air_saving": air_saving})
-    rig = rig.model_copy(update={"control": control})
+    program = rig.program.model_copy(update={"start_ms": 500.0})
+    rig = rig.model_copy(update={"control": control, "program": program})
     parts = with_truth(rig, seconds, [parse_fault(text) for text in faults], seed)
     samples, truth = (np.concatenate(column) for column in zip(*parts, strict=True))
     samples.flags.writeable = truth.flags.writeable = False

@@ -110,7 +110,7 @@ def unexplained(verdict: str, **changed: Any) -> Diagnosis:
 
 
 def insufficient() -> Diagnosis:
-    samples, _ = rigs.recorded("test_rig", 9.5)
+    samples, _ = rigs.recorded("test_rig", 7.0)
     return diagnose(rigs.config("test_rig"), [samples], "short.mcap", lambda _what: None)
 
 
@@ -374,7 +374,7 @@ def test_words_without_a_cause() -> None:
 
 def test_words_for_a_log_that_cannot_answer() -> None:
     first, *rest = in_words(insufficient()).splitlines()
-    assert first.startswith("insufficient: The log cannot answer: only 1 cycle")
+    assert first.startswith("insufficient: The log cannot answer: only 1 cycle can be judged")
     assert len(rest) == 1
     assert "record again" in rest[0]
 

@@ -79,14 +79,19 @@ class Document:
 
     def _line(self, keys: tuple[str, ...]) -> int:
         """Line of the deepest of ``keys`` that can be found; TOML parsers do not keep it."""
-        table, best = "", 1
+        table: tuple[str, ...] = ()
+        best, depth = 1, 0
         for number, line in enumerate(self.text.splitlines(), 1):
             if header := re.match(r"\s*\[+\s*([^\]]+?)\s*\]", line):
-                table = header[1].replace(" ", "").replace('"', "")
-            key = re.match(r"""\s*["']?([\w.-]+)["']?\s*=""", line)
-            here = f"{table}.{key[1]}".lstrip(".") if key else table
-            if here and ".".join(keys).startswith(here) and not line.lstrip().startswith("#"):
-                best = number
-                if here == ".".join(keys):
-                    break
+                here = table = _path(header[1])
+            elif key := re.match(r"""\s*(["'\w.-]+)\s*=""", line):
+                here = (*table, *_path(key[1]))
+            else:
+                continue
+            if depth < len(here) and here == keys[: len(here)]:
+                best, depth = number, len(here)
         return best
+
+
+def _path(key: str) -> tuple[str, ...]:
+    return tuple(part.strip(" \t\"'") for part in key.split("."))

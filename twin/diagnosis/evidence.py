@@ -119,11 +119,12 @@ class Evidence:
         phase: npt.NDArray[np.uint8] = self.ticks["phase"].copy()
         for index, name in ((c.RAMP_DOWN, Phase.HOLD), (c.RAMP_UP, Phase.SUCTION)):
             lags = [round((at[index] + at[c.SENSOR_LAG]) / MS) for at in (self.theta, theta)]
-            if lags[0] == lags[1]:
+            if (later := lags[1] - lags[0]) == 0:
                 continue
+            before = lags[0] if name == Phase.SUCTION else 0  # rows from the valve to the knee
             for knee in self._knees(name):
-                phase[max(knee - lags[0], 0) : knee] = _OTHER[name]
-                phase[max(knee - lags[1], 0) : knee] = name
+                phase[max(knee - before, 0) : knee] = _OTHER[name]
+                phase[max(knee - before - later, 0) : knee] = name
         return phase
 
     def _knees(self, name: Phase) -> npt.NDArray[np.int64]:

@@ -61,7 +61,8 @@ def port(p, jet, flow_in, theta, suction, end):  # type: ignore[no-untyped-def]
     ambient, resistance = theta[c.AMBIENT], theta[c.RESISTANCE]
     span = ambient - end
     p_port, a, b = p, 0.0, 0.0
-    for _ in range(3):
+    floor = min(p, end + 1e-6 * span)  # the ejector draws no deeper, whatever a tangent says
+    for _ in range(4):
         share, slope = characteristic((p_port - end) / span, theta[c.BULGE], theta[c.SKEW])
         b = max(jet * suction * slope / span, 0.0)
         a = jet * suction * share - b * p_port - flow_in
@@ -72,7 +73,7 @@ def port(p, jet, flow_in, theta, suction, end):  # type: ignore[no-untyped-def]
             return p, a + b * p
         sign = resistance if a + b * p >= 0.0 else -resistance
         root = math.sqrt(max(p * p + sign * (b * b * p * p - a * a), 1.0))
-        p_port = max((p * p - sign * a * a) / (sign * a * b + root), 100.0)
+        p_port = max((p * p - sign * a * a) / (sign * a * b + root), floor)
     return p_port, a + b * p_port
 
 
@@ -107,7 +108,7 @@ def rates(y, open_cup, nozzle, blow, theta, supplied, dy):  # type: ignore[no-un
     dtemperature = temperature * (dp / p + stretch * dp / volume - (flow_in - flow_out) / mass)
     if open_cup > 0.0:
         dp = (ambient - p) / OPEN_TIME
-        dtemperature = (outside - temperature) / OPEN_TIME
+        dtemperature = (flow_in * (outside - temperature) + heat / CP) / mass
 
     dy[0] = dp
     dy[1] = dtemperature

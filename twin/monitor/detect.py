@@ -17,7 +17,7 @@ from twin.model.dataset import Theta
 from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, figures
 from twin.monitor.signatures import Likeness, likenesses, look_alikes
 from twin.settings import Settings
-from twin.signals import NS, SAMPLE, Quality, Samples, Ticks
+from twin.signals import BREAK, NS, SAMPLE, Quality, Samples, Ticks
 
 _UNFIT = Quality.OUT_OF_RANGE | Quality.OVERFLOW | Quality.STALE | Quality.BAD
 FEWEST_SHARE = 0.95  # of a cycle's samples, to judge it: commands seen late look like a deviation
@@ -62,21 +62,24 @@ class Monitor:
     _before: Cycle | None = None
     _quiet_cycles: int = 0
     _last: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # row of the stream
-    _stale_since: int | None = None  # PLC time of the row after which the PLC fell silent
+    _silences: set[int] = field(default_factory=set)  # told of, by PLC time of the row before
     _unfit: int = 0  # quality bits that stand
 
     def update(self, samples: Samples, ticks: Ticks) -> list[Event]:
         """Take rows with the twin's ticks; give what they make happen."""
-        events = list(self._stream_events(samples))
-        for cycle in self._cutter.push(samples, ticks):
-            events += self._judge(cycle)
+        events = []
+        for rows in np.split(np.arange(len(samples)), np.flatnonzero(samples["quality"] & BREAK)):
+            found = list(self._stream_events(samples[rows]))
+            for cycle in self._cutter.push(samples[rows], ticks[rows]):
+                found += self._judge(cycle)
+            events += sorted(found, key=lambda event: event.time_ns)  # as if row by row
         return events
 
     def silent(self, last: np.void, now_ns: int) -> list[Event]:
         """Nothing arrived: give PLC_STALE once it is too long after the ``last`` row received."""
         time_ns = int(last["time_ns"])
         silence_ns = now_ns - int(last["host_ns"])
-        if self._stale_since == time_ns or silence_ns * NS * 1e3 <= self.settings.stale_ms:
+        if time_ns in self._silences or silence_ns * NS * 1e3 <= self.settings.stale_ms:
             return []
         return [self._stale(time_ns)]
 
@@ -107,8 +110,9 @@ class Monitor:
         time_ns, quality = int(row["time_ns"]), int(row["quality"])
         events = []
         if before is not None and silence_ms > self.settings.stale_ms:
-            if self._stale_since != int(before["time_ns"]):
+            if int(before["time_ns"]) not in self._silences:
                 events.append(self._stale(int(before["time_ns"])))
+            self._silences.remove(int(before["time_ns"]))
             text = f"the PLC is back after {silence_ms / 1e3:.2f} s"
             events.append(Event(time_ns, Kind.PLC_BACK, text, {"silence_ms": silence_ms}))
         if quality & Quality.RESTART:
@@ -129,7 +133,7 @@ class Monitor:
         return events
 
     def _stale(self, last_time_ns: int) -> Event:
-        self._stale_since = last_time_ns
+        self._silences.add(last_time_ns)
         after_ns = int(self.settings.stale_ms * 1e6)
         text = f"no fresh sample for {self.settings.stale_ms:.0f} ms: check PLC and network"
         return Event(last_time_ns + after_ns, Kind.PLC_STALE, text)

@@ -34,18 +34,21 @@ _IDLE, _SUCTION, _HOLD, _BLOW_OFF = (int(phase) for phase in Phase)
 
 @dataclass(frozen=True)
 class Knees:
-    """How knees look in this system: rows of the window, noise (Pa), rows from valve to knee."""
+    """How knees look in this system: rows of the window, noise (Pa), rows from valve to knee.
+
+    The nozzle's opening shows when jet and sensor have followed; its closing shows at once, because
+    the step at the port pulls the knee forward by as much as the two delay it.
+    """
 
     window: int
     noise: float
-    off_shift: int
     on_shift: int
     settled: int
 
     @property
     def lag(self) -> int:
         """Rows the finder stays behind: half a window to see the peak, and the way back."""
-        return self.window + self.window // 2 + max(self.off_shift, self.on_shift) + 1
+        return self.window + self.window // 2 + self.on_shift + 1
 
 
 def expected_knees(theta: Theta, noise: float) -> Knees:
@@ -67,7 +70,6 @@ def expected_knees(theta: Theta, noise: float) -> Knees:
     return Knees(
         window=int(min(max(math.ceil(rows), SHORTEST_WINDOW), LONGEST_WINDOW)),
         noise=noise,
-        off_shift=round((theta[c.RAMP_DOWN] + theta[c.SENSOR_LAG]) / MS),
         on_shift=round((theta[c.RAMP_UP] + theta[c.SENSOR_LAG]) / MS),
         settled=round((theta[c.RESPONSE] + SETTLED) / MS),
     )
@@ -107,7 +109,7 @@ def _break_at(pressure, row, window, noise, nozzle_on):  # type: ignore[no-untyp
 def _find(state, pressure, commands, first, last, look, phase, level):  # type: ignore[no-untyped-def]
     """Fill ``phase`` and ``level`` for rows first..last−1; a knee reaches back by its shift.
 
-    ``look`` = window, noise, off shift, on shift, settled; window 0 looks for no knees (at the end
+    ``look`` = window, noise, on shift, settled; window 0 looks for no knees (at the end
     of a stretch, where the rows after are missing).
     """
     for row in range(first, last):
@@ -154,7 +156,7 @@ def _look(state, pressure, commands, row, look, phase, level):  # type: ignore[n
     """Follow the break's significance over the rows and settle on its peak."""
     window, noise, nozzle_on = int(look[0]), look[1], state[_NOZZLE] > 0.0
     significance, here = 0.0, 0.0
-    if state[_AGE] > look[4] + window and commands[row + window] == commands[row]:
+    if state[_AGE] > look[3] + window and commands[row + window] == commands[row]:
         significance, here = _break_at(pressure, row, window, noise, nozzle_on)
     if significance > max(state[_BEST], SIGNIFICANT):
         state[_BEST], state[_BEST_AGE], state[_BEST_LEVEL] = significance, 0.0, here
@@ -164,7 +166,7 @@ def _look(state, pressure, commands, row, look, phase, level):  # type: ignore[n
     state[_BEST_AGE] += 1.0
     if state[_BEST_AGE] >= window // 2:
         knee = row - int(state[_BEST_AGE])
-        shift = int(look[2] if nozzle_on else look[3])
+        shift = 0 if nozzle_on else int(look[2])
         level[knee] = state[_BEST_LEVEL]
         phase[knee - shift : row + 1] = _HOLD if nozzle_on else _SUCTION
         state[_NOZZLE], state[_BEST] = 0.0 if nozzle_on else 1.0, 0.0
@@ -227,15 +229,7 @@ class PhaseFinder:
     def _run(self, last: int, window: int) -> None:
         pressure = self._rows["pressure"].astype(np.float64)
         pressure[(self._rows["quality"] & UNUSABLE) != 0] = np.nan
-        look = np.array(
-            [
-                window,
-                self.knees.noise,
-                self.knees.off_shift,
-                self.knees.on_shift,
-                self.knees.settled,
-            ]
-        )
+        look = np.array([window, self.knees.noise, self.knees.on_shift, self.knees.settled])
         commands = self._rows["commands"] & (Command.SUCTION | Command.BLOW_OFF)
         _find(self._state, pressure, commands, self._seen, last, look, self._phase, self._level)
         self._seen = last

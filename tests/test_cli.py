@@ -1,0 +1,330 @@
+"""The command line: exit codes, messages for people, and logs that survive what is done to it."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rigs
+from plc_process import PlcProcess, start_plc
+
+from twin.cli import main
+from twin.events import Kind
+from twin.live import run
+from twin.log.header import LogHeader
+from twin.log.reader import open_log
+from twin.log.recorder import Recorder
+from twin.model.effects import table
+
+GRIPPER, RIG = rigs.path_of("gripper"), rigs.path_of("test_rig")
+PATIENCE_S = 30.0  # for a busy machine; nothing waits that long otherwise
+
+
+def twin(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
+    """Run the command line in this process; gives its exit code."""
+    monkeypatch.setattr(sys, "argv", ["twin", *map(str, arguments)])
+    try:
+        main()
+    except SystemExit as left:
+        return int(left.code or 0)
+    return 0
+
+
+@contextmanager
+def started(*arguments: str | Path) -> Iterator["subprocess.Popen[str]"]:
+    """Run the command line as a process of its own; it is killed at the end if it still runs."""
+    command = [sys.executable, "-m", "twin.cli", *map(str, arguments)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, cwd=rigs.ROOT, stdout=pipe, stderr=pipe, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def edited(tmp_path: Path, old: str, new: str) -> tuple[Path, int]:
+    """A configuration with one passage changed, and the line of it."""
+    text = RIG.read_text()
+    assert old in text
+    path = tmp_path / "cell.toml"
+    path.write_text(text.replace(old, new, 1))
+    return path, text[: text.index(old)].count("\n") + 1
+
+
+def make_log(path: Path, name: str, faults: tuple[str, ...]) -> Path:
+    document = rigs.config(name).document
+    clock = count(0.0, 0.5).__next__  # half a second for each block, so that each is flushed
+    recorder = Recorder(path, LogHeader("type", "id", f"{name}.toml", document.text), clock=clock)
+    blocks = rigs.cut(rigs.recorded(name, 25.0, faults)[0], 500)
+    run(blocks, rigs.twin(name), rigs.monitor(name), [recorder])
+    return path
+
+
+@pytest.fixture(scope="module")
+def faulty_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_log(tmp_path_factory.mktemp("log") / "f.mcap", "test_rig", ("sensor_lag=25@c3",))
+
+
+@pytest.fixture(scope="module")
+def healthy_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_log(tmp_path_factory.mktemp("log") / "h.mcap", "test_rig", ())
+
+
+# Messages.
+
+
+def test_effects_are_listed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twin(monkeypatch, "effects") == 0
+    assert capsys.readouterr().out.strip() == table()
+
+
+@pytest.mark.parametrize("command", ["run", "replay", "plc", "probe", "effects", "log"])
+def test_every_command_explains_itself(
+    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twin(monkeypatch, command, "--help") == 0
+    assert command in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("arguments", [("run",), ("walk",), ("run", GRIPPER, "--fast"), ("log",)])
+def test_wrong_usage_is_exit_code_2(
+    arguments: Sequence[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert twin(monkeypatch, *arguments) == 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key"),
+    [
+        ("response_ms = ", "responce_ms = ", "data.ejector.responce_ms: unknown key"),
+        ("response_ms = ", "response_ms = -", "data.ejector.response_ms: "),
+        ("interval_ms = 30", "interval_ms = 3000", "driver.interval_ms: "),
+        ("raise_sigma = ", "raise_sigma = -", "monitor.raise_sigma: "),
+        ("[asset]", "[aset]", "unknown table [aset]"),
+    ],
+)
+def test_a_wrong_configuration_is_exit_code_2_with_its_place(
+    old: str,
+    new: str,
+    key: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path, line = edited(tmp_path, old, new)
+    assert twin(monkeypatch, "run", path) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"twin: {path}:{line}: {key}")
+    assert len(said.splitlines()) >= 2  # a hint
+
+
+def test_no_configuration_is_exit_code_3(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twin(monkeypatch, "run", tmp_path / "none.toml") == 3
+    assert "none.toml: cannot be read" in capsys.readouterr().err
+
+
+def test_no_plc_is_exit_code_3(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with socket.socket() as nobody:
+        nobody.bind(("127.0.0.1", 0))  # and does not listen
+        address = f"127.0.0.1:{nobody.getsockname()[1]}"
+        assert twin(monkeypatch, "run", GRIPPER, "--address", address) == 3
+    said = capsys.readouterr().err
+    assert f"{address}: no connection" in said
+    assert "is the PLC on" in said
+
+
+@pytest.mark.parametrize("address", ["nowhere", ":502", "10.0.0.5:", "10.0.0.5:http"])
+def test_what_is_no_address_is_exit_code_2(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert twin(monkeypatch, "run", GRIPPER, "--address", address) == 2
+
+
+def test_two_views_at_once_are_exit_code_2(
+    plc: PlcProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views = ("--view", "--rrd", tmp_path / "a.rrd")
+    assert twin(monkeypatch, "run", GRIPPER, "--address", f"127.0.0.1:{plc.port}", *views) == 2
+
+
+def test_a_fault_that_cannot_be_meant_is_exit_code_2(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twin(monkeypatch, "plc", GRIPPER, "--port", "0", "--fault", "leek=2") == 2
+    assert "no effect 'leek'" in capsys.readouterr().err
+
+
+def test_probe_says_what_answers(
+    plc: PlcProcess, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twin(monkeypatch, "probe", GRIPPER, "--address", f"127.0.0.1:{plc.port}") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines
+    assert all(line.startswith("ok") for line in lines)
+
+
+# Logs.
+
+
+def test_a_replay_prints_and_counts_what_happened(
+    faulty_log: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    answer = tmp_path / "events.json"
+    assert twin(monkeypatch, "replay", faulty_log, "--json", answer) == 0
+    said = capsys.readouterr()
+    assert "sensor_lag" in said.out
+    assert said.err == ""  # no progress in a pipe
+    events = json.loads(answer.read_text())["events"]
+    stored = list(open_log(faulty_log).events())
+    assert [(e["time_ns"], e["kind"], e["severity"], e["text"], e["data"]) for e in events] == [
+        (e.time_ns, e.kind, e.severity, e.text, dict(e.data)) for e in stored
+    ]
+    assert len(said.out.splitlines()) == len(stored)
+
+
+def test_an_alarm_is_exit_code_1_only_where_that_is_asked_for(
+    faulty_log: Path, healthy_log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert twin(monkeypatch, "replay", faulty_log) == 0
+    assert twin(monkeypatch, "replay", faulty_log, "--fail-on-alarm") == 1
+    assert twin(monkeypatch, "replay", healthy_log, "--fail-on-alarm") == 0
+
+
+def test_a_replay_into_a_new_log_holds_the_same_rows(
+    faulty_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out.mcap"
+    assert twin(monkeypatch, "replay", faulty_log, "-o", out) == 0
+    for old, new in zip(open_log(faulty_log).blocks(), open_log(out).blocks(), strict=True):
+        assert [rows.tobytes() for rows in old] == [rows.tobytes() for rows in new]
+    assert twin(monkeypatch, "replay", faulty_log, "-o", out) == 3  # never overwritten
+
+
+def test_a_replay_with_another_configuration_expects_something_else(
+    faulty_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, _ = edited(tmp_path, "volume_ml = 755.0", "volume_ml = 700.0")
+    assert twin(monkeypatch, "replay", faulty_log, "--config", path, "-o", tmp_path / "b.mcap") == 0
+    old, new = (
+        np.concatenate([ticks["expected"] for _, ticks in open_log(log).blocks()])
+        for log in (faulty_log, tmp_path / "b.mcap")
+    )
+    assert np.nanmax(np.abs(old - new)) > 1000
+
+
+def test_what_is_no_log_is_exit_code_3(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twin(monkeypatch, "replay", GRIPPER) == 3
+    assert "not an MCAP file" in capsys.readouterr().err
+
+
+def test_a_torn_log_is_checked_and_recovered(
+    healthy_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torn, whole = tmp_path / "torn.mcap", tmp_path / "whole.mcap"
+    data = healthy_log.read_bytes()
+    torn.write_bytes(data[: len(data) * 2 // 3])
+    assert twin(monkeypatch, "log", "check", healthy_log) == 0
+    assert twin(monkeypatch, "log", "check", torn) == 3
+    assert twin(monkeypatch, "log", "recover", torn, "-o", whole) == 0
+    assert twin(monkeypatch, "log", "check", whole) == 0
+    assert 1000 < sum(len(samples) for samples, _ in open_log(whole).blocks()) < 25_000
+
+
+# The live loop as a process.
+
+
+def run_beside(plc: PlcProcess, log: Path) -> tuple[str | Path, ...]:
+    return "run", GRIPPER, "--address", f"127.0.0.1:{plc.port}", "--log", log
+
+
+def until_logged(log: Path, process: "subprocess.Popen[str]", pieces: int) -> None:
+    """Wait until the log has grown so many times: then it is being written."""
+    deadline = time.monotonic() + PATIENCE_S
+    size = 0
+    while pieces:
+        assert time.monotonic() < deadline, "nothing is logged"
+        assert process.poll() is None, process.communicate()[1]
+        time.sleep(0.02)
+        if log.exists() and log.stat().st_size > size:
+            size = log.stat().st_size
+            pieces -= 1
+
+
+def rows_in(log: Path) -> np.ndarray[tuple[int], np.dtype[np.void]]:
+    rows = np.concatenate([samples for samples, _ in open_log(log).blocks()])
+    assert len(rows) > 200
+    return rows
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_ends_it_with_130_and_a_finished_log(
+    plc: PlcProcess, tmp_path: Path, number: signal.Signals
+) -> None:
+    log = tmp_path / "a.mcap"
+    with started(*run_beside(plc, log)) as process:
+        until_logged(log, process, 4)
+        process.send_signal(number)
+        _, said = process.communicate(timeout=PATIENCE_S)
+        assert process.returncode == 130
+    assert "Traceback" not in said
+    rows_in(log)
+    assert open_log(log).complete
+
+
+def test_a_kill_costs_half_a_second_at_most(plc: PlcProcess, tmp_path: Path) -> None:
+    """Measured from the last row logged; a stall of the whole machine may spoil a try."""
+    lost_s = []
+    for attempt in range(3):
+        log = tmp_path / f"{attempt}.mcap"
+        with started(*run_beside(plc, log)) as process:
+            until_logged(log, process, 3)
+            time.sleep(0.2)  # anywhere between two flushes
+            process.kill()
+            killed_ns = time.time_ns()
+            process.wait(PATIENCE_S)
+        assert not open_log(log).complete
+        lost_s.append((killed_ns - int(rows_in(log)["host_ns"][-1])) * 1e-9)
+        if lost_s[-1] <= 0.5:
+            return
+    pytest.fail(f"lost {lost_s} s")
+
+
+def test_a_duration_ends_it_with_0(
+    plc: PlcProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = tmp_path / "a.mcap"
+    assert twin(monkeypatch, *run_beside(plc, log), "--duration", "1") == 0
+    rows = rows_in(log)
+    assert open_log(log).complete
+    assert (rows["time_ns"][-1] - rows["time_ns"][0]) * 1e-9 > 0.3
+
+
+def test_a_plc_that_restarts_is_told_and_followed_on(tmp_path: Path) -> None:
+    log = tmp_path / "a.mcap"
+    with start_plc(GRIPPER) as first, started(*run_beside(first, log)) as process:
+        until_logged(log, process, 3)
+        first.kill()
+        with start_plc(GRIPPER, port=first.port):
+            before = len(rows_in(log))
+            while not any(event.kind is Kind.PLC_RESTARTED for event in open_log(log).events()):
+                until_logged(log, process, 1)
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=PATIENCE_S)
+    assert len(rows_in(log)) > before

@@ -1,0 +1,198 @@
+"""Cycles cut out of a stream, and the figures each one gives."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import rigs
+from hypothesis import given
+from hypothesis import strategies as st
+
+from twin.model import dataset as c
+from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, figures
+from twin.signals import BREAK, MBAR, SAMPLE, TICK, Phase, Quality, Samples, Ticks
+
+AMBIENT = 1e5
+IDLE, SUCTION, HOLD, BLOW_OFF = Phase
+CYCLE = [(SUCTION, 50), (HOLD, 30), (BLOW_OFF, 20), (IDLE, 40)]
+
+
+def rows(*phases: tuple[Phase, int]) -> tuple[Samples, Ticks]:
+    """Rows of 1 ms with these phases; measured and expected are 100 and 110 mbar below ambient."""
+    phase = np.concatenate([np.full(n, value, "u1") for value, n in phases])
+    samples, ticks = np.zeros(len(phase), SAMPLE), np.zeros(len(phase), TICK)
+    samples["sequence"] = np.arange(len(phase))
+    samples["time_ns"] = samples["sequence"] * 1_000_000
+    samples["pressure"] = AMBIENT - 100 * MBAR
+    ticks["expected"] = AMBIENT - 110 * MBAR
+    ticks["level"] = np.nan
+    ticks["phase"] = phase
+    return samples, ticks
+
+
+def cycles(samples: Samples, ticks: Ticks, cuts: Sequence[int] = ()) -> list[Cycle]:
+    cutter, found = CycleCutter(), []
+    for part in zip(np.split(samples, cuts), np.split(ticks, cuts), strict=True):
+        found += cutter.push(*part)
+    return [*found, *cutter.flush()]
+
+
+def lengths(found: list[Cycle]) -> list[tuple[int, int, bool]]:
+    return [(one.index, len(one.samples), one.complete) for one in found]
+
+
+# Cutting.
+
+
+def test_a_cycle_runs_from_one_suction_edge_to_the_next() -> None:
+    found = cycles(*rows((IDLE, 25), *CYCLE, *CYCLE))
+    assert lengths(found) == [(-1, 25, False), (0, 140, True), (1, 140, True)]
+    assert found[1].end_ns == 164_000_000
+
+
+def test_the_nozzle_on_again_begins_no_cycle() -> None:
+    found = cycles(*rows((IDLE, 5), (SUCTION, 9), (HOLD, 9), (SUCTION, 9), (HOLD, 9), (IDLE, 9)))
+    assert lengths(found) == [(-1, 5, False), (0, 45, True)]
+
+
+def test_a_cycle_without_pause_begins_after_blow_off() -> None:
+    found = cycles(*rows((IDLE, 5), (SUCTION, 9), (BLOW_OFF, 9), (SUCTION, 9), (BLOW_OFF, 9)))
+    assert lengths(found) == [(-1, 5, False), (0, 18, True), (1, 18, True)]
+
+
+def test_what_begins_or_ends_in_the_middle_is_not_complete() -> None:
+    found = cycles(*rows((SUCTION, 30), (IDLE, 9), (SUCTION, 30)))
+    assert lengths(found) == [(-1, 39, False), (0, 30, False)]
+
+
+@pytest.mark.parametrize("flag", BREAK)
+def test_a_break_ends_a_cycle(flag: Quality) -> None:
+    samples, ticks = rows((IDLE, 10), *CYCLE, *CYCLE)
+    samples["quality"][10 + 30] = flag
+    found = cycles(samples, ticks)
+    assert lengths(found) == [(-1, 10, False), (0, 30, False), (0, 110, False), (1, 140, True)]
+
+
+def test_a_long_cycle_comes_in_pieces() -> None:
+    found = cycles(*rows((IDLE, 5), (SUCTION, 25_000), (IDLE, 10)))
+    assert lengths(found) == [
+        (-1, 5, False),
+        (0, LONGEST_PIECE, False),
+        (0, LONGEST_PIECE, False),
+        (0, 5010, False),
+    ]
+
+
+phases = st.lists(st.tuples(st.sampled_from(Phase), st.integers(1, 60)), min_size=1, max_size=25)
+
+
+@given(phases, st.lists(st.integers(0, 900), max_size=12), st.lists(st.integers(0, 900)))
+def test_every_row_is_in_one_cycle_however_it_comes(
+    steps: list[tuple[Phase, int]], cuts: list[int], breaks: list[int]
+) -> None:
+    samples, ticks = rows(*steps)
+    samples["quality"][[row for row in breaks if row < len(samples)]] = Quality.GAP
+    whole, parts = cycles(samples, ticks), cycles(samples, ticks, sorted(cuts))
+    assert lengths(whole) == lengths(parts)
+    for found in (whole, parts):
+        assert np.concatenate([one.samples for one in found]).tobytes() == samples.tobytes()
+        assert np.concatenate([one.ticks for one in found]).tobytes() == ticks.tobytes()
+
+
+@pytest.mark.parametrize(("name", "period_s"), [("test_rig", 3.2), ("gripper", 2.0)])
+def test_the_simulated_rig_gives_its_cycles(name: str, period_s: float) -> None:
+    samples, ticks = rigs.expectation(rigs.twin(name), [rigs.recorded(name, 20.0)[0]])
+    found = [one for one in cycles(samples, ticks) if one.complete]
+    assert abs(len(found) - int(19.5 / period_s)) <= 1  # the program jitters
+    assert [one.index for one in found] == list(range(len(found)))
+
+
+# Figures.
+
+
+def one_cycle() -> Cycle:
+    return cycles(*rows((IDLE, 5), *CYCLE, *CYCLE))[1]
+
+
+def test_deviations_are_measured_minus_expected_in_mbar_by_phase() -> None:
+    cycle = one_cycle()
+    cycle.samples["pressure"][:25] += 20 * MBAR  # half of suction reads 30 over expected
+    found = figures(cycle, AMBIENT)
+    assert found["suction_mean"] == pytest.approx(20.0)
+    assert found["suction_rms"] == pytest.approx(np.sqrt((30**2 + 10**2) / 2))
+    for phase in ("hold", "blow_off", "idle"):
+        assert found[f"{phase}_mean"] == found[f"{phase}_rms"] == pytest.approx(10.0)
+
+
+def test_rows_that_cannot_be_compared_are_left_out() -> None:
+    cycle = one_cycle()
+    cycle.samples["pressure"][10:15] = 5e5
+    cycle.samples["quality"][10:15] = Quality.BAD
+    cycle.ticks["expected"][15:20] = np.nan
+    cycle.samples["pressure"][20:25] = np.nan
+    found = figures(cycle, AMBIENT)
+    assert found["suction_mean"] == pytest.approx(10.0)
+    assert found["max_vacuum"] == pytest.approx(100.0)
+
+
+def test_a_phase_of_few_rows_is_not_judged() -> None:
+    cycle = cycles(*rows((IDLE, 5), (SUCTION, 50), (BLOW_OFF, 19), *CYCLE))[1]
+    assert "suction_mean" in figures(cycle, AMBIENT)
+    assert "blow_off_mean" not in figures(cycle, AMBIENT)
+
+
+def test_a_phase_that_was_cut_short_is_not_judged() -> None:
+    cycle = cycles(*rows((IDLE, 5), *CYCLE))[1]
+    assert cycle.cut_short
+    assert "blow_off_mean" in figures(cycle, AMBIENT)
+    assert "idle_mean" not in figures(cycle, AMBIENT)
+
+
+@pytest.mark.parametrize("quality", [Quality.BAD, Quality(0)])
+def test_a_cycle_without_one_reading_says_nothing(quality: Quality) -> None:
+    cycle = one_cycle()
+    cycle.samples["pressure"] = np.nan
+    cycle.samples["quality"] = quality
+    found = figures(cycle, AMBIENT)
+    assert not {name for name in found if name.endswith(("mean", "rms"))}
+    assert "t0_measured" not in found
+    assert "max_vacuum" not in found
+
+
+def test_evacuation_is_timed_to_h2() -> None:
+    cycle = one_cycle()
+    cycle.samples["pressure"][33:80] = AMBIENT - 551 * MBAR
+    cycle.samples["pressure"][20] = AMBIENT - 700 * MBAR
+    cycle.samples["quality"][20] = Quality.OVERFLOW
+    cycle.ticks["expected"][41:80] = AMBIENT - 600 * MBAR
+    found = figures(cycle, AMBIENT)
+    assert found["t0_measured"] == pytest.approx(33.0)
+    assert found["t0_expected"] == pytest.approx(41.0)
+    assert found["max_vacuum"] == pytest.approx(551.0)
+
+
+def test_h2_that_is_not_reached_has_no_time() -> None:
+    assert not {"t0_measured", "t0_expected"} & figures(one_cycle(), AMBIENT).keys()
+
+
+def test_the_levels_of_the_air_saving_are_its_knees() -> None:
+    samples, ticks = rows(
+        (IDLE, 5), (SUCTION, 30), (HOLD, 30), (SUCTION, 30), (HOLD, 30), (IDLE, 9)
+    )
+    for row, vacuum in ((5, 3), (36, 750), (66, 600), (97, 752)):  # the first is the cycle's sync
+        ticks["level"][row] = AMBIENT - vacuum * MBAR
+    found = figures(cycles(samples, ticks)[1], AMBIENT)
+    assert found["h1_level"] == pytest.approx(751.0)
+    assert found["h1_low_level"] == pytest.approx(600.0)
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_a_healthy_cycle_of_the_rig(name: str) -> None:
+    samples, ticks = rigs.expectation(rigs.twin(name), [rigs.recorded(name, 20.0)[0]])
+    ambient = float(rigs.theta(name)[c.AMBIENT])
+    found = [figures(one, ambient) for one in cycles(samples, ticks) if one.complete]
+    for one in found[1:]:
+        assert one["t0_measured"] == pytest.approx(one["t0_expected"], rel=0.03)
+        assert one["h1_level"] == pytest.approx(750, abs=10)
+        assert one["max_vacuum"] == pytest.approx(750, abs=15)
+        assert one["suction_rms"] < 8

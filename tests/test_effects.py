@@ -1,0 +1,223 @@
+"""The table of effects: as promised to the outside, and each one acts as an effect must."""
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import rigs
+from hypothesis import given
+from hypothesis import strategies as st
+
+from twin.errors import ConfigError
+from twin.model import dataset as c
+from twin.model import kernel
+from twin.model.dataset import Theta
+from twin.model.effects import EFFECTS, apply, table
+from twin.signals import BAR, MBAR, MS, Command
+
+# What people, scripts and other systems hold on to.
+CONTRACT = """
+leakage: sonic_flow (sl/min)
+porous_leakage: flow_at_600mbar (sl/min)
+check_valve_leak: sonic_flow (sl/min)
+suction_loss: loss (%)
+end_vacuum_loss: end_pressure_rise (mbar)
+supply_pressure_drop: drop (bar)
+filter_clogging: pressure_drop_at_nominal (mbar)
+added_volume: volume (ml)
+cup_compliance: volume_at_full_vacuum (ml)
+heat_exchange: film_coefficient (W/(m²·K))
+response_delay: delay (ms)
+slow_ramp_up: time_constant (ms)
+threshold_drift: h1_shift (mbar), h2_shift (mbar)
+weak_blow_off: loss (%)
+blow_off_delay: delay (ms)
+sensor_offset: offset (mbar)
+sensor_gain: error (%)
+sensor_lag: time_constant (ms)
+ambient_pressure: shift (mbar)
+"""
+
+every_effect = pytest.mark.parametrize("name", EFFECTS)
+every_rig = pytest.mark.parametrize("rig", rigs.NAMES)
+PARAMETERS = [(name, p) for name, effect in EFFECTS.items() for p in effect.parameters]
+each_parameter = pytest.mark.parametrize(
+    ("name", "parameter"), PARAMETERS, ids=[f"{name}.{p.name}" for name, p in PARAMETERS]
+)
+
+
+def cycle(theta: Theta) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Free-running cycle with evacuation, hold, blow-off, idle: pressure read and final state."""
+    steps = ((Command.SUCTION, 2300), (Command.BLOW_OFF, 250), (Command(0), 250))
+    commands = np.concatenate([np.full(rows, command, "u1") for command, rows in steps])
+    phase, expected = np.empty(len(commands), "u1"), np.empty(len(commands))
+    state = kernel.at_rest(theta)
+    kernel.simulate(state, theta, np.full(len(commands), MS), commands, phase, expected)
+    return expected, state
+
+
+def leaking(rig: str) -> Theta:
+    """Coefficients of a rig that leaks so much that its air saving switches on again."""
+    theta = rigs.theta(rig)
+    theta[c.LEAK] *= 5.0
+    theta[c.H1], theta[c.H1_LOW] = 650 * MBAR, 640 * MBAR
+    return theta
+
+
+def test_the_table_is_the_one_promised() -> None:
+    lines = [
+        f"{name}: " + ", ".join(f"{p.name} ({p.unit})" for p in effect.parameters)
+        for name, effect in EFFECTS.items()
+    ]
+    assert lines == CONTRACT.strip().splitlines()
+
+
+@every_effect
+def test_every_effect_is_said_in_a_sentence(name: str) -> None:
+    effect = EFFECTS[name]
+    assert effect.name == name
+    assert len(effect.sentence.split()) > 4
+    assert effect.sentence[0].isupper()
+
+
+@each_parameter
+@every_rig
+def test_neutral_and_typical_lie_within_the_bounds(name: str, parameter, rig: str) -> None:
+    neutral = parameter.neutral(rigs.theta(rig))
+    assert parameter.low <= neutral <= parameter.high
+    assert neutral < neutral + parameter.typical <= parameter.high
+
+
+@every_effect
+@every_rig
+def test_at_neutral_nothing_changes_to_the_last_bit(name: str, rig: str) -> None:
+    theta = leaking(rig)
+    neutral = {p.name: p.neutral(theta) for p in EFFECTS[name].parameters}
+    for values in ({}, neutral):
+        changed = apply(theta, name, values)
+        assert changed is not theta
+        assert changed.tobytes() == theta.tobytes()
+    assert cycle(changed)[0].tobytes() == cycle(theta)[0].tobytes()
+
+
+@each_parameter
+@pytest.mark.parametrize("bound", ["low", "high"])
+@every_rig
+def test_at_its_bounds_it_stays_physical(name: str, parameter, bound: str, rig: str) -> None:
+    theta = apply(leaking(rig), name, {parameter.name: getattr(parameter, bound)})
+    expected, state = cycle(theta)
+    assert np.isfinite(expected).all()
+    assert -0.4 * BAR < expected.min() <= expected.max() < 6 * BAR  # readings, sensor faults too
+    assert 0.01 * BAR < state[kernel.PRESSURE] < 6 * BAR
+    assert 150 < state[kernel.TEMPERATURE] < 600
+    assert 0 <= state[kernel.JET] <= 1
+
+
+@each_parameter
+@every_rig
+def test_at_typical_size_it_shows(name: str, parameter, rig: str) -> None:
+    theta = leaking(rig)
+    changed = apply(theta, name, {parameter.name: parameter.neutral(theta) + parameter.typical})
+    difference = cycle(changed)[0] - cycle(theta)[0]
+    assert np.abs(difference).max() > 1 * MBAR
+
+
+@each_parameter
+@given(share=st.floats(0.0, 1.0))
+def test_theta_itself_is_left_alone(name: str, parameter, share: float) -> None:
+    theta = rigs.theta("gripper")
+    before = theta.copy()
+    apply(theta, name, {parameter.name: parameter.low + share * (parameter.high - parameter.low)})
+    assert theta.tobytes() == before.tobytes()
+
+
+def test_effects_add_up() -> None:
+    theta = rigs.theta("test_rig")
+    both = apply(apply(theta, "sensor_offset", {"offset": 3.0}), "sensor_offset", {"offset": 4.0})
+    assert both[c.SENSOR_OFFSET] == 7 * MBAR
+
+
+# What an effect does where it can be said in one number.
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "coefficient", "expected"),
+    [
+        ("leakage", 2.0, c.LEAK, 2.0 * 1.185e-3 / 60),
+        ("check_valve_leak", 2.0, c.BACK_FLOW, 2.0 * 1.185e-3 / 60),
+        ("porous_leakage", 6.0, c.LAMINAR_LEAK, 6.0 * 1.185e-3 / 60 / 60e3),
+        ("supply_pressure_drop", 0.5, c.SUPPLY, -0.5e5),
+        ("added_volume", 20.0, c.VOLUME, 20e-6),
+        ("cup_compliance", 10.0, c.COMPLIANCE, 10e-6),
+        ("response_delay", 7.0, c.RESPONSE, 7e-3),
+        ("slow_ramp_up", 7.0, c.RAMP_UP, 7e-3),
+        ("blow_off_delay", 7.0, c.BLOW_OFF_RESPONSE, 7e-3),
+        ("sensor_offset", -7.0, c.SENSOR_OFFSET, -700.0),
+        ("sensor_gain", 2.0, c.SENSOR_GAIN, 0.02),
+        ("sensor_lag", 7.0, c.SENSOR_LAG, 7e-3),
+        ("ambient_pressure", -20.0, c.AMBIENT, -2000.0),
+        ("end_vacuum_loss", 10.13, c.END_RATIO, 0.01),
+    ],
+)
+def test_the_fields_units_become_si(
+    name: str, value: float, coefficient: int, expected: float
+) -> None:
+    theta = rigs.theta("test_rig")
+    (parameter,) = EFFECTS[name].parameters
+    change = apply(theta, name, {parameter.name: value}) - theta
+    assert change[coefficient] == pytest.approx(expected, rel=1e-6)
+    change[coefficient] = 0.0
+    assert not np.nan_to_num(change).any()
+
+
+@pytest.mark.parametrize(
+    ("name", "coefficient"), [("suction_loss", c.SUCTION), ("weak_blow_off", c.BLOW_OFF)]
+)
+def test_losses_are_shares(name: str, coefficient: int) -> None:
+    theta = rigs.theta("test_rig")
+    assert apply(theta, name, {"loss": 15.0})[coefficient] == pytest.approx(
+        0.85 * theta[coefficient]
+    )
+
+
+def test_heat_exchange_replaces_the_film_coefficient() -> None:
+    theta = rigs.theta("test_rig")
+    assert apply(theta, "heat_exchange", {"film_coefficient": 42.0})[c.FILM] == 42.0
+
+
+def test_clogging_costs_the_drop_it_says_at_nominal_suction() -> None:
+    theta = rigs.theta("test_rig")
+    theta[c.RESISTANCE] = 0.0
+    clogged = apply(theta, "filter_clogging", {"pressure_drop_at_nominal": 100.0})
+    after = np.sqrt(theta[c.AMBIENT] ** 2 - clogged[c.RESISTANCE] * theta[c.SUCTION] ** 2)
+    assert theta[c.AMBIENT] - after == pytest.approx(100 * MBAR)
+
+
+# What cannot be meant.
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "complaint"),
+    [
+        ("leek", {}, "unknown effect 'leek'"),
+        ("leakage", {"flow": 1.0}, "leakage has no parameter flow"),
+        ("leakage", {"sonic_flow": -0.1}, r"leakage.sonic_flow = -0.1 sl/min is out of bounds"),
+        ("leakage", {"sonic_flow": 60.1}, "out of bounds"),
+        ("sensor_gain", {"error": float("nan")}, "out of bounds"),
+        ("threshold_drift", {"h1_shift": 0.0, "h2_shift": 900.0}, "threshold_drift.h2_shift"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_with_a_hint(
+    name: str, values: dict[str, float], complaint: str
+) -> None:
+    with pytest.raises(ConfigError, match=complaint) as refused:
+        apply(rigs.theta("test_rig"), name, values)
+    assert refused.value.hint
+
+
+def test_the_printed_table_lists_all() -> None:
+    lines = table().splitlines()
+    assert len(lines) == 2 + len(EFFECTS)
+    for line, (name, effect) in zip(lines[2:], EFFECTS.items(), strict=True):
+        assert line.startswith(f"| `{name}` | {effect.sentence} |")
+        for p in effect.parameters:
+            assert f"`{p.name}` {p.low:g} to {p.high:g} {p.unit}" in line

@@ -1,0 +1,206 @@
+"""The loop: what comes in goes through twin and monitor to every sink, live and from a log."""
+
+from collections.abc import Iterator, Sequence
+from itertools import takewhile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rigs
+from plc_process import PlcProcess
+from rigs import Collect
+
+from drivers.sources import open_source
+from twin.events import Event, Kind
+from twin.live import run
+from twin.log.header import LogHeader
+from twin.log.reader import Log, open_log
+from twin.log.recorder import Recorder
+from twin.signals import SAMPLE, Command, Phase, Quality, Samples, Ticks
+
+EMPTY = np.empty(0, SAMPLE)
+
+
+class Failing(Collect):
+    """A sink that cannot do one thing."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__()
+        self.what = what
+
+    def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
+        super().write(samples, ticks, events)
+        if self.what == "write":
+            raise OSError("disk full")
+
+    def close(self) -> None:
+        super().close()
+        if self.what == "close":
+            raise OSError("disk full")
+
+
+def header(name: str) -> LogHeader:
+    document = rigs.config(name).document
+    return LogHeader("type", "id", "cell.toml", document.text)
+
+
+def rows_of(seen: Collect) -> tuple[bytes, bytes]:
+    return b"".join(part.tobytes() for part in seen.samples), b"".join(
+        part.tobytes() for part in seen.ticks
+    )
+
+
+# Sinks.
+
+
+def test_every_sink_is_given_every_row_and_is_closed() -> None:
+    samples, _ = rigs.recorded("gripper", 6.0)
+    one, other = Collect(), Collect()
+    run(rigs.cut(samples, 30), rigs.twin("gripper"), rigs.monitor("gripper"), [one, other])
+    assert rows_of(one)[0] == samples.tobytes()
+    assert rows_of(one) == rows_of(other)
+    assert one.events == other.events
+    assert one.closed == other.closed == 1
+
+
+def test_the_rows_held_back_are_flushed_at_the_end() -> None:
+    samples, _ = rigs.recorded("gripper", 6.0)
+    seen = Collect()
+    run([samples], rigs.twin("gripper"), rigs.monitor("gripper"), [seen])
+    lag = rigs.knees("gripper").lag
+    assert [len(part) for part in seen.samples] == [len(samples) - lag, lag]
+
+
+def test_no_source_no_rows() -> None:
+    seen = rigs.watch("gripper", [])
+    assert rows_of(seen) == (b"", b"")
+    assert seen.events == []
+    assert seen.closed == 1
+
+
+def test_all_sinks_are_closed_when_the_source_breaks() -> None:
+    def source() -> Iterator[Samples]:
+        yield rigs.recorded("gripper", 6.0)[0][:500]
+        raise OSError("cable")
+
+    sinks = [Collect(), Collect()]
+    with pytest.raises(OSError, match="cable"):
+        run(source(), rigs.twin("gripper"), rigs.monitor("gripper"), sinks)
+    assert [sink.closed for sink in sinks] == [1, 1]
+    assert sinks[0].samples
+
+
+@pytest.mark.parametrize("what", ["write", "close"])
+def test_all_sinks_are_closed_when_one_fails(what: str) -> None:
+    sinks = [Collect(), Failing(what), Collect()]
+    blocks = rigs.cut(rigs.recorded("gripper", 6.0)[0], 100)
+    with pytest.raises(OSError, match="disk full"):
+        run(blocks, rigs.twin("gripper"), rigs.monitor("gripper"), sinks)
+    assert [sink.closed for sink in sinks] == [1, 1, 1]
+
+
+# Silence.
+
+
+def test_silence_is_told_while_it_lasts_and_in_a_replay_the_same() -> None:
+    samples = rigs.recorded("gripper", 6.0)[0].copy()
+    for field in ("time_ns", "host_ns"):
+        samples[field][3000:] += 2_000_000_000
+    samples["sequence"][3000:] += 2000
+    samples["quality"][3000] = Quality.GAP
+    now = int(samples["host_ns"][2999])
+    told: list[int] = []
+
+    def clock() -> int:
+        nonlocal now
+        now += 100_000_000  # an empty block every 0.1 s
+        return now
+
+    class Watch(Collect):
+        def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
+            super().write(samples, ticks, events)
+            told.extend(len(self.samples) for event in events if event.kind is Kind.PLC_STALE)
+
+    live = Watch()
+    blocks = [samples[:3000], *[EMPTY] * 20, samples[3000:]]
+    run(blocks, rigs.twin("gripper"), rigs.monitor("gripper"), [live], clock)
+    assert told == [1 + 6]  # with the sixth empty block, 0.6 s after the last sample
+    replayed = rigs.watch("gripper", rigs.cut(samples, 700))
+    assert replayed.events == live.events
+    assert rows_of(replayed) == rows_of(live)
+
+
+def test_silence_before_the_first_sample_is_not_stale() -> None:
+    def clock() -> int:
+        raise AssertionError("nothing to compare with")
+
+    seen = Collect()
+    run([EMPTY] * 5, rigs.twin("gripper"), rigs.monitor("gripper"), [seen], clock)
+    assert seen.events == []
+
+
+# Through a log.
+
+
+def recorded_run(path: Path, name: str, blocks: Sequence[Samples]) -> Collect:
+    seen = Collect()
+    sinks = [Recorder(path, header(name)), seen]
+    run(blocks, rigs.twin(name), rigs.monitor(name), sinks)
+    return seen
+
+
+def replay(log: Log, name: str, size: int) -> Collect:
+    return rigs.watch(name, (samples for samples, _ in log.blocks(size)))
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_a_replay_expects_the_same_to_the_bit_and_tells_the_same(tmp_path: Path, name: str) -> None:
+    samples = rigs.recorded(name, 25.0, ("sensor_lag=25@c3",), 4)[0].copy()
+    samples["quality"][5000:5100] = Quality.BAD
+    samples["quality"][9000] = Quality.GAP
+    samples["sequence"][9000:] += 50
+    samples["time_ns"][9000:] += 50_000_000
+    live = recorded_run(tmp_path / "a.mcap", name, rigs.cut(samples, 30))
+    assert {Kind.GAP, Kind.SIGNAL_BAD, Kind.CYCLE, Kind.DEVIATION} <= {e.kind for e in live.events}
+    log = open_log(tmp_path / "a.mcap")
+    stored = list(log.blocks(10**6))
+    assert b"".join(rows.tobytes() for _, rows in stored) == rows_of(live)[1]
+    assert list(log.events()) == live.events
+    for size in (10_000, 777):
+        again = replay(log, name, size)
+        assert rows_of(again) == rows_of(live)
+        assert again.events == live.events
+
+
+def test_a_replay_of_a_replay_is_the_same(tmp_path: Path) -> None:
+    samples, _ = rigs.recorded("gripper", 6.0)
+    recorded_run(tmp_path / "a.mcap", "gripper", rigs.cut(samples, 30))
+    log = open_log(tmp_path / "a.mcap")
+    recorded_run(tmp_path / "b.mcap", "gripper", [samples for samples, _ in log.blocks()])
+    first, second = (
+        [rows.tobytes() for pair in open_log(tmp_path / name).blocks() for rows in pair]
+        for name in ("a.mcap", "b.mcap")
+    )
+    assert first == second
+
+
+# End to end.
+
+
+def test_beside_a_plc_nothing_is_lost_and_the_twin_follows(plc: PlcProcess) -> None:
+    """Over Modbus from another process, for two whole cycles."""
+    seen = Collect()
+    source = open_source(rigs.config("gripper").document, f"127.0.0.1:{plc.port}")
+    blocks = takewhile(lambda _: len(seen.of(Kind.CYCLE)) < 2, source)
+    try:
+        run(blocks, rigs.twin("gripper"), rigs.monitor("gripper"), [seen])
+    finally:
+        source.close()  # type: ignore[attr-defined]
+    samples, ticks = np.concatenate(seen.samples), np.concatenate(seen.ticks)
+    lost = np.diff(samples["sequence"]) != 1
+    assert not (lost & ((samples["quality"][1:] & Quality.GAP) == 0)).any()
+    assert set(ticks["phase"].tolist()) == set(Phase)
+    follows = np.abs(samples["pressure"] - ticks["expected"].astype(float))
+    in_suction = (samples["commands"] == Command.SUCTION) & np.isfinite(ticks["expected"])
+    assert in_suction.sum() > 1000
+    assert np.median(follows[in_suction]) < 1500  # Pa

@@ -1,0 +1,231 @@
+"""Phases from commands and pressure: every unseen switch of the air saving, and no other."""
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import rigs
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from twin.model import dataset as c
+from twin.monitor.phases import (
+    IDLE_ROWS,
+    LONGEST_WINDOW,
+    SHORTEST_WINDOW,
+    Knees,
+    PhaseFinder,
+    expected_knees,
+)
+from twin.signals import BREAK, MBAR, SAMPLE, Command, Phase, Quality, Samples
+
+NEAR = 20  # rows between a switch and where it is found, lag of sensor and jet included
+SECONDS = 24.0
+CONDITIONS = {
+    "healthy": (),
+    "slow sensor": ("sensor_lag=20",),
+    "sticking sensor": ("sensor_backlash=10",),
+    "leak": ("leakage=5",),
+    "small leak": ("leakage=2",),
+    "worn nozzle": ("suction_loss=15",),
+    "leaking check valve": ("check_valve_leak=3",),
+}
+Found = tuple[Samples, npt.NDArray[np.uint8], npt.NDArray[np.float64]]
+
+
+def find(samples: Samples, knees: Knees, block: int = 1000) -> Found:
+    finder = PhaseFinder(knees)
+    parts = [finder.push(part) for part in rigs.cut(samples, block)]
+    parts.append(finder.flush())
+    rows, phase, level = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return rows, phase, level
+
+
+def switches(on: npt.NDArray[np.bool_], suction: npt.NDArray[np.bool_]) -> set[tuple[int, bool]]:
+    """Rows at which ``on`` changes while suction is and stays commanded, and what it becomes."""
+    rows = np.flatnonzero(np.diff(on.astype(int))) + 1
+    return {(int(row), bool(on[row])) for row in rows if suction[row - 1] and suction[row]}
+
+
+def since_edge(suction: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+    """Rows since ``suction`` last changed."""
+    row = np.arange(len(suction))
+    edges = np.concatenate(([True], suction[1:] != suction[:-1]))
+    return row - np.maximum.accumulate(np.where(edges, row, 0))
+
+
+def compare(name: str, faults: tuple[str, ...], seed: int, air_saving: bool = True) -> list[int]:
+    """Rows by which each switch is found late; an assertion fails where one is not or is no one.
+
+    A switch just before the end of suction cannot be told from it; one just after its beginning
+    is the valve's answer to the command.
+    """
+    samples, truth = rigs.recorded(name, SECONDS, faults, seed, air_saving)
+    knees = rigs.knees(name)
+    _, phase, _ = find(samples, knees)
+    suction = samples["commands"] == Command.SUCTION
+    to_end = since_edge(suction[::-1])[::-1]
+    true = switches(truth["nozzle"] == 1, suction)
+    true = {(row, on) for row, on in true if since_edge(suction)[row] > knees.settled}
+    late = []
+    found = switches(phase == Phase.SUCTION, suction)
+    for row, on in sorted(true):
+        near = [one for one in found if one[1] == on and abs(one[0] - row) <= NEAR]
+        if not near and to_end[row] <= knees.lag + NEAR:
+            continue
+        assert len(near) == 1, f"the nozzle switched to {on} at row {row}, found: {sorted(found)}"
+        found -= set(near)
+        late.append(near[0][0] - row)
+    assert not found, "switches that never were"
+    return late
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+@pytest.mark.parametrize("condition", CONDITIONS)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_every_switch_is_found_and_none_invented(name: str, condition: str, seed: int) -> None:
+    late = compare(name, CONDITIONS[condition], seed)
+    reaches_h1 = (name, condition) != ("test_rig", "leak")
+    assert (len(late) > 3) == reaches_h1
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_without_air_saving_there_is_no_switch(name: str) -> None:
+    assert compare(name, (), seed=1, air_saving=False) == []
+
+
+def test_a_gripper_that_leaks_switches_on_again() -> None:
+    samples, truth = rigs.recorded("gripper", SECONDS, ("leakage=2",), 1)
+    suction = samples["commands"] == Command.SUCTION
+    again = {row for row, on in switches(truth["nozzle"] == 1, suction) if on}
+    again = {row for row in again if since_edge(suction)[row] > rigs.knees("gripper").settled}
+    assert len(again) >= 9  # so that the comparison above sees both directions
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_the_level_at_a_knee_is_that_of_the_control(name: str) -> None:
+    samples, _ = rigs.recorded(name, SECONDS)
+    _, phase, level = find(samples, rigs.knees(name))
+    vacuum = (
+        rigs.theta(name)[c.AMBIENT] - level[(phase == Phase.HOLD) & np.isfinite(level)]
+    ) / MBAR
+    assert len(vacuum) >= 6
+    assert vacuum == pytest.approx(750, abs=10)
+    assert vacuum.std() < 2
+
+
+# What commands say.
+
+
+KNEES = Knees(window=10, noise=30.0, on_shift=4, settled=30)
+
+
+def stream(commands: npt.ArrayLike, pressure: float | npt.ArrayLike = 1e5) -> Samples:
+    samples = np.zeros(np.size(commands), SAMPLE)
+    samples["commands"] = commands
+    samples["pressure"] = pressure
+    samples["sequence"] = np.arange(len(samples))
+    samples["time_ns"] = samples["host_ns"] = 1_000_000 * samples["sequence"]
+    return samples
+
+
+@given(st.lists(st.integers(0, 255), min_size=1, max_size=200), st.integers(1, 50))
+def test_at_constant_pressure_the_commands_are_the_phases(commands: list[int], block: int) -> None:
+    rows, phase, _ = find(stream(commands), KNEES, block)
+    wanted = [
+        Phase.BLOW_OFF if value & 2 else Phase.SUCTION if value & 1 else Phase.IDLE
+        for value in commands
+    ]
+    assert phase.tolist() == wanted
+    assert rows["commands"].tolist() == commands
+
+
+def test_blow_off_wins() -> None:
+    _, phase, _ = find(stream([1] * 50 + [3] * 50 + [1] * 50), KNEES)
+    assert phase.tolist() == [1] * 50 + [3] * 50 + [1] * 50
+
+
+@pytest.mark.parametrize("noise", [1.0, 30.0])
+@pytest.mark.parametrize("command", [0, 1, 2])
+def test_noise_alone_makes_no_knee(noise: float, command: int) -> None:
+    pressure = 3e4 + noise * np.random.default_rng(5).standard_normal(40_000)
+    _, phase, _ = find(stream(np.full(40_000, command), pressure), KNEES)
+    assert len(set(phase.tolist())) == 1
+
+
+# Synchronisation.
+
+
+def test_a_cycle_begins_at_the_mean_of_the_last_idle_rows() -> None:
+    pressure = 1e5 + 30.0 * np.random.default_rng(1).standard_normal(150)
+    samples = stream([0] * 100 + [1] * 50, pressure)
+    _, _, level = find(samples, KNEES)
+    synced = np.flatnonzero(np.isfinite(level))
+    assert synced.tolist() == [IDLE_ROWS - 1, 100]
+    assert level[IDLE_ROWS - 1] == pytest.approx(samples["pressure"][:IDLE_ROWS].mean())
+    assert level[100] == pytest.approx(pressure[60:100].mean(), abs=20)
+
+
+def test_unreadable_rows_have_no_say_in_it() -> None:
+    samples = stream([0] * 60 + [1] * 50)
+    for row, flag in ((30, Quality.BAD), (40, Quality.STALE), (50, Quality.OVERFLOW)):
+        samples["pressure"][row] = 5e5
+        samples["quality"][row] = flag
+    samples["pressure"][55] = np.nan
+    _, _, level = find(samples, KNEES)
+    assert level[60] == 1e5
+
+
+def test_too_short_an_idle_says_nothing() -> None:
+    samples = stream([1] * 50 + [0] * 4 + [1] * 50)
+    _, _, level = find(samples, KNEES)
+    assert np.isnan(level).all()
+
+
+def test_rows_before_a_break_say_nothing_about_those_after_it() -> None:
+    samples = stream([0] * 60 + [1] * 50)
+    samples["pressure"][:58] = 0.5e5
+    samples["quality"][58] = Quality.CLOCK
+    _, _, level = find(samples, KNEES)
+    assert np.flatnonzero(np.isfinite(level)).tolist() == [IDLE_ROWS - 1]
+
+
+@pytest.mark.parametrize("flag", BREAK)
+def test_a_break_is_no_knee(flag: Quality) -> None:
+    falling = 1e5 - 100.0 * np.arange(300)
+    samples = stream([1] * 600, np.concatenate([falling, np.full(300, 2e4)]))
+    samples["quality"][300] = flag
+    _, phase, _ = find(samples, KNEES)
+    assert (phase == Phase.SUCTION).all()
+    samples["quality"][300] = 0
+    _, phase, _ = find(samples, KNEES)
+    assert (phase == Phase.HOLD).any()
+
+
+# The window.
+
+
+@settings(max_examples=30)
+@given(st.floats(1.0, 5000.0), st.sampled_from(rigs.NAMES))
+def test_the_window_has_its_bounds(noise: float, name: str) -> None:
+    knees = expected_knees(rigs.theta(name), noise)
+    assert SHORTEST_WINDOW <= knees.window <= LONGEST_WINDOW
+    assert knees.noise == noise
+    assert knees.lag < 200
+
+
+def test_more_noise_takes_a_longer_window() -> None:
+    theta = rigs.theta("test_rig")
+    assert expected_knees(theta, 10.0).window < expected_knees(theta, 50.0).window
+
+
+@given(st.integers(1, 400))
+def test_no_row_is_held_back_longer_than_the_lag(block: int) -> None:
+    finder = PhaseFinder(replace(KNEES, window=12))
+    pushed = given_out = 0
+    for part in rigs.cut(stream([0] * 300 + [1] * 700), block):
+        pushed += len(part)
+        given_out += len(finder.push(part)[0])
+        assert given_out == max(pushed - finder.knees.lag, 0)
+    assert given_out + len(finder.flush()[0]) == pushed

@@ -1,0 +1,213 @@
+"""Configurations: what is wrong in them is said with file, line and key."""
+
+import string
+from pathlib import Path
+from typing import Literal
+
+import pytest
+import rigs
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import Field
+
+from twin.config import TABLES, Config
+from twin.errors import ConfigError, SourceError
+from twin.model.dataset import COEFFICIENTS, DataSet, coefficients
+from twin.settings import Document, Settings
+
+TEXT = """\
+# a comment with delay_ms = 3 in it
+[driver]
+host = "10.0.0.5"
+
+[driver.tags]  # not [driver.tags.other]
+[driver.tags.pressure]
+delay_ms = 5.0
+"unit" = "mbar"
+
+[ driver . limits ]
+low = 1
+high = 2
+"""
+
+
+class Tag(Settings):
+    delay_ms: float = Field(1.0, ge=0.0, le=100.0)
+    unit: Literal["mbar", "Pa"] = "Pa"
+
+
+class Limits(Settings):
+    low: int = 0
+    high: int = 1
+
+
+class Driver(Settings):
+    host: str
+    port: int = 502
+    tags: dict[str, Tag] = Field(default_factory=dict)
+    limits: Limits = Limits()
+
+
+def complaint(text: str, *path: str, kind: type[Settings] = Driver) -> str:
+    with pytest.raises(ConfigError) as refused:
+        Document.parse(text, "cell.toml").section(kind, *path)
+    assert refused.value.hint
+    assert refused.value.exit_code == 2
+    return str(refused.value)
+
+
+def test_what_stands_there_is_taken_and_the_rest_is_default() -> None:
+    driver = Document.parse(TEXT, "cell.toml").section(Driver, "driver")
+    assert driver == Driver(
+        host="10.0.0.5",
+        tags={"pressure": Tag(delay_ms=5.0, unit="mbar")},
+        limits=Limits(low=1, high=2),
+    )
+
+
+def test_a_missing_table_is_all_defaults() -> None:
+    assert Document.parse("", "cell.toml").section(Limits, "driver", "limits") == Limits()
+
+
+def test_settings_are_frozen() -> None:
+    with pytest.raises(ValueError, match="frozen"):
+        Limits().low = 3  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "wanted"),
+    [
+        ("delay_ms = 5.0", "delay_ms = 500.0", "cell.toml:7: driver.tags.pressure.delay_ms: "),
+        ("delay_ms = 5.0", "delai_ms = 5.0", "cell.toml:7: driver.tags.pressure.delai_ms: unknown"),
+        ('"unit" = "mbar"', '"unit" = "bar"', "cell.toml:8: driver.tags.pressure.unit: "),
+        ("low = 1", 'low = "one"', "cell.toml:11: driver.limits.low: "),
+        ("high = 2", "hihg = 2", "cell.toml:12: driver.limits.hihg: unknown key (is 2)"),
+        ('host = "10.0.0.5"', "", "cell.toml:2: driver.host: Field required"),
+        ('host = "10.0.0.5"', "host = 5", "cell.toml:3: driver.host: "),
+        ("[ driver . limits ]", "[driver.limit]", "cell.toml:10: driver.limit: unknown key"),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_line(old: str, new: str, wanted: str) -> None:
+    assert complaint(TEXT.replace(old, new), "driver").startswith(wanted)
+
+
+def test_the_value_that_was_given_is_shown() -> None:
+    assert complaint(TEXT.replace("5.0", "-5.0"), "driver").endswith("(is -5.0)")
+
+
+def test_several_faults_are_told_together() -> None:
+    text = TEXT.replace("low = 1", "lwo = 1").replace("high = 2", "hihg = 2")
+    assert len(complaint(text, "driver").splitlines()) == 2
+
+
+def test_a_comment_is_no_key() -> None:
+    text = "# delay_ms = 500\n\n[tag]\n# delay_ms = 400\ndelay_ms = 300\n"
+    assert complaint(text, "tag", kind=Tag).startswith("cell.toml:5: ")
+
+
+def test_a_table_that_is_a_number_is_refused() -> None:
+    assert complaint("driver = 3\n", "driver").startswith("cell.toml:1: driver: ")
+
+
+def test_unknown_tables_are_refused_with_their_line() -> None:
+    document = Document.parse("[driver]\n\n[monitr]\nx = 1\n", "cell.toml")
+    with pytest.raises(ConfigError, match=r"cell.toml:3: unknown table \[monitr\]") as refused:
+        document.refuse_unknown_tables({"driver", "monitor"})
+    assert refused.value.hint == "known tables: driver, monitor"
+
+
+@pytest.mark.parametrize("text", ["[driver", "a = ", "a = 1\na = 2", "a = 1 2", "\x00"])
+def test_what_is_no_toml_is_said_so(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"cell.toml: not valid TOML: .*(line \d|end of)"):
+        Document.parse(text, "cell.toml")
+
+
+def test_a_file_that_is_not_there_is_a_bad_source(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"none.toml: cannot be read: .*No such file") as refused:
+        Document.read(tmp_path / "none.toml")
+    assert refused.value.exit_code == 3
+
+
+def test_a_file_that_is_no_text_is_a_bad_source(tmp_path: Path) -> None:
+    (tmp_path / "cell.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(SourceError, match="cannot be read"):
+        Document.read(tmp_path / "cell.toml")
+
+
+keys = st.text(string.ascii_lowercase + "_", min_size=1, max_size=8).filter(
+    lambda key: key not in ("low", "high")
+)
+
+
+@given(st.integers(0, 20), st.lists(keys, min_size=1, max_size=3, unique=True), keys)
+def test_the_line_is_that_of_the_key(blank: int, tables: list[str], key: str) -> None:
+    """Whatever stands around it: other tables, comments, the same key elsewhere."""
+    other = "".join(f"[other.{table}]\n{key} = 1 # {key} = 2\n" for table in tables)
+    text = other + "\n" * blank + f"# {key} = 3\n[{'.'.join(tables)}]\nlow = 1\n{key} = 7\n" + other
+    line = len(other.splitlines()) + blank + 4
+    if tables[0] != "other":
+        text = text[: text.rindex(other)]  # TOML allows no table twice
+        message = complaint(text, *tables, kind=Limits)
+        assert message == f"cell.toml:{line}: {'.'.join([*tables, key])}: unknown key (is 7)"
+
+
+@given(st.text(max_size=60))
+def test_no_text_does_more_than_be_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"cell\.toml"):  # no host stands in it by chance
+        Document.parse(text, "cell.toml").section(Driver, "driver")
+
+
+# The twin's own tables.
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_the_shipped_configurations_are_taken(name: str) -> None:
+    config = rigs.config(name)
+    assert set(config.document.tables) <= TABLES
+    assert config.asset.id
+    assert config.monitor.healthy
+
+
+def refused(old: str, new: str) -> str:
+    text = rigs.path_of("test_rig").read_text()
+    assert old in text
+    with pytest.raises(ConfigError) as error:
+        Config.of(Document.parse(text.replace(old, new, 1), "cell.toml"))
+    line = text[: text.index(old)].count("\n") + 1
+    assert str(error.value).startswith(f"cell.toml:{line}: ")
+    return str(error.value)
+
+
+def test_an_impossible_data_set_is_refused_at_its_line() -> None:
+    assert "data.ejector.bulge" in refused("bulge = ", "bulge = 1")
+    assert "data.ambient.pressure_mbar" in refused("pressure_mbar = 1013.0", "pressure_mbar = 1.0")
+    assert "data.vessel.volumen_ml: unknown key" in refused("volume_ml = ", "volumen_ml = ")
+
+
+@pytest.mark.parametrize(
+    ("tables", "rule"),
+    [
+        ({"ejector": {"h1_mbar": 200.0, "h1_hysteresis_mbar": 200.0}}, "less than h1_mbar"),
+        ({"ejector": {"end_pressure_mbar": 1013.0}}, "below ambient"),
+        ({"sensor": {"lag_ms": 0.0}}, "greater than or equal to 1"),
+        ({"vessel": {"volume_ml": 0.0}}, "greater than 0"),
+        ({"vessel": {"volume_ml": float("nan")}}, "greater than 0"),
+    ],
+)
+def test_what_no_ejector_can_be_is_refused(tables: dict[str, object], rule: str) -> None:
+    with pytest.raises(ValueError, match=rule):
+        DataSet.model_validate(tables)
+
+
+def test_every_coefficient_is_filled_in() -> None:
+    theta = coefficients(rigs.config("gripper").data)
+    assert len(theta) == len(COEFFICIENTS)
+    zero = {name for name, value in zip(COEFFICIENTS, theta, strict=True) if value == 0.0}
+    assert zero == {"COMPLIANCE", "LAMINAR_LEAK", "BACK_FLOW", "SENSOR_OFFSET"}
+
+
+def test_the_hash_tells_data_sets_apart() -> None:
+    data = rigs.config("test_rig").data
+    sensor = data.sensor.model_copy(update={"lag_ms": data.sensor.lag_ms + 1e-3})
+    assert data.hash == rigs.config("test_rig").data.model_copy().hash
+    assert data.hash != data.model_copy(update={"sensor": sensor}).hash
