@@ -136,12 +136,15 @@ def test_no_configuration_is_exit_code_3(
 
 
 def test_no_plc_is_exit_code_3(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))  # and does not listen
         address = f"127.0.0.1:{nobody.getsockname()[1]}"
-        assert twin(monkeypatch, "run", GRIPPER, "--address", address) == 3
+        log = tmp_path / "run.mcap"
+        command = ("run", GRIPPER, "--address", address, "--log", log)
+        assert twin(monkeypatch, *command) == 3
+    assert not log.exists()  # or the next try would find a log it may not overwrite
     said = capsys.readouterr().err
     assert f"{address}: no connection" in said
     assert "is the PLC on" in said

@@ -70,14 +70,16 @@ def run(
     settings = Config.of(Document.read(config))
     twin, monitor = _pair(settings)
     with _stop_on_signal(duration) as stopped:
-        source = open_source(settings.document, address)
-        sinks: list[Sink] = []
-        if log is not None:
-            rotate = round(settings.log.rotate_mb * 1e6)
-            sinks.append(Recorder(log, _header(settings), rotate_bytes=rotate))
-        sinks += _views(settings, view, rrd)
+        # A PLC that does not answer is said before a log is begun.
+        source = _begun(open_source(settings.document, address))
+        rotate = round(settings.log.rotate_mb * 1e6)
         console = Console()
-        run_loop(_until(stopped, source), twin, monitor, [*sinks, console])
+        sinks = _opened(
+            (lambda: Recorder(log, _header(settings), rotate_bytes=rotate)) if log else None,
+            _view_of(settings, view, rrd),
+            lambda: console,
+        )
+        run_loop(_until(stopped, source), twin, monitor, sinks)
         _leave(console, fail_on_alarm, interrupted=stopped() == "interrupted")
 
 
@@ -100,13 +102,14 @@ def replay(
     settings = _settings_of(recorded.header, config)
     twin, monitor = _pair(settings)
     with _stop_on_signal(None) as stopped:
-        sinks: list[Sink] = []
-        if output is not None:
-            sinks.append(Recorder(output, _header(settings)))
-        sinks += _views(settings, view, rrd)
         console = Console()
+        sinks = _opened(
+            (lambda: Recorder(output, _header(settings))) if output else None,
+            _view_of(settings, view, rrd),
+            lambda: console,
+        )
         blocks = (samples for samples, _ in recorded.blocks())
-        run_loop(_until(stopped, _progress(blocks, "replaying")), twin, monitor, [*sinks, console])
+        run_loop(_until(stopped, _progress(blocks, "replaying")), twin, monitor, sinks)
     if json_file is not None:
         events = [_plain(event) for event in console.events]
         json_file.write_text(json.dumps({"log": str(log), "events": events}, indent=1))
@@ -273,20 +276,49 @@ def _settings_of(header: "LogHeader", instead: Path | None) -> "Config":
     return Config.of(Document.parse(header.config_text, header.config_name))
 
 
-def _views(settings: "Config", view: bool, rrd: Path | None) -> "list[Sink]":
-    """The Rerun view, in a window, in a file, or neither."""
+def _opened(*makers: "Callable[[], Sink] | None") -> "list[Sink]":
+    """The sinks that are wanted; if one cannot be opened, those before it are closed."""
+    sinks: list[Sink] = []
+    try:
+        for make in makers:
+            if make is not None:
+                sinks.append(make())
+    except BaseException:
+        for sink in sinks:
+            sink.close()
+        raise
+    return sinks
+
+
+def _view_of(settings: "Config", view: bool, rrd: Path | None) -> "Callable[[], Sink] | None":
+    """What opens the Rerun view, in a window or in a file; or None."""
     if not view and rrd is None:
-        return []
+        return None
     if view and rrd is not None:
         raise ConfigError("--view and --rrd exclude each other", "open the file: rerun FILE.rrd")
-    from twin.signals import MBAR
-    from twin.view import View
 
-    title = f"{settings.asset.type} {settings.asset.id}"
-    shown = View(title, rrd, settings.data.ambient.pressure_mbar * MBAR)
-    if shown.url:
-        print(f"the view is at {shown.url}", file=sys.stderr)
-    return [shown]
+    def open_view() -> "Sink":
+        from twin.signals import MBAR
+        from twin.view import View
+
+        title = f"{settings.asset.type} {settings.asset.id}"
+        shown = View(title, rrd, settings.data.ambient.pressure_mbar * MBAR)
+        if shown.url:
+            print(f"the view is at {shown.url}", file=sys.stderr)
+        return shown
+
+    return open_view
+
+
+def _begun(source: "Iterator[Samples]") -> "Iterator[Samples]":
+    """The same blocks, the first of them already fetched."""
+    first = next(source)
+
+    def blocks() -> "Iterator[Samples]":
+        yield first
+        yield from source
+
+    return blocks()
 
 
 @contextmanager

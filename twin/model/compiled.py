@@ -6,11 +6,14 @@ another file goes unnoticed. Here the cache lies in a folder named by the source
 
 import hashlib
 import os
+import shutil
 import tempfile
+import time
 from pathlib import Path
 
 import numba
 
+DAY_S = 86_400.0
 _PACKAGE = Path(__file__).parent.parent
 
 
@@ -23,7 +26,16 @@ def _cache_folder() -> Path:
     return root / "__pycache__" / f"compiled-{sources.hexdigest()[:12]}"
 
 
-numba.config.CACHE_DIR = str(_cache_folder())  # type: ignore[attr-defined]
+def _forget_others(folder: Path) -> None:
+    """Delete what no version has used for a day; numba itself never does."""
+    for other in folder.parent.glob("compiled-*"):
+        if other != folder and time.time() - other.stat().st_mtime > DAY_S:
+            shutil.rmtree(other, ignore_errors=True)
+
+
+_FOLDER = _cache_folder()
+_forget_others(_FOLDER)
+numba.config.CACHE_DIR = str(_FOLDER)  # type: ignore[attr-defined]
 
 # Results stay the same to the last bit: no fast-math. Dividing by zero gives inf as in NumPy.
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
