@@ -1,6 +1,7 @@
 """One Modbus TCP connection, its settings, and its errors for people."""
 
-import logging
+import socket
+import struct
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,18 +9,11 @@ from typing import Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
-from pymodbus.client import ModbusTcpClient
-from pymodbus.exceptions import ModbusException
-from pymodbus.pdu import ModbusPDU
 
 from drivers.tags import Address, Place, Pressure, Tag, WordOrder, Words
+from drivers.telegram import HEAD, Request, belongs, exception
 from twin.errors import SourceError
 from twin.settings import Settings
-
-MOST_WORDS = 125  # in one request, by the protocol
-
-# pymodbus reports lost connections on its own log as well; they are said here, once.
-logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
 EXCEPTIONS = {
     1: "illegal function: it does not serve this kind of address",
@@ -113,66 +107,80 @@ class LostError(SourceError):
 
 
 class Link:
-    """A connection that reads words and bits, and closes on the first broken answer."""
+    """A connection that reads words and bits, and closes on the first broken answer.
+
+    A bare socket, since polling has a millisecond for everything: docs/decisions/0007.
+    """
 
     def __init__(self, settings: ModbusSettings) -> None:
         self._settings = settings
-        self._client = ModbusTcpClient(
-            settings.host, port=settings.port, timeout=settings.timeout_ms * 1e-3, retries=0
-        )
-        self._read = {
-            "coil": self._client.read_coils,
-            "discrete": self._client.read_discrete_inputs,
-            "input": self._client.read_input_registers,
-            "holding": self._client.read_holding_registers,
-        }
+        self._socket: socket.socket | None = None
+        self._transaction = 0
 
     def open(self) -> None:
-        """Connect; LostError if that fails."""
-        if not self._client.connect():  # type: ignore[no-untyped-call]
+        """Connect, unless it is connected; LostError if that fails."""
+        if self._socket is not None:
+            return
+        host, port = self._settings.host, self._settings.port
+        try:
+            self._socket = connected(host, port, self._settings.timeout_ms)
+        except (OSError, UnicodeError) as error:  # the latter where it cannot be a host's name
             raise LostError(
-                f"{self._settings.host}:{self._settings.port}: no connection",
+                f"{host}:{port}: no connection",
                 "is the PLC on and reachable, its Modbus TCP server started, host and port right?",
-            )
+            ) from error
 
     def close(self) -> None:
         """Hang up."""
-        self._client.close()  # type: ignore[no-untyped-call]
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
 
     def read(self, address: Address, count: int) -> Words:
         """Read ``count`` words (bits as 0 or 1) from ``address`` on, in one request.
 
         LostError if no complete answer comes; SourceError if the PLC refuses the address.
         """
-        answer = self._ask(address, count)
-        if answer.isError():
-            raise self._refused(answer.exception_code, address, count)
-        values = answer.registers if address.of_words else answer.bits[:count]
-        if len(values) != count:
-            raise self._lost(address, count, "the answer has the wrong length")
-        return np.array(values, dtype=np.uint16)
+        request = Request(address, count)
+        data = np.frombuffer(self.ask(request), np.uint8)
+        return request.words(data[np.newaxis]).reshape(count)
 
-    def _ask(self, address: Address, count: int) -> ModbusPDU:
-        if not self._client.connected:  # pymodbus would connect again by itself
-            raise self._lost(address, count, "the connection is closed")
+    def ask(self, request: Request) -> bytes:
+        """Data of the answer as they came, ``request.size`` bytes; errors as from ``read``."""
+        if self._socket is None:
+            raise self._lost(request, "the connection is closed")
+        self._transaction = (self._transaction + 1) & 0xFFFF
+        stamp = self._transaction, self._settings.unit
+        expected = request.head(*stamp)
         try:
-            return self._read[address.area](
-                address.offset, count=count, device_id=self._settings.unit
-            )
-        except (ModbusException, OSError) as error:
-            raise self._lost(address, count, "no answer") from error
+            self._socket.sendall(request.question(*stamp))
+            head = received(self._socket, HEAD.size)
+            if head == expected:
+                return received(self._socket, request.size)
+        except OSError as error:
+            raise self._lost(request, "no answer") from error
+        raise self._unexpected(request, head, expected)
 
-    def _lost(self, address: Address, count: int, what: str) -> LostError:
+    def _unexpected(self, request: Request, head: bytes, expected: bytes) -> SourceError:
+        """What is wrong with an answer that does not begin as it should."""
+        if not belongs(head, expected):
+            return self._lost(request, "no answer")
+        code = exception(head)
+        if code is None:
+            return self._lost(request, "the answer has the wrong length")
+        return self._refused(request, code)
+
+    def _lost(self, request: Request, what: str) -> LostError:
         """Close too: a late answer must not be taken for that to the next request."""
         self.close()
         return LostError(
-            f"{self._settings.where}: {span(address, count)}: {what}",
+            f"{self._about(request)}: {what}",
             "is the unit id right, is it a Modbus TCP server, does it answer within timeout_ms?",
         )
 
-    def _refused(self, code: int, address: Address, count: int) -> SourceError:
+    def _refused(self, request: Request, code: int) -> SourceError:
         what = EXCEPTIONS.get(code, "an exception unknown to the protocol")
-        text = f"{self._settings.where}: {span(address, count)}: {what} (Modbus exception {code})"
+        text = f"{self._about(request)}: {what} (Modbus exception {code})"
         if code not in OURS:
             self.close()
             return LostError(text, "is the unit id right, and does the PLC run?")
@@ -181,6 +189,31 @@ class Link:
             "check the addresses in [driver]: holding:0 counts from 0, the manual's 40001 from 1; "
             "everything read at once must exist",
         )
+
+    def _about(self, request: Request) -> str:
+        return f"{self._settings.where}: {span(request.address, request.count)}"
+
+
+def connected(host: str, port: int, timeout_ms: float) -> socket.socket:
+    """Connect a socket that waits ``timeout_ms`` for an answer; OSError if it cannot.
+
+    The waiting is left to the kernel: Python's own would ask before each read whether there is
+    something, and not wait for whole answers.
+    """
+    connection = socket.create_connection((host, port), timeout_ms * 1e-3)
+    connection.settimeout(None)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    patience = struct.pack("@ll", 0, round(timeout_ms * 1e3))  # struct timeval: s, µs
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, patience)
+    return connection
+
+
+def received(connection: socket.socket, size: int) -> bytes:
+    """Exactly ``size`` bytes, in however many pieces they come; OSError if they do not."""
+    data = connection.recv(size, socket.MSG_WAITALL)
+    if len(data) < size:
+        raise ConnectionError(f"{len(data)} of {size} bytes came")
+    return data
 
 
 def span(address: Address, count: int) -> str:

@@ -8,13 +8,13 @@ import queue
 import threading
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from drivers.link import MOST_WORDS, Clock, Link, LostError, ModbusSettings
-from drivers.tags import Address, Flags, Tag, Words
+from drivers.link import Clock, Link, LostError, ModbusSettings
+from drivers.tags import Flags, Tag, Words
+from drivers.telegram import MOST_WORDS, Request
 from twin.signals import MBAR, SAMPLE, Command, Quality, Samples
 
 SLOT_NS = 1_000_000
@@ -24,14 +24,6 @@ WAITING = 256  # blocks that may wait to be taken; then slots are missed
 LONGEST_SILENCE_S = 0.25
 
 EMPTY: Samples = np.empty(0, SAMPLE)
-
-
-@dataclass(frozen=True)
-class Request:
-    """Words or bits to read at once."""
-
-    address: Address
-    count: int
 
 
 def plan(tags: Iterable[Tag], most: int = MOST_WORDS) -> list[Request]:
@@ -78,7 +70,7 @@ class Poller:
     def _block(self, link: Link) -> Samples:
         """The slots of one interval; where the connection breaks, those before it."""
         end = max(self._slot, self._now_slot()) + round(self._settings.interval_ms)
-        rows: list[list[Words]] = []
+        rows: list[bytes] = []
         slots: list[tuple[int, int, int]] = []  # slot, middle of the request, receipt
         try:
             while self._slot < end:
@@ -90,7 +82,7 @@ class Poller:
         except LostError:
             if not rows:
                 raise  # else the closed connection says so again at the next block
-        return self._decode(rows, np.array(slots, dtype=np.int64))
+        return self._decode(self._answers(rows), np.array(slots, dtype=np.int64))
 
     def _now_slot(self) -> int:
         return (self._clock.now_ns() - self._start_ns) // SLOT_NS
@@ -105,12 +97,20 @@ class Poller:
         while self._clock.now_ns() < due:
             pass
 
-    def _ask(self, link: Link) -> tuple[list[Words], int, int]:
-        row, asked_ns = [], 0
+    def _ask(self, link: Link) -> tuple[bytes, int, int]:
+        """One slot: the data of all answers, when the last was asked for and when it came."""
+        row, asked_ns = b"", 0
         for request in self._requests:
             asked_ns = self._clock.now_ns()
-            row.append(link.read(request.address, request.count))
+            row += link.ask(request)
         return row, asked_ns, self._clock.now_ns()
+
+    def _answers(self, rows: list[bytes]) -> list[Words]:
+        """Words (rows, count) for each request."""
+        data = np.frombuffer(b"".join(rows), np.uint8).reshape(len(rows), -1)
+        starts = np.cumsum([request.size for request in self._requests])
+        parts = np.split(data, starts[:-1], axis=1)
+        return [request.words(part) for request, part in zip(self._requests, parts, strict=True)]
 
     def _column(self, tag: Tag, request: Request) -> slice | None:
         """Where in the answer to ``request`` the tag lies, if it does."""
@@ -118,32 +118,32 @@ class Poller:
         inside = tag.address.area == request.address.area and 0 <= at < request.count
         return slice(at, at + tag.size) if inside else None
 
-    def _words(self, tag: Tag, rows: list[list[Words]]) -> Words:
+    def _words(self, tag: Tag, answers: list[Words]) -> Words:
         """Words of one tag (rows, size) from all answers."""
-        for index, request in enumerate(self._requests):
+        for request, words in zip(self._requests, answers, strict=True):
             if (columns := self._column(tag, request)) is not None:
-                return np.array([row[index][columns] for row in rows], dtype=np.uint16)
+                return words[:, columns]
         raise AssertionError(f"{tag.address} is in no request")
 
-    def _decode(self, rows: list[list[Words]], slots: npt.NDArray[np.int64]) -> Samples:
+    def _decode(self, answers: list[Words], slots: npt.NDArray[np.int64]) -> Samples:
         tags, order = self._settings.tags, self._settings.word_order
         ambient = self._settings.ambient_mbar * MBAR
-        block = np.zeros(len(rows), SAMPLE)
+        block = np.zeros(len(slots), SAMPLE)
         block["sequence"] = slots[:, 0]
         block["time_ns"] = slots[:, 1] + self._wall_ns
         block["host_ns"] = slots[:, 2] + self._wall_ns
         for tag, command in ((tags.suction, Command.SUCTION), (tags.blow_off, Command.BLOW_OFF)):
             assert tag is not None  # the settings see to it
-            bits = tag.raw(self._words(tag, rows), order).astype(np.uint8)
+            bits = tag.raw(self._words(tag, answers), order).astype(np.uint8)
             block["commands"] |= bits * np.uint8(command)
-        words = self._words(tags.pressure, rows)
+        words = self._words(tags.pressure, answers)
         block["pressure"], block["quality"] = tags.pressure.decode(words, order, ambient)
         block["supply"] = np.nan
         if tags.supply is not None:
-            block["supply"] = tags.supply.supply(self._words(tags.supply, rows), order, ambient)
+            block["supply"] = tags.supply.supply(self._words(tags.supply, answers), order, ambient)
         block["quality"] |= self._gaps(slots[:, 0])
         if tags.heartbeat is not None:
-            beats = tags.heartbeat.raw(self._words(tags.heartbeat, rows), order)
+            beats = tags.heartbeat.raw(self._words(tags.heartbeat, answers), order)
             block["quality"] |= self._stale(beats, slots[:, 2])
         return block
 

@@ -1,6 +1,7 @@
 """Modbus TCP over the trace: pymodbus answers, the registers are filled in at each request."""
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -13,6 +14,9 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from drivers.plc import registers
 from drivers.plc.registers import Registers
 from twin.errors import SourceError
+
+# It logs clients that hang up as errors, frames and all; what stops the PLC is raised as well.
+logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 READ_COILS, READ_HOLDING, READ_INPUTS, WRITE_COIL, WRITE_COILS = 1, 3, 4, 5, 15
 

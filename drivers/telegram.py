@@ -1,0 +1,60 @@
+"""Modbus TCP telegrams that read: the request as bytes, its answer as bytes and as words."""
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.tags import Address, Area, Words
+
+MOST_WORDS = 125  # in one request, by the protocol
+FUNCTION: dict[Area, int] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
+REFUSAL = 0x80  # set in the function code of an answer that brings an exception
+
+QUESTION = struct.Struct(">HHHBBHH")  # transaction, protocol 0, length, unit, function, from, count
+# Transaction, protocol 0, length, unit, function, bytes of data to follow; or in the last place,
+# and then nothing follows, the exception. The length counts from the unit on.
+HEAD = struct.Struct(">HHHBBB")
+
+
+@dataclass(frozen=True)
+class Request:
+    """Words or bits to read at once."""
+
+    address: Address
+    count: int
+
+    @property
+    def size(self) -> int:
+        """Bytes of data in the answer."""
+        return 2 * self.count if self.address.of_words else (self.count + 7) // 8
+
+    def question(self, transaction: int, unit: int) -> bytes:
+        """Encode the whole request."""
+        function = FUNCTION[self.address.area]
+        return QUESTION.pack(transaction, 0, 6, unit, function, self.address.offset, self.count)
+
+    def head(self, transaction: int, unit: int) -> bytes:
+        """How the answer begins that brings the data; only the data follow."""
+        function = FUNCTION[self.address.area]
+        return HEAD.pack(transaction, 0, 3 + self.size, unit, function, self.size)
+
+    def words(self, data: npt.NDArray[np.uint8]) -> Words:
+        """Words, or bits as 0 and 1, (rows, count) from the data of answers (rows, size)."""
+        if self.address.of_words:
+            return np.ascontiguousarray(data).view(">u2").astype(np.uint16)
+        return np.unpackbits(data, axis=1, count=self.count, bitorder="little").astype(np.uint16)
+
+
+def belongs(head: bytes, expected: bytes) -> bool:
+    """Whether an answer that begins so is one to the request whose answer was to begin so."""
+    *whose, _, unit, function, _ = HEAD.unpack(head)
+    *wanted, _, wanted_unit, wanted_function, _ = HEAD.unpack(expected)
+    return (whose, unit, function & ~REFUSAL) == (wanted, wanted_unit, wanted_function)
+
+
+def exception(head: bytes) -> int | None:
+    """Code of the exception that an answer brings; None if it brings none."""
+    *_, length, _, function, code = HEAD.unpack(head)
+    return code if function & REFUSAL and length == 3 else None
