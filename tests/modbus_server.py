@@ -1,6 +1,6 @@
 """A Modbus TCP server that does what a test tells it, and a PLC with a trace inside it.
 
-Plain sockets and threads, nothing of pymodbus: the driver's library must not check itself.
+Plain sockets and threads, nothing shared with the driver: a client must not check itself.
 """
 
 import socket
