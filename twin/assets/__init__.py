@@ -1,0 +1,1 @@
+"""The asset database: type → object-specific data set, ID → instance-specific data set."""

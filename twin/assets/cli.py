@@ -1,0 +1,220 @@
+"""``twin assets``: look into the asset database, add to it, carry it elsewhere."""
+
+import json
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from twin.errors import ConfigError, SourceError
+
+if TYPE_CHECKING:
+    from twin.assets.database import Assets
+    from twin.assets.record import Record
+
+assets_app = typer.Typer(help="The asset database: type and ID to data sets.", no_args_is_help=True)
+
+Url = Annotated[
+    str,
+    typer.Option("--assets", metavar="URL", help="Database: sqlite:///FILE, postgresql://..."),
+]
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option("--config", metavar="CONFIG", help="Take [assets] url, or the file beside it."),
+]
+Time = Annotated[str, typer.Option(metavar="TIME", help="UTC, for example 2026-05-31T14:00.")]
+
+
+@assets_app.command("list")
+def list_(assets: Url = "", config: ConfigFile = None) -> None:
+    """List all types and units, each with the data set that holds now."""
+    with _open(assets, config, write=False) as database:
+        records = database.records()
+    print(_table(records, time.time_ns()))
+
+
+@assets_app.command()
+def show(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A type, or the ID of a unit.")],
+    at: Time = "",
+    as_of: Time = "",
+    history: Annotated[bool, typer.Option("--history", help="All records, oldest first.")] = False,
+    assets: Url = "",
+    config: ConfigFile = None,
+) -> None:
+    """Show the data set of a type or unit, in the form that `add` takes.
+
+    It is the one that holds now, or --at another time; with --as-of as it was known then.
+    """
+    from twin.assets.file import parse_time
+
+    now = parse_time(at) if at else time.time_ns()
+    known = parse_time(as_of) if as_of else None
+    with _open(assets, config, write=False) as database:
+        records = database.records(name=name, as_of_ns=known)
+        _require(records, name, database)
+    if history:
+        print("\n".join(_line_of_history(record) for record in records))
+        return
+    shown = _holding_each(records, now)
+    if not shown:
+        raise ConfigError(f"no data set of {name!r} holds at that time", "see --history")
+    print("\n".join(_in_full(record) for record in shown), end="")
+
+
+@assets_app.command()
+def add(
+    file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="As `show` prints it.")],
+    assets: Url = "",
+    config: ConfigFile = None,
+) -> None:
+    """Add a data set of a type or unit; what was there stays and can be asked for.
+
+    Without valid_from the first data set of an asset always holds, a later one from now on.
+    """
+    from importlib.metadata import version
+
+    from twin.assets.file import read_asset, show_time
+    from twin.assets.record import checked, holding
+    from twin.settings import Document
+
+    provenance = {"file": file.name, "code": f"ejector-twin {version('ejector-twin')}"}
+    given, dated = read_asset(Document.read(file), provenance)
+    record = checked(given)
+    with _open(assets, config, write=True) as database:
+        before = database.records(record.kind, record.name)
+        if before and not dated:
+            record = replace(record, valid_from_ns=time.time_ns())
+        same = holding(before, record.valid_from_ns)
+        if same and (same.hash, same.type) == (record.hash, record.type):
+            print(f"{same.name}: unchanged, {same.hash} already holds")
+            return
+        added = database.add(record)
+        since = show_time(added.valid_from_ns)
+        print(f"{added.name}: added {added.hash} to {database.name}, valid from: {since}")
+
+
+@assets_app.command("import")
+def import_(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="What `export` wrote.")],
+    assets: Url = "",
+    config: ConfigFile = None,
+) -> None:
+    """Take over the records of an exported database that are not here yet."""
+    document = _read_json(file)
+    with _open(assets, config, write=True, shipped=False) as database:
+        new = database.import_(document)
+        print(f"{new} new of {len(document['records'])} records, in {database.name}")
+
+
+@assets_app.command()
+def export(
+    output: Annotated[Path | None, typer.Option("-o", metavar="FILE", help="Not stdout.")] = None,
+    assets: Url = "",
+    config: ConfigFile = None,
+) -> None:
+    """Write the whole database as one JSON document."""
+    with _open(assets, config, write=False) as database:
+        document = database.export()
+    text = json.dumps(document, indent=1, ensure_ascii=False)
+    if output is None:
+        print(text)
+    else:
+        _write_whole(output, text + "\n")
+        print(f"{len(document['records'])} records in {output}")
+
+
+# --- what the commands share --------------------------------------------------------------------
+
+
+def _open(url: str, config: Path | None, *, write: bool, shipped: bool = True) -> "Assets":
+    from twin.assets.place import open_chosen
+    from twin.settings import Document
+
+    document = Document.read(config) if config else None
+    database = open_chosen(url, document, write=write, shipped=shipped)
+    print(f"asset database: {database.name}", file=sys.stderr)
+    return database
+
+
+def _holding_each(records: "Iterable[Record]", now: int) -> "list[Record]":
+    """Of every type and unit the record that holds."""
+    from twin.assets.record import holding
+
+    assets: dict[tuple[str, str], list[Record]] = {}
+    for record in records:
+        assets.setdefault((record.kind, record.name), []).append(record)
+    held = (holding(assets[asset], now) for asset in sorted(assets, reverse=True))
+    return [record for record in held if record is not None]
+
+
+def _require(records: "list[Record]", name: str, database: "Assets") -> None:
+    if not records:
+        known = sorted({record.name for record in database.records()})
+        raise ConfigError(
+            f"{database.name}: no type or unit is called {name!r}", f"known: {', '.join(known)}"
+        )
+
+
+def _table(records: "list[Record]", now: int) -> str:
+    from twin.assets.file import show_time
+
+    rows = [("kind", "name", "type", "valid from", "recorded", "hash")]
+    for record in _holding_each(records, now):
+        times = show_time(record.valid_from_ns), show_time(record.recorded_ns)
+        rows.append((record.kind, record.name, record.type, *times, record.hash))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    )
+
+
+def _line_of_history(record: "Record") -> str:
+    from twin.assets.file import show_time
+
+    since = show_time(record.valid_from_ns)
+    source = ", ".join(f"{key} {value}" for key, value in record.provenance.items())
+    recorded = show_time(record.recorded_ns)
+    return f"recorded {recorded}  valid from {since:<20}  {record.kind}  {record.hash}  {source}"
+
+
+def _in_full(record: "Record") -> str:
+    from twin.assets.file import show_time, write_asset
+
+    lines = [
+        f"hash {record.hash}, recorded {show_time(record.recorded_ns)}, id {record.id}",
+        *(f"{key}: {value}" for key, value in record.provenance.items()),
+        *(f"array {name}: shape {array.shape}" for name, array in record.arrays.items()),
+    ]
+    comments = "".join(f"# {line}\n" for text in lines for line in text.splitlines())
+    return comments + write_asset(record)
+
+
+def _read_json(file: Path) -> dict[str, Any]:
+    """The document in a file; whether it is an export is for the database to say."""
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise SourceError(f"{file}: cannot be read: {error}", "check the path") from error
+    except (ValueError, RecursionError) as error:
+        hint = "twin assets export makes it"
+        raise ConfigError(f"{file}: not valid JSON: {error}", hint) from error
+    if not isinstance(document, dict):
+        raise ConfigError(f"{file}: not an export of an asset database")
+    return document
+
+
+def _write_whole(output: Path, text: str) -> None:
+    """The file is there complete, or as it was before."""
+    part = output.with_name(output.name + ".part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(output)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise SourceError(f"{output}: cannot be written: {error}", "check the folder") from error

@@ -1,0 +1,304 @@
+"""The database: records are added and never changed; which one holds is a question of two times.
+
+Valid time says from when on a data set describes its asset, recorded time when we came to know it.
+So a replay of last month's log can ask for what held then, as it was known then (``as_of``).
+"""
+
+import json
+import time
+import uuid
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from sqlalchemy import URL, ColumnElement, Connection, Engine, Row, func, select
+
+from twin.assets.engine import make_engine, parse_url, plain_errors, shown, sqlite_file
+from twin.assets.exchange import parse_export, to_export
+from twin.assets.record import Array, Kind, Record, checked, content_hash, holding, to_json
+from twin.assets.schema import ARRAY, RECORD, is_made, make
+from twin.assets.shipped import shipped_types
+from twin.errors import ConfigError, SourceError
+
+Conditions = Sequence[ColumnElement[bool]]
+
+
+@dataclass(frozen=True)
+class Found:
+    """What ``Assets.get`` found, and whether it is the unit's own or its type's."""
+
+    record: Record
+    used: Kind
+
+
+def open_assets(
+    where: str | Path,
+    *,
+    create: bool = True,
+    shipped: bool = True,
+    busy_s: float = 5.0,
+    clock: Callable[[], int] = time.time_ns,
+) -> "Assets":
+    """Open the database at a URL or in an SQLite file; close it, or use it as a context.
+
+    A new one gets its tables, and every one the types this program ships that it never had;
+    ``shipped=False`` leaves these to the next opening, for an import that brings its own.
+    ``create=False`` refuses an SQLite file that is not there. ``busy_s`` is how long to wait for
+    other writers, ``clock`` gives UTC in ns.
+
+    ConfigError for a URL of an unknown kind, a newer schema and another program's file; SourceError
+    if it cannot be reached, read or written, or stays locked.
+    """
+    url = parse_url(where)
+    file = sqlite_file(url)
+    if not create and file is not None and not file.exists():
+        raise SourceError(
+            f"{file}: no such asset database", "check --assets; twin assets add or import makes one"
+        )
+    assets = Assets(url, make_engine(url, busy_s), clock)
+    try:
+        assets.prepare(shipped=shipped)
+    except BaseException:
+        assets.close()
+        raise
+    return assets
+
+
+class Assets:
+    """An open asset database. What is written is written whole or not at all."""
+
+    def __init__(self, url: URL, engine: Engine, clock: Callable[[], int]) -> None:
+        self._url = url
+        self._engine = engine
+        self._clock = clock
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give all connections back."""
+        self._engine.dispose()
+
+    @property
+    def name(self) -> str:
+        """The file or the URL, for messages; without a password."""
+        return shown(self._url)
+
+    def prepare(self, *, shipped: bool) -> None:
+        """Make the tables and add the shipped types, each where it is missing."""
+        wanted = shipped_types() if shipped else ()
+        with self._reading() as connection:
+            if is_made(connection, self.name) and not _missing(connection, wanted):
+                return
+        with self._writing() as connection:
+            if not is_made(connection, self.name):
+                make(connection, self.name)
+            for record in _missing(connection, wanted):
+                self._append(connection, record)
+
+    def add(self, record: Record) -> Record:
+        """Append a record; gives it back with its id, recorded time and hash.
+
+        ConfigError for a unit whose type is not there, and for what cannot be kept.
+        """
+        record = checked(record)
+        with self._writing() as connection:
+            if record.kind == "instance":
+                _require_type(record, _known(connection, "type"))
+            return self._append(connection, replace(record, id=uuid.uuid4().hex))
+
+    def get(
+        self,
+        type: str,  # noqa: A002
+        id: str = "",  # noqa: A002
+        *,
+        at_ns: int | None = None,
+        as_of_ns: int | None = None,
+    ) -> Found:
+        """The data set that holds for a unit at a time (default: now), else that of its type.
+
+        ``as_of_ns`` takes only what was recorded until then. Of several the one with the newest
+        valid time holds, among these the one recorded last. ConfigError if there is none, or if
+        the unit is of another type.
+        """
+        if not type:
+            raise ConfigError(f"asset {id!r} has no type", "say [asset] type in the configuration")
+        at = self._clock() if at_ns is None else at_ns
+        if id and (record := holding(self.records("instance", id, as_of_ns=as_of_ns), at)):
+            return Found(_of_type(record, type), "instance")
+        if record := holding(self.records("type", type, as_of_ns=as_of_ns), at):
+            return Found(record, "type")
+        with self._reading() as connection:
+            raise _nothing(self.name, type, id, _known(connection, "type"))
+
+    def records(
+        self, kind: Kind | None = None, name: str | None = None, *, as_of_ns: int | None = None
+    ) -> list[Record]:
+        """All records (of a kind, of a name, recorded until then), in the order of recording."""
+        conditions: list[ColumnElement[bool]] = []
+        if kind is not None:
+            conditions.append(RECORD.c.kind == kind)
+        if name is not None:
+            conditions.append(RECORD.c.name == name)
+        if as_of_ns is not None:
+            conditions.append(RECORD.c.recorded_ns <= as_of_ns)
+        with self._reading() as connection:
+            return _read(connection, conditions)
+
+    def export(self) -> dict[str, Any]:
+        """Everything, as one JSON document that ``import_`` takes without loss."""
+        return to_export(self.records())
+
+    def import_(self, document: Mapping[str, Any]) -> int:
+        """Append the records of an export that are not here yet; gives their number.
+
+        They keep their id and their recorded time. ConfigError, and nothing is appended, if one is
+        damaged, differs from the record of the same id here, or is a unit without a type.
+        """
+        given = parse_export(document)
+        with self._writing() as connection:
+            here = {record.id: record for record in _read(connection, ())}
+            before = len(here)
+            types = _known(connection, "type") | {r.name for r in given if r.kind == "type"}
+            for record in given:
+                if _is_here(record, here):
+                    continue
+                if record.kind == "instance":
+                    _require_type(record, types)
+                _insert(connection, record)
+                here[record.id] = record
+        return len(here) - before
+
+    def _append(self, connection: Connection, record: Record) -> Record:
+        """Insert as the last one: recorded later than all before, whatever the clocks say."""
+        last = connection.scalar(select(func.max(RECORD.c.recorded_ns)))
+        now = self._clock() if last is None else max(self._clock(), last + 1)
+        record = replace(record, recorded_ns=now)
+        _insert(connection, record)
+        return record
+
+    @contextmanager
+    def _reading(self) -> Iterator[Connection]:
+        with plain_errors(self._url), self._engine.begin() as connection:
+            yield connection
+
+    @contextmanager
+    def _writing(self) -> Iterator[Connection]:
+        writer = self._engine.execution_options(writing=True)
+        with plain_errors(self._url), writer.begin() as connection:
+            yield connection
+
+
+# --- rows and records ---------------------------------------------------------------------------
+
+
+def _insert(connection: Connection, record: Record) -> None:
+    values = {column.name: getattr(record, column.name) for column in RECORD.c}
+    for table in ("data", "healthy", "provenance"):
+        values[table] = to_json(values[table])
+    connection.execute(RECORD.insert().values(values))
+    arrays = [
+        {
+            "record": record.id,
+            "name": name,
+            "shape": json.dumps(array.shape),
+            "bytes": array.astype("<f8").tobytes(),
+        }
+        for name, array in record.arrays.items()
+    ]
+    if arrays:
+        connection.execute(ARRAY.insert(), arrays)
+
+
+def _read(connection: Connection, conditions: Conditions) -> list[Record]:
+    """Records with their arrays, in the order of recording."""
+    wanted = select(RECORD).where(*conditions).order_by(RECORD.c.recorded_ns, RECORD.c.id)
+    found = connection.execute(wanted).all()
+    arrays: defaultdict[str, dict[str, Array]] = defaultdict(dict)
+    for row in connection.execute(select(ARRAY).join(RECORD).where(*conditions)):
+        arrays[row.record][row.name] = _array(row)
+    return [_record(row, arrays[row.id]) for row in found]
+
+
+def _array(row: Row[Any]) -> Array:
+    flat = np.frombuffer(row.bytes, dtype="<f8").astype(np.float64)
+    return flat.reshape(json.loads(row.shape))
+
+
+def _record(row: Row[Any], arrays: Mapping[str, Array]) -> Record:
+    """SourceError if the content is no longer what was written."""
+    values: dict[str, Any] = dict(row._mapping)
+    for table in ("data", "healthy", "provenance"):
+        values[table] = json.loads(values[table])
+    record = Record(**values, arrays=dict(sorted(arrays.items())))
+    if content_hash(record) != record.hash:
+        raise SourceError(
+            f"asset database: the record {record.id} of {record.name!r} is damaged",
+            "import an export into a new database",
+        )
+    return record
+
+
+def _known(connection: Connection, kind: Kind) -> set[str]:
+    """The names of all types, or of all units."""
+    return set(connection.scalars(select(RECORD.c.name).where(RECORD.c.kind == kind)))
+
+
+def _missing(connection: Connection, wanted: Sequence[Record]) -> list[Record]:
+    """Those never recorded here: an older program does not put its types back on top."""
+    ids = [record.id for record in wanted]
+    here = set(connection.scalars(select(RECORD.c.id).where(RECORD.c.id.in_(ids))))
+    return [record for record in wanted if record.id not in here]
+
+
+# --- what is refused ----------------------------------------------------------------------------
+
+
+def _require_type(record: Record, types: Iterable[str]) -> None:
+    if record.type not in types:
+        raise ConfigError(
+            f"{record.name!r} is of a type that is not in the database: {record.type!r}",
+            f"add the type first; known types: {', '.join(sorted(types)) or 'none'}",
+        )
+
+
+def _of_type(record: Record, wanted: str) -> Record:
+    if record.type != wanted:
+        raise ConfigError(
+            f"{record.name!r} is of type {record.type!r} in the database, not {wanted!r}",
+            "change [asset] type, or add a data set of the unit with the right type",
+        )
+    return record
+
+
+def _nothing(where: str, type_name: str, unit: str, types: Iterable[str]) -> ConfigError:
+    asset = f"{unit!r} or its type {type_name!r}" if unit else f"type {type_name!r}"
+    known = ", ".join(sorted(types)) or "none"
+    return ConfigError(
+        f"{where}: no data set of {asset} at that time", f"known types: {known}; twin assets add"
+    )
+
+
+def _is_here(record: Record, here: Mapping[str, Record]) -> bool:
+    """Whether this record is known; ConfigError if its id stands for another one.
+
+    A shipped type has the same id everywhere, and in each database its own recorded time.
+    """
+    same = here.get(record.id)
+    if same is not None and _identity(same) != _identity(record):
+        raise ConfigError(
+            f"record {record.id} of {record.name!r} differs from the one in the database",
+            "an exported record was changed; add it as a new one instead",
+        )
+    return same is not None
+
+
+def _identity(record: Record) -> tuple[str, str, str, int, str]:
+    return record.kind, record.name, record.type, record.valid_from_ns, record.hash

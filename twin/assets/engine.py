@@ -1,0 +1,150 @@
+"""From a URL to a connection: what SQLite and PostgreSQL need, and their errors for people.
+
+SQLite keeps its rollback journal. The faster write-ahead log needs memory shared by all who have
+the file open, which network folders do not give, and two more files that a copy easily forgets.
+"""
+
+import math
+import random
+import sqlite3
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url
+from sqlalchemy.engine.interfaces import DBAPIConnection
+from sqlalchemy.exc import ArgumentError, DBAPIError, OperationalError
+from sqlalchemy.pool import ConnectionPoolEntry, NullPool, StaticPool
+
+from twin.errors import ConfigError, SourceError
+
+POSTGRES = {"postgresql", "postgres", "postgresql+psycopg"}
+_WRITERS_LOCK = 0x656A6563  # any number that no other program takes in the same database
+
+_TRY_AGAIN = "another program holds it; try again, or end the program that keeps it open"
+_HINTS = {  # by SQLite's error name, or PostgreSQL's SQLSTATE
+    "SQLITE_BUSY": _TRY_AGAIN,
+    "SQLITE_CANTOPEN": "check that the folder exists and may be written to",
+    "SQLITE_CORRUPT": "the file is damaged; import an export into a new one",
+    "SQLITE_FULL": "make room on the disk",
+    "SQLITE_NOTADB": "choose an asset database with --assets; this file is something else",
+    "SQLITE_READONLY": "have the file and its folder made writable for you",
+    "42501": "have this user granted the rights, or name another one in the URL",
+    "55P03": _TRY_AGAIN,
+}
+_ELSE = {
+    "sqlite": "choose another database with --assets",
+    "postgresql": "check that the server runs and that host, user, password and name are right",
+}
+
+
+def parse_url(where: str | Path) -> URL:
+    """The URL of a database: a URL, or the path of an SQLite file; ConfigError for other kinds."""
+    if isinstance(where, Path) or "://" not in where:
+        return URL.create("sqlite", database=str(where))
+    try:
+        url = make_url(where)
+    except (ArgumentError, ValueError) as error:  # ValueError: a port that is no number
+        raise _unknown_kind("the URL of the asset database cannot be read") from error
+    if url.drivername == "sqlite":
+        return url
+    if url.drivername in POSTGRES:
+        return url.set(drivername="postgresql+psycopg")
+    raise _unknown_kind(f"asset databases of kind {url.drivername!r} are not supported")
+
+
+def _unknown_kind(message: str) -> ConfigError:
+    return ConfigError(message, "use sqlite:///FILE, or postgresql://USER@HOST/NAME")
+
+
+def sqlite_file(url: URL) -> Path | None:
+    """The file of an SQLite database; None for one in memory or on a server."""
+    if url.get_backend_name() != "sqlite" or url.database in (None, "", ":memory:"):
+        return None
+    return Path(str(url.database))
+
+
+def make_engine(url: URL, busy_s: float) -> Engine:
+    """An engine whose transactions are serial where they write; waits ``busy_s`` for its turn."""
+    options = {"busy_ms": max(1, round(busy_s * 1e3))}  # to PostgreSQL 0 is for ever
+    if url.get_backend_name() == "sqlite":
+        pool = NullPool if sqlite_file(url) else StaticPool  # in memory: the one there is
+        engine = create_engine(
+            url, poolclass=pool, connect_args={"timeout": busy_s}, execution_options=options
+        )
+        event.listen(engine, "connect", _prepare_sqlite)
+    else:
+        patience = {"connect_timeout": str(max(2, math.ceil(busy_s)))}  # 2 s is libpq's least
+        url = url.update_query_dict({**patience, **url.query})
+        engine = create_engine(url, pool_pre_ping=True, execution_options=options)
+    event.listen(engine, "begin", _begin)
+    return engine
+
+
+def _prepare_sqlite(connection: DBAPIConnection, _entry: ConnectionPoolEntry) -> None:
+    """Leave transactions to us, and be durable through a loss of power."""
+    assert isinstance(connection, sqlite3.Connection)
+    connection.isolation_level = None
+    connection.execute("PRAGMA foreign_keys = ON")
+    connection.execute("PRAGMA synchronous = EXTRA")
+
+
+def _begin(connection: Connection) -> None:
+    """Writers take their turn at once: nobody who has read must wait in order to write."""
+    options = connection.get_execution_options()
+    writing = options.get("writing", False)
+    if connection.dialect.name == "sqlite":
+        if writing:
+            _take_turn(connection, options["busy_ms"])
+        else:
+            connection.exec_driver_sql("BEGIN")
+        return
+    connection.exec_driver_sql(f"SET LOCAL lock_timeout = {options['busy_ms']}")
+    if writing:
+        connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({_WRITERS_LOCK})")
+
+
+def _take_turn(connection: Connection, busy_ms: int) -> None:
+    """Begin to write, looking often: SQLite itself looks every 100 ms, and a busy writer starves
+    all others.
+    """
+    end = time.monotonic() + busy_ms * 1e-3
+    connection.exec_driver_sql("PRAGMA busy_timeout = 0")
+    while True:
+        try:
+            connection.exec_driver_sql("BEGIN IMMEDIATE")
+        except OperationalError as error:
+            if _code(error.orig) != "SQLITE_BUSY" or time.monotonic() > end:
+                raise
+            time.sleep(random.uniform(0.5e-3, 3e-3))
+        else:
+            break
+    connection.exec_driver_sql(f"PRAGMA busy_timeout = {busy_ms}")
+
+
+@contextmanager
+def plain_errors(url: URL) -> Iterator[None]:
+    """Turn the database's errors into a SourceError that says where and what to do."""
+    try:
+        yield
+    except DBAPIError as error:
+        first = str(error.orig).strip().partition("\n")[0]
+        code = _code(error.orig)
+        hint = _HINTS.get(code, _ELSE[url.get_backend_name()])
+        raise SourceError(f"{shown(url)}: asset database: {first}", hint) from error
+
+
+def _code(error: BaseException | None) -> str:
+    """SQLite's error name without its refinement, or PostgreSQL's SQLSTATE, or nothing."""
+    if isinstance(error, sqlite3.Error):
+        name = getattr(error, "sqlite_errorname", "")  # some errors are Python's own
+        return "_".join(name.split("_")[:2])
+    return getattr(error, "sqlstate", None) or ""
+
+
+def shown(url: URL) -> str:
+    """How messages name the database: the file, or the URL without its password."""
+    if url.get_backend_name() == "sqlite":
+        return str(sqlite_file(url) or "shipped types only")
+    return url.set(drivername=url.get_backend_name(), query={}).render_as_string()
