@@ -1,0 +1,90 @@
+"""Rows of a table as samples, and which of their cells hold nothing usable."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from twin.signals import BAR, SAMPLE, UNUSABLE, Quality, Samples
+from twin.tables.layout import ABSOLUTE, BELOW_AMBIENT, COMMANDS, DIGITS, Layout
+from twin.tables.numbers import Mask, floats, integers
+from twin.tables.settings import Column
+
+_ALL_FLAGS = sum(Quality)
+
+Spoilt = dict[Column, Mask]  # where the cells of each column hold nothing usable
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Some rows of a file as they stand there."""
+
+    columns: Mapping[Column, pa.Array]  # of ``count`` cells each, null where a row is broken
+    count: int
+    broken: Mapping[int, str]  # rows whose cells cannot be told apart, and why
+    place: Callable[[int], str]  # file and line of a row, for messages
+    cell: Callable[[int, Column], str]  # as it is written in the file
+
+
+def decode(batch: Batch, layout: Layout, ambient: float) -> tuple[Samples, Spoilt]:
+    """Give rows of SAMPLE and, by column, where a cell is bad; ``ambient`` in Pa.
+
+    Bad cells are NaN or 0. A column that the file does not have is NaN or 0 too.
+    """
+    rows, bad = np.zeros(batch.count, SAMPLE), Spoilt()
+    if Column.QUALITY in batch.columns:  # the others ask what it says
+        _flags(batch, rows, bad)
+    _whole(batch, layout.time, rows["time_ns"], bad)
+    for name in (Column.SEQUENCE, Column.HOST_NS):
+        if name in batch.columns:
+            _whole(batch, name, rows[name.value], bad)
+    for name in COMMANDS:
+        _command(batch, name, rows, bad)
+    with np.errstate(over="ignore"):  # too large is infinite, and infinite is bad
+        _pressure(batch, layout.pressure, ambient, rows, bad)
+        _supply(batch, rows, bad)
+    return rows, bad
+
+
+def _flags(batch: Batch, rows: Samples, bad: Spoilt) -> None:
+    flags, empty, unreadable = integers(batch.columns[Column.QUALITY])
+    bad[Column.QUALITY] = empty | unreadable | (flags < 0) | (flags > _ALL_FLAGS)
+    rows["quality"] = np.where(bad[Column.QUALITY], 0, flags)
+
+
+def _whole(batch: Batch, name: Column, out: npt.NDArray[np.int64], bad: Spoilt) -> None:
+    out[:], empty, unreadable = integers(batch.columns[name], DIGITS.get(name, 0))
+    bad[name] = empty | unreadable
+
+
+def _command(batch: Batch, name: Column, rows: Samples, bad: Spoilt) -> None:
+    state, empty, unreadable = floats(batch.columns[name])
+    bad[name] = empty | unreadable | ((state != 0) & (state != 1))
+    rows["commands"][state == 1] |= COMMANDS[name].value
+
+
+def _pressure(batch: Batch, name: Column, ambient: float, rows: Samples, bad: Spoilt) -> None:
+    """An empty cell is as it should be where the quality says that there is no pressure."""
+    value, empty, unreadable = floats(batch.columns[name])
+    pascal = value * ABSOLUTE[name] if name in ABSOLUTE else ambient - value * BELOW_AMBIENT[name]
+    rows["pressure"] = _single(pascal)
+    told = empty & ((rows["quality"] & UNUSABLE) != 0)
+    bad[name] = unreadable | (np.isnan(rows["pressure"]) & ~told)
+
+
+def _supply(batch: Batch, rows: Samples, bad: Spoilt) -> None:
+    """An empty cell means that it is not measured."""
+    rows["supply"] = np.nan
+    if Column.SUPPLY_BAR in batch.columns:
+        value, empty, unreadable = floats(batch.columns[Column.SUPPLY_BAR])
+        rows["supply"] = _single(value * BAR)
+        bad[Column.SUPPLY_BAR] = unreadable | (np.isnan(rows["supply"]) & ~empty)
+
+
+def _single(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
+    """NaN for whatever is not finite in float32."""
+    single = values.astype(np.float32)
+    single[~np.isfinite(single)] = np.nan
+    return single

@@ -1,0 +1,138 @@
+"""A log as a table for other programs, lossless."""
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+from pyarrow import csv, parquet
+
+from twin.errors import ConfigError, SourceError
+from twin.log.header import LogHeader
+from twin.signals import BAR, MBAR, Command, Phase, Quality, Samples, Ticks
+
+ROWS = 100_000  # a good size of block to export: what a reader of Parquet takes at once
+
+Rows = Iterable[tuple[Samples, Ticks]]
+
+
+class _Field(NamedTuple):
+    unit: str
+    kind: pa.DataType
+    of: Callable[[Samples, Ticks], npt.NDArray[np.generic]]
+
+
+def _flag(bit: Command) -> Callable[[Samples, Ticks], npt.NDArray[np.generic]]:
+    return lambda samples, _: (samples["commands"] & bit.value) != 0
+
+
+def _wide(column: npt.NDArray[np.float32], unit: float) -> npt.NDArray[np.float64]:
+    """In ``unit``, with digits enough to come back to the bit."""
+    return column.astype(np.float64) / unit
+
+
+_FLAGS = ", ".join(f"{flag.value} {str(flag.name).lower()}" for flag in Quality)
+_PHASES = ", ".join(f"{phase.value} {phase.name.lower()}" for phase in Phase)
+
+_FIELDS = {
+    "time_ns": _Field("ns, PLC time", pa.int64(), lambda s, _: s["time_ns"]),
+    "sequence": _Field("scans of the PLC", pa.int64(), lambda s, _: s["sequence"]),
+    "suction": _Field("0 or 1", pa.uint8(), _flag(Command.SUCTION)),
+    "blow_off": _Field("0 or 1", pa.uint8(), _flag(Command.BLOW_OFF)),
+    "pressure_mbar": _Field("mbar absolute", pa.float64(), lambda s, _: _wide(s["pressure"], MBAR)),
+    "supply_bar": _Field("bar gauge", pa.float64(), lambda s, _: _wide(s["supply"], BAR)),
+    "quality": _Field(f"sum of {_FLAGS}", pa.uint8(), lambda s, _: s["quality"]),
+    "expected_mbar": _Field("mbar absolute", pa.float64(), lambda _, t: _wide(t["expected"], MBAR)),
+    "phase": _Field(_PHASES, pa.uint8(), lambda _, t: t["phase"]),
+    "level_mbar": _Field(
+        "mbar absolute, on which the model was set anew",
+        pa.float64(),
+        lambda _, t: _wide(t["level"], MBAR),
+    ),
+    "host_ns": _Field("ns, time of receipt", pa.int64(), lambda s, _: s["host_ns"]),
+}
+
+
+def export(rows: Rows, header: LogHeader, path: Path) -> None:
+    """Write rows of a log as CSV or Parquet, by the suffix of ``path``, a block in memory.
+
+    The file is there once it is complete, or not at all. ConfigError for another suffix,
+    SourceError if there is a file of that name or it cannot be written.
+    """
+    write = _KINDS.get(path.suffix.lower())
+    if write is None:
+        known = " and ".join(_KINDS)
+        raise ConfigError(f"{path}: cannot tell what to write", f"{known} files can be written")
+    with _complete(path) as file:
+        write(rows, header, file)
+
+
+def _write_csv(rows: Rows, header: LogHeader, file: BinaryIO) -> None:
+    lines = [f"{name}: {text}" for name, text in _origin(header).items()]
+    lines += [f"{name}: {field.unit}" for name, field in _FIELDS.items()]
+    file.writelines(f"# {' '.join(line.split())}\n".encode() for line in lines)
+    options = csv.WriteOptions(quoting_style="none", quoting_header="none", batch_size=10_000)
+    with csv.CSVWriter(file, _schema(header), write_options=options) as writer:
+        for samples, ticks in rows:
+            writer.write_batch(_batch(samples, ticks, header))
+
+
+def _write_parquet(rows: Rows, header: LogHeader, file: BinaryIO) -> None:
+    with parquet.ParquetWriter(
+        file, _schema(header), compression="zstd", write_page_checksum=True
+    ) as writer:
+        for samples, ticks in rows:
+            writer.write_batch(_batch(samples, ticks, header))
+
+
+_KINDS = {".csv": _write_csv, ".parquet": _write_parquet}
+
+
+def _batch(samples: Samples, ticks: Ticks, header: LogHeader) -> pa.RecordBatch:
+    columns = [
+        pa.array(field.of(samples, ticks).astype(field.kind.to_pandas_dtype()), from_pandas=True)
+        for field in _FIELDS.values()  # from_pandas: NaN becomes null
+    ]
+    return pa.record_batch(columns, _schema(header))
+
+
+def _schema(header: LogHeader) -> pa.Schema:
+    fields = [
+        pa.field(name, field.kind, metadata={"unit": field.unit}) for name, field in _FIELDS.items()
+    ]
+    return pa.schema(fields, _origin(header))
+
+
+def _origin(header: LogHeader) -> dict[str, str]:
+    own = {
+        "asset_type": header.asset_type,
+        "asset_id": header.asset_id,
+        "config_name": header.config_name,
+        "ambient_pa": repr(header.ambient),
+    }
+    return header.metadata | own
+
+
+@contextmanager
+def _complete(path: Path) -> Iterator[BinaryIO]:
+    """A file to write to, which gets its name once all is written."""
+    if path.exists():
+        message = f"{path}: there is already a file of that name"
+        raise SourceError(message, "choose another name, or remove it")
+    draft = path.with_name(f"{path.name}.part")
+    try:
+        try:
+            with draft.open("wb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            draft.rename(path)
+        finally:
+            draft.unlink(missing_ok=True)
+    except OSError as error:
+        message = f"{path}: cannot be written: {error.strerror or error}"
+        raise SourceError(message, "check that the folder exists and has space") from error

@@ -1,0 +1,73 @@
+"""Which column of a file is which of the known ones."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from twin.errors import SourceError
+from twin.signals import MBAR, Command
+from twin.tables.settings import Column, ImportSettings
+
+DIGITS = {Column.TIME_S: 9, Column.TIME_MS: 6, Column.TIME_US: 3, Column.TIME_NS: 0}  # down to ns
+COMMANDS = {Column.SUCTION: Command.SUCTION, Column.BLOW_OFF: Command.BLOW_OFF}
+ABSOLUTE = {Column.PRESSURE_MBAR: MBAR, Column.PRESSURE_PA: 1.0}  # in Pa
+BELOW_AMBIENT = {Column.VACUUM_MBAR: MBAR, Column.VACUUM_PA: 1.0}  # in Pa
+
+_REQUIRED = (tuple(DIGITS), *((name,) for name in COMMANDS), (*ABSOLUTE, *BELOW_AMBIENT))
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The columns that are taken; the file's other ones are ignored."""
+
+    theirs: Mapping[Column, str]  # name in the file
+    ignored: tuple[str, ...]
+
+    @property
+    def time(self) -> Column:
+        """The column of time."""
+        return next(name for name in DIGITS if name in self.theirs)
+
+    @property
+    def pressure(self) -> Column:
+        """The column of pressure."""
+        return next(name for name in (*ABSOLUTE, *BELOW_AMBIENT) if name in self.theirs)
+
+
+def find_layout(header: Sequence[str], settings: ImportSettings, place: str) -> Layout:
+    """Find the known columns among a file's; SourceError names ``place`` and what is amiss."""
+    wanted = {name: settings.columns.get(name, name.value) for name in Column}
+    theirs = {name: there for name, there in wanted.items() if there in header}
+    for name in settings.columns:
+        if name not in theirs:
+            what = f"no column {wanted[name]!r}, which [import.columns] gives for {name}"
+            raise _missing(what, name, header, place)
+    for names in _REQUIRED:
+        _require_one(names, theirs, header, place)
+    for there in theirs.values():
+        if header.count(there) > 1:
+            raise _too_many(f"column {there!r} stands there {header.count(there)} times", place)
+    ignored = set(header) - set(theirs.values()) - {""}
+    return Layout(theirs, tuple(name for name in dict.fromkeys(header) if name in ignored))
+
+
+def _require_one(
+    names: Sequence[Column], theirs: Mapping[Column, str], header: Sequence[str], place: str
+) -> None:
+    found = [theirs[name] for name in names if name in theirs]
+    if not found:
+        raise _missing(f"no column {' or '.join(names)}", names[0], header, place)
+    if len(found) > 1:
+        raise _too_many(f"only one of the columns {', '.join(map(repr, found))} can be used", place)
+
+
+def _missing(what: str, name: Column, header: Sequence[str], place: str) -> SourceError:
+    there = ", ".join(map(repr, header))
+    shown = there if len(there) <= 300 else f"{there[:300]} ..."
+    return SourceError(
+        f"{place}: {what}; the columns are {shown}",
+        f'say under [import.columns] which one it is: {name} = "NAME IN THE FILE"',
+    )
+
+
+def _too_many(what: str, place: str) -> SourceError:
+    return SourceError(f"{place}: {what}", "take one of them out of the file, or rename it")

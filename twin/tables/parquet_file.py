@@ -1,0 +1,74 @@
+"""A Parquet file as batches of columns."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import pyarrow as pa
+from pyarrow import parquet
+
+from twin.errors import SourceError
+from twin.tables.decode import Batch
+from twin.tables.numbers import is_readable
+from twin.tables.settings import Column
+
+_ROWS = 10_000
+_BUFFER = 1 << 20  # bytes read ahead of each column, instead of a whole row group
+
+
+class ParquetFile:
+    """A Parquet file of which the schema is read; SourceError where it is none."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        with self._opened() as file:
+            self._schema = file.schema_arrow
+            self.names: list[str] = self._schema.names
+
+    @property
+    def place(self) -> str:
+        """Where the columns are named."""
+        return str(self._path)
+
+    def batches(self, theirs: Mapping[Column, str]) -> Iterator[Batch]:
+        """Give the rows in order, with the columns of these names in the file."""
+        for there in theirs.values():
+            kind = self._schema.field(there).type
+            if not is_readable(kind):
+                message = f"{self._path}: column {there!r} holds {kind}, which is no number"
+                raise SourceError(message, "write it as integers or floating point numbers")
+        first = 1
+        with self._opened() as file:
+            for table in file.iter_batches(_ROWS, columns=list(dict.fromkeys(theirs.values()))):
+                table.validate(full=True)  # of text, that it is UTF-8
+                if table.num_rows:
+                    yield self._batch(first, table, theirs)
+                first += table.num_rows
+            if first - 1 != file.metadata.num_rows:
+                raise pa.ArrowInvalid(f"{first - 1} rows instead of {file.metadata.num_rows}")
+
+    def _batch(self, first: int, table: pa.RecordBatch, theirs: Mapping[Column, str]) -> Batch:
+        def place(row: int) -> str:
+            return f"{self._path}: row {first + row}"
+
+        def cell(row: int, name: Column) -> str:
+            value = columns[name][row].as_py()
+            return "" if value is None else str(value)
+
+        columns = {name: table.column(there) for name, there in theirs.items()}
+        return Batch(columns, table.num_rows, {}, place, cell)
+
+    @contextmanager
+    def _opened(self) -> Iterator[parquet.ParquetFile]:
+        try:
+            with (
+                self._path.open("rb") as raw,
+                parquet.ParquetFile(
+                    raw, buffer_size=_BUFFER, pre_buffer=False, page_checksum_verification=True
+                ) as file,
+            ):
+                yield file
+        except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+            what = getattr(error, "strerror", None) or str(error).strip().splitlines()[0]
+            message = f"{self._path}: cannot be read as Parquet: {what}"
+            raise SourceError(message, "check the path, or export the file anew") from error

@@ -1,0 +1,75 @@
+"""A table of another program, opened: its rows as blocks of samples."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from twin.errors import ConfigError, SourceError
+from twin.signals import Samples
+from twin.tables.csv_file import CsvFile
+from twin.tables.decode import Batch
+from twin.tables.intake import Intake
+from twin.tables.layout import Layout, find_layout
+from twin.tables.parquet_file import ParquetFile
+from twin.tables.settings import Column, ImportSettings
+
+
+class _File(Protocol):
+    names: list[str]  # of its columns
+
+    def __init__(self, path: Path) -> None: ...
+
+    @property
+    def place(self) -> str:
+        """Where the columns are named."""
+
+    def batches(self, theirs: Mapping[Column, str]) -> Iterator[Batch]:
+        """Give the rows in order, with the columns of these names in the file."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table whose columns are known; each iteration reads the file anew, a piece at a time."""
+
+    path: Path
+    layout: Layout
+    settings: ImportSettings
+    ambient: float  # Pa, from which a vacuum is counted
+    _file: _File
+
+    @property
+    def ignored(self) -> tuple[str, ...]:
+        """Names of the columns in the file that are not taken."""
+        return self.layout.ignored
+
+    def blocks(self) -> Iterator[Samples]:
+        """Every row of the file in order, about 10 000 rows of SAMPLE at a time.
+
+        SourceError names the line and column of the first bad input, once all blocks before its
+        own are given, and says where a file ends without a row.
+        """
+        intake = Intake(self.layout, self.settings, self.ambient)
+        block = None
+        for batch in self._file.batches(self.layout.theirs):
+            block = intake.take(batch)
+            yield block
+        if block is None:
+            raise SourceError(f"{self._file.place}: no row follows", "export it with its data")
+
+
+_KINDS: dict[str, type[_File]] = {".csv": CsvFile, ".parquet": ParquetFile}
+
+
+def open_table(path: Path, settings: ImportSettings, ambient: float) -> Table:
+    """Open a CSV or Parquet file by its suffix and find its columns; ``ambient`` in Pa.
+
+    ConfigError for another suffix, SourceError where the file cannot be read or lacks a column.
+    """
+    kind = _KINDS.get(path.suffix.lower())
+    if kind is None:
+        known = " and ".join(_KINDS)
+        raise ConfigError(f"{path}: cannot tell what it is", f"{known} files can be read")
+    file = kind(path)
+    layout = find_layout(file.names, settings, file.place)
+    return Table(path, layout, settings, ambient, file)

@@ -1,0 +1,47 @@
+"""The names a table's columns go by, and how it is taken in."""
+
+from collections.abc import Mapping
+from enum import StrEnum
+
+from pydantic import Field
+
+from twin.settings import Settings
+
+
+class Column(StrEnum):
+    """The known columns; docs/csv.md describes them."""
+
+    TIME_S = "time_s"
+    TIME_MS = "time_ms"
+    TIME_US = "time_us"
+    TIME_NS = "time_ns"
+    SEQUENCE = "sequence"
+    SUCTION = "suction"
+    BLOW_OFF = "blow_off"
+    VACUUM_MBAR = "vacuum_mbar"
+    PRESSURE_MBAR = "pressure_mbar"
+    VACUUM_PA = "vacuum_pa"
+    PRESSURE_PA = "pressure_pa"
+    SUPPLY_BAR = "supply_bar"
+    QUALITY = "quality"
+    HOST_NS = "host_ns"
+
+
+class Bad(StrEnum):
+    """What becomes of bad input."""
+
+    REFUSE = "refuse"
+    MARK = "mark"  # keep the row and set its quality
+
+
+class ImportSettings(Settings):
+    """The table ``[import]``: how a table of another program is taken in.
+
+    ``columns`` says under which name the file has a known column: ``vacuum_mbar = "Vakuum"``.
+    """
+
+    columns: Mapping[Column, str] = Field(default_factory=dict)
+    values: Bad = Bad.REFUSE  # text in a number, NaN, an empty cell, too many or too few cells
+    jumps: Bad = Bad.REFUSE  # time or sequence that does not go forward
+    gaps: Bad = Bad.REFUSE  # samples that are missing
+    period_ms: float | None = Field(None, gt=0.0, le=60_000.0)  # else the median of the file's
