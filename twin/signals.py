@@ -35,6 +35,7 @@ TICK = np.dtype(
         ("expected", "<f4"),  # Pa, absolute, what the sensor should read; NaN before the first sync
         ("level", "<f4"),  # Pa, what the model was synchronised on at this row; NaN for most
         ("phase", "u1"),  # Phase
+        ("signals", "u1"),  # Signal bits: what the model hands out to other components
     ]
 )
 
@@ -47,6 +48,13 @@ class Command(IntFlag):
 
     SUCTION = 1
     BLOW_OFF = 2
+
+
+class Signal(IntFlag):
+    """The switching signals a compact ejector gives; the model hands them out as well."""
+
+    PART_PRESENT = 1  # H2
+    AIR_SAVING = 2  # H1
 
 
 class Quality(IntFlag):

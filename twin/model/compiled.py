@@ -1,7 +1,8 @@
 """The decorator for compiled functions, with a cache that never serves yesterday's physics.
 
 Numba caches each function by the time stamp of its own file, so a change in a function it calls in
-another file goes unnoticed. Here the cache lies in a folder named by the sources of the package.
+another file goes unnoticed. Here the cache lies in a folder named by all sources that are compiled
+or hold constants for it.
 """
 
 import hashlib
@@ -11,6 +12,7 @@ import tempfile
 import time
 from pathlib import Path
 
+import llvmlite.binding as llvm
 import numba
 
 DAY_S = 86_400.0
@@ -20,7 +22,9 @@ _PACKAGE = Path(__file__).parent.parent
 def _cache_folder() -> Path:
     sources = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*.py")):
-        sources.update(path.read_bytes())
+        text = path.read_bytes()
+        if path.parent.name == "model" or path.name == "signals.py" or b"model.compiled" in text:
+            sources.update(text)
     writable = os.access(_PACKAGE, os.W_OK)
     root = _PACKAGE if writable else Path(tempfile.gettempdir()) / f"ejector-twin-{os.getuid()}"
     return root / "__pycache__" / f"compiled-{sources.hexdigest()[:12]}"
@@ -37,5 +41,13 @@ _FOLDER = _cache_folder()
 _forget_others(_FOLDER)
 numba.config.CACHE_DIR = str(_FOLDER)  # type: ignore[attr-defined]
 
+# A loop over hypotheses reads and writes some fifty rows of three arrays. Whether rows overlap is
+# checked before such a loop is run four at a time, and by default LLVM balks at so many checks.
+for _limit in ("runtime-memory-check-threshold", "vectorize-memory-check-threshold"):
+    llvm.set_option("", f"--{_limit}=100000")
+
 # Results stay the same to the last bit: no fast-math. Dividing by zero gives inf as in NumPy.
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+# For functions called inside a loop over hypotheses: only loops without calls are vectorised.
+inlined = numba.njit(forceinline=True, error_model="numpy")

@@ -6,91 +6,39 @@ the model's units are converted.
 """
 
 import hashlib
-from typing import Annotated
+import math
+from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
+from twin.model import theta as c
+from twin.model.gas import GAMMA, R
+from twin.model.system import Part, Tube, Vessel, lumped
+from twin.model.theta import Theta
 from twin.settings import Settings
 from twin.signals import BAR, MBAR, ML, MS, SL_MIN
 
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 
-# The coefficients by name; the kernel and the effects index the vector with these numbers.
-COEFFICIENTS = (
-    "AMBIENT",  # Pa
-    "AMBIENT_NOMINAL",  # Pa, at which suction capacity was measured
-    "TEMPERATURE",  # K, of ambient, wall and supply air
-    "SUPPLY",  # Pa gauge at the nozzle
-    "SUPPLY_NOMINAL",  # Pa gauge, at which suction capacity and end pressure hold
-    "SUPPLY_OPTIMUM",  # Pa gauge, where suction capacity peaks
-    "SUPPLY_CURVATURE",  # -, how sharply it peaks
-    "END_SLOPE",  # 1/Pa, relative rise of end pressure per drop of supply
-    "SUCTION",  # kg/s at ambient pressure in the port
-    "END_RATIO",  # -, end pressure over ambient
-    "BULGE",  # -, how far the characteristic bulges above a straight line
-    "SKEW",  # -, and towards which end
-    "RESPONSE",  # s, from the command to the valve's action
-    "RAMP_UP",  # s, time constant of the jet
-    "RAMP_DOWN",  # s, of its collapse
-    "RESISTANCE",  # Pa²/(kg/s)², between port with sensor and vessel
-    "BLOW_OFF",  # kg/s at nominal supply
-    "BLOW_OFF_RESPONSE",  # s
-    "BLOW_OFF_RAMP",  # s, time constant of the blow-off valve
-    "RELIEF",  # kg/(s Pa), out through the exhaust while the port is above ambient
-    "VOLUME",  # m³
-    "COMPLIANCE",  # m³ less at full vacuum
-    "FILM",  # W/(m² K)
-    "AREA",  # m²
-    "LEAK",  # kg/s sonic, opening to ambient
-    "LAMINAR_LEAK",  # kg/(s Pa)
-    "BACK_FLOW",  # kg/s sonic, through the ejector while its nozzle is off
-    "SENSOR_LAG",  # s
-    "SENSOR_OFFSET",  # Pa added to the absolute reading
-    "SENSOR_GAIN",  # -, reads this many times the vacuum
-    "H1",  # Pa below ambient, nozzle off
-    "H1_LOW",  # Pa below ambient, nozzle on again
-    "RELEASE",  # Pa below ambient, where blow-off lets the part go and the cup stands open; or NaN
-)
-(
-    AMBIENT,
-    AMBIENT_NOMINAL,
-    TEMPERATURE,
-    SUPPLY,
-    SUPPLY_NOMINAL,
-    SUPPLY_OPTIMUM,
-    SUPPLY_CURVATURE,
-    END_SLOPE,
-    SUCTION,
-    END_RATIO,
-    BULGE,
-    SKEW,
-    RESPONSE,
-    RAMP_UP,
-    RAMP_DOWN,
-    RESISTANCE,
-    BLOW_OFF,
-    BLOW_OFF_RESPONSE,
-    BLOW_OFF_RAMP,
-    RELIEF,
-    VOLUME,
-    COMPLIANCE,
-    FILM,
-    AREA,
-    LEAK,
-    LAMINAR_LEAK,
-    BACK_FLOW,
-    SENSOR_LAG,
-    SENSOR_OFFSET,
-    SENSOR_GAIN,
-    H1,
-    H1_LOW,
-    RELEASE,
-) = range(len(COEFFICIENTS))
+SHORTEST_SWING = 5e-3  # s, of a line's gas that can be seen at a sample each millisecond
+RIPPLE = 1e-3  # of suction capacity, from one hundredth of the range to the next: still monotonic
 
-Theta = npt.NDArray[np.float64]  # one value per coefficient
+# The modes of the configuration as the coefficients hold them.
+_AIR_SAVING = {
+    "off": c.OFF,
+    "on": c.ON,
+    "leak_monitoring": c.LEAK_MONITORING,
+    "without_continuous": c.WITHOUT_CONTINUOUS,
+}
+_BLOW_OFF = {
+    "external": c.EXTERNAL,
+    "internal": c.INTERNAL,
+    "timed": c.TIMED,
+}
+_CONTROL_SENSOR = {"own": c.OWN, "plc": c.PLC}
 
 
 class Ambient(Settings):
@@ -103,67 +51,138 @@ class Ambient(Settings):
 class Supply(Settings):
     """Operating pressure, and how suction and end pressure follow it."""
 
-    pressure_bar: float = Field(4.5, gt=0.0, le=10.0)
+    pressure_bar: float = Field(4.5, gt=0.0, le=10.0)  # gauge, at the regulator
+    droop_bar: NotNegative = 0.0  # less at the nozzle while a valve is open
+    lag_ms: float = Field(20.0, ge=1.0, le=1000.0)  # of the supply line
     optimum_bar: float = Field(4.5, gt=0.0, le=10.0)
     curvature: NotNegative = 1.0
     end_pressure_slope: NotNegative = 0.2  # relative rise of end pressure per bar missing
 
-
-class Ejector(Settings):
-    """Characteristic, timing and blow-off of the ejector."""
-
-    suction_capacity_sl_min: Positive = 35.0
-    end_pressure_mbar: Positive = 150.0
-    bulge: float = Field(0.0, ge=-0.5, le=2.0)
-    skew: float = Field(0.0, ge=-2.0, le=2.0)
-    response_ms: float = Field(15.0, ge=0.0, le=500.0)
-    ramp_up_ms: float = Field(8.0, ge=1.0, le=500.0)
-    ramp_down_ms: float = Field(4.0, ge=1.0, le=500.0)
-    blow_off_sl_min: NotNegative = 100.0
-    blow_off_response_ms: float = Field(15.0, ge=0.0, le=500.0)
-    blow_off_ramp_ms: float = Field(5.0, ge=1.0, le=500.0)
-    relief_sl_min: NotNegative = 200.0  # out through the exhaust at 100 mbar above ambient
-    h1_mbar: float = Field(750.0, gt=0.0, le=998.0)
-    h1_hysteresis_mbar: float = Field(150.0, gt=0.0)
+    @property
+    def nozzle_bar(self) -> float:
+        """Operating pressure at the nozzle while it is on (bar gauge)."""
+        return self.pressure_bar - self.droop_bar
 
     @model_validator(mode="after")
-    def _hysteresis_fits(self) -> "Ejector":
-        if self.h1_hysteresis_mbar >= self.h1_mbar:
-            raise ValueError("h1_hysteresis_mbar must be less than h1_mbar")
+    def _something_is_left(self) -> "Supply":
+        if self.nozzle_bar <= 0.0:
+            raise ValueError("droop_bar leaves no operating pressure: it is below ambient")
         return self
 
 
-class Vessel(Settings):
-    """Where the vacuum is stored, with the line to it."""
+class Ejector(Settings):
+    """Characteristic, timing, blow-off and control of the ejector."""
 
-    volume_ml: Positive = 755.0
-    wall_area_cm2: NotNegative = 500.0
-    film_coefficient: NotNegative = 10.0  # W/(m² K)
-    line_drop_mbar: NotNegative = 5.0  # at nominal suction
-    leak_sl_min: NotNegative = 0.3
-    release_mbar: float | None = None  # vacuum at which blow-off lets the part go; a tank has none
+    suction_capacity_sl_min: Positive = 33.4
+    end_pressure_mbar: Positive = 150.0
+    bulge: float = Field(0.0, ge=-0.9, le=3.0)
+    skew: float = Field(0.0, ge=-5.0, le=5.0)
+    bend_2: float = Field(0.0, ge=-10.0, le=10.0)
+    bend_3: float = Field(0.0, ge=-10.0, le=10.0)
+    port_volume_ml: Positive = 1.0
+    air_consumption_sl_min: NotNegative = 80.0  # of the nozzle, at operating pressure
+    response_ms: float = Field(15.0, ge=0.0, le=500.0)
+    response_off_ms: float = Field(12.0, ge=0.0, le=500.0)
+    ramp_up_ms: float = Field(8.0, ge=0.5, le=500.0)
+    ramp_down_ms: float = Field(4.0, ge=0.5, le=500.0)
+    blow_off_sl_min: NotNegative = 100.0
+    blow_off_response_ms: float = Field(15.0, ge=0.0, le=500.0)
+    blow_off_response_off_ms: float = Field(12.0, ge=0.0, le=500.0)
+    blow_off_ramp_ms: float = Field(5.0, ge=0.5, le=500.0)
+    relief_sl_min: NotNegative = 200.0  # out through the exhaust at 100 mbar above ambient
+    h1_mbar: float = Field(750.0, gt=0.0, le=998.0)
+    h1_hysteresis_mbar: float = Field(150.0, gt=0.0)
+    h2_mbar: float = Field(550.0, gt=0.0, le=998.0)
+    h2_hysteresis_mbar: float = Field(10.0, gt=0.0)
+    air_saving: Literal["off", "on", "leak_monitoring", "without_continuous"] = "on"
+    permitted_leakage_mbar_s: Positive = 250.0
+    blow_off: Literal["external", "internal", "timed"] = "external"
+    blow_off_time_ms: float = Field(200.0, ge=100.0, le=9990.0)
+    control_sensor: Literal["own", "plc"] = "own"
+
+    def share(self, x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Suction over suction capacity; ``x`` runs from 0 at end pressure to 1 at ambient."""
+        bend = self.bulge + x * (self.skew + x * (self.bend_2 + x * self.bend_3))
+        return x * (1.0 + (1.0 - x) * bend)
+
+    @model_validator(mode="after")
+    def _thresholds_fit(self) -> "Ejector":
+        if self.h1_mbar < self.h2_mbar + self.h1_hysteresis_mbar:
+            raise ValueError(
+                f"h1_mbar must be at least h2_mbar + h1_hysteresis_mbar"
+                f" = {self.h2_mbar + self.h1_hysteresis_mbar:g}: else air saving loses the part"
+            )
+        if self.h2_hysteresis_mbar >= self.h2_mbar:
+            raise ValueError("h2_hysteresis_mbar must be less than h2_mbar")
+        return self
+
+    @model_validator(mode="after")
+    def _characteristic_falls(self) -> "Ejector":
+        """Less suction at more vacuum, as any ejector: the slope over x stays positive."""
+        x = np.linspace(0.0, 1.0, 101)
+        steps = np.diff(self.share(x))
+        if (steps < -RIPPLE).any():
+            worst = x[int(np.argmin(steps))]
+            raise ValueError(
+                "bulge, skew, bend_2 and bend_3 make a characteristic that is not monotonic:"
+                f" suction falls towards ambient {100 * worst:.0f} % of the way from end pressure"
+            )
+        return self
 
 
-class Sensor(Settings):
-    """The pressure sensor the PLC reads."""
+class Wiring(Settings):
+    """The pressure sensor the PLC reads, as a signal."""
 
-    lag_ms: float = Field(3.0, ge=1.0, le=500.0)
+    lag_ms: float = Field(3.0, ge=0.5, le=500.0)
     noise_mbar: float = Field(0.4, gt=0.0, le=50.0)  # one standard deviation, steps included
 
 
+class System(Settings):
+    """What the ejector evacuates: its parts outwards from the port, and how they are joined."""
+
+    parts: tuple[Part, ...] = (
+        Tube(kind="tube", length_mm=100.0, diameter_mm=6.0),
+        Vessel(kind="vessel", volume_ml=750.0),
+    )
+    film_coefficient: NotNegative = 10.0  # W/(m² K), of vessel and cups
+    tube_film_coefficient: NotNegative = 60.0  # W/(m² K)
+    line_factor: NotNegative = 1.0  # flow resistance over what the parts add up to
+    line_share: float = Field(0.6, gt=0.0, lt=1.0)  # of the tubes' volume, half-way along
+    sensor_shift: float = Field(0.0, ge=-1.0, le=1.0)  # of its place: 1 is the whole line outwards
+    leak_sl_min: NotNegative = 0.3  # of seals and fittings, sonic
+
+    @model_validator(mode="after")
+    def _line_has_volume(self) -> "System":
+        if not any(part.kind == "tube" for part in self.parts):
+            raise ValueError("parts need a tube between the ejector and the rest")
+        return self
+
+    @model_validator(mode="after")
+    def _ends_somewhere(self) -> "System":
+        kinds = [part.kind for part in self.parts]
+        if not {"vessel", "cups"} & set(kinds):
+            raise ValueError("parts need a vessel or cups: there is nothing to evacuate")
+        if kinds.count("sensor") > 1:
+            raise ValueError("parts has more than one sensor; the PLC reads one")
+        return self
+
+
 class DataSet(Settings):
-    """Everything the model knows of one type or one unit."""
+    """Everything the model knows of one type or one unit, and of what hangs on it."""
 
     ambient: Ambient = Ambient()
     supply: Supply = Supply()
     ejector: Ejector = Ejector()
-    vessel: Vessel = Vessel()
-    sensor: Sensor = Sensor()
+    sensor: Wiring = Wiring()
+    system: System = System()
 
     @model_validator(mode="after")
-    def _end_pressure_below_ambient(self) -> "DataSet":
-        if self.ejector.end_pressure_mbar >= self.ambient.pressure_mbar:
+    def _pressures_fit(self) -> "DataSet":
+        ambient = self.ambient.pressure_mbar
+        if self.ejector.end_pressure_mbar >= ambient:
             raise ValueError("ejector.end_pressure_mbar must be below ambient.pressure_mbar")
+        if self.ejector.h1_mbar >= ambient:
+            raise ValueError("ejector.h1_mbar must be below ambient.pressure_mbar: it is a vacuum")
         return self
 
     @property
@@ -172,41 +191,80 @@ class DataSet(Settings):
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
 
 
-def resistance(theta: Theta, drop: float) -> float:
-    """Resistance that takes ``drop`` Pa at nominal suction from ambient (isothermal pipe flow)."""
-    ambient = theta[AMBIENT_NOMINAL]
-    return float((ambient**2 - (ambient - drop) ** 2) / theta[SUCTION] ** 2)
-
-
 def coefficients(data: DataSet) -> Theta:
     """Turn a data set into the kernel's vector, in SI units."""
-    ambient, supply, ejector, vessel = data.ambient, data.supply, data.ejector, data.vessel
-    theta = np.zeros(len(COEFFICIENTS))
-    theta[AMBIENT] = theta[AMBIENT_NOMINAL] = ambient.pressure_mbar * MBAR
-    theta[TEMPERATURE] = ambient.temperature_c + 273.15
-    theta[SUPPLY] = theta[SUPPLY_NOMINAL] = supply.pressure_bar * BAR
-    theta[SUPPLY_OPTIMUM] = supply.optimum_bar * BAR
-    theta[SUPPLY_CURVATURE] = supply.curvature
-    theta[END_SLOPE] = supply.end_pressure_slope / BAR
-    theta[SUCTION] = ejector.suction_capacity_sl_min * SL_MIN
-    theta[END_RATIO] = ejector.end_pressure_mbar / ambient.pressure_mbar
-    theta[BULGE] = ejector.bulge
-    theta[SKEW] = ejector.skew
-    theta[RESPONSE] = ejector.response_ms * MS
-    theta[RAMP_UP] = ejector.ramp_up_ms * MS
-    theta[RAMP_DOWN] = ejector.ramp_down_ms * MS
-    theta[BLOW_OFF] = ejector.blow_off_sl_min * SL_MIN
-    theta[BLOW_OFF_RESPONSE] = ejector.blow_off_response_ms * MS
-    theta[BLOW_OFF_RAMP] = ejector.blow_off_ramp_ms * MS
-    theta[RELIEF] = ejector.relief_sl_min * SL_MIN / (100.0 * MBAR)
-    theta[H1] = ejector.h1_mbar * MBAR
-    theta[H1_LOW] = (ejector.h1_mbar - ejector.h1_hysteresis_mbar) * MBAR
-    theta[VOLUME] = vessel.volume_ml * ML
-    theta[FILM] = vessel.film_coefficient
-    theta[AREA] = vessel.wall_area_cm2 * 1e-4
-    theta[LEAK] = vessel.leak_sl_min * SL_MIN
-    theta[SENSOR_LAG] = data.sensor.lag_ms * MS
-    theta[SENSOR_GAIN] = 1.0
-    theta[RELEASE] = np.nan if vessel.release_mbar is None else vessel.release_mbar * MBAR
-    theta[RESISTANCE] = resistance(theta, vessel.line_drop_mbar * MBAR)
+    theta = np.zeros(len(c.COEFFICIENTS))
+    ambient, temperature = data.ambient.pressure_mbar * MBAR, data.ambient.temperature_c + 273.15
+    theta[[c.AMBIENT, c.AMBIENT_NOMINAL]] = ambient
+    theta[c.TEMPERATURE] = temperature
+    theta[[c.SENSOR_LAG, c.SENSOR_GAIN]] = data.sensor.lag_ms * MS / 2.0, 1.0
+    _set_supply(theta, data.supply)
+    _set_ejector(theta, data.ejector, data.ejector.end_pressure_mbar * MBAR / ambient)
+    _set_system(theta, data.system, data.ejector.port_volume_ml * ML)
     return theta
+
+
+def _set_supply(theta: Theta, supply: Supply) -> None:
+    theta[c.SUPPLY] = supply.pressure_bar * BAR
+    theta[c.DROOP] = supply.droop_bar * BAR
+    theta[c.SUPPLY_LAG] = supply.lag_ms * MS
+    theta[c.SUPPLY_NOMINAL] = supply.nozzle_bar * BAR
+    theta[c.SUPPLY_OPTIMUM] = supply.optimum_bar * BAR
+    theta[c.SUPPLY_CURVATURE] = supply.curvature
+    theta[c.END_SLOPE] = supply.end_pressure_slope / BAR
+
+
+def _set_ejector(theta: Theta, ejector: Ejector, end_ratio: float) -> None:
+    theta[c.SUCTION] = ejector.suction_capacity_sl_min * SL_MIN
+    theta[c.END_RATIO] = end_ratio
+    theta[[c.BULGE, c.SKEW]] = ejector.bulge, ejector.skew
+    theta[[c.BEND_2, c.BEND_3]] = ejector.bend_2, ejector.bend_3
+    theta[c.RESPONSE] = ejector.response_ms * MS
+    theta[c.RESPONSE_OFF] = ejector.response_off_ms * MS
+    theta[c.RAMP_UP] = ejector.ramp_up_ms * MS / 2.0
+    theta[c.RAMP_DOWN] = ejector.ramp_down_ms * MS / 2.0
+    theta[c.BLOW_OFF] = ejector.blow_off_sl_min * SL_MIN
+    theta[c.BLOW_OFF_RESPONSE] = ejector.blow_off_response_ms * MS
+    theta[c.BLOW_OFF_RESPONSE_OFF] = ejector.blow_off_response_off_ms * MS
+    theta[c.BLOW_OFF_RAMP] = ejector.blow_off_ramp_ms * MS
+    theta[c.RELIEF] = ejector.relief_sl_min * SL_MIN / (100.0 * MBAR)
+    theta[[c.H1, c.H2]] = ejector.h1_mbar * MBAR, ejector.h2_mbar * MBAR
+    theta[c.H1_LOW] = (ejector.h1_mbar - ejector.h1_hysteresis_mbar) * MBAR
+    theta[c.H2_LOW] = (ejector.h2_mbar - ejector.h2_hysteresis_mbar) * MBAR
+    theta[c.AIR_SAVING] = _AIR_SAVING[ejector.air_saving]
+    theta[c.PERMITTED_LEAKAGE] = ejector.permitted_leakage_mbar_s * MBAR
+    theta[c.BLOW_OFF_MODE] = _BLOW_OFF[ejector.blow_off]
+    theta[c.BLOW_OFF_TIME] = ejector.blow_off_time_ms * MS
+    theta[c.CONTROL_SENSOR] = _CONTROL_SENSOR[ejector.control_sensor]
+
+
+def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
+    total = lumped(system.parts, theta[c.SUCTION], theta[c.AMBIENT], theta[c.TEMPERATURE])
+    half_way, ends = system.line_share, (1.0 - system.line_share) / 2.0
+    theta[c.PORT_VOLUME] = ejector_volume + total.port_volume + ends * total.line_volume
+    theta[c.LINE_VOLUME] = half_way * total.line_volume
+    theta[c.VOLUME] = total.vessel_volume + ends * total.line_volume
+    port_area = total.port_area + ends * total.line_area
+    theta[c.PORT_HEAT] = port_area * system.tube_film_coefficient
+    theta[c.LINE_HEAT] = half_way * total.line_area * system.tube_film_coefficient
+    theta[c.COMPLIANCE] = total.shrinks
+    theta[c.FILM] = system.film_coefficient
+    theta[c.AREA] = total.vessel_area + ends * total.line_area
+    near = 0.5 if _swings(theta, total.inertance) else 0.0
+    theta[[c.NEAR_INERTANCE, c.INERTANCE]] = near * total.inertance
+    for line, value in ((c.RESISTANCE, total.resistance), (c.LAMINAR, total.laminar)):
+        theta[line] = (1.0 - near) * value * system.line_factor
+    theta[c.NEAR_RESISTANCE] = near * total.resistance * system.line_factor
+    theta[c.NEAR_LAMINAR] = near * total.laminar * system.line_factor
+    place = min(max(total.place + system.sensor_shift, 0.0), 1.0)
+    theta[c.PLACE] = place * total.drop * system.line_factor
+    theta[c.LEAK] = total.leak + system.leak_sl_min * SL_MIN
+    theta[c.LAMINAR_LEAK] = total.open
+    theta[c.OPENING] = total.opening
+    theta[c.RELEASE] = total.release
+
+
+def _swings(theta: Theta, inertance: float) -> bool:
+    """Whether the line's gas swings slowly enough to be seen; a shorter line is only friction."""
+    stored = (theta[c.PORT_VOLUME] + theta[c.LINE_VOLUME]) / (GAMMA * R * theta[c.TEMPERATURE])
+    return 2.0 * math.pi * math.sqrt(inertance * stored) > SHORTEST_SWING

@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from twin.errors import ConfigError
-from twin.model import dataset as c
-from twin.model.dataset import Theta
+from twin.model import theta as c
+from twin.model.theta import Theta
 from twin.signals import BAR, MBAR, ML, MS, SL_MIN
 
 
@@ -88,11 +88,11 @@ def _heat_exchange(theta: Theta, film_coefficient: float) -> None:
 
 
 def _response_delay(theta: Theta, delay: float) -> None:
-    theta[c.RESPONSE] += delay * MS
+    theta[[c.RESPONSE, c.RESPONSE_OFF]] += delay * MS
 
 
 def _slow_ramp_up(theta: Theta, time_constant: float) -> None:
-    theta[c.RAMP_UP] += time_constant * MS
+    theta[c.SLOW_RAMP_UP] += time_constant * MS
 
 
 def _threshold_drift(theta: Theta, h1_shift: float, h2_shift: float) -> None:
@@ -105,7 +105,7 @@ def _weak_blow_off(theta: Theta, percent: float) -> None:
 
 
 def _blow_off_delay(theta: Theta, delay: float) -> None:
-    theta[c.BLOW_OFF_RESPONSE] += delay * MS
+    theta[[c.BLOW_OFF_RESPONSE, c.BLOW_OFF_RESPONSE_OFF]] += delay * MS
 
 
 def _sensor_offset(theta: Theta, offset: float) -> None:
@@ -117,7 +117,7 @@ def _sensor_gain(theta: Theta, percent: float) -> None:
 
 
 def _sensor_lag(theta: Theta, time_constant: float) -> None:
-    theta[c.SENSOR_LAG] += time_constant * MS
+    theta[c.SLOW_SENSOR] += time_constant * MS
 
 
 def _ambient_pressure(theta: Theta, shift: float) -> None:

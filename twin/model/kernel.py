@@ -1,7 +1,8 @@
-"""The compiled path: many samples through the right-hand side in one call.
+"""The compiled path: many samples through the right-hand side in one call, for many hypotheses.
 
 ``advance`` carries everything it needs from call to call in ``state``, so the same samples give the
-same expected pressures to the last bit however they are cut into blocks.
+same expected pressures to the last bit however they are cut into blocks, and whether a hypothesis
+runs alone or among others.
 """
 
 import math
@@ -9,163 +10,359 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from twin.model import dataset as c
-from twin.model.compiled import compiled
-from twin.model.plant import ORDER, WORK, at_supply, reading, runge_kutta, sensed_at
-from twin.signals import Phase
+from twin.model import theta as c
+from twin.model.compiled import compiled, inlined
+from twin.model.control import air_saving, new_timer, nothing_done, part_present, switch, timed
+from twin.model.gas import GAMMA, R
+from twin.model.plant import ORDER, Gas, Lags, prepare, reading, sensed_at
+from twin.model.plant import advance as advance_gas
+from twin.signals import Command, Phase, Signal
 
-# State: the continuous part first (pressure, temperature, jet, blow-off valve, sensor) ...
-PRESSURE, TEMPERATURE, JET, BLOWING, SENSED = range(ORDER)
-# ... then the valves (position, what is commanded, for how long), phase, open cup, and whether the
-# model stands on a measurement at all.
-NOZZLE, NOZZLE_COMMAND, NOZZLE_AGE, BLOW, BLOW_COMMAND, BLOW_AGE, PHASE, OPEN, VALID = range(5, 14)
-STATE = 14
+# Rows of the state: what plant carries on ...
+PORT, PORT_MASS, LINE, LINE_MASS, VESSEL, VESSEL_MASS, NEAR, FAR = range(8)
+DRIVE, JET, BLOWING, SUPPLIED, FELT, SENSED = range(8, ORDER)
+# ... then the valves (position, what is commanded, for how long), how roughly the pressures run
+# (Pa/s³), the phase, the open cup, whether the model stands on a measurement at all, and the
+# switching signals it hands out.
+NOZZLE, NOZZLE_COMMAND, NOZZLE_AGE, BLOW, BLOW_COMMAND, BLOW_AGE = range(ORDER, ORDER + 6)
+ROUGH, PHASE, OPEN, VALID, SIGNALS = range(ORDER + 6, ORDER + 11)
+STATE = ORDER + 11
 
 LONGEST_STEP = 1e-3  # s
 LONGEST_BRIDGE = 0.1  # s; after a longer silence the model waits for the next sync
 NEVER = 1e9  # s, an age that is past every delay
+# A step in which a valve moves, a cup opens or blow-off passes ambient pressure (the exhaust opens)
+# is done in the most steps; any other in as many as keep each within the tolerance.
+FINEST = 24  # steps
+TOLERANCE = 0.02  # Pa, of a step, by which a scheme of second order may be off
 
 _IDLE, _SUCTION, _HOLD, _BLOW_OFF = (int(phase) for phase in Phase)
+_SUCTION_COMMAND = int(Command.SUCTION)
+_PART_PRESENT, _AIR_SAVING = int(Signal.PART_PRESENT), int(Signal.AIR_SAVING)
 
-State = npt.NDArray[np.float64]
+State = npt.NDArray[np.float64]  # STATE rows; a second axis where there are many hypotheses
+Floats = npt.NDArray[np.float64]
+Bytes = npt.NDArray[np.uint8]
 
 
-def new_state() -> State:
+def new_state(hypotheses: int | None = None) -> State:
     """Return a model that waits for its first sync; it expects NaN until then."""
-    state = np.zeros(STATE)
-    state[NOZZLE_AGE] = state[BLOW_AGE] = NEVER
+    state = np.zeros(STATE if hypotheses is None else (STATE, hypotheses))
+    state[[NOZZLE_AGE, BLOW_AGE]] = NEVER
     return state
 
 
-@compiled
-def _valve(state, position, h, response):  # type: ignore[no-untyped-def]
-    """Mean position of a valve over a step of ``h``; it follows its command ``response`` later.
-
-    ``position`` indexes position, command and age in ``state``. A command shorter than the response
-    is not acted on, as with a real valve.
-    """
-    age = state[position + 2]
-    state[position + 2] = age + h
-    before, command = state[position], state[position + 1]
-    late = response - age
-    if before == command or late >= h:
-        return before
-    state[position] = command
-    return command + (before - command) * max(late, 0.0) / h
-
-
-@compiled
-def _step(state, dt, theta, supplied, work):  # type: ignore[no-untyped-def]
-    """Advance by ``dt`` seconds under the commands of the last sample."""
-    count = max(math.ceil(dt / LONGEST_STEP - 1e-6), 1)
-    h = dt / count
-    for _ in range(count):
-        nozzle = _valve(state, NOZZLE, h, theta[c.RESPONSE])
-        blow = _valve(state, BLOW, h, theta[c.BLOW_OFF_RESPONSE])
-        runge_kutta(state, h, state[OPEN], nozzle, blow, theta, supplied, work)
-        released = theta[c.AMBIENT] - state[PRESSURE] <= theta[c.RELEASE]  # never if that is NaN
-        if released and state[BLOW_COMMAND] > 0.0:
-            state[OPEN] = 1.0
-
-
-@compiled
-def _command(state, position, value):  # type: ignore[no-untyped-def]
-    if state[position + 1] != value:
-        state[position + 1] = value
-        state[position + 2] = 0.0
-
-
-@compiled
-def _enter(state, phase, theta):  # type: ignore[no-untyped-def]
-    """Take over the phase of a sample: what it commands, and what was measured of the nozzle."""
-    before = int(state[PHASE])
-    if phase == before:
-        return
-    state[PHASE] = phase
-    _command(state, NOZZLE, 1.0 if phase == _SUCTION else 0.0)
-    _command(state, BLOW, 1.0 if phase == _BLOW_OFF else 0.0)
-    if (before == _HOLD and phase == _SUCTION) or (before == _SUCTION and phase == _HOLD):
-        state[NOZZLE_AGE] = NEVER  # seen in the pressure: the valve has already acted
-    if phase == _SUCTION and before != _HOLD:
-        state[OPEN] = 0.0  # the next part is there
-    if phase == _IDLE and before == _BLOW_OFF and theta[c.RELEASE] >= 0.0:
-        state[OPEN] = 1.0  # blow-off has let the part go, early or late
-
-
-@compiled
-def _synchronise(state, level, theta):  # type: ignore[no-untyped-def]
-    """Set the model onto a measured ``level`` (Pa); an open cup is at ambient whatever is read."""
-    idle = state[PHASE] == _IDLE
-    if theta[c.RELEASE] >= 0.0 and (idle or state[OPEN] > 0.0):
-        state[PRESSURE] = state[SENSED] = theta[c.AMBIENT]
-        state[TEMPERATURE] = theta[c.TEMPERATURE]
-        state[OPEN] = 1.0
-    elif state[VALID] > 0.0:
-        shift = sensed_at(level, theta) - state[SENSED]
-        state[PRESSURE] = max(state[PRESSURE] + shift, 100.0)
-        state[SENSED] += shift
-    else:
-        state[PRESSURE] = state[SENSED] = sensed_at(level, theta)
-        state[TEMPERATURE] = theta[c.TEMPERATURE]
-    if state[VALID] == 0.0:
-        state[JET] = state[NOZZLE] = state[NOZZLE_COMMAND]
-        state[BLOWING] = state[BLOW] = state[BLOW_COMMAND]
-    state[VALID] = 1.0
-
-
-@compiled
-def advance(state, theta, dt, phase, level, expected):  # type: ignore[no-untyped-def]
+def advance(
+    state: State,
+    theta: c.Theta,
+    dt: Floats,
+    phase: Bytes,
+    level: Floats,
+    expected: Floats,
+    signals: Bytes | None = None,
+) -> None:
     """Step the model over a block; write what the sensor should read (Pa) into ``expected``.
 
     Row by row: ``dt`` seconds since the row before (negative: time does not run on, wait for a
     sync), ``phase`` as found by the cycle finder, ``level`` the pressure to synchronise on (Pa, NaN
-    for most rows).
+    for most rows). Into ``signals`` go the switching signals handed out (``Signal`` bits). With
+    many hypotheses ``state`` is (STATE, n), ``theta`` (coefficients, n), what is written (rows, n).
     """
-    work = np.empty((WORK, ORDER))
-    supplied = at_supply(theta)
-    for row in range(dt.shape[0]):
-        if dt[row] < 0.0 or dt[row] > LONGEST_BRIDGE:
-            state[VALID] = 0.0
-        elif state[VALID] > 0.0 and dt[row] > 0.0:
-            _step(state, dt[row], theta, supplied, work)
-        _enter(state, phase[row], theta)
-        if not math.isnan(level[row]):
-            _synchronise(state, level[row], theta)
-        expected[row] = reading(state[SENSED], theta) if state[VALID] > 0.0 else math.nan
+    if len(dt) == 0:
+        return
+    if signals is None:
+        signals = np.empty(expected.shape, np.uint8)
+    _advance(
+        state.reshape(STATE, -1),
+        theta.reshape(len(c.COEFFICIENTS), -1),
+        dt,
+        phase,
+        level,
+        expected.reshape(len(dt), -1),
+        signals.reshape(len(dt), -1),
+    )
 
 
-@compiled
-def simulate(state, theta, dt, commands, phase, expected):  # type: ignore[no-untyped-def]
-    """Run free: the model's own air saving switches the nozzle; ``phase`` and ``expected`` are out.
+def simulate(
+    state: State,
+    theta: c.Theta,
+    dt: Floats,
+    commands: Bytes,
+    phase: Bytes,
+    expected: Floats,
+) -> None:
+    """Run free: the model's own control switches the nozzle; ``phase`` and ``expected`` are out.
 
-    ``commands`` per row are those of ``Command``; blow-off wins over suction. ``state`` must stand
-    on something (``at_rest``).
+    ``commands`` per row are those of ``Command``. ``state`` must stand on something (``at_rest``);
+    the control begins anew with every call.
     """
-    work = np.empty((WORK, ORDER))
-    supplied = at_supply(theta)
-    for row in range(dt.shape[0]):
-        if dt[row] > 0.0:
-            _step(state, dt[row], theta, supplied, work)
-        vacuum = theta[c.AMBIENT] - state[SENSED]
-        now = _IDLE
-        if commands[row] & 2:
-            now = _BLOW_OFF
-        elif commands[row] & 1:
-            now = _HOLD if state[PHASE] == _HOLD else _SUCTION
-            if now == _SUCTION and vacuum >= theta[c.H1]:
-                now = _HOLD
-            elif now == _HOLD and vacuum < theta[c.H1_LOW]:
-                now = _SUCTION
-        switched = now + int(state[PHASE]) == _SUCTION + _HOLD and now != state[PHASE]
-        _enter(state, now, theta)
-        if switched:
-            state[NOZZLE_AGE] = 0.0  # nothing was measured yet: the valve takes its response
-        phase[row] = now
-        expected[row] = reading(state[SENSED], theta)
+    _simulate(
+        state.reshape(STATE, 1),
+        nothing_done(),
+        new_timer(),
+        theta.reshape(-1, 1),
+        dt,
+        commands,
+        phase,
+        expected.reshape(-1, 1),
+    )
 
 
 def at_rest(theta: c.Theta) -> State:
     """Return a model that stands at ambient pressure and temperature, nothing commanded."""
     state = new_state()
-    _synchronise(state, reading(theta[c.AMBIENT], theta), theta)
+    _settle(state.reshape(STATE, 1), theta.reshape(-1, 1), 0, theta[c.AMBIENT])
+    state[OPEN] = 1.0 if theta[c.RELEASE] >= 0.0 else 0.0
+    state[VALID] = 1.0
     return state
+
+
+def take_over(state: State, before: c.Theta, after: c.Theta) -> None:
+    """Let ``state`` go on under other coefficients: where room is added, gas comes with it."""
+    for mass, volume in ((PORT_MASS, c.PORT_VOLUME), (LINE_MASS, c.LINE_VOLUME)):
+        state[mass] *= after[volume] / before[volume]
+    state[VESSEL_MASS] *= _room(state, after) / _room(state, before)
+
+
+def _room(state: State, theta: c.Theta) -> State:
+    """Volume of the vessel as it is (m³), shrunk by its vacuum."""
+    vacuum: State = 1.0 - state[VESSEL] / theta[c.AMBIENT]
+    room: State = theta[c.VOLUME] - theta[c.COMPLIANCE] * vacuum
+    return room
+
+
+@inlined
+def _valve(state, position, h, k, response, i):  # type: ignore[no-untyped-def]
+    """Mean position of a valve over a step of ``h``; it follows its command a response later.
+
+    ``position`` indexes position, command and age in ``state``, ``response`` those for opening and
+    closing in ``k``. A command shorter than the response is not acted on, as with a real valve.
+    """
+    before, command, age = state[position, i], state[position + 1, i], state[position + 2, i]
+    opening, closing = k[response, i], k[response + 1, i]
+    late = (opening if command > 0.5 else closing) - age
+    acts = late < h
+    state[position, i] = command if acts else before
+    state[position + 2, i] = age + h
+    return command + (before - command) * max(late, 0.0) / h if acts else before
+
+
+@inlined
+def _release(state, k, h, i):  # type: ignore[no-untyped-def]
+    """Whether blow-off lets the part go within about ``h``, or has just done so."""
+    filling = -GAMMA * state[FAR, i] * state[VESSEL, i] / state[VESSEL_MASS, i]  # Pa/s, about
+    left = k[c.AMBIENT, i] - state[VESSEL, i] - k[c.RELEASE, i]  # NaN where nothing is let go
+    soon = state[BLOW_COMMAND, i] > 0.0 and left < 1.5 * h * filling
+    return soon if state[OPEN, i] == 0.0 else state[OPEN, i] > 1.0
+
+
+@inlined
+def _opened(before, gas, commanded, k, i):  # type: ignore[no-untyped-def]
+    """Cup after a step in which the vessel's pressure rose from ``before``: 0 if still closed.
+
+    More than 1 by the share of the step that it was open already: the next one makes up for that.
+    """
+    beyond = gas.vessel - (k[c.AMBIENT, i] - k[c.RELEASE, i])
+    missed = min(beyond / max(gas.vessel - before, 1e-9), 1.0)
+    return 1.0 + missed if beyond >= 0.0 and commanded > 0.0 else 0.0
+
+
+@inlined
+def _jumps(state, k, h, i):  # type: ignore[no-untyped-def]
+    """Whether a valve moves or a cup opens within the next ``h``, or has just done so."""
+    for position, response in ((NOZZLE, c.RESPONSE), (BLOW, c.BLOW_OFF_RESPONSE)):
+        command = state[position + 1, i]
+        late = k[response if command > 0.5 else response + 1, i] - state[position + 2, i]
+        if late < h and (state[position, i] != command or late > -h):
+            return True
+    return _release(state, k, h, i)
+
+
+@inlined
+def _passes(state, k, h, i):  # type: ignore[no-untyped-def]
+    """Whether blow-off brings the port as near to ambient pressure as it moves within ``h``.
+
+    The sensor's first stage follows it, so the distance between them tells how quickly it moves.
+    """
+    moves = abs(state[PORT, i] - state[FELT, i]) / k[c.SENSOR_LAG, i] * h
+    return state[BLOWING, i] > 0.01 and abs(state[PORT, i] - k[c.AMBIENT, i]) < moves
+
+
+@compiled
+def _finer(state, k, h):  # type: ignore[no-untyped-def]
+    """In how many steps the next ``h`` is to be done, for the sake of any hypothesis."""
+    rough = 0.0
+    for i in range(state.shape[1]):
+        if _jumps(state, k, h, i) or _passes(state, k, h, i):
+            return FINEST
+        rough = max(rough, state[ROUGH, i])
+    return min(max(math.ceil(h * (rough / TOLERANCE) ** (1.0 / 3.0)), 1), FINEST)
+
+
+@compiled
+def _substep(state, k, h):  # type: ignore[no-untyped-def]
+    """Advance every hypothesis by ``h`` seconds; this is the loop that is run four at a time."""
+    for i in range(state.shape[1]):
+        nozzle = _valve(state, NOZZLE, h, k, c.RESPONSE, i)
+        blow = _valve(state, BLOW, h, k, c.BLOW_OFF_RESPONSE, i)
+        gas = Gas(
+            state[PORT, i],
+            state[PORT_MASS, i],
+            state[LINE, i],
+            state[LINE_MASS, i],
+            state[VESSEL, i],
+            state[VESSEL_MASS, i],
+            state[NEAR, i],
+            state[FAR, i],
+        )
+        lags = Lags(
+            state[DRIVE, i],
+            state[JET, i],
+            state[BLOWING, i],
+            state[SUPPLIED, i],
+            state[FELT, i],
+            state[SENSED, i],
+        )
+        before, open_cup = gas.vessel, state[OPEN, i]
+        gas, lags, off = advance_gas(gas, lags, h, (nozzle, blow, open_cup), k, i)
+        state[PORT, i], state[PORT_MASS, i] = gas.port, gas.port_mass
+        state[VESSEL, i], state[VESSEL_MASS, i] = gas.vessel, gas.vessel_mass
+        state[LINE, i], state[LINE_MASS, i] = gas.line, gas.line_mass
+        state[NEAR, i], state[FAR, i] = gas.near, gas.far
+        state[DRIVE, i], state[JET, i], state[BLOWING, i] = lags.drive, lags.jet, lags.valve
+        state[SUPPLIED, i], state[FELT, i], state[SENSED, i] = lags.supply, lags.felt, lags.sensed
+        opened = _opened(before, gas, state[BLOW_COMMAND, i], k, i)
+        state[OPEN, i] = min(open_cup, 1.0) if open_cup > 0.0 else opened
+        state[ROUGH, i] = off / (h * h * h)
+
+
+@compiled
+def _step(state, k, dt):  # type: ignore[no-untyped-def]
+    """Advance by ``dt`` seconds under the commands of the last sample."""
+    count = max(math.ceil(dt / LONGEST_STEP - 1e-6), 1)
+    h = dt / count
+    for _ in range(count):
+        finer = _finer(state, k, h)
+        for _ in range(finer):
+            _substep(state, k, h / finer)
+
+
+@compiled
+def _command(state, position, value, i):  # type: ignore[no-untyped-def]
+    if state[position + 1, i] != value:
+        state[position + 1, i] = value
+        state[position + 2, i] = 0.0
+
+
+@compiled
+def _enter(state, phase, k):  # type: ignore[no-untyped-def]
+    """Take over the phase of a sample: what it commands, and what was measured of the nozzle."""
+    for i in range(state.shape[1]):
+        before = int(state[PHASE, i])
+        if phase == before:
+            continue
+        state[PHASE, i] = phase
+        _command(state, NOZZLE, 1.0 if phase == _SUCTION else 0.0, i)
+        _command(state, BLOW, 1.0 if phase == _BLOW_OFF else 0.0, i)
+        if (before == _HOLD and phase == _SUCTION) or (before == _SUCTION and phase == _HOLD):
+            state[NOZZLE_AGE, i] = NEVER  # seen in the pressure: the valve has already acted
+        if phase == _SUCTION and before != _HOLD:
+            state[OPEN, i] = 0.0  # the next part is there
+        if phase == _IDLE and before == _BLOW_OFF and k[c.RELEASE, i] >= 0.0:
+            state[OPEN, i] = 1.0  # blow-off has let the part go, early or late
+
+
+@compiled
+def _settle(state, k, i, pressure):  # type: ignore[no-untyped-def]
+    """Let gas, sensor and supply stand at ``pressure``, as warm as the wall."""
+    temperature = k[c.TEMPERATURE, i]
+    volume = k[c.VOLUME, i] - k[c.COMPLIANCE, i] * (1.0 - pressure / k[c.AMBIENT, i])
+    state[PORT, i] = state[LINE, i] = state[VESSEL, i] = pressure
+    state[FELT, i] = state[SENSED, i] = pressure
+    state[PORT_MASS, i] = pressure * k[c.PORT_VOLUME, i] / (R * temperature)
+    state[VESSEL_MASS, i] = pressure * volume / (R * temperature)
+    state[LINE_MASS, i] = pressure * k[c.LINE_VOLUME, i] / (R * temperature)
+    state[NEAR, i] = state[FAR, i] = 0.0
+    state[SUPPLIED, i] = k[c.SUPPLY, i]
+
+
+@compiled
+def _shift(state, shift, i):  # type: ignore[no-untyped-def]
+    """Move all pressures by ``shift`` Pa at the temperatures they have."""
+    for node in (PORT, LINE, VESSEL):
+        moved = max(state[node, i] + shift, 100.0)
+        state[node + 1, i] *= moved / state[node, i]
+        state[node, i] = moved
+    state[FELT, i] += shift
+    state[SENSED, i] += shift
+
+
+@compiled
+def _synchronise(state, level, k):  # type: ignore[no-untyped-def]
+    """Set the model onto a measured ``level`` (Pa); an open cup is at ambient whatever is read."""
+    for i in range(state.shape[1]):
+        idle = state[PHASE, i] == _IDLE
+        if k[c.RELEASE, i] >= 0.0 and (idle or state[OPEN, i] > 0.0):
+            _settle(state, k, i, k[c.AMBIENT, i])
+            state[OPEN, i] = 1.0
+        elif state[VALID, i] > 0.0:
+            _shift(state, sensed_at(level, k, i) - state[SENSED, i], i)
+        else:
+            _settle(state, k, i, sensed_at(level, k, i))
+        if state[VALID, i] == 0.0:
+            state[DRIVE, i] = state[JET, i] = state[NOZZLE, i] = state[NOZZLE_COMMAND, i]
+            state[BLOWING, i] = state[BLOW, i] = state[BLOW_COMMAND, i]
+        state[VALID, i] = 1.0
+
+
+@compiled
+def _read(state, k, expected, signals):  # type: ignore[no-untyped-def]
+    """Write what each hypothesis expects, and the signals it hands out."""
+    for i in range(state.shape[1]):
+        expected[i] = reading(state[SENSED, i], k, i) if state[VALID, i] > 0.0 else math.nan
+        vacuum = k[c.AMBIENT, i] - state[PORT, i]
+        before = int(state[SIGNALS, i])
+        present = part_present(1 if before & _PART_PRESENT else 0, vacuum, k, i)
+        reached = air_saving(1 if before & _AIR_SAVING else 0, vacuum, k, i)
+        state[SIGNALS, i] = signals[i] = present * _PART_PRESENT + reached * _AIR_SAVING
+
+
+@compiled
+def _advance(state, theta, dt, phase, level, expected, signals):  # type: ignore[no-untyped-def]
+    k = prepare(theta)
+    for row in range(dt.shape[0]):
+        if dt[row] < 0.0 or dt[row] > LONGEST_BRIDGE:
+            state[VALID] = 0.0
+        elif state[VALID, 0] > 0.0 and dt[row] > 0.0:
+            _step(state, k, dt[row])
+        _enter(state, phase[row], k)
+        if not math.isnan(level[row]):
+            _synchronise(state, level[row], k)
+        _read(state, k, expected[row], signals[row])
+
+
+@compiled
+def _seen_by_control(state, k):  # type: ignore[no-untyped-def]
+    """Vacuum (Pa) at the sensor that the ejector's own control acts on."""
+    if k[c.CONTROL_SENSOR, 0] == c.PLC:
+        return k[c.AMBIENT_NOMINAL, 0] - reading(state[SENSED, 0], k, 0)
+    return k[c.AMBIENT, 0] - state[PORT, 0]
+
+
+@compiled
+def _simulate(state, control, timer, theta, dt, commands, phase, expected):  # type: ignore[no-untyped-def]
+    k, signals = prepare(theta), np.empty(1, np.uint8)
+    told = np.empty_like(commands)
+    timed(timer, commands, dt, k[c.BLOW_OFF_MODE, 0], k[c.BLOW_OFF_TIME, 0], told)
+    for row in range(dt.shape[0]):
+        if dt[row] > 0.0:
+            _step(state, k, dt[row])
+        asked = told[row] == _SUCTION_COMMAND  # blow-off wins
+        on = switch(control, asked, _seen_by_control(state, k), max(dt[row], 0.0), k)
+        now = _SUCTION if on else _HOLD if asked else _BLOW_OFF if told[row] else _IDLE
+        switched = now + int(state[PHASE, 0]) == _SUCTION + _HOLD and now != state[PHASE, 0]
+        _enter(state, now, k)
+        if switched:
+            state[NOZZLE_AGE, 0] = 0.0  # nothing was measured yet: the valve takes its response
+        phase[row] = now
+        _read(state, k, expected[row], signals)

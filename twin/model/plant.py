@@ -1,160 +1,435 @@
 """The physics of ejector, line and vessel: one right-hand side for everything that simulates.
 
-A lumped vessel with mass and energy balance and wall heat hangs behind a series resistance on the
-port, where the ejector draws and the sensor reads. Resistance stores no gas, so port pressure
-follows from the vessel's at every instant. Pressures are absolute, units SI.
+Three nodes store gas, each with mass and energy balance and wall heat: the port, where the ejector
+draws and blows, the line half-way, and the vessel with what hangs on it. The gas between them has
+friction and inertia. A node may be far smaller than the next, or a line far too short, for explicit
+steps; so a step is implicit, and what is not linear in it is solved as quadratics.
+
+Functions work on one hypothesis and have no branches; ``k`` holds prepared coefficients row by row
+and hypothesis by hypothesis, ``i`` picks one. Pressures are absolute, units SI.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from twin.model import dataset as c
-from twin.model.compiled import compiled
-from twin.model.gas import CP, GAMMA, R, orifice
+from twin.model import theta as c
+from twin.model.compiled import compiled, inlined
+from twin.model.gas import CP, GAMMA, R, opening
 
-OPEN_TIME = 2e-3  # s, in which an open cup takes ambient pressure
+# What a step needs and a call computes only once, in rows behind the coefficients.
+(_SUCTION, _END, _BLOW_OFF, _FLATTER, _HEAT, _PORT_HEAT, _LINE_HEAT, _PLACE) = range(
+    len(c.COEFFICIENTS), len(c.COEFFICIENTS) + 8
+)
+PREPARED = len(c.COEFFICIENTS) + 8
+
+# A runaway hypothesis stays a number; a node that is flushed many times in a step keeps its gas.
+LIGHTEST = 1e-15  # kg
+LOWEST, HIGHEST = 1.0, 1e7  # Pa
+COLDEST, HOTTEST = 60.0, 2000.0  # K
+MOST = 100.0  # kg/s
+FAINTEST = 1e-12  # of a jet that fades; less is none, and slow to calculate with
+
+# Alexander's SDIRK of third order: L-stable, each stage implicit in itself by the same G, the last
+# stage is the step's result (R. Alexander, SIAM J. Numer. Anal. 14, 1977). In multiples of G.
+# The stages stand at G, half-way from there to 1, and 1; _FURTHER leads from the first to the next.
+G = 0.435866521508459
+_A21 = (1.0 - G) / 2.0 / G
+_FURTHER = (1.0 + G) / 2.0 / G
+_B1 = -(6.0 * G * G - 16.0 * G + 1.0) / 4.0 / G
+_B2 = (6.0 * G * G - 20.0 * G + 5.0) / 4.0 / G
+
+
+class Gas(NamedTuple):
+    """What the three nodes store, and the flows between them."""
+
+    port: float  # Pa
+    port_mass: float  # kg
+    line: float  # Pa
+    line_mass: float  # kg
+    vessel: float  # Pa
+    vessel_mass: float  # kg
+    near: float  # kg/s, line to port
+    far: float  # kg/s, vessel to line
+
+
+class Lags(NamedTuple):
+    """What follows the valves, the supply and the pressure a little later."""
+
+    drive: float  # 0 to 1, first stage of the jet
+    jet: float  # 0 to 1
+    valve: float  # 0 to 1, of the blow-off
+    supply: float  # Pa gauge, at the nozzle
+    felt: float  # Pa, first stage of the sensor
+    sensed: float  # Pa, at the sensor
+
+
+class Driven(NamedTuple):
+    """What acts on the gas during a stage."""
+
+    jet: float  # 0 to 1
+    suction: float  # kg/s at ambient pressure in the port
+    end: float  # Pa, end pressure
+    blow_off: float  # kg/s
+    open: float  # 1 while the cup stands open
+
+
+ORDER = len(Gas._fields) + len(Lags._fields)
 
 
 @compiled
-def at_supply(theta):  # type: ignore[no-untyped-def]
-    """Suction at ambient (kg/s), end pressure (Pa) and blow-off (kg/s) at the supply in ``theta``.
+def prepare(theta):  # type: ignore[no-untyped-def]
+    """Coefficients, one column per hypothesis, with what follows from them alone below."""
+    k = np.empty((PREPARED, theta.shape[1]))
+    k[: theta.shape[0]] = theta
+    for i in range(theta.shape[1]):
+        ambient, nominal = theta[c.AMBIENT, i], theta[c.AMBIENT_NOMINAL, i]
+        off = theta[c.SUPPLY_NOMINAL, i] / theta[c.SUPPLY_OPTIMUM, i] - 1.0
+        peak = max(1.0 - theta[c.SUPPLY_CURVATURE, i] * off * off, 1e-3)
+        k[_SUCTION, i] = theta[c.SUCTION, i] * (ambient / nominal) / peak
+        k[_END, i] = theta[c.END_RATIO, i] * ambient
+        k[_BLOW_OFF, i] = theta[c.BLOW_OFF, i] / (theta[c.SUPPLY_NOMINAL, i] + nominal)
+        k[_FLATTER, i] = 1.0 / theta[c.SUPPLY_OPTIMUM, i]
+        k[_HEAT, i] = theta[c.FILM, i] * theta[c.AREA, i] / CP
+        k[_PORT_HEAT, i] = theta[c.PORT_HEAT, i] / CP
+        k[_LINE_HEAT, i] = theta[c.LINE_HEAT, i] / CP
+        suction = theta[c.SUCTION, i]
+        quadratic = theta[c.NEAR_RESISTANCE, i] + theta[c.RESISTANCE, i]
+        drop = (quadratic * suction + theta[c.NEAR_LAMINAR, i] + theta[c.LAMINAR, i]) * suction
+        k[_PLACE, i] = min(theta[c.PLACE, i] / drop, 1.0) if drop > 0.0 else 0.0
+    return k
 
-    Suction capacity peaks at the optimum supply pressure; end pressure rises when supply is
-    missing; blow-off is sonic, hence proportional to absolute supply pressure.
+
+@inlined
+def at_supply(supply, k, i):  # type: ignore[no-untyped-def]
+    """Suction at ambient (kg/s), end pressure (Pa) and blow-off (kg/s) at a supply (Pa gauge).
+
+    Suction capacity peaks at the optimum supply; end pressure rises as supply falls; blow-off is
+    sonic, hence proportional to absolute supply pressure.
     """
-    ambient, nominal = theta[c.AMBIENT], theta[c.AMBIENT_NOMINAL]
-    supply, supply_nominal = max(theta[c.SUPPLY], 0.0), theta[c.SUPPLY_NOMINAL]
-    optimum, curvature = theta[c.SUPPLY_OPTIMUM], theta[c.SUPPLY_CURVATURE]
-    peak = max(1.0 - curvature * (supply / optimum - 1.0) ** 2, 0.0)
-    peak_nominal = max(1.0 - curvature * (supply_nominal / optimum - 1.0) ** 2, 1e-3)
-    suction = theta[c.SUCTION] * (peak / peak_nominal) * (ambient / nominal)
-    end = theta[c.END_RATIO] * ambient * (1.0 + theta[c.END_SLOPE] * (supply_nominal - supply))
-    blow_off = theta[c.BLOW_OFF] * ((supply + ambient) / (supply_nominal + nominal))
+    ambient = k[c.AMBIENT, i]
+    off = supply * k[_FLATTER, i] - 1.0
+    suction = k[_SUCTION, i] * max(1.0 - k[c.SUPPLY_CURVATURE, i] * off * off, 0.0)
+    missing = k[c.SUPPLY_NOMINAL, i] - supply
+    end = k[_END, i] * (1.0 + k[c.END_SLOPE, i] * missing)
+    blow_off = k[_BLOW_OFF, i] * (supply + ambient)
     return suction, min(max(end, 0.0), 0.98 * ambient), blow_off
 
 
-@compiled
-def characteristic(x, bulge, skew):  # type: ignore[no-untyped-def]
+@inlined
+def characteristic(x, k, i):  # type: ignore[no-untyped-def]
     """Suction flow as a share of its value at ambient, and its slope, over ``x``.
 
-    ``x`` runs from 0 at end pressure to 1 at ambient. Straight (the founding paper's shape) with
-    ``bulge`` and ``skew`` zero. Below end pressure the check valve closes: no flow back.
+    ``x`` runs from 0 at end pressure to 1 at ambient. Straight (the founding paper's shape) where
+    all bends are zero. Below end pressure the check valve closes: no flow back.
     """
-    if x <= 0.0:
-        return 0.0, 0.0
-    bend = bulge + skew * x
-    share = x * (1.0 + (1.0 - x) * bend)
-    slope = 1.0 + (1.0 - 2.0 * x) * bend + x * (1.0 - x) * skew
-    return max(share, 0.0), slope
+    b0, b1, b2, b3 = k[c.BULGE, i], k[c.SKEW, i], k[c.BEND_2, i], k[c.BEND_3, i]
+    x = min(max(x, 0.0), 1.2)
+    bend = b0 + x * (b1 + x * (b2 + x * b3))
+    slope = b1 + x * (2.0 * b2 + x * 3.0 * b3)
+    share = max(x * (1.0 + (1.0 - x) * bend), 0.0)
+    rise = 1.0 + (1.0 - 2.0 * x) * bend + x * (1.0 - x) * slope
+    return share, (max(rise, 0.0) if x > 0.0 else 0.0)
+
+
+def suction_at(theta: c.Theta, p: float) -> float:
+    """Suction flow (kg/s) at port pressure ``p`` (Pa), nominal supply and full jet."""
+    return float(_suction_at(prepare(theta.reshape(-1, 1)), p))
 
 
 @compiled
-def port(p, jet, flow_in, theta, suction, end):  # type: ignore[no-untyped-def]
-    """Port pressure (Pa) and flow from vessel to port (kg/s) at vessel pressure ``p``.
+def _suction_at(k, p):  # type: ignore[no-untyped-def]
+    suction, end, _ = at_supply(k[c.SUPPLY_NOMINAL, 0], k, 0)
+    share, _ = characteristic((p - end) / (k[c.AMBIENT, 0] - end), k, 0)
+    return suction * share
 
-    The flow w is suction and exhaust (above ambient the port breathes out) less ``flow_in`` at the
-    port; only w reaches the vessel. With isothermal pipe flow, p_port² = p² − K w|w|. Each pass
-    takes the tangent w = a + b p_port and solves the quadratic exactly, so it cannot run away.
-    Without resistance the port has the vessel's pressure to the last bit.
+
+@inlined
+def at_port(p, driven, k, i):  # type: ignore[no-untyped-def]
+    """Flows out of and into the port (kg/s) at ``p``, as tangents: two each, level and slope.
+
+    Out: the ejector's suction, and above ambient the exhaust. A jet that is still building up draws
+    neither as much nor as deep. In: blow-off, and back-flow through a leaking check valve while the
+    nozzle is off.
     """
-    ambient, resistance = theta[c.AMBIENT], theta[c.RESISTANCE]
-    span = ambient - end
-    p_port, a, b = p, 0.0, 0.0
-    floor = min(p, end + 1e-6 * span)  # the ejector draws no deeper, whatever a tangent says
-    for _ in range(4):
-        share, slope = characteristic((p_port - end) / span, theta[c.BULGE], theta[c.SKEW])
-        b = max(jet * suction * slope / span, 0.0)
-        a = jet * suction * share - b * p_port - flow_in
-        if p_port > ambient:
-            a -= theta[c.RELIEF] * ambient
-            b += theta[c.RELIEF]
-        if resistance == 0.0:
-            return p, a + b * p
-        sign = resistance if a + b * p >= 0.0 else -resistance
-        root = math.sqrt(max(p * p + sign * (b * b * p * p - a * a), 1.0))
-        p_port = max((p * p - sign * a * a) / (sign * a * b + root), floor)
-    return p_port, a + b * p_port
+    ambient = k[c.AMBIENT, i]
+    span = ambient - driven.end
+    share, rise = characteristic(driven.jet - (ambient - p) / span, k, i)
+    out_slope = driven.jet * driven.suction * rise / span
+    out = driven.jet * driven.suction * share - out_slope * p
+    relief = k[c.RELIEF, i]
+    relief = relief if p > ambient else 0.0
+    share, rise = opening(p, ambient)
+    back = k[c.BACK_FLOW, i] * (1.0 - min(driven.jet, 1.0))
+    back = back if p < ambient else 0.0
+    return (
+        out - relief * ambient,
+        out_slope + relief,
+        driven.blow_off + back * (share - rise * p),
+        back * rise,
+    )
 
 
-@compiled
-def rates(y, open_cup, nozzle, blow, theta, supplied, dy):  # type: ignore[no-untyped-def]
-    """Write d/dt of ``y`` = pressure, temperature, jet, blow-off valve, sensor into ``dy``.
+@inlined
+def at_vessel(p, driven, k, i):  # type: ignore[no-untyped-def]
+    """Flow from ambient into the vessel (kg/s) at ``p``, as a tangent: level and slope.
 
-    ``nozzle`` and ``blow`` are the valve positions (0 to 1), ``supplied`` the result of
-    ``at_supply``. Mass and energy balance of an ideal gas in a volume that shrinks linearly with
-    vacuum: dp/dt (V + γ p dV/dp) = (γ − 1)(Σ w cp T + Q).
+    An opening, a porous part, and the rim of a cup without a part.
     """
-    p, temperature, jet, valve, sensed = y[0], y[1], y[2], y[3], y[4]
-    ambient, outside = theta[c.AMBIENT], theta[c.TEMPERATURE]
-    suction, end, blow_off = supplied
-
-    flow_back = 0.0
-    if theta[c.BACK_FLOW] > 0.0 and p < ambient:
-        flow_back = theta[c.BACK_FLOW] * (1.0 - min(jet, 1.0)) * orifice(p / ambient)
-    p_port, through = port(p, jet, blow_off * valve + flow_back, theta, suction, end)
-
-    flow_in = theta[c.LAMINAR_LEAK] * (ambient - p) + max(-through, 0.0)
-    if p < ambient:
-        flow_in += theta[c.LEAK] * orifice(p / ambient)
-    flow_out = max(through, 0.0)
-
-    volume = theta[c.VOLUME] - theta[c.COMPLIANCE] * (1.0 - p / ambient)
-    stretch = theta[c.COMPLIANCE] / ambient
-    heat = theta[c.FILM] * theta[c.AREA] * (outside - temperature)
-    enthalpy = CP * (flow_in * outside - flow_out * temperature)
-    dp = (GAMMA - 1.0) * (enthalpy + heat) / (volume + GAMMA * p * stretch)
-    mass = p * volume / (R * temperature)
-    dtemperature = temperature * (dp / p + stretch * dp / volume - (flow_in - flow_out) / mass)
-    if open_cup > 0.0:
-        dp = (ambient - p) / OPEN_TIME
-        dtemperature = (flow_in * (outside - temperature) + heat / CP) / mass
-
-    dy[0] = dp
-    dy[1] = dtemperature
-    dy[2] = (nozzle - jet) / (theta[c.RAMP_UP] if nozzle > jet else theta[c.RAMP_DOWN])
-    dy[3] = (blow - valve) / theta[c.BLOW_OFF_RAMP]
-    dy[4] = (p_port - sensed) / theta[c.SENSOR_LAG]
+    ambient = k[c.AMBIENT, i]
+    laminar = k[c.LAMINAR_LEAK, i] + driven.open * k[c.OPENING, i]
+    share, rise = opening(p, ambient)
+    slope = k[c.LEAK, i] * rise - laminar
+    return k[c.LEAK, i] * (share - rise * p) + laminar * ambient, slope
 
 
-@compiled
-def reading(sensed, theta):  # type: ignore[no-untyped-def]
+@inlined
+def through(rest, fall, before, rise, quadratic, linear, pushed):  # type: ignore[no-untyped-def]
+    """Flow w (kg/s) through a line between two pressures that are linear in it.
+
+    From ``rest − fall w`` to ``before + rise w``, against friction and inertia; isothermal pipe
+    flow, p₁² − p₂² = K w |w| + L w − pushed, where inertia adds (p₁ + p₂) I / step to L and, times
+    the flow before, is what ``pushed``. Gas that is warm is thin: K and L grow with temperature.
+    """
+    difference = rest * rest - before * before + pushed
+    friction = quadratic if difference >= 0.0 else -quadratic
+    square = fall * fall - rise * rise - friction
+    slope = 2.0 * (rest * fall + before * rise) + linear
+    root = math.sqrt(max(slope * slope - 4.0 * square * difference, 0.0))
+    return 2.0 * difference / (slope + root)
+
+
+@inlined
+def kept(mass, work):  # type: ignore[no-untyped-def]
+    """Mass (kg) within what pressure times volume (J) allows for."""
+    return min(max(mass, work / (R * HOTTEST)), work / (R * COLDEST))
+
+
+@inlined
+def temperatures(y, known, step, entering, drawn, k, i):  # type: ignore[no-untyped-def]
+    """Gas temperatures (K) of port, line and vessel, at which it leaves them.
+
+    Port's and line's follow from their balances, the port's with what is ``entering`` and ``drawn``
+    (kg/s): a small node is flushed many times in a step, and p V / (m R) would swing from pass to
+    pass.
+    """
+    outside, per_pa = k[c.TEMPERATURE, i], 1.0 / (GAMMA * R * step)
+    volume = k[c.VOLUME, i] - k[c.COMPLIANCE, i] / k[c.AMBIENT, i] * (k[c.AMBIENT, i] - y.vessel)
+    vessel_t = y.vessel * volume / (R * y.vessel_mass)
+    line_t = y.line * k[c.LINE_VOLUME, i] / (R * y.line_mass)
+    held = k[c.PORT_VOLUME, i] * per_pa * known.port + (entering + k[_PORT_HEAT, i]) * outside
+    leaving = y.port_mass / (GAMMA * step) + drawn + k[_PORT_HEAT, i]
+    port_t = (held + max(y.near, 0.0) * line_t) / (leaving + max(-y.near, 0.0))
+    held = k[c.LINE_VOLUME, i] * per_pa * known.line + k[_LINE_HEAT, i] * outside
+    held += max(y.far, 0.0) * vessel_t + max(-y.near, 0.0) * port_t
+    leaving = y.line_mass / (GAMMA * step) + k[_LINE_HEAT, i]
+    return port_t, held / (leaving + max(y.near, 0.0) + max(-y.far, 0.0)), vessel_t
+
+
+@inlined
+def solve(y, known, step, driven, k, i):  # type: ignore[no-untyped-def]
+    """One pass over the balances of all nodes: ``y`` is the guess, ``known`` what came before.
+
+    Mass and energy of an ideal gas: V dp/dt = γ R Σ w T + (γ − 1) Q, and with a volume that shrinks
+    in proportion to vacuum (V + γ p dV/dp) in place of V. So each pressure is linear in the flows;
+    the near flow is made a tangent over the line's pressure, the far one is solved for.
+    """
+    ambient, outside = k[c.AMBIENT, i], k[c.TEMPERATURE, i]
+    per_pa = 1.0 / (GAMMA * R * step)
+    out, out_slope, blown, blown_slope = at_port(y.port, driven, k, i)
+    leak, leak_slope = at_vessel(y.vessel, driven, k, i)
+    stretch = k[c.COMPLIANCE, i] / ambient
+    volume = k[c.VOLUME, i] - stretch * (ambient - y.vessel)
+    port_stored, line_stored = k[c.PORT_VOLUME, i] * per_pa, k[c.LINE_VOLUME, i] * per_pa
+    vessel_stored = (volume + GAMMA * y.vessel * stretch) * per_pa
+    warmth, port_warmth, line_warmth = k[_HEAT, i], k[_PORT_HEAT, i], k[_LINE_HEAT, i]
+
+    entering, drawn = blown + blown_slope * y.port, max(out + out_slope * y.port, 0.0)
+    port_t, line_t, vessel_t = temperatures(y, known, step, entering, drawn, k, i)
+    near_t = line_t if y.near >= 0.0 else port_t
+    far_t = vessel_t if y.far >= 0.0 else line_t
+    leak_t = outside if y.vessel <= ambient else vessel_t
+
+    # Pressures as rest and slope over the flows.
+    cooling = port_warmth * k[c.PORT_VOLUME, i] / (R * y.port_mass)
+    weight = 1.0 / (port_stored + out_slope * port_t - blown_slope * outside + cooling)
+    gained = port_stored * known.port + (blown + port_warmth) * outside - out * port_t
+    port_rest, port_rise = gained * weight, near_t * weight
+    cooling = line_warmth * k[c.LINE_VOLUME, i] / (R * y.line_mass)
+    weight = 1.0 / (line_stored + cooling)
+    line_rest = (line_stored * known.line + line_warmth * outside) * weight
+    line_fall, line_rise = near_t * weight, far_t * weight
+    cooling = warmth * volume / (R * y.vessel_mass)
+    weight = 1.0 / (vessel_stored - leak_slope * leak_t + cooling)
+    gained = vessel_stored * known.vessel + leak * leak_t + warmth * outside
+    vessel_rest, vessel_fall = gained * weight, far_t * weight
+
+    inertia = k[c.NEAR_INERTANCE, i] * (y.line + y.port) / step
+    warm = near_t / outside
+    quadratic, linear = warm * k[c.NEAR_RESISTANCE, i], warm * k[c.NEAR_LAMINAR, i] + inertia
+    pushed = inertia * known.near
+    near = through(y.line, 0.0, port_rest, port_rise, quadratic, linear, pushed)
+    slope = 2.0 * (port_rise * (port_rest + port_rise * near) + quadratic * abs(near)) + linear
+    near_slope = 2.0 * y.line / slope
+    near -= near_slope * y.line
+    weight = 1.0 / (1.0 + line_fall * near_slope)
+    line_rest, line_rise = (line_rest - line_fall * near) * weight, line_rise * weight
+
+    inertia = k[c.INERTANCE, i] * (y.vessel + y.line) / step
+    warm = far_t / outside
+    quadratic, linear = warm * k[c.RESISTANCE, i], warm * k[c.LAMINAR, i] + inertia
+    pushed = inertia * known.far
+    far = through(vessel_rest, vessel_fall, line_rest, line_rise, quadratic, linear, pushed)
+
+    line = min(max(line_rest + line_rise * far, LOWEST), HIGHEST)
+    vessel = min(max(vessel_rest - vessel_fall * far, LOWEST), HIGHEST)
+    near += near_slope * line
+    port = min(max(port_rest + port_rise * near, LOWEST), HIGHEST)
+    net = near - (out + out_slope * port) + blown + blown_slope * port
+    return Gas(
+        port,
+        kept(known.port_mass + step * net, port * k[c.PORT_VOLUME, i]),
+        line,
+        kept(known.line_mass + step * (far - near), line * k[c.LINE_VOLUME, i]),
+        vessel,
+        kept(known.vessel_mass + step * (leak + leak_slope * vessel - far), vessel * volume),
+        min(max(near, -MOST), MOST),
+        min(max(far, -MOST), MOST),
+    )
+
+
+@inlined
+def lag(known, target, ratio):  # type: ignore[no-untyped-def]
+    """Implicit stage of a first-order lag; ``ratio`` is the step over the time constant."""
+    return (known + ratio * target) / (1.0 + ratio)
+
+
+@inlined
+def stage(guess, known, lags, step, valves, far_off, k, i):  # type: ignore[no-untyped-def]
+    """Solve one implicit stage of ``step`` seconds from ``known`` gas and ``lags``.
+
+    A pass brings the guess nearer by about one order in the step, so a ``far_off`` guess, which is
+    no more than where the step began, takes three for a scheme of third order, others two.
+    ``valves`` are the positions of nozzle and blow-off valve and whether the cup stands open, each
+    0 to 1. The jet builds up in two stages: the valve opens, then the jet gathers strength.
+    """
+    nozzle, blow, open_cup = valves
+    rise, fall = k[c.RAMP_UP, i], k[c.RAMP_DOWN, i]
+    first = rise + k[c.SLOW_RAMP_UP, i]
+    rising = nozzle > lags.drive
+    drive = lag(lags.drive, nozzle, step / (first if rising else fall))
+    jet = lag(lags.jet, drive, step / (rise if rising else fall))
+    valve = lag(lags.valve, blow, step / k[c.BLOW_OFF_RAMP, i])
+    regulated = max(k[c.SUPPLY, i] - k[c.DROOP, i] * max(nozzle, blow), 0.0)
+    supply = lag(lags.supply, regulated, step / k[c.SUPPLY_LAG, i])
+    suction, end, blow_off = at_supply(supply, k, i)
+    driven = Driven(jet, suction, end, blow_off * valve, open_cup)
+    gas = solve(guess, known, step, driven, k, i)
+    gas = solve(gas, known, step, driven, k, i)
+    if far_off:
+        gas = solve(gas, known, step, driven, k, i)
+    there = gas.port + k[_PLACE, i] * (gas.vessel - gas.port)
+    slow = k[c.SENSOR_LAG, i]
+    felt = lag(lags.felt, there, step / slow)
+    sensed = lag(lags.sensed, felt, step / (slow + k[c.SLOW_SENSOR, i]))
+    return gas, Lags(drive, jet, valve, supply, felt, sensed)
+
+
+@inlined
+def gas_on(start, begin, end, share):  # type: ignore[no-untyped-def]
+    """Go on from ``start`` by a ``share`` of the way from ``begin`` to ``end``."""
+    return Gas(
+        start.port + share * (end.port - begin.port),
+        start.port_mass + share * (end.port_mass - begin.port_mass),
+        start.line + share * (end.line - begin.line),
+        start.line_mass + share * (end.line_mass - begin.line_mass),
+        start.vessel + share * (end.vessel - begin.vessel),
+        start.vessel_mass + share * (end.vessel_mass - begin.vessel_mass),
+        start.near + share * (end.near - begin.near),
+        start.far + share * (end.far - begin.far),
+    )
+
+
+@inlined
+def lags_on(start, begin, end, share):  # type: ignore[no-untyped-def]
+    """As ``gas_on``."""
+    return Lags(
+        start.drive + share * (end.drive - begin.drive),
+        start.jet + share * (end.jet - begin.jet),
+        start.valve + share * (end.valve - begin.valve),
+        start.supply + share * (end.supply - begin.supply),
+        start.felt + share * (end.felt - begin.felt),
+        start.sensed + share * (end.sensed - begin.sensed),
+    )
+
+
+@inlined
+def positive(gas):  # type: ignore[no-untyped-def]
+    """Gas that went on too far, brought back to where there is a pressure and a mass."""
+    return Gas(
+        max(gas.port, LOWEST),
+        max(gas.port_mass, LIGHTEST),
+        max(gas.line, LOWEST),
+        max(gas.line_mass, LIGHTEST),
+        max(gas.vessel, LOWEST),
+        max(gas.vessel_mass, LIGHTEST),
+        gas.near,
+        gas.far,
+    )
+
+
+@inlined
+def advance(gas, lags, h, valves, k, i):  # type: ignore[no-untyped-def]
+    """Gas and lags after ``h`` seconds, and how far (Pa) a scheme of second order is from them.
+
+    The stages stand at equal distances, so that is the second difference of what each adds.
+    """
+    step = G * h
+    gas_1, lags_1 = stage(gas, gas, lags, step, valves, True, k, i)
+    known, held = gas_on(gas, gas, gas_1, _A21), lags_on(lags, lags, lags_1, _A21)
+    guess = positive(gas_on(gas, gas, gas_1, _FURTHER))
+    gas_2, lags_2 = stage(guess, known, held, step, valves, False, k, i)
+    last = gas_on(gas_on(gas, gas, gas_1, _B1), known, gas_2, _B2)
+    late = lags_on(lags_on(lags, lags, lags_1, _B1), held, lags_2, _B2)
+    guess = positive(gas_on(gas_1, gas_1, gas_2, 2.0))
+    gas_3, lags_3 = stage(guess, last, late, step, valves, False, k, i)
+    off = (
+        bent(gas_1.port - gas.port, gas_2.port - known.port, gas_3.port - last.port),
+        bent(gas_1.vessel - gas.vessel, gas_2.vessel - known.vessel, gas_3.vessel - last.vessel),
+        bent(lags_1.sensed - lags.sensed, lags_2.sensed - held.sensed, lags_3.sensed - late.sensed),
+    )
+    return gas_3, ended(lags_3), max(off[0], off[1], off[2])
+
+
+@inlined
+def ended(lags):  # type: ignore[no-untyped-def]
+    """What has faded away, or a little beyond by the scheme's doing, is gone."""
+    return Lags(
+        lags.drive if lags.drive > FAINTEST else 0.0,
+        lags.jet if lags.jet > FAINTEST else 0.0,
+        lags.valve if lags.valve > FAINTEST else 0.0,
+        lags.supply,
+        lags.felt,
+        lags.sensed,
+    )
+
+
+@inlined
+def bent(first, second, third):  # type: ignore[no-untyped-def]
+    """Size of the second difference."""
+    return abs(first - 2.0 * second + third)
+
+
+@inlined
+def reading(sensed, theta, i):  # type: ignore[no-untyped-def]
     """Absolute pressure the PLC reads (Pa); span and offset errors act on what is sensed."""
-    vacuum = theta[c.AMBIENT] - sensed
-    return sensed - (theta[c.SENSOR_GAIN] - 1.0) * vacuum + theta[c.SENSOR_OFFSET]
+    vacuum = theta[c.AMBIENT, i] - sensed
+    return sensed - (theta[c.SENSOR_GAIN, i] - 1.0) * vacuum + theta[c.SENSOR_OFFSET, i]
 
 
-@compiled
-def sensed_at(value, theta):  # type: ignore[no-untyped-def]
+@inlined
+def sensed_at(value, theta, i):  # type: ignore[no-untyped-def]
     """Pressure (Pa) at the sensor when it reads ``value``: the inverse of ``reading``."""
-    gain = theta[c.SENSOR_GAIN]
-    return (value - theta[c.SENSOR_OFFSET] + (gain - 1.0) * theta[c.AMBIENT]) / gain
-
-
-WORK = 5  # rows of scratch that ``runge_kutta`` needs
-ORDER = 5  # length of the continuous state
-
-
-@compiled
-def runge_kutta(y, h, open_cup, nozzle, blow, theta, supplied, work):  # type: ignore[no-untyped-def]
-    """Advance the first ``ORDER`` entries of ``y`` by ``h`` seconds, classical fourth order."""
-    k1, k2, k3, k4, mid = work[0], work[1], work[2], work[3], work[4]
-    rates(y, open_cup, nozzle, blow, theta, supplied, k1)
-    for i in range(ORDER):
-        mid[i] = y[i] + 0.5 * h * k1[i]
-    rates(mid, open_cup, nozzle, blow, theta, supplied, k2)
-    for i in range(ORDER):
-        mid[i] = y[i] + 0.5 * h * k2[i]
-    rates(mid, open_cup, nozzle, blow, theta, supplied, k3)
-    for i in range(ORDER):
-        mid[i] = y[i] + h * k3[i]
-    rates(mid, open_cup, nozzle, blow, theta, supplied, k4)
-    for i in range(ORDER):
-        y[i] += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
-    y[0] = max(y[0], 1.0)  # a runaway hypothesis stays a number
-    y[1] = min(max(y[1], 100.0), 1000.0)
-
-
-def scratch() -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    """Room for the stages of one step."""
-    return np.empty((WORK, ORDER))
+    gain = theta[c.SENSOR_GAIN, i]
+    return (value - theta[c.SENSOR_OFFSET, i] + (gain - 1.0) * theta[c.AMBIENT, i]) / gain

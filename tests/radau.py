@@ -1,0 +1,190 @@
+"""The model's equations once more, plainly, for SciPy's Radau: what the kernel must meet."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.integrate import solve_ivp
+
+from twin.model import theta as c
+from twin.model.theta import Theta
+
+R, GAMMA = 287.05, 1.4
+CP = GAMMA * R / (GAMMA - 1.0)
+CRITICAL, LAMINAR = 0.528, 0.999
+
+Floats = npt.NDArray[np.float64]
+
+
+def psi(ratio: float) -> float:
+    """ISO 6358 flow function, straight near 1."""
+    if ratio <= CRITICAL:
+        return 1.0
+    bent = (min(ratio, LAMINAR) - CRITICAL) / (1.0 - CRITICAL)
+    root = float(np.sqrt(1.0 - bent**2))
+    return root if ratio <= LAMINAR else root * (1.0 - ratio) / (1.0 - LAMINAR)
+
+
+def through_hole(sonic: float, p: float, ambient: float) -> float:
+    """Flow inwards (kg/s)."""
+    if p <= ambient:
+        return sonic * psi(p / ambient)
+    return -sonic * p / ambient * psi(ambient / p)
+
+
+@dataclass(frozen=True)
+class Valves:
+    """Positions of nozzle and blow-off valve from a time on, and whether the cup stands open.
+
+    The cup is as before where ``open`` is None; while blow-off is on it opens by itself at the
+    vacuum that lets the part go.
+    """
+
+    time: float
+    nozzle: float
+    blow: float
+    open: float | None = None
+
+
+def suction_flow(theta: Theta, p: float, jet: float, supply: float) -> float:
+    def peak(at: float) -> float:
+        off = at / theta[c.SUPPLY_OPTIMUM] - 1.0
+        return max(1.0 - theta[c.SUPPLY_CURVATURE] * off**2, 0.0)
+
+    ambient = theta[c.AMBIENT]
+    capacity = theta[c.SUCTION] * peak(supply) / peak(theta[c.SUPPLY_NOMINAL])
+    capacity *= ambient / theta[c.AMBIENT_NOMINAL]
+    missing = theta[c.SUPPLY_NOMINAL] - supply
+    end = theta[c.END_RATIO] * ambient * (1.0 + theta[c.END_SLOPE] * missing)
+    end = min(max(end, 0.0), 0.98 * ambient)
+    x = min(max(jet - (ambient - p) / (ambient - end), 0.0), 1.2)
+    bend = np.polyval(theta[[c.BEND_3, c.BEND_2, c.SKEW, c.BULGE]], x)
+    return float(jet * capacity * max(x * (1.0 + (1.0 - x) * bend), 0.0))
+
+
+def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:  # noqa: PLR0915
+    """d/dt of three pressures, three masses, two flows, drive, jet, valve, supply, sensor."""
+    port, line, vessel, port_mass, line_mass, vessel_mass, near, far = y[:8]
+    drive, jet, valve, supply, felt, sensed = y[8:]
+    ambient, outside = theta[c.AMBIENT], theta[c.TEMPERATURE]
+    shrunk = theta[c.COMPLIANCE] * (1.0 - vessel / ambient)
+    volume = theta[c.VOLUME] - shrunk
+    port_t = port * theta[c.PORT_VOLUME] / (R * port_mass)
+    line_t = line * theta[c.LINE_VOLUME] / (R * line_mass)
+    vessel_t = vessel * volume / (R * vessel_mass)
+
+    stiff = theta[c.NEAR_INERTANCE] == 0.0  # then port and line are one node, and far is friction
+    if stiff:
+        difference = vessel**2 - port**2
+        warm = (vessel_t if difference >= 0.0 else line_t) / outside
+        linear, quadratic = warm * theta[c.LAMINAR], warm * theta[c.RESISTANCE]
+        root = np.sqrt(linear**2 + 4.0 * quadratic * abs(difference))
+        far = 2.0 * difference / (linear + root)
+
+    out = suction_flow(theta, port, jet, supply)
+    out += theta[c.RELIEF] * max(port - ambient, 0.0)
+    blown = valve * theta[c.BLOW_OFF] * (supply + ambient)
+    blown /= theta[c.SUPPLY_NOMINAL] + theta[c.AMBIENT_NOMINAL]
+    if port < ambient:
+        blown += through_hole(theta[c.BACK_FLOW] * (1.0 - min(jet, 1.0)), port, ambient)
+    seep = theta[c.LAMINAR_LEAK] + (valves.open or 0.0) * theta[c.OPENING]
+    leak = through_hole(theta[c.LEAK], vessel, ambient) + seep * (ambient - vessel)
+
+    far_t = vessel_t if far >= 0.0 else line_t
+    leak_t = outside if vessel <= ambient else vessel_t
+    port_gain = CP * (blown * outside - out * port_t) + theta[c.PORT_HEAT] * (outside - port_t)
+    line_gain = CP * far * far_t + theta[c.LINE_HEAT] * (outside - line_t)
+    if stiff:
+        near = _that_keeps_them_equal(theta, port_gain, line_gain, line_t, port_t)
+    near_t = line_t if near >= 0.0 else port_t
+    port_gain += CP * near * near_t
+    line_gain -= CP * near * near_t
+    into_vessel = CP * (leak * leak_t - far * far_t)
+    into_vessel += theta[c.FILM] * theta[c.AREA] * (outside - vessel_t)
+    stretch = theta[c.COMPLIANCE] / ambient
+
+    rising = valves.nozzle > drive
+    rise, fall = theta[c.RAMP_UP], theta[c.RAMP_DOWN]
+    first, second = (rise + theta[c.SLOW_RAMP_UP], rise) if rising else (fall, fall)
+    regulated = theta[c.SUPPLY] - theta[c.DROOP] * max(valves.nozzle, valves.blow)
+    suction = theta[c.SUCTION]
+    drop = (theta[c.NEAR_RESISTANCE] + theta[c.RESISTANCE]) * suction**2
+    drop += (theta[c.NEAR_LAMINAR] + theta[c.LAMINAR]) * suction
+    there = port + (min(theta[c.PLACE] / drop, 1.0) if drop > 0.0 else 0.0) * (vessel - port)
+    pushes = (0.0, 0.0)
+    if not stiff:
+        rub = (theta[c.NEAR_RESISTANCE] * abs(near) + theta[c.NEAR_LAMINAR]) * near
+        rub *= near_t / outside
+        near_push = (line**2 - port**2 - rub) / (theta[c.NEAR_INERTANCE] * (line + port))
+        rub = (theta[c.RESISTANCE] * abs(far) + theta[c.LAMINAR]) * far * far_t / outside
+        pushes = near_push, (vessel**2 - line**2 - rub) / (theta[c.INERTANCE] * (vessel + line))
+    return np.array(
+        [
+            (GAMMA - 1.0) * port_gain / theta[c.PORT_VOLUME],
+            (GAMMA - 1.0) * line_gain / theta[c.LINE_VOLUME],
+            (GAMMA - 1.0) * into_vessel / (volume + GAMMA * vessel * stretch),
+            near - out + blown,
+            far - near,
+            leak - far,
+            *pushes,
+            (valves.nozzle - drive) / first,
+            (drive - jet) / second,
+            (valves.blow - valve) / theta[c.BLOW_OFF_RAMP],
+            (regulated - supply) / theta[c.SUPPLY_LAG],
+            (there - felt) / theta[c.SENSOR_LAG],
+            (felt - sensed) / (theta[c.SENSOR_LAG] + theta[c.SLOW_SENSOR]),
+        ]
+    )
+
+
+def _that_keeps_them_equal(
+    theta: Theta, port_gain: float, line_gain: float, line_t: float, port_t: float
+) -> float:
+    """Flow from line to port that lets both pressures change alike: nothing resists it."""
+    port, line = theta[c.PORT_VOLUME], theta[c.LINE_VOLUME]
+    heat = (line_gain * port - port_gain * line) / (port + line)
+    return heat / (CP * (line_t if heat >= 0.0 else port_t))
+
+
+def at_rest(theta: Theta) -> Floats:
+    ambient, gas = theta[c.AMBIENT], R * theta[c.TEMPERATURE]
+    masses = ambient * theta[[c.PORT_VOLUME, c.LINE_VOLUME, c.VOLUME]] / gas
+    return np.array([*[ambient] * 3, *masses, *[0.0] * 5, theta[c.SUPPLY], *[ambient] * 2])
+
+
+def reference(theta: Theta, moves: Sequence[Valves], times: Floats) -> Floats:
+    """Run from rest through the moves (the first at the beginning); rows of states at ``times``.
+
+    A cup that blow-off opens (``RELEASE`` is not NaN) stands open from the very crossing on.
+    """
+
+    def closed(_t: float, y: Floats, *_: object) -> float:
+        return float(theta[c.AMBIENT] - y[2] - theta[c.RELEASE])
+
+    closed.terminal = True  # type: ignore[attr-defined]
+    y, rows, is_open = at_rest(theta), [], 0.0
+    size = np.array([*[1e5] * 3, 1e-6, 1e-6, 1e-4, *[1e-3] * 2, *[1.0] * 3, *[1e5] * 3])
+    for move, end in zip(moves, [*(move.time for move in moves[1:]), times[-1]], strict=True):
+        begin = move.time
+        is_open = is_open if move.open is None else move.open
+        while begin < end:
+            lets_go = move.blow > 0.0 and is_open == 0.0 and theta[c.RELEASE] >= 0.0
+            found = solve_ivp(
+                rates,
+                (begin, end),
+                y,
+                "Radau",
+                np.unique(np.append(times[(times > begin) & (times <= end)], end)),
+                events=closed if lets_go else None,
+                rtol=1e-10,
+                atol=1e-10 * size,
+                args=(theta, replace(move, open=is_open)),
+                max_step=5e-3,
+            )
+            assert found.success
+            rows += [y for t, y in zip(found.t, found.y.T, strict=True) if t in times]
+            y, begin = found.y[:, -1], end
+            if found.status == 1:
+                y, begin, is_open = found.y_events[0][0], found.t_events[0][0], 1.0
+    return np.array(rows)

@@ -1,0 +1,113 @@
+"""How an effect runs in time: constant, step, ramp or intermittent, for every effect alike.
+
+A cause is an effect with a course. Causes turn into coefficients that hold from one row of a log on
+to the next change; the kernel itself knows no time.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from twin.errors import ConfigError
+from twin.model.effects import EFFECTS, apply
+from twin.model.theta import Theta
+
+HOUR = 3600.0  # s
+RAMP_STEP = 0.2  # s after which a ramp's coefficients are set anew
+
+# How coefficients run in time: from which row on which ones hold; the first at row 0.
+Schedule = list[tuple[int, Theta]]
+
+
+class Course(StrEnum):
+    """How an effect runs in time."""
+
+    CONSTANT = "constant"
+    STEP = "step"
+    RAMP = "ramp"
+    INTERMITTENT = "intermittent"
+
+
+MEANING = {
+    Course.CONSTANT: "it is there from beginning to end",
+    Course.STEP: "it begins at `onset_s` and stays",
+    Course.RAMP: "it grows from `onset_s` on; its size is a rate per hour",
+    Course.INTERMITTENT: "it is there in some cycles: their share, and which",
+}
+
+
+@dataclass(frozen=True)
+class Cause:
+    """An effect of some size with its course; a ramp's ``values`` are its change per hour."""
+
+    effect: str
+    values: Mapping[str, float]
+    course: Course = Course.CONSTANT
+    onset_s: float = 0.0  # of step and ramp, since the first row
+    cycles: frozenset[int] = frozenset()  # of an intermittent one
+
+    def at(self, theta: Theta, second: float, cycle: int) -> Mapping[str, float]:
+        """Values of the parameters at a time in a cycle; empty where it does not act."""
+        if self.course == Course.INTERMITTENT:
+            return self.values if cycle in self.cycles else {}
+        if self.course == Course.CONSTANT:
+            return self.values
+        if second < self.onset_s:
+            return {}
+        if self.course == Course.STEP:
+            return self.values
+        grown = {}
+        for parameter in EFFECTS[self.effect].parameters:
+            rate = self.values.get(parameter.name, 0.0)
+            value = parameter.neutral(theta) + rate * (second - self.onset_s) / HOUR
+            grown[parameter.name] = min(max(value, parameter.low), parameter.high)
+        return grown
+
+
+def schedule(
+    theta: Theta,
+    causes: Sequence[Cause],
+    seconds: npt.NDArray[np.float64],
+    cycles: npt.NDArray[np.int64],
+) -> Schedule:
+    """Coefficients over the rows of a log, given the time and the cycle of each.
+
+    ``seconds`` rise from 0. ConfigError for an unknown effect, parameter or course, and for a value
+    out of bounds.
+    """
+    found: Schedule = []
+    for row in _changes(causes, seconds, cycles):
+        now = theta
+        for cause in causes:
+            now = apply(now, cause.effect, cause.at(now, float(seconds[row]), int(cycles[row])))
+        found.append((row, now))
+    return found
+
+
+def _changes(
+    causes: Sequence[Cause], seconds: npt.NDArray[np.float64], cycles: npt.NDArray[np.int64]
+) -> list[int]:
+    """Rows at which any cause changes, row 0 first."""
+    rows = {0}
+    for cause in causes:
+        if cause.effect not in EFFECTS:
+            raise ConfigError(f"unknown effect {cause.effect!r}", "twin effects lists them")
+        times: npt.NDArray[np.float64] = np.empty(0)
+        if cause.course == Course.STEP:
+            times = np.array([cause.onset_s])
+        elif cause.course == Course.RAMP and len(seconds):
+            times = np.arange(cause.onset_s, seconds[-1], RAMP_STEP)
+        elif cause.course == Course.INTERMITTENT:
+            rows |= set((np.flatnonzero(np.diff(cycles)) + 1).tolist())
+        rows |= set(np.searchsorted(seconds, times).tolist())
+    return sorted(row for row in rows if row < len(seconds))
+
+
+def table() -> str:
+    """The table of courses in Markdown, as the README has it and ``twin effects`` prints it."""
+    lines = ["| course | how an effect runs in time |", "| --- | --- |"]
+    lines += [f"| `{course}` | {MEANING[course]} |" for course in Course]
+    return "\n".join(lines)

@@ -1,0 +1,144 @@
+"""The model's coefficients: a vector in SI units, by name.
+
+The kernel works on it, a data set is turned into it, effects change it.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+# The coefficients by name; the kernel and the effects index the vector with these numbers.
+COEFFICIENTS = (
+    "AMBIENT",  # Pa
+    "AMBIENT_NOMINAL",  # Pa, at which suction capacity was measured
+    "TEMPERATURE",  # K, of ambient, wall and supply air
+    "SUPPLY",  # Pa gauge, at the regulator
+    "DROOP",  # Pa less at the nozzle while a valve is open
+    "SUPPLY_LAG",  # s, of the supply line
+    "SUPPLY_NOMINAL",  # Pa gauge at the nozzle, at which suction capacity and end pressure hold
+    "SUPPLY_OPTIMUM",  # Pa gauge, where suction capacity peaks
+    "SUPPLY_CURVATURE",  # -, how sharply it peaks
+    "END_SLOPE",  # 1/Pa, relative rise of end pressure per drop of supply
+    "SUCTION",  # kg/s at ambient pressure in the port
+    "END_RATIO",  # -, end pressure over ambient
+    "BULGE",  # -, how far the characteristic bulges above a straight line
+    "SKEW",  # -, and towards which end
+    "BEND_2",  # -, finer
+    "BEND_3",  # -, and finer still
+    "RESPONSE",  # s, from the command to the valve's action
+    "RESPONSE_OFF",  # s, the same for its end
+    "RAMP_UP",  # s, time constant of each of the jet's two stages
+    "SLOW_RAMP_UP",  # s more, of the first one
+    "RAMP_DOWN",  # s, of each stage in its collapse
+    "BLOW_OFF",  # kg/s at nominal supply
+    "BLOW_OFF_RESPONSE",  # s
+    "BLOW_OFF_RESPONSE_OFF",  # s
+    "BLOW_OFF_RAMP",  # s, time constant of the blow-off valve
+    "RELIEF",  # kg/(s Pa), out through the exhaust while the port is above ambient
+    "PORT_VOLUME",  # m³, of the node at the port
+    "PORT_HEAT",  # W/K, between its gas and the wall
+    "LINE_VOLUME",  # m³, of the node half-way
+    "LINE_HEAT",  # W/K
+    "VOLUME",  # m³, of the node at the far end
+    "COMPLIANCE",  # m³ less at full vacuum
+    "FILM",  # W/(m² K), between its gas and the wall
+    "AREA",  # m²
+    "NEAR_RESISTANCE",  # Pa²/(kg/s)², port to line: what grows with the square of the flow
+    "NEAR_LAMINAR",  # Pa²/(kg/s): what grows with the flow
+    "NEAR_INERTANCE",  # 1/m, length over bore: its gas has inertia
+    "RESISTANCE",  # Pa²/(kg/s)², line to vessel, and so on
+    "LAMINAR",  # Pa²/(kg/s)
+    "INERTANCE",  # 1/m
+    "PLACE",  # Pa² at nominal suction, between port and sensor
+    "LEAK",  # kg/s sonic, opening to ambient
+    "LAMINAR_LEAK",  # kg/(s Pa)
+    "BACK_FLOW",  # kg/s sonic, through the ejector while its nozzle is off
+    "OPENING",  # kg/(s Pa), rims of the cups when they stand open
+    "SENSOR_LAG",  # s, time constant of each of the sensor's two stages
+    "SLOW_SENSOR",  # s more, of the second one
+    "SENSOR_OFFSET",  # Pa added to the absolute reading
+    "SENSOR_GAIN",  # -, reads this many times the vacuum
+    "H1",  # Pa below ambient, nozzle off
+    "H1_LOW",  # Pa below ambient, nozzle on again
+    "H2",  # Pa below ambient, part present
+    "H2_LOW",  # Pa below ambient, not any more
+    "RELEASE",  # Pa below ambient, where blow-off lets the part go and the cup stands open; or NaN
+    "CONTROL_SENSOR",  # OWN or PLC
+    "AIR_SAVING",  # OFF to WITHOUT_CONTINUOUS
+    "PERMITTED_LEAKAGE",  # Pa/s, for leak monitoring
+    "BLOW_OFF_MODE",  # EXTERNAL to TIMED
+    "BLOW_OFF_TIME",  # s, of a timed pulse
+)
+(
+    AMBIENT,
+    AMBIENT_NOMINAL,
+    TEMPERATURE,
+    SUPPLY,
+    DROOP,
+    SUPPLY_LAG,
+    SUPPLY_NOMINAL,
+    SUPPLY_OPTIMUM,
+    SUPPLY_CURVATURE,
+    END_SLOPE,
+    SUCTION,
+    END_RATIO,
+    BULGE,
+    SKEW,
+    BEND_2,
+    BEND_3,
+    RESPONSE,
+    RESPONSE_OFF,
+    RAMP_UP,
+    SLOW_RAMP_UP,
+    RAMP_DOWN,
+    BLOW_OFF,
+    BLOW_OFF_RESPONSE,
+    BLOW_OFF_RESPONSE_OFF,
+    BLOW_OFF_RAMP,
+    RELIEF,
+    PORT_VOLUME,
+    PORT_HEAT,
+    LINE_VOLUME,
+    LINE_HEAT,
+    VOLUME,
+    COMPLIANCE,
+    FILM,
+    AREA,
+    NEAR_RESISTANCE,
+    NEAR_LAMINAR,
+    NEAR_INERTANCE,
+    RESISTANCE,
+    LAMINAR,
+    INERTANCE,
+    PLACE,
+    LEAK,
+    LAMINAR_LEAK,
+    BACK_FLOW,
+    OPENING,
+    SENSOR_LAG,
+    SLOW_SENSOR,
+    SENSOR_OFFSET,
+    SENSOR_GAIN,
+    H1,
+    H1_LOW,
+    H2,
+    H2_LOW,
+    RELEASE,
+    CONTROL_SENSOR,
+    AIR_SAVING,
+    PERMITTED_LEAKAGE,
+    BLOW_OFF_MODE,
+    BLOW_OFF_TIME,
+) = range(len(COEFFICIENTS))
+
+Theta = npt.NDArray[np.float64]  # one value per coefficient
+
+# Air-saving modes, blow-off modes, and whose sensor the ejector's control acts on.
+OFF, ON, LEAK_MONITORING, WITHOUT_CONTINUOUS = range(4)
+EXTERNAL, INTERNAL, TIMED = range(3)
+OWN, PLC = range(2)
+
+
+def resistance(theta: Theta, drop: float) -> float:
+    """Resistance that takes ``drop`` Pa at nominal suction from ambient (isothermal pipe flow)."""
+    ambient = theta[AMBIENT_NOMINAL]
+    return float((ambient**2 - (ambient - drop) ** 2) / theta[SUCTION] ** 2)
