@@ -13,7 +13,8 @@ from drivers.plc.simulate import with_truth
 from twin.config import Config
 from twin.events import Event, Kind
 from twin.live import Twin, run
-from twin.model.dataset import Theta, coefficients
+from twin.model.dataset import coefficients
+from twin.model.theta import Theta
 from twin.monitor.detect import Monitor
 from twin.monitor.phases import Knees, expected_knees
 from twin.settings import Document

@@ -14,28 +14,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rigs
+from command_line import edited, twin
 from plc_process import PlcProcess, start_plc
 
-from twin.cli import main
 from twin.events import Kind
 from twin.live import run
 from twin.log.header import LogHeader
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
+from twin.model.courses import table as courses
 from twin.model.effects import table
 
-GRIPPER, RIG = rigs.path_of("gripper"), rigs.path_of("test_rig")
+GRIPPER = rigs.path_of("gripper")
 PATIENCE_S = 30.0  # for a busy machine; nothing waits that long otherwise
-
-
-def twin(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
-    """Run the command line in this process; gives its exit code."""
-    monkeypatch.setattr(sys, "argv", ["twin", *map(str, arguments)])
-    try:
-        main()
-    except SystemExit as left:
-        return int(left.code or 0)
-    return 0
 
 
 @contextmanager
@@ -48,15 +39,6 @@ def started(*arguments: str | Path) -> Iterator["subprocess.Popen[str]"]:
             yield process
         finally:
             process.kill()
-
-
-def edited(tmp_path: Path, old: str, new: str) -> tuple[Path, int]:
-    """A configuration with one passage changed, and the line of it."""
-    text = RIG.read_text()
-    assert old in text
-    path = tmp_path / "cell.toml"
-    path.write_text(text.replace(old, new, 1))
-    return path, text[: text.index(old)].count("\n") + 1
 
 
 def make_log(path: Path, name: str, faults: tuple[str, ...]) -> Path:
@@ -85,7 +67,7 @@ def test_effects_are_listed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert twin(monkeypatch, "effects") == 0
-    assert capsys.readouterr().out.strip() == table()
+    assert capsys.readouterr().out.strip() == f"{table()}\n\n{courses()}"
 
 
 @pytest.mark.parametrize("command", ["run", "replay", "plc", "probe", "effects", "log"])
@@ -221,7 +203,7 @@ def test_a_replay_into_a_new_log_holds_the_same_rows(
 def test_a_replay_with_another_configuration_expects_something_else(
     faulty_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, _ = edited(tmp_path, "volume_ml = 755.0", "volume_ml = 700.0")
+    path, _ = edited(tmp_path, "volume_ml = 750.0", "volume_ml = 700.0")
     assert twin(monkeypatch, "replay", faulty_log, "--config", path, "-o", tmp_path / "b.mcap") == 0
     old, new = (
         np.concatenate([ticks["expected"] for _, ticks in open_log(log).blocks()])

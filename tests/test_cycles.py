@@ -8,7 +8,7 @@ import rigs
 from hypothesis import given
 from hypothesis import strategies as st
 
-from twin.model import dataset as c
+from twin.model import theta as c
 from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, figures
 from twin.signals import BREAK, MBAR, SAMPLE, TICK, Phase, Quality, Samples, Ticks
 

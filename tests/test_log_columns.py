@@ -59,6 +59,17 @@ def test_a_missing_column_is_refused() -> None:
         decode(message.SerializeToString())
 
 
+def test_a_log_from_before_a_column_was_added_is_read() -> None:
+    samples, ticks = course(5)
+    ticks["signals"] = [0, 1, 1, 3, 2]
+    message = SAMPLES.message.FromString(encode(samples, ticks))
+    assert decode(message.SerializeToString())[1]["signals"].tolist() == [0, 1, 1, 3, 2]
+    message.ClearField("signals")
+    before, beside = decode(message.SerializeToString())
+    ticks["signals"] = 0
+    assert (before.tobytes(), beside.tobytes()) == (samples.tobytes(), ticks.tobytes())
+
+
 @given(st.lists(st.integers(0, 70)), st.integers(1, 50))
 def test_a_tray_changes_the_cuts_and_nothing_else(lengths: list[int], size: int) -> None:
     samples, ticks = course(sum(lengths))

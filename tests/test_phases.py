@@ -9,7 +9,7 @@ import rigs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from twin.model import dataset as c
+from twin.model import theta as c
 from twin.monitor.phases import (
     IDLE_ROWS,
     LONGEST_WINDOW,
@@ -130,6 +130,7 @@ def stream(commands: npt.ArrayLike, pressure: float | npt.ArrayLike = 1e5) -> Sa
     return samples
 
 
+@settings(deadline=None)  # the first call compiles
 @given(st.lists(st.integers(0, 255), min_size=1, max_size=200), st.integers(1, 50))
 def test_at_constant_pressure_the_commands_are_the_phases(commands: list[int], block: int) -> None:
     rows, phase, _ = find(stream(commands), KNEES, block)
@@ -139,6 +140,21 @@ def test_at_constant_pressure_the_commands_are_the_phases(commands: list[int], b
     ]
     assert phase.tolist() == wanted
     assert rows["commands"].tolist() == commands
+
+
+@given(st.integers(1, 40), st.integers(1, 100))
+@settings(deadline=None)
+def test_a_timed_pulse_is_as_long_as_the_ejector_makes_it(command_rows: int, block: int) -> None:
+    knees = replace(KNEES, blow_off=(float(c.TIMED), 0.1))
+    commands = [1] * 50 + [2] * command_rows + [0] * (200 - command_rows)
+    _, phase, _ = find(stream(commands), knees, block)
+    assert phase.tolist() == [1] * 50 + [3] * 100 + [0] * 100
+
+
+def test_an_internal_pulse_follows_suction_by_itself() -> None:
+    knees = replace(KNEES, blow_off=(float(c.INTERNAL), 0.1))
+    _, phase, _ = find(stream([1] * 50 + [0] * 200), knees, 30)
+    assert phase.tolist() == [1] * 50 + [3] * 100 + [0] * 100
 
 
 def test_blow_off_wins() -> None:
@@ -157,14 +173,21 @@ def test_noise_alone_makes_no_knee(noise: float, command: int) -> None:
 # Synchronisation.
 
 
-def test_a_cycle_begins_at_the_mean_of_the_last_idle_rows() -> None:
-    pressure = 1e5 + 30.0 * np.random.default_rng(1).standard_normal(150)
-    samples = stream([0] * 100 + [1] * 50, pressure)
-    _, _, level = find(samples, KNEES)
-    synced = np.flatnonzero(np.isfinite(level))
-    assert synced.tolist() == [IDLE_ROWS - 1, 100]
-    assert level[IDLE_ROWS - 1] == pytest.approx(samples["pressure"][:IDLE_ROWS].mean())
-    assert level[100] == pytest.approx(pressure[60:100].mean(), abs=20)
+@pytest.mark.parametrize("slope", [0.0, -5.0, 5.0])  # Pa per row: a closed vessel cools or warms
+@pytest.mark.parametrize("block", [7, 1000])
+def test_a_cycle_begins_where_the_last_idle_rows_lead(slope: float, block: int) -> None:
+    pressure = 1e5 + slope * np.arange(150) + np.random.default_rng(1).normal(0.0, 3.0, 150)
+    pressure[100:] = 5e4  # suction has no say in it
+    _, _, level = find(stream([0] * 100 + [1] * 50, pressure), KNEES, block)
+    assert np.flatnonzero(np.isfinite(level)).tolist() == [IDLE_ROWS - 1, 100]
+    for row in (IDLE_ROWS - 1, 100):
+        assert level[row] == pytest.approx(1e5 + slope * row, abs=6 + abs(slope))
+
+
+def test_a_few_idle_rows_give_their_mean() -> None:
+    pressure = 1e5 + np.arange(80.0)
+    _, _, level = find(stream([1] * 20 + [0] * 10 + [1] * 50, pressure), KNEES)
+    assert level[30] == pytest.approx(pressure[20:30].mean())
 
 
 def test_unreadable_rows_have_no_say_in_it() -> None:

@@ -267,7 +267,7 @@ def test_tables_carry_the_numbers(pages: dict[str, str]) -> None:
     assert "<dt>fitted on</dt><dd>1, 2, 3, 5</dd>" in page
     assert "<dt>held out, to judge by</dt><dd>4, 6</dd>" in page
     assert "<dt>log</dt><dd>night.mcap</dd>" in page
-    assert "volume 755 ml" in page
+    assert "volume 755.7 ml" in page  # tank, 165 mm of 6 mm tube, and what is in the ejector
     assert "ejector-twin 0." in page
 
 

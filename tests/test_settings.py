@@ -12,7 +12,8 @@ from pydantic import Field
 
 from twin.config import TABLES, Config
 from twin.errors import ConfigError, SourceError
-from twin.model.dataset import COEFFICIENTS, DataSet, coefficients
+from twin.model.dataset import DataSet, coefficients
+from twin.model.theta import COEFFICIENTS
 from twin.settings import Document, Settings
 
 TEXT = """\
@@ -179,19 +180,42 @@ def refused(old: str, new: str) -> str:
 
 
 def test_an_impossible_data_set_is_refused_at_its_line() -> None:
-    assert "data.ejector.bulge" in refused("bulge = ", "bulge = 1")
+    message = refused("end_pressure_slope = ", "end_pressure_slope = -")
+    assert "data.supply.end_pressure_slope" in message
     assert "data.ambient.pressure_mbar" in refused("pressure_mbar = 1013.0", "pressure_mbar = 1.0")
-    assert "data.vessel.volumen_ml: unknown key" in refused("volume_ml = ", "volumen_ml = ")
+    message = refused("volume_ml = ", "volumen_ml = ")
+    assert "data.system.parts.4.volumen_ml: unknown key" in message
+
+
+def test_a_part_of_the_system_is_refused_at_its_own_line() -> None:
+    message = refused("tube_length_mm = 65.0", "tube_length_mm = -65.0")
+    assert "data.system.parts.2.tube_length_mm: Input should be greater than" in message
+    old = '[[data.system.parts]]\nkind = "vessel"'
+    assert "data.system.parts.4: Input tag 'bucket'" in refused(
+        old, old.replace("vessel", "bucket")
+    )
+
+
+VESSEL = {"kind": "vessel", "volume_ml": 750.0}
+TUBE = {"kind": "tube", "length_mm": 100.0, "diameter_mm": 6.0}
 
 
 @pytest.mark.parametrize(
     ("tables", "rule"),
     [
-        ({"ejector": {"h1_mbar": 200.0, "h1_hysteresis_mbar": 200.0}}, "less than h1_mbar"),
+        ({"ejector": {"h1_mbar": 600.0}}, "at least h2_mbar"),
+        ({"ejector": {"h1_mbar": 998.0}, "ambient": {"pressure_mbar": 900.0}}, "below ambient"),
         ({"ejector": {"end_pressure_mbar": 1013.0}}, "below ambient"),
-        ({"sensor": {"lag_ms": 0.0}}, "greater than or equal to 1"),
-        ({"vessel": {"volume_ml": 0.0}}, "greater than 0"),
-        ({"vessel": {"volume_ml": float("nan")}}, "greater than 0"),
+        ({"ejector": {"bulge": -0.9, "skew": 5.0}}, "not monotonic"),
+        ({"ejector": {"suction_capacity_sl_min": 0.0}}, "greater than 0"),
+        ({"supply": {"pressure_bar": -0.5}}, "greater than 0"),
+        ({"supply": {"pressure_bar": 1.0, "droop_bar": 1.5}}, "below ambient"),
+        ({"sensor": {"lag_ms": 0.0}}, "greater than or equal to 0.5"),
+        ({"system": {"parts": [TUBE, VESSEL | {"volume_ml": 0.0}]}}, "greater than 0"),
+        ({"system": {"parts": [TUBE, VESSEL | {"volume_ml": float("nan")}]}}, "greater than 0"),
+        ({"system": {"parts": [TUBE]}}, "nothing to evacuate"),
+        ({"system": {"parts": [VESSEL]}}, "need a tube"),
+        ({"system": {"parts": [TUBE, VESSEL, *[{"kind": "sensor"}] * 2]}}, "more than one sensor"),
     ],
 )
 def test_what_no_ejector_can_be_is_refused(tables: dict[str, object], rule: str) -> None:
@@ -203,7 +227,9 @@ def test_every_coefficient_is_filled_in() -> None:
     theta = coefficients(rigs.config("gripper").data)
     assert len(theta) == len(COEFFICIENTS)
     zero = {name for name, value in zip(COEFFICIENTS, theta, strict=True) if value == 0.0}
-    assert zero == {"COMPLIANCE", "LAMINAR_LEAK", "BACK_FLOW", "SENSOR_OFFSET"}
+    effects = {"LAMINAR_LEAK", "BACK_FLOW", "SENSOR_OFFSET", "SLOW_RAMP_UP", "SLOW_SENSOR"}
+    modes = {"CONTROL_SENSOR", "BLOW_OFF_MODE"}  # the first of each
+    assert zero == {"COMPLIANCE"} | effects | modes
 
 
 def test_the_hash_tells_data_sets_apart() -> None:

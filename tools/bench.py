@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
-from benchmarks import acquisition, kernel, log, machine, polling, replay
+from benchmarks import acquisition, calibration, kernel, log, machine, polling, replay
 from benchmarks.figures import Benchmark, Figure, Measured, Run, kept
 from benchmarks.processes import ROOT
 
@@ -58,10 +58,28 @@ BENCHMARKS = (
     ),
     Benchmark(
         "kernel",
-        kernel.step,
-        "100 000 rows of the rig's cycles through `kernel.advance` and through "
-        "tools/benchmarks/kernel.c by turns, in processor time.",
-        (Figure("model: one step of 1 ms", "ns", "the same in C, -O2", 1.5, limits_ratio=True),),
+        kernel.speed,
+        "The first rows of the rig's cycles through `kernel.advance` and through "
+        "tools/benchmarks/kernel.c by turns, in processor time: 100 000 rows for one hypothesis, "
+        "10 000 for 64, which are the data set with each effect at several sizes. They go through "
+        "`kernel.advance` together, through the C one after another, and count per hypothesis.",
+        (
+            Figure("model: one row of 1 ms", "ns", "the same in C, -O2", 1.5, limits_ratio=True),
+            Figure(
+                "model: one row for each of 64 hypotheses",
+                "ns",
+                "each alone in C, -O2",
+                0.5,
+                limits_ratio=True,
+            ),
+        ),
+    ),
+    Benchmark(
+        "calibration",
+        calibration.from_cycles,
+        "`twin.calibration.calibrate` over samples of the simulated rig, in this process and on "
+        "all cores.",
+        (Figure("calibration: 12 healthy cycles", "s", limit=15.0),),
     ),
     Benchmark(
         "log",

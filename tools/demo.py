@@ -28,7 +28,7 @@ def main() -> int:
     """Run the demo; give its exit code."""
     shutil.rmtree(FOLDER, ignore_errors=True)
     FOLDER.mkdir()
-    print("Compiling the model (some seconds the first time).", flush=True)
+    print("Compiling the model (up to a minute the first time).", flush=True)
     data = Config.of(Document.read(CONFIG)).data
     theta = coefficients(data)
     compiled(theta, expected_knees(theta, data.sensor.noise_mbar * MBAR))

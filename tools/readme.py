@@ -4,10 +4,11 @@ import re
 from pathlib import Path
 
 from drivers.plc.registers import table as register_table
+from twin.model.courses import table as courses_table
 from twin.model.effects import table as effects_table
 
 README = Path(__file__).parent.parent / "README.md"
-TABLES = {"register map": register_table, "effects": effects_table}
+TABLES = {"register map": register_table, "effects": effects_table, "courses": courses_table}
 
 
 def filled(text: str) -> str:

@@ -9,14 +9,15 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.errors import ConfigError, TwinError
+from twin.assets.cli import assets_app
+from twin.errors import ConfigError, SourceError, TwinError
 from twin.events import Event, Severity
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
+app.add_typer(assets_app, name="assets")
 log_app = typer.Typer(help="Look after logs.", no_args_is_help=True)
 app.add_typer(log_app, name="log")
 
@@ -43,6 +45,12 @@ LogFile = Annotated[Path, typer.Argument(metavar="LOG.mcap", help="A recorded lo
 Address = Annotated[
     str, typer.Option(metavar="HOST:PORT", help="Where the PLC is, instead of the configuration's.")
 ]
+AssetsUrl = Annotated[
+    str, typer.Option("--assets", metavar="URL", help="Asset database, instead of the configured.")
+]
+UnitId = Annotated[str, typer.Option("--id", metavar="ID", help="Unit, instead of [asset] id.")]
+ConfigOption = Annotated[Path | None, typer.Option(help="Instead of the one in the log.")]
+JsonFile = Annotated[Path | None, typer.Option("--json", metavar="F", help="The answer.")]
 ViewFlag = Annotated[bool, typer.Option("--view", help="Open the Rerun viewer.")]
 RrdFile = Annotated[Path | None, typer.Option(metavar="F.rrd", help="Write the view to a file.")]
 FailOnAlarm = Annotated[bool, typer.Option(help="Exit with 1 if an alarm was raised.")]
@@ -51,6 +59,7 @@ FailOnAlarm = Annotated[bool, typer.Option(help="Exit with 1 if an alarm was rai
 @app.command()
 def run(
     config: ConfigFile,
+    *,
     duration: Annotated[
         float | None, typer.Option(metavar="S", help="Stop after S seconds.")
     ] = None,
@@ -58,6 +67,8 @@ def run(
     view: ViewFlag = False,
     rrd: RrdFile = None,
     address: Address = "",
+    unit: UnitId = "",
+    assets: AssetsUrl = "",
     fail_on_alarm: FailOnAlarm = False,
 ) -> None:
     """Run the twin beside a PLC: read, expect, compare, log, alarm. Ctrl-C ends it."""
@@ -67,7 +78,7 @@ def run(
     from twin.log.recorder import Recorder
     from twin.settings import Document
 
-    settings = Config.of(Document.read(config))
+    settings = Config.of(Document.read(config), assets, unit)
     twin, monitor = _pair(settings)
     with _stop_on_signal(duration) as stopped:
         # A PLC that does not answer is said before a log is begun.
@@ -86,7 +97,10 @@ def run(
 @app.command()
 def replay(
     log: LogFile,
-    config: Annotated[Path | None, typer.Option(help="Instead of the one in the log.")] = None,
+    *,
+    config: ConfigOption = None,
+    unit: UnitId = "",
+    assets: AssetsUrl = "",
     output: Annotated[Path | None, typer.Option("-o", metavar="OUT.mcap", help="New log.")] = None,
     json_file: Annotated[Path | None, typer.Option("--json", metavar="F", help="Events.")] = None,
     view: ViewFlag = False,
@@ -99,7 +113,7 @@ def replay(
     from twin.log.recorder import Recorder
 
     recorded = open_log(log)
-    settings = _settings_of(recorded.header, config)
+    settings = _settings_of(recorded.header, config, assets, unit)
     twin, monitor = _pair(settings)
     with _stop_on_signal(None) as stopped:
         console = Console()
@@ -152,10 +166,10 @@ def probe(config: ConfigFile, address: Address = "") -> None:
 @app.command()
 def diagnose(
     log: LogFile,
-    config: Annotated[Path | None, typer.Option(help="Instead of the one in the log.")] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="F", help="The answer.")
-    ] = None,
+    config: ConfigOption = None,
+    unit: UnitId = "",
+    assets: AssetsUrl = "",
+    json_file: JsonFile = None,
     report: Annotated[Path | None, typer.Option(metavar="F.html", help="With pictures.")] = None,
 ) -> None:
     """Say what the simulation gets wrong on a log, why, and what knowing it gains."""
@@ -164,7 +178,7 @@ def diagnose(
     from twin.log.reader import open_log
 
     recorded = open_log(log)
-    settings = _settings_of(recorded.header, config)
+    settings = _settings_of(recorded.header, config, assets, unit)
     with _status() as say:
         diagnosis = find_cause(settings, (rows for rows, _ in recorded.blocks()), str(log), say)
     print(in_words(diagnosis))
@@ -175,11 +189,111 @@ def diagnose(
 
 
 @app.command()
+def calibrate(
+    log: LogFile,
+    config: Annotated[Path, typer.Option(help="TOML configuration of the unit and its system.")],
+    unit: UnitId = "",
+    assets: AssetsUrl = "",
+    json_file: JsonFile = None,
+) -> None:
+    """Fit the instance-specific data set of one unit to healthy cycles, and store it."""
+    from twin.calibration.calibrate import calibrate as fit_unit
+    from twin.calibration.report import as_json, in_words
+    from twin.calibration.store import store
+    from twin.config import Config
+    from twin.log.reader import open_log
+    from twin.settings import Document
+
+    settings = Config.of(Document.read(config), assets, unit, calibrated=False)
+    if not settings.asset.id:
+        raise ConfigError("no unit is named", "give --id ID, or [asset] id in the configuration")
+    recorded = open_log(log)
+    with _status() as say:
+        calibration = fit_unit(settings, (rows for rows, _ in recorded.blocks()), say)
+    record, where = store(calibration, settings, assets, log)
+    print(in_words(calibration))
+    print(f"stored as {settings.asset.id} in {where}, record {record.id[:8]}")
+    if json_file is not None:
+        json_file.write_text(json.dumps(as_json(calibration, record), indent=1, ensure_ascii=False))
+
+
+@app.command("import")
+def import_(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV or Parquet.")],
+    config: Annotated[Path, typer.Option(help="TOML configuration; [import] maps columns.")],
+    output: Annotated[Path, typer.Option("-o", metavar="LOG.mcap", help="New log.")],
+    unit: UnitId = "",
+    assets: AssetsUrl = "",
+) -> None:
+    """Make a log of a PLC's trace export, with what the twin expects beside it."""
+    from twin.config import Config
+    from twin.live import run as run_loop
+    from twin.log.recorder import Recorder
+    from twin.settings import Document
+    from twin.signals import MBAR
+    from twin.tables.reader import open_table
+    from twin.tables.settings import ImportSettings
+
+    settings = Config.of(Document.read(config), assets, unit)
+    wanted = settings.document.section(ImportSettings, "import")
+    table = open_table(file, wanted, settings.data.ambient.pressure_mbar * MBAR)
+    if table.ignored:
+        print(f"twin: columns not taken: {', '.join(table.ignored)}", file=sys.stderr)
+    twin, monitor = _pair(settings)
+    console = Console()
+    with _whole(output) as part, _stop_on_signal(None) as stopped:
+        sinks = _opened(lambda: Recorder(part, _header(settings)), lambda: console)
+        blocks = _until(stopped, _progress(table.blocks(), "importing"))
+        run_loop(blocks, twin, monitor, sinks)
+    _leave(console, False, interrupted=stopped() == "interrupted")
+
+
+@app.command()
+def export(
+    log: LogFile,
+    output: Annotated[Path, typer.Option("-o", metavar="FILE", help="*.csv or *.parquet.")],
+) -> None:
+    """Write a log as a table for other programs, lossless."""
+    from twin.log.reader import open_log
+    from twin.tables.export import ROWS
+    from twin.tables.export import export as write_table
+
+    recorded = open_log(log)
+    if not recorded.complete:
+        print(f"twin: {log} is not complete; what can be read is exported", file=sys.stderr)
+    write_table(recorded.blocks(ROWS), recorded.header, output)
+
+
+@app.command()
 def effects() -> None:
-    """List the effects: every way a real ejector can differ from its data set."""
+    """List the effects, the ways a real ejector can differ from its data set, and their courses."""
+    from twin.model.courses import table as courses
     from twin.model.effects import table
 
-    print(table())
+    print(table(), courses(), sep="\n\n")
+
+
+@app.command()
+def paper(
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="F", help="The recomputed figures.")
+    ] = None,
+    picture: Annotated[Path | None, typer.Option(metavar="F.(svg|png)", help="The curves.")] = None,
+) -> None:
+    """Recompute the founding paper's tables 2 and 4, and say what they can tell."""
+    from twin.paper.separation import separate
+    from twin.paper.tables import late_by, recomputed, write_json
+    from twin.paper.words import in_words
+
+    rows = recomputed()
+    separation = separate(late_by(rows))
+    if picture is not None:
+        from twin.paper.picture import draw
+
+        draw(rows, separation, picture)
+    if json_file is not None:
+        write_json(rows, json_file)
+    print(in_words(rows, separation))
 
 
 @log_app.command()
@@ -261,19 +375,45 @@ def _header(settings: "Config") -> "LogHeader":
         asset_id=settings.asset.id,
         config_name=Path(settings.document.name).name,
         config_text=settings.document.text,
-        metadata={"data_set": settings.data.hash, "program": version("ejector-twin")},
+        metadata={
+            "program": version("ejector-twin"),
+            "data_set": settings.data.hash,
+            "origin": settings.origin,
+            "data": settings.data.model_dump_json(),
+            "healthy": json.dumps(settings.monitor.model_dump()["healthy"]),
+        },
         ambient=settings.data.ambient.pressure_mbar * MBAR,
     )
 
 
-def _settings_of(header: "LogHeader", instead: Path | None) -> "Config":
-    """The configuration a log carries, or another one."""
+def _settings_of(header: "LogHeader", instead: Path | None, assets: str, unit: str) -> "Config":
+    """The configuration a log carries, with the data set it was made with; or another one."""
     from twin.config import Config
     from twin.settings import Document
 
     if instead is not None:
-        return Config.of(Document.read(instead))
-    return Config.of(Document.parse(header.config_text, header.config_name))
+        return Config.of(Document.read(instead), assets, unit)
+    document = Document.parse(header.config_text, header.config_name)
+    if unit or assets:
+        return Config.of(document, assets, unit)
+    return Config.of_log(document, header.metadata)
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """Give a name to write under; ``path`` is there only once all went well, and never replaced."""
+    if path.exists():
+        message = f"{path}: there is already a file of that name"
+        raise SourceError(message, "choose another name, or remove it")
+    part = path.with_name(f"{path.name}.part")
+    with suppress(OSError):
+        part.unlink()  # left by one that was killed
+    try:
+        yield part
+        part.rename(path)
+    finally:
+        with suppress(OSError):
+            part.unlink()
 
 
 def _opened(*makers: "Callable[[], Sink] | None") -> "list[Sink]":

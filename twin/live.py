@@ -10,7 +10,7 @@ import numpy as np
 
 from twin.events import Event
 from twin.model import kernel
-from twin.model.dataset import Theta
+from twin.model.theta import Theta
 from twin.monitor.detect import Monitor
 from twin.monitor.phases import Found, Knees, PhaseFinder
 from twin.monitor.signatures import steps
@@ -53,8 +53,9 @@ class Twin:
         ticks["phase"], ticks["level"] = phase, level
         expected = np.empty(len(samples))
         dt = steps(samples, self._last_ns)
-        kernel.advance(self._state, self.theta, dt, phase, ticks["level"].astype("f8"), expected)
-        ticks["expected"] = expected
+        level, signals = ticks["level"].astype("f8"), np.empty(len(samples), "u1")
+        kernel.advance(self._state, self.theta, dt, phase, level, expected, signals)
+        ticks["expected"], ticks["signals"] = expected, signals
         if len(samples):
             self._last_ns = int(samples["time_ns"][-1])
         return samples, ticks

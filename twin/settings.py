@@ -6,9 +6,11 @@ units, with bounds; a ``Document`` hands each part its table, checked.
 
 import re
 import tomllib
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import shorten
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -70,20 +72,42 @@ class Document:
 
     def _explain(self, path: tuple[str, ...], error: ValidationError) -> str:
         lines = []
-        for problem in error.errors(include_url=False):
-            keys = (*path, *(str(part) for part in problem["loc"]))
+        problems = error.errors(include_url=False)
+        # A mistyped key first: that the right one is missing follows from it.
+        for problem in sorted(problems, key=lambda one: one["type"] != "extra_forbidden"):
+            keys = self._written((*path, *problem["loc"]))
             what = "unknown key" if problem["type"] == "extra_forbidden" else problem["msg"]
-            given = "" if problem["type"] == "missing" else f" (is {problem['input']!r})"
+            is_said = problem["type"] in ("missing", "value_error")  # or is a whole table
+            given = "" if is_said else f" (is {shorten(repr(problem['input']), 80)})"
             lines.append(f"{self.name}:{self._line(keys)}: {'.'.join(keys)}: {what}{given}")
         return "\n".join(lines)
+
+    def _written(self, path: tuple[str | int, ...]) -> tuple[str, ...]:
+        """Keys as they stand in the text: without the kind that tells a list's tables apart."""
+        keys: list[str] = []
+        here: Any = self.tables
+        for step in path:
+            if isinstance(here, Mapping) and step == here.get("kind") and step not in here:
+                continue
+            keys.append(str(step))
+            try:
+                here = here[step]
+            except (KeyError, IndexError, TypeError):
+                here = None
+        return tuple(keys)
 
     def _line(self, keys: tuple[str, ...]) -> int:
         """Line of the deepest of ``keys`` that can be found; TOML parsers do not keep it."""
         table: tuple[str, ...] = ()
+        seen: Counter[str] = Counter()  # how often a table of a list has begun
         best, depth = 1, 0
         for number, line in enumerate(self.text.splitlines(), 1):
             if header := re.match(r"\s*\[+\s*([^\]]+?)\s*\]", line):
-                here = table = _path(header[1])
+                table = _path(header[1])
+                if line.lstrip().startswith("[["):
+                    table = (*table, str(seen[header[1]]))
+                    seen[header[1]] += 1
+                here = table
             elif key := re.match(r"""\s*(["'\w.-]+)\s*=""", line):
                 here = (*table, *_path(key[1]))
             else:

@@ -59,6 +59,7 @@ def plant(settings: PlcSettings) -> Record:
             "port_heat": rig.tube_film * 4 * rig.port_ml * ML / diameter,  # a tube's wall area
             "line_heat": rig.tube_film * 4 * rig.line_ml * ML / diameter,
             "vessel_area": rig.vessel_area_m2,
+            "sensor_in_line": float(rig.sensor == "line"),
             "inertance": half / bore,
             "laminar": 32 * VISCOSITY * half / (diameter**2 * bore),
             "turbulent": (0.03 * half / diameter + 0.75) / (2 * bore**2),

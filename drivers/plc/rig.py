@@ -102,10 +102,15 @@ def move_lines(p: Any, s: Any, row: Any) -> None:
     port = s.port_energy / (CV * s.port_mass)
     line = s.line_energy / (CV * s.line_mass)
     vessel = s.vessel_energy / (CV * s.vessel_mass)
-    density = s.line_mass / p.line_volume
-    drop = row.filter_clogging_pressure_drop_at_nominal
-    s.near_flow = line_flow(p, s.near_flow, s.port_pressure - s.line_pressure, density, drop)
-    s.far_flow = line_flow(p, s.far_flow, s.line_pressure - s.vessel_pressure, density, 0.0)
+    middle = s.line_mass / p.line_volume
+    near_density = (s.port_mass / p.port_volume + middle) / 2.0
+    far_density = (middle + s.vessel_mass / s.vessel_volume) / 2.0
+    far = row.filter_clogging_pressure_drop_at_nominal * p.sensor_in_line  # behind the sensor
+    near = row.filter_clogging_pressure_drop_at_nominal - far
+    pushed = s.port_pressure - s.line_pressure
+    s.near_flow = line_flow(p, s.near_flow, pushed, near_density, near)
+    pushed = s.line_pressure - s.vessel_pressure
+    s.far_flow = line_flow(p, s.far_flow, pushed, far_density, far)
     near, far = enthalpy(s.near_flow, port, line), enthalpy(s.far_flow, line, vessel)
     s.port_mass -= DT * s.near_flow
     s.line_mass += DT * (s.near_flow - s.far_flow)
@@ -198,7 +203,8 @@ def drive(p: Any, s: Any, row: Any, time: float) -> None:
 def sense(p: Any, s: Any, row: Any) -> None:
     """Step both sensors."""
     quick = DT / (p.sensor_lag + DT)
-    s.sensor_first += (s.port_pressure - s.sensor_first) * quick
+    there = s.line_pressure if p.sensor_in_line > 0.0 else s.port_pressure
+    s.sensor_first += (there - s.sensor_first) * quick
     s.sensor_second += (s.sensor_first - s.sensor_second) * quick
     s.sensor_lagged += (
         (s.sensor_second - s.sensor_lagged) * DT / (row.sensor_lag_time_constant + DT)

@@ -18,6 +18,7 @@ class Rig(Settings):
     vessel_ml: float = Field(default=750.0, ge=5, le=100_000)
     line_length_m: float = Field(default=0.1, ge=0.02, le=20)
     line_diameter_mm: float = Field(default=6.0, ge=1, le=50)
+    sensor: Literal["port", "line"] = "port"  # at the ejector's port, or at a T half-way
     vessel_area_m2: float = Field(default=0.047, ge=0, le=10)
     vessel_film: float = Field(default=10.0, ge=0, le=500)  # W/(m²·K)
     tube_film: float = Field(default=60.0, ge=0, le=500)  # W/(m²·K), port and line
@@ -56,7 +57,7 @@ class Valves(Settings):
 
 
 class Sensor(Settings):
-    """The sensor at the port that the PLC reads."""
+    """The sensor that the PLC reads."""
 
     lag_ms: float = Field(default=1.5, ge=0, le=100)  # of each of its two stages
     noise_mbar: float = Field(default=0.3, ge=0, le=20)  # one standard deviation

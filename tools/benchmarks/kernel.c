@@ -5,182 +5,448 @@
 #include <math.h>
 #include <stdint.h>
 
-static const double R = 287.05, GAMMA = 1.4, CP = 1.4 * 287.05 / (1.4 - 1.0);
-static const double CRITICAL_RATIO = 0.528, LAMINAR_RATIO = 0.999;
-static const double OPEN_TIME = 2e-3, LONGEST_STEP = 1e-3, LONGEST_BRIDGE = 0.1, NEVER = 1e9;
-
-enum { /* twin.model.dataset.COEFFICIENTS */
-    AMBIENT, AMBIENT_NOMINAL, TEMPERATURE, SUPPLY, SUPPLY_NOMINAL, SUPPLY_OPTIMUM,
-    SUPPLY_CURVATURE, END_SLOPE, SUCTION, END_RATIO, BULGE, SKEW, RESPONSE, RAMP_UP, RAMP_DOWN,
-    RESISTANCE, BLOW_OFF, BLOW_OFF_RESPONSE, BLOW_OFF_RAMP, RELIEF, VOLUME, COMPLIANCE, FILM, AREA,
-    LEAK, LAMINAR_LEAK, BACK_FLOW, SENSOR_LAG, SENSOR_OFFSET, SENSOR_GAIN, H1, H1_LOW, RELEASE
+enum { /* twin.model.theta.COEFFICIENTS */
+    AMBIENT, AMBIENT_NOMINAL, TEMPERATURE, SUPPLY, DROOP, SUPPLY_LAG, SUPPLY_NOMINAL,
+    SUPPLY_OPTIMUM, SUPPLY_CURVATURE, END_SLOPE, SUCTION, END_RATIO, BULGE, SKEW, BEND_2, BEND_3,
+    RESPONSE, RESPONSE_OFF, RAMP_UP, SLOW_RAMP_UP, RAMP_DOWN, BLOW_OFF, BLOW_OFF_RESPONSE,
+    BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, RELIEF, PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT,
+    VOLUME, COMPLIANCE, FILM, AREA, NEAR_RESISTANCE, NEAR_LAMINAR, NEAR_INERTANCE, RESISTANCE,
+    LAMINAR, INERTANCE, PLACE, LEAK, LAMINAR_LEAK, BACK_FLOW, OPENING, SENSOR_LAG, SLOW_SENSOR,
+    SENSOR_OFFSET, SENSOR_GAIN, H1, H1_LOW, H2, H2_LOW, RELEASE, CONTROL_SENSOR, AIR_SAVING,
+    PERMITTED_LEAKAGE, BLOW_OFF_MODE, BLOW_OFF_TIME, COEFFICIENTS
+};
+enum { /* what a call computes only once, behind them */
+    K_SUCTION = COEFFICIENTS, K_END, K_BLOW_OFF, K_FLATTER, K_HEAT, K_PORT_HEAT, K_LINE_HEAT,
+    K_PLACE, PREPARED
 };
 enum { /* the state of twin.model.kernel */
-    Y_PRESSURE, Y_TEMPERATURE, Y_JET, Y_BLOWING, Y_SENSED, ORDER,
-    NOZZLE = ORDER, NOZZLE_COMMAND, NOZZLE_AGE, BLOW, BLOW_COMMAND, BLOW_AGE, PHASE, OPEN, VALID
+    S_PORT, S_PORT_MASS, S_LINE, S_LINE_MASS, S_VESSEL, S_VESSEL_MASS, S_NEAR, S_FAR,
+    S_DRIVE, S_JET, S_BLOWING, S_SUPPLIED, S_FELT, S_SENSED,
+    NOZZLE, NOZZLE_COMMAND, NOZZLE_AGE, BLOW, BLOW_COMMAND, BLOW_AGE,
+    ROUGH, PHASE, OPEN, VALID, SIGNALS, STATE
 };
 enum { IDLE_PHASE, SUCTION_PHASE, HOLD_PHASE, BLOW_OFF_PHASE }; /* twin.signals.Phase */
-
-typedef struct { double suction, end, blow_off; } Supplied;
+enum { PART_PRESENT_SIGNAL = 1, AIR_SAVING_SIGNAL = 2 }; /* twin.signals.Signal */
 
 static inline double max(double a, double b) { return a > b ? a : b; }
 static inline double min(double a, double b) { return a < b ? a : b; }
-static inline double square(double a) { return a * a; }
 
-static double orifice(double ratio)
+/* --- gas.py -------------------------------------------------------------------------------- */
+
+#define R 287.05
+#define GAMMA 1.4
+#define CP (GAMMA * R / (GAMMA - 1.0))
+#define CRITICAL_RATIO 0.528
+#define LAMINAR_RATIO 0.999
+#define EDGE ((LAMINAR_RATIO - CRITICAL_RATIO) / (1.0 - CRITICAL_RATIO))
+#define LAMINAR_SLOPE (-sqrt(1.0 - EDGE * EDGE) / (1.0 - LAMINAR_RATIO))
+
+typedef struct { double level, slope; } Tangent;
+
+static inline Tangent orifice(double ratio)
 {
-    if (ratio <= CRITICAL_RATIO)
-        return 1.0;
-    if (ratio < LAMINAR_RATIO) {
-        double below = (ratio - CRITICAL_RATIO) / (1.0 - CRITICAL_RATIO);
-        return sqrt(1.0 - below * below);
-    }
-    double edge = (LAMINAR_RATIO - CRITICAL_RATIO) / (1.0 - CRITICAL_RATIO);
-    return sqrt(1.0 - edge * edge) * (1.0 - ratio) / (1.0 - LAMINAR_RATIO);
+    double below = min(max((ratio - CRITICAL_RATIO) / (1.0 - CRITICAL_RATIO), 0.0), EDGE);
+    double share = sqrt(1.0 - below * below);
+    int laminar = ratio > LAMINAR_RATIO;
+    double slope = laminar ? LAMINAR_SLOPE : -below / (share * (1.0 - CRITICAL_RATIO));
+    return (Tangent){laminar ? -LAMINAR_SLOPE * (1.0 - ratio) : share, slope};
 }
 
-static Supplied at_supply(const double *theta)
+static inline Tangent opening(double p, double ambient)
 {
+    int inwards = p <= ambient;
+    Tangent flow = orifice(inwards ? p / ambient : ambient / p);
+    double share = flow.level, slope = flow.slope;
+    double out = share * p / ambient;
+    double steeper = (share - slope * ambient / p) / ambient;
+    return (Tangent){inwards ? share : -out, inwards ? slope / ambient : -steeper};
+}
+
+/* --- plant.py ------------------------------------------------------------------------------ */
+
+#define LIGHTEST 1e-10
+#define LOWEST 1.0
+#define HIGHEST 1e7
+#define MOST 100.0
+#define FAINTEST 1e-12
+#define G 0.435866521508459
+#define A21 ((1.0 - G) / 2.0 / G)
+#define FURTHER ((1.0 + G) / 2.0 / G)
+#define B1 (-(6.0 * G * G - 16.0 * G + 1.0) / 4.0 / G)
+#define B2 ((6.0 * G * G - 20.0 * G + 5.0) / 4.0 / G)
+
+typedef struct {
+    double port, port_mass, line, line_mass, vessel, vessel_mass, near, far;
+} Gas;
+typedef struct { double drive, jet, valve, supply, felt, sensed; } Lags;
+typedef struct { double jet, suction, end, blow_off, open; } Driven;
+typedef struct { double nozzle, blow, open; } Valves;
+typedef struct { double suction, end, blow_off; } Supplied;
+typedef struct { double out, out_slope, in, in_slope; } Port;
+typedef struct { Gas gas; Lags lags; } Stage;
+typedef struct { Gas gas; Lags lags; double off; } Advanced;
+
+static void prepare(const double *theta, double *k)
+{
+    for (int j = 0; j < COEFFICIENTS; j++)
+        k[j] = theta[j];
     double ambient = theta[AMBIENT], nominal = theta[AMBIENT_NOMINAL];
-    double supply = max(theta[SUPPLY], 0.0), supply_nominal = theta[SUPPLY_NOMINAL];
-    double optimum = theta[SUPPLY_OPTIMUM], curvature = theta[SUPPLY_CURVATURE];
-    double peak = max(1.0 - curvature * square(supply / optimum - 1.0), 0.0);
-    double peak_nominal = max(1.0 - curvature * square(supply_nominal / optimum - 1.0), 1e-3);
-    double suction = theta[SUCTION] * (peak / peak_nominal) * (ambient / nominal);
-    double end = theta[END_RATIO] * ambient * (1.0 + theta[END_SLOPE] * (supply_nominal - supply));
-    double blow_off = theta[BLOW_OFF] * ((supply + ambient) / (supply_nominal + nominal));
+    double off = theta[SUPPLY_NOMINAL] / theta[SUPPLY_OPTIMUM] - 1.0;
+    double peak = max(1.0 - theta[SUPPLY_CURVATURE] * off * off, 1e-3);
+    k[K_SUCTION] = theta[SUCTION] * (ambient / nominal) / peak;
+    k[K_END] = theta[END_RATIO] * ambient;
+    k[K_BLOW_OFF] = theta[BLOW_OFF] / (theta[SUPPLY_NOMINAL] + nominal);
+    k[K_FLATTER] = 1.0 / theta[SUPPLY_OPTIMUM];
+    k[K_HEAT] = theta[FILM] * theta[AREA] / CP;
+    k[K_PORT_HEAT] = theta[PORT_HEAT] / CP;
+    k[K_LINE_HEAT] = theta[LINE_HEAT] / CP;
+    double suction = theta[SUCTION];
+    double quadratic = theta[NEAR_RESISTANCE] + theta[RESISTANCE];
+    double drop = (quadratic * suction + theta[NEAR_LAMINAR] + theta[LAMINAR]) * suction;
+    k[K_PLACE] = drop > 0.0 ? min(theta[PLACE] / drop, 1.0) : 0.0;
+}
+
+static inline Supplied at_supply(double supply, const double *k)
+{
+    double ambient = k[AMBIENT];
+    double off = supply * k[K_FLATTER] - 1.0;
+    double suction = k[K_SUCTION] * max(1.0 - k[SUPPLY_CURVATURE] * off * off, 0.0);
+    double missing = k[SUPPLY_NOMINAL] - supply;
+    double end = k[K_END] * (1.0 + k[END_SLOPE] * missing);
+    double blow_off = k[K_BLOW_OFF] * (supply + ambient);
     return (Supplied){suction, min(max(end, 0.0), 0.98 * ambient), blow_off};
 }
 
-static void characteristic(double x, double bulge, double skew, double *share, double *slope)
+static inline Tangent characteristic(double x, const double *k)
 {
-    if (x <= 0.0) {
-        *share = *slope = 0.0;
-        return;
-    }
-    double bend = bulge + skew * x;
-    *share = max(x * (1.0 + (1.0 - x) * bend), 0.0);
-    *slope = 1.0 + (1.0 - 2.0 * x) * bend + x * (1.0 - x) * skew;
+    double b0 = k[BULGE], b1 = k[SKEW], b2 = k[BEND_2], b3 = k[BEND_3];
+    x = min(max(x, 0.0), 1.2);
+    double bend = b0 + x * (b1 + x * (b2 + x * b3));
+    double slope = b1 + x * (2.0 * b2 + x * 3.0 * b3);
+    double share = max(x * (1.0 + (1.0 - x) * bend), 0.0);
+    double rise = 1.0 + (1.0 - 2.0 * x) * bend + x * (1.0 - x) * slope;
+    return (Tangent){share, x > 0.0 ? max(rise, 0.0) : 0.0};
 }
 
-static double port(double p, double jet, double flow_in, const double *theta, Supplied supplied,
-                   double *through)
+static inline Port at_port(double p, const Driven *driven, const double *k)
 {
-    double ambient = theta[AMBIENT], resistance = theta[RESISTANCE];
-    double end = supplied.end, span = ambient - end;
-    double p_port = p, a = 0.0, b = 0.0;
-    double floor = min(p, end + 1e-6 * span);
-    for (int pass = 0; pass < 4; pass++) {
-        double share, slope;
-        characteristic((p_port - end) / span, theta[BULGE], theta[SKEW], &share, &slope);
-        b = max(jet * supplied.suction * slope / span, 0.0);
-        a = jet * supplied.suction * share - b * p_port - flow_in;
-        if (p_port > ambient) {
-            a -= theta[RELIEF] * ambient;
-            b += theta[RELIEF];
-        }
-        if (resistance == 0.0) {
-            *through = a + b * p;
-            return p;
-        }
-        double sign = a + b * p >= 0.0 ? resistance : -resistance;
-        double root = sqrt(max(p * p + sign * (b * b * p * p - a * a), 1.0));
-        p_port = max((p * p - sign * a * a) / (sign * a * b + root), floor);
-    }
-    *through = a + b * p_port;
-    return p_port;
+    double ambient = k[AMBIENT];
+    double span = ambient - driven->end;
+    Tangent curve = characteristic(driven->jet - (ambient - p) / span, k);
+    double out_slope = driven->jet * driven->suction * curve.slope / span;
+    double out = driven->jet * driven->suction * curve.level - out_slope * p;
+    double relief = p > ambient ? k[RELIEF] : 0.0;
+    Tangent flow = opening(p, ambient);
+    double back = k[BACK_FLOW] * (1.0 - min(driven->jet, 1.0));
+    back = p < ambient ? back : 0.0;
+    return (Port){
+        out - relief * ambient,
+        out_slope + relief,
+        driven->blow_off + back * (flow.level - flow.slope * p),
+        back * flow.slope,
+    };
 }
 
-static void rates(const double *y, double open_cup, double nozzle, double blow, const double *theta,
-                  Supplied supplied, double *dy)
+static inline Tangent at_vessel(double p, const Driven *driven, const double *k)
 {
-    double p = y[0], temperature = y[1], jet = y[2], valve = y[3], sensed = y[4];
-    double ambient = theta[AMBIENT], outside = theta[TEMPERATURE];
-
-    double flow_back = 0.0, through;
-    if (theta[BACK_FLOW] > 0.0 && p < ambient)
-        flow_back = theta[BACK_FLOW] * (1.0 - min(jet, 1.0)) * orifice(p / ambient);
-    double p_port =
-        port(p, jet, supplied.blow_off * valve + flow_back, theta, supplied, &through);
-
-    double flow_in = theta[LAMINAR_LEAK] * (ambient - p) + max(-through, 0.0);
-    if (p < ambient)
-        flow_in += theta[LEAK] * orifice(p / ambient);
-    double flow_out = max(through, 0.0);
-
-    double volume = theta[VOLUME] - theta[COMPLIANCE] * (1.0 - p / ambient);
-    double stretch = theta[COMPLIANCE] / ambient;
-    double heat = theta[FILM] * theta[AREA] * (outside - temperature);
-    double enthalpy = CP * (flow_in * outside - flow_out * temperature);
-    double dp = (GAMMA - 1.0) * (enthalpy + heat) / (volume + GAMMA * p * stretch);
-    double mass = p * volume / (R * temperature);
-    double dtemperature =
-        temperature * (dp / p + stretch * dp / volume - (flow_in - flow_out) / mass);
-    if (open_cup > 0.0) {
-        dp = (ambient - p) / OPEN_TIME;
-        dtemperature = (outside - temperature) / OPEN_TIME;
-    }
-    dy[0] = dp;
-    dy[1] = dtemperature;
-    dy[2] = (nozzle - jet) / (nozzle > jet ? theta[RAMP_UP] : theta[RAMP_DOWN]);
-    dy[3] = (blow - valve) / theta[BLOW_OFF_RAMP];
-    dy[4] = (p_port - sensed) / theta[SENSOR_LAG];
+    double ambient = k[AMBIENT];
+    double laminar = k[LAMINAR_LEAK] + driven->open * k[OPENING];
+    Tangent flow = opening(p, ambient);
+    double slope = k[LEAK] * flow.slope - laminar;
+    return (Tangent){k[LEAK] * (flow.level - flow.slope * p) + laminar * ambient, slope};
 }
 
-static double reading(double sensed, const double *theta)
+static inline double through(double rest, double fall, double before, double rise,
+                             double quadratic, double linear, double pushed)
 {
-    double vacuum = theta[AMBIENT] - sensed;
-    return sensed - (theta[SENSOR_GAIN] - 1.0) * vacuum + theta[SENSOR_OFFSET];
+    double difference = rest * rest - before * before + pushed;
+    double friction = difference >= 0.0 ? quadratic : -quadratic;
+    double square = fall * fall - rise * rise - friction;
+    double slope = 2.0 * (rest * fall + before * rise) + linear;
+    double root = sqrt(max(slope * slope - 4.0 * square * difference, 0.0));
+    return 2.0 * difference / (slope + root);
 }
 
-static double sensed_at(double value, const double *theta)
+static Gas solve(Gas y, const Gas *known, double step, const Driven *driven, const double *k)
 {
-    double gain = theta[SENSOR_GAIN];
-    return (value - theta[SENSOR_OFFSET] + (gain - 1.0) * theta[AMBIENT]) / gain;
+    double ambient = k[AMBIENT], outside = k[TEMPERATURE];
+    double per_pa = 1.0 / (GAMMA * R * step);
+    Port at = at_port(y.port, driven, k);
+    double out = at.out, out_slope = at.out_slope, blown = at.in, blown_slope = at.in_slope;
+    Tangent leaking = at_vessel(y.vessel, driven, k);
+    double leak = leaking.level, leak_slope = leaking.slope;
+    double stretch = k[COMPLIANCE] / ambient;
+    double volume = k[VOLUME] - stretch * (ambient - y.vessel);
+    double port_stored = k[PORT_VOLUME] * per_pa, line_stored = k[LINE_VOLUME] * per_pa;
+    double vessel_stored = (volume + GAMMA * y.vessel * stretch) * per_pa;
+    double warmth = k[K_HEAT], port_warmth = k[K_PORT_HEAT], line_warmth = k[K_LINE_HEAT];
+
+    /* Gas leaves a node at the node's temperature. */
+    double vessel_t = y.vessel * volume / (R * y.vessel_mass);
+    double entering = blown + blown_slope * y.port;
+    double held = port_stored * known->port + (entering + port_warmth) * outside;
+    double leaving =
+        y.port_mass / (GAMMA * step) + max(out + out_slope * y.port, 0.0) + port_warmth;
+    double line_t = y.line * k[LINE_VOLUME] / (R * y.line_mass);
+    double port_t = (held + max(y.near, 0.0) * line_t) / (leaving + max(-y.near, 0.0));
+    held = line_stored * known->line + line_warmth * outside;
+    held += max(y.far, 0.0) * vessel_t + max(-y.near, 0.0) * port_t;
+    leaving = y.line_mass / (GAMMA * step) + line_warmth;
+    line_t = held / (leaving + max(y.near, 0.0) + max(-y.far, 0.0));
+    double near_t = y.near >= 0.0 ? line_t : port_t;
+    double far_t = y.far >= 0.0 ? vessel_t : line_t;
+    double leak_t = y.vessel <= ambient ? outside : vessel_t;
+
+    /* Pressures as rest and slope over the flows. */
+    double cooling = port_warmth * k[PORT_VOLUME] / (R * y.port_mass);
+    double weight = 1.0 / (port_stored + out_slope * port_t - blown_slope * outside + cooling);
+    double gained = port_stored * known->port + (blown + port_warmth) * outside - out * port_t;
+    double port_rest = gained * weight, port_rise = near_t * weight;
+    cooling = line_warmth * k[LINE_VOLUME] / (R * y.line_mass);
+    weight = 1.0 / (line_stored + cooling);
+    double line_rest = (line_stored * known->line + line_warmth * outside) * weight;
+    double line_fall = near_t * weight, line_rise = far_t * weight;
+    cooling = warmth * volume / (R * y.vessel_mass);
+    weight = 1.0 / (vessel_stored - leak_slope * leak_t + cooling);
+    gained = vessel_stored * known->vessel + leak * leak_t + warmth * outside;
+    double vessel_rest = gained * weight, vessel_fall = far_t * weight;
+
+    double inertia = k[NEAR_INERTANCE] * (y.line + y.port) / step;
+    double warm = near_t / outside;
+    double quadratic = warm * k[NEAR_RESISTANCE], linear = warm * k[NEAR_LAMINAR] + inertia;
+    double pushed = inertia * known->near;
+    double near = through(y.line, 0.0, port_rest, port_rise, quadratic, linear, pushed);
+    double slope =
+        2.0 * (port_rise * (port_rest + port_rise * near) + quadratic * fabs(near)) + linear;
+    double near_slope = 2.0 * y.line / slope;
+    near -= near_slope * y.line;
+    weight = 1.0 / (1.0 + line_fall * near_slope);
+    line_rest = (line_rest - line_fall * near) * weight;
+    line_rise = line_rise * weight;
+
+    inertia = k[INERTANCE] * (y.vessel + y.line) / step;
+    warm = far_t / outside;
+    quadratic = warm * k[RESISTANCE];
+    linear = warm * k[LAMINAR] + inertia;
+    pushed = inertia * known->far;
+    double far = through(vessel_rest, vessel_fall, line_rest, line_rise, quadratic, linear, pushed);
+
+    double line = min(max(line_rest + line_rise * far, LOWEST), HIGHEST);
+    double vessel = min(max(vessel_rest - vessel_fall * far, LOWEST), HIGHEST);
+    near += near_slope * line;
+    double port = min(max(port_rest + port_rise * near, LOWEST), HIGHEST);
+    double net = near - (out + out_slope * port) + blown + blown_slope * port;
+    return (Gas){
+        port,
+        max(known->port_mass + step * net, LIGHTEST),
+        line,
+        max(known->line_mass + step * (far - near), LIGHTEST),
+        vessel,
+        max(known->vessel_mass + step * (leak + leak_slope * vessel - far), LIGHTEST),
+        min(max(near, -MOST), MOST),
+        min(max(far, -MOST), MOST),
+    };
 }
 
-static void runge_kutta(double *y, double h, double open_cup, double nozzle, double blow,
-                        const double *theta, Supplied supplied)
+static inline double lag(double known, double target, double ratio)
 {
-    double k1[ORDER], k2[ORDER], k3[ORDER], k4[ORDER], mid[ORDER];
-    rates(y, open_cup, nozzle, blow, theta, supplied, k1);
-    for (int i = 0; i < ORDER; i++)
-        mid[i] = y[i] + 0.5 * h * k1[i];
-    rates(mid, open_cup, nozzle, blow, theta, supplied, k2);
-    for (int i = 0; i < ORDER; i++)
-        mid[i] = y[i] + 0.5 * h * k2[i];
-    rates(mid, open_cup, nozzle, blow, theta, supplied, k3);
-    for (int i = 0; i < ORDER; i++)
-        mid[i] = y[i] + h * k3[i];
-    rates(mid, open_cup, nozzle, blow, theta, supplied, k4);
-    for (int i = 0; i < ORDER; i++)
-        y[i] += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]);
-    y[0] = max(y[0], 1.0);
-    y[1] = min(max(y[1], 100.0), 1000.0);
+    return (known + ratio * target) / (1.0 + ratio);
 }
 
-static double valve_over(double *state, int position, double h, double response)
+static Stage stage(const Gas *guess, const Gas *known, const Lags *lags, double step,
+                   const Valves *valves, int far_off, const double *k)
 {
-    double age = state[position + 2];
+    double rise = k[RAMP_UP], fall = k[RAMP_DOWN];
+    double first = rise + k[SLOW_RAMP_UP];
+    int rising = valves->nozzle > lags->drive;
+    double drive = lag(lags->drive, valves->nozzle, step / (rising ? first : fall));
+    double jet = lag(lags->jet, drive, step / (rising ? rise : fall));
+    double valve = lag(lags->valve, valves->blow, step / k[BLOW_OFF_RAMP]);
+    double regulated = max(k[SUPPLY] - k[DROOP] * max(valves->nozzle, valves->blow), 0.0);
+    double supply = lag(lags->supply, regulated, step / k[SUPPLY_LAG]);
+    Supplied at = at_supply(supply, k);
+    Driven driven = {jet, at.suction, at.end, at.blow_off * valve, valves->open};
+    Gas gas = solve(*guess, known, step, &driven, k);
+    gas = solve(gas, known, step, &driven, k);
+    if (far_off)
+        gas = solve(gas, known, step, &driven, k);
+    double there = gas.port + k[K_PLACE] * (gas.vessel - gas.port);
+    double slow = k[SENSOR_LAG];
+    double felt = lag(lags->felt, there, step / slow);
+    double sensed = lag(lags->sensed, felt, step / (slow + k[SLOW_SENSOR]));
+    return (Stage){gas, {drive, jet, valve, supply, felt, sensed}};
+}
+
+#define ON(of) start->of + share * (end->of - begin->of)
+
+static inline Gas gas_on(const Gas *start, const Gas *begin, const Gas *end, double share)
+{
+    return (Gas){
+        ON(port), ON(port_mass), ON(line), ON(line_mass),
+        ON(vessel), ON(vessel_mass), ON(near), ON(far),
+    };
+}
+
+static inline Lags lags_on(const Lags *start, const Lags *begin, const Lags *end, double share)
+{
+    return (Lags){ON(drive), ON(jet), ON(valve), ON(supply), ON(felt), ON(sensed)};
+}
+
+static inline Gas positive(Gas gas)
+{
+    return (Gas){
+        max(gas.port, LOWEST), max(gas.port_mass, LIGHTEST),
+        max(gas.line, LOWEST), max(gas.line_mass, LIGHTEST),
+        max(gas.vessel, LOWEST), max(gas.vessel_mass, LIGHTEST),
+        gas.near, gas.far,
+    };
+}
+
+static inline double bent(double first, double second, double third)
+{
+    return fabs(first - 2.0 * second + third);
+}
+
+static inline Lags ended(Lags lags)
+{
+    return (Lags){
+        lags.drive > FAINTEST ? lags.drive : 0.0,
+        lags.jet > FAINTEST ? lags.jet : 0.0,
+        lags.valve > FAINTEST ? lags.valve : 0.0,
+        lags.supply, lags.felt, lags.sensed,
+    };
+}
+
+static Advanced advance_gas(const Gas *gas, const Lags *lags, double h, const Valves *valves,
+                            const double *k)
+{
+    double step = G * h;
+    Stage one = stage(gas, gas, lags, step, valves, 1, k);
+    Gas known = gas_on(gas, gas, &one.gas, A21), guess = gas_on(gas, gas, &one.gas, FURTHER);
+    Lags held = lags_on(lags, lags, &one.lags, A21);
+    guess = positive(guess);
+    Stage two = stage(&guess, &known, &held, step, valves, 0, k);
+    Gas last = gas_on(gas, gas, &one.gas, B1);
+    last = gas_on(&last, &known, &two.gas, B2);
+    Lags late = lags_on(lags, lags, &one.lags, B1);
+    late = lags_on(&late, &held, &two.lags, B2);
+    guess = positive(gas_on(&one.gas, &one.gas, &two.gas, 2.0));
+    Stage three = stage(&guess, &last, &late, step, valves, 0, k);
+    double port = bent(one.gas.port - gas->port, two.gas.port - known.port,
+                       three.gas.port - last.port);
+    double vessel = bent(one.gas.vessel - gas->vessel, two.gas.vessel - known.vessel,
+                         three.gas.vessel - last.vessel);
+    double sensed = bent(one.lags.sensed - lags->sensed, two.lags.sensed - held.sensed,
+                         three.lags.sensed - late.sensed);
+    return (Advanced){three.gas, ended(three.lags), max(max(port, vessel), sensed)};
+}
+
+static double reading(double sensed, const double *k)
+{
+    double vacuum = k[AMBIENT] - sensed;
+    return sensed - (k[SENSOR_GAIN] - 1.0) * vacuum + k[SENSOR_OFFSET];
+}
+
+static double sensed_at(double value, const double *k)
+{
+    double gain = k[SENSOR_GAIN];
+    return (value - k[SENSOR_OFFSET] + (gain - 1.0) * k[AMBIENT]) / gain;
+}
+
+/* --- kernel.py ----------------------------------------------------------------------------- */
+
+#define LONGEST_STEP 1e-3
+#define LONGEST_BRIDGE 0.1
+#define NEVER 1e9
+#define FINEST 32
+#define TOLERANCE 0.01
+
+static double valve_over(double *state, int position, double h, const double *k, int response)
+{
+    double before = state[position], command = state[position + 1], age = state[position + 2];
+    double late = (command > 0.5 ? k[response] : k[response + 1]) - age;
+    int acts = late < h;
+    state[position] = acts ? command : before;
     state[position + 2] = age + h;
-    double before = state[position], command = state[position + 1], late = response - age;
-    if (before == command || late >= h)
-        return before;
-    state[position] = command;
-    return command + (before - command) * max(late, 0.0) / h;
+    return acts ? command + (before - command) * max(late, 0.0) / h : before;
 }
 
-static void step(double *state, double dt, const double *theta, Supplied supplied)
+static int release(const double *state, const double *k, double h)
+{
+    double filling = -GAMMA * state[S_FAR] * state[S_VESSEL] / state[S_VESSEL_MASS];
+    double left = k[AMBIENT] - state[S_VESSEL] - k[RELEASE]; /* NaN where nothing is let go */
+    int soon = state[BLOW_COMMAND] > 0.0 && left < 1.5 * h * filling;
+    return state[OPEN] == 0.0 ? soon : state[OPEN] > 1.0;
+}
+
+static double opened(double before, const Gas *gas, double commanded, const double *k)
+{
+    double beyond = gas->vessel - (k[AMBIENT] - k[RELEASE]);
+    double missed = min(beyond / max(gas->vessel - before, 1e-9), 1.0);
+    return beyond >= 0.0 && commanded > 0.0 ? 1.0 + missed : 0.0;
+}
+
+static int moves(const double *state, int position, double h, const double *k, int response)
+{
+    double command = state[position + 1];
+    double late = k[command > 0.5 ? response : response + 1] - state[position + 2];
+    return late < h && (state[position] != command || late > -h);
+}
+
+static int jumps(const double *state, const double *k, double h)
+{
+    return moves(state, NOZZLE, h, k, RESPONSE) || moves(state, BLOW, h, k, BLOW_OFF_RESPONSE) ||
+           release(state, k, h);
+}
+
+static int passes(const double *state, const double *k, double h)
+{
+    double moved = fabs(state[S_PORT] - state[S_FELT]) / k[SENSOR_LAG] * h;
+    return state[S_BLOWING] > 0.01 && fabs(state[S_PORT] - k[AMBIENT]) < moved;
+}
+
+static int finer(const double *state, const double *k, double h)
+{
+    if (jumps(state, k, h) || passes(state, k, h))
+        return FINEST;
+    double steps = ceil(h * pow(max(0.0, state[ROUGH]) / TOLERANCE, 1.0 / 3.0));
+    return (int)min(max(steps, 1.0), FINEST);
+}
+
+static void substep(double *state, const double *k, double h)
+{
+    double nozzle = valve_over(state, NOZZLE, h, k, RESPONSE);
+    double blow = valve_over(state, BLOW, h, k, BLOW_OFF_RESPONSE);
+    Gas gas = {
+        state[S_PORT], state[S_PORT_MASS], state[S_LINE], state[S_LINE_MASS],
+        state[S_VESSEL], state[S_VESSEL_MASS], state[S_NEAR], state[S_FAR],
+    };
+    Lags lags = {
+        state[S_DRIVE], state[S_JET], state[S_BLOWING],
+        state[S_SUPPLIED], state[S_FELT], state[S_SENSED],
+    };
+    double before = gas.vessel, open_cup = state[OPEN];
+    Advanced next = advance_gas(&gas, &lags, h, &(Valves){nozzle, blow, open_cup}, k);
+    state[S_PORT] = next.gas.port, state[S_PORT_MASS] = next.gas.port_mass;
+    state[S_VESSEL] = next.gas.vessel, state[S_VESSEL_MASS] = next.gas.vessel_mass;
+    state[S_LINE] = next.gas.line, state[S_LINE_MASS] = next.gas.line_mass;
+    state[S_NEAR] = next.gas.near, state[S_FAR] = next.gas.far;
+    state[S_DRIVE] = next.lags.drive, state[S_JET] = next.lags.jet;
+    state[S_BLOWING] = next.lags.valve, state[S_SUPPLIED] = next.lags.supply;
+    state[S_FELT] = next.lags.felt, state[S_SENSED] = next.lags.sensed;
+    double now = opened(before, &next.gas, state[BLOW_COMMAND], k);
+    state[OPEN] = open_cup > 0.0 ? min(open_cup, 1.0) : now;
+    state[ROUGH] = next.off / (h * h * h);
+}
+
+static void step(double *state, const double *k, double dt)
 {
     int count = (int)max(ceil(dt / LONGEST_STEP - 1e-6), 1);
     double h = dt / count;
     for (int i = 0; i < count; i++) {
-        double nozzle = valve_over(state, NOZZLE, h, theta[RESPONSE]);
-        double blow = valve_over(state, BLOW, h, theta[BLOW_OFF_RESPONSE]);
-        runge_kutta(state, h, state[OPEN], nozzle, blow, theta, supplied);
-        int released = theta[AMBIENT] - state[Y_PRESSURE] <= theta[RELEASE];
-        if (released && state[BLOW_COMMAND] > 0.0)
-            state[OPEN] = 1.0;
+        int steps = finer(state, k, h);
+        for (int j = 0; j < steps; j++)
+            substep(state, k, h / steps);
     }
 }
 
@@ -192,7 +458,7 @@ static void command(double *state, int position, double value)
     }
 }
 
-static void enter(double *state, int phase)
+static void enter(double *state, int phase, const double *k)
 {
     int before = (int)state[PHASE];
     if (phase == before)
@@ -205,42 +471,82 @@ static void enter(double *state, int phase)
         state[NOZZLE_AGE] = NEVER;
     if (phase == SUCTION_PHASE && before != HOLD_PHASE)
         state[OPEN] = 0.0;
+    if (phase == IDLE_PHASE && before == BLOW_OFF_PHASE && k[RELEASE] >= 0.0)
+        state[OPEN] = 1.0;
 }
 
-static void synchronise(double *state, double level, const double *theta)
+static void settle(double *state, const double *k, double pressure)
+{
+    double temperature = k[TEMPERATURE];
+    double volume = k[VOLUME] - k[COMPLIANCE] * (1.0 - pressure / k[AMBIENT]);
+    state[S_PORT] = state[S_LINE] = state[S_VESSEL] = pressure;
+    state[S_FELT] = state[S_SENSED] = pressure;
+    state[S_PORT_MASS] = pressure * k[PORT_VOLUME] / (R * temperature);
+    state[S_VESSEL_MASS] = pressure * volume / (R * temperature);
+    state[S_LINE_MASS] = pressure * k[LINE_VOLUME] / (R * temperature);
+    state[S_NEAR] = state[S_FAR] = 0.0;
+    state[S_SUPPLIED] = k[SUPPLY];
+}
+
+static void shift_by(double *state, double shift)
+{
+    for (int node = S_PORT; node <= S_VESSEL; node += 2) {
+        double moved = max(state[node] + shift, 100.0);
+        state[node + 1] *= moved / state[node];
+        state[node] = moved;
+    }
+    state[S_FELT] += shift;
+    state[S_SENSED] += shift;
+}
+
+static void synchronise(double *state, double level, const double *k)
 {
     int idle = state[PHASE] == IDLE_PHASE;
-    if (theta[RELEASE] >= 0.0 && (idle || state[OPEN] > 0.0)) {
-        state[Y_PRESSURE] = state[Y_SENSED] = theta[AMBIENT];
-        state[Y_TEMPERATURE] = theta[TEMPERATURE];
+    if (k[RELEASE] >= 0.0 && (idle || state[OPEN] > 0.0)) {
+        settle(state, k, k[AMBIENT]);
         state[OPEN] = 1.0;
     } else if (state[VALID] > 0.0) {
-        double shift = sensed_at(level, theta) - state[Y_SENSED];
-        state[Y_PRESSURE] = max(state[Y_PRESSURE] + shift, 100.0);
-        state[Y_SENSED] += shift;
+        shift_by(state, sensed_at(level, k) - state[S_SENSED]);
     } else {
-        state[Y_PRESSURE] = state[Y_SENSED] = sensed_at(level, theta);
-        state[Y_TEMPERATURE] = theta[TEMPERATURE];
+        settle(state, k, sensed_at(level, k));
     }
     if (state[VALID] == 0.0) {
-        state[Y_JET] = state[NOZZLE] = state[NOZZLE_COMMAND];
-        state[Y_BLOWING] = state[BLOW] = state[BLOW_COMMAND];
+        state[S_DRIVE] = state[S_JET] = state[NOZZLE] = state[NOZZLE_COMMAND];
+        state[S_BLOWING] = state[BLOW] = state[BLOW_COMMAND];
     }
     state[VALID] = 1.0;
 }
 
-void advance(double *state, const double *theta, const double *dt, const uint8_t *phase,
-             const double *level, double *expected, int64_t rows)
+/* control.py */
+static int two_point(int before, double vacuum, double high, double low)
 {
-    Supplied supplied = at_supply(theta);
+    return vacuum >= high ? 1 : vacuum < low ? 0 : before;
+}
+
+static void read_out(double *state, const double *k, double *expected, uint8_t *signals)
+{
+    *expected = state[VALID] > 0.0 ? reading(state[S_SENSED], k) : NAN;
+    double vacuum = k[AMBIENT] - state[S_PORT];
+    int before = (int)state[SIGNALS];
+    int present = two_point((before & PART_PRESENT_SIGNAL) != 0, vacuum, k[H2], k[H2_LOW]);
+    int reached = two_point((before & AIR_SAVING_SIGNAL) != 0, vacuum, k[H1], k[H1_LOW]);
+    *signals = (uint8_t)(present * PART_PRESENT_SIGNAL + reached * AIR_SAVING_SIGNAL);
+    state[SIGNALS] = *signals;
+}
+
+void advance(double *state, const double *theta, const double *dt, const uint8_t *phase,
+             const double *level, double *expected, uint8_t *signals, int64_t rows)
+{
+    double k[PREPARED];
+    prepare(theta, k);
     for (int64_t row = 0; row < rows; row++) {
         if (dt[row] < 0.0 || dt[row] > LONGEST_BRIDGE)
             state[VALID] = 0.0;
         else if (state[VALID] > 0.0 && dt[row] > 0.0)
-            step(state, dt[row], theta, supplied);
-        enter(state, phase[row]);
+            step(state, k, dt[row]);
+        enter(state, phase[row], k);
         if (!isnan(level[row]))
-            synchronise(state, level[row], theta);
-        expected[row] = state[VALID] > 0.0 ? reading(state[Y_SENSED], theta) : NAN;
+            synchronise(state, level[row], k);
+        read_out(state, k, &expected[row], &signals[row]);
     }
 }

@@ -1,9 +1,10 @@
-"""The compiled step of the model beside the same scheme in C."""
+"""The compiled model beside the same scheme in C: one hypothesis, and many at once."""
 
 import ctypes
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -14,37 +15,80 @@ from benchmarks.machine import TWIN_CORE, on_core
 from benchmarks.native import library
 from benchmarks.recording import Recording, hour
 from twin.model import kernel
+from twin.model.effects import EFFECTS, Effect, apply
+from twin.model.theta import Theta
 from twin.monitor.signatures import steps
 
 ROWS = 100_000
 REPEATS = 25
+HYPOTHESES = 64
+BANK_ROWS = 10_000  # three cycles
+BANK_REPEATS = 9
+SIZES = (1.0, 0.5, 2.0, 4.0)  # of an effect, in its typical size
 AGREE = 1e-9  # relative
 
 Floats = npt.NDArray[np.float64]
-Advance = Callable[[Floats, Floats, Floats, npt.NDArray[np.uint8], Floats, Floats], None]
+Bytes = npt.NDArray[np.uint8]
+Advance = Callable[[Floats, Theta, Floats, Bytes, Floats, Floats, Bytes], None]
+Driven = tuple[Floats, Bytes, Floats]  # time steps, phases, levels
 
 
-def step(run: Run) -> Sequence[Measured]:
-    """Processor time (ns) of one step of 1 ms, in numba and in C by turns."""
+def speed(run: Run) -> Sequence[Measured]:
+    """Processor time (ns) of a row for one hypothesis, and for each of 64 advanced together."""
     run.tell("kernel: simulating the rig")
-    driven = _rows(hour(), ROWS)
+    theta, bank = hour().theta, hypotheses(hour().theta)
+    one, few = _rows(hour(), ROWS), _rows(hour(), BANK_ROWS)
     native = in_c(run.folder)
-    run.tell("kernel")
     with on_core(TWIN_CORE):
-        _, expected = _timed(kernel.advance, *driven)
-        if native is None:
-            ours = [_timed(kernel.advance, *driven)[0] for _ in range(REPEATS)]
-            return (Measured(_per_step(ours), note="no C compiler"),)
-        note = _compared(expected, _timed(native, *driven)[1])
-        turns = [
-            (_timed(kernel.advance, *driven)[0], _timed(native, *driven)[0]) for _ in range(REPEATS)
-        ]
+        run.tell("kernel: one hypothesis")
+        single = _one(theta, one, native)
+        run.tell(f"kernel: {HYPOTHESES} hypotheses")
+        return single, _many(bank, few, native)
+
+
+def hypotheses(theta: Theta) -> list[Theta]:
+    """The data set with each effect of the table at its typical size, then at other sizes."""
+    every = (_changed(theta, effect, size) for size in SIZES for effect in EFFECTS.values())
+    return list(islice(every, HYPOTHESES))
+
+
+def _changed(theta: Theta, effect: Effect, size: float) -> Theta:
+    sizes = {
+        p.name: min(max(p.neutral(theta) + size * p.typical, p.low), p.high)
+        for p in effect.parameters
+    }
+    return apply(theta, effect.name, sizes)
+
+
+def _one(theta: Theta, driven: Driven, native: Advance | None) -> Measured:
+    expected = _timed(kernel.advance, theta, driven)[1]
+    if native is None:
+        ours = [_timed(kernel.advance, theta, driven)[0] for _ in range(REPEATS)]
+        return Measured(ours, note="no C compiler")
+    note = _compared(expected, _timed(native, theta, driven)[1])
+    turns = [
+        (_timed(kernel.advance, theta, driven)[0], _timed(native, theta, driven)[0])
+        for _ in range(REPEATS)
+    ]
     ours, c = zip(*turns, strict=True)
-    return (Measured(_per_step(ours), _per_step(c), note),)
+    return Measured(ours, c, note)
 
 
-def _per_step(seconds: Sequence[float]) -> list[float]:
-    return [1e9 * one / ROWS for one in seconds]
+def _many(bank: Sequence[Theta], driven: Driven, native: Advance | None) -> Measured:
+    """All of ``bank`` in one call by turns with the C, which takes them one after another."""
+    together = np.ascontiguousarray(np.transpose(bank))
+    expected = _timed(kernel.advance, together, driven)[1]
+    alone = np.transpose([_timed(kernel.advance, theta, driven)[1] for theta in bank])
+    note = f"each within {np.nanmax(np.abs(expected - alone)):.1g} Pa of itself alone"
+    if native is None:
+        ours = [_timed(kernel.advance, together, driven)[0] for _ in range(BANK_REPEATS)]
+        return Measured(ours, note=f"{note}; no C compiler")
+    _compared(alone, np.transpose([_timed(native, theta, driven)[1] for theta in bank]))
+    ours, c = [], []
+    for _ in range(BANK_REPEATS):
+        ours.append(_timed(kernel.advance, together, driven)[0])
+        c.append(float(np.mean([_timed(native, theta, driven)[0] for theta in bank])))
+    return Measured(ours, c, note)
 
 
 def _compared(expected: Floats, native: Floats) -> str:
@@ -58,49 +102,47 @@ def _compared(expected: Floats, native: Floats) -> str:
 
 def over_hour(native: Advance) -> float:
     """Processor time (s) of ``native`` for every row of the hour."""
-    return _timed(native, *_rows(hour(), len(hour().samples)))[0]
+    rows = len(hour().samples)
+    return _timed(native, hour().theta, _rows(hour(), rows))[0] * 1e-9 * rows
 
 
 def in_c(folder: Path) -> Advance | None:
-    """``kernel.advance`` in C; None where there is no compiler."""
+    """``kernel.advance`` for one hypothesis in C; None where there is no compiler."""
     compiled = library("kernel", folder)
     return None if compiled is None else partial(_advance, compiled)
 
 
-def _rows(recording: Recording, rows: int) -> tuple[Floats, Floats, npt.NDArray[np.uint8], Floats]:
-    """Coefficients, time steps, phases and levels of the first ``rows``."""
+def _rows(recording: Recording, rows: int) -> Driven:
+    """Time steps, phases and levels of the first ``rows``."""
     samples, ticks = recording.samples[:rows], recording.ticks[:rows]
     phase = np.ascontiguousarray(ticks["phase"])
-    return recording.theta, steps(samples, None), phase, ticks["level"].astype(np.float64)
+    return steps(samples, None), phase, ticks["level"].astype(np.float64)
 
 
-def _timed(
-    advance: Advance,
-    theta: Floats,
-    dt: Floats,
-    phase: npt.NDArray[np.uint8],
-    level: Floats,
-) -> tuple[float, Floats]:
-    """Processor seconds for a fresh model over the rows, and what it expects (Pa).
+def _timed(advance: Advance, theta: Theta, driven: Driven) -> tuple[float, Floats]:
+    """Processor time (ns) per row and hypothesis of a fresh model, and what it expects (Pa).
 
     Both only compute, so the time that others take on the machine can be left out.
     """
-    state, expected = kernel.new_state(), np.empty(len(dt))
+    many = theta.shape[1:]
+    shape = (len(driven[0]), *many)
+    state, expected, signals = kernel.new_state(*many), np.empty(shape), np.empty(shape, np.uint8)
     begin = time.thread_time()
-    advance(state, theta, dt, phase, level, expected)
-    return time.thread_time() - begin, expected
+    advance(state, theta, *driven, expected, signals)
+    return 1e9 * (time.thread_time() - begin) / expected.size, expected
 
 
 def _advance(
     compiled: ctypes.CDLL,
     state: Floats,
-    theta: Floats,
+    theta: Theta,
     dt: Floats,
-    phase: npt.NDArray[np.uint8],
+    phase: Bytes,
     level: Floats,
     expected: Floats,
+    signals: Bytes,
 ) -> None:
-    arrays = (state, theta, dt, phase, level, expected)
+    arrays = (state, theta, dt, phase, level, expected, signals)
     assert all(array.flags.c_contiguous for array in arrays)
     pointers = [ctypes.c_void_p(array.ctypes.data) for array in arrays]
     compiled.advance(*pointers, ctypes.c_int64(len(dt)))

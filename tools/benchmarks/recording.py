@@ -11,7 +11,8 @@ from drivers.plc.simulate import blocks
 from twin.config import Config
 from twin.live import Twin
 from twin.log.header import LogHeader
-from twin.model.dataset import Theta, coefficients
+from twin.model.dataset import coefficients
+from twin.model.theta import Theta
 from twin.monitor.phases import expected_knees
 from twin.settings import Document
 from twin.signals import MBAR, MS, NS, Samples, Ticks

@@ -10,7 +10,7 @@ import numpy as np
 from twin.config import Config
 from twin.diagnosis.evidence import Course, Evidence, Floats, collect
 from twin.diagnosis.search import SAME, Finding, search
-from twin.model import dataset as c
+from twin.model import theta as c
 from twin.model.effects import EFFECTS
 from twin.monitor.cycles import PAPER_VACUUM, time_to_vacuum
 from twin.signals import MBAR, MS, NS, Phase, Quality, Samples

@@ -15,11 +15,12 @@ from scipy.linalg import solve_triangular
 from twin.config import Config
 from twin.errors import ConfigError
 from twin.live import Twin
-from twin.model import dataset as c
 from twin.model import kernel
-from twin.model.dataset import Theta, coefficients
+from twin.model import theta as c
+from twin.model.dataset import coefficients
 from twin.model.effects import apply
 from twin.model.plant import reading
+from twin.model.theta import Theta
 from twin.monitor.cycles import Cycle, CycleCutter, figures
 from twin.monitor.phases import expected_knees
 from twin.monitor.signatures import steps
@@ -68,9 +69,12 @@ class Evidence:
         dt = steps(self.samples, None)
         state = kernel.new_state()
         ends = [row for row, _ in course[1:]] + [len(dt)]
+        before = course[0][1]
         for (first, theta), last in zip(course, ends, strict=True):
             phase = self._phase(theta)[first:last]
             part = slice(first, last)
+            kernel.take_over(state, before, theta)
+            before = theta
             kernel.advance(state, theta, dt[part], phase, level[part], expected[part])
         return expected
 
@@ -117,8 +121,8 @@ class Evidence:
     def _phase(self, theta: Theta) -> npt.NDArray[np.uint8]:
         """Phases with the nozzle's switching moved as far before each knee as ``theta`` has it."""
         phase: npt.NDArray[np.uint8] = self.ticks["phase"].copy()
-        for index, name in ((c.RAMP_DOWN, Phase.HOLD), (c.RAMP_UP, Phase.SUCTION)):
-            lags = [round((at[index] + at[c.SENSOR_LAG]) / MS) for at in (self.theta, theta)]
+        for jet, name in ((_collapse, Phase.HOLD), (_build_up, Phase.SUCTION)):
+            lags = [round((jet(at) + _sensing(at)) / MS) for at in (self.theta, theta)]
             if (later := lags[1] - lags[0]) == 0:
                 continue
             before = lags[0] if name == Phase.SUCTION else 0  # rows from the valve to the knee
@@ -138,9 +142,21 @@ LEVEL_MBAR = 0.7  # a switching level is not known better, whatever healthy cycl
 _OTHER = {Phase.HOLD: Phase.SUCTION, Phase.SUCTION: Phase.HOLD}
 
 
+def _build_up(theta: Theta) -> float:
+    return float(2.0 * theta[c.RAMP_UP] + theta[c.SLOW_RAMP_UP])
+
+
+def _sensing(theta: Theta) -> float:
+    return float(2.0 * theta[c.SENSOR_LAG] + theta[c.SLOW_SENSOR])
+
+
+def _collapse(theta: Theta) -> float:
+    return float(2.0 * theta[c.RAMP_DOWN])
+
+
 def _read_vacuum(theta: Theta, index: int) -> float:
     nominal = theta[c.AMBIENT_NOMINAL]
-    return float(nominal - reading(nominal - theta[index], theta))
+    return float(nominal - reading(nominal - theta[index], theta.reshape(-1, 1), 0))
 
 
 def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:

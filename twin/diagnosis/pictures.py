@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from twin.diagnosis.answer import Diagnosis
 from twin.diagnosis.evidence import Evidence, Floats
-from twin.model import dataset as c
+from twin.model import theta as c
 from twin.signals import MBAR, MS, NS, Phase
 
 POINTS = 1000  # of a line; more cannot be seen

@@ -21,9 +21,9 @@ from twin.diagnosis.pictures import (
     worst_phase,
 )
 from twin.errors import SourceError
-from twin.model import dataset as c
-from twin.model.dataset import Theta
+from twin.model import theta as c
 from twin.model.effects import EFFECTS
+from twin.model.theta import Theta
 from twin.signals import BAR, MBAR, ML, SL_MIN, Phase
 
 MOST_LISTED = 12  # cycles named one by one
@@ -359,15 +359,15 @@ def _footer(diagnosis: Diagnosis) -> str:
 
 def _data_set(theta: Theta) -> str:
     """What the twin was calibrated to, as far as one can compare it with a nameplate."""
+    volume = theta[[c.PORT_VOLUME, c.LINE_VOLUME, c.VOLUME]].sum()
     numbers = (
-        ("suction capacity", c.SUCTION, SL_MIN, "sl/min"),
-        ("volume", c.VOLUME, ML, "ml"),
-        ("supply", c.SUPPLY, BAR, "bar"),
-        ("ambient", c.AMBIENT, MBAR, "mbar"),
-        ("H1", c.H1, MBAR, "mbar"),
+        ("suction capacity", theta[c.SUCTION] / SL_MIN, "sl/min"),
+        ("volume", volume / ML, "ml"),
+        ("supply", theta[c.SUPPLY] / BAR, "bar"),
+        ("ambient", theta[c.AMBIENT] / MBAR, "mbar"),
+        ("H1", theta[c.H1] / MBAR, "mbar"),
     )
-    said = (f"{name} {theta[index] / scale:.4g} {unit}" for name, index, scale, unit in numbers)
-    return ", ".join(said)
+    return ", ".join(f"{name} {value:.4g} {unit}" for name, value, unit in numbers)
 
 
 def _section(title: str, body: str) -> str:

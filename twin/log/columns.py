@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
-from twin.log.schema import COLUMNS, SAMPLES
+from twin.log.schema import ADDED, COLUMNS, SAMPLES
 from twin.signals import SAMPLE, TICK, Samples, Ticks
 
 _INT64 = struct.Struct("<q")  # the first row's bits
@@ -56,9 +56,11 @@ def decode(packed: bytes) -> tuple[Samples, Ticks]:
     """Reverse ``encode``; ValueError, struct.error or DecodeError if it is something else."""
     message = SAMPLES.message.FromString(packed)
     planes = np.zeros((len(COLUMNS), message.count, 8), np.uint8)
-    first = np.empty((len(COLUMNS), 1), np.int64)
+    first = np.zeros((len(COLUMNS), 1), np.int64)
     for index, name in enumerate(COLUMNS):
         column = getattr(message, name)
+        if not column and name in ADDED:
+            continue
         first[index] = _INT64.unpack_from(column)
         if len(column) > _INT64.size:
             kept = np.frombuffer(column, np.uint8, offset=_INT64.size).reshape(-1, message.count)

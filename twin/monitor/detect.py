@@ -12,8 +12,8 @@ import numpy as np
 from pydantic import Field
 
 from twin.events import Event, Kind
-from twin.model import dataset as c
-from twin.model.dataset import Theta
+from twin.model import theta as c
+from twin.model.theta import Theta
 from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, figures
 from twin.monitor.signatures import Likeness, likenesses, look_alikes
 from twin.settings import Settings
@@ -35,8 +35,8 @@ class MonitorSettings(Settings):
     """When a deviation is an alarm."""
 
     raise_sigma: float = Field(6.0, gt=0.0)
-    clear_sigma: float = Field(4.0, gt=0.0)
-    clear_cycles: int = Field(2, ge=1)
+    clear_sigma: float = Field(3.5, gt=0.0)
+    clear_cycles: int = Field(3, ge=1)
     smallest_mbar: float = Field(0.5, ge=0.0)  # deviations below are never worth an alarm
     stale_ms: float = Field(500.0, gt=0.0)
     healthy: Mapping[str, Scatter] = Field(default_factory=dict)

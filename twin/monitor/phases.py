@@ -12,14 +12,15 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from twin.model import dataset as c
-from twin.model import kernel
+from twin.model import theta as c
 from twin.model.compiled import compiled
-from twin.model.dataset import Theta
-from twin.model.plant import ORDER, at_supply, rates
-from twin.signals import BREAK, MS, SAMPLE, UNUSABLE, Command, Phase, Samples
+from twin.model.control import new_timer, timed
+from twin.model.gas import GAMMA, R
+from twin.model.plant import suction_at
+from twin.model.theta import Theta
+from twin.signals import BREAK, MS, NS, SAMPLE, UNUSABLE, Phase, Samples
 
-IDLE_ROWS = 20  # rows of idle whose mean is the level before a cycle
+IDLE_ROWS = 20  # rows of idle that give the level before a cycle
 FEWEST_IDLE_ROWS = 5
 SIGNIFICANT = 7.0  # sigmas of slope difference that make a knee
 SHORTEST_WINDOW, LONGEST_WINDOW = 8, 60  # rows
@@ -44,6 +45,7 @@ class Knees:
     noise: float
     on_shift: int
     settled: int
+    blow_off: tuple[float, float] = (float(c.EXTERNAL), 0.0)  # the ejector's own: mode, pulse (s)
 
     @property
     def lag(self) -> int:
@@ -57,21 +59,16 @@ def expected_knees(theta: Theta, noise: float) -> Knees:
     The slope of a straight line over n rows of noise s has the deviation s √(12/n³); the window is
     chosen so that the break is SIGNIFICANT against the difference of two such slopes.
     """
-    state = kernel.at_rest(theta)[:ORDER]
-    state[kernel.PRESSURE] = theta[c.AMBIENT] - theta[c.H1]
-    slopes = []
-    for jet in (1.0, 0.0):
-        state[kernel.JET] = jet
-        change = np.empty(ORDER)
-        rates(state, 0.0, jet, 0.0, theta, at_supply(theta), change)
-        slopes.append(change[kernel.PRESSURE] * MS)
-    bend = max(abs(slopes[1] - slopes[0]), 1e-3)
+    h1 = theta[c.AMBIENT] - theta[c.H1]
+    suction = suction_at(theta, h1) * R * theta[c.TEMPERATURE]
+    bend = max(GAMMA * suction / (theta[c.VOLUME] + theta[c.PORT_VOLUME]) * MS, 1e-3)  # Pa per row
     rows = (24.0 * (2.5 * SIGNIFICANT * noise / bend) ** 2) ** (1.0 / 3.0)
     return Knees(
         window=int(min(max(math.ceil(rows), SHORTEST_WINDOW), LONGEST_WINDOW)),
         noise=noise,
-        on_shift=round((theta[c.RAMP_UP] + theta[c.SENSOR_LAG]) / MS),
+        on_shift=round((2.0 * theta[c.RAMP_UP] + 2.0 * theta[c.SENSOR_LAG]) / MS),
         settled=round((theta[c.RESPONSE] + SETTLED) / MS),
+        blow_off=(float(theta[c.BLOW_OFF_MODE]), float(theta[c.BLOW_OFF_TIME])),
     )
 
 
@@ -122,7 +119,7 @@ def _find(state, pressure, commands, first, last, look, phase, level):  # type: 
         if starts:
             state[_NOZZLE], state[_BEST] = 1.0, 0.0
             if state[_IDLE_AGE] >= FEWEST_IDLE_ROWS:
-                level[row] = state[_IDLE_SUM] / state[_IDLE_AGE]
+                level[row] = _idle_level(state, pressure, row)
                 state[_ANCHORED] = 1.0
         if commands[row] == 0:
             _idle(state, pressure, row, level)
@@ -138,7 +135,7 @@ def _find(state, pressure, commands, first, last, look, phase, level):  # type: 
 
 @compiled
 def _idle(state, pressure, row, level):  # type: ignore[no-untyped-def]
-    """Keep the mean of the last idle rows; the first of a stretch anchors the model."""
+    """Keep the mean of the last idle rows; the first of a stretch anchor the model."""
     if math.isnan(pressure[row]):
         return
     if state[_IDLE_AGE] >= IDLE_ROWS:  # let the oldest go
@@ -147,8 +144,19 @@ def _idle(state, pressure, row, level):  # type: ignore[no-untyped-def]
     state[_IDLE_SUM] += pressure[row]
     state[_IDLE_AGE] += 1.0
     if state[_ANCHORED] == 0.0 and state[_IDLE_AGE] >= IDLE_ROWS:
-        level[row] = state[_IDLE_SUM] / state[_IDLE_AGE]
+        level[row] = _idle_level(state, pressure, row + 1)
         state[_ANCHORED] = 1.0
+
+
+@compiled
+def _idle_level(state, pressure, row):  # type: ignore[no-untyped-def]
+    """Pressure (Pa) to which the idle rows before ``row`` lead: a closed vessel may still cool."""
+    mean = state[_IDLE_SUM] / state[_IDLE_AGE]
+    if state[_IDLE_AGE] < IDLE_ROWS or row < IDLE_ROWS:
+        return mean
+    slope, middle = _line(pressure, row - IDLE_ROWS, IDLE_ROWS)
+    level = middle + slope * 0.5 * (IDLE_ROWS + 1)
+    return mean if math.isnan(level) else level
 
 
 @compiled
@@ -183,6 +191,8 @@ class PhaseFinder:
     knees: Knees
     _state: npt.NDArray[np.float64] = field(default_factory=lambda: np.array(_BEGINNING))
     _rows: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))
+    _told: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, "u1"))  # the valves
+    _timer: npt.NDArray[np.float64] = field(default_factory=new_timer)  # of the blow-off
     _phase: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, "u1"))
     _level: npt.NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     _seen: int = 0  # rows of _rows that are through the search
@@ -205,11 +215,13 @@ class PhaseFinder:
         rest = slice(self._given, None)
         given = self._rows[rest], self._phase[rest], self._level[rest]
         self._state, self._rows = np.array(_BEGINNING), np.empty(0, SAMPLE)
+        self._told, self._timer = np.empty(0, "u1"), new_timer()
         self._phase, self._level = np.empty(0, "u1"), np.empty(0)
         self._seen = self._given = 0
         return given
 
     def _search(self, stretch: Samples) -> Found:
+        self._told = np.concatenate([self._told, self._what_valves_are_told(stretch)])
         self._rows = np.concatenate([self._rows, stretch])
         self._phase = np.concatenate([self._phase, np.zeros(len(stretch), "u1")])
         self._level = np.concatenate([self._level, np.full(len(stretch), np.nan)])
@@ -218,18 +230,26 @@ class PhaseFinder:
         ready = slice(self._given, max(len(self._rows) - lag, self._given))
         given = self._rows[ready], self._phase[ready], self._level[ready]
         self._given = ready.stop
-        drop = max(self._seen - window - lag, 0)  # what no later row will look back on
+        context = max(window + lag, IDLE_ROWS)  # how far later rows look back
+        drop = max(self._seen - context, 0)
         drop = min(drop, self._given)
         self._rows, self._phase = self._rows[drop:], self._phase[drop:]
-        self._level = self._level[drop:]
+        self._level, self._told = self._level[drop:], self._told[drop:]
         self._seen -= drop
         self._given -= drop
         return given
+
+    def _what_valves_are_told(self, stretch: Samples) -> npt.NDArray[np.uint8]:
+        """Commands as the ejector acts on them: its blow-off timer adds and ends pulses."""
+        times = np.concatenate([self._rows["time_ns"][-1:], stretch["time_ns"]])
+        dt = np.diff(times, prepend=times[:1])[-len(stretch) :] * NS
+        told = np.empty(len(stretch), "u1")
+        timed(self._timer, stretch["commands"], dt, *self.knees.blow_off, told)
+        return told
 
     def _run(self, last: int, window: int) -> None:
         pressure = self._rows["pressure"].astype(np.float64)
         pressure[(self._rows["quality"] & UNUSABLE) != 0] = np.nan
         look = np.array([window, self.knees.noise, self.knees.on_shift, self.knees.settled])
-        commands = self._rows["commands"] & (Command.SUCTION | Command.BLOW_OFF)
-        _find(self._state, pressure, commands, self._seen, last, look, self._phase, self._level)
+        _find(self._state, pressure, self._told, self._seen, last, look, self._phase, self._level)
         self._seen = last

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.model import kernel
-from twin.model.dataset import Theta
 from twin.model.effects import EFFECTS, Effect, apply
+from twin.model.theta import Theta
 from twin.signals import BREAK, MBAR, NS, Samples, Ticks, deviation
 
 LOOK_ALIKE = 0.9  # of the best fit's gain
@@ -30,9 +30,12 @@ class Likeness:
 def expect(
     theta: Theta, samples: Samples, phase: npt.NDArray[np.uint8], level: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """Expected pressure (Pa) of a fresh model over rows whose phases and levels are known."""
-    expected = np.empty(len(samples))
-    kernel.advance(kernel.new_state(), theta, steps(samples, None), phase, level, expected)
+    """Expected pressure (Pa) of fresh models over rows whose phases and levels are known.
+
+    ``theta`` is (coefficients, n), one column for each of n hypotheses; the result is (rows, n).
+    """
+    state, expected = kernel.new_state(theta.shape[1]), np.empty((len(samples), theta.shape[1]))
+    kernel.advance(state, theta, steps(samples, None), phase, level, expected)
     return expected
 
 
@@ -50,18 +53,18 @@ def likenesses(theta: Theta, samples: Samples, ticks: Ticks, begin: int) -> list
 
     The rows before ``begin`` let the model swing in.
     """
-    level = ticks["level"].astype(np.float64)
-    neutral = expect(theta, samples, ticks["phase"], level)
+    changed = np.stack([theta, *(_typical(theta, effect) for effect in EFFECTS.values())], axis=1)
+    expected = expect(changed, samples, ticks["phase"], ticks["level"].astype(np.float64)) / MBAR
     off = deviation(samples, ticks) / MBAR
-    rows = np.isfinite(off) & np.isfinite(neutral)
+    rows = np.isfinite(off) & np.isfinite(expected[:, 0])
     rows[:begin] = False
     if not rows.any():
         return []
-    found = []
-    for effect in EFFECTS.values():
-        changed = expect(_typical(theta, effect), samples, ticks["phase"], level)
-        signature = (changed[rows] - neutral[rows]) / MBAR
-        found.append(_fit(effect, off[rows], signature))
+    signatures = expected[rows, 1:] - expected[rows, :1]
+    found = [
+        _fit(effect, off[rows], signature)
+        for effect, signature in zip(EFFECTS.values(), signatures.T, strict=True)
+    ]
     return sorted(found, key=lambda likeness: -likeness.share)
 
 

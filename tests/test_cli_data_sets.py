@@ -1,0 +1,223 @@
+"""The commands that carry data sets and tables: what one writes, the next one takes up."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rigs
+import tomli_w
+from command_line import edited, twin
+
+from twin.log.header import LogHeader
+from twin.log.reader import open_log
+from twin.log.recorder import Recorder
+from twin.signals import Samples, Ticks
+
+GRIPPER = rigs.path_of("gripper")
+UNIT = "gripper-77"
+SECONDS = 15.0  # six cycles that count: one more than a calibration needs
+
+
+def record(path: Path, samples: Samples, ticks: Ticks) -> Path:
+    """A log as an earlier program wrote it: without the data set."""
+    document = rigs.config("gripper").document
+    recorder = Recorder(path, LogHeader("compact-ejector-35", "", "g.toml", document.text))
+    recorder.write(samples, ticks, [])
+    recorder.close()
+    return path
+
+
+def rows(log: Path) -> tuple[Samples, Ticks]:
+    samples, ticks = zip(*open_log(log).blocks(), strict=True)
+    return np.concatenate(samples), np.concatenate(ticks)
+
+
+def same(one: Path, other: Path) -> bool:
+    return [part.tobytes() for part in rows(one)] == [part.tobytes() for part in rows(other)]
+
+
+def about(log: Path, what: str) -> str:
+    return open_log(log).header.metadata[what]
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    samples, _ = rigs.recorded("gripper", SECONDS)
+    path = tmp_path_factory.mktemp("log") / "gripper.mcap"
+    return record(path, *rigs.expectation(rigs.twin("gripper"), [samples]))
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder to work in: databases that nobody names lie there."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def add_unit(monkeypatch: pytest.MonkeyPatch, suction: float, *database: str) -> None:
+    """Put a unit into the database that is the gripper but for its suction capacity."""
+    data = rigs.config("gripper").data
+    ejector = data.ejector.model_copy(update={"suction_capacity_sl_min": suction})
+    data = data.model_copy(update={"ejector": ejector})
+    healthy = {
+        name: one.model_dump() for name, one in rigs.config("gripper").monitor.healthy.items()
+    }
+    unit = {"kind": "instance", "name": UNIT, "type": "compact-ejector-35"}
+    Path("unit.toml").write_text(
+        tomli_w.dumps({**unit, "data": data.model_dump(exclude_none=True), "healthy": healthy})
+    )
+    assert twin(monkeypatch, "assets", "add", "unit.toml", *database) == 0
+
+
+# The data set of a log.
+
+
+def test_a_log_replays_with_the_data_set_it_was_made_with(
+    log: Path, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add_unit(monkeypatch, 30.0, "--assets", "elsewhere.sqlite")
+    chosen = ("--id", UNIT, "--assets", "elsewhere.sqlite")
+    assert twin(monkeypatch, "replay", log, *chosen, "-o", "unit.mcap") == 0
+    assert "instance-specific data of gripper-77" in about(here / "unit.mcap", "origin")
+    assert not same(log, here / "unit.mcap")
+
+    (here / "elsewhere.sqlite").unlink()
+    assert twin(monkeypatch, "replay", "unit.mcap", "-o", "again.mcap") == 0
+    assert same(here / "unit.mcap", here / "again.mcap")
+    for what in ("data_set", "origin", "data", "healthy"):
+        assert about(here / "unit.mcap", what) == about(here / "again.mcap", what)
+
+
+def test_another_configuration_or_unit_takes_the_place_of_the_data_set_in_the_log(
+    log: Path, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add_unit(monkeypatch, 30.0)
+    assert twin(monkeypatch, "replay", log, "--id", UNIT, "-o", "unit.mcap") == 0
+    assert twin(monkeypatch, "replay", "unit.mcap", "--config", GRIPPER, "-o", "file.mcap") == 0
+    assert same(log, here / "file.mcap")
+    assert twin(monkeypatch, "replay", "file.mcap", "--id", UNIT, "-o", "back.mcap") == 0
+    assert same(here / "unit.mcap", here / "back.mcap")
+
+
+def test_a_diagnosis_judges_by_the_data_set_of_the_log_or_the_unit_that_is_named(
+    log: Path, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Too short a log is quick to diagnose, and the report names the data set all the same."""
+    add_unit(monkeypatch, 30.0)
+    samples, ticks = rows(log)
+    short = record(here / "short.mcap", samples[:4000], ticks[:4000])
+    assert twin(monkeypatch, "replay", short, "--id", UNIT, "-o", "unit.mcap") == 0
+    used = {}
+    for name, chosen in (("short", ()), ("unit", ()), ("short", ("--id", UNIT))):
+        report = here / f"{name}{len(chosen)}.html"
+        assert twin(monkeypatch, "diagnose", f"{name}.mcap", *chosen, "--report", report) == 0
+        used[report.stem] = "suction capacity 30 sl/min" in report.read_text()
+    assert used == {"short0": False, "unit0": True, "short2": True}
+    assert about(here / "unit.mcap", "data_set") in (here / "short2.html").read_text()
+
+
+def test_a_unit_that_is_calibrated_is_the_one_that_is_replayed(
+    log: Path,
+    here: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    config = here / "cell.toml"
+    config.write_text(GRIPPER.read_text())
+    answer = here / "calibration.json"
+    command = ("calibrate", log, "--config", config, "--id", UNIT, "--json", answer)
+    assert twin(monkeypatch, *command) == 0
+    said = capsys.readouterr()
+    assert f"stored as {UNIT}" in said.out
+    assert json.loads(answer.read_text())
+
+    assert twin(monkeypatch, "assets", "show", UNIT, "--config", config) == 0
+    shown = capsys.readouterr().out
+    assert f'name = "{UNIT}"' in shown
+    assert "# log: gripper.mcap" in shown
+
+    assert twin(monkeypatch, "replay", log, "--id", UNIT, "--fail-on-alarm", "-o", "unit.mcap") == 0
+    assert about(here / "unit.mcap", "origin").startswith(f"instance-specific data of {UNIT}")
+    healthy = json.loads(about(here / "unit.mcap", "healthy"))
+    assert {"idle_rms", "suction_rms", "hold_rms", "blow_off_rms", "leftover"} <= set(healthy)
+
+
+def test_a_calibration_without_a_unit_is_exit_code_2(
+    log: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, _ = edited(here, 'id = "gripper-01"', 'id = ""', "gripper")
+    assert twin(monkeypatch, "calibrate", log, "--config", config) == 2
+    assert "no unit is named" in capsys.readouterr().err
+    assert not (here / "assets.sqlite").exists()
+
+
+# Tables.
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_a_log_goes_out_and_comes_back_the_same(
+    suffix: str, log: Path, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = here / f"a.{suffix}"
+    assert twin(monkeypatch, "export", log, "-o", table) == 0
+    assert twin(monkeypatch, "import", table, "--config", GRIPPER, "-o", "in.mcap") == 0
+    assert same(log, here / "in.mcap")
+    assert twin(monkeypatch, "replay", "in.mcap", "-o", "replayed.mcap") == 0
+    assert same(log, here / "replayed.mcap")
+    assert twin(monkeypatch, "export", "replayed.mcap", "-o", f"b.{suffix}") == 0
+    if suffix == "csv":
+        first, second = (
+            [line for line in (here / name).read_text().splitlines() if not line.startswith("#")]
+            for name in ("a.csv", "b.csv")
+        )
+        assert first == second
+
+
+def damaged(text: str) -> str:
+    lines = text.splitlines(keepends=True)
+    return "".join([*lines[:9000], lines[9000].replace(",", ",x", 1), *lines[9001:]])
+
+
+def test_a_refused_import_leaves_nothing(
+    log: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twin(monkeypatch, "export", log, "-o", "a.csv") == 0
+    (here / "a.csv").write_text(damaged((here / "a.csv").read_text()))
+    assert twin(monkeypatch, "import", "a.csv", "--config", GRIPPER, "-o", "in.mcap") == 3
+    assert "a.csv:9001: " in capsys.readouterr().err
+    assert [path.name for path in here.iterdir()] == ["a.csv"]
+
+
+@pytest.mark.parametrize(
+    ("config", "output", "code"),
+    [("none.toml", "in.mcap", 3), (GRIPPER, "nowhere/in.mcap", 3), (GRIPPER, "a.csv/in.mcap", 3)],
+)
+def test_what_cannot_be_imported_is_said_and_leaves_nothing(
+    config: str | Path,
+    output: str,
+    code: int,
+    log: Path,
+    here: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert twin(monkeypatch, "export", log, "-o", "a.csv") == 0
+    assert twin(monkeypatch, "import", "a.csv", "--config", config, "-o", output) == code
+    assert "Traceback" not in capsys.readouterr().err
+    assert [path.name for path in here.iterdir()] == ["a.csv"]
+
+
+def test_an_import_replaces_no_log_but_what_a_killed_one_left(
+    log: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ("import", "a.csv", "--config", GRIPPER, "-o", "in.mcap")
+    assert twin(monkeypatch, "export", log, "-o", "a.csv") == 0
+    (here / "in.mcap").write_bytes(b"mine")
+    assert twin(monkeypatch, *command) == 3
+    assert "already a file of that name" in capsys.readouterr().err
+    assert (here / "in.mcap").read_bytes() == b"mine"
+    (here / "in.mcap").rename(here / "in.mcap.part")
+    assert twin(monkeypatch, *command) == 0
+    assert same(log, here / "in.mcap")
+    assert sorted(path.name for path in here.iterdir()) == ["a.csv", "in.mcap"]

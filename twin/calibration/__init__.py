@@ -1,0 +1,1 @@
+"""From healthy cycles of one unit to its instance-specific data set."""

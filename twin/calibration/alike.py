@@ -1,0 +1,96 @@
+"""Whether healthy cycles are alike: nothing may come or go while they are recorded."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.calibration.cycles import Cycles, Floats
+from twin.calibration.weights import weighted
+from twin.errors import ConfigError
+from twin.model.effects import EFFECTS, Parameter, apply
+from twin.model.theta import Theta
+
+SMALLEST = 0.5  # of an effect's typical size: less is within what cycles scatter
+LEAST_SCATTER = 0.05  # of it, from cycle to cycle, whatever a few cycles show
+MEDIAN = 0.954  # of the difference of two, over the standard deviation of each
+SIGNIFICANT = 8.0  # standard errors between the cycles before and after
+LEVELS = {"h1_level": "h1_shift", "h1_low_level": "h2_shift"}  # figures and what moves them
+
+
+@dataclass(frozen=True)
+class Step:
+    """The clearest step in what an effect would be, cycle by cycle."""
+
+    effect: str
+    parameter: Parameter
+    size: float  # in typical sizes
+    errors: float  # standard errors
+    first: int  # cycle, counted from 0, from which on it is there
+    gain: float  # sigmas² it explains
+
+    @property
+    def significant(self) -> bool:
+        """Whether it is more than chance and more than a healthy unit has."""
+        return abs(self.size) > SMALLEST and self.errors > SIGNIFICANT
+
+
+def refuse_changing(
+    cycles: Cycles, theta: Theta, noise: float, figures: Sequence[Mapping[str, float]]
+) -> None:
+    """ConfigError if an effect comes or goes in ``cycles``; ``theta`` is the unit's, ``figures``
+    what each of its complete cycles says. ``noise`` (Pa) is the sensor's.
+    """
+    steps = [*_in_pressure(cycles, theta, noise), *_in_levels(figures)]
+    steps = sorted((one for one in steps if one.significant), key=lambda one: -one.gain)
+    if steps:
+        best = steps[0]
+        size = abs(best.size) * best.parameter.typical
+        raise ConfigError(
+            f"the cycles are not alike: with cycle {best.first + 1} something changes that looks"
+            f" like {best.effect}, by {size:.2g} {best.parameter.unit}",
+            "record healthy cycles of one state; twin diagnose says more",
+        )
+
+
+def _in_pressure(cycles: Cycles, theta: Theta, noise: float) -> Iterator[Step]:
+    """A step for each parameter of each effect, the model made linear."""
+    moves = [
+        (effect.name, parameter, {parameter.name: parameter.neutral(theta) + parameter.typical})
+        for effect in EFFECTS.values()
+        for parameter in effect.parameters
+    ]
+    moved = [apply(theta, name, sizes) for name, _, sizes in moves]
+    off = cycles.off(np.stack([theta, *moved], axis=1))
+    white = weighted(cycles, theta, noise, fitted=False).white(off)[1:]  # it swings in in the first
+    for number, (name, parameter, _) in enumerate(moves, 1):
+        slopes = [one[:, 0] - one[:, number] for one in white]
+        power = np.array([slope @ slope for slope in slopes])
+        if power.min() < 1.0:  # a typical size would be no more than noise
+            continue
+        pull = np.array([slope @ one[:, 0] for slope, one in zip(slopes, white, strict=True)])
+        yield _clearest(name, parameter, pull / power, float(power.mean()), before=1)
+
+
+def _in_levels(figures: Sequence[Mapping[str, float]]) -> Iterator[Step]:
+    """The same for the thresholds, which show only in where the nozzle switches."""
+    drift = EFFECTS["threshold_drift"]
+    for figure, name in LEVELS.items():
+        levels = np.array([one[figure] for one in figures if figure in one])
+        parameter = next(one for one in drift.parameters if one.name == name)
+        if len(levels) == len(figures):
+            yield _clearest(drift.name, parameter, levels / parameter.typical, 1.0, before=1)
+
+
+def _clearest(name: str, parameter: Parameter, sizes: Floats, power: float, before: int) -> Step:
+    """Where the sizes (in typical ones) part most clearly; ``before`` cycles precede them."""
+    n, steps = len(sizes), []
+    median = float(np.median(np.abs(np.diff(sizes))))  # a step in the midst of a cycle moves it not
+    sigma = np.hypot(median / MEDIAN, LEAST_SCATTER)
+    for first in range(1, n):
+        shares = first * (n - first) / n
+        size = float(sizes[first:].mean() - sizes[:first].mean())
+        errors = float(abs(size) / sigma * np.sqrt(shares))
+        gain = size**2 * shares * power
+        steps.append(Step(name, parameter, size, errors, first + before, gain))
+    return max(steps, key=lambda one: one.errors)

@@ -1,0 +1,153 @@
+"""Calibration: healthy cycles in, instance-specific data set out, or a reason why not."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from twin.calibration.alike import refuse_changing
+from twin.calibration.cycles import Cycles
+from twin.calibration.fit import Fitted, fit
+from twin.calibration.parameters import FREE
+from twin.config import Config
+from twin.diagnosis.evidence import collect
+from twin.errors import ConfigError
+from twin.live import Twin
+from twin.model.dataset import DataSet, coefficients
+from twin.model.theta import AMBIENT
+from twin.monitor.cycles import Cycle, CycleCutter, figures
+from twin.monitor.detect import Scatter
+from twin.monitor.phases import expected_knees
+from twin.signals import BREAK, MBAR, SAMPLE, UNUSABLE, Command, Phase, Samples
+
+FEWEST = 5  # complete cycles
+MOST_FITTED = 12  # cycles that are fitted; what more there are tell the scatter
+MOST_SPOILT = 0.02  # share of samples that are saturated, stale or bad
+MOST_LEFT = 15.0  # mbar rms, above which no ejector of this kind is behind the log
+SURE = 0.9  # that the scatter is no larger than a few cycles show
+LEAST_SCATTER = 0.05  # mbar
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What healthy cycles say about one unit."""
+
+    fitted: Fitted
+    healthy: dict[str, Scatter]  # what healthy cycles scatter, by figure
+    cycles: int
+    first_ns: int  # when the log was recorded, by the clock here
+    last_ns: int
+
+
+def calibrate(
+    config: Config, blocks: Iterable[Samples], progress: Callable[[str], None]
+) -> Calibration:
+    """Calibrate the unit of ``config`` on a log; its data set says what the type leaves open.
+
+    ConfigError where the log does not suffice or is not that of a healthy unit.
+    """
+    progress("reading the log")
+    samples = np.concatenate([np.empty(0, SAMPLE), *blocks])
+    before = complete(config.data, samples)
+    refuse_insufficient(samples, before)
+    samples = samples[samples["time_ns"] <= before[-1].end_ns]
+    used = samples["time_ns"] <= before[:MOST_FITTED][-1].end_ns
+    fitted = fit(samples[used], config.data, progress)
+    progress("what healthy cycles scatter")
+    cycles = complete(fitted.data, samples)
+    refuse_unalike(fitted.data, samples, cycles)
+    refuse_unlike(fitted, config.data)
+    healthy = scatter(fitted.data, cycles)
+    healthy["leftover"] = leftover(config, fitted.data, healthy, samples)
+    times = samples["host_ns"]
+    return Calibration(fitted, healthy, len(cycles), int(times[0]), int(times[-1]))
+
+
+def complete(data: DataSet, samples: Samples) -> list[Cycle]:
+    """Complete cycles beside the twin of ``data``, but for the first, in which it swings in."""
+    theta = coefficients(data)
+    twin = Twin(theta, expected_knees(theta, data.sensor.noise_mbar * MBAR))
+    cutter = CycleCutter()
+    cycles = [*cutter.push(*twin.advance(samples)), *cutter.push(*twin.flush()), *cutter.flush()]
+    return [cycle for cycle in cycles if cycle.complete and cycle.settled]
+
+
+def refuse_insufficient(samples: Samples, cycles: Sequence[Cycle]) -> None:
+    """ConfigError if there is not enough to calibrate on."""
+    if not (samples["commands"] & Command.SUCTION).any():
+        raise ConfigError("the log has no suction phase", "check which tag is suction")
+    spoilt = np.isnan(samples["pressure"]) | ((samples["quality"] & UNUSABLE) != 0)
+    if (share := float(np.mean(spoilt))) > MOST_SPOILT:
+        raise ConfigError(
+            f"the pressure is saturated, stale or bad in {share:.1%} of the samples",
+            "check the sensor's range and wiring, then record again",
+        )
+    breaks = int(np.count_nonzero(samples["quality"][1:] & BREAK))
+    if breaks > len(cycles):
+        raise ConfigError(
+            f"the log has {breaks} gaps and {len(cycles)} cycles without one",
+            "record again in block mode",
+        )
+    if len(cycles) < FEWEST:
+        raise ConfigError(
+            f"the log has {len(cycles)} complete cycles that count; a calibration needs {FEWEST}",
+            "record suction, blow-off and idle again and again without a gap",
+        )
+
+
+def refuse_unlike(fitted: Fitted, data: DataSet) -> None:
+    """ConfigError if what was fitted is no healthy unit of its type."""
+    if fitted.left > MOST_LEFT * MBAR:
+        raise ConfigError(
+            f"the model cannot follow this log: {fitted.left / MBAR:.0f} mbar rms are left",
+            "check [data.system] against what hangs on the ejector; twin diagnose says more",
+        )
+    for free in FREE:
+        value, expected, sigma = free.of(fitted.data), free.of(data), free.sigma(data)
+        low, high = free.healthy or (np.inf, np.inf)
+        if not -low * sigma <= value - expected <= high * sigma:
+            raise ConfigError(
+                f"this log is not that of a healthy unit: {free.name} would be {value:.3g}"
+                f" {free.unit}, where {max(expected - low * sigma, free.low):.3g} to"
+                f" {expected + high * sigma:.3g} is healthy for its type",
+                "repair first (twin diagnose names the cause), or set the value in [data] if it is"
+                " as built",
+            )
+
+
+def refuse_unalike(data: DataSet, samples: Samples, cycles: Sequence[Cycle]) -> None:
+    """ConfigError if something came or went while the log was recorded."""
+    theta = coefficients(data)
+    found = [figures(cycle, theta[AMBIENT]) for cycle in cycles]
+    refuse_changing(Cycles.found(samples, data), theta, data.sensor.noise_mbar * MBAR, found)
+
+
+def scatter(data: DataSet, cycles: Sequence[Cycle]) -> dict[str, Scatter]:
+    """Mean and scatter of every figure of healthy cycles.
+
+    A few cycles show their scatter only roughly; what is given is not exceeded with SURE.
+    """
+    ambient = coefficients(data)[AMBIENT]
+    found = [figures(cycle, ambient) for cycle in cycles]
+    names = [f"{phase.name.lower()}_{kind}" for phase in Phase for kind in ("mean", "rms")]
+    result = {}
+    for name in [*names, "h1_level", "h1_low_level"]:
+        values = np.array([one[name] for one in found if name in one])
+        if len(values) >= FEWEST:
+            degrees = len(values) - 1
+            sigma = float(np.std(values, ddof=1) * np.sqrt(degrees / chi2.ppf(1.0 - SURE, degrees)))
+            sigma = max(sigma, LEAST_SCATTER)
+            result[name] = Scatter(mean=float(np.mean(values)), sigma=sigma)
+    return result
+
+
+def leftover(
+    config: Config, data: DataSet, healthy: dict[str, Scatter], samples: Samples
+) -> Scatter:
+    """Sigmas left in each healthy cycle once whitened, beside the calibrated twin."""
+    monitor = config.monitor.model_copy(update={"healthy": healthy})
+    evidence = collect(replace(config, data=data, monitor=monitor), [samples])
+    off = evidence.off(evidence.expect([(0, evidence.theta)]))
+    left = [float(np.sqrt(np.mean(evidence.whitened(off, one) ** 2))) for one in evidence.judged]
+    return Scatter(mean=float(np.mean(left)), sigma=max(float(np.std(left)), 0.02))

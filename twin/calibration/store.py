@@ -1,0 +1,49 @@
+"""A calibration becomes a record of the asset database, with where it came from."""
+
+import hashlib
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+from twin.assets.place import open_chosen
+from twin.assets.record import Record
+from twin.calibration.calibrate import Calibration
+from twin.calibration.parameters import FREE
+from twin.config import Config
+from twin.signals import MBAR
+
+
+def store(calibration: Calibration, config: Config, assets: str, log: Path) -> tuple[Record, str]:
+    """Add the unit's data set to the database; give the record and the database's name.
+
+    It holds from the time the log was recorded on.
+    """
+    fitted = calibration.fitted
+    record = Record(
+        kind="instance",
+        name=config.asset.id,
+        type=config.asset.type,
+        data=fitted.data.model_dump(),
+        healthy={name: one.model_dump() for name, one in calibration.healthy.items()},
+        arrays={"covariance": fitted.covariance},
+        provenance={
+            "log": log.name,
+            "log_sha256": _digest(log),
+            "cycles": calibration.cycles,
+            "program": f"ejector-twin {version('ejector-twin')}",
+            "from": config.origin,
+            "parameters": [free.name for free in FREE],
+            "determined": [
+                free.name for free, known in zip(FREE, fitted.determined, strict=True) if known
+            ],
+            "left_mbar": round(fitted.left / MBAR, 3),
+        },
+        valid_from_ns=min(max(calibration.first_ns, 0), time.time_ns()),
+    )
+    with open_chosen(assets, config.document, write=True) as database:
+        return database.add(record), database.name
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,98 @@
+"""What a residual weighs: the covariance of noise, cycle-to-cycle scatter and the model's error.
+
+Scatter differs from cycle to cycle and averages out. The model's own error is the same in all of
+them and does not: the fit may not believe in more than it would from the mean cycle. So the error
+counts in each of n cycles with n times its variance, which is the same.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from twin.calibration.cycles import Bins, Cycles, Floats, Ints
+from twin.diagnosis.evidence import SCATTER
+from twin.model import theta as c
+from twin.model.effects import apply
+from twin.model.theta import Theta
+from twin.signals import MBAR, ML, MS
+
+FIRST_ERROR = 3.0 * MBAR  # Pa, of a model that has not been fitted
+LEAST_ERROR = 0.15 * MBAR  # Pa
+VOLUME = 0.01  # of what is evacuated, to which its parts are known
+LATE = 0.5 * MS  # s, by which what the model has at an edge may be early or late
+HIDDEN = 1.5  # the error over what is left of it once a fit has done its best
+NEAR = 4  # places before and behind, over which the error's size is taken
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Whitens residuals cycle by cycle."""
+
+    parts: Sequence[tuple[Ints, Floats]]  # bins of a cycle, Cholesky factor of their covariance
+
+    def white(self, off: Floats) -> list[Floats]:
+        """Residuals (bins, n) in sigmas for each cycle; what belongs to none is left out."""
+        return [solve_triangular(factor, off[here], lower=True) for here, factor in self.parts]
+
+
+def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> Weights:
+    """Weights for residuals about ``theta``, by what it leaves if it is ``fitted``.
+
+    ``noise`` (Pa) is the sensor's.
+    """
+    bins = cycles.bins
+    bigger = ("added_volume", {"volume": VOLUME * theta[c.VOLUME] / ML})
+    moved = [apply(theta, name, sizes) for name, sizes in (bigger, *SCATTER)]
+    off = cycles.off(np.stack([theta, *moved], axis=1))
+    moves = off[:, 1:] - off[:, :1]
+    error, cycle_error = np.full(len(off), FIRST_ERROR), np.zeros(len(off))
+    if fitted:
+        error, cycle_error = _errors(off[:, 0], bins, noise)
+    error = np.hypot(error, LATE * _slope(cycles))
+    numbers = np.unique(bins.cycle[bins.cycle > 0])
+    parts = []
+    for one in numbers:
+        here = np.flatnonzero(bins.cycle == one)
+        apart = np.exp(-np.abs(bins.time[here, None] - bins.time[here]))
+        common = apart * (bins.kind[here, None] == bins.kind[here])
+        alone = apart * (bins.stretch[here, None] == bins.stretch[here])
+        volume, scatter = moves[here, :1], moves[here, 1:]
+        covariance = np.outer(error[here], error[here]) * common + volume @ volume.T
+        covariance *= len(numbers)
+        covariance += np.outer(cycle_error[here], cycle_error[here]) * alone
+        covariance += scatter @ scatter.T + np.diag(noise**2 / bins.count[here])
+        parts.append((here, np.linalg.cholesky(covariance)))
+    return Weights(parts)
+
+
+def _slope(cycles: Cycles) -> Floats:
+    """Slope of the measured pressure in each bin (Pa/s)."""
+    used = cycles.bin >= 0
+    slope = np.gradient(np.nan_to_num(cycles.samples["pressure"].astype(np.float64))) / MS
+    mean: Floats = np.bincount(cycles.bin[used], slope[used]) / cycles.bins.count
+    return mean
+
+
+def _errors(off: Floats, bins: Bins, noise: float) -> tuple[Floats, Floats]:
+    """How far the model is off in each bin (Pa): in all cycles alike, and in each differently."""
+    places, place, many = np.unique(bins.place, return_inverse=True, return_counts=True)
+    mean = np.bincount(place, off) / many
+    noisy = np.bincount(place, noise**2 / bins.count) / many
+    within = np.bincount(place, (off - mean[place]) ** 2) / np.maximum(many - 1, 1) - noisy
+    kind = places >> 16
+    common = np.maximum(_near(mean**2 - noisy / many, kind), LEAST_ERROR**2)
+    alone = np.maximum(_near(within, kind), 0.0)
+    return HIDDEN * np.sqrt(common)[place], np.sqrt(alone)[place]
+
+
+def _near(values: Floats, kind: Ints) -> Floats:
+    """Mean over NEAR places of the same kind on either side."""
+    smooth = np.empty_like(values)
+    for one in np.unique(kind):
+        here = np.flatnonzero(kind == one)
+        window = np.ones(2 * NEAR + 1)
+        sums = np.convolve(values[here], window)[NEAR:-NEAR]
+        smooth[here] = sums / np.convolve(np.ones(len(here)), window)[NEAR:-NEAR]
+    return smooth

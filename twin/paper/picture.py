@@ -1,0 +1,121 @@
+"""The picture of ``twin paper``: curves like the paper's Fig. 7, and pairs that part later."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from twin.diagnosis.pictures import ANONYMOUS, MEASURED, STYLE
+from twin.errors import ConfigError, SourceError
+from twin.paper.evacuation import (
+    END_MBAR,
+    INSTANCE_SL_MIN,
+    OBJECT_SL_MIN,
+    RIG,
+    SAFETY,
+    Floats,
+    Unit,
+    pressures,
+    time_constant,
+)
+from twin.paper.separation import Separation
+from twin.paper.tables import Row, percent_more
+from twin.signals import MBAR
+
+LONGEST_MS, HOLD_MS = 2000, 4000
+SHOWN = (0.0, 2.0, 10.0, 40.0)  # film coefficients
+TEXTBOOK = (("eq. (1)", "#7d3c98", (1, 1.2)), (f"eq. (2) × {SAFETY:g}", "#2e8b57", (1, 1.2)))
+COLOURS = ("#8a8a8a", "#3f9b8f", "#0a62a8", "#c8500a")
+FORMATS = {".svg": ANONYMOUS, ".png": {"Software": None}}
+
+
+def draw(rows: Sequence[Row], separation: Separation, path: Path) -> None:
+    """Write the picture: SVG or PNG, as ``path`` ends.
+
+    ConfigError if it ends otherwise, SourceError if the file cannot be written.
+    """
+    if path.suffix not in FORMATS:
+        raise ConfigError(f"{path}: not a picture", f"let it end in {' or '.join(FORMATS)}")
+    with mpl.rc_context({**STYLE, "svg.hashsalt": "paper"}):
+        figure = Figure(figsize=(11.0, 4.9), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        _draw_tables(left, rows, separation)
+        _draw_pairs(right, separation)
+        try:
+            figure.savefig(path, metadata=FORMATS[path.suffix], dpi=110)
+        except OSError as error:
+            raise SourceError(f"{path}: cannot be written: {error}", "check the path") from error
+
+
+def _draw_tables(axes: Axes, rows: Sequence[Row], separation: Separation) -> None:
+    """Like Fig. 7: vacuum over time on the rig."""
+    seconds = np.linspace(0.0, LONGEST_MS * 1e-3, LONGEST_MS + 1)
+    textbook = zip(TEXTBOOK, _textbook(seconds), strict=True)
+    for (label, colour, dots), curve in textbook:
+        axes.plot(seconds, curve, color=colour, lw=1.8, ls=(0, dots), label=label)
+    (extended,) = (one.unit for one in separation.pairs if one.unit.film == separation.film)
+    for label, colour, style, unit in (
+        ("the paper's model, object-specific", "#c8500a", "--", Unit(OBJECT_SL_MIN)),
+        ("the paper's model, instance-specific", "#e0a100", "--", Unit(INSTANCE_SL_MIN)),
+        ("this twin, with wall heat and a bulge", "#0a62a8", "-", extended),
+    ):
+        curve = _vacuum(pressures(RIG, unit, LONGEST_MS))
+        axes.plot(seconds, curve, style, color=colour, lw=1.8, label=label)
+    _mark(axes)
+    off = [percent_more(row.twin_ms, RIG.measured_ms) for row in rows if row.setup is RIG]
+    axes.set_title(
+        f"Test rig to 600 mbar,rel: the equations take {min(off[:2]):.0f} to {max(off[:2]):.0f} %"
+        f" too long,\nthe paper's model {off[3]:.0f} to {off[2]:.0f} %",
+        fontsize=10.5,
+    )
+    axes.set(xlim=(0.0, LONGEST_MS * 1e-3), ylim=(0.0, 880.0))
+    _label(axes)
+
+
+def _draw_pairs(axes: Axes, separation: Separation) -> None:
+    """Pairs of film coefficient and bulge that meet the measured time, with the hold after it."""
+    off = round(RIG.measured_ms)
+    seconds = np.linspace(0.0, (off + HOLD_MS) * 1e-3, off + HOLD_MS + 1)
+    shown = [pair.unit for pair in separation.pairs if pair.unit.film in SHOWN]
+    for unit, colour in zip(shown, COLOURS, strict=True):
+        label = f"film {unit.film:g} W/(m² K), bulge {unit.bulge:.2f}"
+        width = 2.4 if unit.film == separation.film else 1.6
+        curve = _vacuum(pressures(RIG, unit, off, HOLD_MS))
+        axes.plot(seconds, curve, color=colour, lw=width, label=label)
+    _mark(axes)
+    axes.set_title(
+        "Wall heat and bulge: many pairs meet the one measured time,\n"
+        "and part when the nozzle goes off and the gas warms up",
+        fontsize=10.5,
+    )
+    axes.set(xlim=(0.0, seconds[-1]), ylim=(0.0, 660.0))
+    _label(axes)
+
+
+def _textbook(seconds: Floats) -> tuple[Floats, Floats]:
+    """Vacuum (mbar) over time by equations (1) and (2); the latter ends at end pressure."""
+    shares = seconds / (time_constant(RIG) * 1e-3)
+    ambient = RIG.ambient_mbar
+    first = (ambient - END_MBAR) * -np.expm1(-shares)
+    second = -ambient * np.expm1(-shares / SAFETY)
+    return first, np.minimum(second, ambient - END_MBAR)
+
+
+def _vacuum(p: Floats) -> Floats:
+    return RIG.ambient_mbar - p / MBAR
+
+
+def _mark(axes: Axes) -> None:
+    vacuum = RIG.ambient_mbar - RIG.target_mbar
+    seconds = RIG.measured_ms * 1e-3
+    label = f"measured: {RIG.measured_ms:.0f} ms to {vacuum:.0f} mbar,rel"
+    axes.plot(seconds, vacuum, "o", color=MEASURED, ms=8, zorder=5, label=label)
+
+
+def _label(axes: Axes) -> None:
+    axes.set_xlabel("time (s)")
+    axes.set_ylabel("vacuum (mbar below ambient)")
+    axes.legend(loc="lower right", fontsize=9)
