@@ -1,6 +1,6 @@
 """Calibrate many simulated rigs and count how often a 95 % interval holds the true value.
 
-    python tools/coverage.py [--rigs 40] [--cycles 8]
+    python tools/calibration_coverage.py [--rigs 40] [--cycles 8]
 
 Every rig has true parameters of its own, drawn by seed; the twin begins from the type's data. Rigs
 alternate between the shipped configurations. Compared is what means the same in rig and model.
