@@ -14,6 +14,8 @@ import pytest
 import rigs
 from plc_process import PlcProcess, start_plc
 
+from twin.live import compiled
+
 _ME = psutil.Process()
 
 
@@ -47,3 +49,9 @@ def plc() -> Iterator[PlcProcess]:
     """The gripper's PLC in a process of its own; nobody may write to it or stop it."""
     with start_plc(rigs.path_of("gripper")) as running:
         yield running
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled_once() -> None:
+    """Compile before a child process has to: tests wait for what it does, not for a compiler."""
+    compiled(rigs.theta("test_rig"), rigs.knees("test_rig"))
