@@ -64,9 +64,11 @@ static inline Tangent opening(double p, double ambient)
 
 /* --- plant.py ------------------------------------------------------------------------------ */
 
-#define LIGHTEST 1e-10
+#define LIGHTEST 1e-15
 #define LOWEST 1.0
 #define HIGHEST 1e7
+#define COLDEST 60.0
+#define HOTTEST 2000.0
 #define MOST 100.0
 #define FAINTEST 1e-12
 #define G 0.435866521508459
@@ -167,6 +169,11 @@ static inline double through(double rest, double fall, double before, double ris
     return 2.0 * difference / (slope + root);
 }
 
+static inline double kept(double mass, double work)
+{
+    return min(max(mass, work / (R * HOTTEST)), work / (R * COLDEST));
+}
+
 static Gas solve(Gas y, const Gas *known, double step, const Driven *driven, const double *k)
 {
     double ambient = k[AMBIENT], outside = k[TEMPERATURE];
@@ -238,11 +245,11 @@ static Gas solve(Gas y, const Gas *known, double step, const Driven *driven, con
     double net = near - (out + out_slope * port) + blown + blown_slope * port;
     return (Gas){
         port,
-        max(known->port_mass + step * net, LIGHTEST),
+        kept(known->port_mass + step * net, port * k[PORT_VOLUME]),
         line,
-        max(known->line_mass + step * (far - near), LIGHTEST),
+        kept(known->line_mass + step * (far - near), line * k[LINE_VOLUME]),
         vessel,
-        max(known->vessel_mass + step * (leak + leak_slope * vessel - far), LIGHTEST),
+        kept(known->vessel_mass + step * (leak + leak_slope * vessel - far), vessel * volume),
         min(max(near, -MOST), MOST),
         min(max(far, -MOST), MOST),
     };
@@ -358,8 +365,8 @@ static double sensed_at(double value, const double *k)
 #define LONGEST_STEP 1e-3
 #define LONGEST_BRIDGE 0.1
 #define NEVER 1e9
-#define FINEST 32
-#define TOLERANCE 0.01
+#define FINEST 24
+#define TOLERANCE 0.02
 
 static double valve_over(double *state, int position, double h, const double *k, int response)
 {

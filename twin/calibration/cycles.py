@@ -18,7 +18,6 @@ from twin.signals import MBAR, MS, UNUSABLE, Phase, Samples
 
 EARLIEST_S, LATEST_S = 5e-3, 0.3  # how long an error goes on, at an edge and long after it
 BINS = 6  # in each unit of warped time
-LANES = 4  # hypotheses that the kernel runs at a time
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -67,8 +66,8 @@ class Cycles:
 
     def off(self, theta: Floats) -> Floats:
         """Measured minus expected pressure (Pa) in each bin for hypotheses, (coefficients, n)."""
-        lanes = -(-theta.shape[1] // (2 * LANES)) * LANES
-        halves = [half for half in (theta[:, :lanes], theta[:, lanes:]) if half.shape[1]]
+        half = -(-theta.shape[1] // (2 * kernel.LANES)) * kernel.LANES
+        halves = [part for part in (theta[:, :half], theta[:, half:]) if part.shape[1]]
         with ThreadPoolExecutor(len(halves)) as pool:
             return np.concatenate(list(pool.map(self._off, halves)), axis=1)
 
@@ -82,12 +81,10 @@ class Cycles:
 
 
 def _expected(theta: Floats, dt: Floats, phase: npt.NDArray[np.uint8], level: Floats) -> Floats:
-    """Run hypotheses, (coefficients, n), over rows: (rows, n) in Pa; filled up to whole lanes."""
-    n = theta.shape[1]
-    filled = np.concatenate([theta, *[theta[:, :1]] * (-n % LANES)], axis=1)
-    expected = np.empty((len(dt), filled.shape[1]))
-    kernel.advance(kernel.new_state(filled.shape[1]), filled, dt, phase, level, expected)
-    return expected[:, :n]
+    """Run hypotheses, (coefficients, n), over rows: (rows, n) in Pa."""
+    expected = np.empty((len(dt), theta.shape[1]))
+    kernel.advance(kernel.new_state(theta.shape[1]), theta, dt, phase, level, expected)
+    return expected
 
 
 def warped(seconds: Floats) -> Floats:
