@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.assets.cli import assets_app
 from twin.assets.database import open_assets
 from twin.assets.place import open_chosen
 from twin.assets.record import Record
+from twin.cli_assets import assets_app
 from twin.errors import ConfigError, SourceError, TwinError
 from twin.settings import Document
 
-TYPE = "compact-ejector-35"
+TYPE, PAPER_UNIT = "compact-ejector-35", "paper-unit"  # shipped
 
 UNIT = """\
 kind = "instance"
@@ -69,7 +69,8 @@ def rows(table: str) -> list[list[str]]:
 
 
 def test_reading_makes_no_file(run: Run, tmp_path: Path) -> None:
-    assert [row[:2] for row in rows(run("list"))] == [["type", TYPE]]
+    assert [row[:2] for row in rows(run("list"))] == [["type", TYPE], ["instance", PAPER_UNIT]]
+    assert "suction_capacity_sl_min = 35.0" in run("show", PAPER_UNIT)
     shown = run("show", TYPE)
     assert "suction_capacity_sl_min = 33.4" in shown
     assert "valid_from" not in shown  # always; an edited copy holds from when it is added
@@ -80,12 +81,14 @@ def test_reading_makes_no_file(run: Run, tmp_path: Path) -> None:
 def test_what_is_added_is_listed_and_shown(run: Run, unit: Path) -> None:
     assert "unit-1: added " in run("add", unit)
     table = rows(run("list"))
+    added = next(row for row in table if row[1] == "unit-1")
     assert [row[:4] for row in table] == [
         ["type", TYPE, TYPE, "always"],
+        ["instance", PAPER_UNIT, TYPE, "always"],
         ["instance", "unit-1", TYPE, "2026-05-01T12:00:00Z"],
     ]
     shown = run("show", "unit-1")
-    assert f"# hash {table[1][-1]}, recorded " in shown
+    assert f"# hash {added[-1]}, recorded " in shown
     assert "# note: measured on the bench" in shown
     assert "# file: unit.toml" in shown
     assert "# code: ejector-twin " in shown
@@ -130,7 +133,7 @@ def test_a_first_data_set_always_holds_and_a_later_one_from_now_on(
     unit.write_text(undated.replace("35.0", "34.0"))
     assert "valid from: 2" in run("add", unit)
     with open_assets(tmp_path / "assets.sqlite") as assets:
-        first, second = assets.records("instance")
+        first, second = assets.records(name="unit-1")
         assert abs(second.valid_from_ns - second.recorded_ns) < 60 * 10**9
         assert assets.get(TYPE, "unit-1", at_ns=0).record.id == first.id
         assert assets.get(TYPE, "unit-1").record.id == second.id
@@ -138,7 +141,7 @@ def test_a_first_data_set_always_holds_and_a_later_one_from_now_on(
 
 def test_show_looks_back_in_both_times(run: Run, tmp_path: Path) -> None:
     day = 86_400 * 10**9
-    clock = iter([day, 10 * day, 20 * day])  # recorded: the type, then two data sets
+    clock = iter([day, day, 10 * day, 20 * day])  # recorded: what is shipped, then two data sets
     with open_assets(tmp_path / "assets.sqlite", clock=lambda: next(clock)) as assets:
         assets.add(Record("instance", "u", TYPE, {"a": 1}, valid_from_ns=5 * day))
         assets.add(Record("instance", "u", TYPE, {"a": 2}, valid_from_ns=5 * day))
@@ -164,9 +167,9 @@ def test_a_name_that_is_not_there_lists_those_that_are(run: Run) -> None:
 
 def test_export_and_import_carry_everything_over(run: Run, unit: Path, tmp_path: Path) -> None:
     run("add", unit)
-    assert run("export", "-o", "all.json") == "2 records in all.json\n"
-    assert run("import", "all.json", "--assets", "sqlite:///new.sqlite").startswith("2 new of 2 ")
-    assert run("import", "all.json", "--assets", "sqlite:///new.sqlite").startswith("0 new of 2 ")
+    assert run("export", "-o", "all.json") == "3 records in all.json\n"
+    assert run("import", "all.json", "--assets", "sqlite:///new.sqlite").startswith("3 new of 3 ")
+    assert run("import", "all.json", "--assets", "sqlite:///new.sqlite").startswith("0 new of 3 ")
     assert run("export", "--assets", "new.sqlite") == (tmp_path / "all.json").read_text()
 
 
@@ -200,6 +203,13 @@ def test_what_is_no_export_is_refused(
 # --- the file of an asset -----------------------------------------------------------------------
 
 VACUUM, ROWS = "vacuum_mbar = [0, 400, 850]", "[30.0, 16.0, 0.0]"
+CAPACITY = "suction_capacity_sl_min = 35.0"
+SYSTEM = """[[data.system.parts]]
+kind = "tube"
+length_mm = 100.0
+diameter_mm = 6.0
+[[data.system.parts]]
+kind = "vessel\""""
 
 
 @pytest.mark.parametrize(
@@ -243,9 +253,73 @@ def test_what_json_cannot_keep_is_refused(run: Run, unit: Path) -> None:
     assert not Path("assets.sqlite").exists()
 
 
-def test_a_flat_characteristic_is_allowed(run: Run, unit: Path) -> None:
-    unit.write_text(UNIT.replace(ROWS, "[30.0, 30.0, 30.0]"))
+def test_a_characteristic_may_be_flat_where_nothing_is_left(run: Run, unit: Path) -> None:
+    flat = UNIT.replace(VACUUM, "vacuum_mbar = [0, 400, 850, 900]")
+    unit.write_text(flat.replace("0.0],", "0.0, 0.0],").replace("1.0],", "1.0, 0.0],"))
     assert "added" in run("add", unit)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "message"),
+    [
+        (CAPACITY, "suction_capacity_sl_min = 0.0", 8, "data.ejector.suction_capacity_sl_min: "),
+        (CAPACITY, "suction = 35.0", 8, "data.ejector.suction: unknown key (is 35.0)"),
+        (CAPACITY, "h2_mbar = 700.0", 7, "data.ejector: Value error, h1_mbar must be at least"),
+        (CAPACITY, "end_pressure_mbar = 1013.0", 1, "end_pressure_mbar must be below ambient"),
+        (CAPACITY, "bulge = -0.9\nskew = 5.0", 7, "a characteristic that is not monotonic"),
+        ("[data.ejector]", "[data.supply]\npressure_bar = -1.0\n[data.ejector]", 8, "than 0"),
+        ("[data.ejector]", f"{SYSTEM}\nvolume_ml = 0\n[data.ejector]", 13, "volume_ml: Input sh"),
+        ("sigma = 0.5", "sigma = 0.0", 11, "healthy.hold_rms.sigma: Input should be greater"),
+    ],
+)
+def test_a_data_set_that_cannot_be_is_refused_with_its_line(
+    run: Run, unit: Path, old: str, new: str, line: int, message: str
+) -> None:
+    run("add", unit)
+    before = run("export")
+    assert old in UNIT
+    unit.write_text(UNIT.replace(old, new, 1))
+    with pytest.raises(ConfigError) as caught:
+        run("add", unit)
+    assert str(caught.value).startswith(f"{unit}:{line}: ")
+    assert message in str(caught.value)
+    assert run("export") == before
+
+
+def test_a_unit_is_judged_over_what_is_known_of_its_type(run: Run, tmp_path: Path) -> None:
+    """H2 alone is right or wrong by the H1 of the type."""
+    kind, unit = tmp_path / "kind.toml", tmp_path / "unit.toml"
+    kind.write_text('kind = "type"\nname = "deep"\n[data.ejector]\nh1_mbar = 850.0\n')
+    run("add", kind)
+    text = 'kind = "instance"\nname = "u"\ntype = "TYPE"\n[data.ejector]\nh2_mbar = 650.0\n'
+    unit.write_text(text.replace("TYPE", TYPE))
+    with pytest.raises(ConfigError, match=r"unit\.toml:4: data\.ejector: .*h1_mbar must be"):
+        run("add", unit)
+    unit.write_text(text.replace("TYPE", "deep"))
+    assert "u: added" in run("add", unit)
+    unit.write_text(text.replace("TYPE", "shallow"))
+    with pytest.raises(ConfigError, match="no data set of type 'shallow'") as caught:
+        run("add", unit)
+    assert f"{TYPE}, deep" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (UNIT.replace(ROWS, "[30.0, 30.0, 30.0]"), "missed by up to 26"),
+        (
+            UNIT.replace(ROWS, "[30.0, 30.0, 0.0]").replace("20.0, 1.0]", "35.0, 1.0]"),
+            "ejector: .* not monotonic",
+        ),
+    ],
+)
+def test_a_diagram_that_no_ejector_has_is_refused(
+    run: Run, unit: Path, text: str, why: str
+) -> None:
+    unit.write_text(text)
+    with pytest.raises(ConfigError, match=f"instance 'unit-1': the model cannot .*{why}"):
+        run("add", unit)
+    assert "unit-1" not in run("list")
 
 
 @pytest.mark.parametrize(
@@ -263,7 +337,7 @@ def test_valid_from_takes_days_and_times(
     unit.write_text(UNIT.replace("2026-05-01T12:00:00Z", written))
     run("add", unit)
     with open_assets(tmp_path / "assets.sqlite") as assets:
-        assert assets.records("instance")[0].valid_from_ns == ns
+        assert assets.get(TYPE, "unit-1", at_ns=2**62).record.valid_from_ns == ns
 
 
 # --- which database -----------------------------------------------------------------------------

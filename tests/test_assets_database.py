@@ -24,10 +24,12 @@ from twin.assets import database
 from twin.assets.database import Assets, open_assets
 from twin.assets.exchange import to_export, to_plain
 from twin.assets.record import Record, checked
+from twin.assets.shipped import shipped_records
 from twin.errors import ConfigError, SourceError
 from twin.model.dataset import DataSet
 
-TYPE = "compact-ejector-35"  # shipped
+TYPE, PAPER_UNIT = "compact-ejector-35", "paper-unit"  # shipped
+SHIPPED = [TYPE, PAPER_UNIT]
 WRITER = Path(__file__).with_name("assets_writer.py")
 WRITES = 100
 NUMBERS = itertools.count()  # names that no other example uses
@@ -87,6 +89,11 @@ def sabotage(url: str, on_sqlite: str, on_postgresql: str) -> None:
         connection.execute(on_sqlite if url.startswith("sqlite") else on_postgresql)
 
 
+def units(assets: Assets, **when: int) -> list[Record]:
+    """Those that did not come with the program."""
+    return [r for r in assets.records("instance", **when) if r.name != PAPER_UNIT]
+
+
 def same(left: Record, right: Record) -> bool:
     """Equal to the last bit; JSON tells -0.0 from 0.0."""
     texts = {json.dumps(to_plain(record), sort_keys=True) for record in (left, right)}
@@ -141,21 +148,30 @@ def test_any_array_and_any_text_survive_database_and_export(
 def test_a_unit_without_data_of_its_own_falls_back_to_its_type(url: str) -> None:
     with open_assets(url) as assets:
         found = assets.get(TYPE, "unit-1")
-        assert (found.used, found.record.kind, found.record.name) == ("type", "type", TYPE)
+        assert (found.used, found.record.name, found.base) == ("type", TYPE, None)
         assets.add(replace(UNIT, valid_from_ns=100))
         assert assets.get(TYPE, "unit-1", at_ns=99).used == "type"
-        assert assets.get(TYPE, "unit-1", at_ns=100).used == "instance"
+        own = assets.get(TYPE, "unit-1", at_ns=100)
+        assert own.used == "instance"
+        assert own.base is not None
+        assert same(own.base, found.record)  # for what the unit's leaves out
         assert assets.get(TYPE).used == "type"
         assert assets.get(TYPE, "unit-2").used == "type"
 
 
-def test_the_papers_type_is_shipped(url: str) -> None:
+def test_the_papers_type_and_the_one_unit_it_measured_are_shipped(url: str) -> None:
+    """Table 1: the mean of ten units, and one of them."""
     with open_assets(url) as assets:
-        record = assets.get(TYPE).record
-    assert record.data["ejector"]["suction_capacity_sl_min"] == 33.4
-    assert record.data["ejector"]["end_pressure_mbar"] == 150.0
-    assert record.provenance["source"].startswith("shipped with ejector-twin ")
-    DataSet.model_validate(record.data)
+        found = assets.get(TYPE, PAPER_UNIT)
+        assert [record.name for record in assets.records()] == SHIPPED
+    assert found.base is not None
+    kind, unit = found.base.data["ejector"], found.record.data["ejector"]
+    assert (kind["suction_capacity_sl_min"], kind["end_pressure_mbar"]) == (33.4, 150.0)
+    assert unit == {"suction_capacity_sl_min": 35.0}
+    for record in (found.base, found.record):
+        assert record.provenance["source"].startswith("shipped with ejector-twin ")
+        assert "table 1" in record.provenance["note"]
+        DataSet.model_validate(record.data)
 
 
 def test_neither_unit_nor_type_names_the_known_types(url: str) -> None:
@@ -289,14 +305,14 @@ def test_get_is_right_in_both_times(
 
 
 def test_the_clock_says_now_and_recorded_times_rise_even_if_it_does_not(url: str) -> None:
-    times = iter([1000, 2000, 1500, 2000, 1999, 2500])
+    times = iter([900, 1000, 2000, 1500, 2000, 1999, 2500])  # the first two are of the shipped
     with open_assets(url, clock=lambda: next(times)) as assets:
         first, second, third = (assets.add(replace(UNIT, valid_from_ns=2000)) for _ in range(3))
         assert [r.recorded_ns for r in (first, second, third)] == [2000, 2001, 2002]
         assert assets.get(TYPE, "unit-1").used == "type"  # at 1999
         assert assets.get(TYPE, "unit-1").record.id == third.id  # at 2500
-        assert [r.recorded_ns for r in assets.records()] == [1000, 2000, 2001, 2002]
-        assert [r.id for r in assets.records("instance", as_of_ns=2001)] == [first.id, second.id]
+        assert [r.recorded_ns for r in assets.records()] == [900, 1000, 2000, 2001, 2002]
+        assert [r.id for r in units(assets, as_of_ns=2001)] == [first.id, second.id]
         assert assets.records("instance", "nobody") == []
 
 
@@ -398,12 +414,12 @@ def test_opening_again_adds_nothing_and_a_new_shipped_version_is_added_once(
         old = assets.export()
     with open_assets(url) as assets:
         assert assets.export() == old
-    (shipped,) = database.shipped_types()
+    shipped = shipped_records()[0]
     newer = checked(replace(shipped, data={"new": True}, id="f" * 32))
-    for types in ((newer,), (newer,), (shipped,)):  # the last is an older program again
-        monkeypatch.setattr(database, "shipped_types", lambda given=types: given)
+    for records in ((newer,), (newer,), (shipped,)):  # the last is an older program again
+        monkeypatch.setattr(database, "shipped_records", lambda given=records: given)
         with open_assets(url) as assets:
-            assert len(assets.records()) == 2
+            assert [record.name for record in assets.records()] == [*SHIPPED, TYPE]
             assert assets.get(TYPE).record.data == {"new": True}
 
 
@@ -510,7 +526,7 @@ def test_an_export_makes_the_same_database_and_importing_twice_changes_nothing(u
         assets.add(replace(UNIT, data={}, valid_from_ns=500))
         document = json.loads(json.dumps(assets.export()))
     with open_assets(url, shipped=False) as assets:
-        assert assets.import_(document) == 3
+        assert assets.import_(document) == len(SHIPPED) + 2
         assert assets.import_(document) == 0
     with open_assets(url) as assets:
         assert json.dumps(assets.export()) == json.dumps(document)
@@ -522,8 +538,8 @@ def test_two_databases_flow_together(url: str) -> None:
         document = other.export()
     with open_assets(url) as assets:
         ours = assets.add(replace(UNIT, name="unit-2"))
-        assert assets.import_(document) == 1  # the shipped type is here already
-        assert {r.id for r in assets.records("instance")} == {theirs.id, ours.id}
+        assert assets.import_(document) == 1  # what is shipped is here already
+        assert {r.id for r in units(assets)} == {theirs.id, ours.id}
 
 
 def edited(change: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
@@ -591,8 +607,8 @@ def test_two_writers_at_once_lose_nothing(url: str) -> None:
             assert process.returncode == 0, error
             told_ids.append(out.split())
     with open_assets(url) as assets:
-        records = assets.records("instance")
-        assert len(assets.records("type")) == 1
+        records = units(assets)
+        assert len(assets.records()) == len(records) + len(SHIPPED)
     assert [len(ids) for ids in told_ids] == [WRITES, WRITES]
     for unit, ids in zip(("left", "right"), told_ids, strict=True):
         own = [record for record in records if record.name == unit]
@@ -613,7 +629,7 @@ def test_who_writes_is_alone(url: str) -> None:
 
     with open_assets(url, busy_s=0.05) as other, open_assets(url, clock=meanwhile) as assets:
         assets.add(UNIT)
-        assert len(assets.records("instance")) == 1
+        assert len(units(assets)) == 1
 
 
 def test_a_writer_that_is_killed_leaves_whole_records(url: str) -> None:
@@ -625,7 +641,7 @@ def test_a_writer_that_is_killed_leaves_whole_records(url: str) -> None:
         process.kill()
         told_ids += process.stdout.read().split()
     with open_assets(url) as assets:  # reading checks every hash
-        ids = [record.id for record in assets.records("instance")]
+        ids = [record.id for record in units(assets)]
     whole = [told_id for told_id in told_ids if len(told_id) == 32]
     assert ids[: len(whole)] == whole
     assert len(ids) <= len(whole) + 1

@@ -1,6 +1,10 @@
 """The commands that carry data sets and tables: what one writes, the next one takes up."""
 
 import json
+import sqlite3
+from contextlib import closing
+from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +13,9 @@ import rigs
 import tomli_w
 from command_line import edited, twin
 
+from twin.assets import place
+from twin.assets.database import open_assets
+from twin.assets.record import Record
 from twin.log.header import LogHeader
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
@@ -100,6 +107,153 @@ def test_another_configuration_or_unit_takes_the_place_of_the_data_set_in_the_lo
     assert same(here / "unit.mcap", here / "back.mcap")
 
 
+def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """What the program had to say of its work, but for the monitor."""
+    return capsys.readouterr().err.splitlines()
+
+
+def test_a_unit_that_is_named_and_not_known_is_said_once_and_its_type_is_used(
+    log: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    add_unit(monkeypatch, 30.0)
+    capsys.readouterr()
+    assert twin(monkeypatch, "replay", log, "--id", "gripper-78", "-o", "out.mcap") == 0
+    assert said(capsys) == [
+        "twin: no instance-specific data set of 'gripper-78' in assets.sqlite;"
+        " using the type's 'compact-ejector-35'"
+    ]
+    origin = about(here / "out.mcap", "origin")
+    assert origin.startswith("object-specific data of compact-ejector-35, record ")
+    assert open_log(here / "out.mcap").header.asset_id == "gripper-78"
+    for known in (("--id", UNIT), (), ("--config", GRIPPER)):  # what nobody named is not missed
+        assert twin(monkeypatch, "replay", log, *known) == 0
+        assert said(capsys) == []
+
+
+def test_without_a_database_the_shipped_type_is_used_and_said(
+    log: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twin(monkeypatch, "replay", log, "--id", UNIT) == 0
+    (line,) = said(capsys)
+    assert f"no instance-specific data set of '{UNIT}' in the shipped data sets; using the" in line
+    assert list(here.iterdir()) == []
+
+
+def test_a_unit_of_a_type_nobody_knows_is_what_the_configuration_says_or_refused(
+    log: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, _ = edited(here, 'type = "compact-ejector-35"', 'type = "other"', "gripper")
+    command = ("replay", log, "--config", config, "--id", UNIT)
+    assert twin(monkeypatch, *command, "-o", "out.mcap") == 0
+    (line,) = said(capsys)
+    assert f"no data set of '{UNIT}' or its type 'other' in " in line
+    assert "using [data] of the configuration" in line
+    assert about(here / "out.mcap", "origin") == "[data] of the configuration"
+    config.write_text('[asset]\ntype = "other"\n')
+    assert twin(monkeypatch, *command) == 2
+    message = capsys.readouterr().err
+    assert f"no data set of '{UNIT}' or its type 'other' at that time" in message
+    assert "known types: compact-ejector-35" in message
+
+
+def test_a_replay_takes_what_was_known_at_a_time(
+    log: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    add_unit(monkeypatch, 30.0)
+    between = datetime.now(UTC).isoformat()
+    add_unit(monkeypatch, 31.0)
+    capsys.readouterr()
+    for name, as_of in (("now", ()), ("then", ("--as-of", between))):
+        assert twin(monkeypatch, "replay", log, "--id", UNIT, *as_of, "-o", f"{name}.mcap") == 0
+        assert said(capsys) == []
+    used = [json.loads(about(here / f"{name}.mcap", "data")) for name in ("now", "then")]
+    assert [data["ejector"]["suction_capacity_sl_min"] for data in used] == [31.0, 30.0]
+    assert twin(monkeypatch, "replay", log, "--id", UNIT, "--as-of", "then") == 2
+    assert "not a time: 'then'" in capsys.readouterr().err
+
+
+def test_a_log_with_a_data_set_of_another_shape_is_named_with_the_key(
+    log: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    samples, ticks = rows(log)
+    text = rigs.config("gripper").document.text
+    data = rigs.config("gripper").data.model_dump(mode="json") | {"colour": "red"}
+    metadata = {"data": json.dumps(data), "program": "9.8.7"}
+    with Recorder(here / "new.mcap", LogHeader("t", "", "g.toml", text, metadata)) as recorder:
+        recorder.write(samples[:2000], ticks[:2000])
+    for command in ("replay", "diagnose"):
+        assert twin(monkeypatch, command, "new.mcap") == 3
+        problem, hint = said(capsys)
+        assert problem == (
+            "twin: new.mcap: its data set cannot be used: data.colour: unknown key (is 'red')"
+        )
+        assert "--config CONFIG" in hint
+        assert "9.8.7" in hint
+    assert twin(monkeypatch, "replay", "new.mcap", "--config", GRIPPER) == 0
+
+
+def test_a_stored_data_set_of_another_shape_is_named_with_record_and_key(
+    log: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = {"ejector": {"h2_mbar": "high"}}
+    with open_assets(here / "assets.sqlite") as assets:  # as another version might have had it
+        record = assets.add(Record("instance", UNIT, "compact-ejector-35", data))
+    assert twin(monkeypatch, "replay", log, "--id", UNIT, "-o", "out.mcap") == 2
+    problem, hint = said(capsys)
+    assert problem == (
+        f"twin: assets.sqlite: record {record.id[:8]} of instance '{UNIT}' cannot be used:"
+        " data.ejector.h2_mbar: Input should be a valid number, unable to parse string as a number"
+        " (is 'high')"
+    )
+    assert f"twin assets show {UNIT}" in hint
+    assert [path.name for path in here.iterdir()] == ["assets.sqlite"]
+
+
+NEWER = "INSERT INTO asset_schema VALUES (2, '9.8.7')"
+
+
+@pytest.mark.parametrize(
+    ("deed", "code", "message"),
+    [
+        (NEWER, 2, "an asset database of ejector-twin 9.8.7 (schema 2)"),
+        ("BEGIN EXCLUSIVE", 3, "asset database: database is locked"),
+    ],
+)
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("replay", "LOG", "--id", UNIT, "-o", "out.mcap"),
+        ("import", "none.csv", "--config", "cell.toml", "-o", "out.mcap"),
+        ("calibrate", "LOG", "--config", "cell.toml"),
+        ("assets", "add", "unit.toml"),
+    ],
+    ids=lambda command: command[0],
+)
+def test_a_database_that_cannot_be_used_is_said_and_nothing_is_half_written(
+    command: tuple[str, ...],
+    deed: str,
+    code: int,
+    message: str,
+    log: Path,
+    here: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (here / "cell.toml").write_text(GRIPPER.read_text())
+    add_unit(monkeypatch, 30.0)
+    monkeypatch.setattr(place, "open_assets", partial(open_assets, busy_s=0.05))
+    before = sorted(here.iterdir())
+    capsys.readouterr()
+    with closing(sqlite3.connect(here / "assets.sqlite", isolation_level=None)) as other:
+        other.execute(deed)
+        content = (here / "assets.sqlite").read_bytes()
+        arguments = [log if argument == "LOG" else argument for argument in command]
+        assert twin(monkeypatch, *arguments) == code
+    assert message in capsys.readouterr().err
+    assert sorted(here.iterdir()) == before
+    assert (here / "assets.sqlite").read_bytes() == content
+
+
 def test_a_diagnosis_judges_by_the_data_set_of_the_log_or_the_unit_that_is_named(
     log: Path, here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -162,7 +316,8 @@ def test_a_log_goes_out_and_comes_back_the_same(
     table = here / f"a.{suffix}"
     assert twin(monkeypatch, "export", log, "-o", table) == 0
     assert twin(monkeypatch, "import", table, "--config", GRIPPER, "-o", "in.mcap") == 0
-    assert same(log, here / "in.mcap")
+    assert same(log, here / "in.mcap")  # the switching signals too, which are worked out anew
+    assert set(rows(log)[1]["signals"]) == {0, 1, 3}
     assert twin(monkeypatch, "replay", "in.mcap", "-o", "replayed.mcap") == 0
     assert same(log, here / "replayed.mcap")
     assert twin(monkeypatch, "export", "replayed.mcap", "-o", f"b.{suffix}") == 0

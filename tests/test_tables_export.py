@@ -16,13 +16,14 @@ from twin.errors import ConfigError, SourceError
 from twin.log.header import LogHeader
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
-from twin.signals import Quality, Samples, Ticks
+from twin.signals import Quality, Samples, Signal, Ticks
 from twin.tables import parquet_file
 from twin.tables.export import export
 from twin.tables.reader import open_table
 from twin.tables.settings import ImportSettings
 
 SUFFIXES = ["csv", "parquet"]
+SAID = ("expected_mbar", "phase", "level_mbar", "part_present", "air_saving")  # by the twin
 
 
 def recorded(count: int = 25_000) -> tuple[Samples, Ticks]:
@@ -34,6 +35,9 @@ def recorded(count: int = 25_000) -> tuple[Samples, Ticks]:
     samples["pressure"][400:410] = np.nan
     samples["supply"][500:600] = np.nan
     ticks["expected"][:50] = np.nan
+    ticks["signals"][600:] = Signal.PART_PRESENT
+    ticks["signals"][700:] = Signal.PART_PRESENT | Signal.AIR_SAVING
+    ticks["signals"][800:] = Signal.AIR_SAVING
     for row, flag in ((100, Quality.GAP), (200, Quality.CLOCK), (300, Quality.RESTART)):
         samples["quality"][row] = flag
     samples["quality"][400:410] = Quality.BAD | Quality.OUT_OF_RANGE
@@ -49,7 +53,7 @@ def test_a_log_comes_back_to_the_bit(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a.{suffix}"
     export(log.blocks(7000), log.header, path)
     assert taken(path).tobytes() == samples.tobytes()
-    assert open_table(path, REFUSE, 1.0).ignored == ("expected_mbar", "phase", "level_mbar")
+    assert open_table(path, REFUSE, 1.0).ignored == SAID
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted(["a.mcap", path.name])
 
 
@@ -67,6 +71,12 @@ def test_other_programs_read_the_ticks_too(tmp_path: Path) -> None:
         there = np.array([np.nan if cell is None else cell for cell in table[column]]) * unit
         np.testing.assert_array_equal(here.astype(ticks.dtype[name]), ticks[name])
         np.testing.assert_array_equal(there.astype(ticks.dtype[name]), ticks[name])
+    for signal in Signal:
+        column = str(signal.name).lower()
+        given = (ticks["signals"] & signal) != 0
+        assert 0 < given.sum() < len(given)
+        assert [row[column] for row in rows] == ["1" if one else "0" for one in given]
+        assert table[column] == given.astype(int).tolist()
 
 
 def test_whose_it_is_and_the_units_stand_in_it(tmp_path: Path) -> None:

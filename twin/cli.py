@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.assets.cli import assets_app
+from twin.cli_assets import assets_app
 from twin.errors import ConfigError, SourceError, TwinError
 from twin.events import Event, Severity
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from twin.live import Sink, Twin
     from twin.log.header import LogHeader
     from twin.monitor.detect import Monitor
+    from twin.settings import Document
     from twin.signals import Samples, Ticks
 
 INTERRUPTED = 130
@@ -50,6 +51,7 @@ AssetsUrl = Annotated[
 ]
 UnitId = Annotated[str, typer.Option("--id", metavar="ID", help="Unit, instead of [asset] id.")]
 ConfigOption = Annotated[Path | None, typer.Option(help="Instead of the one in the log.")]
+AsOf = Annotated[str, typer.Option(metavar="TIME", help="What the asset database knew then, UTC.")]
 JsonFile = Annotated[Path | None, typer.Option("--json", metavar="F", help="The answer.")]
 ViewFlag = Annotated[bool, typer.Option("--view", help="Open the Rerun viewer.")]
 RrdFile = Annotated[Path | None, typer.Option(metavar="F.rrd", help="Write the view to a file.")]
@@ -73,12 +75,11 @@ def run(
 ) -> None:
     """Run the twin beside a PLC: read, expect, compare, log, alarm. Ctrl-C ends it."""
     from drivers.sources import open_source
-    from twin.config import Config
     from twin.live import run as run_loop
     from twin.log.recorder import Recorder
     from twin.settings import Document
 
-    settings = Config.of(Document.read(config), assets, unit)
+    settings = _configured(Document.read(config), assets, unit)
     twin, monitor = _pair(settings)
     with _stop_on_signal(duration) as stopped:
         # A PLC that does not answer is said before a log is begun.
@@ -101,6 +102,7 @@ def replay(
     config: ConfigOption = None,
     unit: UnitId = "",
     assets: AssetsUrl = "",
+    as_of: AsOf = "",
     output: Annotated[Path | None, typer.Option("-o", metavar="OUT.mcap", help="New log.")] = None,
     json_file: Annotated[Path | None, typer.Option("--json", metavar="F", help="Events.")] = None,
     view: ViewFlag = False,
@@ -113,7 +115,7 @@ def replay(
     from twin.log.recorder import Recorder
 
     recorded = open_log(log)
-    settings = _settings_of(recorded.header, config, assets, unit)
+    settings = _settings_of(recorded.header, log, config, assets, unit, as_of)
     twin, monitor = _pair(settings)
     with _stop_on_signal(None) as stopped:
         console = Console()
@@ -169,6 +171,7 @@ def diagnose(
     config: ConfigOption = None,
     unit: UnitId = "",
     assets: AssetsUrl = "",
+    as_of: AsOf = "",
     json_file: JsonFile = None,
     report: Annotated[Path | None, typer.Option(metavar="F.html", help="With pictures.")] = None,
 ) -> None:
@@ -178,7 +181,7 @@ def diagnose(
     from twin.log.reader import open_log
 
     recorded = open_log(log)
-    settings = _settings_of(recorded.header, config, assets, unit)
+    settings = _settings_of(recorded.header, log, config, assets, unit, as_of)
     with _status() as say:
         diagnosis = find_cause(settings, (rows for rows, _ in recorded.blocks()), str(log), say)
     print(in_words(diagnosis))
@@ -226,7 +229,6 @@ def import_(
     assets: AssetsUrl = "",
 ) -> None:
     """Make a log of a PLC's trace export, with what the twin expects beside it."""
-    from twin.config import Config
     from twin.live import run as run_loop
     from twin.log.recorder import Recorder
     from twin.settings import Document
@@ -234,7 +236,7 @@ def import_(
     from twin.tables.reader import open_table
     from twin.tables.settings import ImportSettings
 
-    settings = Config.of(Document.read(config), assets, unit)
+    settings = _configured(Document.read(config), assets, unit)
     wanted = settings.document.section(ImportSettings, "import")
     table = open_table(file, wanted, settings.data.ambient.pressure_mbar * MBAR)
     if table.ignored:
@@ -386,17 +388,31 @@ def _header(settings: "Config") -> "LogHeader":
     )
 
 
-def _settings_of(header: "LogHeader", instead: Path | None, assets: str, unit: str) -> "Config":
+def _configured(document: "Document", assets: str, unit: str, as_of: str = "") -> "Config":
+    """The configuration with what is known of its unit; says so if one that is named is unknown."""
+    from twin.assets.file import parse_time
+    from twin.config import Config
+
+    known = parse_time(as_of) if as_of else None
+    settings = Config.of(document, assets, unit, as_of_ns=known)
+    if unit and settings.instead:
+        print(f"twin: {settings.instead}", file=sys.stderr)
+    return settings
+
+
+def _settings_of(
+    header: "LogHeader", log: Path, instead: Path | None, assets: str, unit: str, as_of: str
+) -> "Config":
     """The configuration a log carries, with the data set it was made with; or another one."""
     from twin.config import Config
     from twin.settings import Document
 
     if instead is not None:
-        return Config.of(Document.read(instead), assets, unit)
+        return _configured(Document.read(instead), assets, unit, as_of)
     document = Document.parse(header.config_text, header.config_name)
-    if unit or assets:
-        return Config.of(document, assets, unit)
-    return Config.of_log(document, header.metadata)
+    if unit or assets or as_of:
+        return _configured(document, assets, unit, as_of)
+    return Config.of_log(document, header.metadata, str(log))
 
 
 @contextmanager

@@ -1,34 +1,41 @@
 """The twin's own part of a configuration: which asset, what is known of it, when to raise an alarm.
 
-What is known comes from one of three places, and which one is kept: the instance-specific data set
-of the unit in the asset database; else its type's object-specific one with what ``[data]`` adds;
-else ``[data]`` alone, where nobody knows the type.
+What is known lies in layers, each over the one before: the defaults; the object-specific data set
+of the type in the asset database; ``[data]``; the instance-specific data set of the unit in the
+asset database. Where they came from is kept.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
+from textwrap import shorten
 from typing import Any
 
-from pydantic import Field, TypeAdapter
+from pydantic import Field, ValidationError
 
+from twin.assets.database import Assets, Found, UnknownAssetError
 from twin.assets.diagram import FLOW, SUPPLY, VACUUM
 from twin.assets.place import open_chosen
 from twin.assets.record import Record
-from twin.errors import ConfigError
-from twin.model.dataset import Ambient, DataSet, Supply, System
+from twin.errors import ConfigError, SourceError
+from twin.model.dataset import DataSet
 from twin.model.diagram import reduce
 from twin.monitor.detect import MonitorSettings, Scatter
 from twin.settings import Document, Settings
 
 TABLES = {"asset", "assets", "data", "driver", "import", "log", "monitor", "plc"}
-_HEALTHY = TypeAdapter(dict[str, Scatter])
+NO_TYPE = "unknown"
+HAND_WRITTEN = "[data] of the configuration"
+_WORDS = {"type": "object-specific data", "instance": "instance-specific data"}
+
+Tables = Mapping[str, Any]  # as [data] has them
 
 
 class Asset(Settings):
     """The ejector: its type (object-specific data) and the one unit (instance-specific data)."""
 
-    type: str = "unknown"
+    type: str = NO_TYPE
     id: str = ""
 
 
@@ -36,6 +43,13 @@ class LogSettings(Settings):
     """How logs are kept."""
 
     rotate_mb: float = Field(64.0, gt=0.0)  # a new part begins beyond this size
+
+
+class Known(Settings):
+    """What is known of an asset, as it is stored: its data set, and what healthy cycles scatter."""
+
+    data: DataSet = DataSet()
+    healthy: Mapping[str, Scatter] = Field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -47,99 +61,241 @@ class Config:
     data: DataSet
     monitor: MonitorSettings
     log: LogSettings
-    origin: str = "[data] of the configuration"  # where the data set is from, in words
+    origin: str = HAND_WRITTEN  # where the data set is from, in words
+    instead: str = ""  # of the unit's own data set, which nobody has: what is used, in words
 
     @classmethod
     def of(
-        cls, document: Document, assets: str = "", unit: str = "", *, calibrated: bool = True
+        cls,
+        document: Document,
+        assets: str = "",
+        unit: str = "",
+        *,
+        calibrated: bool = True,
+        as_of_ns: int | None = None,
     ) -> "Config":
-        """Check all of the twin's tables; ConfigError names file, line and key.
+        """Check all of the twin's tables; ConfigError names file, line and key, or the record.
 
         ``assets`` names the database in place of the configuration's, ``unit`` the ID in place of
         its own. Not ``calibrated`` is the unit as its type has it, whatever is known of itself.
+        ``as_of_ns`` (UTC) takes what the database knew then.
         """
         document.refuse_unknown_tables(TABLES)
-        asset = document.section(Asset, "asset")
-        asset = asset.model_copy(update={"id": unit}) if unit else asset
-        monitor = document.section(MonitorSettings, "monitor")
-        logs = document.section(LogSettings, "log")
-        record = _known(document, asset, assets, calibrated=calibrated)
-        if record is None:
-            return cls(document, asset, document.section(DataSet, "data"), monitor, logs)
-        origin = f"{record.kind}-specific data of {record.name}, record {record.id[:8]}"
-        if record.kind == "type":
-            known = _merged(_diagram(record), record.data)
-            tables = {"data": _merged(known, document.tables.get("data", {}))}
-            merged = replace(document, tables={**document.tables, **tables})
-            data = merged.section(DataSet, "data")
-            return cls(document, asset, data, monitor, logs, f"object-{origin[5:]}")
-        data = DataSet.model_validate(record.data)
-        _refuse_moved(document, data, asset)
-        config = cls(document, asset, data, monitor, logs, origin)
-        return config.with_healthy(record.healthy)
+        asset = _asset(document, unit)
+        with open_chosen(assets, document, write=False) as database:
+            found = _find(database, document, asset.type, asset.id if calibrated else "", as_of_ns)
+            where = database.name
+        known = _layered(document, found, where)
+        config = cls._checked(document, asset, known, _origin(found, known))
+        if calibrated and not (found and found.used == "instance"):
+            config = replace(config, instead=_instead(asset, found, where))
+        return config
 
     @classmethod
-    def of_log(cls, document: Document, metadata: Mapping[str, str]) -> "Config":
-        """The configuration of a log, with the data set it was recorded beside."""
+    def of_log(cls, document: Document, metadata: Mapping[str, str], log: str) -> "Config":
+        """The configuration of a log, with the data set it was recorded beside.
+
+        SourceError names ``log`` and the key where this program cannot take that data set.
+        """
         if "data" not in metadata:
             return cls.of(document)
         document.refuse_unknown_tables(TABLES)
-        config = cls(
-            document,
-            document.section(Asset, "asset"),
-            DataSet.model_validate_json(metadata["data"]),
-            document.section(MonitorSettings, "monitor"),
-            document.section(LogSettings, "log"),
-            metadata.get("origin", "the log"),
-        )
-        return config.with_healthy(json.loads(metadata.get("healthy", "{}")))
+        asset = document.section(Asset, "asset")
+        known = _of_log(metadata, log)
+        return cls._checked(document, asset, known, metadata.get("origin", "the log"))
 
-    def with_healthy(self, healthy: Mapping[str, Any]) -> "Config":
-        """The same with what healthy cycles of the unit scatter, if that is known."""
-        if not healthy:
-            return self
-        update = {"healthy": _HEALTHY.validate_python(dict(healthy))}
-        return replace(self, monitor=self.monitor.model_copy(update=update))
+    @classmethod
+    def _checked(cls, document: Document, asset: Asset, known: Known, origin: str) -> "Config":
+        monitor = document.section(MonitorSettings, "monitor")
+        if known.healthy:
+            monitor = monitor.model_copy(update={"healthy": known.healthy})
+        log = document.section(LogSettings, "log")
+        return cls(document, asset, known.data, monitor, log, origin)
 
 
-def _known(document: Document, asset: Asset, assets: str, *, calibrated: bool) -> Record | None:
-    """What the database has for the asset; None where it does not know it and [data] does."""
-    with open_chosen(assets, document, write=False) as database:
-        unit = asset.id if calibrated else ""
-        types = {record.name for record in database.records("type")}
-        units = {record.name for record in database.records("instance", unit)} if unit else set()
-        if asset.type not in types and unit not in units and "data" in document.tables:
-            return None
-        return database.get(asset.type, unit).record
+def check_asset(document: Document, record: Record, database: Assets) -> None:
+    """ConfigError with file, line and key if a record read from a file would be of no use.
+
+    A unit is checked over what the database has of its type.
+    """
+    below: Tables = {}
+    if record.kind == "instance":
+        kind = database.get(record.type).record
+        below = _laid(kind, {}, partial(_in_record, kind, database.name))
+    _laid(record, below, partial(_in_file, document))
+    replace(document, tables={"healthy": record.healthy}).section(Known)
 
 
-def _diagram(record: Record) -> Mapping[str, Any]:
-    """What a type's characteristic diagram says, where it has one; its data may say it better."""
-    if VACUUM not in record.arrays:
-        return {}
-    ambient = Ambient.model_validate(record.data.get("ambient", {})).pressure_mbar
-    nominal = Supply.model_validate(record.data.get("supply", {})).nozzle_bar
-    axes = record.arrays[VACUUM], record.arrays[SUPPLY]
-    return reduce(*axes, record.arrays[FLOW], nominal, ambient).tables
+# --- which records ------------------------------------------------------------------------------
 
 
-def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """``base`` with the values of ``over``, table by table."""
-    merged = dict(base)
-    for key, value in over.items():
-        both = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
-        merged[key] = _merged(merged[key], value) if both else value
-    return merged
-
-
-def _refuse_moved(document: Document, data: DataSet, asset: Asset) -> None:
-    """ConfigError if the unit was calibrated on another system than the configuration has."""
-    if "system" not in document.tables.get("data", {}):
-        return
-    configured = document.section(System, "data", "system").parts
-    if configured != data.system.parts:
+def _asset(document: Document, unit: str) -> Asset:
+    asset = document.section(Asset, "asset")
+    asset = asset.model_copy(update={"id": unit}) if unit else asset
+    if asset.id and asset.type in ("", NO_TYPE):
         raise ConfigError(
-            f"{document.name}: {asset.id} was calibrated on another system than"
+            f"{document.name}: asset {asset.id!r} has no type",
+            'say which type of ejector it is: type = "..." under [asset]',
+        )
+    return asset
+
+
+def _find(
+    database: Assets, document: Document, type_name: str, unit: str, as_of_ns: int | None
+) -> Found | None:
+    """What the database has; None where it knows neither unit nor type, but [data] does."""
+    try:
+        return database.get(type_name, unit, as_of_ns=as_of_ns)
+    except UnknownAssetError:
+        if "data" not in document.tables:
+            raise
+        return None
+
+
+def _origin(found: Found | None, known: Known) -> str:
+    """Where the data set is from, in words."""
+    if found is None:
+        return HAND_WRITTEN
+    words = _named(found.record)
+    if found.base and any(_left_out(known.data.model_dump(), found.record.data)):
+        words += f", over {_named(found.base)}"
+    return words
+
+
+def _named(record: Record) -> str:
+    return f"{_WORDS[record.kind]} of {record.name}, record {record.id[:8]}"
+
+
+def _instead(asset: Asset, found: Found | None, where: str) -> str:
+    if not asset.id:
+        return ""
+    if found is None:
+        nobody = f"no data set of {asset.id!r} or its type {asset.type!r} in {where}"
+        return f"{nobody}; using {HAND_WRITTEN}"
+    nobody = f"no instance-specific data set of {asset.id!r} in {where}"
+    return f"{nobody}; using the type's {asset.type!r}"
+
+
+# --- layers -------------------------------------------------------------------------------------
+
+
+def _layered(document: Document, found: Found | None, where: str) -> Known:
+    """What is known of an asset; every layer is checked by itself, so that the right one is named.
+
+    ConfigError too if the unit was calibrated on another system than the configuration has.
+    """
+    kind = found.base or found.record if found else None
+    below = _laid(kind, {}, partial(_in_record, kind, where)) if kind else {}
+    tables = _merged(below, document.tables.get("data", {}))
+    known = _in_file(document, tables)
+    if found is None or found.used == "type":
+        return known
+    unit = found.record
+    check = partial(_in_record, unit, where)
+    own = check(_laid(unit, tables, check))
+    configured = "parts" in document.tables.get("data", {}).get("system", {})
+    if configured and own.data.system.parts != known.data.system.parts:
+        raise ConfigError(
+            f"{document.name}: {unit.name} was calibrated on another system than"
             " [data.system.parts] has",
             "calibrate it again on this one (twin calibrate), or give it another id",
         )
+    return own
+
+
+def _laid(record: Record, below: Tables, check: Callable[[Tables], object]) -> Tables:
+    """A record over what lies ``below``; what it says outright holds over what its diagram says."""
+    tables: Tables = _merged(below, record.data)
+    check(tables)
+    if VACUUM not in record.arrays:
+        return tables
+    try:
+        diagram = _reduced(record, DataSet.model_validate(tables))
+        tables = _merged(_merged(below, diagram), record.data)
+        DataSet.model_validate(tables)
+    except (ConfigError, ValidationError) as error:
+        why = _in_words(error) if isinstance(error, ValidationError) else str(error)
+        raise ConfigError(
+            f"{record.kind} {record.name!r}: the model cannot follow its characteristic diagram:"
+            f" {why}",
+            "check its rows: one peak over operating pressure, and capacity that falls with vacuum",
+        ) from error
+    return tables
+
+
+def _reduced(record: Record, data: DataSet) -> Tables:
+    """What a record's characteristic diagram says."""
+    axes = record.arrays[VACUUM], record.arrays[SUPPLY]
+    nominal, ambient = data.supply.nozzle_bar, data.ambient.pressure_mbar
+    return reduce(*axes, record.arrays[FLOW], nominal, ambient).tables
+
+
+def _merged(base: Any, over: Any) -> Any:
+    """``over`` laid over ``base``, table by table."""
+    if not (isinstance(base, Mapping) and isinstance(over, Mapping)):
+        return over
+    return {**base, **{key: _merged(base.get(key), value) for key, value in over.items()}}
+
+
+# --- checks, each naming where a wrong key stands -----------------------------------------------
+
+
+def _in_file(document: Document, tables: Tables) -> Known:
+    merged = replace(document, tables={**document.tables, "data": tables})
+    return Known(data=merged.section(DataSet, "data"))
+
+
+def _in_record(record: Record, where: str, tables: Tables) -> Known:
+    try:
+        return Known.model_validate({"data": tables, "healthy": record.healthy})
+    except ValidationError as error:
+        unfit = f"record {record.id[:8]} of {record.kind} {record.name!r} cannot be used"
+        raise ConfigError(
+            f"{where}: {unfit}: {_in_words(error)}",
+            f"twin assets show {record.name} prints it; add one that is right: twin assets add",
+        ) from error
+
+
+def _of_log(metadata: Mapping[str, str], log: str) -> Known:
+    """All that a log says of the data set; nothing is made up where it leaves something out."""
+    try:
+        stored = {key: json.loads(metadata[key]) for key in ("data", "healthy") if key in metadata}
+        known = Known.model_validate(stored)
+        missing = list(_left_out(known.data.model_dump(mode="json"), stored["data"], "data"))
+        problem = f"{', '.join(missing)}: missing" if missing else ""
+    except ValidationError as error:
+        problem = _in_words(error)
+    except ValueError as error:  # no JSON
+        problem = str(error)
+    if problem:
+        raise SourceError(
+            f"{log}: its data set cannot be used: {problem}",
+            "give another one with --config CONFIG, or use the ejector-twin that made the log"
+            f" ({metadata.get('program', 'of unknown version')})",
+        )
+    return known
+
+
+def _in_words(error: ValidationError) -> str:
+    """What is wrong with stored tables: key, what, and what stands there."""
+    lines = []
+    for problem in error.errors(include_url=False):
+        what = "unknown key" if problem["type"] == "extra_forbidden" else problem["msg"]
+        is_said = problem["type"] in ("missing", "value_error")  # or is a whole table
+        given = "" if is_said else f" (is {shorten(repr(problem['input']), 80)})"
+        lines.append(f"{'.'.join(map(str, problem['loc']))}: {what}{given}")
+    return "; ".join(lines)
+
+
+def _left_out(whole: Any, given: Any, at: str = "") -> Iterator[str]:
+    """The keys of ``whole`` that are not in ``given``, where both have tables or lists."""
+    if isinstance(whole, Mapping) and isinstance(given, Mapping):
+        for key, value in whole.items():
+            here = f"{at}.{key}".removeprefix(".")
+            if key not in given:
+                yield here
+            else:
+                yield from _left_out(value, given[key], here)
+    elif isinstance(whole, list | tuple) and isinstance(given, list | tuple):
+        for number, (one, other) in enumerate(zip(whole, given, strict=True)):
+            yield from _left_out(one, other, f"{at}.{number}")

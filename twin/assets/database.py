@@ -21,18 +21,27 @@ from twin.assets.engine import make_engine, parse_url, plain_errors, shown, sqli
 from twin.assets.exchange import parse_export, to_export
 from twin.assets.record import Array, Kind, Record, checked, content_hash, holding, to_json
 from twin.assets.schema import ARRAY, RECORD, is_made, make
-from twin.assets.shipped import shipped_types
+from twin.assets.shipped import shipped_records
 from twin.errors import ConfigError, SourceError
 
 Conditions = Sequence[ColumnElement[bool]]
 
 
+class UnknownAssetError(ConfigError):
+    """Neither a unit nor its type is in the database."""
+
+
 @dataclass(frozen=True)
 class Found:
-    """What ``Assets.get`` found, and whether it is the unit's own or its type's."""
+    """What ``Assets.get`` found: the unit's own data set or its type's."""
 
     record: Record
-    used: Kind
+    base: Record | None = None  # of a unit: what holds of its type
+
+    @property
+    def used(self) -> Kind:
+        """Whether it is the unit's own or its type's."""
+        return self.record.kind
 
 
 def open_assets(
@@ -45,7 +54,7 @@ def open_assets(
 ) -> "Assets":
     """Open the database at a URL or in an SQLite file; close it, or use it as a context.
 
-    A new one gets its tables, and every one the types this program ships that it never had;
+    A new one gets its tables, and every one the records this program ships that it never had;
     ``shipped=False`` leaves these to the next opening, for an import that brings its own.
     ``create=False`` refuses an SQLite file that is not there. ``busy_s`` is how long to wait for
     other writers, ``clock`` gives UTC in ns.
@@ -92,8 +101,8 @@ class Assets:
         return shown(self._url)
 
     def prepare(self, *, shipped: bool) -> None:
-        """Make the tables and add the shipped types, each where it is missing."""
-        wanted = shipped_types() if shipped else ()
+        """Make the tables and add the shipped records, each where it is missing."""
+        wanted = shipped_records() if shipped else ()
         with self._reading() as connection:
             if is_made(connection, self.name) and not _missing(connection, wanted):
                 return
@@ -125,16 +134,17 @@ class Assets:
         """The data set that holds for a unit at a time (default: now), else that of its type.
 
         ``as_of_ns`` takes only what was recorded until then. Of several the one with the newest
-        valid time holds, among these the one recorded last. ConfigError if there is none, or if
-        the unit is of another type.
+        valid time holds, among these the one recorded last. UnknownAssetError if there is none,
+        ConfigError if the unit is of another type.
         """
         if not type:
             raise ConfigError(f"asset {id!r} has no type", "say [asset] type in the configuration")
         at = self._clock() if at_ns is None else at_ns
+        base = holding(self.records("type", type, as_of_ns=as_of_ns), at)
         if id and (record := holding(self.records("instance", id, as_of_ns=as_of_ns), at)):
-            return Found(_of_type(record, type), "instance")
-        if record := holding(self.records("type", type, as_of_ns=as_of_ns), at):
-            return Found(record, "type")
+            return Found(_of_type(record, type), base)
+        if base:
+            return Found(base)
         with self._reading() as connection:
             raise _nothing(self.name, type, id, _known(connection, "type"))
 
@@ -252,7 +262,7 @@ def _known(connection: Connection, kind: Kind) -> set[str]:
 
 
 def _missing(connection: Connection, wanted: Sequence[Record]) -> list[Record]:
-    """Those never recorded here: an older program does not put its types back on top."""
+    """Those never recorded here: an older program does not put its own back on top."""
     ids = [record.id for record in wanted]
     here = set(connection.scalars(select(RECORD.c.id).where(RECORD.c.id.in_(ids))))
     return [record for record in wanted if record.id not in here]
@@ -278,10 +288,10 @@ def _of_type(record: Record, wanted: str) -> Record:
     return record
 
 
-def _nothing(where: str, type_name: str, unit: str, types: Iterable[str]) -> ConfigError:
+def _nothing(where: str, type_name: str, unit: str, types: Iterable[str]) -> UnknownAssetError:
     asset = f"{unit!r} or its type {type_name!r}" if unit else f"type {type_name!r}"
     known = ", ".join(sorted(types)) or "none"
-    return ConfigError(
+    return UnknownAssetError(
         f"{where}: no data set of {asset} at that time", f"known types: {known}; twin assets add"
     )
 

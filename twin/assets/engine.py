@@ -146,5 +146,5 @@ def _code(error: BaseException | None) -> str:
 def shown(url: URL) -> str:
     """How messages name the database: the file, or the URL without its password."""
     if url.get_backend_name() == "sqlite":
-        return str(sqlite_file(url) or "shipped types only")
+        return str(sqlite_file(url) or "the shipped data sets")
     return url.set(drivername=url.get_backend_name(), query={}).render_as_string()

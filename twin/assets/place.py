@@ -22,7 +22,7 @@ def open_chosen(
     """Open the database named on the command line, else in the configuration, else the default.
 
     The default is a file beside the configuration, without one in the current folder. Only who
-    writes makes a file: to read where the default is not there, the shipped types are enough.
+    writes makes a file: to read where the default is not there, the shipped ones are enough.
     ``shipped`` as in ``open_assets``.
     """
     if named:

@@ -1,4 +1,4 @@
-"""The types that come with the program, as TOML files in ``types/``."""
+"""The types and units that come with the program, as TOML files in ``types/`` and ``units/``."""
 
 from dataclasses import replace
 from functools import cache
@@ -10,18 +10,24 @@ from twin.assets.file import read_asset
 from twin.assets.record import Record, checked
 from twin.settings import Document
 
+FOLDERS = ("types", "units")  # in this order: a unit is of a type
+
 
 @cache
-def shipped_types() -> tuple[Record, ...]:
-    """All of them, checked, in the order of their file names, with their ids."""
-    folder = files("twin.assets") / "types"
+def shipped_records() -> tuple[Record, ...]:
+    """All of them, checked, types first, each in the order of their file names, with their ids."""
     provenance = {"source": f"shipped with ejector-twin {version('ejector-twin')}"}
-    documents = [
+    given = (read_asset(document, provenance)[0] for document in _documents())
+    return tuple(_named(checked(record)) for record in given)
+
+
+def _documents() -> list[Document]:
+    return [
         Document.parse(file.read_text(encoding="utf-8"), file.name)
-        for file in sorted(folder.iterdir(), key=lambda file: file.name)
+        for folder in FOLDERS
+        for file in sorted((files("twin.assets") / folder).iterdir(), key=lambda file: file.name)
         if file.name.endswith(".toml")
     ]
-    return tuple(_named(checked(read_asset(document, provenance)[0])) for document in documents)
 
 
 def _named(record: Record) -> Record:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from twin.assets.shipped import shipped_records
 from twin.model import kernel
 from twin.model import theta as c
 from twin.model.dataset import Ambient, DataSet, Ejector, System, coefficients
@@ -18,9 +19,11 @@ from twin.model.gas import R
 from twin.model.system import Part, Sensor, Tube, Vessel, area, volume
 from twin.signals import MBAR, ML, MS, SL_MIN, Phase
 
-INSTANCE_SL_MIN = 35.0  # suction capacity of the one unit
-OBJECT_SL_MIN = 33.4  # mean of ten units of the type
-END_MBAR = 150.0  # absolute
+_SHIPPED = {record.name: record.data["ejector"] for record in shipped_records()}
+_MEAN_OF_TEN, _MEASURED = _SHIPPED["compact-ejector-35"], _SHIPPED["paper-unit"]
+INSTANCE_SL_MIN: float = _MEASURED["suction_capacity_sl_min"]
+OBJECT_SL_MIN: float = _MEAN_OF_TEN["suction_capacity_sl_min"]
+END_MBAR: float = _MEAN_OF_TEN["end_pressure_mbar"]  # absolute
 SAFETY = 1.2  # usual factor on equation (2)
 HOSE = Tube(kind="tube", length_mm=2000.0, diameter_mm=4.0)  # of the application
 

@@ -13,21 +13,28 @@ from pyarrow import csv, parquet
 
 from twin.errors import ConfigError, SourceError
 from twin.log.header import LogHeader
-from twin.signals import BAR, MBAR, Command, Phase, Quality, Samples, Ticks
+from twin.signals import BAR, MBAR, Command, Phase, Quality, Samples, Signal, Ticks
 
 ROWS = 100_000  # a good size of block to export: what a reader of Parquet takes at once
 
 Rows = Iterable[tuple[Samples, Ticks]]
 
 
+_Column = Callable[[Samples, Ticks], npt.NDArray[np.generic]]
+
+
 class _Field(NamedTuple):
     unit: str
     kind: pa.DataType
-    of: Callable[[Samples, Ticks], npt.NDArray[np.generic]]
+    of: _Column
 
 
-def _flag(bit: Command) -> Callable[[Samples, Ticks], npt.NDArray[np.generic]]:
+def _commanded(bit: Command) -> _Column:
     return lambda samples, _: (samples["commands"] & bit.value) != 0
+
+
+def _given(bit: Signal) -> _Column:
+    return lambda _, ticks: (ticks["signals"] & bit.value) != 0
 
 
 def _wide(column: npt.NDArray[np.float32], unit: float) -> npt.NDArray[np.float64]:
@@ -41,8 +48,8 @@ _PHASES = ", ".join(f"{phase.value} {phase.name.lower()}" for phase in Phase)
 _FIELDS = {
     "time_ns": _Field("ns, PLC time", pa.int64(), lambda s, _: s["time_ns"]),
     "sequence": _Field("scans of the PLC", pa.int64(), lambda s, _: s["sequence"]),
-    "suction": _Field("0 or 1", pa.uint8(), _flag(Command.SUCTION)),
-    "blow_off": _Field("0 or 1", pa.uint8(), _flag(Command.BLOW_OFF)),
+    "suction": _Field("0 or 1", pa.uint8(), _commanded(Command.SUCTION)),
+    "blow_off": _Field("0 or 1", pa.uint8(), _commanded(Command.BLOW_OFF)),
     "pressure_mbar": _Field("mbar absolute", pa.float64(), lambda s, _: _wide(s["pressure"], MBAR)),
     "supply_bar": _Field("bar gauge", pa.float64(), lambda s, _: _wide(s["supply"], BAR)),
     "quality": _Field(f"sum of {_FLAGS}", pa.uint8(), lambda s, _: s["quality"]),
@@ -53,6 +60,8 @@ _FIELDS = {
         pa.float64(),
         lambda _, t: _wide(t["level"], MBAR),
     ),
+    "part_present": _Field("0 or 1, H2", pa.uint8(), _given(Signal.PART_PRESENT)),
+    "air_saving": _Field("0 or 1, H1", pa.uint8(), _given(Signal.AIR_SAVING)),
     "host_ns": _Field("ns, time of receipt", pa.int64(), lambda s, _: s["host_ns"]),
 }
 

@@ -80,12 +80,15 @@ def add(
 
     from twin.assets.file import read_asset, show_time
     from twin.assets.record import checked, holding
+    from twin.config import check_asset
     from twin.settings import Document
 
+    document = Document.read(file)
     provenance = {"file": file.name, "code": f"ejector-twin {version('ejector-twin')}"}
-    given, dated = read_asset(Document.read(file), provenance)
+    given, dated = read_asset(document, provenance)
     record = checked(given)
     with _open(assets, config, write=True) as database:
+        check_asset(document, record, database)
         before = database.records(record.kind, record.name)
         if before and not dated:
             record = replace(record, valid_from_ns=time.time_ns())
@@ -142,13 +145,14 @@ def _open(url: str, config: Path | None, *, write: bool, shipped: bool = True) -
 
 
 def _holding_each(records: "Iterable[Record]", now: int) -> "list[Record]":
-    """Of every type and unit the record that holds."""
+    """Of every type, then of every unit, the record that holds."""
     from twin.assets.record import holding
 
     assets: dict[tuple[str, str], list[Record]] = {}
     for record in records:
         assets.setdefault((record.kind, record.name), []).append(record)
-    held = (holding(assets[asset], now) for asset in sorted(assets, reverse=True))
+    in_order = sorted(assets, key=lambda asset: (asset[0] == "instance", asset[1]))
+    held = (holding(assets[asset], now) for asset in in_order)
     return [record for record in held if record is not None]
 
 
