@@ -1,6 +1,6 @@
 """Calibrate many simulated rigs and count how often a 95 % interval holds the true value.
 
-    python tools/calibration_coverage.py [--rigs 40] [--cycles 8]
+    python tools/calibration_coverage.py [--rigs 40] [--first 0] [--cycles 8]
 
 Every rig has true parameters of its own, drawn by seed; the twin begins from the type's data. Rigs
 alternate between the shipped configurations. Compared is what means the same in rig and model.
@@ -8,13 +8,14 @@ alternate between the shipped configurations. Compared is what means the same in
 
 import argparse
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from drivers.plc.faults import Fault
 from drivers.plc.settings import PlcSettings
 from drivers.plc.simulate import blocks
 from twin.calibration.fit import Fitted, fit
@@ -40,9 +41,13 @@ TRUE: Mapping[str, Callable[[PlcSettings], float]] = {
 }
 
 
-def as_type(name: str) -> Config:
-    """A shipped configuration with the system as built, and of the ejector only its type's data."""
-    document = Document.read(CONFIGS / f"{name}.toml")
+def shipped(name: str) -> Document:
+    """A shipped configuration."""
+    return Document.read(CONFIGS / f"{name}.toml")
+
+
+def as_type(document: Document) -> Config:
+    """A configuration with the system as built, and of the ejector only its type's data."""
     data: dict[str, Any] = {
         key: {k: v for k, v in table.items() if k in KEPT.get(key, set(table))}
         for key, table in document.tables["data"].items()
@@ -50,9 +55,9 @@ def as_type(name: str) -> Config:
     return Config.of(replace(document, tables={**document.tables, "data": data}), calibrated=False)
 
 
-def rig_of(name: str) -> PlcSettings:
-    """The simulated PLC of a shipped configuration."""
-    return Document.read(CONFIGS / f"{name}.toml").section(PlcSettings, "plc")
+def rig_of(document: Document) -> PlcSettings:
+    """The simulated PLC of a configuration."""
+    return document.section(PlcSettings, "plc")
 
 
 def drawn(plc: PlcSettings, seed: int) -> PlcSettings:
@@ -75,13 +80,13 @@ def drawn(plc: PlcSettings, seed: int) -> PlcSettings:
     return PlcSettings.model_validate(tables)
 
 
-def recorded(plc: PlcSettings, cycles: int, seed: int) -> Samples:
-    """Healthy samples in which ``cycles`` count: not the first one, nor what is cut at the end."""
+def recorded(plc: PlcSettings, cycles: int, seed: int, faults: Sequence[Fault] = ()) -> Samples:
+    """Samples in which ``cycles`` count: not the first one, nor what is cut at the end."""
     program = plc.program.model_copy(update={"start_ms": 500.0})
     cycle = program.suction_ms + program.blow_off_ms + program.idle_ms
     seconds = (program.start_ms + (cycles + 1.2) * cycle) * MS
     plc = plc.model_copy(update={"program": program})
-    return np.concatenate(list(blocks(plc, seconds, seed=seed)))
+    return np.concatenate(list(blocks(plc, seconds, faults, seed)))
 
 
 def misses(fitted: Fitted, plc: PlcSettings) -> dict[str, float]:
@@ -97,13 +102,15 @@ def main() -> None:
     """Calibrate and print a line for each rig, then the table for the record."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rigs", type=int, default=40)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first rig")
     parser.add_argument("--cycles", type=int, default=8)
     asked = parser.parse_args()
-    types = {name: as_type(name).data for name in SYSTEMS}
+    documents = {name: shipped(name) for name in SYSTEMS}
+    types = {name: as_type(document).data for name, document in documents.items()}
     found: dict[str, list[dict[str, float]]] = {name: [] for name in SYSTEMS}
-    for seed in range(asked.rigs):
+    for seed in range(asked.first, asked.first + asked.rigs):
         name = SYSTEMS[seed % len(SYSTEMS)]
-        plc = drawn(rig_of(name), seed)
+        plc = drawn(rig_of(documents[name]), seed)
         begin = time.perf_counter()
         fitted = fit(recorded(plc, asked.cycles, seed), types[name], lambda _what: None)
         found[name].append(misses(fitted, plc))

@@ -5,7 +5,7 @@ how far units differ, the cycles say the rest, each residual weighing what noise
 model's own error leave of it. All derivatives come from one run of the bank of hypotheses.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy.typing as npt
 from scipy.optimize import least_squares
 
 from twin.calibration.cycles import Cycles
+from twin.calibration.left_out import with_left_out
 from twin.calibration.parameters import FREE, directions, values, with_values
 from twin.calibration.weights import Weights, weighted
 from twin.model.dataset import RIPPLE, DataSet, coefficients
@@ -120,9 +121,21 @@ def fit(samples: Samples, data: DataSet, progress: Callable[[str], None]) -> Fit
         )
         x, best = found.x, problem.data_at(found.x)
     ways = directions(data)
-    jacobian = problem.jacobian(x)
-    covariance = ways @ np.linalg.inv(jacobian.T @ jacobian) @ ways.T
+    off = cycles.off(np.stack(with_left_out(best), axis=1))
+    covariance = ways @ _covariance(problem.jacobian(x), weights.white(off)) @ ways.T
     prior = np.sqrt(np.diag(ways @ ways.T))
-    off = cycles.off(coefficients(best).reshape(-1, 1))[:, 0]
-    left = float(np.sqrt(np.average(off**2, weights=cycles.bins.count)))
+    left = float(np.sqrt(np.average(off[:, 0] ** 2, weights=cycles.bins.count)))
     return Fitted(DataSet.model_validate(best.model_dump()), covariance, prior, left)
+
+
+def _covariance(jacobian: Floats, white: Sequence[Floats]) -> Floats:
+    """Covariance of ``x``: of what residuals scatter, and where what is left out moves it.
+
+    ``white`` are residuals (bins, n) in sigmas: of the fit, then with what the model leaves out.
+    """
+    covariance = np.linalg.inv(jacobian.T @ jacobian)
+    all_white = np.concatenate(white)
+    changes = all_white[:, 1:] - all_white[:, :1]
+    moves = covariance @ jacobian[: len(changes)].T @ changes
+    total: Floats = covariance + moves @ moves.T
+    return total
