@@ -12,8 +12,7 @@ from tools.calibration_coverage import as_type, recorded, rig_of, shipped
 from twin.calibration.calibrate import Calibration, calibrate
 from twin.config import Config
 from twin.live import Twin
-from twin.model.dataset import DataSet, coefficients
-from twin.monitor.phases import expected_knees
+from twin.model.dataset import DataSet
 from twin.signals import MBAR, Phase, Samples, Ticks, deviation
 
 CYCLES = 8
@@ -51,8 +50,7 @@ def calibrated(name: str) -> Calibration:
 
 def beside(data: DataSet, samples: Samples) -> tuple[Samples, Ticks]:
     """All rows of a log with what the twin of a data set says to them."""
-    theta = coefficients(data)
-    twin = Twin(theta, expected_knees(theta, data.sensor.noise_mbar * MBAR))
+    twin = Twin.of(data)
     (early, said), (late, last) = twin.advance(samples), twin.flush()
     return np.concatenate([early, late]), np.concatenate([said, last])
 

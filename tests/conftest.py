@@ -54,4 +54,4 @@ def plc() -> Iterator[PlcProcess]:
 @pytest.fixture(scope="session", autouse=True)
 def compiled_once() -> None:
     """Compile before a child process has to: tests wait for what it does, not for a compiler."""
-    compiled(rigs.theta("test_rig"), rigs.knees("test_rig"))
+    compiled(rigs.config("test_rig").data)

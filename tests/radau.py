@@ -63,7 +63,7 @@ def suction_flow(theta: Theta, p: float, jet: float, supply: float) -> float:
     return float(jet * capacity * max(x * (1.0 + (1.0 - x) * bend), 0.0))
 
 
-def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:  # noqa: PLR0915
+def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
     """d/dt of three pressures, three masses, two flows, drive, jet, valve, supply, sensor."""
     port, line, vessel, port_mass, line_mass, vessel_mass, near, far = y[:8]
     drive, jet, valve, supply, felt, sensed = y[8:]
@@ -108,10 +108,9 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:  # noqa
     rise, fall = theta[c.RAMP_UP], theta[c.RAMP_DOWN]
     first, second = (rise + theta[c.SLOW_RAMP_UP], rise) if rising else (fall, fall)
     regulated = theta[c.SUPPLY] - theta[c.DROOP] * max(valves.nozzle, valves.blow)
-    suction = theta[c.SUCTION]
-    drop = (theta[c.NEAR_RESISTANCE] + theta[c.RESISTANCE]) * suction**2
-    drop += (theta[c.NEAR_LAMINAR] + theta[c.LAMINAR]) * suction
-    there = port + (min(theta[c.PLACE] / drop, 1.0) if drop > 0.0 else 0.0) * (vessel - port)
+    friction = theta[c.NEAR_RESISTANCE] + theta[c.RESISTANCE]
+    place = min(theta[c.PLACE] / friction, 1.0) if friction > 0.0 else 0.0
+    there = port + place * (vessel - port)
     pushes = (0.0, 0.0)
     if not stiff:
         rub = (theta[c.NEAR_RESISTANCE] * abs(near) + theta[c.NEAR_LAMINAR]) * near

@@ -44,7 +44,7 @@ def knees(name: str) -> Knees:
 
 
 def twin(name: str) -> Twin:
-    return Twin(theta(name), knees(name))
+    return Twin.of(config(name).data)
 
 
 def monitor(name: str) -> Monitor:

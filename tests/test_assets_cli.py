@@ -26,7 +26,7 @@ note = "measured on the bench"
 [data.ejector]
 suction_capacity_sl_min = 35.0
 
-[healthy]
+[healthy.figures]
 hold_rms = { mean = 2.0, sigma = 0.5 }
 
 [diagram]
@@ -269,7 +269,12 @@ def test_a_characteristic_may_be_flat_where_nothing_is_left(run: Run, unit: Path
         (CAPACITY, "bulge = -0.9\nskew = 5.0", 7, "a characteristic that is not monotonic"),
         ("[data.ejector]", "[data.supply]\npressure_bar = -1.0\n[data.ejector]", 8, "than 0"),
         ("[data.ejector]", f"{SYSTEM}\nvolume_ml = 0\n[data.ejector]", 13, "volume_ml: Input sh"),
-        ("sigma = 0.5", "sigma = 0.0", 11, "healthy.hold_rms.sigma: Input should be greater"),
+        (
+            "sigma = 0.5",
+            "sigma = 0.0",
+            11,
+            "healthy.figures.hold_rms.sigma: Input should be greater",
+        ),
     ],
 )
 def test_a_data_set_that_cannot_be_is_refused_with_its_line(

@@ -26,7 +26,6 @@ from twin.model.dataset import coefficients
 from twin.model.theta import Theta
 from twin.monitor.cycles import PAPER_VACUUM, CycleCutter, time_to_vacuum
 from twin.monitor.detect import Monitor
-from twin.monitor.phases import expected_knees
 from twin.signals import MBAR, Phase, Quality, Samples
 
 HELD_OUT = (21, 22, 23)
@@ -124,7 +123,7 @@ def test_another_healthy_log_raises_no_alarm_and_is_consistent(name: str, seed: 
         def close(self) -> None:
             pass
 
-    twin = Twin(theta, expected_knees(theta, config.data.sensor.noise_mbar * MBAR))
+    twin = Twin.of(config.data)
     run([log_of(name, seed)], twin, Monitor(config.monitor, theta), [Events()])
     assert [event.text for event in events if event.kind.name.startswith("ALARM")] == []
     answer = diagnose(config, [log_of(name, seed)], "log.mcap", quiet).json

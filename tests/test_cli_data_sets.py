@@ -67,9 +67,7 @@ def add_unit(monkeypatch: pytest.MonkeyPatch, suction: float, *database: str) ->
     data = rigs.config("gripper").data
     ejector = data.ejector.model_copy(update={"suction_capacity_sl_min": suction})
     data = data.model_copy(update={"ejector": ejector})
-    healthy = {
-        name: one.model_dump() for name, one in rigs.config("gripper").monitor.healthy.items()
-    }
+    healthy = rigs.config("gripper").monitor.healthy.model_dump(mode="json")
     unit = {"kind": "instance", "name": UNIT, "type": "compact-ejector-35"}
     Path("unit.toml").write_text(
         tomli_w.dumps({**unit, "data": data.model_dump(exclude_none=True), "healthy": healthy})
@@ -294,7 +292,7 @@ def test_a_unit_that_is_calibrated_is_the_one_that_is_replayed(
     assert twin(monkeypatch, "replay", log, "--id", UNIT, "--fail-on-alarm", "-o", "unit.mcap") == 0
     assert about(here / "unit.mcap", "origin").startswith(f"instance-specific data of {UNIT}")
     healthy = json.loads(about(here / "unit.mcap", "healthy"))
-    assert {"idle_rms", "suction_rms", "hold_rms", "blow_off_rms", "leftover"} <= set(healthy)
+    assert {"idle_rms", "suction_rms", "hold_rms", "blow_off_rms"} <= set(healthy["figures"])
 
 
 def test_a_calibration_without_a_unit_is_exit_code_2(

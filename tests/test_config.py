@@ -16,6 +16,7 @@ from twin.config import Config
 from twin.errors import ConfigError, SourceError
 from twin.model.dataset import DataSet
 from twin.model.diagram import capacity
+from twin.monitor.healthy import Healthy
 from twin.settings import Document
 
 TYPE, UNIT = "deep", "unit-1"
@@ -41,10 +42,10 @@ diameter_mm = 4.0
 kind = "vessel"
 volume_ml = 90.0
 
-[monitor.healthy]
+[monitor.healthy.figures]
 hold_rms = {{ mean = 1.0, sigma = 0.1 }}
 """
-HEALTHY = {"hold_rms": {"mean": 2.0, "sigma": 0.5}}
+HEALTHY = {"figures": {"hold_rms": {"mean": 2.0, "sigma": 0.5}}}
 
 
 @pytest.fixture
@@ -148,11 +149,11 @@ def test_not_calibrated_is_the_unit_as_its_type_has_it(database: Assets, url: st
 
 
 def test_the_healthy_scatter_is_the_units_if_it_has_one(database: Assets, url: str) -> None:
-    assert taken(url).monitor.healthy["hold_rms"].mean == 1.0
+    assert taken(url).monitor.healthy.figures["hold_rms"].mean == 1.0
     add(database, {})
-    assert taken(url).monitor.healthy["hold_rms"].mean == 1.0
+    assert taken(url).monitor.healthy.figures["hold_rms"].mean == 1.0
     add(database, {}, healthy=HEALTHY)
-    assert {name: one.model_dump() for name, one in taken(url).monitor.healthy.items()} == HEALTHY
+    assert taken(url).monitor.healthy == Healthy.model_validate(HEALTHY)
 
 
 def test_a_unit_moved_to_another_system_is_refused(database: Assets, url: str) -> None:
@@ -259,9 +260,18 @@ def test_a_record_of_another_shape_is_named_with_its_key(
 @pytest.mark.parametrize(
     ("healthy", "problem"),
     [
-        ({"hold_rms": {"mean": 1.0}}, "healthy.hold_rms.sigma: Field required"),
-        ({"hold_rms": {"mean": 1.0, "sigma": 0.0}}, "healthy.hold_rms.sigma: Input should be gre"),
-        ({"hold_rms": 1.0}, "healthy.hold_rms: Input should be a valid dictionary"),
+        (
+            {"figures": {"hold_rms": {"mean": 1.0}}},
+            "healthy.figures.hold_rms.sigma: Field required",
+        ),
+        (
+            {"figures": {"hold_rms": {"mean": 1.0, "sigma": 0.0}}},
+            "healthy.figures.hold_rms.sigma: Input",
+        ),
+        (
+            {"figures": {"hold_rms": 1.0}},
+            "healthy.figures.hold_rms: Input should be a valid dictionary",
+        ),
     ],
 )
 def test_a_healthy_scatter_of_another_shape_is_named_with_its_key(
@@ -308,7 +318,7 @@ def test_a_log_gives_its_data_set_back_without_a_database() -> None:
     config = of_log(data=whole_json(), origin="elsewhere", healthy=json.dumps(HEALTHY))
     assert config.data == DataSet()
     assert config.origin == "elsewhere"
-    assert config.monitor.healthy["hold_rms"].sigma == 0.5
+    assert config.monitor.healthy.figures["hold_rms"].sigma == 0.5
     assert (config.asset.id, config.instead) == (UNIT, "")
 
 

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from twin.events import Event, Kind, Severity
 from twin.model.effects import EFFECTS
-from twin.monitor.detect import Monitor, MonitorSettings, Scatter
+from twin.monitor.detect import Monitor, MonitorSettings
+from twin.monitor.healthy import Healthy, Scatter
 from twin.signals import MBAR, NS, SAMPLE, TICK, Phase, Quality, Samples, Ticks
 
 STREAM = (
@@ -337,7 +338,7 @@ def test_a_cause_that_changes_is_named_anew() -> None:
 
 def test_a_long_piece_without_a_sync_has_an_alarm_without_a_name() -> None:
     """Minutes of hold come in pieces, and most of them hold nothing to set a model on."""
-    healthy = {"hold_mean": Scatter(mean=0.0, sigma=1.0)}
+    healthy = Healthy(figures={"hold_mean": Scatter(mean=0.0, sigma=1.0)})
     monitor = Monitor(MonitorSettings(healthy=healthy), rigs.theta("test_rig"))
     samples = calm(80_000)
     ticks = unsaid(samples)

@@ -166,7 +166,7 @@ def test_the_shipped_configurations_are_taken(name: str) -> None:
     config = rigs.config(name)
     assert set(config.document.tables) <= TABLES
     assert config.asset.id
-    assert config.monitor.healthy
+    assert config.monitor.healthy.figures
 
 
 def refused(old: str, new: str) -> str:

@@ -111,7 +111,7 @@ def test_a_tube_resists_swift_flow_as_darcy_says() -> None:
 
 def test_tubes_in_line_add_up() -> None:
     one, two = total(tube(500.0), vessel()), total(tube(500.0), tube(500.0), vessel())
-    for name in ("resistance", "laminar", "inertance", "drop", "line_volume"):
+    for name in ("resistance", "laminar", "inertance", "line_volume"):
         assert getattr(two, name) == pytest.approx(2.0 * getattr(one, name))
     assert one.inertance == pytest.approx(0.5 / (math.pi / 4 * 0.006**2))
 

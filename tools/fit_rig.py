@@ -32,7 +32,7 @@ def main() -> None:
         found = calibrate(
             config, blocks(rig_of(document), duration_s=SECONDS, seed=7), status.update
         )
-    healthy = {name: one.model_dump() for name, one in found.healthy.items()}
+    healthy = found.healthy.model_dump()
     data = found.fitted.data.model_dump(exclude_none=True)
     print(tomli_w.dumps({"data": _rounded(data), "monitor": {"healthy": _rounded(healthy)}}))
 

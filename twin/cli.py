@@ -5,11 +5,13 @@ stdout, what it has to say about its work to stderr.
 """
 
 import json
+import os
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated
@@ -22,6 +24,7 @@ from twin.events import Event, Severity
 
 if TYPE_CHECKING:
     from twin.config import Config
+    from twin.diagnosis.answer import Diagnosis
     from twin.live import Sink, Twin
     from twin.log.header import LogHeader
     from twin.monitor.detect import Monitor
@@ -73,8 +76,9 @@ def run(
     assets: AssetsUrl = "",
     fail_on_alarm: FailOnAlarm = False,
 ) -> None:
-    """Run the twin beside a PLC: read, expect, compare, log, alarm. Ctrl-C ends it."""
+    """Run the twin beside a PLC: read, expect, compare, log, alarm, diagnose. Ctrl-C ends it."""
     from drivers.sources import open_source
+    from twin.diagnosis.process import LiveDiagnosis
     from twin.live import run as run_loop
     from twin.log.recorder import Recorder
     from twin.settings import Document
@@ -91,7 +95,10 @@ def run(
             _view_of(settings, view, rrd),
             lambda: console,
         )
-        run_loop(_until(stopped, source), twin, monitor, sinks)
+        adviser = LiveDiagnosis(
+            settings, str(log or "live"), lambda: stopped() == "interrupted", _status
+        )
+        run_loop(_until(stopped, source), twin, monitor, sinks, advisers=[adviser])
         _leave(console, fail_on_alarm, interrupted=stopped() == "interrupted")
 
 
@@ -114,6 +121,7 @@ def replay(
     from twin.log.reader import open_log
     from twin.log.recorder import Recorder
 
+    _require_writable(json_file)
     recorded = open_log(log)
     settings = _settings_of(recorded.header, log, config, assets, unit, as_of)
     twin, monitor = _pair(settings)
@@ -128,7 +136,7 @@ def replay(
         run_loop(_until(stopped, _progress(blocks, "replaying")), twin, monitor, sinks)
     if json_file is not None:
         events = [_plain(event) for event in console.events]
-        json_file.write_text(json.dumps({"log": str(log), "events": events}, indent=1))
+        _write_json(json_file, {"log": str(log), "events": events})
     _leave(console, fail_on_alarm, interrupted=stopped() == "interrupted")
 
 
@@ -174,21 +182,29 @@ def diagnose(
     as_of: AsOf = "",
     json_file: JsonFile = None,
     report: Annotated[Path | None, typer.Option(metavar="F.html", help="With pictures.")] = None,
+    save_as: Annotated[
+        str, typer.Option(metavar="NEWID", help="Keep the extended model as that of a unit.")
+    ] = "",
 ) -> None:
     """Say what the simulation gets wrong on a log, why, and what knowing it gains."""
     from twin.diagnosis.answer import diagnose as find_cause
     from twin.diagnosis.report import in_words, write_report
     from twin.log.reader import open_log
 
+    _require_writable(json_file, report)
     recorded = open_log(log)
     settings = _settings_of(recorded.header, log, config, assets, unit, as_of)
+    if not unit:
+        _refuse_another(recorded.header, log, settings)
     with _status() as say:
         diagnosis = find_cause(settings, (rows for rows, _ in recorded.blocks()), str(log), say)
     print(in_words(diagnosis))
     if json_file is not None:
-        json_file.write_text(json.dumps(diagnosis.json, indent=1, ensure_ascii=False))
+        _write_json(json_file, diagnosis.json)
     if report is not None:
         write_report(diagnosis, report)
+    if save_as:
+        _save(diagnosis, settings, save_as, assets, log)
 
 
 @app.command()
@@ -207,6 +223,7 @@ def calibrate(
     from twin.log.reader import open_log
     from twin.settings import Document
 
+    _require_writable(json_file)
     settings = Config.of(Document.read(config), assets, unit, calibrated=False)
     if not settings.asset.id:
         raise ConfigError("no unit is named", "give --id ID, or [asset] id in the configuration")
@@ -217,7 +234,7 @@ def calibrate(
     print(in_words(calibration))
     print(f"stored as {settings.asset.id} in {where}, record {record.id[:8]}")
     if json_file is not None:
-        json_file.write_text(json.dumps(as_json(calibration, record), indent=1, ensure_ascii=False))
+        _write_json(json_file, as_json(calibration, record))
 
 
 @app.command("import")
@@ -355,14 +372,10 @@ class Console:
 def _pair(settings: "Config") -> tuple["Twin", "Monitor"]:
     """The twin of a configuration and its monitor."""
     from twin.live import compiled
-    from twin.model.dataset import coefficients
     from twin.monitor.detect import Monitor
-    from twin.monitor.phases import expected_knees
-    from twin.signals import MBAR
 
-    theta = coefficients(settings.data)
-    knees = expected_knees(theta, settings.data.sensor.noise_mbar * MBAR)
-    return compiled(theta, knees), Monitor(settings.monitor, theta)
+    twin = compiled(settings.data)
+    return twin, Monitor(settings.monitor, twin.theta)
 
 
 def _header(settings: "Config") -> "LogHeader":
@@ -382,7 +395,7 @@ def _header(settings: "Config") -> "LogHeader":
             "data_set": settings.data.hash,
             "origin": settings.origin,
             "data": settings.data.model_dump_json(),
-            "healthy": json.dumps(settings.monitor.model_dump()["healthy"]),
+            "healthy": settings.monitor.healthy.model_dump_json(),
         },
         ambient=settings.data.ambient.pressure_mbar * MBAR,
     )
@@ -404,7 +417,7 @@ def _settings_of(
     header: "LogHeader", log: Path, instead: Path | None, assets: str, unit: str, as_of: str
 ) -> "Config":
     """The configuration a log carries, with the data set it was made with; or another one."""
-    from twin.config import Config
+    from twin.config import Asset, Config
     from twin.settings import Document
 
     if instead is not None:
@@ -412,7 +425,57 @@ def _settings_of(
     document = Document.parse(header.config_text, header.config_name)
     if unit or assets or as_of:
         return _configured(document, assets, unit, as_of)
-    return Config.of_log(document, header.metadata, str(log))
+    settings = Config.of_log(document, header.metadata, str(log))
+    # --id may have named another unit than the configuration does.
+    return replace(settings, asset=Asset(type=header.asset_type, id=header.asset_id))
+
+
+def _refuse_another(header: "LogHeader", log: Path, settings: "Config") -> None:
+    """ConfigError if the configuration is that of another asset than the log."""
+    recorded = header.asset_type, header.asset_id
+    asked = settings.asset.type, settings.asset.id
+    if all((*recorded, *asked)) and recorded != asked:
+        raise ConfigError(
+            f"{log} is a log of {' '.join(recorded)}, {settings.document.name} is for"
+            f" {' '.join(asked)}",
+            "take the log's own configuration (no --config), or say with --id which unit to"
+            " compare it with",
+        )
+
+
+def _save(diagnosis: "Diagnosis", settings: "Config", unit: str, assets: str, log: Path) -> None:
+    """Keep the extended model, or say why there is none."""
+    from twin.diagnosis.extend import extended, nothing, remarks, store
+
+    print()
+    for line in remarks(diagnosis):
+        print(line)
+    known = extended(diagnosis, settings)
+    if known is None:
+        print(f"nothing is stored as {unit}: {nothing(diagnosis)}")
+        return
+    record, where = store(known, diagnosis, settings, unit, assets, log)
+    print(f"stored as {unit} in {where}, record {record.id[:8]}; use it: --id {unit}")
+
+
+def _require_writable(*paths: Path | None) -> None:
+    """SourceError before the work is done, if its answer could not be written."""
+    for path in paths:
+        if path is not None and (path.is_dir() or not os.access(path.parent, os.W_OK)):
+            raise _unwritable(path, "it is a folder" if path.is_dir() else "no folder to write to")
+
+
+def _write_json(path: Path, document: object) -> None:
+    """SourceError if it cannot be written."""
+    try:
+        path.write_text(json.dumps(document, indent=1, ensure_ascii=False), encoding="utf-8")
+    except OSError as error:
+        raise _unwritable(path, str(error.strerror)) from error
+
+
+def _unwritable(path: Path, why: str) -> SourceError:
+    hint = "check that the folder exists, may be written to and has space"
+    return SourceError(f"{path}: cannot be written: {why}", hint)
 
 
 @contextmanager

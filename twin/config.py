@@ -21,7 +21,8 @@ from twin.assets.record import Record
 from twin.errors import ConfigError, SourceError
 from twin.model.dataset import DataSet
 from twin.model.diagram import reduce
-from twin.monitor.detect import MonitorSettings, Scatter
+from twin.monitor.detect import MonitorSettings
+from twin.monitor.healthy import Healthy
 from twin.settings import Document, Settings
 
 TABLES = {"asset", "assets", "data", "driver", "import", "log", "monitor", "plc"}
@@ -49,7 +50,7 @@ class Known(Settings):
     """What is known of an asset, as it is stored: its data set, and what healthy cycles scatter."""
 
     data: DataSet = DataSet()
-    healthy: Mapping[str, Scatter] = Field(default_factory=dict)
+    healthy: Healthy = Healthy()
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ class Config:
     @classmethod
     def _checked(cls, document: Document, asset: Asset, known: Known, origin: str) -> "Config":
         monitor = document.section(MonitorSettings, "monitor")
-        if known.healthy:
+        if known.healthy != Healthy():
             monitor = monitor.model_copy(update={"healthy": known.healthy})
         log = document.section(LogSettings, "log")
         return cls(document, asset, known.data, monitor, log, origin)

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Any
 
 
 class Severity(StrEnum):
@@ -26,6 +27,7 @@ class Kind(StrEnum):
     CYCLE = "cycle"
     DEVIATION = "deviation"
     DEVIATION_CLEARED = "deviation_cleared"
+    DIAGNOSIS = "diagnosis"
 
 
 SEVERITY: dict[Kind, Severity] = {
@@ -39,17 +41,21 @@ SEVERITY: dict[Kind, Severity] = {
     Kind.CYCLE: Severity.INFO,
     Kind.DEVIATION: Severity.ALARM,
     Kind.DEVIATION_CLEARED: Severity.INFO,
+    Kind.DIAGNOSIS: Severity.WARNING,  # the alarm has been raised already; this says why
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One thing that happened, in PLC time, with its numbers in the field's units."""
+    """One thing that happened, in PLC time, with its numbers in the field's units.
+
+    ``data`` is what JSON can hold: numbers and texts, and of a diagnosis the whole answer.
+    """
 
     time_ns: int
     kind: Kind
     text: str
-    data: Mapping[str, float | int | str] = field(default_factory=dict)
+    data: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def severity(self) -> Severity:

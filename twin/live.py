@@ -10,11 +10,14 @@ import numpy as np
 
 from twin.events import Event
 from twin.model import kernel
+from twin.model import theta as c
+from twin.model.dataset import DataSet, coefficients
+from twin.model.term import Term, Terms
 from twin.model.theta import Theta
 from twin.monitor.detect import Monitor
-from twin.monitor.phases import Found, Knees, PhaseFinder
+from twin.monitor.phases import Found, Knees, PhaseFinder, expected_knees
 from twin.monitor.signatures import steps
-from twin.signals import SAMPLE, TICK, Samples, Ticks
+from twin.signals import MBAR, SAMPLE, TICK, Samples, Ticks
 
 
 class Sink(Protocol):
@@ -27,17 +30,38 @@ class Sink(Protocol):
         """Finish; nothing comes after it."""
 
 
+class Adviser(Protocol):
+    """Whoever has more to say to what happens, once it has found out."""
+
+    def follow(self, samples: Samples, events: Sequence[Event]) -> list[Event]:
+        """Take rows and what happened, without delay; give what has been found out by now."""
+
+    def finish(self) -> list[Event]:
+        """Give what is still to be said when the rows have ended; this may take a while."""
+
+    def close(self) -> None:
+        """Let go of everything; called in every case."""
+
+
 @dataclass
 class Twin:
     """The model beside the rig: what the sensor should read, a fixed lag behind the measurement."""
 
     theta: Theta
     knees: Knees
+    terms: Sequence[Term] = ()
     _state: kernel.State = field(default_factory=kernel.new_state)
     _last_ns: int | None = None
 
     def __post_init__(self) -> None:
         self._finder = PhaseFinder(self.knees)
+        self._terms = Terms(self.terms, float(self.theta[c.AMBIENT]))
+
+    @classmethod
+    def of(cls, data: DataSet) -> "Twin":
+        """The twin of a data set."""
+        theta = coefficients(data)
+        return cls(theta, expected_knees(theta, data.sensor.noise_mbar * MBAR), data.terms)
 
     def advance(self, block: Samples) -> tuple[Samples, Ticks]:
         """Take a block; give the rows that are settled with what the twin says to them."""
@@ -55,16 +79,18 @@ class Twin:
         dt = steps(samples, self._last_ns)
         level, signals = ticks["level"].astype("f8"), np.empty(len(samples), "u1")
         kernel.advance(self._state, self.theta, dt, phase, level, expected, signals)
+        self._terms.add(phase, expected)
         ticks["expected"], ticks["signals"] = expected, signals
         if len(samples):
             self._last_ns = int(samples["time_ns"][-1])
         return samples, ticks
 
 
-def compiled(theta: Theta, knees: Knees) -> Twin:
+def compiled(data: DataSet) -> Twin:
     """A twin whose path is compiled: seconds where nothing is cached, not to fall into a block."""
-    Twin(theta, knees).advance(np.zeros(3 * knees.lag, SAMPLE))
-    return Twin(theta, knees)
+    twin = Twin.of(data)
+    twin.advance(np.zeros(3 * twin.knees.lag, SAMPLE))
+    return Twin.of(data)
 
 
 def run(
@@ -73,15 +99,17 @@ def run(
     monitor: Monitor,
     sinks: Sequence[Sink],
     clock: Callable[[], int] = time.time_ns,
+    advisers: Sequence[Adviser] = (),
 ) -> None:
     """Take every block of ``source`` through twin and monitor to the sinks; close them at the end.
 
-    ``clock`` (ns, as the driver stamps receipts) is asked only while nothing arrives.
+    ``clock`` (ns, as the driver stamps receipts) is asked only while nothing arrives. What
+    ``advisers`` say goes to the sinks with what it follows.
     """
     last = None
     with ExitStack() as closing:
-        for sink in sinks:
-            closing.callback(sink.close)
+        for close in [sink.close for sink in sinks] + [adviser.close for adviser in advisers]:
+            closing.callback(close)
         for block in source:
             silent: list[Event] = []
             if len(block):
@@ -89,9 +117,17 @@ def run(
             elif last is not None:
                 silent = monitor.silent(last, clock())
             samples, ticks = twin.advance(block)
-            hand_out(sinks, samples, ticks, silent + monitor.update(samples, ticks))
+            events = silent + monitor.update(samples, ticks)
+            hand_out(sinks, samples, ticks, events + _advice(advisers, samples, events))
         samples, ticks = twin.flush()
-        hand_out(sinks, samples, ticks, monitor.update(samples, ticks) + monitor.close())
+        events = monitor.update(samples, ticks) + monitor.close()
+        hand_out(sinks, samples, ticks, events + _advice(advisers, samples, events))
+        if last_words := [event for adviser in advisers for event in adviser.finish()]:
+            hand_out(sinks, samples[:0], ticks[:0], last_words)
+
+
+def _advice(advisers: Sequence[Adviser], samples: Samples, events: Sequence[Event]) -> list[Event]:
+    return [said for adviser in advisers for said in adviser.follow(samples, events)]
 
 
 def hand_out(

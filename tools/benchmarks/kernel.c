@@ -102,10 +102,8 @@ static void prepare(const double *theta, double *k)
     k[K_HEAT] = theta[FILM] * theta[AREA] / CP;
     k[K_PORT_HEAT] = theta[PORT_HEAT] / CP;
     k[K_LINE_HEAT] = theta[LINE_HEAT] / CP;
-    double suction = theta[SUCTION];
-    double quadratic = theta[NEAR_RESISTANCE] + theta[RESISTANCE];
-    double drop = (quadratic * suction + theta[NEAR_LAMINAR] + theta[LAMINAR]) * suction;
-    k[K_PLACE] = drop > 0.0 ? min(theta[PLACE] / drop, 1.0) : 0.0;
+    double friction = theta[NEAR_RESISTANCE] + theta[RESISTANCE];
+    k[K_PLACE] = friction > 0.0 ? min(theta[PLACE] / friction, 1.0) : 0.0;
 }
 
 static inline Supplied at_supply(double supply, const double *k)

@@ -11,9 +11,7 @@ from drivers.plc.simulate import blocks
 from twin.config import Config
 from twin.live import Twin
 from twin.log.header import LogHeader
-from twin.model.dataset import coefficients
 from twin.model.theta import Theta
-from twin.monitor.phases import expected_knees
 from twin.settings import Document
 from twin.signals import MBAR, MS, NS, Samples, Ticks
 
@@ -45,8 +43,7 @@ class Recording:
 
 def new_twin(config: Config) -> Twin:
     """The twin of the rig as the command line makes it."""
-    theta = coefficients(config.data)
-    return Twin(theta, expected_knees(theta, config.data.sensor.noise_mbar * MBAR))
+    return Twin.of(config.data)
 
 
 @cache

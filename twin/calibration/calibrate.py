@@ -12,13 +12,13 @@ from twin.calibration.fit import Fitted, fit
 from twin.calibration.parameters import FREE
 from twin.config import Config
 from twin.diagnosis.evidence import collect
+from twin.diagnosis.healthy import learned
 from twin.errors import ConfigError
 from twin.live import Twin
 from twin.model.dataset import DataSet, coefficients
 from twin.model.theta import AMBIENT
 from twin.monitor.cycles import Cycle, CycleCutter, figures
-from twin.monitor.detect import Scatter
-from twin.monitor.phases import expected_knees
+from twin.monitor.healthy import Healthy, Scatter
 from twin.signals import BREAK, MBAR, SAMPLE, UNUSABLE, Command, Phase, Samples
 
 FEWEST = 5  # complete cycles
@@ -34,7 +34,7 @@ class Calibration:
     """What healthy cycles say about one unit."""
 
     fitted: Fitted
-    healthy: dict[str, Scatter]  # what healthy cycles scatter, by figure
+    healthy: Healthy
     cycles: int
     first_ns: int  # when the log was recorded, by the clock here
     last_ns: int
@@ -58,16 +58,14 @@ def calibrate(
     cycles = complete(fitted.data, samples)
     refuse_unalike(fitted.data, samples, cycles)
     refuse_unlike(fitted, config.data)
-    healthy = scatter(fitted.data, cycles)
-    healthy["leftover"] = leftover(config, fitted.data, healthy, samples)
+    healthy = like_these(config, fitted, scatter(fitted.data, cycles), samples)
     times = samples["host_ns"]
     return Calibration(fitted, healthy, len(cycles), int(times[0]), int(times[-1]))
 
 
 def complete(data: DataSet, samples: Samples) -> list[Cycle]:
     """Complete cycles beside the twin of ``data``, but for the first, in which it swings in."""
-    theta = coefficients(data)
-    twin = Twin(theta, expected_knees(theta, data.sensor.noise_mbar * MBAR))
+    twin = Twin.of(data)
     cutter = CycleCutter()
     cycles = [*cutter.push(*twin.advance(samples)), *cutter.push(*twin.flush()), *cutter.flush()]
     return [cycle for cycle in cycles if cycle.complete and cycle.settled]
@@ -142,12 +140,19 @@ def scatter(data: DataSet, cycles: Sequence[Cycle]) -> dict[str, Scatter]:
     return result
 
 
-def leftover(
-    config: Config, data: DataSet, healthy: dict[str, Scatter], samples: Samples
-) -> Scatter:
-    """Sigmas left in each healthy cycle once whitened, beside the calibrated twin."""
-    monitor = config.monitor.model_copy(update={"healthy": healthy})
-    evidence = collect(replace(config, data=data, monitor=monitor), [samples])
-    off = evidence.off(evidence.expect([(0, evidence.theta)]))
-    left = [float(np.sqrt(np.mean(evidence.whitened(off, one) ** 2))) for one in evidence.judged]
-    return Scatter(mean=float(np.mean(left)), sigma=max(float(np.std(left)), 0.02))
+def uncertain(fitted: Fitted) -> dict[str, tuple[float, ...]]:
+    """Ways in which the log leaves the data set open, as ``Healthy`` has them."""
+    factor = np.linalg.cholesky(fitted.left_open)
+    return {
+        free.name: tuple(float(f"{change:.4g}") for change in row[: number + 1])
+        for number, (free, row) in enumerate(zip(FREE, factor, strict=True))
+    }
+
+
+def like_these(
+    config: Config, fitted: Fitted, figures: dict[str, Scatter], samples: Samples
+) -> Healthy:
+    """What healthy cycles are like beside the calibrated twin."""
+    known = Healthy(figures=figures, uncertain=uncertain(fitted))
+    monitor = config.monitor.model_copy(update={"healthy": known})
+    return learned(collect(replace(config, data=fitted.data, monitor=monitor), [samples]))

@@ -80,6 +80,7 @@ class Fitted:
 
     data: DataSet
     covariance: Floats  # of the free parameters, in their units
+    left_open: Floats  # the same without what the model leaves out: what other logs may show
     prior: Floats  # one standard deviation of each before the log, in its unit
     left: float  # Pa rms that the model is off in the fitted cycles
 
@@ -122,18 +123,21 @@ def fit(samples: Samples, data: DataSet, progress: Callable[[str], None]) -> Fit
         x, best = found.x, problem.data_at(found.x)
     ways = directions(data)
     off = cycles.off(np.stack(with_left_out(best), axis=1))
-    covariance = ways @ _covariance(problem.jacobian(x), weights.white(off)) @ ways.T
+    jacobian = problem.jacobian(x)
+    plain = np.asarray(np.linalg.inv(jacobian.T @ jacobian), np.float64)
+    covariance = ways @ _with_left_out(plain, jacobian, weights.white(off)) @ ways.T
     prior = np.sqrt(np.diag(ways @ ways.T))
     left = float(np.sqrt(np.average(off[:, 0] ** 2, weights=cycles.bins.count)))
-    return Fitted(DataSet.model_validate(best.model_dump()), covariance, prior, left)
+    return Fitted(
+        DataSet.model_validate(best.model_dump()), covariance, ways @ plain @ ways.T, prior, left
+    )
 
 
-def _covariance(jacobian: Floats, white: Sequence[Floats]) -> Floats:
+def _with_left_out(covariance: Floats, jacobian: Floats, white: Sequence[Floats]) -> Floats:
     """Covariance of ``x``: of what residuals scatter, and where what is left out moves it.
 
     ``white`` are residuals (bins, n) in sigmas: of the fit, then with what the model leaves out.
     """
-    covariance = np.linalg.inv(jacobian.T @ jacobian)
     all_white = np.concatenate(white)
     changes = all_white[:, 1:] - all_white[:, :1]
     moves = covariance @ jacobian[: len(changes)].T @ changes

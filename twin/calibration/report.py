@@ -29,7 +29,7 @@ def in_words(calibration: Calibration) -> str:
 
 def _scatter(calibration: Calibration) -> list[str]:
     phases = [(phase.name.lower(), f"{phase.name.lower()}_rms") for phase in Phase]
-    healthy = calibration.healthy
+    healthy = calibration.healthy.figures
     return [
         f"{phase.replace('_', '-')} {healthy[name].mean:.2f}"
         for phase, name in phases

@@ -1,10 +1,8 @@
 """A calibration becomes a record of the asset database, with where it came from."""
 
-import hashlib
-import time
-from importlib.metadata import version
 from pathlib import Path
 
+from twin.assets import provenance
 from twin.assets.place import open_chosen
 from twin.assets.record import Record
 from twin.calibration.calibrate import Calibration
@@ -24,13 +22,11 @@ def store(calibration: Calibration, config: Config, assets: str, log: Path) -> t
         name=config.asset.id,
         type=config.asset.type,
         data=fitted.data.model_dump(),
-        healthy={name: one.model_dump() for name, one in calibration.healthy.items()},
+        healthy=calibration.healthy.model_dump(mode="json"),
         arrays={"covariance": fitted.covariance},
-        provenance={
-            "log": log.name,
-            "log_sha256": _digest(log),
+        provenance=provenance.of_log(log)
+        | {
             "cycles": calibration.cycles,
-            "program": f"ejector-twin {version('ejector-twin')}",
             "from": config.origin,
             "parameters": [free.name for free in FREE],
             "determined": [
@@ -38,12 +34,7 @@ def store(calibration: Calibration, config: Config, assets: str, log: Path) -> t
             ],
             "left_mbar": round(fitted.left / MBAR, 3),
         },
-        valid_from_ns=min(max(calibration.first_ns, 0), time.time_ns()),
+        valid_from_ns=provenance.valid_from(calibration.first_ns),
     )
     with open_chosen(assets, config.document, write=True) as database:
         return database.add(record), database.name
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

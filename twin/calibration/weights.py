@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from twin.calibration.cycles import Bins, Cycles, Floats, Ints
-from twin.diagnosis.evidence import SCATTER
+from twin.diagnosis.weights import SCATTER
 from twin.model import theta as c
 from twin.model.effects import apply
 from twin.model.theta import Theta
@@ -44,7 +44,8 @@ def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> Wei
     """
     bins = cycles.bins
     bigger = ("added_volume", {"volume": VOLUME * theta[c.VOLUME] / ML})
-    moved = [apply(theta, name, sizes) for name, sizes in (bigger, *SCATTER)]
+    scattering = [(name, {key: size}) for name, (key, size) in SCATTER.items()]
+    moved = [apply(theta, name, sizes) for name, sizes in (bigger, *scattering)]
     off = cycles.off(np.stack([theta, *moved], axis=1))
     moves = off[:, 1:] - off[:, :1]
     error, cycle_error = np.full(len(off), FIRST_ERROR), np.zeros(len(off))

@@ -1,44 +1,40 @@
-"""What a log has to say: its complete cycles, and residuals in sigmas of what healthy ones scatter.
+"""What a log has to say: its complete cycles, and how far any hypothesis is from them.
 
-A residual is measured minus expected pressure, averaged over short bins that never cross a phase
-change. Noise, cycle-to-cycle scatter and the model's own error are correlated in known ways; each
-cycle's residual is whitened with their covariance, so that its squares add up to chi-square.
+A hypothesis is a set of causes; the calibrated twin as it stands is the empty one. Its residual is
+measured minus expected pressure, averaged over short bins, and the vacuum at which the air saving
+switched against the vacuum at which the hypothesis would.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from itertools import groupby
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import solve_triangular
 
 from twin.config import Config
+from twin.diagnosis.bins import Bins, Floats, Ints, binned
+from twin.diagnosis.switching import Seen, seen
 from twin.errors import ConfigError
 from twin.live import Twin
 from twin.model import kernel
 from twin.model import theta as c
+from twin.model.courses import Cause, Schedule, schedule
 from twin.model.dataset import coefficients
-from twin.model.effects import apply
-from twin.model.plant import reading
+from twin.model.term import Term, Terms
 from twin.model.theta import Theta
 from twin.monitor.cycles import Cycle, CycleCutter, figures
-from twin.monitor.phases import expected_knees
+from twin.monitor.healthy import Healthy
+from twin.monitor.phases import Knees, expected_knees
 from twin.monitor.signatures import steps
-from twin.signals import MBAR, MS, SAMPLE, TICK, UNUSABLE, Phase, Samples, Ticks
+from twin.signals import MBAR, NS, SAMPLE, TICK, UNUSABLE, Command, Phase, Samples, Ticks
 
-BIN_ROWS = 10
-MODEL_ERROR_S = 0.15  # over which the model's error goes on being the same
-# What differs from cycle to cycle in a healthy ejector: effect, parameter, one standard deviation.
-SCATTER = (
-    ("supply_pressure_drop", {"drop": 0.02}),
-    ("leakage", {"sonic_flow": 0.03}),
-    ("response_delay", {"delay": 0.5}),
-    ("blow_off_delay", {"delay": 0.5}),
-)
+WORKERS = 2
+LONGEST_SUCTION = 10_000  # rows
 
-Floats = npt.NDArray[np.float64]
-# How a coefficient vector runs in time: from which row on which one holds; the first at row 0.
-Course = Sequence[tuple[int, Theta]]
+Hypothesis = tuple[Cause, ...]
+HEALTHY: Hypothesis = ()
 
 
 @dataclass(frozen=True)
@@ -49,156 +45,264 @@ class Evidence:
     begin_ns: int  # PLC time at which the log begins
     samples: Samples
     ticks: Ticks
-    starts: npt.NDArray[np.int64]  # first row of each cycle, and the row after the last one
-    judged: list[int]  # the cycles that count; in the others the model still swings in
+    starts: Ints  # first row of each cycle, and the row after the last one
+    numbers: Ints  # of the cycles in the log
+    judged: list[int]  # positions of those that count; in the others the model still swings in
     figures: list[dict[str, float]]  # of each cycle
-    healthy: Mapping[str, tuple[float, float]]  # mean and sigma of each figure
-    bins: npt.NDArray[np.int64]  # of each row, ascending; -1 where nothing can be compared
-    bin_starts: npt.NDArray[np.int64]  # first bin of each cycle, and the one after the last
-    whitening: list[Floats]  # lower Cholesky factor of each cycle's covariance, mbar²
+    healthy: Healthy
+    noise: float  # mbar
+    bins: Bins
+    terms: tuple[Term, ...]  # that data gave the data set
+    knees: Knees  # how they were looked for
+    uncertain: tuple[Theta, ...]  # data sets as likely, a sigma away where no log decided
+    _seen: dict[bytes, Seen] = field(default_factory=dict)  # by coefficients
 
     @property
     def cycles(self) -> int:
         """How many complete cycles there are."""
         return len(self.starts) - 1
 
-    def expect(self, course: Course) -> Floats:
-        """Pressure (Pa) that the sensor should read if the coefficients ran like ``course``."""
-        expected = np.empty(len(self.samples))
-        level = self.ticks["level"].astype(np.float64)
-        dt = steps(self.samples, None)
-        state = kernel.new_state()
-        ends = [row for row, _ in course[1:]] + [len(dt)]
-        before = course[0][1]
-        for (first, theta), last in zip(course, ends, strict=True):
-            phase = self._phase(theta)[first:last]
-            part = slice(first, last)
-            kernel.take_over(state, before, theta)
-            before = theta
-            kernel.advance(state, theta, dt[part], phase, level[part], expected[part])
-        return expected
+    @property
+    def seconds(self) -> Floats:
+        """Time of each row since the log began."""
+        times: Floats = (self.samples["time_ns"] - self.begin_ns) * NS
+        return times
 
-    def off(self, expected: Floats) -> Floats:
-        """Measured minus ``expected`` pressure in mbar, averaged over each bin."""
-        used = self.bins >= 0
-        difference = (self.samples["pressure"][used] - expected[used]) / MBAR
-        count = np.bincount(self.bins[used])
-        mean: Floats = np.bincount(self.bins[used], difference) / count
-        return mean
+    @property
+    def cycle_of_row(self) -> Ints:
+        """Number of the cycle of each row."""
+        return np.repeat(self.numbers, np.diff(self.starts))
 
-    def whitened(self, off: Floats, cycle: int) -> Floats:
-        """Residuals of a cycle in sigmas."""
-        part = off[self.bin_starts[cycle] : self.bin_starts[cycle + 1]]
-        white: Floats = solve_triangular(self.whitening[cycle], part, lower=True)
-        return white
+    def course(self, hypothesis: Hypothesis, base: Theta | None = None) -> Schedule:
+        """The coefficients under a hypothesis, from which row on which."""
+        base = self.theta if base is None else base
+        return schedule(base, hypothesis, self.seconds, self.cycle_of_row)
 
-    def residuals(self, course: Course) -> list[Floats]:
-        """All that contradicts ``course`` in each judged cycle, in sigmas: waveform and levels."""
-        off = self.off(self.expect(course))
-        found = []
-        for cycle in self.judged:
-            theta = [theta for row, theta in course if row <= self.starts[cycle]][-1]
-            found.append(np.concatenate([self.whitened(off, cycle), self.levels(theta, cycle)]))
+    def expected(self, hypothesis: Hypothesis) -> Floats:
+        """Pressure (Pa) that the sensor should read at each row."""
+        course = self.course(hypothesis)
+        return self._run([course], self._sensing(self.theta, course))[:, 0]
+
+    def off(self, hypotheses: Sequence[Hypothesis], bases: Sequence[Theta] | None = None) -> Floats:
+        """Measured minus expected pressure (mbar) in each bin, (bins, hypotheses).
+
+        ``bases`` are the coefficients that each hypothesis changes, where not the twin's own.
+        """
+        bases = [self.theta] * len(hypotheses) if bases is None else bases
+        pairs = list(zip(bases, hypotheses, strict=True))
+        courses = [self.course(one, base) for base, one in pairs]
+        sensing = [self._sensing(base, course) for base, course in zip(bases, courses, strict=True)]
+        order = sorted(range(len(courses)), key=lambda i: sensing[i])
+        alike = groupby(order, key=lambda i: sensing[i])  # the nozzle switches at the same rows
+        jobs = [job for _, group in alike for job in _in_lanes(list(group))]
+
+        def run(job: Sequence[int]) -> Floats:
+            expected = self._run([courses[i] for i in job], sensing[job[0]])
+            return self.bins.mean(self.samples["pressure"][:, None] - expected) / MBAR
+
+        found = np.empty((len(self.bins.count), len(courses)))
+        with ThreadPoolExecutor(WORKERS) as pool:
+            for job, off in zip(jobs, pool.map(run, jobs), strict=True):
+                found[:, job] = off
         return found
 
-    def levels(self, theta: Theta, cycle: int) -> Floats:
-        """Switching levels of a cycle against those ``theta`` would give, in sigmas.
+    def _run(self, courses: Sequence[Schedule], sensing: "Sensing") -> Floats:
+        """Expected pressures (Pa), (rows, courses), of courses that switch at the same rows."""
+        dt = steps(self.samples, None)
+        phase, level = self._switched(sensing)
+        expected = np.empty((len(dt), len(courses)))
+        state, before = kernel.new_state(len(courses)), None
+        for first, last, theta in _together(courses, len(dt)):
+            part = slice(first, last)
+            if before is not None:
+                kernel.take_over(state, before, theta)
+            before = theta
+            kernel.advance(state, theta, dt[part], phase[part], level[part], expected[part])
+        Terms(self.terms, float(self.theta[c.AMBIENT])).add(phase, expected)
+        return expected
 
-        The ejector switches on its own sensor; what the PLC reads there moves with the thresholds
-        and with the errors of the PLC's sensor.
+    def _sensing(self, base: Theta, course: Schedule) -> "Sensing":
+        """How much earlier than it is seen the nozzle switches, and what that does to the level.
+
+        It is the same for all coefficients but those of jet and sensor.
         """
-        found = []
-        for name, index in (("h1_level", c.H1), ("h1_low_level", c.H1_LOW)):
-            if name not in self.healthy:
-                continue
-            mean, sigma = self.healthy[name]
-            moved = (_read_vacuum(theta, index) - _read_vacuum(self.theta, index)) / MBAR
-            if name in self.figures[cycle]:
-                level = self.figures[cycle][name]
-                found.append((level - mean - moved) / np.hypot(sigma, LEVEL_MBAR))
-        return np.array(found)
+        if all((theta[_SENSING] == base[_SENSING]).all() for _, theta in course):
+            return ()
+        as_it_is, found = self.seen(base), []
+        begins, knees = [row for row, _ in course], self._knees()
+        for number in np.unique(np.searchsorted(begins, knees, "right") - 1):
+            row, theta = course[number]
+            alike = base.copy()
+            alike[_SENSING] = theta[_SENSING]
+            here = self.seen(alike)
+            found.append(
+                (
+                    row,
+                    here.off_rows - as_it_is.off_rows,
+                    here.on_rows - as_it_is.on_rows,
+                    here.off_above - as_it_is.off_above,
+                    here.on_above - as_it_is.on_above,
+                )
+            )
+        return tuple(found)
 
-    def _phase(self, theta: Theta) -> npt.NDArray[np.uint8]:
-        """Phases with the nozzle's switching moved as far before each knee as ``theta`` has it."""
+    def _switched(self, sensing: "Sensing") -> tuple[npt.NDArray[np.uint8], Floats]:
+        """Phases and levels, as the nozzle must have switched to be seen as it was."""
         phase: npt.NDArray[np.uint8] = self.ticks["phase"].copy()
-        for jet, name in ((_collapse, Phase.HOLD), (_build_up, Phase.SUCTION)):
-            lags = [round((jet(at) + _sensing(at)) / MS) for at in (self.theta, theta)]
-            if (later := lags[1] - lags[0]) == 0:
-                continue
-            before = lags[0] if name == Phase.SUCTION else 0  # rows from the valve to the knee
-            for knee in self._knees(name):
-                phase[max(knee - before, 0) : knee] = _OTHER[name]
-                phase[max(knee - before - later, 0) : knee] = name
-        return phase
+        level: Floats = self.ticks["level"].astype(np.float64)
+        if not any(value for _, *values in sensing for value in values):
+            return phase, level
+        begins = [row for row, *_ in sensing]
+        for knee in self._knees():
+            _, off, on, above_off, above_on = sensing[np.searchsorted(begins, knee, "right") - 1]
+            name = Phase(int(self.ticks["phase"][knee]))
+            closing = name == Phase.HOLD
+            earlier, known = (off, 0) if closing else (on, self.knees.on_shift)
+            level[knee] -= above_off if closing else above_on
+            phase[max(knee - known, 0) : knee] = _OTHER[name]
+            phase[max(knee - known - earlier, 0) : knee] = name
+        return phase, level
 
-    def _knees(self, name: Phase) -> npt.NDArray[np.int64]:
-        rows = np.flatnonzero(np.isfinite(self.ticks["level"]) & (self.ticks["phase"] == name))
+    def _knees(self) -> Ints:
+        """Rows at which the air saving was seen to switch."""
+        phase = self.ticks["phase"]
+        rows = np.flatnonzero(np.isfinite(self.ticks["level"]))
         rows = rows[rows > 0]
-        inside = np.isin(self.ticks["phase"][rows - 1], (Phase.SUCTION, Phase.HOLD))
-        return rows[inside]
+        inside = [Phase.SUCTION, Phase.HOLD]
+        return rows[np.isin(phase[rows], inside) & np.isin(phase[rows - 1], inside)]
+
+    def seen(self, theta: Theta) -> Seen:
+        """How the air saving would be seen to switch, by the finder that found it in the log."""
+        self.look([theta])
+        return self._seen[theta.tobytes()]
+
+    def look(self, thetas: Iterable[Theta]) -> None:
+        """Find out for many how the air saving would be seen to switch."""
+        new = {theta.tobytes(): theta for theta in thetas}
+        new = {key: theta for key, theta in new.items() if key not in self._seen}
+        if not new:
+            return
+        cycle = slice(self.starts[self.judged[0]], self.starts[self.judged[0] + 1])
+        suction = int(np.count_nonzero(self.samples["commands"][cycle] == Command.SUCTION))
+        rows = min(2 * suction, LONGEST_SUCTION)  # long enough for H1 to be reached at last
+        with ThreadPoolExecutor(WORKERS) as pool:
+            found = pool.map(lambda theta: seen(theta, rows, self.knees), new.values())
+            self._seen.update(zip(new, found, strict=True))
 
 
-LEVEL_MBAR = 0.7  # a switching level is not known better, whatever healthy cycles scatter
+# Where coefficients change; by how many rows the nozzle's closing and opening come earlier than in
+# the calibrated twin; by how much more (Pa) the level found at each is above what is read there.
+Sensing = tuple[tuple[int, int, int, float, float], ...]
 _OTHER = {Phase.HOLD: Phase.SUCTION, Phase.SUCTION: Phase.HOLD}
+_SENSING = [c.SENSOR_LAG, c.SLOW_SENSOR, c.RAMP_UP, c.SLOW_RAMP_UP, c.RAMP_DOWN]
 
 
-def _build_up(theta: Theta) -> float:
-    return float(2.0 * theta[c.RAMP_UP] + theta[c.SLOW_RAMP_UP])
+def _together(courses: Sequence[Schedule], rows: int) -> Iterator[tuple[int, int, Theta]]:
+    """Stretches of rows in which no course changes, with the coefficients of all, (·, courses)."""
+    changes = sorted({row for course in courses for row, _ in course})
+    now = [course[0][1] for course in courses]
+    at = [dict(course) for course in courses]
+    for first, last in zip(changes, [*changes[1:], rows], strict=True):
+        now = [changed.get(first, before) for changed, before in zip(at, now, strict=True)]
+        yield first, last, np.stack(now, axis=1)
 
 
-def _sensing(theta: Theta) -> float:
-    return float(2.0 * theta[c.SENSOR_LAG] + theta[c.SLOW_SENSOR])
-
-
-def _collapse(theta: Theta) -> float:
-    return float(2.0 * theta[c.RAMP_DOWN])
-
-
-def _read_vacuum(theta: Theta, index: int) -> float:
-    nominal = theta[c.AMBIENT_NOMINAL]
-    return float(nominal - reading(nominal - theta[index], theta.reshape(-1, 1), 0))
+def _in_lanes(jobs: list[int]) -> Iterator[list[int]]:
+    for first in range(0, len(jobs), kernel.LANES):
+        yield jobs[first : first + kernel.LANES]
 
 
 def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
     """Run the calibrated twin over a log and collect its complete cycles.
 
-    ConfigError if the configuration
-    does not say what healthy cycles scatter.
+    ConfigError if nobody says what healthy cycles are like.
     """
-    if "suction_rms" not in config.monitor.healthy:
-        hint = "calibrate the twin first: [monitor.healthy] comes from healthy cycles"
+    if "suction_rms" not in config.monitor.healthy.figures:
+        hint = "calibrate the twin first: twin calibrate LOG --config CONFIG, on healthy cycles"
         raise ConfigError(f"{config.document.name}: the twin is not calibrated", hint)
     theta = coefficients(config.data)
-    cycles, begin_ns = complete_cycles(config, theta, blocks)
+    nothing = Evidence(
+        theta=theta,
+        begin_ns=0,
+        samples=np.empty(0, SAMPLE),
+        ticks=np.empty(0, TICK),
+        starts=np.zeros(1, np.int64),
+        numbers=np.empty(0, np.int64),
+        judged=[],
+        figures=[],
+        healthy=config.monitor.healthy,
+        noise=config.data.sensor.noise_mbar,
+        bins=_binned(np.empty(0, SAMPLE), np.empty(0, TICK), np.zeros(1, np.int64), []),
+        terms=config.data.terms,
+        knees=expected_knees(theta, config.data.sensor.noise_mbar * MBAR),
+        uncertain=tuple(_uncertain(config)),
+    )
+    return of_log(nothing, blocks)
+
+
+def of_log(beside: Evidence, blocks: Iterable[Samples]) -> Evidence:
+    """What another log says beside the same twin."""
+    cycles, begin_ns = _complete_cycles(Twin(beside.theta, beside.knees, beside.terms), blocks)
     samples = np.concatenate([np.empty(0, SAMPLE), *(cycle.samples for cycle in cycles)])
     ticks = np.concatenate([np.empty(0, TICK), *(cycle.ticks for cycle in cycles)])
     starts = np.cumsum([0, *(len(cycle.samples) for cycle in cycles)])
     judged = [number for number, cycle in enumerate(cycles) if cycle.settled]
-    bins, bin_starts = _bins(samples, ticks, starts, judged)
-    evidence = Evidence(
-        theta=theta,
+    return replace(
+        beside,
         begin_ns=begin_ns,
         samples=samples,
         ticks=ticks,
         starts=starts,
+        numbers=np.arange(len(cycles)),
         judged=judged,
-        figures=[figures(cycle, theta[c.AMBIENT]) for cycle in cycles],
-        healthy={name: (one.mean, one.sigma) for name, one in config.monitor.healthy.items()},
-        bins=bins,
-        bin_starts=bin_starts,
-        whitening=[],
+        figures=[figures(cycle, beside.theta[c.AMBIENT]) for cycle in cycles],
+        bins=_binned(samples, ticks, starts, judged),
     )
-    if not judged:
-        return evidence
-    return replace(evidence, whitening=_whitening(evidence, config.data.sensor.noise_mbar))
 
 
-def complete_cycles(
-    config: Config, theta: Theta, blocks: Iterable[Samples]
-) -> tuple[list[Cycle], int]:
+def _uncertain(config: Config) -> Iterator[Theta]:
+    """Coefficients one sigma away, each way that the calibration left the data set open."""
+    rows = config.monitor.healthy.uncertain
+    for way in range(len(rows)):
+        data = config.data
+        for name, row in list(rows.items())[way:]:
+            table, key = name.split(".")
+            part = getattr(data, table)
+            moved = part.model_copy(update={key: getattr(part, key) + row[way]})
+            data = data.model_copy(update={table: moved})  # unchecked: it need be no ejector
+        yield coefficients(data)
+
+
+def thinned(evidence: Evidence, cycles: Sequence[int], most: int) -> Evidence:
+    """The same with at most about ``most`` of its judged ``cycles``, evenly spread in pairs."""
+    if len(cycles) <= most:
+        return of_cycles(evidence, cycles)
+    first = np.linspace(0, len(cycles) - 2, most // 2).astype(int)
+    return of_cycles(evidence, [cycles[i] for i in sorted({*first, *(first + 1)})])
+
+
+def of_cycles(evidence: Evidence, cycles: Sequence[int]) -> Evidence:
+    """The same with only some cycles and the one before each, in which the model swings in."""
+    kept = sorted({near for cycle in cycles for near in (cycle - 1, cycle) if near >= 0})
+    rows = np.concatenate([np.arange(evidence.starts[k], evidence.starts[k + 1]) for k in kept])
+    starts = np.cumsum([0, *(evidence.starts[k + 1] - evidence.starts[k] for k in kept)])
+    judged = [kept.index(cycle) for cycle in cycles]
+    samples, ticks = evidence.samples[rows], evidence.ticks[rows]
+    return replace(
+        evidence,
+        samples=samples,
+        ticks=ticks,
+        starts=starts,
+        numbers=evidence.numbers[kept],
+        judged=judged,
+        figures=[evidence.figures[k] for k in kept],
+        bins=_binned(samples, ticks, starts, judged),
+    )
+
+
+def _complete_cycles(twin: Twin, blocks: Iterable[Samples]) -> tuple[list[Cycle], int]:
     """The complete cycles of a stream in order, and the PLC time of its first row."""
-    knees = expected_knees(theta, config.data.sensor.noise_mbar * MBAR)
-    twin, cutter = Twin(theta, knees), CycleCutter()
+    cutter = CycleCutter()
     cycles: list[Cycle] = []
     begin_ns = 0
     for block in blocks:
@@ -209,57 +313,9 @@ def complete_cycles(
     return [cycle for cycle in cycles if cycle.complete], begin_ns
 
 
-def _bins(
-    samples: Samples, ticks: Ticks, starts: npt.NDArray[np.int64], judged: Sequence[int]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Number the bins: BIN_ROWS rows of one phase of one cycle each."""
-    rows = np.arange(len(samples))
+def _binned(samples: Samples, ticks: Ticks, starts: Ints, judged: Sequence[int]) -> Bins:
+    """Bins of the rows of judged cycles that can be compared."""
     usable = ((samples["quality"] & UNUSABLE) == 0) & np.isfinite(samples["pressure"])
     usable &= np.isfinite(ticks["expected"])
-    usable &= np.isin(np.searchsorted(starts, rows, "right") - 1, judged)
-    run = np.zeros(len(samples), bool)
-    run[starts[:-1]] = True
-    run[1:] |= ticks["phase"][1:] != ticks["phase"][:-1]
-    first = np.maximum.accumulate(np.where(run, rows, 0))
-    edge = run | ((rows - first) % BIN_ROWS == 0)
-    label = np.cumsum(edge)  # every cycle begins with a new one
-    labels, inverse = np.unique(label[usable], return_inverse=True)
-    bins = np.full(len(samples), -1)
-    bins[usable] = inverse
-    after_all = len(label) and label[-1] + 1
-    bin_starts = np.searchsorted(labels, np.append(label, after_all)[starts])
-    return bins, bin_starts
-
-
-def _whitening(evidence: Evidence, noise: float) -> list[Floats]:
-    """Cholesky factors of each cycle's covariance: noise, scatter, and the model's own error."""
-    base = evidence.off(evidence.expect([(0, evidence.theta)]))
-    moves = []
-    for name, sizes in SCATTER:
-        changed = apply(evidence.theta, name, sizes)
-        moves.append(evidence.off(evidence.expect([(0, changed)])) - base)
-    used = evidence.bins >= 0
-    rows = evidence.bins[used]
-    count = np.bincount(rows)
-    time = np.bincount(rows, np.flatnonzero(used) * MS) / count
-    phase = np.zeros(len(count), np.uint8)
-    phase[rows] = evidence.ticks["phase"][used]
-    error = np.array([_model_error(evidence.healthy, Phase(p), noise) for p in range(len(Phase))])
-    leftover, _ = evidence.healthy.get("leftover", (1.0, 0.0))  # what healthy cycles still have
-    factors = []
-    for first, last in zip(evidence.bin_starts, evidence.bin_starts[1:], strict=False):
-        part = slice(first, last)
-        apart = np.abs(time[part, None] - time[None, part])
-        same = phase[part, None] == phase[None, part]
-        size = error[phase[part]]
-        covariance = np.outer(size, size) * same * np.exp(-apart / MODEL_ERROR_S)
-        covariance += np.diag(noise**2 / count[part])
-        covariance += sum(np.outer(move[part], move[part]) for move in moves)
-        factors.append(np.linalg.cholesky(covariance) * leftover)
-    return factors
-
-
-def _model_error(healthy: Mapping[str, tuple[float, float]], phase: Phase, noise: float) -> float:
-    """How far the model itself is off in a phase (mbar): healthy deviation that is not noise."""
-    mean, sigma = healthy.get(f"{phase.name.lower()}_rms", (1.0, 0.0))
-    return float(np.sqrt(max((mean + sigma) ** 2 - noise**2, 0.1**2)))
+    usable &= np.isin(np.searchsorted(starts, np.arange(len(samples)), "right") - 1, judged)
+    return binned(ticks["phase"], usable, starts)

@@ -1,40 +1,53 @@
-"""The answer for people: a few lines for the terminal, and a page that can be kept and printed.
-
-The page is one file that needs no network: pictures are inlined as SVG, the style stands in it.
-"""
+"""The answer for people: a few lines for the terminal, and a page that can be kept and printed."""
 
 import html
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
-from string import Template
-from typing import Any
 
+from twin.diagnosis import page
 from twin.diagnosis.answer import Diagnosis
-from twin.diagnosis.pictures import (
-    Comparison,
-    draw_cycle,
+from twin.diagnosis.over_log import (
+    draw_log,
+)
+from twin.diagnosis.over_phases import (
+    Laid,
+    acting,
+    draw_left,
     draw_phases,
+    laid_over,
+    unseen,
+    worst_kind,
+)
+from twin.diagnosis.pictures import (
+    Found,
+    draw_cycle,
     draw_ranking,
-    spoken,
     worst_cycle,
-    worst_phase,
+)
+from twin.diagnosis.words import (
+    FIGURES,
+    Answer,
+    about,
+    change,
+    extended,
+    headline,
+    left_over,
+    lines,
+    listed,
+    number,
+    sized,
+    some,
+    spoken,
+    to_do,
+    when,
 )
 from twin.errors import SourceError
 from twin.model import theta as c
+from twin.model.courses import Course
 from twin.model.effects import EFFECTS
 from twin.model.theta import Theta
-from twin.signals import BAR, MBAR, ML, SL_MIN, Phase
-
-MOST_LISTED = 12  # cycles named one by one
-
-# Key in the answer, what it is, unit.
-FIGURES = (
-    ("rms_mbar", "rms deviation", "mbar"),
-    ("max_mbar", "largest deviation", "mbar"),
-    ("evacuation_time_error_pct", "evacuation time error", "%"),
-    ("leftover_sigma", "leftover (healthy: 1)", "sigma"),
-)
+from twin.signals import BAR, MBAR, ML, SL_MIN
 
 # Colour, mark and words of each verdict's banner.
 BANNER = {
@@ -44,203 +57,77 @@ BANNER = {
     "insufficient": ("#555555", "…", "No answer from this log"),
 }
 
-PAGE = Template("""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>$title</title>
-<style>
-:root { color-scheme: light; }
-body { font: 16px/1.45 system-ui, "Segoe UI", Roboto, "DejaVu Sans", Arial, sans-serif;
-  color: #1a1a1a; background: #fff; max-width: 60rem; margin: 1.5rem auto; padding: 0 1rem; }
-.banner { background: $colour; color: #fff; border-radius: .4rem; padding: .8rem 1.2rem;
-  print-color-adjust: exact; -webkit-print-color-adjust: exact; }
-.banner p { margin: 0; font-weight: 600; letter-spacing: .03em; }
-.banner h1 { margin: .2rem 0 0; font-size: 1.35rem; line-height: 1.3; }
-h2 { font-size: 1.15rem; margin: 2rem 0 .5rem; }
-figure { margin: 0; }
-svg { width: 100%; height: auto; }
-figcaption, footer { color: #444; font-size: .88rem; }
-table { border-collapse: collapse; margin: .3rem 0 1.4rem; min-width: 50%; }
-caption { text-align: left; font-weight: 600; padding: .3rem 0; }
-th, td { text-align: left; padding: .25rem 1.6rem .25rem 0; border-bottom: 1px solid #ddd;
-  vertical-align: top; overflow-wrap: anywhere; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1.6rem; }
-dt { color: #444; }
-dd { margin: 0; overflow-wrap: anywhere; }
-thead th { border-bottom: 2px solid #888; font-weight: 600; }
-tbody th { font-weight: 400; white-space: nowrap; }
-.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
-section, figure, table { break-inside: avoid; }
-h2 { break-after: avoid; }
-@media print { body { margin: 0; max-width: none; font-size: 11pt; } }
-</style>
-</head>
-<body>
-<header class="banner">
-<p><span aria-hidden="true">$mark</span> $verdict</p>
-<h1>$headline</h1>
-</header>
-<main>
-$body
-</main>
-<footer>
-$footer
-</footer>
-</body>
-</html>
-""")
-
 
 def in_words(diagnosis: Diagnosis) -> str:
     """The answer in a few lines of plain text."""
-    answer = diagnosis.json
-    lines = [f"{answer['verdict']}: {_headline(answer)}"]
-    lines += [f"  {label:<14} {text}" for label, text in _facts(answer)]
-    return "\n".join(lines)
+    return lines(diagnosis.json)
 
 
 def write_report(diagnosis: Diagnosis, path: Path) -> None:
     """Write the answer with pictures as one HTML file; SourceError if it cannot be written."""
-    page = _page(diagnosis)
+    text = _page(diagnosis)
     try:
-        path.write_text(page, encoding="utf-8")
+        path.write_text(text, encoding="utf-8")
     except OSError as error:
         hint = "check that the directory is there and may be written to"
         raise SourceError(f"{path}: cannot be written: {error.strerror}", hint) from error
-
-
-# --- what is said ---------------------------------------------------------------------------------
-
-
-def _headline(answer: dict[str, Any]) -> str:
-    """One sentence for the technician."""
-    match answer["verdict"]:
-        case "consistent":
-            left = _number(answer["baseline"]["rms_mbar"])
-            return f"The ejector does what its twin expects; {left} mbar rms left over are healthy."
-        case "explained":
-            return " ".join(cause["why"] for cause in answer["causes"])
-        case "unlisted":
-            unlisted = answer["unlisted"]
-            where = spoken(unlisted["where"])
-            return f"No listed cause explains what is left in {where}: {unlisted['shape']}."
-    return f"The log cannot answer: {answer['next_experiment']}."
-
-
-def _facts(answer: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Labelled lines for the terminal."""
-    for cause in answer["causes"]:
-        yield ("cause" if answer["verdict"] == "explained" else "closest cause"), _cause(cause)
-        if answer["verdict"] == "explained":
-            yield "how sure", _sure(cause)
-    yield from _to_do(answer)
-    if answer["verdict"] == "insufficient":
-        return
-    changes = (f"{_change(answer, key)} {unit}" for key, _, unit in FIGURES)
-    names = ("rms", "max", "evacuation time error", "leftover")
-    said = (f"{name} {change}" for name, change in zip(names, changes, strict=True))
-    yield "unseen cycles", ", ".join(said)
-    if answer["causes"]:
-        yield "gain", _gain(answer["gain"])
-    cycles = answer["cycles"]
-    fitted, held_out = _some(cycles["fitted"]), _some(cycles["held_out"])
-    yield "cycles", f"{cycles['total']}; fitted: {fitted}; held out: {held_out}"
-
-
-def _to_do(answer: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """What to look at and to record next."""
-    sure = answer["verdict"] == "explained"
-    for cause in answer["causes"]:
-        yield ("look at" if sure else "perhaps"), EFFECTS[cause["effect"]].look_at
-        for name in cause["not_separable_from"]:
-            yield "or it may be", f"{spoken(name)}; then look at {EFFECTS[name].look_at}"
-    if answer["verdict"] == "unlisted":
-        where = spoken(answer["unlisted"]["where"])
-        yield "find out", f"what in {where} differs from when the twin was calibrated"
-    if answer["verdict"] == "insufficient":
-        yield "next", "put this right, record again and diagnose the new log"
-    elif answer["next_experiment"]:
-        yield "next recording", answer["next_experiment"]
-
-
-def _cause(cause: dict[str, Any]) -> str:
-    sizes = [
-        f"{spoken(name)} {_number(p['value'])} {p['unit']}"
-        f" (95 %: {_number(p['low95'])} to {_number(p['high95'])})"
-        for name, p in cause["parameters"].items()
-    ]
-    return f"{spoken(cause['effect'])}, {', '.join([*sizes, _since(cause)])}"
-
-
-def _since(cause: dict[str, Any]) -> str:
-    if cause["onset_s"] is None:
-        return "there from the beginning"
-    return f"since {cause['onset_s']:.1f} s into the log"
-
-
-def _sure(cause: dict[str, Any]) -> str:
-    percent = 100.0 * cause["probability"]
-    sure = "more than 99 %" if percent > 99.0 else f"{percent:.0f} %"
-    alike = ", ".join(spoken(name) for name in cause["not_separable_from"])
-    return f"{sure}; " + (f"this log cannot tell it from {alike}" if alike else "no look-alikes")
-
-
-def _change(answer: dict[str, Any], key: str) -> str:
-    before, after = (_number(answer[part][key]) for part in ("baseline", "extended"))
-    return f"{before} → {after}" if answer["causes"] else before
-
-
-def _gain(gain: dict[str, float]) -> str:
-    low, high = _number(gain["low95"]), _number(gain["high95"])
-    return f"{_number(gain['rms_reduction_pct'])} % less rms deviation (95 %: {low} to {high})"
-
-
-def _some(cycles: Sequence[int]) -> str:
-    if len(cycles) <= MOST_LISTED:
-        return ", ".join(map(str, cycles))
-    return f"{', '.join(map(str, cycles[:3]))} … {cycles[-1]} ({len(cycles)} cycles)"
-
-
-def _number(value: float) -> str:
-    """Three significant digits, without an exponent."""
-    return f"{float(f'{value:.3g}'):g}"
-
-
-# --- the page -------------------------------------------------------------------------------------
 
 
 def _page(diagnosis: Diagnosis) -> str:
     answer = diagnosis.json
     colour, mark, verdict = BANNER[answer["verdict"]]
     asset = f"{answer['asset']['type']} {answer['asset']['id']}"
-    parts = [_section("What to do", _steps(answer))]
-    if answer["verdict"] != "insufficient":
-        parts += [*_pictures(diagnosis), _section("Numbers", "\n".join(_tables(answer)))]
-    return PAGE.substitute(
+    parts = [page.section("What to do", "\n".join(_steps(answer)))]
+    if answer["verdict"] == "insufficient":
+        parts.append(page.section("The log", page.pairs(_cycles(answer))))
+    else:
+        parts += _pictures(Found.of(diagnosis))
+        parts.append(page.section("Numbers", "\n".join(_tables(answer))))
+    return page.PAGE.substitute(
         title=html.escape(f"Diagnosis of {asset}"),
         colour=colour,
         mark=mark,
         verdict=html.escape(f"{verdict} – {asset}"),
-        headline=html.escape(_headline(answer)),
+        headline=html.escape(headline(answer)),
         body="\n".join(parts),
         footer=_footer(diagnosis),
     )
 
 
-def _steps(answer: dict[str, Any]) -> str:
-    steps = [f"{label.capitalize()}: {text}." for label, text in _to_do(answer)]
-    items = "".join(
-        f"<li>{html.escape(step)}</li>" for step in steps or ["Nothing: no cause is worth naming."]
-    )
-    return f"<ul>{items}</ul>"
+def _steps(answer: Answer) -> Iterator[str]:
+    """A card for each cause and for what is unknown, a box for what to record next."""
+    sure = answer["verdict"] == "explained"
+    for cause in answer["causes"]:
+        title = spoken(cause["effect"]).capitalize()
+        known = [row for row in about(cause, sure=sure) if row[1] != spoken(cause["effect"])]
+        yield page.card(title, f"{EFFECTS[cause['effect']].sentence}.", known)
+    steps = dict(to_do(answer))
+    record = {name: steps.pop(name) for name in ("next", "next recording") if name in steps}
+    if answer["verdict"] == "unlisted":
+        title = "Something that no listed cause explains"
+        yield page.card(title, f"Left in {left_over(answer)}.", steps.items())
+    for title, text in record.items():
+        yield page.box(title.capitalize(), f"{text[:1].upper()}{text[1:]}.")
+    if answer["verdict"] == "consistent":
+        yield page.paragraph("Nothing: no cause is worth naming.")
 
 
-def _pictures(diagnosis: Diagnosis) -> Iterator[str]:
-    answer = diagnosis.json
-    found = Comparison.of(diagnosis)
-    cycle = worst_cycle(found)
+# --- pictures -------------------------------------------------------------------------------------
+
+
+def _pictures(found: Found) -> Iterator[str]:
+    yield _cycle_picture(found)
+    yield _log_picture(found)
+    yield _phases_picture(found)
+    if found.answer["unlisted"]:
+        yield _left_picture(found)
+    if found.answer["verdict"] != "consistent":
+        yield _ranking_picture(found)
+
+
+def _cycle_picture(found: Found) -> str:
+    answer, worst = found.answer, worst_cycle(found)
+    (cycle,) = found.numbers([worst])
     title = _verdict_in_numbers(answer)
     alt = f"{title}. Vacuum in cycle {cycle}, measured and expected, and the deviation, over time."
     caption = (
@@ -248,102 +135,160 @@ def _pictures(diagnosis: Diagnosis) -> Iterator[str]:
         " fit, the one furthest off. The rms is over all held-out cycles. A deviation above zero is"
         " too little vacuum."
     )
-    yield _figure(title, draw_cycle(found, cycle, alt), caption)
-    title = _where(answer, worst_phase(found))
-    alt = f"{title}. Mean deviation of every cycle in each phase, over the time in the log."
+    return page.picture(title, draw_cycle(found, worst, alt), caption)
+
+
+def _log_picture(found: Found) -> str:
+    answer = found.answer
+    said = [f"{spoken(cause['effect'])} {when(cause)}" for cause in answer["causes"]]
+    title = f"Over time: {'; '.join(said) or 'no cause comes or goes'}"
+    alt = f"{title}. Rms deviation of each cycle, before and after, and the size of each cause."
     caption = (
-        "A point is one cycle's mean deviation from the twin as it stands; a line, what the cause"
-        " would make it; the band, where healthy cycles are. Cycles in which the model still swings"
-        " in are left out."
+        "A filled mark is a cycle that was fitted, an empty one was held out to judge by. Cycles in"
+        " which the model still swings in are left out."
     )
-    yield _figure(title, draw_phases(found, alt), caption)
-    title = _ranked(answer)
-    look_alikes = [name for cause in answer["causes"] for name in cause["not_separable_from"]]
-    alt = f"{title}. Bars: sigmas left by each cause that was fitted, best first."
-    caption = "Each cause was fitted alone, with its own size; the shorter the bar, the better."
-    yield _figure(title, draw_ranking(found, look_alikes, alt), caption)
+    if answer["causes"]:
+        caption += " Below: the size of each cause with its 95 % interval; dotted: as it should be."
+    return page.picture(title, draw_log(found, alt), caption)
 
 
-def _verdict_in_numbers(answer: dict[str, Any]) -> str:
-    rms = f"{_change(answer, 'rms_mbar')} mbar rms"
+def _phases_picture(found: Found) -> str:
+    laid = laid_over(found.evidence, acting(found))
+    title = _where(found, laid)
+    alt = f"{title}. Mean deviation over the time since each phase began."
+    caption = (
+        f"Mean over the cycles {some(found.numbers(laid.cycles))}: {_which(found, laid)}. A"
+        " deviation above zero is too little vacuum. The band is where 95 % of such means of"
+        " healthy cycles lie."
+    )
+    return page.picture(title, draw_phases(found, laid, alt), caption)
+
+
+def _left_picture(found: Found) -> str:
+    laid = laid_over(found.evidence, unseen(found))
+    title = f"What no listed cause explains: {left_over(found.answer)}"
+    alt = f"{title}. Mean deviation left over time since the phase began and over vacuum."
+    caption = (
+        f"The held-out cycles {some(found.numbers(laid.cycles))} laid over each other. On what it"
+        " depends, over that the dots form one curve. A deviation above zero is too little vacuum."
+    )
+    if found.terms:
+        caption += " Dashed: the term that takes it away in the extended model."
+    return page.picture(title, draw_left(found, laid, alt), caption)
+
+
+def _ranking_picture(found: Found) -> str:
+    title = _ranked(found.answer)
+    alt = f"{title}. Sigmas left by each cause that was fitted, best first."
+    caption = (
+        "Each cause was fitted with its own size and course. The nearer to the dashed line, the"
+        " better it explains the log; a look-alike is one that this log cannot reject."
+    )
+    return page.picture(title, draw_ranking(found, alt), caption)
+
+
+def _verdict_in_numbers(answer: Answer) -> str:
+    rms = f"{change(answer, 'rms_mbar')} mbar rms"
     if not answer["causes"]:
         fits = answer["verdict"] == "consistent"
-        return f"The twin as it stands {'fits' if fits else 'does not fit'}: {rms}"
-    said = " and ".join(_sized(cause) for cause in answer["causes"])
-    does = "explains" if answer["verdict"] == "explained" else "explains only part of"
-    return f"{said} {does} the deviation: {rms}"
+        term = " with a term from data" if extended(answer) else ""
+        return f"The twin as it stands {'fits' if fits else 'does not fit'}: {rms}{term}"
+    said = listed([sized(cause) for cause in answer["causes"]])
+    one = len(answer["causes"]) == 1
+    does = "explains" if one else "explain"
+    if answer["verdict"] != "explained":
+        does += " only a part of"
+    return f"{said[:1].upper()}{said[1:]} {does} the deviation: {rms}"
 
 
-def _sized(cause: dict[str, Any]) -> str:
-    sizes = [f"{_number(p['value'])} {p['unit']}" for p in cause["parameters"].values()]
-    return f"{spoken(cause['effect']).capitalize()} ({', '.join(sizes)})"
+def _which(found: Found, laid: Laid) -> str:
+    which = (
+        "held out from the fit" if set(laid.cycles.tolist()) <= set(found.held_out) else "fitted"
+    )
+    return f"{which}, with the cause at work" if found.causes else which
 
 
-def _where(answer: dict[str, Any], phase: Phase) -> str:
-    if answer["verdict"] == "consistent":
+def _where(found: Found, laid: Laid) -> str:
+    if found.answer["verdict"] == "consistent":
         return "Every phase is as in healthy cycles"
-    onsets = [_since(cause) for cause in answer["causes"] if cause["onset_s"] is not None]
-    return ", ".join([f"The deviation is largest in {spoken(phase.name.lower())}", *onsets])
+    kind, before, after = worst_kind(found, laid)
+    rms = f"{number(before)} → {number(after)}" if found.extended else number(before)
+    return f"The deviation is largest in {spoken(kind)}: {rms} mbar rms in the mean"
 
 
-def _ranked(answer: dict[str, Any]) -> str:
+def _ranked(answer: Answer) -> str:
     if not answer["causes"]:
-        return "No single cause is worth naming"
-    best = answer["causes"][0]
-    name = spoken(best["effect"])
-    if best["not_separable_from"]:
-        alike = ", ".join(map(spoken, best["not_separable_from"]))
-        return f"This log cannot tell {name} from {alike}"
+        return "No listed cause is worth naming"
+    for cause in answer["causes"]:
+        if cause["not_separable_from"]:
+            alike = listed([spoken(name) for name in cause["not_separable_from"]], "or")
+            return f"This log cannot tell {spoken(cause['effect'])} from {alike}"
+    name = listed([spoken(cause["effect"]) for cause in answer["causes"]])
+    leave = "leaves" if len(answer["causes"]) == 1 else "leave"
     yet = "" if answer["verdict"] == "explained" else ", but more than healthy cycles have"
-    return f"{name.capitalize()} leaves least of all causes{yet}"
+    return f"{name.capitalize()} {leave} least{yet}"
 
 
-def _tables(answer: dict[str, Any]) -> Iterator[str]:
+# --- tables ---------------------------------------------------------------------------------------
+
+
+def _tables(answer: Answer) -> Iterator[str]:
     if answer["causes"]:
-        yield _cause_table(answer)
+        head = ("cause", "course", "parameter", "value", "95 % from", "to", "unit")
+        yield page.table("Causes", head, _parameters(answer), numbers=(3, 4, 5))
     yield _gain_table(answer)
     if answer["runners_up"]:
-        rows = [
-            (spoken(r["effect"]), EFFECTS[r["effect"]].sentence, _number(r["leftover_sigma"]))
-            for r in answer["runners_up"]
-        ]
-        yield _table("Runners-up", ("effect", "meaning", "leftover (sigma)"), rows, numbers=(2,))
-    yield _pairs(_cycles(answer["cycles"]))
+        columns = ("effect", "course", "leftover (sigma)")
+        yield page.table("Runners-up, each alone", columns, _runners_up(answer), numbers=(2,))
+    yield page.pairs(_cycles(answer))
 
 
-def _cause_table(answer: dict[str, Any]) -> str:
-    explained = answer["verdict"] == "explained"
-    caption = "; ".join(map(_sure, answer["causes"])) if explained else "explains only a part"
-    head = ("cause", "since", "parameter", "value", "95 % from", "to", "unit")
-    return _table(f"Cause: {caption}", head, _parameters(answer["causes"]), numbers=(3, 4, 5))
+def _runners_up(answer: Answer) -> Iterator[tuple[str, ...]]:
+    for one in answer["runners_up"]:
+        yield spoken(one["effect"]), one["course"], number(one["leftover_sigma"])
 
 
-def _gain_table(answer: dict[str, Any]) -> str:
-    """The figures on the held-out cycles, with and without the cause if there is one."""
-    columns, caption = {"baseline": "twin as it stands"}, "Held-out cycles"
-    if answer["causes"]:
-        columns["extended"] = "with the cause"
-        caption = f"Held-out cycles: {_gain(answer['gain'])}"
-    rows = [
-        (name, *(_number(answer[column][key]) for column in columns), unit)
-        for key, name, unit in FIGURES
-    ]
-    return _table(caption, ("", *columns.values(), "unit"), rows, range(1, 1 + len(columns)))
-
-
-def _parameters(causes: list[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
-    for cause in causes:
+def _parameters(answer: Answer) -> Iterator[tuple[str, ...]]:
+    for cause in answer["causes"]:
         for name, p in cause["parameters"].items():
-            numbers = (_number(p[key]) for key in ("value", "low95", "high95"))
-            yield spoken(cause["effect"]), _since(cause), spoken(name), *numbers, p["unit"]
+            numbers = [number(p[key]) for key in ("value", "low95", "high95")]
+            course = when(cause, interval=True)
+            yield spoken(cause["effect"]), course, spoken(name), *numbers, p["unit"]
+            if cause["course"] == Course.RAMP:
+                numbers = [number(p["at_end"]), "", ""]
+                name_at_end = f"{spoken(name)} at the end"
+                yield "", "", name_at_end, *numbers, p["unit"].removesuffix("/h")
 
 
-def _cycles(cycles: dict[str, Any]) -> list[tuple[str, str]]:
-    return [
-        ("cycles complete in the log", str(cycles["total"])),
-        ("fitted on", _some(cycles["fitted"])),
-        ("held out, to judge by", _some(cycles["held_out"])),
+def _gain_table(answer: Answer) -> str:
+    """The figures on the held-out cycles, before and after if there is an after."""
+    columns, caption = {"baseline": "twin as it stands"}, "Held-out cycles"
+    if extended(answer):
+        columns, caption = {"baseline": "before", "extended": "after"}, "Gain on held-out cycles"
+    rows = [
+        (name, *(number(answer[column][key]) for column in columns), unit)
+        for key, name, _, unit in FIGURES
     ]
+    if extended(answer):
+        rows += _gained(answer["gain"])
+    head = ("", *columns.values(), "unit")
+    return page.table(caption, head, rows, range(1, 1 + len(columns)))
+
+
+def _gained(gain: Answer) -> Iterator[tuple[str, ...]]:
+    between = f"{number(gain['low95'])} to {number(gain['high95'])}"
+    yield "less rms deviation", "", number(gain["rms_reduction_pct"]), "%"
+    yield "its 95 % interval", "", between, "%"
+    yield "share of what can be gained", "", number(gain["share_of_achievable_pct"]), "%"
+
+
+def _cycles(answer: Answer) -> list[tuple[str, str]]:
+    cycles = answer["cycles"]
+    rows = [("cycles complete in the log", str(cycles["total"]))]
+    if cycles["fitted"]:
+        rows.append(("fitted on", some(cycles["fitted"])))
+        rows.append(("held out, to judge by", some(cycles["held_out"])))
+    return rows
 
 
 def _footer(diagnosis: Diagnosis) -> str:
@@ -354,7 +299,7 @@ def _footer(diagnosis: Diagnosis) -> str:
         ("data set", f"{diagnosis.data_set}: {_data_set(diagnosis.evidence.theta)}"),
         ("program", f"ejector-twin {version('ejector-twin')}"),
     ]
-    return _pairs(rows)
+    return page.pairs(rows)
 
 
 def _data_set(theta: Theta) -> str:
@@ -368,41 +313,3 @@ def _data_set(theta: Theta) -> str:
         ("H1", theta[c.H1] / MBAR, "mbar"),
     )
     return ", ".join(f"{name} {value:.4g} {unit}" for name, value, unit in numbers)
-
-
-def _section(title: str, body: str) -> str:
-    return f"<section><h2>{html.escape(title)}</h2>\n{body}\n</section>"
-
-
-def _figure(title: str, svg: str, caption: str) -> str:
-    caption = f"<figcaption>{html.escape(caption)}</figcaption>"
-    return _section(title, f"<figure>{svg}{caption}</figure>")
-
-
-def _pairs(rows: Iterable[tuple[str, str]]) -> str:
-    said = (f"<dt>{html.escape(what)}</dt><dd>{html.escape(which)}</dd>" for what, which in rows)
-    return f"<dl>{''.join(said)}</dl>"
-
-
-def _table(
-    caption: str,
-    head: Sequence[str],
-    rows: Iterable[Sequence[str]],
-    numbers: Iterable[int] = (),
-) -> str:
-    """Return a table; the columns ``numbers`` are set to the right."""
-    style = ['class="number"' if i in set(numbers) else "" for i in range(len(head))]
-    top = "".join(
-        f'<th scope="col" {s}>{html.escape(h)}</th>' for h, s in zip(head, style, strict=True)
-    )
-    body = "".join(f"<tr>{_row(row, style)}</tr>\n" for row in rows)
-    return (
-        f"<table><caption>{html.escape(caption)}</caption>\n"
-        f"<thead><tr>{top}</tr></thead>\n<tbody>{body}</tbody></table>"
-    )
-
-
-def _row(cells: Sequence[str], style: Sequence[str]) -> str:
-    first, *rest = map(html.escape, cells)
-    others = "".join(f"<td {s}>{one}</td>" for one, s in zip(rest, style[1:], strict=True))
-    return f'<th scope="row">{first}</th>{others}'

@@ -1,196 +1,303 @@
-"""The search for one cause: every effect, as it is and switching on, fitted and ranked.
+"""The search for causes: every effect with every course, alone and together, fitted and ranked.
 
-First every effect's amplitude is estimated in each cycle alone, with the model made linear; how
-the amplitudes run over the cycles tells the course. Then the promising ones are fitted in the
-non-linear simulation by least squares on the fitted cycles only.
+Forward: what the linear model promises is fitted in the non-linear one, singles and pairs side by
+side, because the members of a true pair may each look poor alone. What explains most is kept if it
+is worth its price, then the search begins anew about it. Backward: each cause must still be worth
+its price beside the others.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares, minimize_scalar
 
-from twin.diagnosis.evidence import Course, Evidence, Floats
-from twin.model.effects import EFFECTS, Effect, apply
+from twin.diagnosis.bins import Floats
+from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, thinned
+from twin.diagnosis.fit import Fitted, fit, white
+from twin.diagnosis.hypotheses import bounds, parameters, sized, sizes
+from twin.diagnosis.screen import columns, pairs, promises
+from twin.diagnosis.weights import Weights, covariance
+from twin.model.courses import Cause, Course
 
-PROMISING = 8  # effects that are fitted
-STEP_GAIN = 15.0  # chi-square a step must gain over a constant course: it has more freedom
-PARAMETER_PRICE = 2.0  # chi-square each parameter must be worth (Akaike)
+MOST_CAUSES = 3
+SIGNIFICANT = 20.0  # chi-square, beyond its price, that a cause must gain before it is named
+SHARE = (
+    0.005  # of what is explained already, that one more cause must gain: else it mends the model
+)
+SMALLEST = 0.2  # of an effect's typical size: less is within what calibration leaves
 SAME = 10.8  # chi-square up to which a log cannot reject a rival (one in a thousand)
+TRIED_PAIRS, TRIED_MORE, TRIED_TIMES = 12, 8, 6
+SECOND = 0.5  # of the best gain, above which an effect's second course is fitted as well
+START = np.array([0.4, 1.0, 1.7, 2.5, 3.5, 5.0])  # typical sizes to begin a fit from
+ONSETS = 16  # in a round of looking for when a step began
+ONSET_S = 0.01  # to which it is found
+FARTHEST_S = 4.0  # from an onset, that its interval may reach
+SURE = 3.84  # chi-square that bounds a 95 % interval
+
+Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Finding:
-    """A hypothesis fitted to the evidence."""
+class Search:
+    """What the search found: the causes with their rivals, judged alike."""
 
-    effect: str
-    onset: int | None  # row at which it begins; None: it was always there
-    values: dict[str, float]
-    low95: dict[str, float]
-    high95: dict[str, float]
-    chi2: float  # over the fitted cycles, price included
-    leftover: float  # sigmas left on the fitted cycles; 1 is healthy
-
-    def course(self, evidence: Evidence) -> Course:
-        """The coefficients' course under this hypothesis."""
-        return course_of(evidence, EFFECTS[self.effect], self.values, self.onset)
+    weights: Weights  # of the fitted cycles, about what was found
+    healthy: float  # chi-square without any cause
+    found: Fitted | None
+    ranking: list[Fitted]  # of all single causes, and of what was found
+    rivals: list[list[Fitted]]  # of each cause: what could stand in its place
+    onsets: list[tuple[float, float]]  # 95 % interval of each cause's onset
 
 
-@dataclass(frozen=True)
-class Screened:
-    """What an effect promises in the linear model: gain in chi-square, where it begins, how big."""
-
-    effect: Effect
-    gain: float
-    first: int  # position among the judged cycles from which on it is there; 0: always
-    values: list[float]
-
-
-def course_of(
-    evidence: Evidence, effect: Effect, values: dict[str, float], onset: int | None
-) -> Course:
-    """The coefficients' course with an effect of some size from a row on."""
-    changed = apply(evidence.theta, effect.name, values)
-    return [(0, changed)] if onset is None else [(0, evidence.theta), (onset, changed)]
-
-
-def search(
-    evidence: Evidence, fitted: Sequence[int], progress: Callable[[str], None]
-) -> list[Finding]:
-    """Rank the effects by how well they explain the fitted cycles, best first."""
-    progress("screening all effects")
-    screened = screen(evidence)
-    if not screened:
-        return []
-    best = screened[0]
-    onset = None
-    if best.first > 0:
-        progress(f"{best.effect.name}: looking for the onset")
-        onset = find_onset(evidence, best)
-    found = []
-    for one in screened[:PROMISING]:
-        progress(f"fitting {one.effect.name}")
-        for begin in {onset if one.first > 0 else None, None}:
-            found.append(fit(evidence, one, begin, fitted))
-    found.sort(key=lambda finding: finding.chi2)
-    effects_seen: set[str] = set()
-    return [f for f in found if not (f.effect in effects_seen or effects_seen.add(f.effect))]  # type: ignore[func-returns-value]
+def search(evidence: Evidence, fitted: Sequence[int], progress: Progress) -> Search:
+    """Find up to three causes; sizes and ranking from the ``fitted`` cycles only."""
+    progress("screening all effects and courses")
+    judged, weights = _weights(evidence, fitted, HEALTHY)
+    singles = _fit_singles(evidence, judged, weights, progress)
+    best = min(singles, key=lambda one: one.score)
+    healthy = _healthy(evidence, weights)
+    if not _worth(healthy, healthy, 0.0, best):
+        return Search(weights, healthy, None, singles, [], [])
+    judged, weights = _weights(evidence, fitted, best.hypothesis)
+    healthy = _healthy(evidence, weights)
+    progress("fitting single causes")
+    singles = _ranked(fit(evidence, weights, [one.hypothesis for one in singles]))
+    found = singles[0]
+    while len(found.hypothesis) < MOST_CAUSES:
+        progress(f"looking for what else there is beside {', '.join(found.effects)}")
+        more = _best_addition(evidence, judged, weights, found, healthy)
+        if more is None:
+            break
+        found = more
+        judged, weights = _weights(evidence, fitted, found.hypothesis)
+        (found,) = fit(evidence, weights, [found.hypothesis])
+        healthy = _healthy(evidence, weights)
+        found = _pruned(evidence, weights, found, healthy)
+    progress("looking for what the log cannot tell apart")
+    rivals = _rivals(evidence, judged, weights, found, singles)
+    onsets = [
+        _onset_interval(evidence, judged, found, number) for number in range(len(found.hypothesis))
+    ]
+    return Search(weights, healthy, found, singles, rivals, onsets)
 
 
-def screen(evidence: Evidence) -> list[Screened]:
-    """Estimate every effect's gain with the model made linear about the data set, best first."""
-    base = evidence.residuals([(0, evidence.theta)])
-    found = []
-    for effect in EFFECTS.values():
-        sizes, gains = [], []
-        for parameter in effect.parameters:
-            neutral = parameter.neutral(evidence.theta)
-            changed = apply(
-                evidence.theta, effect.name, {parameter.name: neutral + parameter.typical}
-            )
-            moved = evidence.residuals([(0, changed)])
-            slopes = [after - before for after, before in zip(moved, base, strict=True)]
-            one_sided = parameter.low == neutral
-            gain, first, times = _best_course(base, slopes, one_sided=one_sided)
-            size = neutral + times * parameter.typical
-            sizes.append(float(np.clip(size, parameter.low, parameter.high)))
-            gains.append((gain, first))
-        gain, first = max(gains)
-        found.append(Screened(effect, sum(g for g, _ in gains), first, sizes))
-    return sorted(found, key=lambda one: -one.gain)
+def _weights(
+    evidence: Evidence, fitted: Sequence[int], about: Hypothesis
+) -> tuple[Weights, Weights]:
+    """Weights about a hypothesis, of all judged cycles and of the fitted ones."""
+    known = covariance(evidence, about)
+    return known.of(evidence.judged), known.of(fitted)
 
 
-def _best_course(
-    base: list[Floats], slopes: list[Floats], *, one_sided: bool
-) -> tuple[float, int, float]:
-    """Gain, first cycle and amplitude of the best constant or switched-on amplitude."""
-    pull = np.array([-float(s @ b) for s, b in zip(slopes, base, strict=True)])
-    power = np.array([float(s @ s) for s in slopes])
-    pulls, powers = (np.cumsum(x[::-1])[::-1] for x in (pull, power))  # from cycle i to the end
-    if one_sided:
-        pulls = np.maximum(pulls, 0.0)
-    gains = np.where(powers > 1e-9, pulls**2 / np.maximum(powers, 1e-9), 0.0)
-    first = int(np.argmax(gains))
-    if gains[first] < gains[0] + STEP_GAIN:
-        first = 0
-    return float(gains[first]), first, float(pulls[first] / max(powers[first], 1e-9))
+def _healthy(evidence: Evidence, weights: Weights) -> float:
+    residual = white(evidence, weights, [HEALTHY])
+    return float(np.sum(residual**2))
 
 
-def find_onset(evidence: Evidence, one: Screened) -> int:
-    """Row at which an effect switches on, to some ten ms where the data can tell."""
-    first = evidence.judged[one.first]
-    values = _named(one.effect, one.values)
-    low = int(evidence.starts[max(first - 1, 1)])
-    high = int(evidence.starts[min(first + 1, evidence.cycles)])
-
-    def misfit(row: float) -> float:
-        return _chi2(evidence.residuals(course_of(evidence, one.effect, values, int(row))))
-
-    rows = np.linspace(low, high, 13)
-    nearest = int(np.argmin([misfit(row) for row in rows]))
-    around = (rows[max(nearest - 1, 0)], rows[min(nearest + 1, len(rows) - 1)])
-    best = minimize_scalar(misfit, bounds=around, method="bounded", options={"xatol": 5.0})
-    return int(best.x)
+def _ranked(found: Iterable[Fitted]) -> list[Fitted]:
+    """The best course of each set of effects, the best first."""
+    best: dict[tuple[str, ...], Fitted] = {}
+    for one in found:
+        key = tuple(sorted(one.effects))
+        if key not in best or one.score < best[key].score:
+            best[key] = one
+    return sorted(best.values(), key=lambda one: one.score)
 
 
-def fit(evidence: Evidence, one: Screened, onset: int | None, fitted: Sequence[int]) -> Finding:
-    """Fit an effect's parameters in the non-linear simulation on the fitted cycles."""
-    effect, judged = one.effect, evidence.judged
-    scale = np.array([p.typical for p in effect.parameters])
-    low = np.array([p.low for p in effect.parameters])
-    high = np.array([p.high for p in effect.parameters])
-
-    def residual(x: Floats) -> Floats:
-        values = _named(effect, np.clip(x * scale, low, high))
-        found = evidence.residuals(course_of(evidence, effect, values, onset))
-        return np.concatenate([found[judged.index(cycle)] for cycle in fitted])
-
-    def jacobian(x: Floats) -> Floats:
-        at = residual(x)
-        steps = np.where((x + 0.02) * scale < high, 0.02, -0.02)
-        moves = [(residual(x + move) - at) for move in np.diag(steps)]
-        return np.stack(moves, axis=1) / steps
-
-    bounds = (low / scale, high / scale)
-    start = np.clip(np.array(one.values) / scale, bounds[0] + 1e-6, bounds[1] - 1e-6)
-    best = least_squares(residual, start, jacobian, bounds, max_nfev=12, xtol=1e-4, ftol=1e-5)
-    chi2 = float(best.fun @ best.fun)
-    left = chi2 / len(best.fun)
-    spread = _spread(jacobian(best.x), max(left, 1.0)) * scale
-    size = best.x * scale
-
-    def held(numbers: Floats) -> dict[str, float]:  # without those that nothing here depends on
-        return {
-            p.name: float(n)
-            for p, n, s in zip(effect.parameters, numbers, spread, strict=True)
-            if np.isfinite(s)
-        }
-
-    return Finding(
-        effect.name,
-        onset,
-        held(size),
-        held(np.maximum(size - 1.96 * spread, low)),
-        held(np.minimum(size + 1.96 * spread, high)),
-        chi2 + PARAMETER_PRICE * (len(size) + (onset is not None)),
-        float(np.sqrt(left)),
-    )
+def _fit_singles(
+    evidence: Evidence, judged: Weights, weights: Weights, progress: Progress
+) -> list[Fitted]:
+    """Fit every effect with its most promising courses."""
+    promised = promises(evidence, judged, columns(evidence, judged), each=2)
+    first = {one.hypothesis[0].effect: one for one in reversed(promised)}
+    hypotheses = [
+        one.hypothesis
+        for one in promised
+        if one is first[one.hypothesis[0].effect] or one.gain > SECOND * promised[0].gain
+    ]
+    progress("fitting single causes")
+    started = _started(evidence, judged, hypotheses)
+    return _ranked(fit(evidence, weights, _timed(evidence, judged, started)))
 
 
-def _spread(jacobian: Floats, variance: float) -> Floats:
-    """One standard deviation of each parameter; infinite where the evidence does not hold it."""
-    information = jacobian.T @ jacobian
-    held = np.diag(information) > 1e-6
-    spread = np.full(len(information), np.inf)
-    part = information[np.ix_(held, held)]
-    spread[held] = np.sqrt(np.diag(np.linalg.pinv(part)) * variance)
-    return spread
+def _started(
+    evidence: Evidence, judged: Weights, hypotheses: Sequence[Hypothesis]
+) -> list[Hypothesis]:
+    """The same with the last cause at the best of some sizes.
+
+    A delay moves what is sharp: from far away a step towards its true size does not seem to help.
+    """
+    tried: list[list[Hypothesis]] = []
+    for hypothesis in hypotheses:
+        low, high = bounds(evidence, hypothesis)
+        x = sizes(evidence, hypothesis)
+        last = len(x) - len(parameters(hypothesis[-1:]))
+        around = [x]
+        for size in (*-START, *START):
+            if low[last] < size < high[last]:
+                around.append(np.concatenate([x[:last], [size], x[last + 1 :]]))
+        tried.append([sized(evidence, hypothesis, one) for one in around])
+    every = [one for some in tried for one in some]
+    chi2 = np.sum(white(evidence, judged, every, with_levels=False) ** 2, axis=0)
+    best, first = [], 0
+    for some in tried:
+        best.append(some[int(np.argmin(chi2[first : first + len(some)]))])
+        first += len(some)
+    return best
 
 
-def _named(effect: Effect, values: Sequence[float] | Floats) -> dict[str, float]:
-    return {p.name: float(v) for p, v in zip(effect.parameters, values, strict=True)}
+def _best_addition(
+    evidence: Evidence, judged: Weights, weights: Weights, found: Fitted, healthy: float
+) -> Fitted | None:
+    """What is found with one more cause, or a pair in its place; None if not worth it."""
+    about = found.hypothesis
+    promised = promises(evidence, judged, columns(evidence, judged, about), each=2)
+    new = [one for one in promised if one.hypothesis[0].effect not in found.effects]
+    candidates = _started(evidence, judged, [(*about, *one.hypothesis) for one in new[:TRIED_MORE]])
+    if len(about) == 1:
+        alone = columns(evidence, judged)
+        singles = promises(evidence, judged, alone, each=2)
+        candidates += [
+            one.hypothesis for one in pairs(evidence, judged, alone, singles)[:TRIED_PAIRS]
+        ]
+    candidates = _timed(evidence, judged, candidates)
+    tried = _ranked(fit(evidence, weights, candidates))
+    for one in tried:
+        if _worth(healthy, found.chi2, found.chi2 - found.score, one):
+            return one
+    return None
 
 
-def _chi2(residuals: list[Floats]) -> float:
-    return sum(float(part @ part) for part in residuals)
+def _worth(healthy: float, chi2: float, paid: float, fitted: Fitted) -> bool:
+    """Whether a hypothesis gains enough over a smaller one, and all its causes are big enough."""
+    scale = max(fitted.leftover**2, 1.0)
+    gain = (chi2 - fitted.chi2) / scale - (fitted.score - fitted.chi2 + paid)
+    enough = max(SIGNIFICANT, SHARE * (healthy - chi2) / scale)
+    return gain > enough and _smallest(fitted) >= SMALLEST
+
+
+def _smallest(fitted: Fitted) -> float:
+    """The size of the smallest cause, in typical ones."""
+    first, sizes = 0, []
+    for cause in fitted.hypothesis:
+        count = len(parameters((cause,)))
+        sizes.append(float(np.abs(fitted.x[first : first + count]).max()))
+        first += count
+    return min(sizes)
+
+
+def _pruned(evidence: Evidence, weights: Weights, found: Fitted, healthy: float) -> Fitted:
+    """Without the causes that are not worth their price beside the others."""
+    while len(found.hypothesis) > 1:
+        without = [
+            tuple(c for i, c in enumerate(found.hypothesis) if i != left)
+            for left in range(len(found.hypothesis))
+        ]
+        best = min(fit(evidence, weights, without), key=lambda one: one.score)
+        if _worth(healthy, best.chi2, best.chi2 - best.score, found):
+            break
+        found = best
+    return found
+
+
+def _rivals(
+    evidence: Evidence, judged: Weights, weights: Weights, found: Fitted, singles: list[Fitted]
+) -> list[list[Fitted]]:
+    """For each cause: what fits as well in its place, re-fitted with the others."""
+    result = []
+    margin = SAME * max(found.leftover**2, 1.0)
+    for left in range(len(found.hypothesis)):
+        others = tuple(c for i, c in enumerate(found.hypothesis) if i != left)
+        if others:
+            promised = promises(evidence, judged, columns(evidence, judged, others), each=1)
+            tried = [
+                (*others, *one.hypothesis)
+                for one in promised
+                if one.hypothesis[0].effect not in found.effects
+            ][:TRIED_PAIRS]
+            fitted = _ranked(fit(evidence, weights, _timed(evidence, judged, tried)))
+        else:
+            fitted = [one for one in singles if one.effects != found.effects]
+        result.append([one for one in fitted if one.score - found.score < margin])
+    return result
+
+
+# --- when -----------------------------------------------------------------------------------------
+
+
+def _timed(
+    evidence: Evidence, judged: Weights, hypotheses: Sequence[Hypothesis]
+) -> list[Hypothesis]:
+    """The same with the onsets of the first few steps found within their cycle."""
+    result, timed = [], 0
+    for hypothesis in hypotheses:
+        if hypothesis[-1].course == Course.STEP and timed < TRIED_TIMES:
+            result.append(_with_onset(evidence, judged, hypothesis))
+            timed += 1
+        else:
+            result.append(hypothesis)
+    return result
+
+
+def _with_onset(evidence: Evidence, judged: Weights, hypothesis: Hypothesis) -> Hypothesis:
+    """The last cause's onset where it explains most, about a cycle about where it is."""
+    *others, cause = hypothesis
+    cycle = float(np.median(np.diff(evidence.seconds[evidence.starts[:-1]])))
+    low, high = cause.onset_s - cycle, cause.onset_s + cycle
+    while (high - low) / ONSETS > ONSET_S:
+        onsets = np.linspace(low, high, ONSETS)
+        best = onsets[int(np.argmin(_misfits(evidence, judged, tuple(others), cause, onsets)))]
+        reach = 1.5 * (high - low) / ONSETS
+        low, high = best - reach, best + reach
+    return (*others, replace(cause, onset_s=float(best)))
+
+
+def sharpened(whole: Evidence, part: Evidence, hypothesis: Hypothesis) -> Hypothesis:
+    """A hypothesis from ``part`` of a log with the onsets of steps as all of its cycles tell."""
+    for number, cause in enumerate(hypothesis):
+        if cause.course == Course.STEP:
+            others = hypothesis[:number] + hypothesis[number + 1 :]
+            onset = _sharp_onset(whole, part, others, cause)
+            hypothesis = (*hypothesis[:number], onset, *hypothesis[number + 1 :])
+    return hypothesis
+
+
+def _sharp_onset(whole: Evidence, part: Evidence, others: Hypothesis, cause: Cause) -> Cause:
+    begins = whole.seconds[whole.starts[:-1]]
+    near = part.seconds[part.starts[part.judged]]
+    low = near[near < cause.onset_s].max(initial=begins[whole.judged[0]])
+    high = near[near > cause.onset_s].min(initial=np.inf)
+    while True:
+        inside = [one for one in whole.judged if low <= begins[one] <= high]
+        looked = thinned(whole, inside, ONSETS)
+        judged = covariance(looked, (*others, cause)).of(looked.judged)
+        if len(inside) <= ONSETS:
+            return _with_onset(looked, judged, (*others, cause))[-1]
+        tried = looked.seconds[looked.starts[looked.judged]]
+        best = int(np.argmin(_misfits(looked, judged, others, cause, tried)))
+        low, high = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
+        cause = replace(cause, onset_s=float(tried[best]))
+
+
+def _misfits(
+    evidence: Evidence, judged: Weights, others: Hypothesis, cause: Cause, onsets: Floats
+) -> Floats:
+    tried = [(*others, replace(cause, onset_s=float(onset))) for onset in onsets]
+    found: Floats = np.sum(white(evidence, judged, tried, with_levels=False) ** 2, axis=0)
+    return found
+
+
+def _onset_interval(
+    evidence: Evidence, judged: Weights, found: Fitted, number: int
+) -> tuple[float, float]:
+    """95 % interval (s) of a step's onset, from how the misfit grows about it."""
+    cause = found.hypothesis[number]
+    if cause.course != Course.STEP:
+        return cause.onset_s, cause.onset_s
+    others = tuple(c for i, c in enumerate(found.hypothesis) if i != number)
+    reach = np.geomspace(ONSET_S, FARTHEST_S, 10)
+    onsets = cause.onset_s + np.concatenate([-reach[::-1], [0.0], reach])
+    misfit = _misfits(evidence, judged, others, cause, onsets)
+    inside = np.flatnonzero(misfit < misfit.min() + SURE * max(found.leftover**2, 1.0))
+    last = len(onsets) - 1  # the first that is rejected bounds it
+    return float(onsets[max(inside[0] - 1, 0)]), float(onsets[min(inside[-1] + 1, last)])

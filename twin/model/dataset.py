@@ -7,15 +7,19 @@ the model's units are converted.
 
 import hashlib
 import math
+from collections.abc import Mapping
 from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
+from twin.errors import ConfigError
 from twin.model import theta as c
+from twin.model.effects import apply
 from twin.model.gas import GAMMA, R
 from twin.model.system import Part, Tube, Vessel, lumped
+from twin.model.term import Term
 from twin.model.theta import Theta
 from twin.settings import Settings
 from twin.signals import BAR, MBAR, ML, MS, SL_MIN
@@ -175,6 +179,17 @@ class DataSet(Settings):
     ejector: Ejector = Ejector()
     sensor: Wiring = Wiring()
     system: System = System()
+    # What a diagnosis found beside all that: effects with their sizes, and terms that data gave.
+    effects: Mapping[str, Mapping[str, float]] = Field(default_factory=dict)
+    terms: tuple[Term, ...] = ()
+
+    @model_validator(mode="after")
+    def _effects_fit(self) -> "DataSet":
+        try:
+            coefficients(self)
+        except ConfigError as error:
+            raise ValueError(f"effects: {error}") from error
+        return self
 
     @model_validator(mode="after")
     def _pressures_fit(self) -> "DataSet":
@@ -201,6 +216,8 @@ def coefficients(data: DataSet) -> Theta:
     _set_supply(theta, data.supply)
     _set_ejector(theta, data.ejector, data.ejector.end_pressure_mbar * MBAR / ambient)
     _set_system(theta, data.system, data.ejector.port_volume_ml * ML)
+    for name, values in data.effects.items():
+        theta = apply(theta, name, values)
     return theta
 
 
@@ -257,7 +274,7 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     theta[c.NEAR_RESISTANCE] = near * total.resistance * system.line_factor
     theta[c.NEAR_LAMINAR] = near * total.laminar * system.line_factor
     place = min(max(total.place + system.sensor_shift, 0.0), 1.0)
-    theta[c.PLACE] = place * total.drop * system.line_factor
+    theta[c.PLACE] = place * total.resistance * system.line_factor
     theta[c.LEAK] = total.leak + system.leak_sl_min * SL_MIN
     theta[c.LAMINAR_LEAK] = total.open
     theta[c.OPENING] = total.opening

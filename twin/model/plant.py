@@ -94,10 +94,8 @@ def prepare(theta):  # type: ignore[no-untyped-def]
         k[_HEAT, i] = theta[c.FILM, i] * theta[c.AREA, i] / CP
         k[_PORT_HEAT, i] = theta[c.PORT_HEAT, i] / CP
         k[_LINE_HEAT, i] = theta[c.LINE_HEAT, i] / CP
-        suction = theta[c.SUCTION, i]
-        quadratic = theta[c.NEAR_RESISTANCE, i] + theta[c.RESISTANCE, i]
-        drop = (quadratic * suction + theta[c.NEAR_LAMINAR, i] + theta[c.LAMINAR, i]) * suction
-        k[_PLACE, i] = min(theta[c.PLACE, i] / drop, 1.0) if drop > 0.0 else 0.0
+        friction = theta[c.NEAR_RESISTANCE, i] + theta[c.RESISTANCE, i]
+        k[_PLACE, i] = min(theta[c.PLACE, i] / friction, 1.0) if friction > 0.0 else 0.0
     return k
 
 

@@ -102,8 +102,7 @@ class Lumped:
     resistance: float  # Pa²/(kg/s)²
     laminar: float  # Pa²/(kg/s)
     inertance: float  # 1/m
-    drop: float  # Pa² at nominal suction
-    place: float  # of the sensor, as a share of that: 0 at the port, 1 at the vessel
+    place: float  # of the sensor, as a share of the drop: 0 at the port, 1 at the vessel
     shrinks: float  # m³ at full vacuum
     leak: float  # kg/s sonic
     opening: float  # kg/(s Pa) through the rims of all cups, when they stand open
@@ -137,7 +136,6 @@ def lumped(parts: tuple[Part, ...], suction: float, ambient: float, temperature:
         resistance=sum(quadratic for quadratic, _ in drops) / suction**2,
         laminar=sum(linear for _, linear in drops) / suction,
         inertance=sum(inertance(part) for part in parts),
-        drop=total,
         place=place / total if total > 0.0 else 0.0,
         shrinks=sum(cup.count * cup.shrinks_ml for cup in cups) * ML,
         leak=sum(cup.count * cup.lip_leak_sl_min for cup in cups) * SL_MIN,

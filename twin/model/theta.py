@@ -48,7 +48,7 @@ COEFFICIENTS = (
     "RESISTANCE",  # Pa²/(kg/s)², line to vessel, and so on
     "LAMINAR",  # Pa²/(kg/s)
     "INERTANCE",  # 1/m
-    "PLACE",  # Pa² at nominal suction, between port and sensor
+    "PLACE",  # as RESISTANCE: what of it lies between port and sensor
     "LEAK",  # kg/s sonic, opening to ambient
     "LAMINAR_LEAK",  # kg/(s Pa)
     "BACK_FLOW",  # kg/s sonic, through the ejector while its nozzle is off

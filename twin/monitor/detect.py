@@ -15,6 +15,7 @@ from twin.events import Event, Kind
 from twin.model import theta as c
 from twin.model.theta import Theta
 from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, figures
+from twin.monitor.healthy import Healthy
 from twin.monitor.signatures import Likeness, likenesses, look_alikes
 from twin.settings import Settings
 from twin.signals import BREAK, NS, SAMPLE, Quality, Samples, Ticks
@@ -22,13 +23,6 @@ from twin.signals import BREAK, NS, SAMPLE, Quality, Samples, Ticks
 _UNFIT = Quality.OUT_OF_RANGE | Quality.OVERFLOW | Quality.STALE | Quality.BAD
 FEWEST_SHARE = 0.95  # of a cycle's samples, to judge it: commands seen late look like a deviation
 STANDING = 0.8  # of the best fit's gain: then the name of a standing alarm still holds
-
-
-class Scatter(Settings):
-    """What one figure is in healthy cycles: mean and one standard deviation, its unit in mbar."""
-
-    mean: float
-    sigma: float = Field(gt=0.0)
 
 
 class MonitorSettings(Settings):
@@ -39,7 +33,7 @@ class MonitorSettings(Settings):
     clear_cycles: int = Field(3, ge=1)
     smallest_mbar: float = Field(0.5, ge=0.0)  # deviations below are never worth an alarm
     stale_ms: float = Field(500.0, gt=0.0)
-    healthy: Mapping[str, Scatter] = Field(default_factory=dict)
+    healthy: Healthy = Healthy()
 
 
 @dataclass(frozen=True)
@@ -166,7 +160,7 @@ class Monitor:
 
     def _worst(self, found: Mapping[str, float]) -> Outlier | None:
         outliers = []
-        for figure, healthy in self.settings.healthy.items():
+        for figure, healthy in self.settings.healthy.figures.items():
             if figure in found:
                 excess = found[figure] - healthy.mean
                 if figure.endswith("_rms"):

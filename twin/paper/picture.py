@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from twin.diagnosis.pictures import ANONYMOUS, MEASURED, STYLE
+from twin.diagnosis.drawing import ANONYMOUS, MEASURED, STYLE
 from twin.errors import ConfigError, SourceError
 from twin.paper.evacuation import (
     END_MBAR,

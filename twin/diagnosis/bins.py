@@ -1,0 +1,74 @@
+"""Rows averaged into bins that suit how a model errs.
+
+What a model gets wrong after a switching goes on for about as long as the switching is past. So
+bins, correlations and all else run in warped time: logarithmic from an edge on, then uniform.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from twin.model.term import kinds
+from twin.signals import MS
+
+EARLIEST_S, LATEST_S = 5e-3, 0.3  # how long an error goes on, at an edge and long after it
+PER_UNIT = 4  # bins in each unit of warped time
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Bins:
+    """What each bin is, in order of time; no bin crosses a phase change."""
+
+    number: Ints  # of the bin of each row; -1 where nothing can be compared
+    count: Ints  # rows
+    cycle: Ints
+    stretch: Ints  # of one phase, counted over all rows
+    kind: Ints  # of stretch, index into KINDS
+    time: Floats  # warped, since the stretch began
+
+    def mean(self, values: Floats) -> Floats:
+        """Mean over each bin of row-by-row ``values``, (rows, ...) to (bins, ...)."""
+        used = np.flatnonzero(self.number >= 0)
+        if not len(used):
+            return values[:0]
+        first = np.searchsorted(self.number[used], np.arange(len(self.count)))
+        sums: Floats = np.add.reduceat(values[used], first, axis=0)
+        return sums / self.count.reshape(-1, *[1] * (values.ndim - 1))
+
+
+def warped(seconds: Floats) -> Floats:
+    """Warped time: it passes by 1 while an error goes on being about the same."""
+    early = np.minimum(seconds, LATEST_S - EARLIEST_S)
+    late: Floats = (seconds - early) / LATEST_S
+    return np.log1p(early / EARLIEST_S) + late
+
+
+def unwarped(time: Floats) -> Floats:
+    """Seconds after which warped time is ``time``."""
+    turn = np.log1p((LATEST_S - EARLIEST_S) / EARLIEST_S)
+    early = EARLIEST_S * np.expm1(np.minimum(time, turn))
+    seconds: Floats = early + np.maximum(time - turn, 0.0) * LATEST_S
+    return seconds
+
+
+def binned(phase: npt.NDArray[np.uint8], usable: npt.NDArray[np.bool_], starts: Ints) -> Bins:
+    """Bins of rows whose phases are given; ``starts`` are the first rows of cycles."""
+    rows = np.arange(len(phase))
+    begins = np.diff(phase, prepend=255) != 0
+    begins[starts[starts < len(rows)]] = True
+    first = np.flatnonzero(begins)
+    stretch = np.cumsum(begins) - 1
+    time = warped((rows - first[stretch]) * MS)
+    place = (stretch << 16) + np.floor(time * PER_UNIT).astype(np.int64)
+    _, at, number, count = np.unique(
+        place[usable], return_index=True, return_inverse=True, return_counts=True
+    )
+    here = rows[usable][at]
+    kind = kinds(phase[first], phase[np.maximum(first - 1, 0)])
+    result = np.full(len(phase), -1)
+    result[usable] = number
+    cycle = np.searchsorted(starts, here, "right") - 1
+    return Bins(result, count, cycle, stretch[here], kind[stretch[here]], time[here])

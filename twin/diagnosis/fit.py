@@ -1,0 +1,139 @@
+"""Many hypotheses fitted at once: damped Gauss-Newton, all of them in one run of the bank."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from twin.diagnosis.bins import Floats
+from twin.diagnosis.evidence import Evidence, Hypothesis
+from twin.diagnosis.hypotheses import bounds, price, sized, sizes
+from twin.diagnosis.weights import Weights, levels
+
+MOST_ROUNDS = 10
+STEP = 0.1  # typical sizes, for derivatives
+LONGEST = 6.0  # typical sizes that one round may move
+CONVERGED = 0.05  # chi-square that one more round would gain
+HOPELESS = 3.0  # times the chi-square of the best, after some rounds: not worth going on
+BACK = 0.3  # of a step that made it worse
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A hypothesis with the sizes that suit the evidence best."""
+
+    hypothesis: Hypothesis
+    x: Floats  # sizes
+    covariance: Floats  # of the sizes
+    chi2: float
+    score: float  # chi-square with the price of the hypothesis: the least is the best
+    count: int  # of residuals
+
+    @property
+    def leftover(self) -> float:
+        """Sigmas left; 1 is healthy."""
+        return float(np.sqrt(self.chi2 / max(self.count, 1)))
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of the effects in it."""
+        return tuple(cause.effect for cause in self.hypothesis)
+
+
+@dataclass
+class _Trial:
+    """One fit on its way: the best point so far, and the one to look at next."""
+
+    hypothesis: Hypothesis
+    low: Floats
+    high: Floats
+    x: Floats
+    chi2: float = np.inf
+    residual: Floats = field(default_factory=lambda: np.empty(0))
+    jacobian: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    next: Floats = field(default_factory=lambda: np.empty(0))
+    done: bool = False
+
+    def moves(self) -> Floats:
+        """Steps for derivatives at the next point, one per size, away from the nearer bound."""
+        return np.where(self.next + STEP <= self.high, STEP, -STEP)
+
+    def take(self, white: Floats) -> None:
+        """Take the residuals at the next point and beside it; choose the point after it."""
+        residual, chi2 = white[:, 0], float(white[:, 0] @ white[:, 0])
+        if not chi2 < self.chi2:
+            back = self.x + BACK * (self.next - self.x)
+            self.done = bool(np.abs(self.next - self.x).max(initial=0.0) < 0.01)
+            self.next = back
+            return
+        self.x, self.chi2, self.residual = self.next, chi2, residual
+        self.jacobian = (white[:, 1:] - white[:, :1]) / self.moves()
+        q, r = np.linalg.qr(self.jacobian)
+        pull = q.T @ residual
+        low = np.maximum(self.low - self.x, -LONGEST) - 1e-9
+        high = np.minimum(self.high - self.x, LONGEST) + 1e-9
+        r = np.concatenate([r, 1e-4 * np.eye(len(low))])  # where nothing holds a size, it stays
+        step = lsq_linear(r, -np.concatenate([pull, np.zeros(len(low))]), (low, high)).x
+        gain = float(pull @ pull - np.sum((pull + r[: len(low)] @ step) ** 2))
+        self.next = np.clip(self.x + step, self.low, self.high)
+        self.done = gain < CONVERGED
+
+
+def white(
+    evidence: Evidence,
+    weights: Weights,
+    hypotheses: Sequence[Hypothesis],
+    *,
+    with_levels: bool = True,
+) -> Floats:
+    """Residuals of hypotheses in sigmas, (residuals, hypotheses)."""
+    if not with_levels:
+        return weights.white(evidence.off(hypotheses))
+    return weights.white(evidence.off(hypotheses), levels(evidence, weights.cycles, hypotheses))
+
+
+def fit(evidence: Evidence, weights: Weights, hypotheses: Sequence[Hypothesis]) -> list[Fitted]:
+    """Fit the sizes of hypotheses, from those they have."""
+    trials = [_trial(evidence, one) for one in hypotheses]
+    for turn in range(MOST_ROUNDS):
+        if turn >= 2:
+            _give_up(trials)
+        going = [trial for trial in trials if not trial.done]
+        if not going:
+            break
+        points = [[trial.next, *(trial.next + np.diag(trial.moves()))] for trial in going]
+        asked = [
+            sized(evidence, trial.hypothesis, point)
+            for trial, around in zip(going, points, strict=True)
+            for point in around
+        ]
+        found = white(evidence, weights, asked)
+        first = 0
+        for trial, around in zip(going, points, strict=True):
+            trial.take(found[:, first : first + len(around)])
+            first += len(around)
+    return [_fitted(evidence, trial) for trial in trials]
+
+
+def _give_up(trials: Sequence[_Trial]) -> None:
+    best = min(trial.chi2 for trial in trials)
+    for trial in trials:
+        trial.done = trial.done or trial.chi2 > HOPELESS * best + HOPELESS * len(trial.residual)
+
+
+def _trial(evidence: Evidence, hypothesis: Hypothesis) -> _Trial:
+    low, high = bounds(evidence, hypothesis)
+    x = np.clip(sizes(evidence, hypothesis), low, high)
+    return _Trial(hypothesis, low, high, x, next=x, done=not len(x))
+
+
+def _fitted(evidence: Evidence, trial: _Trial) -> Fitted:
+    hypothesis = sized(evidence, trial.hypothesis, trial.x)
+    information = trial.jacobian.T @ trial.jacobian
+    information += 1e-6 * np.eye(len(information))
+    covariance = np.asarray(np.linalg.inv(information), np.float64)
+    cost = price(evidence, hypothesis)
+    return Fitted(
+        hypothesis, trial.x, covariance, trial.chi2, trial.chi2 + cost, len(trial.residual)
+    )

@@ -1,0 +1,112 @@
+"""What healthy cycles are like: how far the model is off in them, and what scatters by how much."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from twin.diagnosis.bins import Floats, Ints, unwarped
+from twin.diagnosis.evidence import HEALTHY, Evidence
+from twin.diagnosis.weights import SCATTER, covariance
+from twin.model.courses import Cause
+from twin.model.term import KINDS
+from twin.monitor.healthy import Healthy, ModelError
+from twin.signals import MS
+
+ROUNDS = 3
+LEAST_COMMON, LEAST_ALONE = 0.15, 0.1  # mbar
+FIRST_ERROR = 2.0  # mbar, before anything is known
+HIDDEN = 1.3  # the error over what is left of it once the data set was fitted to the same cycles
+LEAST_SCATTER, MOST_SCATTER = 0.2, 5.0  # of what is usual
+
+
+def learned(evidence: Evidence) -> Healthy:
+    """Learn the model's error and the scatter from healthy cycles; the rest stays as it is."""
+    first = ModelError(after_ms=(0.0,), common_mbar=(FIRST_ERROR,), alone_mbar=(FIRST_ERROR / 4,))
+    found = evidence.healthy.model_copy(
+        update={"error": dict.fromkeys(KINDS, first), "scatter": {}}
+    )
+    off, moves = _moves(evidence)
+    for _ in range(ROUNDS):
+        evidence = replace(evidence, healthy=found)
+        amplitudes, spread = _amplitudes(evidence, off, moves)
+        left = off - np.einsum("bs,bs->b", moves, amplitudes[evidence.bins.cycle])
+        judged = evidence.judged
+        scatter = np.sqrt(amplitudes[judged].var(axis=0, ddof=1) + spread[judged].mean(axis=0))
+        scatter = np.clip(scatter, LEAST_SCATTER, MOST_SCATTER)
+        found = found.model_copy(
+            update={
+                "error": _errors(evidence, left),
+                "scatter": {
+                    name: float(size * times)
+                    for (name, (_, size)), times in zip(SCATTER.items(), scatter, strict=True)
+                },
+            }
+        )
+    return found.model_copy(update={"leftover": _leftover(replace(evidence, healthy=found))})
+
+
+def _leftover(evidence: Evidence) -> float:
+    """Sigmas that healthy cycles have by all this: what is learned here is a little too much."""
+    left = covariance(evidence).of(evidence.judged).white(evidence.off([HEALTHY]))
+    return float(np.sqrt(np.mean(left**2)))
+
+
+def _moves(evidence: Evidence) -> tuple[Floats, Floats]:
+    """Deviation in bins (mbar), and by how much each scatter's usual size moves it, (bins, ·)."""
+    scattered = [(Cause(name, {key: size}),) for name, (key, size) in SCATTER.items()]
+    off = evidence.off([HEALTHY, *scattered])
+    return off[:, 0], off[:, 1:] - off[:, :1]
+
+
+def _amplitudes(evidence: Evidence, off: Floats, moves: Floats) -> tuple[Floats, Floats]:
+    """What scattered in each cycle, in its usual sizes, and with what variance that is known."""
+    size = (evidence.cycles, moves.shape[1])
+    found, spread = np.zeros(size), np.zeros(size)
+    known = covariance(evidence)
+    usual = np.array([size for _, size in SCATTER.values()])
+    for cycle in evidence.judged:
+        alone = known.of([cycle], scattered=False)
+        both = alone.white(np.column_stack([off, moves]))
+        prior = [evidence.healthy.scatter.get(name, size) for name, (_, size) in SCATTER.items()]
+        information = both[:, 1:].T @ both[:, 1:] + np.diag((usual / np.array(prior)) ** 2)
+        variance = np.linalg.inv(information)
+        found[cycle] = variance @ both[:, 1:].T @ both[:, 0]
+        spread[cycle] = np.diag(variance)
+    return found, spread
+
+
+def _errors(evidence: Evidence, left: Floats) -> dict[str, ModelError]:
+    """How far the model is off, by kind of stretch and time since it began."""
+    found = {}
+    for kind, name in enumerate(KINDS):
+        here = np.flatnonzero(evidence.bins.kind == kind)
+        if len(here):
+            found[name] = _error(evidence, left, here)
+    return found
+
+
+def _error(evidence: Evidence, left: Floats, here: Ints) -> ModelError:
+    unit = np.floor(evidence.bins.time[here]).astype(np.int64)
+    noise = evidence.noise**2 / evidence.bins.count[here]
+    after, common, alone = [], [], []
+    for one in np.unique(unit):
+        at = here[unit == one]
+        apart = _apart(evidence, left, at)
+        after.append(float(unwarped(np.array(one + 0.5)) / MS))
+        noisy = float(np.mean(noise[unit == one]))
+        common.append(float(np.sqrt(max(HIDDEN**2 * (apart[0] - apart[1]), LEAST_COMMON**2))))
+        alone.append(float(np.sqrt(max(apart[2] - noisy, LEAST_ALONE**2))))
+    return ModelError(after_ms=tuple(after), common_mbar=tuple(common), alone_mbar=tuple(alone))
+
+
+def _apart(evidence: Evidence, left: Floats, at: Ints) -> tuple[float, float, float]:
+    """Mean square of bins' means over cycles, what of it is chance, and the variance about them."""
+    place = np.floor(evidence.bins.time[at] * 4).astype(np.int64)
+    squares, chance, within = [], [], []
+    for one in np.unique(place):
+        values = left[at[place == one]]
+        variance = float(np.var(values, ddof=1)) if len(values) > 1 else 0.0
+        squares.append(float(np.mean(values)) ** 2)
+        chance.append(variance / len(values))
+        within.append(variance)
+    return float(np.mean(squares)), float(np.mean(chance)), float(np.mean(within))

@@ -1,0 +1,85 @@
+"""Hypotheses as points: sizes of causes in multiples of what is worth an alarm, with bounds."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from twin.diagnosis.bins import Floats
+from twin.diagnosis.evidence import Evidence, Hypothesis
+from twin.model.courses import HOUR, Cause, Course
+from twin.model.effects import EFFECTS, Parameter
+
+LOCAL_ONSETS = 20  # as many onsets in a cycle can be told apart
+
+
+def parameters(hypothesis: Hypothesis) -> list[Parameter]:
+    """What can be sized in a hypothesis, in order."""
+    return [one for cause in hypothesis for one in EFFECTS[cause.effect].parameters]
+
+
+def bounds(evidence: Evidence, hypothesis: Hypothesis) -> tuple[Floats, Floats]:
+    """Least and greatest sizes, in typical ones away from neutral."""
+    table = [(p, p.neutral(evidence.theta)) for p in parameters(hypothesis)]
+    low = np.array([(p.low - neutral) / p.typical for p, neutral in table])
+    high = np.array([(p.high - neutral) / p.typical for p, neutral in table])
+    return low, high
+
+
+def sized(evidence: Evidence, hypothesis: Hypothesis, x: Floats) -> Hypothesis:
+    """The hypothesis with sizes ``x``, in typical ones away from neutral, kept within bounds.
+
+    A ramp's size is what it has come to at the end of the log.
+    """
+    x = np.clip(x, *bounds(evidence, hypothesis))
+    sizes = iter(x)
+    return tuple(_sized(evidence, cause, sizes) for cause in hypothesis)
+
+
+def _sized(evidence: Evidence, cause: Cause, sizes: Iterator[float]) -> Cause:
+    values = {}
+    for p in EFFECTS[cause.effect].parameters:
+        change = float(next(sizes)) * p.typical
+        if cause.course == Course.RAMP:
+            values[p.name] = change / hours(evidence, cause)
+        else:
+            neutral = p.neutral(evidence.theta)
+            values[p.name] = float(np.clip(neutral + change, p.low, p.high))
+    return replace(cause, values=values)
+
+
+def sizes(evidence: Evidence, hypothesis: Hypothesis) -> Floats:
+    """The sizes of a hypothesis: the inverse of ``sized``."""
+    found = []
+    for cause in hypothesis:
+        for p in EFFECTS[cause.effect].parameters:
+            neutral = p.neutral(evidence.theta)
+            if cause.course == Course.RAMP:
+                change = cause.values.get(p.name, 0.0) * hours(evidence, cause)
+            else:
+                change = cause.values.get(p.name, neutral) - neutral
+            found.append(change / p.typical)
+    return np.array(found)
+
+
+def hours(evidence: Evidence, cause: Cause) -> float:
+    """How long a ramp has gone on at the end of the log."""
+    return max(float(evidence.seconds[-1]) - cause.onset_s, 1e-3) / HOUR
+
+
+def price(evidence: Evidence, hypothesis: Hypothesis) -> float:
+    """Chi-square a hypothesis must be worth: its sizes, and how many like it there are."""
+    return sum(_price(evidence, cause) for cause in hypothesis)
+
+
+def _price(evidence: Evidence, cause: Cause) -> float:
+    effect, cycles = EFFECTS[cause.effect], len(evidence.judged)
+    ways = float(len(EFFECTS))
+    if cause.course == Course.STEP:
+        ways *= LOCAL_ONSETS * cycles
+    elif cause.course == Course.RAMP:
+        ways *= 2.0 if cause.onset_s <= 0.0 else 2.0 * cycles
+    elif cause.course == Course.INTERMITTENT:
+        ways *= 2.0 * math.comb(cycles, min(len(cause.cycles), cycles))
+    return 2.0 * len(effect.parameters) + 2.0 * math.log(ways)

@@ -1,0 +1,117 @@
+"""How far measurement and a model part on cycles that nothing was fitted to."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.diagnosis.bins import Floats, Ints
+from twin.diagnosis.evidence import Evidence, Hypothesis
+from twin.diagnosis.weights import Weights, levels
+from twin.model import theta as c
+from twin.monitor.cycles import H2, PAPER_VACUUM, time_to_vacuum
+from twin.signals import MBAR, MS, Phase
+
+RESAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A hypothesis beside the held-out cycles."""
+
+    expected: Floats  # Pa, of each row of the log
+    off: Floats  # mbar, of each bin
+    squares: Floats  # mean square deviation of each held-out cycle, mbar²
+    leftover: float  # sigmas
+    healthy_rms: float  # mbar, of healthy cycles with phases as long as here
+    figures: dict[str, float | None]
+
+    @property
+    def rms(self) -> float:
+        """Deviation (mbar rms) over all held-out cycles."""
+        return math.sqrt(float(self.squares.mean()))
+
+
+def judge(evidence: Evidence, weights: Weights, hypothesis: Hypothesis) -> Judged:
+    """Deviation, evacuation times and what is left in sigmas on the cycles of ``weights``."""
+    expected = evidence.expected(hypothesis)
+    off = evidence.bins.mean(evidence.samples["pressure"] - expected) / MBAR
+    level = levels(evidence, weights.cycles, [hypothesis])
+    white = weights.white(off[:, None], level)
+    rows = [_rows(evidence, cycle) for cycle in weights.cycles]
+    deviations = [(evidence.samples["pressure"][one] - expected[one]) / MBAR for one in rows]
+    squares = np.array([float(np.mean(one**2)) for one in deviations])
+    binned = off[np.isin(evidence.bins.cycle, weights.cycles)]
+    leftover = float(np.sqrt(np.mean(white**2)))
+    figures: dict[str, float | None] = {
+        "rms_mbar": float(np.sqrt(np.mean(np.concatenate(deviations) ** 2))),
+        "max_mbar": float(np.max(np.abs(binned))),
+        "evacuation_time_error_pct": _time_error(evidence, expected, weights.cycles, PAPER_VACUUM),
+        "h2_time_error_pct": _time_error(evidence, expected, weights.cycles, H2),
+        "leftover_sigma": leftover,
+    }
+    return Judged(
+        expected,
+        off,
+        squares,
+        leftover,
+        _healthy_rms(evidence),
+        {name: None if one is None else rounded(one) for name, one in figures.items()},
+    )
+
+
+def gain(before: Judged, after: Judged) -> dict[str, float]:
+    """Reduction of the rms deviation (%), its interval from resampling the cycles, its share of
+    what could be reached: healthy cycles are not without deviation either.
+    """
+    cycles = len(before.squares)
+    drawn = np.random.default_rng(0).integers(cycles, size=(RESAMPLES, cycles))
+    ratio = np.sqrt(after.squares[drawn].sum(axis=1) / before.squares[drawn].sum(axis=1))
+    low, high = np.percentile(100.0 * (1.0 - ratio), [2.5, 97.5])
+    rms = [one.rms for one in (before, after)]
+    best = min(before.healthy_rms, rms[0])
+    reachable = rms[0] - best
+    return {
+        "rms_reduction_pct": rounded(100.0 * (1.0 - rms[1] / rms[0])),
+        "low95": rounded(float(low)),
+        "high95": rounded(float(high)),
+        "share_of_achievable_pct": rounded(
+            100.0 * min((rms[0] - rms[1]) / reachable, 1.0) if reachable > 0.0 else 0.0
+        ),
+    }
+
+
+def _healthy_rms(evidence: Evidence) -> float:
+    """Deviation (mbar rms) of healthy cycles with phases as long as here."""
+    phase, squares = evidence.ticks["phase"][evidence.bins.number >= 0], 0.0
+    for one in Phase:
+        healthy = evidence.healthy.figures.get(f"{one.name.lower()}_rms")
+        squares += float(np.mean(phase == one)) * (healthy.mean if healthy else 1.0) ** 2
+    return math.sqrt(squares)
+
+
+def _rows(evidence: Evidence, cycle: int) -> Ints:
+    rows = np.arange(evidence.starts[cycle], evidence.starts[cycle + 1])
+    return rows[evidence.bins.number[rows] >= 0]
+
+
+def _time_error(
+    evidence: Evidence, expected: Floats, cycles: Sequence[int], vacuum: float
+) -> float | None:
+    """Mean error of the evacuation time to ``vacuum`` (Pa), %; None where it is not reached."""
+    ambient = float(evidence.theta[c.AMBIENT])
+    errors = []
+    for cycle in cycles:
+        rows = _rows(evidence, cycle)
+        times = evidence.samples["time_ns"][rows]
+        measured = evidence.samples["pressure"][rows].astype(np.float64)
+        found = [time_to_vacuum(vacuum, p, times, ambient) for p in (measured, expected[rows])]
+        if found[0] > MS and math.isfinite(found[1]):
+            errors.append(100.0 * abs(found[1] / found[0] - 1.0))
+    return float(np.mean(errors)) if errors else None
+
+
+def rounded(value: float) -> float:
+    """Four significant digits: more would be a claim."""
+    return float(f"{value:.4g}")

@@ -1,0 +1,126 @@
+"""Parts of the report's page: one HTML file that needs no network, with its style inside.
+
+Everything that comes in as text is escaped; pictures come in as SVG.
+"""
+
+import html
+from collections.abc import Iterable, Sequence
+from string import Template
+
+PAGE = Template("""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>$title</title>
+<style>
+:root { color-scheme: light; }
+body { font: 16px/1.45 system-ui, "Segoe UI", Roboto, "DejaVu Sans", Arial, sans-serif;
+  color: #1a1a1a; background: #fff; max-width: 60rem; margin: 1.5rem auto; padding: 0 1rem; }
+.banner { background: $colour; color: #fff; border-radius: .4rem; padding: .8rem 1.2rem;
+  print-color-adjust: exact; -webkit-print-color-adjust: exact; }
+.banner p { margin: 0; font-weight: 600; letter-spacing: .03em; }
+.banner h1 { margin: .2rem 0 0; font-size: 1.35rem; line-height: 1.3; }
+h2 { font-size: 1.15rem; margin: 2rem 0 .5rem; }
+h3 { font-size: 1rem; margin: 0 0 .3rem; }
+article, aside { border: 1px solid #ccc; border-left: .3rem solid $colour; border-radius: .3rem;
+  padding: .7rem 1rem; margin: .8rem 0; }
+aside { background: #f3f6fa; border-left-color: #0a62a8;
+  print-color-adjust: exact; -webkit-print-color-adjust: exact; }
+article p, aside p { margin: 0; }
+article dl { margin: .5rem 0 0; grid-template-columns: 7.5rem 1fr; }
+figure { margin: 0; overflow-x: auto; }
+svg { width: 100%; min-width: 36rem; height: auto; }
+figcaption, footer { color: #444; font-size: .88rem; }
+footer { border-top: 1px solid #ccc; margin-top: 2rem; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; margin: .3rem 0 1.4rem; min-width: 50%; }
+caption { text-align: left; font-weight: 600; padding: .3rem 0; }
+th, td { text-align: left; padding: .25rem 1.6rem .25rem 0; border-bottom: 1px solid #ddd;
+  vertical-align: top; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1.6rem; }
+dt { color: #444; }
+dd { margin: 0; overflow-wrap: anywhere; }
+thead th { border-bottom: 2px solid #888; font-weight: 600; }
+tbody th { font-weight: 400; white-space: nowrap; }
+td { min-width: 2.5rem; }
+td:nth-child(2) { min-width: 7rem; }
+.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+figure, table, article, aside { break-inside: avoid; }
+h2, h3 { break-after: avoid; }
+@media print {
+  body { margin: 0; max-width: none; padding: 0; font-size: 10.5pt; }
+  svg { min-width: 0; max-height: 8.8cm; }
+  section { break-inside: avoid; }
+}
+</style>
+</head>
+<body>
+<header class="banner">
+<p><span aria-hidden="true">$mark</span> $verdict</p>
+<h1>$headline</h1>
+</header>
+<main>
+$body
+</main>
+<footer>
+$footer
+</footer>
+</body>
+</html>
+""")
+
+
+def section(title: str, body: str) -> str:
+    """A part of the page under a heading."""
+    return f"<section><h2>{html.escape(title)}</h2>\n{body}\n</section>"
+
+
+def picture(title: str, svg: str, caption: str) -> str:
+    """A picture under a heading that says what to conclude."""
+    caption = f"<figcaption>{html.escape(caption)}</figcaption>"
+    return section(title, f"<figure>{svg}{caption}</figure>")
+
+
+def card(title: str, sentence: str, rows: Iterable[tuple[str, str]]) -> str:
+    """One thing found, with what is known of it."""
+    top = f"<h3>{html.escape(title)}</h3>\n<p>{html.escape(sentence)}</p>"
+    return f"<article>{top}\n{pairs(rows)}</article>"
+
+
+def box(title: str, text: str) -> str:
+    """Something to do."""
+    return f"<aside><h3>{html.escape(title)}</h3><p>{html.escape(text)}</p></aside>"
+
+
+def paragraph(text: str) -> str:
+    """A paragraph of text."""
+    return f"<p>{html.escape(text)}</p>"
+
+
+def pairs(rows: Iterable[tuple[str, str]]) -> str:
+    """What and which, side by side."""
+    said = (f"<dt>{html.escape(what)}</dt><dd>{html.escape(which)}</dd>" for what, which in rows)
+    return f"<dl>{''.join(said)}</dl>"
+
+
+def table(
+    caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Iterable[int] = ()
+) -> str:
+    """Return a table; the columns ``numbers`` are set to the right."""
+    right = set(numbers)
+    style = [' class="number"' if i in right else "" for i in range(len(head))]
+    top = "".join(
+        f'<th scope="col"{s}>{html.escape(h)}</th>' for h, s in zip(head, style, strict=True)
+    )
+    body = "".join(f"<tr>{_row(row, style)}</tr>\n" for row in rows)
+    return (
+        f'<div class="wide"><table><caption>{html.escape(caption)}</caption>\n'
+        f"<thead><tr>{top}</tr></thead>\n<tbody>{body}</tbody></table></div>"
+    )
+
+
+def _row(cells: Sequence[str], style: Sequence[str]) -> str:
+    first, *rest = map(html.escape, cells)
+    others = "".join(f"<td{s}>{one}</td>" for one, s in zip(rest, style[1:], strict=True))
+    return f'<th scope="row">{first}</th>{others}'

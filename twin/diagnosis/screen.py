@@ -1,0 +1,207 @@
+"""The linear search: what every effect with every course would explain, alone and in pairs.
+
+The signature of each effect in each cycle is one whitened column; a course is a weight for each
+cycle. So thousands of combinations cost some products of small matrices.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from twin.diagnosis.bins import Floats, Ints
+from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
+from twin.diagnosis.hypotheses import price, sized
+from twin.diagnosis.weights import Weights, levels
+from twin.model.courses import Cause, Course
+from twin.model.effects import EFFECTS, Parameter
+
+SHARE = 0.5  # of its typical size, at which an effect's signature is taken
+ALIKE = 1e-6  # of their lengths' product: two columns are the same
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Whitened signatures of every parameter in every cycle, as products; sizes in typical ones."""
+
+    names: list[tuple[str, Parameter]]  # effect and parameter
+    signs: list[float]  # -1 or 1 where only smaller or greater than neutral is possible, else 0
+    gram: Floats  # (parameters, cycles, parameters, cycles)
+    pull: Floats  # (parameters, cycles), towards what is measured
+
+    def spread(self, number: int, weights: Floats) -> Floats:
+        """A parameter with a weight for each cycle as one row over all columns."""
+        row = np.zeros(self.pull.shape)
+        row[number] = weights
+        return row.reshape(-1)
+
+    def allowed(self, number: int, size: float) -> bool:
+        """Whether an effect can have a size of that sign."""
+        return size * self.signs[number] >= 0.0
+
+
+@dataclass(frozen=True)
+class Promise:
+    """A hypothesis of the linear model: what it gains in chi-square, price included."""
+
+    hypothesis: Hypothesis
+    gain: float
+
+
+@dataclass(frozen=True)
+class _Option:
+    """One parameter with one course."""
+
+    number: int  # of the parameter
+    cause: Cause
+    weights: Floats  # of each cycle
+
+
+def columns(evidence: Evidence, weights: Weights, about: Hypothesis = HEALTHY) -> Columns:
+    """Signatures of all parameters about a hypothesis."""
+    names = [(effect.name, p) for effect in EFFECTS.values() for p in effect.parameters]
+    lone = [Cause(name, {}) for name, _ in names]
+    moved = [
+        (*about, _with_size(evidence, cause, p, SHARE))
+        for cause, (_, p) in zip(lone, names, strict=True)
+    ]
+    hypotheses = [about, *moved]
+    off, level = evidence.off(hypotheses), levels(evidence, weights.cycles, hypotheses)
+    base = weights.white(off[:, :1], level[:, :1])[:, 0]
+    off, level = (off[:, 1:] - off[:, :1]) / SHARE, (level[:, 1:] - level[:, :1]) / SHARE
+    parts = []
+    for cycle in weights.cycles:
+        inside = (evidence.bins.cycle == cycle)[:, None]
+        parts.append(weights.white(off * inside, level * (weights.level_cycles == cycle)[:, None]))
+    signatures = np.stack(parts, axis=2)  # (residuals, parameters, cycles)
+    size = signatures.shape[1:]
+    flat = signatures.reshape(len(base), -1)
+    gram, pull = flat.T @ flat, -(flat.T @ base)
+    signs = [_sign(evidence, p) for _, p in names]
+    return Columns(names, signs, gram.reshape(*size, *size), pull.reshape(size))
+
+
+def _sign(evidence: Evidence, p: Parameter) -> float:
+    neutral = p.neutral(evidence.theta)
+    return float(p.high > neutral) - float(p.low < neutral)
+
+
+def promises(evidence: Evidence, weights: Weights, found: Columns, each: int) -> list[Promise]:
+    """The best courses (``each`` of them) of every parameter, the most promising first."""
+    result: list[Promise] = []
+    for number in range(len(found.names)):
+        best: dict[Course, Promise] = {}
+        for option in _options(evidence, weights, found, number):
+            promise = _alone(evidence, found, option)
+            before = best.get(option.cause.course)
+            if before is None or promise.gain > before.gain:
+                best[option.cause.course] = promise
+        result += sorted(best.values(), key=lambda one: -one.gain)[:each]
+    return sorted(result, key=lambda one: -one.gain)
+
+
+def pairs(
+    evidence: Evidence, weights: Weights, found: Columns, singles: Sequence[Promise]
+) -> list[Promise]:
+    """Pairs of promises that explain more together, both sizes fitted, the best first."""
+    options = [_option(evidence, weights, found, one.hypothesis[0]) for one in singles]
+    rows = np.stack([found.spread(one.number, one.weights) for one in options])
+    size = found.pull.size
+    gram = rows @ found.gram.reshape(size, size) @ rows.T
+    pull = rows @ found.pull.reshape(size)
+    result = []
+    for two in combinations(range(len(options)), 2):
+        one, other = (options[i] for i in two)
+        square = gram[np.ix_(two, two)]
+        apart = square[0, 0] * square[1, 1] - square[0, 1] ** 2
+        if one.cause.effect == other.cause.effect or apart <= ALIKE * square[0, 0] * square[1, 1]:
+            continue
+        sizes = np.linalg.solve(square, pull[list(two)])
+        if found.allowed(one.number, sizes[0]) and found.allowed(other.number, sizes[1]):
+            both = tuple(
+                _with_size(evidence, option.cause, found.names[option.number][1], float(times))
+                for option, times in zip((one, other), sizes, strict=True)
+            )
+            result.append(Promise(both, float(pull[list(two)] @ sizes) - price(evidence, both)))
+    return sorted(result, key=lambda one: -one.gain)
+
+
+def _alone(evidence: Evidence, found: Columns, option: _Option) -> Promise:
+    """What one parameter with one course gains."""
+    power = option.weights @ found.gram[option.number, :, option.number] @ option.weights
+    pull = float(option.weights @ found.pull[option.number])
+    size = pull / max(float(power), 1e-9)
+    if not found.allowed(option.number, size):
+        size = 0.0
+    p = found.names[option.number][1]
+    hypothesis = (_with_size(evidence, option.cause, p, size),)
+    return Promise(hypothesis, size * pull - price(evidence, hypothesis))
+
+
+def _options(
+    evidence: Evidence, weights: Weights, found: Columns, number: int
+) -> Iterator[_Option]:
+    """All courses of a parameter that the cycles can tell apart."""
+    name = found.names[number][0]
+    cycles = np.array(weights.cycles)
+    causes = [Cause(name, {}), Cause(name, {}, Course.RAMP)]
+    for onset in evidence.seconds[evidence.starts[cycles[1:]]]:
+        causes += [Cause(name, {}, course, float(onset)) for course in (Course.STEP, Course.RAMP)]
+    for chosen in _striking(found, number):
+        struck = frozenset(int(n) for n in evidence.numbers[cycles[chosen]])
+        causes.append(Cause(name, {}, Course.INTERMITTENT, cycles=struck))
+    for cause in causes:
+        yield _Option(number, cause, share_of_cycles(evidence, weights, cause))
+
+
+def _striking(found: Columns, number: int) -> Iterator[Ints]:
+    """Sets of cycles that an intermittent effect may be in: those where it is largest.
+
+    Sizes are estimated together: what cycles have in common is cheap for a data set that is not
+    quite sure, so that a cycle without the effect would look like one with less than none.
+    """
+    square = found.gram[number, :, number]
+    cycles = len(square)
+    steady = 1e-3 * np.trace(square) / cycles * np.eye(cycles)
+    sizes = np.linalg.solve(square + steady, found.pull[number])
+    for sign in (1.0, -1.0):
+        if not found.allowed(number, sign):
+            continue
+        order = np.argsort(-sign * sizes)
+        for count in range(1, cycles):
+            chosen = np.sort(order[:count])
+            if chosen[0] != cycles - count:  # else it is a step
+                yield chosen
+
+
+def _option(evidence: Evidence, weights: Weights, found: Columns, cause: Cause) -> _Option:
+    names = [(name, p.name) for name, p in found.names]
+    number = names.index((cause.effect, next(iter(cause.values))))
+    return _Option(number, cause, share_of_cycles(evidence, weights, cause))
+
+
+def share_of_cycles(evidence: Evidence, weights: Weights, cause: Cause) -> Floats:
+    """How much of its size a cause has in each cycle; a ramp's size is what it comes to."""
+    cycles = np.array(weights.cycles)
+    begins = evidence.seconds[evidence.starts[cycles]]
+    ends = evidence.seconds[evidence.starts[cycles + 1] - 1]
+    last = float(evidence.seconds[-1])
+    match cause.course:
+        case Course.STEP:
+            share: Floats = np.clip((ends - cause.onset_s) / (ends - begins), 0.0, 1.0)
+            return share
+        case Course.RAMP:
+            past: Floats = np.maximum((begins + ends) / 2.0 - cause.onset_s, 0.0)
+            return past / max(last - cause.onset_s, 1e-3)
+        case Course.INTERMITTENT:
+            return np.isin(evidence.numbers[cycles], list(cause.cycles)).astype(float)
+    return np.ones(len(cycles))
+
+
+def _with_size(evidence: Evidence, cause: Cause, parameter: Parameter, size: float) -> Cause:
+    """A cause with one of its parameters that many typical sizes away from neutral."""
+    effect = EFFECTS[cause.effect]
+    x = np.array([size if p is parameter else 0.0 for p in effect.parameters])
+    (whole,) = sized(evidence, (cause,), x)
+    return replace(whole, values={parameter.name: whole.values[parameter.name]})

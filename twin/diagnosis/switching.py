@@ -1,0 +1,66 @@
+"""How the air saving's switching would be seen: the model runs free, and its knees are looked for.
+
+A knee is found where lines on either side of it meet. A slow sensor rounds it, so it is seen later
+and at another level than it happened; all that is the same here as in the log.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.model import kernel
+from twin.model import theta as c
+from twin.model.theta import Theta
+from twin.monitor.phases import Knees, PhaseFinder
+from twin.signals import MBAR, MS, SAMPLE, Command, Phase
+
+IDLE_ROWS = 50  # before the cycle
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Vacuum (mbar) at which the nozzle was seen to go off and on; NaN where it did not switch.
+
+    Rows from when the valve acted until it was seen, and how much (Pa) the level found was above
+    what the sensor read then; 0 where it did not switch.
+    """
+
+    off: float
+    on: float
+    off_rows: int = 0
+    on_rows: int = 0
+    off_above: float = 0.0
+    on_above: float = 0.0
+
+
+def seen(theta: Theta, rows: int, knees: Knees) -> Seen:
+    """Command suction for ``rows`` from rest, let the model run free and look for its knees."""
+    commands = np.full(IDLE_ROWS + rows, Command.SUCTION, np.uint8)
+    commands[:IDLE_ROWS] = 0
+    phase, expected = np.empty(len(commands), np.uint8), np.empty(len(commands))
+    dt = np.full(len(commands), MS)
+    kernel.simulate(kernel.at_rest(theta), theta, dt, commands, phase, expected)
+    samples = np.zeros(len(commands), SAMPLE)
+    samples["sequence"] = np.arange(len(commands))
+    samples["time_ns"] = np.arange(len(commands)) * 1_000_000
+    samples["pressure"], samples["commands"] = expected, commands
+    finder = PhaseFinder(knees)
+    (_, early, low), (_, late, high) = finder.push(samples), finder.flush()
+    found, level = np.concatenate([early, late]), np.concatenate([low, high])
+    off = _one(theta, phase, expected, found, level, Phase.HOLD)
+    on = _one(theta, phase, expected, found, level, Phase.SUCTION)
+    return Seen(off[0], on[0], off[1], on[1], off[2], on[2])
+
+
+def _one(theta: Theta, phase, expected, found, level, name: Phase):  # type: ignore[no-untyped-def]
+    """Vacuum, rows and level above the reading, for the first switching into ``name``."""
+    before = Phase.SUCTION if name == Phase.HOLD else Phase.HOLD
+    switched = np.flatnonzero((phase[1:] == name) & (phase[:-1] == before)) + 1
+    knees = np.flatnonzero(np.isfinite(level) & (found == name))
+    knees = knees[np.isin(found[knees - 1], (before, name)) & (knees > IDLE_ROWS + 1)]
+    if not len(switched) or not len(knees):
+        return np.nan, 0, 0.0
+    response = theta[c.RESPONSE_OFF if name == Phase.HOLD else c.RESPONSE]
+    rows = int(knees[0] - switched[0] - round(float(response) / MS))
+    vacuum = (theta[c.AMBIENT_NOMINAL] - level[knees[0]]) / MBAR
+    return float(vacuum), rows, float(level[knees[0]] - expected[knees[0]])

@@ -1,0 +1,183 @@
+"""What a residual weighs: the covariance of noise, cycle-to-cycle scatter and the model's error.
+
+Scatter differs from cycle to cycle and averages out. The model's own error is the same in all of
+them and does not; where a hypothesis explains much, a share of that is its error as well.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag, solve_triangular
+
+from twin.diagnosis.bins import Floats, Ints, warped
+from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
+from twin.model.courses import Cause, Schedule
+from twin.model.term import KINDS
+from twin.model.theta import Theta
+from twin.monitor.healthy import ModelError
+from twin.signals import MS
+
+# What differs from cycle to cycle in a healthy ejector: effect, parameter, one standard deviation
+# where nothing better was learned.
+SCATTER: Mapping[str, tuple[str, float]] = {
+    "supply_pressure_drop": ("drop", 0.02),
+    "leakage": ("sonic_flow", 0.03),
+    "response_delay": ("delay", 0.5),
+    "blow_off_delay": ("delay", 0.5),
+}
+MISMATCH = 0.03  # of what a hypothesis explains, is off in its waveform
+LEVELS = ("h1_level", "h1_low_level")
+LEVEL_MBAR = 0.5  # a switching level is not known better, in all cycles alike
+UNKNOWN_LEVEL_MBAR = 3.0  # of a level that healthy cycles do not show
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Whitens the residuals of some cycles: each becomes one of sigma 1, all independent."""
+
+    cycles: tuple[int, ...]  # positions
+    bins: Ints  # of these cycles
+    factor: Floats  # lower Cholesky factor of the covariance of bins, then levels
+    sigma: Floats  # of each level
+    level_cycles: Ints  # of each level, positions
+
+    def white(self, off: Floats, levels: Floats | None = None) -> Floats:
+        """Residuals of hypotheses (mbar), (bins, n) and (levels, n), in sigmas."""
+        rest = np.zeros((len(self.sigma), off.shape[1])) if levels is None else levels
+        both = np.concatenate([off[self.bins], rest])
+        result: Floats = solve_triangular(self.factor, both, lower=True, check_finite=False)
+        return result
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """What bins of the judged cycles have in common about a hypothesis (mbar)."""
+
+    evidence: Evidence
+    mismatch: Floats  # of what is explained, in each bin
+    moves: Floats  # by one sigma of each scatter, (bins, scatters)
+    left_open: Floats  # by one sigma of each way that the data set is uncertain, (bins, ways)
+
+    def of(self, cycles: Sequence[int], *, scattered: bool = True) -> Weights:
+        """Weights of some cycles; where not ``scattered``, that is told apart by somebody else."""
+        evidence, bins = self.evidence, self.evidence.bins
+        here = np.flatnonzero(np.isin(bins.cycle, cycles))
+        cycle, stretch, kind = (of[here] for of in (bins.cycle, bins.stretch, bins.kind))
+        time = bins.time[here]
+        common, alone = _errors(evidence, kind, time)
+        common = np.hypot(common, self.mismatch[here])
+        moves, left_open = self.moves[here] * float(scattered), self.left_open[here]
+        apart = np.exp(-np.abs(time[:, None] - time))
+        covariance = moves @ moves.T * (cycle[:, None] == cycle) + left_open @ left_open.T
+        covariance += np.outer(common, common) * (apart * (kind[:, None] == kind))
+        covariance += np.outer(alone, alone) * (apart * (stretch[:, None] == stretch))
+        covariance[np.diag_indices_from(covariance)] += evidence.noise**2 / bins.count[here]
+        sigma = _level_sigmas(evidence, cycles)
+        levels = np.diag(sigma**2) + _together(evidence, cycles)
+        factor = np.linalg.cholesky(block_diag(covariance * evidence.healthy.leftover**2, levels))
+        shown = np.array([one for one, _ in _shown(evidence, cycles)], np.int64)
+        return Weights(tuple(cycles), here, factor, sigma, shown)
+
+
+def covariance(evidence: Evidence, about: Hypothesis = HEALTHY) -> Covariance:
+    """What scatters and is uncertain about a hypothesis."""
+    scattered = [
+        (*about, Cause(name, {key: size})) for name, (key, size) in scatter(evidence).items()
+    ]
+    hypotheses = [about, HEALTHY, *scattered, *[about] * len(evidence.uncertain)]
+    bases = [evidence.theta] * (2 + len(scattered)) + list(evidence.uncertain)
+    off = evidence.off(hypotheses, bases)
+    moved = off[:, 2:] - off[:, :1]
+    explained = MISMATCH * np.abs(off[:, 1] - off[:, 0])
+    return Covariance(evidence, explained, moved[:, : len(scattered)], moved[:, len(scattered) :])
+
+
+def scatter(evidence: Evidence) -> dict[str, tuple[str, float]]:
+    """What scatters: effect to parameter and one standard deviation."""
+    known = evidence.healthy.scatter
+    return {name: (key, known.get(name, size)) for name, (key, size) in SCATTER.items()}
+
+
+def _errors(evidence: Evidence, kind: Ints, time: Floats) -> tuple[Floats, Floats]:
+    """The model's error in bins (mbar): in all cycles alike, and from cycle to cycle."""
+    common, alone = np.empty(len(kind)), np.empty(len(kind))
+    for number, name in enumerate(KINDS):
+        here = kind == number
+        error = evidence.healthy.error.get(name) or _like(evidence.healthy.error)
+        knots = warped(np.array(error.after_ms) * MS)
+        common[here] = np.interp(time[here], knots, error.common_mbar)
+        alone[here] = np.interp(time[here], knots, error.alone_mbar)
+    return common, alone
+
+
+def _like(known: Mapping[str, ModelError]) -> ModelError:
+    """The error of a kind of stretch that healthy cycles did not have: the worst of the others."""
+    worst = [max(max(getattr(one, key)) for one in known.values()) for key in _ERRORS]
+    return ModelError(after_ms=(0.0,), common_mbar=(worst[0],), alone_mbar=(worst[1],))
+
+
+_ERRORS = ("common_mbar", "alone_mbar")
+
+
+# --- levels: one row for each that a cycle shows --------------------------------------------------
+
+
+def levels(evidence: Evidence, cycles: Sequence[int], hypotheses: Sequence[Hypothesis]) -> Floats:
+    """Measured minus expected switching levels (mbar) of cycles, (levels, hypotheses)."""
+    shown = _shown(evidence, cycles)
+    at = [
+        [_in_cycle(evidence, course, cycle) for cycle, _ in shown]
+        for course in map(evidence.course, hypotheses)
+    ]
+    evidence.look(theta for one in at for theta in one)
+    found = [
+        [
+            _level(evidence, cycle, number, theta)
+            for (cycle, number), theta in zip(shown, one, strict=True)
+        ]
+        for one in at
+    ]
+    return np.array(found).reshape(len(hypotheses), -1).T
+
+
+def _shown(evidence: Evidence, cycles: Sequence[int]) -> list[tuple[int, int]]:
+    """Cycle and index into LEVELS of each level that was measured."""
+    return [
+        (cycle, number)
+        for cycle in cycles
+        for number, name in enumerate(LEVELS)
+        if name in evidence.figures[cycle]
+    ]
+
+
+def _in_cycle(evidence: Evidence, course: Schedule, cycle: int) -> Theta:
+    """The coefficients at the beginning of a cycle."""
+    return [theta for row, theta in course if row <= evidence.starts[cycle]][-1]
+
+
+def _level(evidence: Evidence, cycle: int, number: int, theta: Theta) -> float:
+    """Measured minus expected level (mbar)."""
+    here, base = evidence.seen(theta), evidence.seen(evidence.theta)
+    expected, as_it_is = (here.off, base.off) if number == 0 else (here.on, base.on)
+    if healthy := evidence.healthy.figures.get(LEVELS[number]):
+        expected += healthy.mean - as_it_is
+    off = evidence.figures[cycle][LEVELS[number]] - expected
+    return 0.0 if np.isnan(off) else off  # it never comes there: its curve says that
+
+
+def _level_sigmas(evidence: Evidence, cycles: Sequence[int]) -> Floats:
+    sigmas = []
+    for _, number in _shown(evidence, cycles):
+        healthy = evidence.healthy.figures.get(LEVELS[number])
+        sigmas.append(healthy.sigma if healthy else UNKNOWN_LEVEL_MBAR)
+    return np.array(sigmas)
+
+
+def _together(evidence: Evidence, cycles: Sequence[int]) -> Floats:
+    """Covariance of levels that cycles have in common."""
+    number = np.array([number for _, number in _shown(evidence, cycles)])
+    known = np.array([LEVELS[n] in evidence.healthy.figures for n in number], bool)
+    size = np.where(known, LEVEL_MBAR, UNKNOWN_LEVEL_MBAR)
+    common: Floats = np.outer(size, size) * (number[:, None] == number)
+    return common

@@ -1,0 +1,216 @@
+"""The answer in words: what people read on the terminal, beside an alarm and on the page.
+
+All of it is read from the answer as the contract has it, which may come from another process.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from twin.model.courses import Course
+from twin.model.effects import EFFECTS
+
+Answer = Mapping[str, Any]
+MOST_LISTED = 12  # cycles named one by one
+LONG_S = 120.0  # from here on times are said in minutes
+COUNTED = ("No", "One", "Two", "Three")
+
+# Key in the answer, what it is, in few words, unit.
+FIGURES = (
+    ("rms_mbar", "rms deviation", "rms", "mbar"),
+    ("max_mbar", "largest deviation", "max", "mbar"),
+    ("evacuation_time_error_pct", "error of the time to 600 mbar", "time to 600 mbar off by", "%"),
+    ("h2_time_error_pct", "error of the time to H2", "time to H2 off by", "%"),
+    ("leftover_sigma", "leftover (healthy: about 1)", "leftover", "sigma"),
+)
+
+
+def lines(answer: Answer) -> str:
+    """The answer in a few lines of plain text."""
+    said = [f"{answer['verdict']}: {headline(answer)}"]
+    said += [f"  {label:<14} {text}" for label, text in _facts(answer)]
+    return "\n".join(said)
+
+
+def headline(answer: Answer) -> str:
+    """One sentence for the technician."""
+    causes = answer["causes"]
+    match answer["verdict"]:
+        case "consistent":
+            left = number(answer["baseline"]["rms_mbar"])
+            return f"The ejector does what its twin expects; {left} mbar rms left over are healthy."
+        case "explained" if len(causes) == 1:
+            (cause,) = causes
+            return f"{EFFECTS[cause['effect']].sentence} – {size(cause)}, {when(cause)}."
+        case "explained":
+            each = (f"{size(cause)}, {when(cause)}" for cause in causes)
+            names = (spoken(cause["effect"]) for cause in causes)
+            named = listed([f"{name} ({one})" for name, one in zip(names, each, strict=True)])
+            return f"{COUNTED[len(causes)]} causes together: {named}."
+        case "unlisted":
+            return f"{_known(causes)} {left_over(answer)}."
+    return f"The log cannot answer: {answer['next_experiment']}."
+
+
+def _known(causes: Sequence[Answer]) -> str:
+    if not causes:
+        return "No listed cause explains the deviation in"
+    verb = "explains" if len(causes) == 1 else "explain"
+    named = listed([sized(cause) for cause in causes])
+    return f"{_capital(named)} {verb} a part; no listed cause explains what is left in"
+
+
+def left_over(answer: Answer) -> str:
+    """Where something unknown remains, and of what shape."""
+    unlisted = answer["unlisted"]
+    return f"{spoken(unlisted['where'])}: {unlisted['shape']}"
+
+
+def _facts(answer: Answer) -> Iterator[tuple[str, str]]:
+    """Labelled lines for the terminal."""
+    for cause in answer["causes"]:
+        yield from about(cause, sure=answer["verdict"] == "explained")
+    yield from to_do(answer)
+    if answer["verdict"] == "insufficient":
+        return
+    yield (
+        "unseen cycles",
+        ", ".join(f"{short} {change(answer, key)} {unit}" for key, _, short, unit in FIGURES),
+    )
+    if extended(answer):
+        yield "gain", gain(answer["gain"])
+    cycles = answer["cycles"]
+    fitted, held_out = some(cycles["fitted"]), some(cycles["held_out"])
+    yield "cycles", f"{cycles['total']}; fitted: {fitted}; held out: {held_out}"
+
+
+def about(cause: Answer, *, sure: bool) -> Iterator[tuple[str, str]]:
+    """What is known of one cause, and where to look for it."""
+    yield "cause" if sure else "a part of it", spoken(cause["effect"])
+    yield "size", "; ".join(_sizes(cause))
+    yield "when", when(cause, interval=True)
+    if sure:
+        yield "how sure", certainty(cause)
+    yield "look at", EFFECTS[cause["effect"]].look_at
+    for name in cause["not_separable_from"]:
+        yield "or it may be", f"{spoken(name)}; then look at {EFFECTS[name].look_at}"
+
+
+def to_do(answer: Answer) -> Iterator[tuple[str, str]]:
+    """What to find out and to record next."""
+    if answer["verdict"] == "unlisted":
+        where, depends = spoken(answer["unlisted"]["where"]), answer["unlisted"]["depends_on"]
+        yield "find out", f"what in {where} differs from when the twin was calibrated"
+        if depends:
+            yield "it depends on", listed([spoken(one) for one in depends])
+    if answer["verdict"] == "insufficient":
+        yield "next", "put this right, record again and diagnose the new log"
+    elif answer["next_experiment"]:
+        yield "next recording", answer["next_experiment"]
+
+
+# --- one cause ------------------------------------------------------------------------------------
+
+
+def sized(cause: Answer) -> str:
+    """The cause with its size, short."""
+    return f"{spoken(cause['effect'])} ({size(cause)})"
+
+
+def size(cause: Answer) -> str:
+    """How big it is, or has become by the end of the log."""
+    known = cause["parameters"]
+    return ", ".join(
+        (f"{spoken(name)} " if len(known) > 1 else "")
+        + f"{number(p.get('at_end', p['value']))} {p['unit'].removesuffix('/h')}"
+        for name, p in known.items()
+    )
+
+
+def _sizes(cause: Answer) -> Iterator[str]:
+    for name, p in cause["parameters"].items():
+        grown = ""
+        if "at_end" in p:
+            grown = f"{number(p['at_end'])} {p['unit'].removesuffix('/h')} by the end, growing by "
+        between = f"95 %: {number(p['low95'])} to {number(p['high95'])}"
+        yield f"{spoken(name)} {grown}{number(p['value'])} {p['unit']} ({between})"
+
+
+def when(cause: Answer, *, interval: bool = False) -> str:
+    """How it runs in time; with the ``interval`` of an onset and the cycles where it is there."""
+    match Course(cause["course"]):
+        case Course.STEP:
+            low, high = cause["onset_low95_s"], cause["onset_high95_s"]
+            known = f" (95 %: {clock(low)} to {clock(high)})" if interval else ""
+            return f"since {clock(cause['onset_s'])} into the log{known}"
+        case Course.RAMP if cause["onset_s"] > 0.0:
+            return f"growing since {clock(cause['onset_s'])} into the log"
+        case Course.RAMP:
+            return "growing from the beginning of the log"
+        case Course.INTERMITTENT:
+            which = f": {some(cause['cycles'])}" if interval else ""
+            return f"in {number(cause['share_pct'])} % of the cycles{which}"
+    return "in all of the log"
+
+
+def certainty(cause: Answer) -> str:
+    """How sure it is, with what the log cannot tell from it."""
+    percent = 100.0 * cause["probability"]
+    sure = "more than 99 %" if percent > 99.0 else f"{percent:.0f} %"
+    alike = listed([spoken(name) for name in cause["not_separable_from"]], "or")
+    return f"{sure}; " + (f"this log cannot tell it from {alike}" if alike else "no look-alikes")
+
+
+# --- numbers and lists ----------------------------------------------------------------------------
+
+
+def change(answer: Answer, key: str) -> str:
+    """A figure of the twin as it stands, and with the causes if there are any."""
+    before, after = (number(answer[part][key]) for part in ("baseline", "extended"))
+    return f"{before} → {after}" if extended(answer) else before
+
+
+def extended(answer: Answer) -> bool:
+    """Whether there is a model that is not just the twin as it stands."""
+    return bool(answer["causes"]) or answer["extended"] != answer["baseline"]
+
+
+def gain(known: Answer) -> str:
+    """How much less deviation there is, and what share of what can be gained at all."""
+    low, high = number(known["low95"]), number(known["high95"])
+    less = f"{number(known['rms_reduction_pct'])} % less rms deviation (95 %: {low} to {high})"
+    return f"{less}, {number(known['share_of_achievable_pct'])} % of what can be gained"
+
+
+def number(value: float | None) -> str:
+    """Three significant digits, without an exponent."""
+    return "–" if value is None else f"{float(f'{value:.3g}'):.10g}"
+
+
+def clock(seconds: float) -> str:
+    """A time in the log."""
+    if seconds < LONG_S:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s"
+
+
+def some(cycles: Sequence[int]) -> str:
+    """Cycles by number, as many as one reads."""
+    if len(cycles) <= MOST_LISTED:
+        return ", ".join(map(str, cycles))
+    return f"{', '.join(map(str, cycles[:3]))} … {cycles[-1]} ({len(cycles)} cycles)"
+
+
+def listed(parts: Sequence[str], last: str = "and") -> str:
+    """A list as people say it."""
+    *first, end = parts or [""]
+    return f"{', '.join(first)} {last} {end}" if first else end
+
+
+def spoken(name: str) -> str:
+    """A name as people say it."""
+    return name.replace("blow_off", "blow-off").replace("_", " ")
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
