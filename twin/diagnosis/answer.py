@@ -107,13 +107,17 @@ def diagnose(
 def _verdict(found: Hypothesis, before: Judged, after: Judged, strange: Unlisted) -> str:
     """Consistent, explained, or something real is left."""
     left = after.leftover > EXPLAINED
-    if left or strange.gain >= STRANGE or (found and not _takes_away(before, after)):
+    mimicked = len(found) > 1 and not _takes_away(before, after)
+    if left or strange.gain >= STRANGE or mimicked:
         return "unlisted"
     return "explained" if found else "consistent"
 
 
 def _takes_away(before: Judged, after: Judged) -> bool:
-    """Whether causes take away the most of what was far more than healthy cycles have."""
+    """Whether causes take away the most of what was far more than healthy cycles have.
+
+    Several together can look like something that nobody listed, but not all along its curve.
+    """
     gross = before.rms > GROSS * before.healthy_rms
     return not gross or before.rms - after.rms > LEAST_SHARE * (before.rms - before.healthy_rms)
 
