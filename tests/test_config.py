@@ -339,7 +339,11 @@ def test_a_logs_data_set_of_another_shape_is_named_with_its_key(
     [
         ("{", "line 1 column 2"),
         ("5", "data: Input should be a valid dictionary"),
-        ("{}", "data.ambient, data.supply, data.ejector, data.sensor, data.system: missing"),
+        (
+            "{}",
+            "data.ambient, data.supply, data.ejector, data.sensor, data.system, data.effects,"
+            " data.terms: missing",
+        ),
         (whole_json(sensor={"noise_mbar": 0.4}), "data.sensor.lag_ms: missing"),
         (
             whole_json(

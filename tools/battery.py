@@ -191,9 +191,8 @@ def _covers(cause: Mapping[str, Any], truth: Hidden) -> bool | None:
     if not cause["parameters"] or cause["course"] != truth.course:
         return None
     found = next(iter(cause["parameters"].values()))
-    scale = found["at_end"] / found["value"] if "at_end" in found and found["value"] else 1.0
-    low, high = sorted((found["low95"] * scale, found["high95"] * scale))
-    return bool(low <= truth.size <= high)
+    of = "at_end_" if truth.course == "ramp" else ""
+    return bool(found[f"{of}low95"] <= truth.size <= found[f"{of}high95"])
 
 
 def judge_pair(answer: Mapping[str, Any], hidden: Sequence[Hidden], tally: Tally) -> str:

@@ -248,7 +248,8 @@ def _parameters(
             "high95": rounded(high * scale),
         }
         if ramp:
-            found[p.name]["at_end"] = rounded(value)
+            for name, change in (("at_end", value), ("at_end_low95", low), ("at_end_high95", high)):
+                found[p.name][name] = rounded(p.neutral(evidence.theta) + change)
     return found
 
 
