@@ -11,7 +11,7 @@ from calibrations import CYCLES, beside, calibrated, log_of, quiet, rig, typed
 
 from tools.calibration_coverage import SYSTEMS, TRUE, drawn, misses, recorded
 from twin.calibration.calibrate import calibrate
-from twin.calibration.cycles import Cycles, warped
+from twin.calibration.cycles import Cycles
 from twin.calibration.fit import fit
 from twin.calibration.left_out import with_left_out
 from twin.calibration.parameters import FREE, directions, values, with_values
@@ -19,6 +19,7 @@ from twin.calibration.report import as_json, in_words
 from twin.calibration.store import store
 from twin.config import Config
 from twin.diagnosis.answer import diagnose
+from twin.diagnosis.bins import warped
 from twin.errors import ConfigError
 from twin.live import Twin, run
 from twin.model import theta as c
@@ -220,12 +221,12 @@ def test_what_was_stored_is_what_the_configuration_gives(tmp_path: Path) -> None
 
 def test_bins_cross_no_phase_change_and_hold_every_row_once() -> None:
     cycles = Cycles.found(log_of("gripper"), calibrated("gripper").fitted.data)
-    used = cycles.bin >= 0
-    assert (np.bincount(cycles.bin[used]) == cycles.bins.count).all()
+    used = cycles.bins.number >= 0
+    assert (np.bincount(cycles.bins.number[used]) == cycles.bins.count).all()
     changes = np.flatnonzero(np.diff(cycles.phase)) + 1
-    assert (cycles.bin[changes] != cycles.bin[changes - 1]).all()
-    assert (np.diff(cycles.bin[used]) >= 0).all()
-    assert cycles.bins.cycle.max() == CYCLES + 2  # the first, and what is cut at the end
+    assert (cycles.bins.number[changes] != cycles.bins.number[changes - 1]).all()
+    assert (np.diff(cycles.bins.number[used]) >= 0).all()
+    assert cycles.bins.cycle.max() == CYCLES + 1  # the first, and what is cut at the end
     assert used[cycles.phase == Phase.SUCTION].all()
 
 

@@ -13,7 +13,10 @@ from drivers.plc.simulate import blocks
 from tools import battery
 from twin.config import Config
 from twin.diagnosis.answer import Diagnosis, diagnose
+from twin.diagnosis.evidence import HEALTHY, collect, thinned
+from twin.diagnosis.search import sharpened
 from twin.errors import ConfigError
+from twin.model.courses import Cause, Course
 from twin.settings import Document
 from twin.signals import Command, Quality, Samples
 
@@ -131,6 +134,26 @@ def test_the_answer_has_the_form_that_others_rely_on() -> None:
     assert set(answer["baseline"]) == set(answer["extended"]) == figures | {"h2_time_error_pct"}
     assert set(answer["gain"]) >= {"rms_reduction_pct", "low95", "high95"}
     assert set(answer["runners_up"][0]) == {"effect", "course", "leftover_sigma"}
+
+
+def test_of_a_long_log_some_cycles_are_looked_at_as_in_the_whole() -> None:
+    whole = collect(CONFIG, record(40.0, "leakage=1", seed=26))
+    part = thinned(whole, whole.judged, 6)
+    assert len(part.judged) == 6
+    assert list(part.numbers[part.judged]) == sorted({*part.numbers[part.judged]})
+    off = [one.off([HEALTHY])[:, 0] for one in (whole, part)]
+    for position in part.judged[1::2]:  # the second of each pair: the model has swung in
+        number = part.numbers[position]
+        here = off[1][part.bins.cycle == position]
+        assert here == pytest.approx(off[0][whole.bins.cycle == number], abs=0.1)  # mbar
+
+
+def test_a_step_in_a_long_log_begins_when_all_cycles_say() -> None:
+    whole = collect(CONFIG, record(66.0, "leakage=1.5@31.3", seed=27))
+    part = thinned(whole, whole.judged, 6)
+    guess = (Cause("leakage", {"sonic_flow": 1.5}, Course.STEP, 36.0),)
+    (sharp,) = sharpened(whole, part, guess)
+    assert sharp.onset_s == pytest.approx(31.3, abs=0.1)
 
 
 def test_too_few_cycles_are_insufficient() -> None:

@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -10,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import twin
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from twin.cli import main
 from twin.model import theta as c
 from twin.model.dataset import coefficients
 from twin.paper.evacuation import (
@@ -266,15 +265,6 @@ def test_picture_says_what_to_conclude(tmp_path: Path) -> None:
         "vacuum (mbar below ambient)",
     ):
         assert said in drawn
-
-
-def twin(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
-    monkeypatch.setattr(sys, "argv", ["twin", *map(str, arguments)])
-    try:
-        main()
-    except SystemExit as left:
-        return int(left.code or 0)
-    return 0
 
 
 def test_command_prints_and_writes(

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.calibration.cycles import Cycles, Floats
+from twin.calibration.cycles import Cycles
 from twin.calibration.weights import weighted
+from twin.diagnosis.bins import Floats
 from twin.errors import ConfigError
 from twin.model.effects import EFFECTS, Parameter, apply
 from twin.model.theta import Theta

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from twin.calibration.cycles import Bins, Cycles, Floats, Ints
+from twin.calibration.cycles import Cycles
+from twin.diagnosis.bins import Bins, Floats, Ints
 from twin.diagnosis.weights import SCATTER
 from twin.model import theta as c
 from twin.model.effects import apply
@@ -52,7 +53,7 @@ def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> Wei
     if fitted:
         error, cycle_error = _errors(off[:, 0], bins, noise)
     error = np.hypot(error, LATE * _slope(cycles))
-    numbers = np.unique(bins.cycle[bins.cycle > 0])
+    numbers = np.unique(bins.cycle[bins.cycle >= 0])
     parts = []
     for one in numbers:
         here = np.flatnonzero(bins.cycle == one)
@@ -70,10 +71,8 @@ def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> Wei
 
 def _slope(cycles: Cycles) -> Floats:
     """Slope of the measured pressure in each bin (Pa/s)."""
-    used = cycles.bin >= 0
-    slope = np.gradient(np.nan_to_num(cycles.samples["pressure"].astype(np.float64))) / MS
-    mean: Floats = np.bincount(cycles.bin[used], slope[used]) / cycles.bins.count
-    return mean
+    pressure = np.nan_to_num(cycles.samples["pressure"].astype(np.float64))
+    return cycles.bins.mean(np.gradient(pressure) / MS)
 
 
 def _errors(off: Floats, bins: Bins, noise: float) -> tuple[Floats, Floats]:

@@ -187,7 +187,7 @@ def _causes(evidence: Evidence, searched: Search, before: Judged) -> list[dict[s
         entry: dict[str, Any] = {
             "effect": cause.effect,
             "course": str(cause.course),
-            "onset_s": rounded_onset(cause),
+            "onset_s": _rounded_onset(cause),
             "parameters": values,
             "probability": _probability(found, rivals),
             "not_separable_from": [_stranger(one, found) for one in rivals],
@@ -216,7 +216,7 @@ def _probability(found: Fitted, rivals: list[Fitted]) -> float:
     return round(1.0 / (1.0 + sum(weights)), 3)
 
 
-def rounded_onset(cause: Cause) -> float | None:
+def _rounded_onset(cause: Cause) -> float | None:
     """When a step or ramp began, s since the log did."""
     timed = cause.course in (Course.STEP, Course.RAMP)
     return round(cause.onset_s, 3) if timed else None

@@ -28,6 +28,7 @@ class Bins:
     stretch: Ints  # of one phase, counted over all rows
     kind: Ints  # of stretch, index into KINDS
     time: Floats  # warped, since the stretch began
+    place: Ints  # the same number for what is alike from cycle to cycle: kind and time
 
     def mean(self, values: Floats) -> Floats:
         """Mean over each bin of row-by-row ``values``, (rows, ...) to (bins, ...)."""
@@ -54,21 +55,31 @@ def unwarped(time: Floats) -> Floats:
     return seconds
 
 
-def binned(phase: npt.NDArray[np.uint8], usable: npt.NDArray[np.bool_], starts: Ints) -> Bins:
-    """Bins of rows whose phases are given; ``starts`` are the first rows of cycles."""
+def binned(
+    phase: npt.NDArray[np.uint8],
+    usable: npt.NDArray[np.bool_],
+    starts: Ints,
+    per_unit: int = PER_UNIT,
+) -> Bins:
+    """Bins of rows whose phases are given; ``starts`` are the first rows of cycles.
+
+    What comes before the first of them belongs to cycle -1.
+    """
     rows = np.arange(len(phase))
     begins = np.diff(phase, prepend=255) != 0
     begins[starts[starts < len(rows)]] = True
     first = np.flatnonzero(begins)
     stretch = np.cumsum(begins) - 1
     time = warped((rows - first[stretch]) * MS)
-    place = (stretch << 16) + np.floor(time * PER_UNIT).astype(np.int64)
+    step = np.floor(time * per_unit).astype(np.int64)
+    place = (stretch << 16) + step
     _, at, number, count = np.unique(
         place[usable], return_index=True, return_inverse=True, return_counts=True
     )
     here = rows[usable][at]
-    kind = kinds(phase[first], phase[np.maximum(first - 1, 0)])
+    kind = kinds(phase[first], phase[np.maximum(first - 1, 0)])[stretch[here]]
     result = np.full(len(phase), -1)
     result[usable] = number
     cycle = np.searchsorted(starts, here, "right") - 1
-    return Bins(result, count, cycle, stretch[here], kind[stretch[here]], time[here])
+    alike = (kind << 16) + step[here]
+    return Bins(result, count, cycle, stretch[here], kind, time[here], alike)

@@ -101,7 +101,7 @@ def _error(evidence: Evidence, left: Floats, here: Ints) -> ModelError:
 
 def _apart(evidence: Evidence, left: Floats, at: Ints) -> tuple[float, float, float]:
     """Mean square of bins' means over cycles, what of it is chance, and the variance about them."""
-    place = np.floor(evidence.bins.time[at] * 4).astype(np.int64)
+    place = evidence.bins.place[at]
     squares, chance, within = [], [], []
     for one in np.unique(place):
         values = left[at[place == one]]

@@ -265,18 +265,19 @@ def sharpened(whole: Evidence, part: Evidence, hypothesis: Hypothesis) -> Hypoth
 def _sharp_onset(whole: Evidence, part: Evidence, others: Hypothesis, cause: Cause) -> Cause:
     begins = whole.seconds[whole.starts[:-1]]
     near = part.seconds[part.starts[part.judged]]
-    low = near[near < cause.onset_s].max(initial=begins[whole.judged[0]])
-    high = near[near > cause.onset_s].min(initial=np.inf)
+    here = int(np.searchsorted(near, cause.onset_s))
+    low = near[here - 2] if here >= 2 else begins[whole.judged[0]]
+    high = near[here + 1] if here + 1 < len(near) else np.inf
     while True:
         inside = [one for one in whole.judged if low <= begins[one] <= high]
         looked = thinned(whole, inside, ONSETS)
         judged = covariance(looked, (*others, cause)).of(looked.judged)
-        if len(inside) <= ONSETS:
-            return _with_onset(looked, judged, (*others, cause))[-1]
         tried = looked.seconds[looked.starts[looked.judged]]
         best = int(np.argmin(_misfits(looked, judged, others, cause, tried)))
-        low, high = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
         cause = replace(cause, onset_s=float(tried[best]))
+        if len(inside) <= ONSETS:
+            return _with_onset(looked, judged, (*others, cause))[-1]
+        low, high = tried[max(best - 2, 0)], tried[min(best + 2, len(tried) - 1)]
 
 
 def _misfits(
