@@ -235,6 +235,8 @@ class _Viewer:
         quiet = {**os.environ, "CI": "1", "RUST_LOG": "error"}
         self._process = subprocess.Popen(command, env=quiet, start_new_session=True)  # noqa: S603
         self._wait_for(port)
+        if self.url:
+            self._wait_for(page)
 
     def running(self) -> bool:
         """Say whether the process lives; the user may have closed its window."""
