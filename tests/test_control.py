@@ -128,7 +128,7 @@ def nozzle(
     """Whether the nozzle is on, asked every ``dt`` with suction commanded; vacuum in mbar."""
     state = nothing_done() if state is None else state
     k = theta.reshape(-1, 1)
-    return [bool(switch(state, True, mbar * MBAR, dt, k)) for mbar in vacuum]
+    return [bool(switch(state, True, mbar * MBAR, dt, k, 0)) for mbar in vacuum]
 
 
 @compiling
@@ -149,9 +149,9 @@ def test_between_its_points_the_nozzle_stays_as_it_is(vacuum: list[float]) -> No
 def test_what_is_not_asked_for_is_off_and_begins_anew() -> None:
     state, k = nothing_done(), saving(c.ON).reshape(-1, 1)
     state[CONTINUOUS] = 1.0
-    assert not switch(state, False, 800 * MBAR, MS, k)
+    assert not switch(state, False, 800 * MBAR, MS, k, 0)
     assert state[CONTINUOUS] == 0.0
-    assert switch(state, True, 700 * MBAR, MS, k)
+    assert switch(state, True, 700 * MBAR, MS, k, 0)
 
 
 SWINGS = [800.0, 500.0] * 10  # off and on again

@@ -77,7 +77,11 @@ ASKED = {
     "pairs": 0.85,
     "consistent": 29.0 / 30.0,
     "unlisted": 0.85,
+    "left": 0.95,
+    "gain": 0.90,
 }
+MOST_LEFT = 1.2  # sigmas, where explained
+LEAST_GAIN = 90.0  # % of what could be gained, where explained
 
 
 @dataclass(frozen=True)
@@ -235,6 +239,11 @@ def run(kind: str, seeds: range, units: int, tally: Tally) -> Iterator[str]:
             tally.count(**{"named" if kind == "single" else kind: False})
             continue
         outcome = KINDS[kind][1](answer, hidden, tally)
+        if answer["verdict"] == "explained":
+            tally.count(
+                left=answer["extended"]["leftover_sigma"] <= MOST_LEFT,
+                gain=answer["gain"]["share_of_achievable_pct"] >= LEAST_GAIN,
+            )
         spent = time.perf_counter() - begin
         told = f"{kind} {seed} {one.name}: {_said(hidden)} -> {_found(answer)}"
         yield f"{outcome:<14} {told} {spent:.0f} s"
@@ -252,7 +261,8 @@ def _found(answer: Mapping[str, Any]) -> str:
         for one in answer["causes"]
     )
     left = answer["extended"]["leftover_sigma"]
-    return f"{answer['verdict']} {causes} (left {left})"
+    gained = answer["gain"]["share_of_achievable_pct"] if answer["gain"] else 0.0
+    return f"{answer['verdict']} {causes} (left {left}, gain {gained:.0f} %)"
 
 
 def table(tally: Tally) -> Iterator[str]:

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csr_array
 
 from twin.model.term import kinds
 from twin.signals import MS
 
 EARLIEST_S, LATEST_S = 5e-3, 0.3  # how long an error goes on, at an edge and long after it
 PER_UNIT = 4  # bins in each unit of warped time
+SPARSE, FARTHEST = 20, 10  # rows kept: one in as many as a SPARSEth of those past, at most FARTHEST
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
@@ -38,6 +40,18 @@ class Bins:
         first = np.searchsorted(self.number[used], np.arange(len(self.count)))
         sums: Floats = np.add.reduceat(values[used], first, axis=0)
         return sums / self.count.reshape(-1, *[1] * (values.ndim - 1))
+
+    def through(self, kept: Ints) -> csr_array:
+        """The mean over each bin of straight lines through the rows ``kept``, (bins, kept)."""
+        used = np.flatnonzero(self.number >= 0)
+        after = np.searchsorted(kept, used)
+        before = np.maximum(after - 1, 0)
+        share = (kept[after] - used) / np.maximum(kept[after] - kept[before], 1)
+        bins, weight = self.number[used], 1.0 / self.count[self.number[used]]
+        parts = np.concatenate([weight * share, weight * (1.0 - share)])
+        there = parts > 0.0
+        where = np.tile(bins, 2)[there], np.concatenate([before, after])[there]
+        return csr_array((parts[there], where), shape=(len(self.count), len(kept)))
 
 
 def warped(seconds: Floats) -> Floats:
@@ -83,3 +97,15 @@ def binned(
     cycle = np.searchsorted(starts, here, "right") - 1
     alike = (kind << 16) + step[here]
     return Bins(result, count, cycle, stretch[here], kind, time[here], alike)
+
+
+def sparse(begins: npt.NDArray[np.bool_]) -> Ints:
+    """Rows that suffice to draw a curve whose bends begin at some rows: fewer, the later after."""
+    offsets = [0]
+    while offsets[-1] < len(begins):
+        offsets.append(offsets[-1] + min(max(offsets[-1] // SPARSE, 1), FARTHEST))
+    rows = np.arange(len(begins))
+    since = rows - np.maximum.accumulate(np.where(begins, rows, 0))
+    kept = np.isin(since, offsets) | np.roll(begins, -1)  # the last ones before as well
+    kept[-1:] = True
+    return np.flatnonzero(kept)

@@ -8,13 +8,14 @@ switched against the vacuum at which the hypothesis would.
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from itertools import groupby
+from functools import cached_property
+from itertools import chain
 
 import numpy as np
 import numpy.typing as npt
 
 from twin.config import Config
-from twin.diagnosis.bins import Bins, Floats, Ints, binned
+from twin.diagnosis.bins import Bins, Floats, Ints, binned, sparse
 from twin.diagnosis.switching import Seen, seen
 from twin.errors import ConfigError
 from twin.live import Twin
@@ -28,10 +29,10 @@ from twin.monitor.cycles import Cycle, CycleCutter, figures
 from twin.monitor.healthy import Healthy
 from twin.monitor.phases import Knees, expected_knees
 from twin.monitor.signatures import steps
-from twin.signals import MBAR, NS, SAMPLE, TICK, UNUSABLE, Command, Phase, Samples, Ticks
+from twin.signals import MBAR, MS, NS, SAMPLE, TICK, UNUSABLE, Command, Phase, Samples, Ticks
 
 WORKERS = 2
-LONGEST_SUCTION = 10_000  # rows
+LATER, LONGEST_SUCTION = 1.3, 10_000  # cycles' suction, rows: until when H1 may be reached
 
 Hypothesis = tuple[Cause, ...]
 HEALTHY: Hypothesis = ()
@@ -55,6 +56,7 @@ class Evidence:
     terms: tuple[Term, ...]  # that data gave the data set
     knees: Knees  # how they were looked for
     uncertain: tuple[Theta, ...]  # data sets as likely, a sigma away where no log decided
+    rows: Ints  # that suffice to draw what is expected
     _seen: dict[bytes, Seen] = field(default_factory=dict)  # by coefficients
 
     @property
@@ -62,13 +64,13 @@ class Evidence:
         """How many complete cycles there are."""
         return len(self.starts) - 1
 
-    @property
+    @cached_property
     def seconds(self) -> Floats:
         """Time of each row since the log began."""
         times: Floats = (self.samples["time_ns"] - self.begin_ns) * NS
         return times
 
-    @property
+    @cached_property
     def cycle_of_row(self) -> Ints:
         """Number of the cycle of each row."""
         return np.repeat(self.numbers, np.diff(self.starts))
@@ -81,7 +83,9 @@ class Evidence:
     def expected(self, hypothesis: Hypothesis) -> Floats:
         """Pressure (Pa) that the sensor should read at each row."""
         course = self.course(hypothesis)
-        return self._run([course], self._sensing(self.theta, course))[:, 0]
+        phase, level = self._switched(self._sensing([self.theta], [course]))
+        rows = np.arange(len(self.samples))
+        return self._run([course], phase, level, rows, kernel.TOLERANCE)[:, 0]
 
     def off(self, hypotheses: Sequence[Hypothesis], bases: Sequence[Theta] | None = None) -> Floats:
         """Measured minus expected pressure (mbar) in each bin, (bins, hypotheses).
@@ -91,78 +95,112 @@ class Evidence:
         bases = [self.theta] * len(hypotheses) if bases is None else bases
         pairs = list(zip(bases, hypotheses, strict=True))
         courses = [self.course(one, base) for base, one in pairs]
-        sensing = [self._sensing(base, course) for base, course in zip(bases, courses, strict=True)]
-        order = sorted(range(len(courses)), key=lambda i: sensing[i])
-        alike = groupby(order, key=lambda i: sensing[i])  # the nozzle switches at the same rows
-        jobs = [job for _, group in alike for job in _in_lanes(list(group))]
+        sensing = self._sensing(bases, courses)
+        measured = self.bins.mean(self.samples["pressure"].astype(np.float64))
+        lanes = [slice(i, i + kernel.LANES) for i in range(0, len(courses), kernel.LANES)]
 
-        def run(job: Sequence[int]) -> Floats:
-            expected = self._run([courses[i] for i in job], sensing[job[0]])
-            return self.bins.mean(self.samples["pressure"][:, None] - expected) / MBAR
+        def run(lane: slice) -> Floats:
+            phase, level = self._switched(sensing[lane])
+            rows = self._drawn(courses[lane], phase)
+            expected = self._run(courses[lane], phase, level, rows, kernel.ROUGHLY)
+            off: Floats = (measured[:, None] - self.bins.through(rows) @ expected) / MBAR
+            return off
 
         found = np.empty((len(self.bins.count), len(courses)))
         with ThreadPoolExecutor(WORKERS) as pool:
-            for job, off in zip(jobs, pool.map(run, jobs), strict=True):
-                found[:, job] = off
+            for lane, off in zip(lanes, pool.map(run, lanes), strict=True):
+                found[:, lane] = off
         return found
 
-    def _run(self, courses: Sequence[Schedule], sensing: "Sensing") -> Floats:
-        """Expected pressures (Pa), (rows, courses), of courses that switch at the same rows."""
-        dt = steps(self.samples, None)
-        phase, level = self._switched(sensing)
-        expected = np.empty((len(dt), len(courses)))
+    def _drawn(self, courses: Sequence[Schedule], phase: npt.NDArray[np.uint8]) -> Ints:
+        """Rows that suffice to draw what these courses expect."""
+        if self.terms:  # they count rows
+            return np.arange(len(phase))
+        changes = np.concatenate(
+            [
+                np.flatnonzero(np.diff(phase, axis=0).any(axis=1)) + 1,
+                *([row for row, _ in course if row] for course in courses),
+            ]
+        ).astype(np.int64)
+        return np.unique(np.concatenate([self.rows, changes - 1, changes]))
+
+    def _run(
+        self,
+        courses: Sequence[Schedule],
+        phase: npt.NDArray[np.uint8],
+        level: Floats,
+        rows: Ints,
+        tolerance: float,
+    ) -> Floats:
+        """Expected pressures (Pa) at ``rows``, (rows, courses)."""
+        times = np.cumsum(steps(self.samples, None))[rows]
+        dt = np.diff(times, prepend=0.0)
+        phase, level = phase[rows], level[rows]
+        expected = np.empty((len(rows), len(courses)))
         state, before = kernel.new_state(len(courses)), None
-        for first, last, theta in _together(courses, len(dt)):
-            part = slice(first, last)
+        for first, last, theta in _together(courses, len(self.samples)):
+            part = slice(*np.searchsorted(rows, (first, last)))
             if before is not None:
                 kernel.take_over(state, before, theta)
             before = theta
-            kernel.advance(state, theta, dt[part], phase[part], level[part], expected[part])
-        Terms(self.terms, float(self.theta[c.AMBIENT])).add(phase, expected)
+            driven = dt[part], phase[part], level[part]
+            kernel.advance(state, theta, *driven, expected[part], tolerance=tolerance)
+        for phases, one in zip(phase.T, expected.T, strict=True):
+            Terms(self.terms, float(self.theta[c.AMBIENT])).add(phases, one)
         return expected
 
-    def _sensing(self, base: Theta, course: Schedule) -> "Sensing":
+    def _sensing(
+        self, bases: Sequence[Theta], courses: Sequence[Schedule]
+    ) -> list[tuple["Sensing", ...]]:
         """How much earlier than it is seen the nozzle switches, and what that does to the level.
 
         It is the same for all coefficients but those of jet and sensor.
         """
+        stretches = [self._alike(base, course) for base, course in zip(bases, courses, strict=True)]
+        self.look([*bases, *(alike for some in stretches for _, alike in some)])
+        return [
+            tuple(Sensing.of(row, self.seen(alike), self.seen(base)) for row, alike in some)
+            for base, some in zip(bases, stretches, strict=True)
+        ]
+
+    def _alike(self, base: Theta, course: Schedule) -> Schedule:
+        """The coefficients of a course that hold at knees, with jet and sensor alone changed."""
         if all((theta[_SENSING] == base[_SENSING]).all() for _, theta in course):
-            return ()
-        as_it_is, found = self.seen(base), []
-        begins, knees = [row for row, _ in course], self._knees()
-        for number in np.unique(np.searchsorted(begins, knees, "right") - 1):
+            return []
+        begins, found = [row for row, _ in course], []
+        for number in np.unique(np.searchsorted(begins, self._knees, "right") - 1):
             row, theta = course[number]
             alike = base.copy()
             alike[_SENSING] = theta[_SENSING]
-            here = self.seen(alike)
-            found.append(
-                (
-                    row,
-                    here.off_rows - as_it_is.off_rows,
-                    here.on_rows - as_it_is.on_rows,
-                    here.off_above - as_it_is.off_above,
-                    here.on_above - as_it_is.on_above,
-                )
-            )
-        return tuple(found)
+            found.append((row, alike))
+        return found
 
-    def _switched(self, sensing: "Sensing") -> tuple[npt.NDArray[np.uint8], Floats]:
-        """Phases and levels, as the nozzle must have switched to be seen as it was."""
-        phase: npt.NDArray[np.uint8] = self.ticks["phase"].copy()
-        level: Floats = self.ticks["level"].astype(np.float64)
-        if not any(value for _, *values in sensing for value in values):
-            return phase, level
-        begins = [row for row, *_ in sensing]
-        for knee in self._knees():
-            _, off, on, above_off, above_on = sensing[np.searchsorted(begins, knee, "right") - 1]
-            name = Phase(int(self.ticks["phase"][knee]))
-            closing = name == Phase.HOLD
-            earlier, known = (off, 0) if closing else (on, self.knees.on_shift)
-            level[knee] -= above_off if closing else above_on
-            phase[max(knee - known, 0) : knee] = _OTHER[name]
-            phase[max(knee - known - earlier, 0) : knee] = name
+    def _switched(
+        self, sensing: Sequence[tuple["Sensing", ...]]
+    ) -> tuple[npt.NDArray[np.uint8], Floats]:
+        """Phases and levels, (rows, n), as the nozzle must have switched to be seen as it was."""
+        phase = np.repeat(self.ticks["phase"][:, None], len(sensing), axis=1)
+        level = np.repeat(self.ticks["level"].astype(np.float64)[:, None], len(sensing), axis=1)
+        for i, some in enumerate(sensing):
+            if some:
+                self._move(phase[:, i], level[:, i], some)
         return phase, level
 
+    def _move(
+        self, phase: npt.NDArray[np.uint8], level: Floats, sensing: Sequence["Sensing"]
+    ) -> None:
+        """Move the switching of one hypothesis, in place."""
+        begins = [one.row for one in sensing]
+        for knee in self._knees:
+            here = sensing[np.searchsorted(begins, knee, "right") - 1]
+            name = Phase(int(self.ticks["phase"][knee]))
+            closing = name == Phase.HOLD
+            earlier, known = (here.off, 0) if closing else (here.on, self.knees.on_shift)
+            level[knee] -= here.off_above if closing else here.on_above
+            phase[max(knee - known, 0) : knee] = _OTHER[name]
+            phase[max(knee - known - earlier, 0) : knee] = name
+
+    @cached_property
     def _knees(self) -> Ints:
         """Rows at which the air saving was seen to switch."""
         phase = self.ticks["phase"]
@@ -184,15 +222,36 @@ class Evidence:
             return
         cycle = slice(self.starts[self.judged[0]], self.starts[self.judged[0] + 1])
         suction = int(np.count_nonzero(self.samples["commands"][cycle] == Command.SUCTION))
-        rows = min(2 * suction, LONGEST_SUCTION)  # long enough for H1 to be reached at last
+        rows = min(int(LATER * suction), LONGEST_SUCTION)
+        thetas = list(new.values())
+        lanes = [thetas[i : i + kernel.LANES] for i in range(0, len(thetas), kernel.LANES)]
         with ThreadPoolExecutor(WORKERS) as pool:
-            found = pool.map(lambda theta: seen(theta, rows, self.knees), new.values())
-            self._seen.update(zip(new, found, strict=True))
+            found = pool.map(lambda lane: seen(lane, rows, self.knees), lanes)
+            self._seen.update(zip(new, chain.from_iterable(found), strict=True))
 
 
-# Where coefficients change; by how many rows the nozzle's closing and opening come earlier than in
-# the calibrated twin; by how much more (Pa) the level found at each is above what is read there.
-Sensing = tuple[tuple[int, int, int, float, float], ...]
+@dataclass(frozen=True)
+class Sensing:
+    """How much earlier than in the calibrated twin the nozzle switches to be seen when it was."""
+
+    row: int  # from which on
+    off: int  # rows, closing
+    on: int  # rows, opening
+    off_above: float  # Pa, by how much more the level found is above what is read there
+    on_above: float
+
+    @classmethod
+    def of(cls, row: int, here: Seen, as_it_is: Seen) -> "Sensing":
+        """Compare with the calibrated twin."""
+        return cls(
+            row,
+            here.off_rows - as_it_is.off_rows,
+            here.on_rows - as_it_is.on_rows,
+            here.off_above - as_it_is.off_above,
+            here.on_above - as_it_is.on_above,
+        )
+
+
 _OTHER = {Phase.HOLD: Phase.SUCTION, Phase.SUCTION: Phase.HOLD}
 _SENSING = [c.SENSOR_LAG, c.SLOW_SENSOR, c.RAMP_UP, c.SLOW_RAMP_UP, c.RAMP_DOWN]
 
@@ -205,11 +264,6 @@ def _together(courses: Sequence[Schedule], rows: int) -> Iterator[tuple[int, int
     for first, last in zip(changes, [*changes[1:], rows], strict=True):
         now = [changed.get(first, before) for changed, before in zip(at, now, strict=True)]
         yield first, last, np.stack(now, axis=1)
-
-
-def _in_lanes(jobs: list[int]) -> Iterator[list[int]]:
-    for first in range(0, len(jobs), kernel.LANES):
-        yield jobs[first : first + kernel.LANES]
 
 
 def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
@@ -233,6 +287,7 @@ def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
         healthy=config.monitor.healthy,
         noise=config.data.sensor.noise_mbar,
         bins=_binned(np.empty(0, SAMPLE), np.empty(0, TICK), np.zeros(1, np.int64), []),
+        rows=np.empty(0, np.int64),
         terms=config.data.terms,
         knees=expected_knees(theta, config.data.sensor.noise_mbar * MBAR),
         uncertain=tuple(_uncertain(config)),
@@ -257,6 +312,7 @@ def of_log(beside: Evidence, blocks: Iterable[Samples]) -> Evidence:
         judged=judged,
         figures=[figures(cycle, beside.theta[c.AMBIENT]) for cycle in cycles],
         bins=_binned(samples, ticks, starts, judged),
+        rows=_rows(samples, ticks),
     )
 
 
@@ -297,6 +353,7 @@ def of_cycles(evidence: Evidence, cycles: Sequence[int]) -> Evidence:
         judged=judged,
         figures=[evidence.figures[k] for k in kept],
         bins=_binned(samples, ticks, starts, judged),
+        rows=_rows(samples, ticks),
     )
 
 
@@ -319,3 +376,14 @@ def _binned(samples: Samples, ticks: Ticks, starts: Ints, judged: Sequence[int])
     usable &= np.isfinite(ticks["expected"])
     usable &= np.isin(np.searchsorted(starts, np.arange(len(samples)), "right") - 1, judged)
     return binned(ticks["phase"], usable, starts)
+
+
+def _rows(samples: Samples, ticks: Ticks) -> Ints:
+    """Rows that suffice to draw what is expected: every one where something changes."""
+    begins = np.diff(ticks["phase"], prepend=255) != 0
+    begins |= np.isfinite(ticks["level"])
+    known = np.isfinite(ticks["expected"])
+    begins |= np.diff(known, prepend=False) != 0
+    dt = steps(samples, None)
+    begins |= (dt < 0.5 * MS) | (dt > 1.5 * MS)
+    return sparse(begins)

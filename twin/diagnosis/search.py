@@ -26,8 +26,10 @@ SHARE = (
 )
 SMALLEST = 0.2  # of an effect's typical size: less is within what calibration leaves
 SAME = 10.8  # chi-square up to which a log cannot reject a rival (one in a thousand)
+HOPEFUL = 5.0  # chi-square that the linear model must promise of one more cause
 TRIED_PAIRS, TRIED_MORE, TRIED_TIMES = 12, 8, 6
 SECOND = 0.5  # of the best gain, above which an effect's second course is fitted as well
+NEARLY = 0.3  # of the best gain, above which an effect may turn out to be a rival
 START = np.array([0.4, 1.0, 1.7, 2.5, 3.5, 5.0])  # typical sizes to begin a fit from
 ONSETS = 16  # in a round of looking for when a step began
 ONSET_S = 0.01  # to which it is found
@@ -153,13 +155,13 @@ def _best_addition(
     about = found.hypothesis
     promised = promises(evidence, judged, columns(evidence, judged, about), each=2)
     new = [one for one in promised if one.hypothesis[0].effect not in found.effects]
-    candidates = _started(evidence, judged, [(*about, *one.hypothesis) for one in new[:TRIED_MORE]])
+    new = [one for one in new[:TRIED_MORE] if one.gain > HOPEFUL]
+    candidates = _started(evidence, judged, [(*about, *one.hypothesis) for one in new])
     if len(about) == 1:
         alone = columns(evidence, judged)
         singles = promises(evidence, judged, alone, each=2)
-        candidates += [
-            one.hypothesis for one in pairs(evidence, judged, alone, singles)[:TRIED_PAIRS]
-        ]
+        two = pairs(evidence, judged, alone, singles)[:TRIED_PAIRS]
+        candidates += [one.hypothesis for one in two if one.gain > singles[0].gain + HOPEFUL]
     candidates = _timed(evidence, judged, candidates)
     tried = _ranked(fit(evidence, weights, candidates))
     for one in tried:
@@ -214,6 +216,7 @@ def _rivals(
                 (*others, *one.hypothesis)
                 for one in promised
                 if one.hypothesis[0].effect not in found.effects
+                and one.gain > NEARLY * promised[0].gain
             ][:TRIED_PAIRS]
             fitted = _ranked(fit(evidence, weights, _timed(evidence, judged, tried)))
         else:

@@ -4,17 +4,21 @@ A knee is found where lines on either side of it meet. A slow sensor rounds it, 
 and at another level than it happened; all that is the same here as in the log.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
+from twin.diagnosis.bins import Floats
 from twin.model import kernel
 from twin.model import theta as c
 from twin.model.theta import Theta
 from twin.monitor.phases import Knees, PhaseFinder
-from twin.signals import MBAR, MS, SAMPLE, Command, Phase
+from twin.signals import MBAR, MS, SAMPLE, Command, Phase, Samples
 
 IDLE_ROWS = 50  # before the cycle
+Bytes = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -33,17 +37,25 @@ class Seen:
     on_above: float = 0.0
 
 
-def seen(theta: Theta, rows: int, knees: Knees) -> Seen:
+def seen(thetas: Sequence[Theta], rows: int, knees: Knees) -> list[Seen]:
     """Command suction for ``rows`` from rest, let the model run free and look for its knees."""
     commands = np.full(IDLE_ROWS + rows, Command.SUCTION, np.uint8)
     commands[:IDLE_ROWS] = 0
-    phase, expected = np.empty(len(commands), np.uint8), np.empty(len(commands))
-    dt = np.full(len(commands), MS)
-    kernel.simulate(kernel.at_rest(theta), theta, dt, commands, phase, expected)
+    together = np.stack(thetas, axis=1)
+    phase = np.empty((len(commands), len(thetas)), np.uint8)
+    expected = np.empty(phase.shape)
+    driven = np.full(len(commands), MS), commands
+    state = kernel.at_rest(together)
+    kernel.simulate(state, together, *driven, phase, expected, kernel.ROUGHLY)
     samples = np.zeros(len(commands), SAMPLE)
     samples["sequence"] = np.arange(len(commands))
     samples["time_ns"] = np.arange(len(commands)) * 1_000_000
-    samples["pressure"], samples["commands"] = expected, commands
+    samples["commands"] = commands
+    return [_seen(samples, *each, knees) for each in zip(thetas, phase.T, expected.T, strict=True)]
+
+
+def _seen(samples: Samples, theta: Theta, phase: Bytes, expected: Floats, knees: Knees) -> Seen:
+    samples["pressure"] = expected
     finder = PhaseFinder(knees)
     (_, early, low), (_, late, high) = finder.push(samples), finder.flush()
     found, level = np.concatenate([early, late]), np.concatenate([low, high])
@@ -52,7 +64,9 @@ def seen(theta: Theta, rows: int, knees: Knees) -> Seen:
     return Seen(off[0], on[0], off[1], on[1], off[2], on[2])
 
 
-def _one(theta: Theta, phase, expected, found, level, name: Phase):  # type: ignore[no-untyped-def]
+def _one(
+    theta: Theta, phase: Bytes, expected: Floats, found: Bytes, level: Floats, name: Phase
+) -> tuple[float, int, float]:
     """Vacuum, rows and level above the reading, for the first switching into ``name``."""
     before = Phase.SUCTION if name == Phase.HOLD else Phase.HOLD
     switched = np.flatnonzero((phase[1:] == name) & (phase[:-1] == before)) + 1

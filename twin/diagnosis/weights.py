@@ -4,6 +4,7 @@ Scatter differs from cycle to cycle and averages out. The model's own error is t
 them and does not; where a hypothesis explains much, a share of that is its error as well.
 """
 
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -12,7 +13,7 @@ from scipy.linalg import block_diag, solve_triangular
 
 from twin.diagnosis.bins import Floats, Ints, warped
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
-from twin.model.courses import Cause, Schedule
+from twin.model.courses import Cause, Course, Schedule
 from twin.model.term import KINDS
 from twin.model.theta import Theta
 from twin.monitor.healthy import ModelError
@@ -126,19 +127,36 @@ _ERRORS = ("common_mbar", "alone_mbar")
 def levels(evidence: Evidence, cycles: Sequence[int], hypotheses: Sequence[Hypothesis]) -> Floats:
     """Measured minus expected switching levels (mbar) of cycles, (levels, hypotheses)."""
     shown = _shown(evidence, cycles)
-    at = [
-        [_in_cycle(evidence, course, cycle) for cycle, _ in shown]
-        for course in map(evidence.course, hypotheses)
+    begins = evidence.starts[[cycle for cycle, _ in shown]]
+    nodes = [_nodes(evidence, begins, one) for one in hypotheses]
+    there = [
+        [_at(course, row) for row in rows]
+        for course, rows in zip(map(evidence.course, hypotheses), nodes, strict=True)
     ]
-    evidence.look(theta for one in at for theta in one)
-    found = [
-        [
-            _level(evidence, cycle, number, theta)
-            for (cycle, number), theta in zip(shown, one, strict=True)
-        ]
-        for one in at
-    ]
-    return np.array(found).reshape(len(hypotheses), -1).T
+    evidence.look(theta for some in there for theta in some)
+    found = np.empty((len(shown), len(hypotheses)))
+    for i, (rows, some) in enumerate(zip(nodes, there, strict=True)):
+        seen = np.array([[one.off, one.on] for one in map(evidence.seen, some)]).reshape(-1, 2)
+        for j, (cycle, number) in enumerate(shown):
+            expected = float(np.interp(begins[j], rows, seen[:, number])) if len(rows) else 0.0
+            found[j, i] = _level(evidence, cycle, number, expected)
+    return found
+
+
+def _nodes(evidence: Evidence, begins: Ints, hypothesis: Hypothesis) -> Ints:
+    """Rows at which a hypothesis is looked at, to know its switching at ``begins`` of cycles.
+
+    What grows steadily is looked at in its middle and at its ends.
+    """
+    if not {cause.course for cause in hypothesis} <= {Course.CONSTANT, Course.RAMP}:
+        return np.unique(begins)
+    nodes: set[int] = {*begins[:1], *begins[-1:]}
+    for cause in hypothesis:
+        if cause.course == Course.RAMP:
+            grown = begins[evidence.seconds[begins] > cause.onset_s]
+            before = begins[evidence.seconds[begins] <= cause.onset_s]
+            nodes |= {*before[-1:], *grown[:1], *grown[len(grown) // 2 : len(grown) // 2 + 1]}
+    return np.array(sorted(nodes), np.int64)
 
 
 def _shown(evidence: Evidence, cycles: Sequence[int]) -> list[tuple[int, int]]:
@@ -151,17 +169,16 @@ def _shown(evidence: Evidence, cycles: Sequence[int]) -> list[tuple[int, int]]:
     ]
 
 
-def _in_cycle(evidence: Evidence, course: Schedule, cycle: int) -> Theta:
-    """The coefficients at the beginning of a cycle."""
-    return [theta for row, theta in course if row <= evidence.starts[cycle]][-1]
+def _at(course: Schedule, row: int) -> Theta:
+    """The coefficients at a row."""
+    return course[bisect_right(course, row, key=lambda one: one[0]) - 1][1]
 
 
-def _level(evidence: Evidence, cycle: int, number: int, theta: Theta) -> float:
+def _level(evidence: Evidence, cycle: int, number: int, expected: float) -> float:
     """Measured minus expected level (mbar)."""
-    here, base = evidence.seen(theta), evidence.seen(evidence.theta)
-    expected, as_it_is = (here.off, base.off) if number == 0 else (here.on, base.on)
+    base = evidence.seen(evidence.theta)
     if healthy := evidence.healthy.figures.get(LEVELS[number]):
-        expected += healthy.mean - as_it_is
+        expected += healthy.mean - (base.off, base.on)[number]
     off = evidence.figures[cycle][LEVELS[number]] - expected
     return 0.0 if np.isnan(off) else off  # it never comes there: its curve says that
 

@@ -47,29 +47,29 @@ def part_present(before, vacuum, k, i):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def switch(control, asked, vacuum, dt, k):  # type: ignore[no-untyped-def]
+def switch(control, asked, vacuum, dt, k, i):  # type: ignore[no-untyped-def]
     """Say whether the nozzle is to be on: suction is ``asked`` for and air is not being saved.
 
     ``control`` is the state (``CONTROL`` values), ``vacuum`` (Pa) what its sensor says, ``dt`` the
-    seconds since it was asked last.
+    seconds since it was asked last. ``i`` is the hypothesis.
     """
     control[TIME] += dt
     if not asked:
         control[SAVING] = control[CONTINUOUS] = 0.0
         return False
-    mode = k[c.AIR_SAVING, 0]
+    mode = k[c.AIR_SAVING, i]
     if mode == c.OFF or control[CONTINUOUS] > 0.0:
         control[SAVING] = 0.0
         return True
     before = control[SAVING]
-    control[SAVING] = air_saving(before, vacuum, k, 0)
+    control[SAVING] = air_saving(before, vacuum, k, i)
     if control[SAVING] > before:
         control[OFF_SINCE], control[OFF_VACUUM] = control[TIME], vacuum
     if control[SAVING] != before and mode != c.WITHOUT_CONTINUOUS:
         _protect(control)
     saved = control[TIME] - control[OFF_SINCE]
     watched = mode == c.LEAK_MONITORING and control[SAVING] > 0.0 and saved > LEAK_SETTLE_S
-    if watched and control[OFF_VACUUM] - vacuum > k[c.PERMITTED_LEAKAGE, 0] * saved:
+    if watched and control[OFF_VACUUM] - vacuum > k[c.PERMITTED_LEAKAGE, i] * saved:
         control[CONTINUOUS], control[SAVING] = 1.0, 0.0
     return control[SAVING] == 0.0
 

@@ -16,7 +16,7 @@ from twin.model.effects import EFFECTS, apply
 from twin.model.theta import Theta
 
 HOUR = 3600.0  # s
-RAMP_STEP = 0.2  # s after which a ramp's coefficients are set anew
+RAMP_STEP = 0.5  # s that a ramp's coefficients hold, as they are in the middle of it
 
 # How coefficients run in time: from which row on which ones hold; the first at row 0.
 Schedule = list[tuple[int, Theta]]
@@ -82,7 +82,9 @@ def schedule(
     for row in _changes(causes, seconds, cycles):
         now = theta
         for cause in causes:
-            now = apply(now, cause.effect, cause.at(now, float(seconds[row]), int(cycles[row])))
+            ahead = RAMP_STEP / 2.0 if cause.course == Course.RAMP else 0.0
+            values = cause.at(now, float(seconds[row]) + ahead, int(cycles[row]))
+            now = apply(now, cause.effect, values)
         found.append((row, now))
     return found
 

@@ -30,13 +30,14 @@ ROUGH, PHASE, OPEN, VALID, SIGNALS = range(ORDER + 6, ORDER + 11)
 STATE = ORDER + 11
 
 LANES = 8  # hypotheses that are run together, with a step that suits them all
-LONGEST_STEP = 1e-3  # s
+LONGEST_STEP = 0.01  # s
 LONGEST_BRIDGE = 0.1  # s; after a longer silence the model waits for the next sync
 NEVER = 1e9  # s, an age that is past every delay
 # A step in which a valve moves, a cup opens or blow-off passes ambient pressure (the exhaust opens)
 # is done in the most steps; any other in as many as keep each within the tolerance.
 FINEST = 24  # steps
 TOLERANCE = 0.02  # Pa, of a step, by which a scheme of second order may be off
+ROUGHLY = 1.0  # Pa, the same where many hypotheses are tried: far below what a sensor resolves
 
 _IDLE, _SUCTION, _HOLD, _BLOW_OFF = (int(phase) for phase in Phase)
 _SUCTION_COMMAND = int(Command.SUCTION)
@@ -62,13 +63,16 @@ def advance(
     level: Floats,
     expected: Floats,
     signals: Bytes | None = None,
+    tolerance: float = TOLERANCE,
 ) -> None:
     """Step the model over a block; write what the sensor should read (Pa) into ``expected``.
 
     Row by row: ``dt`` seconds since the row before (negative: time does not run on, wait for a
     sync), ``phase`` as found by the cycle finder, ``level`` the pressure to synchronise on (Pa, NaN
     for most rows). Into ``signals`` go the switching signals handed out (``Signal`` bits). With
-    many hypotheses ``state`` is (STATE, n), ``theta`` (coefficients, n), what is written (rows, n).
+    many hypotheses ``state`` is (STATE, n), ``theta`` (coefficients, n), what is written (rows, n);
+    ``phase`` and ``level`` are (rows, n) where each has its own.
+    Each step is within about ``tolerance`` (Pa).
     """
     if len(dt) == 0:
         return
@@ -78,10 +82,11 @@ def advance(
         state.reshape(STATE, -1),
         theta.reshape(len(c.COEFFICIENTS), -1),
         dt,
-        phase,
-        level,
+        phase.reshape(len(dt), -1),
+        level.reshape(len(dt), -1),
         expected.reshape(len(dt), -1),
         signals.reshape(len(dt), -1),
+        tolerance,
     )
 
 
@@ -92,29 +97,32 @@ def simulate(
     commands: Bytes,
     phase: Bytes,
     expected: Floats,
+    tolerance: float = TOLERANCE,
 ) -> None:
     """Run free: the model's own control switches the nozzle; ``phase`` and ``expected`` are out.
 
     ``commands`` per row are those of ``Command``. ``state`` must stand on something (``at_rest``);
-    the control begins anew with every call.
+    the control begins anew with every call. Many hypotheses as with ``advance``.
     """
     _simulate(
-        state.reshape(STATE, 1),
-        nothing_done(),
-        new_timer(),
-        theta.reshape(-1, 1),
+        state.reshape(STATE, -1),
+        (nothing_done(), new_timer()),
+        theta.reshape(len(c.COEFFICIENTS), -1),
         dt,
         commands,
-        phase,
-        expected.reshape(-1, 1),
+        phase.reshape(len(dt), -1),
+        expected.reshape(len(dt), -1),
+        tolerance,
     )
 
 
 def at_rest(theta: c.Theta) -> State:
     """Return a model that stands at ambient pressure and temperature, nothing commanded."""
-    state = new_state()
-    _settle(state.reshape(STATE, 1), theta.reshape(-1, 1), 0, theta[c.AMBIENT])
-    state[OPEN] = 1.0 if theta[c.RELEASE] >= 0.0 else 0.0
+    state = new_state(*theta.shape[1:])
+    for i in range(state[0].size):
+        both = state.reshape(STATE, -1), theta.reshape(len(c.COEFFICIENTS), -1)
+        _settle(*both, i, both[1][c.AMBIENT, i])
+    state[OPEN] = np.where(theta[c.RELEASE] >= 0.0, 1.0, 0.0)
     state[VALID] = 1.0
     return state
 
@@ -191,14 +199,14 @@ def _passes(state, k, h, i):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _finer(state, k, h):  # type: ignore[no-untyped-def]
+def _finer(state, k, h, tolerance):  # type: ignore[no-untyped-def]
     """In how many steps the next ``h`` is to be done, for the sake of any hypothesis."""
     rough = 0.0
     for i in range(state.shape[1]):
         if _jumps(state, k, h, i) or _passes(state, k, h, i):
             return FINEST
         rough = max(rough, state[ROUGH, i])
-    return min(max(math.ceil(h * (rough / TOLERANCE) ** (1.0 / 3.0)), 1), FINEST)
+    return min(max(math.ceil(h * (rough / tolerance) ** (1.0 / 3.0)), 1), FINEST)
 
 
 @inlined
@@ -239,12 +247,12 @@ def _substep(state, k, h):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _step(state, k, dt):  # type: ignore[no-untyped-def]
+def _step(state, k, dt, tolerance):  # type: ignore[no-untyped-def]
     """Advance by ``dt`` seconds under the commands of the last sample."""
     count = max(math.ceil(dt / LONGEST_STEP - 1e-6), 1)
     h = dt / count
     for _ in range(count):
-        finer = _finer(state, k, h)
+        finer = _finer(state, k, h, tolerance)
         for _ in range(finer):
             _substep(state, k, h / finer)
 
@@ -257,10 +265,10 @@ def _command(state, position, value, i):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _enter(state, phase, k):  # type: ignore[no-untyped-def]
+def _enter(state, phases, k):  # type: ignore[no-untyped-def]
     """Take over the phase of a sample: what it commands, and what was measured of the nozzle."""
     for i in range(state.shape[1]):
-        before = int(state[PHASE, i])
+        before, phase = int(state[PHASE, i]), int(phases[i])
         if phase == before:
             continue
         state[PHASE, i] = phase
@@ -300,9 +308,12 @@ def _shift(state, shift, i):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _synchronise(state, level, k):  # type: ignore[no-untyped-def]
-    """Set the model onto a measured ``level`` (Pa); an open cup is at ambient whatever is read."""
+def _synchronise(state, levels, k):  # type: ignore[no-untyped-def]
+    """Set the model onto a measured level (Pa); an open cup is at ambient whatever is read."""
     for i in range(state.shape[1]):
+        level = levels[i]
+        if math.isnan(level):
+            continue
         idle = state[PHASE, i] == _IDLE
         if k[c.RELEASE, i] >= 0.0 and (idle or state[OPEN, i] > 0.0):
             _settle(state, k, i, k[c.AMBIENT, i])
@@ -330,7 +341,7 @@ def _read(state, k, expected, signals):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _together(state, all_k, driven, out, first, width):  # type: ignore[no-untyped-def]
+def _together(state, all_k, driven, out, first, width, tolerance):  # type: ignore[no-untyped-def]
     """Advance ``width`` hypotheses from ``first`` on; where there are fewer, copies of the last.
 
     Copied to where rows have a length that the compiler knows: it then sees that no two of them
@@ -340,6 +351,7 @@ def _together(state, all_k, driven, out, first, width):  # type: ignore[no-untyp
     last = state.shape[1] - 1
     mine, k = np.empty((STATE, width)), np.empty((PREPARED, width))
     said, handed = np.empty(width), np.empty(width, np.uint8)
+    phases, levels = np.empty(width, np.uint8), np.empty(width)
     for i in range(width):
         mine[:, i] = state[:, min(first + i, last)]
         k[:, i] = all_k[:, min(first + i, last)]
@@ -347,10 +359,12 @@ def _together(state, all_k, driven, out, first, width):  # type: ignore[no-untyp
         if dt[row] < 0.0 or dt[row] > LONGEST_BRIDGE:
             mine[VALID] = 0.0
         elif mine[VALID, 0] > 0.0 and dt[row] > 0.0:
-            _step(mine, k, dt[row])
-        _enter(mine, phase[row], k)
-        if not math.isnan(level[row]):
-            _synchronise(mine, level[row], k)
+            _step(mine, k, dt[row], tolerance)
+        for i in range(width):  # all alike, or each its own
+            phases[i] = phase[row, min(first + i, last) % phase.shape[1]]
+            levels[i] = level[row, min(first + i, last) % level.shape[1]]
+        _enter(mine, phases, k)
+        _synchronise(mine, levels, k)
         _read(mine, k, said, handed)
         for i in range(width):
             expected[row, min(first + i, last)] = said[i]
@@ -360,37 +374,69 @@ def _together(state, all_k, driven, out, first, width):  # type: ignore[no-untyp
 
 
 @compiled
-def _advance(state, theta, dt, phase, level, expected, signals):  # type: ignore[no-untyped-def]
+def _advance(state, theta, dt, phase, level, expected, signals, tolerance):  # type: ignore[no-untyped-def]
     k, driven, out = prepare(theta), (dt, phase, level), (expected, signals)
     if state.shape[1] == 1:
-        _together(state, k, driven, out, 0, 1)
+        _together(state, k, driven, out, 0, 1, tolerance)
     else:
         for first in range(0, state.shape[1], LANES):
-            _together(state, k, driven, out, first, LANES)
+            _together(state, k, driven, out, first, LANES, tolerance)
 
 
 @compiled
-def _seen_by_control(state, k):  # type: ignore[no-untyped-def]
+def _seen_by_control(state, k, i):  # type: ignore[no-untyped-def]
     """Vacuum (Pa) at the sensor that the ejector's own control acts on."""
-    if k[c.CONTROL_SENSOR, 0] == c.PLC:
-        return k[c.AMBIENT_NOMINAL, 0] - reading(state[SENSED, 0], k, 0)
-    return k[c.AMBIENT, 0] - state[PORT, 0]
+    if k[c.CONTROL_SENSOR, i] == c.PLC:
+        return k[c.AMBIENT_NOMINAL, i] - reading(state[SENSED, i], k, i)
+    return k[c.AMBIENT, i] - state[PORT, i]
 
 
 @compiled
-def _simulate(state, control, timer, theta, dt, commands, phase, expected):  # type: ignore[no-untyped-def]
-    k, signals = prepare(theta), np.empty(1, np.uint8)
-    told = np.empty_like(commands)
-    timed(timer, commands, dt, k[c.BLOW_OFF_MODE, 0], k[c.BLOW_OFF_TIME, 0], told)
+def _control(state, controls, told, dt, k, phases):  # type: ignore[no-untyped-def]
+    """Let the ejectors' own controls switch the nozzle, and enter the phases that result."""
+    for i in range(state.shape[1]):
+        asked = told[i] == _SUCTION_COMMAND  # blow-off wins
+        on = switch(controls[i], asked, _seen_by_control(state, k, i), max(dt, 0.0), k, i)
+        phases[i] = _SUCTION if on else _HOLD if asked else _BLOW_OFF if told[i] else _IDLE
+    before = state[PHASE].copy()
+    _enter(state, phases, k)
+    for i in range(state.shape[1]):
+        if phases[i] + before[i] == _SUCTION + _HOLD and phases[i] != before[i]:
+            state[NOZZLE_AGE, i] = 0.0  # nothing was measured yet: the valve takes its response
+
+
+@inlined
+def _free(state, all_k, driven, out, first, width, tolerance):  # type: ignore[no-untyped-def]
+    """Let ``width`` hypotheses from ``first`` on run free, copied as in ``_together``."""
+    (dt, commands, control, timer), (phase, expected) = driven, out
+    last = state.shape[1] - 1
+    mine, k = np.empty((STATE, width)), np.empty((PREPARED, width))
+    said, handed, phases = np.empty(width), np.empty(width, np.uint8), np.empty(width, np.uint8)
+    controls, told = np.empty((width, len(control))), np.empty((len(dt), width), np.uint8)
+    for i in range(width):
+        mine[:, i] = state[:, min(first + i, last)]
+        k[:, i] = all_k[:, min(first + i, last)]
+        controls[i] = control
+        mode, pulse = k[c.BLOW_OFF_MODE, i], k[c.BLOW_OFF_TIME, i]
+        timed(timer.copy(), commands, dt, mode, pulse, told[:, i])
     for row in range(dt.shape[0]):
         if dt[row] > 0.0:
-            _step(state, k, dt[row])
-        asked = told[row] == _SUCTION_COMMAND  # blow-off wins
-        on = switch(control, asked, _seen_by_control(state, k), max(dt[row], 0.0), k)
-        now = _SUCTION if on else _HOLD if asked else _BLOW_OFF if told[row] else _IDLE
-        switched = now + int(state[PHASE, 0]) == _SUCTION + _HOLD and now != state[PHASE, 0]
-        _enter(state, now, k)
-        if switched:
-            state[NOZZLE_AGE, 0] = 0.0  # nothing was measured yet: the valve takes its response
-        phase[row] = now
-        _read(state, k, expected[row], signals)
+            _step(mine, k, dt[row], tolerance)
+        _control(mine, controls, told[row], dt[row], k, phases)
+        _read(mine, k, said, handed)
+        for i in range(width):
+            phase[row, min(first + i, last)] = phases[i]
+            expected[row, min(first + i, last)] = said[i]
+    for i in range(width):
+        state[:, min(first + i, last)] = mine[:, i]
+
+
+@compiled
+def _simulate(state, controlled, theta, dt, commands, phase, expected, tolerance):  # type: ignore[no-untyped-def]
+    control, timer = controlled
+    k, driven, out = prepare(theta), (dt, commands, control, timer), (phase, expected)
+    if state.shape[1] == 1:
+        _free(state, k, driven, out, 0, 1, tolerance)
+    else:
+        for first in range(0, state.shape[1], LANES):
+            _free(state, k, driven, out, first, LANES, tolerance)
