@@ -14,9 +14,7 @@ from tools import battery
 from twin.config import Config
 from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.diagnosis.evidence import HEALTHY, collect, thinned
-from twin.diagnosis.search import sharpened
 from twin.errors import ConfigError
-from twin.model.courses import Cause, Course
 from twin.settings import Document
 from twin.signals import Command, Quality, Samples
 
@@ -148,12 +146,12 @@ def test_of_a_long_log_some_cycles_are_looked_at_as_in_the_whole() -> None:
         assert here == pytest.approx(off[0][whole.bins.cycle == number], abs=0.1)  # mbar
 
 
-def test_a_step_in_a_long_log_begins_when_all_cycles_say() -> None:
-    whole = collect(CONFIG, record(66.0, "leakage=1.5@31.3", seed=27))
-    part = thinned(whole, whole.judged, 6)
-    guess = (Cause("leakage", {"sonic_flow": 1.5}, Course.STEP, 36.0),)
-    (sharp,) = sharpened(whole, part, guess)
-    assert sharp.onset_s == pytest.approx(31.3, abs=0.1)
+def test_a_step_in_a_long_log_begins_when_all_cycles_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("twin.diagnosis.answer.MOST_JUDGED", 6)
+    (cause,) = of(record(66.0, "leakage=1.5@31.3", seed=27)).json["causes"]
+    assert cause["onset_s"] == pytest.approx(31.3, abs=0.1)
+    assert cause["onset_low95_s"] <= cause["onset_s"] <= cause["onset_high95_s"]
+    assert cause["onset_high95_s"] - cause["onset_low95_s"] < 0.5
 
 
 def test_too_few_cycles_are_insufficient() -> None:

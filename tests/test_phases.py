@@ -217,13 +217,21 @@ def test_rows_before_a_break_say_nothing_about_those_after_it() -> None:
 @pytest.mark.parametrize("flag", BREAK)
 def test_a_break_is_no_knee(flag: Quality) -> None:
     falling = 1e5 - 100.0 * np.arange(300)
-    samples = stream([1] * 600, np.concatenate([falling, np.full(300, 2e4)]))
+    samples = stream([1] * 600, np.concatenate([falling, np.full(300, falling[-1])]))
     samples["quality"][300] = flag
     _, phase, _ = find(samples, KNEES)
     assert (phase == Phase.SUCTION).all()
     samples["quality"][300] = 0
     _, phase, _ = find(samples, KNEES)
     assert (phase == Phase.HOLD).any()
+
+
+def test_a_jump_is_no_knee() -> None:
+    samples = stream([1] * 600, 1e5 - 100.0 * np.arange(600))
+    samples["pressure"][300:] += 2500.0
+    _, phase, level = find(samples, KNEES)
+    assert (phase == Phase.SUCTION).all()
+    assert not np.isfinite(level[1:]).any()
 
 
 # The window.

@@ -23,11 +23,11 @@ from twin.signals import Quality, Samples
 
 FORMAT = "ejector-twin-diagnosis/1"
 FEWEST_CYCLES = 3  # judged ones: two to fit on, one to judge by
-EXPLAINED = 1.35  # sigmas left up to which causes explain a deviation
+EXPLAINED = 1.2  # sigmas left up to which causes explain a deviation
 GROSS = 1.5  # times the deviation of healthy cycles, above which causes must take it away
 LEAST_SHARE = 0.5  # of what can be taken away
 SEVERAL = 1.6  # sigmas that several causes may leave and still be sure
-MOST_LEFT = 0.2  # of chi-square, that a cause may leave and still be sure
+MOST_LEFT = 0.3  # of chi-square beyond noise, that a cause may leave and still be sure
 MOST_SATURATED = 0.05  # share of samples
 MOST_JUDGED = 24  # cycles of a long log that are looked at, evenly spread
 MOST_NAMED = 4  # runners-up
@@ -68,8 +68,7 @@ def diagnose(
     searched = search(evidence, fitted, progress)
     if searched.found and whole.cycles > evidence.cycles:
         progress("looking for when it began")
-        sharp = sharpened(whole, evidence, searched.found.hypothesis)
-        searched = replace(searched, found=replace(searched.found, hypothesis=sharp))
+        searched = sharpened(whole, evidence, searched)
     found = searched.found.hypothesis if searched.found else HEALTHY
     progress("judging on the cycles it has not seen")
     before = judge(evidence, covariance(evidence).of(held_out), HEALTHY)
@@ -118,8 +117,8 @@ def _takes_away(before: Judged, after: Judged) -> bool:
 
     Several together can look like something that nobody listed, but not all along its curve.
     """
-    gross = before.rms > GROSS * before.healthy_rms
-    return not gross or before.rms - after.rms > LEAST_SHARE * (before.rms - before.healthy_rms)
+    gross = before.rms > GROSS * before.usual
+    return not gross or before.rms - after.rms > LEAST_SHARE * (before.rms - before.usual)
 
 
 def _sure(found: Hypothesis, before: Judged, after: Judged) -> bool:
@@ -128,7 +127,7 @@ def _sure(found: Hypothesis, before: Judged, after: Judged) -> bool:
     Several together can look like something nobody listed, so little may be left of them.
     """
     left = after.leftover
-    share = (left / before.leftover) ** 2
+    share = (left**2 - 1.0) / max(before.leftover**2 - 1.0, 1e-9)
     return share < MOST_LEFT and (len(found) == 1 or left < SEVERAL)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import chain
+from itertools import chain, pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,7 @@ from twin.model import kernel
 from twin.model import theta as c
 from twin.model.courses import Cause, Schedule, schedule
 from twin.model.dataset import coefficients
+from twin.model.plant import reading, sensed_at
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
 from twin.monitor.cycles import Cycle, CycleCutter, figures
@@ -33,6 +34,9 @@ from twin.signals import MBAR, MS, NS, SAMPLE, TICK, UNUSABLE, Command, Phase, S
 
 WORKERS = 2
 LATER, LONGEST_SUCTION = 1.3, 10_000  # cycles' suction, rows: until when H1 may be reached
+
+# How suction and end pressure follow the supply is the type's; of its value, one sigma.
+SUPPLY_UNKNOWN = {"end_pressure_slope": 0.5, "curvature": 0.5, "optimum_bar": 0.03}
 
 Hypothesis = tuple[Cause, ...]
 HEALTHY: Hypothesis = ()
@@ -83,7 +87,7 @@ class Evidence:
     def expected(self, hypothesis: Hypothesis) -> Floats:
         """Pressure (Pa) that the sensor should read at each row."""
         course = self.course(hypothesis)
-        phase, level = self._switched(self._sensing([self.theta], [course]))
+        phase, level = self._switched([course], self._sensing([self.theta], [course]))
         rows = np.arange(len(self.samples))
         return self._run([course], phase, level, rows, kernel.TOLERANCE)[:, 0]
 
@@ -100,7 +104,7 @@ class Evidence:
         lanes = [slice(i, i + kernel.LANES) for i in range(0, len(courses), kernel.LANES)]
 
         def run(lane: slice) -> Floats:
-            phase, level = self._switched(sensing[lane])
+            phase, level = self._switched(courses[lane], sensing[lane])
             rows = self._drawn(courses[lane], phase)
             expected = self._run(courses[lane], phase, level, rows, kernel.ROUGHLY)
             off: Floats = (measured[:, None] - self.bins.through(rows) @ expected) / MBAR
@@ -176,15 +180,23 @@ class Evidence:
         return found
 
     def _switched(
-        self, sensing: Sequence[tuple["Sensing", ...]]
+        self, courses: Sequence[Schedule], sensing: Sequence[tuple["Sensing", ...]]
     ) -> tuple[npt.NDArray[np.uint8], Floats]:
         """Phases and levels, (rows, n), as the nozzle must have switched to be seen as it was."""
         phase = np.repeat(self.ticks["phase"][:, None], len(sensing), axis=1)
         level = np.repeat(self.ticks["level"].astype(np.float64)[:, None], len(sensing), axis=1)
-        for i, some in enumerate(sensing):
+        for i, (course, some) in enumerate(zip(courses, sensing, strict=True)):
             if some:
                 self._move(phase[:, i], level[:, i], some)
+            self._read_anew(level[:, i], course)
         return phase, level
+
+    def _read_anew(self, level: Floats, course: Schedule) -> None:
+        """Where coefficients change at a cycle's start, the level is what was read before that."""
+        for (_, before), (row, after) in pairwise(course):
+            if np.isfinite(level[row]) and self.ticks["phase"][row - 1] == Phase.IDLE:
+                sensed = sensed_at(level[row], before.reshape(-1, 1), 0)
+                level[row] = reading(sensed, after.reshape(-1, 1), 0)
 
     def _move(
         self, phase: npt.NDArray[np.uint8], level: Floats, sensing: Sequence["Sensing"]
@@ -208,6 +220,11 @@ class Evidence:
         rows = rows[rows > 0]
         inside = [Phase.SUCTION, Phase.HOLD]
         return rows[np.isin(phase[rows], inside) & np.isin(phase[rows - 1], inside)]
+
+    def knee(self, cycle: int, into: Phase) -> int:
+        """First row of a cycle at which the air saving was seen to switch into a phase."""
+        knees = self._knees[self._knees >= self.starts[cycle]]
+        return int(knees[self.ticks["phase"][knees] == into][0])
 
     def seen(self, theta: Theta) -> Seen:
         """How the air saving would be seen to switch, by the finder that found it in the log."""
@@ -275,6 +292,7 @@ def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
         hint = "calibrate the twin first: twin calibrate LOG --config CONFIG, on healthy cycles"
         raise ConfigError(f"{config.document.name}: the twin is not calibrated", hint)
     theta = coefficients(config.data)
+    knees = expected_knees(theta, config.data.sensor.noise_mbar * MBAR)
     nothing = Evidence(
         theta=theta,
         begin_ns=0,
@@ -286,10 +304,10 @@ def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
         figures=[],
         healthy=config.monitor.healthy,
         noise=config.data.sensor.noise_mbar,
-        bins=_binned(np.empty(0, SAMPLE), np.empty(0, TICK), np.zeros(1, np.int64), []),
+        bins=_binned(np.empty(0, SAMPLE), np.empty(0, TICK), np.zeros(1, np.int64), [], knees),
         rows=np.empty(0, np.int64),
         terms=config.data.terms,
-        knees=expected_knees(theta, config.data.sensor.noise_mbar * MBAR),
+        knees=knees,
         uncertain=tuple(_uncertain(config)),
     )
     return of_log(nothing, blocks)
@@ -311,13 +329,20 @@ def of_log(beside: Evidence, blocks: Iterable[Samples]) -> Evidence:
         numbers=np.arange(len(cycles)),
         judged=judged,
         figures=[figures(cycle, beside.theta[c.AMBIENT]) for cycle in cycles],
-        bins=_binned(samples, ticks, starts, judged),
+        bins=_binned(samples, ticks, starts, judged, beside.knees),
         rows=_rows(samples, ticks),
     )
 
 
 def _uncertain(config: Config) -> Iterator[Theta]:
-    """Coefficients one sigma away, each way that the calibration left the data set open."""
+    """Coefficients one sigma away, each way that calibration left the data set open.
+
+    And each that calibration says nothing about: only one supply was ever measured.
+    """
+    for key, share in SUPPLY_UNKNOWN.items():
+        supply = config.data.supply
+        moved = supply.model_copy(update={key: getattr(supply, key) * (1.0 + share)})
+        yield coefficients(config.data.model_copy(update={"supply": moved}))
     rows = config.monitor.healthy.uncertain
     for way in range(len(rows)):
         data = config.data
@@ -352,7 +377,7 @@ def of_cycles(evidence: Evidence, cycles: Sequence[int]) -> Evidence:
         numbers=evidence.numbers[kept],
         judged=judged,
         figures=[evidence.figures[k] for k in kept],
-        bins=_binned(samples, ticks, starts, judged),
+        bins=_binned(samples, ticks, starts, judged, evidence.knees),
         rows=_rows(samples, ticks),
     )
 
@@ -370,12 +395,26 @@ def _complete_cycles(twin: Twin, blocks: Iterable[Samples]) -> tuple[list[Cycle]
     return [cycle for cycle in cycles if cycle.complete], begin_ns
 
 
-def _binned(samples: Samples, ticks: Ticks, starts: Ints, judged: Sequence[int]) -> Bins:
+def _binned(
+    samples: Samples, ticks: Ticks, starts: Ints, judged: Sequence[int], knees: Knees
+) -> Bins:
     """Bins of the rows of judged cycles that can be compared."""
     usable = ((samples["quality"] & UNUSABLE) == 0) & np.isfinite(samples["pressure"])
     usable &= np.isfinite(ticks["expected"])
     usable &= np.isin(np.searchsorted(starts, np.arange(len(samples)), "right") - 1, judged)
+    usable &= ~_unsettled(ticks["phase"], knees)
     return binned(ticks["phase"], usable, starts)
+
+
+def _unsettled(phase: npt.NDArray[np.uint8], knees: Knees) -> npt.NDArray[np.bool_]:
+    """Rows after a knee that suction's end followed too soon for it to be found well."""
+    begins = np.flatnonzero(np.diff(phase, prepend=255))
+    lengths = np.diff(begins, append=len(phase))
+    kind = phase[begins]
+    before = np.concatenate([[255], kind[:-1]])
+    inside = [Phase.SUCTION, Phase.HOLD]
+    soon = np.isin(kind, inside) & np.isin(before, inside) & (lengths < knees.settles)
+    return np.repeat(soon, lengths)
 
 
 def _rows(samples: Samples, ticks: Ticks) -> Ints:

@@ -11,9 +11,10 @@ from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.weights import Weights, levels
 from twin.model import theta as c
 from twin.monitor.cycles import H2, PAPER_VACUUM, time_to_vacuum
-from twin.signals import MBAR, MS, Phase
+from twin.signals import MBAR, MS
 
 RESAMPLES = 2000
+LITTLE = 1.25  # times the usual deviation: cycles differ by as much
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Judged:
     off: Floats  # mbar, of each bin
     squares: Floats  # mean square deviation of each held-out cycle, mbar²
     leftover: float  # sigmas
-    healthy_rms: float  # mbar, of healthy cycles with phases as long as here
+    usual: float  # mbar rms, of healthy cycles like these
     figures: dict[str, float | None]
 
     @property
@@ -56,7 +57,7 @@ def judge(evidence: Evidence, weights: Weights, hypothesis: Hypothesis) -> Judge
         off,
         squares,
         leftover,
-        _healthy_rms(evidence),
+        weights.usual,
         {name: None if one is None else rounded(one) for name, one in figures.items()},
     )
 
@@ -69,26 +70,19 @@ def gain(before: Judged, after: Judged) -> dict[str, float]:
     drawn = np.random.default_rng(0).integers(cycles, size=(RESAMPLES, cycles))
     ratio = np.sqrt(after.squares[drawn].sum(axis=1) / before.squares[drawn].sum(axis=1))
     low, high = np.percentile(100.0 * (1.0 - ratio), [2.5, 97.5])
-    rms = [one.rms for one in (before, after)]
-    best = min(before.healthy_rms, rms[0])
-    reachable = rms[0] - best
     return {
-        "rms_reduction_pct": rounded(100.0 * (1.0 - rms[1] / rms[0])),
+        "rms_reduction_pct": rounded(100.0 * (1.0 - after.rms / before.rms)),
         "low95": rounded(float(low)),
         "high95": rounded(float(high)),
-        "share_of_achievable_pct": rounded(
-            100.0 * min((rms[0] - rms[1]) / reachable, 1.0) if reachable > 0.0 else 0.0
-        ),
+        "share_of_achievable_pct": rounded(100.0 * _share(before.rms, after.rms, before.usual)),
     }
 
 
-def _healthy_rms(evidence: Evidence) -> float:
-    """Deviation (mbar rms) of healthy cycles with phases as long as here."""
-    phase, squares = evidence.ticks["phase"][evidence.bins.number >= 0], 0.0
-    for one in Phase:
-        healthy = evidence.healthy.figures.get(f"{one.name.lower()}_rms")
-        squares += float(np.mean(phase == one)) * (healthy.mean if healthy else 1.0) ** 2
-    return math.sqrt(squares)
+def _share(before: float, after: float, usual: float) -> float:
+    """Share of the achievable reduction; all of it where hardly anything could be reduced."""
+    if before < LITTLE * usual:
+        return float(after < LITTLE * usual)
+    return min((before - after) / (before - usual), 1.0)
 
 
 def _rows(evidence: Evidence, cycle: int) -> Ints:

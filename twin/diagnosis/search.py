@@ -6,7 +6,7 @@ is worth its price, then the search begins anew about it. Backward: each cause m
 its price beside the others.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,21 +18,24 @@ from twin.diagnosis.hypotheses import bounds, parameters, sized, sizes
 from twin.diagnosis.screen import columns, pairs, promises
 from twin.diagnosis.weights import Weights, covariance
 from twin.model.courses import Cause, Course
+from twin.signals import MS
 
 MOST_CAUSES = 3
 SIGNIFICANT = 20.0  # chi-square, beyond its price, that a cause must gain before it is named
 SHARE = (
     0.005  # of what is explained already, that one more cause must gain: else it mends the model
 )
-SMALLEST = 0.2  # of an effect's typical size: less is within what calibration leaves
+# Of an effect's typical size: less is within what calibration leaves, or beside another cause mends
+# what the model gets wrong about that.
+SMALLEST, SMALLEST_MORE = 0.2, 0.4
 SAME = 10.8  # chi-square up to which a log cannot reject a rival (one in a thousand)
 HOPEFUL = 5.0  # chi-square that the linear model must promise of one more cause
 TRIED_PAIRS, TRIED_MORE, TRIED_TIMES = 12, 8, 6
 SECOND = 0.5  # of the best gain, above which an effect's second course is fitted as well
 NEARLY = 0.3  # of the best gain, above which an effect may turn out to be a rival
 START = np.array([0.4, 1.0, 1.7, 2.5, 3.5, 5.0])  # typical sizes to begin a fit from
-ONSETS = 16  # in a round of looking for when a step began
-ONSET_S = 0.01  # to which it is found
+ONSETS, MANY_ONSETS = 16, 64  # in a round of looking for when a step began
+ONSET_S = 0.01  # to which it is found at first
 FARTHEST_S = 4.0  # from an onset, that its interval may reach
 SURE = 3.84  # chi-square that bounds a 95 % interval
 
@@ -63,7 +66,8 @@ def search(evidence: Evidence, fitted: Sequence[int], progress: Progress) -> Sea
     judged, weights = _weights(evidence, fitted, best.hypothesis)
     healthy = _healthy(evidence, weights)
     progress("fitting single causes")
-    singles = _ranked(fit(evidence, weights, [one.hypothesis for one in singles]))
+    again = fit(evidence, weights, [one.hypothesis for one in singles])
+    singles = _ranked(evidence, judged, again)
     found = singles[0]
     while len(found.hypothesis) < MOST_CAUSES:
         progress(f"looking for what else there is beside {', '.join(found.effects)}")
@@ -75,10 +79,13 @@ def search(evidence: Evidence, fitted: Sequence[int], progress: Progress) -> Sea
         (found,) = fit(evidence, weights, [found.hypothesis])
         healthy = _healthy(evidence, weights)
         found = _pruned(evidence, weights, found, healthy)
+    if any(cause.course == Course.STEP for cause in found.hypothesis):
+        (found,) = fit(evidence, weights, [_finely_timed(evidence, judged, found.hypothesis)])
     progress("looking for what the log cannot tell apart")
     rivals = _rivals(evidence, judged, weights, found, singles)
     onsets = [
-        _onset_interval(evidence, judged, found, number) for number in range(len(found.hypothesis))
+        _onset_interval(evidence, judged, found.hypothesis, number, found.leftover)
+        for number in range(len(found.hypothesis))
     ]
     return Search(weights, healthy, found, singles, rivals, onsets)
 
@@ -96,14 +103,18 @@ def _healthy(evidence: Evidence, weights: Weights) -> float:
     return float(np.sum(residual**2))
 
 
-def _ranked(found: Iterable[Fitted]) -> list[Fitted]:
-    """The best course of each set of effects, the best first."""
-    best: dict[tuple[str, ...], Fitted] = {}
-    for one in found:
-        key = tuple(sorted(one.effects))
-        if key not in best or one.score < best[key].score:
-            best[key] = one
-    return sorted(best.values(), key=lambda one: one.score)
+def _ranked(evidence: Evidence, judged: Weights, found: Sequence[Fitted]) -> list[Fitted]:
+    """The best course of each set of effects, the best first.
+
+    All cycles choose the course: in which of them an effect acts does not show in the fitted ones.
+    """
+    residual = white(evidence, judged, [one.hypothesis for one in found], with_levels=False)
+    best: dict[tuple[str, ...], tuple[float, Fitted]] = {}
+    for one, chi2 in zip(found, np.sum(residual**2, axis=0), strict=True):
+        key, score = tuple(sorted(one.effects)), float(chi2) + one.score - one.chi2
+        if key not in best or score < best[key][0]:
+            best[key] = score, one
+    return sorted((one for _, one in best.values()), key=lambda one: one.score)
 
 
 def _fit_singles(
@@ -119,7 +130,8 @@ def _fit_singles(
     ]
     progress("fitting single causes")
     started = _started(evidence, judged, hypotheses)
-    return _ranked(fit(evidence, weights, _timed(evidence, judged, started)))
+    found = fit(evidence, weights, _timed(evidence, judged, started))
+    return _ranked(evidence, judged, found)
 
 
 def _started(
@@ -163,7 +175,7 @@ def _best_addition(
         two = pairs(evidence, judged, alone, singles)[:TRIED_PAIRS]
         candidates += [one.hypothesis for one in two if one.gain > singles[0].gain + HOPEFUL]
     candidates = _timed(evidence, judged, candidates)
-    tried = _ranked(fit(evidence, weights, candidates))
+    tried = _ranked(evidence, judged, fit(evidence, weights, candidates))
     for one in tried:
         if _worth(healthy, found.chi2, found.chi2 - found.score, one):
             return one
@@ -175,7 +187,8 @@ def _worth(healthy: float, chi2: float, paid: float, fitted: Fitted) -> bool:
     scale = max(fitted.leftover**2, 1.0)
     gain = (chi2 - fitted.chi2) / scale - (fitted.score - fitted.chi2 + paid)
     enough = max(SIGNIFICANT, SHARE * (healthy - chi2) / scale)
-    return gain > enough and _smallest(fitted) >= SMALLEST
+    least = SMALLEST if len(fitted.hypothesis) == 1 else SMALLEST_MORE
+    return gain > enough and _smallest(fitted) >= least
 
 
 def _smallest(fitted: Fitted) -> float:
@@ -218,7 +231,8 @@ def _rivals(
                 if one.hypothesis[0].effect not in found.effects
                 and one.gain > NEARLY * promised[0].gain
             ][:TRIED_PAIRS]
-            fitted = _ranked(fit(evidence, weights, _timed(evidence, judged, tried)))
+            timed = _timed(evidence, judged, tried)
+            fitted = _ranked(evidence, judged, fit(evidence, weights, timed))
         else:
             fitted = [one for one in singles if one.effects != found.effects]
         result.append([one for one in fitted if one.score - found.score < margin])
@@ -245,27 +259,51 @@ def _timed(
 def _with_onset(evidence: Evidence, judged: Weights, hypothesis: Hypothesis) -> Hypothesis:
     """The last cause's onset where it explains most, about a cycle about where it is."""
     *others, cause = hypothesis
-    cycle = float(np.median(np.diff(evidence.seconds[evidence.starts[:-1]])))
-    low, high = cause.onset_s - cycle, cause.onset_s + cycle
-    while (high - low) / ONSETS > ONSET_S:
-        onsets = np.linspace(low, high, ONSETS)
-        best = onsets[int(np.argmin(_misfits(evidence, judged, tuple(others), cause, onsets)))]
-        reach = 1.5 * (high - low) / ONSETS
-        low, high = best - reach, best + reach
-    return (*others, replace(cause, onset_s=float(best)))
+    return (*others, _begun(evidence, judged, tuple(others), cause, ONSETS, ONSET_S))
 
 
-def sharpened(whole: Evidence, part: Evidence, hypothesis: Hypothesis) -> Hypothesis:
-    """A hypothesis from ``part`` of a log with the onsets of steps as all of its cycles tell."""
+def _finely_timed(evidence: Evidence, judged: Weights, hypothesis: Hypothesis) -> Hypothesis:
+    """The onset of every step to the row, looked for anew now that the sizes are known."""
     for number, cause in enumerate(hypothesis):
         if cause.course == Course.STEP:
-            others = hypothesis[:number] + hypothesis[number + 1 :]
-            onset = _sharp_onset(whole, part, others, cause)
-            hypothesis = (*hypothesis[:number], onset, *hypothesis[number + 1 :])
+            others = (*hypothesis[:number], *hypothesis[number + 1 :])
+            begun = _begun(evidence, judged, others, cause, MANY_ONSETS, MS)
+            hypothesis = (*hypothesis[:number], begun, *hypothesis[number + 1 :])
     return hypothesis
 
 
-def _sharp_onset(whole: Evidence, part: Evidence, others: Hypothesis, cause: Cause) -> Cause:
+def _begun(
+    evidence: Evidence, judged: Weights, others: Hypothesis, cause: Cause, count: int, fine: float
+) -> Cause:
+    """A cause with its onset where it explains most, within a cycle: ``count`` tried at first."""
+    cycle = float(np.median(np.diff(evidence.seconds[evidence.starts[:-1]])))
+    low, high = cause.onset_s - cycle, cause.onset_s + cycle
+    while (high - low) / count > fine:
+        onsets = np.linspace(low, high, count)
+        best = onsets[int(np.argmin(_misfits(evidence, judged, others, cause, onsets)))]
+        cause = replace(cause, onset_s=float(best))
+        reach, count = 1.5 * (high - low) / count, ONSETS
+        low, high = best - reach, best + reach
+    return cause
+
+
+def sharpened(whole: Evidence, part: Evidence, searched: Search) -> Search:
+    """What was found in ``part`` of a log with the onsets of steps as all of its cycles tell."""
+    found, onsets = searched.found, list(searched.onsets)
+    assert found is not None
+    for number, cause in enumerate(found.hypothesis):
+        if cause.course == Course.STEP:
+            hypothesis, onsets[number] = _sharp_onset(whole, part, found, number)
+            found = replace(found, hypothesis=hypothesis)
+    return replace(searched, found=found, onsets=onsets)
+
+
+def _sharp_onset(
+    whole: Evidence, part: Evidence, found: Fitted, number: int
+) -> tuple[Hypothesis, tuple[float, float]]:
+    """A hypothesis with the onset of one of its causes looked for, and its interval."""
+    cause, hypothesis = found.hypothesis[number], found.hypothesis
+    others = (*hypothesis[:number], *hypothesis[number + 1 :])
     begins = whole.seconds[whole.starts[:-1]]
     near = part.seconds[part.starts[part.judged]]
     here = int(np.searchsorted(near, cause.onset_s))
@@ -279,8 +317,11 @@ def _sharp_onset(whole: Evidence, part: Evidence, others: Hypothesis, cause: Cau
         best = int(np.argmin(_misfits(looked, judged, others, cause, tried)))
         cause = replace(cause, onset_s=float(tried[best]))
         if len(inside) <= ONSETS:
-            return _with_onset(looked, judged, (*others, cause))[-1]
+            break
         low, high = tried[max(best - 2, 0)], tried[min(best + 2, len(tried) - 1)]
+    cause = _with_onset(looked, judged, (*others, cause))[-1]
+    hypothesis = (*hypothesis[:number], cause, *hypothesis[number + 1 :])
+    return hypothesis, _onset_interval(looked, judged, hypothesis, number, found.leftover)
 
 
 def _misfits(
@@ -292,16 +333,16 @@ def _misfits(
 
 
 def _onset_interval(
-    evidence: Evidence, judged: Weights, found: Fitted, number: int
+    evidence: Evidence, judged: Weights, hypothesis: Hypothesis, number: int, leftover: float
 ) -> tuple[float, float]:
     """95 % interval (s) of a step's onset, from how the misfit grows about it."""
-    cause = found.hypothesis[number]
+    cause = hypothesis[number]
     if cause.course != Course.STEP:
         return cause.onset_s, cause.onset_s
-    others = tuple(c for i, c in enumerate(found.hypothesis) if i != number)
+    others = (*hypothesis[:number], *hypothesis[number + 1 :])
     reach = np.geomspace(ONSET_S, FARTHEST_S, 10)
     onsets = cause.onset_s + np.concatenate([-reach[::-1], [0.0], reach])
     misfit = _misfits(evidence, judged, others, cause, onsets)
-    inside = np.flatnonzero(misfit < misfit.min() + SURE * max(found.leftover**2, 1.0))
+    inside = np.flatnonzero(misfit < misfit.min() + SURE * max(leftover**2, 1.0))
     last = len(onsets) - 1  # the first that is rejected bounds it
     return float(onsets[max(inside[0] - 1, 0)]), float(onsets[min(inside[-1] + 1, last)])

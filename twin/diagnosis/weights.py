@@ -17,7 +17,7 @@ from twin.model.courses import Cause, Course, Schedule
 from twin.model.term import KINDS
 from twin.model.theta import Theta
 from twin.monitor.healthy import ModelError
-from twin.signals import MS
+from twin.signals import MS, Phase
 
 # What differs from cycle to cycle in a healthy ejector: effect, parameter, one standard deviation
 # where nothing better was learned.
@@ -27,8 +27,9 @@ SCATTER: Mapping[str, tuple[str, float]] = {
     "response_delay": ("delay", 0.5),
     "blow_off_delay": ("delay", 0.5),
 }
-MISMATCH = 0.03  # of what a hypothesis explains, is off in its waveform
+MISMATCH = 0.08  # of what a hypothesis explains, is off in its waveform
 LEVELS = ("h1_level", "h1_low_level")
+_INTO = (Phase.HOLD, Phase.SUCTION)  # what begins at each
 LEVEL_MBAR = 0.5  # a switching level is not known better, in all cycles alike
 UNKNOWN_LEVEL_MBAR = 3.0  # of a level that healthy cycles do not show
 
@@ -40,6 +41,7 @@ class Weights:
     cycles: tuple[int, ...]  # positions
     bins: Ints  # of these cycles
     factor: Floats  # lower Cholesky factor of the covariance of bins, then levels
+    usual: float  # rms (mbar) over rows of a model that is as right as it was in healthy cycles
     sigma: Floats  # of each level
     level_cycles: Ints  # of each level, positions
 
@@ -70,15 +72,23 @@ class Covariance:
         common = np.hypot(common, self.mismatch[here])
         moves, left_open = self.moves[here] * float(scattered), self.left_open[here]
         apart = np.exp(-np.abs(time[:, None] - time))
-        covariance = moves @ moves.T * (cycle[:, None] == cycle) + left_open @ left_open.T
+        covariance = moves @ moves.T * (cycle[:, None] == cycle)
         covariance += np.outer(common, common) * (apart * (kind[:, None] == kind))
         covariance += np.outer(alone, alone) * (apart * (stretch[:, None] == stretch))
         covariance[np.diag_indices_from(covariance)] += evidence.noise**2 / bins.count[here]
+        usual = _usual(np.diag(covariance), bins.count[here], evidence.noise)
+        covariance += left_open @ left_open.T
         sigma = _level_sigmas(evidence, cycles)
         levels = np.diag(sigma**2) + _together(evidence, cycles)
         factor = np.linalg.cholesky(block_diag(covariance * evidence.healthy.leftover**2, levels))
         shown = np.array([one for one, _ in _shown(evidence, cycles)], np.int64)
-        return Weights(tuple(cycles), here, factor, sigma, shown)
+        return Weights(tuple(cycles), here, factor, usual, sigma, shown)
+
+
+def _usual(variance: Floats, count: Ints, noise: float) -> float:
+    """The rms (mbar) over rows of bins that vary so; a bin's mean has less noise than its rows."""
+    rows = variance + noise**2 * (1.0 - 1.0 / count)
+    return float(np.sqrt(np.average(rows, weights=count))) if len(count) else 0.0
 
 
 def covariance(evidence: Evidence, about: Hypothesis = HEALTHY) -> Covariance:
@@ -127,8 +137,8 @@ _ERRORS = ("common_mbar", "alone_mbar")
 def levels(evidence: Evidence, cycles: Sequence[int], hypotheses: Sequence[Hypothesis]) -> Floats:
     """Measured minus expected switching levels (mbar) of cycles, (levels, hypotheses)."""
     shown = _shown(evidence, cycles)
-    begins = evidence.starts[[cycle for cycle, _ in shown]]
-    nodes = [_nodes(evidence, begins, one) for one in hypotheses]
+    at = np.array([evidence.knee(cycle, _INTO[number]) for cycle, number in shown], np.int64)
+    nodes = [_nodes(evidence, at, one) for one in hypotheses]
     there = [
         [_at(course, row) for row in rows]
         for course, rows in zip(map(evidence.course, hypotheses), nodes, strict=True)
@@ -138,23 +148,24 @@ def levels(evidence: Evidence, cycles: Sequence[int], hypotheses: Sequence[Hypot
     for i, (rows, some) in enumerate(zip(nodes, there, strict=True)):
         seen = np.array([[one.off, one.on] for one in map(evidence.seen, some)]).reshape(-1, 2)
         for j, (cycle, number) in enumerate(shown):
-            expected = float(np.interp(begins[j], rows, seen[:, number])) if len(rows) else 0.0
+            expected = float(np.interp(at[j], rows, seen[:, number])) if len(rows) else 0.0
             found[j, i] = _level(evidence, cycle, number, expected)
     return found
 
 
-def _nodes(evidence: Evidence, begins: Ints, hypothesis: Hypothesis) -> Ints:
-    """Rows at which a hypothesis is looked at, to know its switching at ``begins`` of cycles.
+def _nodes(evidence: Evidence, at: Ints, hypothesis: Hypothesis) -> Ints:
+    """Rows at which a hypothesis is looked at, to know its switching ``at`` others.
 
     What grows steadily is looked at in its middle and at its ends.
     """
+    at = np.unique(at)
     if not {cause.course for cause in hypothesis} <= {Course.CONSTANT, Course.RAMP}:
-        return np.unique(begins)
-    nodes: set[int] = {*begins[:1], *begins[-1:]}
+        return at
+    nodes: set[int] = {*at[:1], *at[-1:]}
     for cause in hypothesis:
         if cause.course == Course.RAMP:
-            grown = begins[evidence.seconds[begins] > cause.onset_s]
-            before = begins[evidence.seconds[begins] <= cause.onset_s]
+            grown = at[evidence.seconds[at] > cause.onset_s]
+            before = at[evidence.seconds[at] <= cause.onset_s]
             nodes |= {*before[-1:], *grown[:1], *grown[len(grown) // 2 : len(grown) // 2 + 1]}
     return np.array(sorted(nodes), np.int64)
 

@@ -72,7 +72,8 @@ def _supply_pressure_drop(theta: Theta, drop: float) -> None:
 
 
 def _filter_clogging(theta: Theta, drop: float) -> None:
-    theta[c.RESISTANCE] += c.resistance(theta, drop * MBAR)
+    at_ejector = theta[c.PLACE] < theta[c.NEAR_RESISTANCE]  # where the sensor is; behind that
+    theta[c.NEAR_RESISTANCE if at_ejector else c.RESISTANCE] += c.resistance(theta, drop * MBAR)
 
 
 def _added_volume(theta: Theta, volume: float) -> None:

@@ -23,6 +23,7 @@ from twin.signals import BREAK, MS, NS, SAMPLE, UNUSABLE, Phase, Samples
 IDLE_ROWS = 20  # rows of idle that give the level before a cycle
 FEWEST_IDLE_ROWS = 5
 SIGNIFICANT = 7.0  # sigmas of slope difference that make a knee
+JUMP = 8.0  # times the noise, from one row to the next: knees are rounder
 SHORTEST_WINDOW, LONGEST_WINDOW = 8, 60  # rows
 SETTLED = 20e-3  # s after the valve's response before a knee can be one
 
@@ -48,9 +49,14 @@ class Knees:
     blow_off: tuple[float, float] = (float(c.EXTERNAL), 0.0)  # the ejector's own: mode, pulse (s)
 
     @property
+    def settles(self) -> int:
+        """Rows that must follow a knee for its peak to be seen whole."""
+        return self.window + self.window // 2
+
+    @property
     def lag(self) -> int:
         """Rows the finder stays behind: half a window to see the peak, and the way back."""
-        return self.window + self.window // 2 + self.on_shift + 1
+        return self.settles + self.on_shift + 1
 
 
 def expected_knees(theta: Theta, noise: float) -> Knees:
@@ -84,10 +90,34 @@ def _line(pressure, start, rows):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _greatest_jump(pressure, first, last):  # type: ignore[no-untyped-def]
+    """Row after which pressure changes most (Pa) beside the changes before and after, and that."""
+    row, greatest = first, 0.0
+    for i in range(first + 1, last - 1):
+        beside = 0.5 * (pressure[i] - pressure[i - 1] + pressure[i + 2] - pressure[i + 1])
+        jump = abs(pressure[i + 1] - pressure[i] - beside)
+        if jump > greatest:
+            row, greatest = i, jump
+    return row, greatest
+
+
+@compiled
+def _bends_at(pressure, first, jump, last, noise):  # type: ignore[no-untyped-def]
+    """Significance of a difference in slope before and after a jump, which is in neither."""
+    before, after = jump + 1 - first, last - jump
+    if min(before, after) < SHORTEST_WINDOW // 2:
+        return 0.0
+    left, _ = _line(pressure, first, before)
+    right, _ = _line(pressure, jump + 1, after)
+    return (right - left) / (noise * math.sqrt(12.0 / before**3 + 12.0 / after**3))
+
+
+@compiled
 def _break_at(pressure, row, window, noise, nozzle_on):  # type: ignore[no-untyped-def]
     """Significance of the slope's break at ``row`` and the level there; 0 where it is no knee.
 
     Nozzle off: pressure fell and now does not fall any more. Nozzle on: it did not fall, now does.
+    Slopes across a jump (a sensor that has come loose) differ as well.
     """
     left, left_mean = _line(pressure, row - window, window + 1)
     right, right_mean = _line(pressure, row, window + 1)
@@ -99,7 +129,14 @@ def _break_at(pressure, row, window, noise, nozzle_on):  # type: ignore[no-untyp
         significance = -significance
         is_knee = left > -3.0 * sigma and right < -3.0 * sigma
     level = 0.5 * (left_mean + left * window / 2.0 + right_mean - right * window / 2.0)
-    return (significance if is_knee else 0.0), level
+    if not is_knee or significance < SIGNIFICANT:
+        return 0.0, level
+    jump, height = _greatest_jump(pressure, row - window, row + window)
+    if height > JUMP * noise:
+        bend = _bends_at(pressure, row - window, jump, row + window, noise)
+        if (bend if nozzle_on else -bend) < SIGNIFICANT:
+            return 0.0, level
+    return significance, level
 
 
 @compiled
