@@ -24,10 +24,10 @@ from twin.signals import Quality, Samples
 FORMAT = "ejector-twin-diagnosis/1"
 FEWEST_CYCLES = 3  # judged ones: two to fit on, one to judge by
 EXPLAINED = 1.2  # sigmas left up to which causes explain a deviation
-GROSS = 1.5  # times the deviation of healthy cycles, above which causes must take it away
-LEAST_SHARE = 0.5  # of what can be taken away
+BEYOND = 1.8  # times the usual deviation, with a share of what was explained: more is left over
+ROUGH = 0.04  # of what was explained, that causes may be off
 SEVERAL = 1.6  # sigmas that several causes may leave and still be sure
-MOST_LEFT = 0.3  # of chi-square beyond noise, that a cause may leave and still be sure
+MOST_LEFT = 0.5  # of chi-square beyond noise, that a cause may leave and still be sure
 MOST_SATURATED = 0.05  # share of samples
 MOST_JUDGED = 24  # cycles of a long log that are looked at, evenly spread
 MOST_NAMED = 4  # runners-up
@@ -104,21 +104,12 @@ def diagnose(
 
 
 def _verdict(found: Hypothesis, before: Judged, after: Judged, strange: Unlisted) -> str:
-    """Consistent, explained, or something real is left."""
+    """Consistent, explained, or something real is left: in sigmas, in mbar, or of a kind."""
     left = after.leftover > EXPLAINED
-    mimicked = len(found) > 1 and not _takes_away(before, after)
-    if left or strange.gain >= STRANGE or mimicked:
+    beyond = after.rms > BEYOND * math.hypot(before.usual, ROUGH * before.rms)
+    if left or beyond or strange.gain >= STRANGE:
         return "unlisted"
     return "explained" if found else "consistent"
-
-
-def _takes_away(before: Judged, after: Judged) -> bool:
-    """Whether causes take away the most of what was far more than healthy cycles have.
-
-    Several together can look like something that nobody listed, but not all along its curve.
-    """
-    gross = before.rms > GROSS * before.usual
-    return not gross or before.rms - after.rms > LEAST_SHARE * (before.rms - before.usual)
 
 
 def _sure(found: Hypothesis, before: Judged, after: Judged) -> bool:

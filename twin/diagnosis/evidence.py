@@ -91,15 +91,23 @@ class Evidence:
         rows = np.arange(len(self.samples))
         return self._run([course], phase, level, rows, kernel.TOLERANCE)[:, 0]
 
-    def off(self, hypotheses: Sequence[Hypothesis], bases: Sequence[Theta] | None = None) -> Floats:
+    def off(
+        self,
+        hypotheses: Sequence[Hypothesis],
+        bases: Sequence[Theta] | None = None,
+        late: Sequence[int] | None = None,
+    ) -> Floats:
         """Measured minus expected pressure (mbar) in each bin, (bins, hypotheses).
 
-        ``bases`` are the coefficients that each hypothesis changes, where not the twin's own.
+        ``bases`` are the coefficients that each hypothesis changes, where not the twin's own;
+        ``late`` by how many rows its knees are later than they were found.
         """
         bases = [self.theta] * len(hypotheses) if bases is None else bases
         pairs = list(zip(bases, hypotheses, strict=True))
         courses = [self.course(one, base) for base, one in pairs]
         sensing = self._sensing(bases, courses)
+        if late is not None:
+            sensing = [_later(*both) for both in zip(sensing, late, strict=True)]
         measured = self.bins.mean(self.samples["pressure"].astype(np.float64))
         lanes = [slice(i, i + kernel.LANES) for i in range(0, len(courses), kernel.LANES)]
 
@@ -158,7 +166,7 @@ class Evidence:
     ) -> list[tuple["Sensing", ...]]:
         """How much earlier than it is seen the nozzle switches, and what that does to the level.
 
-        It is the same for all coefficients but those of jet and sensor.
+        It is the same for all coefficients but those of jet, line and sensor.
         """
         stretches = [self._alike(base, course) for base, course in zip(bases, courses, strict=True)]
         self.look([*bases, *(alike for some in stretches for _, alike in some)])
@@ -168,7 +176,7 @@ class Evidence:
         ]
 
     def _alike(self, base: Theta, course: Schedule) -> Schedule:
-        """The coefficients of a course that hold at knees, with jet and sensor alone changed."""
+        """Coefficients of a course that hold at knees, with jet, line and sensor alone changed."""
         if all((theta[_SENSING] == base[_SENSING]).all() for _, theta in course):
             return []
         begins, found = [row for row, _ in course], []
@@ -209,8 +217,11 @@ class Evidence:
             closing = name == Phase.HOLD
             earlier, known = (here.off, 0) if closing else (here.on, self.knees.on_shift)
             level[knee] -= here.off_above if closing else here.on_above
+            acts = max(knee - known - earlier, 0)
             phase[max(knee - known, 0) : knee] = _OTHER[name]
-            phase[max(knee - known - earlier, 0) : knee] = name
+            phase[acts:knee] = name
+            late = phase[knee : max(knee, acts)]
+            late[late == name] = _OTHER[name]
 
     @cached_property
     def _knees(self) -> Ints:
@@ -271,6 +282,15 @@ class Sensing:
 
 _OTHER = {Phase.HOLD: Phase.SUCTION, Phase.SUCTION: Phase.HOLD}
 _SENSING = [c.SENSOR_LAG, c.SLOW_SENSOR, c.RAMP_UP, c.SLOW_RAMP_UP, c.RAMP_DOWN]
+_SENSING += [c.NEAR_RESISTANCE, c.RESISTANCE]  # a drop along the line vanishes at a knee
+
+
+def _later(sensing: tuple[Sensing, ...], rows: int) -> tuple[Sensing, ...]:
+    """The same with knees later by so many rows."""
+    if not rows:
+        return sensing
+    some = sensing or (Sensing(0, 0, 0, 0.0, 0.0),)
+    return tuple(replace(one, off=one.off - rows, on=one.on - rows) for one in some)
 
 
 def _together(courses: Sequence[Schedule], rows: int) -> Iterator[tuple[int, int, Theta]]:

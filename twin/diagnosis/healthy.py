@@ -1,18 +1,19 @@
 """What healthy cycles are like: how far the model is off in them, and what scatters by how much."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from twin.diagnosis.bins import Floats, Ints, unwarped
-from twin.diagnosis.evidence import HEALTHY, Evidence
-from twin.diagnosis.weights import SCATTER, covariance
-from twin.model.courses import Cause
+from twin.diagnosis.evidence import HEALTHY, Evidence, of_cycles
+from twin.diagnosis.weights import SCATTER, covariance, moved
 from twin.model.term import KINDS
 from twin.monitor.healthy import Healthy, ModelError
 from twin.signals import MS
 
 ROUNDS = 3
+FEWEST = 6  # cycles, to judge on others what was learned from some
 LEAST_COMMON, LEAST_ALONE = 0.15, 0.1  # mbar
 FIRST_ERROR = 2.0  # mbar, before anything is known
 HIDDEN = 1.3  # the error over what is left of it once the data set was fitted to the same cycles
@@ -21,18 +22,36 @@ LEAST_SCATTER, MOST_SCATTER = 0.2, 5.0  # of what is usual
 
 def learned(evidence: Evidence) -> Healthy:
     """Learn the model's error and the scatter from healthy cycles; the rest stays as it is."""
+    judged = evidence.judged
+    halves = [(judged[::2], judged[1::2]), (judged[1::2], judged[::2])]
+    if len(judged) < FEWEST:
+        halves = [(judged, judged)]
+    left = [
+        _left(replace(evidence, healthy=_learned(of_cycles(evidence, here))), there)
+        for here, there in halves
+    ]
+    return _learned(evidence).model_copy(update={"leftover": float(np.sqrt(np.mean(left)))})
+
+
+def _left(evidence: Evidence, cycles: Sequence[int]) -> float:
+    """Chi-square per residual that cycles have by what was learned from others."""
+    white = covariance(evidence).of(cycles).white(evidence.off([HEALTHY]))
+    return float(np.mean(white**2))
+
+
+def _learned(evidence: Evidence) -> Healthy:
     first = ModelError(after_ms=(0.0,), common_mbar=(FIRST_ERROR,), alone_mbar=(FIRST_ERROR / 4,))
     found = evidence.healthy.model_copy(
-        update={"error": dict.fromkeys(KINDS, first), "scatter": {}}
+        update={"error": dict.fromkeys(KINDS, first), "scatter": {}, "leftover": 1.0}
     )
-    off, moves = _moves(evidence)
+    off, moves, _ = moved(evidence, HEALTHY, SCATTER)  # in what is usual
     for _ in range(ROUNDS):
         evidence = replace(evidence, healthy=found)
         amplitudes, spread = _amplitudes(evidence, off, moves)
         left = off - np.einsum("bs,bs->b", moves, amplitudes[evidence.bins.cycle])
         judged = evidence.judged
         scatter = np.sqrt(amplitudes[judged].var(axis=0, ddof=1) + spread[judged].mean(axis=0))
-        scatter = np.clip(scatter, LEAST_SCATTER, MOST_SCATTER)
+        scatter = np.clip(scatter[: len(SCATTER)], LEAST_SCATTER, MOST_SCATTER)
         found = found.model_copy(
             update={
                 "error": _errors(evidence, left),
@@ -42,20 +61,7 @@ def learned(evidence: Evidence) -> Healthy:
                 },
             }
         )
-    return found.model_copy(update={"leftover": _leftover(replace(evidence, healthy=found))})
-
-
-def _leftover(evidence: Evidence) -> float:
-    """Sigmas that healthy cycles have by all this: what is learned here is a little too much."""
-    left = covariance(evidence).of(evidence.judged).white(evidence.off([HEALTHY]))
-    return float(np.sqrt(np.mean(left**2)))
-
-
-def _moves(evidence: Evidence) -> tuple[Floats, Floats]:
-    """Deviation in bins (mbar), and by how much each scatter's usual size moves it, (bins, ·)."""
-    scattered = [(Cause(name, {key: size}),) for name, (key, size) in SCATTER.items()]
-    off = evidence.off([HEALTHY, *scattered])
-    return off[:, 0], off[:, 1:] - off[:, :1]
+    return found
 
 
 def _amplitudes(evidence: Evidence, off: Floats, moves: Floats) -> tuple[Floats, Floats]:
@@ -63,12 +69,15 @@ def _amplitudes(evidence: Evidence, off: Floats, moves: Floats) -> tuple[Floats,
     size = (evidence.cycles, moves.shape[1])
     found, spread = np.zeros(size), np.zeros(size)
     known = covariance(evidence)
-    usual = np.array([size for _, size in SCATTER.values()])
+    known_sizes = [
+        evidence.healthy.scatter.get(name, size) / size for name, (_, size) in SCATTER.items()
+    ]
+    prior = np.ones(moves.shape[1])
+    prior[: len(known_sizes)] = known_sizes
     for cycle in evidence.judged:
         alone = known.of([cycle], scattered=False)
         both = alone.white(np.column_stack([off, moves]))
-        prior = [evidence.healthy.scatter.get(name, size) for name, (_, size) in SCATTER.items()]
-        information = both[:, 1:].T @ both[:, 1:] + np.diag((usual / np.array(prior)) ** 2)
+        information = both[:, 1:].T @ both[:, 1:] + np.diag(prior**-2.0)
         variance = np.linalg.inv(information)
         found[cycle] = variance @ both[:, 1:].T @ both[:, 0]
         spread[cycle] = np.diag(variance)

@@ -8,6 +8,7 @@ its price beside the others.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -71,7 +72,7 @@ def search(evidence: Evidence, fitted: Sequence[int], progress: Progress) -> Sea
     found = singles[0]
     while len(found.hypothesis) < MOST_CAUSES:
         progress(f"looking for what else there is beside {', '.join(found.effects)}")
-        more = _best_addition(evidence, judged, weights, found, healthy)
+        more = _best_addition(evidence, judged, weights, found, singles, healthy)
         if more is None:
             break
         found = more
@@ -161,7 +162,12 @@ def _started(
 
 
 def _best_addition(
-    evidence: Evidence, judged: Weights, weights: Weights, found: Fitted, healthy: float
+    evidence: Evidence,
+    judged: Weights,
+    weights: Weights,
+    found: Fitted,
+    singles: Sequence[Fitted],
+    healthy: float,
 ) -> Fitted | None:
     """What is found with one more cause, or a pair in its place; None if not worth it."""
     about = found.hypothesis
@@ -170,16 +176,32 @@ def _best_addition(
     new = [one for one in new[:TRIED_MORE] if one.gain > HOPEFUL]
     candidates = _started(evidence, judged, [(*about, *one.hypothesis) for one in new])
     if len(about) == 1:
-        alone = columns(evidence, judged)
-        singles = promises(evidence, judged, alone, each=2)
-        two = pairs(evidence, judged, alone, singles)[:TRIED_PAIRS]
-        candidates += [one.hypothesis for one in two if one.gain > singles[0].gain + HOPEFUL]
+        candidates += _linear_pairs(evidence, judged)
+        candidates += _fitted_pairs(evidence, weights, singles[:TRIED_PAIRS], found)
     candidates = _timed(evidence, judged, candidates)
     tried = _ranked(evidence, judged, fit(evidence, weights, candidates))
     for one in tried:
         if _worth(healthy, found.chi2, found.chi2 - found.score, one):
             return one
     return None
+
+
+def _linear_pairs(evidence: Evidence, judged: Weights) -> list[Hypothesis]:
+    """Pairs that explain more than any single cause in the linear model."""
+    alone = columns(evidence, judged)
+    singles = promises(evidence, judged, alone, each=2)
+    two = pairs(evidence, judged, alone, singles)[:TRIED_PAIRS]
+    return [one.hypothesis for one in two if one.gain > singles[0].gain + HOPEFUL]
+
+
+def _fitted_pairs(
+    evidence: Evidence, weights: Weights, singles: Sequence[Fitted], found: Fitted
+) -> list[Hypothesis]:
+    """Pairs of single causes, each as it was fitted: delays are far from linear."""
+    both = [(*one.hypothesis, *two.hypothesis) for one, two in combinations(singles, 2)]
+    chi2 = np.sum(white(evidence, weights, both, with_levels=False) ** 2, axis=0)
+    best = np.argsort(chi2)[:TRIED_MORE]
+    return [both[i] for i in best if chi2[i] < found.chi2]
 
 
 def _worth(healthy: float, chi2: float, paid: float, fitted: Fitted) -> bool:

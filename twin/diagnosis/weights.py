@@ -13,8 +13,9 @@ from scipy.linalg import block_diag, solve_triangular
 
 from twin.diagnosis.bins import Floats, Ints, warped
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
+from twin.model import theta as c
 from twin.model.courses import Cause, Course, Schedule
-from twin.model.term import KINDS
+from twin.model.term import AGAIN, KINDS
 from twin.model.theta import Theta
 from twin.monitor.healthy import ModelError
 from twin.signals import MS, Phase
@@ -27,7 +28,11 @@ SCATTER: Mapping[str, tuple[str, float]] = {
     "response_delay": ("delay", 0.5),
     "blow_off_delay": ("delay", 0.5),
 }
+CLOSING_MS = 0.5  # by which the blow-off valve's closing differs, one sigma
+KNEE_WINDOWS = 10  # a knee is found to a tenth of its window
+KNEE_MBAR = 0.7  # the level at a knee is not found better, and the model is set onto it
 MISMATCH = 0.08  # of what a hypothesis explains, is off in its waveform
+_AFTER_KNEE = [KINDS.index("hold"), AGAIN]
 LEVELS = ("h1_level", "h1_low_level")
 _INTO = (Phase.HOLD, Phase.SUCTION)  # what begins at each
 LEVEL_MBAR = 0.5  # a switching level is not known better, in all cycles alike
@@ -75,6 +80,7 @@ class Covariance:
         covariance = moves @ moves.T * (cycle[:, None] == cycle)
         covariance += np.outer(common, common) * (apart * (kind[:, None] == kind))
         covariance += np.outer(alone, alone) * (apart * (stretch[:, None] == stretch))
+        covariance += KNEE_MBAR**2 * ((stretch[:, None] == stretch) * np.isin(kind, _AFTER_KNEE))
         covariance[np.diag_indices_from(covariance)] += evidence.noise**2 / bins.count[here]
         usual = _usual(np.diag(covariance), bins.count[here], evidence.noise)
         covariance += left_open @ left_open.T
@@ -93,15 +99,35 @@ def _usual(variance: Floats, count: Ints, noise: float) -> float:
 
 def covariance(evidence: Evidence, about: Hypothesis = HEALTHY) -> Covariance:
     """What scatters and is uncertain about a hypothesis."""
-    scattered = [
-        (*about, Cause(name, {key: size})) for name, (key, size) in scatter(evidence).items()
-    ]
-    hypotheses = [about, HEALTHY, *scattered, *[about] * len(evidence.uncertain)]
-    bases = [evidence.theta] * (2 + len(scattered)) + list(evidence.uncertain)
-    off = evidence.off(hypotheses, bases)
-    moved = off[:, 2:] - off[:, :1]
-    explained = MISMATCH * np.abs(off[:, 1] - off[:, 0])
-    return Covariance(evidence, explained, moved[:, : len(scattered)], moved[:, len(scattered) :])
+    sizes = scatter(evidence)
+    off, moves, left_open = moved(evidence, about, sizes, evidence.uncertain)
+    (healthy,) = evidence.off([HEALTHY]).T
+    return Covariance(evidence, MISMATCH * np.abs(healthy - off), moves, left_open)
+
+
+def moved(
+    evidence: Evidence,
+    about: Hypothesis,
+    sizes: Mapping[str, tuple[str, float]],
+    uncertain: Sequence[Theta] = (),
+) -> tuple[Floats, Floats, Floats]:
+    """Deviation of a hypothesis (mbar), and by how much it moves, (bins, ·).
+
+    By each scatter's size, then by one sigma of what else differs from cycle to cycle: when the
+    blow-off valve closes, and where a knee was found; last with each of the ``uncertain`` data
+    sets.
+    """
+    scattered = [(*about, Cause(name, {key: size})) for name, (key, size) in sizes.items()]
+    closing = evidence.theta.copy()
+    closing[c.BLOW_OFF_RESPONSE_OFF] += CLOSING_MS * MS
+    late = max(round(evidence.knees.window / KNEE_WINDOWS), 1)
+    off = evidence.off(
+        [about, *scattered, about, about, *[about] * len(uncertain)],
+        [*[evidence.theta] * (1 + len(scattered)), closing, evidence.theta, *uncertain],
+        [*[0] * (2 + len(scattered)), late, *[0] * len(uncertain)],
+    )
+    moves, first = off[:, 1:] - off[:, :1], len(scattered) + 2
+    return off[:, 0], moves[:, :first], moves[:, first:]
 
 
 def scatter(evidence: Evidence) -> dict[str, tuple[str, float]]:
