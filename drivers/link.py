@@ -2,14 +2,12 @@
 
 import socket
 import struct
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from drivers.lasting import LostError
 from drivers.tags import Address, Place, Pressure, Tag, WordOrder, Words
 from drivers.telegram import HEAD, Request, belongs, exception
 from twin.errors import SourceError
@@ -27,15 +25,6 @@ EXCEPTIONS = {
     11: "gateway: the unit does not answer",
 }
 OURS = (1, 2, 3)  # the request is wrong and stays wrong; the others may pass
-
-
-@dataclass(frozen=True)
-class Clock:
-    """What time it is, and waiting; tests pass their own."""
-
-    wall_ns: Callable[[], int] = time.time_ns
-    now_ns: Callable[[], int] = time.perf_counter_ns  # runs on evenly
-    sleep: Callable[[float], None] = time.sleep
 
 
 class Tags(Settings):
@@ -96,14 +85,14 @@ class ModbusSettings(Settings):
             raise ValueError("the ring holds a 16-bit supply: tags.supply.type must be so too")
         return self
 
+    def at(self, host: str, port: int) -> "ModbusSettings":
+        """Give the same for a PLC at another address."""
+        return self.model_copy(update={"host": host, "port": port})
+
     @property
     def where(self) -> str:
         """Whom messages are about."""
         return f"{self.host}:{self.port}, unit {self.unit}"
-
-
-class LostError(SourceError):
-    """No connection, no answer, or a broken one: it may come back."""
 
 
 class Link:

@@ -4,15 +4,13 @@ It cannot be lossless on a general-purpose machine: slots are numbered, and a mi
 missing number. Time is that of the middle of the request here.
 """
 
-import queue
-import threading
-from collections.abc import Generator, Iterable, Iterator
-from contextlib import closing
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import numpy.typing as npt
 
-from drivers.link import Clock, Link, LostError, ModbusSettings
+from drivers.lasting import Clock, LostError
+from drivers.link import Link, ModbusSettings
 from drivers.tags import Flags, Tag, Words
 from drivers.telegram import MOST_WORDS, Request
 from twin.signals import MBAR, SAMPLE, Command, Quality, Samples
@@ -20,10 +18,6 @@ from twin.signals import MBAR, SAMPLE, Command, Quality, Samples
 SLOT_NS = 1_000_000
 SPIN_NS = 60_000  # a sleeping thread wakes about this late; longer spinning won nothing
 HEARTBEAT_NS = 100_000_000  # unchanged for longer: the PLC's program stands still
-WAITING = 256  # blocks that may wait to be taken; then slots are missed
-LONGEST_SILENCE_S = 0.25
-
-EMPTY: Samples = np.empty(0, SAMPLE)
 
 
 def plan(tags: Iterable[Tag], most: int = MOST_WORDS) -> list[Request]:
@@ -160,53 +154,3 @@ class Poller:
         since = np.maximum.accumulate(np.where(changed, at_ns, self._beat_ns))
         self._beat, self._beat_ns = beats[-1], int(since[-1])
         return np.where(at_ns - since > HEARTBEAT_NS, Quality.STALE.value, 0).astype(np.uint8)
-
-
-def in_thread(source: Generator[Samples, None, None]) -> Generator[Samples, None, None]:
-    """Run ``source`` in its own thread; empty blocks while it has nothing.
-
-    Its exception comes out here; closing this closes it.
-    """
-    blocks: queue.Queue[Samples | Exception] = queue.Queue(WAITING)
-    stop = threading.Event()
-    thread = threading.Thread(target=_pump, args=(source, blocks, stop), name="modbus poll")
-    thread.start()
-    try:
-        while True:
-            try:
-                block = blocks.get(timeout=LONGEST_SILENCE_S)
-            except queue.Empty:
-                block = EMPTY
-            if isinstance(block, Exception):
-                raise block
-            yield block
-    finally:
-        stop.set()
-        thread.join()
-
-
-def _pump(
-    source: Generator[Samples, None, None],
-    blocks: "queue.Queue[Samples | Exception]",
-    stop: threading.Event,
-) -> None:
-    with closing(source):
-        try:
-            for block in source:
-                if not _put(block, blocks, stop):
-                    return
-        except Exception as error:  # it is raised where the blocks are taken
-            _put(error, blocks, stop)
-
-
-def _put(
-    item: Samples | Exception, blocks: "queue.Queue[Samples | Exception]", stop: threading.Event
-) -> bool:
-    """Hand over, however long it takes; False once nobody takes any more."""
-    while not stop.is_set():
-        try:
-            blocks.put(item, timeout=LONGEST_SILENCE_S)
-            return True
-        except queue.Full:
-            continue
-    return False

@@ -7,11 +7,12 @@ from functools import partial
 
 import numpy as np
 
-from drivers.link import Clock, Link, ModbusSettings
-from drivers.modbus import REAL
+from drivers.lasting import REAL, Clock
+from drivers.link import Link, ModbusSettings
 from drivers.poll import plan
 from drivers.ring import RECORDS_AT_ONCE, Header, Trace
 from drivers.tags import Address, Pressure, Tag, WordOrder, Words, numbers
+from drivers.trace import Header as AnyHeader
 from twin.errors import SourceError
 
 TEST_REGISTERS = Address("holding", 0)
@@ -33,27 +34,28 @@ def probe(settings: ModbusSettings, clock: Clock = REAL) -> list[Line]:
     """Connect, read everything the settings name, and say what came; never raises SourceError."""
     link = Link(settings)
     try:
-        connected = _line("connection", lambda: _connect(link, settings, clock))
+        connected = looked_at("connection", lambda: _connect(link, settings, clock))
         return [connected, *_look(link, settings, clock)] if connected.good else [connected]
     finally:
         link.close()
 
 
 def _look(link: Link, settings: ModbusSettings, clock: Clock) -> list[Line]:
-    lines = [_line("round trip", lambda: _round_trip(link, settings, clock))]
+    lines = [looked_at("round trip", lambda: _round_trip(link, settings, clock))]
     for name, tag in settings.tags:
         if tag is not None:
-            lines.append(_line(name, partial(_show, link, tag, settings)))
+            lines.append(looked_at(name, partial(_show, link, tag, settings)))
     lines.append(_word_order(link, settings))
     if settings.mode == "block":
         trace = Trace(settings, clock)
-        lines.append(_line("trace header", lambda: _header(link, trace)))
-        lines.append(_line("trace records", lambda: _records(link, trace)))
-        lines.append(_line("scan rate", lambda: _rate(link, trace, clock)))
+        lines.append(looked_at("trace header", lambda: _header(link, trace)))
+        lines.append(looked_at("trace records", lambda: _records(link, trace)))
+        lines.append(looked_at("scan rate", lambda: _rate(link, trace, clock)))
     return lines
 
 
-def _line(what: str, look: Callable[[], str]) -> Line:
+def looked_at(what: str, look: Callable[[], str]) -> Line:
+    """What ``look`` says, or why it could not."""
     try:
         return Line(what, look())
     except SourceError as error:
@@ -154,6 +156,16 @@ def _rate(link: Link, trace: Trace, clock: Clock) -> str:
     first, first_ns = _timed_header(link, trace, clock)
     clock.sleep(WATCHED_S)
     last, last_ns = _timed_header(link, trace, clock)
+    return scan_rate(first, first_ns, last, last_ns)
+
+
+def _timed_header(link: Link, trace: Trace, clock: Clock) -> tuple[Header, int]:
+    header = trace.header(link)
+    return header, clock.now_ns()
+
+
+def scan_rate(first: AnyHeader, first_ns: int, last: AnyHeader, last_ns: int) -> str:
+    """Scans per second between two headers; SourceError if the sequence stands still."""
     scans = last.advance(first)
     if not scans:
         raise SourceError(
@@ -162,8 +174,3 @@ def _rate(link: Link, trace: Trace, clock: Clock) -> str:
         )
     nominal = 1e9 / first.period_ns
     return f"{scans / (last_ns - first_ns) * 1e9:.1f} scans/s, nominal {nominal:.1f}"
-
-
-def _timed_header(link: Link, trace: Trace, clock: Clock) -> tuple[Header, int]:
-    header = trace.header(link)
-    return header, clock.now_ns()

@@ -1,43 +1,31 @@
-"""Block mode: follow the PLC's ring of scans without losing one.
+"""Block mode over Modbus: the ring of scans as registers.
 
-The PLC writes a record per scan into a ring and counts them in a header. Here the header is read,
-then what is new. A record proves itself by the low 16 bits of its sequence; whatever is missing
-shows as a missing number and as a flag on the sample after it.
+The header is read first, then what is new. A record carries the low 16 bits of its sequence.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from drivers.link import Clock, Link, ModbusSettings, span
+from drivers.lasting import EMPTY, Clock
+from drivers.link import Link, ModbusSettings, span
 from drivers.tags import WordOrder, Words, numbers
+from drivers.trace import COMMANDS, OVERFLOW_BIT, RESERVE, WRAP, Follower
+from drivers.trace import Header as AnyHeader
 from twin.errors import SourceError
 from twin.signals import MBAR, SAMPLE, Quality, Samples
 
 HEADER_WORDS = 12
 RECORD_WORDS = 4
 RECORDS_AT_ONCE = 31  # 124 of the 125 words that a request may carry
-COMMANDS = 0b11  # in the status word, as in Command
-OVERFLOW_BIT = 8  # in the status word
-RESERVE = 64  # records at the old end of the ring that the PLC may overwrite while they are read
 LONGEST_FETCH_NS = 100_000_000  # then yield what came; no interval is longer
-CLOCK_TOLERANCE_NS = 50_000_000  # PLC time against sequence
-WRAP = 1 << 32  # the PLC counts with 32 bits
-
-EMPTY: Samples = np.empty(0, SAMPLE)
 
 
 @dataclass(frozen=True)
-class Header:
-    """What the PLC says about its ring."""
+class Header(AnyHeader):
+    """What the PLC says about its ring, and of its records."""
 
-    sequence: int  # of the newest complete record, 32 bits
-    time_ns: int  # of that record
-    boot: int  # differs after every restart
-    period_ns: int
-    depth: int  # records
     record_words: int
     supply: Words  # (1, 1), as its tag declares
 
@@ -56,54 +44,16 @@ class Header:
 
     @property
     def ready(self) -> bool:
-        """Whether it describes a ring; a PLC that just starts may show zeros."""
-        return self.record_words == RECORD_WORDS and self.depth > 2 * RESERVE and self.period_ns > 0
-
-    def advance(self, earlier: "Header") -> int | None:
-        """Scans since ``earlier``; None if the PLC restarted in between."""
-        scans = (self.sequence - earlier.sequence) % WRAP
-        return None if self.boot != earlier.boot or scans >= WRAP // 2 else scans
-
-    def clock_jumped(self, earlier: "Header", scans: int) -> bool:
-        """Whether PLC time did not run with the sequence."""
-        ran = self.time_ns - earlier.time_ns - scans * self.period_ns
-        return abs(ran) > CLOCK_TOLERANCE_NS
-
-    def follows(self, earlier: "Header") -> bool:
-        """Whether nothing happened but a few more scans."""
-        scans = self.advance(earlier)
-        return (
-            self.ready
-            and scans is not None
-            and scans < self.depth
-            and not self.clock_jumped(earlier, scans)
-        )
+        """Whether it describes a ring as we know it."""
+        return self.record_words == RECORD_WORDS and super().ready
 
 
-class Trace:
+class Trace(Follower[Header, Link]):
     """Where we are in the ring of one PLC; it outlives connections."""
 
     def __init__(self, settings: ModbusSettings, clock: Clock) -> None:
+        super().__init__(settings, clock)
         self._settings = settings
-        self._clock = clock
-        self._header: Header | None = None
-        self._newest = -1  # sequence of the header, beyond 32 bits
-        self._next = 0  # sequence to fetch next
-        self._last = -1  # sequence of the last sample given
-        self._last_ns = 0  # and its PLC time
-        self._break = 0  # Quality bits for the next sample
-
-    def samples(self, link: Link) -> Iterator[Samples]:
-        """Blocks of what is new, one every interval; ends only by an exception."""
-        interval_ns = round(self._settings.interval_ms * 1e6)
-        if self._header is None:
-            self._header = self.start(link)
-        while True:
-            started = self._clock.now_ns()
-            yield self._read(link)
-            rest = started + interval_ns - self._clock.now_ns()
-            if rest > 0:
-                self._clock.sleep(rest * 1e-9)
 
     def start(self, link: Link) -> Header:
         """Begin at the newest record; SourceError if there is no ring as configured."""
@@ -112,9 +62,7 @@ class Trace:
         for _ in range(3):  # some PLCs announce a record a little before it can be read
             self.refuse_other(header)
             if self._announced(link, header):
-                self._newest = header.sequence
-                self._next, self._last = header.sequence, header.sequence - 1
-                self._last_ns = header.time_ns - header.period_ns
+                self._begin(header)
                 return header
             header = self.header(link)
         raise SourceError(
@@ -163,28 +111,14 @@ class Trace:
         if took_ns > header.period_ns * (first - self._newest + header.depth) // 2:
             overwritten = self._overwritten(link, header)
             valid &= np.arange(first, end) > overwritten
-        return self._take(header, records, first, valid)
+        sequence = self._pass(first, valid)
+        return self._stamp(self._decode(header, records[valid]), header, sequence)
 
     def _next_header(self, link: Link) -> Header:
         """Read the header; twice where it surprises, since it may have been torn."""
         assert self._header is not None
         header = self.header(link)
         return header if header.follows(self._header) else self.header(link)
-
-    def _place(self, header: Header) -> None:
-        """Say where ``header`` is and what broke on the way there."""
-        assert self._header is not None
-        scans = header.advance(self._header)
-        if scans is None:
-            self.refuse_other(header)
-            self._break |= Quality.RESTART
-            self._newest, self._next, self._last = header.sequence, 0, -1
-        else:
-            self._newest += scans
-            if header.clock_jumped(self._header, scans):
-                self._break |= Quality.CLOCK
-        self._header = header
-        self._next = max(self._next, self._newest - header.depth + RESERVE)
 
     def _fetch(
         self, link: Link, header: Header, first: int, end: int
@@ -212,22 +146,6 @@ class Trace:
             return self._newest
         return self._newest + scans - header.depth + 1  # one is being written
 
-    def _take(
-        self, header: Header, records: Words, first: int, valid: npt.NDArray[np.bool_]
-    ) -> Samples:
-        """Make samples of the valid records and go on after them."""
-        sequence = first + np.flatnonzero(valid)
-        # Records behind the last valid one may only be late; without any there is no use waiting.
-        self._next = int(sequence[-1]) + 1 if len(sequence) else first + len(valid)
-        if not len(sequence):
-            return EMPTY
-        block = self._decode(header, records[valid])
-        block["sequence"] = sequence
-        block["time_ns"] = header.time_ns - (self._newest - sequence) * header.period_ns
-        block["host_ns"] = self._clock.wall_ns()
-        self._mark_breaks(block)
-        return block
-
     def _decode(self, header: Header, records: Words) -> Samples:
         tags, order = self._settings.tags, self._settings.word_order
         ambient = self._settings.ambient_mbar * MBAR
@@ -241,13 +159,3 @@ class Trace:
         if tags.supply is not None:
             block["supply"] = tags.supply.supply(header.supply, order, ambient)
         return block
-
-    def _mark_breaks(self, block: Samples) -> None:
-        gaps = np.diff(block["sequence"], prepend=self._last) != 1
-        block["quality"][gaps] |= Quality.GAP.value
-        if block["time_ns"][0] <= self._last_ns:
-            self._break |= Quality.CLOCK
-        block["quality"][0] |= self._break
-        self._break = 0
-        self._last = int(block["sequence"][-1])
-        self._last_ns = int(block["time_ns"][-1])

@@ -1,15 +1,20 @@
 """The table of drivers: which kinds of source a configuration can name."""
 
 from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from drivers import modbus
 from drivers.link import ModbusSettings
-from drivers.probe import probe
+from drivers.probe import Line, probe
 from twin.errors import ConfigError
 from twin.settings import Document
 from twin.signals import Samples
 
-KINDS = ("modbus",)
+if TYPE_CHECKING:
+    from drivers.opcua import OpcuaSettings
+
+KINDS = ("modbus", "opcua")
 
 
 def open_source(document: Document, address: str = "") -> Iterator[Samples]:
@@ -17,26 +22,48 @@ def open_source(document: Document, address: str = "") -> Iterator[Samples]:
 
     Raises ConfigError for an unknown kind or bad settings, SourceError if it does not answer.
     """
-    return modbus.blocks(_settings(document, address))
+    settings = _settings(document, address)
+    if isinstance(settings, ModbusSettings):
+        return modbus.blocks(settings)
+    from drivers import opcua  # noqa: PLC0415 - the library takes its time
+
+    return opcua.blocks(settings)
 
 
 def probe_source(document: Document, address: str = "") -> Iterator[str]:
     """Say, line by line, what the source answers."""
-    for line in probe(_settings(document, address)):
+    for line in _probed(_settings(document, address)):
         yield f"{'ok ' if line.good else '!! '} {line.what:<14} {line.text}"
 
 
-def _settings(document: Document, address: str) -> ModbusSettings:
+def _probed(settings: "ModbusSettings | OpcuaSettings") -> list[Line]:
+    if isinstance(settings, ModbusSettings):
+        return probe(settings)
+    from drivers import opcua_probe  # noqa: PLC0415 - the library takes its time
+
+    return opcua_probe.probe(settings)
+
+
+def _settings(document: Document, address: str) -> "ModbusSettings | OpcuaSettings":
+    settings = _configured(document)
+    if not address:
+        return settings
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal():
+        raise ConfigError(f"{address!r} is no address", "write it as HOST:PORT, e.g. 10.0.0.5:502")
+    return settings.at(host, int(port))
+
+
+def _configured(document: Document) -> "ModbusSettings | OpcuaSettings":
     table = document.tables.get("driver")
     if table is None:
         raise ConfigError(f"{document.name}: there is no [driver] table", "say where the PLC is")
     kind = table.get("kind", "modbus")
     if kind not in KINDS:
         raise ConfigError(f"{document.name}: unknown driver {kind!r}", f"known: {', '.join(KINDS)}")
-    settings = document.section(ModbusSettings, "driver")
-    if not address:
-        return settings
-    host, _, port = address.rpartition(":")
-    if not host or not port.isdecimal():
-        raise ConfigError(f"{address!r} is no address", "write it as HOST:PORT, e.g. 10.0.0.5:502")
-    return settings.model_copy(update={"host": host, "port": int(port)})
+    if kind == "modbus":
+        return document.section(ModbusSettings, "driver")
+    from drivers.opcua_settings import OpcuaSettings  # noqa: PLC0415 - as above
+
+    # Files lie beside the configuration, wherever the program was started.
+    return document.section(OpcuaSettings, "driver").below(Path(document.name).parent)

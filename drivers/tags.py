@@ -126,10 +126,9 @@ class Tag(Settings):
         return values if self.bit is None else (values.astype(np.uint16) >> self.bit) & 1
 
 
-class Pressure(Tag):
-    """A pressure: value = raw · scale + offset in ``unit``, counted from ``reference``."""
+class Quantity(Settings):
+    """What a number means: pressure = raw · scale + offset in ``unit``, from ``reference``."""
 
-    type: Type
     scale: float = 1.0
     offset: float = 0.0
     unit: Literal["mbar", "bar", "kPa", "Pa", "psi"]
@@ -138,24 +137,21 @@ class Pressure(Tag):
     overflow_above: int | None = Field(default=None, ge=0)  # raw; Siemens 32511; both signs
 
     @model_validator(mode="after")
-    def _means_a_pressure(self) -> Self:
-        if self.type == "bit":
-            raise ValueError("a pressure is a number, not a bit")
+    def _can_be_used(self) -> Self:
         if self.scale == 0:
             raise ValueError("scale must not be 0")
         if self.range is not None and not self.range[0] < self.range[1]:
             raise ValueError("range must be [low, high] with low < high")
         return self
 
-    def decode(
-        self, words: Words, order: WordOrder, ambient: float, onto: Reference = "absolute"
+    def pressure(
+        self, raw: Floats, ambient: float, onto: Reference = "absolute"
     ) -> tuple[npt.NDArray[np.float32], Flags]:
-        """Pressures in Pa, counted from ``onto``, and quality bits, from words (rows, size).
+        """Pressures in Pa, counted from ``onto``, and quality bits.
 
         ``ambient`` is in Pa. NaN and infinite values become NaN and BAD.
         """
-        with np.errstate(invalid="ignore", over="ignore"):  # whatever bits come, they are judged
-            raw = self.raw(words, order).astype(np.float64)
+        with np.errstate(invalid="ignore", over="ignore"):  # whatever comes, it is judged
             value = raw * self.scale + self.offset
             pascal = _counted(value * PASCAL[self.unit], self.reference, onto, ambient)
             column = pascal.astype(np.float32)
@@ -175,11 +171,37 @@ class Pressure(Tag):
             quality[(raw > above) | (raw < -above - 1)] |= Quality.OVERFLOW.value
         return quality
 
-    def supply(self, words: Words, order: WordOrder, ambient: float) -> npt.NDArray[np.float32]:
-        """Supply pressures in Pa gauge from words (rows, size); NaN where they are none."""
-        pascal, quality = self.decode(words, order, ambient, onto="gauge")
+    def gauge(self, raw: Floats, ambient: float) -> npt.NDArray[np.float32]:
+        """Pressures in Pa gauge; NaN where they are none."""
+        pascal, quality = self.pressure(raw, ambient, onto="gauge")
         pascal[(quality & UNUSABLE) != 0] = np.nan
         return pascal
+
+
+class Pressure(Quantity, Tag):
+    """A pressure in the PLC's registers."""
+
+    type: Type
+
+    @model_validator(mode="after")
+    def _is_a_number(self) -> Self:
+        if self.type == "bit":
+            raise ValueError("a pressure is a number, not a bit")
+        return self
+
+    def decode(
+        self, words: Words, order: WordOrder, ambient: float, onto: Reference = "absolute"
+    ) -> tuple[npt.NDArray[np.float32], Flags]:
+        """Pressures in Pa, counted from ``onto``, and quality bits, from words (rows, size)."""
+        return self.pressure(self._numbers(words, order), ambient, onto)
+
+    def supply(self, words: Words, order: WordOrder, ambient: float) -> npt.NDArray[np.float32]:
+        """Supply pressures in Pa gauge from words (rows, size); NaN where they are none."""
+        return self.gauge(self._numbers(words, order), ambient)
+
+    def _numbers(self, words: Words, order: WordOrder) -> Floats:
+        with np.errstate(invalid="ignore"):  # signalling NaNs too
+            return self.raw(words, order).astype(np.float64)
 
 
 def _counted(pascal: Floats, reference: Reference, onto: Reference, ambient: float) -> Floats:

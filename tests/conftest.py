@@ -12,6 +12,7 @@ from collections.abc import Iterator
 import psutil
 import pytest
 import rigs
+from opcua_plc import OpcuaPlc, start_opcua
 from plc_process import PlcProcess, start_plc
 
 from twin.live import compiled
@@ -48,6 +49,14 @@ def nothing_left_behind() -> Iterator[None]:
 def plc() -> Iterator[PlcProcess]:
     """The gripper's PLC in a process of its own; nobody may write to it or stop it."""
     with start_plc(rigs.path_of("gripper")) as running:
+        yield running
+
+
+@pytest.fixture(scope="session")
+def opcua(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OpcuaPlc]:
+    """A PLC that serves OPC UA with every policy, and lets anybody in; nobody may stop it."""
+    policies = ["None", "Basic256Sha256", "Aes256Sha256RsaPss"]
+    with start_opcua(tmp_path_factory.mktemp("opcua"), policies=policies) as running:
         yield running
 
 

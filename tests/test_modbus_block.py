@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.link import Clock
+from drivers.lasting import Clock
 from drivers.modbus import ModbusSettings, blocks
 from tests.modbus_server import CUT, HALF, SILENT, ModbusServer, PlcTime, TracePlc
 from twin.errors import SourceError

@@ -22,7 +22,8 @@ from pymodbus.pdu.register_message import (
 )
 from rigs import path_of
 
-from drivers.link import Link, LostError, ModbusSettings, received
+from drivers.lasting import LostError
+from drivers.link import Link, ModbusSettings, received
 from drivers.tags import Address
 from drivers.telegram import FUNCTION, HEAD, MOST_WORDS, Request, belongs, exception
 from twin.errors import SourceError

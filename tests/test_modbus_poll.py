@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.link import Clock, Link, LostError, ModbusSettings
+from drivers.lasting import Clock, LostError
+from drivers.link import Link, ModbusSettings
 from drivers.modbus import blocks
 from drivers.poll import Poller, plan
 from drivers.tags import Tag

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.link import Clock, ModbusSettings
+from drivers.lasting import Clock
+from drivers.link import ModbusSettings
 from drivers.probe import Line, probe, word_order_of
 from tests.modbus_server import SILENT, ModbusServer, PlcTime, TracePlc
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli_assets import assets_app
+from twin.cli_cert import cert
 from twin.errors import ConfigError, SourceError, TwinError
 from twin.events import Event, Severity
 
@@ -43,6 +44,7 @@ app = typer.Typer(
 app.add_typer(assets_app, name="assets")
 log_app = typer.Typer(help="Look after logs.", no_args_is_help=True)
 app.add_typer(log_app, name="log")
+app.command()(cert)
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML configuration.")]
 LogFile = Annotated[Path, typer.Argument(metavar="LOG.mcap", help="A recorded log.")]

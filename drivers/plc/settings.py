@@ -1,8 +1,9 @@
 """The ``[plc]`` table: the simulated PLC, its program and the rig behind it, in field units."""
 
-from typing import Literal
+from pathlib import Path
+from typing import Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from twin.errors import ConfigError
 from twin.settings import Settings
@@ -96,13 +97,39 @@ class Scatter(Settings):
     valve_ms: float = Field(default=0.5, ge=0, le=20)
 
 
+Policy = Literal["None", "Basic256Sha256", "Aes256Sha256RsaPss"]  # with sign-and-encrypt
+
+
 class Server(Settings):
-    """Where the PLC listens and how it lays out 32-bit and 64-bit values."""
+    """Where the PLC speaks Modbus and how it lays out 32-bit and 64-bit values."""
 
     host: str = "127.0.0.1"
     port: int = Field(default=5020, ge=0, le=65535)  # 0 takes any free one
     unit: int = Field(default=1, ge=1, le=247)
     word_order: Literal["big", "little"] = "big"
+
+
+class OpcuaServer(Settings):
+    """Where the PLC serves OPC UA, to whom, and how much like a real server it behaves."""
+
+    host: str = "127.0.0.1"
+    port: int = Field(default=4840, ge=0, le=65535)  # 0 takes any free one
+    namespace_index: int = Field(default=2, ge=2, le=50)  # real ones change it when reconfigured
+    trace_depth: int = Field(default=1024, ge=256, le=4096)  # newest scans in the trace's arrays
+    min_sampling_ms: int = Field(default=1, ge=1, le=10_000)  # asked for less, it is revised
+    min_publishing_ms: float = Field(default=1.0, ge=1, le=10_000)  # the same
+    max_queue: int = Field(default=10_000, ge=1, le=100_000)  # values of one node
+    late_publishing_ms: float = Field(default=0.0, ge=0, le=10_000)  # so long publishing takes
+    drop_every_s: float = Field(default=0.0, ge=0)  # hang up on everybody so often; 0: never
+    policies: tuple[Policy, ...] = ("None",)
+    certificates: Path | None = None  # a folder as twin cert makes it
+    users: dict[str, str] = Field(default={})  # name = "password"; if any, of all
+
+    @model_validator(mode="after")
+    def _can_be_secure(self) -> Self:
+        if self.policies != ("None",) and self.certificates is None:
+            raise ValueError("policies other than None need certificates, a folder by twin cert")
+        return self
 
 
 class PlcSettings(Settings):
@@ -116,6 +143,7 @@ class PlcSettings(Settings):
     program: Program = Program()
     scatter: Scatter = Scatter()
     server: Server = Server()
+    opcua: OpcuaServer | None = None  # beside Modbus, from the same scans, if there is a table
 
     def on_port(self, port: int | None) -> "PlcSettings":
         """Give the same on another port (None: the configured one); ConfigError if it is none."""

@@ -1,0 +1,204 @@
+"""Certificates in a folder: our own with its key, those we trust, those we have refused.
+
+``own/certificate.der`` and ``own/key.pem`` say who we are; whoever lies in ``trusted/``, or is
+signed by a certificate authority that does, is known. A certificate that was refused is kept in
+``rejected/``, so that a person can look at it and move it.
+"""
+
+import socket
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import rsa
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from twin.errors import ConfigError, SourceError
+
+OWN, KEY = Path("own") / "certificate.der", Path("own") / "key.pem"
+TRUSTED, REJECTED = "trusted", "rejected"
+USERS = "users"  # of a server: those of the persons that it lets in
+KEY_BITS = 2048
+DAYS = 5 * 365
+CLOCK_SKEW = timedelta(days=1)  # of a PLC that is behind: it would find a fresh one not yet valid
+
+
+@dataclass(frozen=True)
+class Own:
+    """Our own certificate, and where it and its key are."""
+
+    certificate: x509.Certificate
+    path: Path
+    key: Path
+
+    @property
+    def uri(self) -> str:
+        """The application that it names; "" if it names none."""
+        names = _alternative_names(self.certificate)
+        return next(iter(names.get_values_for_type(x509.UniformResourceIdentifier)), "")
+
+
+def make(folder: Path, name: str = "ejector-twin", days: int = DAYS) -> Own:
+    """Make a certificate of our own and its key; ConfigError if there is one already."""
+    own = folder / OWN
+    if own.exists():
+        raise ConfigError(f"{own} is there already", "delete it first if it is to be replaced")
+    for part in (own.parent, folder / TRUSTED, folder / REJECTED):
+        part.mkdir(parents=True, exist_ok=True)
+    key = rsa.generate_private_key(public_exponent=65537, key_size=KEY_BITS)
+    _write_key(folder / KEY, key)
+    certificate = signed(key, name, datetime.now(UTC) - CLOCK_SKEW, days)
+    own.write_bytes(certificate.public_bytes(serialization.Encoding.DER))
+    return Own(certificate, own, folder / KEY)
+
+
+def _write_key(path: Path, key: rsa.RSAPrivateKey) -> None:
+    path.touch(mode=0o600)  # before anything stands in it
+    path.write_bytes(
+        key.private_bytes(
+            serialization.Encoding.PEM,
+            serialization.PrivateFormat.PKCS8,
+            serialization.NoEncryption(),
+        )
+    )
+
+
+def signed(key: rsa.RSAPrivateKey, name: str, begin: datetime, days: int) -> x509.Certificate:
+    """A self-signed certificate of an OPC UA application (OPC 10000-6, 6.2.2)."""
+    host = socket.gethostname()
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    public = key.public_key()
+    identifier = x509.SubjectKeyIdentifier.from_public_key(public)
+    usage = x509.KeyUsage(
+        digital_signature=True,
+        content_commitment=True,
+        key_encipherment=True,
+        data_encipherment=True,
+        key_agreement=False,
+        key_cert_sign=True,  # itself
+        crl_sign=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+    extensions: list[tuple[x509.ExtensionType, bool]] = [
+        (_names(name, host), False),
+        (x509.BasicConstraints(ca=False, path_length=None), True),
+        (usage, True),
+        (
+            x509.ExtendedKeyUsage(
+                [ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH]
+            ),
+            False,
+        ),
+        (identifier, False),
+        (x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(identifier), False),
+    ]
+    builder = x509.CertificateBuilder(
+        issuer_name=subject,
+        subject_name=subject,
+        public_key=public,
+        serial_number=x509.random_serial_number(),
+        not_valid_before=begin,
+        not_valid_after=begin + timedelta(days=days),
+    )
+    for extension, critical in extensions:
+        builder = builder.add_extension(extension, critical)
+    return builder.sign(key, hashes.SHA256())
+
+
+def _names(name: str, host: str) -> x509.SubjectAlternativeName:
+    uri = f"urn:{host}:{name}".replace(" ", "-")
+    return x509.SubjectAlternativeName([x509.UniformResourceIdentifier(uri), x509.DNSName(host)])
+
+
+def _alternative_names(certificate: x509.Certificate) -> x509.SubjectAlternativeName:
+    try:
+        kind = x509.SubjectAlternativeName
+        return certificate.extensions.get_extension_for_class(kind).value
+    except (x509.ExtensionNotFound, ValueError):
+        return x509.SubjectAlternativeName([])
+
+
+def own(folder: Path, now: datetime) -> Own:
+    """Our own certificate; ConfigError if it is missing, unreadable, or out of date."""
+    path, key = folder / OWN, folder / KEY
+    again = f"make one: twin cert {folder}"
+    if not (path.is_file() and key.is_file()):
+        raise ConfigError(f"{folder}: there is no certificate of our own", again)
+    certificate = _read(path)
+    if certificate is None:
+        raise ConfigError(f"{path} is no certificate", f"delete it and {again}")
+    if not _in_time(certificate, now):
+        raise ConfigError(f"{path}: our own certificate {_when(certificate, now)}", again)
+    return Own(certificate, path, key)
+
+
+def check(certificate: x509.Certificate, folder: Path, now: datetime, whose: str) -> None:
+    """SourceError if the certificate of ``whose`` is out of date or nobody we trust."""
+    who = f"{whose}: its certificate ({described(certificate)})"
+    if not _in_time(certificate, now):
+        raise SourceError(
+            f"{who} {_when(certificate, now)}",
+            "give that server a new certificate, or set its clock and ours",
+        )
+    if not trusted(certificate, folder, now):
+        kept = _keep(certificate, folder)
+        raise SourceError(
+            f"{who} is not trusted",
+            f"if the fingerprint is the one the server shows: mv {kept} {folder / TRUSTED}/",
+        )
+
+
+def trusted(certificate: x509.Certificate, folder: Path, now: datetime) -> bool:
+    """Whether it, or a certificate authority that signed it, lies in ``trusted/``."""
+    known = [_read(path) for path in sorted((folder / TRUSTED).glob("*.*"))]
+    return any(
+        one == certificate or _signed_by(certificate, one, now) for one in known if one is not None
+    )
+
+
+def _signed_by(certificate: x509.Certificate, issuer: x509.Certificate, now: datetime) -> bool:
+    try:
+        constraints = issuer.extensions.get_extension_for_class(x509.BasicConstraints).value
+        certificate.verify_directly_issued_by(issuer)
+    except (x509.ExtensionNotFound, ValueError, TypeError, InvalidSignature):
+        return False
+    return constraints.ca and _in_time(issuer, now)
+
+
+def described(certificate: x509.Certificate) -> str:
+    """Its name and fingerprint, as servers show them."""
+    fingerprint = certificate.fingerprint(hashes.SHA1()).hex().upper()  # noqa: S303 - as shown
+    return f"{certificate.subject.rfc4514_string()}, SHA1 {fingerprint}"
+
+
+def _keep(certificate: x509.Certificate, folder: Path) -> Path:
+    fingerprint = certificate.fingerprint(hashes.SHA1()).hex().upper()  # noqa: S303 - as shown
+    path = folder / REJECTED / f"{fingerprint}.der"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(certificate.public_bytes(serialization.Encoding.DER))
+    return path
+
+
+def _read(path: Path) -> x509.Certificate | None:
+    """A certificate from a DER or PEM file; None if it is none."""
+    content = path.read_bytes()
+    try:
+        if content.startswith(b"-----BEGIN"):
+            return x509.load_pem_x509_certificate(content)
+        return x509.load_der_x509_certificate(content)
+    except ValueError:
+        return None
+
+
+def _in_time(certificate: x509.Certificate, now: datetime) -> bool:
+    return certificate.not_valid_before_utc <= now <= certificate.not_valid_after_utc
+
+
+def _when(certificate: x509.Certificate, now: datetime) -> str:
+    if now < certificate.not_valid_before_utc:
+        return f"is valid only from {certificate.not_valid_before_utc:%Y-%m-%d} on"
+    return f"expired on {certificate.not_valid_after_utc:%Y-%m-%d}"

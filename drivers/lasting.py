@@ -1,0 +1,148 @@
+"""Connections that come and go, whatever protocol they speak: retried for ever, in one stream."""
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from twin.errors import SourceError
+from twin.signals import SAMPLE, Samples
+
+RETRY_S = 0.4  # between two attempts to connect
+WAITING = 256  # blocks that may wait to be taken from a thread
+LONGEST_SILENCE_S = 0.25
+
+EMPTY: Samples = np.empty(0, SAMPLE)
+
+
+class LostError(SourceError):
+    """No connection, no answer, or a broken one: it may come back."""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """What time it is, and waiting; tests pass their own."""
+
+    wall_ns: Callable[[], int] = time.time_ns
+    now_ns: Callable[[], int] = time.perf_counter_ns  # runs on evenly
+    sleep: Callable[[float], None] = time.sleep
+
+
+REAL = Clock()
+
+
+class Connection(Protocol):
+    """Something to read from that can be lost and opened again."""
+
+    def open(self) -> None:
+        """Connect, unless it is connected; LostError if that fails."""
+
+    def close(self) -> None:
+        """Hang up."""
+
+
+C_contra = TypeVar("C_contra", bound=Connection, contravariant=True)
+
+
+class Source(Protocol[C_contra]):
+    """Where we are in the samples of one PLC; it outlives connections."""
+
+    def samples(self, link: C_contra) -> Iterator[Samples]:
+        """Blocks as they come; ends only by an exception."""
+        ...
+
+
+def lasting(
+    source: Source[C_contra], link: C_contra, clock: Clock
+) -> Generator[Samples, None, None]:
+    """Samples of ``source`` over one connection after the other; empty blocks in between.
+
+    Errors before the first sample come out, and later all but LostError. Closing hangs up.
+    """
+    begun = False
+    try:
+        link.open()
+        while True:
+            try:
+                for block in source.samples(link):
+                    begun = True
+                    yield block
+            except LostError:
+                if not begun:
+                    raise
+                link.close()  # if it is not yet: what it knows of the PLC may no longer hold
+                yield from _reconnect(link, clock)
+    finally:
+        link.close()
+
+
+def _reconnect(link: Connection, clock: Clock) -> Iterator[Samples]:
+    """Empty blocks until there is a connection again."""
+    while True:
+        yield EMPTY  # and around whatever may take its time
+        for _ in range(2):
+            clock.sleep(RETRY_S / 2)
+            yield EMPTY
+        try:
+            link.open()
+        except LostError:
+            continue
+        yield EMPTY  # connected is not yet answered
+        return
+
+
+def in_thread(source: Generator[Samples, None, None]) -> Generator[Samples, None, None]:
+    """Run ``source`` in its own thread; empty blocks while it has nothing, once it has begun.
+
+    Its exception comes out here; closing this closes it.
+    """
+    blocks: queue.Queue[Samples | Exception] = queue.Queue(WAITING)
+    stop = threading.Event()
+    thread = threading.Thread(target=_pump, args=(source, blocks, stop), name="driver")
+    thread.start()
+    try:
+        block = blocks.get()
+        while True:
+            if isinstance(block, Exception):
+                raise block
+            yield block
+            try:
+                block = blocks.get(timeout=LONGEST_SILENCE_S)
+            except queue.Empty:
+                block = EMPTY
+    finally:
+        stop.set()
+        if threading.current_thread() is not thread:  # forgotten, and collected over there
+            thread.join()
+
+
+def _pump(
+    source: Generator[Samples, None, None],
+    blocks: "queue.Queue[Samples | Exception]",
+    stop: threading.Event,
+) -> None:
+    with closing(source):
+        try:
+            for block in source:
+                if not _put(block, blocks, stop):
+                    return
+        except Exception as error:  # it is raised where the blocks are taken
+            _put(error, blocks, stop)
+
+
+def _put(
+    item: Samples | Exception, blocks: "queue.Queue[Samples | Exception]", stop: threading.Event
+) -> bool:
+    """Hand over, however long it takes; False once nobody takes any more."""
+    while not stop.is_set():
+        try:
+            blocks.put(item, timeout=LONGEST_SILENCE_S)
+            return True
+        except queue.Full:
+            continue
+    return False

@@ -1,0 +1,97 @@
+"""What an OPC UA server shows of itself, line by line: for the first hour with an unknown PLC."""
+
+import statistics
+from functools import partial
+
+from drivers.lasting import REAL, Clock
+from drivers.opcua_link import OpcuaLink
+from drivers.opcua_settings import Node, OpcuaSettings
+from drivers.opcua_subscribe import Subscription
+from drivers.opcua_trace import NodeTrace
+from drivers.opcua_values import code_of, readable, status_name
+from drivers.probe import TIMES, WATCHED_S, Line, looked_at, scan_rate
+from twin.errors import SourceError
+
+
+def probe(settings: OpcuaSettings, clock: Clock = REAL) -> list[Line]:
+    """Connect, read everything the settings name, and say what came; never raises SourceError."""
+    link = OpcuaLink(settings, clock)
+    try:
+        connected = looked_at("connection", lambda: _connect(link, settings, clock))
+        return [connected, *_look(link, settings, clock)] if connected.good else [connected]
+    finally:
+        link.close()
+
+
+def _look(link: OpcuaLink, settings: OpcuaSettings, clock: Clock) -> list[Line]:
+    lines = [looked_at(name, partial(_show, link, tag.node)) for name, tag in settings.tags if tag]
+    if settings.mode == "subscribe":
+        subscription = Subscription(settings, clock)
+        return [*lines, looked_at("subscription", lambda: _granted(link, subscription, settings))]
+    trace = NodeTrace(settings, clock)
+    return [
+        *lines,
+        looked_at("round trip", lambda: _round_trip(link, trace, settings, clock)),
+        looked_at("trace", lambda: _ring(link, trace)),
+        looked_at("scan rate", lambda: _rate(link, trace, clock)),
+    ]
+
+
+def _connect(link: OpcuaLink, settings: OpcuaSettings, clock: Clock) -> str:
+    started = clock.now_ns()
+    link.open()
+    took_ms = (clock.now_ns() - started) * 1e-6
+    return f"{settings.where}: connected in {took_ms:.0f} ms, security {settings.security.policy}"
+
+
+def _show(link: OpcuaLink, node: Node) -> str:
+    link.open()
+    value = link.read((node,))[0]
+    held = f"{value.Value.VariantType.name} {value.Value.Value}" if readable(value) else "nothing"
+    return f"{node}: {held}, {status_name(code_of(value))}, of {value.SourceTimestamp} UTC"
+
+
+def _granted(link: OpcuaLink, subscription: Subscription, settings: OpcuaSettings) -> str:
+    """What the server grants; SourceError if it samples too seldom to see anything."""
+    link.open()
+    granted = link.subscribe(subscription.nodes, subscription.queue)
+    text = (
+        f"samples every {granted.sampling_ms:g} ms, publishes every {granted.publishing_ms:g} ms, "
+        f"keeps {granted.queue} values"
+    )
+    if granted.sampling_ms > 2 * settings.sampling_ms:
+        raise SourceError(text, f"asked for was a sample every {settings.sampling_ms:g} ms")
+    return text
+
+
+def _round_trip(link: OpcuaLink, trace: NodeTrace, settings: OpcuaSettings, clock: Clock) -> str:
+    """Median time to read the whole trace; SourceError if that is too slow."""
+    link.open()
+    took_ms = []
+    for _ in range(TIMES):
+        started = clock.now_ns()
+        trace.ask(link)
+        took_ms.append((clock.now_ns() - started) * 1e-6)
+    median, worst = statistics.median(took_ms), max(took_ms)
+    text = f"{median:.2f} ms in the median, {worst:.2f} ms at worst, of {TIMES} whole traces"
+    if median > settings.interval_ms:
+        raise SourceError(text, "too slow to read it every interval_ms")
+    return text
+
+
+def _ring(link: OpcuaLink, trace: NodeTrace) -> str:
+    link.open()
+    header = trace.start(link)
+    return (
+        f"{header.depth} records, one every {header.period_ns // 1000} µs; boot {header.boot}, "
+        f"sequence {header.sequence}, PLC time {header.time_ns * 1e-9:.3f} s"
+    )
+
+
+def _rate(link: OpcuaLink, trace: NodeTrace, clock: Clock) -> str:
+    """Scans per second by the clock here; SourceError if the sequence stands still."""
+    link.open()
+    first, first_ns = trace.ask(link).header, clock.now_ns()
+    clock.sleep(WATCHED_S)
+    last, last_ns = trace.ask(link).header, clock.now_ns()
+    return scan_rate(first, first_ns, last, last_ns)

@@ -1,0 +1,179 @@
+"""The ``[driver]`` table for an OPC UA server: where it is, its nodes, and who we are to it."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, Self
+from urllib.parse import urlsplit
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from drivers.tags import Quantity
+from twin.settings import Settings
+
+PORT = 4840  # registered for OPC UA
+NODE = re.compile(r"(?:nsu=(?P<uri>[^;]+);)?(?P<identifier>[sigb]=.+)", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Node:
+    """A node as a configuration names it; "" as URI means the driver's ``namespace``."""
+
+    identifier: str  # with its kind, as "s=Meas.Pressure"
+    uri: str = ""
+
+    @classmethod
+    def parse(cls, text: object) -> "Node":
+        """Take ``"s=Meas.Pressure"`` or ``"nsu=urn:plc;s=Meas.Pressure"``; else ValueError."""
+        if isinstance(text, cls):
+            return text
+        if match := NODE.fullmatch(str(text)):
+            return cls(match["identifier"], match["uri"] or "")
+        indexed = re.match(r"ns=\d+;", str(text))
+        why = "the index may be another after a restart; " if indexed else ""
+        raise ValueError(
+            f'"{text}" is no node: {why}write "s=Name" (also i=, g=, b=) and the URI of its '
+            'namespace as namespace = "…" in [driver], or "nsu=URI;s=Name"'
+        )
+
+    def __str__(self) -> str:
+        return f"nsu={self.uri};{self.identifier}" if self.uri else self.identifier
+
+
+NodeName = Annotated[Node, BeforeValidator(Node.parse)]
+
+
+class NodeTag(Settings):
+    """A value in the server that is on or off: a Boolean, or a bit of a number."""
+
+    node: NodeName
+    bit: int | None = Field(default=None, ge=0, le=63)  # of a number, 0 the lowest
+
+
+class NodePressure(Quantity):
+    """A pressure in the server: a number, and what it means."""
+
+    node: NodeName
+
+
+class NodeTags(Settings):
+    """The server's values that the twin reads one by one."""
+
+    pressure: NodePressure
+    suction: NodeTag | None = None
+    blow_off: NodeTag | None = None
+    supply: NodePressure | None = None
+
+
+class TraceNodes(Settings):
+    """The PLC's trace of its scans: where it stands, and its ring as arrays of one length."""
+
+    sequence: NodeName = Node("s=Trace.Sequence")  # of the newest complete record, 32 bits
+    time: NodeName = Node("s=Trace.Time")  # of that record: ns since 1970, or a DateTime
+    boot: NodeName = Node("s=Trace.Boot")  # differs after every restart
+    period: NodeName = Node("s=Trace.Period")  # of the scans, µs
+    sequences: NodeName = Node("s=Trace.Sequences")  # scan s at s mod length
+    statuses: NodeName = Node("s=Trace.Statuses")  # bits 0 suction, 1 blow-off, 8 overflow
+    pressures: NodeName = Node("s=Trace.Pressures")  # as tags.pressure says
+
+
+class Security(Settings):
+    """How the connection is protected. With a policy, all is signed and encrypted."""
+
+    policy: Literal["None", "Basic256Sha256", "Aes256Sha256RsaPss"] = "None"
+    certificates: Path | None = None  # folder that twin cert makes: ours, and whom we trust
+
+    @model_validator(mode="after")
+    def _has_certificates(self) -> Self:
+        if self.policy != "None" and self.certificates is None:
+            raise ValueError(f'"{self.policy}" needs certificates = "FOLDER"; twin cert makes it')
+        return self
+
+
+class User(Settings):
+    """Who we are to the server: nobody, a name and password, or a certificate."""
+
+    name: str = ""
+    password_file: Path | None = None  # a file, since configurations are copied into logs
+    certificate: Path | None = None
+    key: Path | None = None
+
+    @model_validator(mode="after")
+    def _is_one(self) -> Self:
+        if bool(self.name) != (self.password_file is not None):
+            raise ValueError("name and password_file belong together")
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("certificate and key belong together")
+        if self.name and self.certificate:
+            raise ValueError("a name with a password, or a certificate: not both")
+        return self
+
+
+class OpcuaSettings(Settings):
+    """The ``[driver]`` table for a PLC behind an OPC UA server."""
+
+    kind: Literal["opcua"] = "opcua"
+    url: str
+    namespace: str = ""  # URI of the nodes' namespace; needed where they do not name it
+    mode: Literal["block", "subscribe"] = "block"
+    interval_ms: float = Field(default=50.0, ge=5, le=1000)  # between blocks, of publishing
+    sampling_ms: float = Field(default=1.0, ge=0.1, le=1000)  # subscribed: asked of the server
+    timeout_ms: float = Field(default=2000.0, ge=50, le=20_000)  # of one answer
+    gap_ms: float = Field(default=20.0, ge=1)  # subscribed: less missing is no gap
+    ambient_mbar: float = Field(default=1013.25, ge=500, le=1200)
+    security: Security = Security()
+    user: User = User()
+    tags: NodeTags
+    trace: TraceNodes = TraceNodes()
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        _checked_url(self.url)
+        if self.mode == "subscribe" and (self.tags.suction is None or self.tags.blow_off is None):
+            raise ValueError("subscribing needs the tags suction and blow_off")
+        if self.security.policy == "None" and (self.user.name or self.user.certificate):
+            raise ValueError("a user needs security.policy: a password is not sent in the clear")
+        nameless = [node for node in self._nodes() if not node.uri]
+        if nameless and not self.namespace:
+            raise ValueError(
+                f"{nameless[0]}: in which namespace? Give its URI as namespace, or write "
+                f'"nsu=URI;{nameless[0]}"'
+            )
+        return self
+
+    def _nodes(self) -> list[Node]:
+        nodes = [tag.node for _, tag in self.tags if tag is not None]
+        return nodes + ([node for _, node in self.trace] if self.mode == "block" else [])
+
+    def at(self, host: str, port: int) -> "OpcuaSettings":
+        """Give the same for a server at another address."""
+        path = urlsplit(self.url).path
+        return self.model_copy(update={"url": f"opc.tcp://{host}:{port}{path}"})
+
+    def below(self, folder: Path) -> "OpcuaSettings":
+        """Give the same with files looked for in ``folder``, unless their paths are absolute."""
+        security = _below(self.security, folder, "certificates")
+        user = _below(self.user, folder, "password_file", "certificate", "key")
+        return self.model_copy(update={"security": security, "user": user})
+
+    @property
+    def where(self) -> str:
+        """Whom messages are about."""
+        return self.url
+
+
+def _below(settings: Settings, folder: Path, *names: str) -> Settings:
+    paths = {name: getattr(settings, name) for name in names}
+    return settings.model_copy(
+        update={name: folder / path for name, path in paths.items() if path is not None}
+    )
+
+
+def _checked_url(url: str) -> None:
+    parts = urlsplit(url)
+    try:
+        fine = parts.scheme == "opc.tcp" and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # no port
+        fine = False
+    if not fine or parts.username:
+        raise ValueError(f'"{url}" is no address: write "opc.tcp://HOST:{PORT}"; the user apart')

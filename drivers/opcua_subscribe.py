@@ -1,0 +1,191 @@
+"""Subscribe mode over OPC UA: single nodes, for servers that keep no trace.
+
+The server samples, queues and publishes as often as it likes. Each value of the pressure is a row
+at its source time; commands and supply are those that held then. Rows are numbered by the sampling
+interval that the server grants, so that a missing one is a missing number.
+"""
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+from asyncua import ua
+
+from drivers.lasting import EMPTY, Clock, LostError
+from drivers.opcua_link import OpcuaLink, Subscribed
+from drivers.opcua_settings import Node, NodeTag, OpcuaSettings
+from drivers.opcua_values import code_of, lost_some, number, quality, readable, time_ns, truth
+from twin.errors import SourceError
+from twin.signals import MBAR, SAMPLE, UNUSABLE, Command, Quality, Samples
+
+QUEUE_MS = 2000.0  # of samples that the server is asked to keep for us
+PRESSURE = 0  # its place among the nodes, and so its handle
+
+Integers = npt.NDArray[np.int64]
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class Column:
+    """Values of one node as they came: times, numbers, StatusCodes."""
+
+    times: list[int] = field(default_factory=list)
+    values: list[float] = field(default_factory=list)
+    codes: list[int] = field(default_factory=list)
+
+    def add(self, at_ns: int, value: float, code: int) -> None:
+        """Append one."""
+        self.times.append(at_ns)
+        self.values.append(value)
+        self.codes.append(code)
+
+    def keep_last(self) -> None:
+        """Forget all but the newest, which still holds."""
+        del self.times[:-1], self.values[:-1], self.codes[:-1]
+
+    def at(self, times: Integers) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
+        """What held at ``times``, and its quality; the first value held before it as well."""
+        if not self.times:
+            return np.full(len(times), np.nan), np.full(len(times), Quality.BAD, np.uint8)
+        order = np.argsort(self.times, kind="stable")
+        index = np.searchsorted(np.array(self.times)[order], times, side="right") - 1
+        chosen = order[np.maximum(index, 0)]
+        flags = np.array([quality(code) for code in self.codes], np.uint8)
+        return np.array(self.values)[chosen], flags[chosen]
+
+
+class Subscription:
+    """What one PLC publishes; it outlives connections."""
+
+    def __init__(self, settings: OpcuaSettings, clock: Clock) -> None:
+        tags = settings.tags
+        assert tags.suction is not None  # the settings see to both
+        assert tags.blow_off is not None
+        self._settings = settings
+        self._clock = clock
+        self._bits: tuple[NodeTag, ...] = (tags.suction, tags.blow_off)
+        supply = () if tags.supply is None else (tags.supply.node,)
+        self.nodes: tuple[Node, ...] = (
+            tags.pressure.node,
+            *(tag.node for tag in self._bits),
+            *supply,
+        )
+        self.queue = max(10, round(QUEUE_MS / settings.sampling_ms))  # values to be kept of each
+        self._columns: list[Column] = []
+        self._said = ""
+        self._period_ns = 0  # of samples, as granted
+        self._published = 0  # number of the last publication with values; 0: none yet
+        self._sequence = -1  # of the last row
+        self._last_ns = 0  # and its source time
+        self._break = 0  # Quality bits for the next row
+
+    def samples(self, link: OpcuaLink) -> Iterator[Samples]:
+        """Blocks as they are published; ends only by an exception."""
+        for node, value in zip(self.nodes, link.read(self.nodes), strict=True):
+            self._number(self.nodes.index(node), value)  # says so if it has another type
+        granted = link.subscribe(self.nodes, self.queue)
+        self._say(granted)
+        self._period_ns = round(max(granted.sampling_ms, self._settings.sampling_ms) * 1e6)
+        self._columns = [Column() for _ in self.nodes]
+        self._published = 0
+        while True:
+            yield self._take(link.published(granted.silence_s))
+
+    def _say(self, granted: Subscribed) -> None:
+        """Report what the server made of what was asked for, once for each answer."""
+        settings = self._settings
+        parts = []
+        if granted.sampling_ms > settings.sampling_ms:
+            parts.append(f"samples every {granted.sampling_ms:g} ms, not {settings.sampling_ms:g}")
+        if granted.publishing_ms > settings.interval_ms:
+            publishing = f"publishes every {granted.publishing_ms:g} ms"
+            parts.append(f"{publishing}, not {settings.interval_ms:g}")
+        if granted.queue * granted.sampling_ms < 2 * granted.publishing_ms:
+            parts.append(f"keeps only {granted.queue} values, not {self.queue}: some will be lost")
+        said = f"{settings.where}: the server {', '.join(parts)}" if parts else ""
+        if said and said != self._said:
+            log.warning(said)
+        self._said = said
+
+    def _take(self, publication: ua.PublishResult) -> Samples:
+        """Rows of one publication."""
+        message = publication.NotificationMessage
+        changes: list[ua.MonitoredItemNotification] = []
+        for part in message.NotificationData or ():
+            if isinstance(part, ua.StatusChangeNotification):
+                raise LostError(
+                    f"{self._settings.where}: the server ended the subscription",
+                    "did it restart, or did nothing come through for too long?",
+                )
+            if isinstance(part, ua.DataChangeNotification):
+                changes += part.MonitoredItems
+        if not changes:
+            return EMPTY
+        if self._published and message.SequenceNumber != self._published % 0xFFFF_FFFF + 1:
+            self._break |= Quality.GAP  # a publication was lost on the way
+        self._published = message.SequenceNumber
+        for change in changes:
+            if 0 <= change.ClientHandle < len(self.nodes):
+                self._put(change.ClientHandle, change.Value)
+        return self._rows()
+
+    def _put(self, place: int, value: ua.DataValue) -> None:
+        at_ns = time_ns(value)
+        if at_ns is None:
+            raise SourceError(
+                f"{self._settings.where}: {self.nodes[place]} comes without any time",
+                "the server must send source or server timestamps",
+            )
+        self._columns[place].add(at_ns, self._number(place, value), code_of(value))
+
+    def _number(self, place: int, value: ua.DataValue) -> float:
+        """The value as a number, commands as 0 and 1; NaN where there is none."""
+        node = self.nodes[place]
+        if not readable(value):
+            return float("nan")
+        if 1 <= place <= len(self._bits):
+            return float(truth(value, node, self._bits[place - 1].bit))
+        return number(value, node)
+
+    def _rows(self) -> Samples:
+        """All pressures that have come, as rows."""
+        pressures = self._columns[PRESSURE]
+        if not pressures.times:
+            return EMPTY
+        tags, ambient = self._settings.tags, self._settings.ambient_mbar * MBAR
+        block = np.zeros(len(pressures.times), SAMPLE)
+        times = block["time_ns"] = np.array(pressures.times)
+        block["host_ns"] = self._clock.wall_ns()
+        raw = np.array(pressures.values)
+        block["pressure"], block["quality"] = tags.pressure.pressure(raw, ambient)
+        block["quality"] |= np.array([quality(code) for code in pressures.codes], np.uint8)
+        for place, command in enumerate((Command.SUCTION, Command.BLOW_OFF), 1):
+            on, flags = self._columns[place].at(times)
+            block["commands"] |= np.where(on == 1, np.uint8(command), np.uint8(0))
+            block["quality"] |= flags | np.where(np.isnan(on), Quality.BAD, 0).astype(np.uint8)
+        block["supply"] = np.nan
+        if tags.supply is not None:
+            supply, flags = self._columns[-1].at(times)
+            supply[(flags & UNUSABLE) != 0] = np.nan
+            block["supply"] = tags.supply.gauge(supply, ambient)
+        self._count(block, np.array([lost_some(code) for code in pressures.codes]))
+        self._columns[PRESSURE] = Column()
+        for column in self._columns[1:]:
+            column.keep_last()
+        return block
+
+    def _count(self, block: Samples, lost: npt.NDArray[np.bool_]) -> None:
+        """Number the rows, and mark where some are missing or time does not run on."""
+        times = block["time_ns"]
+        before = self._last_ns if self._sequence >= 0 else int(times[0]) - self._period_ns
+        ran = np.diff(times, prepend=before)
+        steps = np.maximum(np.rint(ran / self._period_ns).astype(np.int64), 1)
+        missing = (steps > 1) & (ran - self._period_ns > self._settings.gap_ms * 1e6)
+        block["sequence"] = self._sequence + np.cumsum(steps)
+        block["quality"][missing | lost] |= Quality.GAP.value
+        block["quality"][ran <= 0] |= Quality.CLOCK.value
+        block["quality"][0] |= self._break
+        self._break = 0
+        self._sequence, self._last_ns = int(block["sequence"][-1]), int(times[-1])

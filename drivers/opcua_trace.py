@@ -1,0 +1,201 @@
+"""Block mode over OPC UA: the ring of scans as arrays, read whole by one request.
+
+The server may answer for one node earlier than for another, in any order. So a record is believed
+if it was complete before we asked and not overwritten until the answer was here: as long as the
+answer took is kept clear of both ends of the ring. What is too fresh comes with the next block.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.lasting import EMPTY, Clock, LostError
+from drivers.opcua_link import OpcuaLink
+from drivers.opcua_settings import Node, OpcuaSettings
+from drivers.opcua_values import (
+    SEVERITY,
+    code_of,
+    moment,
+    number,
+    numbers,
+    quality,
+    readable,
+    status_name,
+    whole,
+    wholes,
+)
+from drivers.trace import (
+    COMMANDS,
+    OVERFLOW_BIT,
+    RESERVE,
+    WRAP,
+    Follower,
+    Header,
+)
+from twin.errors import SourceError
+from twin.signals import MBAR, SAMPLE, UNUSABLE, Quality, Samples
+
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Ring:
+    """One answer: where the ring stands, and all that is in it."""
+
+    header: Header
+    sequences: Integers
+    statuses: Integers
+    pressures: Floats  # NaN where there is none
+    supply: float  # NaN where there is none
+    quality: int  # Quality bits that the server gives to all of it
+    margin: int  # scans that may have gone by while it was read
+
+
+class NodeTrace(Follower[Header, OpcuaLink]):
+    """Where we are in the ring of one PLC; it outlives connections."""
+
+    def __init__(self, settings: OpcuaSettings, clock: Clock) -> None:
+        super().__init__(settings, clock)
+        self._settings = settings
+        trace, supply = settings.trace, settings.tags.supply
+        self._header_nodes = (trace.sequence, trace.time, trace.boot, trace.period)
+        self._arrays = (trace.sequences, trace.statuses, trace.pressures)
+        self._supply = () if supply is None else (supply.node,)
+
+    @property
+    def nodes(self) -> tuple[Node, ...]:
+        """All that is read at once."""
+        return self._header_nodes + self._arrays + self._supply
+
+    def start(self, link: OpcuaLink) -> Header:
+        """Begin at the newest record; SourceError if there is no ring as configured."""
+        ring = self.ask(link)
+        self.refuse_other(ring.header)
+        newest = ring.header.sequence
+        announced = np.arange(max(0, newest - 2 * RESERVE), max(0, newest - ring.margin) + 1)
+        if not (ring.sequences[announced % ring.header.depth] == announced).any():
+            raise SourceError(
+                f"{self._settings.where}: {self._settings.trace.sequences} does not hold the "
+                f"sequence numbers that {self._settings.trace.sequence} announces ({newest})",
+                "check [driver.trace]; scan s must stand at s modulo the arrays' length",
+            )
+        self._begin(ring.header)
+        return ring.header
+
+    def refuse_other(self, header: Header) -> None:
+        """SourceError if ``header`` does not describe a ring that can be followed."""
+        if not header.ready:
+            raise SourceError(
+                f"{self._settings.where}: no trace at {self._settings.trace.sequence}: it says "
+                f"{header.depth} records, one every {header.period_ns // 1000} µs; more than "
+                f"{2 * RESERVE} are needed",
+                "check [driver.trace] against the PLC's trace block; is its program running?",
+            )
+
+    def ask(self, link: OpcuaLink) -> Ring:
+        """Read everything; LostError where the server has no values, SourceError for other ones."""
+        asked_ns = self._clock.now_ns()
+        values = link.read(self.nodes)
+        took_ns = self._clock.now_ns() - asked_ns
+        given = dict(zip(self.nodes, values, strict=True))
+        arrays = self._columns(given)
+        header = self._parse(given, len(arrays[0]))
+        return Ring(
+            header,
+            *arrays,
+            supply=self._supply_of(given),
+            quality=self._quality(given),
+            margin=-(-took_ns // max(header.period_ns, 1)),
+        )
+
+    def _parse(self, given: dict[Node, Any], depth: int) -> Header:
+        trace = self._settings.trace
+        for node in (*self._header_nodes, trace.sequences, trace.statuses):
+            code = code_of(given[node])
+            if code & SEVERITY:
+                raise LostError(
+                    f"{self._settings.where}: {node} is {status_name(code)}",
+                    "does the PLC's program run?",
+                )
+        return Header(
+            sequence=whole(given[trace.sequence], trace.sequence) % WRAP,
+            time_ns=moment(given[trace.time], trace.time),
+            boot=whole(given[trace.boot], trace.boot),
+            period_ns=whole(given[trace.period], trace.period) * 1000,
+            depth=depth,
+        )
+
+    def _columns(self, given: dict[Node, Any]) -> tuple[Integers, Integers, Floats]:
+        """Sequences, statuses and pressures, of one length."""
+        trace = self._settings.trace
+        sequences = wholes(given[trace.sequences], trace.sequences)
+        statuses = wholes(given[trace.statuses], trace.statuses)
+        if readable(given[trace.pressures]):
+            pressures = numbers(given[trace.pressures], trace.pressures)
+        else:  # the server has none to give, and says why in the quality
+            pressures = np.full(len(sequences), np.nan)
+        if not len(sequences) == len(statuses) == len(pressures):
+            lengths = f"{len(sequences)}, {len(statuses)} and {len(pressures)}"
+            raise SourceError(
+                f"{self._settings.where}: the trace's arrays have {lengths} elements",
+                "sequences, statuses and pressures in [driver.trace] must be of one length",
+            )
+        return sequences, statuses, pressures
+
+    def _quality(self, given: dict[Node, Any]) -> int:
+        return quality(code_of(given[self._settings.trace.pressures]))
+
+    def _supply_of(self, given: dict[Node, Any]) -> float:
+        for node in self._supply:
+            if not quality(code_of(given[node])) & UNUSABLE:
+                return number(given[node], node)
+        return float("nan")
+
+    def _read(self, link: OpcuaLink) -> Samples:
+        """Whatever is new and has settled."""
+        assert self._header is not None
+        ring = self._steadied(self.ask(link))
+        if not ring.header.follows(self._header):  # it may have been torn
+            ring = self._steadied(self.ask(link))
+        if not ring.header.ready:
+            return EMPTY
+        self._place(ring.header)
+        first, depth = self._next, ring.header.depth
+        wanted = np.arange(first, max(first, self._newest - ring.margin + 1))
+        slots = wanted % WRAP % depth
+        valid = ring.sequences[slots] == wanted % WRAP
+        valid &= wanted > self._newest + ring.margin - depth
+        sequence = self._pass(first, valid)
+        return self._stamp(self._decode(ring, slots[valid]), ring.header, sequence)
+
+    def _steadied(self, ring: Ring) -> Ring:
+        """The same with its time as the scans say, as far as that can be.
+
+        Time and sequence are of slightly different moments: they tell the time of a scan only to
+        within the scans that go by while they are read. Within that, time runs on evenly.
+        """
+        assert self._header is not None
+        header = ring.header
+        scans = header.advance(self._header)
+        if scans is None:
+            return ring
+        expected = self._header.time_ns + scans * header.period_ns
+        off = ring.margin * header.period_ns
+        time_ns = min(max(expected, header.time_ns - off), header.time_ns + off)
+        return replace(ring, header=replace(header, time_ns=time_ns))
+
+    def _decode(self, ring: Ring, slots: Integers) -> Samples:
+        tags, ambient = self._settings.tags, self._settings.ambient_mbar * MBAR
+        block = np.zeros(len(slots), SAMPLE)
+        status = ring.statuses[slots]
+        block["commands"] = status & COMMANDS
+        block["pressure"], flags = tags.pressure.pressure(ring.pressures[slots], ambient)
+        overflow = (status >> OVERFLOW_BIT & 1).astype(np.uint8) * Quality.OVERFLOW.value
+        block["quality"] = flags | overflow | np.uint8(ring.quality)
+        block["supply"] = np.nan
+        if tags.supply is not None:
+            block["supply"] = tags.supply.gauge(np.array([ring.supply]), ambient)
+        return block

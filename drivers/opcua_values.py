@@ -1,0 +1,150 @@
+"""OPC UA values as numbers, times and quality; whatever a server sends, it is judged here."""
+
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from asyncua import ua
+
+from drivers.opcua_settings import Node
+from twin.errors import SourceError
+from twin.signals import Quality
+
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+
+LATEST_NS = 1 << 62  # the year 2116; beyond it is no time
+
+_T = ua.VariantType
+WHOLE = {_T.SByte, _T.Byte, _T.Int16, _T.UInt16, _T.Int32, _T.UInt32, _T.Int64, _T.UInt64}
+NUMBERS = WHOLE | {_T.Float, _T.Double}
+
+# StatusCodes (OPC 10000-4, 7.39): the code proper, and flags that may come with any value.
+SEVERITY, UNCERTAIN = 0xC000_0000, 0x4000_0000
+CODE = 0xFFFF_0000
+DATA_INFO, LIMITS, LOST = 0x0400, 0x0300, 0x0080  # the others mean something with the first
+LIMITED = (0x0100, 0x0200)  # the input stands at its low or high end
+NO_LONGER_FRESH = {
+    ua.StatusCodes.UncertainLastUsableValue,
+    ua.StatusCodes.UncertainNoCommunicationLastUsableValue,
+    ua.StatusCodes.BadWaitingForInitialData,
+}
+BEYOND = {ua.StatusCodes.UncertainEngineeringUnitsExceeded, ua.StatusCodes.BadOutOfRange}
+
+
+def code_of(value: ua.DataValue) -> int:
+    """Its StatusCode; one that is not sent is good."""
+    return int(value.StatusCode.value) if value.StatusCode is not None else 0
+
+
+def quality(code: int) -> int:
+    """Quality bits of a value with this StatusCode; 0 if it is good."""
+    limited = code & DATA_INFO and code & LIMITS in LIMITED
+    flags = int(Quality.OVERFLOW) if limited else 0
+    if not code & SEVERITY:
+        return flags
+    if code & CODE in NO_LONGER_FRESH:
+        return flags | Quality.STALE
+    return flags | Quality.BAD | (Quality.OUT_OF_RANGE if code & CODE in BEYOND else 0)
+
+
+def lost_some(code: int) -> bool:
+    """Whether the server says that its queue overflowed before this value."""
+    return bool(code & DATA_INFO and code & LOST)
+
+
+def status_name(code: int) -> str:
+    """As the standard names it."""
+    return str(ua.StatusCode(code & CODE).name)
+
+
+def time_ns(value: ua.DataValue) -> int | None:
+    """When the source gave the value, ns since 1970; None if the server does not say."""
+    for stamp in (value.SourceTimestamp, value.ServerTimestamp):
+        if stamp is not None and (ns := nanoseconds(stamp)) > 0:  # 1601 means none
+            return ns
+    return None
+
+
+def nanoseconds(stamp: datetime) -> int:
+    """Nanoseconds since 1970; OPC UA means UTC where it does not say."""
+    aware = stamp if stamp.tzinfo is not None else stamp.replace(tzinfo=UTC)
+    return (aware - EPOCH) // timedelta(microseconds=1) * 1000
+
+
+def readable(value: ua.DataValue) -> bool:
+    """Whether there is a value at all, good or not."""
+    return value.Value is not None and value.Value.Value is not None
+
+
+def number(value: ua.DataValue, node: Node) -> float:
+    """One number; NaN where there is no value. SourceError if it is none."""
+    if not readable(value):
+        return float("nan")
+    variant = value.Value
+    if variant.is_array or variant.VariantType not in NUMBERS:
+        raise wrong_type(node, variant, "a number")
+    return float(variant.Value)
+
+
+def whole(value: ua.DataValue, node: Node) -> int:
+    """One whole number; SourceError if it is none, or none is there."""
+    variant = value.Value
+    if not readable(value) or variant.is_array or variant.VariantType not in WHOLE:
+        raise wrong_type(node, variant, "a whole number")
+    return int(variant.Value)
+
+
+def moment(value: ua.DataValue, node: Node) -> int:
+    """A time in ns since 1970, from a whole number of them or a DateTime; 0 where it is before."""
+    variant = value.Value
+    if readable(value) and not variant.is_array and variant.VariantType == _T.DateTime:
+        ns = nanoseconds(variant.Value)
+    else:
+        ns = whole(value, node)
+    return min(max(ns, 0), LATEST_NS)
+
+
+def truth(value: ua.DataValue, node: Node, bit: int | None) -> bool:
+    """On or off: a Boolean, or one bit of a whole number; SourceError if it is neither."""
+    variant = value.Value
+    if bit is not None:
+        return bool(whole(value, node) >> bit & 1)
+    if not readable(value) or variant.is_array or variant.VariantType != _T.Boolean:
+        raise wrong_type(node, variant, "a Boolean (or a number, and bit = …)")
+    return bool(variant.Value)
+
+
+def numbers(value: ua.DataValue, node: Node) -> Floats:
+    """An array of numbers; SourceError if it is none, or none is there."""
+    return np.array(_array(value, node, NUMBERS, "an array of numbers"), np.float64)
+
+
+def wholes(value: ua.DataValue, node: Node) -> Integers:
+    """An array of whole numbers; SourceError if it is none, or none is there."""
+    fitting = WHOLE - {_T.UInt64}  # the ring counts with 32 bits
+    return np.array(_array(value, node, fitting, "an array of whole numbers"), np.int64)
+
+
+def _array(value: ua.DataValue, node: Node, kinds: set[ua.VariantType], wanted: str) -> list[Any]:
+    variant = value.Value
+    fits = readable(value) and variant.is_array and variant.VariantType in kinds
+    if not fits or (variant.Dimensions and len(variant.Dimensions) > 1):
+        raise wrong_type(node, variant, wanted)
+    listed: list[Any] = variant.Value
+    return listed
+
+
+def wrong_type(node: Node, variant: ua.Variant | None, wanted: str) -> SourceError:
+    """The error where a node holds something else."""
+    if variant is None or variant.VariantType == _T.Null:
+        held = "nothing"
+    else:
+        held = f"{'an array of ' if variant.is_array else ''}{variant.VariantType.name}"
+    return SourceError(
+        f"{node} holds {held}; expected is {wanted}",
+        "compare the nodes in [driver] with the server's; twin probe shows what they hold",
+    )

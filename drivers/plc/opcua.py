@@ -1,0 +1,295 @@
+"""OPC UA over the trace: the address space, filled in from the newest scans at each request."""
+
+import logging
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+from asyncua import Node, Server, ua
+from asyncua.common.instantiate_util import instantiate
+from asyncua.common.utils import ServiceError
+
+from drivers.plc.opcua_security import secure
+from drivers.plc.opcua_server import Behaviour
+from drivers.plc.registers import Registers
+from drivers.plc.scan import DEPTH, OVERFLOW, PERIOD_NS, Scans
+from drivers.plc.settings import OpcuaServer, PlcSettings
+from twin.errors import SourceError
+from twin.signals import Command
+
+# It logs clients that hang up as errors; what stops the PLC is raised as well.
+logging.getLogger("asyncua").setLevel(logging.CRITICAL)
+
+NAMESPACE = "urn:ejector-twin:plc"
+APPLICATION = "urn:ejector-twin:simulated-plc"
+UNECE = "http://www.opcfoundation.org/UA/units/un/cefact"
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+Type = ua.VariantType
+Read = Callable[[], ua.DataValue]
+
+
+@dataclass(frozen=True)
+class Unit:
+    """An engineering unit: its UNECE common code and symbol."""
+
+    code: str
+    symbol: str
+
+    @property
+    def information(self) -> ua.EUInformation:
+        """As OPC UA has it: the code's letters are the number (OPC 10000-8)."""
+        return ua.EUInformation(
+            NamespaceUri=UNECE,
+            UnitId=int.from_bytes(self.code.encode(), "big"),
+            DisplayName=ua.LocalizedText(self.symbol),
+            Description=ua.LocalizedText(self.symbol),
+        )
+
+
+MBAR = Unit("MBR", "mbar")
+MILLISECOND = Unit("C26", "ms")
+
+
+class Memory:
+    """The PLC's memory as OPC UA values; each read shows the scans up to now."""
+
+    def __init__(self, registers: Registers, catch_up: Callable[[], None], depth: int) -> None:
+        self._task = registers.task
+        self._start_ns = registers.start_ns
+        self._boot = registers.boot
+        self._catch_up = catch_up
+        self._depth = depth
+
+    @property
+    def newest(self) -> int:
+        """Sequence of the newest scan."""
+        return self._task.newest
+
+    def time(self, sequence: int) -> datetime:
+        """PLC time of a scan, to the microsecond that OPC UA's library keeps."""
+        return EPOCH + timedelta(microseconds=(self._start_ns + sequence * PERIOD_NS) // 1000)
+
+    def value(self, name: str, sequence: int) -> ua.DataValue:
+        """One value of one scan, stamped with its time."""
+        variant = MEASURED[name](self._task.ring[sequence % DEPTH])
+        return ua.DataValue(Value=variant, SourceTimestamp=self.time(sequence))
+
+    def trace(self, name: str) -> ua.DataValue:
+        """One of the trace's values."""
+        variant = TRACE[name](self)
+        return ua.DataValue(Value=variant, SourceTimestamp=self.time(self.newest))
+
+    def command(self, bit: Command, on: bool) -> None:
+        """Command from a client, where the program leaves it to them."""
+        coils = self._task.coils
+        self._task.coils = coils | bit if on else coils & ~bit
+
+    def reader(self, name: str) -> Read:
+        """How a client's read of a node is answered."""
+
+        def read() -> ua.DataValue:
+            self._catch_up()
+            return self.trace(name) if name in TRACE else self.value(name, self.newest)
+
+        return read
+
+    @property
+    def header(self) -> Mapping[str, ua.Variant]:
+        """Where the trace stands."""
+        newest = self.newest
+        return {
+            "Trace.Sequence": ua.Variant(newest & 0xFFFFFFFF, Type.UInt32),
+            "Trace.Time": ua.Variant(self._start_ns + newest * PERIOD_NS, Type.UInt64),
+            "Trace.Boot": ua.Variant(self._boot, Type.UInt16),
+            "Trace.Period": ua.Variant(PERIOD_NS // 1000, Type.UInt16),
+        }
+
+    def ring(self) -> Scans:
+        """The newest scans: scan s at s mod depth; zeros where there was none yet."""
+        newest = self.newest
+        slots = np.arange(self._depth)
+        return self._task.ring[(newest - (newest - slots) % self._depth) % DEPTH]
+
+
+def _bit(bit: int) -> Callable[[np.void], ua.Variant]:
+    return lambda scan: ua.Variant(bool(int(scan["status"]) & bit), Type.Boolean)
+
+
+def _column(field: str, kind: ua.VariantType) -> Callable[[Memory], ua.Variant]:
+    return lambda memory: ua.Variant(memory.ring()[field].tolist(), kind, is_array=True)
+
+
+def _header(name: str) -> Callable[[Memory], ua.Variant]:
+    return lambda memory: memory.header[name]
+
+
+MEASURED: dict[str, Callable[[np.void], ua.Variant]] = {
+    "Cmd.Suction": _bit(Command.SUCTION),
+    "Cmd.BlowOff": _bit(Command.BLOW_OFF),
+    "Meas.Pressure": lambda scan: ua.Variant(float(scan["pressure"]), Type.Float),
+    "Meas.Supply": lambda scan: ua.Variant(int(scan["supply"]), Type.Int16),
+    "Meas.Overflow": _bit(OVERFLOW),
+}
+TRACE: dict[str, Callable[[Memory], ua.Variant]] = {
+    "Trace.Sequence": _header("Trace.Sequence"),
+    "Trace.Time": _header("Trace.Time"),
+    "Trace.Boot": _header("Trace.Boot"),
+    "Trace.Period": _header("Trace.Period"),
+    "Trace.Sequences": lambda memory: ua.Variant(
+        (memory.ring()["sequence"] & 0xFFFFFFFF).tolist(), Type.UInt32, is_array=True
+    ),
+    "Trace.Statuses": _column("status", Type.UInt16),
+    "Trace.Pressures": _column("pressure", Type.Float),
+}
+RANGES: dict[str, tuple[Unit, float, float]] = {
+    "Meas.Pressure": (MBAR, 0.0, 2000.0),  # absolute
+    "Meas.Supply": (MBAR, 0.0, 10_000.0),  # gauge
+}
+
+
+@asynccontextmanager
+async def serving(
+    registers: Registers, settings: OpcuaServer, catch_up: Callable[[], None]
+) -> AsyncIterator["Serving"]:
+    """Serve OPC UA while the context lasts. SourceError where the address cannot be had."""
+    server = Server()
+    await server.init()
+    memory = Memory(registers, catch_up, settings.trace_depth)
+    server.set_endpoint(f"opc.tcp://{settings.host}:{settings.port}/")
+    server.set_server_name("ejector-twin simulated PLC")
+    await server.set_application_uri(APPLICATION)
+    await secure(server, settings)
+    index = await _namespace(server, settings.namespace_index)
+    await _Space(server, index, memory).build(registers.task.settings)
+    behaviour = Behaviour(server, settings, memory.value, set(MEASURED), lambda: memory.newest)
+    try:
+        await server.start()
+    except OSError as error:
+        raise SourceError(
+            f"cannot listen on {settings.host}:{settings.port} (OPC UA)",
+            "take another port under [plc.opcua], or 0 for any free one",
+        ) from error
+    try:
+        yield Serving(server, behaviour)
+    finally:
+        await server.stop()
+
+
+@dataclass(frozen=True)
+class Serving:
+    """A running server."""
+
+    server: Server
+    behaviour: Behaviour
+
+    @property
+    def url(self) -> str:
+        """Where it is reached."""
+        binary = self.server.bserver
+        assert binary is not None
+        return f"opc.tcp://{self.server.endpoint.hostname}:{binary.port}"
+
+    def sample(self) -> None:
+        """Give subscribers what the scans since the last call have brought."""
+        self.behaviour.sample()
+
+
+async def _namespace(server: Server, index: int) -> int:
+    """Register ours so that it gets ``index``, as a server does that serves others as well."""
+    for number in range(len(await server.get_namespace_array()), index):
+        await server.register_namespace(f"urn:ejector-twin:other-{number}")
+    return int(await server.register_namespace(NAMESPACE))
+
+
+class _Space:
+    """Builds the address space: string NodeIds that read as the path."""
+
+    def __init__(self, server: Server, index: int, memory: Memory) -> None:
+        self._server = server
+        self._index = index
+        self._memory = memory
+
+    async def build(self, settings: PlcSettings) -> None:
+        """Lay out ``Identification, Cmd, Meas, Param, Trace`` below one object."""
+        objects = self._server.get_objects_node()
+        root = await objects.add_object(*self._names("Ejector"))
+        groups = {
+            name: await root.add_object(*self._names(name))
+            for name in ("Identification", "Cmd", "Meas", "Param", "Trace")
+        }
+        await self._identify(groups["Identification"])
+        for name in (*MEASURED, *TRACE):
+            await self._live(groups[name.partition(".")[0]], name)
+        await self._parameters(groups["Param"], settings)
+        if settings.program.commands == "coils":
+            for name, bit in (("Cmd.Suction", Command.SUCTION), ("Cmd.BlowOff", Command.BLOW_OFF)):
+                await self._commandable(name, bit)
+
+    def _names(self, name: str) -> tuple[ua.NodeId, ua.QualifiedName]:
+        """NodeId and browse name: the last part of the path."""
+        last = name.rpartition(".")[2]
+        return ua.NodeId(name, self._index), ua.QualifiedName(last, self._index)
+
+    async def _identify(self, group: Node) -> None:
+        texts = {
+            "Manufacturer": "ejector-twin",
+            "Model": "simulated PLC with a compact ejector",
+            "SerialNumber": "0",
+        }
+        for name, text in texts.items():
+            await group.add_variable(*self._names(f"Identification.{name}"), text, Type.String)
+
+    async def _live(self, group: Node, name: str) -> None:
+        read = self._memory.reader(name)
+        example = read().Value
+        assert example is not None
+        if name in RANGES:
+            node = await self._analog(group, name, *RANGES[name], example)
+        else:
+            kind = example.VariantType
+            node = await group.add_variable(*self._names(name), example.Value, kind)
+        space = self._server.iserver.aspace
+        space.set_attribute_value_callback(
+            node.nodeid, ua.AttributeIds.Value, lambda _node, _attribute: read()
+        )
+
+    async def _analog(
+        self, group: Node, name: str, unit: Unit, low: float, high: float, value: ua.Variant
+    ) -> Node:
+        kind = self._server.get_node(ua.ObjectIds.AnalogItemType)
+        node, *_ = await instantiate(group, kind, *self._names(name), idx=self._index)
+        data_type = ua.NodeId(value.VariantType.value)
+        await node.write_attribute(ua.AttributeIds.DataType, ua.DataValue(data_type))
+        await node.write_value(value)
+        await (await node.get_child("0:EURange")).write_value(ua.Range(low, high))
+        await (await node.get_child("0:EngineeringUnits")).write_value(unit.information)
+        return node
+
+    async def _parameters(self, group: Node, settings: PlcSettings) -> None:
+        program, control = settings.program, settings.control
+        values = {
+            "SuctionTime": (MILLISECOND, 3.6e6, program.suction_ms),
+            "BlowOffTime": (MILLISECOND, 3.6e6, program.blow_off_ms),
+            "IdleTime": (MILLISECOND, 3.6e6, program.idle_ms),
+            "H1": (MBAR, 998.0, control.h1_mbar),  # vacuum
+            "H2": (MBAR, 998.0, control.h2_mbar),  # vacuum
+        }
+        for name, (unit, high, number) in values.items():
+            value = ua.Variant(number, Type.Double)
+            await self._analog(group, f"Param.{name}", unit, 0.0, high, value)
+
+    async def _commandable(self, name: str, bit: Command) -> None:
+        """Let clients command, where the program leaves it to them."""
+        node = self._server.get_node(self._names(name)[0])
+        await node.set_writable()
+
+        def write(_node: object, _attribute: object, value: ua.DataValue) -> None:
+            if value.Value is None or value.Value.VariantType != Type.Boolean:
+                raise ServiceError(ua.StatusCodes.BadTypeMismatch)
+            self._memory.command(bit, bool(value.Value.Value))
+
+        space = self._server.iserver.aspace
+        space.set_attribute_value_setter(node.nodeid, ua.AttributeIds.Value, write)

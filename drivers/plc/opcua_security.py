@@ -1,0 +1,74 @@
+"""Who may talk to the simulated PLC's OPC UA server, and how that is kept private."""
+
+import hmac
+from datetime import UTC, datetime
+from typing import Any
+
+from asyncua import Server, ua
+from asyncua.common.utils import ServiceError
+from asyncua.crypto.permission_rules import User, UserRole
+from cryptography import x509
+
+from drivers import certificates
+from drivers.plc.settings import OpcuaServer
+from twin.errors import SourceError
+
+POLICIES = {
+    "None": ua.SecurityPolicyType.NoSecurity,
+    "Basic256Sha256": ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt,
+    "Aes256Sha256RsaPss": ua.SecurityPolicyType.Aes256Sha256RsaPss_SignAndEncrypt,
+}
+
+
+class Users:
+    """Whom the server lets in, as the library asks for it."""
+
+    def __init__(self, settings: OpcuaServer) -> None:
+        self._passwords = settings.users
+        folder = settings.certificates
+        paths = sorted((folder / certificates.USERS).glob("*.der")) if folder else []
+        self._certificates = {path.read_bytes() for path in paths}
+
+    @property
+    def anybody(self) -> bool:
+        """Whether nobody needs to say who it is."""
+        return not self._passwords and not self._certificates
+
+    def get_user(
+        self,
+        iserver: Any,
+        username: str | None = None,
+        password: str | None = None,
+        certificate: bytes | None = None,
+    ) -> User | None:
+        """A user, or None if that is nobody we know."""
+        if username:
+            known = self._passwords.get(username)
+            right = known is not None and hmac.compare_digest(known, password or "")
+        else:
+            right = self.anybody or certificate in self._certificates
+        return User(role=UserRole.User, name=username) if right else None
+
+
+async def secure(server: Server, settings: OpcuaServer) -> None:
+    """Set policies, our own certificate, and whose certificates are trusted."""
+    server.set_security_policy([POLICIES[policy] for policy in settings.policies])
+    users = Users(settings)
+    server.iserver.user_manager = users
+    known = [ua.UserNameIdentityToken, ua.X509IdentityToken]
+    server.set_identity_tokens([ua.AnonymousIdentityToken] if users.anybody else known)
+    folder = settings.certificates
+    if folder is None:
+        return
+    own = certificates.own(folder, datetime.now(UTC))
+    await server.load_certificate(own.path)
+    await server.load_private_key(own.key)
+    await server.set_application_uri(own.uri)
+
+    async def check(certificate: x509.Certificate, _application: object) -> None:
+        try:
+            certificates.check(certificate, folder, datetime.now(UTC), "client")
+        except SourceError as error:
+            raise ServiceError(ua.StatusCodes.BadSecurityChecksFailed) from error
+
+    server.iserver.certificate_validator = check

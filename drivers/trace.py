@@ -1,0 +1,157 @@
+"""A PLC's ring of scans, followed without losing one, whatever transports it.
+
+The PLC writes a record per scan into a ring and counts them in a header. A record proves itself by
+its sequence; whatever is missing shows as a missing number and as a flag on the sample after it.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.lasting import EMPTY, Clock
+from twin.signals import Quality, Samples
+
+COMMANDS = 0b11  # in the status of a record, as in Command
+OVERFLOW_BIT = 8  # in the status of a record
+RESERVE = 64  # records at the old end of the ring that the PLC may overwrite while they are read
+CLOCK_TOLERANCE_NS = 50_000_000  # PLC time against sequence
+LONGEST_PERIOD_NS = 1_000_000_000  # of scans that can be called so
+WRAP = 1 << 32  # the PLC counts with 32 bits
+
+
+@dataclass(frozen=True)
+class Header:
+    """What the PLC says about its ring."""
+
+    sequence: int  # of the newest complete record, 32 bits
+    time_ns: int  # of that record
+    boot: int  # differs after every restart
+    period_ns: int
+    depth: int  # records
+
+    @property
+    def ready(self) -> bool:
+        """Whether it describes a ring; a PLC that just starts may show zeros."""
+        return self.depth > 2 * RESERVE and 0 < self.period_ns <= LONGEST_PERIOD_NS
+
+    def advance(self, earlier: "Header") -> int | None:
+        """Scans since ``earlier``; None if the PLC restarted in between."""
+        scans = (self.sequence - earlier.sequence) % WRAP
+        return None if self.boot != earlier.boot or scans >= WRAP // 2 else scans
+
+    def clock_jumped(self, earlier: "Header", scans: int) -> bool:
+        """Whether PLC time did not run with the sequence."""
+        ran = self.time_ns - earlier.time_ns - scans * self.period_ns
+        return abs(ran) > CLOCK_TOLERANCE_NS
+
+    def follows(self, earlier: "Header") -> bool:
+        """Whether nothing happened but a few more scans."""
+        scans = self.advance(earlier)
+        return (
+            self.ready
+            and scans is not None
+            and scans < self.depth
+            and not self.clock_jumped(earlier, scans)
+        )
+
+
+class Paced(Protocol):
+    """Settings that say how often to read."""
+
+    @property
+    def interval_ms(self) -> float:
+        """Between blocks."""
+        ...
+
+
+H = TypeVar("H", bound=Header)
+L = TypeVar("L")
+
+
+class Follower(ABC, Generic[H, L]):
+    """Where we are in the ring of one PLC; it outlives connections."""
+
+    def __init__(self, settings: Paced, clock: Clock) -> None:
+        self._interval_ns = round(settings.interval_ms * 1e6)
+        self._clock = clock
+        self._header: H | None = None
+        self._newest = -1  # sequence of the header, beyond 32 bits
+        self._next = 0  # sequence to fetch next
+        self._last = -1  # sequence of the last sample given
+        self._last_ns = 0  # and its PLC time
+        self._break = 0  # Quality bits for the next sample
+
+    @abstractmethod
+    def start(self, link: L) -> H:
+        """Begin at the newest record; SourceError if there is no ring as configured."""
+
+    @abstractmethod
+    def refuse_other(self, header: H) -> None:
+        """SourceError if ``header`` does not describe a ring that can be followed."""
+
+    @abstractmethod
+    def _read(self, link: L) -> Samples:
+        """Whatever is new, as far as the time for one block goes."""
+
+    def samples(self, link: L) -> Iterator[Samples]:
+        """Blocks of what is new, one every interval; ends only by an exception."""
+        if self._header is None:
+            self._header = self.start(link)
+        while True:
+            started = self._clock.now_ns()
+            yield self._read(link)
+            rest = started + self._interval_ns - self._clock.now_ns()
+            if rest > 0:
+                self._clock.sleep(rest * 1e-9)
+
+    def _begin(self, header: H) -> None:
+        """Take the newest record as the first."""
+        self._newest = header.sequence
+        self._next, self._last = header.sequence, header.sequence - 1
+        self._last_ns = header.time_ns - header.period_ns
+
+    def _place(self, header: H) -> None:
+        """Say where ``header`` is and what broke on the way there."""
+        assert self._header is not None
+        scans = header.advance(self._header)
+        if scans is None:
+            self.refuse_other(header)
+            self._break |= Quality.RESTART
+            self._newest, self._next, self._last = header.sequence, 0, -1
+        else:
+            self._newest += scans
+            if header.clock_jumped(self._header, scans):
+                self._break |= Quality.CLOCK
+        self._header = header
+        self._next = max(self._next, self._newest - header.depth + RESERVE)
+
+    def _pass(self, first: int, valid: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+        """Sequences of the valid ones of the records from ``first`` on; go on after them."""
+        sequence = first + np.flatnonzero(valid)
+        # Records behind the last valid one may only be late; without any there is no use waiting.
+        self._next = int(sequence[-1]) + 1 if len(sequence) else first + len(valid)
+        return sequence
+
+    def _stamp(self, block: Samples, header: H, sequence: npt.NDArray[np.int64]) -> Samples:
+        """Give decoded records their numbers and times, and mark where they do not run on."""
+        if not len(block):
+            return EMPTY
+        block["sequence"] = sequence
+        block["time_ns"] = header.time_ns - (self._newest - sequence) * header.period_ns
+        block["host_ns"] = self._clock.wall_ns()
+        self._mark_breaks(block)
+        return block
+
+    def _mark_breaks(self, block: Samples) -> None:
+        gaps = np.diff(block["sequence"], prepend=self._last) != 1
+        block["quality"][gaps] |= Quality.GAP.value
+        if block["time_ns"][0] <= self._last_ns:
+            self._break |= Quality.CLOCK
+        block["quality"][0] |= self._break
+        self._break = 0
+        self._last = int(block["sequence"][-1])
+        self._last_ns = int(block["time_ns"][-1])

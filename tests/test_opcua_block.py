@@ -1,0 +1,310 @@
+"""The trace's arrays, followed without losing or inventing a scan, however a server reads them."""
+
+from collections.abc import Callable, Iterator
+from itertools import islice
+from typing import Any
+
+import numpy as np
+import pytest
+from asyncua import ua
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from modbus_server import PlcTime
+
+from drivers.lasting import Clock, LostError, lasting
+from drivers.opcua_settings import Node, OpcuaSettings
+from drivers.opcua_trace import NodeTrace
+from twin.errors import SourceError
+from twin.signals import SAMPLE, Quality, Samples
+
+T = ua.VariantType
+DEPTH = 1024
+TAGS = {
+    "pressure": {"node": "s=P", "unit": "mbar", "reference": "absolute", "range": [0, 1300]},
+    "supply": {"node": "s=Supply", "unit": "mbar", "reference": "gauge"},
+}
+
+
+def settings_for(**changes: Any) -> OpcuaSettings:
+    table = {"url": "opc.tcp://plc:4840", "namespace": "urn:plc", "tags": TAGS}
+    return OpcuaSettings.model_validate(table | changes)
+
+
+class TornServer:
+    """A PLC and its server, which reads each node at a time of its own while it answers.
+
+    ``order`` says in which order, ``pauses`` how many scans go by after each.
+    """
+
+    def __init__(self, depth: int = DEPTH, sequence: int = 10) -> None:
+        self.depth = depth
+        self.sequence = sequence
+        self.time_ns = 1_000_000_000_000
+        self.boot = 7
+        self.codes: dict[str, int] = {}
+        self.replaced: dict[str, ua.Variant] = {}
+        self.order: list[int] = []
+        self.pauses: list[int] = []
+        self.clock: PlcTime | None = None
+        self.sequences = np.zeros(depth, np.int64)
+        self.pressures = np.zeros(depth)
+        self.open_count = self.close_count = self.broken = 0
+        self.sequence -= min(sequence, depth)
+        self.record(self.sequence)
+        self.scan(min(sequence, depth))
+
+    def pressure(self, sequence: int) -> float:
+        return 200.0 + sequence % 997  # never the same at the same place of the ring
+
+    def scan(self, scans: int) -> None:
+        self.sequence += scans
+        self.time_ns += scans * 1_000_000
+        for sequence in range(self.sequence - min(scans, self.depth) + 1, self.sequence + 1):
+            self.record(sequence)
+
+    def record(self, sequence: int) -> None:
+        slot = sequence % (1 << 32) % self.depth
+        self.sequences[slot] = sequence % (1 << 32)
+        self.pressures[slot] = self.pressure(sequence)
+
+    def restart(self, sequence: int = 0) -> None:
+        self.boot += 1
+        self.sequence, self.time_ns = sequence, self.time_ns + 3_000_000_000
+        self.sequences[:], self.pressures[:] = 0, 0
+        self.record(sequence)
+
+    def value(self, node: Node) -> ua.DataValue:
+        name = node.identifier.removeprefix("s=")
+        sequence = self.sequence % (1 << 32)
+        variant = (
+            self.replaced.get(name)
+            or {
+                "Trace.Sequence": lambda: ua.Variant(sequence, T.UInt32),
+                "Trace.Time": lambda: ua.Variant(self.time_ns, T.UInt64),
+                "Trace.Boot": lambda: ua.Variant(self.boot, T.UInt16),
+                "Trace.Period": lambda: ua.Variant(1000, T.UInt16),
+                "Trace.Sequences": lambda: ua.Variant(
+                    self.sequences.tolist(), T.UInt32, None, True
+                ),
+                "Trace.Statuses": lambda: ua.Variant([0x101] * self.depth, T.UInt16, None, True),
+                "Trace.Pressures": lambda: ua.Variant(self.pressures.tolist(), T.Float, None, True),
+                "Supply": lambda: ua.Variant(5000, T.Int16),
+            }[name]()
+        )
+        return ua.DataValue(variant, ua.StatusCode(self.codes.get(name, 0)))
+
+    # As a link:
+
+    def open(self) -> None:
+        self.open_count += 1
+
+    def close(self) -> None:
+        self.close_count += 1
+
+    def read(self, nodes: tuple[Node, ...]) -> list[ua.DataValue]:
+        if self.broken:
+            self.broken -= 1
+            raise LostError("lost")
+        values: list[ua.DataValue] = [ua.DataValue()] * len(nodes)
+        order = self.order or range(len(nodes))
+        for place, pause in zip(order, self.pauses or [0] * len(nodes), strict=True):
+            values[place] = self.value(nodes[place])
+            assert self.clock is not None
+            if pause:
+                self.clock.sleep(pause * 1e-3)
+        return values
+
+
+class Rig:
+    def __init__(self, server: TornServer, **changes: Any) -> None:
+        self.server = server
+        self.time = server.clock = PlcTime(server.scan)
+        clock = Clock(self.time.wall_ns, self.time.now_ns, self.time.sleep)
+        trace = NodeTrace(settings_for(**changes), clock)
+        self.stream: Iterator[Samples] = lasting(trace, server, clock)  # type: ignore[type-var]
+
+    def take(self, count: int) -> Samples:
+        return np.concatenate([np.empty(0, SAMPLE), *islice(self.stream, count)])
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig(TornServer())
+
+
+def flags(samples: Samples, quality: Quality) -> list[int]:
+    return [int(row) for row in np.flatnonzero(samples["quality"] & quality.value)]
+
+
+def assert_true(rig: Rig, samples: Samples) -> None:
+    """Every row has the pressure of its own scan."""
+    assert samples["pressure"] == pytest.approx(
+        [rig.server.pressure(int(s)) * 100 for s in samples["sequence"]]
+    )
+
+
+def test_every_scan_comes_once_with_its_values_and_times(rig: Rig) -> None:
+    samples = rig.take(20)
+    assert len(samples) > 900
+    assert (np.diff(samples["sequence"]) == 1).all()
+    assert (np.diff(samples["time_ns"]) == 1_000_000).all()
+    assert_true(rig, samples)
+    assert set(samples["quality"]) == {Quality.OVERFLOW}  # bit 8 of every status here
+    assert set(samples["commands"]) == {1}
+    assert samples["supply"] == pytest.approx(5e5)
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    order=st.permutations(range(8)),
+    pauses=st.lists(st.integers(0, 25), min_size=8, max_size=8),
+    stalls=st.lists(st.integers(0, 400), min_size=3, max_size=6),
+)
+def test_in_whatever_order_nodes_are_read_no_wrong_value_is_taken(
+    order: list[int], pauses: list[int], stalls: list[int]
+) -> None:
+    rig = Rig(TornServer())
+    parts = [rig.take(2)]
+    rig.server.order, rig.server.pauses = order, pauses
+    for stall in stalls:
+        rig.time.sleep(stall * 1e-3)
+        parts.append(rig.take(3))
+    rig.server.pauses = []
+    samples = np.concatenate([*parts, rig.take(2)])
+    assert_true(rig, samples)
+    assert (np.diff(samples["sequence"]) == 1).all()  # the ring is deeper than any of the stalls
+    assert not flags(samples, Quality.GAP | Quality.CLOCK | Quality.RESTART)
+    assert (np.diff(samples["time_ns"]) > 0).all()
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    order=st.permutations(range(8)),
+    pauses=st.lists(st.integers(0, 150), min_size=8, max_size=8),
+)
+def test_a_server_too_slow_for_the_ring_loses_some_and_says_so(
+    order: list[int], pauses: list[int]
+) -> None:
+    rig = Rig(TornServer())
+    parts = [rig.take(2)]
+    rig.server.order, rig.server.pauses = order, pauses
+    samples = np.concatenate([*parts, rig.take(6)])
+    assert_true(rig, samples)
+    missing = np.diff(samples["sequence"]) != 1
+    assert (np.flatnonzero(missing) + 1).tolist() == flags(samples, Quality.GAP)
+
+
+def test_away_for_longer_than_the_ring_is_a_gap(rig: Rig) -> None:
+    rig.take(3)
+    rig.time.sleep(2.0)
+    samples = rig.take(2)
+    assert flags(samples, Quality.GAP) == [0]
+    assert_true(rig, samples)
+
+
+def test_a_restart_is_flagged_and_goes_on_from_zero(rig: Rig) -> None:
+    rig.take(3)
+    rig.server.restart()
+    samples = rig.take(3)
+    assert flags(samples, Quality.RESTART) == [0]
+    assert (np.diff(samples["sequence"]) == 1).all()
+    assert_true(rig, samples)
+
+
+@pytest.mark.parametrize("jump_ms", [-10_000, 3_600_000])
+def test_a_jump_of_the_plcs_clock_is_flagged_and_followed(rig: Rig, jump_ms: int) -> None:
+    before = rig.take(3)
+    rig.server.time_ns += jump_ms * 1_000_000
+    after = rig.take(2)
+    assert flags(after, Quality.CLOCK) == [0]
+    elapsed = int(after["time_ns"][0] - before["time_ns"][-1])
+    assert elapsed == pytest.approx(jump_ms * 1_000_000, abs=5_000_000)
+
+
+def test_a_small_correction_of_the_plcs_clock_is_followed(rig: Rig) -> None:
+    rig.take(3)
+    rig.server.time_ns += 20_000_000
+    samples = rig.take(30)
+    newest = rig.server.time_ns - (rig.server.sequence - samples["sequence"][-1]) * 1_000_000
+    assert samples["time_ns"][-1] == pytest.approx(newest, abs=2_000_000)
+    assert not flags(samples, Quality.CLOCK)
+
+
+@pytest.mark.parametrize("depth", [DEPTH, 900])
+def test_the_sequence_goes_on_beyond_32_bits(depth: int) -> None:
+    rig = Rig(TornServer(depth, (1 << 32) - 1100))
+    rig.server.scan(900)
+    samples = rig.take(10)
+    assert samples["sequence"][0] < 1 << 32 < samples["sequence"][-1]
+    assert (np.diff(samples["sequence"]) == 1).all()
+
+
+def test_records_that_come_after_their_sequence_is_announced_are_not_believed(rig: Rig) -> None:
+    rig.take(3)
+    rig.server.record = lambda sequence: None  # type: ignore[method-assign]
+    assert len(rig.take(4)) <= 1  # of before
+
+
+def test_bad_values_are_kept_and_marked(rig: Rig) -> None:
+    rig.take(3)
+    rig.server.codes["Trace.Pressures"] = ua.StatusCodes.UncertainLastUsableValue
+    assert set(rig.take(1)["quality"]) == {Quality.OVERFLOW | Quality.STALE}
+    rig.server.codes["Trace.Pressures"] = ua.StatusCodes.BadSensorFailure
+    rig.server.replaced["Trace.Pressures"] = ua.Variant(None, T.Null)
+    rig.server.codes["Supply"] = ua.StatusCodes.BadNoCommunication
+    samples = rig.take(1)
+    assert len(samples)
+    assert set(samples["quality"]) == {Quality.OVERFLOW | Quality.BAD}
+    assert np.isnan(samples["pressure"]).all()
+    assert np.isnan(samples["supply"]).all()
+
+
+def test_a_lost_connection_comes_back_and_the_ring_fills_the_gap(rig: Rig) -> None:
+    first = rig.take(3)
+    rig.server.broken = 1
+    samples = np.concatenate([first, rig.take(6)])
+    assert rig.server.open_count == 2
+    assert rig.server.close_count == 1
+    assert (np.diff(samples["sequence"]) == 1).all()
+
+
+def test_a_program_that_stands_still_gives_empty_blocks(rig: Rig) -> None:
+    rig.take(3)
+    rig.server.codes["Trace.Sequence"] = ua.StatusCodes.BadOutOfService
+    assert not len(rig.take(8))
+    rig.server.codes.clear()
+    assert len(rig.take(8))
+
+
+def wrong(server: TornServer, name: str, variant: ua.Variant) -> None:
+    server.replaced[name] = variant
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda server: wrong(server, "Trace.Boot", ua.Variant("x", T.String)),
+            "s=Trace.Boot holds String; expected is a whole number",
+        ),
+        (
+            lambda server: wrong(server, "Trace.Pressures", ua.Variant(1.0, T.Float)),
+            "s=Trace.Pressures holds Float; expected is an array of numbers",
+        ),
+        (
+            lambda server: wrong(server, "Trace.Statuses", ua.Variant([1], T.UInt16, None, True)),
+            "arrays have 1024, 1 and 1024 elements",
+        ),
+        (lambda server: wrong(server, "Trace.Period", ua.Variant(0, T.UInt16)), "no trace at"),
+        (lambda server: server.sequences.fill(3), "does not hold the sequence numbers"),
+    ],
+)
+def test_a_trace_that_is_none_is_told_at_once(
+    change: Callable[[TornServer], None], message: str
+) -> None:
+    rig = Rig(TornServer(sequence=5000))
+    rig.server.scan(DEPTH)
+    change(rig.server)
+    with pytest.raises(SourceError, match=message) as caught:
+        rig.take(1)
+    assert caught.value.hint

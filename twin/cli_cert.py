@@ -1,0 +1,22 @@
+"""``twin cert``: a certificate of our own, for OPC UA servers that want to know who we are."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def cert(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="New or empty.")],
+    name: Annotated[str, typer.Option(help="Of this application, for people.")] = "ejector-twin",
+) -> None:
+    """Make a certificate and key of our own, beside folders for those we trust."""
+    from drivers import certificates
+
+    own = certificates.make(folder, name)
+    print(f"made {own.path}")
+    print(f"     {certificates.described(own.certificate)}")
+    print(f"     valid until {own.certificate.not_valid_after_utc:%Y-%m-%d}; the key stays here")
+    print(f"then let the server trust {own.path},")
+    print(f"put the server's certificate into {folder / certificates.TRUSTED}/")
+    print(f'and say so in [driver.security]: certificates = "{folder}"')
