@@ -157,9 +157,9 @@ class NodeTrace(Follower[Header, OpcuaLink]):
     def _read(self, link: OpcuaLink) -> Samples:
         """Whatever is new and has settled."""
         assert self._header is not None
-        ring = self._steadied(self.ask(link))
+        ring = self._steady(self.ask(link))
         if not ring.header.follows(self._header):  # it may have been torn
-            ring = self._steadied(self.ask(link))
+            ring = self._steady(self.ask(link))
         if not ring.header.ready:
             return EMPTY
         self._place(ring.header)
@@ -171,21 +171,8 @@ class NodeTrace(Follower[Header, OpcuaLink]):
         sequence = self._pass(first, valid)
         return self._stamp(self._decode(ring, slots[valid]), ring.header, sequence)
 
-    def _steadied(self, ring: Ring) -> Ring:
-        """The same with its time as the scans say, as far as that can be.
-
-        Time and sequence are of slightly different moments: they tell the time of a scan only to
-        within the scans that go by while they are read. Within that, time runs on evenly.
-        """
-        assert self._header is not None
-        header = ring.header
-        scans = header.advance(self._header)
-        if scans is None:
-            return ring
-        expected = self._header.time_ns + scans * header.period_ns
-        off = ring.margin * header.period_ns
-        time_ns = min(max(expected, header.time_ns - off), header.time_ns + off)
-        return replace(ring, header=replace(header, time_ns=time_ns))
+    def _steady(self, ring: Ring) -> Ring:
+        return replace(ring, header=self._steadied(ring.header, ring.margin))
 
     def _decode(self, ring: Ring, slots: Integers) -> Samples:
         tags, ambient = self._settings.tags, self._settings.ambient_mbar * MBAR

@@ -115,10 +115,15 @@ class Trace(Follower[Header, Link]):
         return self._stamp(self._decode(header, records[valid]), header, sequence)
 
     def _next_header(self, link: Link) -> Header:
-        """Read the header; twice where it surprises, since it may have been torn."""
+        """Read the header; twice where it surprises, since it may have been torn.
+
+        Torn between sequence and time it does not surprise: its time is another scan's.
+        """
         assert self._header is not None
         header = self.header(link)
-        return header if header.follows(self._header) else self.header(link)
+        if not header.follows(self._header):
+            header = self.header(link)
+        return self._steadied(header, 1)
 
     def _fetch(
         self, link: Link, header: Header, first: int, end: int

@@ -6,7 +6,7 @@ its sequence; whatever is missing shows as a missing number and as a flag on the
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -128,6 +128,23 @@ class Follower(ABC, Generic[H, L]):
                 self._break |= Quality.CLOCK
         self._header = header
         self._next = max(self._next, self._newest - header.depth + RESERVE)
+
+    def _steadied(self, header: H, scans_apart: int) -> H:
+        """The same with its time as the scans say, as far as that can be.
+
+        Time and sequence may be of moments up to ``scans_apart`` from each other: they tell the
+        time of a scan only to within that. Within it, time runs on evenly.
+        """
+        assert self._header is not None
+        scans = header.advance(self._header)
+        if scans is None:
+            return header
+        expected = self._header.time_ns + scans * header.period_ns
+        off = scans_apart * header.period_ns
+        if abs(header.time_ns - expected) > max(CLOCK_TOLERANCE_NS, off):
+            return header  # the clock was set
+        time_ns = min(max(expected, header.time_ns - off), header.time_ns + off)
+        return replace(header, time_ns=time_ns)
 
     def _pass(self, first: int, valid: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
         """Sequences of the valid ones of the records from ``first`` on; go on after them."""

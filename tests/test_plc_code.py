@@ -206,6 +206,7 @@ def test_registers_read_between_any_two_statements_give_no_wrong_value(
     samples = client.take(Trace(modbus(TABLES[0]), client.clock).samples(client))
     assert len(samples) > 2 * DEPTH
     assert_whole(samples, plc, late=1)  # in a header the time may be one scan off the sequence
+    assert not (samples["quality"] & Quality.CLOCK).any()
 
 
 @pytest.mark.parametrize("first", [0, WRAP - 3000])
