@@ -215,8 +215,9 @@ def live(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[View, psutil.Process
     pytest.importorskip("rerun")
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "CI"):
         monkeypatch.delenv(name, raising=False)
+    before = psutil.Process().children()
     view = View("gripper 7", None, AMBIENT)
-    (viewer,) = psutil.Process().children()
+    (viewer,) = (one for one in psutil.Process().children() if one not in before)
     yield view, viewer
     view.close()
 
