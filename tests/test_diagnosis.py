@@ -2,9 +2,11 @@
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from drivers.plc.faults import parse_fault
@@ -15,6 +17,7 @@ from twin.config import Config
 from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.diagnosis.evidence import HEALTHY, collect, thinned
 from twin.errors import ConfigError
+from twin.model.courses import Cause
 from twin.settings import Document
 from twin.signals import Command, Quality, Samples
 
@@ -131,6 +134,21 @@ def test_the_answer_has_the_form_that_others_rely_on() -> None:
     assert set(answer["baseline"]) == set(answer["extended"]) == figures | {"h2_time_error_pct"}
     assert set(answer["gain"]) >= {"rms_reduction_pct", "low95", "high95"}
     assert set(answer["runners_up"][0]) == {"effect", "course", "leftover_sigma"}
+
+
+def test_few_rows_draw_the_same_curve_as_all() -> None:
+    few = collect(CONFIG, record(14.0, "leakage=1", seed=28))
+    every = replace(few, rows=np.arange(len(few.samples)))
+    assert len(few.rows) < len(few.samples) / 4
+    causes = [HEALTHY, (Cause("blow_off_delay", {"delay": 23.4}),)]
+    assert few.off(causes) == pytest.approx(every.off(causes), abs=1.0)  # mbar
+
+
+def test_an_offset_that_comes_and_goes_does_not_move_the_level_before_it() -> None:
+    answer = of(record(30.0, "sensor_offset=13/every:3", seed=29)).json
+    (cause,) = answer["causes"]
+    assert (cause["effect"], cause["course"]) == ("sensor_offset", "intermittent")
+    assert answer["verdict"] == "explained"
 
 
 def test_of_a_long_log_some_cycles_are_looked_at_as_in_the_whole() -> None:

@@ -221,6 +221,37 @@ def test_the_models_own_air_saving_keeps_between_its_levels() -> None:
     assert (vacuum[on - 1] >= theta[c.H1_LOW]).all()
 
 
+def test_many_run_free_as_each_does_alone() -> None:
+    thetas = [rigs.theta("gripper") for _ in range(3)]
+    for number, theta in enumerate(thetas):
+        theta[c.H1] -= number * 40 * MBAR
+    commands, dt = np.full(1500, Command.SUCTION, "u1"), np.full(1500, MS)
+    together = np.stack(thetas, axis=1)
+    phase, expected = np.empty((1500, 3), "u1"), np.empty((1500, 3))
+    kernel.simulate(kernel.at_rest(together), together, dt, commands, phase, expected)
+    for number, theta in enumerate(thetas):
+        alone = free(theta, (Command.SUCTION, 1500))
+        assert phase[:, number].tolist() == alone[0].tolist()
+        # Pa; a valve acts somewhere within one of the finest steps, which are shared
+        assert expected[:, number] == pytest.approx(alone[1], abs=5.0)
+
+
+def test_each_of_many_may_have_phases_of_its_own() -> None:
+    theta = rigs.theta("test_rig")
+    phase = np.full((800, 2), SUCTION, "u1")
+    phase[500:, 1] = HOLD
+    level = np.full(800, np.nan)
+    level[0] = theta[c.AMBIENT]
+    dt, expected = np.full(800, MS), np.empty((800, 2))
+    both = np.stack([theta, theta], axis=1)
+    kernel.advance(kernel.new_state(2), both, dt, phase, level, expected)
+    for one in range(2):
+        alone = np.empty(800)
+        kernel.advance(kernel.new_state(), theta, dt, phase[:, one].copy(), level, alone)
+        assert expected[:, one] == pytest.approx(alone, abs=0.5)
+    assert expected[-1, 1] > expected[-1, 0] + 10 * MBAR
+
+
 def test_blow_off_wins_over_suction() -> None:
     both = Command.SUCTION | Command.BLOW_OFF
     phase, expected = free(rigs.theta("test_rig"), (both, 300))

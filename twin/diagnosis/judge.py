@@ -1,4 +1,4 @@
-"""How far measurement and a model part on cycles that nothing was fitted to."""
+"""How far measurement and a model part on cycles that no size was fitted to."""
 
 import math
 from collections.abc import Sequence

@@ -56,7 +56,10 @@ class Search:
 
 
 def search(evidence: Evidence, fitted: Sequence[int], progress: Progress) -> Search:
-    """Find up to three causes; sizes and ranking from the ``fitted`` cycles only."""
+    """Find up to three causes; sizes and ranking of effects from the ``fitted`` cycles only.
+
+    When a cause acts (course, onset, which cycles) is taken from all of them: no other shows it.
+    """
     progress("screening all effects and courses")
     judged, weights = _weights(evidence, fitted, HEALTHY)
     singles = _fit_singles(evidence, judged, weights, progress)
