@@ -13,9 +13,11 @@ from drivers.plc.faults import parse_fault
 from drivers.plc.settings import PlcSettings
 from drivers.plc.simulate import blocks
 from tools import battery
+from tools.calibration_coverage import recorded
 from twin.config import Config
 from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.diagnosis.evidence import HEALTHY, collect, thinned
+from twin.diagnosis.weights import levels
 from twin.errors import ConfigError
 from twin.model.courses import Cause
 from twin.settings import Document
@@ -25,6 +27,9 @@ ROOT = Path(__file__).parent.parent
 DOCUMENT = Document.read(ROOT / "configs" / "test_rig.toml")
 CONFIG = Config.of(DOCUMENT)
 PLC = DOCUMENT.section(PlcSettings, "plc")
+GRIPPER_DOCUMENT = Document.read(ROOT / "configs" / "gripper.toml")
+GRIPPER = Config.of(GRIPPER_DOCUMENT)
+GRIPPER_PLC = GRIPPER_DOCUMENT.section(PlcSettings, "plc")
 
 
 def quiet(_what: str) -> None:
@@ -149,6 +154,47 @@ def test_an_offset_that_comes_and_goes_does_not_move_the_level_before_it() -> No
     (cause,) = answer["causes"]
     assert (cause["effect"], cause["course"]) == ("sensor_offset", "intermittent")
     assert answer["verdict"] == "explained"
+
+
+def test_what_comes_in_every_second_cycle_is_fitted_and_judged() -> None:
+    answer = of(record(34.0, "leakage=1.5/every:2", seed=30)).json
+    (cause,) = answer["causes"]
+    assert (answer["verdict"], cause["effect"]) == ("explained", "leakage")
+    assert cause["course"] == "intermittent"
+    assert {cycle % 2 for cycle in cause["cycles"]} == {0}
+    assert set(answer["cycles"]["fitted"]) & set(cause["cycles"])
+    assert set(answer["cycles"]["held_out"]) & set(cause["cycles"])
+
+
+def test_thresholds_that_come_and_go_are_found_by_the_levels() -> None:
+    log = recorded(GRIPPER_PLC, 8, 31, [parse_fault("threshold_drift=-25/every:3")])
+    answer = of(iter([log]), GRIPPER).json
+    (cause,) = answer["causes"]
+    assert (cause["effect"], cause["course"]) == ("threshold_drift", "intermittent")
+    assert cause["parameters"]["h1_shift"]["value"] == pytest.approx(-25.0, abs=2.0)
+
+
+def test_a_threshold_that_is_never_reached_is_no_excuse() -> None:
+    evidence = collect(GRIPPER, [recorded(GRIPPER_PLC, 4, 32)])
+    beyond = (Cause("threshold_drift", {"h1_shift": 190.0}),)
+    assert (np.abs(levels(evidence, evidence.judged, [beyond])) > 150.0).all()
+    assert (np.abs(levels(evidence, evidence.judged, [HEALTHY])) < 10.0).all()
+
+
+def test_what_another_heat_exchange_leaves_for_the_next_cycle_is_counted() -> None:
+    # Also what acted in the first cycle, which is not judged.
+    log = recorded(GRIPPER_PLC, 9, 33, [parse_fault("heat_exchange=32/every:3")])
+    answer = of(iter([log]), GRIPPER).json
+    (cause,) = answer["causes"]
+    assert (cause["effect"], cause["course"]) == ("heat_exchange", "intermittent")
+    assert {0, 3, 6} <= set(cause["cycles"])
+
+
+def test_a_great_delay_does_not_look_like_a_small_one() -> None:
+    log = recorded(GRIPPER_PLC, 7, 34, [parse_fault("blow_off_delay=31")])
+    (cause,) = of(iter([log]), GRIPPER).json["causes"]
+    assert (cause["effect"], cause["course"]) == ("blow_off_delay", "constant")
+    assert cause["parameters"]["delay"]["value"] == pytest.approx(31.0, abs=1.5)
 
 
 def test_of_a_long_log_some_cycles_are_looked_at_as_in_the_whole() -> None:

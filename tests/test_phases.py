@@ -234,6 +234,20 @@ def test_a_jump_is_no_knee() -> None:
     assert not np.isfinite(level[1:]).any()
 
 
+def test_a_line_that_rings_does_not_hide_the_knee() -> None:
+    """Pressure may rise as fast as if it jumped, but it takes some rows for it."""
+    rise = [2.4, 9.1, 16.6, 25.1, 29.2, 29.4, 28.0, 25.2, 22.7, 22.9, 23.9, 26.0, 28.8, 29.8]
+    ringing = [*rise, 30.0, 28.5, 26.5, 24.0, 21.4, 20.1, *np.full(280, 20.0)]  # as on a gripper
+    falling = -0.42 * np.arange(-300, 1)
+    mbar = 261.0 + np.concatenate([falling, ringing])
+    noise = np.random.default_rng(0).normal(0.0, 0.31, len(mbar))
+    knees = Knees(window=11, noise=31.0, on_shift=9, settled=36)
+    _, phase, _ = find(stream([1] * len(mbar), 100.0 * (mbar + noise)), knees)
+    (knee,) = np.flatnonzero(np.diff(phase)) + 1
+    assert phase[knee] == Phase.HOLD
+    assert abs(int(knee) - 301) <= 4
+
+
 # The window.
 
 

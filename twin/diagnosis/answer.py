@@ -143,9 +143,13 @@ def insufficient(evidence: Evidence) -> str:
 
 
 def split(evidence: Evidence) -> tuple[list[int], list[int]]:
-    """Cycles to fit on and to judge by, in turn."""
-    held_out = evidence.judged[1::2]
-    return [cycle for cycle in evidence.judged if cycle not in held_out], held_out
+    """Cycles to fit on and to judge by, about half of each, in Thue and Morse's order.
+
+    That has no period: what comes in every second or third cycle falls into both.
+    """
+    odd = [(place + 3).bit_count() % 2 == 1 for place in range(len(evidence.judged))]
+    both = list(zip(evidence.judged, odd, strict=True))
+    return [one for one, held in both if not held], [one for one, held in both if held]
 
 
 def _runners_up(searched: Search) -> list[dict[str, Any]]:

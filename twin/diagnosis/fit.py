@@ -80,16 +80,8 @@ class _Trial:
         self.done = gain < CONVERGED
 
 
-def white(
-    evidence: Evidence,
-    weights: Weights,
-    hypotheses: Sequence[Hypothesis],
-    *,
-    with_levels: bool = True,
-) -> Floats:
+def white(evidence: Evidence, weights: Weights, hypotheses: Sequence[Hypothesis]) -> Floats:
     """Residuals of hypotheses in sigmas, (residuals, hypotheses)."""
-    if not with_levels:
-        return weights.white(evidence.off(hypotheses))
     return weights.white(evidence.off(hypotheses), levels(evidence, weights.cycles, hypotheses))
 
 

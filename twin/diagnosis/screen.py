@@ -6,7 +6,7 @@ cycle. So thousands of combinations cost some products of small matrices.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import chain, combinations
 
 import numpy as np
 
@@ -17,7 +17,10 @@ from twin.diagnosis.weights import Weights, levels
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS, Parameter
 
-SHARE = 0.5  # of its typical size, at which an effect's signature is taken
+# Of its typical size, at which an effect's signature is taken. A delay moves what is sharp: a small
+# one's signature looks nothing like a great one's.
+SHARES = (0.5,)
+SHARES_OF_TIMES = (0.5, 1.5, 3.0)
 ALIKE = 1e-6  # of their lengths' product: two columns are the same
 
 
@@ -25,7 +28,7 @@ ALIKE = 1e-6  # of their lengths' product: two columns are the same
 class Columns:
     """Whitened signatures of every parameter in every cycle, as products; sizes in typical ones."""
 
-    names: list[tuple[str, Parameter]]  # effect and parameter
+    names: list[tuple[str, Parameter]]  # effect and parameter; again for each of its shares
     signs: list[float]  # -1 or 1 where only smaller or greater than neutral is possible, else 0
     gram: Floats  # (parameters, cycles, parameters, cycles)
     pull: Floats  # (parameters, cycles), towards what is measured
@@ -47,6 +50,7 @@ class Promise:
 
     hypothesis: Hypothesis
     gain: float
+    number: int = -1  # of the signature, of a single one
 
 
 @dataclass(frozen=True)
@@ -60,16 +64,18 @@ class _Option:
 
 def columns(evidence: Evidence, weights: Weights, about: Hypothesis = HEALTHY) -> Columns:
     """Signatures of all parameters about a hypothesis."""
-    names = [(effect.name, p) for effect in EFFECTS.values() for p in effect.parameters]
-    lone = [Cause(name, {}) for name, _ in names]
-    moved = [
-        (*about, _with_size(evidence, cause, p, SHARE))
-        for cause, (_, p) in zip(lone, names, strict=True)
+    taken = [
+        (effect.name, p, share)
+        for effect in EFFECTS.values()
+        for p in effect.parameters
+        for share in (SHARES_OF_TIMES if p.unit == "ms" else SHARES)
     ]
+    names, shares = [(name, p) for name, p, _ in taken], np.array([share for *_, share in taken])
+    moved = [(*about, _with_size(evidence, Cause(name, {}), p, x)) for name, p, x in taken]
     hypotheses = [about, *moved]
     off, level = evidence.off(hypotheses), levels(evidence, weights.cycles, hypotheses)
     base = weights.white(off[:, :1], level[:, :1])[:, 0]
-    off, level = (off[:, 1:] - off[:, :1]) / SHARE, (level[:, 1:] - level[:, :1]) / SHARE
+    off, level = (off[:, 1:] - off[:, :1]) / shares, (level[:, 1:] - level[:, :1]) / shares
     parts = []
     for cycle in weights.cycles:
         inside = (evidence.bins.cycle == cycle)[:, None]
@@ -89,23 +95,31 @@ def _sign(evidence: Evidence, p: Parameter) -> float:
 
 def promises(evidence: Evidence, weights: Weights, found: Columns, each: int) -> list[Promise]:
     """The best courses (``each`` of them) of every parameter, the most promising first."""
-    result: list[Promise] = []
-    for number in range(len(found.names)):
-        best: dict[Course, Promise] = {}
+    best: dict[tuple[str, str], dict[Course, Promise]] = {}
+    for number, (name, p) in enumerate(found.names):
+        mine = best.setdefault((name, p.name), {})
         for option in _options(evidence, weights, found, number):
             promise = _alone(evidence, found, option)
-            before = best.get(option.cause.course)
+            before = mine.get(option.cause.course)
             if before is None or promise.gain > before.gain:
-                best[option.cause.course] = promise
-        result += sorted(best.values(), key=lambda one: -one.gain)[:each]
-    return sorted(result, key=lambda one: -one.gain)
+                mine[option.cause.course] = promise
+    chosen = [sorted(one.values(), key=_loss)[:each] for one in best.values()]
+    return sorted(chain.from_iterable(chosen), key=_loss)
+
+
+def _loss(promise: Promise) -> float:
+    return -promise.gain
 
 
 def pairs(
     evidence: Evidence, weights: Weights, found: Columns, singles: Sequence[Promise]
 ) -> list[Promise]:
     """Pairs of promises that explain more together, both sizes fitted, the best first."""
-    options = [_option(evidence, weights, found, one.hypothesis[0]) for one in singles]
+    options = [
+        _Option(one.number, cause, share_of_cycles(evidence, weights, cause))
+        for one in singles
+        for cause in one.hypothesis
+    ]
     rows = np.stack([found.spread(one.number, one.weights) for one in options])
     size = found.pull.size
     gram = rows @ found.gram.reshape(size, size) @ rows.T
@@ -124,7 +138,7 @@ def pairs(
                 for option, times in zip((one, other), sizes, strict=True)
             )
             result.append(Promise(both, float(pull[list(two)] @ sizes) - price(evidence, both)))
-    return sorted(result, key=lambda one: -one.gain)
+    return sorted(result, key=_loss)
 
 
 def _alone(evidence: Evidence, found: Columns, option: _Option) -> Promise:
@@ -136,7 +150,7 @@ def _alone(evidence: Evidence, found: Columns, option: _Option) -> Promise:
         size = 0.0
     p = found.names[option.number][1]
     hypothesis = (_with_size(evidence, option.cause, p, size),)
-    return Promise(hypothesis, size * pull - price(evidence, hypothesis))
+    return Promise(hypothesis, size * pull - price(evidence, hypothesis), option.number)
 
 
 def _options(
@@ -173,12 +187,6 @@ def _striking(found: Columns, number: int) -> Iterator[Ints]:
             chosen = np.sort(order[:count])
             if chosen[0] != cycles - count:  # else it is a step
                 yield chosen
-
-
-def _option(evidence: Evidence, weights: Weights, found: Columns, cause: Cause) -> _Option:
-    names = [(name, p.name) for name, p in found.names]
-    number = names.index((cause.effect, next(iter(cause.values))))
-    return _Option(number, cause, share_of_cycles(evidence, weights, cause))
 
 
 def share_of_cycles(evidence: Evidence, weights: Weights, cause: Cause) -> Floats:

@@ -30,11 +30,16 @@ SHARE = (
 # what the model gets wrong about that.
 SMALLEST, SMALLEST_MORE = 0.2, 0.4
 SAME = 10.8  # chi-square up to which a log cannot reject a rival (one in a thousand)
+TRIED_ALONE = 5  # hypotheses that are compared with weights about themselves
+NEAR = 2.5  # times the least score, up to which they are
+QUIET = 1.2  # sigmas left, below which there is nothing to compare
 HOPEFUL = 5.0  # chi-square that the linear model must promise of one more cause
 TRIED_PAIRS, TRIED_MORE, TRIED_TIMES = 12, 8, 6
 SECOND = 0.5  # of the best gain, above which an effect's second course is fitted as well
 NEARLY = 0.3  # of the best gain, above which an effect may turn out to be a rival
 START = np.array([0.4, 1.0, 1.7, 2.5, 3.5, 5.0])  # typical sizes to begin a fit from
+MOST_FLIPS = 3  # rounds of looking for the cycles that something comes in
+WORTH_FLIPPING = 5.0  # chi-square that another set of cycles must gain
 ONSETS, MANY_ONSETS = 16, 64  # in a round of looking for when a step began
 ONSET_S = 0.01  # to which it is found at first
 FARTHEST_S = 4.0  # from an onset, that its interval may reach
@@ -62,17 +67,20 @@ def search(evidence: Evidence, fitted: Sequence[int], progress: Progress) -> Sea
     """
     progress("screening all effects and courses")
     judged, weights = _weights(evidence, fitted, HEALTHY)
-    singles = _fit_singles(evidence, judged, weights, progress)
-    best = min(singles, key=lambda one: one.score)
+    tried = _fit_singles(evidence, judged, weights, progress)
+    singles = _ranked(evidence, judged, tried)
     healthy = _healthy(evidence, weights)
-    if not _worth(healthy, healthy, 0.0, best):
+    if not any(_worth(healthy, healthy, 0.0, one) for one in singles):
         return Search(weights, healthy, None, singles, [], [])
-    judged, weights = _weights(evidence, fitted, best.hypothesis)
-    healthy = _healthy(evidence, weights)
-    progress("fitting single causes")
-    again = fit(evidence, weights, [one.hypothesis for one in singles])
-    singles = _ranked(evidence, judged, again)
     found = singles[0]
+    if found.leftover > QUIET:
+        progress("comparing the best, each with its own weights")
+        found = _likeliest(evidence, fitted, tried)
+    judged, weights = _weights(evidence, fitted, found.hypothesis)
+    healthy = _healthy(evidence, weights)
+    others = [one.hypothesis for one in singles if one.effects != found.effects]
+    found, *rest = fit(evidence, weights, [found.hypothesis, *others])
+    singles = [found, *sorted(rest, key=lambda one: one.score)]
     while len(found.hypothesis) < MOST_CAUSES:
         progress(f"looking for what else there is beside {', '.join(found.effects)}")
         more = _best_addition(evidence, judged, weights, found, singles, healthy)
@@ -112,7 +120,7 @@ def _ranked(evidence: Evidence, judged: Weights, found: Sequence[Fitted]) -> lis
 
     All cycles choose the course: in which of them an effect acts does not show in the fitted ones.
     """
-    residual = white(evidence, judged, [one.hypothesis for one in found], with_levels=False)
+    residual = white(evidence, judged, [one.hypothesis for one in found])
     best: dict[tuple[str, ...], tuple[float, Fitted]] = {}
     for one, chi2 in zip(found, np.sum(residual**2, axis=0), strict=True):
         key, score = tuple(sorted(one.effects)), float(chi2) + one.score - one.chi2
@@ -134,8 +142,27 @@ def _fit_singles(
     ]
     progress("fitting single causes")
     started = _started(evidence, judged, hypotheses)
-    found = fit(evidence, weights, _timed(evidence, judged, started))
-    return _ranked(evidence, judged, found)
+    return fit(evidence, weights, _timed(evidence, judged, started))
+
+
+def _likeliest(evidence: Evidence, fitted: Sequence[int], tried: Sequence[Fitted]) -> Fitted:
+    """The best of hypotheses, each with weights about itself; the price of wide ones counts.
+
+    What scatters moves with the causes: about the healthy twin, a valve's half millisecond is not
+    where a delay of ten has put its edge. All cycles choose the course, the fitted ones the effect.
+    """
+    best: dict[tuple[str, ...], tuple[float, float, Fitted]] = {}
+    least = min(one.score for one in tried)
+    near = [one for one in sorted(tried, key=lambda one: one.score) if one.score < NEAR * least]
+    for first in near[:TRIED_ALONE]:
+        judged, weights = _weights(evidence, fitted, first.hypothesis)
+        (one,) = fit(evidence, weights, [first.hypothesis])
+        chi2 = float(np.sum(white(evidence, judged, [one.hypothesis]) ** 2))
+        price = one.score - one.chi2
+        everywhere, unseen = chi2 + judged.volume + price, one.score + weights.volume
+        if one.effects not in best or everywhere < best[one.effects][0]:
+            best[one.effects] = everywhere, unseen, one
+    return min(best.values(), key=lambda each: each[1])[2]
 
 
 def _started(
@@ -156,7 +183,7 @@ def _started(
                 around.append(np.concatenate([x[:last], [size], x[last + 1 :]]))
         tried.append([sized(evidence, hypothesis, one) for one in around])
     every = [one for some in tried for one in some]
-    chi2 = np.sum(white(evidence, judged, every, with_levels=False) ** 2, axis=0)
+    chi2 = np.sum(white(evidence, judged, every) ** 2, axis=0)
     best, first = [], 0
     for some in tried:
         best.append(some[int(np.argmin(chi2[first : first + len(some)]))])
@@ -202,7 +229,7 @@ def _fitted_pairs(
 ) -> list[Hypothesis]:
     """Pairs of single causes, each as it was fitted: delays are far from linear."""
     both = [(*one.hypothesis, *two.hypothesis) for one, two in combinations(singles, 2)]
-    chi2 = np.sum(white(evidence, weights, both, with_levels=False) ** 2, axis=0)
+    chi2 = np.sum(white(evidence, weights, both) ** 2, axis=0)
     best = np.argsort(chi2)[:TRIED_MORE]
     return [both[i] for i in best if chi2[i] < found.chi2]
 
@@ -270,11 +297,12 @@ def _rivals(
 def _timed(
     evidence: Evidence, judged: Weights, hypotheses: Sequence[Hypothesis]
 ) -> list[Hypothesis]:
-    """The same with the onsets of the first few steps found within their cycle."""
+    """The same; of the first few the onset within its cycle, or the cycles, where they fit best."""
     result, timed = [], 0
     for hypothesis in hypotheses:
-        if hypothesis[-1].course == Course.STEP and timed < TRIED_TIMES:
-            result.append(_with_onset(evidence, judged, hypothesis))
+        place = _PLACED.get(hypothesis[-1].course)
+        if place is not None and timed < TRIED_TIMES:
+            result.append(place(evidence, judged, hypothesis))
             timed += 1
         else:
             result.append(hypothesis)
@@ -285,6 +313,29 @@ def _with_onset(evidence: Evidence, judged: Weights, hypothesis: Hypothesis) -> 
     """The last cause's onset where it explains most, about a cycle about where it is."""
     *others, cause = hypothesis
     return (*others, _begun(evidence, judged, tuple(others), cause, ONSETS, ONSET_S))
+
+
+def _with_cycles(evidence: Evidence, judged: Weights, hypothesis: Hypothesis) -> Hypothesis:
+    """The last cause in those cycles in which it explains most: each tried in or out.
+
+    Also those that are not judged: what acts there shows in the gas of the one after.
+    """
+    *others, cause = hypothesis
+    for _ in range(MOST_FLIPS):
+        flipped = [replace(cause, cycles=cause.cycles ^ {int(n)}) for n in evidence.numbers]
+        tried = [cause, *flipped]
+        chi2 = np.sum(white(evidence, judged, [(*others, one) for one in tried]) ** 2, axis=0)
+        better = evidence.numbers[chi2[1:] < chi2[0] - WORTH_FLIPPING]
+        if not len(better):
+            break
+        together = replace(cause, cycles=cause.cycles ^ frozenset(better.tolist()))
+        both = [together, tried[int(np.argmin(chi2))]]
+        chi2 = np.sum(white(evidence, judged, [(*others, one) for one in both]) ** 2, axis=0)
+        cause = both[int(np.argmin(chi2))]
+    return (*others, cause)
+
+
+_PLACED = {Course.STEP: _with_onset, Course.INTERMITTENT: _with_cycles}
 
 
 def _finely_timed(evidence: Evidence, judged: Weights, hypothesis: Hypothesis) -> Hypothesis:
@@ -353,7 +404,7 @@ def _misfits(
     evidence: Evidence, judged: Weights, others: Hypothesis, cause: Cause, onsets: Floats
 ) -> Floats:
     tried = [(*others, replace(cause, onset_s=float(onset))) for onset in onsets]
-    found: Floats = np.sum(white(evidence, judged, tried, with_levels=False) ** 2, axis=0)
+    found: Floats = np.sum(white(evidence, judged, tried) ** 2, axis=0)
     return found
 
 

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from twin.diagnosis.bins import Floats
 from twin.model import kernel
 from twin.model import theta as c
+from twin.model.plant import reading
 from twin.model.theta import Theta
 from twin.monitor.phases import Knees, PhaseFinder
 from twin.signals import MBAR, MS, SAMPLE, Command, Phase, Samples
@@ -35,6 +36,16 @@ class Seen:
     on_rows: int = 0
     off_above: float = 0.0
     on_above: float = 0.0
+    thresholds: tuple[float, float] = (np.nan, np.nan)  # mbar, what is read at them
+
+    @property
+    def levels(self) -> tuple[float, float]:
+        """Vacuum (mbar) of either switching.
+
+        Where the pressure does not come there, what is read at the threshold.
+        """
+        off, on = self.thresholds
+        return off if np.isnan(self.off) else self.off, on if np.isnan(self.on) else self.on
 
 
 def seen(thetas: Sequence[Theta], rows: int, knees: Knees) -> list[Seen]:
@@ -61,7 +72,8 @@ def _seen(samples: Samples, theta: Theta, phase: Bytes, expected: Floats, knees:
     found, level = np.concatenate([early, late]), np.concatenate([low, high])
     off = _one(theta, phase, expected, found, level, Phase.HOLD)
     on = _one(theta, phase, expected, found, level, Phase.SUCTION)
-    return Seen(off[0], on[0], off[1], on[1], off[2], on[2])
+    thresholds = _read_at(theta, c.H1), _read_at(theta, c.H1_LOW)
+    return Seen(off[0], on[0], off[1], on[1], off[2], on[2], thresholds)
 
 
 def _one(
@@ -78,3 +90,12 @@ def _one(
     rows = int(knees[0] - switched[0] - round(float(response) / MS))
     vacuum = (theta[c.AMBIENT_NOMINAL] - level[knees[0]]) / MBAR
     return float(vacuum), rows, float(level[knees[0]] - expected[knees[0]])
+
+
+def _read_at(theta: Theta, threshold: int) -> float:
+    """Vacuum (mbar) that is read where the control switches."""
+    vacuum = float(theta[threshold])
+    if theta[c.CONTROL_SENSOR] == c.OWN:
+        at = float(theta[c.AMBIENT]) - vacuum
+        vacuum = float(theta[c.AMBIENT_NOMINAL]) - float(reading(at, theta.reshape(-1, 1), 0))
+    return vacuum / MBAR

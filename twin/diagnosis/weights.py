@@ -50,6 +50,11 @@ class Weights:
     sigma: Floats  # of each level
     level_cycles: Ints  # of each level, positions
 
+    @property
+    def volume(self) -> float:
+        """Logarithm of the covariance's determinant: what wide weights cost a likelihood."""
+        return 2.0 * float(np.sum(np.log(np.diag(self.factor))))
+
     def white(self, off: Floats, levels: Floats | None = None) -> Floats:
         """Residuals of hypotheses (mbar), (bins, n) and (levels, n), in sigmas."""
         rest = np.zeros((len(self.sigma), off.shape[1])) if levels is None else levels
@@ -172,7 +177,7 @@ def levels(evidence: Evidence, cycles: Sequence[int], hypotheses: Sequence[Hypot
     evidence.look(theta for some in there for theta in some)
     found = np.empty((len(shown), len(hypotheses)))
     for i, (rows, some) in enumerate(zip(nodes, there, strict=True)):
-        seen = np.array([[one.off, one.on] for one in map(evidence.seen, some)]).reshape(-1, 2)
+        seen = np.array([evidence.seen(one).levels for one in some]).reshape(-1, 2)
         for j, (cycle, number) in enumerate(shown):
             expected = float(np.interp(at[j], rows, seen[:, number])) if len(rows) else 0.0
             found[j, i] = _level(evidence, cycle, number, expected)
@@ -215,9 +220,8 @@ def _level(evidence: Evidence, cycle: int, number: int, expected: float) -> floa
     """Measured minus expected level (mbar)."""
     base = evidence.seen(evidence.theta)
     if healthy := evidence.healthy.figures.get(LEVELS[number]):
-        expected += healthy.mean - (base.off, base.on)[number]
-    off = evidence.figures[cycle][LEVELS[number]] - expected
-    return 0.0 if np.isnan(off) else off  # it never comes there: its curve says that
+        expected += healthy.mean - base.levels[number]
+    return evidence.figures[cycle][LEVELS[number]] - expected
 
 
 def _level_sigmas(evidence: Evidence, cycles: Sequence[int]) -> Floats:

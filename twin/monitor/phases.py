@@ -24,6 +24,7 @@ IDLE_ROWS = 20  # rows of idle that give the level before a cycle
 FEWEST_IDLE_ROWS = 5
 SIGNIFICANT = 7.0  # sigmas of slope difference that make a knee
 JUMP = 8.0  # times the noise, from one row to the next: knees are rounder
+ALONE = 2.0  # times the changes before and after it: a line that rings rises as fast, but longer
 SHORTEST_WINDOW, LONGEST_WINDOW = 8, 60  # rows
 SETTLED = 20e-3  # s after the valve's response before a knee can be one
 
@@ -91,12 +92,15 @@ def _line(pressure, start, rows):  # type: ignore[no-untyped-def]
 
 @compiled
 def _greatest_jump(pressure, first, last):  # type: ignore[no-untyped-def]
-    """Row after which pressure changes most (Pa) beside the changes before and after, and that."""
+    """Row after which pressure jumps most (Pa): far more than before and after, and that."""
     row, greatest = first, 0.0
-    for i in range(first + 1, last - 1):
-        beside = 0.5 * (pressure[i] - pressure[i - 1] + pressure[i + 2] - pressure[i + 1])
-        jump = abs(pressure[i + 1] - pressure[i] - beside)
-        if jump > greatest:
+    for i in range(first, last):
+        change = pressure[i + 1] - pressure[i]
+        before = pressure[i] - pressure[i - 1] if i > first else 0.0
+        after = pressure[i + 2] - pressure[i + 1] if i + 1 < last else 0.0
+        jump = abs(change - 0.5 * (before + after))
+        alone = abs(change) > ALONE * max(abs(before), abs(after))
+        if alone and jump > greatest:
             row, greatest = i, jump
     return row, greatest
 
