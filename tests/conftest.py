@@ -12,12 +12,16 @@ from collections.abc import Iterator
 import psutil
 import pytest
 import rigs
+from hypothesis import settings
 from opcua_plc import OpcuaPlc, start_opcua
 from plc_process import PlcProcess, start_plc
 
 from twin.live import compiled
 
 _ME = psutil.Process()
+
+settings.register_profile("untimed", deadline=None)  # what is slow here may be quick elsewhere
+settings.load_profile("untimed")
 
 
 def _alive() -> set[str]:

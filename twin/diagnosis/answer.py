@@ -25,13 +25,15 @@ FORMAT = "ejector-twin-diagnosis/1"
 FEWEST_CYCLES = 3  # judged ones: two to fit on, one to judge by
 EXPLAINED = 1.2  # sigmas left up to which causes explain a deviation
 BEYOND = 1.8  # times the usual deviation, with a share of what was explained: more is left over
-ROUGH = 0.04  # of what was explained, that causes may be off
+ROUGH = 0.06  # of what was explained, that causes may be off
 SEVERAL = 1.6  # sigmas that several causes may leave and still be sure
 MOST_LEFT = 0.5  # of chi-square beyond noise, that a cause may leave and still be sure
 MOST_SATURATED = 0.05  # share of samples
 MOST_JUDGED = 24  # cycles of a long log that are looked at, evenly spread
 MOST_NAMED = 4  # runners-up
-RELATIVE = 0.03  # of a size, that the data set's own scale (volume, suction) is not known better
+# Of a size, that the data set's own scale is not known better: volume and suction; and how the
+# wall's heat is shared between vessel and line.
+RELATIVE, OF_HEAT = 0.03, 0.1
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,8 @@ def diagnose(
 def _verdict(found: Hypothesis, before: Judged, after: Judged, strange: Unlisted) -> str:
     """Consistent, explained, or something real is left: in sigmas, in mbar, or of a kind."""
     left = after.leftover > EXPLAINED
-    beyond = after.rms > BEYOND * math.hypot(before.usual, ROUGH * before.rms)
+    usual = math.hypot(before.usual, ROUGH * before.rms, after.unmeasured)
+    beyond = after.rms > BEYOND * usual
     if left or beyond or strange.gain >= STRANGE:
         return "unlisted"
     return "explained" if found else "consistent"
@@ -193,7 +196,8 @@ def _causes(evidence: Evidence, searched: Search, before: Judged) -> list[dict[s
             )
         if cause.course == Course.INTERMITTENT:
             entry["cycles"] = sorted(cause.cycles)
-            entry["share_pct"] = rounded(100.0 * len(cause.cycles) / len(evidence.judged))
+            judged = {int(evidence.numbers[one]) for one in evidence.judged}
+            entry["share_pct"] = rounded(100.0 * len(cause.cycles & judged) / len(judged))
         result.append(entry)
         first += count
     return result
@@ -230,16 +234,17 @@ def _parameters(
             continue  # nothing in this log depends on it
         neutral = 0.0 if ramp else p.neutral(evidence.theta)
         value = neutral + float(size) * p.typical
-        reach = 1.96 * math.hypot(float(sigma) * p.typical, RELATIVE * value)
+        scale = OF_HEAT if cause.effect == "heat_exchange" else RELATIVE
+        reach = 1.96 * math.hypot(float(sigma) * p.typical, scale * value)
         low, high = value - reach, value + reach
         if not ramp:
             low, high = max(low, p.low), min(high, p.high)
-        scale = 1.0 / hours(evidence, cause) if ramp else 1.0
+        per_hour = 1.0 / hours(evidence, cause) if ramp else 1.0
         found[p.name] = {
-            "value": rounded(value * scale),
+            "value": rounded(value * per_hour),
             "unit": f"{p.unit}/h" if ramp else p.unit,
-            "low95": rounded(low * scale),
-            "high95": rounded(high * scale),
+            "low95": rounded(low * per_hour),
+            "high95": rounded(high * per_hour),
         }
         if ramp:
             for name, change in (("at_end", value), ("at_end_low95", low), ("at_end_high95", high)):

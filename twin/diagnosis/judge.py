@@ -26,6 +26,7 @@ class Judged:
     squares: Floats  # mean square deviation of each held-out cycle, mbar²
     leftover: float  # sigmas
     usual: float  # mbar rms, of healthy cycles like these
+    unmeasured: float  # mbar rms, that may be left because only one supply was ever measured
     figures: dict[str, float | None]
 
     @property
@@ -58,6 +59,7 @@ def judge(evidence: Evidence, weights: Weights, hypothesis: Hypothesis) -> Judge
         squares,
         leftover,
         weights.usual,
+        weights.unmeasured,
         {name: None if one is None else rounded(one) for name, one in figures.items()},
     )
 

@@ -4,6 +4,7 @@ Scatter differs from cycle to cycle and averages out. The model's own error is t
 them and does not; where a hypothesis explains much, a share of that is its error as well.
 """
 
+import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import numpy as np
 from scipy.linalg import block_diag, solve_triangular
 
 from twin.diagnosis.bins import Floats, Ints, warped
-from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
+from twin.diagnosis.evidence import HEALTHY, SUPPLY_UNKNOWN, Evidence, Hypothesis
 from twin.model import theta as c
 from twin.model.courses import Cause, Course, Schedule
 from twin.model.term import AGAIN, KINDS
@@ -28,7 +29,10 @@ SCATTER: Mapping[str, tuple[str, float]] = {
     "response_delay": ("delay", 0.5),
     "blow_off_delay": ("delay", 0.5),
 }
-CLOSING_MS = 0.5  # by which the blow-off valve's closing differs, one sigma
+# When a valve acts: an edge that moves is not linear in that.
+_ACTS = {"response_delay": c.RESPONSE, "blow_off_delay": c.BLOW_OFF_RESPONSE}
+_CLOSES = (c.RESPONSE_OFF, c.BLOW_OFF_RESPONSE_OFF)
+CLOSING_MS = 0.5  # by which a valve's closing differs, one sigma
 KNEE_WINDOWS = 10  # a knee is found to a tenth of its window
 KNEE_MBAR = 0.7  # the level at a knee is not found better, and the model is set onto it
 MISMATCH = 0.08  # of what a hypothesis explains, is off in its waveform
@@ -47,6 +51,7 @@ class Weights:
     bins: Ints  # of these cycles
     factor: Floats  # lower Cholesky factor of the covariance of bins, then levels
     usual: float  # rms (mbar) over rows of a model that is as right as it was in healthy cycles
+    unmeasured: float  # and of what nobody knows of how suction follows the supply
     sigma: Floats  # of each level
     level_cycles: Ints  # of each level, positions
 
@@ -88,12 +93,14 @@ class Covariance:
         covariance += KNEE_MBAR**2 * ((stretch[:, None] == stretch) * np.isin(kind, _AFTER_KNEE))
         covariance[np.diag_indices_from(covariance)] += evidence.noise**2 / bins.count[here]
         usual = _usual(np.diag(covariance), bins.count[here], evidence.noise)
+        at_supply = np.sum(left_open[:, : len(SUPPLY_UNKNOWN)] ** 2, axis=1)
+        unmeasured = _usual(at_supply, bins.count[here], 0.0)
         covariance += left_open @ left_open.T
         sigma = _level_sigmas(evidence, cycles)
         levels = np.diag(sigma**2) + _together(evidence, cycles)
         factor = np.linalg.cholesky(block_diag(covariance * evidence.healthy.leftover**2, levels))
         shown = np.array([one for one, _ in _shown(evidence, cycles)], np.int64)
-        return Weights(tuple(cycles), here, factor, usual, sigma, shown)
+        return Weights(tuple(cycles), here, factor, usual, unmeasured, sigma, shown)
 
 
 def _usual(variance: Floats, count: Ints, noise: float) -> float:
@@ -118,21 +125,37 @@ def moved(
 ) -> tuple[Floats, Floats, Floats]:
     """Deviation of a hypothesis (mbar), and by how much it moves, (bins, ·).
 
-    By each scatter's size, then by one sigma of what else differs from cycle to cycle: when the
-    blow-off valve closes, and where a knee was found; last with each of the ``uncertain`` data
-    sets.
+    By each scatter's size; then by one sigma of what else differs from cycle to cycle: when the
+    valves close, and where a knee was found; then by what is not linear in such times. Last with
+    each of the ``uncertain`` data sets.
     """
-    scattered = [(*about, Cause(name, {key: size})) for name, (key, size) in sizes.items()]
-    closing = evidence.theta.copy()
-    closing[c.BLOW_OFF_RESPONSE_OFF] += CLOSING_MS * MS
+    steady = [(*about, Cause(name, {key: size})) for name, (key, size) in sizes.items()]
+    acts = [(_ACTS[name], size) for name, (_, size) in sizes.items() if name in _ACTS]
+    times = [*acts, *((closes, CLOSING_MS) for closes in _CLOSES)]
+    steady = steady[: len(steady) - len(acts)]
     late = max(round(evidence.knees.window / KNEE_WINDOWS), 1)
+    both = [(_acting(evidence.theta, *one, sign), 0) for sign in (1, -1) for one in times]
+    both[len(times) : len(times)] = [(evidence.theta, late)]
+    both.append((evidence.theta, -late))
+    as_it_is = len(steady) + 1
     off = evidence.off(
-        [about, *scattered, about, about, *[about] * len(uncertain)],
-        [*[evidence.theta] * (1 + len(scattered)), closing, evidence.theta, *uncertain],
-        [*[0] * (2 + len(scattered)), late, *[0] * len(uncertain)],
+        [about, *steady, *[about] * (len(both) + len(uncertain))],
+        [*[evidence.theta] * as_it_is, *(theta for theta, _ in both), *uncertain],
+        [*[0] * as_it_is, *(rows for _, rows in both), *[0] * len(uncertain)],
     )
-    moves, first = off[:, 1:] - off[:, :1], len(scattered) + 2
-    return off[:, 0], moves[:, :first], moves[:, first:]
+    moves = off[:, 1:] - off[:, :1]
+    linear, plus, minus, left_open = np.split(
+        moves, np.cumsum([len(steady), len(times) + 1, len(times) + 1]), axis=1
+    )
+    bent = (plus + minus) / math.sqrt(2.0)  # of a normal variable's square
+    return off[:, 0], np.hstack([linear, (plus - minus) / 2.0, bent]), left_open
+
+
+def _acting(theta: Theta, place: int, size: float, sign: int) -> Theta:
+    """Coefficients of an ejector in which something acts later by ``size`` ms, or earlier."""
+    moved = theta.copy()
+    moved[place] = max(moved[place] + sign * size * MS, 0.0)
+    return moved
 
 
 def scatter(evidence: Evidence) -> dict[str, tuple[str, float]]:

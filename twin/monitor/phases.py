@@ -124,7 +124,7 @@ def _break_at(pressure, row, window, noise, nozzle_on):  # type: ignore[no-untyp
     Slopes across a jump (a sensor that has come loose) differ as well.
     """
     left, left_mean = _line(pressure, row - window, window + 1)
-    right, right_mean = _line(pressure, row, window + 1)
+    right, _ = _line(pressure, row, window + 1)
     sigma = noise * math.sqrt(12.0 / float(window + 1) ** 3)
     significance = (right - left) / (math.sqrt(2.0) * sigma)
     if nozzle_on:
@@ -132,7 +132,7 @@ def _break_at(pressure, row, window, noise, nozzle_on):  # type: ignore[no-untyp
     else:
         significance = -significance
         is_knee = left > -3.0 * sigma and right < -3.0 * sigma
-    level = 0.5 * (left_mean + left * window / 2.0 + right_mean - right * window / 2.0)
+    level = left_mean + left * window / 2.0  # what follows may ring
     if not is_knee or significance < SIGNIFICANT:
         return 0.0, level
     jump, height = _greatest_jump(pressure, row - window, row + window)
