@@ -2,6 +2,7 @@
 
 import socket
 import struct
+from pathlib import Path
 from typing import Literal, Self
 
 import numpy as np
@@ -9,7 +10,8 @@ from pydantic import Field, model_validator
 
 from drivers.lasting import LostError
 from drivers.tags import Address, Place, Pressure, Tag, WordOrder, Words
-from drivers.telegram import HEAD, Request, belongs, exception
+from drivers.telegram import HEAD, Request, Store, belongs, exception
+from drivers.tls import Tls, secured
 from twin.errors import SourceError
 from twin.settings import Settings
 
@@ -73,6 +75,7 @@ class ModbusSettings(Settings):
     ambient_mbar: float = Field(default=1013.25, ge=500, le=1200)
     tags: Tags
     ring: Ring = Ring()
+    tls: Tls | None = None  # Modbus/TCP Security
 
     @model_validator(mode="after")
     def _tags_fit_the_mode(self) -> Self:
@@ -88,6 +91,11 @@ class ModbusSettings(Settings):
     def at(self, host: str, port: int) -> "ModbusSettings":
         """Give the same for a PLC at another address."""
         return self.model_copy(update={"host": host, "port": port})
+
+    def below(self, folder: Path) -> "ModbusSettings":
+        """Give the same with files looked for in ``folder``, unless their paths are absolute."""
+        tls = None if self.tls is None else self.tls.below(folder)
+        return self.model_copy(update={"tls": tls})
 
     @property
     def where(self) -> str:
@@ -107,17 +115,19 @@ class Link:
         self._transaction = 0
 
     def open(self) -> None:
-        """Connect, unless it is connected; LostError if that fails."""
+        """Connect, unless it is connected; LostError if that fails, and as ``tls.secured``."""
         if self._socket is not None:
             return
-        host, port = self._settings.host, self._settings.port
+        host, port, tls = self._settings.host, self._settings.port, self._settings.tls
+        patience_ms = self._settings.timeout_ms
         try:
-            self._socket = connected(host, port, self._settings.timeout_ms)
+            plain = connected(host, port, patience_ms)
         except (OSError, UnicodeError) as error:  # the latter where it cannot be a host's name
             raise LostError(
                 f"{host}:{port}: no connection",
                 "is the PLC on and reachable, its Modbus TCP server started, host and port right?",
             ) from error
+        self._socket = plain if tls is None else secured(plain, tls, f"{host}:{port}", patience_ms)
 
     def close(self) -> None:
         """Hang up."""
@@ -134,7 +144,7 @@ class Link:
         data = np.frombuffer(self.ask(request), np.uint8)
         return request.words(data[np.newaxis]).reshape(count)
 
-    def ask(self, request: Request) -> bytes:
+    def ask(self, request: Request | Store) -> bytes:
         """Data of the answer as they came, ``request.size`` bytes; errors as from ``read``."""
         if self._socket is None:
             raise self._lost(request, "the connection is closed")
@@ -150,7 +160,7 @@ class Link:
             raise self._lost(request, "no answer") from error
         raise self._unexpected(request, head, expected)
 
-    def _unexpected(self, request: Request, head: bytes, expected: bytes) -> SourceError:
+    def _unexpected(self, request: Request | Store, head: bytes, expected: bytes) -> SourceError:
         """What is wrong with an answer that does not begin as it should."""
         if not belongs(head, expected):
             return self._lost(request, "no answer")
@@ -159,15 +169,16 @@ class Link:
             return self._lost(request, "the answer has the wrong length")
         return self._refused(request, code)
 
-    def _lost(self, request: Request, what: str) -> LostError:
+    def _lost(self, request: Request | Store, what: str) -> LostError:
         """Close too: a late answer must not be taken for that to the next request."""
         self.close()
         return LostError(
             f"{self._about(request)}: {what}",
-            "is the unit id right, is it a Modbus TCP server, does it answer within timeout_ms?",
+            "is the unit id right, is it a Modbus TCP server, does it answer within timeout_ms? "
+            "A secure port (often 802) needs [driver.tls]",
         )
 
-    def _refused(self, request: Request, code: int) -> SourceError:
+    def _refused(self, request: Request | Store, code: int) -> SourceError:
         what = EXCEPTIONS.get(code, "an exception unknown to the protocol")
         text = f"{self._about(request)}: {what} (Modbus exception {code})"
         if code not in OURS:
@@ -179,8 +190,17 @@ class Link:
             "everything read at once must exist",
         )
 
-    def _about(self, request: Request) -> str:
+    def _about(self, request: Request | Store) -> str:
         return f"{self._settings.where}: {span(request.address, request.count)}"
+
+    def write(self, address: Address, values: tuple[int, ...]) -> None:
+        """Write words (to coils 0 or 1) from ``address`` on; errors as from ``read``.
+
+        Only hardware in the loop does (drivers/hil.py).
+        """
+        store = Store(address, values)
+        if self.ask(store) != store.echo:
+            raise self._lost(store, "the answer is to another request")
 
 
 def connected(host: str, port: int, timeout_ms: float) -> socket.socket:

@@ -6,18 +6,24 @@ from drivers.lasting import REAL, Clock, in_thread, lasting
 from drivers.link import Link, ModbusSettings
 from drivers.poll import Poller
 from drivers.ring import Trace
+from drivers.shared import Lines, SharedLink
 from twin.signals import Samples
 
 __all__ = ["ModbusSettings", "blocks"]
 
 
-def blocks(settings: ModbusSettings, clock: Clock = REAL) -> Generator[Samples, None, None]:
+def blocks(
+    settings: ModbusSettings, clock: Clock = REAL, lines: Lines | None = None
+) -> Generator[Samples, None, None]:
     """Samples as they come: a block at least every 0.5 s, empty while there is nothing.
 
     Once there was a sample, a lost connection is retried for ever and shows as empty blocks and
     flags. SourceError before that, and whenever the PLC refuses an address. Closing releases all.
+    Blocks come over a connection that they share with others, where there are ``lines``; polling
+    has no millisecond to wait for others.
     """
-    link = Link(settings)
-    if settings.mode == "block":
-        return lasting(Trace(settings, clock), link, clock)
-    return in_thread(lasting(Poller(settings, clock), link, clock))
+    if settings.mode == "poll":
+        return in_thread(lasting(Poller(settings, clock), Link(settings), clock))
+    link = Link(settings) if lines is None else SharedLink(settings, lines.to(settings))
+    stream = lasting(Trace(settings, clock), link, clock)
+    return stream if settings.tls is None else in_thread(stream)  # shaking hands takes time

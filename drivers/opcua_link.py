@@ -2,7 +2,7 @@
 
 import asyncio
 import logging
-from collections.abc import Coroutine, Sequence
+from collections.abc import Coroutine, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +15,16 @@ from cryptography import x509
 from drivers import certificates
 from drivers.lasting import Clock, LostError
 from drivers.opcua_settings import Node, OpcuaSettings
-from drivers.opcua_values import CODE, SEVERITY, UNCERTAIN, code_of, status_name
+from drivers.opcua_values import (
+    CODE,
+    SEVERITY,
+    UNCERTAIN,
+    WRITABLE,
+    code_of,
+    status_name,
+    typed,
+    wrong_type,
+)
 from twin.errors import ConfigError, SourceError
 
 # It logs whatever goes wrong, tracebacks and all; what matters is raised as well.
@@ -47,6 +56,7 @@ UNTRUSTED = {
     _S.BadCertificateUriInvalid,
     _S.BadCertificateUseNotAllowed,
 }
+UNPROTECTED = {_S.BadSecurityModeRejected, _S.BadSecurityPolicyRejected}
 
 T = TypeVar("T")
 
@@ -74,6 +84,7 @@ class OpcuaLink:
         self._client: Client | None = None
         self._uris: list[str] = []
         self._plans: dict[tuple[Node, ...], ua.ReadParameters] = {}
+        self._kinds: dict[tuple[Node, ...], tuple[ua.VariantType, ...]] = {}  # to be written as
         self._published: asyncio.Queue[ua.PublishResult] = asyncio.Queue()
         self._known = False  # it has once served all that we want
 
@@ -115,13 +126,31 @@ class OpcuaLink:
         if settings.security.policy != "None":
             await self._protect(client)
         await self._introduce(client)
-        await client.connect()
+        await self._enter(client)
         try:
             self._uris = await self._namespaces(client)
         except BaseException:
             await _leave(client, settings.timeout_ms * 1e-3)
             raise
         return client
+
+    async def _enter(self, client: Client) -> None:
+        """Open channel and session."""
+        try:
+            await client.connect()
+        except ConnectionError as error:
+            if self._settings.security.policy == "None":
+                raise
+            # It told its endpoints just now; some hang up without a word on whom they do not know.
+            raise LostError(*self._stranger("it hung up")) from error
+
+    def _stranger(self, how: str) -> tuple[str, str]:
+        """Text and hint where the server does not take our certificate."""
+        folder = self._settings.security.certificates or "FOLDER"
+        return (
+            f"{self._settings.where}: it does not trust our certificate, or wants one ({how})",
+            f"let the server trust {folder}/{certificates.OWN}, and set security.policy",
+        )
 
     async def _protect(self, client: Client) -> None:
         """Know the server by its certificate before anything is said to it."""
@@ -141,11 +170,10 @@ class OpcuaLink:
             if endpoint.SecurityPolicyUri == uri and endpoint.SecurityMode == ENCRYPTED:
                 chain: bytes = endpoint.ServerCertificate
                 return chain[: int.from_bytes(chain[2:4], "big") + 4]  # the first of it, DER
-        policies = sorted({one.SecurityPolicyUri.rpartition("#")[2] for one in offered})
         raise SourceError(
             f"{self._settings.where}: it does not offer {self._settings.security.policy} with "
             "signing and encryption",
-            f"set security.policy in [driver] to one that it has: {', '.join(policies)}",
+            f"set security.policy in [driver] to one that it has: {', '.join(_usable(offered))}",
         )
 
     async def _introduce(self, client: Client) -> None:
@@ -294,6 +322,51 @@ class OpcuaLink:
         """The next publication; LostError if none comes, not even one that is empty."""
         return self._do("waiting for values", asyncio.wait_for(self._published.get(), silence_s))
 
+    # --- writing ----------------------------------------------------------------------------------
+
+    def write(self, values: Mapping[Node, float]) -> None:
+        """Write numbers, by one request, each as its node's type; Booleans as unlike 0.
+
+        LostError if no answer comes; SourceError if a node cannot be written or cannot hold its
+        number. Only hardware in the loop does (drivers/hil_opcua.py).
+        """
+        nodes = tuple(values)
+        if nodes not in self._kinds:
+            self._kinds[nodes] = tuple(
+                self._kind(*one) for one in zip(nodes, self.read(nodes), strict=True)
+            )
+        variants = [
+            typed(value, kind, node)
+            for (node, value), kind in zip(values.items(), self._kinds[nodes], strict=True)
+        ]
+        for node, code in zip(
+            nodes, self._do("writing", self._write(nodes, variants)), strict=True
+        ):
+            if code & SEVERITY:
+                raise SourceError(
+                    f"{self._settings.where}: {node} cannot be written ({status_name(code)})",
+                    "may this user write it? Only what stands under [hil.tags] is written",
+                )
+
+    async def _write(self, nodes: tuple[Node, ...], variants: list[ua.Variant]) -> list[int]:
+        assert self._client is not None
+        written = [
+            ua.WriteValue(
+                NodeId=self._id(node),
+                AttributeId=ua.AttributeIds.Value,
+                Value=ua.DataValue(variant, None),  # many servers refuse a status, or times
+            )
+            for node, variant in zip(nodes, variants, strict=True)
+        ]
+        params = ua.WriteParameters(NodesToWrite=written)
+        return [int(code.value) for code in await self._client.uaclient.write(params)]
+
+    def _kind(self, node: Node, value: ua.DataValue) -> ua.VariantType:
+        variant = value.Value
+        if variant is None or variant.is_array or variant.VariantType not in WRITABLE:
+            raise wrong_type(node, variant, "a number or a Boolean")
+        return variant.VariantType
+
     # --- errors -----------------------------------------------------------------------------------
 
     def _do(self, what: str, work: Coroutine[Any, Any, T]) -> T:
@@ -326,10 +399,12 @@ class OpcuaLink:
             )
         if what == "connecting" and code & CODE in UNTRUSTED:
             self.close()
+            return SourceError(*self._stranger(name))
+        if what == "connecting" and code & CODE in UNPROTECTED:
+            self.close()
             return SourceError(
-                f"{where}: it does not trust our certificate, or wants one ({name})",
-                f"let the server trust {self._settings.security.certificates or 'FOLDER'}/"
-                f"{certificates.OWN}, and set security.policy",
+                f"{where}: it wants the connection protected otherwise ({name})",
+                f"set security.policy in [driver], to None or one of {', '.join(POLICIES)}",
             )
         return self._lost(what, f"it said {name}")
 
@@ -352,6 +427,18 @@ class OpcuaLink:
 
     def _now(self) -> datetime:
         return datetime.fromtimestamp(self._clock.wall_ns() * 1e-9, UTC)
+
+
+def _usable(offered: Sequence[ua.EndpointDescription]) -> list[str]:
+    """The policies among the endpoints that we can take, as the settings name them."""
+    modes = {"None": ua.MessageSecurityMode.None_} | dict.fromkeys(POLICIES, ENCRYPTED)
+    names = [one.SecurityPolicyUri.rpartition("#")[2].replace("_", "") for one in offered]
+    fit = {
+        name
+        for name, one in zip(names, offered, strict=True)
+        if modes.get(name) == one.SecurityMode
+    }
+    return sorted(fit) or ["none of ours"]
 
 
 async def _leave(client: Client, patience_s: float) -> None:

@@ -16,7 +16,16 @@ from asyncua import ua
 from drivers.lasting import EMPTY, Clock, LostError
 from drivers.opcua_link import OpcuaLink, Subscribed
 from drivers.opcua_settings import Node, NodeTag, OpcuaSettings
-from drivers.opcua_values import code_of, lost_some, number, quality, readable, time_ns, truth
+from drivers.opcua_values import (
+    code_of,
+    lost_some,
+    number,
+    passing,
+    quality,
+    readable,
+    time_ns,
+    truth,
+)
 from twin.errors import SourceError
 from twin.signals import MBAR, SAMPLE, UNUSABLE, Command, Quality, Samples
 
@@ -83,6 +92,14 @@ class Subscription:
 
     def samples(self, link: OpcuaLink) -> Iterator[Samples]:
         """Blocks as they are published; ends only by an exception."""
+        try:
+            yield from self._published_blocks(link)
+        except SourceError as error:
+            if self._sequence < 0:
+                raise
+            raise passing(error) from error
+
+    def _published_blocks(self, link: OpcuaLink) -> Iterator[Samples]:
         for node, value in zip(self.nodes, link.read(self.nodes), strict=True):
             self._number(self.nodes.index(node), value)  # says so if it has another type
         granted = link.subscribe(self.nodes, self.queue)

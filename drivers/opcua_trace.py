@@ -20,6 +20,7 @@ from drivers.opcua_values import (
     moment,
     number,
     numbers,
+    passing,
     quality,
     readable,
     status_name,
@@ -96,11 +97,22 @@ class NodeTrace(Follower[Header, OpcuaLink]):
             )
 
     def ask(self, link: OpcuaLink) -> Ring:
-        """Read everything; LostError where the server has no values, SourceError for other ones."""
+        """Read everything; LostError where the server has no values, SourceError for other ones.
+
+        Those that come later are LostErrors too: a PLC that starts has none of what it will have.
+        """
         asked_ns = self._clock.now_ns()
         values = link.read(self.nodes)
         took_ns = self._clock.now_ns() - asked_ns
-        given = dict(zip(self.nodes, values, strict=True))
+        try:
+            return self._ring(dict(zip(self.nodes, values, strict=True)), took_ns)
+        except SourceError as error:
+            if self._header is None:
+                raise
+            raise passing(error) from error
+
+    def _ring(self, given: dict[Node, Any], took_ns: int) -> Ring:
+        self._refuse_bad(given)
         arrays = self._columns(given)
         header = self._parse(given, len(arrays[0]))
         return Ring(
@@ -111,7 +123,8 @@ class NodeTrace(Follower[Header, OpcuaLink]):
             margin=-(-took_ns // max(header.period_ns, 1)),
         )
 
-    def _parse(self, given: dict[Node, Any], depth: int) -> Header:
+    def _refuse_bad(self, given: dict[Node, Any]) -> None:
+        """LostError where the server itself does not stand by what must be right."""
         trace = self._settings.trace
         for node in (*self._header_nodes, trace.sequences, trace.statuses):
             code = code_of(given[node])
@@ -120,6 +133,9 @@ class NodeTrace(Follower[Header, OpcuaLink]):
                     f"{self._settings.where}: {node} is {status_name(code)}",
                     "does the PLC's program run?",
                 )
+
+    def _parse(self, given: dict[Node, Any], depth: int) -> Header:
+        trace = self._settings.trace
         return Header(
             sequence=whole(given[trace.sequence], trace.sequence) % WRAP,
             time_ns=moment(given[trace.time], trace.time),

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from asyncua import ua
 
+from drivers.lasting import LostError
 from drivers.opcua_settings import Node
 from twin.errors import SourceError
 from twin.signals import Quality
@@ -21,6 +22,14 @@ LATEST_NS = 1 << 62  # the year 2116; beyond it is no time
 _T = ua.VariantType
 WHOLE = {_T.SByte, _T.Byte, _T.Int16, _T.UInt16, _T.Int32, _T.UInt32, _T.Int64, _T.UInt64}
 NUMBERS = WHOLE | {_T.Float, _T.Double}
+WRITABLE = NUMBERS | {_T.Boolean}
+BITS = {
+    **dict.fromkeys((_T.SByte, _T.Byte), 8),
+    **dict.fromkeys((_T.Int16, _T.UInt16), 16),
+    **dict.fromkeys((_T.Int32, _T.UInt32), 32),
+    **dict.fromkeys((_T.Int64, _T.UInt64), 64),
+}
+SIGNED = {_T.SByte, _T.Int16, _T.Int32, _T.Int64}
 
 # StatusCodes (OPC 10000-4, 7.39): the code proper, and flags that may come with any value.
 SEVERITY, UNCERTAIN = 0xC000_0000, 0x4000_0000
@@ -136,6 +145,27 @@ def _array(value: ua.DataValue, node: Node, kinds: set[ua.VariantType], wanted: 
         raise wrong_type(node, variant, wanted)
     listed: list[Any] = variant.Value
     return listed
+
+
+def typed(number: float, kind: ua.VariantType, node: Node) -> ua.Variant:
+    """A number as a node of this type takes it; SourceError if it cannot hold it."""
+    if kind == _T.Boolean:
+        return ua.Variant(bool(number), kind)
+    if kind not in WHOLE:
+        return ua.Variant(float(number), kind)
+    bits = BITS[kind] - (kind in SIGNED)
+    low = -(1 << bits) if kind in SIGNED else 0
+    if not low <= round(number) < 1 << bits:
+        raise SourceError(
+            f"{node} is of type {kind.name} and cannot hold {round(number)}",
+            "choose another unit, scale or range for it under [hil.tags]",
+        )
+    return ua.Variant(round(number), kind)
+
+
+def passing(error: SourceError) -> LostError:
+    """The same as one that may pass: what was once there is waited for, as while a PLC starts."""
+    return LostError(str(error), error.hint)
 
 
 def wrong_type(node: Node, variant: ua.Variant | None, wanted: str) -> SourceError:

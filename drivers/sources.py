@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from drivers import modbus
 from drivers.link import ModbusSettings
 from drivers.probe import Line, probe
+from drivers.shared import Lines
 from twin.errors import ConfigError
 from twin.settings import Document
 from twin.signals import Samples
@@ -17,14 +18,17 @@ if TYPE_CHECKING:
 KINDS = ("modbus", "opcua")
 
 
-def open_source(document: Document, address: str = "") -> Iterator[Samples]:
+def open_source(
+    document: Document, address: str = "", lines: Lines | None = None
+) -> Iterator[Samples]:
     """The blocks of the source that ``[driver]`` names; ``address`` (host:port) goes before it.
 
+    Several that are opened with the same ``lines`` share a connection where that can be done.
     Raises ConfigError for an unknown kind or bad settings, SourceError if it does not answer.
     """
-    settings = _settings(document, address)
+    settings = settings_of(document, address)
     if isinstance(settings, ModbusSettings):
-        return modbus.blocks(settings)
+        return modbus.blocks(settings, lines=lines)
     from drivers import opcua  # noqa: PLC0415 - the library takes its time
 
     return opcua.blocks(settings)
@@ -32,7 +36,7 @@ def open_source(document: Document, address: str = "") -> Iterator[Samples]:
 
 def probe_source(document: Document, address: str = "") -> Iterator[str]:
     """Say, line by line, what the source answers."""
-    for line in _probed(_settings(document, address)):
+    for line in _probed(settings_of(document, address)):
         yield f"{'ok ' if line.good else '!! '} {line.what:<14} {line.text}"
 
 
@@ -44,7 +48,8 @@ def _probed(settings: "ModbusSettings | OpcuaSettings") -> list[Line]:
     return opcua_probe.probe(settings)
 
 
-def _settings(document: Document, address: str) -> "ModbusSettings | OpcuaSettings":
+def settings_of(document: Document, address: str = "") -> "ModbusSettings | OpcuaSettings":
+    """Where the source is and what it holds; raises as ``open_source``."""
     settings = _configured(document)
     if not address:
         return settings
@@ -61,9 +66,9 @@ def _configured(document: Document) -> "ModbusSettings | OpcuaSettings":
     kind = table.get("kind", "modbus")
     if kind not in KINDS:
         raise ConfigError(f"{document.name}: unknown driver {kind!r}", f"known: {', '.join(KINDS)}")
+    folder = Path(document.name).parent  # files lie there, wherever the program was started
     if kind == "modbus":
-        return document.section(ModbusSettings, "driver")
+        return document.section(ModbusSettings, "driver").below(folder)
     from drivers.opcua_settings import OpcuaSettings  # noqa: PLC0415 - as above
 
-    # Files lie beside the configuration, wherever the program was started.
-    return document.section(OpcuaSettings, "driver").below(Path(document.name).parent)
+    return document.section(OpcuaSettings, "driver").below(folder)

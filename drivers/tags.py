@@ -161,6 +161,17 @@ class Quantity(Settings):
         quality[unreadable] |= Quality.BAD.value
         return column, quality
 
+    def raw_of(self, pressure: float, ambient: float) -> tuple[float, bool]:
+        """What stands in the PLC for ``pressure`` (Pa, absolute), and whether that is within range.
+
+        Beyond the range it is that of the range's end.
+        """
+        counted = _counted(np.array([pressure]), "absolute", self.reference, ambient)
+        value = float(counted[0]) / PASCAL[self.unit]
+        low, high = self.range or (value, value)
+        within = min(max(value, low), high)
+        return (within - self.offset) / self.scale, within == value
+
     def _judge(self, raw: Floats, value: Floats) -> Flags:
         quality = np.zeros(len(raw), np.uint8)
         if self.range is not None:
@@ -202,6 +213,12 @@ class Pressure(Quantity, Tag):
     def _numbers(self, words: Words, order: WordOrder) -> Floats:
         with np.errstate(invalid="ignore"):  # signalling NaNs too
             return self.raw(words, order).astype(np.float64)
+
+
+def words_of(number: float, code: str, order: WordOrder) -> tuple[int, ...]:
+    """The words of a number of NumPy type ``code`` (big-endian), as ``numbers`` reads them."""
+    words = np.array([number]).astype(code).view(">u2").tolist()
+    return tuple(words if order == "big" else words[::-1])
 
 
 def _counted(pascal: Floats, reference: Reference, onto: Reference, ambient: float) -> Floats:

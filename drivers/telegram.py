@@ -1,4 +1,4 @@
-"""Modbus TCP telegrams that read: the request as bytes, its answer as bytes and as words."""
+"""Modbus TCP telegrams: the request as bytes, its answer as bytes and as words."""
 
 import struct
 from dataclasses import dataclass
@@ -10,6 +10,8 @@ from drivers.tags import Address, Area, Words
 
 MOST_WORDS = 125  # in one request, by the protocol
 FUNCTION: dict[Area, int] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
+MOST_STORED = 123  # words in one request that writes, by the protocol
+STORING: dict[Area, int] = {"coil": 15, "holding": 16}
 REFUSAL = 0x80  # set in the function code of an answer that brings an exception
 
 QUESTION = struct.Struct(">HHHBBHH")  # transaction, protocol 0, length, unit, function, from, count
@@ -45,6 +47,43 @@ class Request:
         if self.address.of_words:
             return np.ascontiguousarray(data).view(">u2").astype(np.uint16)
         return np.unpackbits(data, axis=1, count=self.count, bitorder="little").astype(np.uint16)
+
+
+@dataclass(frozen=True)
+class Store:
+    """Words, or bits as 0 and 1, to write at once; the answer repeats where and how many."""
+
+    address: Address
+    values: tuple[int, ...]
+
+    @property
+    def count(self) -> int:
+        """How many words or bits."""
+        return len(self.values)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the answer that follow its head."""
+        return len(self.echo)
+
+    @property
+    def echo(self) -> bytes:
+        """The rest of the answer: the second byte of where, and how many."""
+        return struct.pack(">BH", self.address.offset & 0xFF, self.count)
+
+    def question(self, transaction: int, unit: int) -> bytes:
+        """Encode the whole request."""
+        values = np.array(self.values, ">u2")
+        if not self.address.of_words:
+            values = np.packbits(values.astype(np.uint8), bitorder="little")
+        data, function = values.tobytes(), STORING[self.address.area]
+        head = (transaction, 0, 7 + len(data), unit, function, self.address.offset, self.count)
+        return QUESTION.pack(*head) + bytes([len(data)]) + data
+
+    def head(self, transaction: int, unit: int) -> bytes:
+        """How the answer begins, where it was written."""
+        function, high = STORING[self.address.area], self.address.offset >> 8
+        return HEAD.pack(transaction, 0, 6, unit, function, high)
 
 
 def belongs(head: bytes, expected: bytes) -> bool:

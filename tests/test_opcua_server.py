@@ -63,7 +63,7 @@ def test_clients_command_where_the_program_leaves_it_to_them() -> None:
     async def command() -> None:
         memory = Registers(task, start_ns=0, boot=1)
         async with (
-            serving(memory, OpcuaServer(port=0), lambda: task.advance_to(1)) as opcua,
+            serving([memory], OpcuaServer(port=0), lambda: task.advance_to(1)) as opcua,
             Client(opcua.url) as client,
         ):
             index = await client.get_namespace_index(NAMESPACE)

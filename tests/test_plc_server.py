@@ -43,7 +43,7 @@ async def plc(faults=(), **tables):
     task = Task(PlcSettings.model_validate(tables), faults)
     served = Plc(task, None)
     memory = Registers(task, START_NS, BOOT)
-    async with listening(memory, lambda: task.advance_to(served.now)) as port:
+    async with listening([memory], lambda: task.advance_to(served.now)) as port:
         served.client = AsyncModbusTcpClient("127.0.0.1", port=port, timeout=2, retries=0)
         assert await served.client.connect()
         try:

@@ -5,33 +5,52 @@ import signal
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from drivers.plc.faults import Fault
+from drivers.plc.partner import PartnerTask
 from drivers.plc.registers import Registers
-from drivers.plc.scan import PERIOD_NS, Task
+from drivers.plc.scan import PERIOD_NS, Scans, Task
 from drivers.plc.server import listening
 from drivers.plc.settings import PlcSettings
 
 if TYPE_CHECKING:
     from drivers.plc.opcua import Serving
 
+SET_NS = 2_000_000_000  # by so much the clock is set, ahead or back
+WITNESSED = np.dtype(
+    [("sequence", "<i8"), ("time_ns", "<i8"), ("pressure", "<f4"), ("status", "<u2")]
+)
 PERIOD_S = 0.01  # of the timer that keeps the scans up while nobody asks
 
 
 def run_plc(
-    settings: PlcSettings,
+    settings: PlcSettings | Sequence[PlcSettings],
     faults: Sequence[Fault] = (),
     seed: int = 0,
     duration_s: float | None = None,
     ready: Callable[[str, int], None] | None = None,
+    witness: Path | None = None,
 ) -> None:
     """Run the PLC until SIGINT, SIGTERM or ``duration_s``; call it in the main thread.
 
+    Of several ejectors behind it the first says where it listens; the others differ in their unit
+    and, by OPC UA, in the prefix of their nodes. The faults are the first one's.
     ``ready(host, port)`` is called once when it listens, by Modbus and, where there is a table
-    for it, by OPC UA. Raises SourceError where it cannot.
+    for it, by OPC UA. Raises SourceError where it cannot. SIGUSR1 and SIGUSR2 set its clock ahead
+    and back by ``SET_NS``. Into ``witness`` goes every scan of the first ejector, as ``WITNESSED``.
     """
-    asyncio.run(_run(Task(settings, faults, seed), duration_s, ready or announce))
+    first, *others = [settings] if isinstance(settings, PlcSettings) else settings
+    tasks = [_task(first, faults, seed), *(_task(one, (), seed) for one in others)]
+    asyncio.run(_run(tasks, duration_s, ready or announce, witness))
+
+
+def _task(settings: PlcSettings, faults: Sequence[Fault], seed: int) -> Task:
+    kind = PartnerTask if settings.program.commands == "hil" else Task
+    return kind(settings, faults, seed)
 
 
 def announce(host: str, port: int) -> None:
@@ -39,19 +58,30 @@ def announce(host: str, port: int) -> None:
     print(f"listening on {host}:{port}", flush=True)  # noqa: T201 - it is the command's output
 
 
-async def _run(task: Task, duration_s: float | None, ready: Callable[[str, int], None]) -> None:
+async def _run(
+    tasks: Sequence[Task],
+    duration_s: float | None,
+    ready: Callable[[str, int], None],
+    witness: Path | None,
+) -> None:
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    Task(task.settings).compute(1)  # compiles the rig before the clock runs
+    _task(tasks[0].settings, (), 0).compute(1)  # compiles the rig before the clock runs
     start_ns, first_ns = time.time_ns(), time.monotonic_ns()
 
     def catch_up() -> None:
-        task.advance_to((time.monotonic_ns() - first_ns) // PERIOD_NS + 1)
+        scans = (time.monotonic_ns() - first_ns) // PERIOD_NS + 1
+        for task in tasks:
+            task.advance_to(scans)
 
-    memory = Registers(task, start_ns, boot=start_ns // 10_000_000 & 0xFFFF)
-    async with listening(memory, catch_up) as port, _opcua(memory, catch_up) as opcua:
-        ready(task.settings.server.host, port)
+    boot = start_ns // 10_000_000 & 0xFFFF
+    memories = [Registers(task, start_ns, boot) for task in tasks]
+    _let_clock_be_set(memories)
+    if witness is not None:
+        tasks[0].witness = _witness(witness, memories[0])
+    async with listening(memories, catch_up) as port, _opcua(memories, catch_up) as opcua:
+        ready(tasks[0].settings.server.host, port)
         if opcua:
             print(f"OPC UA on {opcua.url}", flush=True)  # noqa: T201 - as above
         end_ns = first_ns + (duration_s or float("inf")) * 1e9
@@ -62,16 +92,40 @@ async def _run(task: Task, duration_s: float | None, ready: Callable[[str, int],
             await asyncio.sleep(PERIOD_S)
 
 
+def _let_clock_be_set(memories: Sequence[Registers]) -> None:
+    def set_by(step_ns: int) -> None:
+        for memory in memories:
+            memory.start_ns += step_ns
+
+    loop = asyncio.get_running_loop()
+    loop.add_signal_handler(signal.SIGUSR1, set_by, SET_NS)
+    loop.add_signal_handler(signal.SIGUSR2, set_by, -SET_NS)
+
+
+def _witness(path: Path, memory: Registers) -> Callable[[Scans], None]:
+    """What keeps scans in a file; without a buffer, so that nothing is lost with the process."""
+    file = path.open("wb", buffering=0)
+
+    def keep(scans: Scans) -> None:
+        rows = np.empty(len(scans), WITNESSED)
+        for name in ("sequence", "pressure", "status"):
+            rows[name] = scans[name]
+        rows["time_ns"] = memory.start_ns + scans["sequence"] * PERIOD_NS
+        file.write(rows.tobytes())
+
+    return keep
+
+
 @asynccontextmanager
 async def _opcua(
-    memory: Registers, catch_up: Callable[[], None]
+    memories: Sequence[Registers], catch_up: Callable[[], None]
 ) -> AsyncIterator["Serving | None"]:
     """Serve OPC UA too, where it is wanted."""
-    settings = memory.task.settings.opcua
+    settings = memories[0].task.settings.opcua
     if settings is None:
         yield None
         return
     from drivers.plc.opcua import serving  # noqa: PLC0415 - the library takes its time
 
-    async with serving(memory, settings, catch_up) as opcua:
+    async with serving(memories, settings, catch_up) as opcua:
         yield opcua

@@ -1,22 +1,24 @@
 """OPC UA over the trace: the address space, filled in from the newest scans at each request."""
 
 import logging
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from typing import Any
 
 import numpy as np
 from asyncua import Node, Server, ua
-from asyncua.common.instantiate_util import instantiate
 from asyncua.common.utils import ServiceError
 
-from drivers.plc.opcua_security import secure
+from drivers.opcua_nodes import Unit, add_quantity
+from drivers.opcua_security import secure
 from drivers.plc.opcua_server import Behaviour
+from drivers.plc.partner import Written
 from drivers.plc.registers import Registers
 from drivers.plc.scan import DEPTH, OVERFLOW, PERIOD_NS, Scans
 from drivers.plc.settings import OpcuaServer, PlcSettings
-from twin.errors import SourceError
+from twin.errors import ConfigError, SourceError
 from twin.signals import Command
 
 # It logs clients that hang up as errors; what stops the PLC is raised as well.
@@ -24,29 +26,10 @@ logging.getLogger("asyncua").setLevel(logging.CRITICAL)
 
 NAMESPACE = "urn:ejector-twin:plc"
 APPLICATION = "urn:ejector-twin:simulated-plc"
-UNECE = "http://www.opcfoundation.org/UA/units/un/cefact"
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 Type = ua.VariantType
 Read = Callable[[], ua.DataValue]
-
-
-@dataclass(frozen=True)
-class Unit:
-    """An engineering unit: its UNECE common code and symbol."""
-
-    code: str
-    symbol: str
-
-    @property
-    def information(self) -> ua.EUInformation:
-        """As OPC UA has it: the code's letters are the number (OPC 10000-8)."""
-        return ua.EUInformation(
-            NamespaceUri=UNECE,
-            UnitId=int.from_bytes(self.code.encode(), "big"),
-            DisplayName=ua.LocalizedText(self.symbol),
-            Description=ua.LocalizedText(self.symbol),
-        )
 
 
 MBAR = Unit("MBR", "mbar")
@@ -57,10 +40,13 @@ class Memory:
     """The PLC's memory as OPC UA values; each read shows the scans up to now."""
 
     def __init__(self, registers: Registers, catch_up: Callable[[], None], depth: int) -> None:
+        opcua = registers.task.settings.opcua
+        self.prefix = opcua.prefix if opcua else ""
         self._task = registers.task
-        self._start_ns = registers.start_ns
+        self.partner = registers.partner
+        self._registers = registers
         self._boot = registers.boot
-        self._catch_up = catch_up
+        self.catch_up = catch_up
         self._depth = depth
 
     @property
@@ -70,7 +56,9 @@ class Memory:
 
     def time(self, sequence: int) -> datetime:
         """PLC time of a scan, to the microsecond that OPC UA's library keeps."""
-        return EPOCH + timedelta(microseconds=(self._start_ns + sequence * PERIOD_NS) // 1000)
+        return EPOCH + timedelta(
+            microseconds=(self._registers.start_ns + sequence * PERIOD_NS) // 1000
+        )
 
     def value(self, name: str, sequence: int) -> ua.DataValue:
         """One value of one scan, stamped with its time."""
@@ -91,7 +79,7 @@ class Memory:
         """How a client's read of a node is answered."""
 
         def read() -> ua.DataValue:
-            self._catch_up()
+            self.catch_up()
             return self.trace(name) if name in TRACE else self.value(name, self.newest)
 
         return read
@@ -102,7 +90,7 @@ class Memory:
         newest = self.newest
         return {
             "Trace.Sequence": ua.Variant(newest & 0xFFFFFFFF, Type.UInt32),
-            "Trace.Time": ua.Variant(self._start_ns + newest * PERIOD_NS, Type.UInt64),
+            "Trace.Time": ua.Variant(self._registers.start_ns + newest * PERIOD_NS, Type.UInt64),
             "Trace.Boot": ua.Variant(self._boot, Type.UInt16),
             "Trace.Period": ua.Variant(PERIOD_NS // 1000, Type.UInt16),
         }
@@ -144,6 +132,17 @@ TRACE: dict[str, Callable[[Memory], ua.Variant]] = {
     "Trace.Statuses": _column("status", Type.UInt16),
     "Trace.Pressures": _column("pressure", Type.Float),
 }
+WRITTEN = {  # by a twin that answers the program
+    "Hil.Pressure": ("pressure", Type.Float),  # mbar, absolute
+    "Hil.PartPresent": ("part_present", Type.Boolean),
+    "Hil.AirSaving": ("air_saving", Type.Boolean),
+    "Hil.Watchdog": ("watchdog", Type.UInt16),
+}
+KINDS: dict[ua.VariantType, Callable[[Any], Any]] = {
+    Type.Float: float,
+    Type.Boolean: bool,
+    Type.UInt16: int,
+}
 RANGES: dict[str, tuple[Unit, float, float]] = {
     "Meas.Pressure": (MBAR, 0.0, 2000.0),  # absolute
     "Meas.Supply": (MBAR, 0.0, 10_000.0),  # gauge
@@ -152,19 +151,28 @@ RANGES: dict[str, tuple[Unit, float, float]] = {
 
 @asynccontextmanager
 async def serving(
-    registers: Registers, settings: OpcuaServer, catch_up: Callable[[], None]
+    memories: Sequence[Registers], settings: OpcuaServer, catch_up: Callable[[], None]
 ) -> AsyncIterator["Serving"]:
     """Serve OPC UA while the context lasts. SourceError where the address cannot be had."""
+    served = [Memory(one, catch_up, settings.trace_depth) for one in memories]
+    named = {f"{memory.prefix}{name}": (memory, name) for memory in served for name in MEASURED}
+    if len(named) < len(served) * len(MEASURED):
+        raise ConfigError("two ejectors have the same nodes", "set prefix under [plc.opcua]")
+
+    def value(node: str, sequence: int) -> ua.DataValue:
+        memory, name = named[node]
+        return memory.value(name, sequence)
+
     server = Server()
     await server.init()
-    memory = Memory(registers, catch_up, settings.trace_depth)
     server.set_endpoint(f"opc.tcp://{settings.host}:{settings.port}/")
     server.set_server_name("ejector-twin simulated PLC")
     await server.set_application_uri(APPLICATION)
     await secure(server, settings)
     index = await _namespace(server, settings.namespace_index)
-    await _Space(server, index, memory).build(registers.task.settings)
-    behaviour = Behaviour(server, settings, memory.value, set(MEASURED), lambda: memory.newest)
+    for memory, registers in zip(served, memories, strict=True):
+        await _Space(server, index, memory).build(registers.task.settings)
+    behaviour = Behaviour(server, settings, value, set(named), lambda: served[0].newest)
     try:
         await server.start()
     except OSError as error:
@@ -224,14 +232,39 @@ class _Space:
         for name in (*MEASURED, *TRACE):
             await self._live(groups[name.partition(".")[0]], name)
         await self._parameters(groups["Param"], settings)
+        if self._memory.partner is not None:
+            group = await root.add_object(*self._names("Hil"))
+            for name in WRITTEN:
+                await self._writable(group, name, self._memory.partner.written)
         if settings.program.commands == "coils":
             for name, bit in (("Cmd.Suction", Command.SUCTION), ("Cmd.BlowOff", Command.BLOW_OFF)):
                 await self._commandable(name, bit)
 
+    async def _writable(self, group: Node, name: str, written: Written) -> None:
+        """What the twin writes, where it answers the program."""
+        field, kind = WRITTEN[name]
+        value = ua.Variant(KINDS[kind](getattr(written, field)), kind)
+        node = await group.add_variable(*self._names(name), value)
+        await node.set_writable()
+
+        def read(_node: object, _attribute: object) -> ua.DataValue:
+            return ua.DataValue(ua.Variant(KINDS[kind](getattr(written, field)), kind))
+
+        def write(_node: object, _attribute: object, value: ua.DataValue) -> None:
+            if value.Value is None or value.Value.VariantType != kind:
+                raise ServiceError(ua.StatusCodes.BadTypeMismatch)
+            self._memory.catch_up()
+            setattr(written, field, KINDS[kind](value.Value.Value))
+
+        space = self._server.iserver.aspace
+        space.set_attribute_value_callback(node.nodeid, ua.AttributeIds.Value, read)
+        space.set_attribute_value_setter(node.nodeid, ua.AttributeIds.Value, write)
+
     def _names(self, name: str) -> tuple[ua.NodeId, ua.QualifiedName]:
         """NodeId and browse name: the last part of the path."""
         last = name.rpartition(".")[2]
-        return ua.NodeId(name, self._index), ua.QualifiedName(last, self._index)
+        node = ua.NodeId(f"{self._memory.prefix}{name}", self._index)
+        return node, ua.QualifiedName(last, self._index)
 
     async def _identify(self, group: Node) -> None:
         texts = {
@@ -259,13 +292,9 @@ class _Space:
     async def _analog(
         self, group: Node, name: str, unit: Unit, low: float, high: float, value: ua.Variant
     ) -> Node:
-        kind = self._server.get_node(ua.ObjectIds.AnalogItemType)
-        node, *_ = await instantiate(group, kind, *self._names(name), idx=self._index)
-        data_type = ua.NodeId(value.VariantType.value)
-        await node.write_attribute(ua.AttributeIds.DataType, ua.DataValue(data_type))
+        kind = ua.NodeId(value.VariantType.value)
+        node = await add_quantity(self._server, group, self._names(name), unit, (low, high), kind)
         await node.write_value(value)
-        await (await node.get_child("0:EURange")).write_value(ua.Range(low, high))
-        await (await node.get_child("0:EngineeringUnits")).write_value(unit.information)
         return node
 
     async def _parameters(self, group: Node, settings: PlcSettings) -> None:

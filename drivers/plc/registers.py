@@ -10,12 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drivers.plc.partner import PartnerTask, Written
 from drivers.plc.scan import DEPTH, PERIOD_NS, Task
 from twin.signals import Command
 
 RECORD = 4  # registers of one scan in the ring
-HEADER, RING = 100, 1000
-HEADER_SIZE, TEST_SIZE, INPUT_SIZE, COILS = 12, 6, 7, 2
+HEADER, HIL, RING = 100, 200, 1000
+HEADER_SIZE, TEST_SIZE, INPUT_SIZE, HIL_SIZE, COILS = 12, 6, 7, 5, 2
 RING_SIZE = RECORD * DEPTH
 
 Words = list[int]
@@ -74,9 +75,12 @@ def table() -> str:
     return "\n".join(lines)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Registers:
-    """The PLC's memory as a client sees it; ``start_ns`` is the PLC time of sequence 0."""
+    """The PLC's memory as a client sees it; ``start_ns`` is the PLC time of sequence 0.
+
+    It changes where the PLC's clock is set.
+    """
 
     task: Task
     start_ns: int
@@ -114,6 +118,8 @@ class Registers:
         if address >= RING:
             return self.ring(address - RING, count)
         begin, words = (HEADER, self.header()) if address >= HEADER else (0, self.test())
+        if address >= HIL and self.partner is not None:
+            begin, words = HIL, self.hil(self.partner.written)
         return words[address - begin : address - begin + count]
 
     def test(self) -> Words:
@@ -139,6 +145,29 @@ class Registers:
             supply & 0xFFFF,
             0,
         ]
+
+    @property
+    def partner(self) -> PartnerTask | None:
+        """The task, if a twin answers it."""
+        return self.task if isinstance(self.task, PartnerTask) else None
+
+    def hil(self, written: Written) -> Words:
+        """Holding registers 200 to 204: what the twin writes."""
+        signals = written.part_present, written.air_saving, written.watchdog
+        return [*self._split(np.float32(written.pressure)), *signals]
+
+    def write_hil(self, address: int, values: Sequence[int]) -> bool:
+        """Take what the twin writes; False where it has no business."""
+        first = address - HIL
+        if self.partner is None or first < 0 or first + len(values) > HIL_SIZE:
+            return False
+        written = self.partner.written
+        words = np.array(self.hil(written), np.uint16)
+        words[first : first + len(values)] = values
+        pair = words[:2] if self._big else words[1::-1]
+        written.pressure = float(pair.astype(">u2").view(">f4")[0])
+        written.part_present, written.air_saving, written.watchdog = words[2:].tolist()
+        return True
 
     def ring(self, first: int, count: int) -> Words:
         """``count`` holding registers of the ring from offset ``first`` within it."""

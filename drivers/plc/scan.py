@@ -4,7 +4,7 @@ Whatever the host does, a scan is computed exactly once and in order, and the sa
 are the same however the calls are chopped.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -74,6 +74,7 @@ class Task:
         self.coils = Command(0)  # asked by a client, where commands come from coils
         self.newest = -1  # sequence of the newest scan
         self.ring = np.zeros(DEPTH, SCAN)
+        self.witness: Callable[[Scans], None] = lambda _scans: None  # sees each once
         self._plant = plant(settings)
         refuse_stiff(self._plant, DT)
         self._cycles = Cycles(settings.program, seed)
@@ -89,6 +90,7 @@ class Task:
         while self.newest + 1 < n_scans:
             scans, _ = self.compute(min(n_scans - self.newest - 1, 1000))
             self.ring[scans["sequence"] % DEPTH] = scans
+            self.witness(scans)
 
     def compute(self, n: int) -> tuple[Scans, Record]:
         """Compute the next ``n`` scans past the ring: what the PLC sees, and ``plant.TRUTH``."""

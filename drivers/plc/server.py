@@ -2,7 +2,7 @@
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import cast
@@ -13,23 +13,30 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 
 from drivers.plc import registers
 from drivers.plc.registers import Registers
-from twin.errors import SourceError
+from twin.errors import ConfigError, SourceError
 
 # It logs clients that hang up as errors, frames and all; what stops the PLC is raised as well.
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 READ_COILS, READ_HOLDING, READ_INPUTS, WRITE_COIL, WRITE_COILS = 1, 3, 4, 5, 15
+WRITE_REGISTER, WRITE_REGISTERS = 6, 16
 
 
 @asynccontextmanager
-async def listening(memory: Registers, catch_up: Callable[[], None]) -> AsyncIterator[int]:
-    """Serve ``memory`` while the context lasts; gives the port.
+async def listening(
+    memories: Sequence[Registers], catch_up: Callable[[], None]
+) -> AsyncIterator[int]:
+    """Serve ``memories``, each as its own unit, while the context lasts; gives the port.
 
     ``catch_up`` is called before each answer, so that it shows the scans up to now. Raises
     SourceError where the address cannot be had.
     """
-    wanted = memory.task.settings.server
-    devices = [_device(wanted.unit, Answers(memory, catch_up)), _nobody()]
+    wanted = memories[0].task.settings.server
+    units = {memory.task.settings.server.unit: memory for memory in memories}
+    if len(units) < len(memories):
+        raise ConfigError("two ejectors have the same unit", "set unit under [plc.server] in each")
+    answers = {unit: Answers(memory, catch_up) for unit, memory in units.items()}
+    devices = [*(_device(unit, answer) for unit, answer in answers.items()), _nobody()]
     server = ModbusTcpServer(devices, address=(wanted.host, wanted.port))
     try:
         await server.serve_forever(background=True)
@@ -64,6 +71,10 @@ class Answers:
         self.catch_up()
         if function in (READ_COILS, WRITE_COIL, WRITE_COILS):
             return self._coils(address, current, values)
+        if function in (WRITE_REGISTER, WRITE_REGISTERS):
+            if not self.memory.write_hil(address, [int(value) for value in values or ()]):
+                return ExcCodes.ILLEGAL_FUNCTION
+            function = READ_HOLDING  # as it stands there now
         if function == READ_INPUTS:
             words = self.memory.inputs()[address : address + count]
         elif function == READ_HOLDING:
@@ -99,6 +110,8 @@ def _device(unit: int, answers: Answers) -> SimDevice:
         _words(registers.HEADER, registers.HEADER_SIZE),
         _words(registers.RING, registers.RING_SIZE),
     ]
+    if answers.memory.partner:
+        holding.insert(2, _words(registers.HIL, registers.HIL_SIZE))
     inputs = [_words(0, registers.INPUT_SIZE)]
     return SimDevice(unit, simdata=(_bits(), _bits(), holding, inputs), action=answers.answer)
 

@@ -79,9 +79,13 @@ class Control(Settings):
 
 
 class Program(Settings):
-    """What the PLC commands: a pick-and-place cycle, or coils that a client writes."""
+    """What the PLC commands: a pick-and-place cycle, or coils that a client writes.
 
-    commands: Literal["program", "coils"] = "program"
+    In "hil" it is a PLC without a rig: its pressure is what the twin writes, and its program
+    waits for part present before it goes on, for ``suction_ms`` more.
+    """
+
+    commands: Literal["program", "coils", "hil"] = "program"
     start_ms: float = Field(default=500.0, ge=0, le=60_000)  # idle before the first cycle
     suction_ms: float = Field(default=2300.0, ge=1, le=3.6e6)
     blow_off_ms: float = Field(default=300.0, ge=0, le=3.6e6)
@@ -114,6 +118,7 @@ class OpcuaServer(Settings):
 
     host: str = "127.0.0.1"
     port: int = Field(default=4840, ge=0, le=65535)  # 0 takes any free one
+    prefix: str = ""  # of its nodes' names, where several ejectors are served
     namespace_index: int = Field(default=2, ge=2, le=50)  # real ones change it when reconfigured
     trace_depth: int = Field(default=1024, ge=256, le=4096)  # newest scans in the trace's arrays
     min_sampling_ms: int = Field(default=1, ge=1, le=10_000)  # asked for less, it is revised

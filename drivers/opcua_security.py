@@ -1,8 +1,10 @@
-"""Who may talk to the simulated PLC's OPC UA server, and how that is kept private."""
+"""Who may talk to an OPC UA server of ours, and how that is kept private."""
 
 import hmac
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 from asyncua import Server, ua
 from asyncua.common.utils import ServiceError
@@ -10,7 +12,6 @@ from asyncua.crypto.permission_rules import User, UserRole
 from cryptography import x509
 
 from drivers import certificates
-from drivers.plc.settings import OpcuaServer
 from twin.errors import SourceError
 
 POLICIES = {
@@ -20,10 +21,26 @@ POLICIES = {
 }
 
 
+class Guard(Protocol):
+    """What to keep to."""
+
+    @property
+    def policies(self) -> Sequence[str]:
+        """Names of ``POLICIES``."""
+
+    @property
+    def certificates(self) -> Path | None:
+        """A folder as ``certificates.make`` makes it; needed for policies but None."""
+
+    @property
+    def users(self) -> Mapping[str, str]:
+        """Names and passwords; if there are any, everybody has to be one of them."""
+
+
 class Users:
     """Whom the server lets in, as the library asks for it."""
 
-    def __init__(self, settings: OpcuaServer) -> None:
+    def __init__(self, settings: Guard) -> None:
         self._passwords = settings.users
         folder = settings.certificates
         paths = sorted((folder / certificates.USERS).glob("*.der")) if folder else []
@@ -50,7 +67,7 @@ class Users:
         return User(role=UserRole.User, name=username) if right else None
 
 
-async def secure(server: Server, settings: OpcuaServer) -> None:
+async def secure(server: Server, settings: Guard) -> None:
     """Set policies, our own certificate, and whose certificates are trusted."""
     server.set_security_policy([POLICIES[policy] for policy in settings.policies])
     users = Users(settings)

@@ -1,0 +1,114 @@
+"""Hardware in the loop over Modbus: outputs as holding registers and coils."""
+
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from drivers.hil import Outputs, Ranged, Writer, counted, refuse_empty, refuse_no_range
+from drivers.link import Link, ModbusSettings
+from drivers.shared import Lines, SharedLink
+from drivers.tags import CODE, Address, Pressure, Tag, words_of
+from drivers.telegram import MOST_STORED, STORING
+from twin.settings import Document, Settings
+from twin.signals import MBAR
+
+Group = tuple[Address, tuple[int, ...]]  # words, or bits, from there on
+
+
+class Written(Tag):
+    """A value that is written; a register or coil that is listed is ours whole."""
+
+    @model_validator(mode="after")
+    def _can_be_written(self) -> Self:
+        if self.address.area not in STORING:
+            raise ValueError(f"{self.address} cannot be written: holding registers and coils can")
+        if self.bit is not None or self.type == "float32":
+            raise ValueError("a signal that is written takes a coil, or a register of integer type")
+        return self
+
+
+class Counter(Written):
+    """The watchdog: counts up with each block, and from the high end on from the low one."""
+
+    type: Literal["int16", "uint16", "int32", "uint32"] = "uint16"
+    range: tuple[int, int] = (0, 32_767)
+
+    @model_validator(mode="after")
+    def _counts(self) -> Self:
+        refuse_empty(self.range)
+        return self
+
+
+class WrittenPressure(Pressure):
+    """The pressure as the PLC expects it, within ``range``."""
+
+    @model_validator(mode="after")
+    def _can_be_written(self) -> Self:
+        refuse_no_range(self.range)
+        if self.address.area != "holding":
+            raise ValueError(f"{self.address} cannot be written: a holding register can")
+        return self
+
+
+class HilTags(Settings):
+    """What may be written; what is not listed never is."""
+
+    pressure: WrittenPressure | None = None
+    part_present: Written | None = None  # H2
+    air_saving: Written | None = None  # H1
+    watchdog: Counter | None = None
+
+
+class HilSettings(Settings):
+    """The ``[hil]`` table beside a Modbus ``[driver]``."""
+
+    min_interval_ms: float = Field(default=5.0, ge=1, le=1000)  # between two writes
+    tags: HilTags
+
+
+class RegisterOutlet:
+    """Registers and coils; what lies side by side goes in one request, the watchdog last."""
+
+    def __init__(self, link: Link, driver: ModbusSettings, tags: HilTags) -> None:
+        self._link, self._tags, self._order = link, tags, driver.word_order
+        ambient = driver.ambient_mbar * MBAR
+        self._pressure = tags.pressure and Ranged(tags.pressure, ambient, driver.where)
+        self.open, self.close = link.open, link.close
+
+    def write(self, outputs: Outputs, watchdog: int) -> None:
+        """Write every tag that is listed."""
+        for address, values in self.groups(outputs, watchdog):
+            self._link.write(address, values)
+
+    def groups(self, outputs: Outputs, watchdog: int) -> list[Group]:
+        """What is written, in order; neighbours in one."""
+        tags, groups = self._tags, list[Group]()
+        if tags.pressure and self._pressure:
+            groups.append(self._words(tags.pressure, self._pressure.raw(outputs.pressure)))
+        if tags.part_present:
+            groups.append(self._words(tags.part_present, outputs.part_present))
+        if tags.air_saving:
+            groups.append(self._words(tags.air_saving, outputs.air_saving))
+        if tags.watchdog:
+            groups.append(self._words(tags.watchdog, counted(watchdog, tags.watchdog.range)))
+        joined: list[Group] = []
+        for address, values in groups:
+            before, so_far = joined[-1] if joined else (None, ())
+            fits = before is not None and len(so_far) + len(values) <= MOST_STORED
+            if before is not None and fits and before + len(so_far) == address:
+                joined[-1] = before, (*so_far, *values)
+            else:
+                joined.append((address, values))
+        return joined
+
+    def _words(self, tag: Tag, number: float) -> Group:
+        whole = number if tag.type == "float32" else round(number)
+        return tag.address, words_of(whole, CODE[tag.type], self._order)
+
+
+def writer(driver: ModbusSettings, document: Document, lines: Lines | None = None) -> Writer:
+    """Whoever writes to this PLC, over the connection of others where there are ``lines``."""
+    settings = document.section(HilSettings, "hil")
+    link = Link(driver) if lines is None else SharedLink(driver, lines.to(driver))
+    outlet = RegisterOutlet(link, driver, settings.tags)
+    return Writer(outlet, driver.where, settings.min_interval_ms)

@@ -1,0 +1,111 @@
+"""The ``[results]`` table: whether others may read what the twin finds, where, and who."""
+
+import ipaddress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, Self
+
+from pydantic import Field, model_validator
+
+from twin.errors import ConfigError
+from twin.settings import Document, Settings
+
+if TYPE_CHECKING:
+    from drivers.results_state import Results
+
+Policy = Literal["None", "Basic256Sha256", "Aes256Sha256RsaPss"]  # with sign-and-encrypt
+
+
+class ResultsSettings(Settings):
+    """Off unless ``opcua`` is set, and for this machine alone unless it is protected."""
+
+    opcua: bool = False
+    host: str = "127.0.0.1"
+    port: int = Field(default=4841, ge=0, le=65535)  # 0 takes any free one
+    interval_ms: float = Field(default=100.0, ge=20, le=10_000)  # between two values
+    policies: tuple[Policy, ...] = Field(default=("None",), min_length=1)
+    certificates: Path | None = None  # a folder as twin cert makes it; the same as the driver's
+    users: dict[str, Path] = Field(default={})  # name = "file with the password"; if any, of all
+    unprotected: bool = False  # beyond this machine without a policy all the same
+
+    @model_validator(mode="after")
+    def _is_protected(self) -> Self:
+        if self.policies != ("None",) and self.certificates is None:
+            raise ValueError('policies need certificates = "FOLDER"; twin cert makes it')
+        if self.users and "None" in self.policies:
+            raise ValueError(
+                "users need policies without None: a password is not sent in the clear"
+            )
+        if "None" in self.policies and not _is_loopback(self.host) and not self.unprotected:
+            raise ValueError(
+                f'"{self.host}" is beyond this machine: set policies without None, or say '
+                "unprotected = true if everybody there may read"
+            )
+        return self
+
+    def below(self, folder: Path) -> "ResultsSettings":
+        """Give the same with files looked for in ``folder``, unless their paths are absolute."""
+        pki = None if self.certificates is None else folder / self.certificates
+        users = {name: folder / path for name, path in self.users.items()}
+        return self.model_copy(update={"certificates": pki, "users": users})
+
+    def passwords(self) -> dict[str, str]:
+        """Of every user, from the files; ConfigError where one cannot be read or is empty."""
+        return {name: _secret(name, path) for name, path in self.users.items()}
+
+
+@contextmanager
+def open_results(
+    documents: Sequence[Document], figures: Mapping[str, str]
+) -> Iterator["Callable[[str, str], Results] | None"]:
+    """Serve the results of all configurations that want it, at one place; None if none does.
+
+    Gives what makes a sink of an asset's name and type. ConfigError if two name different places;
+    for the others see ``ResultsServer``.
+    """
+    wanted = _wanted(documents)
+    if wanted is None:
+        yield None
+        return
+    from drivers.results import ResultsServer  # noqa: PLC0415 - the library takes its time
+
+    with ResultsServer(wanted, figures) as server:
+        yield server.sink
+
+
+def _wanted(documents: Sequence[Document]) -> ResultsSettings | None:
+    """The settings that all agree on who serve their results."""
+    first: tuple[str, ResultsSettings] | None = None
+    for document in documents:
+        folder = Path(document.name).parent  # files lie there, wherever the program was started
+        one = document.section(ResultsSettings, "results").below(folder)
+        if not one.opcua:
+            continue
+        if first is not None and first[1] != one:
+            raise ConfigError(
+                f"{first[0]} and {document.name} serve their results differently under [results]",
+                "one server stands for all ejectors of a process: write the same in both",
+            )
+        first = document.name, one
+    return first[1] if first else None
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:  # a name
+        return host == "localhost"
+
+
+def _secret(name: str, path: Path) -> str:
+    try:
+        secret = path.read_text(encoding="utf-8").strip("\r\n")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"[results] users.{name} {path}: cannot be read: {error}",
+            "a text file with the password alone",
+        ) from error
+    if not secret:
+        raise ConfigError(f"[results] users.{name} {path}: is empty", "write the password into it")
+    return secret

@@ -1,0 +1,193 @@
+"""Modbus/TCP Security: the same telegrams inside TLS, to a PLC whose certificate we trust.
+
+The PLC is known by its own certificate or that of the authority that signed it, and by its name.
+"""
+
+import socket
+import ssl
+import time
+from pathlib import Path
+from typing import Any, Self
+
+from pydantic import model_validator
+
+from drivers.lasting import LostError
+from twin.errors import ConfigError, SourceError
+from twin.settings import Settings
+
+PORT = 802  # registered for Modbus/TCP Security
+
+# OpenSSL's reasons to reject a certificate (X509_V_ERR_…), as people can put them right.
+_NOT_YET, _EXPIRED, _WRONG_NAME, _WRONG_ADDRESS = 9, 10, 62, 64
+HANDSHAKE_S = 2.0  # a PLC's processor takes its time for it
+
+
+class Tls(Settings):
+    """How the connection to the PLC is protected; missing: it is not."""
+
+    trusted: Path  # PEM: the PLC's certificate, or the authority's that signed it
+    name: str = ""  # in the PLC's certificate; "" means the host
+    certificate: Path | None = None  # PEM, our own, where the PLC wants one
+    key: Path | None = None
+
+    @model_validator(mode="after")
+    def _belong_together(self) -> Self:
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("certificate and key belong together")
+        return self
+
+    def below(self, folder: Path) -> "Tls":
+        """Give the same with files looked for in ``folder``, unless their paths are absolute."""
+        given = {key: getattr(self, key) for key in ("trusted", "certificate", "key")}
+        found = {key: folder / path for key, path in given.items() if path is not None}
+        return self.model_copy(update=found)
+
+
+class Secured(ssl.SSLSocket):
+    """A connection inside TLS; ``recv`` waits for all that is asked for, as MSG_WAITALL does."""
+
+    where = ""  # whom messages are about
+    heard = False  # it has answered at least once
+
+    def recv(self, buflen: int = 1024, flags: int = 0) -> bytes:
+        """Exactly ``buflen`` bytes, or fewer where the other side ends; OSError if too late.
+
+        SourceError if it does not want us, which TLS 1.3 says only now; LostError where it
+        hangs up instead.
+        """
+        patience = self.gettimeout()
+        assert patience is not None
+        end = time.monotonic() + patience
+        data = bytearray()
+        try:
+            while len(data) < buflen:
+                self.settimeout(max(end - time.monotonic(), 1e-3))
+                if not (part := super().recv(buflen - len(data))):
+                    break
+                data += part
+        except (ssl.SSLError, ConnectionError) as error:
+            raise self._hung_up(error) from error
+        finally:
+            self.settimeout(patience)
+        if not data and not self.heard:
+            raise _unwanted(self.where, LostError)
+        self.heard = True
+        return bytes(data)
+
+    def sendall(self, data: Any, flags: int = 0) -> None:
+        """Send everything; errors as from ``recv``."""
+        try:
+            super().sendall(data, flags)
+        except (ssl.SSLError, ConnectionError) as error:
+            raise self._hung_up(error) from error
+
+    def _hung_up(self, error: OSError) -> Exception:
+        """What an error means: right after the handshake, that it did not want us."""
+        if isinstance(error, ssl.SSLError) and _refuses(error):
+            return _unwanted(self.where)
+        return error if self.heard else _unwanted(self.where, LostError)
+
+
+def secured(connection: socket.socket, tls: Tls, where: str, timeout_ms: float) -> Secured:
+    """Shake hands on ``connection`` to ``where`` (host:port); it is closed where that fails.
+
+    SourceError if the PLC's certificate is not to be trusted or the PLC does not want ours,
+    LostError if it does not speak TLS, ConfigError where our own files cannot be used.
+    """
+    try:
+        context = _context(tls)
+        connection.settimeout(HANDSHAKE_S)
+        inside = context.wrap_socket(connection, server_hostname=tls.name or _host(where))
+    except OSError as error:
+        connection.close()
+        raise _explained(error, tls, where) from error
+    except BaseException:
+        connection.close()
+        raise
+    assert isinstance(inside, Secured)
+    inside.where = where
+    inside.settimeout(timeout_ms * 1e-3)
+    return inside
+
+
+def _host(where: str) -> str:
+    return where.rpartition(":")[0]
+
+
+# --- our own files ------------------------------------------------------------------------------
+
+
+def _context(tls: Tls) -> ssl.SSLContext:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2  # as the protocol has it
+    context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN  # the PLC's own certificate is enough
+    context.sslsocket_class = Secured
+    try:
+        context.load_verify_locations(cadata=_certificates(tls.trusted))
+    except (OSError, ValueError) as error:
+        raise _unusable("trusted", tls.trusted, error) from error
+    if tls.certificate and tls.key:
+        try:
+            context.load_cert_chain(tls.certificate, tls.key, password=lambda: "")
+        except (OSError, ValueError) as error:
+            raise _unusable("certificate and key", tls.certificate, error) from error
+    return context
+
+
+def _certificates(path: Path) -> str | bytes:
+    """Text if it is PEM, bytes if DER, as the library takes them."""
+    content = path.read_bytes()
+    return content.decode("ascii") if b"-----BEGIN" in content else content
+
+
+def _unusable(key: str, path: Path, error: Exception) -> ConfigError:
+    return ConfigError(
+        f"[driver.tls] {key} {path}: cannot be used: {error}",
+        "trusted: PEM or DER; certificate and key: PEM, the key without a password",
+    )
+
+
+# --- what goes wrong on the way -----------------------------------------------------------------
+
+
+def _explained(error: OSError, tls: Tls, where: str) -> SourceError:
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return _untrusted(error, tls, where)
+    if isinstance(error, ssl.SSLError) and _refuses(error):
+        return _unwanted(where)
+    return LostError(
+        f"{where}: it does not speak TLS",
+        f"is it the secure port (often {PORT}), and is the PLC awake? For a PLC "
+        "that speaks plain Modbus TCP leave [driver.tls] out",
+    )
+
+
+def _untrusted(error: ssl.SSLCertVerificationError, tls: Tls, where: str) -> SourceError:
+    name = tls.name or _host(where)
+    if error.verify_code in (_WRONG_NAME, _WRONG_ADDRESS):
+        return SourceError(
+            f"{where}: its certificate is not for {name}",
+            "if it is the right PLC, set name in [driver.tls] to the one in its certificate",
+        )
+    if error.verify_code in (_EXPIRED, _NOT_YET):
+        when = "has expired" if error.verify_code == _EXPIRED else "is not valid yet"
+        return SourceError(
+            f"{where}: its certificate {when}",
+            "give the PLC a new certificate, or set its clock and ours",
+        )
+    return SourceError(
+        f"{where}: its certificate is not trusted ({error.verify_message})",
+        f"if it is the right PLC, put its certificate, or its authority's, into {tls.trusted}",
+    )
+
+
+def _refuses(error: ssl.SSLError) -> bool:
+    """Whether the other side said no, and not just anything."""
+    return "_ALERT_" in (error.reason or "")
+
+
+def _unwanted(where: str, kind: type[SourceError] = SourceError) -> SourceError:
+    return kind(
+        f"{where}: it does not trust our certificate, or wants one",
+        "set certificate and key in [driver.tls], and let the PLC trust them",
+    )
