@@ -18,6 +18,7 @@ from command_line import edited, twin
 from plc_process import PlcProcess, start_plc
 
 from twin.events import Kind
+from twin.figures.cycle import KeyFigures
 from twin.live import run
 from twin.log.header import LogHeader
 from twin.log.reader import open_log
@@ -46,7 +47,9 @@ def make_log(path: Path, name: str, faults: tuple[str, ...]) -> Path:
     clock = count(0.0, 0.5).__next__  # half a second for each block, so that each is flushed
     recorder = Recorder(path, LogHeader("type", "id", f"{name}.toml", document.text), clock=clock)
     blocks = rigs.cut(rigs.recorded(name, 25.0, faults)[0], 500)
-    run(blocks, rigs.twin(name), rigs.monitor(name), [recorder])
+    monitor = rigs.monitor(name)
+    monitor.teller = KeyFigures(rigs.config(name).data)  # as the program has it
+    run(blocks, rigs.twin(name), monitor, [recorder])
     return path
 
 

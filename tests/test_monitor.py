@@ -188,7 +188,7 @@ def test_a_replay_tells_the_same_as_the_live_run(
         late = samples[given_out : max(row + 1 - held_back, given_out)]
         live += monitor.update(late, unsaid(late))
         given_out += len(late)
-    live += monitor.update(samples[given_out:], unsaid(samples[given_out:]))
+    live += monitor.update(samples[given_out:], unsaid(samples[given_out:])) + monitor.close()
     replayed = told(samples)
     assert sorted(live, key=str) == sorted(replayed, key=str)
     if held_back == 0:

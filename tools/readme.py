@@ -1,14 +1,23 @@
-"""Write the README's generated tables anew: effects and register map, from the code."""
+"""Write the generated tables of README and documentation anew, from the code."""
 
 import re
 from pathlib import Path
 
 from drivers.plc.registers import table as register_table
+from twin.figures.table import table as figures_table
+from twin.figures.warnings import table as warnings_table
 from twin.model.courses import table as courses_table
 from twin.model.effects import table as effects_table
 
-README = Path(__file__).parent.parent / "README.md"
-TABLES = {"register map": register_table, "effects": effects_table, "courses": courses_table}
+ROOT = Path(__file__).parent.parent
+PAGES = (ROOT / "README.md", ROOT / "docs" / "key-figures.md")
+TABLES = {
+    "register map": register_table,
+    "effects": effects_table,
+    "courses": courses_table,
+    "key figures": figures_table,
+    "warnings": warnings_table,
+}
 
 
 def filled(text: str) -> str:
@@ -20,4 +29,5 @@ def filled(text: str) -> str:
 
 
 if __name__ == "__main__":
-    README.write_text(filled(README.read_text()))
+    for page in PAGES:
+        page.write_text(filled(page.read_text()))

@@ -6,12 +6,14 @@ stdout, what it has to say about its work to stderr.
 
 import json
 import os
+import re
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated
@@ -20,10 +22,12 @@ import typer
 
 from twin.cli_assets import assets_app
 from twin.cli_cert import cert
+from twin.cli_figures import figures_app, keeper_of, key_figures_of
 from twin.errors import ConfigError, SourceError, TwinError
 from twin.events import Event, Severity
 
 if TYPE_CHECKING:
+    from drivers.shared import Lines
     from twin.config import Config
     from twin.diagnosis.answer import Diagnosis
     from twin.live import Sink, Twin
@@ -42,11 +46,15 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(assets_app, name="assets")
+app.add_typer(figures_app, name="figures")
 log_app = typer.Typer(help="Look after logs.", no_args_is_help=True)
 app.add_typer(log_app, name="log")
 app.command()(cert)
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML configuration.")]
+ConfigFiles = Annotated[
+    list[Path], typer.Argument(metavar="CONFIG...", help="TOML configuration, one per ejector.")
+]
 LogFile = Annotated[Path, typer.Argument(metavar="LOG.mcap", help="A recorded log.")]
 Address = Annotated[
     str, typer.Option(metavar="HOST:PORT", help="Where the PLC is, instead of the configuration's.")
@@ -65,7 +73,7 @@ FailOnAlarm = Annotated[bool, typer.Option(help="Exit with 1 if an alarm was rai
 
 @app.command()
 def run(
-    config: ConfigFile,
+    configs: ConfigFiles,
     *,
     duration: Annotated[
         float | None, typer.Option(metavar="S", help="Stop after S seconds.")
@@ -76,32 +84,75 @@ def run(
     address: Address = "",
     unit: UnitId = "",
     assets: AssetsUrl = "",
+    hil: Annotated[
+        bool, typer.Option("--hil", help="Be the plant of the PLC: write what [hil.tags] lists.")
+    ] = False,
     fail_on_alarm: FailOnAlarm = False,
 ) -> None:
-    """Run the twin beside a PLC: read, expect, compare, log, alarm, diagnose. Ctrl-C ends it."""
+    """Run the twin beside a PLC: read, expect, compare, log, alarm, diagnose. Ctrl-C ends it.
+
+    Several configurations are as many ejectors, each with its own twin and log (FILE gets the
+    asset's id before its suffix). One that fails does not stop the others.
+    """
+    from drivers.results_settings import open_results
+    from drivers.shared import Lines
     from drivers.sources import open_source
     from twin.diagnosis.process import LiveDiagnosis
+    from twin.figures.table import FIGURES
     from twin.live import run as run_loop
     from twin.log.recorder import Recorder
     from twin.settings import Document
+    from twin.together import run_together
 
-    settings = _configured(Document.read(config), assets, unit)
-    twin, monitor = _pair(settings)
-    with _stop_on_signal(duration) as stopped:
-        # A PLC that does not answer is said before a log is begun.
-        source = _begun(open_source(settings.document, address))
-        rotate = round(settings.log.rotate_mb * 1e6)
-        console = Console()
-        sinks = _opened(
-            (lambda: Recorder(log, _header(settings), rotate_bytes=rotate)) if log else None,
-            _view_of(settings, view, rrd),
-            lambda: console,
+    alone = len(configs) == 1
+    if not alone and (unit or view):
+        raise ConfigError(
+            f"{'--id' if unit else '--view'} is for one ejector, and here are {len(configs)}",
+            "leave it out; --rrd FILE writes what is to be viewed",
         )
-        adviser = LiveDiagnosis(
-            settings, str(log or "live"), lambda: stopped() == "interrupted", _status
-        )
-        run_loop(_until(stopped, source), twin, monitor, sinks, advisers=[adviser])
-        _leave(console, fail_on_alarm, interrupted=stopped() == "interrupted")
+    ejectors = _named([_configured(Document.read(one), assets, unit) for one in configs])
+    events: list[Event] = []
+    lines = Lines()
+
+    def beside(name: str, settings: "Config") -> None:
+        label = "" if alone else name
+        twin, monitor = _pair(settings)
+        shown = show(name, settings.asset.type) if show else None
+        shared = lines if hil or not alone else None
+        source = open_source(settings.document, address, shared)
+        if hil:
+            source = _answering(source, settings, address, lines)
+        with _closed(shown), _closed(source):
+            # A PLC that does not answer is said before a log is begun.
+            begun, file = _begun(source), _file_of(log, label)
+            rotate = round(settings.log.rotate_mb * 1e6)
+            header = _header(settings, hil)
+            sinks = _opened(
+                (lambda: Recorder(file, header, rotate_bytes=rotate)) if file else None,
+                (lambda: shown) if shown else None,
+                keeper_of(settings, _complain),
+                _view_of(settings, view, _file_of(rrd, label)),
+                lambda: Console(label.ljust(max(map(len, ejectors))) if label else "", events),
+            )
+            status = _status if alone else _unsaid
+            adviser = LiveDiagnosis(
+                settings, str(file or "live"), lambda: stopped() == "interrupted", status
+            )
+            advisers = [] if hil else [adviser]  # what is not measured has no faults
+            run_loop(_until(stopped, begun), twin, monitor, sinks, advisers=advisers)
+
+    failed: list[str] = []
+    units = {figure.name: figure.unit for figure in FIGURES.values()}
+    documents = [one.document for one in ejectors.values()]
+    with open_results(documents, units) as show, _stop_on_signal(duration) as stopped:
+        if alone:
+            beside(*ejectors.popitem())
+        else:
+            loops = {name: partial(beside, name, one) for name, one in ejectors.items()}
+            failed = run_together(loops, lambda name, why: _complain(f"{name}: {why}"))
+        if failed:
+            raise SourceError(f"{len(failed)} of {len(loops)} ejectors failed: {', '.join(failed)}")
+        _leave(events, fail_on_alarm, interrupted=stopped() == "interrupted")
 
 
 @app.command()
@@ -139,12 +190,12 @@ def replay(
     if json_file is not None:
         events = [_plain(event) for event in console.events]
         _write_json(json_file, {"log": str(log), "events": events})
-    _leave(console, fail_on_alarm, interrupted=stopped() == "interrupted")
+    _leave(console.events, fail_on_alarm, interrupted=stopped() == "interrupted")
 
 
 @app.command()
 def plc(
-    config: ConfigFile,
+    configs: ConfigFiles,
     fault: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME=VALUE[@START][/COURSE]", help="For example leakage=2.0@10."),
@@ -155,13 +206,17 @@ def plc(
         float | None, typer.Option(metavar="S", help="Stop after S seconds.")
     ] = None,
 ) -> None:
-    """Run the simulated PLC with an ejector behind it, for trials and tests."""
+    """Run the simulated PLC with an ejector behind it, for trials and tests.
+
+    With several configurations as many ejectors are behind it, each with its own unit and prefix
+    of nodes; the first one says where it listens and has the faults.
+    """
     from drivers.plc.faults import parse_fault
     from drivers.plc.live import run_plc
     from drivers.plc.settings import PlcSettings
     from twin.settings import Document
 
-    settings = Document.read(config).section(PlcSettings, "plc").on_port(port)
+    settings = [Document.read(one).section(PlcSettings, "plc").on_port(port) for one in configs]
     run_plc(settings, [parse_fault(text) for text in fault or []], seed, duration)
 
 
@@ -266,7 +321,7 @@ def import_(
         sinks = _opened(lambda: Recorder(part, _header(settings)), lambda: console)
         blocks = _until(stopped, _progress(table.blocks(), "importing"))
         run_loop(blocks, twin, monitor, sinks)
-    _leave(console, False, interrupted=stopped() == "interrupted")
+    _leave(console.events, False, interrupted=stopped() == "interrupted")
 
 
 @app.command()
@@ -344,8 +399,7 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
     except TwinError as error:
-        hint = f"\n  {error.hint}" if error.hint else ""
-        print(f"twin: {error}{hint}", file=sys.stderr)
+        _complain(f"{error}\n  {error.hint}" if error.hint else str(error))
         sys.exit(error.exit_code)
 
 
@@ -353,10 +407,11 @@ def main() -> None:
 
 
 class Console:
-    """A sink that prints what happens, one line each; cycles only where nobody redirects it."""
+    """A sink that prints what happens, one line each, with whose loop says it; and keeps it."""
 
-    def __init__(self) -> None:
-        self.events: list[Event] = []
+    def __init__(self, name: str = "", events: list[Event] | None = None) -> None:
+        self.events: list[Event] = [] if events is None else events
+        self._name = f"{name}  " if name else ""
 
     def write(self, _samples: "Samples", _ticks: "Ticks", events: Sequence[Event]) -> None:
         """Print what happened."""
@@ -364,11 +419,36 @@ class Console:
             self.events.append(event)
             stamp = time.strftime("%H:%M:%S", time.gmtime(event.time_ns // 1_000_000_000))
             milli = event.time_ns // 1_000_000 % 1000
-            line = f"{stamp}.{milli:03d}  {event.severity:<7}  {event.kind:<17}  {event.text}"
-            print(line, flush=True)
+            what = f"{event.severity:<7}  {event.kind:<17}  {event.text}"
+            # In one piece, since others may be printing too.
+            print(f"{stamp}.{milli:03d}  {self._name}{what}\n", end="", flush=True)
 
     def close(self) -> None:
         """Nothing to finish."""
+
+
+def _complain(what: str) -> None:
+    """In one piece, since others may be printing too."""
+    print(f"twin: {what}\n", end="", file=sys.stderr, flush=True)
+
+
+def _named(ejectors: "Sequence[Config]") -> "dict[str, Config]":
+    """The configurations by asset; ConfigError where two are of the same."""
+    named: dict[str, Config] = {}
+    for settings in ejectors:
+        name = re.sub(r"[^\w.-]", "_", settings.asset.id) or Path(settings.document.name).stem
+        if name in named:
+            raise ConfigError(
+                f"{named[name].document.name} and {settings.document.name} are both of {name}",
+                "give each ejector its own id under [asset]",
+            )
+        named[name] = settings
+    return named
+
+
+def _file_of(path: Path | None, name: str) -> Path | None:
+    """Where one of several writes: run.mcap becomes run.rig-01.mcap."""
+    return path.with_name(f"{path.stem}.{name}{path.suffix}") if path and name else path
 
 
 def _pair(settings: "Config") -> tuple["Twin", "Monitor"]:
@@ -377,10 +457,26 @@ def _pair(settings: "Config") -> tuple["Twin", "Monitor"]:
     from twin.monitor.detect import Monitor
 
     twin = compiled(settings.data)
-    return twin, Monitor(settings.monitor, twin.theta)
+    monitor = Monitor(settings.monitor, twin.theta, teller=key_figures_of(settings))
+    if settings.document.tables.get("driver", {}).get("mode") == "poll":
+        monitor.clocks = None  # then time is that of the poll here
+    return twin, monitor
 
 
-def _header(settings: "Config") -> "LogHeader":
+def _answering(
+    source: "Iterator[Samples]", settings: "Config", address: str, lines: "Lines"
+) -> "Iterator[Samples]":
+    """The blocks with the model as the plant, which answers what the PLC commands."""
+    from drivers.hil import Outputs, open_writer
+    from twin.hil import Plant, in_place
+    from twin.model.dataset import coefficients
+
+    plant = Plant(coefficients(settings.data), settings.data.terms)
+    with open_writer(settings.document, address, lines) as writer:
+        yield from in_place(source, plant, lambda *values: writer.put(Outputs(*values)))
+
+
+def _header(settings: "Config", hil: bool = False) -> "LogHeader":
     """What a log must carry to be replayed alone."""
     from importlib.metadata import version
 
@@ -398,6 +494,11 @@ def _header(settings: "Config") -> "LogHeader":
             "origin": settings.origin,
             "data": settings.data.model_dump_json(),
             "healthy": settings.monitor.healthy.model_dump_json(),
+            **(
+                {"hil": "the pressure is the model's own, as it was written to the PLC"}
+                if hil
+                else {}
+            ),
         },
         ambient=settings.data.ambient.pressure_mbar * MBAR,
     )
@@ -531,6 +632,16 @@ def _view_of(settings: "Config", view: bool, rrd: Path | None) -> "Callable[[], 
     return open_view
 
 
+@contextmanager
+def _closed(source: object) -> Iterator[None]:
+    """Close it at the end, begun or not: drivers have threads and connections."""
+    try:
+        yield
+    finally:
+        if hasattr(source, "close"):
+            source.close()
+
+
 def _begun(source: "Iterator[Samples]") -> "Iterator[Samples]":
     """The same blocks, the first of them already fetched."""
     first = next(source)
@@ -604,7 +715,8 @@ def _progress(source: "Iterable[Samples]", what: str) -> "Iterator[Samples]":
 def _status() -> Iterator[Callable[[str], None]]:
     """Give a function that says what is being done: on a terminal, and nothing in a pipe."""
     if not sys.stderr.isatty():
-        yield lambda _what: None
+        with _unsaid() as say:
+            yield say
         return
     from rich.console import Console as Terminal
 
@@ -612,11 +724,17 @@ def _status() -> Iterator[Callable[[str], None]]:
         yield status.update
 
 
-def _leave(console: Console, fail_on_alarm: bool, *, interrupted: bool) -> None:
+@contextmanager
+def _unsaid() -> Iterator[Callable[[str], None]]:
+    """As ``_status`` where several would say it at once."""
+    yield lambda _what: None
+
+
+def _leave(events: Iterable[Event], fail_on_alarm: bool, *, interrupted: bool) -> None:
     """Exit as the contract of the command line has it."""
     if interrupted:
         raise typer.Exit(INTERRUPTED)
-    if fail_on_alarm and any(event.severity is Severity.ALARM for event in console.events):
+    if fail_on_alarm and any(event.severity is Severity.ALARM for event in events):
         raise typer.Exit(ALARMED)
 
 

@@ -25,7 +25,19 @@ from twin.monitor.detect import MonitorSettings
 from twin.monitor.healthy import Healthy
 from twin.settings import Document, Settings
 
-TABLES = {"asset", "assets", "data", "driver", "import", "log", "monitor", "plc"}
+TABLES = {
+    "asset",
+    "assets",
+    "data",
+    "driver",
+    "figures",
+    "hil",
+    "import",
+    "log",
+    "monitor",
+    "plc",
+    "results",
+}
 NO_TYPE = "unknown"
 HAND_WRITTEN = "[data] of the configuration"
 _WORDS = {"type": "object-specific data", "instance": "instance-specific data"}

@@ -20,6 +20,7 @@ class Kind(StrEnum):
     GAP = "gap"
     PLC_RESTARTED = "plc_restarted"
     CLOCK_JUMPED = "clock_jumped"
+    CLOCK = "clock"
     PLC_STALE = "plc_stale"
     PLC_BACK = "plc_back"
     SIGNAL_BAD = "signal_bad"
@@ -34,6 +35,7 @@ SEVERITY: dict[Kind, Severity] = {
     Kind.GAP: Severity.WARNING,
     Kind.PLC_RESTARTED: Severity.WARNING,
     Kind.CLOCK_JUMPED: Severity.WARNING,
+    Kind.CLOCK: Severity.INFO,
     Kind.PLC_STALE: Severity.ALARM,
     Kind.PLC_BACK: Severity.INFO,
     Kind.SIGNAL_BAD: Severity.WARNING,

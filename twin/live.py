@@ -17,7 +17,7 @@ from twin.model.theta import Theta
 from twin.monitor.detect import Monitor
 from twin.monitor.phases import Found, Knees, PhaseFinder, expected_knees
 from twin.monitor.signatures import steps
-from twin.signals import MBAR, SAMPLE, TICK, Samples, Ticks
+from twin.signals import MBAR, SAMPLE, TICK, Quality, Samples, Ticks
 
 
 class Sink(Protocol):
@@ -112,8 +112,9 @@ def run(
             closing.callback(close)
         for block in source:
             silent: list[Event] = []
-            if len(block):
-                last = block[-1].copy()
+            fresh = block[(block["quality"] & Quality.STALE) == 0]
+            if len(fresh):
+                last = fresh[-1].copy()
             elif last is not None:
                 silent = monitor.silent(last, clock())
             samples, ticks = twin.advance(block)

@@ -10,6 +10,7 @@ import sqlite3
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url
@@ -19,6 +20,16 @@ from sqlalchemy.pool import ConnectionPoolEntry, NullPool, StaticPool
 
 from twin.errors import ConfigError, SourceError
 
+
+@dataclass(frozen=True)
+class Purpose:
+    """What a database is for, as messages name it, and the option that chooses another one."""
+
+    name: str
+    option: str
+
+
+ASSETS = Purpose("asset database", "--assets")
 POSTGRES = {"postgresql", "postgres", "postgresql+psycopg"}
 _WRITERS_LOCK = 0x656A6563  # any number that no other program takes in the same database
 
@@ -28,30 +39,30 @@ _HINTS = {  # by SQLite's error name, or PostgreSQL's SQLSTATE
     "SQLITE_CANTOPEN": "check that the folder exists and may be written to",
     "SQLITE_CORRUPT": "the file is damaged; import an export into a new one",
     "SQLITE_FULL": "make room on the disk",
-    "SQLITE_NOTADB": "choose an asset database with --assets; this file is something else",
+    "SQLITE_NOTADB": "choose another file with {option}; this one is something else",
     "SQLITE_READONLY": "have the file and its folder made writable for you",
     "42501": "have this user granted the rights, or name another one in the URL",
     "55P03": _TRY_AGAIN,
 }
 _ELSE = {
-    "sqlite": "choose another database with --assets",
+    "sqlite": "choose another database with {option}",
     "postgresql": "check that the server runs and that host, user, password and name are right",
 }
 
 
-def parse_url(where: str | Path) -> URL:
+def parse_url(where: str | Path, purpose: Purpose = ASSETS) -> URL:
     """The URL of a database: a URL, or the path of an SQLite file; ConfigError for other kinds."""
     if isinstance(where, Path) or "://" not in where:
         return URL.create("sqlite", database=str(where))
     try:
         url = make_url(where)
     except (ArgumentError, ValueError) as error:  # ValueError: a port that is no number
-        raise _unknown_kind("the URL of the asset database cannot be read") from error
+        raise _unknown_kind(f"the URL of the {purpose.name} cannot be read") from error
     if url.drivername == "sqlite":
         return url
     if url.drivername in POSTGRES:
         return url.set(drivername="postgresql+psycopg")
-    raise _unknown_kind(f"asset databases of kind {url.drivername!r} are not supported")
+    raise _unknown_kind(f"{purpose.name}s of kind {url.drivername!r} are not supported")
 
 
 def _unknown_kind(message: str) -> ConfigError:
@@ -124,7 +135,7 @@ def _take_turn(connection: Connection, busy_ms: int) -> None:
 
 
 @contextmanager
-def plain_errors(url: URL) -> Iterator[None]:
+def plain_errors(url: URL, purpose: Purpose = ASSETS) -> Iterator[None]:
     """Turn the database's errors into a SourceError that says where and what to do."""
     try:
         yield
@@ -132,7 +143,8 @@ def plain_errors(url: URL) -> Iterator[None]:
         first = str(error.orig).strip().partition("\n")[0]
         code = _code(error.orig)
         hint = _HINTS.get(code, _ELSE[url.get_backend_name()])
-        raise SourceError(f"{shown(url)}: asset database: {first}", hint) from error
+        hint = hint.format(option=purpose.option)
+        raise SourceError(f"{shown(url)}: {purpose.name}: {first}", hint) from error
 
 
 def _code(error: BaseException | None) -> str:

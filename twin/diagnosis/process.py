@@ -66,7 +66,7 @@ class LiveDiagnosis:
 
     def follow(self, samples: Samples, events: Sequence[Event]) -> list[Event]:
         """Take rows and what happened; give the answer that has come by now."""
-        self._recent.add(samples, sum(event.kind is Kind.CYCLE for event in events))
+        self._recent.add(samples, sum(_is_whole_cycle(event) for event in events))
         if len(samples):
             self._now_ns = int(samples["time_ns"][-1])
         for event in events:
@@ -100,7 +100,7 @@ class LiveDiagnosis:
             self._asked = None
 
     def _note(self, event: Event) -> None:
-        if event.kind is Kind.CYCLE:
+        if _is_whole_cycle(event):
             self._since += 1
         elif event.kind is Kind.DEVIATION:
             if self._alarm is None:
@@ -142,6 +142,11 @@ class LiveDiagnosis:
     def _failed(self, alarm: Event, why: str) -> Event:
         text = f"no diagnosis: {why}; twin diagnose LOG does it afterwards"
         return Event(self._now_ns, Kind.DIAGNOSIS, text, {"alarm_ns": alarm.time_ns})
+
+
+def _is_whole_cycle(event: Event) -> bool:
+    """Whether a cycle has ended that was not cut off."""
+    return event.kind is Kind.CYCLE and bool(event.data.get("complete", True))
 
 
 @dataclass

@@ -11,6 +11,7 @@ from twin.log.schema import CHANNELS, LIBRARY
 
 OWN_METADATA = "ejector-twin"
 FREE_METADATA = "run"
+CLOCK_METADATA = "clock"  # at the end: the PLC's clock against the one here
 
 
 def part_path(path: Path, number: int) -> Path:

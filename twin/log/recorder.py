@@ -10,12 +10,12 @@ from typing import Self
 import numpy as np
 
 from twin.errors import SourceError
-from twin.events import Event
+from twin.events import Event, Kind
 from twin.log.columns import Tray, encode
 from twin.log.header import Identity, LogHeader
 from twin.log.messages import Scalars, encode_event, encode_log
 from twin.log.output import Output
-from twin.log.part import part_path, write_head
+from twin.log.part import CLOCK_METADATA, part_path, write_head
 from twin.log.schema import CHANNELS
 from twin.signals import Samples, Ticks
 
@@ -50,6 +50,7 @@ class Recorder:
         self._scalars = Scalars(header.ambient)
         self._events: list[tuple[int, Event]] = []  # with ns of receipt
         self._host_ns: int | None = None  # of the last row
+        self._clocks: dict[str, str] = {}  # as last told of
         self._failure: SourceError | None = None
         self._closed = False
         self._series = uuid.uuid4().hex
@@ -94,6 +95,10 @@ class Recorder:
         if len(samples):
             self._host_ns = int(samples["host_ns"][-1])
         self._events.extend((self._received(event, samples), event) for event in events)
+        for event in events:
+            if event.kind is Kind.CLOCK:
+                at = {"time_ns": str(event.time_ns)}
+                self._clocks = at | {name: str(value) for name, value in event.data.items()}
         for block in self._tray.add(samples, ticks):
             self._add_rows(*block)
         now = self._clock()
@@ -155,6 +160,8 @@ class Recorder:
             raise self._fail(error) from error
 
     def _finish(self) -> None:
+        if self._clocks:
+            self._writer.add_metadata(CLOCK_METADATA, self._clocks)
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._output.finish()
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -50,6 +51,28 @@ class Cycle:
     def end_ns(self) -> int:
         """PLC time of the last row."""
         return int(self.samples["time_ns"][-1])
+
+
+class Told(Protocol):
+    """What can be told of a whole cycle."""
+
+    @property
+    def end_ns(self) -> int:
+        """PLC time of its last row."""
+
+    @property
+    def words(self) -> str:
+        """For people, in a line."""
+
+    def plain(self) -> dict[str, Any]:
+        """Its numbers, as JSON has them."""
+
+
+class Teller(Protocol):
+    """Whoever tells more of cycles than ``figures`` does: the key figures."""
+
+    def take(self, piece: Cycle) -> Told | None:
+        """Take what a CycleCutter gives, in order; tell of the cycle that is over with it."""
 
 
 @dataclass

@@ -14,7 +14,8 @@ from pydantic import Field
 from twin.events import Event, Kind
 from twin.model import theta as c
 from twin.model.theta import Theta
-from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, figures
+from twin.monitor.clock import ClockWatch
+from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, Teller, Told, figures
 from twin.monitor.healthy import Healthy
 from twin.monitor.signatures import Likeness, likenesses, look_alikes
 from twin.settings import Settings
@@ -51,11 +52,14 @@ class Monitor:
 
     settings: MonitorSettings
     theta: Theta
+    teller: Teller | None = None  # of key figures, for what is said of each cycle
     active: str = ""  # the effect named by the standing alarm; empty while there is none
+    clocks: ClockWatch | None = field(default_factory=ClockWatch)  # None: the PLC has none
     _cutter: CycleCutter = field(default_factory=CycleCutter)
     _before: Cycle | None = None
     _quiet_cycles: int = 0
     _last: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # row of the stream
+    _fresh: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # the last that was
     _silences: set[int] = field(default_factory=set)  # told of, by PLC time of the row before
     _unfit: int = 0  # quality bits that stand
 
@@ -64,13 +68,15 @@ class Monitor:
         events = []
         for rows in np.split(np.arange(len(samples)), np.flatnonzero(samples["quality"] & BREAK)):
             found = list(self._stream_events(samples[rows]))
+            silent = any(event.kind is Kind.PLC_BACK for event in found)
             for cycle in self._cutter.push(samples[rows], ticks[rows]):
-                found += self._judge(cycle)
-            events += sorted(found, key=lambda event: event.time_ns)  # as if row by row
+                found += self._judge(cycle, silent and cycle.cut_short)
+            found += self.clocks.push(samples[rows]) if self.clocks else []
+            events += sorted(found, key=_order)  # as if row by row
         return events
 
     def silent(self, last: np.void, now_ns: int) -> list[Event]:
-        """Nothing arrived: give PLC_STALE once it is too long after the ``last`` row received."""
+        """Nothing arrived: give PLC_STALE once it is too long after the ``last`` fresh row."""
         time_ns = int(last["time_ns"])
         silence_ns = now_ns - int(last["host_ns"])
         if time_ns in self._silences or silence_ns * NS * 1e3 <= self.settings.stale_ms:
@@ -78,8 +84,10 @@ class Monitor:
         return [self._stale(time_ns)]
 
     def close(self) -> list[Event]:
-        """Judge the cycle that the end cut off."""
-        return [event for cycle in self._cutter.flush() for event in self._judge(cycle)]
+        """Judge the cycle that the end cut off, and say what is still to be said of the clocks."""
+        stale = bool(self._silences)
+        events = [event for one in self._cutter.flush() for event in self._judge(one, stale)]
+        return events + (self.clocks.close() if self.clocks else [])
 
     # --- the stream -----------------------------------------------------------------------------
 
@@ -87,28 +95,32 @@ class Monitor:
         """Find the rows at which something happened to the stream; most blocks have none."""
         if not len(samples):
             return
-        rows = np.concatenate([self._last, samples])
+        rows = np.concatenate([self._fresh, self._last, samples])
         first = len(rows) - len(samples)
         quality = rows["quality"]
-        silence_ms = np.diff(rows["host_ns"], prepend=rows["host_ns"][:1]) * NS * 1e3
         changes = np.diff(quality & _UNFIT, prepend=np.uint8(self._unfit)) != 0
         changes |= (quality & (Quality.GAP | Quality.RESTART | Quality.CLOCK)) != 0
-        changes |= silence_ms > self.settings.stale_ms
+        fresh = (quality & Quality.STALE) == 0
+        latest = np.maximum.accumulate(np.where(fresh, np.arange(len(rows)), -1))
+        before = np.concatenate([[-1], latest[:-1]])  # the last fresh row before each
+        silence_ms = (rows["host_ns"] - rows["host_ns"][before]) * NS * 1e3
+        silent = (silence_ms > self.settings.stale_ms) & (before >= 0)
+        changes |= silent & (fresh | ~np.concatenate([[False], (silent & ~fresh)[:-1]]))
         for row in np.flatnonzero(changes):
             if row >= first:
-                before = rows[row - 1] if row else None
-                yield from self._row_events(before, rows[row], float(silence_ms[row]))
+                heard = rows[before[row]] if silent[row] else None
+                yield from self._row_events(rows[row - 1] if row else None, rows[row], heard)
         self._last = rows[-1:].copy()
+        self._fresh = rows[fresh][-1:].copy()
 
-    def _row_events(self, before: np.void | None, row: np.void, silence_ms: float) -> list[Event]:
+    def _row_events(
+        self, before: np.void | None, row: np.void, heard: np.void | None
+    ) -> list[Event]:
+        """What a row brings; ``heard`` is the last fresh one, if that was too long ago."""
         time_ns, quality = int(row["time_ns"]), int(row["quality"])
         events = []
-        if before is not None and silence_ms > self.settings.stale_ms:
-            if int(before["time_ns"]) not in self._silences:
-                events.append(self._stale(int(before["time_ns"])))
-            self._silences.remove(int(before["time_ns"]))
-            text = f"the PLC is back after {silence_ms / 1e3:.2f} s"
-            events.append(Event(time_ns, Kind.PLC_BACK, text, {"silence_ms": silence_ms}))
+        if heard is not None:
+            events += self._silence_events(row, heard)
         if quality & Quality.RESTART:
             text = f"the PLC restarted; its sequence goes on at {int(row['sequence'])}"
             events.append(Event(time_ns, Kind.PLC_RESTARTED, text))
@@ -126,20 +138,35 @@ class Monitor:
             events.append(Event(time_ns, kind, text, {"quality": self._unfit}))
         return events
 
+    def _silence_events(self, row: np.void, heard: np.void) -> list[Event]:
+        """One that it is stale, unless that was told, and one that it is back, once it is."""
+        since_ns = int(heard["time_ns"])
+        events = [] if since_ns in self._silences else [self._stale(since_ns)]
+        if not row["quality"] & Quality.STALE:
+            self._silences.remove(since_ns)
+            silence_ms = float(int(row["host_ns"]) - int(heard["host_ns"])) * NS * 1e3
+            text = f"the PLC is back after {silence_ms / 1e3:.2f} s"
+            data = {"silence_ms": silence_ms}
+            events.append(Event(int(row["time_ns"]), Kind.PLC_BACK, text, data))
+        return events
+
     def _stale(self, last_time_ns: int) -> Event:
         self._silences.add(last_time_ns)
         after_ns = int(self.settings.stale_ms * 1e6)
         text = f"no fresh sample for {self.settings.stale_ms:.0f} ms: check PLC and network"
-        return Event(last_time_ns + after_ns, Kind.PLC_STALE, text)
+        return Event(last_time_ns + after_ns, Kind.PLC_STALE, text, {"since_ns": last_time_ns})
 
     # --- the cycles -----------------------------------------------------------------------------
 
-    def _judge(self, cycle: Cycle) -> list[Event]:
+    def _judge(self, cycle: Cycle, silent: bool) -> list[Event]:
+        """Its figures, and an alarm; none of one that a silent PLC cut off."""
         before, self._before = self._before, cycle
         found = figures(cycle, self.theta[c.AMBIENT])
-        events = [_summary(cycle, found)] if cycle.complete else []
+        told = self.teller.take(cycle) if self.teller else None
+        events = [_summary(cycle, found, told)] if cycle.complete or told else []
         whole = cycle.complete or len(cycle.samples) >= LONGEST_PIECE
-        judged = whole and cycle.settled and cycle.coverage >= FEWEST_SHARE
+        stale = silent or any(map(_has_stale, (cycle, before or cycle)))
+        judged = whole and cycle.settled and cycle.coverage >= FEWEST_SHARE and not stale
         if not judged or (worst := self._worst(found)) is None:
             return events
         if abs(worst.sigmas) >= self.settings.raise_sigma:
@@ -217,6 +244,16 @@ class Monitor:
         return ranking or [Likeness("unknown", 0.0, "", 0.0)]  # not one sync in a long piece
 
 
+def _order(event: Event) -> int:
+    """Where an event belongs among others; silence before what ends it, though rows fill it."""
+    return int(event.data["since_ns"]) if event.kind is Kind.PLC_STALE else event.time_ns
+
+
+def _has_stale(cycle: Cycle) -> bool:
+    """Whether nobody knows what was commanded during some of it: the model may be anywhere."""
+    return bool((cycle.samples["quality"] & Quality.STALE).any())
+
+
 def _gap(before: np.void, row: np.void) -> Event:
     missing = int(row["sequence"]) - int(before["sequence"]) - 1
     seconds = (int(row["time_ns"]) - int(before["time_ns"])) * NS
@@ -227,12 +264,18 @@ def _gap(before: np.void, row: np.void) -> Event:
     return Event(int(row["time_ns"]), Kind.GAP, text, data)
 
 
-def _summary(cycle: Cycle, found: Mapping[str, float]) -> Event:
+def _summary(cycle: Cycle, found: Mapping[str, float], told: Told | None) -> Event:
+    """What there is to say of a cycle; in the words of who tells most of it."""
+    data = {"cycle": cycle.index} | {name: round(value, 3) for name, value in found.items()}
+    if told is not None:
+        if not cycle.complete:  # a piece's own figures are not the cycle's
+            data = {}
+        data = {name: value for name, value in data.items() if not name.startswith("t0_")}
+        return Event(told.end_ns, Kind.CYCLE, told.words, data | told.plain())
     text = f"cycle {cycle.index}"
     if "t0_measured" in found and "t0_expected" in found:
         text += (
             f": evacuated to H2 in {found['t0_measured']:.0f} ms"
             f" (expected {found['t0_expected']:.0f} ms)"
         )
-    data = {"cycle": cycle.index} | {name: round(value, 3) for name, value in found.items()}
     return Event(cycle.end_ns, Kind.CYCLE, text, data)

@@ -76,7 +76,7 @@ def export(rows: Rows, header: LogHeader, path: Path) -> None:
     if write is None:
         known = " and ".join(_KINDS)
         raise ConfigError(f"{path}: cannot tell what to write", f"{known} files can be written")
-    with _complete(path) as file:
+    with complete_file(path) as file:
         write(rows, header, file)
 
 
@@ -127,7 +127,7 @@ def _origin(header: LogHeader) -> dict[str, str]:
 
 
 @contextmanager
-def _complete(path: Path) -> Iterator[BinaryIO]:
+def complete_file(path: Path) -> Iterator[BinaryIO]:
     """A file to write to, which gets its name once all is written."""
     if path.exists():
         message = f"{path}: there is already a file of that name"

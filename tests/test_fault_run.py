@@ -1,0 +1,101 @@
+"""The fault run in short, and that it would see what it looks for."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rigs
+from log_rows import HEADER
+
+from drivers.plc.live import WITNESSED
+from tools import fault_run
+from twin.log.recorder import Recorder
+from twin.signals import MBAR, Quality, Samples
+
+
+def test_after_every_disturbance_the_log_is_true_and_the_twin_right(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fault_run, "SETTLED_S", 5.0)
+    monkeypatch.setattr(fault_run, "GROWTH_MB", 60.0)  # this short it is still filling its buffers
+    verdict, done = fault_run.run("modbus", 34.0, 4, 5, tmp_path)
+    assert verdict.problems == []
+    assert len(done) == len(set(done)) == 4
+    assert verdict.counts["rows"] > 15_000
+
+
+# Logs that are not true.
+
+SCANS = 12_000
+
+
+def sampled() -> tuple[Samples, np.ndarray]:
+    samples = rigs.recorded("test_rig", SCANS / 1000)[0].copy()
+    theirs = np.zeros(SCANS, WITNESSED)
+    theirs["sequence"], theirs["time_ns"] = samples["sequence"], samples["time_ns"]
+    theirs["pressure"] = samples["pressure"].astype(np.float64) / MBAR
+    theirs["status"] = samples["commands"]
+    samples["pressure"] = (theirs["pressure"].astype(np.float64) * MBAR).astype(np.float32)
+    return samples, theirs
+
+
+def judged(folder: Path, samples: Samples, *boots: np.ndarray) -> list[str]:
+    paths = [folder / f"boot{number}.bin" for number in range(len(boots))]
+    for path, theirs in zip(paths, boots, strict=True):
+        theirs.tofile(path)
+    twin, monitor = rigs.twin("test_rig"), rigs.monitor("test_rig")
+    with Recorder(folder / "a.mcap", HEADER) as recorder:
+        for block in rigs.cut(samples, 1000):
+            rows, ticks = twin.advance(block)
+            recorder.write(rows, ticks, monitor.update(rows, ticks))
+        rows, ticks = twin.flush()
+        recorder.write(rows, ticks, monitor.update(rows, ticks))
+    verdict = fault_run.Verdict()
+    fault_run.judge(folder / "a.mcap", paths, verdict)
+    return list(verdict.problems)
+
+
+def test_a_true_log_has_no_problems(tmp_path: Path) -> None:
+    samples, theirs = sampled()
+    rows = np.delete(samples, np.s_[300:400])
+    rows["quality"][300] = Quality.GAP
+    assert judged(tmp_path, rows, theirs) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (lambda rows: rows["pressure"].__setitem__(5000, 101_324.0), "other pressures"),
+        (lambda rows: rows["commands"].__setitem__(5000, 3), "other commands"),
+        (lambda rows: rows["quality"].__setitem__(50, Quality.GAP), "gaps are not where"),
+        (lambda rows: rows["sequence"].__setitem__(np.s_[50:], rows["sequence"][49:-1]), "twice"),
+        (lambda rows: rows["time_ns"].__iadd__(10**9), "of the times are wrong"),
+    ],
+)
+def test_what_is_not_true_is_seen(change: object, problem: str, tmp_path: Path) -> None:
+    samples, theirs = sampled()
+    change(samples)  # type: ignore[operator]
+    assert problem in "; ".join(judged(tmp_path, samples, theirs))
+
+
+def test_a_hole_without_a_mark_is_seen(tmp_path: Path) -> None:
+    samples, theirs = sampled()
+    rows = np.delete(samples, np.s_[300:301])
+    assert "gaps are not where rows are missing" in "; ".join(judged(tmp_path, rows, theirs))
+
+
+def test_rows_of_no_plc_are_seen(tmp_path: Path) -> None:
+    samples, theirs = sampled()
+    samples["pressure"] += 100
+    assert "are of no PLC" in "; ".join(judged(tmp_path, samples, theirs))
+
+
+def test_growth_is_seen() -> None:
+    seen = [{"threads": 5.0, "files": 9.0, "sockets": 1.0, "mb": 200.0 + i} for i in range(30)]
+    verdict = fault_run.Verdict()
+    fault_run.judge_growth(seen, verdict)
+    assert verdict.problems == ["mb grew from 205 to 224"]
+    seen = [one | {"files": 9.0 + (i > 5)} for i, one in enumerate(seen[:12])]
+    verdict = fault_run.Verdict()
+    fault_run.judge_growth(seen, verdict)
+    assert verdict.problems == ["files grew from 9 to 10"]

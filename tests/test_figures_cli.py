@@ -1,0 +1,205 @@
+"""``twin figures``, from a log to tables, trends, counters and taught limits."""
+
+import csv
+import json
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rigs
+from pyarrow import parquet
+
+from twin.cli_figures import figures_app
+from twin.errors import ConfigError, SourceError
+from twin.figures.store import VALUES, Unit, open_store
+from twin.live import run as run_loop
+from twin.log.header import LogHeader
+from twin.log.recorder import Recorder
+
+Run = Callable[..., str]
+UNIT = Unit("compact-ejector-35", "gripper-01")
+DAY = 86_400 * 10**9
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Nine healthy cycles of the gripper."""
+    path = tmp_path_factory.mktemp("log") / "run.mcap"
+    config = rigs.config("gripper")
+    metadata = {"data": config.data.model_dump_json(), "data_set": config.data.hash}
+    header = LogHeader(*UNIT, "gripper.toml", config.document.text, metadata)
+    recorded = rigs.cut(rigs.recorded("gripper", 20.0)[0], 100)
+    sinks = [Recorder(path, header)]
+    run_loop(recorded, rigs.twin("gripper"), rigs.monitor("gripper"), sinks)
+    return path
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run a command in an empty folder; gives what it printed."""
+    monkeypatch.chdir(tmp_path)
+
+    def command(*arguments: str | Path) -> str:
+        figures_app([str(one) for one in arguments], standalone_mode=False)
+        return capsys.readouterr().out
+
+    return command
+
+
+def fill(days: float, count: int, unit: Unit = UNIT, **values: float) -> None:
+    """A database in this folder with cycles over days, whose leakage rises by 5 mbar/s a day."""
+    rng = np.random.default_rng(1)
+    host = (10**18 + np.linspace(0, days, count) * DAY).astype(int)
+    cycles = [
+        {
+            "cycle": number,
+            "begin_ns": int(ns),
+            "host_ns": int(ns),
+            "warnings": [],
+            "t1_measured": 250.0 + rng.normal(),
+            "leakage_measured": 100 + 5 * (ns - host[0]) / DAY + rng.normal(),
+            "switchings_measured": 1,
+            **values,
+        }
+        for number, ns in enumerate(host)
+    ]
+    with open_store("figures.sqlite") as store:
+        store.add(unit, "a", "test", cycles)
+
+
+def counted(out: str) -> list[list[str]]:
+    """Suction cycles, valve switchings and alarms: in all, and erasable."""
+    return [line.split()[-2:] for line in out.splitlines()[1:]]
+
+
+def test_a_log_is_shown_with_what_was_expected(run: Run, log: Path) -> None:
+    head, *rows = run("show", log).splitlines()
+    assert head.split()[:3] == ["cycle", "t0", "(ms)"]
+    assert len(rows) == 10  # the last one cut off
+    assert rows[3].split()[0] == "3"
+    assert rows[3].split()[1:3] == ["189", "(189)"]
+
+
+def test_a_log_as_json_and_as_tables(run: Run, log: Path) -> None:
+    run("show", log, "--json", "f.json", "-o", "f.csv")
+    run("show", log, "-o", "f.parquet")
+    cycles = json.loads(Path("f.json").read_text())["cycles"]
+    with Path("f.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    table = parquet.read_table("f.parquet")
+    assert table.schema.field("leakage_measured").metadata[b"unit"] == b"mbar/s"
+    assert len(cycles) == len(rows) == table.num_rows == 10
+    for cycle, row, other in zip(cycles, rows, table.to_pylist(), strict=True):
+        assert row["time"].startswith("2026-01-01 00:00:")
+        assert row["asset_id"] == "gripper-01"
+        for name in VALUES:
+            assert other[name] == cycle.get(name)
+            assert (float(row[name]) if row[name] else None) == cycle.get(name)
+
+
+def test_another_suffix_is_refused(run: Run, log: Path) -> None:
+    with pytest.raises(ConfigError, match=r"f\.txt: cannot tell what to write"):
+        run("show", log, "-o", "f.txt")
+
+
+def test_a_log_is_kept_once(run: Run, log: Path) -> None:
+    assert run("show", log, "--keep").splitlines()[-1].startswith("10 new of 10 cycles, in ")
+    assert run("show", log, "--keep").splitlines()[-1].startswith("0 new of 10 cycles, in ")
+    assert counted(run("counters")) == [["10", "10"], ["10", "10"], ["0", "0"]]
+
+
+def test_trends_are_said_drawn_and_written(run: Run) -> None:
+    fill(10, 2000)
+    out = run("trend", "leakage", "t1", "--json", "t.json")
+    rising, flat = out.splitlines()
+    assert rising.startswith(("leakage: 149.9 mbar/s, +", "leakage: 150 mbar/s, +"))
+    assert "its limit of 250 mbar/s in 20.0 days (" in rising
+    assert "no trend" in flat
+    leakage, t1 = json.loads(Path("t.json").read_text())
+    assert leakage["line"]["is_trend"]
+    assert leakage["days_to_limit"]["low95"] < 20 < leakage["days_to_limit"]["high95"]
+    assert t1["days_to_limit"] is None
+    run("trend", "leakage", "--picture", "t.png")
+    assert Path("t.png").stat().st_size > 10_000
+    assert len(run("trend").splitlines()) == len(VALUES) // 2
+
+
+def test_a_limit_too_far_to_be_dated_is_drawn_all_the_same(run: Run, tmp_path: Path) -> None:
+    fill(10, 500)
+    config = tmp_path / "cell.toml"
+    text = rigs.path_of("gripper").read_text()
+    config.write_text(text.replace("h2_mbar = 550.0", "permitted_leakage_mbar_s = 900.0", 1))
+    out = run("trend", "leakage", "--config", config, "--picture", "t.svg")
+    assert out.rstrip().endswith("its limit of 900 mbar/s is more than 29.8 days away")
+    assert b"</svg>" in Path("t.svg").read_bytes()
+
+
+def test_a_picture_is_of_one_figure_and_there_must_be_such(run: Run) -> None:
+    fill(10, 100)
+    with pytest.raises(ConfigError, match="--picture draws one figure"):
+        run("trend", "--picture", "t.png")
+    with pytest.raises(ConfigError, match="no figure is called leak"):
+        run("trend", "leak")
+    with pytest.raises(SourceError, match=r"t\.xyz: cannot be written"):
+        run("trend", "leakage", "--picture", "t.xyz")
+
+
+def test_only_the_last_days(run: Run) -> None:
+    fill(10, 100)
+    with pytest.raises(ConfigError, match="no cycles of gripper-01 in that time"):
+        run("trend", "--days", "1")
+
+
+def test_counters_are_erased(run: Run) -> None:
+    fill(1, 50)
+    assert counted(run("counters")) == [["50", "50"], ["50", "50"], ["0", "0"]]
+    assert counted(run("counters", "--erase")) == [["50", "0"], ["50", "0"], ["0", "0"]]
+
+
+def test_autoset_gives_what_stands_in_a_configuration(run: Run) -> None:
+    fill(10, 100)
+    text = run("autoset")
+    table = tomllib.loads(text)["figures"]
+    assert text.startswith("# from the last 5 good cycles of gripper-01\n")
+    assert table["permitted_leakage_mbar_s"] == pytest.approx(150 * 1.25, abs=3)
+    assert table["permitted_t1_ms"] == pytest.approx(250 * 1.25, abs=4)
+    more = tomllib.loads(run("autoset", "--tolerance", "0.5"))["figures"]
+    assert more["permitted_leakage_mbar_s"] == pytest.approx(150 * 1.5, abs=3)
+    assert tomllib.loads(run("autoset", "--tolerance", "0"))["figures"]["permitted_t1_ms"] > 290
+
+
+def test_autoset_learns_from_good_cycles_only(run: Run) -> None:
+    fill(1, 20, warnings=["leakage_over_limit"])  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="no good cycle is stored"):
+        run("autoset")
+
+
+def test_kept_cycles_are_exported(run: Run) -> None:
+    fill(10, 100)
+    assert run("export", "-o", "f.parquet") == "100 cycles in f.parquet\n"
+    assert parquet.read_table("f.parquet")["leakage_measured"][-1].as_py() == pytest.approx(
+        150, abs=4
+    )
+    with pytest.raises(SourceError, match="there is already a file of that name"):
+        run("export", "-o", "f.parquet")
+
+
+def test_of_several_units_one_is_named(run: Run, tmp_path: Path) -> None:
+    fill(1, 20)
+    fill(1, 30, Unit("compact-ejector-35", "rig-01"))
+    with pytest.raises(ConfigError, match="2 units") as caught:
+        run("counters")
+    assert caught.value.hint == "choose with --id; there are: gripper-01, rig-01"
+    assert "30" in run("counters", "--id", "rig-01")
+    where = ("--figures", tmp_path / "figures.sqlite", "--config", rigs.path_of("gripper"))
+    assert "20" in run("counters", *where)
+    with pytest.raises(ConfigError, match="0 units 'nobody'"):
+        run("counters", "--id", "nobody")
+
+
+def test_without_a_database_there_is_nothing_to_read(run: Run) -> None:
+    with pytest.raises(SourceError, match=r"figures\.sqlite: no such figure database"):
+        run("trend")
+    assert not Path("figures.sqlite").exists()

@@ -1,0 +1,406 @@
+"""Key figures of hand-made courses, whose answers are known."""
+
+import math
+import re
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tools.readme import filled
+from twin.figures.course import LONGEST_HOLE, Course, Floats
+from twin.figures.settings import FigureSettings, Limits, limits
+from twin.figures.table import FIGURES, Unit, figures, table
+from twin.figures.warnings import CAUTIONS, in_words, warnings
+from twin.model.control import PROTECTED_SWITCHES
+from twin.model.dataset import DataSet, Ejector, Supply
+from twin.signals import Phase
+
+ROOT = Path(__file__).parents[1]
+IDLE, SUCTION, HOLD, BLOW_OFF = Phase
+DATA = DataSet(
+    supply=Supply(pressure_bar=5.0, droop_bar=0.2, optimum_bar=4.8),
+    ejector=Ejector(air_consumption_sl_min=60.0, blow_off_sl_min=120.0),
+)
+UNIT = Unit(DATA, energy_kwh_m3=0.12)
+LIMITS = limits(FigureSettings(), DATA)
+
+
+def course(
+    *stretches: tuple[Phase, float, float],
+    supply: float = 4.8,
+    off_lag: float = 0.0,
+    on_lag: float = 0.0,
+) -> Course:
+    """Rows of 1 ms: of each stretch its phase, its length (s) and the vacuum it leads to (mbar)."""
+    phase, vacuum = [], [np.zeros(1)]
+    for kind, seconds, target in stretches:
+        rows = round(seconds * 1000)
+        phase += [kind] * rows
+        vacuum.append(np.linspace(vacuum[-1][-1], target, rows + 1)[1:])
+    values = np.concatenate(vacuum)[:-1]
+    return Course(
+        time=np.arange(len(phase)) * 1e-3,
+        vacuum=values,
+        supply=np.full(len(phase), supply),
+        phase=np.array(phase, np.uint8),
+        ended=phase[-1] in (IDLE, BLOW_OFF),
+        blown=phase[-1] in (IDLE, BLOW_OFF),
+        off_lag=off_lag,
+        on_lag=on_lag,
+    )
+
+
+# Evacuated at 1000 mbar/s to 750, where the nozzle goes off; 100 mbar/s are lost; blown off.
+PICK = ((SUCTION, 0.75, 750.0), (HOLD, 1.25, 625.0), (BLOW_OFF, 0.3, 0.0), (IDLE, 0.7, 0.0))
+
+
+def unknown(found: dict[str, float], *names: str) -> bool:
+    return all(math.isnan(found[name]) for name in names)
+
+
+def of(shape: Course) -> dict[str, float]:
+    return figures(shape, UNIT)
+
+
+def changed(shape: Course, rows: slice, vacuum: float) -> Course:
+    values = shape.vacuum.copy()
+    values[rows] = vacuum
+    return replace(shape, vacuum=values)
+
+
+# A whole cycle.
+
+
+def test_a_pick_whose_figures_are_known() -> None:
+    found = of(course(*PICK))
+    assert found["t0"] == pytest.approx(550.0, abs=0.01)
+    assert found["t1"] == pytest.approx(200.0, abs=0.01)
+    assert found["leakage"] == pytest.approx(100.0, abs=0.01)
+    assert found["leakage_band"] == 1
+    assert found["quality"] == pytest.approx(80.0, abs=0.01)
+    assert found["max_vacuum"] == pytest.approx(750.0, abs=2.0)  # the peak's median of five
+    assert found["h1_not_reached"] == 0
+    assert found["nozzle_share"] == pytest.approx(100 * 0.75 / 2.0)
+    assert found["air"] == pytest.approx((0.75 * 60 + 0.3 * 120) / 60)
+    assert found["energy"] == pytest.approx(found["air"] * 0.12)  # Wh: 0.12 kWh/m³ is 0.12 Wh/l
+    assert (found["switchings"], found["quick_switchings"]) == (1, 1)
+    for name in ("supply", "lowest_supply", "highest_supply"):
+        assert found[name] == pytest.approx(4.8)
+    assert unknown(found, "free_flow", "performance")
+
+
+def test_the_levels_are_those_of_the_data_set() -> None:
+    ejector = DATA.ejector.model_copy(update={"h1_mbar": 700.0, "h2_mbar": 300.0})
+    unit = replace(UNIT, data=DATA.model_copy(update={"ejector": ejector}))
+    found = figures(course((SUCTION, 0.72, 720.0), (IDLE, 1.0, 0.0)), unit)
+    assert found["t0"] == pytest.approx(300.0, abs=0.01)
+    assert found["t1"] == pytest.approx(400.0, abs=0.01)  # no air saving: as the sensor reads H1
+
+
+def test_the_valves_lags_are_taken_from_where_the_pressure_shows_a_switching() -> None:
+    again = ((SUCTION, 0.75, 750.0), (HOLD, 0.5, 600.0), (SUCTION, 0.25, 750.0), (HOLD, 0.5, 740.0))
+    shape = course(*again, (IDLE, 1.0, 0.0), off_lag=0.012, on_lag=0.007)
+    assert np.array(shape.nozzle) == pytest.approx(np.array([[0.0, 0.738], [1.243, 1.488]]))
+    assert of(shape)["t1"] == pytest.approx(188.0, abs=0.01)
+    assert of(shape)["switchings"] == 2
+    assert of(shape)["quick_switchings"] == 3
+
+
+def test_a_hold_shorter_than_the_lags_takes_no_time_twice() -> None:
+    blip = ((SUCTION, 0.1, 100.0), (HOLD, 0.002, 100.0), (SUCTION, 0.1, 200.0))
+    shape = course(*blip, (IDLE, 1.0, 0.0), on_lag=0.02)
+    assert np.array(shape.nozzle) == pytest.approx(np.array([[0.0, 0.1], [0.1, 0.202]]))
+    assert of(shape)["nozzle_share"] == pytest.approx(100.0)
+
+
+def test_h1_is_where_the_nozzle_went_off_and_not_what_another_sensor_reads() -> None:
+    """The ejector's own sensor sees more vacuum than one behind a long line."""
+    found = of(course((SUCTION, 0.7, 700.0), (HOLD, 0.5, 690.0), (IDLE, 1.0, 0.0)))
+    assert found["t1"] == pytest.approx(150.0, abs=0.01)
+    assert found["h1_not_reached"] == 0
+
+
+def test_a_sensor_too_slow_to_see_h2_before_h1_says_nothing_of_t1() -> None:
+    found = of(course((SUCTION, 0.5, 500.0), (HOLD, 0.5, 600.0), (IDLE, 1.0, 0.0)))
+    assert found["t0"] == pytest.approx(750.0, abs=0.01)
+    assert unknown(found, "t1")
+
+
+@pytest.mark.parametrize(
+    ("rate", "band"), [(66, 0), (68, 1), (132, 1), (134, 2), (199, 2), (201, 3)]
+)
+def test_the_bands_of_leakage(rate: float, band: int) -> None:
+    found = of(course((SUCTION, 0.75, 750.0), (HOLD, 0.7, 750 - 0.7 * rate), (IDLE, 1.0, 0.0)))
+    assert found["leakage"] == pytest.approx(rate, abs=0.01)
+    assert found["leakage_band"] == band
+
+
+def test_leakage_settles_first_and_is_that_of_the_first_second() -> None:
+    quick, slow = (HOLD, 0.049, 700.0), (HOLD, 1.0, 690.0)
+    found = of(course((SUCTION, 0.75, 750.0), quick, slow, (HOLD, 5.0, 100.0), (IDLE, 1.0, 0.0)))
+    assert found["leakage"] == pytest.approx(10.0, abs=0.1)
+
+
+def test_a_hold_too_short_tells_no_leakage() -> None:
+    found = of(course((SUCTION, 0.75, 750.0), (HOLD, 0.095, 700.0), (BLOW_OFF, 0.3, 0.0)))
+    assert unknown(found, "leakage", "quality", "leakage_band")
+
+
+def test_quality_ends_at_nothing() -> None:
+    found = of(course((SUCTION, 0.75, 750.0), (HOLD, 0.2, 600.0), (IDLE, 1.0, 0.0)))
+    assert found["leakage"] == pytest.approx(750.0, abs=0.1)
+    assert found["quality"] == 0
+
+
+# What is not reached.
+
+
+def test_h1_that_is_not_reached() -> None:
+    found = of(course((SUCTION, 0.6, 600.0), (SUCTION, 1.0, 740.0), (IDLE, 1.0, 0.0)))
+    assert found["h1_not_reached"] == 1
+    assert found["t0"] == pytest.approx(550.0, abs=0.01)
+    assert unknown(found, "t1", "leakage", "free_flow")
+    assert found["nozzle_share"] == 100
+
+
+@pytest.mark.parametrize("level", [5.1, 80.0, 745.0])
+def test_free_flow_is_where_a_second_of_suction_stands_still(level: float) -> None:
+    found = of(course((SUCTION, 0.1, level), (SUCTION, 0.95, level), (IDLE, 1.0, 0.0)))
+    assert found["free_flow"] == pytest.approx(level)
+    assert found["performance"] == pytest.approx(100 * (1 - level / 750))
+
+
+@pytest.mark.parametrize(
+    "stretches",
+    [
+        ((SUCTION, 0.1, 80.0), (SUCTION, 0.85, 80.0), (IDLE, 1.0, 0.0)),  # not a second
+        ((SUCTION, 0.5, 80.0), (SUCTION, 1.0, 95.0), (IDLE, 1.0, 0.0)),  # still rising
+        ((SUCTION, 1.2, 4.0), (IDLE, 1.0, 0.0)),  # nothing
+        ((SUCTION, 0.1, 760.0), (SUCTION, 0.95, 760.0), (IDLE, 1.0, 0.0)),  # beyond H1
+        ((SUCTION, 0.1, 760.0), (SUCTION, 0.1, 80.0), (SUCTION, 0.9, 80.0), (IDLE, 1.0, 0.0)),
+        ((SUCTION, 0.1, 80.0), (SUCTION, 0.95, 80.0)),  # nobody knows how it ended
+    ],
+)
+def test_no_free_flow(stretches: tuple[tuple[Phase, float, float], ...]) -> None:
+    found = of(course(*stretches))
+    assert unknown(found, "free_flow", "performance")
+
+
+# Air.
+
+
+def test_air_follows_absolute_operating_pressure() -> None:
+    """A sonic nozzle: its flow is proportional to the absolute pressure before it."""
+    nominal, more = of(course(*PICK))["air"], of(course(*PICK, supply=5.8))["air"]
+    assert more / nominal == pytest.approx((5.8 + 1.013) / (4.8 + 1.013))
+    assert of(course(*PICK, supply=math.nan))["air"] == pytest.approx(nominal)
+
+
+def test_air_of_a_nozzle_is_what_the_field_computes() -> None:
+    """Nl/min ≈ 9.36·Cd·d²·p_abs: 1 mm, Cd 0.9 and 5.8 bar absolute are 49 Nl/min."""
+    field = 9.36 * 0.9 * 1.0**2 * 5.813
+    ejector = DATA.ejector.model_copy(update={"air_consumption_sl_min": field})
+    unit = replace(UNIT, data=DATA.model_copy(update={"ejector": ejector}))
+    found = figures(course((SUCTION, 1.0, 600.0), (IDLE, 1.0, 0.0)), unit)
+    assert found["air"] == pytest.approx(field / 60)
+
+
+def test_the_supply_is_that_while_the_nozzle_is_on() -> None:
+    shape = course(*PICK)
+    supply = np.where(shape.phase == SUCTION, 4.5, 5.0)
+    supply[100:120] = 2.5
+    found = of(replace(shape, supply=supply))
+    assert found["lowest_supply"] == 2.5
+    assert found["highest_supply"] == 4.5
+    assert found["supply"] == pytest.approx(4.5 - 2.0 * 20 / 750)
+
+
+def test_single_readings_of_the_supply_are_no_extremes() -> None:
+    shape = course(*PICK)
+    supply = shape.supply.copy()
+    supply[[10, 20]] = 0.0, 9.0
+    found = of(replace(shape, supply=supply))
+    assert (found["lowest_supply"], found["highest_supply"]) == (4.8, 4.8)
+
+
+# Valve protection.
+
+
+def swinging(times: int, half_s: float) -> Course:
+    swings = [(HOLD, half_s, 600.0), (SUCTION, half_s, 750.0)] * times
+    return course((SUCTION, 0.75, 750.0), *swings, (IDLE, 1.0, 0.0))
+
+
+def test_switchings_within_the_time_of_valve_protection_are_counted() -> None:
+    assert of(swinging(2, 0.4))["quick_switchings"] == 4
+    assert of(swinging(5, 0.7))["quick_switchings"] == 5  # 0, 0.7, ... 2.8 s of ten
+    assert of(swinging(5, 0.4))["quick_switchings"] == 8
+    assert of(swinging(5, 0.4))["switchings"] == 6
+
+
+def test_a_cycle_that_never_saves_air_switches_once() -> None:
+    found = of(course((SUCTION, 0.7, 700.0), (IDLE, 1.0, 0.0)))
+    assert (found["switchings"], found["quick_switchings"]) == (1, 0)
+
+
+# What cannot be told is missing, not wrong.
+
+NEEDS_ALL = ("t1", "leakage", "max_vacuum", "h1_not_reached", "nozzle_share", "air", "switchings")
+
+
+def test_a_hole_in_the_readings_may_hide_a_switching() -> None:
+    hole = changed(course(*PICK), slice(300, 300 + round(LONGEST_HOLE * 1000)), math.nan)
+    found = of(hole)
+    assert found["t0"] == pytest.approx(550.0, abs=0.01)  # it is not in the hole
+    for name in NEEDS_ALL:
+        assert unknown(found, name), name
+
+
+def test_a_few_bad_readings_hide_nothing() -> None:
+    whole, holed = of(course(*PICK)), of(changed(course(*PICK), slice(300, 305), math.nan))
+    for name, value in whole.items():
+        assert holed[name] == pytest.approx(value, nan_ok=True), name
+
+
+def test_suction_of_which_nothing_was_read_tells_nothing() -> None:
+    short = course((SUCTION, 0.005, 5.0), (BLOW_OFF, 0.3, 0.0), (IDLE, 0.7, 0.0))
+    found = of(changed(short, slice(0, 5), math.nan))
+    assert unknown(found, *FIGURES.keys() - {"supply", "lowest_supply", "highest_supply"})
+
+
+def test_h2_within_a_hole_has_no_time() -> None:
+    found = of(changed(course(*PICK), slice(540, 560), math.nan))
+    assert unknown(found, "t0")
+
+
+def test_one_reading_alone_reaches_nothing() -> None:
+    spiked = of(changed(course(*PICK), slice(100, 102), 990.0))
+    assert spiked["t0"] == pytest.approx(550.0, abs=0.01)
+    assert spiked["max_vacuum"] == of(course(*PICK))["max_vacuum"]
+
+
+def test_a_cycle_whose_end_was_not_seen_tells_what_came_before() -> None:
+    found = of(course(*PICK[:2]))
+    assert found["t0"] == pytest.approx(550.0, abs=0.01)
+    assert found["t1"] == pytest.approx(200.0, abs=0.01)
+    assert found["leakage"] == pytest.approx(100.0, abs=0.01)
+    assert found["h1_not_reached"] == 0  # that is sure already
+    for name in ("max_vacuum", "nozzle_share", "air", "energy", "switchings", "quick_switchings"):
+        assert unknown(found, name), name
+
+
+def test_a_blow_off_cut_short_tells_no_air() -> None:
+    found = of(replace(course(*PICK[:3]), blown=False))
+    assert unknown(found, "air")
+    assert found["nozzle_share"] == pytest.approx(37.5)
+
+
+phases = st.lists(
+    st.tuples(st.sampled_from([SUCTION, HOLD, BLOW_OFF, IDLE]), st.integers(1, 400)), max_size=8
+)
+holes = st.lists(st.tuples(st.integers(0, 900), st.integers(0, 60)), max_size=4)
+
+
+@given(phases, holes, st.floats(-50.0, 1000.0), st.booleans())
+def test_any_course_gives_finite_figures_or_none(
+    stretches: list[tuple[Phase, int]],
+    missing: list[tuple[int, int]],
+    target: float,
+    measured: bool,
+) -> None:
+    rows = [(SUCTION, 0.001, 0.0), *((kind, n / 1000, target) for kind, n in stretches)]
+    lags = {"off_lag": 0.012, "on_lag": 0.007} if measured else {}
+    shape = course(*rows, supply=4.8 if measured else math.nan, **lags)
+    for first, length in missing:
+        shape = changed(shape, slice(first, first + length), math.nan)
+    found = of(shape)
+    assert set(found) == set(FIGURES)
+    assert not [name for name, value in found.items() if math.isinf(value)]
+    for name in ("quality", "performance", "nozzle_share"):
+        assert math.isnan(found[name]) or -1e-6 < found[name] < 100.0 + 1e-6
+
+
+@given(st.floats(20.0, 400.0), st.floats(0.05, 0.5), st.integers(0, 2**32 - 1))
+def test_noise_moves_the_figures_by_what_it_must(rate: float, noise: float, seed: int) -> None:
+    hold = round(min(1.25, 140.0 / rate), 3)
+    shape = course((SUCTION, 0.75, 750.0), (HOLD, hold, 750 - rate * hold), (IDLE, 1.0, 0.0))
+    read: Floats = shape.vacuum + np.random.default_rng(seed).normal(0.0, noise, len(shape.time))
+    found = of(replace(shape, vacuum=read))
+    seen = min(hold - 0.05, 1.0)
+    sigma = noise * math.sqrt(12.0 / (seen**3 * 1000))
+    assert found["leakage"] == pytest.approx(rate, abs=6 * sigma + 0.01)
+    assert found["t0"] == pytest.approx(550.0, abs=4.0)
+
+
+# Warnings.
+
+
+def beyond(**measured: float) -> tuple[str, ...]:
+    return warnings(dict.fromkeys(FIGURES, math.nan) | measured, LIMITS)
+
+
+def test_limits_are_the_fields_where_nothing_is_set() -> None:
+    assert Limits(2000.0, 250.0, 540.0, (3.0, 6.0)) == LIMITS
+    own = FigureSettings(permitted_leakage_mbar_s=90.0, permitted_free_flow_mbar=40.0)
+    assert (limits(own, DATA).leakage, limits(own, DATA).free_flow) == (90.0, 40.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "within", "over"),
+    [
+        ("valve_protection", {"quick_switchings": 5}, {"quick_switchings": PROTECTED_SWITCHES}),
+        ("t1_over_limit", {"t1": 2000.0}, {"t1": 2001.0}),
+        ("leakage_over_limit", {"leakage": 250.0}, {"leakage": 250.1}),
+        ("h1_not_reached", {"h1_not_reached": 0}, {"h1_not_reached": 1, "max_vacuum": 700.0}),
+        ("free_flow_too_high", {"free_flow": 540.0}, {"free_flow": 541.0}),
+        (
+            "supply_out_of_range",
+            {"lowest_supply": 3.0},
+            {"lowest_supply": 2.9, "highest_supply": 5},
+        ),
+        (
+            "supply_out_of_range",
+            {"highest_supply": 6.0},
+            {"lowest_supply": 5, "highest_supply": 6.1},
+        ),
+    ],
+)
+def test_a_warning_stands_beyond_its_limit(
+    name: str, within: dict[str, float], over: dict[str, float]
+) -> None:
+    assert beyond(**within) == ()
+    assert beyond(**over) == (name,)
+    (words,) = in_words([name], over, LIMITS)
+    assert "nan" not in words
+
+
+def test_what_is_not_known_warns_of_nothing() -> None:
+    assert beyond() == ()
+    assert len(CAUTIONS) == 6
+    assert {one.figure for one in CAUTIONS.values()} <= set(FIGURES)
+
+
+def test_the_table_names_every_figure() -> None:
+    rows = table().splitlines()[2:]
+    assert [row.split("`")[1] for row in rows] == list(FIGURES)
+
+
+def test_the_page_has_the_tables_and_every_key() -> None:
+    page = (ROOT / "docs" / "key-figures.md").read_text()
+    assert filled(page) == page, "run: python tools/readme.py"
+    assert all(f"`{name}`" in page for name in (*FIGURES, *CAUTIONS))
+    (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    keys = tomllib.loads(example)["figures"]
+    given = FigureSettings.model_validate(keys)
+    assert set(keys) == set(FigureSettings.model_fields)
+    assert limits(given, DATA) == LIMITS  # the defaults, as the page says
+
+
+def test_the_supply_range_is_one() -> None:
+    with pytest.raises(ValueError, match="supply_low_bar must be below"):
+        FigureSettings(supply_low_bar=6.0, supply_high_bar=5.0)

@@ -1,0 +1,189 @@
+"""Trends: lines that are known, scatter that is not a trend, and when a limit comes."""
+
+import math
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import lfilter
+
+from twin.figures.settings import FigureSettings, limits
+from twin.figures.table import FIGURES
+from twin.figures.trend import DAY_NS, FARTHEST, Line, line_through, reach
+from twin.figures.words import in_words, limit_of, trend_plain
+from twin.model.dataset import DataSet
+
+TRIALS = 150
+
+
+def times(days: float, cycles: int) -> "np.ndarray[tuple[int], np.dtype[np.int64]]":
+    return (np.linspace(0.0, days, cycles) * DAY_NS).astype(np.int64)
+
+
+def through(days: float, values: "np.ndarray[tuple[int], np.dtype[np.float64]]") -> Line:
+    line = line_through(times(days, len(values)), values)
+    assert line is not None
+    return line
+
+
+def kept(correlation: float, count: int, rng: np.random.Generator) -> "np.ndarray":  # type: ignore[type-arg]
+    """Scatter of 1 whose neighbours correlate."""
+    steps = rng.normal(size=count + 500) * math.sqrt(1 - correlation**2)
+    return lfilter([1.0], [1.0, -correlation], steps)[500:]
+
+
+# The line.
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(-50, 50), st.floats(-5, 5), st.floats(0.01, 100.0))
+def test_a_line_without_scatter_is_found(level: float, slope: float, days: float) -> None:
+    line = through(days, level + slope * (times(days, 500) / DAY_NS - days))
+    assert line.level == pytest.approx(level, abs=1e-6 * (1 + abs(slope) * days))
+    assert line.slope == pytest.approx(slope, rel=1e-4, abs=1e-6 / days)
+    assert line.span == pytest.approx(days, rel=0.05)
+
+
+def test_a_tenth_of_the_cycles_gone_wrong_moves_nothing() -> None:
+    rng = np.random.default_rng(3)
+    values = 40 + 2 * np.linspace(-10, 0, 3000) + rng.normal(size=3000)
+    wrong = values.copy()
+    wrong[rng.choice(3000, 300, replace=False)] += 500
+    assert through(10, wrong).slope == pytest.approx(through(10, values).slope, abs=0.1)
+    assert through(10, wrong).level == pytest.approx(through(10, values).level, abs=0.5)
+
+
+def test_hours_that_went_wrong_move_little() -> None:
+    rng = np.random.default_rng(4)
+    values = 40 + 2 * np.linspace(-10, 0, 3000) + rng.normal(size=3000)
+    values[1000:1200] += 200
+    assert through(10, values).slope == pytest.approx(2.0, abs=0.2)
+
+
+@pytest.mark.parametrize("cycles", [0, 1, 11])
+def test_few_cycles_are_no_record(cycles: int) -> None:
+    assert line_through(times(5, cycles), np.ones(cycles)) is None
+
+
+def test_cycles_that_do_not_tell_are_left_out() -> None:
+    values = np.where(np.arange(900) % 3 == 0, np.linspace(0, 9, 900), np.nan)
+    assert through(9, values).slope == pytest.approx(1.0, rel=0.01)
+    assert line_through(times(9, 900), np.full(900, np.nan)) is None
+
+
+def test_a_week_of_shifts_has_empty_nights() -> None:
+    days = np.arange(0, 7, 0.002)
+    days = days[days % 1 < 0.33]
+    line = line_through((days * DAY_NS).astype(np.int64), 5 + days)
+    assert line is not None
+    assert line.slope == pytest.approx(1.0)
+    assert len(line.days) < 40
+
+
+# Whether it is one, and how sure.
+
+
+@pytest.mark.parametrize(("correlation", "most"), [(0.0, 0.04), (0.9, 0.05), (0.99, 0.07)])
+def test_scatter_is_seldom_called_a_trend(correlation: float, most: float) -> None:
+    """One in a hundred is what is asked for; the last has a memory of two bins."""
+    rng = np.random.default_rng(1)
+    found = [through(7, kept(correlation, 3000, rng)).is_trend for _ in range(TRIALS)]
+    assert np.mean(found) <= most
+
+
+def test_the_temperature_of_the_day_is_no_trend() -> None:
+    rng = np.random.default_rng(2)
+    days = times(5, 2000) / DAY_NS
+    for phase in np.linspace(0, 6, 12):
+        line = through(5, 3 * np.sin(2 * math.pi * days + phase) + rng.normal(size=2000))
+        assert not line.is_trend
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.9])
+def test_intervals_hold_what_they_promise(correlation: float) -> None:
+    rng = np.random.default_rng(5)
+    days = times(10, 3000) / DAY_NS - 10
+    slopes, levels, comes = [], [], []
+    for _ in range(TRIALS):
+        line = through(10, 60 + 0.5 * days + kept(correlation, 3000, rng))
+        slopes.append(abs(line.slope - 0.5) < line.slope_half())
+        levels.append(abs(line.level - 60) < line.half(np.zeros(1))[0])
+        when = reach(line, 65.0)
+        assert when is not None
+        comes.append(when.earliest <= 10.0 <= when.latest)
+    for name, held in (("slope", slopes), ("level", levels), ("days", comes)):
+        assert np.mean(held) > 0.87, name  # of 0.95, in 150 trials
+
+
+def test_a_band_is_wider_away_from_the_record() -> None:
+    line = through(10, np.random.default_rng(6).normal(size=1000))
+    middle, end, ahead = line.half(np.array([-5.0, 0.0, 10.0]))
+    assert middle < end < ahead
+
+
+# When the limit comes.
+
+
+def test_the_limit_comes_when_the_line_says() -> None:
+    rng = np.random.default_rng(7)
+    line = through(10, 200 + 2 * np.linspace(-10, 0, 2000) + rng.normal(size=2000))
+    when = reach(line, 220.0)
+    assert when is not None
+    assert when.expected == pytest.approx(10.0, rel=0.05)
+    assert when.earliest < when.expected < when.latest < 12
+
+
+def test_no_limit_comes_where_there_is_no_trend_or_it_falls_or_is_over() -> None:
+    rng = np.random.default_rng(8)
+    flat, slope = rng.normal(size=1000), np.linspace(-5, 0, 1000)
+    assert reach(through(10, flat), 5.0) is None
+    assert reach(through(10, flat - 3 * slope), 50.0) is None
+    assert reach(through(10, flat + 3 * slope), -2.0) is None
+
+
+def test_a_limit_far_ahead_is_not_dated() -> None:
+    line = through(10, 2 * np.linspace(-10, 0, 1000))
+    when = reach(line, 2 * 10 * FARTHEST * 1.5)
+    assert when is not None
+    assert when.expected == math.inf
+
+
+# In words.
+
+LIMITS = limits(FigureSettings(), DataSet())
+LEAKAGE = FIGURES["leakage"]
+
+
+def said(values: "np.ndarray[tuple[int], np.dtype[np.float64]]", limit: float | None) -> str:
+    line = line_through(times(10, len(values)), values)
+    comes = reach(line, limit) if line and limit is not None else None
+    plain = trend_plain(LEAKAGE, line, limit, comes)
+    assert (plain["days_to_limit"] is not None) == (comes is not None)
+    return in_words(LEAKAGE, line, limit, comes)
+
+
+def test_trends_in_words() -> None:
+    noise, days = np.random.default_rng(9).normal(size=1000), np.linspace(-10, 0, 1000)
+    assert said(np.ones(3), 250.0).startswith("leakage: not enough to say")
+    assert "no trend (" in said(noise, 250.0)
+    rising = said(200 + 5 * days + noise, 250.0)
+    words = (
+        r"leakage: 200\S* mbar/s, \+[45]\S* ± 0.0\S+ mbar/s per day, in 9.9 days; its limit of 250"
+    )
+    assert re.match(words + r" mbar/s in (9.9|10.0|10.1) days \(9\.\d to 10\.\d\)$", rising)
+    assert said(200 - 5 * days + noise, 250.0).endswith("away from its limit of 250 mbar/s")
+    assert said(300 + 5 * days + noise, 250.0).endswith("over its limit of 250 mbar/s")
+    assert "more than 29" in said(10 + 2 * days + noise, 250.0)
+    assert said(200 + 5 * days + noise, None).endswith("days")
+
+
+def test_limits_are_of_the_figures_that_have_one() -> None:
+    found = {name: limit_of(name, LIMITS) for name in FIGURES}
+    assert {name for name, limit in found.items() if limit is not None} == {
+        "t1",
+        "leakage",
+        "free_flow",
+    }
+    assert found["t1"] == 2000.0

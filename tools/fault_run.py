@@ -1,0 +1,434 @@
+"""A fault run: ``twin run`` beside the simulated PLC while everything that can go wrong does.
+
+Disturbances are drawn by seed; between the twin and the PLC stands a proxy that cuts, garbles,
+truncates and delays. The PLC keeps what it sampled, and the log is held against that: every sample
+is in it exactly once, bit for bit, or inside a recorded gap with the right bounds. The twin must be
+right again within a cycle, and its process must not grow.
+
+    python tools/fault_run.py --protocol opcua --seconds 1200 --disturbances 40
+"""
+
+import argparse
+import json
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import tomllib
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+import psutil
+import tomli_w
+
+from drivers.plc.live import WITNESSED
+from twin.events import Kind
+from twin.log.reader import open_log
+from twin.signals import BREAK, MBAR, SAMPLE, TICK, Phase, Quality, Samples, Ticks
+
+ROOT = Path(__file__).parents[1]
+CONFIGS = {"modbus": "test_rig", "opcua": "test_rig_opcua"}
+RIGHT_MBAR = 3.0  # rms of a cycle; healthy ones have 0.6
+SETTLED_S = 8.0  # from the end of a disturbance to the next
+GROWTH_MB = 12.0
+
+
+# --- between the twin and the PLC -----------------------------------------------------------------
+
+
+class Proxy:
+    """Passes on what comes, and does to it what it is told."""
+
+    def __init__(self, random: np.random.Generator) -> None:
+        self.target = 0
+        self.how = "pass"  # cut, garbage, truncate, slow, swallow
+        self._random = random
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port: int = self._listener.getsockname()[1]
+        self._pairs: list[tuple[socket.socket, socket.socket]] = []
+        self._closed = False
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def _accept(self) -> None:
+        while not self._closed:
+            try:
+                client, _ = self._listener.accept()
+            except OSError:
+                return
+            try:
+                assert self.how != "cut"
+                server = socket.create_connection(("127.0.0.1", self.target), 2.0)
+                server.settimeout(None)
+            except (AssertionError, OSError):
+                client.close()
+                continue
+            for one in (client, server):
+                one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._pairs.append((client, server))
+            for ends, answers in (((client, server), False), ((server, client), True)):
+                threading.Thread(target=self._pass, args=(*ends, answers), daemon=True).start()
+
+    def _pass(self, source: socket.socket, to: socket.socket, answers: bool) -> None:
+        with suppress(OSError):
+            while data := source.recv(65_536):
+                to.sendall(self._disturbed(data) if answers else data)
+                if answers and self.how == "truncate":
+                    break
+        for one in (source, to):
+            with suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+            one.close()
+
+    def _disturbed(self, data: bytes) -> bytes:
+        match self.how:
+            case "garbage":
+                return self._random.bytes(len(data))
+            case "truncate":
+                return data[: len(data) // 2]
+            case "slow":
+                time.sleep(0.12)
+            case "swallow":
+                return b""
+        return data
+
+    def hang_up(self) -> None:
+        """Cut all connections."""
+        pairs, self._pairs = self._pairs, []
+        for one in (end for pair in pairs for end in pair):
+            with suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """Take nobody any more."""
+        self._closed = True
+        with suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        self.hang_up()
+
+
+# --- the three processes --------------------------------------------------------------------------
+
+
+@dataclass
+class Cell:
+    """PLC, proxy and twin, and what can be done to them."""
+
+    protocol: str
+    folder: Path
+    random: np.random.Generator
+    boots: list[Path] = field(default_factory=list)  # what each PLC sampled
+    seen: list[dict[str, float]] = field(default_factory=list)  # of the twin's process
+
+    def __enter__(self) -> Self:
+        self.proxy = Proxy(self.random)
+        self._plc_config = self._configured("plc.toml", 0)
+        self.start_plc()
+        self.log = self.folder / "run.mcap"
+        config = self._configured("twin.toml", self.proxy.port)
+        command = [sys.executable, "-m", "twin.cli", "run", str(config), "--log", str(self.log)]
+        self._said = (self.folder / "twin.txt").open("w")
+        self.twin = psutil.Popen(command, cwd=ROOT, stdout=self._said, stderr=self._said)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        with suppress(psutil.NoSuchProcess):
+            self.twin.kill()
+            self.twin.wait()
+        self.plc.kill()
+        self.plc.wait()
+        assert self.plc.stdout is not None
+        self.plc.stdout.close()
+        self._said.close()
+        self.proxy.close()
+
+    def _configured(self, name: str, port: int) -> Path:
+        tables: dict[str, Any] = tomllib.loads(
+            (ROOT / "configs" / f"{CONFIGS[self.protocol]}.toml").read_text(encoding="utf-8")
+        )
+        tables["plc"]["program"]["start_ms"] = 500.0
+        tables["plc"]["server"]["port"] = 0
+        if self.protocol == "opcua":
+            tables["plc"]["opcua"]["port"] = 0
+            tables["driver"]["url"] = f"opc.tcp://127.0.0.1:{port or 4840}"
+        else:
+            tables["driver"]["port"] = port or 502
+        path = self.folder / name
+        path.write_text(tomli_w.dumps(tables), encoding="utf-8")
+        return path
+
+    def start_plc(self) -> None:
+        """Start it, and have the proxy lead there."""
+        self.boots.append(self.folder / f"boot{len(self.boots)}.bin")
+        command = [sys.executable, "-m", "drivers.plc", str(self._plc_config), "--port", "0"]
+        command += ["--seed", str(len(self.boots)), "--witness", str(self.boots[-1])]
+        self.plc = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        assert self.plc.stdout is not None
+        port = int(self.plc.stdout.readline().strip().rpartition(":")[2])
+        if self.protocol == "opcua":
+            port = int(self.plc.stdout.readline().strip().rpartition(":")[2])
+        self.proxy.target = port
+
+    def rows(self) -> int:
+        """Bytes of log by now, which grow while rows come."""
+        return self.log.stat().st_size if self.log.exists() else 0
+
+    def watch(self) -> None:
+        """Take down how big the twin's process is."""
+        if self.twin.status() == psutil.STATUS_STOPPED:
+            return
+        self.seen.append(
+            {
+                "threads": self.twin.num_threads(),
+                "files": self.twin.num_fds(),
+                "sockets": len(self.twin.net_connections()),
+                "mb": self.twin.memory_info().rss / 1e6,
+            }
+        )
+
+
+def _restart(cell: Cell, seconds: float) -> None:
+    cell.plc.kill()
+    cell.plc.wait()
+    assert cell.plc.stdout is not None
+    cell.plc.stdout.close()
+    time.sleep(seconds)
+    cell.start_plc()
+
+
+def _stop_client(cell: Cell, seconds: float) -> None:
+    cell.twin.suspend()
+    time.sleep(seconds)
+    cell.twin.resume()
+
+
+def _through_proxy(how: str) -> Callable[[Cell, float], None]:
+    def disturb(cell: Cell, seconds: float) -> None:
+        cell.proxy.how = how
+        if how == "cut":
+            cell.proxy.hang_up()
+        time.sleep(seconds)
+        cell.proxy.how = "pass"
+
+    return disturb
+
+
+def _set_clock(cell: Cell, seconds: float) -> None:
+    ahead = bool(cell.random.integers(2))
+    cell.plc.send_signal(signal.SIGUSR1 if ahead else signal.SIGUSR2)
+    time.sleep(min(seconds, 1.0))
+
+
+DISTURBANCES: dict[str, Callable[[Cell, float], None]] = {
+    "the PLC is killed and restarted": _restart,
+    "the connection is cut": _through_proxy("cut"),
+    "the client is stopped": _stop_client,
+    "the PLC's clock is set": _set_clock,
+    "answers are garbage": _through_proxy("garbage"),
+    "answers are truncated": _through_proxy("truncate"),
+    "answers are slow": _through_proxy("slow"),
+    "answers are swallowed": _through_proxy("swallow"),
+}
+
+
+# --- the log against what was sampled -------------------------------------------------------------
+
+
+@dataclass
+class Verdict:
+    """What is wrong, and what was counted."""
+
+    problems: list[str] = field(default_factory=list)
+    counts: dict[str, float] = field(default_factory=dict)
+
+    def check(self, good: bool, problem: str) -> None:
+        """Note ``problem`` unless it is ``good``."""
+        if not good:
+            self.problems.append(problem)
+
+
+def judge(log: Path, boots: list[Path], verdict: Verdict) -> None:
+    """Hold the log against what the PLCs sampled."""
+    opened = open_log(log)
+    pairs = [(np.empty(0, SAMPLE), np.empty(0, TICK)), *opened.blocks()]
+    samples, ticks = (np.concatenate(column) for column in zip(*pairs, strict=True))
+    verdict.check(opened.complete, "the log is not complete")
+    verdict.check(len(samples) > 0, "there is nothing in the log")
+    sampled = [np.fromfile(path, WITNESSED) for path in boots]
+    starts = np.flatnonzero(samples["quality"] & Quality.RESTART)
+    boot = 0
+    for rows in np.split(samples, starts):
+        boot = _boot_of(rows, sampled, boot)
+        if boot == len(sampled):
+            verdict.problems.append(f"rows from {rows['sequence'][0]} on are of no PLC")
+            break
+        _held_against(rows, sampled[boot], boot, verdict)
+        boot += 1
+    events = list(opened.events())
+    told = sum(event.data["missing"] for event in events if event.kind is Kind.GAP)
+    first = samples["quality"] & Quality.RESTART == 0
+    steps = np.diff(samples["sequence"])
+    missing = int((steps[first[1:]] - 1).sum()) if len(steps) else 0
+    verdict.check(told == missing, f"gaps say that {told} are missing, and {missing} are")
+    verdict.counts |= {"rows": len(samples), "restarts": len(starts), "missing": missing}
+    verdict.counts["gaps"] = sum(event.kind is Kind.GAP for event in events)
+    verdict.counts["stale"] = sum(event.kind is Kind.PLC_STALE for event in events)
+    back = sum(event.kind is Kind.PLC_BACK for event in events)
+    verdict.check(verdict.counts["stale"] - back in (0, 1), "stale and back do not take turns")
+    alarms = [event.text for event in events if event.kind is Kind.DEVIATION]
+    verdict.check(not alarms, f"healthy, and yet: {alarms}")
+    _judge_twin(samples, ticks, verdict)
+
+
+def _boot_of(rows: Samples, sampled: list[npt.NDArray[np.void]], first: int) -> int:
+    """Which PLC these rows are of: the first from ``first`` on that sampled just that."""
+    some = rows[:50]
+    for boot in range(first, len(sampled)):
+        theirs = sampled[boot]
+        if some["sequence"][-1] < len(theirs):
+            pressure = _pascal(theirs[some["sequence"]])
+            if np.array_equal(pressure, some["pressure"]):
+                return boot
+    return len(sampled)
+
+
+def _pascal(sampled: npt.NDArray[np.void]) -> npt.NDArray[np.float32]:
+    return (sampled["pressure"].astype(np.float64) * MBAR).astype(np.float32)
+
+
+def _held_against(
+    rows: Samples, sampled: npt.NDArray[np.void], boot: int, verdict: Verdict
+) -> None:
+    """Bit for bit, in order, and each hole marked by a gap behind it."""
+    of = f"PLC {boot}"
+    sequence, quality = rows["sequence"], rows["quality"]
+    steps = np.diff(sequence)
+    verdict.check(bool((steps > 0).all()), f"{of}: rows come twice, or out of order")
+    if sequence[-1] >= len(sampled) or (steps <= 0).any():
+        verdict.problems.append(f"{of}: rows that were never sampled")
+        return
+    theirs = sampled[sequence]
+    verdict.check(bool((theirs["sequence"] == sequence).all()), f"{of}: its own count is broken")
+    verdict.check(np.array_equal(_pascal(theirs), rows["pressure"]), f"{of}: other pressures")
+    commands = theirs["status"] & 3
+    verdict.check(np.array_equal(commands, rows["commands"]), f"{of}: other commands")
+    marked = (quality[1:] & Quality.GAP) != 0
+    verdict.check(np.array_equal(marked, steps > 1), f"{of}: gaps are not where rows are missing")
+    if boot:
+        headless = bool(sequence[0] > 0) == bool(quality[0] & Quality.GAP)
+        verdict.check(headless, f"{of}: what is missing before its first row is not marked")
+    off = np.abs(rows["time_ns"] - theirs["time_ns"]) * 1e-6
+    worst = float(off.max())
+    verdict.counts["time_off_ms"] = max(verdict.counts.get("time_off_ms", 0.0), worst)
+    # A clock that was set is seen with the next header; rows before it may have the new time.
+    set_late = float(np.mean(off > 200.0))
+    verdict.check(set_late < 0.05, f"{of}: {100 * set_late:.1f} % of the times are wrong")
+
+
+def _judge_twin(samples: Samples, ticks: Ticks, verdict: Verdict) -> None:
+    """Each cycle that follows a whole one since the last break is expected right."""
+    suction = ticks["phase"] == Phase.SUCTION
+    released = np.isin(ticks["phase"], (Phase.IDLE, Phase.BLOW_OFF))
+    edges = np.flatnonzero(suction[1:] & released[:-1]) + 1
+    breaks = np.flatnonzero(samples["quality"] & BREAK)
+    worst, judged = 0.0, 0
+    for before, begin, end in zip(edges[:-2], edges[1:-1], edges[2:], strict=True):
+        if np.any((breaks >= before) & (breaks < end)):
+            continue
+        off = samples["pressure"][begin:end] - ticks["expected"][begin:end].astype(np.float64)
+        worst, judged = max(worst, float(np.sqrt(np.mean(off**2))) / MBAR), judged + 1
+        verdict.check(bool(np.isfinite(off).all()), "nothing is expected where it should be")
+    verdict.counts |= {"cycles_judged": judged, "worst_rms_mbar": round(worst, 2)}
+    verdict.check(judged > 0, "no cycle was left alone")
+    verdict.check(worst < RIGHT_MBAR, f"a cycle after a whole one is {worst:.1f} mbar off")
+
+
+def judge_growth(seen: list[dict[str, float]], verdict: Verdict) -> None:
+    """The process at the end, quiet again, against the beginning."""
+    early, late = seen[: max(len(seen) // 5, 1)], seen[-max(len(seen) // 5, 1) :]
+    for name, allowed in (("threads", 0.0), ("files", 0.0), ("sockets", 0.0), ("mb", GROWTH_MB)):
+        before = max(one[name] for one in early)
+        after = min(one[name] for one in late)
+        verdict.counts[f"{name}_before"], verdict.counts[f"{name}_after"] = before, after
+        verdict.check(after <= before + allowed, f"{name} grew from {before:g} to {after:g}")
+
+
+# --- the run --------------------------------------------------------------------------------------
+
+
+def run(
+    protocol: str, seconds: float, disturbances: int, seed: int, folder: Path
+) -> tuple[Verdict, list[str]]:
+    """Do it; gives the verdict and what was done."""
+    random, verdict, done = np.random.default_rng(seed), Verdict(), list[str]()
+    # Each kind as often as any other, in an order of its own.
+    kinds = [name for _ in range(disturbances) for name in DISTURBANCES]
+    order = [str(name) for name in random.permutation(kinds[:disturbances])]
+    with Cell(protocol, folder, random) as cell:
+        _until_logged(cell)
+        end = time.monotonic() + seconds
+        for number, name in enumerate(order):
+            rest = end - time.monotonic() - SETTLED_S * (len(order) - number)
+            pause = SETTLED_S + max(rest, 0.0) / (len(order) - number) * random.uniform(0.5, 1.0)
+            _quiet(cell, pause)
+            lasts = float(random.uniform(0.3, 4.0))
+            done.append(f"{name} ({lasts:.1f} s)")
+            print(f"{done[-1]}", file=sys.stderr, flush=True)
+            DISTURBANCES[name](cell, lasts)
+            verdict.check(cell.twin.is_running(), f"the twin ended at: {name}")
+        _quiet(cell, max(end - time.monotonic(), SETTLED_S))
+        cell.twin.send_signal(signal.SIGINT)
+        verdict.check(cell.twin.wait(60) == 130, "the twin did not end as it should")
+    judge(cell.log, cell.boots, verdict)
+    judge_growth(cell.seen, verdict)
+    return verdict, done
+
+
+def _until_logged(cell: Cell) -> None:
+    deadline = time.monotonic() + 90
+    while cell.rows() < 20_000:
+        if time.monotonic() > deadline or cell.twin.poll() is not None:
+            raise SystemExit((cell.folder / "twin.txt").read_text())
+        time.sleep(0.1)
+
+
+def _quiet(cell: Cell, seconds: float) -> None:
+    """Let everything run, and take down how big the twin is once it is quiet."""
+    time.sleep(seconds)
+    cell.watch()
+
+
+def main() -> int:
+    """Run from the command line; 1 if anything is wrong."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--protocol", choices=sorted(CONFIGS), default="modbus")
+    parser.add_argument("--seconds", type=float, default=1200.0)
+    parser.add_argument("--disturbances", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--folder", type=Path, help="kept; else a temporary one")
+    given = parser.parse_args()
+    with ExitStack() as stack:
+        folder = given.folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        folder.mkdir(parents=True, exist_ok=True)
+        verdict, done = run(given.protocol, given.seconds, given.disturbances, given.seed, folder)
+    answer = {"disturbances": len(done), **verdict.counts, "problems": verdict.problems}
+    print(json.dumps(answer, indent=1))
+    return 1 if verdict.problems else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

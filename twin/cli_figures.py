@@ -1,0 +1,297 @@
+"""``twin figures``: key figures of a log, and of what the database has kept."""
+
+import json
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from twin.errors import ConfigError, SourceError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from twin.config import Config
+    from twin.figures.cycle import KeyFigures
+    from twin.figures.keeper import Keeper
+    from twin.figures.settings import FigureSettings, Limits
+    from twin.figures.store import History, Store, Unit
+    from twin.figures.table import Figure
+    from twin.log.reader import Log
+    from twin.settings import Document
+
+figures_app = typer.Typer(
+    help="Key figures per cycle: leakage, evacuation times, air, counters, trends.",
+    no_args_is_help=True,
+)
+
+Url = Annotated[
+    str,
+    typer.Option("--figures", metavar="URL", help="Database: sqlite:///FILE, postgresql://..."),
+]
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option("--config", metavar="CONFIG", help="Its unit, limits and [figures] url."),
+]
+UnitId = Annotated[str, typer.Option("--id", metavar="ID", help="Unit, where there are several.")]
+Days = Annotated[float | None, typer.Option(metavar="N", help="Only the last N days.")]
+JsonFile = Annotated[Path | None, typer.Option("--json", metavar="F", help="The same as JSON.")]
+
+
+@figures_app.command()
+def show(
+    log: Annotated[Path, typer.Argument(metavar="LOG.mcap", help="A recorded log.")],
+    config: ConfigFile = None,
+    json_file: JsonFile = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", metavar="FILE", help="*.csv or *.parquet.")
+    ] = None,
+    keep: Annotated[bool, typer.Option("--keep", help="Add them to the database.")] = False,
+    figures: Url = "",
+) -> None:
+    """Key figures of every cycle of a log: measured, and what the twin expected."""
+    from twin.figures.export import export as export_table
+    from twin.figures.export import to_table
+    from twin.figures.read import of_log
+    from twin.figures.store import Unit, open_store
+    from twin.figures.words import cycles_table
+    from twin.log.reader import open_log
+
+    recorded = open_log(log)
+    settings = _of_log(recorded, log, config)
+    plain = [kept for _, kept in of_log(recorded, key_figures_of(settings))]
+    print(cycles_table(plain))
+    unit, data_set = Unit(recorded.header.asset_type, recorded.header.asset_id), settings.data.hash
+    if json_file is not None:
+        _write_json(json_file, {"log": str(log), "cycles": plain})
+    if output is not None:
+        with open_store("sqlite://") as store:
+            store.add(unit, data_set, log.name, plain)
+            export_table(to_table(store.history(unit), unit), output)
+    if keep:
+        with _open(figures, config, write=True) as store:
+            new = store.add(unit, data_set, log.name, plain)
+            print(f"{new} new of {len(plain)} cycles, in {store.name}")
+
+
+@figures_app.command()
+def trend(
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[FIGURE...]", help="Default: all there are.")
+    ] = None,
+    config: ConfigFile = None,
+    unit: UnitId = "",
+    figures: Url = "",
+    days: Days = None,
+    json_file: JsonFile = None,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="F.(png|svg)", help="Of one figure.")
+    ] = None,
+) -> None:
+    """How figures run over days, how sure that is, and when they come to their limits."""
+    from twin.figures.store import SIDES
+    from twin.figures.words import in_words, trend_of, trend_plain
+
+    wanted = _wanted(names, picture)
+    limits = _limits(config)
+    with _open(figures, config, write=False) as store:
+        columns = [f"{figure.name}_{side}" for figure in wanted for side in SIDES]
+        history = _history(store, _chosen(store, config, unit), days, columns)
+    plain = []
+    for figure in wanted:
+        line, limit, comes = trend_of(history, figure, limits)
+        print(in_words(figure, line, limit, comes))
+        plain.append(trend_plain(figure, line, limit, comes))
+        if picture is not None:
+            from twin.figures.picture import draw
+
+            draw(history, figure, line, limit, comes, picture)
+    if json_file is not None:
+        _write_json(json_file, plain)
+
+
+@figures_app.command()
+def counters(
+    config: ConfigFile = None,
+    unit: UnitId = "",
+    figures: Url = "",
+    erase: Annotated[
+        bool, typer.Option("--erase", help="Let the erasable counters begin anew.")
+    ] = False,
+) -> None:
+    """Suction cycles, valve switchings and alarms: in all, and since they were erased."""
+    with _open(figures, config, write=erase) as store:
+        whose = _chosen(store, config, unit)
+        if erase:
+            store.erase(whose)
+        total, erasable = store.counters(whose), store.counters(whose, erasable=True)
+    print(f"{'':18}{'in all':>12}{'erasable':>12}")
+    for name, label in _COUNTED.items():
+        print(f"{label:18}{getattr(total, name):12}{getattr(erasable, name):12}")
+
+
+@figures_app.command()
+def autoset(
+    config: ConfigFile = None,
+    unit: UnitId = "",
+    figures: Url = "",
+    tolerance: Annotated[
+        float | None, typer.Option(metavar="S", help="Share of the worst good cycle, over it.")
+    ] = None,
+) -> None:
+    """Permitted t1 and leakage from the last good cycles, to put into the configuration."""
+    from twin.figures.autoset import autoset as teach
+
+    over = _settings(config).autoset_tolerance if tolerance is None else tolerance
+    with _open(figures, config, write=False) as store:
+        whose = _chosen(store, config, unit)
+        taught = teach(store.history(whose), over)
+    print(f"# from the last {taught.cycles} good cycles of {whose.id or whose.type}")
+    print(taught.toml(), end="")
+
+
+@figures_app.command()
+def export(
+    output: Annotated[Path, typer.Option("-o", metavar="FILE", help="*.csv or *.parquet.")],
+    config: ConfigFile = None,
+    unit: UnitId = "",
+    figures: Url = "",
+    days: Days = None,
+) -> None:
+    """Write the kept cycles of a unit as a table for other programs."""
+    from twin.figures.export import export as export_table
+    from twin.figures.export import to_table
+
+    with _open(figures, config, write=False) as store:
+        whose = _chosen(store, config, unit)
+        table = to_table(_history(store, whose, days), whose)
+    export_table(table, output)
+    print(f"{table.num_rows} cycles in {output}")
+
+
+# --- for the loop -------------------------------------------------------------------------------
+
+
+def key_figures_of(settings: "Config") -> "KeyFigures":
+    """The key figures of a configuration's unit, compiled; ConfigError names a wrong key."""
+    from twin.figures.cycle import compiled
+    from twin.figures.settings import FigureSettings
+
+    return compiled(settings.data, settings.document.section(FigureSettings, "figures"))
+
+
+def keeper_of(settings: "Config", say: "Callable[[str], None]") -> "Callable[[], Keeper] | None":
+    """What opens the sink that keeps key figures, where ``[figures]`` asks for it; or None.
+
+    ConfigError for a URL of an unknown kind; a database that is away is said, and waited for.
+    """
+    from twin.assets.engine import parse_url
+    from twin.figures.keeper import Keeper
+    from twin.figures.place import open_chosen
+    from twin.figures.settings import FigureSettings
+    from twin.figures.store import FIGURE_DATABASE, Unit
+
+    wanted = settings.document.section(FigureSettings, "figures")
+    if not wanted.keep:
+        return None
+    parse_url(wanted.url, FIGURE_DATABASE)
+    unit = Unit(settings.asset.type, settings.asset.id)
+    opened = partial(open_chosen, "", settings.document, write=True)
+    return lambda: Keeper(opened, unit, settings.data.hash, say)
+
+
+# --- what the commands share --------------------------------------------------------------------
+
+_COUNTED = {"cycles": "suction cycles", "switchings": "valve switchings", "alarms": "alarms"}
+
+
+def _document(config: Path | None) -> "Document | None":
+    from twin.settings import Document
+
+    return Document.read(config) if config else None
+
+
+def _open(url: str, config: Path | None, *, write: bool) -> "Store":
+    from twin.figures.place import open_chosen
+
+    store = open_chosen(url, _document(config), write=write)
+    print(f"figure database: {store.name}", file=sys.stderr)
+    return store
+
+
+def _settings(config: Path | None) -> "FigureSettings":
+    from twin.figures.settings import FigureSettings
+
+    document = _document(config)
+    return document.section(FigureSettings, "figures") if document else FigureSettings()
+
+
+def _limits(config: Path | None) -> "Limits":
+    """The limits of a configuration's unit; without one the field's defaults."""
+    from twin.config import Config
+    from twin.figures.settings import limits
+    from twin.model.dataset import DataSet
+
+    document = _document(config)
+    return limits(_settings(config), Config.of(document).data if document else DataSet())
+
+
+def _of_log(recorded: "Log", log: Path, instead: Path | None) -> "Config":
+    """The configuration of a log, with the data set it was recorded beside; or another one."""
+    from twin.config import Config
+    from twin.settings import Document
+
+    if instead is not None:
+        return Config.of(Document.read(instead))
+    header = recorded.header
+    document = Document.parse(header.config_text, header.config_name)
+    return Config.of_log(document, header.metadata, str(log))
+
+
+def _chosen(store: "Store", config: Path | None, unit: str) -> "Unit":
+    """The unit that is meant: named, that of the configuration, or the only one there is."""
+    units = store.units()
+    asked = unit
+    if not asked and (document := _document(config)) is not None:
+        asked = str(document.tables.get("asset", {}).get("id", ""))
+    found = [one for one in units if not asked or one.id == asked]
+    if len(found) != 1:
+        known = ", ".join(one.id or one.type for one in units) or "none"
+        what = f"{len(found)} units {asked!r}" if asked else f"{len(found)} units"
+        raise ConfigError(f"{store.name}: {what}", f"choose with --id; there are: {known}")
+    return found[0]
+
+
+def _history(
+    store: "Store", unit: "Unit", days: float | None, columns: "Sequence[str] | None" = None
+) -> "History":
+    since = None if days is None else time.time_ns() - round(days * 86_400e9)
+    history = store.history(unit, since, *([] if columns is None else [columns]))
+    if not len(history.host_ns):
+        raise ConfigError(f"{store.name}: no cycles of {unit.id or unit.type} in that time")
+    return history
+
+
+def _wanted(names: list[str] | None, picture: Path | None) -> "list[Figure]":
+    from twin.figures.table import FIGURES
+
+    unknown = [name for name in names or [] if name not in FIGURES]
+    if unknown:
+        raise ConfigError(
+            f"no figure is called {', '.join(unknown)}", f"there are: {', '.join(FIGURES)}"
+        )
+    if picture is not None and len(names or []) != 1:
+        raise ConfigError("--picture draws one figure", "name one: twin figures trend leakage")
+    return [FIGURES[name] for name in names or FIGURES]
+
+
+def _write_json(path: Path, document: Any) -> None:
+    try:
+        text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        message = f"{path}: cannot be written: {error.strerror}"
+        raise SourceError(message, "check that the folder exists and has space") from error

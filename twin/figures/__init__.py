@@ -1,0 +1,1 @@
+"""Key figures per cycle, as a maintenance person knows them: measured, expected, kept, trended."""

@@ -1,0 +1,50 @@
+"""Autoset: permitted values taught by the last good cycles, as compact ejectors do it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.errors import ConfigError
+from twin.figures.store import History
+
+GOOD_CYCLES = 5  # the last ones; more tell no more of today
+LEAST_T1_MS, LEAST_LEAKAGE = 50.0, 10.0  # over what was measured: below is scatter
+
+
+@dataclass(frozen=True)
+class Autoset:
+    """What is permitted from now on, and from how many cycles."""
+
+    permitted_t1_ms: float
+    permitted_leakage_mbar_s: float
+    cycles: int
+
+    def toml(self) -> str:
+        """As it stands in a configuration."""
+        return (
+            f"[figures]\npermitted_t1_ms = {self.permitted_t1_ms:.0f}\n"
+            f"permitted_leakage_mbar_s = {self.permitted_leakage_mbar_s:.0f}\n"
+        )
+
+
+def autoset(history: History, tolerance: float) -> Autoset:
+    """Permit the worst of the last good cycles and ``tolerance`` (a share of it) more.
+
+    Good is a cycle without warning and alarm that tells t1 and leakage. ConfigError if there is
+    none.
+    """
+    t1, leakage = history.values["t1_measured"], history.values["leakage_measured"]
+    calm = np.array([not warned for warned in history.warnings], bool) & (history.alarms == 0)
+    good = np.flatnonzero(calm & np.isfinite(t1) & np.isfinite(leakage))[-GOOD_CYCLES:]
+    if not len(good):
+        raise ConfigError(
+            "no good cycle is stored: one that reaches H1, without warning or alarm",
+            "let it run on good parts first (twin run with [figures] keep = true), or add a log of"
+            " good cycles: twin figures show LOG --keep",
+        )
+    worst_t1, worst_leakage = float(t1[good].max()), max(float(leakage[good].max()), 0.0)
+    return Autoset(
+        permitted_t1_ms=worst_t1 + max(tolerance * worst_t1, LEAST_T1_MS),
+        permitted_leakage_mbar_s=worst_leakage + max(tolerance * worst_leakage, LEAST_LEAKAGE),
+        cycles=len(good),
+    )

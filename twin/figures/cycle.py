@@ -1,0 +1,186 @@
+"""From cycles to their key figures: measured and expected side by side, and the warnings."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from twin.figures.course import Course, Floats
+from twin.figures.expected import Expectation
+from twin.figures.settings import FigureSettings, Limits, limits
+from twin.figures.table import FIGURES, UNKNOWN, Unit, figures
+from twin.figures.warnings import in_words, warnings
+from twin.model.dataset import DataSet
+from twin.monitor.cycles import LONGEST_PIECE, Cycle
+from twin.signals import (
+    BAR,
+    BREAK,
+    MBAR,
+    MS,
+    NS,
+    SAMPLE,
+    TICK,
+    UNUSABLE,
+    Phase,
+    Samples,
+    Ticks,
+)
+
+_OVER = (Phase.IDLE, Phase.BLOW_OFF)
+_TOLD = {
+    "t0": "evacuated to H2 in",
+    "t1": "on to H1 in",
+    "leakage": "leakage",
+    "free_flow": "free-flow vacuum",
+}
+MOST_PIECES = 30  # of a long cycle, five minutes; beyond, its end is not waited for
+
+
+@dataclass(frozen=True)
+class CycleFigures:
+    """The key figures of one cycle; NaN where it cannot tell."""
+
+    cycle: int
+    begin_ns: int  # PLC time of its suction edge
+    end_ns: int  # PLC time of its last row
+    host_ns: int  # when that row was received
+    measured: Mapping[str, float]
+    expected: Mapping[str, float]
+    warnings: tuple[str, ...]  # latched to the end of the cycle
+    limits: Limits
+    complete: bool  # the end of its suction was seen
+
+    @property
+    def words(self) -> str:
+        """What a person wants to know of it, in a line."""
+        parts = [
+            f"{label} {self.measured[name]:.0f} {FIGURES[name].unit}{self._beside(name)}"
+            for name, label in _TOLD.items()
+            if math.isfinite(self.measured[name])
+        ]
+        told = f"cycle {self.cycle}: {', '.join(parts) or 'nothing to tell'}"
+        return "; ".join([told, *in_words(self.warnings, self.measured, self.limits)])
+
+    def _beside(self, name: str) -> str:
+        expected = self.expected[name]
+        return f" (expected {expected:.0f})" if math.isfinite(expected) else ""
+
+    def plain(self) -> dict[str, Any]:
+        """As JSON has it: names end with their side, and what is not known is left out."""
+        both = {
+            f"{name}_{side}": round(float(values[name]), 4)
+            for name in FIGURES
+            for side, values in (("measured", self.measured), ("expected", self.expected))
+            if math.isfinite(values[name])
+        }
+        when = {"begin_ns": self.begin_ns, "end_ns": self.end_ns, "host_ns": self.host_ns}
+        own = {"cycle": self.cycle, **when, "complete": self.complete}
+        return {**own, **both, "warnings": list(self.warnings)}
+
+
+def compiled(data: DataSet, settings: FigureSettings) -> "KeyFigures":
+    """Key figures whose path is compiled, which may take seconds: not to fall into the loop."""
+    samples, ticks = np.zeros(3, SAMPLE), np.zeros(3, TICK)
+    ticks["level"] = data.ambient.pressure_mbar * MBAR
+    Expectation(data).over(samples, ticks, at_edge=False)
+    return KeyFigures(data, settings)
+
+
+@dataclass
+class KeyFigures:
+    """Takes the pieces of a CycleCutter, gives key figures as soon as a cycle's suction is over."""
+
+    data: DataSet
+    settings: FigureSettings = field(default_factory=FigureSettings)
+    _pieces: list[Cycle] = field(default_factory=list)  # of a long cycle that is not over
+    _index: int = -1  # of the cycle that was last given or begun
+
+    def __post_init__(self) -> None:
+        self._unit = Unit(self.data, self.settings.energy_kwh_m3)
+        self._limits = limits(self.settings, self.data)
+        self._expectation = Expectation(self.data)
+
+    def take(self, piece: Cycle) -> CycleFigures | None:
+        """Take the next piece; give the key figures of the cycle that it completes, if it does."""
+        at_edge = piece.index > self._index
+        goes_on = bool(self._pieces) and not piece.samples["quality"][0] & BREAK
+        if not at_edge and not goes_on:
+            return self._broken_off(piece)
+        self._index = piece.index
+        self._pieces.append(piece)
+        over = piece.ticks["phase"][-1] in _OVER
+        if not over and len(piece.samples) == LONGEST_PIECE and len(self._pieces) < MOST_PIECES:
+            return None
+        return self._given()
+
+    def _broken_off(self, piece: Cycle) -> CycleFigures | None:
+        """Give what was being collected, if anything; ``piece`` belongs to no cycle from its edge.
+
+        The model only goes on over it where it is what it looks like: no suction is commanded.
+        """
+        given = self._given() if self._pieces else None
+        if np.isin(piece.ticks["phase"], _OVER).all():
+            self._expectation.over(piece.samples, piece.ticks, at_edge=False)
+        else:
+            self._expectation.lose()
+        return given
+
+    def _given(self) -> CycleFigures:
+        pieces, self._pieces = self._pieces, []
+        samples = np.concatenate([piece.samples for piece in pieces])
+        ticks = np.concatenate([piece.ticks for piece in pieces])
+        last = ticks["phase"][-1]
+        ended = last in _OVER
+        seen = ended, bool(ended and not (pieces[-1].cut_short and last == Phase.BLOW_OFF))
+        measured = figures(self._measured(samples, ticks, *seen), self._unit)
+        return CycleFigures(
+            self._index,
+            int(samples["time_ns"][0]),
+            int(samples["time_ns"][-1]),
+            int(samples["host_ns"][0]),
+            measured,
+            self._expected(samples, ticks, *seen, np.isfinite(measured["free_flow"])),
+            warnings(measured, self._limits),
+            self._limits,
+            bool(ended),
+        )
+
+    def _measured(self, samples: Samples, ticks: Ticks, ended: bool, blown: bool) -> Course:
+        ejector = self.data.ejector
+        usable = (samples["quality"] & UNUSABLE) == 0
+        pressure = np.where(usable, samples["pressure"], np.nan).astype(np.float64) / MBAR
+        return Course(
+            time=_since_begin(samples),
+            vacuum=self.data.ambient.pressure_mbar - pressure,
+            supply=samples["supply"].astype(np.float64) / BAR,
+            phase=ticks["phase"],
+            ended=ended,
+            blown=blown,
+            off_lag=ejector.response_off_ms * MS,
+            on_lag=ejector.response_ms * MS,
+        )
+
+    def _expected(
+        self, samples: Samples, ticks: Ticks, ended: bool, blown: bool, is_open: bool
+    ) -> dict[str, float]:
+        """As the model has the same cycle; where a cup was open, with its cups open."""
+        found = self._expectation.over(samples, ticks, at_edge=True)
+        if found is None:
+            return dict.fromkeys(FIGURES, UNKNOWN)
+        vacuum, phase = found
+        supply = np.full(len(vacuum), self.data.supply.nozzle_bar)
+        course = Course(_since_begin(samples), vacuum, supply, phase, ended, blown)
+        expected = figures(course, self._unit)
+        if is_open:
+            share = self._expectation.free_flow / self._unit.h1
+            expected["free_flow"] = self._expectation.free_flow
+            expected["performance"] = 100.0 * (1.0 - share)
+        return expected
+
+
+def _since_begin(samples: Samples) -> Floats:
+    """Time of each row (s) since the first."""
+    since: Floats = (samples["time_ns"] - samples["time_ns"][0]) * NS
+    return since

@@ -1,0 +1,50 @@
+"""Key figures as a table for other programs: CSV or Parquet, a row for each cycle."""
+
+from pathlib import Path
+
+import pyarrow as pa
+from pyarrow import csv, parquet
+
+from twin.errors import ConfigError
+from twin.figures.store import SIDES, History, Unit
+from twin.figures.table import FIGURES
+from twin.tables.export import complete_file
+
+UNITS = {f"{one.name}_{side}": one.unit for one in FIGURES.values() for side in SIDES}
+
+
+def to_table(history: History, unit: Unit) -> pa.Table:
+    """The cycles as a table; what a cycle cannot tell is null."""
+    columns = {
+        "asset_type": pa.array([unit.type] * len(history.host_ns), pa.string()),
+        "asset_id": pa.array([unit.id] * len(history.host_ns), pa.string()),
+        "time": pa.array(history.host_ns, pa.timestamp("ns", "UTC")),
+        "plc_time_ns": pa.array(history.begin_ns, pa.int64()),
+        "cycle": pa.array(history.cycle, pa.int64()),
+        "alarms": pa.array(history.alarms, pa.int64()),
+        "warnings": pa.array(history.warnings, pa.string()),
+    }
+    columns |= {name: pa.array(of, from_pandas=True) for name, of in history.values.items()}
+    fields = [
+        pa.field(name, column.type, metadata={"unit": UNITS[name]} if name in UNITS else None)
+        for name, column in columns.items()
+    ]
+    return pa.table(list(columns.values()), pa.schema(fields))
+
+
+def export(table: pa.Table, path: Path) -> None:
+    """Write a table as its suffix says, whole or not at all.
+
+    ConfigError for another suffix, SourceError if there is a file of that name or it cannot be
+    written.
+    """
+    kind = path.suffix.lower()
+    if kind not in (".csv", ".parquet"):
+        raise ConfigError(
+            f"{path}: cannot tell what to write", ".csv and .parquet files can be written"
+        )
+    with complete_file(path) as file:
+        if kind == ".csv":
+            csv.write_csv(table, file, csv.WriteOptions(quoting_style="needed"))
+        else:
+            parquet.write_table(table, file, compression="zstd", write_page_checksum=True)

@@ -1,0 +1,296 @@
+"""Where key figures are kept: a row for each cycle, only ever added, each cycle once.
+
+A cycle is known by its asset, the PLC time of its suction edge and when that was received: PLC time
+alone may begin anew after a restart. So a replay of a log adds nothing that is there already; with
+another data set it adds what that one expects, and the newest of a cycle's rows holds.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import compress
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+import numpy.typing as npt
+from sqlalchemy import (
+    URL,
+    BigInteger,
+    Column,
+    ColumnElement,
+    Connection,
+    Double,
+    Engine,
+    Integer,
+    MetaData,
+    Row,
+    Table,
+    Text,
+    and_,
+    func,
+    inspect,
+    select,
+    text,
+)
+
+from twin.assets.engine import Purpose, make_engine, parse_url, plain_errors, shown, sqlite_file
+from twin.errors import SourceError
+from twin.figures.table import FIGURES
+
+FIGURE_DATABASE = Purpose("figure database", "--figures")
+SIDES = ("measured", "expected")
+_OWN = ("host_ns", "begin_ns", "cycle", "alarms", "warnings")
+VALUES = tuple(f"{name}_{side}" for name in FIGURES for side in SIDES)
+
+metadata = MetaData()
+
+CYCLE = Table(
+    "figure_cycle",
+    metadata,
+    Column("asset_type", Text, primary_key=True),
+    Column("asset_id", Text, primary_key=True),
+    Column("host_ns", BigInteger, primary_key=True, autoincrement=False),
+    Column("begin_ns", BigInteger, primary_key=True, autoincrement=False),
+    Column("data_set", Text, primary_key=True),  # content hash of what the twin knew
+    Column("cycle", BigInteger, nullable=False),  # its number in that stream
+    Column("source", Text, nullable=False),  # a log, or "live"
+    Column("stored_ns", BigInteger, nullable=False),
+    Column("alarms", Integer, nullable=False),
+    Column("warnings", Text, nullable=False),  # names with spaces between
+    *(Column(value, Double) for value in VALUES),
+    sqlite_with_rowid=False,
+)
+
+# The erasable twins of the counters count from the newest of these on.
+ERASED = Table(
+    "figure_erased",
+    metadata,
+    Column("asset_type", Text, primary_key=True),
+    Column("asset_id", Text, primary_key=True),
+    Column("host_ns", BigInteger, primary_key=True, autoincrement=False),
+)
+
+Floats = npt.NDArray[np.float64]
+
+
+class Unit(NamedTuple):
+    """Whose figures."""
+
+    type: str
+    id: str
+
+
+@dataclass(frozen=True)
+class History:
+    """Cycles of one unit in the order of time, column by column."""
+
+    host_ns: npt.NDArray[np.int64]
+    begin_ns: npt.NDArray[np.int64]
+    cycle: npt.NDArray[np.int64]
+    alarms: npt.NDArray[np.int64]
+    warnings: tuple[str, ...]  # of each cycle, with spaces between
+    values: Mapping[str, Floats]  # by VALUES; NaN where a cycle could not tell
+
+
+@dataclass(frozen=True)
+class Counters:
+    """What the field's counters say: since the first cycle, or since they were erased."""
+
+    cycles: int
+    switchings: int
+    alarms: int
+
+
+def open_store(
+    where: str | Path,
+    *,
+    create: bool = True,
+    busy_s: float = 5.0,
+    clock: Callable[[], int] = time.time_ns,
+) -> "Store":
+    """Open the figure database at a URL or in an SQLite file; close it, or use it as a context.
+
+    ``create=False`` refuses an SQLite file that is not there. ConfigError for a URL of an unknown
+    kind, SourceError if it cannot be reached, read or written.
+    """
+    url = parse_url(where, FIGURE_DATABASE)
+    file = sqlite_file(url)
+    if not create and file is not None and not file.exists():
+        raise SourceError(
+            f"{file}: no such figure database",
+            "check --figures; twin run makes one where [figures] keep = true",
+        )
+    store = Store(url, make_engine(url, busy_s), clock)
+    try:
+        store.prepare()
+    except BaseException:
+        store.close()
+        raise
+    return store
+
+
+class Store:
+    """An open figure database. What is added is added whole or not at all."""
+
+    def __init__(self, url: URL, engine: Engine, clock: Callable[[], int]) -> None:
+        self._url = url
+        self._engine = engine
+        self._clock = clock
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give all connections back."""
+        self._engine.dispose()
+
+    @property
+    def name(self) -> str:
+        """The file or the URL, for messages; without a password."""
+        return shown(self._url)
+
+    def prepare(self) -> None:
+        """Make the tables, and the columns of figures that an older program did not know."""
+        with self._reading() as connection:
+            if not _missing(connection):
+                return
+        with self._writing() as connection:
+            metadata.create_all(connection)
+            for column in _missing(connection):
+                kind = column.type.compile(connection.dialect)
+                connection.execute(
+                    text(f"ALTER TABLE {CYCLE.name} ADD COLUMN {column.name} {kind}")
+                )
+
+    def add(
+        self, unit: Unit, data_set: str, source: str, cycles: Sequence[Mapping[str, Any]]
+    ) -> int:
+        """Append cycles as ``CycleFigures.plain`` has them; gives how many were not there yet."""
+        if not cycles:
+            return 0
+        own = {"asset_type": unit.type, "asset_id": unit.id, "data_set": data_set}
+        own |= {"source": source}
+        with self._writing() as connection:
+            here = _here(connection, own, [int(one["host_ns"]) for one in cycles])
+            new = {
+                key: {**own, **_row(one), "stored_ns": self._clock()}
+                for one in cycles
+                if (key := (int(one["host_ns"]), int(one["begin_ns"]))) not in here
+            }
+            if new:
+                connection.execute(CYCLE.insert(), list(new.values()))
+        return len(new)
+
+    def units(self) -> list[Unit]:
+        """All units of which there are cycles."""
+        names = select(CYCLE.c.asset_type, CYCLE.c.asset_id).distinct()
+        with self._reading() as connection:
+            return sorted(Unit(*row) for row in connection.execute(names))
+
+    def history(
+        self, unit: Unit, since_ns: int | None = None, values: Sequence[str] = VALUES
+    ) -> History:
+        """The cycles of a unit (received since then), each as it was stored last."""
+        conditions = [*_of(CYCLE, unit)]
+        if since_ns is not None:
+            conditions.append(CYCLE.c.host_ns >= since_ns)
+        wanted = select(*(CYCLE.c[name] for name in (*_OWN, *values))).where(*conditions)
+        in_order = wanted.order_by(CYCLE.c.host_ns, CYCLE.c.begin_ns, CYCLE.c.stored_ns)
+        with self._reading() as connection:
+            return _history(connection.execute(in_order).all(), values)
+
+    def counters(self, unit: Unit, *, erasable: bool = False) -> Counters:
+        """Suction cycles, valve switchings and alarms; the erasable ones since they were erased."""
+        conditions = [*_of(CYCLE, unit)]
+        newest = select(func.max(ERASED.c.host_ns)).where(*_of(ERASED, unit))
+        with self._reading() as connection:
+            since = connection.scalar(newest) if erasable else None
+            if since is not None:
+                conditions.append(CYCLE.c.host_ns > since)
+            once = (  # of a cycle stored with several data sets
+                select(
+                    func.max(CYCLE.c.switchings_measured).label("switchings"),
+                    func.max(CYCLE.c.alarms).label("alarms"),
+                )
+                .where(*conditions)
+                .group_by(CYCLE.c.host_ns, CYCLE.c.begin_ns)
+                .subquery()
+            )
+            sums = select(
+                func.count(), func.sum(once.c.switchings), func.sum(once.c.alarms)
+            ).select_from(once)
+            return Counters(*(int(value or 0) for value in connection.execute(sums).one()))
+
+    def erase(self, unit: Unit) -> None:
+        """Let the erasable counters begin anew; the others and the cycles stay."""
+        row = {"asset_type": unit.type, "asset_id": unit.id, "host_ns": self._clock()}
+        with self._writing() as connection:
+            connection.execute(ERASED.insert().values(row))
+
+    @contextmanager
+    def _reading(self) -> Iterator[Connection]:
+        with plain_errors(self._url, FIGURE_DATABASE), self._engine.begin() as connection:
+            yield connection
+
+    @contextmanager
+    def _writing(self) -> Iterator[Connection]:
+        writer = self._engine.execution_options(writing=True)
+        with plain_errors(self._url, FIGURE_DATABASE), writer.begin() as connection:
+            yield connection
+
+
+def _missing(connection: Connection) -> list[Column[Any]]:
+    """The columns that the database does not have; all where it has no tables."""
+    inspector = inspect(connection)
+    if not (inspector.has_table(CYCLE.name) and inspector.has_table(ERASED.name)):
+        return list(CYCLE.columns)
+    there = {column["name"] for column in inspector.get_columns(CYCLE.name)}
+    return [column for column in CYCLE.columns if column.name not in there]
+
+
+def _of(table: Table, unit: Unit) -> tuple[ColumnElement[bool], ...]:
+    return table.c.asset_type == unit.type, table.c.asset_id == unit.id
+
+
+def _here(
+    connection: Connection, own: Mapping[str, str], received: Sequence[int]
+) -> set[tuple[int, int]]:
+    """The cycles that are there already, of those received in that time."""
+    between = and_(CYCLE.c.host_ns >= min(received), CYCLE.c.host_ns <= max(received))
+    same = (CYCLE.c[name] == own[name] for name in ("asset_type", "asset_id", "data_set"))
+    wanted = select(CYCLE.c.host_ns, CYCLE.c.begin_ns).where(*same, between)
+    return {(row.host_ns, row.begin_ns) for row in connection.execute(wanted)}
+
+
+def _row(cycle: Mapping[str, Any]) -> dict[str, Any]:
+    """A cycle's own columns."""
+    names = ("cycle", "begin_ns", "host_ns")
+    values = {value: cycle.get(value) for value in VALUES}
+    warned = " ".join(cycle["warnings"])
+    own = {name: int(cycle[name]) for name in names}
+    return {**own, **values, "alarms": int(cycle.get("alarms", 0)), "warnings": warned}
+
+
+def _history(rows: Sequence[Row[Any]], values: Sequence[str]) -> History:
+    """What rows in their order say; of those of the same cycle the last."""
+    columns = list(zip(*rows, strict=True)) or [()] * (len(_OWN) + len(values))
+    host_ns, begin_ns, cycle, alarms = (np.array(one, dtype=np.int64) for one in columns[:4])
+    changes = (np.diff(host_ns) != 0) | (np.diff(begin_ns) != 0)
+    last = np.append(changes, True)[: len(rows)]
+    floats = columns[len(_OWN) :]  # None becomes NaN
+    return History(
+        host_ns=host_ns[last],
+        begin_ns=begin_ns[last],
+        cycle=cycle[last],
+        alarms=alarms[last],
+        warnings=tuple(compress(columns[4], last)),
+        values={
+            name: np.array(column, dtype=np.float64)[last]
+            for name, column in zip(values, floats, strict=True)
+        },
+    )

@@ -1,0 +1,270 @@
+"""The key figures, one table: name, unit, what it is, and how it is found in one side of a cycle.
+
+Names and definitions are the field's, as condition monitoring of compact ejectors reports them. A
+figure that a cycle cannot tell is NaN; none is guessed.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.figures.course import Course, Floats
+from twin.model.control import LEAK_SETTLE_S, PROTECTED_S
+from twin.model.dataset import DataSet
+from twin.signals import BAR, MBAR, Phase
+
+LEAK_WINDOW_S = 1.0  # after the settling, in which leakage is judged
+LEAST_WINDOW_S = 0.05  # noise of 0.3 mbar then gives 3 mbar/s
+BANDS = (67.0, 133.0, 200.0)  # mbar/s, of leakage
+WORST_LEAKAGE = 500.0  # mbar/s: quality 0
+FREE_SUCTION_S = 1.0  # at least, for a free-flow vacuum
+STEADY_S, STEADY = 0.5, 10.0  # s at the end of it, in which it moves by less (mbar/s)
+LEAST_FREE_FLOW = 5.0  # mbar: below it is not told from nothing
+UNKNOWN = math.nan
+
+
+@dataclass(frozen=True)
+class Unit:
+    """What a figure needs to know of the ejector beside its course."""
+
+    data: DataSet
+    energy_kwh_m3: float
+
+    @property
+    def h1(self) -> float:
+        """Where the air saving switches the nozzle off (mbar)."""
+        return self.data.ejector.h1_mbar
+
+    @property
+    def h2(self) -> float:
+        """From where on a part is present (mbar)."""
+        return self.data.ejector.h2_mbar
+
+
+Of = Callable[[Course, Unit], float]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One key figure."""
+
+    name: str
+    unit: str
+    what: str
+    of: Of
+
+
+def t0(course: Course, unit: Unit) -> float:
+    """Evacuation time to H2 (ms)."""
+    return course.reached(unit.h2) * 1e3
+
+
+def t1(course: Course, unit: Unit) -> float:
+    """Evacuation time from H2 to H1 (ms): the switching of the air saving, where there is one."""
+    if not course.seamless:
+        return UNKNOWN
+    h1 = course.nozzle[0][1] if course.went_off else course.reached(unit.h1)
+    passed = h1 - course.reached(unit.h2)
+    return passed * 1e3 if passed > 0.0 else UNKNOWN  # a sensor so slow that it says nothing of it
+
+
+def leakage(course: Course, _unit: Unit) -> float:
+    """Vacuum lost per time (mbar/s), by a straight line through the first stretch of hold."""
+    if not course.went_off or not course.seamless:
+        return UNKNOWN
+    time, vacuum = course.time[course.hold], course.vacuum[course.hold]
+    since = time - time[0] - LEAK_SETTLE_S
+    rows = (since >= 0.0) & (since <= LEAK_WINDOW_S) & np.isfinite(vacuum)
+    if not rows.any() or since[rows][-1] < LEAST_WINDOW_S:
+        return UNKNOWN
+    return -_slope(time[rows], vacuum[rows])
+
+
+def leakage_band(course: Course, unit: Unit) -> float:
+    """In which of the field's bands leakage is: 0 is good, 3 beyond the last."""
+    found = leakage(course, unit)
+    return UNKNOWN if math.isnan(found) else float(np.searchsorted(BANDS, found, "right"))
+
+
+def quality(course: Course, unit: Unit) -> float:
+    """From leakage (%): 100 without any."""
+    return _percent(1.0 - leakage(course, unit) / WORST_LEAKAGE)
+
+
+def free_flow(course: Course, unit: Unit) -> float:
+    """Vacuum (mbar) at which suction stands still short of H1, as with the cup open."""
+    if not (course.ended and course.seamless) or course.went_off:
+        return UNKNOWN
+    time, vacuum = course.smooth
+    last = time >= course.suction_s - STEADY_S
+    if course.suction_s < FREE_SUCTION_S or abs(_slope(time[last], vacuum[last])) > STEADY:
+        return UNKNOWN
+    found = float(vacuum[last].mean())
+    return found if LEAST_FREE_FLOW <= found < unit.h1 and vacuum.max() < unit.h1 else UNKNOWN
+
+
+def performance(course: Course, unit: Unit) -> float:
+    """From the free-flow vacuum (%): 100 with nothing in the way, 0 at H1."""
+    return _percent(1.0 - free_flow(course, unit) / unit.h1)
+
+
+def max_vacuum(course: Course, _unit: Unit) -> float:
+    """Highest vacuum (mbar)."""
+    known = course.ended and course.seamless
+    return float(course.smooth[1].max()) if known else UNKNOWN
+
+
+def h1_not_reached(course: Course, unit: Unit) -> float:
+    """1 if suction ended before H1 was reached, else 0."""
+    if course.seamless and course.went_off:
+        return 0.0
+    highest = max_vacuum(course, unit)
+    return UNKNOWN if math.isnan(highest) else float(highest < unit.h1)
+
+
+def nozzle_share(course: Course, _unit: Unit) -> float:
+    """Share of the suction time in which the nozzle was on (%)."""
+    return 100.0 * _nozzle_s(course) / course.suction_s if course.suction_s else UNKNOWN
+
+
+def air(course: Course, unit: Unit) -> float:
+    """Compressed air (Nl) through nozzle and blow-off."""
+    if not course.blown:
+        return UNKNOWN
+    ejector = unit.data.ejector
+    nominal = _nozzle_s(course) * ejector.air_consumption_sl_min
+    nominal += course.blow_off_s * ejector.blow_off_sl_min
+    return nominal * _pressed(course, unit) / 60.0
+
+
+def energy(course: Course, unit: Unit) -> float:
+    """Electric energy (Wh) to compress that air."""
+    return air(course, unit) * unit.energy_kwh_m3
+
+
+def switchings(course: Course, _unit: Unit) -> float:
+    """How often the nozzle was switched on."""
+    return float(len(course.nozzle)) if course.ended and course.seamless else UNKNOWN
+
+
+def quick_switchings(course: Course, _unit: Unit) -> float:
+    """Most switchings of the air saving, on or off, within the time that valve protection has."""
+    if not (course.ended and course.seamless):
+        return UNKNOWN
+    edges = np.array(course.nozzle).ravel()[1:]
+    commanded = course.phase[course.suction_rows - 1] == Phase.SUCTION  # the last one
+    times = edges[:-1] if commanded else edges
+    within = np.searchsorted(times, times + PROTECTED_S, "left") - np.arange(len(times))
+    return float(within.max(initial=0))
+
+
+def supply(course: Course, _unit: Unit) -> float:
+    """Mean operating pressure while the nozzle was on (bar)."""
+    there = _supplies(course)
+    return float(there.mean()) if len(there) else UNKNOWN
+
+
+def lowest_supply(course: Course, _unit: Unit) -> float:
+    """Lowest operating pressure while the nozzle was on (bar)."""
+    there = _supplies(course)
+    return float(np.quantile(there, 0.01)) if len(there) else UNKNOWN
+
+
+def highest_supply(course: Course, _unit: Unit) -> float:
+    """Highest operating pressure while the nozzle was on (bar)."""
+    there = _supplies(course)
+    return float(np.quantile(there, 0.99)) if len(there) else UNKNOWN
+
+
+def _supplies(course: Course) -> Floats:
+    """What the supply read while the nozzle was on (bar)."""
+    on = course.phase == Phase.SUCTION
+    there: Floats = course.supply[on & np.isfinite(course.supply)]
+    return there
+
+
+def _nozzle_s(course: Course) -> float:
+    """How long the nozzle was on (s), where nothing was missed."""
+    known = course.ended and course.seamless
+    return sum(off - on for on, off in course.nozzle) if known else UNKNOWN
+
+
+def _pressed(course: Course, unit: Unit) -> float:
+    """Absolute operating pressure over that of the data set: a sonic nozzle's flow follows it."""
+    ambient, nominal = unit.data.ambient.pressure_mbar * MBAR / BAR, unit.data.supply.nozzle_bar
+    there = supply(course, unit)
+    return 1.0 if math.isnan(there) else (there + ambient) / (nominal + ambient)
+
+
+def _slope(time: Floats, values: Floats) -> float:
+    """Of a straight line through the values, per second."""
+    centred = time - time.mean()
+    return float(centred @ values / (centred @ centred))
+
+
+def _percent(share: float) -> float:
+    return 100.0 * min(max(share, 0.0), 1.0) if math.isfinite(share) else UNKNOWN
+
+
+FIGURES = {
+    figure.name: figure
+    for figure in (
+        Figure("t0", "ms", "evacuation time: suction on until H2", t0),
+        Figure("t1", "ms", "evacuation time: H2 until H1", t1),
+        Figure(
+            "leakage",
+            "mbar/s",
+            "vacuum lost per time after the air saving switched the nozzle off at H1",
+            leakage,
+        ),
+        Figure(
+            "leakage_band",
+            "0 to 3",
+            "band of the leakage: below 67, 133, 200 mbar/s, or beyond",
+            leakage_band,
+        ),
+        Figure("quality", "%", "from the leakage: 100 % without any, 0 % at 500 mbar/s", quality),
+        Figure(
+            "free_flow",
+            "mbar",
+            "free-flow vacuum: where a second of suction stands still, from 5 mbar to H1",
+            free_flow,
+        ),
+        Figure(
+            "performance", "%", "from the free-flow vacuum: 100 % at 0 mbar, 0 % at H1", performance
+        ),
+        Figure("max_vacuum", "mbar", "highest vacuum in the cycle", max_vacuum),
+        Figure("h1_not_reached", "0 or 1", "suction ended without H1", h1_not_reached),
+        Figure(
+            "nozzle_share",
+            "%",
+            "valve-on time: share of the suction time with the nozzle on",
+            nozzle_share,
+        ),
+        Figure("air", "Nl", "compressed air through nozzle and blow-off", air),
+        Figure("energy", "Wh", "electric energy to compress that air", energy),
+        Figure("switchings", "-", "how often the nozzle was switched on", switchings),
+        Figure(
+            "quick_switchings",
+            "-",
+            "most switchings of the air saving within 3 s; valve protection begins at 6",
+            quick_switchings,
+        ),
+        Figure("supply", "bar", "mean operating pressure while the nozzle was on", supply),
+        Figure("lowest_supply", "bar", "the lowest of it (1 %)", lowest_supply),
+        Figure("highest_supply", "bar", "the highest of it (99 %)", highest_supply),
+    )
+}
+
+
+def figures(course: Course, unit: Unit) -> dict[str, float]:
+    """All key figures of one side of a cycle; NaN where it cannot tell."""
+    return {name: figure.of(course, unit) for name, figure in FIGURES.items()}
+
+
+def table() -> str:
+    """The figures as a table for people."""
+    rows = [f"| `{one.name}` | {one.unit} | {one.what} |" for one in FIGURES.values()]
+    return "\n".join(["| figure | unit | what |", "| --- | --- | --- |", *rows])

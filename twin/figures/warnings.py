@@ -1,0 +1,92 @@
+"""The field's warnings: one table, each judged on the measured figures of a whole cycle.
+
+So each is latched to the end of its cycle, and stands until the next one has been judged.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from twin.figures.settings import Limits
+from twin.model.control import PROTECTED_SWITCHES
+
+Measured = Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Caution:
+    """One warning: when it stands, and how it is said. Figures that are not known raise none."""
+
+    name: str
+    figure: str  # without which it cannot be judged
+    when: str
+    stands: Callable[[Measured, Limits], bool]
+    words: str  # with the figures, and the limits as {limits}
+
+
+CAUTIONS = {
+    one.name: one
+    for one in (
+        Caution(
+            "valve_protection",
+            "quick_switchings",
+            f"`quick_switchings` is {PROTECTED_SWITCHES} or more",
+            lambda m, _: m["quick_switchings"] >= PROTECTED_SWITCHES,
+            "the air saving switches too often ({quick_switchings:.0f} times in 3 s)",
+        ),
+        Caution(
+            "t1_over_limit",
+            "t1",
+            "`t1` is over `permitted_t1_ms`",
+            lambda m, limits: m["t1"] > limits.t1,
+            "t1 over limit ({t1:.0f} of {limits.t1:.0f} ms)",
+        ),
+        Caution(
+            "leakage_over_limit",
+            "leakage",
+            "`leakage` is over `permitted_leakage_mbar_s`",
+            lambda m, limits: m["leakage"] > limits.leakage,
+            "leakage over limit ({leakage:.0f} of {limits.leakage:.0f} mbar/s)",
+        ),
+        Caution(
+            "h1_not_reached",
+            "h1_not_reached",
+            "`h1_not_reached` is 1",
+            lambda m, _: m["h1_not_reached"] > 0.0,
+            "H1 not reached (highest {max_vacuum:.0f} mbar)",
+        ),
+        Caution(
+            "free_flow_too_high",
+            "free_flow",
+            "`free_flow` is over `permitted_free_flow_mbar`",
+            lambda m, limits: m["free_flow"] > limits.free_flow,
+            "free-flow vacuum too high ({free_flow:.0f} of {limits.free_flow:.0f} mbar):"
+            " an open cup is clogged, or a held part leaks",
+        ),
+        Caution(
+            "supply_out_of_range",
+            "lowest_supply",
+            "`lowest_supply` or `highest_supply` is beyond `supply_low_bar` to `supply_high_bar`",
+            lambda m, limits: (
+                m["lowest_supply"] < limits.supply[0] or m["highest_supply"] > limits.supply[1]
+            ),
+            "supply out of range ({lowest_supply:.1f} to {highest_supply:.1f} of"
+            " {limits.supply[0]:g} to {limits.supply[1]:g} bar)",
+        ),
+    )
+}
+
+
+def warnings(measured: Measured, limits: Limits) -> tuple[str, ...]:
+    """The names of the warnings that a cycle gives, in the order of the table."""
+    return tuple(name for name, one in CAUTIONS.items() if one.stands(measured, limits))
+
+
+def in_words(names: Sequence[str], measured: Measured, limits: Limits) -> list[str]:
+    """The same for people, with figure and limit."""
+    return [CAUTIONS[name].words.format(**measured, limits=limits) for name in names]
+
+
+def table() -> str:
+    """The warnings as a table for people."""
+    rows = [f"| `{one.name}` | {one.when} |" for one in CAUTIONS.values()]
+    return "\n".join(["| warning | stands while |", "| --- | --- |", *rows])

@@ -1,0 +1,237 @@
+"""The PLC's clock against the one here: how far apart, how fast they part, and when one was set.
+
+A sample is received later than it was taken, sometimes much later, and never earlier: the fastest
+of many receipts tells the clocks' distance, but for the shortest way a sample can take. A line
+through the fastest of each window tells how fast they part. Where the PLC counts its scans, a clock
+that was set shows against the count, whatever the way does meanwhile.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from twin.events import Event, Kind
+from twin.signals import SAMPLE, Quality, Samples
+
+WINDOW_NS = 5_000_000_000  # of PLC time; the fastest receipt of each counts
+KEPT = 120  # windows: ten minutes, over which the drift of a quartz is steady
+EVERY = 12  # windows from one report to the next
+FEWEST = 3  # windows for a report
+FULL = 20  # receipts, of which one came by the shortest way: for a window that was cut off
+LEAD = 64  # rows from which the scans' period is taken
+SET_NS = 3_000_000  # a clock that was set by less cannot be told from the PLC's jitter
+CONFIRMED = 3  # receipts that must agree that it was set
+FARTHEST = 1000  # scans between two receipts; beyond, the period is not known that well
+SHORTER, LONGER = 2, 12  # windows after which a way that is shorter, or longer, is a clock's doing
+
+_NEW = int(Quality.RESTART | Quality.CLOCK)  # after these another time begins
+
+Integers = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The PLC's clock less the one here, less the shortest way; ± half of a 95 % interval."""
+
+    offset_ms: float
+    offset_pm_ms: float
+    drift_ppm: float  # above zero the PLC's clock is the faster one
+    drift_pm_ppm: float
+
+    def __str__(self) -> str:
+        ahead = "ahead of" if self.offset_ms > 0 else "behind"
+        runs = "fast" if self.drift_ppm > 0 else "slow"
+        return (
+            f"the PLC's clock is {_long(abs(self.offset_ms))} {ahead} the one here"
+            f" (± {_long(self.offset_pm_ms)}) and runs {abs(self.drift_ppm):.2g} ppm {runs}"
+            f" (± {self.drift_pm_ppm:.2g})"
+        )
+
+
+def _long(ms: float) -> str:
+    return f"{ms:.2f} ms" if ms < 1e4 else f"{ms / 1e3:.1f} s"
+
+
+def line(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> tuple[float, float, float]:
+    """Slope, half of its 95 % interval, and value at the last ``x``; a third may be wild.
+
+    Theil and Sen's line, as SciPy has it, whose import alone would take longer than a block may.
+    """
+    n = len(x)
+    i, j = np.triu_indices(n, 1)
+    slopes = np.sort((y[j] - y[i]) / (x[j] - x[i]))
+    slope = float(np.median(slopes))
+    reach = 1.96 * np.sqrt(n * (n - 1) * (2 * n + 5) / 18)
+    low = max(round((len(slopes) - reach) / 2) - 1, 0)
+    high = min(round((len(slopes) + reach) / 2), len(slopes) - 1)
+    at_end = float(np.median(y - slope * (x - x[-1])))
+    return slope, float(slopes[high] - slopes[low]) / 2, at_end
+
+
+@dataclass
+class ClockWatch:
+    """Takes rows in, gives what they tell of the clocks; all of it in PLC time."""
+
+    _receipt: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # its newest row
+    _lead: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))
+    _period: float = 0.0  # ns a scan; 0 until it is known
+    _zero: tuple[int, int] | None = None  # PLC time, and host less PLC time, counted from here
+    _last: tuple[int, int] = (0, 0)  # PLC time and sequence of the receipt before
+    _apart: float = 0.0  # ns, PLC time from where the count of the scans says it is
+    _aside: list[float] = field(default_factory=list)  # the same of receipts where that is far
+    _window: int = 0
+    _fastest: tuple[int, int] | None = None  # of the window: time and way, ns
+    _receipts: int = 0  # in the window
+    _points: list[tuple[int, int]] = field(default_factory=list)  # of the windows before
+    _since: int = 0  # windows since the last report
+    _off: int = 0  # windows in a row that are off the line, below zero where they are too early
+
+    def push(self, samples: Samples) -> list[Event]:
+        """Take rows without a break, but maybe before the first one."""
+        if not len(samples):
+            return []
+        events = []
+        if samples["quality"][0] & _NEW:
+            events += self.close()
+            self._begin()
+        rows = np.concatenate([self._receipt, samples])
+        self._receipt = rows[-1:].copy()
+        self._learn(samples)
+        for time_ns, host_ns, sequence in self._compared(rows[:-1][np.diff(rows["host_ns"]) != 0]):
+            events += self._take(time_ns, host_ns, sequence)
+        return events
+
+    def close(self) -> list[Event]:
+        """Give what the rows since the last report tell, if it is enough."""
+        if not len(self._receipt):
+            return []
+        if self._receipts >= FULL:
+            self._finish_window()
+        return list(self._report(int(self._receipt["time_ns"][0])))
+
+    def _begin(self) -> None:
+        fresh = ClockWatch()
+        self.__dict__.update(fresh.__dict__)
+
+    def _learn(self, samples: Samples) -> None:
+        """The period of the scans, from the first rows, however they are cut into blocks."""
+        if self._period:
+            return
+        self._lead = np.concatenate([self._lead, samples[: LEAD - len(self._lead)]])
+        if len(self._lead) == LEAD:
+            scans = np.maximum(np.diff(self._lead["sequence"]), 1)
+            us = np.median(np.diff(self._lead["time_ns"]) / scans) / 1e3
+            self._period = max(float(np.rint(us)), 1.0) * 1e3
+
+    def _compared(self, newest: Samples) -> Iterator[tuple[int, int, int]]:
+        """Receipts that can tell anything: where it is PLC time itself, there is one clock only."""
+        newest = newest[newest["host_ns"] != newest["time_ns"]]
+        columns = (newest[name].tolist() for name in ("time_ns", "host_ns", "sequence"))
+        return zip(*columns, strict=True)
+
+    def _take(self, time_ns: int, host_ns: int, sequence: int) -> Iterator[Event]:
+        way = host_ns - time_ns
+        if self._zero is None:
+            self._zero = time_ns, way
+        elif (moved := self._was_set(time_ns, sequence)) is not None:
+            yield from self._moved(time_ns, moved, "PLC time was set by {:+.1f} ms")
+            self._zero = time_ns, way
+        self._last = time_ns, sequence
+        at = time_ns - self._zero[0], way - self._zero[1]
+        if at[0] // WINDOW_NS != self._window:
+            yield from self._next_window(time_ns)
+            if self._zero is None:  # it begins anew
+                self._zero, at = (time_ns, way), (0, 0)
+            self._window = at[0] // WINDOW_NS
+        self._receipts += 1
+        if self._fastest is None or at[1] < self._fastest[1]:
+            self._fastest = at
+
+    # --- a clock that was set -------------------------------------------------------------------
+
+    def _was_set(self, time_ns: int, sequence: int) -> float | None:
+        """By how much (ns) PLC time moved against the count some receipts ago, if it stayed so."""
+        scans = sequence - self._last[1]
+        if not self._period or not 0 < scans <= FARTHEST:
+            self._apart = 0.0
+            self._aside.clear()
+            return None
+        self._apart += time_ns - self._last[0] - scans * self._period
+        if abs(self._apart) < max(SET_NS, 2 * self._period):
+            self._apart = 0.0  # the count's own clock may run a little differently
+            self._aside.clear()
+            return None
+        self._aside.append(self._apart)
+        if len(self._aside) <= CONFIRMED:
+            return None
+        least, most = min(self._aside), max(self._aside)
+        return float(np.median(self._aside)) if least * most > 0 else None
+
+    def _moved(self, time_ns: int, by_ns: float, text: str) -> Iterator[Event]:
+        """A clock was set: what was known is told, and the estimate begins anew."""
+        self._fastest, self._receipts = None, 0  # before it was set, or after: who knows
+        yield from self._report(time_ns)
+        data = {"jump_s": by_ns * 1e-9}
+        yield Event(time_ns, Kind.CLOCK_JUMPED, text.format(by_ns * 1e-6), data)
+        receipt, period = self._receipt, self._period
+        self._begin()
+        self._receipt, self._period = receipt, period
+
+    # --- the fastest of each window -------------------------------------------------------------
+
+    def _next_window(self, time_ns: int) -> Iterator[Event]:
+        off = self._finish_window()
+        if -self._off >= SHORTER or self._off >= LONGER:
+            text = "the clocks were moved by {:+.1f} ms against each other"
+            text += ", or the samples' way is longer now" if self._off > 0 else ""
+            yield from self._moved(time_ns, -off, text)
+        elif self._since >= EVERY:
+            yield from self._report(time_ns)
+
+    def _finish_window(self) -> float:
+        """Take the window's fastest; how far it is off the line (ns), where that is far."""
+        if self._fastest is None:
+            return 0.0
+        off = self._beyond(self._fastest)
+        self._off = 0 if not off else int(np.sign(off)) + (self._off if off * self._off > 0 else 0)
+        self._points = [*self._points[-KEPT + 1 :], self._fastest]
+        self._since, self._fastest, self._receipts = self._since + 1, None, 0
+        return off
+
+    def _beyond(self, point: tuple[int, int]) -> float:
+        if len(self._sure) < FEWEST:
+            return 0.0
+        x, y = self._columns()
+        slope, _, at_end = line(x, y)
+        off = point[1] - at_end - slope * (point[0] - x[-1])
+        scatter = 1.4826 * float(np.median(np.abs(y - at_end - slope * (x - x[-1]))))
+        return off if abs(off) > max(SET_NS, 8.0 * scatter) else 0.0
+
+    def _report(self, time_ns: int) -> Iterator[Event]:
+        if len(self._sure) < FEWEST or not self._since or self._zero is None:
+            return
+        self._since = 0
+        estimate = self._estimate(time_ns - self._zero[0], self._zero[1])
+        data = {name: float(f"{value:.6g}") for name, value in vars(estimate).items()}
+        data["offset_ms"] = round(float(estimate.offset_ms), 3)
+        yield Event(time_ns, Kind.CLOCK, str(estimate), data)
+
+    def _estimate(self, now: int, zero: int) -> Estimate:
+        """At ``now``, which the line is drawn out to."""
+        x, y = self._columns()
+        slope, slope_pm, at_end = line(x, y)
+        scatter = 1.4826 * float(np.median(np.abs(y - at_end - slope * (x - x[-1]))))
+        offset_pm = 1.96 * scatter + slope_pm * float(x[-1] - x[0]) / 2
+        here = at_end + slope * (now - x[-1])
+        return Estimate(-(zero + here) * 1e-6, offset_pm * 1e-6, -slope * 1e6, slope_pm * 1e6)
+
+    @property
+    def _sure(self) -> list[tuple[int, int]]:
+        """Windows without the last ones, if these are off the line: it may be another one."""
+        return self._points[: len(self._points) - abs(self._off)]
+
+    def _columns(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        x, y = np.array(self._sure, np.float64).T
+        return x, y
