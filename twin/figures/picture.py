@@ -11,6 +11,7 @@ from twin.errors import SourceError
 from twin.figures.store import History
 from twin.figures.table import Figure
 from twin.figures.trend import DAY_NS, FARTHEST, Line, Reach
+from twin.figures.words import in_words
 
 MOST_POINTS = 5000  # of cycles
 AHEAD = 0.5  # of the record, drawn after its end where nothing is reached
@@ -42,6 +43,7 @@ def draw(
         _draw_limit(axes, limit)
     axes.set_xlabel("days from the last cycle")
     axes.set_ylabel(f"{figure.name} ({figure.unit})")
+    picture.suptitle(in_words(figure, line, limit, comes), x=0.01, ha="left", fontsize=10)
     picture.legend(loc="outside right upper", fontsize="small")
     axes.margins(x=0.01)
     try:
