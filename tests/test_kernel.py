@@ -10,6 +10,7 @@ from stepping import MASSES, PRESSURES, advance, temperature
 
 from twin.model import kernel
 from twin.model import theta as c
+from twin.model.gas import GAMMA
 from twin.model.theta import Theta
 from twin.signals import BREAK, MBAR, MS, SAMPLE, Command, Phase, Quality, Samples
 
@@ -169,6 +170,25 @@ def test_room_that_is_added_comes_with_gas_of_its_own() -> None:
     assert state[PRESSURES].tolist() == before[PRESSURES].tolist()
     assert temperature(after, state) == pytest.approx(temperature(theta, before))
     assert state[MASSES[:2]].tolist() == before[MASSES[:2]].tolist()
+
+
+def test_a_wall_that_gives_way_squeezes_the_gas() -> None:
+    theta = rigs.theta("gripper")
+    state = kernel.at_rest(theta)
+    advance(theta, [(SUCTION, 400)], state)
+    after = theta.copy()
+    after[c.COMPLIANCE] += 30e-6
+    before = state.copy()
+    kernel.take_over(state, theta, after)
+    assert state[MASSES].tolist() == before[MASSES].tolist()
+    pressure = state[kernel.VESSEL] / before[kernel.VESSEL]
+    room = (
+        after[c.VOLUME] - after[c.COMPLIANCE] * (1.0 - state[kernel.VESSEL] / after[c.AMBIENT])
+    ) / theta[c.VOLUME]
+    assert pressure > 1.1
+    assert pressure * room**GAMMA == pytest.approx(1.0, abs=1e-9)
+    kernel.take_over(state, after, theta)
+    assert state == pytest.approx(before)
 
 
 # A gripper's part.

@@ -15,7 +15,16 @@ from twin.model import theta as c
 from twin.model.compiled import compiled, inlined
 from twin.model.control import air_saving, new_timer, nothing_done, part_present, switch, timed
 from twin.model.gas import GAMMA, R
-from twin.model.plant import ORDER, PREPARED, Gas, Lags, prepare, reading, sensed_at
+from twin.model.plant import (
+    LOWEST,
+    ORDER,
+    PREPARED,
+    Gas,
+    Lags,
+    prepare,
+    reading,
+    sensed_at,
+)
 from twin.model.plant import advance as advance_gas
 from twin.signals import Command, Phase, Signal
 
@@ -36,6 +45,7 @@ NEVER = 1e9  # s, an age that is past every delay
 # A step in which a valve moves, a cup opens or blow-off passes ambient pressure (the exhaust opens)
 # is done in the most steps; any other in as many as keep each within the tolerance.
 FINEST = 24  # steps
+SQUEEZES = 6  # rounds of Newton's method, from a pressure at most ten times off
 TOLERANCE = 0.02  # Pa, of a step, by which a scheme of second order may be off
 ROUGHLY = 1.0  # Pa, the same where many hypotheses are tried: far below what a sensor resolves
 
@@ -128,17 +138,40 @@ def at_rest(theta: c.Theta) -> State:
 
 
 def take_over(state: State, before: c.Theta, after: c.Theta) -> None:
-    """Let ``state`` go on under other coefficients: where room is added, gas comes with it."""
+    """Let ``state`` go on under other coefficients.
+
+    Where room is added, gas comes with it; a wall that gives way squeezes the gas that is there.
+    """
     for mass, volume in ((PORT_MASS, c.PORT_VOLUME), (LINE_MASS, c.LINE_VOLUME)):
         state[mass] *= after[volume] / before[volume]
-    state[VESSEL_MASS] *= _room(state, after) / _room(state, before)
+    room = _room(state[VESSEL], before)
+    joined = room + (after[c.VOLUME] - before[c.VOLUME])
+    state[VESSEL_MASS] *= joined / room
+    walls = (after[[c.COMPLIANCE, c.AMBIENT]] != before[[c.COMPLIANCE, c.AMBIENT]]).any(axis=0)
+    moved = walls & (state[VALID] > 0.0)
+    if moved.any():
+        vessel = np.where(moved, state[VESSEL], LOWEST)
+        state[VESSEL] = np.where(moved, _squeezed(vessel, joined, after), state[VESSEL])
 
 
-def _room(state: State, theta: c.Theta) -> State:
-    """Volume of the vessel as it is (m³), shrunk by its vacuum."""
-    vacuum: State = 1.0 - state[VESSEL] / theta[c.AMBIENT]
-    room: State = theta[c.VOLUME] - theta[c.COMPLIANCE] * vacuum
+def _room(vessel: State, theta: c.Theta) -> State:
+    """Volume of the vessel at a pressure (m³), shrunk by its vacuum."""
+    room: State = theta[c.VOLUME] - theta[c.COMPLIANCE] * (1.0 - vessel / theta[c.AMBIENT])
     return room
+
+
+def _squeezed(vessel: State, joined: State, theta: c.Theta) -> State:
+    """Pressure (Pa) of gas that filled ``joined`` (m³) once its walls stand as they do now.
+
+    Without time for heat: p V^γ stays, and V depends on p. Newton's method on the logarithm.
+    """
+    pressure = vessel.copy()
+    for _ in range(SQUEEZES):
+        room = _room(pressure, theta)
+        off = np.log(pressure / vessel) + GAMMA * np.log(room / joined)
+        slope = 1.0 / pressure + GAMMA * theta[c.COMPLIANCE] / theta[c.AMBIENT] / room
+        pressure *= np.exp(-off / slope / pressure)
+    return pressure
 
 
 @inlined
