@@ -29,7 +29,7 @@ TAGS = {
 
 
 def settings_for(server: ModbusServer, **changes: Any) -> ModbusSettings:
-    table = {"host": "127.0.0.1", "port": server.port, "timeout_ms": 60, "tags": TAGS}
+    table = {"host": "127.0.0.1", "port": server.port, "timeout_ms": 250, "tags": TAGS}
     return ModbusSettings.model_validate(table | changes)
 
 
