@@ -73,7 +73,7 @@ class NodeTrace(Follower[Header, OpcuaLink]):
 
     def start(self, link: OpcuaLink) -> Header:
         """Begin at the newest record; SourceError if there is no ring as configured."""
-        ring = self.ask(link)
+        ring = self._steady(self.ask(link))
         self.refuse_other(ring.header)
         newest = ring.header.sequence
         announced = np.arange(max(0, newest - 2 * RESERVE), max(0, newest - ring.margin) + 1)

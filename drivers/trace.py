@@ -6,7 +6,7 @@ its sequence; whatever is missing shows as a missing number and as a flag on the
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -32,6 +32,7 @@ class Header:
     boot: int  # differs after every restart
     period_ns: int
     depth: int  # records
+    unsure_ns: int = field(default=0, kw_only=True)  # so far off its time may be
 
     @property
     def ready(self) -> bool:
@@ -133,18 +134,31 @@ class Follower(ABC, Generic[H, L]):
         """The same with its time as the scans say, as far as that can be.
 
         Time and sequence may be of moments up to ``scans_apart`` from each other: they tell the
-        time of a scan only to within that. Within it, time runs on evenly.
+        time of a scan only to within that. Within it, time runs on evenly. Where the count of time
+        begins it may be that far off; as this shows, it is put right little by little, so that
+        time never steps.
         """
-        assert self._header is not None
-        scans = header.advance(self._header)
-        if scans is None:
-            return header
-        expected = self._header.time_ns + scans * header.period_ns
         off = scans_apart * header.period_ns
-        if abs(header.time_ns - expected) > max(CLOCK_TOLERANCE_NS, off):
-            return header  # the clock was set
-        time_ns = min(max(expected, header.time_ns - off), header.time_ns + off)
-        return replace(header, time_ns=time_ns)
+        scans = header.advance(self._header) if self._header else None
+        if self._header is None or scans is None:
+            return replace(header, unsure_ns=off)
+        expected = self._header.time_ns + scans * header.period_ns
+        ran = header.time_ns - expected
+        if abs(ran) > max(CLOCK_TOLERANCE_NS, off + self._header.unsure_ns):
+            return replace(header, unsure_ns=off)  # the clock was set
+        shift = min(max(0, ran - off), ran + off)
+        if abs(shift) <= self._header.unsure_ns:
+            earliest, latest = self._evenly(header, scans)
+            shift = max(shift, min(earliest - expected, 0))
+            shift = min(shift, max(latest - expected, 0))
+        unsure = min(self._header.unsure_ns, abs(ran - shift) + off)
+        return replace(header, time_ns=expected + shift, unsure_ns=unsure)
+
+    def _evenly(self, header: H, scans: int) -> tuple[int, int]:
+        """Times for ``header`` with which the next sample is half a period early, or late."""
+        to_next = self._newest + scans - self._last - 1
+        due = self._last_ns + (to_next + 1) * header.period_ns
+        return due - header.period_ns // 2, due + header.period_ns // 2
 
     def _pass(self, first: int, valid: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
         """Sequences of the valid ones of the records from ``first`` on; go on after them."""

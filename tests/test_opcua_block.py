@@ -230,6 +230,68 @@ def test_a_small_correction_of_the_plcs_clock_is_followed(rig: Rig) -> None:
     assert not flags(samples, Quality.CLOCK)
 
 
+SEQUENCE_FIRST, TIME_FIRST = [0, 1, 2, 3, 4, 5, 6, 7], [1, 0, 2, 3, 4, 5, 6, 7]
+TORN = [20, 0, 0, 0, 0, 0, 0, 0]  # so many scans lie between sequence and time
+
+
+def assert_even(rig: Rig, samples: Samples) -> None:
+    """Time runs on without a step but where a jump is flagged, and is right at the end."""
+    steps = np.delete(np.diff(samples["time_ns"]), np.array(flags(samples, Quality.CLOCK), int) - 1)
+    assert (steps >= 500_000).all()
+    assert (steps <= 1_500_000).all()
+    newest = rig.server.time_ns - (rig.server.sequence - samples["sequence"][-1]) * 1_000_000
+    assert samples["time_ns"][-1] == pytest.approx(newest, abs=1_000_000)
+
+
+@pytest.mark.parametrize("order", [SEQUENCE_FIRST, TIME_FIRST])
+def test_time_that_is_torn_from_its_sequence_at_the_start_is_put_right_without_a_step(
+    order: list[int],
+) -> None:
+    rig = Rig(TornServer(sequence=3000))
+    rig.server.order, rig.server.pauses = order, TORN
+    first = rig.take(2)
+    rig.server.pauses = []
+    samples = np.concatenate([first, rig.take(60)])
+    assert not flags(samples, Quality.CLOCK)
+    assert_even(rig, samples)
+
+
+@pytest.mark.parametrize("order", [SEQUENCE_FIRST, TIME_FIRST])
+@pytest.mark.parametrize("jump_ms", [-10_000, 3_600_000])
+def test_a_clock_that_is_set_while_the_server_is_slow_is_flagged_once(
+    rig: Rig, order: list[int], jump_ms: int
+) -> None:
+    before = rig.take(3)
+    rig.server.time_ns += jump_ms * 1_000_000
+    rig.server.order, rig.server.pauses = order, TORN
+    then = rig.take(2)
+    rig.server.pauses = []
+    samples = np.concatenate([before, then, rig.take(60)])
+    assert flags(samples, Quality.CLOCK) == [len(before)]
+    assert_even(rig, samples)
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    order=st.permutations(range(8)),
+    pauses=st.lists(st.integers(0, 8), min_size=8, max_size=8),
+    jump_ms=st.sampled_from([0, -10_000, 3_600_000]),
+)
+def test_time_steps_only_where_the_clock_was_set(
+    order: list[int], pauses: list[int], jump_ms: int
+) -> None:
+    rig = Rig(TornServer(sequence=3000))
+    rig.server.order, rig.server.pauses = order, pauses
+    parts = [rig.take(4)]
+    rig.server.time_ns += jump_ms * 1_000_000
+    parts.append(rig.take(4))
+    rig.server.pauses = []
+    samples = np.concatenate([*parts, rig.take(140)])
+    assert len(flags(samples, Quality.CLOCK)) == (jump_ms != 0)
+    assert (np.diff(samples["sequence"]) == 1).all()
+    assert_even(rig, samples)
+
+
 @pytest.mark.parametrize("depth", [DEPTH, 900])
 def test_the_sequence_goes_on_beyond_32_bits(depth: int) -> None:
     rig = Rig(TornServer(depth, (1 << 32) - 1100))
