@@ -1,9 +1,10 @@
 """Measure what the twin costs, each figure beside its floor in the same run.
 
-    python tools/bench.py [--long] [--only NAME ...]
+    python tools/bench.py [--long] [--only NAME ...] [--seconds S]
 
 Prints a table and writes docs/bench.json and docs/bench.md; with --only it prints only. The short
-run takes some minutes, --long acquires for ten minutes.
+run takes some minutes, --long acquires for ten minutes, and over OPC UA too (twice; node-opcua has
+to be there: npm ci --prefix tests/peers), where --seconds says for how long.
 """
 
 import argparse
@@ -16,13 +17,26 @@ from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
-from benchmarks import acquisition, calibration, kernel, log, machine, polling, replay
+from benchmarks import acquisition, calibration, kernel, log, machine, opcua, polling, replay
 from benchmarks.figures import Benchmark, Figure, Measured, Run, kept
 from benchmarks.processes import ROOT
 
 INTERRUPTED, TERMINATED = 130, 143
 BARE_FETCH = "bare socket that fetches the same registers"
 STARTED = "Python that imports numba, numpy, pydantic, typer"
+
+BARE_OPCUA = "asyncua alone that reads the same arrays"
+
+
+def _over_opcua(plc: str) -> tuple[Figure, ...]:
+    name = f"OPC UA, {plc}, stopped for 300 ms every 10 s"
+    return (
+        Figure(f"{name}: lost samples", "", limit=0),
+        Figure(f"{name}: CPU of the live process", "% of a core", BARE_OPCUA, 10.0),
+        Figure(f"{name}: from sample to receipt, 99th percentile", "ms"),
+        Figure(f"{name}: from sample to event, 99th percentile", "ms", limit=70.0),
+    )
+
 
 BENCHMARKS = (
     Benchmark(
@@ -45,6 +59,22 @@ BENCHMARKS = (
             Figure("stopped for 300 ms every 10 s: lost samples", "", limit=0),
             Figure("stopped for 300 ms every 10 s: CPU", "% of a core", BARE_FETCH, 8.0),
         ),
+    ),
+    Benchmark(
+        "opcua",
+        opcua.ours,
+        "`twin run` with its log reads the trace's arrays every 50 ms, and gets SIGSTOP for 300 ms "
+        "in every slice of 10 s; an event is published when its line comes out of the console. "
+        "Left out of both latencies is what was under way during a stop.",
+        _over_opcua("our PLC"),
+        long=True,
+    ),
+    Benchmark(
+        "opcua-other",
+        opcua.other,
+        "The same beside node-opcua's server, which serves cycles of the simulated rig.",
+        _over_opcua("node-opcua"),
+        long=True,
     ),
     Benchmark(
         "polling",
@@ -124,9 +154,9 @@ def main() -> int:
     before, load = machine.noise(), machine.Load.now()
     results = []
     with tempfile.TemporaryDirectory(prefix="ejector-twin-bench-") as folder:
-        run = Run(given.long, Path(folder), _tell)
+        run = Run(given.long, Path(folder), _tell, given.seconds)
         for benchmark in BENCHMARKS:
-            if not given.only or benchmark.name in given.only:
+            if _wanted(benchmark, given):
                 results += zip(benchmark.figures, benchmark.measure(run), strict=True)
     _tell("")
     notes = [
@@ -145,7 +175,12 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--long", action="store_true", help="acquire for ten minutes")
     names = [benchmark.name for benchmark in BENCHMARKS]
     parser.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=", ".join(names))
+    parser.add_argument("--seconds", type=float, help="acquire over OPC UA for so long")
     return parser.parse_args()
+
+
+def _wanted(benchmark: Benchmark, given: argparse.Namespace) -> bool:
+    return benchmark.name in given.only if given.only else given.long or not benchmark.long
 
 
 def _tell(text: str) -> None:

@@ -1,5 +1,6 @@
 // An OPC UA server of other make: a trace as arrays, and single nodes, of a known signal.
 // usage: node opcua_server.js '{"port": 0, "folder": ".", "policies": [...], "users": {...}}'
+// "signal": a JSON file with {"pressures": [mbar], "statuses": []} is served over and over instead.
 "use strict";
 const fs = require("fs");
 const path = require("path");
@@ -20,8 +21,12 @@ const sequences = new Uint32Array(DEPTH);
 const statuses = new Uint16Array(DEPTH);
 const pressures = new Float32Array(DEPTH);
 
-const pressure = (scan) => 200 + (scan % 4096) * 0.25; // mbar, says which scan it is
-const status = (scan) => [0, 1, 0, 2][(scan >> 8) & 3];
+const signal = options.signal && JSON.parse(fs.readFileSync(options.signal, "utf8"));
+const served = (column, scan) => column[scan % column.length];
+const pressure = (scan) => ( // mbar, says which scan it is
+  signal ? served(signal.pressures, scan) : 200 + (scan % 4096) * 0.25);
+const status = (scan) => (
+  signal ? served(signal.statuses, scan) : [0, 1, 0, 2][(scan >> 8) & 3]);
 
 function catchUp() {
   const now = Number((process.hrtime.bigint() - first) / 1000000n);

@@ -43,6 +43,7 @@ class Run:
     long: bool
     folder: Path
     tell: Callable[[str], None]
+    seconds: float | None = None  # of acquisition over OPC UA, instead of what is usual
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ class Benchmark:
     measure: Callable[[Run], Sequence[Measured]]
     how: str
     figures: Sequence[Figure]
+    long: bool = False  # only in a long run, or where it is named
 
 
 def kept(figure: Figure, measured: Measured) -> bool | None:
