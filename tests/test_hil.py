@@ -470,7 +470,8 @@ def modbus_requests(sent: bytearray) -> list[tuple[int, int]]:
     return requests
 
 
-READ_REQUEST, WRITE_REQUEST = 631, 673  # NodeIds of their binary encodings
+# NodeIds of their binary encodings
+READ_REQUEST, WRITE_REQUEST, PUBLISH_REQUEST = 631, 673, 826
 
 
 def opcua_services(sent: bytearray) -> list[int]:
@@ -546,15 +547,20 @@ def test_beside_a_plc_only_reading_function_codes_are_sent(
     assert {function for function, _ in requests} <= {1, 2, 3, 4}
 
 
+@pytest.mark.parametrize(
+    ("mode", "asked"), [("block", READ_REQUEST), ("subscribe", PUBLISH_REQUEST)]
+)
 def test_beside_an_opcua_server_no_write_is_sent(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    mode: str, asked: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with partner_plc(tmp_path, "test_rig_opcua") as (_, port), closing(Tap(port)) as tap:
-        config = tmp_path / "test_rig_opcua.toml"
+        config = configured(
+            tmp_path, "test_rig_opcua", lambda tables: tables["driver"].update(mode=mode)
+        )
         command = ("run", config, "--address", f"127.0.0.1:{tap.port}", "--duration")
         assert twin(monkeypatch, *command, "2") == 0
         services = [one for sent in tap.sent for one in opcua_services(sent)]
-        assert services.count(READ_REQUEST) > 20
+        assert services.count(asked) > 20
         assert WRITE_REQUEST not in services
         assert twin(monkeypatch, *command, "2", "--hil") == 0  # that the tap would have seen it
         assert WRITE_REQUEST in [one for sent in tap.sent for one in opcua_services(sent)]

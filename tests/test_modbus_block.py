@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rigs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,6 +15,8 @@ from drivers.lasting import Clock
 from drivers.modbus import ModbusSettings, blocks
 from tests.modbus_server import CUT, HALF, SILENT, ModbusServer, PlcTime, TracePlc
 from twin.errors import SourceError
+from twin.events import Kind
+from twin.monitor.clock import ClockWatch
 from twin.signals import SAMPLE, Quality, Samples
 
 TAGS = {
@@ -319,6 +322,17 @@ def test_a_small_correction_of_the_plcs_clock_is_no_jump(rig: Rig) -> None:
     rig.at_work()
     rig.plc.time_ns += 2_000_000
     assert not rig.take(3)["quality"].any()
+
+
+def test_a_clock_that_is_set_ahead_by_little_is_told_once(rig: Rig) -> None:
+    rig.at_work()
+    watch = ClockWatch()
+    before = rig.take(100)
+    rig.plc.time_ns += 20_000_000
+    samples = np.concatenate([before, rig.take(20)])
+    (jump,) = [event for block in rigs.cut(samples, 30) for event in watch.push(block)]
+    assert jump.kind is Kind.CLOCK_JUMPED
+    assert jump.data["jump_s"] * 1e3 == pytest.approx(20.0, abs=1.0)
 
 
 def test_a_small_step_back_of_the_plcs_clock_is_flagged(rig: Rig) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rigs
 from asyncua import ua
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,6 +16,8 @@ from drivers.lasting import Clock, LostError, lasting
 from drivers.opcua_settings import Node, OpcuaSettings
 from drivers.opcua_trace import NodeTrace
 from twin.errors import SourceError
+from twin.events import Event, Kind
+from twin.monitor.clock import ClockWatch
 from twin.signals import SAMPLE, Quality, Samples
 
 T = ua.VariantType
@@ -269,6 +272,30 @@ def test_a_clock_that_is_set_while_the_server_is_slow_is_flagged_once(
     samples = np.concatenate([before, then, rig.take(60)])
     assert flags(samples, Quality.CLOCK) == [len(before)]
     assert_even(rig, samples)
+
+
+def told_of_clocks(samples: Samples) -> list[Event]:
+    watch = ClockWatch()
+    return [event for block in rigs.cut(samples, 50) for event in watch.push(block)]
+
+
+def test_a_clock_that_is_set_ahead_by_little_is_told_once(rig: Rig) -> None:
+    before = rig.take(400)
+    rig.server.time_ns += 20_000_000
+    events = told_of_clocks(np.concatenate([before, rig.take(20)]))
+    estimate, jump = events
+    assert estimate.kind is Kind.CLOCK
+    assert estimate.data["drift_ppm"] == pytest.approx(-20.0, abs=2.0)  # as PlcTime runs here
+    assert jump.kind is Kind.CLOCK_JUMPED
+    assert jump.data["jump_s"] * 1e3 == pytest.approx(20.0, abs=1.0)
+
+
+def test_time_that_is_put_right_is_no_clock_that_was_set() -> None:
+    rig = Rig(TornServer(sequence=3000))
+    rig.server.pauses = TORN
+    first = rig.take(2)
+    rig.server.pauses = []
+    assert told_of_clocks(np.concatenate([first, rig.take(100)])) == []
 
 
 @settings(max_examples=20, deadline=None)

@@ -3,19 +3,23 @@
 import asyncio
 import json
 import math
+import signal
 import subprocess
+import sys
 import threading
 import time
+import tomllib
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import rigs
+import tomli_w
 from asyncua import Client, ua
-from independent import PEERS, node
+from independent import PEERS, free_port, node
 from opcua_plc import acquainted
 from plc_process import start_plc
 from pydantic import ValidationError
@@ -567,3 +571,42 @@ def test_beside_a_plc_the_results_follow(server: ResultsServer) -> None:
     assert expected.Value.Value == pytest.approx(pressure.Value.Value, abs=5.0)
     assert seen_ns[0] - ua_ns(pressure.SourceTimestamp) < 2e9
     assert sink.health.standing is Standing.STOPPED
+
+
+def test_twin_run_serves_them_to_whoever_asks(tmp_path: Path) -> None:
+    port = free_port()
+    tables = tomllib.loads(rigs.path_of("test_rig").read_text(encoding="utf-8"))
+    tables["plc"]["program"]["commands"] = "coils"  # which nobody sets: it stays idle
+    tables["results"] = {"opcua": True, "port": port}
+    config = tmp_path / "rig.toml"
+    config.write_text(tomli_w.dumps(tables), encoding="utf-8")
+    names = [f"rig-01.{name}" for name in ("Meas.Pressure", "Model.Expected", "Health.State")]
+    with start_plc(config) as plc:
+        command = [sys.executable, "-m", "twin.cli", "run", str(config)]
+        command += ["--address", f"127.0.0.1:{plc.port}"]
+        with subprocess.Popen(command, cwd=rigs.ROOT, stdout=subprocess.DEVNULL) as process:
+            try:
+                values = asyncio.run(good(f"opc.tcp://127.0.0.1:{port}", names))
+                process.send_signal(signal.SIGINT)
+                assert process.wait(30) == 130
+            finally:
+                process.kill()
+    pressure, expected, state = (value.Value.Value for value in values)
+    assert pressure == pytest.approx(1013.0, abs=5.0)
+    assert expected == pytest.approx(1013.0, abs=5.0)
+    assert state == Standing.OK
+
+
+async def good(url: str, names: list[str], patience_s: float = 60.0) -> list[ua.DataValue]:
+    """What is served there once all of it is good."""
+    end = time.monotonic() + patience_s
+    while True:
+        assert time.monotonic() < end
+        await asyncio.sleep(0.2)
+        with suppress(OSError, TimeoutError, ua.UaError, ValueError):
+            async with Client(url) as client:
+                index = await client.get_namespace_index(NAMESPACE)
+                nodes = [client.get_node(f"ns={index};s={name}") for name in names]
+                values = [await node.read_data_value(raise_on_bad_status=False) for node in nodes]
+                if all(value.StatusCode.is_good() for value in values):
+                    return values
