@@ -1,6 +1,7 @@
 """Alarms as ISA-18.2 has them: each state by itself, then any history, as a state machine."""
 
 import math
+from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
 
@@ -9,12 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from twin.alarms.board import Board, Episode, episodes
+from tools.readme import filled
+from twin.alarms.board import Board, Diary, Episode
 from twin.alarms.rules import Priority, Rule, default_rules, read_rules, write_rules
+from twin.alarms.settings import board_rules
 from twin.alarms.state import SECOND_NS, Alarm, Change, Deed, State
-from twin.alarms.watch import NAMES, values
+from twin.alarms.watch import NAMES, deviating, values
 from twin.errors import ConfigError
 from twin.events import Event, Kind
+from twin.model.effects import EFFECTS
 from twin.settings import Document
 
 S = SECOND_NS
@@ -26,6 +30,14 @@ def leak(**given: object) -> Rule:
 
 def deeds(changes: list[Change]) -> list[Deed]:
     return [change.deed for change in changes]
+
+
+def episodes(changes: Iterable[Change]) -> list[Episode]:
+    """The episodes that changes in their order make, in the order they were raised."""
+    diary, found = Diary(), dict[tuple[int, str], Episode]()
+    for change in changes:
+        found |= {(one.raised_ns, one.raised_as): one for one in diary.take(change)}
+    return list(found.values())
 
 
 def seen(alarm: Alarm, *values: tuple[float, float]) -> list[tuple[float, Deed]]:
@@ -422,7 +434,10 @@ def event(kind: Kind, **data: object) -> Event:
 def test_events_become_values() -> None:
     assert values(event(Kind.PLC_STALE)) == {"plc_stale": 1.0}
     assert values(event(Kind.PLC_BACK)) == {"plc_stale": 0.0}
-    assert values(event(Kind.DEVIATION_CLEARED)) == {"deviation": 0.0}
+    assert values(event(Kind.DEVIATION_CLEARED)) == deviating()
+    assert values(event(Kind.DEVIATION, effect="leakage")) == deviating("leakage")
+    assert values(event(Kind.DEVIATION, effect="nobody")) == deviating("unlisted")
+    assert sorted(deviating("leakage").values()) == [0.0] * (len(EFFECTS)) + [1.0]
     assert values(event(Kind.GAP)) == {}
     assert values(event(Kind.CYCLE, cycle=3)) == {}
 
@@ -441,3 +456,80 @@ def test_a_file_without_alarms_is_none(tmp_path: Path) -> None:
     path.write_text("")
     with pytest.raises(ConfigError, match="no alarm in it"):
         read_rules(Document.read(path))
+
+
+# By cause.
+
+
+def test_a_rule_on_the_deviation_is_one_for_each_cause() -> None:
+    made = {one.name: one for one in board_rules(None)}
+    assert {f"deviation_{cause}" for cause in (*EFFECTS, "unlisted")} < set(made)
+    assert "deviation" not in made
+    leakage = made["deviation_leakage"]
+    assert leakage.value == "deviation.leakage"
+    assert leakage.action.startswith(f"Look at {EFFECTS['leakage'].look_at}. ")
+
+
+def test_what_the_deviation_suppresses_every_cause_does(tmp_path: Path) -> None:
+    text = write_rules(default_rules()).replace(
+        'name = "valve_protection"', 'name = "valve_protection"\nlatching = true', 1
+    )
+    text = text.replace('suppressed_by = [\n    "plc_stale",\n]', 'suppressed_by = ["deviation"]')
+    assert 'suppressed_by = ["deviation"]' in text
+    (tmp_path / "alarms.toml").write_text(text)
+    (tmp_path / "cell.toml").write_text('[alarms]\nrules = "alarms.toml"\n')
+    made = {one.name: one for one in board_rules(Document.read(tmp_path / "cell.toml"))}
+    assert made["valve_protection"].latching
+    by = made["supply_out_of_range"].suppressed_by
+    assert by == tuple(f"deviation_{cause}" for cause in (*EFFECTS, "unlisted"))
+
+
+def test_a_rule_on_what_nobody_says_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "alarms.toml").write_text(TEXT)
+    (tmp_path / "cell.toml").write_text('[alarms]\nrules = "alarms.toml"\n')
+    with pytest.raises(ConfigError, match=r"alarms\.toml: stale watches silence_s"):
+        board_rules(Document.read(tmp_path / "cell.toml"))
+
+
+def test_an_alarm_goes_on_under_another_name() -> None:
+    board, diary = Board(board_rules(None)), Diary()
+    changes = board.see(S, deviating("leakage"))
+    changes += board["deviation_leakage"].acknowledge(2 * S, "ann")
+    changes += board.rename(3 * S, "deviation.leakage", "deviation.porous_leakage")
+    assert board["deviation_leakage"].state is State.NORMAL
+    assert board["deviation_porous_leakage"].state is State.ACKNOWLEDGED
+    assert deeds(changes) == [Deed.RAISED, Deed.ACKNOWLEDGED, Deed.RENAMED]
+    assert not changes[-1].announced  # somebody takes care already
+    assert board.see(4 * S, {}) == []
+    changes += board.see(5 * S, deviating())
+    assert [len(diary.take(one)) for one in changes] == [1, 1, 1, 1]
+    assert episodes(changes) == [Episode("deviation_porous_leakage", S, 5 * S, 2 * S, "ann")]
+
+
+def test_what_keeps_a_name_quiet_does_not_follow_to_the_other() -> None:
+    board = Board(board_rules(None))
+    list(board["deviation_leakage"].shelve(0, 3600.0, "ann"))
+    assert [one.announced for one in board.see(S, deviating("leakage"))] == [False]
+    (renamed,) = board.rename(2 * S, "deviation.leakage", "deviation.suction_loss")
+    assert renamed.announced
+    assert board["deviation_suction_loss"].state is State.UNACKNOWLEDGED
+    assert board["deviation_leakage"].state is State.SHELVED
+
+
+def test_an_alarm_resumes_where_another_run_ended() -> None:
+    before, after = Alarm(leak(off_delay_s=5.0)), Alarm(leak(off_delay_s=5.0))
+    seen(before, (1, 300.0))
+    list(before.acknowledge(2 * S, "ann"))
+    list(before.shelve(2 * S, 60.0, "ann"))
+    after.resume(before.keep())
+    assert after.state is State.SHELVED
+    assert seen(after, (10, 300.0), (11, 100.0)) == []
+    assert seen(after, (16, 100.0)) == [(16, Deed.CLEARED)]
+    assert deeds(list(after.see(62 * S))) == [Deed.UNSHELVED]
+    assert after.state is State.NORMAL
+
+
+def test_the_page_on_alarms_has_the_tables_of_the_code() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "alarms.md").read_text(encoding="utf-8")
+    assert filled(page) == page, "run: python tools/readme.py"
+    assert all(f"`{state}`" in page for state in State)

@@ -4,19 +4,23 @@ import re
 from pathlib import Path
 
 from drivers.plc.registers import table as register_table
+from twin.alarms.words import rules_table as alarm_rules_table
+from twin.alarms.words import table as alarm_states_table
 from twin.figures.table import table as figures_table
 from twin.figures.warnings import table as warnings_table
 from twin.model.courses import table as courses_table
 from twin.model.effects import table as effects_table
 
 ROOT = Path(__file__).parent.parent
-PAGES = (ROOT / "README.md", ROOT / "docs" / "key-figures.md")
+PAGES = (ROOT / "README.md", ROOT / "docs" / "key-figures.md", ROOT / "docs" / "alarms.md")
 TABLES = {
     "register map": register_table,
     "effects": effects_table,
     "courses": courses_table,
     "key figures": figures_table,
     "warnings": warnings_table,
+    "alarm states": alarm_states_table,
+    "alarm rules": alarm_rules_table,
 }
 
 

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from twin.cli_alarms import alarms_app, alarms_of
 from twin.cli_assets import assets_app
 from twin.cli_cert import cert
 from twin.cli_figures import figures_app, keeper_of, key_figures_of
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from drivers.shared import Lines
     from twin.config import Config
     from twin.diagnosis.answer import Diagnosis
-    from twin.live import Sink, Twin
+    from twin.live import Adviser, Sink, Twin
     from twin.log.header import LogHeader
     from twin.monitor.detect import Monitor
     from twin.settings import Document
@@ -47,6 +48,7 @@ app = typer.Typer(
 )
 app.add_typer(assets_app, name="assets")
 app.add_typer(figures_app, name="figures")
+app.add_typer(alarms_app, name="alarms")
 log_app = typer.Typer(help="Look after logs.", no_args_is_help=True)
 app.add_typer(log_app, name="log")
 app.command()(cert)
@@ -117,6 +119,7 @@ def run(
     def beside(name: str, settings: "Config") -> None:
         label = "" if alone else name
         twin, monitor = _pair(settings)
+        alarms = alarms_of(settings, _complain)
         shown = show(name, settings.asset.type) if show else None
         shared = lines if hil or not alone else None
         source = open_source(settings.document, address, shared)
@@ -138,7 +141,8 @@ def run(
             adviser = LiveDiagnosis(
                 settings, str(file or "live"), lambda: stopped() == "interrupted", status
             )
-            advisers = [] if hil else [adviser]  # what is not measured has no faults
+            # What is not measured has no faults. Alarms come last: they hear the diagnosis.
+            advisers: list[Adviser] = [] if hil else [adviser, alarms()]
             run_loop(_until(stopped, begun), twin, monitor, sinks, advisers=advisers)
 
     failed: list[str] = []
@@ -178,6 +182,7 @@ def replay(
     recorded = open_log(log)
     settings = _settings_of(recorded.header, log, config, assets, unit, as_of)
     twin, monitor = _pair(settings)
+    alarms = alarms_of(settings)()
     with _stop_on_signal(None) as stopped:
         console = Console()
         sinks = _opened(
@@ -185,8 +190,8 @@ def replay(
             _view_of(settings, view, rrd),
             lambda: console,
         )
-        blocks = (samples for samples, _ in recorded.blocks())
-        run_loop(_until(stopped, _progress(blocks, "replaying")), twin, monitor, sinks)
+        blocks = _progress((samples for samples, _ in recorded.blocks()), "replaying")
+        run_loop(_until(stopped, blocks), twin, monitor, sinks, advisers=[alarms])
     if json_file is not None:
         events = [_plain(event) for event in console.events]
         _write_json(json_file, {"log": str(log), "events": events})

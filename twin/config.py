@@ -26,6 +26,7 @@ from twin.monitor.healthy import Healthy
 from twin.settings import Document, Settings
 
 TABLES = {
+    "alarms",
     "asset",
     "assets",
     "data",

@@ -29,6 +29,8 @@ class Kind(StrEnum):
     DEVIATION = "deviation"
     DEVIATION_CLEARED = "deviation_cleared"
     DIAGNOSIS = "diagnosis"
+    ALARM = "alarm"
+    ALARM_CHANGED = "alarm_changed"
 
 
 SEVERITY: dict[Kind, Severity] = {
@@ -44,6 +46,8 @@ SEVERITY: dict[Kind, Severity] = {
     Kind.DEVIATION: Severity.ALARM,
     Kind.DEVIATION_CLEARED: Severity.INFO,
     Kind.DIAGNOSIS: Severity.WARNING,  # the alarm has been raised already; this says why
+    Kind.ALARM: Severity.WARNING,  # people are to be told; what raised it has its own severity
+    Kind.ALARM_CHANGED: Severity.INFO,  # cleared, acknowledged, shelved and so on
 }
 
 

@@ -123,12 +123,24 @@ def run(
         samples, ticks = twin.flush()
         events = monitor.update(samples, ticks) + monitor.close()
         hand_out(sinks, samples, ticks, events + _advice(advisers, samples, events))
-        if last_words := [event for adviser in advisers for event in adviser.finish()]:
+        if last_words := _last_words(advisers, samples[:0]):
             hand_out(sinks, samples[:0], ticks[:0], last_words)
 
 
 def _advice(advisers: Sequence[Adviser], samples: Samples, events: Sequence[Event]) -> list[Event]:
-    return [said for adviser in advisers for said in adviser.follow(samples, events)]
+    """What advisers say; each hears those before it."""
+    said: list[Event] = []
+    for adviser in advisers:
+        said += adviser.follow(samples, [*events, *said])
+    return said
+
+
+def _last_words(advisers: Sequence[Adviser], none: Samples) -> list[Event]:
+    """The same when the rows have ended."""
+    said: list[Event] = []
+    for adviser in advisers:
+        said += (adviser.follow(none, said) if said else []) + adviser.finish()
+    return said
 
 
 def hand_out(

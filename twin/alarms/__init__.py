@@ -1,1 +1,1 @@
-"""Alarms as ISA-18.2 has them: rules, states, episodes. Pure logic: no clock, no database."""
+"""Alarms as ISA-18.2 has them: rules, states, episodes; beside the loop, and in a database."""

@@ -1,10 +1,11 @@
 """All alarms of one ejector together: values in, changes out; and episodes made of changes."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 from twin.alarms.rules import Priority, Rule
-from twin.alarms.state import SECOND_NS, Alarm, Change, Deed, State
+from twin.alarms.state import SECOND_NS, Alarm, Change, Deed, Kept, State
 from twin.errors import ConfigError
 
 _ORDER = tuple(reversed(Priority))  # the most urgent first
@@ -29,6 +30,23 @@ class Board:
         ]
         return [*changes, *designed]
 
+    def resume(self, states: Mapping[str, Kept]) -> None:
+        """Go on where another run ended; alarms that the rules do not know any more are left."""
+        for name, kept in states.items():
+            if name in self.alarms:
+                self.alarms[name].resume(kept)
+
+    def watching(self, value: str) -> list[Alarm]:
+        """The alarms of a value, in the order of the rules."""
+        return [alarm for alarm in self.alarms.values() if alarm.rule.value == value]
+
+    def rename(self, now: int, value: str, other: str) -> list[Change]:
+        """What was taken for one cause is another one: its alarms go on as those of the other."""
+        changes: list[Change] = []
+        for old, new in zip(self.watching(value), self.watching(other), strict=True):
+            changes += old.become(now, new)
+        return [*changes, *self._designed(now)]
+
     def __getitem__(self, name: str) -> Alarm:
         if name not in self.alarms:
             raise ConfigError(f"no alarm is called {name}", f"there are: {', '.join(self.alarms)}")
@@ -43,6 +61,15 @@ class Board:
         ]
         return sorted(shown, key=lambda one: (_ORDER.index(one.rule.priority), one.acknowledged))
 
+    def quiet(self) -> list[Alarm]:
+        """What is shelved or out of service, or has something to say but is suppressed."""
+        return [
+            alarm
+            for alarm in self.alarms.values()
+            if alarm.state in (State.SHELVED, State.OUT_OF_SERVICE)
+            or (alarm.state is State.SUPPRESSED and alarm.concerns)
+        ]
+
     def _designed(self, now: int) -> Iterator[Change]:
         """Suppress what is quiet by design while another alarm is active."""
         active = {name for name, alarm in self.alarms.items() if alarm.active}
@@ -52,13 +79,18 @@ class Board:
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """One time that an alarm was active; None for what has not happened yet."""
+    """One time that an alarm was active; None for what has not happened yet.
+
+    ``raised_as`` is the name it was raised under; with the time it tells an episode from others.
+    """
 
     alarm: str
     raised_ns: int
     cleared_ns: int | None = None
     acknowledged_ns: int | None = None
     acknowledged_by: str = ""
+    evidence: Mapping[str, Any] = field(default_factory=dict)
+    raised_as: str = field(default="", compare=False)
 
     @property
     def is_over(self) -> bool:
@@ -71,20 +103,40 @@ class Episode:
         return None if self.cleared_ns is None else (self.cleared_ns - self.raised_ns) / SECOND_NS
 
 
-def episodes(changes: Iterable[Change]) -> list[Episode]:
-    """The episodes that changes in their order make, in the order they were raised."""
-    found: list[Episode] = []
-    going_on: dict[str, list[int]] = {}  # of each alarm: the places in found of what is not over
-    for change in changes:
-        places = going_on.setdefault(change.alarm, [])
+class Diary:
+    """The episodes that changes in their order make; of those that are over it knows nothing."""
+
+    def __init__(self, going_on: Iterable[Episode] = ()) -> None:
+        self._going_on: dict[str, list[Episode]] = {}  # by alarm
+        for episode in going_on:
+            self._going_on.setdefault(episode.alarm, []).append(episode)
+
+    def take(self, change: Change) -> list[Episode]:
+        """The episodes that a change begins or alters, as they are then."""
+        before = self._going_on.pop(change.alarm, [])
         if change.deed is Deed.RAISED:
-            places.append(len(found))
-            found.append(Episode(change.alarm, change.time_ns))
-            continue
-        for place in places:
-            found[place] = _gone_on(found[place], change)
-        going_on[change.alarm] = [place for place in places if not found[place].is_over]
-    return found
+            new = Episode(change.alarm, change.time_ns, raised_as=change.alarm)
+            self._going_on[change.alarm] = [*before, new]
+            return [new]
+        after = [_gone_on(one, change) for one in before]
+        for one in after:
+            if not one.is_over:
+                self._going_on.setdefault(one.alarm, []).append(one)
+        return [new for old, new in zip(before, after, strict=True) if new is not old]
+
+    def note(self, alarm: str, evidence: Mapping[str, Any]) -> list[Episode]:
+        """The episode of an alarm that is active, with more to speak for it."""
+        episodes = self._going_on.get(alarm, [])
+        if not episodes or episodes[-1].cleared_ns is not None:
+            return []
+        episodes[-1] = replace(episodes[-1], evidence=joined(episodes[-1].evidence, evidence))
+        return episodes[-1:]
+
+
+def joined(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
+    """What is known later over what was; the first cycle and the first guess stay."""
+    stays = {key: before[key] for key in ("first_cycle", "guess") if key in before}
+    return {**before, **after, **stays}
 
 
 def _gone_on(episode: Episode, change: Change) -> Episode:
@@ -93,4 +145,6 @@ def _gone_on(episode: Episode, change: Change) -> Episode:
         return replace(episode, cleared_ns=change.time_ns)
     if change.deed is Deed.ACKNOWLEDGED:
         return replace(episode, acknowledged_ns=change.time_ns, acknowledged_by=change.who)
+    if change.deed is Deed.RENAMED:
+        return replace(episode, alarm=change.to)
     return episode

@@ -28,6 +28,7 @@ class Deed(StrEnum):
     UNSUPPRESSED = "unsuppressed"
     OUT_OF_SERVICE = "out_of_service"
     IN_SERVICE = "in_service"
+    RENAMED = "renamed"  # it has another cause than was thought
 
 
 class State(StrEnum):
@@ -46,7 +47,8 @@ class State(StrEnum):
 class Change:
     """One thing that happened to one alarm; ``who`` is empty where the program did it.
 
-    ``announced`` says that people are to be told of the alarm now.
+    ``announced`` says that people are to be told of the alarm now; one that is renamed goes on as
+    ``to``.
     """
 
     time_ns: int
@@ -54,6 +56,17 @@ class Change:
     deed: Deed
     who: str = ""
     announced: bool = False
+    to: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """What outlives the program of one alarm; suppression follows from the others."""
+
+    active: bool = False
+    acknowledged: bool = True
+    shelved_until: int | None = None
+    out_of_service: bool = False
 
 
 _SPEAKS = (Deed.RAISED, Deed.UNSHELVED, Deed.UNSUPPRESSED, Deed.IN_SERVICE)
@@ -84,6 +97,16 @@ class Alarm:
         if self.active:
             return State.ACKNOWLEDGED if self.acknowledged else State.UNACKNOWLEDGED
         return State.NORMAL if self.acknowledged else State.RETURNED
+
+    @property
+    def concerns(self) -> bool:
+        """Whether it is active, or was and nobody has seen it; however quiet it is kept."""
+        return self.active or not self.acknowledged
+
+    @property
+    def is_coming(self) -> bool:
+        """Whether its value is beyond the limit, but not yet for long enough."""
+        return self._beyond and not self.active
 
     def see(self, now: int, value: float = math.nan) -> Iterator[Change]:
         """Take the newest value; NaN where there is none, then only time goes on."""
@@ -138,6 +161,27 @@ class Alarm:
         if wanted == self.out_of_service:
             self.out_of_service = not wanted
             yield self._done(now, Deed.IN_SERVICE if wanted else Deed.OUT_OF_SERVICE, who)
+
+    def become(self, now: int, other: "Alarm") -> Iterator[Change]:
+        """Go on as another alarm, which has been the one all along; what keeps each quiet stays."""
+        if not (self._beyond or self.concerns):
+            return
+        other.acknowledged = self.acknowledged and other.acknowledged
+        other.active, other._beyond = self.active or other.active, self._beyond or other._beyond
+        other._since = self._since
+        self.active, self.acknowledged, self._beyond, self._since = False, True, False, None
+        speaks = other.state is State.UNACKNOWLEDGED
+        yield Change(now, self.rule.name, Deed.RENAMED, "", speaks, other.rule.name)
+
+    def keep(self) -> "Kept":
+        """What is to outlive the program."""
+        return Kept(self.active, self.acknowledged, self.shelved_until, self.out_of_service)
+
+    def resume(self, kept: "Kept") -> None:
+        """Go on where another run ended."""
+        self.active = self._beyond = kept.active
+        self.acknowledged, self.shelved_until = kept.acknowledged, kept.shelved_until
+        self.out_of_service = kept.out_of_service
 
     def _turn(self, now: int) -> Iterator[Change]:
         """Become what the value has been for long enough."""

@@ -1,27 +1,38 @@
-"""What alarms watch: values made of what the loop says happened."""
+"""What alarms watch: values, and what speaks for them, made of what the loop says happened."""
 
+from collections.abc import Mapping
+from typing import Any
+
+from twin.alarms.causes import CAUSES, DEVIATION, known, value_of
 from twin.events import Event, Kind
+from twin.figures.table import FIGURES
 from twin.figures.warnings import CAUTIONS
+
+Evidence = Mapping[str, Any]  # what JSON can hold; "words" for people
 
 _SWITCHED = {  # events that begin and end something
     Kind.PLC_STALE: ("plc_stale", 1.0),
     Kind.PLC_BACK: ("plc_stale", 0.0),
     Kind.SIGNAL_BAD: ("signal_bad", 1.0),
     Kind.SIGNAL_GOOD: ("signal_bad", 0.0),
-    Kind.DEVIATION: ("deviation", 1.0),
-    Kind.DEVIATION_CLEARED: ("deviation", 0.0),
 }
-NAMES = {name for name, _ in _SWITCHED.values()} | set(CAUTIONS)
+STREAM = frozenset(name for name, _ in _SWITCHED.values())  # nothing is wrong until it is said
+NAMES = STREAM | {DEVIATION} | set(CAUTIONS)
+_MEASURE = ("figure", "excess_mbar", "sigma", "size", "unit", "also")
 
 
 def values(event: Event) -> dict[str, float]:
-    """The values that an event changes, 1 or 0 each: by the names of NAMES.
+    """The values that an event changes, 1 or 0 each: by the names of NAMES, deviation by cause.
 
     A warning that a cycle could not judge keeps the value it had.
     """
     if event.kind in _SWITCHED:
         name, value = _SWITCHED[event.kind]
         return {name: value}
+    if event.kind is Kind.DEVIATION:
+        return deviating(known(str(event.data.get("effect"))))
+    if event.kind is Kind.DEVIATION_CLEARED:
+        return deviating()
     if event.kind is not Kind.CYCLE or "warnings" not in event.data:
         return {}
     standing = event.data["warnings"]
@@ -30,3 +41,39 @@ def values(event: Event) -> dict[str, float]:
         for name, caution in CAUTIONS.items()
         if f"{caution.figure}_measured" in event.data
     }
+
+
+def deviating(*causes: str) -> dict[str, float]:
+    """The values while the deviation has these causes, and no other."""
+    return {value_of(cause): float(cause in causes) for cause in CAUSES}
+
+
+def evidence(event: Event) -> dict[str, Evidence]:
+    """What an event says for the alarms, by the value that it speaks for."""
+    if event.kind in (Kind.PLC_STALE, Kind.SIGNAL_BAD):
+        return {_SWITCHED[event.kind][0]: {"words": event.text}}
+    if event.kind is Kind.DEVIATION:
+        cause = known(str(event.data.get("effect")))
+        measured = {key: event.data[key] for key in _MEASURE if key in event.data}
+        return {value_of(cause): {"words": event.text, "guess": cause, **measured, **_in(event)}}
+    if event.kind is Kind.CYCLE:
+        standing = event.data.get("warnings", ())
+        return {name: _figure(CAUTIONS[name].figure, event) for name in standing}
+    return {}
+
+
+def _figure(name: str, event: Event) -> Evidence:
+    """What a cycle's figure was, and should have been."""
+    measured, expected = (event.data.get(f"{name}_{side}") for side in ("measured", "expected"))
+    unit = FIGURES[name].unit
+    words = f"{name} {measured:.4g} {unit}" if measured is not None else name
+    if expected is not None:
+        words += f", expected {expected:.4g}"
+    sizes = {"figure": name, "measured": measured, "expected": expected, "unit": unit}
+    return {"words": words, **sizes, **_in(event)}
+
+
+def _in(event: Event) -> Evidence:
+    """In which cycle."""
+    number = event.data.get("cycle")
+    return {} if number is None else {"first_cycle": int(number), "last_cycle": int(number)}

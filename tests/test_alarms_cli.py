@@ -1,0 +1,155 @@
+"""``twin alarms`` beside a run, and without one."""
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import rigs
+from command_line import twin
+from test_alarms_loop import APART, LEAK, NONE, UNIT, S, deviation, rows
+
+from twin import cli_alarms
+from twin.alarms import keeper as module
+from twin.alarms.keeper import Keeper
+from twin.alarms.loop import Alarms
+from twin.alarms.rules import Rule, default_rules, read_rules, write_rules
+from twin.alarms.settings import board_rules
+from twin.alarms.store import Unit, open_store
+from twin.cli_alarms import alarms_app
+from twin.errors import ConfigError, SourceError
+from twin.settings import Document
+
+Run = Callable[..., str]
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run a command in an empty folder; gives what it printed."""
+    monkeypatch.chdir(tmp_path)
+
+    def command(*arguments: str | Path) -> str:
+        alarms_app([str(one) for one in arguments], standalone_mode=False)
+        return capsys.readouterr().out
+
+    return command
+
+
+def begun(path: Path) -> Alarms:
+    """Alarms of the gripper, one of them raised, kept in a database."""
+    keeper = Keeper(lambda: open_store(path), UNIT, pytest.fail)
+    alarms = Alarms(board_rules(None), lambda: APART + 6 * S, keeper.begin(), keeper)
+    alarms.follow(rows(5), [deviation(5)])
+    return alarms
+
+
+@pytest.fixture
+def beside(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
+    """The commands beside a run whose loop goes on in a thread."""
+    monkeypatch.setattr(module, "POLL_S", 0.01)
+    monkeypatch.setattr(cli_alarms, "LOOK_S", 0.01)
+    alarms, ended = begun(tmp_path / "alarms.sqlite"), threading.Event()
+
+    def loop() -> None:
+        while not ended.wait(0.01):
+            alarms.follow(NONE, [])
+        alarms.close()
+
+    thread = threading.Thread(target=loop)
+    thread.start()
+    yield run
+    ended.set()
+    thread.join()
+
+
+def test_an_alarm_is_acknowledged_beside_a_run(beside: Run) -> None:
+    assert beside("acknowledge", LEAK, "--by", "ann") == f"{LEAK}: acknowledged\n"
+    shown = beside("list", "--json", "l.json")
+    assert shown.startswith(f"medium  {LEAK}  acknowledged, raised 2001-09-09 01:46:45\n")
+    assert "Look at hoses" in shown
+    (plain,) = json.loads(Path("l.json").read_text())
+    assert (plain["state"], plain["episode"]["acknowledged_by"]) == ("acknowledged", "ann")
+    line = beside("history", "--json", "h.json")
+    assert line == f"2001-09-09 01:46:45  {LEAK}  still active  seen by ann  deviation\n"
+    (plain,) = json.loads(Path("h.json").read_text())
+    assert plain["evidence"]["guess"] == "leakage"
+
+
+def test_alarms_are_taken_out_of_service_and_back(beside: Run) -> None:
+    assert beside("out-of-service", LEAK, "plc_stale").splitlines() == [
+        f"{LEAK}: out of service",
+        "plc_stale: out of service",
+    ]
+    assert [line.split("  ")[1:3] for line in beside("list").splitlines() if LEAK in line] == [
+        [LEAK, "out of service, raised 2001-09-09 01:46:45"]
+    ]
+    assert beside("in-service", LEAK) == f"{LEAK}: in service\n"
+    assert "unacknowledged" in beside("list")
+
+
+def test_a_refusal_is_an_error(beside: Run, tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text(
+        write_rules([Rule(name="our_own", value="plc_stale", above=0.5)])
+    )
+    (tmp_path / "cell.toml").write_text('[alarms]\nrules = "mine.toml"\n')
+    with pytest.raises(ConfigError, match="no alarm is called our_own"):  # says the run
+        beside("acknowledge", "our_own", "--config", "cell.toml")
+    with pytest.raises(ConfigError, match="cannot be shelved for 36000 s"):
+        beside("shelve", LEAK, "--hours", "10")
+    with pytest.raises(ConfigError, match="no alarm is called leak"):
+        beside("acknowledge", "leak")
+
+
+def test_without_a_run_the_next_one_does_it(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli_alarms, "ANSWER_S", 0.0)
+    monkeypatch.setattr(module, "POLL_S", 0.01)
+    begun(tmp_path / "alarms.sqlite").close()
+    assert "unacknowledged" in run("list")
+    said = run("acknowledge", LEAK)
+    assert said == f"{LEAK}: asked; twin run will do it when it is there again\n"
+    run("unshelve", "plc_stale")
+    keeper = Keeper(lambda: open_store("alarms.sqlite"), UNIT, pytest.fail)
+    alarms = Alarms(board_rules(None), lambda: APART + 9 * S, keeper.begin(), keeper)
+    said_there = [one.data["deed"] for _ in range(500) for one in _later(alarms)]
+    alarms.close()
+    assert said_there == ["acknowledged"]
+    assert f"{LEAK}  acknowledged" in run("list")
+
+
+def _later(alarms: Alarms) -> list[object]:
+    threading.Event().wait(0.002)
+    return list(alarms.follow(NONE, []))
+
+
+def test_the_unit_is_found_or_named(run: Run, tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"alarms\.sqlite: no such alarm database"):
+        run("list")
+    assert not (tmp_path / "alarms.sqlite").exists()
+    with open_store("alarms.sqlite") as store:
+        for name in ("gripper-01", "rig-01"):
+            store.before(Unit(UNIT.type, name))
+    with pytest.raises(ConfigError, match="2 units") as caught:
+        run("list")
+    assert caught.value.hint == "choose with --id; there are: gripper-01, rig-01"
+    assert run("list", "--id", "rig-01") == "no alarm of rig-01\n"
+    where = ("--alarms", tmp_path / "alarms.sqlite", "--config", rigs.path_of("gripper"))
+    assert run("list", *where) == "no alarm of gripper-01\n"
+    assert run("history", *where, "--days", "3") == ""
+
+
+def test_the_rules_in_use_are_printed_as_they_can_be_named(run: Run, tmp_path: Path) -> None:
+    text = run("rules")
+    assert read_rules(Document.parse(text, "rules")) == default_rules()
+    (tmp_path / "mine.toml").write_text(text.replace('"medium"', '"high"'))
+    (tmp_path / "cell.toml").write_text('[alarms]\nrules = "mine.toml"\n')
+    assert run("rules", "--config", "cell.toml") == text.replace('"medium"', '"high"')
+
+
+def test_the_whole_command_line_knows_them(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twin(monkeypatch, "alarms", "rules", "--config", rigs.path_of("gripper")) == 0
+    assert 'name = "plc_stale"' in capsys.readouterr().out

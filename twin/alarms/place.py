@@ -1,0 +1,24 @@
+"""Which alarm database: the one that is named, else a file beside the configuration."""
+
+from pathlib import Path
+
+from twin.alarms.settings import AlarmSettings
+from twin.alarms.store import ALARM_DATABASE, Store, open_store
+from twin.assets.engine import parse_url, sqlite_file
+from twin.settings import Document
+
+FILE = "alarms.sqlite"
+
+
+def open_chosen(named: str, document: Document | None, *, write: bool) -> Store:
+    """Open the database named on the command line, else in the configuration, else the default.
+
+    The default is a file beside the configuration, without one in the current folder. Only a run
+    makes a file; SourceError if there is none to read.
+    """
+    if named:
+        return open_store(named, create=write)
+    folder = Path(document.name).parent if document else Path()
+    url = document.section(AlarmSettings, "alarms").url if document else ""
+    file = sqlite_file(parse_url(url or FILE, ALARM_DATABASE))
+    return open_store(url if file is None else folder / file, create=write)

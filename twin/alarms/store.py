@@ -1,0 +1,280 @@
+"""Where alarms are kept: states as they are, episodes as they were, and what people ask for."""
+
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+from sqlalchemy import (
+    URL,
+    BigInteger,
+    Boolean,
+    Column,
+    ColumnElement,
+    Connection,
+    Double,
+    Engine,
+    Integer,
+    MetaData,
+    Row,
+    Table,
+    Text,
+    inspect,
+    select,
+)
+
+from twin.alarms.board import Episode
+from twin.alarms.loop import Before, News
+from twin.alarms.requests import Request
+from twin.alarms.state import Deed, Kept
+from twin.assets.engine import Purpose, make_engine, parse_url, plain_errors, shown, sqlite_file
+from twin.errors import SourceError
+
+ALARM_DATABASE = Purpose("alarm database", "--alarms")
+
+metadata = MetaData()
+
+
+def _whose() -> tuple[Column[Any], Column[Any]]:
+    return Column("asset_type", Text, primary_key=True), Column("asset_id", Text, primary_key=True)
+
+
+STATE = Table(
+    "alarm_state",
+    metadata,
+    *_whose(),
+    Column("alarm", Text, primary_key=True),
+    Column("active", Boolean, nullable=False),
+    Column("acknowledged", Boolean, nullable=False),
+    Column("shelved_until_ns", BigInteger),
+    Column("out_of_service", Boolean, nullable=False),
+    Column("stored_ns", BigInteger, nullable=False),
+)
+
+EPISODE = Table(
+    "alarm_episode",
+    metadata,
+    *_whose(),
+    Column("raised_ns", BigInteger, primary_key=True, autoincrement=False),
+    Column("raised_as", Text, primary_key=True),  # its name then
+    Column("alarm", Text, nullable=False),
+    Column("cleared_ns", BigInteger),
+    Column("acknowledged_ns", BigInteger),
+    Column("acknowledged_by", Text, nullable=False),
+    Column("evidence", Text, nullable=False),  # JSON
+)
+
+REQUEST = Table(
+    "alarm_request",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("asset_type", Text, nullable=False),
+    Column("asset_id", Text, nullable=False),
+    Column("alarm", Text, nullable=False),
+    Column("deed", Text, nullable=False),
+    Column("who", Text, nullable=False),
+    Column("seconds", Double, nullable=False),
+    Column("asked_ns", BigInteger, nullable=False),
+    Column("answered_ns", BigInteger),
+    Column("answer", Text),  # empty: done; else why not
+    sqlite_autoincrement=True,
+)
+
+# What a run has once kept is a unit that can be asked for, whether or not an alarm was ever raised.
+UNIT = Table("alarm_unit", metadata, *_whose())
+
+
+class Unit(NamedTuple):
+    """Whose alarms."""
+
+    type: str
+    id: str
+
+
+def open_store(
+    where: str | Path,
+    *,
+    create: bool = True,
+    busy_s: float = 5.0,
+    clock: Callable[[], int] = time.time_ns,
+) -> "Store":
+    """Open the alarm database at a URL or in an SQLite file; close it, or use it as a context.
+
+    ``create=False`` refuses an SQLite file that is not there. ConfigError for a URL of an unknown
+    kind, SourceError if it cannot be reached, read or written.
+    """
+    url = parse_url(where, ALARM_DATABASE)
+    file = sqlite_file(url)
+    if not create and file is not None and not file.exists():
+        raise SourceError(
+            f"{file}: no such alarm database",
+            "check --alarms; twin run makes one where [alarms] keep = true",
+        )
+    store = Store(url, make_engine(url, busy_s), clock)
+    try:
+        store.prepare()
+    except BaseException:
+        store.close()
+        raise
+    return store
+
+
+class Store:
+    """An open alarm database. What is written is written whole or not at all."""
+
+    def __init__(self, url: URL, engine: Engine, clock: Callable[[], int]) -> None:
+        self._url = url
+        self._engine = engine
+        self._clock = clock
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give all connections back."""
+        self._engine.dispose()
+
+    @property
+    def name(self) -> str:
+        """The file or the URL, for messages; without a password."""
+        return shown(self._url)
+
+    def prepare(self) -> None:
+        """Make the tables that are not there."""
+        with self._reading() as connection:
+            there = set(inspect(connection).get_table_names())
+        if there >= set(metadata.tables):
+            return
+        with self._writing() as connection:
+            metadata.create_all(connection)
+
+    # --- a run ----------------------------------------------------------------------------------
+
+    def before(self, unit: Unit) -> Before:
+        """What was when the last run of a unit ended; the unit can be asked for from now on."""
+        own = {"asset_type": unit.type, "asset_id": unit.id}
+        with self._writing() as connection:
+            _replace(connection, UNIT, own)
+        return Before(self.states(unit), self.episodes(unit, only_going_on=True))
+
+    def save(self, unit: Unit, news: News) -> None:
+        """Write what has changed."""
+        own = {"asset_type": unit.type, "asset_id": unit.id}
+        with self._writing() as connection:
+            _replace(connection, UNIT, own)
+            for name, kept in news.states.items():
+                stored = {"alarm": name, "stored_ns": self._clock()}
+                _replace(connection, STATE, {**own, **stored, **_plain_state(kept)})
+            for episode in news.episodes.values():
+                _replace(connection, EPISODE, {**own, **_plain_episode(episode)})
+            for number, answer in news.answers.items():
+                answered = {"answered_ns": self._clock(), "answer": answer}
+                connection.execute(REQUEST.update().where(REQUEST.c.id == number).values(answered))
+
+    def requests(self, unit: Unit) -> list[Request]:
+        """What is asked of a unit's alarms, and not answered, in the order it was asked."""
+        wanted = select(REQUEST).where(*_of(REQUEST, unit), REQUEST.c.answered_ns.is_(None))
+        with self._reading() as connection:
+            return [_request(row) for row in connection.execute(wanted.order_by(REQUEST.c.id))]
+
+    # --- people ---------------------------------------------------------------------------------
+
+    def ask(self, unit: Unit, alarm: str, deed: Deed, who: str, seconds: float = 0.0) -> int:
+        """Ask something of a unit's alarm; gives the number by which to look for the answer."""
+        values: dict[str, Any] = {"asset_type": unit.type, "asset_id": unit.id, "alarm": alarm}
+        values |= {"deed": deed.value, "who": who, "asked_ns": self._clock(), "seconds": seconds}
+        with self._writing() as connection:
+            done = connection.execute(REQUEST.insert().values(values).returning(REQUEST.c.id))
+            return int(done.scalar_one())
+
+    def answer(self, number: int) -> str | None:
+        """Why a request was refused, empty if it was done; None while nobody has answered."""
+        wanted = select(REQUEST.c.answered_ns, REQUEST.c.answer).where(REQUEST.c.id == number)
+        with self._reading() as connection:
+            answered_ns, answer = connection.execute(wanted).one()
+        return None if answered_ns is None else str(answer)
+
+    def units(self) -> list[Unit]:
+        """All units of which a run has kept alarms."""
+        with self._reading() as connection:
+            return sorted(Unit(*row) for row in connection.execute(select(UNIT)))
+
+    def states(self, unit: Unit) -> dict[str, Kept]:
+        """The alarms of a unit that were ever anything else than normal."""
+        with self._reading() as connection:
+            rows = connection.execute(select(STATE).where(*_of(STATE, unit))).all()
+        return {
+            row.alarm: Kept(row.active, row.acknowledged, row.shelved_until_ns, row.out_of_service)
+            for row in rows
+        }
+
+    def episodes(
+        self, unit: Unit, since_ns: int | None = None, *, only_going_on: bool = False
+    ) -> list[Episode]:
+        """The episodes of a unit (raised since then), in the order they were raised."""
+        wanted = select(EPISODE).where(*_of(EPISODE, unit))
+        if since_ns is not None:
+            wanted = wanted.where(EPISODE.c.raised_ns >= since_ns)
+        if only_going_on:
+            cleared, seen = EPISODE.c.cleared_ns, EPISODE.c.acknowledged_ns
+            wanted = wanted.where(cleared.is_(None) | seen.is_(None))
+        with self._reading() as connection:
+            return [_episode(row) for row in connection.execute(wanted.order_by("raised_ns"))]
+
+    @contextmanager
+    def _reading(self) -> Iterator[Connection]:
+        with plain_errors(self._url, ALARM_DATABASE), self._engine.begin() as connection:
+            yield connection
+
+    @contextmanager
+    def _writing(self) -> Iterator[Connection]:
+        writer = self._engine.execution_options(writing=True)
+        with plain_errors(self._url, ALARM_DATABASE), writer.begin() as connection:
+            yield connection
+
+
+def _of(table: Table, unit: Unit) -> tuple[ColumnElement[bool], ...]:
+    return table.c.asset_type == unit.type, table.c.asset_id == unit.id
+
+
+def _replace(connection: Connection, table: Table, row: Mapping[str, Any]) -> None:
+    """Put a row in place of the one with its key."""
+    key = [column == row[column.name] for column in table.primary_key]
+    connection.execute(table.delete().where(*key))
+    connection.execute(table.insert().values(row))
+
+
+def _plain_state(kept: Kept) -> dict[str, Any]:
+    return {
+        "active": kept.active,
+        "acknowledged": kept.acknowledged,
+        "shelved_until_ns": kept.shelved_until,
+        "out_of_service": kept.out_of_service,
+    }
+
+
+def _plain_episode(episode: Episode) -> dict[str, Any]:
+    names = ("raised_ns", "raised_as", "alarm", "cleared_ns", "acknowledged_ns", "acknowledged_by")
+    plain = {name: getattr(episode, name) for name in names}
+    return {**plain, "evidence": json.dumps(dict(episode.evidence), ensure_ascii=False)}
+
+
+def _episode(row: Row[Any]) -> Episode:
+    return Episode(
+        row.alarm,
+        row.raised_ns,
+        row.cleared_ns,
+        row.acknowledged_ns,
+        row.acknowledged_by,
+        json.loads(row.evidence),
+        row.raised_as,
+    )
+
+
+def _request(row: Row[Any]) -> Request:
+    return Request(row.id, row.alarm, Deed(row.deed), row.who, row.asked_ns, row.seconds)

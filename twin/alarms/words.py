@@ -1,0 +1,96 @@
+"""Changes of alarms as events, in plain words."""
+
+from typing import Any
+
+from twin.alarms.rules import Rule, default_rules
+from twin.alarms.state import SECOND_NS, Alarm, Change, Deed, State
+from twin.alarms.watch import Evidence
+from twin.events import Event, Kind
+
+STATES = {
+    State.NORMAL: "nothing to do",
+    State.UNACKNOWLEDGED: "active, and nobody has acknowledged it",
+    State.ACKNOWLEDGED: "active; somebody has acknowledged it and takes care",
+    State.RETURNED: "not active any more, and nobody has acknowledged it",
+    State.SHELVED: "a person keeps it quiet for a time; then it speaks again by itself",
+    State.SUPPRESSED: "quiet by design, while an alarm of `suppressed_by` is active",
+    State.OUT_OF_SERVICE: "a person keeps it quiet until it is taken into service again",
+}
+_SAID = {
+    Deed.RAISED: "raised",
+    Deed.CLEARED: "cleared",
+    Deed.ACKNOWLEDGED: "acknowledged",
+    Deed.SHELVED: "shelved",
+    Deed.UNSHELVED: "no longer shelved",
+    Deed.SUPPRESSED: "suppressed by design",
+    Deed.UNSUPPRESSED: "no longer suppressed",
+    Deed.OUT_OF_SERVICE: "taken out of service",
+    Deed.IN_SERVICE: "in service again",
+}
+
+
+def table() -> str:
+    """The states as a table for people."""
+    rows = [f"| `{state}` | {what} |" for state, what in STATES.items()]
+    return "\n".join(["| state | what it means |", "| --- | --- |", *rows])
+
+
+def worth_saying(change: Change, alarm: Alarm) -> bool:
+    """Suppression of an alarm that has nothing to say is nobody's concern."""
+    silent = change.deed in (Deed.SUPPRESSED, Deed.UNSUPPRESSED)
+    return change.announced or alarm.concerns or not silent
+
+
+def event_of(change: Change, alarm: Alarm, evidence: Evidence, time_ns: int) -> Event:
+    """A change as an event at a PLC time; ``alarm`` is as it is then, by its new name."""
+    rule = alarm.rule
+    data: dict[str, Any] = {
+        "alarm": rule.name,
+        "deed": change.deed.value,
+        "state": alarm.state.value,
+        "priority": rule.priority.value,
+        "host_ns": change.time_ns,
+        "who": change.who,
+        "consequence": rule.consequence,
+        "action": rule.action,
+        "evidence": dict(evidence),
+    }
+    if change.deed is Deed.RENAMED:
+        data["was"] = change.alarm
+    kind = Kind.ALARM if change.announced else Kind.ALARM_CHANGED
+    return Event(time_ns, kind, _text(change, alarm, evidence), data)
+
+
+def _text(change: Change, alarm: Alarm, evidence: Evidence) -> str:
+    said = _deed(change, alarm)
+    if not change.announced:
+        return said
+    rule = alarm.rule
+    why = f": {evidence['words']}" if "words" in evidence else ""
+    advice = " ".join(filter(None, (rule.consequence, rule.action)))
+    return f"{said} ({rule.priority} priority){why}. {advice}".rstrip()
+
+
+def _deed(change: Change, alarm: Alarm) -> str:
+    """What happened, in a few words."""
+    if change.deed is Deed.RENAMED:
+        return f"{change.alarm} is {change.to}"
+    by = f" by {change.who}" if change.who else ""
+    said = f"{change.alarm} {_SAID[change.deed]}{by}"
+    if change.deed is Deed.SHELVED and alarm.shelved_until is not None:
+        return f"{said} for {(alarm.shelved_until - change.time_ns) / SECOND_NS / 60:.3g} min"
+    if change.deed is Deed.RAISED and not change.announced:
+        return f"{said}, and kept quiet: {str(alarm.state).replace('_', ' ')}"
+    return said
+
+
+def rules_table() -> str:
+    """The rules that come with the program as a table for people."""
+    rows = [f"| `{one.name}` | {_in_columns(one)} |" for one in default_rules()]
+    head = "| alarm | priority | delays | if nobody acts | what to do |"
+    return "\n".join([head, "| --- | --- | --- | --- | --- |", *rows])
+
+
+def _in_columns(rule: Rule) -> str:
+    delays = f"{rule.on_delay_s:g} s on, {rule.off_delay_s:g} s off"
+    return " | ".join((rule.priority, delays, rule.consequence, rule.action))

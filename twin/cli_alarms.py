@@ -1,0 +1,316 @@
+"""``twin alarms``: what stands, what was, and what people do about it, beside a run or after it."""
+
+import getpass
+import json
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from twin.errors import ConfigError, SourceError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from twin.alarms.board import Board, Episode
+    from twin.alarms.loop import Alarms
+    from twin.alarms.state import Alarm, Deed
+    from twin.alarms.store import Store, Unit
+    from twin.config import Config
+    from twin.settings import Document
+
+ANSWER_S = 5.0  # until a run that is there has answered: it looks every second
+LOOK_S = 0.1
+
+alarms_app = typer.Typer(
+    help="Alarms: what stands, what was; acknowledge, shelve, take out of service.",
+    no_args_is_help=True,
+)
+
+Names = Annotated[list[str], typer.Argument(metavar="ALARM...", help="As twin alarms list says.")]
+Url = Annotated[
+    str, typer.Option("--alarms", metavar="URL", help="Database: sqlite:///FILE, postgresql://...")
+]
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option("--config", metavar="CONFIG", help="Its unit, rules and [alarms] url."),
+]
+UnitId = Annotated[str, typer.Option("--id", metavar="ID", help="Unit, where there are several.")]
+Who = Annotated[str, typer.Option("--by", metavar="NAME", help="Instead of the user's name.")]
+JsonFile = Annotated[Path | None, typer.Option("--json", metavar="F", help="The same as JSON.")]
+
+
+@alarms_app.command("list")
+def list_(
+    config: ConfigFile = None, unit: UnitId = "", alarms: Url = "", json_file: JsonFile = None
+) -> None:
+    """What a person is to look at, the most urgent first; then what is kept quiet."""
+    with _open(alarms, config) as store:
+        whose = _chosen(store, config, unit)
+        board = _board(config)
+        board.resume(store.states(whose))
+        board.see(time.time_ns(), {})
+        episodes = {one.alarm: one for one in store.episodes(whose, only_going_on=True)}
+    shown = [*board.standing(), *board.quiet()]
+    plain = [_plain_alarm(alarm, episodes.get(alarm.rule.name)) for alarm in shown]
+    for one in plain:
+        print(_alarm_in_words(one))
+    if not plain:
+        print(f"no alarm of {whose.id or whose.type}")
+    if json_file is not None:
+        _write_json(json_file, plain)
+
+
+@alarms_app.command()
+def history(
+    config: ConfigFile = None,
+    unit: UnitId = "",
+    alarms: Url = "",
+    days: Annotated[float | None, typer.Option(metavar="N", help="Only the last N days.")] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Every time an alarm was active: since when, how long, who acknowledged it, what spoke for it.
+
+    The newest comes last.
+    """
+    since = None if days is None else time.time_ns() - round(days * 86_400e9)
+    with _open(alarms, config) as store:
+        episodes = store.episodes(_chosen(store, config, unit), since)
+    for one in episodes:
+        print(_episode_in_words(one))
+    if json_file is not None:
+        _write_json(json_file, [_plain_episode(one) for one in episodes])
+
+
+@alarms_app.command()
+def acknowledge(
+    names: Names, config: ConfigFile = None, unit: UnitId = "", alarms: Url = "", by: Who = ""
+) -> None:
+    """Say that somebody has seen an alarm."""
+    from twin.alarms.state import Deed
+
+    _ask(names, Deed.ACKNOWLEDGED, by, _From(config, unit, alarms))
+
+
+@alarms_app.command()
+def shelve(
+    names: Names,
+    hours: Annotated[float, typer.Option(metavar="H", help="For how long.")] = 1.0,
+    config: ConfigFile = None,
+    unit: UnitId = "",
+    alarms: Url = "",
+    by: Who = "",
+) -> None:
+    """Keep an alarm quiet for a time."""
+    from twin.alarms.state import Deed
+
+    _ask(names, Deed.SHELVED, by, _From(config, unit, alarms), hours * 3600.0)
+
+
+@alarms_app.command()
+def unshelve(
+    names: Names, config: ConfigFile = None, unit: UnitId = "", alarms: Url = "", by: Who = ""
+) -> None:
+    """Let it speak before that time is over."""
+    from twin.alarms.state import Deed
+
+    _ask(names, Deed.UNSHELVED, by, _From(config, unit, alarms))
+
+
+@alarms_app.command()
+def out_of_service(
+    names: Names, config: ConfigFile = None, unit: UnitId = "", alarms: Url = "", by: Who = ""
+) -> None:
+    """Keep an alarm quiet until it is taken into service again."""
+    from twin.alarms.state import Deed
+
+    _ask(names, Deed.OUT_OF_SERVICE, by, _From(config, unit, alarms))
+
+
+@alarms_app.command()
+def in_service(
+    names: Names, config: ConfigFile = None, unit: UnitId = "", alarms: Url = "", by: Who = ""
+) -> None:
+    """Take an alarm into service again."""
+    from twin.alarms.state import Deed
+
+    _ask(names, Deed.IN_SERVICE, by, _From(config, unit, alarms))
+
+
+@alarms_app.command()
+def rules(config: ConfigFile = None) -> None:
+    """Print the rules in use, as a file that [alarms] rules can name."""
+    from twin.alarms.rules import write_rules
+    from twin.alarms.settings import chosen_rules
+
+    print(write_rules(chosen_rules(_document(config))), end="")
+
+
+# --- for the loop -------------------------------------------------------------------------------
+
+
+def alarms_of(
+    settings: "Config", say: "Callable[[str], None] | None" = None
+) -> "Callable[[], Alarms]":
+    """What begins the alarms of a configuration's unit; ConfigError names a wrong rule or key.
+
+    They are kept where ``[alarms]`` asks for it and there is somebody to ``say`` troubles to; a
+    replay has nobody, and no clock.
+    """
+    from twin.alarms.keeper import Keeper
+    from twin.alarms.loop import Alarms
+    from twin.alarms.place import open_chosen
+    from twin.alarms.settings import AlarmSettings, board_rules
+    from twin.alarms.store import ALARM_DATABASE, Unit
+    from twin.assets.engine import parse_url
+
+    document = settings.document
+    by_cause, wanted = board_rules(document), document.section(AlarmSettings, "alarms")
+    if say is None:
+        return lambda: Alarms(by_cause, None)
+    if not wanted.keep:
+        return lambda: Alarms(by_cause, time.time_ns)
+    parse_url(wanted.url, ALARM_DATABASE)
+    opened = partial(open_chosen, "", document, write=True)
+    keeper = Keeper(opened, Unit(settings.asset.type, settings.asset.id), say)
+    return lambda: Alarms(by_cause, time.time_ns, keeper.begin(), keeper)
+
+
+# --- what the commands share --------------------------------------------------------------------
+
+
+class _From:
+    """Whose alarms, and from where."""
+
+    def __init__(self, config: Path | None, unit: str, url: str) -> None:
+        self.config, self.unit, self.url = config, unit, url
+
+
+def _document(config: Path | None) -> "Document | None":
+    from twin.settings import Document
+
+    return Document.read(config) if config else None
+
+
+def _open(url: str, config: Path | None) -> "Store":
+    from twin.alarms.place import open_chosen
+
+    store = open_chosen(url, _document(config), write=False)
+    print(f"alarm database: {store.name}", file=sys.stderr)
+    return store
+
+
+def _board(config: Path | None) -> "Board":
+    from twin.alarms.board import Board
+    from twin.alarms.settings import board_rules
+
+    return Board(board_rules(_document(config)))
+
+
+def _chosen(store: "Store", config: Path | None, unit: str) -> "Unit":
+    """The unit that is meant: named, that of the configuration, or the only one there is."""
+    units = store.units()
+    document = _document(config)
+    asked = unit or (str(document.tables.get("asset", {}).get("id", "")) if document else "")
+    found = [one for one in units if not asked or one.id == asked]
+    if len(found) != 1:
+        known = ", ".join(one.id or one.type for one in units) or "none"
+        what = f"{len(found)} units {asked!r}" if asked else f"{len(found)} units"
+        raise ConfigError(f"{store.name}: {what}", f"choose with --id; there are: {known}")
+    return found[0]
+
+
+def _ask(names: list[str], deed: "Deed", by: str, of: _From, seconds: float = 0.0) -> None:
+    """Ask a run that is there, and wait a moment for what it says; ConfigError if it refuses."""
+    board = _board(of.config)
+    for name in names:
+        if deed.value == "shelved":
+            list(board[name].shelve(0, seconds, by))  # refuses what a run would refuse
+        board[name]
+    with _open(of.url, of.config) as store:
+        whose = _chosen(store, of.config, of.unit)
+        asked = {
+            store.ask(whose, name, deed, by or getpass.getuser(), seconds): name for name in names
+        }
+        refused = [
+            why for number, name in asked.items() if (why := _answered(store, number, name, deed))
+        ]
+    if refused:
+        raise ConfigError("\n".join(refused))
+
+
+def _answered(store: "Store", number: int, name: str, deed: "Deed") -> str:
+    """Print that it is done; or give why not."""
+    end = time.monotonic() + ANSWER_S
+    while (answer := store.answer(number)) is None:
+        if time.monotonic() > end:
+            print(f"{name}: asked; twin run will do it when it is there again")
+            return ""
+        time.sleep(LOOK_S)
+    if not answer:
+        print(f"{name}: {deed.value.replace('_', ' ')}")
+    return answer
+
+
+# --- in words -----------------------------------------------------------------------------------
+
+
+def _plain_alarm(alarm: "Alarm", episode: "Episode | None") -> dict[str, Any]:
+    rule = alarm.rule
+    return {
+        "alarm": rule.name,
+        "state": alarm.state.value,
+        "priority": rule.priority.value,
+        "consequence": rule.consequence,
+        "action": rule.action,
+        "shelved_until_ns": alarm.shelved_until,
+        "episode": _plain_episode(episode) if episode else None,
+    }
+
+
+def _plain_episode(episode: "Episode") -> dict[str, Any]:
+    return {
+        "alarm": episode.alarm,
+        "raised_ns": episode.raised_ns,
+        "cleared_ns": episode.cleared_ns,
+        "seconds": episode.seconds,
+        "acknowledged_ns": episode.acknowledged_ns,
+        "acknowledged_by": episode.acknowledged_by,
+        "evidence": dict(episode.evidence),
+    }
+
+
+def _alarm_in_words(plain: dict[str, Any]) -> str:
+    """An alarm on some lines: what, since when, what speaks for it, what to do."""
+    head = f"{plain['priority']:<7} {plain['alarm']}  {plain['state'].replace('_', ' ')}"
+    if plain["shelved_until_ns"] is not None:
+        head += f" until {_time(plain['shelved_until_ns'])}"
+    lines = [head]
+    if episode := plain["episode"]:
+        lines[0] += f", raised {_time(episode['raised_ns'])}"
+        lines.append(episode["evidence"].get("words", ""))
+    lines += [plain["consequence"], plain["action"]]
+    return "\n        ".join(line for line in lines if line)
+
+
+def _episode_in_words(episode: "Episode") -> str:
+    lasted = "still active" if episode.seconds is None else f"{episode.seconds:.1f} s"
+    seen = f"seen by {episode.acknowledged_by}" if episode.acknowledged_ns else "not acknowledged"
+    words = episode.evidence.get("words", "")
+    return f"{_time(episode.raised_ns)}  {episode.alarm}  {lasted}  {seen}  {words}".rstrip()
+
+
+def _time(ns: int) -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(ns // 1_000_000_000))
+
+
+def _write_json(path: Path, document: Any) -> None:
+    try:
+        text = json.dumps(document, indent=1, ensure_ascii=False)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        message = f"{path}: cannot be written: {error.strerror}"
+        raise SourceError(message, "check that the folder exists and has space") from error
