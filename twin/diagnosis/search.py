@@ -38,7 +38,6 @@ TRIED_PAIRS, TRIED_MORE, TRIED_TIMES = 12, 8, 6
 SECOND = 0.5  # of the best gain, above which an effect's second course is fitted as well
 NEARLY = 0.3  # of the best gain, above which an effect may turn out to be a rival
 START = np.array([0.4, 1.0, 1.7, 2.5, 3.5, 5.0])  # typical sizes to begin a fit from
-TRIED_CYCLES = 2  # causes that come and go, whose cycles are tried one by one
 MOST_FLIPS = 3  # rounds of looking for the cycles that something comes in
 WORTH_FLIPPING = 5.0  # chi-square that another set of cycles must gain
 ONSETS, MANY_ONSETS = 16, 64  # in a round of looking for when a step began
@@ -143,8 +142,7 @@ def _fit_singles(
     ]
     progress("fitting single causes")
     started = _started(evidence, judged, hypotheses)
-    found = fit(evidence, weights, _timed(evidence, judged, started))
-    return found + _retried(evidence, judged, weights, found, TRIED_CYCLES)
+    return fit(evidence, weights, _timed(evidence, judged, started))
 
 
 def _likeliest(evidence: Evidence, fitted: Sequence[int], tried: Sequence[Fitted]) -> Fitted:
@@ -211,9 +209,8 @@ def _best_addition(
         candidates += _linear_pairs(evidence, judged)
         candidates += _fitted_pairs(evidence, weights, singles[:TRIED_PAIRS], found)
     candidates = _timed(evidence, judged, candidates)
-    tried = fit(evidence, weights, candidates)
-    tried += _retried(evidence, judged, weights, tried, 1)
-    for one in _ranked(evidence, judged, tried):
+    tried = _ranked(evidence, judged, fit(evidence, weights, candidates))
+    for one in tried:
         if _worth(healthy, found.chi2, found.chi2 - found.score, one):
             return one
     return None
@@ -300,24 +297,16 @@ def _rivals(
 def _timed(
     evidence: Evidence, judged: Weights, hypotheses: Sequence[Hypothesis]
 ) -> list[Hypothesis]:
-    """The same with the onsets of the first few steps found within their cycle."""
+    """The same; of the first few the onset within its cycle, or the cycles, where they fit best."""
     result, timed = [], 0
     for hypothesis in hypotheses:
-        if hypothesis[-1].course == Course.STEP and timed < TRIED_TIMES:
-            result.append(_with_onset(evidence, judged, hypothesis))
+        place = _PLACED.get(hypothesis[-1].course)
+        if place is not None and timed < TRIED_TIMES:
+            result.append(place(evidence, judged, hypothesis))
             timed += 1
         else:
             result.append(hypothesis)
     return result
-
-
-def _retried(
-    evidence: Evidence, judged: Weights, weights: Weights, found: Sequence[Fitted], most: int
-) -> list[Fitted]:
-    """The best few whose last cause comes and goes, in the cycles where it fits best."""
-    ranked = sorted(found, key=lambda one: one.score)
-    going = [one for one in ranked if one.hypothesis[-1].course == Course.INTERMITTENT][:most]
-    return fit(evidence, weights, [_with_cycles(evidence, judged, one.hypothesis) for one in going])
 
 
 def _with_onset(evidence: Evidence, judged: Weights, hypothesis: Hypothesis) -> Hypothesis:
@@ -344,6 +333,9 @@ def _with_cycles(evidence: Evidence, judged: Weights, hypothesis: Hypothesis) ->
         chi2 = np.sum(white(evidence, judged, [(*others, one) for one in both]) ** 2, axis=0)
         cause = both[int(np.argmin(chi2))]
     return (*others, cause)
+
+
+_PLACED = {Course.STEP: _with_onset, Course.INTERMITTENT: _with_cycles}
 
 
 def _finely_timed(evidence: Evidence, judged: Weights, hypothesis: Hypothesis) -> Hypothesis:
