@@ -113,12 +113,13 @@ def run(
             "leave it out; --rrd FILE writes what is to be viewed",
         )
     ejectors = _named([_configured(Document.read(one), assets, unit) for one in configs])
+    pairs = {name: _pair(one) for name, one in ejectors.items()}  # compiled before time counts
     events: list[Event] = []
     lines = Lines()
 
     def beside(name: str, settings: "Config") -> None:
         label = "" if alone else name
-        twin, monitor = _pair(settings)
+        twin, monitor = pairs[name]
         alarms = alarms_of(settings, _complain)
         shown = show(name, settings.asset.type) if show else None
         shared = lines if hil or not alone else None
