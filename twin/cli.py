@@ -665,7 +665,7 @@ def _stop_on_signal(duration: float | None) -> Iterator[Callable[[], str]]:
 
     The first Ctrl-C lets the loop finish its block and close the log; the second one is Python's.
     """
-    end = None if duration is None else time.monotonic() + duration
+    end: float | None = None  # from the first question on: what comes before takes its time
     reason = ""
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
@@ -675,7 +675,9 @@ def _stop_on_signal(duration: float | None) -> Iterator[Callable[[], str]]:
         reason = "interrupted"
 
     def why() -> str:
-        nonlocal reason
+        nonlocal reason, end
+        if end is None and duration is not None:
+            end = time.monotonic() + duration
         if not reason and end is not None and time.monotonic() >= end:
             reason = "duration"
         return reason
