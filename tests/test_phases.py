@@ -266,11 +266,28 @@ def test_more_noise_takes_a_longer_window() -> None:
 
 
 @given(st.integers(1, 400))
-def test_no_row_is_held_back_longer_than_the_lag(block: int) -> None:
+def test_a_row_is_held_back_only_where_a_knee_may_be(block: int) -> None:
     finder = PhaseFinder(replace(KNEES, window=12))
+    commands = [0] * 300 + [1] * 700 + [0] * 100 + [1] * 20 + [2] * 100
+    first = 300 + finder.knees.settled + finder.knees.window + 1  # row that may be at a knee
     pushed = given_out = 0
-    for part in rigs.cut(stream([0] * 300 + [1] * 700), block):
+    for part in rigs.cut(stream(commands), block):
         pushed += len(part)
         given_out += len(finder.push(part)[0])
-        assert given_out == max(pushed - finder.knees.lag, 0)
-    assert given_out + len(finder.flush()[0]) == pushed
+        searched = max(pushed - finder.knees.window, first)
+        assert given_out == (min(pushed, searched) if pushed <= 1000 else pushed)
+    assert given_out == len(commands)
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_no_row_is_held_back_longer_than_the_lag(name: str) -> None:
+    samples, _ = rigs.recorded(name, SECONDS)
+    finder = PhaseFinder(rigs.knees(name))
+    pushed = given_out = longest = 0
+    for part in rigs.cut(samples, 10):
+        pushed += len(part)
+        given_out += len(finder.push(part)[0])
+        longest = max(longest, pushed - given_out)
+        if part["commands"][-1] != Command.SUCTION:
+            assert given_out == pushed
+    assert finder.knees.window <= longest <= finder.knees.lag

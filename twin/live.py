@@ -45,7 +45,7 @@ class Adviser(Protocol):
 
 @dataclass
 class Twin:
-    """The model beside the rig: what the sensor should read, a fixed lag behind the measurement."""
+    """The model beside the rig: what the sensor should read, a little behind the measurement."""
 
     theta: Theta
     knees: Knees

@@ -2,8 +2,9 @@
 
 A compact ejector switches its nozzle off at H1 and on again below it by itself; the PLC does not
 see it. It shows as a knee in the pressure: the slope breaks. The finder looks for knees with a
-straight line on each side, so it is a fixed lag behind the measurement; behind it everything is
-known when the model steps, and the model is synchronised on the measured level at each knee.
+straight line on each side, so where there may be one it is a lag behind the measurement; behind it
+everything is known when the model steps, and the model is synchronised on the measured level at
+each knee. Rows that cannot be at a knee are given out at once.
 """
 
 import math
@@ -56,7 +57,7 @@ class Knees:
 
     @property
     def lag(self) -> int:
-        """Rows the finder stays behind: half a window to see the peak, and the way back."""
+        """Rows the finder is behind at most: half a window to see the peak, and the way back."""
         return self.settles + self.on_shift + 1
 
 
@@ -144,15 +145,20 @@ def _break_at(pressure, row, window, noise, nozzle_on):  # type: ignore[no-untyp
 
 
 @compiled
-def _find(state, pressure, commands, first, last, look, phase, level):  # type: ignore[no-untyped-def]
-    """Fill ``phase`` and ``level`` for rows first..last−1; a knee reaches back by its shift.
+def _find(state, pressure, commands, first, look, phase, level):  # type: ignore[no-untyped-def]
+    """Fill ``phase`` and ``level`` from ``first`` on; gives the row that needs later ones.
 
-    ``look`` = window, noise, on shift, settled; window 0 looks for no knees (at the end
-    of a stretch, where the rows after are missing).
+    ``look`` = window, noise, on shift, settled; window 0 looks for no knees (at the end of a
+    stretch, where the rows after are missing). A knee reaches back by its shift.
     """
-    for row in range(first, last):
+    window, settled = int(look[0]), look[3]
+    for row in range(first, len(pressure)):
         suction = commands[row] & 1 and not commands[row] & 2
         starts = suction and state[_AGE] < 0.0
+        may_bend = suction and window > 0 and state[_AGE] >= settled + window
+        same = _unchanged(commands, row, window) if may_bend else 0
+        if may_bend and same < window and row + same + 1 == len(commands):
+            return row
         if suction:
             state[_AGE] = 0.0 if starts else state[_AGE] + 1.0
         else:
@@ -170,8 +176,29 @@ def _find(state, pressure, commands, first, last, look, phase, level):  # type: 
             phase[row] = _BLOW_OFF if commands[row] & 2 else _HOLD
             if suction and state[_NOZZLE] > 0.0:
                 phase[row] = _SUCTION
-        if suction and look[0] > 0.0:
-            _look(state, pressure, commands, row, look, phase, level)
+        if suction and window > 0:
+            _look(state, pressure, row, look, may_bend and same == window, phase, level)
+    return len(pressure)
+
+
+@compiled
+def _unchanged(commands, row, most):  # type: ignore[no-untyped-def]
+    """How many rows after ``row`` have its command, up to ``most`` or to the end."""
+    rows = 0
+    while rows < most and row + rows + 1 < len(commands):
+        if commands[row + rows + 1] != commands[row]:
+            break
+        rows += 1
+    return rows
+
+
+@compiled
+def _unsettled(state, look):  # type: ignore[no-untyped-def]
+    """How many of the rows that are through the search a knee may still change."""
+    if state[_AGE] < 0.0 or look[0] == 0.0:
+        return 0
+    reach = 0 if state[_NOZZLE] > 0.0 else int(look[2])
+    return reach + (int(state[_BEST_AGE]) + 1 if state[_BEST] > 0.0 else 0)
 
 
 @compiled
@@ -201,11 +228,11 @@ def _idle_level(state, pressure, row):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _look(state, pressure, commands, row, look, phase, level):  # type: ignore[no-untyped-def]
+def _look(state, pressure, row, look, may_bend, phase, level):  # type: ignore[no-untyped-def]
     """Follow the break's significance over the rows and settle on its peak."""
     window, noise, nozzle_on = int(look[0]), look[1], state[_NOZZLE] > 0.0
     significance, here = 0.0, 0.0
-    if state[_AGE] > look[3] + window and commands[row + window] == commands[row]:
+    if may_bend:
         significance, here = _break_at(pressure, row, window, noise, nozzle_on)
     if significance > max(state[_BEST], SIGNIFICANT):
         state[_BEST], state[_BEST_AGE], state[_BEST_LEVEL] = significance, 0.0, here
@@ -252,7 +279,7 @@ class PhaseFinder:
 
     def flush(self) -> Found:
         """Give all rows that are left, and begin anew: what follows does not belong to them."""
-        self._run(len(self._rows), window=0)
+        self._run(window=0)
         rest = slice(self._given, None)
         given = self._rows[rest], self._phase[rest], self._level[rest]
         self._state, self._rows = np.array(_BEGINNING), np.empty(0, SAMPLE)
@@ -266,14 +293,12 @@ class PhaseFinder:
         self._rows = np.concatenate([self._rows, stretch])
         self._phase = np.concatenate([self._phase, np.zeros(len(stretch), "u1")])
         self._level = np.concatenate([self._level, np.full(len(stretch), np.nan)])
-        window, lag = self.knees.window, self.knees.lag
-        self._run(max(len(self._rows) - window, self._seen), window)
-        ready = slice(self._given, max(len(self._rows) - lag, self._given))
+        settled = self._run(self.knees.window)
+        ready = slice(self._given, max(settled, self._given))
         given = self._rows[ready], self._phase[ready], self._level[ready]
         self._given = ready.stop
-        context = max(window + lag, IDLE_ROWS)  # how far later rows look back
-        drop = max(self._seen - context, 0)
-        drop = min(drop, self._given)
+        context = max(self.knees.window + self.knees.lag, IDLE_ROWS)  # how far later rows look back
+        drop = min(max(self._seen - context, 0), self._given)
         self._rows, self._phase = self._rows[drop:], self._phase[drop:]
         self._level, self._told = self._level[drop:], self._told[drop:]
         self._seen -= drop
@@ -288,9 +313,12 @@ class PhaseFinder:
         timed(self._timer, stretch["commands"], dt, *self.knees.blow_off, told)
         return told
 
-    def _run(self, last: int, window: int) -> None:
+    def _run(self, window: int) -> int:
+        """Search as far as the rows reach; gives the first row that may still change."""
         pressure = self._rows["pressure"].astype(np.float64)
         pressure[(self._rows["quality"] & UNUSABLE) != 0] = np.nan
         look = np.array([window, self.knees.noise, self.knees.on_shift, self.knees.settled])
-        _find(self._state, pressure, self._told, self._seen, last, look, self._phase, self._level)
-        self._seen = last
+        self._seen = _find(
+            self._state, pressure, self._told, self._seen, look, self._phase, self._level
+        )
+        return self._seen - int(_unsettled(self._state, look))
