@@ -119,6 +119,18 @@ def test_a_slow_network_is_no_clock_that_was_set() -> None:
     close_to(of(events, Kind.CLOCK)[-1], 8.0, 0.0)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_busy_beginning_is_no_clock_that_was_set(seed: int) -> None:
+    samples = stream(100.0, 8.0)
+    busy_ms = 3.5 + np.random.default_rng(seed).exponential(8.0, 1000)
+    samples["host_ns"][:30_000] += np.repeat(busy_ms * MS, 30).astype(np.int64)
+    samples["host_ns"] = np.maximum.accumulate(samples["host_ns"])
+    events = told(samples)
+    assert of(events, Kind.CLOCK_JUMPED) == []
+    data = of(events, Kind.CLOCK)[-1].data
+    assert data["offset_ms"] == pytest.approx(8.0 - WAY_MS, abs=data["offset_pm_ms"])
+
+
 def test_a_clock_here_that_is_set_back_is_told_since_no_way_is_that_short() -> None:
     samples = stream(100.0, 8.0)
     samples["host_ns"][50_000:] -= 30 * MS

@@ -24,6 +24,7 @@ LEAD = 64  # rows from which the scans' period is taken
 SET_NS = 3_000_000  # a clock that was set by less cannot be told from the PLC's jitter
 CONFIRMED = 3  # receipts that must agree that it was set
 FARTHEST = 1000  # scans between two receipts; beyond, the period is not known that well
+UNSTEADY = 2.0  # times what the middle receipt came after the fastest: the fastest may be late too
 SHORTER, LONGER = 2, 12  # windows after which a way that is shorter, or longer, is a clock's doing
 
 _NEW = int(Quality.RESTART | Quality.CLOCK)  # after these another time begins
@@ -83,8 +84,9 @@ class ClockWatch:
     _aside: list[float] = field(default_factory=list)  # the same of receipts where that is far
     _window: int = 0
     _fastest: tuple[int, int] | None = None  # of the window: time and way, ns
-    _receipts: int = 0  # in the window
+    _ways: list[int] = field(default_factory=list)  # of the window's receipts, ns
     _points: list[tuple[int, int]] = field(default_factory=list)  # of the windows before
+    _late: list[float] = field(default_factory=list)  # of their middle receipts after these, ns
     _since: int = 0  # windows since the last report
     _off: int = 0  # windows in a row that are off the line, below zero where they are too early
 
@@ -107,7 +109,7 @@ class ClockWatch:
         """Give what the rows since the last report tell, if it is enough."""
         if not len(self._receipt):
             return []
-        if self._receipts >= FULL:
+        if len(self._ways) >= FULL:
             self._finish_window()
         return list(self._report(int(self._receipt["time_ns"][0])))
 
@@ -145,7 +147,7 @@ class ClockWatch:
             if self._zero is None:  # it begins anew
                 self._zero, at = (time_ns, way), (0, 0)
             self._window = at[0] // WINDOW_NS
-        self._receipts += 1
+        self._ways.append(at[1])
         if self._fastest is None or at[1] < self._fastest[1]:
             self._fastest = at
 
@@ -171,7 +173,7 @@ class ClockWatch:
 
     def _moved(self, time_ns: int, by_ns: float, text: str) -> Iterator[Event]:
         """A clock was set: what was known is told, and the estimate begins anew."""
-        self._fastest, self._receipts = None, 0  # before it was set, or after: who knows
+        self._fastest, self._ways = None, []  # before it was set, or after: who knows
         yield from self._report(time_ns)
         data = {"jump_s": by_ns * 1e-9}
         yield Event(time_ns, Kind.CLOCK_JUMPED, text.format(by_ns * 1e-6), data)
@@ -196,8 +198,10 @@ class ClockWatch:
             return 0.0
         off = self._beyond(self._fastest)
         self._off = 0 if not off else int(np.sign(off)) + (self._off if off * self._off > 0 else 0)
+        late = float(np.median(self._ways)) - self._fastest[1]
         self._points = [*self._points[-KEPT + 1 :], self._fastest]
-        self._since, self._fastest, self._receipts = self._since + 1, None, 0
+        self._late = [*self._late[-KEPT + 1 :], late]
+        self._since, self._fastest, self._ways = self._since + 1, None, []
         return off
 
     def _beyond(self, point: tuple[int, int]) -> float:
@@ -207,7 +211,8 @@ class ClockWatch:
         slope, _, at_end = line(x, y)
         off = point[1] - at_end - slope * (point[0] - x[-1])
         scatter = 1.4826 * float(np.median(np.abs(y - at_end - slope * (x - x[-1]))))
-        return off if abs(off) > max(SET_NS, 8.0 * scatter) else 0.0
+        unsteady = UNSTEADY * float(np.median(self._late[: len(x)]))
+        return off if abs(off) > max(SET_NS, 8.0 * scatter, unsteady) else 0.0
 
     def _report(self, time_ns: int) -> Iterator[Event]:
         if len(self._sure) < FEWEST or not self._since or self._zero is None:
