@@ -19,12 +19,12 @@ from twin.calibration.report import as_json, in_words
 from twin.calibration.store import store
 from twin.config import Config
 from twin.diagnosis.answer import diagnose
-from twin.diagnosis.bins import warped
 from twin.errors import ConfigError
 from twin.live import Twin, run
 from twin.model import theta as c
 from twin.model.dataset import coefficients
 from twin.model.theta import Theta
+from twin.monitor.bins import warped
 from twin.monitor.cycles import PAPER_VACUUM, CycleCutter, time_to_vacuum
 from twin.monitor.detect import Monitor
 from twin.signals import MBAR, Phase, Quality, Samples

@@ -15,7 +15,6 @@ import rigs
 
 from twin.diagnosis import drawing
 from twin.diagnosis.answer import Diagnosis, diagnose
-from twin.diagnosis.bins import Floats
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, collect
 from twin.diagnosis.fit import Fitted
 from twin.diagnosis.judge import Judged, judge
@@ -50,6 +49,7 @@ from twin.errors import SourceError
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS
 from twin.model.term import KINDS, Term
+from twin.monitor.bins import Floats
 from twin.monitor.healthy import ModelError
 from twin.signals import MBAR
 

@@ -461,9 +461,17 @@ def _pair(settings: "Config") -> tuple["Twin", "Monitor"]:
     """The twin of a configuration and its monitor."""
     from twin.live import compiled
     from twin.monitor.detect import Monitor
+    from twin.monitor.isolation import Isolation
 
     twin = compiled(settings.data)
-    monitor = Monitor(settings.monitor, twin.theta, teller=key_figures_of(settings))
+    watch = settings.monitor
+    isolation = (
+        Isolation.of(settings.data, watch.healthy, watch.false_alarm_days)
+        if watch.isolate
+        else None
+    )
+    teller = key_figures_of(settings)
+    monitor = Monitor(watch, twin.theta, teller=teller, isolation=isolation)
     if settings.document.tables.get("driver", {}).get("mode") == "poll":
         monitor.clocks = None  # then time is that of the poll here
     return twin, monitor

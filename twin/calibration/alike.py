@@ -7,10 +7,10 @@ import numpy as np
 
 from twin.calibration.cycles import Cycles
 from twin.calibration.weights import weighted
-from twin.diagnosis.bins import Floats
 from twin.errors import ConfigError
 from twin.model.effects import EFFECTS, Parameter, apply
 from twin.model.theta import Theta
+from twin.monitor.bins import Floats
 
 SMALLEST = 0.5  # of an effect's typical size: less is within what cycles scatter
 LEAST_SCATTER = 0.05  # of it, from cycle to cycle, whatever a few cycles show

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from twin.diagnosis.bins import Bins, Floats, Ints, binned
 from twin.model import kernel
 from twin.model.dataset import DataSet, coefficients
+from twin.monitor.bins import Bins, Floats, Ints, binned
 from twin.monitor.phases import PhaseFinder, expected_knees
 from twin.monitor.signatures import steps
 from twin.signals import MBAR, UNUSABLE, Phase, Samples

@@ -12,11 +12,11 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from twin.calibration.cycles import Cycles
-from twin.diagnosis.bins import Bins, Floats, Ints
-from twin.diagnosis.weights import SCATTER
 from twin.model import theta as c
 from twin.model.effects import apply
 from twin.model.theta import Theta
+from twin.monitor.bins import Bins, Floats, Ints
+from twin.monitor.weights import SCATTER
 from twin.signals import MBAR, ML, MS
 
 FIRST_ERROR = 3.0 * MBAR  # Pa, of a model that has not been fitted

@@ -15,8 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.config import Config
-from twin.diagnosis.bins import Bins, Floats, Ints, binned, sparse
-from twin.diagnosis.switching import Seen, seen
 from twin.errors import ConfigError
 from twin.live import Twin
 from twin.model import kernel
@@ -26,10 +24,12 @@ from twin.model.dataset import coefficients
 from twin.model.plant import reading, sensed_at
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
+from twin.monitor.bins import Bins, Floats, Ints, binned, sparse
 from twin.monitor.cycles import Cycle, CycleCutter, figures
 from twin.monitor.healthy import Healthy
 from twin.monitor.phases import Knees, expected_knees
 from twin.monitor.signatures import steps
+from twin.monitor.switching import Seen, seen
 from twin.signals import MBAR, MS, NS, SAMPLE, TICK, UNUSABLE, Command, Phase, Samples, Ticks
 
 WORKERS = 2

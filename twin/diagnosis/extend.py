@@ -13,9 +13,7 @@ from twin.assets.place import open_chosen
 from twin.assets.record import Record
 from twin.config import Config, Known
 from twin.diagnosis.answer import Diagnosis
-from twin.diagnosis.bins import Floats
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
-from twin.diagnosis.weights import SCATTER
 from twin.diagnosis.words import spoken
 from twin.errors import ConfigError
 from twin.live import Twin
@@ -24,8 +22,10 @@ from twin.model.dataset import DataSet, coefficients
 from twin.model.effects import EFFECTS, Parameter, apply
 from twin.model.term import AGAIN
 from twin.model.theta import AMBIENT
+from twin.monitor.bins import Floats
 from twin.monitor.cycles import CycleCutter, figures
 from twin.monitor.healthy import Healthy, Scatter
+from twin.monitor.weights import SCATTER
 from twin.signals import Phase
 
 Sizes = Mapping[str, float]

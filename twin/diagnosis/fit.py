@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from twin.diagnosis.bins import Floats
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.hypotheses import bounds, price, sized, sizes
 from twin.diagnosis.weights import Weights, levels
+from twin.monitor.bins import Floats
 
 MOST_ROUNDS = 10
 STEP = 0.1  # typical sizes, for derivatives

@@ -5,17 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from twin.diagnosis.bins import Floats, Ints, unwarped
 from twin.diagnosis.evidence import HEALTHY, Evidence, of_cycles
-from twin.diagnosis.weights import SCATTER, covariance, moved
+from twin.diagnosis.weights import covariance, moved
 from twin.model.term import KINDS
+from twin.monitor.bins import Floats, Ints, unwarped
 from twin.monitor.healthy import Healthy, ModelError
+from twin.monitor.weights import FIRST_ERROR, SCATTER
 from twin.signals import MS
 
 ROUNDS = 3
 FEWEST = 6  # cycles, to judge on others what was learned from some
 LEAST_COMMON, LEAST_ALONE = 0.15, 0.1  # mbar
-FIRST_ERROR = 2.0  # mbar, before anything is known
 HIDDEN = 1.3  # the error over what is left of it once the data set was fitted to the same cycles
 LEAST_SCATTER, MOST_SCATTER = 0.2, 5.0  # of what is usual
 
@@ -40,9 +40,8 @@ def _left(evidence: Evidence, cycles: Sequence[int]) -> float:
 
 
 def _learned(evidence: Evidence) -> Healthy:
-    first = ModelError(after_ms=(0.0,), common_mbar=(FIRST_ERROR,), alone_mbar=(FIRST_ERROR / 4,))
     found = evidence.healthy.model_copy(
-        update={"error": dict.fromkeys(KINDS, first), "scatter": {}, "leftover": 1.0}
+        update={"error": dict.fromkeys(KINDS, FIRST_ERROR), "scatter": {}, "leftover": 1.0}
     )
     off, moves, _ = moved(evidence, HEALTHY, SCATTER)  # in what is usual
     for _ in range(ROUNDS):

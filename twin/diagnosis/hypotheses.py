@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from twin.diagnosis.bins import Floats
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.model.courses import HOUR, Cause, Course
 from twin.model.effects import EFFECTS, Parameter
+from twin.monitor.bins import Floats
 
 LOCAL_ONSETS = 20  # as many onsets in a cycle can be told apart
 

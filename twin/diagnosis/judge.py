@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.diagnosis.bins import Floats, Ints
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.weights import Weights, levels
 from twin.model import theta as c
+from twin.monitor.bins import Floats, Ints
 from twin.monitor.cycles import H2, PAPER_VACUUM, time_to_vacuum
 from twin.signals import MBAR, MS
 

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from twin.diagnosis.bins import Floats
 from twin.diagnosis.drawing import AFTER, BEFORE, EACH, QUIET, as_svg, empty, legend
 from twin.diagnosis.evidence import Evidence
 from twin.diagnosis.judge import Judged
@@ -13,6 +12,7 @@ from twin.diagnosis.pictures import Found, spread
 from twin.diagnosis.words import LONG_S, spoken
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS, Parameter
+from twin.monitor.bins import Floats
 from twin.signals import MBAR
 
 MOST_CYCLES = 200  # shown of a long log, evenly spread

@@ -7,7 +7,6 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 
-from twin.diagnosis.bins import PER_UNIT, Floats, Ints
 from twin.diagnosis.drawing import (
     AFTER,
     BAND,
@@ -27,6 +26,7 @@ from twin.diagnosis.weights import covariance
 from twin.diagnosis.words import spoken
 from twin.model import theta as c
 from twin.model.term import KINDS, Term
+from twin.monitor.bins import PER_UNIT, Floats, Ints
 from twin.signals import MBAR
 
 MOST_LAID_OVER = 12  # cycles laid over each other

@@ -9,7 +9,6 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 
 from twin.diagnosis.answer import Diagnosis
-from twin.diagnosis.bins import Floats, Ints
 from twin.diagnosis.drawing import (
     AFTER,
     BEFORE,
@@ -28,6 +27,7 @@ from twin.diagnosis.search import Search
 from twin.diagnosis.words import Answer, spoken
 from twin.model import theta as c
 from twin.model.term import Term
+from twin.monitor.bins import Floats, Ints
 from twin.signals import MBAR, MS, NS, Phase
 
 POINTS = 1000  # of a line; more cannot be seen

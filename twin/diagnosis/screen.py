@@ -10,12 +10,12 @@ from itertools import chain, combinations
 
 import numpy as np
 
-from twin.diagnosis.bins import Floats, Ints
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.hypotheses import price, sized
 from twin.diagnosis.weights import Weights, levels
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS, Parameter
+from twin.monitor.bins import Floats, Ints
 
 # Of its typical size, at which an effect's signature is taken. A delay moves what is sharp: a small
 # one's signature looks nothing like a great one's.

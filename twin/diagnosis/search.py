@@ -12,13 +12,13 @@ from itertools import combinations
 
 import numpy as np
 
-from twin.diagnosis.bins import Floats
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, thinned
 from twin.diagnosis.fit import Fitted, fit, white
 from twin.diagnosis.hypotheses import bounds, parameters, sized, sizes
 from twin.diagnosis.screen import columns, pairs, promises
 from twin.diagnosis.weights import Weights, covariance
 from twin.model.courses import Cause, Course
+from twin.monitor.bins import Floats
 from twin.signals import MS
 
 MOST_CAUSES = 3

@@ -11,12 +11,12 @@ from typing import Literal
 
 import numpy as np
 
-from twin.diagnosis.bins import Bins, Floats, unwarped
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.weights import Weights, covariance, levels
 from twin.model import theta as c
 from twin.model.courses import Cause
 from twin.model.term import KINDS, Term
+from twin.monitor.bins import Bins, Floats, unwarped
 from twin.signals import MBAR, MS
 
 Over = Literal["time", "vacuum"]

@@ -12,31 +12,20 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag, solve_triangular
 
-from twin.diagnosis.bins import Floats, Ints, warped
 from twin.diagnosis.evidence import HEALTHY, SUPPLY_UNKNOWN, Evidence, Hypothesis
 from twin.model import theta as c
 from twin.model.courses import Cause, Course, Schedule
-from twin.model.term import AGAIN, KINDS
 from twin.model.theta import Theta
-from twin.monitor.healthy import ModelError
+from twin.monitor.bins import Floats, Ints
+from twin.monitor.weights import SCATTER, from_cycle_to_cycle, model_error
 from twin.signals import MS, Phase
 
-# What differs from cycle to cycle in a healthy ejector: effect, parameter, one standard deviation
-# where nothing better was learned.
-SCATTER: Mapping[str, tuple[str, float]] = {
-    "supply_pressure_drop": ("drop", 0.02),
-    "leakage": ("sonic_flow", 0.03),
-    "response_delay": ("delay", 0.5),
-    "blow_off_delay": ("delay", 0.5),
-}
 # When a valve acts: an edge that moves is not linear in that.
 _ACTS = {"response_delay": c.RESPONSE, "blow_off_delay": c.BLOW_OFF_RESPONSE}
 _CLOSES = (c.RESPONSE_OFF, c.BLOW_OFF_RESPONSE_OFF)
 CLOSING_MS = 0.5  # by which a valve's closing differs, one sigma
 KNEE_WINDOWS = 10  # a knee is found to a tenth of its window
-KNEE_MBAR = 0.7  # the level at a knee is not found better, and the model is set onto it
 MISMATCH = 0.08  # of what a hypothesis explains, is off in its waveform
-_AFTER_KNEE = [KINDS.index("hold"), AGAIN]
 LEVELS = ("h1_level", "h1_low_level")
 _INTO = (Phase.HOLD, Phase.SUCTION)  # what begins at each
 LEVEL_MBAR = 0.5  # a switching level is not known better, in all cycles alike
@@ -81,24 +70,21 @@ class Covariance:
         """Weights of some cycles; where not ``scattered``, that is told apart by somebody else."""
         evidence, bins = self.evidence, self.evidence.bins
         here = np.flatnonzero(np.isin(bins.cycle, cycles))
-        cycle, stretch, kind = (of[here] for of in (bins.cycle, bins.stretch, bins.kind))
-        time = bins.time[here]
-        common, alone = _errors(evidence, kind, time)
+        kind, time = bins.kind[here], bins.time[here]
+        common, alone = model_error(evidence.healthy.error, kind, time)
         common = np.hypot(common, self.mismatch[here])
         moves, left_open = self.moves[here] * float(scattered), self.left_open[here]
         apart = np.exp(-np.abs(time[:, None] - time))
-        covariance = moves @ moves.T * (cycle[:, None] == cycle)
+        covariance = from_cycle_to_cycle(bins, here, alone, moves, evidence.noise)
         covariance += np.outer(common, common) * (apart * (kind[:, None] == kind))
-        covariance += np.outer(alone, alone) * (apart * (stretch[:, None] == stretch))
-        covariance += KNEE_MBAR**2 * ((stretch[:, None] == stretch) * np.isin(kind, _AFTER_KNEE))
-        covariance[np.diag_indices_from(covariance)] += evidence.noise**2 / bins.count[here]
         usual = _usual(np.diag(covariance), bins.count[here], evidence.noise)
         at_supply = np.sum(left_open[:, : len(SUPPLY_UNKNOWN)] ** 2, axis=1)
         unmeasured = _usual(at_supply, bins.count[here], 0.0)
         covariance += left_open @ left_open.T
         sigma = _level_sigmas(evidence, cycles)
         levels = np.diag(sigma**2) + _together(evidence, cycles)
-        factor = np.linalg.cholesky(block_diag(covariance * evidence.healthy.leftover**2, levels))
+        whole = block_diag(covariance * evidence.healthy.leftover**2, levels)
+        factor = np.linalg.cholesky(whole.astype(np.float64))
         shown = np.array([one for one, _ in _shown(evidence, cycles)], np.int64)
         return Weights(tuple(cycles), here, factor, usual, unmeasured, sigma, shown)
 
@@ -162,27 +148,6 @@ def scatter(evidence: Evidence) -> dict[str, tuple[str, float]]:
     """What scatters: effect to parameter and one standard deviation."""
     known = evidence.healthy.scatter
     return {name: (key, known.get(name, size)) for name, (key, size) in SCATTER.items()}
-
-
-def _errors(evidence: Evidence, kind: Ints, time: Floats) -> tuple[Floats, Floats]:
-    """The model's error in bins (mbar): in all cycles alike, and from cycle to cycle."""
-    common, alone = np.empty(len(kind)), np.empty(len(kind))
-    for number, name in enumerate(KINDS):
-        here = kind == number
-        error = evidence.healthy.error.get(name) or _like(evidence.healthy.error)
-        knots = warped(np.array(error.after_ms) * MS)
-        common[here] = np.interp(time[here], knots, error.common_mbar)
-        alone[here] = np.interp(time[here], knots, error.alone_mbar)
-    return common, alone
-
-
-def _like(known: Mapping[str, ModelError]) -> ModelError:
-    """The error of a kind of stretch that healthy cycles did not have: the worst of the others."""
-    worst = [max(max(getattr(one, key)) for one in known.values()) for key in _ERRORS]
-    return ModelError(after_ms=(0.0,), common_mbar=(worst[0],), alone_mbar=(worst[1],))
-
-
-_ERRORS = ("common_mbar", "alone_mbar")
 
 
 # --- levels: one row for each that a cycle shows --------------------------------------------------

@@ -1,12 +1,13 @@
 """The monitor: what happens in the stream, and when measurement and model part.
 
 Each cycle is boiled down to its figures; a figure is judged in sigmas of what healthy cycles
-scatter. An alarm is raised when one figure is far out and cleared, with hysteresis, when all are
-back for some cycles.
+scatter. An alarm is raised when one figure is far out, or when the isolation says that cycles
+differ where no single one does. It is cleared, with hysteresis, when all are back for some cycles.
 """
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import Field
@@ -21,8 +22,12 @@ from twin.monitor.signatures import Likeness, likenesses, look_alikes
 from twin.settings import Settings
 from twin.signals import BREAK, NS, SAMPLE, Quality, Samples, Ticks
 
+if TYPE_CHECKING:  # its SciPy would be imported with every configuration
+    from twin.monitor.isolation import Isolation, Verdict
+
 _UNFIT = Quality.OUT_OF_RANGE | Quality.OVERFLOW | Quality.STALE | Quality.BAD
 FEWEST_SHARE = 0.95  # of a cycle's samples, to judge it: commands seen late look like a deviation
+RIVAL = 0.05  # probability from which on another cause is named as well
 STANDING = 0.8  # of the best fit's gain: then the name of a standing alarm still holds
 
 
@@ -34,6 +39,8 @@ class MonitorSettings(Settings):
     clear_cycles: int = Field(3, ge=1)
     smallest_mbar: float = Field(0.5, ge=0.0)  # deviations below are never worth an alarm
     stale_ms: float = Field(500.0, gt=0.0)
+    isolate: bool = True  # step a bank of hypotheses beside the twin, and sum over cycles
+    false_alarm_days: float = Field(30.0, gt=0.0)  # between false alarms by these sums
     healthy: Healthy = Healthy()
 
 
@@ -54,6 +61,7 @@ class Monitor:
     theta: Theta
     teller: Teller | None = None  # of key figures, for what is said of each cycle
     active: str = ""  # the effect named by the standing alarm; empty while there is none
+    isolation: "Isolation | None" = None
     clocks: ClockWatch | None = field(default_factory=ClockWatch)  # None: the PLC has none
     _cutter: CycleCutter = field(default_factory=CycleCutter)
     _before: Cycle | None = None
@@ -69,6 +77,8 @@ class Monitor:
         for rows in np.split(np.arange(len(samples)), np.flatnonzero(samples["quality"] & BREAK)):
             found = list(self._stream_events(samples[rows]))
             silent = any(event.kind is Kind.PLC_BACK for event in found)
+            if self.isolation:
+                self.isolation.push(samples[rows], ticks[rows])
             for cycle in self._cutter.push(samples[rows], ticks[rows]):
                 found += self._judge(cycle, silent and cycle.cut_short)
             found += self.clocks.push(samples[rows]) if self.clocks else []
@@ -163,17 +173,23 @@ class Monitor:
         before, self._before = self._before, cycle
         found = figures(cycle, self.theta[c.AMBIENT])
         told = self.teller.take(cycle) if self.teller else None
-        events = [_summary(cycle, found, told)] if cycle.complete or told else []
         whole = cycle.complete or len(cycle.samples) >= LONGEST_PIECE
         stale = silent or any(map(_has_stale, (cycle, before or cycle)))
         judged = whole and cycle.settled and cycle.coverage >= FEWEST_SHARE and not stale
-        if not judged or (worst := self._worst(found)) is None:
+        worst = self._worst(found) if judged else None
+        verdict = self._isolate(cycle, judged, found, worst)
+        events = [_summary(cycle, found, told, verdict)] if cycle.complete or told else []
+        if worst is None:
             return events
+        changed = self.isolation is not None and self.isolation.stands
         if abs(worst.sigmas) >= self.settings.raise_sigma:
             self._quiet_cycles = 0
-            if (raised := self._deviation(worst, before, cycle)) is not None:
+            if (raised := self._deviation(worst, before, cycle, verdict)) is not None:
                 events.append(raised)
-        elif self.active and abs(worst.sigmas) < self.settings.clear_sigma:
+        elif verdict and verdict.raised and not self.active:
+            self._quiet_cycles = 0
+            events.append(self._change(cycle, verdict))
+        elif self.active and abs(worst.sigmas) < self.settings.clear_sigma and not changed:
             self._quiet_cycles += 1
             if self._quiet_cycles >= self.settings.clear_cycles:
                 text = f"measurement and model agree again; it had looked like {self.active}"
@@ -184,6 +200,15 @@ class Monitor:
         else:
             self._quiet_cycles = 0
         return events
+
+    def _isolate(
+        self, cycle: Cycle, judged: bool, found: Mapping[str, float], worst: Outlier | None
+    ) -> "Verdict | None":
+        """What the isolation holds; it does not learn what is usual from what is far out."""
+        if self.isolation is None:
+            return None
+        far = worst is not None and abs(worst.sigmas) >= self.settings.raise_sigma
+        return self.isolation.judge(cycle, judged, found, usual=not far)
 
     def _worst(self, found: Mapping[str, float]) -> Outlier | None:
         outliers = []
@@ -203,9 +228,35 @@ class Monitor:
         level = outlier.figure.endswith("_level")
         return far >= self.settings.raise_sigma, far / 3.0 if level else far
 
-    def _deviation(self, worst: Outlier, before: Cycle | None, cycle: Cycle) -> Event | None:
+    def _change(self, cycle: Cycle, verdict: "Verdict") -> Event:
+        """Raise the alarm for what no single cycle shows."""
+        best = verdict.causes[0]
+        self.active = best.effect
+        also = [one.effect for one in verdict.causes[1:] if one.probability >= RIVAL]
+        text = (
+            f"{verdict.since} cycles: {abs(verdict.sigmas):.1f} sigma off in each;"
+            f" fits {best.effect} {best.size:.3g} {best.unit}"
+        )
+        if also:
+            text += f", or {', '.join(also)}"
+        data: dict[str, float | int | str] = {
+            "cycle": cycle.index,
+            "figure": "cycles",
+            "cycles": verdict.since,
+            "sigma": verdict.sigmas,
+            "effect": best.effect,
+            "size": best.size,
+            "unit": best.unit,
+            "share": best.probability,
+            "also": ",".join(also),
+        }
+        return Event(cycle.end_ns, Kind.DEVIATION, text, data)
+
+    def _deviation(
+        self, worst: Outlier, before: Cycle | None, cycle: Cycle, verdict: "Verdict | None"
+    ) -> Event | None:
         """Raise the alarm, or raise it anew when another cause than the standing one fits."""
-        ranking = self._name(worst, before, cycle)
+        ranking = self._name(worst, before, cycle, verdict)
         best = ranking[0]
         also = look_alikes(ranking)
         standing = max((one.share for one in ranking if one.effect == self.active), default=0.0)
@@ -232,8 +283,13 @@ class Monitor:
         }
         return Event(cycle.end_ns, Kind.DEVIATION, text, data)
 
-    def _name(self, worst: Outlier, before: Cycle | None, cycle: Cycle) -> list[Likeness]:
+    def _name(
+        self, worst: Outlier, before: Cycle | None, cycle: Cycle, verdict: "Verdict | None"
+    ) -> list[Likeness]:
         """Rank the causes of a cycle's deviation; the cycle before lets the model swing in."""
+        if verdict and verdict.causes:
+            named = [(one.effect, one.size, one.unit, one.probability) for one in verdict.causes]
+            return [Likeness(*one) for one in named]
         if worst.figure.endswith("_level"):  # and nothing else: only the thresholds moved
             return [Likeness("threshold_drift", worst.excess, "mbar", 1.0)]
         parts = [cycle] if before is None else [before, cycle]
@@ -264,9 +320,14 @@ def _gap(before: np.void, row: np.void) -> Event:
     return Event(int(row["time_ns"]), Kind.GAP, text, data)
 
 
-def _summary(cycle: Cycle, found: Mapping[str, float], told: Told | None) -> Event:
+def _summary(
+    cycle: Cycle, found: Mapping[str, float], told: Told | None, verdict: "Verdict | None"
+) -> Event:
     """What there is to say of a cycle; in the words of who tells most of it."""
-    data = {"cycle": cycle.index} | {name: round(value, 3) for name, value in found.items()}
+    data: dict[str, Any] = {"cycle": cycle.index}
+    data |= {name: round(value, 3) for name, value in found.items()}
+    if verdict is not None:
+        data["probabilities"] = verdict.plain()
     if told is not None:
         if not cycle.complete:  # a piece's own figures are not the cycle's
             data = {}

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from twin.diagnosis.bins import Floats
 from twin.model import kernel
 from twin.model import theta as c
 from twin.model.plant import reading
 from twin.model.theta import Theta
+from twin.monitor.bins import Floats
 from twin.monitor.phases import Knees, PhaseFinder
 from twin.signals import MBAR, MS, SAMPLE, Command, Phase, Samples
 

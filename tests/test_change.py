@@ -1,0 +1,106 @@
+"""Sums over cycles: false alarms come as seldom as asked for, changes are found nearly as soon."""
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.stats import kstest
+
+from twin.monitor.change import Changes, Reference, began, limit
+
+Floats = npt.NDArray[np.float64]
+SUSPECTS = 12
+
+
+def alike(rng: np.random.Generator, cycles: int, groups: int) -> Floats:
+    """Standard normal scores; those of a group are nearly the same, as signatures are."""
+    group = np.arange(SUSPECTS) % groups
+    common = rng.standard_normal((cycles, groups))[:, group]
+    return np.sqrt(0.95) * common + np.sqrt(0.05) * rng.standard_normal((cycles, SUSPECTS))
+
+
+def cosines(groups: int) -> Floats:
+    group = np.arange(SUSPECTS) % groups
+    return np.where(np.eye(SUSPECTS) > 0, 1.0, 0.95 * (group[:, None] == group))
+
+
+def run_length(scores: Floats, cycles: float, groups: int) -> float:
+    """Cycles until the sums are beyond the limit for one false alarm in ``cycles``."""
+    changes = Changes(np.arange(SUSPECTS) % 3 == 0, cosines(groups))
+    for count, normal in enumerate(scores, 1):
+        changes.take(normal)
+        if changes.log_sum >= limit(cycles):
+            return count
+    return np.inf
+
+
+@pytest.mark.parametrize("groups", [1, 4, SUSPECTS])
+def test_false_alarms_come_as_seldom_as_asked_for_however_alike_the_suspects_are(
+    groups: int,
+) -> None:
+    rng = np.random.default_rng(groups)
+    lengths = [run_length(alike(rng, 3000, groups), 150.0, groups) for _ in range(150)]
+    assert 75.0 < np.mean(lengths) < 300.0
+
+
+@pytest.mark.parametrize(("sigmas", "optimum"), [(0.5, 84.0), (1.0, 24.0), (2.0, 6.8)])
+def test_a_change_is_found_nearly_as_soon_as_by_who_knows_what_to_look_for(
+    sigmas: float, optimum: float
+) -> None:
+    # The optimum is a CUSUM's for this suspect, sign and size alone, at the same false alarms: 1.4
+    # is what looking for all of them costs (tools/bench.py measures it with real signatures).
+    rng = np.random.default_rng(7)
+    month = 30 * 86_400.0 / 3.0
+    delays = []
+    for _ in range(100):
+        scores = alike(rng, 400, 6)
+        scores[:, [0, 6]] += sigmas  # the first of them, and what is alike
+        delays.append(run_length(scores, month, 6))
+    assert np.mean(delays) < 1.4 * optimum
+
+
+def test_a_change_to_less_is_found_only_where_it_can_be() -> None:
+    changes = Changes(np.array([True, False]), np.eye(2))
+    for _ in range(30):
+        changes.take(np.array([-2.0, -2.0]))
+    assert changes.log_sum > 20.0
+    assert changes.foremost() == (0, -1)
+    one_way = Changes(np.array([False, False]), np.eye(2))
+    for _ in range(30):
+        one_way.take(np.array([-2.0, -2.0]))
+    assert one_way.log_sum < 1.0
+
+
+def test_scores_of_unknown_mean_and_scatter_become_standard_normal_and_independent() -> None:
+    rng = np.random.default_rng(3)
+    told = []
+    for _ in range(300):
+        reference = Reference()
+        for score in rng.normal(5.0, 3.0, (12, 1)):
+            told.append(float(reference.standard(score)[0]))
+            reference.add(score)
+    normal = np.array(told).reshape(300, 12)
+    assert (normal[:, :2] == 0.0).all()  # nothing is known yet
+    assert kstest(normal[:, 2:].ravel(), "norm").pvalue > 0.01
+    assert np.abs(np.corrcoef(normal[:, 2:].T) - np.eye(10)).max() < 0.25
+
+
+def test_a_score_that_never_varied_says_nothing() -> None:
+    reference = Reference()
+    for _ in range(5):
+        reference.add(np.zeros(2))
+    assert (reference.standard(np.array([0.0, 1.0])) == 0.0).all()
+
+
+def test_far_off_is_a_number_still() -> None:
+    reference = Reference()
+    for score in np.random.default_rng(1).normal(0.0, 1.0, (500, 1)):
+        reference.add(score)
+    normal = reference.standard(np.array([1e6]))
+    assert 20.0 < normal[0] <= 30.0
+
+
+@pytest.mark.parametrize("since", [1, 4, 30])
+def test_when_it_began_is_found(since: int) -> None:
+    scores = np.random.default_rng(since).standard_normal(100)
+    scores[-since:] += 4.0
+    assert abs(began(scores) - since) <= 1

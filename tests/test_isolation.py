@@ -1,0 +1,150 @@
+"""Causes named while the loop runs: from a rig with a small fault that begins, and is mended."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import rigs
+
+from twin.events import Event, Kind
+from twin.monitor.bank import DELAYS, SUSPECTS, Bank, hypotheses
+from twin.monitor.detect import Monitor
+from twin.monitor.isolation import Isolation
+from twin.signals import Samples, Ticks
+
+BEGINS, CYCLES = 30, 42
+SECONDS = {"test_rig": 3.2, "gripper": 2.3}  # of a cycle, at most
+
+
+def monitor(name: str) -> Monitor:
+    settings = rigs.config(name).monitor
+    watched = rigs.monitor(name)
+    watched.isolation = Isolation.of(rigs.config(name).data, settings.healthy, 30.0)
+    return watched
+
+
+def events(
+    name: str, faults: Sequence[str], cycles: int = CYCLES, seed: int = 11, size: int = 1000
+) -> list[Event]:
+    samples, _ = rigs.recorded(name, cycles * SECONDS[name], tuple(faults), seed)
+    twin, watched, told = rigs.twin(name), monitor(name), []
+    for block in rigs.cut(samples, size):
+        told += watched.update(*twin.advance(block))
+    return told + watched.update(*twin.flush()) + watched.close()
+
+
+def raised(told: Sequence[Event]) -> list[Event]:
+    return [event for event in told if event.kind is Kind.DEVIATION]
+
+
+def probabilities(told: Sequence[Event]) -> dict[int, dict[str, float]]:
+    """By cycle."""
+    return {
+        event.data["cycle"]: event.data["probabilities"]
+        for event in told
+        if event.kind is Kind.CYCLE and "probabilities" in event.data
+    }
+
+
+# All are far below what a single cycle's figures show (six sigma).
+@pytest.mark.parametrize(
+    ("name", "effect", "size"),
+    [
+        ("test_rig", "suction_loss", 1.2),
+        ("test_rig", "leakage", 0.25),
+        ("test_rig", "threshold_drift", 4.0),
+        ("gripper", "check_valve_leak", 0.3),
+        ("gripper", "response_delay", 4.0),
+        ("gripper", "sensor_offset", 2.0),
+    ],
+)
+def test_a_small_fault_is_found_within_cycles_and_named(
+    name: str, effect: str, size: float
+) -> None:
+    told = events(name, [f"{effect}={size}@c{BEGINS}"])
+    first = raised(told)[0]
+    assert 0 <= first.data["cycle"] - BEGINS <= 5
+    assert first.data["effect"] == effect
+    assert first.data["size"] == pytest.approx(size, rel=0.5)
+    last = probabilities(told)[max(probabilities(told))]
+    assert last["none"] < 0.01
+    assert last[effect] > 0.9
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+@pytest.mark.parametrize("seed", [21, 22])
+def test_healthy_cycles_are_probably_nothing(name: str, seed: int) -> None:
+    told = events(name, [], 60, seed)
+    assert raised(told) == []
+    assert len(probabilities(told)) > 50
+    assert min(one["none"] for one in probabilities(told).values()) > 0.5
+
+
+def test_probabilities_are_of_one_cause_or_none() -> None:
+    for one in probabilities(events("test_rig", [f"leakage=0.25@c{BEGINS}"])).values():
+        assert sum(one.values()) == pytest.approx(1.0, abs=0.05)
+        assert set(one) <= {"none", *(suspect.effect for suspect in SUSPECTS)}
+
+
+def test_what_is_told_does_not_depend_on_blocks() -> None:
+    assert events("gripper", [f"leakage=0.5@c{BEGINS}"], size=47) == events(
+        "gripper", [f"leakage=0.5@c{BEGINS}"], size=5000
+    )
+
+
+def test_a_fault_that_goes_is_cleared() -> None:
+    samples, _ = rigs.recorded("gripper", 90 * 2.3, (f"suction_loss=2@c{BEGINS}",), 5)
+    healthy, _ = rigs.recorded("gripper", 90 * 2.3, (), 5)
+    # The same cycles, without the fault from a suction edge on.
+    edge = _edge(samples, 45)
+    whole = np.concatenate([samples[:edge], healthy[_edge(healthy, 45) :]])
+    whole["sequence"] = np.arange(len(whole))
+    whole["time_ns"] = samples["time_ns"][0] + np.arange(len(whole)) * 1_000_000
+    whole["host_ns"] = whole["time_ns"]
+    twin, watched, told = rigs.twin("gripper"), monitor("gripper"), []
+    for block in rigs.cut(whole, 1000):
+        told += watched.update(*twin.advance(block))
+    (alarm,) = raised(told)
+    assert alarm.data["effect"] == "suction_loss"
+    (cleared,) = [event for event in told if event.kind is Kind.DEVIATION_CLEARED]
+    assert cleared.time_ns > int(whole["time_ns"][edge])
+    assert watched.active == ""
+
+
+def _edge(samples: Samples, cycle: int) -> int:
+    """The row at which a cycle's suction begins."""
+    edges = np.flatnonzero(np.diff((samples["commands"] == 1).astype(int)) == 1) + 1
+    return int(edges[cycle])
+
+
+def test_what_is_far_out_is_not_learned_as_usual() -> None:
+    told = events("gripper", ["leakage=10@c3"], 40)
+    assert raised(told)  # by a single cycle's figures
+    assert all(one == {"none": 1.0} for one in probabilities(told).values())
+
+
+def test_the_bank_expects_what_models_alone_expect() -> None:
+    samples, _ = rigs.recorded("gripper", 6.0)
+    rows, ticks = rigs.expectation(rigs.twin("gripper"), [samples])
+    bank = Bank(rigs.theta("gripper"))
+    for begin in range(0, len(rows), 700):
+        bank.push(rows[begin : begin + 700], ticks[begin : begin + 700])
+    together = bank.take(len(rows))
+    assert together.shape[1] == 1 + len(SUSPECTS) + len(DELAYS) + 3
+    assert len(hypotheses(rigs.theta("gripper"))) == together.shape[1]
+    known = np.isfinite(ticks["expected"])
+    unchanged = together[known, 0] - ticks["expected"][known]
+    assert np.abs(unchanged).max() < 30.0  # Pa: it is stepped more roughly
+    assert bank.take(10).shape[0] == 0
+
+
+def test_rows_and_ticks_of_the_bank_go_with_cycles_through_a_gap() -> None:
+    samples = rigs.recorded("test_rig", 40.0)[0].copy()
+    samples["quality"][20_000] |= 1
+    twin, watched = rigs.twin("test_rig"), monitor("test_rig")
+    parts: list[tuple[Samples, Ticks]] = [twin.advance(samples), twin.flush()]
+    for rows, ticks in parts:
+        watched.update(rows, ticks)
+    watched.close()
+    assert watched.isolation is not None
+    assert len(watched.isolation._bank.take(10)) == 0

@@ -1,0 +1,111 @@
+"""When something began to differ: sums over cycles that reach what no single cycle shows.
+
+Scores come in, one for each suspect and cycle. They are made standard normal by what was seen
+before (Hawkins' self-starting way), so that no table of healthy means has to be exact. Then, for
+each suspect, sign and size, the likelihood ratio of "it began at cycle t" to "nothing did" is
+summed over all t (Shiryaev and Roberts). In healthy cycles the weighted sum over all suspects grows
+by 1 a cycle on average, however alike their signatures are: a limit on it is the number of cycles
+to a false alarm, but for the overshoot.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import ndtri, stdtr
+
+Floats = npt.NDArray[np.float64]
+
+SIZES = np.array([0.5, 1.0, 2.0])  # sigmas a cycle that a change is looked for in
+SHARES = np.array([0.33, 0.27, 0.40])  # of the weight, of each size
+ALIKE = 4  # power of the cosine by which suspects that look alike share one weight
+OVERSHOOT = 0.6  # the limit over the cycles to a false alarm, for these sizes (tools/bench.py)
+FARTHEST = 30.0  # sigmas; beyond, a probability is no number any more
+MOST = 1e6  # cycles that a reference counts as, at most
+
+
+@dataclass
+class Reference:
+    """What scores were in the cycles so far: their number, means and sums of squares about them."""
+
+    count: float = 0.0
+    mean: Floats = field(default_factory=lambda: np.zeros(0))
+    squares: Floats = field(default_factory=lambda: np.zeros(0))
+
+    def standard(self, scores: Floats) -> Floats:
+        """Scores as standard normal variables, if they come from where those before came from."""
+        if self.count < 2:
+            return np.zeros(len(scores))
+        sigma = np.sqrt(self.squares / (self.count - 1.0) * (1.0 + 1.0 / self.count))
+        off = scores - self.mean
+        t = np.divide(off, sigma, out=np.zeros(len(scores)), where=sigma > 0.0)
+        tail = ndtri(stdtr(self.count - 1.0, -np.abs(t)))
+        normal: Floats = -np.sign(t) * np.maximum(tail, -FARTHEST)
+        return normal
+
+    def add(self, scores: Floats) -> None:
+        """Take a cycle in (Welford's way)."""
+        if not len(self.mean):
+            self.mean, self.squares = np.zeros(len(scores)), np.zeros(len(scores))
+        self.count += 1.0
+        off = scores - self.mean
+        self.mean = self.mean + off / self.count
+        self.squares = self.squares + off * (scores - self.mean)
+
+
+class Changes:
+    """Sums of likelihood ratios, for each suspect, sign and size."""
+
+    def __init__(self, both_ways: npt.NDArray[np.bool_], alike: Floats) -> None:
+        """``alike`` are the cosines between the suspects' signatures; 0 with all: not shown."""
+        signs = np.stack([np.ones(len(both_ways)), -1.0 * both_ways], axis=1)  # 0: not this way
+        self._shift = signs[:, :, None] * SIZES
+        self._weight = np.log(_weights(signs, alike)[:, :, None] * SHARES + np.finfo(float).tiny)
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget everything."""
+        self._log = np.full(self._shift.shape, -np.inf)
+
+    def take(self, normal: Floats) -> None:
+        """Take the standard normal scores of a cycle."""
+        ratio = self._shift * normal[:, None, None] - 0.5 * self._shift**2
+        self._log = np.logaddexp(0.0, self._log) + ratio
+
+    @property
+    def log_sum(self) -> float:
+        """The logarithm of the weighted sum over all of them."""
+        return float(np.logaddexp.reduce(self._log + self._weight, axis=None))
+
+    def foremost(self) -> tuple[int, int]:
+        """The suspect for which it is greatest, and the sign."""
+        by_size = np.logaddexp.reduce(self._log + self._weight, axis=2)
+        suspect, sign = np.unravel_index(int(np.argmax(by_size)), by_size.shape)
+        return int(suspect), 1 - 2 * int(sign)
+
+
+def _weights(signs: Floats, alike: Floats) -> Floats:
+    """Of each suspect and sign, together 1: what is unlike all others weighs as much as any group.
+
+    So what is found late is found no later than it must be.
+    """
+    ways = signs.ravel()
+    cosines = np.kron(alike, np.ones((2, 2))) * np.outer(ways, ways)
+    others = np.sum(np.maximum(cosines, 0.0) ** ALIKE, axis=1)
+    shown = others > 0.0
+    weights = np.where(shown, 1.0 / np.maximum(others, 1.0), 0.0)
+    weights /= max(weights.sum(), 1.0)
+    result: Floats = weights.reshape(signs.shape)
+    return result
+
+
+def limit(cycles: float) -> float:
+    """What the logarithm of the sum is compared with, for a false alarm in so many cycles."""
+    return float(np.log(OVERSHOOT * cycles))
+
+
+def began(normal: Floats) -> int:
+    """How many of the last scores differ, by the greatest likelihood over when it began."""
+    sums = np.cumsum(normal[::-1])
+    gain = sums**2 / np.arange(1, len(sums) + 1)
+    return int(np.argmax(gain)) + 1

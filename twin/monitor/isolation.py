@@ -1,0 +1,244 @@
+"""Which cause it is, while the loop runs: probabilities of every effect, and of none, per cycle.
+
+That anything differs is judged by sums over cycles (``change``). Which effect it is, by the mean of
+the cycles since it began, less what was usual before: each suspect is fitted to it alone, and its
+likelihood tells how probable it is. Cycle-to-cycle scatter averages out of that mean; what the
+model has wrong about a signature does not, so a share of what is explained counts as error.
+"""
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from twin.model.dataset import DataSet, coefficients
+from twin.monitor.bank import DELAYS, GROSS, STEP, SUSPECTS, UNSURE_OF, Bank
+from twin.monitor.bins import Floats
+from twin.monitor.change import Changes, Reference, began, limit
+from twin.monitor.cycles import Cycle
+from twin.monitor.healthy import Healthy
+from twin.monitor.phases import expected_knees
+from twin.monitor.statistics import Listener, Said
+from twin.signals import MBAR, NS, SAMPLE, TICK, Samples, Ticks
+
+DAY_S = 86_400.0
+KEPT = 400  # cycles that are remembered: a change is not sought further back
+LEARNED = 10  # cycles before which nothing is said
+MISMATCH = 0.08  # of what a suspect explains, is off in its signature
+DOUBTED = 0.05  # probability that anything differs, from which on it is asked what
+RETURNED = float(np.log(1000.0))  # of the odds that it is as before, for it to be over
+FEWEST_BACK = 3  # cycles to be sure of that, however far it was
+
+
+@dataclass(frozen=True)
+class Likely:
+    """One effect, as the cycles since the change have it."""
+
+    effect: str
+    probability: float
+    size: float  # in the unit of the parameter
+    unit: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is held of the causes after a cycle."""
+
+    none: float  # probability that nothing differs
+    causes: Sequence[Likely]  # the most probable first; empty while nothing is doubted
+    raised: bool = False  # with this cycle it is beyond the limit
+    since: int = 0  # cycles that differ
+    sigmas: float = 0.0  # by which a cycle differs, in what is foremost
+
+    def plain(self) -> dict[str, float]:
+        """The probabilities, of what has at least one in a hundred."""
+        shown = {one.effect: round(one.probability, 3) for one in self.causes}
+        likely = {effect: share for effect, share in shown.items() if share >= 0.01}
+        return {"none": round(self.none, 3), **likely}
+
+
+@dataclass
+class _Usual:
+    """Mean deviation at each place in the cycles so far."""
+
+    count: dict[int, int] = field(default_factory=dict)
+    mean: dict[int, float] = field(default_factory=dict)
+
+    def add(self, said: Said) -> None:
+        for place, off in zip(said.place.tolist(), said.off.tolist(), strict=True):
+            count = self.count[place] = self.count.get(place, 0) + 1
+            before = self.mean.get(place, 0.0)
+            self.mean[place] = before + (off - before) / count
+
+    def of(self, said: Said) -> tuple[Floats, Floats]:
+        """Mean (mbar) at the places of a cycle, and in how many cycles they were seen."""
+        places = said.place.tolist()
+        mean = np.array([self.mean.get(place, 0.0) for place in places])
+        return mean, np.array([float(self.count.get(place, 0)) for place in places])
+
+
+class Isolation:
+    """Takes the rows of the twin and its cycles; gives what is held of the causes.
+
+    ``days`` between false alarms, for one ejector.
+    """
+
+    def __init__(self, bank: Bank, listener: Listener, days: float) -> None:
+        self._bank, self._listener = bank, listener
+        self._wanted_s = days * DAY_S
+        self._reference, self._usual = Reference(), _Usual()
+        self._changes: Changes | None = None  # once it is known which suspects look alike
+        self._kept: deque[tuple[Said, Floats]] = deque(maxlen=KEPT)  # with the normal scores
+        self._cycles, self._seconds = 0, 0.0
+        self._raised: tuple[int, float] | None = None  # suspect, and sigmas a cycle
+        self._since = 0  # cycles since it began, while raised
+        self._back = 0.0  # logarithm of the odds that it is as before
+
+    @property
+    def stands(self) -> bool:
+        """Whether it was beyond the limit, and has not come back since."""
+        return self._raised is not None
+
+    def push(self, samples: Samples, ticks: Ticks) -> None:
+        """Step the bank by the twin's rows."""
+        self._bank.push(samples, ticks)
+
+    @classmethod
+    def of(cls, data: DataSet, healthy: Healthy, days: float) -> "Isolation":
+        """The isolation beside the twin of a data set; compiled, not to fall into a block."""
+        theta = coefficients(data)
+        noise = data.sensor.noise_mbar
+        listener = Listener(theta, healthy, noise, expected_knees(theta, noise * MBAR))
+        Bank(theta).push(np.zeros(2, SAMPLE), np.zeros(2, TICK))
+        return cls(Bank(theta), listener, days)
+
+    def judge(
+        self, cycle: Cycle, fit: bool, figures: Mapping[str, float], *, usual: bool = True
+    ) -> Verdict | None:
+        """Take the rows of a cycle or piece, in order; say what is held if it is ``fit`` to say.
+
+        From one that is not ``usual`` it does not learn.
+        """
+        expected = self._bank.take(len(cycle.samples))
+        said = self._listener.hear(cycle, expected, figures) if fit and cycle.complete else None
+        if said is None:
+            return None
+        self._cycles += 1
+        self._seconds += float(cycle.end_ns - int(cycle.samples["time_ns"][0])) * NS
+        scores = said.scores()
+        normal = self._reference.standard(scores)
+        self._kept.append((said, normal))
+        verdict = self._conclude(self._changes, normal) if self._changes else Verdict(1.0, ())
+        if usual and not verdict.causes:
+            self._reference.add(scores)
+            self._usual.add(said)
+        if self._changes is None and self._reference.count >= LEARNED:
+            self._changes = Changes(np.array([one.both_ways for one in SUSPECTS]), said.alike())
+        return verdict
+
+    def _conclude(self, changes: Changes, normal: Floats) -> Verdict:
+        changes.take(normal)
+        cycles = self._wanted_s / (self._seconds / self._cycles)
+        log_odds = changes.log_sum - np.log(cycles)  # a fault is as rare as a false alarm
+        none = float(1.0 / (1.0 + np.exp(min(log_odds, 700.0))))
+        raised = self._raised is None and changes.log_sum >= limit(cycles)
+        if raised:
+            self._raise(changes)
+        elif self._raised is not None:
+            self._since += 1
+            if self._is_back(normal):
+                changes.begin()
+                self._kept.clear()
+                return Verdict(1.0, ())
+        if self._raised is None and 1.0 - none < DOUBTED:
+            return Verdict(none, ())
+        since, sigmas = self._differ(changes)
+        causes = self._causes(since, 1.0 - none)
+        return Verdict(none, causes, raised, since, sigmas)
+
+    def _raise(self, changes: Changes) -> None:
+        self._since, sigmas = self._differ(changes)
+        self._raised = (changes.foremost()[0], sigmas)
+        self._back = 0.0
+
+    def _is_back(self, normal: Floats) -> bool:
+        """Whether it is as before, by a likelihood ratio of its own."""
+        assert self._raised is not None
+        suspect, sigmas = self._raised
+        gain = sigmas * (0.5 * sigmas - float(normal[suspect]))
+        self._back = max(self._back + min(gain, RETURNED / FEWEST_BACK), 0.0)
+        if self._back < RETURNED:
+            return False
+        self._raised, self._since = None, 0
+        return True
+
+    def _differ(self, changes: Changes) -> tuple[int, float]:
+        """How many of the last cycles differ, and by how many sigmas each."""
+        suspect, _ = changes.foremost()
+        scores = np.array([float(normal[suspect]) for _, normal in self._kept])
+        since = min(self._since, len(scores)) if self._raised else began(scores)
+        return since, float(np.mean(scores[-since:]))
+
+    def _causes(self, since: int, changed: float) -> list[Likely]:
+        """How probable each effect is; together as probable as that something ``changed``."""
+        mean, covariance = self._mean(since)
+        fitted = [
+            _fitted(mean.off, signature, covariance, one.both_ways)
+            for one, signature in zip(SUSPECTS, mean.signatures.T, strict=True)
+        ]
+        for number, signature in zip(DELAYS, mean.gross.T, strict=True):
+            size, left = _fitted(mean.off, signature, covariance, False)
+            if left < fitted[number][1]:
+                fitted[number] = np.array([size * GROSS / STEP, left])
+        # What a low supply does is not known well: in proportion to how low it is.
+        ways = fitted[UNSURE_OF][0] * mean.unsure
+        signature = mean.signatures[:, UNSURE_OF]
+        fitted[UNSURE_OF] = _fitted(mean.off, signature, covariance + ways @ ways.T, False)
+        sizes, left = np.array(fitted).T
+        share = np.exp(0.5 * (left.min() - left))
+        return self._by_effect(share * (changed / share.sum()), sizes)
+
+    def _mean(self, since: int) -> tuple[Said, Floats]:
+        """The mean of the last cycles, less what was usual; and its covariance."""
+        last = self._kept[-1][0]
+        some = [said for said, _ in list(self._kept)[-since:]]
+        often = np.mean([np.isin(last.place, said.place) for said in some], axis=0) > 0.5
+        last = last.at(often)
+        columns = np.column_stack([last.off, last.signatures, last.gross]) * 0.0
+        counts = np.zeros(len(last.place))
+        for said in some:
+            _, mine, theirs = np.intersect1d(last.place, said.place, True, True)
+            columns[mine] += np.column_stack([said.off, said.signatures, said.gross])[theirs]
+            counts[mine] += 1.0
+        columns /= counts[:, None]
+        usual, seen = self._usual.of(last)
+        off = columns[:, 0] - usual
+        signatures, gross = np.split(columns[:, 1:], [len(SUSPECTS)], axis=1)
+        own = np.hypot(last.common / np.sqrt(1.0 + seen), MISMATCH * off)
+        together = np.exp(-np.abs(last.time[:, None] - last.time)) * (
+            last.kind[:, None] == last.kind
+        )
+        covariance = last.alone / since + np.outer(own, own) * together
+        return replace(last, off=off, signatures=signatures, gross=gross), covariance
+
+    def _by_effect(self, share: Floats, sizes: Floats) -> list[Likely]:
+        """Parameters of one effect belong together; the most probable one gives the size."""
+        found: dict[str, Likely] = {}
+        for number in np.argsort(-share).tolist():
+            one = SUSPECTS[number]
+            size = float(sizes[number]) * one.step
+            first = found.get(one.effect, Likely(one.effect, 0.0, size, one.parameter.unit))
+            total = first.probability + float(share[number])
+            found[one.effect] = Likely(one.effect, total, first.size, first.unit)
+        return sorted(found.values(), key=lambda likely: -likely.probability)
+
+
+def _fitted(off: Floats, signature: Floats, covariance: Floats, both_ways: bool) -> Floats:
+    """Size (in steps) that fits a deviation best, and twice what the likelihood is less."""
+    weighed = np.linalg.solve(covariance, np.column_stack([off, signature]))
+    power = max(float(signature @ weighed[:, 1]), 1e-12)
+    size = float(signature @ weighed[:, 0]) / power
+    size = size if both_ways else max(size, 0.0)
+    left = float((off - size * signature) @ (weighed[:, 0] - size * weighed[:, 1]))
+    return np.array([size, left + float(np.linalg.slogdet(covariance)[1])])
