@@ -17,7 +17,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
-from benchmarks import acquisition, calibration, kernel, log, machine, opcua, polling, replay
+from benchmarks import (
+    acquisition,
+    calibration,
+    detection,
+    kernel,
+    log,
+    machine,
+    opcua,
+    polling,
+    replay,
+)
 from benchmarks.figures import Benchmark, Figure, Measured, Run, kept
 from benchmarks.processes import ROOT
 
@@ -110,6 +120,29 @@ BENCHMARKS = (
         "`twin.calibration.calibrate` over samples of the simulated rig, in this process and on "
         "all cores.",
         (Figure("calibration: 12 healthy cycles", "s", limit=15.0),),
+    ),
+    Benchmark(
+        "detection",
+        detection.sums,
+        "Healthy cycles of the simulated gripper through twin, bank and isolation (104 000 with "
+        "--long, 10 400 without): alarms over those asked for. Then the limit for one in 30 days "
+        "of 3 s cycles, a change in five effects one by one put into these cycles, and the median "
+        "delays of the five; the floor is the mean delay of a simulated CUSUM that looks for "
+        "nothing but that effect and size.",
+        (
+            Figure("detection: false alarms over asked for, one in 1 000 cycles", "", limit=2.0),
+            Figure("detection: false alarms over asked for, one in 10 000 cycles", "", limit=2.0),
+            *(
+                Figure(
+                    f"detection: delay for {shift:g} sigma a cycle",
+                    "cycles",
+                    "CUSUM for that alone",
+                    1.3,
+                    limits_ratio=True,
+                )
+                for shift in detection.SHIFTS
+            ),
+        ),
     ),
     Benchmark(
         "log",

@@ -100,6 +100,11 @@ class Isolation:
         """Whether it was beyond the limit, and has not come back since."""
         return self._raised is not None
 
+    @property
+    def heard(self) -> tuple[Said, Floats]:
+        """What the last cycle said, and its scores as standard normal variables."""
+        return self._kept[-1]
+
     def push(self, samples: Samples, ticks: Ticks) -> None:
         """Step the bank by the twin's rows."""
         self._bank.push(samples, ticks)

@@ -1,0 +1,143 @@
+"""Detection by sums over cycles: how often wrong, and how late beside a CUSUM that knows more.
+
+Healthy cycles of the simulated rig go through twin, bank and isolation as they do in the loop. A
+change of so many sigmas is put into the scores of the same cycles, drawn at random: into an
+effect's own, and by the cosine of their signatures into those of the others.
+"""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import brentq
+
+from benchmarks.figures import Measured, Run
+from benchmarks.processes import ROOT
+from drivers.plc.settings import PlcSettings
+from drivers.plc.simulate import blocks
+from twin.config import Config
+from twin.live import Twin
+from twin.model import theta as c
+from twin.monitor.bank import SUSPECTS
+from twin.monitor.change import Changes, limit
+from twin.monitor.cycles import CycleCutter, figures
+from twin.monitor.isolation import Isolation
+from twin.settings import Document
+
+Floats = npt.NDArray[np.float64]
+
+CONFIG = ROOT / "configs" / "gripper.toml"
+PROGRAM = {"suction_ms": 900.0, "blow_off_ms": 150.0, "idle_ms": 250.0}  # short, for many cycles
+CYCLE_S = 1.3
+DEVICES, LONG_DEVICES, CYCLES = 4, 40, 2600  # of each device
+SETTLED = 200  # cycles after which a device's scores are what they stay
+ASKED = (1000.0, 10_000.0)  # cycles to a false alarm
+MONTH = 30 * 86_400.0 / 3.0  # the same in 30 days of 3 s cycles
+SHIFTS = (0.5, 1.0, 2.0)  # sigmas a cycle
+EFFECTS = ("leakage", "suction_loss", "filter_clogging", "threshold_drift", "sensor_lag")
+DRAWS = 400
+NEVER = 4000  # cycles
+
+
+def sums(run: Run) -> Sequence[Measured]:
+    """False alarms at two wanted rates, and delays for three sizes, beside the optimum."""
+    devices = LONG_DEVICES if run.long else DEVICES
+    scores, alike = _simulated(run, devices)
+    false = [_false_alarms(scores, alike, cycles) for cycles in ASKED]
+    pool = np.concatenate([one[SETTLED:] for one in scores])
+    run.tell("detection: delays")
+    late = [_late(pool, alike, shift) for shift in SHIFTS]
+    return (*false, *late)
+
+
+def _simulated(run: Run, devices: int) -> tuple[list[Floats], Floats]:
+    """Standard normal scores of each device's cycles, and the cosines between signatures."""
+    found = []
+    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as workers:
+        for one in workers.map(_device, range(devices)):
+            found.append(one)
+            run.tell(f"detection: {len(found)} of {devices} devices")
+    return [scores for scores, _ in found], found[0][1]
+
+
+def _device(seed: int) -> tuple[Floats, Floats]:
+    """Scores of one device's cycles, (cycles, suspects), and the cosines of the last one."""
+    document = Document.read(CONFIG)
+    config, rig = Config.of(document), document.section(PlcSettings, "plc")
+    rig = rig.model_copy(update={"program": rig.program.model_copy(update=PROGRAM)})
+    twin = Twin.of(config.data)
+    isolation = Isolation.of(config.data, config.monitor.healthy, days=1e9)
+    cutter, scores, alike = CycleCutter(), [], np.eye(len(SUSPECTS))
+    ambient = float(twin.theta[c.AMBIENT])
+    for block in blocks(rig, CYCLES * CYCLE_S, seed=seed, block=20_000):
+        rows, ticks = twin.advance(block)
+        isolation.push(rows, ticks)
+        for cycle in cutter.push(rows, ticks):
+            fit = cycle.complete and cycle.settled
+            if isolation.judge(cycle, fit, figures(cycle, ambient)) is not None:
+                said, normal = isolation.heard
+                scores.append(normal)
+                alike = said.alike()
+    return np.array(scores), alike
+
+
+def _changes(alike: Floats) -> Changes:
+    return Changes(np.array([one.both_ways for one in SUSPECTS]), alike)
+
+
+def _false_alarms(devices: Sequence[Floats], alike: Floats, asked: float) -> Measured:
+    """False alarms over those that were asked for."""
+    alarms, cycles = 0, 0
+    for scores in devices:
+        changes = _changes(alike)
+        for normal in scores:
+            changes.take(normal)
+            if changes.log_sum >= limit(asked):
+                alarms += 1
+                changes.begin()
+        cycles += len(scores)
+    note = f"({alarms} in {cycles:,} cycles)"
+    return Measured([alarms * asked / cycles], note=note)
+
+
+def _late(pool: Floats, alike: Floats, shift: float) -> Measured:
+    """Median delay for each effect, and the mean one of a CUSUM that looks for nothing else."""
+    names = [one.effect for one in SUSPECTS]
+    medians = []
+    for effect in EFFECTS:
+        added = shift * alike[names.index(effect)]
+        rng = np.random.default_rng(names.index(effect))
+        medians.append(float(np.median([_delay(pool, alike, added, rng) for _ in range(DRAWS)])))
+    return Measured(medians, [_optimum(shift)])
+
+
+def _delay(pool: Floats, alike: Floats, added: Floats, rng: np.random.Generator) -> int:
+    changes = _changes(alike)
+    for cycle in range(1, NEVER):
+        changes.take(pool[rng.integers(len(pool))] + added)
+        if changes.log_sum >= limit(MONTH):
+            return cycle
+    return NEVER
+
+
+def _optimum(shift: float) -> float:
+    """Mean delay of the CUSUM for one known shift, upwards; its limit after Siegmund."""
+    k = 0.5 * shift
+    height = brentq(lambda h: _run_length(k, h) - MONTH, 0.1, 100.0)
+    rng, delays = np.random.default_rng(1), []
+    for _ in range(10 * DRAWS):
+        steps = rng.normal(shift, 1.0, NEVER) - k
+        # The sum since its least value so far, as it is from zero on.
+        total = np.concatenate([[0.0], np.cumsum(steps)])
+        above = total - np.minimum.accumulate(total)
+        delays.append(int(np.argmax(above >= height)))
+    return float(np.mean(delays))
+
+
+def _run_length(k: float, height: float) -> float:
+    """Cycles to a false alarm (Siegmund): of a CUSUM with reference value k and this limit."""
+    b = height + 1.166
+    return float((np.exp(2 * k * b) - 2 * k * b - 1) / (2 * k * k))
