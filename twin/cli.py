@@ -24,6 +24,7 @@ from twin.cli_alarms import alarms_app, alarms_of
 from twin.cli_assets import assets_app
 from twin.cli_cert import cert
 from twin.cli_figures import figures_app, keeper_of, key_figures_of
+from twin.cli_outlets import outlets_of
 from twin.errors import ConfigError, SourceError, TwinError
 from twin.events import Event, Severity
 
@@ -121,6 +122,7 @@ def run(
         label = "" if alone else name
         twin, monitor = pairs[name]
         alarms = alarms_of(settings, _complain)
+        outlets = None if hil else outlets_of(settings, _complain)
         shown = show(name, settings.asset.type) if show else None
         shared = lines if hil or not alone else None
         source = open_source(settings.document, address, shared)
@@ -143,7 +145,9 @@ def run(
                 settings, str(file or "live"), lambda: stopped() == "interrupted", status
             )
             # What is not measured has no faults. Alarms come last: they hear the diagnosis.
-            advisers: list[Adviser] = [] if hil else [adviser, alarms()]
+            advisers: list[Adviser] = [] if hil else [adviser, board := alarms()]
+            if outlets:
+                sinks.append(outlets(board.standing()))
             run_loop(_until(stopped, begun), twin, monitor, sinks, advisers=advisers)
 
     failed: list[str] = []

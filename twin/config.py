@@ -36,8 +36,10 @@ TABLES = {
     "import",
     "log",
     "monitor",
+    "mqtt",
     "plc",
     "results",
+    "webhook",
 }
 NO_TYPE = "unknown"
 HAND_WRITTEN = "[data] of the configuration"

@@ -124,6 +124,11 @@ class Diary:
                 self._going_on.setdefault(one.alarm, []).append(one)
         return [new for old, new in zip(before, after, strict=True) if new is not old]
 
+    def newest(self, alarm: str) -> Episode | None:
+        """The newest episode of an alarm, of those that go on."""
+        episodes = self._going_on.get(alarm)
+        return episodes[-1] if episodes else None
+
     def note(self, alarm: str, evidence: Mapping[str, Any]) -> list[Episode]:
         """The episode of an alarm that is active, with more to speak for it."""
         episodes = self._going_on.get(alarm, [])

@@ -16,7 +16,7 @@ from twin.alarms.requests import Request, grant
 from twin.alarms.rules import Rule
 from twin.alarms.state import Alarm, Change, Deed, Kept
 from twin.alarms.watch import STREAM, deviating, evidence, values
-from twin.alarms.words import event_of, worth_saying
+from twin.alarms.words import event_of, plain, worth_saying
 from twin.errors import TwinError
 from twin.events import Event, Kind
 from twin.signals import Quality, Samples
@@ -81,6 +81,7 @@ class Alarms:
         before = before or Before()
         self.board = Board(rules)
         self.board.resume(before.states)
+        self._before = [name for name in before.states if name in self.board.alarms]
         self._diary = Diary(before.going_on)
         self._clock, self._office = clock, office
         self._evidence: dict[str, dict[str, Any]] = {  # by value
@@ -108,6 +109,15 @@ class Alarms:
             said += self._grant(request, now)
         self._hand_over()
         return said
+
+    def standing(self) -> list[dict[str, Any]]:
+        """All alarms that were ever anything else than normal, as they are when a run begins."""
+        found = []
+        for name in self._before:
+            alarm = self.board[name]
+            evidence = self._evidence.get(alarm.rule.value, {}) if alarm.concerns else {}
+            found.append(plain(alarm, evidence, self._diary.newest(name)))
+        return found
 
     def finish(self) -> list[Event]:
         """Nothing is left to be said."""
@@ -232,7 +242,8 @@ class Alarms:
     def _say(self, changes: Iterable[Change], time_ns: int) -> list[Event]:
         said = []
         for change in changes:
-            self._record(self._diary.take(change))
+            episodes = self._diary.take(change)
+            self._record(episodes)
             alarm = self.board[change.to or change.alarm]
             told = self._evidence.get(alarm.rule.value, {})
             if change.deed is Deed.RAISED:
@@ -242,8 +253,17 @@ class Alarms:
                 self._keep(self.board[change.alarm])
             self._keep(alarm)
             if worth_saying(change, alarm):
-                said.append(event_of(change, alarm, told, time_ns))
+                said.append(event_of(change, self._plain(change, episodes), alarm, time_ns))
         return said
+
+    def _plain(self, change: Change, episodes: Sequence[Episode]) -> dict[str, Any]:
+        """The alarm that changed as it is, and the one that has become it."""
+        alarm = self.board[change.to or change.alarm]
+        newest = episodes[-1] if episodes else self._diary.newest(alarm.rule.name)
+        now = plain(alarm, self._evidence.get(alarm.rule.value, {}), newest)
+        if change.deed is Deed.RENAMED:
+            now["left"] = plain(self.board[change.alarm], {}, None)
+        return now
 
     def _record(self, episodes: Iterable[Episode]) -> None:
         self._news.episodes |= {(one.raised_ns, one.raised_as): one for one in episodes}

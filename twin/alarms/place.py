@@ -16,9 +16,12 @@ def open_chosen(named: str, document: Document | None, *, write: bool) -> Store:
     The default is a file beside the configuration, without one in the current folder. Only a run
     makes a file; SourceError if there is none to read.
     """
-    if named:
-        return open_store(named, create=write)
+    return open_store(named or place_of(document), create=write)
+
+
+def place_of(document: Document | None) -> str | Path:
+    """The URL or the SQLite file that a configuration names, else the default."""
     folder = Path(document.name).parent if document else Path()
     url = document.section(AlarmSettings, "alarms").url if document else ""
     file = sqlite_file(parse_url(url or FILE, ALARM_DATABASE))
-    return open_store(url if file is None else folder / file, create=write)
+    return url if file is None else folder / file

@@ -1,7 +1,9 @@
 """Changes of alarms as events, in plain words."""
 
+from collections.abc import Mapping
 from typing import Any
 
+from twin.alarms.board import Episode
 from twin.alarms.rules import Rule, default_rules
 from twin.alarms.state import SECOND_NS, Alarm, Change, Deed, State
 from twin.alarms.watch import Evidence
@@ -41,24 +43,31 @@ def worth_saying(change: Change, alarm: Alarm) -> bool:
     return change.announced or alarm.concerns or not silent
 
 
-def event_of(change: Change, alarm: Alarm, evidence: Evidence, time_ns: int) -> Event:
-    """A change as an event at a PLC time; ``alarm`` is as it is then, by its new name."""
+def plain(alarm: Alarm, evidence: Evidence, episode: Episode | None) -> dict[str, Any]:
+    """An alarm as it is with its newest episode, in what JSON can hold."""
     rule = alarm.rule
-    data: dict[str, Any] = {
+    return {
         "alarm": rule.name,
-        "deed": change.deed.value,
         "state": alarm.state.value,
+        "active": alarm.active,
+        "acknowledged": alarm.acknowledged,
+        "raised_ns": episode.raised_ns if episode else None,
+        "raised_as": episode.raised_as if episode else None,
+        "shelved_until_ns": alarm.shelved_until,
         "priority": rule.priority.value,
-        "host_ns": change.time_ns,
-        "who": change.who,
         "consequence": rule.consequence,
         "action": rule.action,
         "evidence": dict(evidence),
     }
+
+
+def event_of(change: Change, now: Mapping[str, Any], alarm: Alarm, time_ns: int) -> Event:
+    """A change as an event at a PLC time; ``now`` is ``plain`` of the alarm, by its new name."""
+    data = {**now, "deed": change.deed.value, "host_ns": change.time_ns, "who": change.who}
     if change.deed is Deed.RENAMED:
         data["was"] = change.alarm
     kind = Kind.ALARM if change.announced else Kind.ALARM_CHANGED
-    return Event(time_ns, kind, _text(change, alarm, evidence), data)
+    return Event(time_ns, kind, _text(change, alarm, now["evidence"]), data)
 
 
 def _text(change: Change, alarm: Alarm, evidence: Evidence) -> str:

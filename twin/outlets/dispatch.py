@@ -1,0 +1,131 @@
+"""A sink that puts changes of alarms into the outbox for all destinations; never waited for."""
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from twin.alarms.store import Unit
+from twin.errors import TwinError
+from twin.events import Event, Kind
+from twin.outlets.message import Message, of_cycle, of_event, restated
+from twin.outlets.outbox import Outbox
+from twin.outlets.sender import Sender
+from twin.signals import Samples, Ticks
+
+MOST_IN_MEMORY = 10_000  # messages, while the database is away
+MOST_AT_ONCE = 1000
+RETRY_S = 5.0
+Letter = tuple[str, Message]  # to whom, and what
+
+
+class Outlets:
+    """Where the alarms of a unit go (``twin.live.Sink``).
+
+    A thread writes into the outbox, and one for each destination delivers. ``restating`` are the
+    destinations that are to know every alarm as it is; ``show_cycle`` takes key figures as JSON.
+    """
+
+    def __init__(
+        self,
+        unit: Unit,
+        open_outbox: Callable[[], Outbox],
+        senders: Sequence[Sender],
+        say: Callable[[str], None],
+        *,
+        restating: Sequence[str] = (),
+        show_cycle: Callable[[str], None] | None = None,
+    ) -> None:
+        self._unit, self._open_outbox, self._senders = unit, open_outbox, senders
+        self._say, self._restating, self._show_cycle = say, restating, show_cycle
+        self._outbox: Outbox | None = None
+        self._failed = False
+        self._lost = 0  # that there was no room for
+        self._waiting: list[Letter] = []
+        self._letters: queue.Queue[Letter] = queue.Queue(MOST_IN_MEMORY)
+        self._ending, self._news = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._work, name="outbox", daemon=True)
+
+    def begin(self, standing: Sequence[Mapping[str, Any]]) -> None:
+        """Start; ``standing`` are the alarms as they are (``twin.alarms.words.plain``)."""
+        now_ns = time.time_ns()
+        for plain in standing:
+            message = restated(self._unit, plain, now_ns)
+            for name in self._restating:
+                self._put(name, message)
+        self._thread.start()
+        for sender in self._senders:
+            sender.start()
+
+    def write(self, _samples: Samples, _ticks: Ticks, events: Sequence[Event]) -> None:
+        """Take what happened."""
+        for event in events:
+            for message in of_event(self._unit, event):
+                for sender in self._senders:
+                    self._put(sender.name, message)
+            if event.kind is Kind.CYCLE and self._show_cycle:
+                self._show_cycle(of_cycle(self._unit, event))
+
+    def close(self) -> None:
+        """Write and deliver what can be at once; the rest waits for the next run."""
+        self._ending.set()
+        self._news.set()
+        self._thread.join()
+        for sender in self._senders:
+            sender.end()
+        for sender in self._senders:
+            sender.join()
+
+    def _put(self, name: str, message: Message) -> None:
+        try:
+            self._letters.put_nowait((name, message))
+        except queue.Full:
+            self._lost += 1
+        self._news.set()
+
+    # --- the thread -----------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        while not self._ending.is_set():
+            self._news.wait()
+            self._news.clear()
+            if not self._write_all():
+                self._ending.wait(RETRY_S)
+                self._news.set()
+        self._write_all()
+        left = len(self._waiting) + self._letters.qsize() + self._lost
+        if left:
+            self._say(f"{left} changes of alarms could not be put into the outbox")
+        self._let_go()
+
+    def _write_all(self) -> bool:
+        while self._waiting or not self._letters.empty():
+            if not self._write():
+                return False
+        return True
+
+    def _write(self) -> bool:
+        """Put what there is into the outbox; says so if that begins to fail."""
+        while len(self._waiting) < MOST_AT_ONCE and not self._letters.empty():
+            self._waiting.append(self._letters.get())
+        try:
+            self._outbox = self._outbox or self._open_outbox()
+            self._outbox.put(self._waiting)
+        except TwinError as error:
+            self._let_go()
+            if not self._failed:
+                self._say(f"changes of alarms wait in memory, not in the outbox: {error}")
+            self._failed = True
+            return False
+        if self._failed:
+            self._say("changes of alarms are in the outbox again")
+        self._failed, self._waiting = False, []
+        for sender in self._senders:
+            sender.wake()
+        return True
+
+    def _let_go(self) -> None:
+        if self._outbox is not None:
+            self._outbox.close()
+        self._outbox = None

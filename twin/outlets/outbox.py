@@ -1,0 +1,189 @@
+"""What is to be told, until it is: a table beside the alarms, in order, under IDs that stay.
+
+A row is a message to one destination. It is there before it is sent, and goes when the destination
+has taken it; so each is delivered at least once, through restarts and lost networks.
+"""
+
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Self
+
+from sqlalchemy import (
+    URL,
+    BigInteger,
+    Column,
+    ColumnElement,
+    Connection,
+    Engine,
+    Integer,
+    MetaData,
+    Row,
+    Table,
+    Text,
+    func,
+    inspect,
+    select,
+)
+
+from twin.alarms.store import ALARM_DATABASE, Unit
+from twin.assets.engine import make_engine, parse_url, plain_errors
+from twin.outlets.message import Message
+
+metadata = MetaData()
+
+OUTBOX = Table(
+    "alarm_outbox",
+    metadata,
+    Column("number", Integer, primary_key=True),  # the order
+    Column("destination", Text, nullable=False),
+    Column("asset_type", Text, nullable=False),
+    Column("asset_id", Text, nullable=False),
+    Column("id", Text, nullable=False),
+    Column("alarm", Text, nullable=False),
+    Column("body", Text, nullable=False),  # JSON
+    Column("made_ns", BigInteger, nullable=False),
+    Column("refused", Text),  # why the destination will not have it; then it is not sent again
+    sqlite_autoincrement=True,
+)
+
+
+def open_outbox(
+    where: str | Path,
+    unit: Unit,
+    *,
+    busy_s: float = 5.0,
+    clock: Callable[[], int] = time.time_ns,
+) -> "Outbox":
+    """Open the outbox of a unit in the alarm database at a URL or in an SQLite file.
+
+    ConfigError for a URL of an unknown kind, SourceError if it cannot be reached or written.
+    """
+    url = parse_url(where, ALARM_DATABASE)
+    outbox = Outbox(url, make_engine(url, busy_s), unit, clock)
+    try:
+        outbox.prepare()
+    except BaseException:
+        outbox.close()
+        raise
+    return outbox
+
+
+class Outbox:
+    """An open outbox. Several threads may use one each; what is written is written whole."""
+
+    def __init__(self, url: URL, engine: Engine, unit: Unit, clock: Callable[[], int]) -> None:
+        self._url, self._engine, self._unit, self._clock = url, engine, unit, clock
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give all connections back."""
+        self._engine.dispose()
+
+    def prepare(self) -> None:
+        """Make the table if it is not there."""
+        with self._reading() as connection:
+            there = inspect(connection).has_table(OUTBOX.name)
+        if not there:
+            with self._writing() as connection:
+                metadata.create_all(connection)
+
+    def put(self, letters: Iterable[tuple[str, Message]]) -> None:
+        """Take messages, each for the destination it is with."""
+        own: dict[str, Any] = {"asset_type": self._unit.type, "asset_id": self._unit.id}
+        own["made_ns"] = self._clock()
+        rows = [
+            {**own, "destination": to, "id": one.id, "alarm": one.alarm, "body": one.body}
+            for to, one in letters
+        ]
+        with self._writing() as connection:
+            connection.execute(OUTBOX.insert(), rows)
+
+    def next(self, destination: str, most: int) -> list[Message]:
+        """The oldest messages that wait, in their order."""
+        with self._reading() as connection:
+            return _messages(connection, self._waiting(destination), most)
+
+    def count(self, destination: str) -> int:
+        """How many wait."""
+        wanted = select(func.count()).select_from(OUTBOX).where(*self._waiting(destination))
+        with self._reading() as connection:
+            return int(connection.execute(wanted).scalar_one())
+
+    def delivered(self, destination: str, numbers: Collection[str]) -> None:
+        """The destination has these, by their IDs."""
+        with self._writing() as connection:
+            connection.execute(OUTBOX.delete().where(*self._named(destination, numbers)))
+
+    def refuse(self, destination: str, number: str, why: str) -> None:
+        """Set one aside that the destination will not have."""
+        with self._writing() as connection:
+            named = OUTBOX.update().where(*self._named(destination, [number]))
+            connection.execute(named.values(refused=why))
+
+    def refused(self, destination: str) -> list[tuple[Message, str]]:
+        """What was set aside, with why."""
+        whose = (*self._own(destination), OUTBOX.c.refused.is_not(None))
+        with self._reading() as connection:
+            rows = connection.execute(select(OUTBOX).where(*whose).order_by(OUTBOX.c.number))
+            return [(_message(row), str(row.refused)) for row in rows]
+
+    def give_up(self, destination: str, most: int, since_ns: int) -> list[Message]:
+        """Let go of what waits beyond the newest ``most`` or from before a time; gives it.
+
+        What was refused goes after that time as well; it has been told.
+        """
+        waiting, number = self._waiting(destination), OUTBOX.c.number
+        with self._reading() as connection:
+            newest = select(number).where(*waiting).order_by(number.desc()).offset(most).limit(1)
+            limit = connection.execute(newest).scalar()
+            gone = OUTBOX.c.made_ns < since_ns
+            if limit is not None:
+                gone |= number <= limit
+            lost = _messages(connection, (*waiting, gone))
+            old = (*self._own(destination), OUTBOX.c.made_ns < since_ns)
+            is_old = connection.execute(select(number).where(*old).limit(1)).first()
+        if lost or is_old:
+            with self._writing() as connection:
+                for which in ((*waiting, gone), old):
+                    connection.execute(OUTBOX.delete().where(*which))
+        return lost
+
+    def _own(self, destination: str) -> tuple[ColumnElement[bool], ...]:
+        table = OUTBOX.c
+        whose = table.asset_type == self._unit.type, table.asset_id == self._unit.id
+        return table.destination == destination, *whose
+
+    def _waiting(self, destination: str) -> tuple[ColumnElement[bool], ...]:
+        return *self._own(destination), OUTBOX.c.refused.is_(None)
+
+    def _named(self, destination: str, numbers: Collection[str]) -> tuple[ColumnElement[bool], ...]:
+        return *self._own(destination), OUTBOX.c.id.in_(numbers)
+
+    @contextmanager
+    def _reading(self) -> Iterator[Connection]:
+        with plain_errors(self._url, ALARM_DATABASE), self._engine.begin() as connection:
+            yield connection
+
+    @contextmanager
+    def _writing(self) -> Iterator[Connection]:
+        writer = self._engine.execution_options(writing=True)
+        with plain_errors(self._url, ALARM_DATABASE), writer.begin() as connection:
+            yield connection
+
+
+def _messages(
+    connection: Connection, which: Sequence[ColumnElement[bool]], most: int | None = None
+) -> list[Message]:
+    wanted = select(OUTBOX).where(*which).order_by(OUTBOX.c.number).limit(most)
+    return [_message(row) for row in connection.execute(wanted)]
+
+
+def _message(row: Row[Any]) -> Message:
+    return Message(row.id, row.alarm, row.body)

@@ -1,0 +1,194 @@
+"""Delivers what waits in the outbox for one destination, in a thread of its own."""
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from twin.errors import SourceError, TwinError
+from twin.outlets.message import Message, again
+from twin.outlets.outbox import Outbox
+from twin.outlets.settings import Outlet
+
+BATCH = 20  # messages on their way at once: what MQTT brokers take
+FIRST_PAUSE_S = 1.0  # after a failure; the next ones are twice as long each
+LONGEST_PAUSE_S = 60.0
+GRACE_S = 3.0  # to deliver what is left when the program ends
+DAY_NS = 86_400 * 1_000_000_000
+
+
+class LostError(SourceError):
+    """The destination cannot be reached now, or does not answer; it may come back."""
+
+
+@dataclass
+class Sent:
+    """What has become of messages; what is in neither is to be sent again."""
+
+    delivered: list[Message] = field(default_factory=list)
+    refused: dict[str, str] = field(default_factory=dict)  # by ID, why; for good
+    lost: LostError | None = None
+
+
+class Channel(Protocol):
+    """A way to a destination; one thread alone uses it."""
+
+    def open(self) -> bool:
+        """Be connected. True if the other side has forgotten what it was told; LostError if not."""
+
+    def send(self, messages: Sequence[Message]) -> Sent:
+        """Deliver in this order, waiting until they are taken."""
+
+    def idle(self, wake: threading.Event) -> None:
+        """Keep the connection for a moment, or until ``wake``; LostError if it is lost."""
+
+    def hang_up(self) -> None:
+        """Let go of a connection that failed."""
+
+    def close(self) -> None:
+        """Say good-bye; nothing comes after it."""
+
+
+class Sender:
+    """Delivers the messages of a unit to one destination, each at least once and in order.
+
+    What goes wrong is said once, until it goes well again.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        channel: Channel,
+        open_outbox: Callable[[], Outbox],
+        limits: Outlet,
+        say: Callable[[str], None],
+        clock: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self.name = name
+        self._channel, self._open_outbox = channel, open_outbox
+        self._limits, self._say, self._clock = limits, say, clock
+        self._outbox: Outbox | None = None
+        self._told: dict[str, Message] = {}  # by alarm: the newest that was delivered
+        self._to_restate = False
+        self._complaint = ""
+        self._refusal = ""
+        self._pause_s = FIRST_PAUSE_S
+        self._wake, self._ending = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._work, name=f"to {name}", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def wake(self) -> None:
+        """There is something in the outbox."""
+        self._wake.set()
+
+    def end(self) -> None:
+        """Deliver what can be delivered at once, then stop."""
+        self._ending.set()
+        self._wake.set()
+
+    def join(self) -> None:
+        """Wait until it has stopped."""
+        self._thread.join()
+
+    # --- the thread -----------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        while not self._ending.is_set():
+            try:
+                if not self._go_on():
+                    self._channel.idle(self._wake)
+            except TwinError as error:
+                self._fail(error)
+        self._finish()
+
+    def _go_on(self) -> bool:
+        """Deliver the next messages; False if there are none."""
+        self._to_restate |= self._channel.open()
+        self._wake.clear()
+        self._outbox = self._outbox or self._open_outbox()
+        self._give_up(self._outbox)
+        messages = self._outbox.next(self.name, BATCH)
+        if messages:
+            self._deliver(self._outbox, messages)
+        elif self._to_restate:
+            self._restate()
+        self._succeed()
+        return bool(messages)
+
+    def _deliver(self, outbox: Outbox, messages: Sequence[Message]) -> None:
+        sent = self._channel.send(messages)
+        outbox.delivered(self.name, [one.id for one in sent.delivered])
+        self._told |= {one.alarm: one for one in sent.delivered}
+        for number, why in sent.refused.items():
+            outbox.refuse(self.name, number, why)
+            if why != self._refusal:
+                self._say(f"{self.name} refuses alarms, which are set aside: {why}")
+            self._refusal = why
+        if sent.lost is not None:
+            raise sent.lost
+
+    def _restate(self) -> None:
+        """Tell every alarm as it was told last, so that whoever has lost everything is right."""
+        messages = [again(one, self._clock()) for one in self._told.values()]
+        for begin in range(0, len(messages), BATCH):
+            sent = self._channel.send(messages[begin : begin + BATCH])
+            if sent.lost is not None:
+                raise sent.lost
+        self._to_restate = False
+
+    def _give_up(self, outbox: Outbox) -> None:
+        """Let go of what waits beyond the bounds, and say so; the newest state is still told."""
+        since_ns = self._clock() - round(self._limits.longest_days * DAY_NS)
+        lost = outbox.give_up(self.name, self._limits.most_waiting, since_ns)
+        if lost:
+            self._told |= {one.alarm: one for one in lost}
+            self._to_restate = True
+            self._say(
+                f"{len(lost)} changes of alarms were never delivered to {self.name} and are given"
+                f" up: more than {self._limits.most_waiting} waited, or longer than"
+                f" {self._limits.longest_days:g} days"
+            )
+
+    # --- when it goes wrong, and well again -----------------------------------------------------
+
+    def _fail(self, error: TwinError) -> None:
+        """Say so if that is new, and wait; longer each time."""
+        self._let_go()
+        if not self._complaint:
+            self._say(f"alarms wait in the outbox: {self.name}: {error}")
+        self._complaint = str(error)
+        self._ending.wait(self._pause_s)
+        self._pause_s = min(2 * self._pause_s, LONGEST_PAUSE_S)
+
+    def _succeed(self) -> None:
+        if self._complaint:
+            self._say(f"alarms go to {self.name} again")
+        self._complaint, self._pause_s = "", FIRST_PAUSE_S
+
+    def _let_go(self) -> None:
+        self._channel.hang_up()
+        if self._outbox is not None:
+            self._outbox.close()
+        self._outbox = None
+
+    def _finish(self) -> None:
+        """Deliver what is left while that goes well and is soon done."""
+        end = time.monotonic() + GRACE_S
+        try:
+            while self._go_on() and time.monotonic() < end:
+                continue
+            self._channel.close()
+        except TwinError as error:
+            self._complaint = str(error)
+        with_why = f": {self._complaint}" if self._complaint else ""
+        try:
+            self._outbox = self._outbox or self._open_outbox()
+            if left := self._outbox.count(self.name):
+                self._say(f"{left} messages to {self.name} wait for the next run{with_why}")
+        except TwinError as error:
+            self._say(f"what waits for {self.name} is not known: {error}")
+        self._let_go()

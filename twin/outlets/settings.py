@@ -1,0 +1,167 @@
+"""The tables ``[mqtt]`` and ``[webhook]``: where alarms go, and what protects them on the way."""
+
+import ipaddress
+import os
+import ssl
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Self
+from urllib.parse import urlsplit
+
+from pydantic import Field, model_validator
+
+from twin.errors import ConfigError
+from twin.settings import Document, Settings
+
+Say = Callable[[str], None]
+
+
+class Secret(Settings):
+    """What nobody else is to know; not in the configuration itself, which is copied into logs."""
+
+    file: Path | None = None  # a text file with it alone, from the configuration's folder
+    env: str = ""  # an environment variable
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Self:
+        if (self.file is None) == (not self.env):
+            raise ValueError("needs one place: file or env")
+        return self
+
+    def read(self, key: str, folder: Path, say: Say) -> str:
+        """The secret of ``key``; ConfigError where there is none.
+
+        A file that others may read is said.
+        """
+        if self.file is None:
+            found, where = os.environ.get(self.env, ""), f"environment variable {self.env}"
+        else:
+            found, where = _read(key, folder / self.file, say), str(folder / self.file)
+        if not found:
+            raise ConfigError(f"{key}: {where} is empty or not set", "put the secret there")
+        return found
+
+
+class Tls(Settings):
+    """How a connection is protected. ``{}`` trusts whom this machine trusts."""
+
+    trusted: Path | None = None  # PEM: the server's certificate, or the authority's
+    certificate: Path | None = None  # PEM, our own, where the server wants one
+    key: Path | None = None
+
+    @model_validator(mode="after")
+    def _belong_together(self) -> Self:
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("certificate and key belong together")
+        return self
+
+    def context(self, table: str, folder: Path) -> ssl.SSLContext:
+        """What a connection takes; ConfigError where a file cannot be used."""
+        try:
+            trusted = folder / self.trusted if self.trusted else None
+            context = ssl.create_default_context(cafile=trusted)
+            context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN  # the server's own is enough
+            if self.certificate and self.key:
+                own = folder / self.certificate, folder / self.key
+                context.load_cert_chain(*own, password=lambda: "")
+        except (OSError, ValueError) as error:
+            raise ConfigError(
+                f"[{table}.tls]: cannot be used: {error}",
+                "trusted, certificate and key are PEM files, the key without a password",
+            ) from error
+        return context
+
+
+class Outlet(Settings):
+    """What every destination has: how much waits for it, and for how long."""
+
+    most_waiting: int = Field(default=10_000, ge=100)  # messages; then the oldest are given up
+    longest_days: float = Field(default=30.0, gt=0.0)
+
+
+class MqttSettings(Outlet):
+    """An MQTT broker; none while ``host`` is empty."""
+
+    host: str = ""
+    port: int = Field(default=0, ge=0, le=65535)  # 0: 8883 with tls, else 1883
+    tls: Tls | None = None
+    user: str = ""
+    password: Secret | None = None
+    unprotected: bool = False  # a password without tls beyond this machine all the same
+    prefix: str = Field(default="ejector-twin", pattern=r"^[^+#\x00/]+(/[^+#\x00/]+)*$")
+    keepalive_s: int = Field(default=30, ge=5, le=3600)  # gone for 1.5 of it, the twin is offline
+    cycles: bool = False  # the key figures of each cycle too
+
+    @model_validator(mode="after")
+    def _is_protected(self) -> Self:
+        if self.password is None:
+            return self
+        if not self.user:
+            raise ValueError("a password needs a user")
+        if self.tls is None and not self.unprotected and not _is_loopback(self.host):
+            raise ValueError(
+                f'"{self.host}" is beyond this machine, and a password is not sent in the clear:'
+                " give [mqtt.tls] (may be empty), or say unprotected = true"
+            )
+        return self
+
+
+class WebhookSettings(Outlet):
+    """An address that takes JSON by POST; none while ``url`` is empty."""
+
+    url: str = ""
+    headers: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9-]+$")], Secret] = Field(default={})
+    tls: Tls = Tls()
+    timeout_s: float = Field(default=10.0, gt=0.0, le=60.0)
+    unprotected: bool = False  # headers without https beyond this machine all the same
+
+    @model_validator(mode="after")
+    def _is_protected(self) -> Self:
+        if not self.url:
+            return self
+        where = urlsplit(self.url)
+        if where.scheme not in ("http", "https") or not where.hostname:
+            raise ValueError(f'url: "{self.url}" is no address: https://HOST/PATH')
+        if where.password:
+            raise ValueError("url: a password does not stand in it; give it in headers")
+        clear = where.scheme == "http" and not _is_loopback(where.hostname)
+        if self.headers and clear and not self.unprotected:
+            raise ValueError(
+                f'"{where.hostname}" is beyond this machine, and headers are secrets: take https,'
+                " or say unprotected = true"
+            )
+        return self
+
+
+def chosen(document: Document) -> tuple[MqttSettings, WebhookSettings]:
+    """What a configuration asks for; ConfigError names file, line and key."""
+    mqtt = document.section(MqttSettings, "mqtt")
+    webhook = document.section(WebhookSettings, "webhook")
+    for table, wanted in (("mqtt", mqtt.host), ("webhook", webhook.url)):
+        if table in document.tables and not wanted:
+            key = "host" if table == "mqtt" else "url"
+            raise ConfigError(
+                f"{document.name}: [{table}] has no {key}", "write where, or leave the table out"
+            )
+    return mqtt, webhook
+
+
+def _read(key: str, path: Path, say: Say) -> str:
+    try:
+        mode = path.stat().st_mode
+        found = path.read_text(encoding="utf-8").strip("\r\n")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"{key} {path}: cannot be read: {error}", "a text file with the secret alone"
+        ) from error
+    if os.name == "posix" and mode & (stat.S_IRWXG | stat.S_IRWXO):
+        say(f"{key}: others may read {path}; keep it to yourself: chmod 600 {path}")
+    return found
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:  # a name
+        return host == "localhost"

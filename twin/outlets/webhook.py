@@ -1,0 +1,89 @@
+"""Alarms to an address that takes JSON by POST, one after the other."""
+
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import urllib3
+
+from twin.outlets.message import Message
+from twin.outlets.sender import LostError, Sent
+from twin.outlets.settings import Say, WebhookSettings
+
+LATER = (408, 425, 429)  # of the client's errors those that say: not now
+IDLE_S = 0.2
+
+
+class Webhook:
+    """A channel (``twin.outlets.sender.Channel``).
+
+    ``folder`` is where relative paths are from. ConfigError where a secret or certificate cannot
+    be used.
+    """
+
+    def __init__(self, settings: WebhookSettings, folder: Path, say: Say) -> None:
+        self._settings = settings
+        self._headers = {"Content-Type": "application/json"} | {
+            name: secret.read(f"[webhook] headers.{name}", folder, say)
+            for name, secret in settings.headers.items()
+        }
+        where = urlsplit(settings.url)
+        self._where = f"{where.scheme}://{where.netloc}"  # what follows may be a secret
+        secured = where.scheme == "https"
+        self._pool = urllib3.PoolManager(
+            1,
+            retries=False,
+            timeout=settings.timeout_s,
+            ssl_context=settings.tls.context("webhook", folder) if secured else None,
+        )
+
+    def open(self) -> bool:
+        """There is a connection for each request, if need be."""
+        return False
+
+    def send(self, messages: Sequence[Message]) -> Sent:
+        """Post each, until one does not come through."""
+        sent = Sent()
+        for message in messages:
+            try:
+                refused = self._post(message)
+            except LostError as error:
+                sent.lost = error
+                break
+            if refused:
+                sent.refused[message.id] = refused
+            else:
+                sent.delivered.append(message)
+        return sent
+
+    def idle(self, wake: threading.Event) -> None:
+        """Nothing is to be kept."""
+        wake.wait(IDLE_S)
+
+    def hang_up(self) -> None:
+        """Let go of connections."""
+        self._pool.clear()
+
+    def close(self) -> None:
+        """Let go of connections."""
+        self._pool.clear()
+
+    def _post(self, message: Message) -> str:
+        """Why it is refused, for good; empty if it is taken. LostError if it is to come again."""
+        headers = {**self._headers, "Idempotency-Key": message.id}
+        try:
+            answer = self._pool.request(
+                "POST",
+                self._settings.url,
+                body=message.body.encode(),
+                headers=headers,
+                redirect=False,
+            )
+        except urllib3.exceptions.HTTPError as error:
+            raise LostError(f"webhook {self._where}: {error}", "is it there?") from error
+        if answer.status in LATER or answer.status >= 500:
+            raise LostError(f"webhook {self._where}: status {answer.status} {answer.reason or ''}")
+        if answer.status >= 300:
+            return f"{self._where}: status {answer.status} {answer.reason or ''}".rstrip()
+        return ""
