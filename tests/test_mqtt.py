@@ -1,6 +1,7 @@
 """Alarms at a real broker (mosquitto): kept there, through its restarts, cuts and ours."""
 
 import json
+import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 
 import pytest
 import tomli_w
+from independent import missing
 from mosquitto import Broker, Listener, Relay, broker
 from test_alarms_loop import LEAK, NONE, UNIT, Stream, deviation
 from test_outlets import NO_TICKS, Bench, message, wait_until
@@ -209,7 +211,7 @@ def test_what_is_forbidden_is_set_aside(tmp_path: Path) -> None:
         bench.end()
     ((_, why),) = bench.outbox.refused("mqtt")
     assert "Not authorized" in why
-    assert len(bench.said) == 1
+    assert bench.said[0].startswith("mqtt refuses alarms")  # this broker may hang up as well
 
 
 def test_names_with_a_meaning_in_topics_are_escaped() -> None:
@@ -260,6 +262,8 @@ def test_inside_tls(tmp_path: Path) -> None:
 def certificate(folder: Path) -> Path:
     """Of 127.0.0.1, with its key, as PEM."""
     path = folder / "own.pem"
+    if shutil.which("openssl") is None:
+        missing("openssl", "on Debian or Ubuntu: apt install openssl")
     command = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2"]
     command += ["-subj", "/CN=broker", "-addext", "subjectAltName=IP:127.0.0.1"]
     key = folder / "key.pem"
