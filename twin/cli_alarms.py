@@ -50,11 +50,7 @@ def list_(
     """What a person is to look at, the most urgent first; then what is kept quiet."""
     with _open(alarms, config) as store:
         whose = _chosen(store, config, unit)
-        board = _board(config)
-        board.resume(store.states(whose))
-        board.see(time.time_ns(), {})
-        episodes = {one.alarm: one for one in store.episodes(whose, only_going_on=True)}
-    shown = [*board.standing(), *board.quiet()]
+        shown, episodes = _standing(store, whose, config)
     plain = [_plain_alarm(alarm, episodes.get(alarm.rule.name)) for alarm in shown]
     for one in plain:
         print(_alarm_in_words(one))
@@ -83,6 +79,34 @@ def history(
         print(_episode_in_words(one))
     if json_file is not None:
         _write_json(json_file, [_plain_episode(one) for one in episodes])
+
+
+@alarms_app.command()
+def export(
+    output: Annotated[Path, typer.Option("-o", metavar="FILE", help="*.csv, *.parquet or *.xlsx.")],
+    config: ConfigFile = None,
+    unit: UnitId = "",
+    alarms: Url = "",
+    days: Annotated[float | None, typer.Option(metavar="N", help="Only the last N days.")] = None,
+    standing: Annotated[
+        bool, typer.Option("--standing", help="What stands now, instead of the history.")
+    ] = False,
+) -> None:
+    """Write the history of a unit's alarms, or what stands, as a table for other programs."""
+    from twin.alarms.export import history_table, standing_table
+    from twin.tables.sheet import export as export_table
+
+    since = None if days is None else time.time_ns() - round(days * 86_400e9)
+    with _open(alarms, config) as store:
+        whose = _chosen(store, config, unit)
+        if standing:
+            shown, going_on = _standing(store, whose, config)
+            table = standing_table(shown, going_on, whose)
+        else:
+            rules = {name: alarm.rule for name, alarm in _board(config).alarms.items()}
+            table = history_table(store.episodes(whose, since), rules, whose)
+    export_table(table, output)
+    print(f"{table.num_rows} alarms in {output}")
 
 
 @alarms_app.command()
@@ -179,6 +203,24 @@ def alarms_of(
     return lambda: Alarms(by_cause, time.time_ns, keeper.begin(), keeper)
 
 
+def asker_of(settings: "Config") -> "Callable[[str, str], None] | None":
+    """What asks the run to acknowledge an alarm, as the command does; None where none are kept."""
+    from twin.alarms.place import open_chosen
+    from twin.alarms.settings import AlarmSettings
+    from twin.alarms.state import Deed
+    from twin.alarms.store import Unit
+
+    if not settings.document.section(AlarmSettings, "alarms").keep:
+        return None
+    unit = Unit(settings.asset.type, settings.asset.id)
+
+    def acknowledge(alarm: str, who: str) -> None:
+        with open_chosen("", settings.document, write=True) as store:
+            store.ask(unit, alarm, Deed.ACKNOWLEDGED, who)
+
+    return acknowledge
+
+
 # --- what the commands share --------------------------------------------------------------------
 
 
@@ -208,6 +250,17 @@ def _board(config: Path | None) -> "Board":
     from twin.alarms.settings import board_rules
 
     return Board(board_rules(_document(config)))
+
+
+def _standing(
+    store: "Store", unit: "Unit", config: Path | None
+) -> "tuple[list[Alarm], dict[str, Episode]]":
+    """What a person is to look at, the most urgent first, then what is quiet; and its episodes."""
+    board = _board(config)
+    board.resume(store.states(unit))
+    board.see(time.time_ns(), {})
+    episodes = {one.alarm: one for one in store.episodes(unit, only_going_on=True)}
+    return [*board.standing(), *board.quiet()], episodes
 
 
 def _chosen(store: "Store", config: Path | None, unit: str) -> "Unit":

@@ -47,18 +47,18 @@ def show(
     config: ConfigFile = None,
     json_file: JsonFile = None,
     output: Annotated[
-        Path | None, typer.Option("-o", metavar="FILE", help="*.csv or *.parquet.")
+        Path | None, typer.Option("-o", metavar="FILE", help="*.csv, *.parquet or *.xlsx.")
     ] = None,
     keep: Annotated[bool, typer.Option("--keep", help="Add them to the database.")] = False,
     figures: Url = "",
 ) -> None:
     """Key figures of every cycle of a log: measured, and what the twin expected."""
-    from twin.figures.export import export as export_table
     from twin.figures.export import to_table
     from twin.figures.read import of_log
     from twin.figures.store import Unit, open_store
     from twin.figures.words import cycles_table
     from twin.log.reader import open_log
+    from twin.tables.sheet import export as export_table
 
     recorded = open_log(log)
     settings = _of_log(recorded, log, config)
@@ -155,15 +155,15 @@ def autoset(
 
 @figures_app.command()
 def export(
-    output: Annotated[Path, typer.Option("-o", metavar="FILE", help="*.csv or *.parquet.")],
+    output: Annotated[Path, typer.Option("-o", metavar="FILE", help="*.csv, *.parquet or *.xlsx.")],
     config: ConfigFile = None,
     unit: UnitId = "",
     figures: Url = "",
     days: Days = None,
 ) -> None:
     """Write the kept cycles of a unit as a table for other programs."""
-    from twin.figures.export import export as export_table
     from twin.figures.export import to_table
+    from twin.tables.sheet import export as export_table
 
     with _open(figures, config, write=False) as store:
         whose = _chosen(store, config, unit)

@@ -1,14 +1,9 @@
-"""Key figures as a table for other programs: CSV or Parquet, a row for each cycle."""
-
-from pathlib import Path
+"""Key figures as a table for other programs: a row for each cycle."""
 
 import pyarrow as pa
-from pyarrow import csv, parquet
 
-from twin.errors import ConfigError
 from twin.figures.store import SIDES, History, Unit
 from twin.figures.table import FIGURES
-from twin.tables.export import complete_file
 
 UNITS = {f"{one.name}_{side}": one.unit for one in FIGURES.values() for side in SIDES}
 
@@ -30,21 +25,3 @@ def to_table(history: History, unit: Unit) -> pa.Table:
         for name, column in columns.items()
     ]
     return pa.table(list(columns.values()), pa.schema(fields))
-
-
-def export(table: pa.Table, path: Path) -> None:
-    """Write a table as its suffix says, whole or not at all.
-
-    ConfigError for another suffix, SourceError if there is a file of that name or it cannot be
-    written.
-    """
-    kind = path.suffix.lower()
-    if kind not in (".csv", ".parquet"):
-        raise ConfigError(
-            f"{path}: cannot tell what to write", ".csv and .parquet files can be written"
-        )
-    with complete_file(path) as file:
-        if kind == ".csv":
-            csv.write_csv(table, file, csv.WriteOptions(quoting_style="needed"))
-        else:
-            parquet.write_table(table, file, compression="zstd", write_page_checksum=True)
