@@ -1,5 +1,6 @@
 """What the twin finds, served over OPC UA, so that a SCADA can read it; nobody can write.
 
+Alarms are conditions, which some users may acknowledge (``drivers.results_alarms``).
 The server runs in a thread of its own. The loops leave what is newest in their ``Results`` and go
 on; here it is taken at an even pace. How it is laid out stands in docs/opcua.md.
 """
@@ -20,6 +21,7 @@ from asyncua import Node, Server, ua
 
 from drivers.opcua_nodes import Names, Unit, add_quantity, add_state
 from drivers.opcua_security import secure
+from drivers.results_alarms import Acknowledge, Conditions, KnowingServer, Source
 from drivers.results_settings import ResultsSettings
 from drivers.results_state import MEANS, SIDES, Reading, Results, Standing, Status
 from twin.errors import SourceError
@@ -75,6 +77,7 @@ class Branch:
     """The nodes of one ejector."""
 
     results: Results
+    source: Source
     leaves: list[Leaf] = field(default_factory=list)
 
 
@@ -119,11 +122,15 @@ class ResultsServer:
         """Where it is reached."""
         return self._ready.result(PATIENCE_S)
 
-    def sink(self, asset: str, kind: str) -> Results:
-        """Give a sink whose rows are served as ``asset``, of the type ``kind`` of ejectors."""
+    def sink(self, asset: str, kind: str, acknowledge: Acknowledge | None = None) -> Results:
+        """Give a sink whose rows are served as ``asset``, of the type ``kind`` of ejectors.
+
+        ``acknowledge`` is asked to acknowledge an alarm, in a thread; it may raise TwinError.
+        """
         assert self._loop is not None
         results = Results(asset, tuple(self._figures))
-        added = asyncio.run_coroutine_threadsafe(self._add(results, kind), self._loop)
+        adding = self._add(results, kind, acknowledge)
+        added = asyncio.run_coroutine_threadsafe(adding, self._loop)
         added.result(PATIENCE_S)
         return results
 
@@ -143,6 +150,7 @@ class ResultsServer:
         self._index = await server.register_namespace(NAMESPACE)
         names = ua.NodeId("EjectorTwin", self._index), ua.QualifiedName("EjectorTwin", self._index)
         self._root = await server.get_objects_node().add_object(*names)
+        self._conditions = Conditions(server, self._settings.acknowledge)
         try:
             await server.start()
         except OSError as error:
@@ -169,6 +177,8 @@ class ResultsServer:
 
     async def _show(self, branch: Branch) -> None:
         """Write what has changed."""
+        for change in branch.results.changes():
+            await self._conditions.tell(branch.source, change)
         readings = branch.results.readings()
         for leaf in branch.leaves:
             reading = readings[leaf.name]
@@ -178,12 +188,12 @@ class ResultsServer:
 
     # --- the address space ----------------------------------------------------------------------
 
-    async def _add(self, results: Results, kind: str) -> None:
-        """Lay out ``Identification, Meas, Model, Cycle, Health, Events`` below one object."""
+    async def _add(self, results: Results, kind: str, acknowledge: Acknowledge | None) -> None:
+        """Lay out ``GROUPS`` below one object."""
         top = await self._root.add_object(*self._names(results.asset))
-        branch = Branch(results)
-        groups = ("Identification", "Meas", "Model", "Cycle", "Health", "Events")
-        made = {name: await top.add_object(*self._names(results.asset, name)) for name in groups}
+        source = Source(top.nodeid, results.asset, self._inputs(results.asset), acknowledge)
+        branch = Branch(results, source)
+        made = {name: await top.add_object(*self._names(results.asset, name)) for name in GROUPS}
         for name, text in (("Id", results.asset), ("Type", kind)):
             names = self._names(results.asset, "Identification", name)
             await made["Identification"].add_variable(*names, text, _T.String)
@@ -203,6 +213,18 @@ class ResultsServer:
         branch.leaves.append(await _plain(made["Cycle"], names, "cycle", _T.Int64, "Cycle"))
         await self._show(branch)
         self._branches.append(branch)
+
+    def _inputs(self, asset: str) -> dict[str, tuple[ua.NodeId, ua.NodeId]]:
+        """Where what alarms compare is: measured and expected, by quantity."""
+        paths = {"pressure": (("Meas", "Pressure"), ("Model", "Expected"))}
+        paths |= {
+            name: (("Cycle", f"{name}_measured"), ("Cycle", f"{name}_expected"))
+            for name in self._figures
+        }
+        return {
+            quantity: (self._names(asset, *measured)[0], self._names(asset, *expected)[0])
+            for quantity, (measured, expected) in paths.items()
+        }
 
     def _names(self, *path: str) -> Names:
         """NodeId and browse name of what lies at ``path``."""
@@ -237,6 +259,7 @@ class ResultsServer:
         return Leaf(name, _T.Double, False, node.nodeid)
 
 
+GROUPS = ("Identification", "Meas", "Model", "Cycle", "Health", "Events", "Alarms")
 STATES: Sequence[tuple[str, str, list[str]]] = (
     ("Model", "Phase", [phase.name.lower().replace("_", "-") for phase in Phase]),
     ("Health", "State", [one.name.lower().replace("_", " ") for one in Standing]),
@@ -251,7 +274,7 @@ class _Guard:
 
 
 async def _prepared(settings: ResultsSettings) -> Server:
-    server = Server()
+    server = Server(KnowingServer())
     await server.init()
     server.set_endpoint(f"opc.tcp://{settings.host}:{settings.port}/")
     server.set_server_name("ejector-twin")

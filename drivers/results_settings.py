@@ -27,6 +27,7 @@ class ResultsSettings(Settings):
     policies: tuple[Policy, ...] = Field(default=("None",), min_length=1)
     certificates: Path | None = None  # a folder as twin cert makes it; the same as the driver's
     users: dict[str, Path] = Field(default={})  # name = "file with the password"; if any, of all
+    acknowledge: tuple[str, ...] = ()  # of the users those who may acknowledge alarms
     unprotected: bool = False  # beyond this machine without a policy all the same
 
     @model_validator(mode="after")
@@ -37,6 +38,8 @@ class ResultsSettings(Settings):
             raise ValueError(
                 "users need policies without None: a password is not sent in the clear"
             )
+        if unknown := set(self.acknowledge) - set(self.users):
+            raise ValueError(f"acknowledge: no such user: {', '.join(sorted(unknown))}")
         if "None" in self.policies and not _is_loopback(self.host) and not self.unprotected:
             raise ValueError(
                 f'"{self.host}" is beyond this machine: set policies without None, or say '
@@ -58,11 +61,11 @@ class ResultsSettings(Settings):
 @contextmanager
 def open_results(
     documents: Sequence[Document], figures: Mapping[str, str]
-) -> Iterator["Callable[[str, str], Results] | None"]:
+) -> Iterator["Callable[..., Results] | None"]:
     """Serve the results of all configurations that want it, at one place; None if none does.
 
-    Gives what makes a sink of an asset's name and type. ConfigError if two name different places;
-    for the others see ``ResultsServer``.
+    Gives ``ResultsServer.sink``, which makes a sink of an asset. ConfigError if two name different
+    places; for the others see ``ResultsServer``.
     """
     wanted = _wanted(documents)
     if wanted is None:

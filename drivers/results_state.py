@@ -4,8 +4,9 @@ The loop only leaves the newest here, and never waits; whoever serves it takes w
 """
 
 import math
+import queue
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, IntEnum
 from typing import Any
@@ -91,6 +92,7 @@ class Results:
         self._standing: Mapping[Standing, Health] = {}
         self._well_since_ns = 0
         self._ended = False
+        self._changes: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
 
     # --- from the loop --------------------------------------------------------------------------
 
@@ -104,11 +106,19 @@ class Results:
             self._well_since_ns = self._well_since_ns or int(samples["time_ns"][0])
             self._newest = Newest(sample, tick, parted, self._clock())
 
+    def resume(self, standing: Iterable[Mapping[str, Any]], now_ns: int) -> None:
+        """Take alarms as they are when a run begins."""
+        for plain in standing:
+            words = f"{plain['alarm']}: {plain['state'].replace('_', ' ')}"
+            self._changes.put({**plain, "host_ns": now_ns, "who": "", "text": words})
+
     def close(self) -> None:
         """Nothing comes any more."""
         self._ended = True
 
     def _hear(self, event: Event) -> None:
+        if event.kind in (Kind.ALARM, Kind.ALARM_CHANGED):
+            self._hear_alarm(event)
         self._events = (event, *self._events)[:KEPT]
         if event.kind is Kind.CYCLE:
             self._cycle = event
@@ -122,7 +132,18 @@ class Results:
             explained = _explained(self._standing[Standing.DEVIATION], event)
             self._standing = {**self._standing, Standing.DEVIATION: explained}
 
+    def _hear_alarm(self, event: Event) -> None:
+        """A change of an alarm, of both where one is renamed; every one of them counts."""
+        told = {"text": event.text, "who": event.data["who"], "host_ns": event.data["host_ns"]}
+        if left := event.data.get("left"):
+            self._changes.put({**left, **told})
+        self._changes.put({**event.data, **told})
+
     # --- for whoever serves it ------------------------------------------------------------------
+
+    def changes(self) -> list[Mapping[str, Any]]:
+        """How alarms have changed since the last time, in order: as they are, with the words."""
+        return [self._changes.get() for _ in range(self._changes.qsize())]
 
     @property
     def health(self) -> Health:

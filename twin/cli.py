@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.cli_alarms import alarms_app, alarms_of
+from twin.cli_alarms import alarms_app, alarms_of, asker_of
 from twin.cli_assets import assets_app
 from twin.cli_cert import cert
 from twin.cli_figures import figures_app, keeper_of, key_figures_of
@@ -29,7 +29,9 @@ from twin.errors import ConfigError, SourceError, TwinError
 from twin.events import Event, Severity
 
 if TYPE_CHECKING:
+    from drivers.results_state import Results
     from drivers.shared import Lines
+    from twin.cli_outlets import Begin, Standing
     from twin.config import Config
     from twin.diagnosis.answer import Diagnosis
     from twin.live import Adviser, Sink, Twin
@@ -121,9 +123,8 @@ def run(
     def beside(name: str, settings: "Config") -> None:
         label = "" if alone else name
         twin, monitor = pairs[name]
-        alarms = alarms_of(settings, _complain)
-        outlets = None if hil else outlets_of(settings, _complain)
-        shown = show(name, settings.asset.type) if show else None
+        alarms, outlets = alarms_of(settings, _complain), outlets_of(settings, _complain)
+        shown = show(name, settings.asset.type, asker_of(settings)) if show else None
         shared = lines if hil or not alone else None
         source = open_source(settings.document, address, shared)
         if hil:
@@ -146,8 +147,7 @@ def run(
             )
             # What is not measured has no faults. Alarms come last: they hear the diagnosis.
             advisers: list[Adviser] = [] if hil else [adviser, board := alarms()]
-            if outlets:
-                sinks.append(outlets(board.standing()))
+            sinks += [] if hil else _told(board.standing(), shown, outlets)
             run_loop(_until(stopped, begun), twin, monitor, sinks, advisers=advisers)
 
     failed: list[str] = []
@@ -628,6 +628,13 @@ def _opened(*makers: "Callable[[], Sink] | None") -> "list[Sink]":
             sink.close()
         raise
     return sinks
+
+
+def _told(standing: "Standing", shown: "Results | None", outlets: "Begin | None") -> "list[Sink]":
+    """Tell of the alarms that stand when a run begins; gives the sinks that tell of the others."""
+    if shown is not None:
+        shown.resume(standing, time.time_ns())
+    return [] if outlets is None else [outlets(standing)]
 
 
 def _view_of(settings: "Config", view: bool, rrd: Path | None) -> "Callable[[], Sink] | None":

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from twin.outlets.settings import Outlet
 
 Say = Callable[[str], None]
-Begin = Callable[[Sequence[Mapping[str, Any]]], "Outlets"]
+Standing = Sequence[Mapping[str, Any]]  # alarms as they are
+Begin = Callable[[Standing], "Outlets"]
 
 
 def outlets_of(settings: "Config", say: Say) -> Begin | None:
@@ -54,7 +55,7 @@ def outlets_of(settings: "Config", say: Say) -> Begin | None:
     if webhook.url:
         channels["webhook"] = Webhook(webhook, folder, say), webhook
 
-    def begin(standing: Sequence[Mapping[str, Any]]) -> "Outlets":
+    def begin(standing: Standing) -> "Outlets":
         senders = [
             Sender(name, channel, outbox, limits, say)
             for name, (channel, limits) in channels.items()

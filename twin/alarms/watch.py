@@ -48,6 +48,13 @@ def deviating(*causes: str) -> dict[str, float]:
     return {value_of(cause): float(cause in causes) for cause in CAUSES}
 
 
+def quantity(value: str) -> str | None:
+    """What a value compares with what is expected: the pressure, a key figure, or nothing."""
+    if value == DEVIATION or value.startswith(f"{DEVIATION}."):
+        return "pressure"
+    return CAUTIONS[value].figure if value in CAUTIONS else None
+
+
 def evidence(event: Event) -> dict[str, Evidence]:
     """What an event says for the alarms, by the value that it speaks for."""
     if event.kind in (Kind.PLC_STALE, Kind.SIGNAL_BAD):

@@ -6,7 +6,7 @@ from typing import Any
 from twin.alarms.board import Episode
 from twin.alarms.rules import Rule, default_rules
 from twin.alarms.state import SECOND_NS, Alarm, Change, Deed, State
-from twin.alarms.watch import Evidence
+from twin.alarms.watch import Evidence, quantity
 from twin.events import Event, Kind
 
 STATES = {
@@ -54,6 +54,7 @@ def plain(alarm: Alarm, evidence: Evidence, episode: Episode | None) -> dict[str
         "raised_ns": episode.raised_ns if episode else None,
         "raised_as": episode.raised_as if episode else None,
         "shelved_until_ns": alarm.shelved_until,
+        "quantity": quantity(rule.value),
         "priority": rule.priority.value,
         "consequence": rule.consequence,
         "action": rule.action,
