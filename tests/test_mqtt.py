@@ -2,19 +2,24 @@
 
 import json
 import shutil
+import signal
 import subprocess
+import sys
+import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
+import rigs
 import tomli_w
 from independent import missing
 from mosquitto import Broker, Listener, Relay, broker
+from plc_process import start_plc
 from test_alarms_loop import LEAK, NONE, UNIT, Stream, deviation
 from test_outlets import NO_TICKS, Bench, message, wait_until
 
-from twin.alarms.store import Unit
+from twin.alarms.store import Unit, open_store
 from twin.cli_outlets import outlets_of
 from twin.config import Config
 from twin.errors import ConfigError
@@ -23,6 +28,7 @@ from twin.outlets import mqtt, sender
 from twin.outlets.dispatch import Outlets
 from twin.outlets.message import Message
 from twin.outlets.mqtt import Mqtt
+from twin.outlets.outbox import open_outbox
 from twin.outlets.sender import LostError
 from twin.outlets.settings import MqttSettings, Secret, Tls
 from twin.settings import Document
@@ -312,6 +318,33 @@ def test_a_run_tells_what_stands_and_what_happens(tmp_path: Path, running: Broke
     assert (cleared["deed"], cleared["state"]) == ("cleared", "returned")
     assert (figures["cycle"], figures["t0_measured"], figures["t1"]) == (7, 825.0, None)
     assert said == []
+
+
+def test_twin_run_tells_that_its_plc_has_gone(tmp_path: Path, running: Broker) -> None:
+    tables = tomllib.loads(rigs.path_of("test_rig").read_text(encoding="utf-8"))
+    tables["plc"]["program"]["commands"] = "coils"  # which nobody sets: it stays idle
+    tables |= {"alarms": {"keep": True}, "mqtt": {"host": "127.0.0.1", "port": running.port}}
+    path = tmp_path / "rig.toml"
+    path.write_text(tomli_w.dumps(tables), encoding="utf-8")
+    command = [sys.executable, "-m", "twin.cli", "run", str(path), "--address"]
+    with start_plc(path) as plc, Listener(running.port) as listener:
+        command.append(f"127.0.0.1:{plc.port}")
+        with subprocess.Popen(command, cwd=rigs.ROOT, stdout=subprocess.DEVNULL) as process:
+            try:
+                listener.until("rig-01/status", status="online")
+                plc.kill()
+                stale = listener.until("rig-01/alarm/plc_stale")
+                process.send_signal(signal.SIGINT)
+                assert process.wait(30) == 130
+            finally:
+                process.kill()
+        stopped = listener.until("rig-01/status", status="offline")
+    assert (stale["deed"], stale["priority"], stale["active"]) == ("raised", "high", True)
+    assert stopped["since"] is not None
+    with open_store(tmp_path / "alarms.sqlite") as store:
+        (unit,) = store.units()
+    with open_outbox(tmp_path / "alarms.sqlite", unit) as outbox:
+        assert outbox.destinations() == []
 
 
 def test_without_the_tables_nothing_goes_anywhere(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from test_alarms_cli import begun, run  # noqa: F401 - a fixture
 from test_alarms_loop import APART, LEAK, NONE, UNIT, S, Stream, deviation, diagnosis, event
 
 from twin.alarms.state import Deed
@@ -171,6 +172,23 @@ def test_what_is_refused_is_set_aside_with_why(outbox: Outbox) -> None:
     outbox.refuse("webhook", "1", "status 400")
     assert outbox.next("webhook", 5) == [message(2)]
     assert outbox.refused("webhook") == [(message(1), "status 400")]
+    assert outbox.destinations() == ["webhook"]
+    assert outbox.again() == 1
+    assert outbox.next("webhook", 5) == [message(1), message(2)]
+
+
+def test_people_see_what_waits_and_send_again_what_was_refused(run: Any, tmp_path: Path) -> None:  # noqa: F811
+    begun(tmp_path / "alarms.sqlite").close()
+    assert run("outbox") == "nothing waits\n"
+    with open_outbox(tmp_path / "alarms.sqlite", UNIT) as outbox:
+        outbox.put([("webhook", message(n)) for n in (1, 2)])
+        outbox.refuse("webhook", "1", "status 400")
+    refused = f"        {LEAK}  1  status 400\n"
+    assert run("outbox") == f"webhook: 1 wait, 1 were refused\n{refused}"
+    assert run("outbox", "--again").splitlines() == [
+        "1 that were refused wait again",
+        "webhook: 2 wait, 0 were refused",
+    ]
 
 
 def test_it_holds_a_number_of_messages_for_a_time(outbox: Outbox, clock: Clock) -> None:

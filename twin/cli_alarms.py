@@ -165,6 +165,33 @@ def in_service(
 
 
 @alarms_app.command()
+def outbox(
+    config: ConfigFile = None,
+    unit: UnitId = "",
+    alarms: Url = "",
+    again: Annotated[
+        bool, typer.Option("--again", help="Send once more what was refused, when a run is there.")
+    ] = False,
+) -> None:
+    """What waits to be told to the outside, and what was refused there."""
+    from twin.alarms.place import place_of
+    from twin.outlets.outbox import open_outbox
+
+    with _open(alarms, config) as store:
+        whose = _chosen(store, config, unit)
+    with open_outbox(alarms or place_of(_document(config)), whose) as box:
+        if again:
+            print(f"{box.again()} that were refused wait again")
+        for name in box.destinations():
+            refused = box.refused(name)
+            print(f"{name}: {box.count(name)} wait, {len(refused)} were refused")
+            for message, why in refused:
+                print(f"        {message.alarm}  {message.id}  {why}")
+        if not box.destinations():
+            print("nothing waits")
+
+
+@alarms_app.command()
 def rules(config: ConfigFile = None) -> None:
     """Print the rules in use, as a file that [alarms] rules can name."""
     from twin.alarms.rules import write_rules

@@ -134,6 +134,18 @@ class Outbox:
             rows = connection.execute(select(OUTBOX).where(*whose).order_by(OUTBOX.c.number))
             return [(_message(row), str(row.refused)) for row in rows]
 
+    def again(self) -> int:
+        """Let everything that was refused wait once more, in its old order; gives how many."""
+        mine = *self._whose(), OUTBOX.c.refused.is_not(None)
+        with self._writing() as connection:
+            return connection.execute(OUTBOX.update().where(*mine).values(refused=None)).rowcount
+
+    def destinations(self) -> list[str]:
+        """For whom there is anything."""
+        wanted = select(OUTBOX.c.destination).where(*self._whose()).distinct()
+        with self._reading() as connection:
+            return sorted(connection.execute(wanted).scalars())
+
     def give_up(self, destination: str, most: int, since_ns: int) -> list[Message]:
         """Let go of what waits beyond the newest ``most`` or from before a time; gives it.
 
@@ -156,9 +168,10 @@ class Outbox:
         return lost
 
     def _own(self, destination: str) -> tuple[ColumnElement[bool], ...]:
-        table = OUTBOX.c
-        whose = table.asset_type == self._unit.type, table.asset_id == self._unit.id
-        return table.destination == destination, *whose
+        return OUTBOX.c.destination == destination, *self._whose()
+
+    def _whose(self) -> tuple[ColumnElement[bool], ...]:
+        return OUTBOX.c.asset_type == self._unit.type, OUTBOX.c.asset_id == self._unit.id
 
     def _waiting(self, destination: str) -> tuple[ColumnElement[bool], ...]:
         return *self._own(destination), OUTBOX.c.refused.is_(None)
