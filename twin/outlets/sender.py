@@ -14,6 +14,7 @@ from twin.outlets.settings import Outlet
 BATCH = 20  # messages on their way at once: what MQTT brokers take
 FIRST_PAUSE_S = 1.0  # after a failure; the next ones are twice as long each
 LONGEST_PAUSE_S = 60.0
+LOOK_S = 30.0  # into the outbox, where nobody has said that there is something
 GRACE_S = 3.0  # to deliver what is left when the program ends
 DAY_NS = 86_400 * 1_000_000_000
 
@@ -100,7 +101,7 @@ class Sender:
         while not self._ending.is_set():
             try:
                 if not self._go_on():
-                    self._channel.idle(self._wake)
+                    self._rest()
             except TwinError as error:
                 self._fail(error)
         self._finish()
@@ -118,6 +119,12 @@ class Sender:
             self._restate()
         self._succeed()
         return bool(messages)
+
+    def _rest(self) -> None:
+        """Keep the connection until there is something to do."""
+        end = time.monotonic() + LOOK_S
+        while not self._wake.is_set() and time.monotonic() < end:
+            self._channel.idle(self._wake)
 
     def _deliver(self, outbox: Outbox, messages: Sequence[Message]) -> None:
         sent = self._channel.send(messages)

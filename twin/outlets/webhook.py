@@ -33,7 +33,7 @@ class Webhook:
         secured = where.scheme == "https"
         self._pool = urllib3.PoolManager(
             1,
-            retries=False,
+            retries=False,  # nor redirects
             timeout=settings.timeout_s,
             ssl_context=settings.tls.context("webhook", folder) if secured else None,
         )
@@ -74,11 +74,7 @@ class Webhook:
         headers = {**self._headers, "Idempotency-Key": message.id}
         try:
             answer = self._pool.request(
-                "POST",
-                self._settings.url,
-                body=message.body.encode(),
-                headers=headers,
-                redirect=False,
+                "POST", self._settings.url, body=message.body.encode(), headers=headers
             )
         except urllib3.exceptions.HTTPError as error:
             raise LostError(f"webhook {self._where}: {error}", "is it there?") from error
