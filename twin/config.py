@@ -37,6 +37,7 @@ TABLES = {
     "log",
     "monitor",
     "mqtt",
+    "page",
     "plc",
     "results",
     "webhook",

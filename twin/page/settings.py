@@ -1,0 +1,24 @@
+"""The table ``[page]``: what a run leaves for the page, and where."""
+
+import re
+from pathlib import Path
+
+from twin.config import Asset
+from twin.settings import Document, Settings
+
+RING = "live.ring"
+REPORTS = "reports"
+
+
+class PageSettings(Settings):
+    """The page of one ejector."""
+
+    keep: bool = False  # twin run leaves live rows and reports of diagnoses for twin serve
+    folder: str = "page"  # from the configuration's folder; each ejector has one of its own in it
+
+
+def folder_of(document: Document, asset: Asset) -> Path:
+    """Where the run of an ejector leaves what its page shows."""
+    wanted = document.section(PageSettings, "page").folder
+    name = "-".join(re.sub(r"[^\w]+", "_", part) for part in (asset.type, asset.id) if part)
+    return Path(document.name).parent / wanted / name
