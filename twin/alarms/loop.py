@@ -201,6 +201,7 @@ class Alarms:
         found = before if before in causes else next(iter(causes))
         for cause, one in causes.items():
             told = _sizes(one) | {"words": event.text}
+            told |= {"report": event.data["report"]} if "report" in event.data else {}
             if cause == found:
                 told = self._evidence.get(value_of(before), {}) | told
             self._note(value_of(cause), told)

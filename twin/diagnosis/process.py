@@ -16,7 +16,9 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 
@@ -36,6 +38,9 @@ POLL_S = 0.05
 NICE = 10  # beyond the loop's own
 COMMAND = (sys.executable, "-m", "twin.diagnosis")
 
+REPORT = ".html"
+
+Question = tuple[Config, Samples, str, Path | None]  # rows, whose log, and where to draw the answer
 Clock = Callable[[], float]
 Status = Callable[[], AbstractContextManager[Callable[[str], None]]]
 
@@ -44,7 +49,7 @@ class LiveDiagnosis:
     """Follows the live loop, and has each alarm diagnosed (``twin.live.Adviser``).
 
     ``status`` gives a function that says what is waited for at the end, until ``stopped`` says that
-    nobody wants to wait.
+    nobody wants to wait. ``reports`` is a folder that keeps the page of each answer.
     """
 
     def __init__(
@@ -54,8 +59,9 @@ class LiveDiagnosis:
         stopped: Callable[[], bool],
         status: Status,
         clock: Clock = time.monotonic,
+        reports: Path | None = None,
     ) -> None:
-        self._config, self._log = config, log
+        self._config, self._log, self._reports = config, log, reports
         self._stopped, self._status, self._clock = stopped, status, clock
         self._recent = Recent()
         self._now_ns = 0  # PLC time
@@ -108,7 +114,8 @@ class LiveDiagnosis:
             self._alarm = event
 
     def _ask(self, alarm: Event) -> list[Event]:
-        question = self._config, self._recent.rows(), self._log
+        report = self._reports / f"{uuid4().hex}{REPORT}" if self._reports else None
+        question = self._config, self._recent.rows(), self._log, report
         cycles, deadline = min(self._recent.cycles, CYCLES), self._clock() + PATIENCE_S
         try:
             self._asked = Asked(question, alarm, cycles, deadline)
@@ -132,6 +139,7 @@ class LiveDiagnosis:
         else:
             self._settle(asked.alarm)
         data = {"alarm_ns": asked.alarm.time_ns, "begin_ns": asked.begin_ns, "answer": answer}
+        data |= {"report": asked.report.stem} if asked.report else {}
         return [Event(self._now_ns, Kind.DIAGNOSIS, in_a_line(answer, asked.begin_ns), data)]
 
     def _settle(self, alarm: Event) -> None:
@@ -175,10 +183,9 @@ class Recent:
 class Asked:
     """A diagnosis under way in another process; OSError where there can be none."""
 
-    def __init__(
-        self, question: tuple[Config, Samples, str], alarm: Event, cycles: int, deadline: float
-    ) -> None:
+    def __init__(self, question: Question, alarm: Event, cycles: int, deadline: float) -> None:
         self.alarm, self.cycles, self.deadline = alarm, cycles, deadline
+        self.report = question[3]
         self.begin_ns = int(question[1]["time_ns"][0])
         with ExitStack() as opened:
             asking, self._said, self._complaint = (
