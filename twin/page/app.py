@@ -1,0 +1,455 @@
+"""The page over HTTP: who may see and do what, and what the browser is told.
+
+Nothing from outside becomes part of a path: what is served stands in tables that are made at the
+start, and a report is known by the name that the run gave it.
+"""
+
+import asyncio
+import hmac
+import html
+import ipaddress
+import json
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass
+from http import HTTPStatus
+from importlib import resources
+from string import Template
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from anyio.to_thread import run_sync
+from starlette.applications import Starlette
+from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from twin.errors import TwinError
+from twin.page.ejector import Ejector
+from twin.page.sessions import SESSION_S, Session, Sessions, Tries
+from twin.page.users import Users
+
+COOKIE = "ejector-twin"
+TOKEN = "x-csrf-token"  # noqa: S105  # a header's name
+MOST_BODY = 4096  # bytes that anybody may send
+MOST_DAYS = 400.0
+ROWS_S = 0.08  # between batches of live rows
+STATE_S = 1.0  # between looks at alarms
+SLOWEST_S = 20.0  # for a browser to take one message
+
+STATIC = {
+    "icon.svg": "image/svg+xml",
+    "page.js": "text/javascript",
+    "page.css": "text/css",
+    "uPlot.iife.min.js": "text/javascript",
+    "uPlot.min.css": "text/css",
+    "uPlot.LICENSE": "text/plain",
+}
+CSP = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self';"
+    " form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+# A report brings its style with it. Nothing in it is run.
+REPORT_CSP = (
+    "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none';"
+    " frame-ancestors 'none'; sandbox allow-popups"
+)
+HEADERS = {
+    "content-security-policy": CSP,
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    "referrer-policy": "same-origin",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "cache-control": "no-store",
+}
+
+
+@dataclass(frozen=True)
+class Access:
+    """How the page is reached, and what that asks for."""
+
+    names: frozenset[str] = frozenset()  # of this machine, beside its addresses and localhost
+    secure: bool = False  # over TLS
+    open_to_see: bool = True  # only loopback: to see needs no login, to act does
+
+    def is_ours(self, host: str) -> bool:
+        """Whether a Host header is of this machine: a foreign name was led here by its DNS."""
+        try:
+            name = (urlsplit(f"//{host}").hostname or "").lower()
+        except ValueError:
+            return False
+        if name == "localhost" or name in self.names:
+            return True
+        try:
+            ipaddress.ip_address(name)
+        except ValueError:
+            return False
+        return True
+
+    def is_own_origin(self, headers: Headers) -> bool:
+        """Whether a request comes from a page of ours."""
+        scheme = "https" if self.secure else "http"
+        return headers.get("origin") == f"{scheme}://{headers.get('host', '')}"
+
+
+class Page:
+    """All that the page does."""
+
+    def __init__(
+        self, ejectors: Sequence[Ejector], users: Users, sessions: Sessions, access: Access
+    ) -> None:
+        self.ejectors, self.users, self.sessions, self.access = ejectors, users, sessions, access
+        self._states = [_Remembered(one.state) for one in ejectors]
+        self._by_address, self._by_name = Tries(60.0), Tries(10.0)
+        self._one_login = asyncio.Lock()  # at a time: its hash takes memory and time
+        self._one_trend = asyncio.Lock()
+        files = resources.files("twin.page").joinpath("static")
+        self._static = {name: files.joinpath(name).read_bytes() for name in STATIC}
+        self._pages = {
+            name: Template(files.joinpath(name).read_text(encoding="utf-8"))
+            for name in ("index.html", "login.html", "error.html")
+        }
+
+    def app(self) -> ASGIApp:
+        """As uvicorn takes it."""
+        one = "/api/ejectors/{number:int}"
+        routes = [
+            Route("/", self.index),
+            Route("/login", self.login_page),
+            Route("/login", self.login, methods=["POST"]),
+            Route("/api/logout", self.logout, methods=["POST"]),
+            Route("/static/{name}", self.static),
+            Route("/api/me", self.me),
+            Route(f"{one}/history", self.history),
+            Route(f"{one}/trends/{{name}}", self.trend),
+            Route(f"{one}/requests", self.ask, methods=["POST"]),
+            Route(f"{one}/requests/{{request_number:int}}", self.answer),
+            Route("/reports/{number:int}/{name}", self.report),
+            WebSocketRoute("/live", self.live),
+        ]
+        handlers: dict[Any, Any] = {HTTPException: self.refused, TwinError: self.trouble}
+
+        @asynccontextmanager
+        async def lifespan(_app: Starlette) -> AsyncIterator[None]:
+            yield
+            for ejector in self.ejectors:
+                ejector.close()
+
+        app = Starlette(routes=routes, exception_handlers=handlers, lifespan=lifespan)
+        return _Guard(app, self.access)
+
+    # --- who it is ------------------------------------------------------------------------------
+
+    def _session(self, connection: HTTPConnection) -> Session | None:
+        return self.sessions.get(connection.cookies.get(COOKIE))
+
+    def _may_see(self, connection: HTTPConnection) -> bool:
+        return self.access.open_to_see or self._session(connection) is not None
+
+    def _require_sight(self, request: Request) -> None:
+        if not self._may_see(request):
+            raise HTTPException(HTTPStatus.UNAUTHORIZED, "log in first")
+
+    def _require_right(self, request: Request) -> Session:
+        """Who asks for a change: logged in, from a page of ours, with its token."""
+        if not self.access.is_own_origin(request.headers):
+            raise HTTPException(HTTPStatus.FORBIDDEN, "this was not asked from the page itself")
+        session = self._session(request)
+        if session is None:
+            raise HTTPException(HTTPStatus.UNAUTHORIZED, "log in first")
+        if not _same(request.headers.get(TOKEN, ""), session.csrf):
+            raise HTTPException(HTTPStatus.FORBIDDEN, "the token is missing: load the page again")
+        return session
+
+    async def login_page(self, request: Request) -> Response:
+        """The form."""
+        return self._login_form(request)
+
+    def _login_form(self, _request: Request, said: str = "", status: int = 200) -> Response:
+        if not said and not self.users.names:
+            said = "There are no users yet. On the machine of the page: twin serve --add-user NAME"
+        role = ' role="alert"' if said else ""
+        page = self._pages["login.html"].substitute(said=html.escape(said), role=role)
+        return HTMLResponse(page, status)
+
+    async def login(self, request: Request) -> Response:
+        """Take name and password; slower after wrong ones."""
+        if not self.access.is_own_origin(request.headers):
+            raise HTTPException(HTTPStatus.FORBIDDEN, "this was not asked from the page itself")
+        form = parse_qs((await _body(request)).decode(errors="replace"), max_num_fields=5)
+        name, password = (form.get(key, [""])[0] for key in ("name", "password"))
+        name = name.strip()[:100]
+        address = request.client.host if request.client else ""
+        async with self._one_login:
+            wait = max(self._by_address.wait_s(address), self._by_name.wait_s(name))
+            if wait > 0.0:
+                said = f"Too many wrong passwords. Try again in {wait:.0f} s."
+                return self._login_form(request, said, HTTPStatus.TOO_MANY_REQUESTS)
+            if not await run_sync(self.users.check, name, password):
+                self._by_address.wrong(address)
+                self._by_name.wrong(name)
+                said = "Name or password is wrong."
+                return self._login_form(request, said, HTTPStatus.UNAUTHORIZED)
+            self._by_address.right(address)
+            self._by_name.right(name)
+        self.sessions.end(request.cookies.get(COOKIE))
+        answer = RedirectResponse("/", HTTPStatus.SEE_OTHER)
+        answer.set_cookie(
+            COOKIE,
+            self.sessions.begin(name),
+            max_age=round(SESSION_S),
+            httponly=True,
+            samesite="strict",
+            secure=self.access.secure,
+        )
+        return answer
+
+    async def logout(self, request: Request) -> Response:
+        """End the session."""
+        self._require_right(request)
+        self.sessions.end(request.cookies.get(COOKIE))
+        answer = JSONResponse({})
+        answer.delete_cookie(COOKIE, httponly=True, samesite="strict", secure=self.access.secure)
+        return answer
+
+    async def me(self, request: Request) -> Response:
+        """Who is logged in, the token for what he asks, and what there is to see."""
+        self._require_sight(request)
+        session = self._session(request)
+        own = {"user": session.user, "csrf": session.csrf} if session else {"user": ""}
+        ejectors = [{"name": one.name, "type": one.config.asset.type} for one in self.ejectors]
+        figures = self.ejectors[0].figures()
+        return JSONResponse({**own, "ejectors": ejectors, "figures": figures})
+
+    # --- pages ----------------------------------------------------------------------------------
+
+    async def index(self, request: Request) -> Response:
+        """The page itself; the rest it asks for."""
+        if not self._may_see(request):
+            return RedirectResponse("/login", HTTPStatus.SEE_OTHER)
+        return HTMLResponse(self._pages["index.html"].substitute())
+
+    async def static(self, request: Request) -> Response:
+        """What the page is made of."""
+        name = request.path_params["name"]
+        if name not in self._static:
+            raise HTTPException(HTTPStatus.NOT_FOUND)
+        headers = {"cache-control": "no-cache"}
+        return Response(self._static[name], headers=headers, media_type=STATIC[name])
+
+    async def report(self, request: Request) -> Response:
+        """The page of a diagnosis."""
+        self._require_sight(request)
+        found = await run_sync(self._ejector(request).report, request.path_params["name"])
+        if found is None:
+            raise HTTPException(HTTPStatus.NOT_FOUND, "this report is not kept any more")
+        return HTMLResponse(found, headers={"content-security-policy": REPORT_CSP})
+
+    # --- what there is to know ------------------------------------------------------------------
+
+    def _ejector(self, request: Request) -> Ejector:
+        number = int(request.path_params["number"])
+        if number >= len(self.ejectors):
+            raise HTTPException(HTTPStatus.NOT_FOUND, "no such ejector")
+        return self.ejectors[number]
+
+    async def history(self, request: Request) -> Response:
+        """Every time an alarm was active."""
+        self._require_sight(request)
+        return JSONResponse(await run_sync(self._ejector(request).history, _days(request)))
+
+    async def trend(self, request: Request) -> Response:
+        """How a figure runs over days; one at a time."""
+        self._require_sight(request)
+        ejector, name = self._ejector(request), request.path_params["name"]
+        async with self._one_trend:
+            return JSONResponse(await run_sync(ejector.trend, name, _days(request)))
+
+    async def ask(self, request: Request) -> Response:
+        """Ask the run something of an alarm; gives the number to look for the answer by."""
+        session = self._require_right(request)
+        ejector = self._ejector(request)
+        try:
+            asked = json.loads(await _body(request))
+            alarm, deed = str(asked["alarm"]), str(asked["deed"])
+            seconds = float(asked.get("seconds", 0.0))
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise HTTPException(HTTPStatus.BAD_REQUEST, "not a request") from error
+        number = await run_sync(ejector.ask, alarm, deed, session.user, seconds)
+        return JSONResponse({"request": number}, HTTPStatus.ACCEPTED)
+
+    async def answer(self, request: Request) -> Response:
+        """What has become of it: null while nobody has answered, empty if it was done."""
+        self._require_sight(request)
+        number = request.path_params["request_number"]
+        return JSONResponse({"answer": await run_sync(self._ejector(request).answer, number)})
+
+    # --- live -----------------------------------------------------------------------------------
+
+    async def live(self, socket: WebSocket) -> None:
+        """States of all ejectors every second, rows of the one that the browser watches.
+
+        A browser that is slow gets what is newest then; nothing waits for it here.
+        """
+        allowed = self.access.is_own_origin(socket.headers) and self._may_see(socket)
+        if not allowed:
+            await socket.close(1008)
+            return
+        await socket.accept()
+        watched = _Watched()
+        telling = asyncio.create_task(self._tell(socket, watched))
+        try:
+            while True:
+                watched.take(await socket.receive_text(), len(self.ejectors))
+        except (WebSocketDisconnect, ValueError):
+            pass
+        finally:
+            telling.cancel()
+            with suppress(asyncio.CancelledError, WebSocketDisconnect, TimeoutError):
+                await telling
+
+    async def _tell(self, socket: WebSocket, watched: "_Watched") -> None:
+        """Until the browser is gone, too slow, or its session over."""
+        loop = asyncio.get_running_loop()
+        next_state = 0.0
+        try:
+            while self._may_see(socket):
+                if loop.time() >= next_state:
+                    next_state = loop.time() + STATE_S
+                    states = [await one.get() for one in self._states]
+                    await _send(socket, {"states": states})
+                await self._tell_rows(socket, watched)
+                await asyncio.sleep(ROWS_S)
+        finally:
+            with suppress(RuntimeError, WebSocketDisconnect):  # it is closed already
+                await socket.close(1008)
+
+    async def _tell_rows(self, socket: WebSocket, watched: "_Watched") -> None:
+        """What is new of the ejector that is watched."""
+        number, since = watched.number, watched.since
+        rows = await run_sync(self.ejectors[number].rows, since)
+        if rows is None or (number, since) != (watched.number, watched.since):
+            return
+        watched.since = rows["next"]
+        await _send(socket, {"rows": rows, "of": number})
+
+    # --- troubles -------------------------------------------------------------------------------
+
+    async def refused(self, request: Request, error: HTTPException) -> Response:
+        """What cannot be had, as a plain page or as JSON."""
+        return self._said(request, error.status_code, error.detail)
+
+    async def trouble(self, request: Request, error: TwinError) -> Response:
+        """What a person can put right."""
+        status = HTTPStatus.BAD_REQUEST if error.exit_code == 2 else HTTPStatus.SERVICE_UNAVAILABLE
+        return self._said(request, status, str(error))
+
+    def _said(self, request: Request, status: int, what: str) -> Response:
+        if request.url.path.startswith("/api/"):
+            return JSONResponse({"error": what}, status)
+        title = HTTPStatus(status).phrase
+        page = self._pages["error.html"]
+        text = page.substitute(title=html.escape(title), what=html.escape(what))
+        return HTMLResponse(text, status)
+
+
+class _Remembered:
+    """A state that several browsers ask for, looked at once a second at most."""
+
+    def __init__(self, look: Callable[[], dict[str, Any]]) -> None:
+        self._look = look
+        self._lock = asyncio.Lock()
+        self._then = float("-inf")
+        self._state: dict[str, Any] = {}
+
+    async def get(self) -> dict[str, Any]:
+        loop = asyncio.get_running_loop()
+        async with self._lock:
+            if loop.time() >= self._then + 0.9 * STATE_S:
+                self._state, self._then = await run_sync(self._look), loop.time()
+            return self._state
+
+
+class _Watched:
+    """Which ejector a browser shows, and from which row on it wants more."""
+
+    def __init__(self) -> None:
+        self.number = self.since = 0
+
+    def take(self, text: str, ejectors: int) -> None:
+        """Take what it says; ValueError for anything else than a number that there is."""
+        number = int(text)
+        if not 0 <= number < ejectors:
+            raise ValueError
+        self.number, self.since = number, 0
+
+
+class _Guard:
+    """Before everything: hosts that are ours. After everything: the headers of every answer."""
+
+    def __init__(self, app: ASGIApp, access: Access) -> None:
+        self._app, self._access = app, access
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        if not self._access.is_ours(Headers(scope=scope).get("host", "")):
+            if scope["type"] == "websocket":
+                await send({"type": "websocket.close", "code": 1008})
+                return
+            refused = Response("This page has another name.\n", HTTPStatus.BAD_REQUEST)
+            await refused(scope, receive, _headed(send))
+            return
+        await self._app(scope, receive, _headed(send))
+
+
+def _headed(send: Send) -> Send:
+    async def with_headers(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            there = {name for name, _ in message["headers"]}
+            message["headers"] = [
+                *message["headers"],
+                *(
+                    (name.encode(), value.encode())
+                    for name, value in HEADERS.items()
+                    if name.encode() not in there
+                ),
+            ]
+        await send(message)
+
+    return with_headers
+
+
+async def _send(socket: WebSocket, what: Any) -> None:
+    async with asyncio.timeout(SLOWEST_S):
+        await socket.send_text(json.dumps(what, ensure_ascii=False, allow_nan=False))
+
+
+async def _body(request: Request) -> bytes:
+    """What was sent, up to MOST_BODY."""
+    body = b""
+    async for part in request.stream():
+        body += part
+        if len(body) > MOST_BODY:
+            raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "that is too much")
+    return body
+
+
+def _days(request: Request) -> float:
+    try:
+        days = float(request.query_params.get("days", "7"))
+    except ValueError:
+        days = -1.0
+    if not 0.0 < days <= MOST_DAYS:
+        raise HTTPException(HTTPStatus.BAD_REQUEST, f"days: up to {MOST_DAYS:g}")
+    return days
+
+
+def _same(given: str, known: str) -> bool:
+    return hmac.compare_digest(given.encode(), known.encode())

@@ -1,0 +1,84 @@
+"""The web server under the page: where it listens, and how much it lets anybody do."""
+
+import ipaddress
+import socket
+import ssl
+from dataclasses import dataclass
+from pathlib import Path
+
+import uvicorn
+from starlette.types import ASGIApp
+
+from twin.errors import ConfigError, SourceError
+
+MOST_AT_ONCE = 200  # connections
+QUIET_S = 20.0  # a browser that does not answer for so long is gone
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the page is; ``certificate`` and ``key`` (PEM) where it is over TLS."""
+
+    host: str
+    port: int
+    certificate: Path | None = None
+    key: Path | None = None
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether nobody else on the network reaches it."""
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+    @property
+    def scheme(self) -> str:
+        """As its address begins."""
+        return "https" if self.certificate else "http"
+
+
+def listen(place: Place) -> socket.socket:
+    """Take the port; SourceError where it is not to be had."""
+    family = socket.AF_INET6 if ":" in place.host else socket.AF_INET
+    try:
+        return socket.create_server((place.host, place.port), family=family, backlog=64)
+    except OSError as error:
+        raise SourceError(
+            f"{place.host}:{place.port}: nobody can listen there: {error.strerror}",
+            "check --host, or take another --port",
+        ) from error
+
+
+def address(place: Place, listening: socket.socket) -> str:
+    """What to open in a browser."""
+    host, port = listening.getsockname()[:2]
+    shown = f"[{host}]" if ":" in host else host
+    return f"{place.scheme}://{shown}:{port}/"
+
+
+def serve(app: ASGIApp, place: Place, listening: socket.socket) -> None:
+    """Serve until Ctrl-C or SIGTERM; ConfigError where certificate or key are of no use."""
+    config = uvicorn.Config(
+        app,
+        ws="websockets-sansio",
+        ws_max_size=64,
+        ws_ping_interval=QUIET_S,
+        ws_ping_timeout=QUIET_S,
+        limit_concurrency=MOST_AT_ONCE,
+        timeout_keep_alive=15,
+        timeout_graceful_shutdown=2,
+        server_header=False,
+        proxy_headers=False,
+        access_log=False,
+        log_level="warning",
+        ssl_certfile=place.certificate,
+        ssl_keyfile=place.key,
+    )
+    try:
+        config.load()
+    except (OSError, ssl.SSLError) as error:
+        raise ConfigError(
+            f"{place.certificate}: cannot be used: {error}", "both files as PEM, and of one pair"
+        ) from error
+    uvicorn.Server(config).run(sockets=[listening])
