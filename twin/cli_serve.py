@@ -1,0 +1,167 @@
+"""``twin serve``: the technician's page, beside ``twin run`` or without it."""
+
+import getpass
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from twin.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from twin.config import Config
+    from twin.page.ring import LiveRows
+    from twin.page.server import Place
+    from twin.page.users import Users
+
+PORT = 8420
+
+
+def serve(
+    *,
+    configs: Annotated[
+        list[Path] | None, typer.Option("--config", metavar="CONFIG", help="One for each ejector.")
+    ] = None,
+    host: Annotated[str, typer.Option(help="Address to listen on; others reach it there.")] = (
+        "127.0.0.1"
+    ),
+    port: Annotated[int, typer.Option(help="0 takes any free.")] = PORT,
+    names: Annotated[
+        list[str] | None,
+        typer.Option("--name", metavar="NAME", help="By which browsers reach this machine."),
+    ] = None,
+    certificate: Annotated[
+        Path | None, typer.Option(metavar="F.pem", help="For HTTPS, with its chain.")
+    ] = None,
+    key: Annotated[Path | None, typer.Option(metavar="F.pem", help="Of the certificate.")] = None,
+    users: Annotated[
+        Path | None,
+        typer.Option(
+            "--users", metavar="FILE", help="Default: users.toml beside the first CONFIG."
+        ),
+    ] = None,
+    add_user: Annotated[
+        str, typer.Option(metavar="NAME", help="Ask for a password, keep it, and end.")
+    ] = "",
+    remove_user: Annotated[str, typer.Option(metavar="NAME", help="And end.")] = "",
+    assets: Annotated[
+        str, typer.Option(metavar="URL", help="Asset database, instead of the configured.")
+    ] = "",
+) -> None:
+    """Show traffic light, alarms, live pressure and trends in a browser; Ctrl-C ends it.
+
+    A process of its own: it shows what twin run leaves, and stays when that ends. To acknowledge
+    needs a login, and so does everything where others than this machine reach it.
+    """
+    _require_extra()
+    from twin.config import Config
+    from twin.page.server import Place
+    from twin.page.users import FILE, Users
+    from twin.settings import Document
+
+    known = Users(users or (configs[0].parent if configs else Path()) / FILE)
+    if add_user or remove_user:
+        _change(known, add_user, remove_user)
+        return
+    if not configs:
+        raise ConfigError("no ejector to show", "name its configuration: --config CONFIG")
+    if (certificate is None) != (key is None):
+        raise ConfigError("--certificate and --key belong together", "give both, as PEM files")
+    place = Place(host, port, certificate, key)
+    _require_users(place, known)
+    settings = [Config.of(Document.read(one), assets) for one in configs]
+    _serve(place, settings, known, names or [])
+
+
+def _serve(place: "Place", settings: "list[Config]", users: "Users", names: list[str]) -> None:
+    import socket
+
+    from twin.page.app import Access, Page
+    from twin.page.ejector import Ejector
+    from twin.page.server import address, listen
+    from twin.page.server import serve as run_server
+    from twin.page.sessions import Sessions
+
+    ours = {one.lower() for one in (*names, place.host, socket.gethostname()) if one}
+    access = Access(frozenset(ours), place.scheme == "https", place.is_loopback)
+    page = Page([Ejector(one) for one in settings], users, Sessions(users), access)
+    with listen(place) as listening:
+        print(f"the page is at {address(place, listening)}", flush=True)
+        run_server(page.app(), place, listening)
+
+
+def _require_extra() -> None:
+    """ConfigError where the page's libraries are not installed."""
+    try:
+        import starlette  # noqa: F401
+        import uvicorn  # noqa: F401
+        import websockets  # noqa: F401
+    except ImportError as error:
+        raise ConfigError(
+            f"twin serve needs {error.name}", "install it: .venv/bin/pip install -e '.[serve]'"
+        ) from error
+
+
+def _require_users(place: "Place", users: "Users") -> None:
+    """ConfigError where the network would reach a page without users."""
+    if place.is_loopback:
+        return
+    if not users.names:
+        raise ConfigError(
+            f"{place.host}: others would reach the page, and it has no users",
+            "make one first: twin serve --config CONFIG --add-user NAME",
+        )
+    if place.certificate is None:
+        warning = "without --certificate others on the network can read passwords on their way"
+        print(f"twin: {warning}", file=sys.stderr)
+
+
+def _change(users: "Users", add: str, remove: str) -> None:
+    """Add or remove a user, and say so."""
+    if add:
+        users.add(add, _password(add))
+        print(f"{add} may act on the page")
+    if remove:
+        users.remove(remove)
+        print(f"{remove} may not act on the page any more")
+
+
+def _password(name: str) -> str:
+    """Asked for twice on a terminal; from a pipe its first line."""
+    if not sys.stdin.isatty():
+        return sys.stdin.readline().rstrip("\r\n")
+    password = getpass.getpass(f"password of {name}: ")
+    if getpass.getpass("once more: ") != password:
+        raise ConfigError("the two passwords differ", "try again")
+    return password
+
+
+# --- for the loop -------------------------------------------------------------------------------
+
+
+def live_rows_of(
+    settings: "Config", say: "Callable[[str], None]"
+) -> "Callable[[], LiveRows] | None":
+    """What opens the sink that leaves live rows, where ``[page]`` asks for it; or None."""
+    from twin.page.ring import LiveRows
+    from twin.page.settings import RING, PageSettings, folder_of
+    from twin.signals import MBAR
+
+    if not settings.document.section(PageSettings, "page").keep:
+        return None
+    path = folder_of(settings.document, settings.asset) / RING
+    ambient = settings.data.ambient.pressure_mbar * MBAR
+    return lambda: LiveRows(path, ambient, say, time.time_ns)
+
+
+def reports_of(settings: "Config") -> Path | None:
+    """The folder for reports of live diagnoses, where ``[page]`` asks for them; or None."""
+    from twin.page.settings import REPORTS, PageSettings, folder_of
+
+    if not settings.document.section(PageSettings, "page").keep:
+        return None
+    return folder_of(settings.document, settings.asset) / REPORTS
