@@ -25,6 +25,7 @@ from twin.cli_assets import assets_app
 from twin.cli_cert import cert
 from twin.cli_figures import figures_app, keeper_of, key_figures_of
 from twin.cli_outlets import outlets_of
+from twin.cli_serve import live_rows_of, reports_of, serve
 from twin.errors import ConfigError, SourceError, TwinError
 from twin.events import Event, Severity
 
@@ -55,6 +56,7 @@ app.add_typer(alarms_app, name="alarms")
 log_app = typer.Typer(help="Look after logs.", no_args_is_help=True)
 app.add_typer(log_app, name="log")
 app.command()(cert)
+app.command()(serve)
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML configuration.")]
 ConfigFiles = Annotated[
@@ -138,12 +140,17 @@ def run(
                 (lambda: Recorder(file, header, rotate_bytes=rotate)) if file else None,
                 (lambda: shown) if shown else None,
                 keeper_of(settings, _complain),
+                live_rows_of(settings, _complain),
                 _view_of(settings, view, _file_of(rrd, label)),
                 lambda: Console(label.ljust(max(map(len, ejectors))) if label else "", events),
             )
             status = _status if alone else _unsaid
             adviser = LiveDiagnosis(
-                settings, str(file or "live"), lambda: stopped() == "interrupted", status
+                settings,
+                str(file or "live"),
+                lambda: stopped() == "interrupted",
+                status,
+                reports=reports_of(settings),
             )
             # What is not measured has no faults. Alarms come last: they hear the diagnosis.
             advisers: list[Adviser] = [] if hil else [adviser, board := alarms()]
