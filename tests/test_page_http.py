@@ -1,0 +1,501 @@
+"""The page over HTTP: who may see, who may act, and what nobody may."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+from page_site import KEPT, LEAK, NOW, Run, config, write_config
+from starlette.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+
+from twin.alarms import keeper as keeper_module
+from twin.errors import ConfigError
+from twin.page import app as module
+from twin.page import users as users_module
+from twin.page.app import COOKIE, STATIC, Access, Page
+from twin.page.ejector import Ejector
+from twin.page.sessions import SESSION_S, Sessions
+from twin.page.settings import REPORTS, folder_of
+from twin.page.users import Users
+
+OURS = "http://127.0.0.1:8420"
+WORD = "correct horse"
+REPORT = "0123456789abcdef" * 2
+ASK = "/api/ejectors/0/requests"
+
+
+class Site:
+    """A page, what its run has left, and a browser."""
+
+    def __init__(self, folder: Path, access: Access) -> None:
+        self.config = config(write_config(folder))
+        self.users = Users(folder / "users.toml")
+        self.now, self.seconds = NOW, 0.0
+        self.run: Run | None = None
+        self.ejector = Ejector(self.config, lambda: self.now)
+        sessions = Sessions(self.users, lambda: self.seconds)
+        self.page = Page([self.ejector], self.users, sessions, access)
+        self.client = TestClient(self.page.app(), OURS, follow_redirects=False)
+
+    def begin(self) -> Run:
+        self.run = Run(self.config)
+        return self.run
+
+    def log_in(self, name: str = "ann", password: str = WORD, **headers: str) -> httpx2.Response:
+        form = {"name": name, "password": password}
+        return self.client.post("/login", data=form, headers={"origin": OURS, **headers})
+
+    def ask(self, alarm: str = LEAK, deed: str = "acknowledged", **how: Any) -> httpx2.Response:
+        csrf = self.client.get("/api/me").json().get("csrf", "")
+        headers = {"origin": OURS, "x-csrf-token": csrf, **how.pop("headers", {})}
+        return self.client.post(ASK, json={"alarm": alarm, "deed": deed, **how}, headers=headers)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(users_module, "N", 2)
+    monkeypatch.setattr(keeper_module, "POLL_S", 0.01)
+    monkeypatch.setattr(module, "ROWS_S", 0.01)
+    monkeypatch.setattr(module, "STATE_S", 0.01)
+
+
+@pytest.fixture
+def opened(tmp_path: Path) -> Iterator[Callable[..., Site]]:
+    sites: list[Site] = []
+
+    def make(**access: Any) -> Site:
+        site = Site(tmp_path, Access(**access))
+        site.users.add("ann", WORD)
+        site.client.__enter__()
+        sites.append(site)
+        return site
+
+    yield make
+    for site in sites:
+        site.client.__exit__(None, None, None)
+        if site.run:
+            site.run.close()
+
+
+@pytest.fixture
+def site(opened: Callable[..., Site]) -> Site:
+    return opened()
+
+
+@pytest.fixture
+def abroad(opened: Callable[..., Site]) -> Site:
+    """A page that others than this machine reach."""
+    return opened(open_to_see=False, secure=False)
+
+
+# --- to see ---------------------------------------------------------------------------------------
+
+SEEN = (
+    *("/", "/api/me", "/api/ejectors/0/history", "/api/ejectors/0/trends/leakage"),
+    *(f"{ASK}/1", f"/reports/0/{REPORT}"),
+)
+
+
+@pytest.mark.parametrize("path", SEEN)
+def test_beyond_loopback_nothing_is_seen_without_login(abroad: Site, path: str) -> None:
+    answer = abroad.client.get(path)
+    if path == "/":
+        assert (answer.status_code, answer.headers["location"]) == (303, "/login")
+    else:
+        assert answer.status_code == 401
+    with pytest.raises(WebSocketDisconnect), _socket(abroad):
+        pass
+
+
+def test_beyond_loopback_who_is_logged_in_sees(abroad: Site) -> None:
+    assert abroad.log_in().status_code == 303
+    assert abroad.client.get("/").status_code == 200
+    assert abroad.client.get("/api/me").json()["user"] == "ann"
+    with _socket(abroad) as socket:
+        assert socket.receive_json()["states"][0]["light"] == "grey"
+
+
+def test_a_session_that_ends_ends_what_is_told(abroad: Site) -> None:
+    abroad.log_in()
+    with _socket(abroad) as socket:
+        socket.receive_json()
+        abroad.seconds = SESSION_S
+        with pytest.raises(WebSocketDisconnect):
+            _to_the_end(socket)
+    assert abroad.client.get("/api/me").status_code == 401
+
+
+def test_on_loopback_to_see_needs_no_login(site: Site) -> None:
+    assert site.client.get("/").status_code == 200
+    assert site.client.get("/api/me").json()["user"] == ""
+
+
+def test_what_the_page_is_made_of_is_here(site: Site) -> None:
+    text = site.client.get("/").text + site.client.get("/login").text
+    assert "//" not in text.replace("//www.w3.org", "")  # of no other place
+    for name, kind in STATIC.items():
+        answer = site.client.get(f"/static/{name}")
+        assert answer.status_code == 200
+        assert answer.headers["content-type"].startswith(kind)
+    assert "MIT" in site.client.get("/static/uPlot.LICENSE").text
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        *("/static/../users.toml", "/static/%2e%2e/app.py", "/static/..%2fapp.py"),
+        *("/static/index.html", "/static//etc/passwd", "/reports/0/..%2f..%2fusers.toml"),
+        *("/reports/0/live.ring", f"/reports/1/{REPORT}", "/users.toml", "/reports/0/" + "g" * 32),
+    ],
+)
+def test_no_path_from_outside_reaches_the_disk(site: Site, path: str) -> None:
+    assert site.client.get(path).status_code == 404
+
+
+def test_every_answer_says_what_a_browser_may_do_with_it(site: Site) -> None:
+    for path in (
+        "/",
+        "/login",
+        "/api/me",
+        "/static/page.js",
+        "/nowhere",
+        "/api/ejectors/9/history",
+    ):
+        headers = site.client.get(path).headers
+        policy = headers["content-security-policy"]
+        assert "default-src 'none'" in policy
+        assert "unsafe" not in policy
+        assert headers["x-content-type-options"] == "nosniff"
+        assert headers["x-frame-options"] == "DENY"
+
+
+def test_errors_are_plain_pages_and_plain_json(site: Site) -> None:
+    page = site.client.get("/<script>")
+    assert page.status_code == 404
+    assert "<h1>Not Found</h1>" in page.text
+    assert site.client.get("/api/ejectors/9/history").json() == {"error": "no such ejector"}
+    wrong = site.client.get("/api/ejectors/0/history?days=nan")
+    assert (wrong.status_code, "days" in wrong.json()["error"]) == (400, True)
+    away = site.client.get("/api/ejectors/0/trends/leakage")
+    assert (away.status_code, "no such figure database" in away.json()["error"]) == (503, True)
+    assert site.client.get("/api/ejectors/0/trends/nonsense").status_code == 400
+
+
+def test_a_report_is_shown_and_nothing_in_it_is_run(site: Site) -> None:
+    folder = folder_of(site.config.document, site.config.asset) / REPORTS
+    folder.mkdir(parents=True)
+    (folder / f"{REPORT}.html").write_text("<h1>Leakage</h1>")
+    answer = site.client.get(f"/reports/0/{REPORT}")
+    assert answer.text == "<h1>Leakage</h1>"
+    assert "sandbox" in answer.headers["content-security-policy"]
+    assert "script-src" not in answer.headers["content-security-policy"]
+    gone = site.client.get(f"/reports/0/{'f' * 32}")
+    assert (gone.status_code, "not kept any more" in gone.text) == (404, True)
+
+
+# --- whose name this is ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "", "[x", "a@b"])
+def test_a_foreign_name_that_leads_here_gets_nothing(site: Site, host: str) -> None:
+    for path in ("/", "/api/me", "/static/page.js"):
+        assert site.client.get(path, headers={"host": host}).status_code == 400
+    headers = {"host": host, "origin": f"http://{host}"}
+    with (
+        pytest.raises(WebSocketDisconnect),
+        site.client.websocket_connect("/live", headers=headers),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("host", ["localhost:8420", "[::1]:8420", "192.168.0.7", "Hall-7:80"])
+def test_names_and_addresses_of_this_machine_are_answered(
+    opened: Callable[..., Site], host: str
+) -> None:
+    site = opened(names=frozenset({"hall-7"}))
+    assert site.client.get("/", headers={"host": host}).status_code == 200
+
+
+# --- to log in ------------------------------------------------------------------------------------
+
+
+def test_the_cookie_is_for_this_page_alone(site: Site) -> None:
+    cookie = site.log_in().headers["set-cookie"].lower()
+    assert "httponly" in cookie
+    assert "samesite=strict" in cookie
+    assert "secure" not in cookie
+
+
+def test_over_tls_the_cookie_is_never_sent_in_clear(opened: Callable[..., Site]) -> None:
+    site = opened(secure=True)
+    answer = site.log_in(origin="https://127.0.0.1:8420")
+    assert "; secure" in answer.headers["set-cookie"].lower()
+    assert site.log_in().status_code == 403  # from a page that is not over TLS
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "", "http://127.0.0.1:8421"])
+def test_nobody_is_logged_in_from_another_page(site: Site, origin: str) -> None:
+    assert site.log_in(origin=origin).status_code == 403
+    assert COOKIE not in site.client.cookies
+
+
+def test_wrong_passwords_are_refused_and_then_slowed_down(site: Site) -> None:
+    said = [site.log_in("ann", "wrong horse") for _ in range(6)]
+    assert [one.status_code for one in said] == [401] * 5 + [429]
+    assert "Name or password is wrong." in said[0].text
+    assert "Too many wrong passwords" in said[5].text
+    assert site.log_in().status_code == 429  # also with the right one
+    assert COOKIE not in site.client.cookies
+
+
+def test_nobody_learns_which_names_there_are(site: Site) -> None:
+    assert site.log_in("bob", WORD).text == site.log_in("ann", "wrong horse").text
+
+
+def test_what_is_typed_in_is_not_markup(site: Site) -> None:
+    assert "<script>" not in site.log_in("<script>", "<script>").text
+
+
+def test_a_login_ends_the_session_before_it(site: Site) -> None:
+    site.log_in()
+    first = site.client.cookies[COOKIE]
+    site.log_in()
+    assert site.page.sessions.get(first) is None
+    assert site.client.cookies[COOKIE] != first
+
+
+def test_logging_out_ends_the_session(site: Site) -> None:
+    site.log_in()
+    token = site.client.cookies[COOKIE]
+    csrf = site.client.get("/api/me").json()["csrf"]
+    assert site.client.post("/api/logout", headers={"origin": OURS}).status_code == 403
+    answer = site.client.post("/api/logout", headers={"origin": OURS, "x-csrf-token": csrf})
+    assert answer.status_code == 200
+    assert site.page.sessions.get(token) is None
+
+
+def test_without_users_the_form_says_how_to_make_one(site: Site) -> None:
+    site.users.remove("ann")
+    assert "twin serve --add-user NAME" in site.client.get("/login").text
+
+
+# --- to act ---------------------------------------------------------------------------------------
+
+
+def test_who_is_logged_in_acknowledges(site: Site) -> None:
+    run = site.begin()
+    run.leak()
+    _until(lambda: site.ejector.state()["alarms"])
+    assert site.ejector.state()["light"] == "red"
+    site.log_in()
+    asked = site.ask()
+    assert asked.status_code == 202
+    number = asked.json()["request"]
+    (alarm,) = site.ejector.state()["alarms"]
+    assert (alarm["asked"][0]["deed"], alarm["asked"][0]["who"]) == ("acknowledged", "ann")
+    assert site.client.get(f"{ASK}/{number}").json() == {"answer": None}
+
+    def granted() -> bool:
+        run.rest()
+        return site.client.get(f"{ASK}/{number}").json() == {"answer": ""}
+
+    _until(granted)
+    state = site.ejector.state()
+    assert (state["light"], state["alarms"][0]["seen_by"]) == ("yellow", "ann")
+    assert state["alarms"][0]["asked"] == []
+
+
+def test_nothing_is_written_without_login(site: Site) -> None:
+    _leaking(site)
+    assert site.ask().status_code == 401
+    assert site.ask(headers={"x-csrf-token": "guess"}).status_code == 401
+    assert _asked(site) == []
+
+
+def test_nothing_is_written_without_the_token_or_from_another_page(site: Site) -> None:
+    _leaking(site)
+    site.log_in()
+    assert site.ask(headers={"x-csrf-token": ""}).status_code == 403
+    assert site.ask(headers={"x-csrf-token": "guess"}).status_code == 403
+    assert site.ask(headers={"x-csrf-token": "ü".encode("latin-1")}).status_code == 403
+    for origin in ("http://evil.example", "null", "", "https://127.0.0.1:8420"):
+        assert site.ask(headers={"origin": origin}).status_code == 403
+    assert _asked(site) == []
+
+
+def test_nothing_is_written_when_the_session_is_over(site: Site) -> None:
+    _leaking(site)
+    site.log_in()
+    csrf = site.client.get("/api/me").json()["csrf"]
+    site.seconds = SESSION_S
+    assert site.ask(headers={"x-csrf-token": csrf}).status_code == 401
+    assert _asked(site) == []
+
+
+def test_what_no_run_would_grant_is_refused_at_once(site: Site) -> None:
+    _leaking(site)
+    site.log_in()
+    for how, why in (
+        ({"alarm": "leak"}, "no alarm is called leak"),
+        ({"deed": "raised"}, "nothing that can be asked"),
+        ({"deed": "shelved", "seconds": 1e9}, "cannot be shelved"),
+        ({"deed": "shelved", "seconds": -1}, "cannot be shelved"),
+        ({"deed": "shelved", "seconds": "nan"}, "cannot be shelved"),
+    ):
+        answer = site.ask(**how)
+        assert answer.status_code == 400
+        assert why in answer.json()["error"]
+    assert _asked(site) == []
+
+
+@pytest.mark.parametrize("body", ["", "[]", "3", "{}", '{"alarm": 1}', "{" * 3000, "x" * 5000])
+def test_what_is_no_request_is_refused(site: Site, body: str) -> None:
+    _leaking(site)
+    site.log_in()
+    csrf = site.client.get("/api/me").json()["csrf"]
+    headers = {"origin": OURS, "x-csrf-token": csrf}
+    answer = site.client.post(ASK, content=body, headers=headers)
+    assert answer.status_code == (413 if len(body) > 4096 else 400)
+    assert _asked(site) == []
+
+
+def test_only_what_was_asked_here_is_answered(site: Site) -> None:
+    _leaking(site)
+    assert site.client.get(f"{ASK}/1").status_code == 400
+
+
+# --- live -----------------------------------------------------------------------------------------
+
+
+def test_rows_come_as_they_are_written(site: Site) -> None:
+    run = site.begin()
+    run.suck(1.0)
+    with _socket(site) as socket:
+        rows = _rows(socket)
+        assert rows["measured_low"][0] == rows["measured_high"][0] == 600.0
+        assert rows["expected_low"][0] == 650.0
+        assert set(rows["phase"]) == {1}
+        run.suck(1.0, vacuum_mbar=700.0)
+        later = _rows(socket)
+        assert later["next"] > rows["next"]
+        assert later["time"][0] > rows["time"][-1]
+        assert later["measured_low"][-1] == 700.0
+
+
+def test_who_comes_late_gets_the_last_ten_seconds(site: Site) -> None:
+    run = site.begin()
+    run.suck(30.0)
+    _until(lambda: (site.ejector.rows(0) or {"next": 0})["next"] >= 1199)
+    rows = site.ejector.rows(0)
+    assert rows is not None
+    assert len(rows["time"]) == 400
+    assert site.ejector.rows(rows["next"]) is None
+
+
+def test_a_socket_from_another_page_is_refused(site: Site) -> None:
+    for origin in ("http://evil.example", "null", ""):
+        with pytest.raises(WebSocketDisconnect), _socket(site, origin):
+            pass
+
+
+@pytest.mark.parametrize("said", ["1", "-1", "x", "1e3"])
+def test_a_browser_that_talks_nonsense_is_left(site: Site, said: str) -> None:
+    with _socket(site) as socket:
+        socket.send_text(said)
+        with pytest.raises(WebSocketDisconnect):
+            _to_the_end(socket)
+
+
+# --- what is shown --------------------------------------------------------------------------------
+
+
+def test_before_the_first_run_the_page_says_so(site: Site) -> None:
+    state = site.ejector.state()
+    assert (state["light"], state["last"], state["trouble"]) == ("grey", None, "")
+
+
+def test_a_run_that_has_ended_is_said_and_its_alarms_stay(site: Site) -> None:
+    run = site.begin()
+    run.leak()
+    run.close()
+    site.run = None
+    state = site.ejector.state()
+    assert (state["light"], state["running"], state["ended"]) == ("grey", False, True)
+    assert state["last"] == NOW / 1e9
+    assert [one["alarm"] for one in state["alarms"]] == [LEAK]
+
+
+def test_a_run_that_hangs_is_not_taken_for_one_that_is_well(site: Site) -> None:
+    site.begin()
+    _until(lambda: site.ejector.state()["light"] == "green")
+    site.now += 6_000_000_000
+    assert site.ejector.state()["light"] == "grey"
+
+
+def test_alarms_that_cannot_be_read_are_never_green(site: Site, tmp_path: Path) -> None:
+    site.begin()
+    _until(lambda: site.ejector.state()["light"] == "green")
+    site.ejector.close()
+    (tmp_path / "alarms.sqlite").rename(tmp_path / "elsewhere")
+    state = site.ejector.state()
+    assert (state["light"], state["words"]) == ("grey", "Alarms unknown")
+    assert "no such alarm database" in state["trouble"]
+    (tmp_path / "elsewhere").rename(tmp_path / "alarms.sqlite")
+    assert site.ejector.state()["light"] == "green"
+
+
+def test_an_alarm_says_what_where_how_sure_and_what_to_do(site: Site) -> None:
+    _leaking(site)
+    (alarm,) = site.ejector.state()["alarms"]
+    assert alarm["what"] == "Leakage"
+    assert alarm["where"] == "hoses, fittings and cups"
+    assert alarm["action"].startswith("Look at hoses")
+    assert dict(alarm["facts"])["how sure"].startswith("a first guess; it may as well be porous")
+    (episode,) = site.client.get("/api/ejectors/0/history").json()
+    assert (episode["what"], episode["cleared"], episode["priority"]) == ("Leakage", None, "medium")
+
+
+@pytest.mark.parametrize("missing", ["alarms", "page"])
+def test_a_configuration_that_keeps_nothing_is_refused(tmp_path: Path, missing: str) -> None:
+    kept = KEPT.replace(f"[{missing}]\nkeep = true", f"[{missing}]\nkeep = false")
+    with pytest.raises(ConfigError, match=rf"under \[{missing}\]"):
+        Ejector(config(write_config(tmp_path, kept=kept)))
+
+
+# --- what the tests share -------------------------------------------------------------------------
+
+
+def _socket(site: Site, origin: str = OURS) -> Any:
+    return site.client.websocket_connect("ws://127.0.0.1:8420/live", headers={"origin": origin})
+
+
+def _to_the_end(socket: Any) -> None:
+    while True:
+        socket.receive_json()
+
+
+def _rows(socket: Any) -> dict[str, Any]:
+    while True:
+        told = socket.receive_json()
+        if "rows" in told:
+            rows: dict[str, Any] = told["rows"]
+            return rows
+
+
+def _leaking(site: Site) -> None:
+    run = site.begin()
+    run.leak()
+    _until(lambda: site.ejector.state()["alarms"])
+
+
+def _asked(site: Site) -> list[Any]:
+    with site.ejector._alarms() as store:
+        return store.requests(site.ejector._unit)
+
+
+def _until(true: Callable[[], Any]) -> None:
+    """Until a thread has done what it does: the test's own time limit ends it."""
+    while not true():
+        pass
