@@ -1,5 +1,6 @@
 """What a run leaves for its page, made without a PLC: alarms, key figures and live rows."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from twin.signals import SAMPLE, TICK, Command, Phase, Samples
 S = 1_000_000_000
 NOW = 1_700_000_000 * S
 KEPT = "\n[alarms]\nkeep = true\n\n[figures]\nkeep = true\n\n[page]\nkeep = true\n"
+NONE, NO_TICKS = np.empty(0, SAMPLE), np.empty(0, TICK)
 LEAK = "deviation_leakage"
 AMBIENT = 101_300.0  # Pa
 
@@ -40,10 +42,10 @@ def config(path: Path) -> Config:
 
 @dataclass
 class Run:
-    """The part of ``twin run`` that the page sees; ``now`` (ns) is its clock."""
+    """The part of ``twin run`` that the page sees."""
 
     config: Config
-    now: int = NOW
+    clock: Callable[[], int] = lambda: NOW
     alarms: Alarms = field(init=False)
     live: LiveRows = field(init=False)
     _plc_ns: int = 0
@@ -53,20 +55,22 @@ class Run:
         path = Path(document.name).parent / "alarms.sqlite"
         keeper = Keeper(lambda: open_store(path), Unit(asset.type, asset.id), pytest.fail)
         before = keeper.begin()
-        self.alarms = Alarms(board_rules(document), lambda: self.now, before, keeper)
+        self.alarms = Alarms(board_rules(document), self.clock, before, keeper)
         ring = folder_of(document, asset) / RING
-        self.live = LiveRows(ring, AMBIENT, pytest.fail, lambda: self.now)
+        self.live = LiveRows(ring, AMBIENT, pytest.fail, self.clock)
 
-    def say(self, kind: Kind, **data: Any) -> None:
+    def say(self, kind: Kind, text: str = "", **data: Any) -> None:
         """Something happens."""
-        self.alarms.follow(np.empty(0, SAMPLE), [Event(self._plc_ns, kind, kind.value, data)])
+        self.alarms.follow(NONE, [Event(self._plc_ns, kind, text or kind.value, data)])
 
-    def leak(self) -> None:
-        self.say(Kind.DEVIATION, effect="leakage", also="porous_leakage", cycle=3, sigma=9.0)
+    def leak(self, text: str = "") -> None:
+        found = {"effect": "leakage", "also": "porous_leakage", "cycle": 3, "sigma": 9.0}
+        self.say(Kind.DEVIATION, text, **found)
 
     def rest(self) -> None:
         """Nothing happens; what people have asked for is done."""
-        self.alarms.follow(np.empty(0, SAMPLE), [])
+        self.alarms.follow(NONE, [])
+        self.live.write(NONE, NO_TICKS, [])
 
     def suck(
         self, seconds: float = 1.0, vacuum_mbar: float = 600.0, expected: float = 650.0
@@ -75,7 +79,7 @@ class Run:
         count = round(seconds * 1000)
         samples, ticks = np.zeros(count, SAMPLE), np.zeros(count, TICK)
         samples["time_ns"] = self._plc_ns + np.arange(count) * 1_000_000
-        samples["host_ns"] = self.now
+        samples["host_ns"] = self.clock()
         samples["pressure"] = AMBIENT - vacuum_mbar * 100.0
         samples["commands"] = Command.SUCTION
         ticks["expected"], ticks["phase"] = AMBIENT - expected * 100.0, Phase.SUCTION

@@ -82,16 +82,16 @@ def _serve(place: "Place", settings: "list[Config]", users: "Users", names: list
 
     from twin.page.app import Access, Page
     from twin.page.ejector import Ejector
-    from twin.page.server import address, listen
-    from twin.page.server import serve as run_server
+    from twin.page.server import address, listen, make_server
     from twin.page.sessions import Sessions
 
     ours = {one.lower() for one in (*names, place.host, socket.gethostname()) if one}
     access = Access(frozenset(ours), place.scheme == "https", place.is_loopback)
     page = Page([Ejector(one) for one in settings], users, Sessions(users), access)
+    server = make_server(page.app(), place)
     with listen(place) as listening:
         print(f"the page is at {address(place, listening)}", flush=True)
-        run_server(page.app(), place, listening)
+        server.run(sockets=[listening])
 
 
 def _require_extra() -> None:

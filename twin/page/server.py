@@ -57,8 +57,8 @@ def address(place: Place, listening: socket.socket) -> str:
     return f"{place.scheme}://{shown}:{port}/"
 
 
-def serve(app: ASGIApp, place: Place, listening: socket.socket) -> None:
-    """Serve until Ctrl-C or SIGTERM; ConfigError where certificate or key are of no use."""
+def make_server(app: ASGIApp, place: Place) -> uvicorn.Server:
+    """What serves until Ctrl-C or SIGTERM; ConfigError where certificate or key are of no use."""
     config = uvicorn.Config(
         app,
         ws="websockets-sansio",
@@ -81,4 +81,4 @@ def serve(app: ASGIApp, place: Place, listening: socket.socket) -> None:
         raise ConfigError(
             f"{place.certificate}: cannot be used: {error}", "both files as PEM, and of one pair"
         ) from error
-    uvicorn.Server(config).run(sockets=[listening])
+    return uvicorn.Server(config)
