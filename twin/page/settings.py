@@ -20,5 +20,5 @@ class PageSettings(Settings):
 def folder_of(document: Document, asset: Asset) -> Path:
     """Where the run of an ejector leaves what its page shows."""
     wanted = document.section(PageSettings, "page").folder
-    name = "-".join(re.sub(r"[^\w]+", "_", part) for part in (asset.type, asset.id) if part)
+    name = ".".join(re.sub(r"[^\w-]+", "_", part) for part in (asset.type, asset.id) if part)
     return Path(document.name).parent / wanted / name

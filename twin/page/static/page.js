@@ -99,7 +99,7 @@ function summary(state) {
   if (!state.running) parts.push(state.last ? `since ${clock(state.last)}` : "never yet");
   if (standing) parts.push(standing === 1 ? "1 alarm" : `${standing} alarms`);
   if (quiet) parts.push(`${quiet} kept quiet`);
-  return parts.join(", ") || "nothing stands";
+  return parts.join(", ") || "no alarm";
 }
 
 function showLights() {

@@ -1,0 +1,200 @@
+"""``twin serve`` on the command line: who it lets in, and what a run leaves for it."""
+
+import io
+import json
+import os
+import pickle
+import socket
+import stat
+import subprocess
+import sys
+import urllib.request
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import rigs
+from command_line import twin
+from page_site import Run, config, flat, write_config
+from plc_process import ROOT
+from test_alarms_loop import Stream as Alarming
+from test_alarms_loop import deviation, diagnosis
+from test_live_diagnosis import ANSWER, Stream, answering, quiet
+
+from twin.cli_serve import live_rows_of, reports_of
+from twin.diagnosis import __main__ as diagnosing
+from twin.diagnosis import process, report
+from twin.diagnosis.process import LiveDiagnosis
+from twin.page import users as users_module
+from twin.page.ejector import REPORT
+from twin.page.ring import read
+from twin.page.settings import RING, folder_of
+from twin.page.users import Users
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(users_module, "N", 2)
+
+
+def test_it_serves_until_it_is_told_to_end(tmp_path: Path) -> None:
+    path = write_config(tmp_path)
+    Run(config(path)).close()
+    command = [sys.executable, "-m", "twin.cli", "serve", "--port", "0", "--config", str(path)]
+    server = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert server.stdout is not None
+    try:
+        url = server.stdout.readline().removeprefix("the page is at ").strip()
+        with urllib.request.urlopen(f"{url}api/me") as answer:
+            assert json.load(answer)["ejectors"][0]["name"] == "gripper-01"
+    finally:
+        server.terminate()
+        assert server.wait(10) in (0, -15)
+        server.stdout.close()
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.0.2.1", "::", "hall-7"])
+def test_others_reach_no_page_without_users(
+    tmp_path: Path, host: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_config(tmp_path)
+    assert twin(monkeypatch, "serve", "--config", path, "--host", host) == 2
+    said = capsys.readouterr().err
+    assert "it has no users" in said
+    assert "--add-user NAME" in said
+
+
+def test_users_are_made_on_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, kept = write_config(tmp_path), tmp_path / "users.toml"
+    monkeypatch.setattr(sys, "stdin", io.StringIO("correct horse\n"))
+    assert twin(monkeypatch, "serve", "--config", path, "--add-user", "ann") == 0
+    assert capsys.readouterr().out == "ann may act on the page\n"
+    assert stat.S_IMODE(kept.stat().st_mode) == 0o600
+    assert Users(kept).check("ann", "correct horse")
+    assert twin(monkeypatch, "serve", "--config", path, "--remove-user", "bob") == 2
+    assert "no user is called 'bob'" in capsys.readouterr().err
+    assert twin(monkeypatch, "serve", "--config", path, "--remove-user", "ann") == 0
+    assert Users(kept).names == []
+
+
+def test_a_password_is_asked_for_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    typed = iter(["correct horse", "correct house"])
+    monkeypatch.setattr("getpass.getpass", lambda _prompt: next(typed))
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
+    assert twin(monkeypatch, "serve", "--users", tmp_path / "u", "--add-user", "ann") == 2
+    assert "differ" in capsys.readouterr().err
+    assert not (tmp_path / "u").exists()
+
+
+def test_what_cannot_be_served_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_config(tmp_path)
+    pem = tmp_path / "page.pem"
+    pem.write_text("none")
+    for options, why in (
+        ([], "no ejector to show"),
+        (["--config", path, "--certificate", pem], "belong together"),
+        (["--config", path, "--certificate", pem, "--key", pem], "cannot be used"),
+        (["--config", rigs.path_of("gripper")], "put keep = true under [alarms]"),
+    ):
+        assert twin(monkeypatch, "serve", "--port", "0", *options) == 2
+        assert why in capsys.readouterr().err
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert twin(monkeypatch, "serve", "--config", path, "--port", str(port)) == 3
+    assert "nobody can listen there" in capsys.readouterr().err
+
+
+# --- what a run leaves ----------------------------------------------------------------------------
+
+
+def test_a_run_leaves_rows_and_reports_only_where_it_is_asked_to(tmp_path: Path) -> None:
+    silent = rigs.config("gripper")
+    assert live_rows_of(silent, pytest.fail) is None
+    assert reports_of(silent) is None
+    settings = config(write_config(tmp_path))
+    opened = live_rows_of(settings, pytest.fail)
+    assert opened is not None
+    live = opened()
+    live.write(*flat(60), [])
+    live.close()
+    folder = folder_of(settings.document, settings.asset)
+    assert folder == tmp_path / "page" / "compact-ejector-35.gripper-01"
+    assert read(folder / RING) is not None
+    assert reports_of(settings) == folder / "reports"
+
+
+def test_an_answer_says_where_it_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    answering(monkeypatch, ANSWER)
+    questions = []
+    asked = process.Asked
+    monkeypatch.setattr(process, "Asked", lambda *how: (questions.append(how[0]), asked(*how))[1])
+    stream = Stream()
+    stream.to = LiveDiagnosis(
+        rigs.config("gripper"), "a.mcap", lambda: False, quiet, reports=tmp_path / "reports"
+    )
+    stream.cycles(5)
+    stream.cycle(alarm=True)
+    stream.cycles(2)
+    stream.answered()
+    (event,), (question,) = stream.told, questions
+    assert question[3] == tmp_path / "reports" / f"{event.data['report']}.html"
+    assert REPORT.fullmatch(event.data["report"])
+
+
+def test_the_alarm_knows_the_report_of_its_diagnosis() -> None:
+    stream = Alarming()
+    stream.at(5, deviation(5))
+    told = diagnosis(9, 5, "leakage")
+    told = replace(told, data={**told.data, "report": "f" * 32})
+    stream.at(9, told)
+    (episode,) = stream.desk.news.episodes.values()
+    assert episode.evidence["report"] == "f" * 32
+
+
+@pytest.mark.parametrize("verdict", ["explained", "unlisted", "consistent", "insufficient"])
+def test_the_process_that_diagnoses_draws_what_it_found(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    verdict: str,
+) -> None:
+    path = tmp_path / "new" / "a.html"
+    _diagnosed(monkeypatch, path, verdict)
+    assert json.loads(capsys.readouterr().out) == {"verdict": verdict}
+    kept = [path] if verdict in ("explained", "unlisted") else []
+    assert list(tmp_path.rglob("*.*")) == kept
+
+
+def test_a_report_that_cannot_be_drawn_costs_no_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    _diagnosed(monkeypatch, tmp_path / "file" / "a.html", "explained")
+    assert json.loads(capsys.readouterr().out) == {"verdict": "explained"}
+
+
+def test_the_oldest_reports_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(diagnosing, "MOST_REPORTS", 3)
+    for number in range(5):
+        path = tmp_path / f"{number}.html"
+        _diagnosed(monkeypatch, path, "explained")
+        os.utime(path, (number, number))
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["2.html", "3.html", "4.html"]
+
+
+def _diagnosed(monkeypatch: pytest.MonkeyPatch, path: Path, verdict: str) -> None:
+    """The process, with an answer in place of the search."""
+    found = SimpleNamespace(json={"verdict": verdict})
+    question = io.BytesIO(pickle.dumps((None, None, "a.mcap", path)))
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=question))
+    monkeypatch.setattr(diagnosing, "diagnose", lambda *_: found)
+    monkeypatch.setattr(report, "write_report", lambda _found, file: file.write_text("drawn"))
+    diagnosing.main()
