@@ -221,7 +221,7 @@ function reportLink(one) {
   if (!one.report) return null;
   const href = `/reports/${chosen}/${one.report}`;
   return element("a", { class: "button", href, target: "_blank", rel: "noopener" },
-    "Report of the diagnosis");
+    "See diagnosis");
 }
 
 function deeds(alarm) {
