@@ -7,11 +7,13 @@ from typing import Any
 import httpx2
 import pytest
 from page_site import KEPT, LEAK, NOW, Run, config, write_config
+from starlette.requests import Request
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
 from twin.alarms import keeper as keeper_module
 from twin.errors import ConfigError
+from twin.events import Kind
 from twin.page import app as module
 from twin.page import users as users_module
 from twin.page.app import COOKIE, STATIC, Access, Page
@@ -176,6 +178,8 @@ def test_errors_are_plain_pages_and_plain_json(site: Site) -> None:
     assert page.status_code == 404
     assert "<h1>Not Found</h1>" in page.text
     assert site.client.get("/api/ejectors/9/history").json() == {"error": "no such ejector"}
+    told = site.page._said(Request({"type": "http", "path": "/", "headers": []}), 400, "<b>")
+    assert b"<b>" not in told.body
     wrong = site.client.get("/api/ejectors/0/history?days=nan")
     assert (wrong.status_code, "days" in wrong.json()["error"]) == (400, True)
     away = site.client.get("/api/ejectors/0/trends/leakage")
@@ -191,6 +195,8 @@ def test_a_report_is_shown_and_nothing_in_it_is_run(site: Site) -> None:
     assert answer.text == "<h1>Leakage</h1>"
     assert "sandbox" in answer.headers["content-security-policy"]
     assert "script-src" not in answer.headers["content-security-policy"]
+    (folder / "other.html").write_text("none of ours")
+    assert site.client.get("/reports/0/other").status_code == 404
     gone = site.client.get(f"/reports/0/{'f' * 32}")
     assert (gone.status_code, "not kept any more" in gone.text) == (404, True)
 
@@ -435,13 +441,13 @@ def test_a_run_that_hangs_is_not_taken_for_one_that_is_well(site: Site) -> None:
 
 
 def test_alarms_that_cannot_be_read_are_never_green(site: Site, tmp_path: Path) -> None:
-    site.begin()
-    _until(lambda: site.ejector.state()["light"] == "green")
-    site.ejector.close()
+    site.begin().alarms.close()  # it would make another database
+    assert site.ejector.state()["light"] == "green"
     (tmp_path / "alarms.sqlite").rename(tmp_path / "elsewhere")
     state = site.ejector.state()
     assert (state["light"], state["words"]) == ("grey", "Alarms unknown")
     assert "no such alarm database" in state["trouble"]
+    assert not (tmp_path / "alarms.sqlite").exists()
     (tmp_path / "elsewhere").rename(tmp_path / "alarms.sqlite")
     assert site.ejector.state()["light"] == "green"
 
@@ -455,6 +461,16 @@ def test_an_alarm_says_what_where_how_sure_and_what_to_do(site: Site) -> None:
     assert dict(alarm["facts"])["how sure"].startswith("a first guess; it may as well be porous")
     (episode,) = site.client.get("/api/ejectors/0/history").json()
     assert (episode["what"], episode["cleared"], episode["priority"]) == ("Leakage", None, "medium")
+
+
+def test_what_another_alarm_explains_is_listed_as_quiet(site: Site) -> None:
+    _leaking(site)
+    assert site.run is not None
+    site.run.say(Kind.PLC_STALE)
+    _until(lambda: len(site.ejector.state()["alarms"]) == 2)
+    stale, leak = site.ejector.state()["alarms"]
+    assert (stale["alarm"], stale["state"]) == ("plc_stale", "unacknowledged")
+    assert (leak["alarm"], leak["state"]) == (LEAK, "suppressed")
 
 
 @pytest.mark.parametrize("missing", ["alarms", "page"])

@@ -34,6 +34,7 @@ def test_a_user_is_known_by_the_password_alone(tmp_path: Path) -> None:
     assert not known.check("ann", "")
     assert not known.check("bob", WORD)
     assert not known.check("", "")
+    assert not known.check("bob", "nobody's")
     assert known.names == ["ann"]
 
 
@@ -65,6 +66,18 @@ def test_what_another_process_writes_holds_at_once(tmp_path: Path) -> None:
     assert not here.check("ann", WORD)
     path.unlink()
     assert here.names == []
+
+
+@pytest.mark.parametrize("name", ["ann", "bob"])
+def test_a_name_that_is_none_takes_as_long(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    known, hashed = Users(tmp_path / "users.toml"), list[str]()
+    known.add("ann", WORD)
+    plain = users._hashed
+    monkeypatch.setattr(users, "_hashed", lambda *how: (hashed.append(how[0]), plain(*how))[1])
+    assert known.check(name, "wrong horse") is False
+    assert hashed == ["wrong horse"]
 
 
 @pytest.mark.parametrize("name", ["", "a b", "a/b", "x" * 41, 'a"', "a\n"])

@@ -9,8 +9,8 @@ import hmac
 import html
 import ipaddress
 import json
-from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import asynccontextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from importlib import resources
@@ -134,13 +134,7 @@ class Page:
         ]
         handlers: dict[Any, Any] = {HTTPException: self.refused, TwinError: self.trouble}
 
-        @asynccontextmanager
-        async def lifespan(_app: Starlette) -> AsyncIterator[None]:
-            yield
-            for ejector in self.ejectors:
-                ejector.close()
-
-        app = Starlette(routes=routes, exception_handlers=handlers, lifespan=lifespan)
+        app = Starlette(routes=routes, exception_handlers=handlers)
         return _Guard(app, self.access)
 
     # --- who it is ------------------------------------------------------------------------------

@@ -6,8 +6,7 @@ Everything here may wait for a disk or a database; the page calls it in a thread
 import math
 import re
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -62,13 +61,6 @@ class Ejector:
         self._folder = folder_of(document, config.asset)
         self._unit = AlarmUnit(config.asset.type, config.asset.id)
         self._asked: set[int] = set()  # through this page
-        self._store: AlarmStore | None = None
-
-    def close(self) -> None:
-        """Let go of the database."""
-        if self._store is not None:
-            self._store.close()
-        self._store = None
 
     # --- what stands ----------------------------------------------------------------------------
 
@@ -203,15 +195,9 @@ class Ejector:
 
     # --- the database ---------------------------------------------------------------------------
 
-    @contextmanager
-    def _alarms(self) -> Iterator[AlarmStore]:
-        """The alarm database; opened anew after it was away."""
-        try:
-            self._store = self._store or open_alarms("", self.config.document, write=False)
-            yield self._store
-        except TwinError:
-            self.close()
-            raise
+    def _alarms(self) -> AlarmStore:
+        """The alarm database, opened anew each time: one that was taken away is none any more."""
+        return open_alarms("", self.config.document, write=False)
 
     def _board(self, store: AlarmStore, now: int) -> Board:
         board = Board(self._rules)

@@ -1,0 +1,53 @@
+"""The traffic light: red for what nobody has taken care of, green only where nothing is."""
+
+import pytest
+
+from twin.alarms.board import Board
+from twin.alarms.rules import Priority, Rule
+from twin.alarms.state import Kept
+from twin.page.light import Light, light_of, listed
+
+STATES = {
+    "normal": (Kept(), Light.GREEN, Light.GREEN),
+    "unacknowledged": (Kept(True, False), Light.RED, Light.YELLOW),
+    "acknowledged": (Kept(True, True), Light.YELLOW, Light.YELLOW),
+    "returned": (Kept(False, False), Light.YELLOW, Light.YELLOW),
+    "shelved, active": (Kept(True, False, 9), Light.YELLOW, Light.YELLOW),
+    "shelved, active, acknowledged": (Kept(True, True, 9), Light.YELLOW, Light.YELLOW),
+    "shelved, nothing to say": (Kept(False, True, 9), Light.GREEN, Light.GREEN),
+    "out of service": (Kept(False, True, None, True), Light.YELLOW, Light.YELLOW),
+    "out of service, active": (Kept(True, False, None, True), Light.YELLOW, Light.YELLOW),
+}
+
+
+def board(**priorities: Priority) -> Board:
+    return Board([Rule(name=n, value=n, above=0.5, priority=p) for n, p in priorities.items()])
+
+
+@pytest.mark.parametrize("priority", list(Priority))
+@pytest.mark.parametrize("state", STATES)
+def test_the_light_of_each_state(state: str, priority: Priority) -> None:
+    kept, urgent, low = STATES[state]
+    one = board(a=priority, other=Priority.HIGH)
+    one.resume({"a": kept})
+    assert light_of(one, running=True) is (low if priority is Priority.LOW else urgent)
+    assert light_of(one, running=False) is Light.GREY
+
+
+def test_the_worst_alarm_counts() -> None:
+    one = board(a=Priority.LOW, b=Priority.MEDIUM, c=Priority.HIGH)
+    one.resume({"a": Kept(True, False), "b": Kept(True, False), "c": Kept(True, True)})
+    assert light_of(one, running=True) is Light.RED
+
+
+def test_what_is_active_and_unseen_is_listed_first() -> None:
+    one = board(seen=Priority.HIGH, gone=Priority.HIGH, low=Priority.LOW, quiet=Priority.HIGH)
+    one.resume(
+        {
+            "seen": Kept(True, True),
+            "gone": Kept(False, False),
+            "low": Kept(True, False),
+            "quiet": Kept(True, False, 9),
+        }
+    )
+    assert [alarm["alarm"] for alarm in listed(one, [], [])] == ["low", "seen", "gone", "quiet"]
