@@ -5,6 +5,7 @@ import json
 import os
 import pickle
 import socket
+import ssl
 import stat
 import subprocess
 import sys
@@ -16,12 +17,14 @@ from types import SimpleNamespace
 import pytest
 import rigs
 from command_line import twin
+from independent import pem
 from page_site import Run, config, flat, write_config
 from plc_process import ROOT
 from test_alarms_loop import Stream as Alarming
 from test_alarms_loop import deviation, diagnosis
 from test_live_diagnosis import ANSWER, Stream, answering, quiet
 
+from drivers import certificates
 from twin.cli_serve import live_rows_of, reports_of
 from twin.diagnosis import __main__ as diagnosing
 from twin.diagnosis import process, report
@@ -51,6 +54,27 @@ def test_it_serves_until_it_is_told_to_end(tmp_path: Path) -> None:
     finally:
         server.terminate()
         assert server.wait(10) in (0, -15)
+        server.stdout.close()
+
+
+def test_it_serves_over_tls(tmp_path: Path) -> None:
+    path = write_config(tmp_path)
+    Run(config(path)).close()
+    own = certificates.make(tmp_path / "tls")
+    options = ("--port", "0", "--config", path, "--certificate", pem(tmp_path / "tls"))
+    command = [sys.executable, "-m", "twin.cli", "serve", *options, "--key", own.key]
+    server = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert server.stdout is not None
+    try:
+        url = server.stdout.readline().removeprefix("the page is at ").strip()
+        assert url.startswith("https://127.0.0.1:")
+        trusting = ssl.create_default_context(cafile=str(tmp_path / "tls" / "certificate.pem"))
+        trusting.check_hostname = False
+        with urllib.request.urlopen(f"{url}login", context=trusting) as answer:
+            assert "Log in" in answer.read().decode()
+    finally:
+        server.terminate()
+        server.wait(10)
         server.stdout.close()
 
 
