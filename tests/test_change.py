@@ -74,25 +74,41 @@ def test_scores_of_unknown_mean_and_scatter_become_standard_normal_and_independe
     rng = np.random.default_rng(3)
     told = []
     for _ in range(300):
-        reference = Reference()
+        reference = Reference.of(1)
         for score in rng.normal(5.0, 3.0, (12, 1)):
             told.append(float(reference.standard(score)[0]))
             reference.add(score)
     normal = np.array(told).reshape(300, 12)
-    assert (normal[:, :2] == 0.0).all()  # nothing is known yet
+    assert np.isnan(normal[:, :2]).all()  # nothing is known yet
     assert kstest(normal[:, 2:].ravel(), "norm").pvalue > 0.01
     assert np.abs(np.corrcoef(normal[:, 2:].T) - np.eye(10)).max() < 0.25
 
 
 def test_a_score_that_never_varied_says_nothing() -> None:
-    reference = Reference()
+    reference = Reference.of(2)
     for _ in range(5):
         reference.add(np.zeros(2))
-    assert (reference.standard(np.array([0.0, 1.0])) == 0.0).all()
+    assert np.isnan(reference.standard(np.array([0.0, 1.0]))).all()
+
+
+def test_what_cycles_do_not_show_is_left_out() -> None:
+    rng = np.random.default_rng(2)
+    some, all_of = Reference.of(2), Reference.of(2)
+    for count, scores in enumerate(rng.normal(3.0, 2.0, (40, 2))):
+        all_of.add(scores)
+        some.add(np.array([scores[0], scores[1] if count % 4 == 0 else np.nan]))
+    assert some.count.tolist() == [40.0, 10.0]
+    seen = np.array([5.0, 5.0])
+    assert some.standard(seen)[0] == all_of.standard(seen)[0]
+    changes = Changes(np.array([False, False]), np.eye(2))
+    changes.take(np.array([3.0, np.nan]))
+    alone = Changes(np.array([False, False]), np.eye(2))
+    alone.take(np.array([3.0, -30.0]))
+    assert changes.log_sum == pytest.approx(alone.log_sum)
 
 
 def test_far_off_is_a_number_still() -> None:
-    reference = Reference()
+    reference = Reference.of(1)
     for score in np.random.default_rng(1).normal(0.0, 1.0, (500, 1)):
         reference.add(score)
     normal = reference.standard(np.array([1e6]))

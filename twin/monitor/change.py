@@ -8,7 +8,7 @@ by 1 a cycle on average, however alike their signatures are: a limit on it is th
 to a false alarm, but for the overshoot.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -21,36 +21,44 @@ SHARES = np.array([0.33, 0.27, 0.40])  # of the weight, of each size
 ALIKE = 4  # power of the cosine by which suspects that look alike share one weight
 OVERSHOOT = 0.6  # the limit over the cycles to a false alarm, for these sizes (tools/bench.py)
 FARTHEST = 30.0  # sigmas; beyond, a probability is no number any more
-MOST = 1e6  # cycles that a reference counts as, at most
 
 
 @dataclass
 class Reference:
-    """What scores were in the cycles so far: their number, means and sums of squares about them."""
+    """What scores were in the cycles so far: their number, means and sums of squares about them.
 
-    count: float = 0.0
-    mean: Floats = field(default_factory=lambda: np.zeros(0))
-    squares: Floats = field(default_factory=lambda: np.zeros(0))
+    NaN is the score of a suspect that a cycle does not show.
+    """
+
+    count: Floats
+    mean: Floats
+    squares: Floats
+
+    @classmethod
+    def of(cls, suspects: int) -> "Reference":
+        """Nothing seen yet."""
+        return cls(np.zeros(suspects), np.zeros(suspects), np.zeros(suspects))
 
     def standard(self, scores: Floats) -> Floats:
-        """Scores as standard normal variables, if they come from where those before came from."""
-        if self.count < 2:
-            return np.zeros(len(scores))
-        sigma = np.sqrt(self.squares / (self.count - 1.0) * (1.0 + 1.0 / self.count))
-        off = scores - self.mean
-        t = np.divide(off, sigma, out=np.zeros(len(scores)), where=sigma > 0.0)
-        tail = ndtri(stdtr(self.count - 1.0, -np.abs(t)))
-        normal: Floats = -np.sign(t) * np.maximum(tail, -FARTHEST)
-        return normal
+        """Scores as standard normal variables, if they come from where those before came from.
+
+        NaN also while too few are known.
+        """
+        known = (self.count >= 2.0) & (self.squares > 0.0)
+        count = np.where(known, self.count, 2.0)
+        variance = np.where(known, self.squares, 1.0) / (count - 1.0) * (1.0 + 1.0 / count)
+        t = (scores - self.mean) / np.sqrt(variance)
+        normal = -np.sign(t) * np.maximum(ndtri(stdtr(count - 1.0, -np.abs(t))), -FARTHEST)
+        result: Floats = np.where(known, normal, np.nan)
+        return result
 
     def add(self, scores: Floats) -> None:
         """Take a cycle in (Welford's way)."""
-        if not len(self.mean):
-            self.mean, self.squares = np.zeros(len(scores)), np.zeros(len(scores))
-        self.count += 1.0
-        off = scores - self.mean
-        self.mean = self.mean + off / self.count
-        self.squares = self.squares + off * (scores - self.mean)
+        shown = np.isfinite(scores)
+        self.count = self.count + shown
+        off = np.where(shown, scores - self.mean, 0.0)
+        self.mean = self.mean + off / np.maximum(self.count, 1.0)
+        self.squares = self.squares + np.where(shown, off * (scores - self.mean), 0.0)
 
 
 class Changes:
@@ -68,9 +76,11 @@ class Changes:
         self._log = np.full(self._shift.shape, -np.inf)
 
     def take(self, normal: Floats) -> None:
-        """Take the standard normal scores of a cycle."""
-        ratio = self._shift * normal[:, None, None] - 0.5 * self._shift**2
-        self._log = np.logaddexp(0.0, self._log) + ratio
+        """Take the standard normal scores of a cycle; where there is none (NaN) all stays."""
+        there = np.isfinite(normal)
+        shift = self._shift[there]
+        ratio = shift * normal[there, None, None] - 0.5 * shift**2
+        self._log[there] = np.logaddexp(0.0, self._log[there]) + ratio
 
     @property
     def log_sum(self) -> float:
@@ -106,6 +116,7 @@ def limit(cycles: float) -> float:
 
 def began(normal: Floats) -> int:
     """How many of the last scores differ, by the greatest likelihood over when it began."""
-    sums = np.cumsum(normal[::-1])
-    gain = sums**2 / np.arange(1, len(sums) + 1)
+    sums = np.cumsum(np.nan_to_num(normal[::-1]))
+    count = np.cumsum(np.isfinite(normal[::-1]))
+    gain = sums**2 / np.maximum(count, 1)
     return int(np.argmax(gain)) + 1

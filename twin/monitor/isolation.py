@@ -87,7 +87,8 @@ class Isolation:
     def __init__(self, bank: Bank, listener: Listener, days: float) -> None:
         self._bank, self._listener = bank, listener
         self._wanted_s = days * DAY_S
-        self._reference, self._usual = Reference(), _Usual()
+        self._reference, self._usual = Reference.of(len(SUSPECTS)), _Usual()
+        self._learned = 0  # cycles
         self._changes: Changes | None = None  # once it is known which suspects look alike
         self._kept: deque[tuple[Said, Floats]] = deque(maxlen=KEPT)  # with the normal scores
         self._cycles, self._seconds = 0, 0.0
@@ -138,7 +139,8 @@ class Isolation:
         if usual and not verdict.causes:
             self._reference.add(scores)
             self._usual.add(said)
-        if self._changes is None and self._reference.count >= LEARNED:
+            self._learned += 1
+        if self._changes is None and self._learned >= LEARNED:
             self._changes = Changes(np.array([one.both_ways for one in SUSPECTS]), said.alike())
         return verdict
 
@@ -171,6 +173,8 @@ class Isolation:
         """Whether it is as before, by a likelihood ratio of its own."""
         assert self._raised is not None
         suspect, sigmas = self._raised
+        if np.isnan(normal[suspect]):
+            return False
         gain = sigmas * (0.5 * sigmas - float(normal[suspect]))
         self._back = max(self._back + min(gain, RETURNED / FEWEST_BACK), 0.0)
         if self._back < RETURNED:
@@ -183,7 +187,7 @@ class Isolation:
         suspect, _ = changes.foremost()
         scores = np.array([float(normal[suspect]) for _, normal in self._kept])
         since = min(self._since, len(scores)) if self._raised else began(scores)
-        return since, float(np.mean(scores[-since:]))
+        return since, float(np.nanmean(scores[-since:]))
 
     def _causes(self, since: int, changed: float) -> list[Likely]:
         """How probable each effect is; together as probable as that something ``changed``."""

@@ -25,7 +25,7 @@ PER_UNIT = 2  # bins in each unit of warped time
 LEVELS = ("h1_level", "h1_low_level")
 UNKNOWN_LEVEL_MBAR = 3.0  # one sigma of a level that healthy cycles do not show
 SUCTION_ROWS = 4000  # commanded, to see where each suspect switches
-WEAK = 1e-9  # sigmas² of a step: nothing in the cycle depends on it
+WEAK = 1e-4  # sigmas² of a step: nothing in the cycle depends on it
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,9 @@ class Said:
         return Said(alone=self.alone[np.ix_(places, places)], **columns)
 
     def scores(self) -> Floats:
-        """How many sigmas of each signature there are; 0 for what this cycle does not show."""
+        """How many sigmas of each signature there are; NaN for what this cycle does not show."""
         weighed, power = self._weighed()
-        scores: Floats = self.off @ weighed / np.sqrt(np.where(power > 0.0, power, np.inf))
+        scores: Floats = self.off @ weighed / np.sqrt(np.where(power > 0.0, power, np.nan))
         return scores
 
     def alike(self) -> Floats:
