@@ -7,7 +7,7 @@ import pytest
 import rigs
 
 from twin.events import Event, Kind
-from twin.monitor.bank import DELAYS, SUSPECTS, Bank, hypotheses
+from twin.monitor.bank import SUSPECTS, Bank, hypotheses
 from twin.monitor.detect import Monitor
 from twin.monitor.isolation import Isolation
 from twin.signals import Samples, Ticks
@@ -123,19 +123,34 @@ def test_what_is_far_out_is_not_learned_as_usual() -> None:
     assert all(one == {"none": 1.0} for one in probabilities(told).values())
 
 
-def test_the_bank_expects_what_models_alone_expect() -> None:
+def test_the_bank_expects_what_the_twin_expects_where_it_is_drawn() -> None:
     samples, _ = rigs.recorded("gripper", 6.0)
     rows, ticks = rigs.expectation(rigs.twin("gripper"), [samples])
     bank = Bank(rigs.theta("gripper"))
     for begin in range(0, len(rows), 700):
         bank.push(rows[begin : begin + 700], ticks[begin : begin + 700])
-    together = bank.take(len(rows))
-    assert together.shape[1] == 1 + len(SUSPECTS) + len(DELAYS) + 3
-    assert len(hypotheses(rigs.theta("gripper"))) == together.shape[1]
-    known = np.isfinite(ticks["expected"])
-    unchanged = together[known, 0] - ticks["expected"][known]
-    assert np.abs(unchanged).max() < 30.0  # Pa: it is stepped more roughly
-    assert bank.take(10).shape[0] == 0
+    drawn, together = bank.take(len(rows))
+    assert together.shape == (len(drawn), len(hypotheses(rigs.theta("gripper"))))
+    assert 0.1 < len(drawn) / len(rows) < 0.35
+    known = np.isfinite(ticks["expected"][drawn])
+    assert known.sum() > 500
+    # Between drawn rows the line between them is enough; it is stepped more roughly.
+    line = np.interp(np.arange(len(rows)), drawn[known], together[known, 0])
+    inside = np.arange(drawn[known][0], drawn[known][-1])
+    assert np.abs(line[inside] - ticks["expected"][inside]).max() < 60.0  # Pa
+    assert np.abs(together[known, 0] - ticks["expected"][drawn[known]]).max() < 30.0
+
+
+@pytest.mark.parametrize("size", [1, 13, 400])
+def test_what_the_bank_draws_does_not_depend_on_blocks(size: int) -> None:
+    samples, _ = rigs.recorded("gripper", 3.0)
+    rows, ticks = rigs.expectation(rigs.twin("gripper"), [samples])
+    whole, cut = Bank(rigs.theta("gripper")), Bank(rigs.theta("gripper"))
+    whole.push(rows, ticks)
+    for begin in range(0, len(rows), size):
+        cut.push(rows[begin : begin + size], ticks[begin : begin + size])
+    for one, other in zip(whole.take(len(rows)), cut.take(len(rows)), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_rows_and_ticks_of_the_bank_go_with_cycles_through_a_gap() -> None:
@@ -147,4 +162,5 @@ def test_rows_and_ticks_of_the_bank_go_with_cycles_through_a_gap() -> None:
         watched.update(rows, ticks)
     watched.close()
     assert watched.isolation is not None
-    assert len(watched.isolation._bank.take(10)) == 0
+    assert len(watched.isolation._bank.take(0)[0]) == 0
+    assert watched.isolation._bank._count == 0

@@ -14,13 +14,24 @@ from twin.model import kernel
 from twin.model import theta as c
 from twin.model.effects import EFFECTS, Parameter, apply
 from twin.model.theta import Theta
+from twin.monitor.bins import drawn
 from twin.monitor.signatures import steps
-from twin.signals import Samples, Ticks
+from twin.signals import MS, NS, Samples, Ticks
 
 STEP = 0.25  # of a parameter's typical size
 GROSS = 1.5  # the same for those that are not linear in it for long: what delays
 
 Floats = npt.NDArray[np.float64]
+_ROW = np.dtype(
+    [
+        ("time_ns", "i8"),
+        ("dt", "f8"),
+        ("level", "f8"),
+        ("phase", "u1"),
+        ("bends", "?"),  # here a bend of what is expected begins
+        ("since", "i8"),  # rows, then
+    ]
+)
 
 
 @dataclass(frozen=True)
@@ -76,28 +87,70 @@ def hypotheses(theta: Theta) -> list[Theta]:
 
 
 class Bank:
-    """Takes the rows of the twin, and keeps what each hypothesis expects until it is taken."""
+    """Takes the rows of the twin, and keeps what each hypothesis expects until it is taken.
+
+    Signatures are smooth but where a phase or a stretch begins, so the bank steps from one to the
+    next of the rows that suffice to draw them (``bins.drawn``); to know them it is one row behind.
+    """
 
     def __init__(self, theta: Theta) -> None:
         self._theta = np.stack(hypotheses(theta), axis=1)
         self._state = kernel.new_state(self._theta.shape[1])
-        self._kept = np.empty((0, self._theta.shape[1]))
-        self._last_ns: int | None = None
+        self._waits = np.empty(0, _ROW)  # the newest row: the one after it is not known yet
+        self._last_ns: int | None = None  # PLC time of the newest row
+        self._phase = -1  # and its phase
+        self._since = 0  # rows since a bend began, of the newest one
+        self._drawn_ns = 0  # PLC time of the newest row that was drawn
+        self._count = 0  # rows that were pushed and not taken
+        self._rows = np.empty(0, np.int64)  # of these, that were drawn
+        self._expected = np.empty((0, self._theta.shape[1]))
 
     def push(self, samples: Samples, ticks: Ticks) -> None:
         """Step on by the twin's rows."""
         if not len(samples):
             return
-        expected = np.empty((len(samples), self._theta.shape[1]))
-        dt, level = steps(samples, self._last_ns), ticks["level"].astype(np.float64)
-        phase = np.ascontiguousarray(ticks["phase"])
+        fresh = np.empty(len(samples), _ROW)
+        fresh["time_ns"], fresh["level"] = samples["time_ns"], ticks["level"]
+        fresh["phase"], fresh["dt"] = ticks["phase"], steps(samples, self._last_ns)
+        fresh["bends"] = np.diff(ticks["phase"], prepend=self._phase) != 0
+        fresh["bends"] |= np.isfinite(ticks["level"]) | (fresh["dt"] < 0.5 * MS)
+        fresh["bends"] |= fresh["dt"] > 1.5 * MS
+        number = np.arange(len(fresh))
+        begun = np.where(fresh["bends"], number, -1 - self._since)
+        fresh["since"] = number - np.maximum.accumulate(begun)
+        self._last_ns, self._phase = int(samples["time_ns"][-1]), int(ticks["phase"][-1])
+        self._since = int(fresh["since"][-1])
+        rows = np.concatenate([self._waits, fresh])
+        drawn_now = drawn(rows["since"][:-1]) | rows["bends"][1:]
+        first = self._count - len(self._waits)
+        self._count += len(samples)
+        self._waits = rows[-1:]
+        self._step(rows[:-1][drawn_now], first + np.flatnonzero(drawn_now))
+
+    def _step(self, rows: npt.NDArray[np.void], numbers: npt.NDArray[np.int64]) -> None:
+        if not len(rows):
+            return
+        before = np.concatenate([[self._drawn_ns], rows["time_ns"][:-1]])
+        dt = np.where(rows["dt"] < 0.0, -1.0, (rows["time_ns"] - before) * NS)
+        expected = np.empty((len(rows), self._theta.shape[1]))
+        phase, level = (np.ascontiguousarray(rows[name]) for name in ("phase", "level"))
         kernel.advance(
             self._state, self._theta, dt, phase, level, expected, tolerance=kernel.ROUGHLY
         )
-        self._last_ns = int(samples["time_ns"][-1])
-        self._kept = np.concatenate([self._kept, expected])
+        self._drawn_ns = int(rows["time_ns"][-1])
+        self._rows = np.concatenate([self._rows, numbers])
+        self._expected = np.concatenate([self._expected, expected])
 
-    def take(self, rows: int) -> Floats:
-        """Give the oldest ``rows`` (Pa), (rows, hypotheses)."""
-        taken, self._kept = self._kept[:rows], self._kept[rows:]
+    def take(self, count: int) -> tuple[npt.NDArray[np.int64], Floats]:
+        """Of the oldest ``count`` rows those that were drawn, and what is expected there (Pa).
+
+        These are (drawn, hypotheses).
+        """
+        if count == self._count and len(self._waits):
+            self._step(self._waits, np.array([count - 1]))
+            self._waits = self._waits[:0]
+        mine = self._rows < count
+        taken = self._rows[mine], self._expected[mine]
+        self._rows, self._expected = self._rows[~mine] - count, self._expected[~mine]
+        self._count -= count
         return taken

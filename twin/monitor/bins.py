@@ -101,11 +101,26 @@ def binned(
 
 def sparse(begins: npt.NDArray[np.bool_]) -> Ints:
     """Rows that suffice to draw a curve whose bends begin at some rows: fewer, the later after."""
-    offsets = [0]
-    while offsets[-1] < len(begins):
-        offsets.append(offsets[-1] + min(max(offsets[-1] // SPARSE, 1), FARTHEST))
     rows = np.arange(len(begins))
     since = rows - np.maximum.accumulate(np.where(begins, rows, 0))
-    kept = np.isin(since, offsets) | np.roll(begins, -1)  # the last ones before as well
+    kept = drawn(since) | np.roll(begins, -1)  # the last ones before as well
     kept[-1:] = True
     return np.flatnonzero(kept)
+
+
+def drawn(since: Ints) -> npt.NDArray[np.bool_]:
+    """Whether a row is one of those, by how many rows ago a bend began."""
+    late = since - _EARLY[-1]
+    found: npt.NDArray[np.bool_] = np.isin(since, _EARLY) | (late > 0) & (late % FARTHEST == 0)
+    return found
+
+
+def _early() -> list[int]:
+    """The first of them, until they are as far apart as they get."""
+    offsets = [0]
+    while offsets[-1] < SPARSE * FARTHEST:
+        offsets.append(offsets[-1] + max(offsets[-1] // SPARSE, 1))
+    return offsets
+
+
+_EARLY = _early()

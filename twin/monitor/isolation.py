@@ -126,8 +126,8 @@ class Isolation:
 
         From one that is not ``usual`` it does not learn.
         """
-        expected = self._bank.take(len(cycle.samples))
-        said = self._listener.hear(cycle, expected, figures) if fit and cycle.complete else None
+        drawn = self._bank.take(len(cycle.samples))
+        said = self._listener.hear(cycle, *drawn, figures) if fit and cycle.complete else None
         if said is None:
             return None
         self._cycles += 1

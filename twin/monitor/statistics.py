@@ -91,17 +91,26 @@ class Listener:
         self._means = np.nan_to_num(np.array(means))
         self._sigmas = np.array([one.sigma if one else UNKNOWN_LEVEL_MBAR for one in known])
 
-    def hear(self, cycle: Cycle, expected: Floats, figures: Mapping[str, float]) -> Said | None:
-        """What a whole cycle says; ``expected`` (Pa) by the bank, ``figures`` as the monitor's."""
-        off = deviation(cycle.samples, cycle.ticks)
-        usable = np.isfinite(off) & np.isfinite(expected).all(axis=1)
+    def hear(
+        self, cycle: Cycle, drawn: Ints, expected: Floats, figures: Mapping[str, float]
+    ) -> Said | None:
+        """What a whole cycle says; ``drawn`` rows and ``expected`` (Pa) there are the bank's.
+
+        ``figures`` are the monitor's.
+        """
+        off = deviation(cycle.samples, cycle.ticks) / MBAR
+        known = np.isfinite(expected).all(axis=1)
+        if not known.any():
+            return None
+        between = np.interp(np.arange(len(off)), drawn, known.astype(float), 0.0, 0.0)
+        usable = np.isfinite(off) & (between == 1.0)
         usable &= (cycle.samples["quality"] & UNUSABLE) == 0
         if not usable.any():
             return None
         bins = binned(cycle.ticks["phase"], usable, np.zeros(1, np.int64), PER_UNIT)
-        columns = np.column_stack([off, expected[:, 1:] - expected[:, :1]]) / MBAR
-        mean = bins.mean(columns)
-        return self._with_levels(bins, mean[:, 0], mean[:, 1:], figures)
+        moved = (expected[:, 1:] - expected[:, :1]) / MBAR
+        signatures = bins.through(drawn) @ np.where(known[:, None], moved, 0.0)
+        return self._with_levels(bins, bins.mean(off), signatures, figures)
 
     def _with_levels(
         self, bins: Bins, off: Floats, signatures: Floats, figures: Mapping[str, float]
