@@ -103,7 +103,7 @@ class Listener:
         if not known.any():
             return None
         between = np.interp(np.arange(len(off)), drawn, known.astype(float), 0.0, 0.0)
-        usable = np.isfinite(off) & (between == 1.0)
+        usable: npt.NDArray[np.bool_] = np.isfinite(off) & (between == 1.0)
         usable &= (cycle.samples["quality"] & UNUSABLE) == 0
         if not usable.any():
             return None
