@@ -99,11 +99,11 @@ class Listener:
         ``figures`` are the monitor's.
         """
         off = deviation(cycle.samples, cycle.ticks) / MBAR
-        known = np.isfinite(expected).all(axis=1)
+        known: npt.NDArray[np.bool_] = np.all(np.isfinite(expected), axis=1)
         if not known.any():
             return None
         between = np.interp(np.arange(len(off)), drawn, known.astype(float), 0.0, 0.0)
-        usable: npt.NDArray[np.bool_] = np.isfinite(off) & (between == 1.0)
+        usable = np.isfinite(off) & (between == 1.0)
         usable &= (cycle.samples["quality"] & UNUSABLE) == 0
         if not usable.any():
             return None
