@@ -85,7 +85,9 @@ def _device(seed: int) -> tuple[Floats, Floats]:
 
 
 def _changes(alike: Floats) -> Changes:
-    return Changes(np.array([one.both_ways for one in SUSPECTS]), alike)
+    changes = Changes(np.array([one.both_ways for one in SUSPECTS]))
+    changes.weigh(alike)
+    return changes
 
 
 def _false_alarms(devices: Sequence[Floats], alike: Floats, asked: float) -> Measured:

@@ -64,12 +64,16 @@ class Reference:
 class Changes:
     """Sums of likelihood ratios, for each suspect, sign and size."""
 
-    def __init__(self, both_ways: npt.NDArray[np.bool_], alike: Floats) -> None:
-        """``alike`` are the cosines between the suspects' signatures; 0 with all: not shown."""
-        signs = np.stack([np.ones(len(both_ways)), -1.0 * both_ways], axis=1)  # 0: not this way
-        self._shift = signs[:, :, None] * SIZES
-        self._weight = np.log(_weights(signs, alike)[:, :, None] * SHARES + np.finfo(float).tiny)
+    def __init__(self, both_ways: npt.NDArray[np.bool_]) -> None:
+        self._signs = np.stack([np.ones(len(both_ways)), -1.0 * both_ways], axis=1)  # 0: not so
+        self._shift = self._signs[:, :, None] * SIZES
+        self.weigh(np.eye(len(both_ways)))
         self.begin()
+
+    def weigh(self, alike: Floats) -> None:
+        """Share the weight by the cosines between signatures; 0 with all: it is not shown."""
+        shares = _weights(self._signs, alike)[:, :, None] * SHARES
+        self._weight = np.log(shares + np.finfo(float).tiny)
 
     def begin(self) -> None:
         """Forget everything."""
@@ -115,8 +119,8 @@ def limit(cycles: float) -> float:
 
 
 def began(normal: Floats) -> int:
-    """How many of the last scores differ, by the greatest likelihood over when it began."""
-    sums = np.cumsum(np.nan_to_num(normal[::-1]))
+    """How many of the last scores are above zero, by the likelihood of when it began."""
+    sums = np.maximum(np.cumsum(np.nan_to_num(normal[::-1])), 0.0)
     count = np.cumsum(np.isfinite(normal[::-1]))
     gain = sums**2 / np.maximum(count, 1)
     return int(np.argmax(gain)) + 1

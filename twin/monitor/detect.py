@@ -177,19 +177,19 @@ class Monitor:
         stale = silent or any(map(_has_stale, (cycle, before or cycle)))
         judged = whole and cycle.settled and cycle.coverage >= FEWEST_SHARE and not stale
         worst = self._worst(found) if judged else None
-        verdict = self._isolate(cycle, judged, found, worst)
+        far = abs(worst.sigmas) if worst else 0.0
+        verdict = self._isolate(cycle, judged, found, far)
         events = [_summary(cycle, found, told, verdict)] if cycle.complete or told else []
-        if worst is None:
+        if not judged or (worst is None and verdict is None):
             return events
-        changed = self.isolation is not None and self.isolation.stands
-        if abs(worst.sigmas) >= self.settings.raise_sigma:
+        if worst and far >= self.settings.raise_sigma:
             self._quiet_cycles = 0
             if (raised := self._deviation(worst, before, cycle, verdict)) is not None:
                 events.append(raised)
-        elif verdict and verdict.raised and not self.active:
+        elif verdict and verdict.raised and verdict.causes and not self.active:
             self._quiet_cycles = 0
             events.append(self._change(cycle, verdict))
-        elif self.active and abs(worst.sigmas) < self.settings.clear_sigma and not changed:
+        elif self.active and far < self.settings.clear_sigma and not self._differs:
             self._quiet_cycles += 1
             if self._quiet_cycles >= self.settings.clear_cycles:
                 text = f"measurement and model agree again; it had looked like {self.active}"
@@ -201,14 +201,19 @@ class Monitor:
             self._quiet_cycles = 0
         return events
 
+    @property
+    def _differs(self) -> bool:
+        """Whether cycles differ together, if no single one does."""
+        return self.isolation is not None and self.isolation.stands
+
     def _isolate(
-        self, cycle: Cycle, judged: bool, found: Mapping[str, float], worst: Outlier | None
+        self, cycle: Cycle, judged: bool, found: Mapping[str, float], far: float
     ) -> "Verdict | None":
         """What the isolation holds; it does not learn what is usual from what is far out."""
         if self.isolation is None:
             return None
-        far = worst is not None and abs(worst.sigmas) >= self.settings.raise_sigma
-        return self.isolation.judge(cycle, judged, found, usual=not far)
+        far = far if far >= self.settings.raise_sigma else 0.0
+        return self.isolation.judge(cycle, judged, found, far)
 
     def _worst(self, found: Mapping[str, float]) -> Outlier | None:
         outliers = []

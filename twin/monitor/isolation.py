@@ -24,7 +24,9 @@ from twin.signals import MBAR, NS, SAMPLE, TICK, Samples, Ticks
 
 DAY_S = 86_400.0
 KEPT = 400  # cycles that are remembered: a change is not sought further back
+RECENT = 60  # of them, the last ones from which a cause is named
 LEARNED = 10  # cycles before which nothing is said
+GREW = 2.0  # times as far out as before: something else may have begun
 MISMATCH = 0.08  # of what a suspect explains, is off in its signature
 DOUBTED = 0.05  # probability that anything differs, from which on it is asked what
 RETURNED = float(np.log(1000.0))  # of the odds that it is as before, for it to be over
@@ -95,6 +97,13 @@ class Isolation:
         self._raised: tuple[int, float] | None = None  # suspect, and sigmas a cycle
         self._since = 0  # cycles since it began, while raised
         self._back = 0.0  # logarithm of the odds that it is as before
+        self._farthest = 0.0  # sigmas by which a single cycle was out, while raised
+        self._alike = np.zeros((len(SUSPECTS), len(SUSPECTS)))  # cosines, as far as known
+        theta = listener.theta
+        neutral = np.array([one.parameter.neutral(theta) for one in SUSPECTS])
+        ends = [(one.parameter.low, one.parameter.high) for one in SUSPECTS]
+        steps = np.array([one.step for one in SUSPECTS])
+        self._bounds = (np.array(ends) - neutral[:, None]) / steps[:, None]
 
     @property
     def stands(self) -> bool:
@@ -120,11 +129,12 @@ class Isolation:
         return cls(Bank(theta), listener, days)
 
     def judge(
-        self, cycle: Cycle, fit: bool, figures: Mapping[str, float], *, usual: bool = True
+        self, cycle: Cycle, fit: bool, figures: Mapping[str, float], far: float = 0.0
     ) -> Verdict | None:
         """Take the rows of a cycle or piece, in order; say what is held if it is ``fit`` to say.
 
-        From one that is not ``usual`` it does not learn.
+        ``far`` are the sigmas by which this cycle alone is out, if it is: from such a one nothing
+        is learned, and if it is much farther than those before, the cause is sought from it on.
         """
         drawn = self._bank.take(len(cycle.samples))
         said = self._listener.hear(cycle, *drawn, figures) if fit and cycle.complete else None
@@ -135,39 +145,58 @@ class Isolation:
         scores = said.scores()
         normal = self._reference.standard(scores)
         self._kept.append((said, normal))
-        verdict = self._conclude(self._changes, normal) if self._changes else Verdict(1.0, ())
-        if usual and not verdict.causes:
-            self._reference.add(scores)
-            self._usual.add(said)
-            self._learned += 1
-        if self._changes is None and self._learned >= LEARNED:
-            self._changes = Changes(np.array([one.both_ways for one in SUSPECTS]), said.alike())
+        verdict = self._conclude(self._changes, normal, far) if self._changes else None
+        if not far and not self.stands and (verdict is None or not verdict.causes):
+            self._learn(said, scores)
         return verdict
 
-    def _conclude(self, changes: Changes, normal: Floats) -> Verdict:
+    def _learn(self, said: Said, scores: Floats) -> None:
+        """Take a cycle as usual; what is shown for the first time is looked for from now on."""
+        new = np.isfinite(scores) & (self._reference.count == 0.0)
+        self._reference.add(scores)
+        self._usual.add(said)
+        self._learned += 1
+        if new.any():
+            alike = said.alike()
+            self._alike = np.where(alike != 0.0, alike, self._alike)
+        if self._learned == LEARNED:
+            self._changes = Changes(np.array([one.both_ways for one in SUSPECTS]))
+        if self._changes and (new.any() or self._learned == LEARNED):
+            self._changes.weigh(self._alike)
+
+    def _conclude(self, changes: Changes, normal: Floats, far: float) -> Verdict:
         changes.take(normal)
         cycles = self._wanted_s / (self._seconds / self._cycles)
         log_odds = changes.log_sum - np.log(cycles)  # a fault is as rare as a false alarm
         none = float(1.0 / (1.0 + np.exp(min(log_odds, 700.0))))
         raised = self._raised is None and changes.log_sum >= limit(cycles)
         if raised:
-            self._raise(changes)
+            self._raise(changes, far)
         elif self._raised is not None:
-            self._since += 1
+            self._go_on(far)
             if self._is_back(normal):
                 changes.begin()
                 self._kept.clear()
                 return Verdict(1.0, ())
         if self._raised is None and 1.0 - none < DOUBTED:
             return Verdict(none, ())
+        if self._raised is not None and np.isnan(normal[self._raised[0]]):
+            return Verdict(none, ())  # this cycle does not show it
         since, sigmas = self._differ(changes)
         causes = self._causes(since, 1.0 - none)
         return Verdict(none, causes, raised, since, sigmas)
 
-    def _raise(self, changes: Changes) -> None:
+    def _go_on(self, far: float) -> None:
+        """One cycle more that differs; one that is much farther out begins anew."""
+        self._since += 1
+        if far > GREW * self._farthest:
+            self._since = 1
+        self._farthest = max(self._farthest, far)
+
+    def _raise(self, changes: Changes, far: float) -> None:
         self._since, sigmas = self._differ(changes)
         self._raised = (changes.foremost()[0], sigmas)
-        self._back = 0.0
+        self._back, self._farthest = 0.0, far
 
     def _is_back(self, normal: Floats) -> bool:
         """Whether it is as before, by a likelihood ratio of its own."""
@@ -184,26 +213,29 @@ class Isolation:
 
     def _differ(self, changes: Changes) -> tuple[int, float]:
         """How many of the last cycles differ, and by how many sigmas each."""
-        suspect, _ = changes.foremost()
+        suspect, sign = changes.foremost()
         scores = np.array([float(normal[suspect]) for _, normal in self._kept])
-        since = min(self._since, len(scores)) if self._raised else began(scores)
-        return since, float(np.nanmean(scores[-since:]))
+        since = min(self._since, len(scores)) if self._raised else began(sign * scores)
+        shown = scores[-since:][np.isfinite(scores[-since:])]
+        return since, float(np.mean(shown)) if len(shown) else 0.0
 
     def _causes(self, since: int, changed: float) -> list[Likely]:
         """How probable each effect is; together as probable as that something ``changed``."""
-        mean, covariance = self._mean(since)
+        mean, covariance = self._mean(min(since, RECENT))
         fitted = [
-            _fitted(mean.off, signature, covariance, one.both_ways)
-            for one, signature in zip(SUSPECTS, mean.signatures.T, strict=True)
+            _fitted(mean.off, signature, covariance, bounds)
+            for signature, bounds in zip(mean.signatures.T, self._bounds, strict=True)
         ]
         for number, signature in zip(DELAYS, mean.gross.T, strict=True):
-            size, left = _fitted(mean.off, signature, covariance, False)
+            bounds = self._bounds[number] * STEP / GROSS
+            size, left = _fitted(mean.off, signature, covariance, bounds)
             if left < fitted[number][1]:
                 fitted[number] = np.array([size * GROSS / STEP, left])
         # What a low supply does is not known well: in proportion to how low it is.
         ways = fitted[UNSURE_OF][0] * mean.unsure
         signature = mean.signatures[:, UNSURE_OF]
-        fitted[UNSURE_OF] = _fitted(mean.off, signature, covariance + ways @ ways.T, False)
+        wider, bounds = covariance + ways @ ways.T, self._bounds[UNSURE_OF]
+        fitted[UNSURE_OF] = _fitted(mean.off, signature, wider, bounds)
         sizes, left = np.array(fitted).T
         share = np.exp(0.5 * (left.min() - left))
         return self._by_effect(share * (changed / share.sum()), sizes)
@@ -228,7 +260,9 @@ class Isolation:
         together = np.exp(-np.abs(last.time[:, None] - last.time)) * (
             last.kind[:, None] == last.kind
         )
-        covariance = last.alone / since + np.outer(own, own) * together
+        usually = 1.0 / np.sqrt(1.0 + seen)
+        scatter = last.alone / len(some) + last.alone * np.outer(usually, usually)
+        covariance = scatter + np.outer(own, own) * together
         return replace(last, off=off, signatures=signatures, gross=gross), covariance
 
     def _by_effect(self, share: Floats, sizes: Floats) -> list[Likely]:
@@ -243,11 +277,10 @@ class Isolation:
         return sorted(found.values(), key=lambda likely: -likely.probability)
 
 
-def _fitted(off: Floats, signature: Floats, covariance: Floats, both_ways: bool) -> Floats:
+def _fitted(off: Floats, signature: Floats, covariance: Floats, bounds: Floats) -> Floats:
     """Size (in steps) that fits a deviation best, and twice what the likelihood is less."""
     weighed = np.linalg.solve(covariance, np.column_stack([off, signature]))
     power = max(float(signature @ weighed[:, 1]), 1e-12)
-    size = float(signature @ weighed[:, 0]) / power
-    size = size if both_ways else max(size, 0.0)
+    size = float(np.clip(signature @ weighed[:, 0] / power, *bounds))
     left = float((off - size * signature) @ (weighed[:, 0] - size * weighed[:, 1]))
     return np.array([size, left + float(np.linalg.slogdet(covariance)[1])])
