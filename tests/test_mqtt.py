@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -178,6 +179,32 @@ def test_what_was_not_answered_comes_again_in_order(
         heard = numbers(listener.on(LEAK))
     assert heard == [*range(20), *range(30)]
     assert "no answer in 0.2 s" in bench.said[0]
+
+
+def test_only_what_the_broker_has_taken_is_delivered(
+    running: Broker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Key figures, which nobody answers, and a connection before had the same packet numbers."""
+    monkeypatch.setattr(mqtt, "ANSWER_S", 0.2)
+    with Relay(running.port) as relay:
+        ours = channel(relay.port, cycles=True)
+        for _ in range(2):
+            ours.open()
+            for _ in range(3):
+                ours.show_cycle("{}")
+                ours.idle(threading.Event())
+            assert ours._answers == {}, "answers that nobody waits for"
+            ours.hang_up()
+        ours.open()
+        assert ours._awaited == set()
+        relay.swallows.set()
+        sent = ours.send([message(1)])
+        ours.hang_up()
+        assert (sent.delivered, type(sent.lost)) == ([], LostError)
+        relay.swallows.clear()
+        ours.open()
+        assert ours._awaited == set(), "of a connection that is no more"
+        ours.close()
 
 
 def test_what_is_left_goes_out_with_the_next_program(tmp_path: Path) -> None:

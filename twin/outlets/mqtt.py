@@ -59,6 +59,7 @@ class Mqtt:
         self._client: Client | None = None
         self._is_first = True
         self._let_in: tuple[ConnectFlags, ReasonCode, Properties] | None = None
+        self._awaited: set[int] = set()  # packets; each connection numbers them anew
         self._answers: dict[int, ReasonCode] = {}  # by packet
         self._largest = 0  # bytes of a message that the broker takes; 0 is any
         self._at_once = BATCH
@@ -76,6 +77,8 @@ class Mqtt:
         session = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
         session.SessionExpiryInterval = SESSION_S
         self._let_in = None
+        self._awaited.clear()
+        self._answers.clear()
         try:
             client.connect(
                 self._settings.host,
@@ -174,7 +177,9 @@ class Mqtt:
     def _on_publish(
         self, _client: Client, _userdata: Any, packet: int, reason: ReasonCode, _properties: Any
     ) -> None:
-        self._answers[packet] = reason
+        if packet in self._awaited:  # it comes for what nobody answers too
+            self._awaited.discard(packet)
+            self._answers[packet] = reason
 
     def _say_status(self, status: str) -> None:
         body = of_status(self._unit, status, self._clock(), _program())
@@ -217,6 +222,8 @@ class Mqtt:
         info = self._client.publish(topic, body, qos=qos, retain=True)
         if info.rc != MQTTErrorCode.MQTT_ERR_SUCCESS:
             raise self._lost(info.rc.name)
+        if qos:
+            self._awaited.add(info.mid)
         return int(info.mid)
 
     def _listen_until(self, is_done: Callable[[], bool], patience_s: float) -> None:
