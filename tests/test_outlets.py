@@ -420,6 +420,24 @@ def test_an_outbox_that_is_away_is_waited_for(bench: Bench) -> None:
     assert bench.settled() == ["1"]
 
 
+FALLS = pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+
+
+@FALLS
+def test_a_sender_that_falls_says_so(bench: Bench) -> None:
+    def fall(_message: Message) -> str:
+        raise ValueError("a defect")
+
+    bench.channel.take = fall
+    bench.put(message(1))
+    bench.sender.start()
+    bench.sender.join()
+    assert bench.said == [
+        "alarms wait in the outbox: mqtt is given up in this run: ValueError: a defect"
+    ]
+    assert bench.outbox.count("mqtt") == 1
+
+
 # --- beside the loop ----------------------------------------------------------------------------
 
 
@@ -488,3 +506,20 @@ def test_what_there_is_no_room_for_is_counted(monkeypatch: pytest.MonkeyPatch) -
     outlets._thread.start()
     outlets.close()
     assert "5 changes of alarms could not be put into the outbox" in said
+
+
+@FALLS
+def test_a_thread_of_the_outbox_that_falls_says_so(tmp_path: Path) -> None:
+    said = list[str]()
+
+    def opened() -> Outbox:
+        raise ValueError("a defect")
+
+    stream = Stream()
+    stream.at(5, deviation(5))
+    to = Sender("mqtt", Fake(), lambda: open_outbox(tmp_path / "a.sqlite", UNIT), Outlet(), print)
+    outlets = Outlets(UNIT, opened, [to], said.append)
+    outlets.begin([])
+    outlets.write(NONE, NO_TICKS, stream.said)
+    outlets.close()
+    assert said == ["changes of alarms are not put into the outbox any more: ValueError: a defect"]

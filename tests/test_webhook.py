@@ -242,3 +242,41 @@ def test_a_header_that_nobody_has_set(monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = WebhookSettings(url="https://a", headers={"A": Secret(env="TOKEN")})
     with pytest.raises(ConfigError, match=r"\[webhook\] headers.A: environment variable TOKEN"):
         Webhook(wanted, Path(), pytest.fail)
+
+
+def test_a_secret_may_end_its_line(monkeypatch: pytest.MonkeyPatch, server: Server) -> None:
+    monkeypatch.setenv("TOKEN", "Bearer s3cret\r\n")
+    url = f"http://127.0.0.1:{server.port}/"
+    wanted = WebhookSettings(url=url, headers={"A": Secret(env="TOKEN")})
+    hook = Webhook(wanted, Path(), pytest.fail)
+    assert hook.send([message(1)]).delivered == [message(1)]
+    hook.close()
+    assert server.heard[0][0]["A"] == "Bearer s3cret"
+
+
+@pytest.mark.parametrize(
+    ("secret", "why"),
+    [
+        ("two\nlines", "on one line"),
+        ("\udcff", "on one line"),
+        ("ключ", "Latin"),
+    ],
+)
+def test_a_secret_that_cannot_be_sent(
+    monkeypatch: pytest.MonkeyPatch, secret: str, why: str
+) -> None:
+    monkeypatch.setenv("TOKEN", secret)
+    wanted = WebhookSettings(url="https://a", headers={"A": Secret(env="TOKEN")})
+    with pytest.raises(ConfigError, match=r"\[webhook\] headers.A") as caught:
+        Webhook(wanted, Path(), pytest.fail)
+    assert why in caught.value.hint
+    assert secret not in str(caught.value)
+
+
+def test_a_request_that_cannot_be_made_is_lost_without_its_secrets(server: Server) -> None:
+    hook = Webhook(WebhookSettings(url=f"http://127.0.0.1:{server.port}/"), Path(), pytest.fail)
+    hook._headers["A"] = "s3cret\n"
+    lost = hook.send([message(1)]).lost
+    hook.close()
+    assert isinstance(lost, LostError)
+    assert "s3cret" not in str(lost)

@@ -87,6 +87,16 @@ class Outlets:
     # --- the thread -----------------------------------------------------------------------------
 
     def _work(self) -> None:
+        try:
+            self._write_until_the_end()
+        except Exception as error:  # ours, which is to be found in what is said
+            what = f"{type(error).__name__}: {error}"
+            self._say(f"changes of alarms are not put into the outbox any more: {what}")
+            raise
+        finally:
+            self._let_go()
+
+    def _write_until_the_end(self) -> None:
         while not self._ending.is_set():
             self._news.wait()
             self._news.clear()
@@ -97,7 +107,6 @@ class Outlets:
         left = len(self._waiting) + self._letters.qsize() + self._lost
         if left:
             self._say(f"{left} changes of alarms could not be put into the outbox")
-        self._let_go()
 
     def _write_all(self) -> bool:
         while self._waiting or not self._letters.empty():

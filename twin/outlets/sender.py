@@ -98,13 +98,23 @@ class Sender:
     # --- the thread -----------------------------------------------------------------------------
 
     def _work(self) -> None:
-        while not self._ending.is_set():
-            try:
-                if not self._go_on():
-                    self._rest()
-            except TwinError as error:
-                self._fail(error)
-        self._finish()
+        try:
+            while not self._ending.is_set():
+                self._go_on_or_wait()
+            self._finish()
+        except Exception as error:  # ours, which is to be found in what is said
+            what = f"{type(error).__name__}: {error}"
+            self._say(f"alarms wait in the outbox: {self.name} is given up in this run: {what}")
+            raise
+        finally:
+            self._let_go()
+
+    def _go_on_or_wait(self) -> None:
+        try:
+            if not self._go_on():
+                self._rest()
+        except TwinError as error:
+            self._fail(error)
 
     def _go_on(self) -> bool:
         """Deliver the next messages; False if there are none."""
@@ -198,4 +208,3 @@ class Sender:
                 self._say(f"{left} messages to {self.name} wait for the next run{with_why}")
         except TwinError as error:
             self._say(f"what waits for {self.name} is not known: {error}")
-        self._let_go()

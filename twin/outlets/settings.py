@@ -30,7 +30,7 @@ class Secret(Settings):
         return self
 
     def read(self, key: str, folder: Path, say: Say) -> str:
-        """The secret of ``key``; ConfigError where there is none.
+        """The secret of ``key``, one line; ConfigError where there is none.
 
         A file that others may read is said.
         """
@@ -38,8 +38,14 @@ class Secret(Settings):
             found, where = os.environ.get(self.env, ""), f"environment variable {self.env}"
         else:
             found, where = _read(key, folder / self.file, say), str(folder / self.file)
+        found = found.strip("\r\n")  # as echo and editors leave them
         if not found:
             raise ConfigError(f"{key}: {where} is empty or not set", "put the secret there")
+        if not found.isprintable():
+            raise ConfigError(
+                f"{key}: {where} has a line break, or another character that cannot be seen, in it",
+                "put the secret there alone, on one line of plain text",
+            )
         return found
 
 
@@ -150,7 +156,7 @@ def chosen(document: Document) -> tuple[MqttSettings, WebhookSettings]:
 def _read(key: str, path: Path, say: Say) -> str:
     try:
         mode = path.stat().st_mode
-        found = path.read_text(encoding="utf-8").strip("\r\n")
+        found = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(
             f"{key} {path}: cannot be read: {error}", "a text file with the secret alone"

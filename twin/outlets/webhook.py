@@ -7,9 +7,10 @@ from urllib.parse import urlsplit
 
 import urllib3
 
+from twin.errors import ConfigError
 from twin.outlets.message import Message
 from twin.outlets.sender import LostError, Sent
-from twin.outlets.settings import Say, WebhookSettings
+from twin.outlets.settings import Say, Secret, WebhookSettings
 
 LATER = (408, 425, 429)  # of the client's errors those that say: not now
 IDLE_S = 0.2
@@ -25,7 +26,7 @@ class Webhook:
     def __init__(self, settings: WebhookSettings, folder: Path, say: Say) -> None:
         self._settings = settings
         self._headers = {"Content-Type": "application/json"} | {
-            name: secret.read(f"[webhook] headers.{name}", folder, say)
+            name: _sendable(f"[webhook] headers.{name}", secret, folder, say)
             for name, secret in settings.headers.items()
         }
         where = urlsplit(settings.url)
@@ -78,8 +79,24 @@ class Webhook:
             )
         except urllib3.exceptions.HTTPError as error:
             raise LostError(f"webhook {self._where}: {error}", "is it there?") from error
+        except ValueError as error:  # whose words may have a secret in them
+            why = f"the request cannot be made ({type(error).__name__})"
+            raise LostError(f"webhook {self._where}: {why}", "check [webhook]") from None
         if answer.status in LATER or answer.status >= 500:
             raise LostError(f"webhook {self._where}: status {answer.status} {answer.reason or ''}")
         if answer.status >= 300:
             return f"{self._where}: status {answer.status} {answer.reason or ''}".rstrip()
         return ""
+
+
+def _sendable(key: str, secret: Secret, folder: Path, say: Say) -> str:
+    """The secret, if a header can have it; ConfigError if not."""
+    found = secret.read(key, folder, say)
+    try:
+        found.encode("latin-1")
+    except UnicodeEncodeError:
+        raise ConfigError(
+            f"{key}: the secret has a character that no header can have",
+            "only Latin letters, digits and signs; was it copied whole and right?",
+        ) from None
+    return found
