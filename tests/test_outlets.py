@@ -508,6 +508,25 @@ def test_what_there_is_no_room_for_is_counted(monkeypatch: pytest.MonkeyPatch) -
     assert "5 changes of alarms could not be put into the outbox" in said
 
 
+def test_the_end_does_not_wait_for_who_does_not_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dispatch, "CLOSE_S", 0.05)
+    said, answers, channel = list[str](), threading.Event(), Fake()
+    channel.take = lambda _one: "" if answers.wait(20.0) else "never"
+    opened = lambda: open_outbox(tmp_path / "a.sqlite", UNIT)  # noqa: E731
+    with opened() as outbox:
+        outbox.put([("mqtt", message(1))])
+    to = Sender("mqtt", channel, opened, Outlet(), print)
+    outlets = Outlets(UNIT, opened, [to], said.append)
+    outlets.begin([])
+    outlets.close()
+    assert "mqtt does not answer: the rest waits for the next run" in said
+    assert channel.taken == []
+    answers.set()
+    assert to.join(20.0)
+
+
 @FALLS
 def test_a_thread_of_the_outbox_that_falls_says_so(tmp_path: Path) -> None:
     said = list[str]()

@@ -1,9 +1,12 @@
 """Alarms by POST at a real HTTP server: again where that helps, set aside where it does not."""
 
 import json
+import socket
 import ssl
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -18,7 +21,7 @@ from twin.cli_outlets import outlets_of
 from twin.config import Config
 from twin.errors import ConfigError
 from twin.outlets import sender
-from twin.outlets.sender import LostError
+from twin.outlets.sender import LostError, Sent
 from twin.outlets.settings import Secret, Tls, WebhookSettings
 from twin.outlets.webhook import Webhook
 from twin.settings import Document
@@ -190,6 +193,58 @@ def test_a_server_that_does_not_answer_is_asked_again(tmp_path: Path, server: Se
     bench.end()
     assert server.taken() == ["1"]
     assert "timed out" in bench.said[0]
+
+
+@contextmanager
+def answering(answer: Callable[[socket.socket], None]) -> Iterator[int]:
+    """A port that takes one request and lets ``answer`` say what it will."""
+
+    def serve() -> None:
+        taken, _ = listener.accept()
+        with taken, suppress(OSError):  # the other side may leave
+            taken.recv(65536)
+            answer(taken)
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield listener.getsockname()[1]
+        thread.join()
+
+
+def posted(port: int, timeout_s: float) -> Sent:
+    url = f"http://127.0.0.1:{port}/"
+    hook = Webhook(WebhookSettings(url=url, timeout_s=timeout_s), Path(), pytest.fail)
+    sent = hook.send([message(1)])
+    hook.close()
+    return sent
+
+
+def test_an_answer_that_drips_is_not_waited_for() -> None:
+    def drip(taken: socket.socket) -> None:
+        taken.sendall(b"HTTP/1.1 204 No Content\r\nX: ")
+        for _ in range(100):
+            taken.sendall(b"x")
+            time.sleep(0.02)
+        taken.sendall(b"\r\n\r\n")
+
+    with answering(drip) as port:
+        sent = posted(port, 0.2)
+    assert sent.delivered == []
+    assert "timed out" in str(sent.lost)
+
+
+def test_what_comes_with_an_answer_is_not_read() -> None:
+    gone = threading.Event()
+
+    def promise(taken: socket.socket) -> None:
+        taken.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 1000000000\r\n\r\n")
+        gone.wait(20.0)
+
+    with answering(promise) as port:
+        sent = posted(port, 5.0)
+        gone.set()
+    assert sent.delivered == [message(1)]
 
 
 def test_inside_tls(tmp_path: Path) -> None:

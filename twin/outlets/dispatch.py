@@ -17,6 +17,7 @@ from twin.signals import Samples, Ticks
 MOST_IN_MEMORY = 10_000  # messages, while the database is away
 MOST_AT_ONCE = 1000
 RETRY_S = 5.0
+CLOSE_S = 15.0  # for all threads to end; they die with the program
 Letter = tuple[str, Message]  # to whom, and what
 
 
@@ -68,14 +69,21 @@ class Outlets:
                 self._show_cycle(of_cycle(self._unit, event))
 
     def close(self) -> None:
-        """Write and deliver what can be at once; the rest waits for the next run."""
+        """Write and deliver what can be at once; the rest waits for the next run.
+
+        Whoever still waits for an answer then is left behind, and that is said.
+        """
+        end = time.monotonic() + CLOSE_S
         self._ending.set()
         self._news.set()
-        self._thread.join()
+        self._thread.join(CLOSE_S)
+        if self._thread.is_alive():
+            self._say("the last changes of alarms may not be in the outbox: it does not answer")
         for sender in self._senders:
             sender.end()
         for sender in self._senders:
-            sender.join()
+            if not sender.join(max(0.0, end - time.monotonic())):
+                self._say(f"{sender.name} does not answer: the rest waits for the next run")
 
     def _put(self, name: str, message: Message) -> None:
         try:

@@ -91,9 +91,10 @@ class Sender:
         self._ending.set()
         self._wake.set()
 
-    def join(self) -> None:
-        """Wait until it has stopped."""
-        self._thread.join()
+    def join(self, patience_s: float | None = None) -> bool:
+        """Wait until it has stopped; whether it has."""
+        self._thread.join(patience_s)
+        return not self._thread.is_alive()
 
     # --- the thread -----------------------------------------------------------------------------
 

@@ -1,11 +1,15 @@
 """Alarms to an address that takes JSON by POST, one after the other."""
 
+import socket
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import urllib3
+from urllib3.connection import HTTPConnection, HTTPSConnection
+from urllib3.response import HTTPResponse
 
 from twin.errors import ConfigError
 from twin.outlets.message import Message
@@ -35,9 +39,10 @@ class Webhook:
         self._pool = urllib3.PoolManager(
             1,
             retries=False,  # nor redirects
-            timeout=settings.timeout_s,
+            timeout=urllib3.Timeout(total=settings.timeout_s),
             ssl_context=settings.tls.context("webhook", folder) if secured else None,
         )
+        self._pool.pool_classes_by_scheme = {"http": _Plain, "https": _Secured}
 
     def open(self) -> bool:
         """There is a connection for each request, if need be."""
@@ -75,8 +80,13 @@ class Webhook:
         headers = {**self._headers, "Idempotency-Key": message.id}
         try:
             answer = self._pool.request(
-                "POST", self._settings.url, body=message.body.encode(), headers=headers
+                "POST",
+                self._settings.url,
+                body=message.body.encode(),
+                headers=headers,
+                preload_content=False,  # nobody reads it, however long it is
             )
+            answer.close()
         except urllib3.exceptions.HTTPError as error:
             raise LostError(f"webhook {self._where}: {error}", "is it there?") from error
         except ValueError as error:  # whose words may have a secret in them
@@ -87,6 +97,40 @@ class Webhook:
         if answer.status >= 300:
             return f"{self._where}: status {answer.status} {answer.reason or ''}".rstrip()
         return ""
+
+
+class _InTime(HTTPConnection):
+    """Its timeout is for a whole answer; the library's is for each piece of it."""
+
+    def getresponse(self) -> HTTPResponse:  # type: ignore[override]  # as the library has it
+        sock, late = self.sock, threading.Event()
+
+        def cut() -> None:
+            late.set()
+            with suppress(OSError):  # it is closed already
+                sock.shutdown(socket.SHUT_RDWR)
+
+        timer = threading.Timer(self.timeout or 0.0, cut)
+        timer.start()
+        try:
+            return super().getresponse()
+        finally:
+            timer.cancel()
+            timer.join()
+            if late.is_set():  # what was cut may look whole
+                raise TimeoutError("timed out")
+
+
+class _InTimeTls(_InTime, HTTPSConnection):
+    pass
+
+
+class _Plain(urllib3.HTTPConnectionPool):
+    ConnectionCls = _InTime
+
+
+class _Secured(urllib3.HTTPSConnectionPool):
+    ConnectionCls = _InTimeTls
 
 
 def _sendable(key: str, secret: Secret, folder: Path, say: Say) -> str:
