@@ -133,6 +133,43 @@ def test_a_plc_that_begins_anew_does_not_stop_the_rows(path: Path) -> None:
     assert list(live.rows["time_ns"] // ROW_NS) == [2400, 2401, 0, 1]
 
 
+def test_while_plc_time_stands_still_no_more_than_a_bound_is_held(path: Path) -> None:
+    samples, ticks = flat(PER_ROW)
+    samples["time_ns"] = 60 * S
+    held = samples[:0], ticks[:0]
+    rows: list[np.float32] = []
+    for _ in range(200):
+        held = np.concatenate([held[0], samples]), np.concatenate([held[1], ticks])
+        made, held = ring._binned(*held)
+        rows.extend(made["measured_low"])
+        assert len(held[0]) == len(held[1]) < ring.MOST_HELD
+    assert rows == [np.float32(1e5)] * (200 * PER_ROW // ring.MOST_HELD)
+    left(path, *[(samples, ticks)] * 200)
+    live = read(path)
+    assert live is not None
+    assert live.next == len(rows)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_the_end_does_not_wait_for_a_thread_that_fell(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fall(*_told: object) -> None:
+        raise ValueError("a defect")
+
+    monkeypatch.setattr(ring, "MOST_WAITING", 2)
+    monkeypatch.setattr(ring._Writer, "add", fall)
+    live = LiveRows(path, AMBIENT, lambda _what: None)
+    live.write(*flat(1), [])
+    live._thread.join()
+    for _ in range(3):
+        live.write(*flat(1), [])  # nobody takes them
+    ends = threading.Thread(target=live.close, daemon=True)
+    ends.start()
+    ends.join(20.0)
+    assert not ends.is_alive()
+
+
 def test_another_run_of_the_same_ejector_is_refused(path: Path) -> None:
     first = LiveRows(path, AMBIENT, pytest.fail)
     with pytest.raises(SourceError, match="cannot be written") as caught:

@@ -12,6 +12,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from fcntl import LOCK_EX, LOCK_NB, flock
 from pathlib import Path
@@ -54,6 +55,8 @@ ROW_NS = 25_000_000
 DEPTH = 2400  # rows: a minute
 FILE = np.dtype([("head", HEAD), ("rows", ROW, (DEPTH,))])
 MOST_WAITING = 400  # blocks: 12 s at 30 ms
+MOST_HELD = 1000  # samples of a row that is not over: its time at 40 kHz
+CLOSE_S = 0.1  # between looks whether the thread is still there
 STALE_S = 5.0  # a driver yields a block at least every half a second
 
 _VALUES = [name for name in ROW.fields or () if name not in ("number", "again", "spare")]
@@ -95,7 +98,10 @@ class LiveRows:
 
     def close(self) -> None:
         """Write what waits, and that the run has ended."""
-        self._blocks.put(None)
+        while self._thread.is_alive():  # one that fell takes nothing any more
+            with suppress(queue.Full):
+                self._blocks.put(None, timeout=CLOSE_S)
+                break
         self._thread.join()
         self._file.close()
 
@@ -108,9 +114,14 @@ class LiveRows:
 
 
 def _binned(samples: Samples, ticks: Ticks) -> tuple[Rows, tuple[Samples, Ticks]]:
-    """A row for each stretch of ROW_NS that is over, and what is left of one that is not."""
+    """A row for each stretch of ROW_NS that is over, and what is left of one that is not.
+
+    Of a PLC whose time stands still there is a row all the same, whenever MOST_HELD are left.
+    """
     stretch = samples["time_ns"] // ROW_NS
     cuts = np.flatnonzero(np.diff(stretch)) + 1
+    if len(samples) - (cuts[-1] if len(cuts) else 0) >= MOST_HELD:
+        cuts = np.append(cuts, len(samples))
     if not len(cuts):
         return np.empty(0, ROW), (samples, ticks)
     end, starts = cuts[-1], np.concatenate([[0], cuts[:-1]])
