@@ -173,6 +173,14 @@ def test_every_answer_says_what_a_browser_may_do_with_it(site: Site) -> None:
         assert headers["x-frame-options"] == "DENY"
 
 
+@pytest.mark.parametrize("number", ["9" * 5000, "9" * 19, "-1", "1.0", "x", "%C2%B2"])
+@pytest.mark.parametrize(
+    "path", ["/api/ejectors/{}/history", f"/reports/{{}}/{REPORT}", ASK + "/{}"]
+)
+def test_what_is_no_number_is_not_found(site: Site, path: str, number: str) -> None:
+    assert site.client.get(path.format(number)).status_code == 404
+
+
 def test_errors_are_plain_pages_and_plain_json(site: Site) -> None:
     page = site.client.get("/<script>")
     assert page.status_code == 404
@@ -356,7 +364,11 @@ def test_what_no_run_would_grant_is_refused_at_once(site: Site) -> None:
     assert _asked(site) == []
 
 
-@pytest.mark.parametrize("body", ["", "[]", "3", "{}", '{"alarm": 1}', "{" * 3000, "x" * 5000])
+NO_REQUESTS = ("", "[]", "3", "{}", '{"alarm": 1}', "{" * 3000, "[" * 4000, "x" * 5000)
+HUGE = f'{{"alarm": "{LEAK}", "deed": "acknowledged", "seconds": 1{"0" * 400}}}'
+
+
+@pytest.mark.parametrize("body", [*NO_REQUESTS, HUGE])
 def test_what_is_no_request_is_refused(site: Site, body: str) -> None:
     _leaking(site)
     site.log_in()

@@ -39,6 +39,9 @@ MOST_BODY = 4096  # bytes that anybody may send
 MOST_DAYS = 400.0
 ROWS_S = 0.08  # between batches of live rows
 STATE_S = 1.0  # between looks at alarms
+MOST_DIGITS = 18  # of a number, which then is one to a database too
+# What reading a body raises that has something else in it; also one nested without end.
+NO_REQUEST = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
 SLOWEST_S = 20.0  # for a browser to take one message
 
 STATIC = {
@@ -117,7 +120,7 @@ class Page:
 
     def app(self) -> ASGIApp:
         """As uvicorn takes it."""
-        one = "/api/ejectors/{number:int}"
+        one = "/api/ejectors/{number}"
         routes = [
             Route("/", self.index),
             Route("/login", self.login_page),
@@ -128,8 +131,8 @@ class Page:
             Route(f"{one}/history", self.history),
             Route(f"{one}/trends/{{name}}", self.trend),
             Route(f"{one}/requests", self.ask, methods=["POST"]),
-            Route(f"{one}/requests/{{request_number:int}}", self.answer),
-            Route("/reports/{number:int}/{name}", self.report),
+            Route(f"{one}/requests/{{request_number}}", self.answer),
+            Route("/reports/{number}/{name}", self.report),
             WebSocketRoute("/live", self.live),
         ]
         handlers: dict[Any, Any] = {HTTPException: self.refused, TwinError: self.trouble}
@@ -247,7 +250,7 @@ class Page:
     # --- what there is to know ------------------------------------------------------------------
 
     def _ejector(self, request: Request) -> Ejector:
-        number = int(request.path_params["number"])
+        number = _number(request, "number")
         if number >= len(self.ejectors):
             raise HTTPException(HTTPStatus.NOT_FOUND, "no such ejector")
         return self.ejectors[number]
@@ -272,7 +275,7 @@ class Page:
             asked = json.loads(await _body(request))
             alarm, deed = str(asked["alarm"]), str(asked["deed"])
             seconds = float(asked.get("seconds", 0.0))
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except NO_REQUEST as error:
             raise HTTPException(HTTPStatus.BAD_REQUEST, "not a request") from error
         number = await run_sync(ejector.ask, alarm, deed, session.user, seconds)
         return JSONResponse({"request": number}, HTTPStatus.ACCEPTED)
@@ -280,7 +283,7 @@ class Page:
     async def answer(self, request: Request) -> Response:
         """What has become of it: null while nobody has answered, empty if it was done."""
         self._require_sight(request)
-        number = request.path_params["request_number"]
+        number = _number(request, "request_number")
         return JSONResponse({"answer": await run_sync(self._ejector(request).answer, number)})
 
     # --- live -----------------------------------------------------------------------------------
@@ -433,6 +436,14 @@ async def _body(request: Request) -> bytes:
         if len(body) > MOST_BODY:
             raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "that is too much")
     return body
+
+
+def _number(request: Request, name: str) -> int:
+    """A number in the path; NOT_FOUND for anything else, and for one that nothing can have."""
+    text = str(request.path_params[name])
+    if not (text.isascii() and text.isdigit() and len(text) <= MOST_DIGITS):
+        raise HTTPException(HTTPStatus.NOT_FOUND)
+    return int(text)
 
 
 def _days(request: Request) -> float:
