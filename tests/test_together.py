@@ -298,7 +298,7 @@ def test_one_that_cannot_begin_leaves_the_others_and_is_exit_code_3(
 
 @pytest.mark.parametrize(
     ("options", "complaint"),
-    [((), "are both of gripper-01"), (("--id", "x"), "--id is for one"), (("--view",), "--view")],
+    [((), "are both of gripper-01"), (("--id", "x"), "--id is for one")],
 )
 def test_what_cannot_be_meant_for_several_is_exit_code_2(
     options: tuple[str, ...],

@@ -17,7 +17,7 @@ import pytest
 from twin.errors import ConfigError, SourceError
 from twin.events import Event, Kind
 from twin.signals import MBAR, SAMPLE, TICK, Command, Phase, Quality, Samples, Ticks
-from twin.view import TIMELINE, View
+from twin.view import TIMELINE, Screen, View
 
 AMBIENT = 100_000.0
 START_NS = 1_790_000_000_000_000_000
@@ -42,11 +42,13 @@ def block(rows: int, first: int = 0) -> tuple[Samples, Ticks]:
 
 
 def record(path: Path, *blocks: tuple[Samples, Ticks], events: tuple[Event, ...] = ()) -> None:
-    view = View("gripper 7", path, AMBIENT)
+    screen = Screen("gripper 7", path)
+    view = View(screen, AMBIENT)
     for samples, ticks in blocks:
         view.write(samples, ticks, events)
         events = ()
     view.close()
+    screen.close()
 
 
 def rows(path: Path, entity: str, component: str) -> list[tuple[int, Any]]:
@@ -144,7 +146,8 @@ def test_rows_are_sent_when_enough_time_is_there_or_nothing_more_comes(
 ) -> None:
     sent: list[int] = []
     monkeypatch.setattr(View, "_send_phases", lambda _, samples, __: sent.append(len(samples)))
-    view = View("gripper 7", target, AMBIENT)
+    screen = Screen("gripper 7", target)
+    view = View(screen, AMBIENT)
     view.write(*block(600), [])
     assert sent == []
     view.write(*block(500, 600), [])
@@ -155,7 +158,7 @@ def test_rows_are_sent_when_enough_time_is_there_or_nothing_more_comes(
     view.write(*block(1, 9000), [])
     view.write(*block(1), [])  # the PLC's clock jumped back
     assert sent == [1100, 5, 2]
-    view.close()
+    screen.close()
 
 
 def test_events_are_a_text_log_with_levels(target: Path) -> None:
@@ -167,19 +170,64 @@ def test_events_are_a_text_log_with_levels(target: Path) -> None:
     assert rows(target, "/events/cycle", "TextLog:level") == [(9, "INFO")]
 
 
-def test_layout_and_name_stand_in_the_recording(target: Path) -> None:
-    record(target, block(10))
-    chunk = pytest.importorskip("rerun.chunk")
-    reader = chunk.RrdReader(target)
-    (layout,) = reader.blueprints()
+def test_alarms_stand_beside_events(target: Path) -> None:
+    alarm = Event(START_NS + 5 * MS_NS, Kind.ALARM, "raised")
+    gone = Event(START_NS + 9 * MS_NS, Kind.ALARM_CHANGED, "acknowledged")
+    record(target, block(10), events=(alarm, gone))
+    assert rows(target, "/alarms/alarm", "TextLog:level") == [(5, "WARN")]
+    assert rows(target, "/alarms/alarm_changed", "TextLog:text") == [(9, gone.text)]
+    assert not rows(target, "/events/alarm", "TextLog:text")
+
+
+def test_probabilities_of_what_is_no_longer_likely_come_to_0(target: Path) -> None:
+    said = ({"none": 1.0}, {"none": 0.1, "leakage": 0.9}, None, {"none": 0.3, "sensor_lag": 0.7})
+    events = tuple(
+        Event(START_NS + at * MS_NS, Kind.CYCLE, "", {} if one is None else {"probabilities": one})
+        for at, one in enumerate(said)
+    )
+    record(target, block(10), events=events)
+    assert scalars(target, "/probabilities/none") == {0: 1.0, 1: 0.1, 3: 0.3}
+    assert scalars(target, "/probabilities/leakage") == {1: 0.9, 3: 0.0}
+    assert scalars(target, "/probabilities/sensor_lag") == {3: 0.7}
+
+
+def test_several_ejectors_are_apart_in_one_recording(target: Path) -> None:
+    names = ("rig-01", "grüner_2.b")
+    screen = Screen("two", target, names)
+    views = [View(screen, AMBIENT, name) for name in names]
+    said = {"probabilities": {"none": 1.0}}
+    for number, view in enumerate(views):
+        event = Event(START_NS, Kind.CYCLE, f"of {names[number]}", said)
+        view.write(*block(7 + number), [event])
+        view.close()
+    screen.close()
+    for number, name in enumerate(("rig-01", "grüner_2.b")):
+        for entity in SERIES:
+            assert len(scalars(target, f"/{name}{entity}")) == 7 + number
+        assert rows(target, f"/{name}/phase", "StateChange:state") == [(0, "idle")]
+        assert rows(target, f"/{name}/events/cycle", "TextLog:text") == [(0, f"of {names[number]}")]
+        assert scalars(target, f"/{name}/probabilities/none") == {0: 1.0}
+    assert layout(target) == {"TimeSeries": 2 * 4 + 2 * 2, "StateTimeline": 2, "TextLog": 2 * 2 + 1}
+
+
+def layout(path: Path) -> Counter[str]:
+    """Count the views of each kind that a recording asks for."""
+    reader = pytest.importorskip("rerun.chunk").RrdReader(path)
+    (plan,) = reader.blueprints()
     kinds: Counter[str] = Counter()
-    for piece in reader.stream(store=layout):
+    for piece in reader.stream(store=plan):
         batch = piece.to_record_batch()
         if "ViewBlueprint:class_identifier" in batch.schema.names:
             kinds.update(
                 kind for (kind,) in batch.column("ViewBlueprint:class_identifier").to_pylist()
             )
-    assert kinds == {"TimeSeries": 3, "StateTimeline": 1, "TextLog": 1}
+    return kinds
+
+
+def test_layout_and_name_stand_in_the_recording(target: Path) -> None:
+    record(target, block(10))
+    assert layout(target) == {"TimeSeries": 4, "StateTimeline": 1, "TextLog": 2}
+    reader = pytest.importorskip("rerun.chunk").RrdReader(target)
     properties = [
         p.to_record_batch().to_pydict() for p in reader.stream() if "prop" in p.entity_path
     ]
@@ -187,17 +235,19 @@ def test_layout_and_name_stand_in_the_recording(target: Path) -> None:
 
 
 def test_closing_twice_and_writing_after_it_does_nothing(target: Path) -> None:
-    view = View("gripper 7", target, AMBIENT)
-    view.close()
+    screen = Screen("gripper 7", target)
+    view = View(screen, AMBIENT)
+    screen.close()
     view.write(*block(2), [])
     view.close()
+    screen.close()
     assert not scalars(target, "/deviation")
 
 
 def test_file_that_cannot_be_written_is_named(target: Path) -> None:
     path = target / "nowhere" / "view.rrd"
     with pytest.raises(SourceError, match="nowhere"):
-        View("gripper 7", path, AMBIENT)
+        Screen("gripper 7", path)
 
 
 def test_missing_rerun_says_what_to_install(
@@ -205,43 +255,47 @@ def test_missing_rerun_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(ConfigError) as caught:
-        View("gripper 7", tmp_path / "view.rrd", AMBIENT)
+        Screen("gripper 7", tmp_path / "view.rrd")
     assert "ejector-twin[view]" in caught.value.hint
 
 
 @pytest.fixture
-def live(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[View, psutil.Process]]:
+def live(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Screen, psutil.Process]]:
     """Start a view with a viewer that serves a page; there is no window in a test."""
     pytest.importorskip("rerun")
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "CI"):
         monkeypatch.delenv(name, raising=False)
     before = psutil.Process().children()
-    view = View("gripper 7", None, AMBIENT)
+    screen = Screen("gripper 7", None)
     (viewer,) = (one for one in psutil.Process().children() if one not in before)
-    yield view, viewer
-    view.close()
+    yield screen, viewer
+    screen.close()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the viewer opens a window")
 class TestLive:
     def test_listens_on_loopback_only_and_ends_with_the_view(
-        self, live: tuple[View, psutil.Process]
+        self, live: tuple[Screen, psutil.Process]
     ) -> None:
-        view, viewer = live
+        screen, viewer = live
+        view = View(screen, AMBIENT)
         listening = [c.laddr for c in viewer.net_connections("inet") if c.status == "LISTEN"]
         assert {address.ip for address in listening} == {"127.0.0.1"}
-        assert urlsplit(view.url).port in {address.port for address in listening}
+        assert urlsplit(screen.url).port in {address.port for address in listening}
         view.write(*block(200), [])
         view.close()
+        assert viewer.is_running()  # other views may draw on
+        screen.close()
         assert not viewer.is_running()
 
-    def test_sends_no_usage_statistics(self, live: tuple[View, psutil.Process]) -> None:
+    def test_sends_no_usage_statistics(self, live: tuple[Screen, psutil.Process]) -> None:
         assert live[1].environ()["CI"]  # what Rerun looks at before it reports anything
 
     def test_a_viewer_that_was_closed_ends_the_view_only(
-        self, live: tuple[View, psutil.Process], caplog: pytest.LogCaptureFixture
+        self, live: tuple[Screen, psutil.Process], caplog: pytest.LogCaptureFixture
     ) -> None:
-        view, viewer = live
+        screen, viewer = live
+        view = View(screen, AMBIENT)
         viewer.kill()
         with caplog.at_level(logging.WARNING):
             for first in range(0, 10_000, 100):
@@ -249,9 +303,10 @@ class TestLive:
         assert caplog.text.count("going on without it") == 1
 
     def test_a_viewer_that_hangs_ends_the_view_only(
-        self, live: tuple[View, psutil.Process], monkeypatch: pytest.MonkeyPatch
+        self, live: tuple[Screen, psutil.Process], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        view, viewer = live
+        screen, viewer = live
+        view = View(screen, AMBIENT)
         monkeypatch.setattr("twin.view.MISSES", 2)
         os.kill(viewer.pid, signal.SIGSTOP)
         for first in range(0, 20_000_000, 100_000):

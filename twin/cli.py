@@ -11,10 +11,11 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
+from threading import Lock
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from twin.monitor.detect import Monitor
     from twin.settings import Document
     from twin.signals import Samples, Ticks
+    from twin.view import Screen
 
 INTERRUPTED = 130
 ALARMED = 1
@@ -112,10 +114,10 @@ def run(
     from twin.together import run_together
 
     alone = len(configs) == 1
-    if not alone and (unit or view):
+    if not alone and unit:
         raise ConfigError(
-            f"{'--id' if unit else '--view'} is for one ejector, and here are {len(configs)}",
-            "leave it out; --rrd FILE writes what is to be viewed",
+            f"--id is for one ejector, and here are {len(configs)}",
+            "leave it out, and give each configuration its own under [asset]",
         )
     ejectors = _named([_configured(Document.read(one), assets, unit) for one in configs])
     pairs = {name: _pair(one) for name, one in ejectors.items()}  # compiled before time counts
@@ -141,7 +143,7 @@ def run(
                 (lambda: shown) if shown else None,
                 keeper_of(settings, _complain),
                 live_rows_of(settings, _complain),
-                _view_of(settings, view, _file_of(rrd, label)),
+                view_of(name),
                 lambda: Console(label.ljust(max(map(len, ejectors))) if label else "", events),
             )
             status = _status if alone else _unsaid
@@ -160,9 +162,13 @@ def run(
     failed: list[str] = []
     units = {figure.name: figure.unit for figure in FIGURES.values()}
     documents = [one.document for one in ejectors.values()]
-    with open_results(documents, units) as show, _stop_on_signal(duration) as stopped:
+    with (
+        open_results(documents, units) as show,
+        _views_of(ejectors, view, rrd) as view_of,
+        _stop_on_signal(duration) as stopped,
+    ):
         if alone:
-            beside(*ejectors.popitem())
+            beside(*next(iter(ejectors.items())))
         else:
             loops = {name: partial(beside, name, one) for name, one in ejectors.items()}
             failed = run_together(loops, lambda name, why: _complain(f"{name}: {why}"))
@@ -195,11 +201,11 @@ def replay(
     settings = _settings_of(recorded.header, log, config, assets, unit, as_of)
     twin, monitor = _pair(settings)
     alarms = alarms_of(settings)()
-    with _stop_on_signal(None) as stopped:
+    with _views_of({"": settings}, view, rrd) as view_of, _stop_on_signal(None) as stopped:
         console = Console()
         sinks = _opened(
             (lambda: Recorder(output, _header(settings))) if output else None,
-            _view_of(settings, view, rrd),
+            view_of(""),
             lambda: console,
         )
         blocks = _progress((samples for samples, _ in recorded.blocks()), "replaying")
@@ -644,24 +650,36 @@ def _told(standing: "Standing", shown: "Results | None", outlets: "Begin | None"
     return [] if outlets is None else [outlets(standing)]
 
 
-def _view_of(settings: "Config", view: bool, rrd: Path | None) -> "Callable[[], Sink] | None":
-    """What opens the Rerun view, in a window or in a file; or None."""
-    if not view and rrd is None:
-        return None
+@contextmanager
+def _views_of(
+    ejectors: "dict[str, Config]", view: bool, rrd: Path | None
+) -> "Iterator[Callable[[str], Callable[[], Sink] | None]]":
+    """Give what opens the Rerun view of an ejector, by its name: all in one window or one file."""
     if view and rrd is not None:
         raise ConfigError("--view and --rrd exclude each other", "open the file: rerun FILE.rrd")
+    one_at_a_time, alone = Lock(), len(ejectors) == 1
+    with ExitStack() as closing:
 
-    def open_view() -> "Sink":
-        from twin.signals import MBAR
-        from twin.view import View
+        @cache
+        def screen() -> "Screen":  # opened by the first that has something to show
+            from twin.view import Screen
 
-        title = f"{settings.asset.type} {settings.asset.id}"
-        shown = View(title, rrd, settings.data.ambient.pressure_mbar * MBAR)
-        if shown.url:
-            print(f"the view is at {shown.url}", file=sys.stderr)
-        return shown
+            titles = [f"{one.asset.type} {one.asset.id}" for one in ejectors.values()]
+            opened = Screen(", ".join(titles), rrd, ("",) if alone else tuple(ejectors))
+            closing.callback(opened.close)
+            if opened.url:
+                print(f"the view is at {opened.url}", file=sys.stderr)
+            return opened
 
-    return open_view
+        def open_view(name: str) -> "Sink":
+            from twin.signals import MBAR
+            from twin.view import View
+
+            ambient = ejectors[name].data.ambient.pressure_mbar * MBAR
+            with one_at_a_time:
+                return View(screen(), ambient, "" if alone else name)
+
+        yield lambda name: partial(open_view, name) if view or rrd is not None else None
 
 
 @contextmanager

@@ -14,6 +14,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.errors import ConfigError, SourceError
-from twin.events import Event, Severity
+from twin.events import Event, Kind, Severity
 from twin.signals import (
     BREAK,
     MBAR,
@@ -63,66 +64,76 @@ _PHASES = {
     Phase.HOLD: ("hold (air saving)", 0x3C9D6BFF),
     Phase.BLOW_OFF: ("blow-off", 0x8E5BB5FF),
 }
+_ALARMS = (Kind.ALARM, Kind.ALARM_CHANGED)
+NO_CAUSE = "no cause: as healthy"
 _LEVELS = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ALARM: "ERROR"}
 
 _log = logging.getLogger(__name__)
 
 
-class View:
-    """A sink that draws what it is given; ``url`` is the page to open where there is no window."""
+class Screen:
+    """One recording, in a file or in a viewer on this machine: what all views are drawn on.
 
-    def __init__(self, title: str, target: Path | None, ambient_pa: float) -> None:
-        """Write to the file ``target``, or start a viewer on this machine where it is None.
+    Views may draw from threads of their own. ``url`` is the page to open where there is no window.
+    """
 
-        Vacuum is drawn in mbar below ``ambient_pa`` (Pa, absolute). ConfigError if Rerun is not
-        installed; SourceError if the file cannot be written or no viewer starts.
+    def __init__(self, title: str, target: Path | None, ejectors: Sequence[str] = ("",)) -> None:
+        """Write to the file ``target``, or start a viewer where it is None.
+
+        Of several ``ejectors`` each has a page named after it, and one shows all. ConfigError if
+        Rerun is not installed; SourceError if the file cannot be written or no viewer starts.
         """
-        self._rr = _rerun()
-        self._ambient_pa = ambient_pa
-        self._waiting: list[tuple[Samples, Ticks]] = []
-        self._phase = -1
-        self._last_ns: int | None = None
+        self.rr = import_rerun()
         self._misses = 0
-        self._batch_ns = FILE_BATCH_NS if target else LIVE_BATCH_NS
+        self._asking = threading.Lock()
+        self.batch_ns = FILE_BATCH_NS if target else LIVE_BATCH_NS
         self._viewer = None if target else _Viewer()
         self.url = self._viewer.url if self._viewer else ""
-        self._stream: Any = self._rr.RecordingStream("ejector-twin")
-        self._connect(target)
+        self._stream: Any = self.rr.RecordingStream("ejector-twin")
+        self._connect(target, _blueprint(self.rr, ejectors, live=target is None))
         self._stream.send_recording_name(title)
-        self._style()
 
-    def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
-        """Take row-aligned blocks of SAMPLE and TICK and what happened in them.
+    def style(self, path: str, archetype: Any) -> None:
+        """Say once how an entity is drawn."""
+        if stream := self._stream:
+            stream.log(path, archetype, static=True, strict=True)
 
-        A viewer that is closed, or hangs for some seconds, ends the view and nothing else.
+    def send(self, path: str, time_ns: npt.NDArray[np.int64], values: Any) -> None:
+        """Draw columns of an entity at PLC times; nothing once the screen is gone."""
+        if stream := self._stream:
+            column = self.rr.TimeColumn(TIMELINE, timestamp=time_ns.astype("datetime64[ns]"))
+            stream.send_columns(path, [column], values, strict=True)
+
+    def follow(self) -> None:
+        """Ask whether the viewer still reads, which bounds what can pile up in memory for it.
+
+        One that is closed, or hangs for some seconds, ends the screen and nothing else.
         """
-        if self._stream is None:
-            return
-        for event in events:
-            self._send_event(event)
-        if len(samples):
-            self._waiting.append((samples, ticks))
-        if self._waiting and (not len(samples) or self._span_ns() >= self._batch_ns):
-            self._send_waiting()
-            if self._viewer and not self._follows(self._viewer):
+        if self._viewer is None or not self._asking.acquire(blocking=False):
+            return  # somebody else is waiting for it: once is enough
+        try:
+            if self._stream and not self._follows(self._viewer):
                 _log.warning("the Rerun viewer was closed or hangs: going on without it")
-                self.close()
+                self._end()
+        finally:
+            self._asking.release()
 
     def close(self) -> None:
-        """Send the rest; end the viewer if one was started, else complete the file."""
-        if self._stream is None:
+        """End the viewer if one was started, else complete the file."""
+        with self._asking:
+            self._end()
+
+    def _end(self) -> None:
+        stream, self._stream = self._stream, None
+        if stream is None:
             return
-        if self._waiting:
-            self._send_waiting()
-        if self._viewer and not self._delivered():
+        if self._viewer and not self._delivered(stream):
             self._viewer.close()  # while it hangs, disconnecting would wait for it for ever
-        self._stream.disconnect()
-        self._stream = None
+        stream.disconnect()
         if self._viewer:
             self._viewer.close()
 
-    def _connect(self, target: Path | None) -> None:
-        plan = _blueprint(self._rr, live=target is None)
+    def _connect(self, target: Path | None, plan: Any) -> None:
         if self._viewer:
             self._stream.connect_grpc(self._viewer.address, default_blueprint=plan)
             return
@@ -133,16 +144,60 @@ class View:
                 f"{target}: cannot be written: {error}", "check the folder and its rights"
             ) from error
 
+    def _follows(self, viewer: "_Viewer") -> bool:
+        if not viewer.running():
+            return False
+        self._misses = 0 if self._delivered(self._stream) else self._misses + 1
+        return self._misses < MISSES
+
+    def _delivered(self, stream: Any) -> bool:
+        try:
+            stream.flush(timeout_sec=PATIENCE_S)
+        except RuntimeError:
+            return False
+        return True
+
+
+class View:
+    """A sink that draws one ejector on a screen, below the entity path ``name`` if it has one."""
+
+    def __init__(self, screen: Screen, ambient_pa: float, name: str = "") -> None:
+        """Draw vacuum in mbar below ``ambient_pa`` (Pa, absolute)."""
+        self._screen = screen
+        self._rr = screen.rr
+        self._ambient_pa = ambient_pa
+        self._at = f"{name}/" if name else ""
+        self._waiting: list[tuple[Samples, Ticks]] = []
+        self._phase = -1
+        self._last_ns: int | None = None
+        self._causes: set[str] = set()  # of which a probability was shown
+        self._style()
+
+    def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
+        """Take row-aligned blocks of SAMPLE and TICK and what happened in them."""
+        for event in events:
+            self._send_event(event)
+        if len(samples):
+            self._waiting.append((samples, ticks))
+        if self._waiting and (not len(samples) or self._span_ns() >= self._screen.batch_ns):
+            self._send_waiting()
+            self._screen.follow()
+
+    def close(self) -> None:
+        """Send the rest; the screen stays."""
+        if self._waiting:
+            self._send_waiting()
+
     def _style(self) -> None:
         """Say once how each entity is drawn."""
         for path, name, colour, width, mode in _SERIES:
             style = self._rr.SeriesLines(
                 names=name, colors=colour, widths=width, interpolation_mode=mode
             )
-            self._stream.log(path, style, static=True, strict=True)
+            self._screen.style(self._at + path, style)
         labels, colours = zip(*_PHASES.values(), strict=True)
         phases = self._rr.StateConfiguration(values=labels, colors=np.array(colours, np.uint32))
-        self._stream.log("phase", phases, static=True, strict=True)
+        self._screen.style(f"{self._at}phase", phases)
 
     def _span_ns(self) -> int:
         first, last = self._waiting[0][0]["time_ns"][0], self._waiting[-1][0]["time_ns"][-1]
@@ -153,9 +208,8 @@ class View:
         samples = np.concatenate([block for block, _ in blocks], dtype=SAMPLE)
         ticks = np.concatenate([block for _, block in blocks], dtype=TICK)
         self._lift_pen(samples)
-        column = self._column(samples["time_ns"])
         for path, values in self._series(samples, ticks).items():
-            self._send(path, column, self._rr.Scalars.columns(scalars=values))
+            self._send(path, samples["time_ns"], self._rr.Scalars.columns(scalars=values))
         self._send_phases(samples, ticks)
         self._last_ns = int(samples["time_ns"][-1])
 
@@ -166,10 +220,10 @@ class View:
             breaks = breaks[breaks > 0]  # before the very first row nothing is drawn
         if len(breaks):
             before = np.concatenate(([self._last_ns or 0], samples["time_ns"]))[breaks]
-            column, blanks = self._column(before + 1), len(breaks)
+            after, blanks = before + 1, len(breaks)
             for path, *_ in _SERIES:
-                self._send(path, column, self._rr.Scalars.columns(scalars=[np.nan] * blanks))
-            self._send("phase", column, self._rr.StateChange.columns(state=[""] * blanks))
+                self._send(path, after, self._rr.Scalars.columns(scalars=[np.nan] * blanks))
+            self._send("phase", after, self._rr.StateChange.columns(state=[""] * blanks))
 
     def _series(self, samples: Samples, ticks: Ticks) -> Mapping[str, npt.NDArray[np.float64]]:
         usable = (samples["quality"] & UNUSABLE) == 0
@@ -190,32 +244,31 @@ class View:
         self._phase = int(phases[-1])
         if len(rows):
             names = [_PHASES[Phase(phase)][0] for phase in phases[rows]]
-            column = self._column(samples["time_ns"][rows])
-            self._send("phase", column, self._rr.StateChange.columns(state=names))
+            times = samples["time_ns"][rows]
+            self._send("phase", times, self._rr.StateChange.columns(state=names))
 
     def _send_event(self, event: Event) -> None:
+        place = "alarms" if event.kind in _ALARMS else "events"
         text = self._rr.TextLog.columns(text=[event.text], level=[_LEVELS[event.severity]])
-        self._send(f"events/{event.kind}", self._column(np.array([event.time_ns])), text)
+        self._send(f"{place}/{event.kind}", np.array([event.time_ns]), text)
+        if event.kind is Kind.CYCLE and "probabilities" in event.data:
+            self._send_probabilities(event.time_ns, event.data["probabilities"])
 
-    def _column(self, time_ns: npt.NDArray[np.int64]) -> Any:
-        return self._rr.TimeColumn(TIMELINE, timestamp=time_ns.astype("datetime64[ns]"))
+    def _send_probabilities(self, time_ns: int, likely: Mapping[str, float]) -> None:
+        """Send those of a cycle; what was likely before and is not among them has come to 0."""
+        for cause in likely.keys() - self._causes:
+            name, colour = (NO_CAUSE, 0x8A93A6FF) if cause == "none" else (cause, None)
+            style = self._rr.SeriesLines(
+                names=name, colors=colour, widths=2.0, interpolation_mode="StepAfter"
+            )
+            self._screen.style(f"{self._at}probabilities/{cause}", style)
+        self._causes |= likely.keys()
+        for cause in sorted(self._causes):
+            value = self._rr.Scalars.columns(scalars=[likely.get(cause, 0.0)])
+            self._send(f"probabilities/{cause}", np.array([time_ns]), value)
 
-    def _send(self, path: str, column: Any, values: Any) -> None:
-        self._stream.send_columns(path, [column], values, strict=True)
-
-    def _follows(self, viewer: "_Viewer") -> bool:
-        """Say whether the viewer still reads; asking bounds what can pile up in memory for it."""
-        if not viewer.running():
-            return False
-        self._misses = 0 if self._delivered() else self._misses + 1
-        return self._misses < MISSES
-
-    def _delivered(self) -> bool:
-        try:
-            self._stream.flush(timeout_sec=PATIENCE_S)
-        except RuntimeError:
-            return False
-        return True
+    def _send(self, path: str, time_ns: npt.NDArray[np.int64], values: Any) -> None:
+        self._screen.send(self._at + path, time_ns, values)
 
 
 class _Viewer:
@@ -260,7 +313,8 @@ class _Viewer:
         )
 
 
-def _rerun() -> Any:
+def import_rerun() -> Any:
+    """The optional package; ConfigError says what to install where it is missing."""
     try:
         return importlib.import_module("rerun")
     except ImportError as error:
@@ -289,15 +343,18 @@ def _free_port() -> int:
         return int(server.getsockname()[1])
 
 
-def _blueprint(rr: Any, *, live: bool) -> Any:
-    """Lay the views out one under the other; a live one follows the newest."""
+def _blueprint(rr: Any, ejectors: Sequence[str], *, live: bool) -> Any:
+    """Lay out one ejector, or several as pages behind one that shows all; live follows the newest.
+
+    Rerun has no linked time axis that also moves on, so the live ones are not linked.
+    """
     plan = rr.blueprint
-    # Rerun has no linked time axis that also moves on, so the live ones are not linked.
     axis = plan.archetypes.TimeAxis(
         link=None if live else "LinkToGlobal", view_range=_window(rr) if live else None
     )
+    pages = [_page(plan, axis, name) for name in ejectors]
     return plan.Blueprint(
-        plan.Vertical(*_views(plan, axis), row_shares=[4.3, 2.9, 1.3, 1.4, 2.2]),
+        pages[0] if len(pages) == 1 else plan.Tabs(_overview(plan, axis, ejectors), *pages),
         plan.TimePanel(
             state="collapsed", timeline=TIMELINE, play_state="following" if live else None
         ),
@@ -306,25 +363,65 @@ def _blueprint(rr: Any, *, live: bool) -> Any:
     )
 
 
-def _views(plan: Any, axis: Any) -> Sequence[Any]:
+def _page(plan: Any, axis: Any, name: str) -> Any:
+    """All of one ejector: its views one under the other."""
     legend = {"axis_x": axis, "plot_legend": plan.PlotLegend(plan.Corner2D.LeftTop)}
-    return (
-        plan.TimeSeriesView(origin="vacuum", name="Vacuum, mbar below ambient", **legend),
-        plan.TimeSeriesView(origin="deviation", name="Deviation, mbar", **legend),
+    views = (
+        _vacuum(plan, axis, name, "Vacuum, mbar below ambient"),
+        plan.TimeSeriesView(origin=f"{name}/deviation", name="Deviation, mbar", **legend),
         plan.TimeSeriesView(
-            origin="commands",
+            origin=f"{name}/commands",
             name="Commands: suction (blue), blow-off (violet)",
             axis_x=axis,
             axis_y=plan.ScalarAxis(range=(-0.15, 1.15), zoom_lock=True),
             plot_legend=plan.PlotLegend(visible=False),  # it would hide the steps
         ),
-        plan.StateTimelineView(origin="phase", name="Phase", time_view=axis),
-        plan.TextLogView(
-            origin="events",
-            name="Events",
-            columns=plan.TextLogColumns(
-                timeline_columns=[TIMELINE], text_log_columns=["loglevel", "body"]
-            ),
+        plan.StateTimelineView(origin=f"{name}/phase", name="Phase", time_view=axis),
+        _probabilities(plan, axis, name),
+        plan.Horizontal(
+            _texts(plan, "Events", [f"{name}/events"]), _texts(plan, "Alarms", [f"{name}/alarms"])
+        ),
+    )
+    return plan.Vertical(*views, row_shares=[4.0, 2.6, 1.3, 1.4, 2.0, 2.2], name=name or None)
+
+
+def _overview(plan: Any, axis: Any, ejectors: Sequence[str]) -> Any:
+    """Vacuum and probabilities of every ejector, and the alarms of all."""
+    cells = [
+        plan.Vertical(
+            _vacuum(plan, axis, name, f"{name}: vacuum, mbar below ambient"),
+            _probabilities(plan, axis, name),
+            row_shares=[3.0, 2.0],
+        )
+        for name in ejectors
+    ]
+    alarms = _texts(plan, "Alarms", [f"{name}/alarms" for name in ejectors])
+    return plan.Vertical(plan.Grid(*cells), alarms, row_shares=[4.0, 1.0], name="all")
+
+
+def _vacuum(plan: Any, axis: Any, name: str, title: str) -> Any:
+    legend = plan.PlotLegend(plan.Corner2D.LeftTop)
+    return plan.TimeSeriesView(origin=f"{name}/vacuum", name=title, axis_x=axis, plot_legend=legend)
+
+
+def _probabilities(plan: Any, axis: Any, name: str) -> Any:
+    return plan.TimeSeriesView(
+        origin=f"{name}/probabilities",
+        name="Probability of each cause after each cycle",
+        axis_x=axis,
+        axis_y=plan.ScalarAxis(range=(-0.05, 1.05), zoom_lock=True),
+        plot_legend=plan.PlotLegend(plan.Corner2D.LeftTop),
+    )
+
+
+def _texts(plan: Any, title: str, places: Sequence[str]) -> Any:
+    shown = ["entitypath"] if len(places) > 1 else []
+    return plan.TextLogView(
+        origin="/",
+        contents=[f"+ /{place.lstrip('/')}/**" for place in places],
+        name=title,
+        columns=plan.TextLogColumns(
+            timeline_columns=[TIMELINE], text_log_columns=[*shown, "loglevel", "body"]
         ),
     )
 
