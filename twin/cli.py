@@ -24,6 +24,7 @@ import typer
 from twin.cli_alarms import alarms_app, alarms_of, asker_of
 from twin.cli_assets import assets_app
 from twin.cli_cert import cert
+from twin.cli_compare import compare
 from twin.cli_figures import figures_app, keeper_of, key_figures_of
 from twin.cli_outlets import outlets_of
 from twin.cli_serve import live_rows_of, reports_of, serve
@@ -58,6 +59,7 @@ app.add_typer(alarms_app, name="alarms")
 log_app = typer.Typer(help="Look after logs.", no_args_is_help=True)
 app.add_typer(log_app, name="log")
 app.command()(cert)
+app.command()(compare)
 app.command()(serve)
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML configuration.")]

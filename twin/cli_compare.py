@@ -1,0 +1,85 @@
+"""``twin compare``: two logs beside each other, aligned at the suction edge."""
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from twin.errors import ConfigError, SourceError
+
+if TYPE_CHECKING:
+    from twin.compare.side import Side
+
+
+def compare(
+    a: Annotated[Path, typer.Argument(metavar="A.mcap", help="A recorded log, as it was.")],
+    b: Annotated[Path, typer.Argument(metavar="B.mcap", help="Another one, as it is.")],
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="F", help="As JSON.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="F.(svg|png)", help="Mean courses of a cycle.")
+    ] = None,
+    rrd: Annotated[Path | None, typer.Option(metavar="F.rrd", help="The same for Rerun.")] = None,
+) -> None:
+    """Say what differs between two logs: key figures and courses, from the suction edge on."""
+    from twin.compare.compare import compare as beside
+    from twin.compare.words import in_words, plain, remarks
+
+    _refuse_before_work(json_file, picture, rrd)
+    found = beside(_read(a), _read(b))
+    for remark in remarks(found):
+        print(f"twin: {remark}", file=sys.stderr)
+    print(in_words(found))
+    if json_file is not None:
+        _write_json(json_file, plain(found))
+    if picture is not None:
+        from twin.compare.picture import draw
+
+        draw(found, picture)
+    if rrd is not None:
+        from twin.compare.recording import record
+
+        record(found, rrd)
+
+
+def _read(path: Path) -> "Side":
+    """All cycles of a log, as its own twin saw them."""
+    from twin.compare.side import side_of
+    from twin.config import Config
+    from twin.figures.cycle import compiled
+    from twin.figures.settings import FigureSettings
+    from twin.log.reader import open_log
+    from twin.settings import Document
+
+    log = open_log(path)
+    if not log.complete:
+        print(f"twin: {path} is not complete; what can be read is compared", file=sys.stderr)
+    document = Document.parse(log.header.config_text, log.header.config_name)
+    settings = Config.of_log(document, log.header.metadata, str(path))
+    figures = compiled(settings.data, document.section(FigureSettings, "figures"))
+    return side_of(log, settings, figures)
+
+
+def _refuse_before_work(json_file: Path | None, picture: Path | None, rrd: Path | None) -> None:
+    """Say what cannot be written before two logs have been read."""
+    from twin.compare.picture import FORMATS
+
+    if picture is not None and picture.suffix not in FORMATS:
+        raise ConfigError(f"{picture}: not a picture", f"let it end in {' or '.join(FORMATS)}")
+    for path in (json_file, picture, rrd):
+        if path is not None and not path.parent.is_dir():
+            raise SourceError(f"{path}: cannot be written: no such folder", "check the path")
+    if rrd is not None:
+        from twin.view import import_rerun
+
+        import_rerun()
+
+
+def _write_json(path: Path, document: object) -> None:
+    text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        message = f"{path}: cannot be written: {error.strerror}"
+        raise SourceError(message, "check that the folder exists and has space") from error

@@ -1,0 +1,101 @@
+"""The picture of a comparison: both mean cycles, their twins, and what differs."""
+
+from pathlib import Path
+from textwrap import fill
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from twin.compare.compare import Comparison
+from twin.compare.side import BIN_S, LONGEST_S, Curve, Floats, Side
+from twin.compare.words import conclusion
+from twin.diagnosis.drawing import ANONYMOUS, STYLE
+from twin.errors import SourceError
+
+FORMATS = {".svg": ANONYMOUS, ".png": {"Software": None}}
+COLOURS = {"A": "#0a62a8", "B": "#c8500a"}
+SURE = 1.96  # standard errors
+TITLE = 130  # characters in a line
+
+
+def draw(comparison: Comparison, path: Path) -> None:
+    """Write the picture, SVG or PNG as ``path`` ends; SourceError if it cannot be written."""
+    with mpl.rc_context({**STYLE, "svg.hashsalt": "compare"}):
+        figure = Figure(figsize=(10.0, 8.0), layout="constrained")
+        vacuum, difference, off = figure.subplots(
+            3, 1, sharex=True, gridspec_kw={"height_ratios": [2.2, 1.2, 1.2]}
+        )
+        for label, side in (("A", comparison.a), ("B", comparison.b)):
+            _draw_vacuum(vacuum, label, side)
+            _band(off, side.off, COLOURS[label], f"{label}: measured − expected")
+        _draw_difference(difference, comparison)
+        _name(vacuum, "vacuum (mbar)")
+        _name(difference, "difference (mbar)")
+        _name(off, "deviation (mbar)")
+        off.set_xlabel("time since the suction edge (s)")
+        off.set_xlim(0.0, _end(comparison))
+        figure.suptitle(fill(conclusion(comparison), TITLE), x=0.01, ha="left", fontsize=10.5)
+        try:
+            figure.savefig(path, metadata=FORMATS[path.suffix], dpi=110)
+        except OSError as error:
+            raise SourceError(f"{path}: cannot be written: {error}", "check the path") from error
+
+
+def bins() -> Floats:
+    """Time of each bin since the suction edge (s)."""
+    count = round(LONGEST_S / BIN_S)
+    return np.linspace(0.0, LONGEST_S, count, endpoint=False) + 0.5 * BIN_S
+
+
+def _draw_vacuum(axes: Axes, label: str, side: Side) -> None:
+    name = f"{label}: {side.name}, {len(side.cycles)} cycles"
+    _band(axes, side.measured_vacuum, COLOURS[label], name)
+    time, expected, _ = _shown(side.expected_vacuum)
+    axes.plot(time, expected, "--", color=COLOURS[label], lw=1.2, label=f"{label}: expected")
+
+
+def _draw_difference(axes: Axes, comparison: Comparison) -> None:
+    """B less A, measured with how sure the means are, and expected."""
+    measured = [side.measured_vacuum for side in (comparison.a, comparison.b)]
+    time, mean, half = difference(*measured)
+    counts = [len(side.cycles) for side in (comparison.a, comparison.b)]
+    if min(counts) > 1:
+        axes.fill_between(time, mean - half, mean + half, color="0.6", alpha=0.5, lw=0)
+    axes.plot(time, mean, color="0.1", lw=1.3, label="B − A, measured vacuum (band: 95 %)")
+    time, expected, _ = difference(comparison.a.expected_vacuum, comparison.b.expected_vacuum)
+    axes.plot(time, expected, "--", color="0.45", lw=1.2, label="B − A, expected vacuum")
+
+
+def difference(a: Curve, b: Curve) -> tuple[Floats, Floats, Floats]:
+    """Time (s), difference of the means B − A (mbar) and half its 95 % band, where both are."""
+    both = np.isfinite(a.mean) & np.isfinite(b.mean)
+    error = np.hypot(a.error, b.error)
+    return bins()[both], (b.mean - a.mean)[both], SURE * error[both]
+
+
+def _band(axes: Axes, curve: Curve, colour: str, label: str) -> None:
+    """Mean, and a spread of a cycle on both sides."""
+    time, mean, spread = _shown(curve)
+    axes.fill_between(time, mean - spread, mean + spread, color=colour, alpha=0.25, lw=0)
+    axes.plot(time, mean, color=colour, lw=1.5, label=label)
+
+
+def _shown(curve: Curve) -> tuple[Floats, Floats, Floats]:
+    there = np.isfinite(curve.mean)
+    return bins()[there], curve.mean[there], curve.spread[there]
+
+
+def _end(comparison: Comparison) -> float:
+    """When the longer of the mean cycles ends (s)."""
+    ends = [
+        float(bins()[np.isfinite(side.measured_vacuum.mean)][-1])
+        for side in (comparison.a, comparison.b)
+    ]
+    return max(ends)
+
+
+def _name(axes: Axes, label: str) -> None:
+    axes.set_ylabel(label)
+    axes.legend(fontsize=9, loc="upper right")

@@ -1,0 +1,153 @@
+"""One side of a comparison: what every cycle of a log says, and its mean course over time."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from twin.config import Config
+from twin.errors import SourceError
+from twin.figures.cycle import MOST_PIECES, CycleFigures, KeyFigures
+from twin.log.header import LogHeader
+from twin.log.reader import Log
+from twin.monitor.cycles import Cycle, CycleCutter
+from twin.monitor.cycles import figures as judged
+from twin.signals import BREAK, MBAR, MS, NS, UNUSABLE, Phase, Samples, Ticks, deviation
+
+Floats = npt.NDArray[np.float64]
+
+BIN_S = 2.0 * MS
+LONGEST_S = 10.0  # of a cycle, whose course is kept
+FEWEST_SHARE = 0.5  # of the cycles, that must reach a time for their mean to be shown
+_OVER = (Phase.IDLE, Phase.BLOW_OFF)
+
+
+@dataclass
+class Curve:
+    """Mean and spread over cycles, by time since the suction edge; in mbar."""
+
+    _sums: Floats = field(default_factory=lambda: np.zeros((3, round(LONGEST_S / BIN_S))))
+
+    def add(self, since: Floats, values: Floats) -> None:
+        """Take the rows of one cycle: s since its suction edge, and values (mbar or NaN)."""
+        places = np.floor(since / BIN_S + 1e-6).astype(np.int64)
+        good = np.isfinite(values) & (places >= 0) & (places < self._sums.shape[1])
+        places, values = places[good], values[good]
+        count = np.bincount(places, minlength=self._sums.shape[1])
+        with np.errstate(invalid="ignore"):
+            mean = np.bincount(places, values, len(count)) / count
+        seen = count > 0  # a cycle counts once in a bin, however many rows it has there
+        self._sums[:, seen] += np.stack([np.ones(len(mean)), mean, mean**2])[:, seen]
+
+    @property
+    def mean(self) -> Floats:
+        """Mean of the cycles in each bin; NaN where too few of them come."""
+        count, total, _ = self._sums
+        enough = count >= max(FEWEST_SHARE * count.max(), 1.0)
+        return np.where(enough, total / np.maximum(count, 1.0), np.nan)
+
+    @property
+    def spread(self) -> Floats:
+        """Standard deviation of the cycles in each bin; NaN where the mean is."""
+        count, total, squares = self._sums
+        left = squares - total**2 / np.maximum(count, 1.0)
+        spread = np.sqrt(np.maximum(left, 0.0) / np.maximum(count - 1.0, 1.0))
+        return np.where(np.isfinite(self.mean), spread, np.nan)
+
+    @property
+    def error(self) -> Floats:
+        """Standard error of the mean in each bin; NaN where the mean is."""
+        error: Floats = self.spread / np.sqrt(np.maximum(self._sums[0], 1.0))
+        return error
+
+
+@dataclass
+class Side:
+    """The complete cycles of one log."""
+
+    name: str
+    header: LogHeader
+    data_set: str  # hash of the one its twin had
+    cycles: list[int] = field(default_factory=list)
+    measured: list[dict[str, float]] = field(default_factory=list)  # a row for each cycle
+    expected: list[dict[str, float]] = field(default_factory=list)
+    deviation: list[dict[str, float]] = field(default_factory=list)
+    measured_vacuum: Curve = field(default_factory=Curve)
+    expected_vacuum: Curve = field(default_factory=Curve)
+    off: Curve = field(default_factory=Curve)  # measured less expected pressure
+
+    @property
+    def asset(self) -> str:
+        """Type and id, for people."""
+        return " ".join(filter(None, (self.header.asset_type, self.header.asset_id)))
+
+    def add(self, cycle: Cycle, told: CycleFigures, ambient: float) -> None:
+        """Take a whole cycle; ``ambient`` in Pa."""
+        self.cycles.append(cycle.index)
+        self.measured.append(dict(told.measured))
+        self.expected.append(dict(told.expected))
+        self.deviation.append(judged(cycle, ambient))
+        since = (cycle.samples["time_ns"] - cycle.samples["time_ns"][0]) * NS
+        usable = (cycle.samples["quality"] & UNUSABLE) == 0
+        pressure = np.where(usable, cycle.samples["pressure"], np.nan).astype(np.float64)
+        self.measured_vacuum.add(since, (ambient - pressure) / MBAR)
+        self.expected_vacuum.add(since, (ambient - cycle.ticks["expected"]) / MBAR)
+        self.off.add(since, deviation(cycle.samples, cycle.ticks) / MBAR)
+
+
+def side_of(log: Log, settings: Config, key_figures: KeyFigures) -> Side:
+    """Read all of a log; SourceError if no cycle of it can be compared.
+
+    The first cycle after the start or a break is left out: its gas, and the model's, is not yet as
+    warm as in all others.
+    """
+    ambient = settings.data.ambient.pressure_mbar * MBAR
+    side = Side(log.path.name, log.header, settings.data.hash)
+    for cycle in whole(log.blocks()):
+        told = key_figures.take(cycle)
+        if told is not None and told.complete and cycle.complete and cycle.settled:
+            side.add(cycle, told, ambient)
+    if not side.cycles:
+        raise SourceError(
+            f"{log.path}: no cycle to compare: none is whole, and follows on another",
+            "record at least two cycles in a row without a gap",
+        )
+    return side
+
+
+def whole(blocks: Iterable[tuple[Samples, Ticks]]) -> Iterator[Cycle]:
+    """Cut rows into cycles, in one piece up to some minutes; and what belongs to none."""
+    pieces: list[Cycle] = []
+    before = -1  # index of what was given last
+    for piece in _pieces(blocks):
+        if pieces and (piece.index > pieces[0].index or piece.samples["quality"][0] & BREAK):
+            yield _joined(pieces, before)
+            before, pieces = pieces[0].index, []
+        pieces.append(piece)
+        if piece.ticks["phase"][-1] in _OVER or len(pieces) == MOST_PIECES:
+            yield _joined(pieces, before)
+            before, pieces = pieces[0].index, []
+    if pieces:
+        yield _joined(pieces, before)
+
+
+def _pieces(blocks: Iterable[tuple[Samples, Ticks]]) -> Iterator[Cycle]:
+    cutter = CycleCutter()
+    for samples, ticks in blocks:
+        yield from cutter.push(samples, ticks)
+    yield from cutter.flush()
+
+
+def _joined(pieces: list[Cycle], before: int) -> Cycle:
+    first, last = pieces[0], pieces[-1]
+    if first is last:
+        return first
+    at_edge, over = first.index > before, last.ticks["phase"][-1] in _OVER
+    return replace(
+        first,
+        samples=np.concatenate([piece.samples for piece in pieces]),
+        ticks=np.concatenate([piece.ticks for piece in pieces]),
+        complete=bool(at_edge and over),
+        cut_short=last.cut_short,
+    )
