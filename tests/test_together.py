@@ -296,6 +296,30 @@ def test_one_that_cannot_begin_leaves_the_others_and_is_exit_code_3(
     assert not (tmp_path / "a.nowhere.mcap").exists()
 
 
+def test_several_ejectors_are_viewed_in_one_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    chunk = pytest.importorskip("rerun.chunk")
+    target = tmp_path / "both.rrd"
+    with two_on_one(tmp_path) as (_, beside):
+        assert twin(monkeypatch, "run", *beside, "--rrd", target, "--duration", "1.5") == 0
+    drawn = {piece.entity_path for piece in chunk.RrdReader(target).stream()}
+    assert {"/test_rig/vacuum/measured", "/gripper/vacuum/expected", "/gripper/phase"} <= drawn
+    assert capsys.readouterr().err == ""
+
+
+def test_nothing_is_viewed_of_a_plc_that_does_not_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ModbusServer() as gone:
+        pass
+    target = tmp_path / "before.rrd"
+    target.write_text("of yesterday")
+    nowhere = configured(tmp_path, "gripper", "nowhere", on(gone.port))
+    assert twin(monkeypatch, "run", nowhere, "--rrd", target) == 3
+    assert target.read_text() == "of yesterday"
+
+
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [((), "are both of gripper-01"), (("--id", "x"), "--id is for one")],

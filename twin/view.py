@@ -6,6 +6,7 @@ on all interfaces, and this one is bound to loopback. Its usage statistics are s
 that process alone; the user's own Rerun settings are neither read nor changed.
 """
 
+import colorsys
 import contextlib
 import importlib
 import logging
@@ -26,6 +27,7 @@ import numpy.typing as npt
 
 from twin.errors import ConfigError, SourceError
 from twin.events import Event, Kind, Severity
+from twin.model.effects import EFFECTS
 from twin.signals import (
     BREAK,
     MBAR,
@@ -257,9 +259,9 @@ class View:
     def _send_probabilities(self, time_ns: int, likely: Mapping[str, float]) -> None:
         """Send those of a cycle; what was likely before and is not among them has come to 0."""
         for cause in likely.keys() - self._causes:
-            name, colour = (NO_CAUSE, 0x8A93A6FF) if cause == "none" else (cause, None)
+            name = NO_CAUSE if cause == "none" else cause
             style = self._rr.SeriesLines(
-                names=name, colors=colour, widths=2.0, interpolation_mode="StepAfter"
+                names=name, colors=_colour_of(cause), widths=2.0, interpolation_mode="StepAfter"
             )
             self._screen.style(f"{self._at}probabilities/{cause}", style)
         self._causes |= likely.keys()
@@ -269,6 +271,15 @@ class View:
 
     def _send(self, path: str, time_ns: npt.NDArray[np.int64], values: Any) -> None:
         self._screen.send(self._at + path, time_ns, values)
+
+
+def _colour_of(cause: str) -> tuple[int, int, int]:
+    """The same for an effect wherever it is drawn; neighbours in the table are far apart."""
+    if cause == "none":
+        return 230, 230, 230
+    hue = list(EFFECTS).index(cause) * 0.618 % 1.0
+    red, green, blue = (round(255 * part) for part in colorsys.hsv_to_rgb(hue, 0.6, 0.95))
+    return red, green, blue
 
 
 class _Viewer:
@@ -382,7 +393,7 @@ def _page(plan: Any, axis: Any, name: str) -> Any:
             _texts(plan, "Events", [f"{name}/events"]), _texts(plan, "Alarms", [f"{name}/alarms"])
         ),
     )
-    return plan.Vertical(*views, row_shares=[4.0, 2.6, 1.3, 1.4, 2.0, 2.2], name=name or None)
+    return plan.Vertical(*views, row_shares=[3.6, 2.4, 1.3, 1.4, 2.8, 2.0], name=name or None)
 
 
 def _overview(plan: Any, axis: Any, ejectors: Sequence[str]) -> Any:
