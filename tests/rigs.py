@@ -16,6 +16,7 @@ from twin.live import Twin, run
 from twin.model.dataset import coefficients
 from twin.model.theta import Theta
 from twin.monitor.detect import Monitor
+from twin.monitor.isolation import Isolation
 from twin.monitor.phases import Knees, expected_knees
 from twin.settings import Document
 from twin.signals import MBAR, Samples, Ticks
@@ -49,6 +50,13 @@ def twin(name: str) -> Twin:
 
 def monitor(name: str) -> Monitor:
     return Monitor(config(name).monitor, theta(name))
+
+
+def isolating(name: str) -> Monitor:
+    """A monitor with the bank of hypotheses, as ``twin run`` and ``twin replay`` have it."""
+    healthy = config(name).monitor.healthy
+    isolation = Isolation.of(config(name).data, healthy, config(name).monitor.false_alarm_days)
+    return Monitor(config(name).monitor, theta(name), isolation=isolation)
 
 
 @cache

@@ -49,7 +49,7 @@ def make_log(path: Path, name: str, faults: tuple[str, ...]) -> Path:
     clock = count(0.0, 0.5).__next__  # half a second for each block, so that each is flushed
     recorder = Recorder(path, LogHeader("type", "id", f"{name}.toml", document.text), clock=clock)
     blocks = rigs.cut(rigs.recorded(name, 25.0, faults)[0], 500)
-    monitor = rigs.monitor(name)
+    monitor = rigs.isolating(name)
     monitor.teller = KeyFigures(rigs.config(name).data)  # as the program has it
     alarms = Alarms(board_rules(None), None)
     run(blocks, rigs.twin(name), monitor, [recorder], advisers=[alarms])
