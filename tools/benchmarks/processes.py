@@ -51,6 +51,7 @@ def live(
             yield process
         finally:
             process.send_signal(signal.SIGINT)
+            process.wait()  # leaving it closes what it still writes to
     if process.returncode != INTERRUPTED:
         sys.exit(f"twin run ended with exit code {process.returncode}")
 
