@@ -2,20 +2,17 @@
 
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 from sqlalchemy import (
-    URL,
     BigInteger,
     Boolean,
     Column,
     ColumnElement,
     Connection,
     Double,
-    Engine,
     Integer,
     MetaData,
     Row,
@@ -29,8 +26,7 @@ from twin.alarms.board import Episode
 from twin.alarms.loop import Before, News
 from twin.alarms.requests import Request
 from twin.alarms.state import Deed, Kept
-from twin.assets.engine import Purpose, make_engine, parse_url, plain_errors, shown, sqlite_file
-from twin.errors import SourceError
+from twin.assets.engine import Database, Purpose
 
 ALARM_DATABASE = Purpose("alarm database", "--alarms")
 
@@ -105,44 +101,15 @@ def open_store(
     ``create=False`` refuses an SQLite file that is not there. ConfigError for a URL of an unknown
     kind, SourceError if it cannot be reached, read or written.
     """
-    url = parse_url(where, ALARM_DATABASE)
-    file = sqlite_file(url)
-    if not create and file is not None and not file.exists():
-        raise SourceError(
-            f"{file}: no such alarm database",
-            "check --alarms; twin run makes one where [alarms] keep = true",
-        )
-    store = Store(url, make_engine(url, busy_s), clock)
-    try:
+    absent = "" if create else "check --alarms; twin run makes one where [alarms] keep = true"
+    store = Store(where, ALARM_DATABASE, busy_s, clock, absent)
+    with store.closed_on_error():
         store.prepare()
-    except BaseException:
-        store.close()
-        raise
     return store
 
 
-class Store:
+class Store(Database):
     """An open alarm database. What is written is written whole or not at all."""
-
-    def __init__(self, url: URL, engine: Engine, clock: Callable[[], int]) -> None:
-        self._url = url
-        self._engine = engine
-        self._clock = clock
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Give all connections back."""
-        self._engine.dispose()
-
-    @property
-    def name(self) -> str:
-        """The file or the URL, for messages; without a password."""
-        return shown(self._url)
 
     def prepare(self) -> None:
         """Make the tables that are not there."""
@@ -225,17 +192,6 @@ class Store:
             wanted = wanted.where(cleared.is_(None) | seen.is_(None))
         with self._reading() as connection:
             return [_episode(row) for row in connection.execute(wanted.order_by("raised_ns"))]
-
-    @contextmanager
-    def _reading(self) -> Iterator[Connection]:
-        with plain_errors(self._url, ALARM_DATABASE), self._engine.begin() as connection:
-            yield connection
-
-    @contextmanager
-    def _writing(self) -> Iterator[Connection]:
-        writer = self._engine.execution_options(writing=True)
-        with plain_errors(self._url, ALARM_DATABASE), writer.begin() as connection:
-            yield connection
 
 
 def _of(table: Table, unit: Unit) -> tuple[ColumnElement[bool], ...]:

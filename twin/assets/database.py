@@ -8,16 +8,15 @@ import json
 import time
 import uuid
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
-from sqlalchemy import URL, ColumnElement, Connection, Engine, Row, func, select
+from sqlalchemy import ColumnElement, Connection, Row, func, select
 
-from twin.assets.engine import make_engine, parse_url, plain_errors, shown, sqlite_file
+from twin.assets.engine import ASSETS, Database
 from twin.assets.exchange import parse_export, to_export
 from twin.assets.record import Array, Kind, Record, checked, content_hash, holding, to_json
 from twin.assets.schema import ARRAY, RECORD, is_made, make
@@ -62,43 +61,15 @@ def open_assets(
     ConfigError for a URL of an unknown kind, a newer schema and another program's file; SourceError
     if it cannot be reached, read or written, or stays locked.
     """
-    url = parse_url(where)
-    file = sqlite_file(url)
-    if not create and file is not None and not file.exists():
-        raise SourceError(
-            f"{file}: no such asset database", "check --assets; twin assets add or import makes one"
-        )
-    assets = Assets(url, make_engine(url, busy_s), clock)
-    try:
+    absent = "" if create else "check --assets; twin assets add or import makes one"
+    assets = Assets(where, ASSETS, busy_s, clock, absent)
+    with assets.closed_on_error():
         assets.prepare(shipped=shipped)
-    except BaseException:
-        assets.close()
-        raise
     return assets
 
 
-class Assets:
+class Assets(Database):
     """An open asset database. What is written is written whole or not at all."""
-
-    def __init__(self, url: URL, engine: Engine, clock: Callable[[], int]) -> None:
-        self._url = url
-        self._engine = engine
-        self._clock = clock
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Give all connections back."""
-        self._engine.dispose()
-
-    @property
-    def name(self) -> str:
-        """The file or the URL, for messages; without a password."""
-        return shown(self._url)
 
     def prepare(self, *, shipped: bool) -> None:
         """Make the tables and add the shipped records, each where it is missing."""
@@ -193,17 +164,6 @@ class Assets:
         record = replace(record, recorded_ns=now)
         _insert(connection, record)
         return record
-
-    @contextmanager
-    def _reading(self) -> Iterator[Connection]:
-        with plain_errors(self._url), self._engine.begin() as connection:
-            yield connection
-
-    @contextmanager
-    def _writing(self) -> Iterator[Connection]:
-        writer = self._engine.execution_options(writing=True)
-        with plain_errors(self._url), writer.begin() as connection:
-            yield connection
 
 
 # --- rows and records ---------------------------------------------------------------------------

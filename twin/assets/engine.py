@@ -8,10 +8,11 @@ import math
 import random
 import sqlite3
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url
 from sqlalchemy.engine.interfaces import DBAPIConnection
@@ -50,7 +51,7 @@ _ELSE = {
 }
 
 
-def parse_url(where: str | Path, purpose: Purpose = ASSETS) -> URL:
+def parse_url(where: str | Path, purpose: Purpose) -> URL:
     """The URL of a database: a URL, or the path of an SQLite file; ConfigError for other kinds."""
     if isinstance(where, Path) or "://" not in where:
         return URL.create("sqlite", database=str(where))
@@ -63,6 +64,65 @@ def parse_url(where: str | Path, purpose: Purpose = ASSETS) -> URL:
     if url.drivername in POSTGRES:
         return url.set(drivername="postgresql+psycopg")
     raise _unknown_kind(f"{purpose.name}s of kind {url.drivername!r} are not supported")
+
+
+class Database:
+    """An open database. What is written is written whole or not at all; close it, or use ``with``.
+
+    ``busy_s`` is how long to wait for other writers, ``clock`` gives UTC in ns. ConfigError for a
+    URL of an unknown kind; with ``absent``, what to do then, SourceError for an SQLite file that is
+    not there.
+    """
+
+    def __init__(
+        self,
+        where: str | Path,
+        purpose: Purpose,
+        busy_s: float,
+        clock: Callable[[], int],
+        absent: str = "",
+    ) -> None:
+        self._url = parse_url(where, purpose)
+        file = sqlite_file(self._url)
+        if absent and file is not None and not file.exists():
+            raise SourceError(f"{file}: no such {purpose.name}", absent)
+        self._engine = make_engine(self._url, busy_s)
+        self._purpose, self._clock = purpose, clock
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give all connections back."""
+        self._engine.dispose()
+
+    @property
+    def name(self) -> str:
+        """The file or the URL, for messages; without a password."""
+        return shown(self._url)
+
+    @contextmanager
+    def closed_on_error(self) -> Iterator[None]:
+        """Make its tables inside: where that fails, it is closed."""
+        try:
+            yield
+        except BaseException:
+            self.close()
+            raise
+
+    @contextmanager
+    def _reading(self) -> Iterator[Connection]:
+        with plain_errors(self._url, self._purpose), self._engine.begin() as connection:
+            yield connection
+
+    @contextmanager
+    def _writing(self) -> Iterator[Connection]:
+        writer = self._engine.execution_options(writing=True)
+        with plain_errors(self._url, self._purpose), writer.begin() as connection:
+            yield connection
 
 
 def _unknown_kind(message: str) -> ConfigError:
@@ -135,7 +195,7 @@ def _take_turn(connection: Connection, busy_ms: int) -> None:
 
 
 @contextmanager
-def plain_errors(url: URL, purpose: Purpose = ASSETS) -> Iterator[None]:
+def plain_errors(url: URL, purpose: Purpose) -> Iterator[None]:
     """Turn the database's errors into a SourceError that says where and what to do."""
     try:
         yield

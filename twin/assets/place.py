@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from twin.assets.database import Assets, open_assets
-from twin.assets.engine import parse_url, sqlite_file
+from twin.assets.engine import ASSETS, parse_url, sqlite_file
 from twin.settings import Document, Settings
 
 FILE = "assets.sqlite"
@@ -37,5 +37,5 @@ def open_chosen(
 
 def _beside(folder: Path, url: str) -> str | Path:
     """What a configuration names, with a file taken from its own folder."""
-    file = sqlite_file(parse_url(url))
+    file = sqlite_file(parse_url(url, ASSETS))
     return url if file is None else folder / file

@@ -6,23 +6,20 @@ another data set it adds what that one expects, and the newest of a cycle's rows
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from sqlalchemy import (
-    URL,
     BigInteger,
     Column,
     ColumnElement,
     Connection,
     Double,
-    Engine,
     Integer,
     MetaData,
     Row,
@@ -35,8 +32,7 @@ from sqlalchemy import (
     text,
 )
 
-from twin.assets.engine import Purpose, make_engine, parse_url, plain_errors, shown, sqlite_file
-from twin.errors import SourceError
+from twin.assets.engine import Database, Purpose
 from twin.figures.table import FIGURES
 
 FIGURE_DATABASE = Purpose("figure database", "--figures")
@@ -115,44 +111,15 @@ def open_store(
     ``create=False`` refuses an SQLite file that is not there. ConfigError for a URL of an unknown
     kind, SourceError if it cannot be reached, read or written.
     """
-    url = parse_url(where, FIGURE_DATABASE)
-    file = sqlite_file(url)
-    if not create and file is not None and not file.exists():
-        raise SourceError(
-            f"{file}: no such figure database",
-            "check --figures; twin run makes one where [figures] keep = true",
-        )
-    store = Store(url, make_engine(url, busy_s), clock)
-    try:
+    absent = "" if create else "check --figures; twin run makes one where [figures] keep = true"
+    store = Store(where, FIGURE_DATABASE, busy_s, clock, absent)
+    with store.closed_on_error():
         store.prepare()
-    except BaseException:
-        store.close()
-        raise
     return store
 
 
-class Store:
+class Store(Database):
     """An open figure database. What is added is added whole or not at all."""
-
-    def __init__(self, url: URL, engine: Engine, clock: Callable[[], int]) -> None:
-        self._url = url
-        self._engine = engine
-        self._clock = clock
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Give all connections back."""
-        self._engine.dispose()
-
-    @property
-    def name(self) -> str:
-        """The file or the URL, for messages; without a password."""
-        return shown(self._url)
 
     def prepare(self) -> None:
         """Make the tables, and the columns of figures that an older program did not know."""
@@ -231,17 +198,6 @@ class Store:
         row = {"asset_type": unit.type, "asset_id": unit.id, "host_ns": self._clock()}
         with self._writing() as connection:
             connection.execute(ERASED.insert().values(row))
-
-    @contextmanager
-    def _reading(self) -> Iterator[Connection]:
-        with plain_errors(self._url, FIGURE_DATABASE), self._engine.begin() as connection:
-            yield connection
-
-    @contextmanager
-    def _writing(self) -> Iterator[Connection]:
-        writer = self._engine.execution_options(writing=True)
-        with plain_errors(self._url, FIGURE_DATABASE), writer.begin() as connection:
-            yield connection
 
 
 def _missing(connection: Connection) -> list[Column[Any]]:

@@ -5,18 +5,15 @@ has taken it; so each is delivered at least once, through restarts and lost netw
 """
 
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from sqlalchemy import (
-    URL,
     BigInteger,
     Column,
     ColumnElement,
     Connection,
-    Engine,
     Integer,
     MetaData,
     Row,
@@ -28,7 +25,7 @@ from sqlalchemy import (
 )
 
 from twin.alarms.store import ALARM_DATABASE, Unit
-from twin.assets.engine import make_engine, parse_url, plain_errors
+from twin.assets.engine import Database
 from twin.outlets.message import Message
 
 metadata = MetaData()
@@ -60,31 +57,20 @@ def open_outbox(
 
     ConfigError for a URL of an unknown kind, SourceError if it cannot be reached or written.
     """
-    url = parse_url(where, ALARM_DATABASE)
-    outbox = Outbox(url, make_engine(url, busy_s), unit, clock)
-    try:
+    outbox = Outbox(where, unit, busy_s, clock)
+    with outbox.closed_on_error():
         outbox.prepare()
-    except BaseException:
-        outbox.close()
-        raise
     return outbox
 
 
-class Outbox:
+class Outbox(Database):
     """An open outbox. Several threads may use one each; what is written is written whole."""
 
-    def __init__(self, url: URL, engine: Engine, unit: Unit, clock: Callable[[], int]) -> None:
-        self._url, self._engine, self._unit, self._clock = url, engine, unit, clock
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Give all connections back."""
-        self._engine.dispose()
+    def __init__(
+        self, where: str | Path, unit: Unit, busy_s: float, clock: Callable[[], int]
+    ) -> None:
+        super().__init__(where, ALARM_DATABASE, busy_s, clock)
+        self._unit = unit
 
     def prepare(self) -> None:
         """Make the table if it is not there."""
@@ -178,17 +164,6 @@ class Outbox:
 
     def _named(self, destination: str, numbers: Collection[str]) -> tuple[ColumnElement[bool], ...]:
         return *self._own(destination), OUTBOX.c.id.in_(numbers)
-
-    @contextmanager
-    def _reading(self) -> Iterator[Connection]:
-        with plain_errors(self._url, ALARM_DATABASE), self._engine.begin() as connection:
-            yield connection
-
-    @contextmanager
-    def _writing(self) -> Iterator[Connection]:
-        writer = self._engine.execution_options(writing=True)
-        with plain_errors(self._url, ALARM_DATABASE), writer.begin() as connection:
-            yield connection
 
 
 def _messages(
