@@ -16,8 +16,9 @@ from twin.model.effects import EFFECTS, Parameter, apply
 from twin.model.theta import Theta
 from twin.monitor.bins import drawn
 from twin.monitor.signatures import steps
-from twin.signals import MS, NS, Samples, Ticks
+from twin.signals import MS, NS, Samples, Ticks, joined
 
+BATCH = 250  # rows that are stepped together: what many calls cost is spared
 STEP = 0.25  # of a parameter's typical size
 GROSS = 1.5  # the same for those that are not linear in it for long: what delays
 
@@ -96,6 +97,8 @@ class Bank:
     def __init__(self, theta: Theta) -> None:
         self._theta = np.stack(hypotheses(theta), axis=1)
         self._state = kernel.new_state(self._theta.shape[1])
+        self._parts: list[tuple[Samples, Ticks]] = []  # rows that are not stepped yet
+        self._fresh = 0  # how many
         self._waits = np.empty(0, _ROW)  # the newest row: the one after it is not known yet
         self._last_ns: int | None = None  # PLC time of the newest row
         self._phase = -1  # and its phase
@@ -106,9 +109,17 @@ class Bank:
         self._expected = np.empty((0, self._theta.shape[1]))
 
     def push(self, samples: Samples, ticks: Ticks) -> None:
-        """Step on by the twin's rows."""
-        if not len(samples):
+        """Step on by the twin's rows, some time."""
+        self._parts.append((samples, ticks))
+        self._fresh += len(samples)
+        if self._fresh >= BATCH:
+            self._step_on()
+
+    def _step_on(self) -> None:
+        if not self._fresh:
             return
+        samples, ticks = (joined(*column) for column in zip(*self._parts, strict=True))
+        self._parts, self._fresh = [], 0
         fresh = np.empty(len(samples), _ROW)
         fresh["time_ns"], fresh["level"] = samples["time_ns"], ticks["level"]
         fresh["phase"], fresh["dt"] = ticks["phase"], steps(samples, self._last_ns)
@@ -120,7 +131,7 @@ class Bank:
         fresh["since"] = number - np.maximum.accumulate(begun)
         self._last_ns, self._phase = int(samples["time_ns"][-1]), int(ticks["phase"][-1])
         self._since = int(fresh["since"][-1])
-        rows = np.concatenate([self._waits, fresh])
+        rows = joined(self._waits, fresh)
         drawn_now = drawn(rows["since"][:-1]) | rows["bends"][1:]
         first = self._count - len(self._waits)
         self._count += len(samples)
@@ -146,6 +157,7 @@ class Bank:
 
         These are (drawn, hypotheses).
         """
+        self._step_on()
         if count == self._count and len(self._waits):
             self._step(self._waits, np.array([count - 1]))
             self._waits = self._waits[:0]

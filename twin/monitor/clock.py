@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.events import Event, Kind
-from twin.signals import SAMPLE, Quality, Samples
+from twin.signals import SAMPLE, Quality, Samples, joined
 
 WINDOW_NS = 5_000_000_000  # of PLC time; the fastest receipt of each counts
 KEPT = 120  # windows: ten minutes, over which the drift of a quartz is steady
@@ -98,7 +98,7 @@ class ClockWatch:
         if samples["quality"][0] & _NEW:
             events += self.close()
             self._begin()
-        rows = np.concatenate([self._receipt, samples])
+        rows = joined(self._receipt, samples)
         self._receipt = rows[-1:].copy()
         self._learn(samples)
         for time_ns, host_ns, sequence in self._compared(rows[:-1][np.diff(rows["host_ns"]) != 0]):

@@ -11,18 +11,18 @@ from twin.signals import (
     BREAK,
     MBAR,
     NS,
-    SAMPLE,
-    TICK,
     UNUSABLE,
     Phase,
     Samples,
     Ticks,
     deviation,
+    joined,
 )
 
 LONGEST_PIECE = 10_000  # rows; a longer cycle is judged in pieces so that alarms do not wait
 FEWEST_ROWS = 20  # of a phase, to judge it
 H2 = 550.0 * MBAR  # Pa below ambient: part present, the field's default
+_IDLE, _SUCTION, _HOLD, _BLOW_OFF = (int(phase) for phase in Phase)
 PAPER_VACUUM = 600.0 * MBAR  # Pa below ambient: what the founding paper times evacuation to
 
 
@@ -79,49 +79,61 @@ class Teller(Protocol):
 class CycleCutter:
     """Takes rows in, gives cycles out as soon as they have ended."""
 
-    _samples: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))
-    _ticks: Ticks = field(default_factory=lambda: np.empty(0, TICK))
+    _parts: list[tuple[Samples, Ticks]] = field(default_factory=list)
+    _count: int = 0  # rows in them
+    _phase: int = Phase.SUCTION  # of the newest row; before the first one none can begin
     _index: int = -1  # of the cycle that is being collected; −1 before the first suction edge
     _at_edge: bool = False  # what is collected begins with a suction edge
     _edges_on_end: int = 0  # suction edges since the start or the last break
 
     def push(self, samples: Samples, ticks: Ticks) -> Iterator[Cycle]:
         """Give every cycle that these rows end."""
-        self._samples = np.concatenate([self._samples, samples])
-        self._ticks = np.concatenate([self._ticks, ticks])
-        while (end := self._next_end()) is not None:
-            yield self._cut(end)
+        breaks = (samples["quality"] & BREAK) != 0
+        edges = self._edges(ticks["phase"])
+        ends = np.flatnonzero(edges | breaks).tolist()
+        begin = 0
+        for end in [*ends, len(samples)]:
+            while self._count + end - begin > LONGEST_PIECE:
+                cut = begin + LONGEST_PIECE - self._count
+                self._keep(samples[begin:cut], ticks[begin:cut])
+                yield self._cut()
+                begin = cut
+            self._keep(samples[begin:end], ticks[begin:end])
+            if end < len(samples) and self._count:
+                yield self._cut(bool(edges[end]), bool(breaks[end]))
+            begin = end
 
     def flush(self) -> Iterator[Cycle]:
         """Give what is left; it is complete if it had come to idle."""
-        if len(self._samples):
-            yield self._cut(len(self._samples))
+        if self._count:
+            yield self._cut()
+        self._phase = Phase.SUCTION
 
-    def _edges(self, last: int) -> npt.NDArray[np.bool_]:
-        """Mark the rows 1..last−1 at which suction begins."""
-        phase = self._ticks["phase"][:last]
-        edges: npt.NDArray[np.bool_] = phase[1:] == Phase.SUCTION
-        edges &= np.isin(phase[:-1], (Phase.IDLE, Phase.BLOW_OFF))
+    def _edges(self, phase: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
+        """Mark the rows at which suction begins."""
+        before = np.concatenate([[np.uint8(self._phase)], phase])
+        self._phase = int(before[-1])
+        edges: npt.NDArray[np.bool_] = before[1:] == _SUCTION
+        edges &= (before[:-1] == _IDLE) | (before[:-1] == _BLOW_OFF)
         return edges
 
-    def _next_end(self) -> int | None:
-        breaks = (self._samples["quality"][1:LONGEST_PIECE] & BREAK) != 0
-        found = np.flatnonzero(self._edges(LONGEST_PIECE) | breaks)
-        if len(found):
-            return int(found[0]) + 1
-        return LONGEST_PIECE if len(self._samples) > LONGEST_PIECE else None
+    def _keep(self, samples: Samples, ticks: Ticks) -> None:
+        if len(samples):
+            self._parts.append((samples, ticks))
+            self._count += len(samples)
 
-    def _cut(self, end: int) -> Cycle:
-        begins, self._at_edge = self._at_edge, bool(self._edges(end + 1)[end - 1 : end].any())
+    def _cut(self, at_edge: bool = False, at_break: bool = False) -> Cycle:
+        """The rows so far, and what the one after them begins."""
+        begins, self._at_edge = self._at_edge, at_edge and not at_break
         self._edges_on_end += begins
         settled = self._edges_on_end >= 2
-        if len(self._samples) > end and self._samples["quality"][end] & BREAK:
-            self._at_edge, self._edges_on_end = False, 0
-        samples, self._samples = self._samples[:end], self._samples[end:]
-        ticks, self._ticks = self._ticks[:end], self._ticks[end:]
+        if at_break:
+            self._edges_on_end = 0
+        samples, ticks = (joined(*column) for column in zip(*self._parts, strict=True))
+        self._parts, self._count = [], 0
         self._index += begins
-        whole = begins and ticks["phase"][-1] in (Phase.IDLE, Phase.BLOW_OFF)
-        cut_short = not self._at_edge and end < LONGEST_PIECE
+        whole = begins and ticks["phase"][-1] in (_IDLE, _BLOW_OFF)
+        cut_short = not self._at_edge and len(samples) < LONGEST_PIECE
         return Cycle(self._index, samples, ticks, bool(whole), cut_short, settled)
 
 

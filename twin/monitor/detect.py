@@ -7,6 +7,7 @@ differ where no single one does. It is cleared, with hysteresis, when all are ba
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, Teller, Told,
 from twin.monitor.healthy import Healthy
 from twin.monitor.signatures import Likeness, likenesses, look_alikes
 from twin.settings import Settings
-from twin.signals import BREAK, NS, SAMPLE, Quality, Samples, Ticks
+from twin.signals import BREAK, NS, SAMPLE, Quality, Samples, Ticks, joined
 
 if TYPE_CHECKING:  # its SciPy would be imported with every configuration
     from twin.monitor.isolation import Isolation, Verdict
@@ -74,7 +75,9 @@ class Monitor:
     def update(self, samples: Samples, ticks: Ticks) -> list[Event]:
         """Take rows with the twin's ticks; give what they make happen."""
         events = []
-        for rows in np.split(np.arange(len(samples)), np.flatnonzero(samples["quality"] & BREAK)):
+        breaks = np.flatnonzero(samples["quality"] & BREAK).tolist()
+        for begin, end in pairwise([0, *breaks, len(samples)]):
+            rows = slice(begin, end)
             found = list(self._stream_events(samples[rows]))
             silent = any(event.kind is Kind.PLC_BACK for event in found)
             if self.isolation:
@@ -105,11 +108,14 @@ class Monitor:
         """Find the rows at which something happened to the stream; most blocks have none."""
         if not len(samples):
             return
-        rows = np.concatenate([self._fresh, self._last, samples])
+        if self._nothing_happens(samples):
+            self._last = self._fresh = samples[-1:].copy()
+            return
+        rows = joined(self._fresh, self._last, samples)
         first = len(rows) - len(samples)
         quality = rows["quality"]
         changes = np.diff(quality & _UNFIT, prepend=np.uint8(self._unfit)) != 0
-        changes |= (quality & (Quality.GAP | Quality.RESTART | Quality.CLOCK)) != 0
+        changes |= (quality & BREAK) != 0
         fresh = (quality & Quality.STALE) == 0
         latest = np.maximum.accumulate(np.where(fresh, np.arange(len(rows)), -1))
         before = np.concatenate([[-1], latest[:-1]])  # the last fresh row before each
@@ -122,6 +128,13 @@ class Monitor:
                 yield from self._row_events(rows[row - 1] if row else None, rows[row], heard)
         self._last = rows[-1:].copy()
         self._fresh = rows[fresh][-1:].copy()
+
+    def _nothing_happens(self, samples: Samples) -> bool:
+        """Whether rows are all good, and all came since the last fresh one without a silence."""
+        if self._unfit or self._silences or samples["quality"].any():
+            return False
+        came = np.concatenate([self._fresh["host_ns"], samples["host_ns"]])
+        return bool(np.ptp(came) * NS * 1e3 <= self.settings.stale_ms)
 
     def _row_events(
         self, before: np.void | None, row: np.void, heard: np.void | None

@@ -125,7 +125,9 @@ class Isolation:
         theta = coefficients(data)
         noise = data.sensor.noise_mbar
         listener = Listener(theta, healthy, noise, expected_knees(theta, noise * MBAR))
-        Bank(theta).push(np.zeros(2, SAMPLE), np.zeros(2, TICK))
+        first = Bank(theta)
+        first.push(np.zeros(2, SAMPLE), np.zeros(2, TICK))
+        first.take(2)
         return cls(Bank(theta), listener, days)
 
     def judge(

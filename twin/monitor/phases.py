@@ -9,6 +9,7 @@ each knee. Rows that cannot be at a knee are given out at once.
 
 import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +20,7 @@ from twin.model.control import new_timer, timed
 from twin.model.gas import GAMMA, R
 from twin.model.plant import suction_at
 from twin.model.theta import Theta
-from twin.signals import BREAK, MS, NS, SAMPLE, UNUSABLE, Phase, Samples
+from twin.signals import BREAK, MS, NS, SAMPLE, UNUSABLE, Phase, Samples, joined
 
 IDLE_ROWS = 20  # rows of idle that give the level before a cycle
 FEWEST_IDLE_ROWS = 5
@@ -268,14 +269,14 @@ class PhaseFinder:
 
     def push(self, block: Samples) -> Found:
         """Take a block; give the rows that are settled, their phases and their levels (Pa)."""
-        breaks = np.flatnonzero(block["quality"] & BREAK)
-        parts = []
-        for stretch in np.split(block, breaks):
-            if len(stretch) and stretch["quality"][0] & BREAK:
-                parts.append(self.flush())
-            parts.append(self._search(stretch))
-        samples, phase, level = (np.concatenate(column) for column in zip(*parts, strict=True))
-        return samples, phase, level
+        breaks = np.flatnonzero(block["quality"] & BREAK).tolist()
+        if not breaks:
+            return self._search(block)
+        parts = [self._search(block[: breaks[0]])]
+        for begin, end in pairwise([*breaks, len(block)]):
+            parts += [self.flush(), self._search(block[begin:end])]
+        samples, phase, level = zip(*parts, strict=True)
+        return joined(*samples), np.concatenate(phase), np.concatenate(level)
 
     def flush(self) -> Found:
         """Give all rows that are left, and begin anew: what follows does not belong to them."""
@@ -290,7 +291,7 @@ class PhaseFinder:
 
     def _search(self, stretch: Samples) -> Found:
         self._told = np.concatenate([self._told, self._what_valves_are_told(stretch)])
-        self._rows = np.concatenate([self._rows, stretch])
+        self._rows = joined(self._rows, stretch)
         self._phase = np.concatenate([self._phase, np.zeros(len(stretch), "u1")])
         self._level = np.concatenate([self._level, np.full(len(stretch), np.nan)])
         settled = self._run(self.knees.window)
