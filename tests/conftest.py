@@ -5,9 +5,11 @@ And what takes long to come by and is shared: a simulated PLC beside the tests o
 
 import asyncio
 import gc
+import itertools
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import psutil
 import pytest
@@ -15,10 +17,12 @@ import rigs
 from hypothesis import settings
 from opcua_plc import OpcuaPlc, start_opcua
 from plc_process import PlcProcess, start_plc
+from postgres import make_schema, postgres_server
 
 from twin.live import compiled
 
 _ME = psutil.Process()
+_SCHEMAS = itertools.count()
 
 settings.register_profile("untimed", deadline=None)  # what is slow here may be quick elsewhere
 settings.load_profile("untimed")
@@ -62,6 +66,27 @@ def opcua(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OpcuaPlc]:
     policies = ["None", "Basic256Sha256", "Aes256Sha256RsaPss"]
     with start_opcua(tmp_path_factory.mktemp("opcua"), policies=policies) as running:
         yield running
+
+
+@pytest.fixture(scope="session")
+def postgresql() -> Iterator[Path]:
+    """The folder of the socket of a PostgreSQL server."""
+    with postgres_server() as folder:
+        yield folder
+
+
+@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
+def server(request: pytest.FixtureRequest) -> Path | None:
+    """The folder of PostgreSQL's socket, or None for SQLite."""
+    return None if request.param == "sqlite" else request.getfixturevalue("postgresql")
+
+
+@pytest.fixture
+def url(server: Path | None, tmp_path: Path) -> str:
+    """A database that is not there yet, or is empty."""
+    if server is None:
+        return f"sqlite:///{tmp_path / 'test.sqlite'}"
+    return make_schema(server, f"test{next(_SCHEMAS)}")
 
 
 @pytest.fixture(scope="session", autouse=True)

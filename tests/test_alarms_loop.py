@@ -18,7 +18,8 @@ from twin.alarms.requests import Request
 from twin.alarms.rules import Rule, default_rules
 from twin.alarms.settings import board_rules
 from twin.alarms.state import Deed, Kept, State
-from twin.alarms.store import Store, Unit, open_store
+from twin.alarms.store import Store, open_store
+from twin.assets.unit import Unit
 from twin.cli_alarms import alarms_of
 from twin.config import Config
 from twin.errors import ConfigError, SourceError
@@ -296,16 +297,15 @@ def test_states_of_alarms_that_there_are_no_more_are_left() -> None:
 # The database.
 
 
-def kept(path: Path) -> Keeper:
-    return Keeper(lambda: open_store(path), UNIT, pytest.fail)
+def kept(where: str | Path) -> Keeper:
+    return Keeper(lambda: open_store(where), UNIT, pytest.fail)
 
 
-def test_the_loop_keeps_its_episodes_and_goes_on_after_a_restart(tmp_path: Path) -> None:
+def test_the_loop_keeps_its_episodes_and_goes_on_after_a_restart(url: str) -> None:
     """The simulated rig with a leak, twice; between the runs somebody acknowledges it."""
-    path = tmp_path / "a.sqlite"
 
     def one_run(fault: str) -> Collect:
-        seen, keeper = Collect(), kept(path)
+        seen, keeper = Collect(), kept(url)
         alarms = Alarms(board_rules(None), lambda: 0, keeper.begin(), keeper)
         theta, config = rigs.theta("gripper"), rigs.config("gripper")
         monitor = Monitor(config.monitor, theta, KeyFigures(config.data))
@@ -319,7 +319,7 @@ def test_the_loop_keeps_its_episodes_and_goes_on_after_a_restart(tmp_path: Path)
     assert raised.time_ns == deviation.time_ns
     name = raised.data["alarm"]
     assert name == f"deviation_{deviation.data['effect']}"
-    with open_store(path) as store:
+    with open_store(url) as store:
         before = store.before(UNIT)
         (episode,) = [one for one in before.going_on if one.alarm == name]
         assert before.states[name] == Kept(active=True, acknowledged=False)
@@ -331,7 +331,7 @@ def test_the_loop_keeps_its_episodes_and_goes_on_after_a_restart(tmp_path: Path)
     seen = one_run("leakage=2.0")
     assert seen.of(Kind.DEVIATION)
     assert name not in [one.data["alarm"] for one in seen.of(Kind.ALARM)]
-    with open_store(path) as store:
+    with open_store(url) as store:
         assert store.states(UNIT)[name] == Kept(active=True, acknowledged=True)
         assert len([one for one in store.episodes(UNIT) if one.alarm == name]) == 1
         assert store.episodes(UNIT, episode.raised_ns + 1) == [

@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from postgres import make_schema, postgres_server
+from postgres import make_schema
 
 from twin.assets import database
 from twin.assets.database import Assets, open_assets
@@ -48,24 +48,6 @@ UNIT = Record(
     },
     provenance={"log": "day.mcap", "cycles": [0, 2, 4], "code": "1.2.3", "names": ["a", "b"]},
 )
-
-
-@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
-def server(request: pytest.FixtureRequest) -> Iterator[Path | None]:
-    """The folder of PostgreSQL's socket, or None for SQLite."""
-    if request.param == "sqlite":
-        yield None
-        return
-    with postgres_server() as folder:
-        yield folder
-
-
-@pytest.fixture
-def url(server: Path | None, tmp_path: Path) -> str:
-    """A database that is not there yet, or is empty."""
-    if server is None:
-        return f"sqlite:///{tmp_path / 'assets.sqlite'}"
-    return make_schema(server, f"test{next(NUMBERS)}")
 
 
 @pytest.fixture(scope="module")

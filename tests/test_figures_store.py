@@ -4,7 +4,6 @@ import itertools
 import math
 import sqlite3
 import threading
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -12,35 +11,16 @@ from typing import Any
 import numpy as np
 import psycopg
 import pytest
-from postgres import make_schema, postgres_server
 
 from twin.assets.database import open_assets
+from twin.assets.unit import Unit
 from twin.errors import ConfigError, SourceError
 from twin.figures.place import FILE, open_chosen
-from twin.figures.store import VALUES, Counters, Store, Unit, open_store
+from twin.figures.store import VALUES, Counters, Store, open_store
 from twin.settings import Document
 
-NUMBERS = itertools.count()
 RIG, GRIPPER = Unit("ejector-35", "rig-01"), Unit("ejector-35", "gripper-01")
 SECOND = 1_000_000_000
-
-
-@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
-def server(request: pytest.FixtureRequest) -> Iterator[Path | None]:
-    """The folder of PostgreSQL's socket, or None for SQLite."""
-    if request.param == "sqlite":
-        yield None
-        return
-    with postgres_server() as folder:
-        yield folder
-
-
-@pytest.fixture
-def url(server: Path | None, tmp_path: Path) -> str:
-    """A database that is not there yet, or is empty."""
-    if server is None:
-        return f"sqlite:///{tmp_path / 'figures.sqlite'}"
-    return make_schema(server, f"figures{next(NUMBERS)}")
 
 
 def execute(url: str, statement: str) -> None:

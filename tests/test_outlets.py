@@ -14,7 +14,7 @@ from test_alarms_cli import begun, run  # noqa: F401 - a fixture
 from test_alarms_loop import APART, LEAK, NONE, UNIT, S, Stream, deviation, diagnosis, event
 
 from twin.alarms.state import Deed
-from twin.alarms.store import Unit
+from twin.assets.unit import Unit
 from twin.errors import SourceError
 from twin.events import Event, Kind
 from twin.outlets import dispatch, sender
@@ -146,8 +146,8 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def outbox(tmp_path: Path, clock: Clock) -> Iterator[Outbox]:
-    with open_outbox(tmp_path / "a.sqlite", UNIT, clock=clock) as opened:
+def outbox(url: str, clock: Clock) -> Iterator[Outbox]:
+    with open_outbox(url, UNIT, clock=clock) as opened:
         yield opened
 
 
@@ -159,9 +159,9 @@ def test_messages_wait_for_each_destination_in_order(outbox: Outbox) -> None:
     assert (outbox.count("mqtt"), outbox.count("webhook")) == (1, 3)
 
 
-def test_units_do_not_see_each_others(outbox: Outbox, tmp_path: Path) -> None:
+def test_units_do_not_see_each_others(outbox: Outbox, url: str) -> None:
     outbox.put([("mqtt", message(1))])
-    with open_outbox(tmp_path / "a.sqlite", Unit(UNIT.type, "other")) as other:
+    with open_outbox(url, Unit(UNIT.type, "other")) as other:
         assert other.next("mqtt", 5) == []
         other.delivered("mqtt", ["1"])
     assert outbox.count("mqtt") == 1
