@@ -26,7 +26,8 @@ FEWEST_CYCLES = 3  # judged ones: two to fit on, one to judge by
 EXPLAINED = 1.2  # sigmas left up to which causes explain a deviation
 BEYOND = 1.8  # times the usual deviation, with a share of what was explained: more is left over
 ROUGH = 0.06  # of what was explained, that causes may be off
-SEVERAL = 1.6  # sigmas that several causes may leave and still be sure
+SEVERAL = 1.6  # sigmas that several causes may leave and still be sure,
+NEARLY_ALL = 0.1  # or this of chi-square beyond noise: gross effects leave many sigmas
 MOST_LEFT = 0.5  # of chi-square beyond noise, that a cause may leave and still be sure
 MOST_SATURATED = 0.05  # share of samples
 MOST_JUDGED = 24  # cycles of a long log that are looked at, evenly spread
@@ -118,11 +119,12 @@ def _verdict(found: Hypothesis, before: Judged, after: Judged, strange: Unlisted
 def _sure(found: Hypothesis, before: Judged, after: Judged) -> bool:
     """Whether causes stand although something is left: they take away nearly all of it.
 
-    Several together can look like something nobody listed, so little may be left of them.
+    Several together can look like something nobody listed, so little may be left of them, in
+    sigmas or beside what they take away.
     """
     left = after.leftover
     share = (left**2 - 1.0) / max(before.leftover**2 - 1.0, 1e-9)
-    return share < MOST_LEFT and (len(found) == 1 or left < SEVERAL)
+    return share < MOST_LEFT and (len(found) == 1 or left < SEVERAL or share < NEARLY_ALL)
 
 
 def insufficient(evidence: Evidence) -> str:
