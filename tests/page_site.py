@@ -12,7 +12,8 @@ import rigs
 from twin.alarms.keeper import Keeper
 from twin.alarms.loop import Alarms
 from twin.alarms.settings import board_rules
-from twin.alarms.store import Unit, open_store
+from twin.alarms.store import open_store
+from twin.assets.unit import Unit
 from twin.config import Config
 from twin.events import Event, Kind
 from twin.page.ring import ROW_NS, LiveRows

@@ -16,7 +16,8 @@ from twin.alarms.keeper import Keeper
 from twin.alarms.loop import Alarms
 from twin.alarms.rules import Rule, default_rules, read_rules, write_rules
 from twin.alarms.settings import board_rules
-from twin.alarms.store import Unit, open_store
+from twin.alarms.store import open_store
+from twin.assets.unit import Unit
 from twin.cli_alarms import alarms_app
 from twin.errors import ConfigError, SourceError
 from twin.settings import Document

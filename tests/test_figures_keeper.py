@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import rigs
 
+from twin.assets.unit import Unit
 from twin.cli_figures import keeper_of, key_figures_of
 from twin.config import Config
 from twin.errors import ConfigError, SourceError
@@ -19,7 +20,7 @@ from twin.figures import keeper as module
 from twin.figures.cycle import KeyFigures
 from twin.figures.keeper import Alarms, Keeper
 from twin.figures.read import of_log
-from twin.figures.store import Store, Unit, open_store
+from twin.figures.store import Store, open_store
 from twin.live import run
 from twin.log.header import LogHeader
 from twin.log.reader import open_log

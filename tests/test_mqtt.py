@@ -20,7 +20,8 @@ from plc_process import start_plc
 from test_alarms_loop import LEAK, NONE, UNIT, Stream, deviation
 from test_outlets import NO_TICKS, Bench, message, wait_until
 
-from twin.alarms.store import Unit, open_store
+from twin.alarms.store import open_store
+from twin.assets.unit import Unit
 from twin.cli_outlets import outlets_of
 from twin.config import Config
 from twin.errors import ConfigError

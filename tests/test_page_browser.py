@@ -16,8 +16,9 @@ from page_site import LEAK, Run, S, config, write_config
 from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
 
 from twin.alarms import keeper as keeper_module
+from twin.assets.unit import Unit
 from twin.events import Kind
-from twin.figures.store import Unit, open_store
+from twin.figures.store import open_store
 from twin.page.app import Access
 from twin.page.app import Page as Served
 from twin.page.ejector import Ejector

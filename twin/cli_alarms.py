@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from twin.alarms.board import Board, Episode
     from twin.alarms.loop import Alarms
     from twin.alarms.state import Alarm, Deed
-    from twin.alarms.store import Store, Unit
+    from twin.alarms.store import Store
+    from twin.assets.unit import Unit
     from twin.config import Config
     from twin.settings import Document
 
@@ -215,8 +216,9 @@ def alarms_of(
     from twin.alarms.loop import Alarms
     from twin.alarms.place import open_chosen
     from twin.alarms.settings import AlarmSettings, board_rules
-    from twin.alarms.store import ALARM_DATABASE, Unit
+    from twin.alarms.store import ALARM_DATABASE
     from twin.assets.engine import parse_url
+    from twin.assets.unit import Unit
 
     document = settings.document
     by_cause, wanted = board_rules(document), document.section(AlarmSettings, "alarms")
@@ -235,7 +237,7 @@ def asker_of(settings: "Config") -> "Callable[[str, str], None] | None":
     from twin.alarms.place import open_chosen
     from twin.alarms.settings import AlarmSettings
     from twin.alarms.state import Deed
-    from twin.alarms.store import Unit
+    from twin.assets.unit import Unit
 
     if not settings.document.section(AlarmSettings, "alarms").keep:
         return None

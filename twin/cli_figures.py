@@ -14,11 +14,12 @@ from twin.errors import ConfigError, SourceError
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from twin.assets.unit import Unit
     from twin.config import Config
     from twin.figures.cycle import KeyFigures
     from twin.figures.keeper import Keeper
     from twin.figures.settings import FigureSettings, Limits
-    from twin.figures.store import History, Store, Unit
+    from twin.figures.store import History, Store
     from twin.figures.table import Figure
     from twin.log.reader import Log
     from twin.settings import Document
@@ -53,9 +54,10 @@ def show(
     figures: Url = "",
 ) -> None:
     """Key figures of every cycle of a log: measured, and what the twin expected."""
+    from twin.assets.unit import Unit
     from twin.figures.export import to_table
     from twin.figures.read import of_log
-    from twin.figures.store import Unit, open_store
+    from twin.figures.store import open_store
     from twin.figures.words import cycles_table
     from twin.log.reader import open_log
     from twin.tables.sheet import export as export_table
@@ -189,10 +191,11 @@ def keeper_of(settings: "Config", say: "Callable[[str], None]") -> "Callable[[],
     ConfigError for a URL of an unknown kind; a database that is away is said, and waited for.
     """
     from twin.assets.engine import parse_url
+    from twin.assets.unit import Unit
     from twin.figures.keeper import Keeper
     from twin.figures.place import open_chosen
     from twin.figures.settings import FigureSettings
-    from twin.figures.store import FIGURE_DATABASE, Unit
+    from twin.figures.store import FIGURE_DATABASE
 
     wanted = settings.document.section(FigureSettings, "figures")
     if not wanted.keep:

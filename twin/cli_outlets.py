@@ -25,7 +25,7 @@ def outlets_of(settings: "Config", say: Say) -> Begin | None:
     """
     from twin.alarms.place import place_of
     from twin.alarms.settings import AlarmSettings
-    from twin.alarms.store import Unit
+    from twin.assets.unit import Unit
     from twin.outlets.settings import chosen
 
     document = settings.document

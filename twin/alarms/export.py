@@ -8,7 +8,7 @@ import pyarrow as pa
 from twin.alarms.board import Episode
 from twin.alarms.rules import Rule
 from twin.alarms.state import Alarm
-from twin.alarms.store import Unit
+from twin.assets.unit import Unit
 
 _TIME = pa.timestamp("ns", "UTC")
 _TEXT, _CYCLE = pa.string(), pa.int64()

@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 from twin.alarms.loop import Before, News
 from twin.alarms.requests import Request
-from twin.alarms.store import Store, Unit
+from twin.alarms.store import Store
+from twin.assets.unit import Unit
 from twin.errors import TwinError
 
 POLL_S = 1.0  # between looks at what is asked; what has changed is written with it

@@ -4,13 +4,12 @@ import json
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from sqlalchemy import (
     BigInteger,
     Boolean,
     Column,
-    ColumnElement,
     Connection,
     Double,
     Integer,
@@ -27,6 +26,7 @@ from twin.alarms.loop import Before, News
 from twin.alarms.requests import Request
 from twin.alarms.state import Deed, Kept
 from twin.assets.engine import Database, Purpose
+from twin.assets.unit import Unit, of_unit
 
 ALARM_DATABASE = Purpose("alarm database", "--alarms")
 
@@ -80,13 +80,6 @@ REQUEST = Table(
 
 # What a run has once kept is a unit that can be asked for, whether or not an alarm was ever raised.
 UNIT = Table("alarm_unit", metadata, *_whose())
-
-
-class Unit(NamedTuple):
-    """Whose alarms."""
-
-    type: str
-    id: str
 
 
 def open_store(
@@ -145,7 +138,7 @@ class Store(Database):
 
     def requests(self, unit: Unit) -> list[Request]:
         """What is asked of a unit's alarms, and not answered, in the order it was asked."""
-        wanted = select(REQUEST).where(*_of(REQUEST, unit), REQUEST.c.answered_ns.is_(None))
+        wanted = select(REQUEST).where(*of_unit(REQUEST, unit), REQUEST.c.answered_ns.is_(None))
         with self._reading() as connection:
             return [_request(row) for row in connection.execute(wanted.order_by(REQUEST.c.id))]
 
@@ -174,7 +167,7 @@ class Store(Database):
     def states(self, unit: Unit) -> dict[str, Kept]:
         """The alarms of a unit that were ever anything else than normal."""
         with self._reading() as connection:
-            rows = connection.execute(select(STATE).where(*_of(STATE, unit))).all()
+            rows = connection.execute(select(STATE).where(*of_unit(STATE, unit))).all()
         return {
             row.alarm: Kept(row.active, row.acknowledged, row.shelved_until_ns, row.out_of_service)
             for row in rows
@@ -184,7 +177,7 @@ class Store(Database):
         self, unit: Unit, since_ns: int | None = None, *, only_going_on: bool = False
     ) -> list[Episode]:
         """The episodes of a unit (raised since then), in the order they were raised."""
-        wanted = select(EPISODE).where(*_of(EPISODE, unit))
+        wanted = select(EPISODE).where(*of_unit(EPISODE, unit))
         if since_ns is not None:
             wanted = wanted.where(EPISODE.c.raised_ns >= since_ns)
         if only_going_on:
@@ -192,10 +185,6 @@ class Store(Database):
             wanted = wanted.where(cleared.is_(None) | seen.is_(None))
         with self._reading() as connection:
             return [_episode(row) for row in connection.execute(wanted.order_by("raised_ns"))]
-
-
-def _of(table: Table, unit: Unit) -> tuple[ColumnElement[bool], ...]:
-    return table.c.asset_type == unit.type, table.c.asset_id == unit.id
 
 
 def _replace(connection: Connection, table: Table, row: Mapping[str, Any]) -> None:

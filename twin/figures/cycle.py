@@ -26,6 +26,7 @@ from twin.signals import (
     Phase,
     Samples,
     Ticks,
+    joined,
 )
 
 _OVER = (Phase.IDLE, Phase.BLOW_OFF)
@@ -129,8 +130,8 @@ class KeyFigures:
 
     def _given(self) -> CycleFigures:
         pieces, self._pieces = self._pieces, []
-        samples = np.concatenate([piece.samples for piece in pieces])
-        ticks = np.concatenate([piece.ticks for piece in pieces])
+        samples = joined(*(piece.samples for piece in pieces))
+        ticks = joined(*(piece.ticks for piece in pieces))
         last = ticks["phase"][-1]
         ended = last in _OVER
         seen = ended, bool(ended and not (pieces[-1].cut_short and last == Phase.BLOW_OFF))

@@ -5,9 +5,10 @@ import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+from twin.assets.unit import Unit
 from twin.errors import TwinError
 from twin.events import Event, Kind, Severity
-from twin.figures.store import Store, Unit
+from twin.figures.store import Store
 from twin.signals import Samples, Ticks
 
 BATCH_S = 2.0  # cycles of so long are written together

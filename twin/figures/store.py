@@ -10,14 +10,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from sqlalchemy import (
     BigInteger,
     Column,
-    ColumnElement,
     Connection,
     Double,
     Integer,
@@ -33,6 +32,7 @@ from sqlalchemy import (
 )
 
 from twin.assets.engine import Database, Purpose
+from twin.assets.unit import Unit, of_unit
 from twin.figures.table import FIGURES
 
 FIGURE_DATABASE = Purpose("figure database", "--figures")
@@ -69,13 +69,6 @@ ERASED = Table(
 )
 
 Floats = npt.NDArray[np.float64]
-
-
-class Unit(NamedTuple):
-    """Whose figures."""
-
-    type: str
-    id: str
 
 
 @dataclass(frozen=True)
@@ -163,7 +156,7 @@ class Store(Database):
         self, unit: Unit, since_ns: int | None = None, values: Sequence[str] = VALUES
     ) -> History:
         """The cycles of a unit (received since then), each as it was stored last."""
-        conditions = [*_of(CYCLE, unit)]
+        conditions = [*of_unit(CYCLE, unit)]
         if since_ns is not None:
             conditions.append(CYCLE.c.host_ns >= since_ns)
         wanted = select(*(CYCLE.c[name] for name in (*_OWN, *values))).where(*conditions)
@@ -173,8 +166,8 @@ class Store(Database):
 
     def counters(self, unit: Unit, *, erasable: bool = False) -> Counters:
         """Suction cycles, valve switchings and alarms; the erasable ones since they were erased."""
-        conditions = [*_of(CYCLE, unit)]
-        newest = select(func.max(ERASED.c.host_ns)).where(*_of(ERASED, unit))
+        conditions = [*of_unit(CYCLE, unit)]
+        newest = select(func.max(ERASED.c.host_ns)).where(*of_unit(ERASED, unit))
         with self._reading() as connection:
             since = connection.scalar(newest) if erasable else None
             if since is not None:
@@ -207,10 +200,6 @@ def _missing(connection: Connection) -> list[Column[Any]]:
         return list(CYCLE.columns)
     there = {column["name"] for column in inspector.get_columns(CYCLE.name)}
     return [column for column in CYCLE.columns if column.name not in there]
-
-
-def _of(table: Table, unit: Unit) -> tuple[ColumnElement[bool], ...]:
-    return table.c.asset_type == unit.type, table.c.asset_id == unit.id
 
 
 def _here(

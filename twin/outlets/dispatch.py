@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from twin.alarms.store import Unit
+from twin.assets.unit import Unit
 from twin.errors import TwinError
 from twin.events import Event, Kind
 from twin.outlets.message import Message, of_cycle, of_event, restated

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from twin.alarms.store import Unit
+from twin.assets.unit import Unit
 from twin.events import Event, Kind
 
 ALARM_FORMAT = "ejector-twin-alarm/1"

@@ -21,7 +21,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
-from twin.alarms.store import Unit
+from twin.assets.unit import Unit
 from twin.outlets.message import Message, of_status
 from twin.outlets.sender import BATCH, LostError, Sent
 from twin.outlets.settings import MqttSettings, Say

@@ -24,8 +24,9 @@ from sqlalchemy import (
     select,
 )
 
-from twin.alarms.store import ALARM_DATABASE, Unit
+from twin.alarms.store import ALARM_DATABASE
 from twin.assets.engine import Database
+from twin.assets.unit import Unit, of_unit
 from twin.outlets.message import Message
 
 metadata = MetaData()
@@ -157,7 +158,7 @@ class Outbox(Database):
         return OUTBOX.c.destination == destination, *self._whose()
 
     def _whose(self) -> tuple[ColumnElement[bool], ...]:
-        return OUTBOX.c.asset_type == self._unit.type, OUTBOX.c.asset_id == self._unit.id
+        return of_unit(OUTBOX, self._unit)
 
     def _waiting(self, destination: str) -> tuple[ColumnElement[bool], ...]:
         return *self._own(destination), OUTBOX.c.refused.is_(None)

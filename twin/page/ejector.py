@@ -17,13 +17,12 @@ from twin.alarms.requests import ASKABLE
 from twin.alarms.settings import AlarmSettings, board_rules
 from twin.alarms.state import Deed
 from twin.alarms.store import Store as AlarmStore
-from twin.alarms.store import Unit as AlarmUnit
+from twin.assets.unit import Unit
 from twin.config import Config
 from twin.errors import ConfigError, TwinError
 from twin.figures.place import open_chosen as open_figures
 from twin.figures.settings import FigureSettings, limits
 from twin.figures.store import SIDES
-from twin.figures.store import Unit as FigureUnit
 from twin.figures.table import FIGURES
 from twin.figures.trend import DAY_NS, FARTHEST, Line, Reach
 from twin.figures.words import in_words, trend_of
@@ -59,7 +58,7 @@ class Ejector:
         self._rules = board_rules(document)
         self._limits = limits(document.section(FigureSettings, "figures"), config.data)
         self._folder = folder_of(document, config.asset)
-        self._unit = AlarmUnit(config.asset.type, config.asset.id)
+        self._unit = Unit(config.asset.type, config.asset.id)
         self._asked: set[int] = set()  # through this page
 
     # --- what stands ----------------------------------------------------------------------------
@@ -166,7 +165,7 @@ class Ejector:
         columns = [f"{name}_{side}" for side in SIDES]
         since = self._clock() - round(days * DAY_NS)
         with open_figures("", self.config.document, write=False) as store:
-            history = store.history(FigureUnit(*self._unit), since, columns)
+            history = store.history(self._unit, since, columns)
         found: dict[str, Any] = {
             "name": name,
             "unit": figure.unit,
