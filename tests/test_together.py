@@ -276,6 +276,52 @@ def test_several_ejectors_each_with_its_twin_and_log(tmp_path: Path) -> None:
     assert len({one.header.metadata["data_set"] for one in opened}) == 2
 
 
+def over_opcua(url: str, prefix: str, unit: int) -> Callable[[dict[str, Any]], None]:
+    """Nodes below a prefix, as a server with several ejectors has them."""
+
+    def change(tables: dict[str, Any]) -> None:
+        tables["driver"]["url"] = url
+        tables["plc"]["server"]["unit"] = unit
+        tables["plc"]["opcua"] |= {"port": 0, "prefix": prefix}
+        for tag in tables["driver"]["tags"].values():
+            tag["node"] = tag["node"].replace("s=", f"s={prefix}")
+        trace = tables["driver"]["trace"]
+        tables["driver"]["trace"] = {k: v.replace("s=", f"s={prefix}") for k, v in trace.items()}
+
+    return change
+
+
+def test_several_ejectors_of_one_opc_ua_server(tmp_path: Path) -> None:
+    names = ("left", "right")
+
+    def at(url: str) -> list[Path]:
+        return [
+            configured(tmp_path, "test_rig_opcua", name, over_opcua(url, f"{name}.", unit))
+            for unit, name in enumerate(names, 1)
+        ]
+
+    first, second = at("opc.tcp://127.0.0.1:1")
+    with start_plc(first, str(second)) as plc:
+        assert plc.process.stdout is not None
+        url = plc.process.stdout.readline().strip().removeprefix("OPC UA on ")
+        logs = [tmp_path / f"run.{name}.mcap" for name in names]
+        with running(*at(url), "--log", tmp_path / "run.mcap") as process:
+            until(process, lambda: all(rows(one) > 1500 for one in logs))
+            process.send_signal(signal.SIGINT)
+            _, complaints = process.communicate(timeout=PATIENCE_S)
+        assert process.returncode == 130, complaints
+    for name, one in zip(names, map(open_log, logs), strict=True):
+        assert one.complete
+        assert one.header.asset_id == name
+        assert kinds(one) <= {Kind.CYCLE, Kind.CLOCK}
+        assert not any((samples["quality"] & BREAK).any() for samples, _ in one.blocks())
+    left, right = (
+        np.concatenate([samples["pressure"] for samples, _ in open_log(one).blocks()])[:1000]
+        for one in logs
+    )
+    assert not np.array_equal(left, right)  # each has the noise of its own rig
+
+
 def test_one_that_cannot_begin_leaves_the_others_and_is_exit_code_3(
     plc: PlcProcess,
     tmp_path: Path,
