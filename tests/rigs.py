@@ -19,7 +19,7 @@ from twin.monitor.detect import Monitor
 from twin.monitor.isolation import Isolation
 from twin.monitor.phases import Knees, expected_knees
 from twin.settings import Document
-from twin.signals import MBAR, Samples, Ticks
+from twin.signals import MBAR, Quality, Samples, Ticks
 
 ROOT = Path(__file__).parents[1]
 NAMES = ("test_rig", "gripper")
@@ -72,6 +72,16 @@ def recorded(
     samples, truth = (np.concatenate(column) for column in zip(*parts, strict=True))
     samples.flags.writeable = truth.flags.writeable = False
     return samples, truth
+
+
+def spoilt(samples: Samples, share: float, seed: int) -> Samples:
+    """With bad rows, one to three at a time."""
+    rng = np.random.default_rng(seed)
+    rows = np.flatnonzero(rng.random(len(samples) - 3) < share / 2)
+    rows = np.unique(np.concatenate([row + np.arange(rng.integers(1, 4)) for row in rows]))
+    samples = samples.copy()
+    samples["pressure"][rows], samples["quality"][rows] = 5e5, Quality.BAD
+    return samples
 
 
 def cut(samples: Samples, size: int) -> list[Samples]:

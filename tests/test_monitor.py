@@ -219,6 +219,15 @@ def test_healthy_cycles_raise_no_alarm(name: str, seed: int) -> None:
     assert kinds(seen.events) == [Kind.CYCLE] * len(seen.events)
 
 
+@pytest.mark.parametrize("name", rigs.NAMES)
+@pytest.mark.parametrize("seed", [21, 22])
+def test_bad_rows_in_healthy_cycles_are_no_deviation(name: str, seed: int) -> None:
+    samples = rigs.spoilt(rigs.recorded(name, 160.0, seed=seed)[0], 0.02, seed)
+    seen = rigs.watch(name, rigs.cut(samples, 1000))
+    assert len(seen.of(Kind.CYCLE)) >= 48
+    assert seen.of(Kind.DEVIATION) == []
+
+
 @pytest.mark.parametrize("stop_s", [10.6, 11.2, 11.9])
 @pytest.mark.parametrize("name", rigs.NAMES)
 def test_the_end_of_the_run_is_no_deviation(name: str, stop_s: float) -> None:

@@ -55,13 +55,17 @@ def since_edge(suction: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
     return row - np.maximum.accumulate(np.where(edges, row, 0))
 
 
-def compare(name: str, faults: tuple[str, ...], seed: int, air_saving: bool = True) -> list[int]:
+def compare(
+    name: str, faults: tuple[str, ...], seed: int, air_saving: bool = True, bad: float = 0.0
+) -> list[int]:
     """Rows by which each switch is found late; an assertion fails where one is not or is no one.
 
     A switch just before the end of suction cannot be told from it; one just after its beginning
-    is the valve's answer to the command.
+    is the valve's answer to the command. A share ``bad`` of the rows has no good pressure.
     """
     samples, truth = rigs.recorded(name, SECONDS, faults, seed, air_saving)
+    if bad:
+        samples = rigs.spoilt(samples, bad, seed)
     knees = rigs.knees(name)
     _, phase, _ = find(samples, knees)
     suction = samples["commands"] == Command.SUCTION
@@ -88,6 +92,12 @@ def test_every_switch_is_found_and_none_invented(name: str, condition: str, seed
     late = compare(name, CONDITIONS[condition], seed)
     reaches_h1 = (name, condition) != ("test_rig", "leak")
     assert (len(late) > 3) == reaches_h1
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_a_few_bad_rows_hide_no_switch_and_make_none(name: str, seed: int) -> None:
+    compare(name, (), seed, bad=0.05)
 
 
 @pytest.mark.parametrize("name", rigs.NAMES)

@@ -28,6 +28,7 @@ SIGNIFICANT = 7.0  # sigmas of slope difference that make a knee
 JUMP = 8.0  # times the noise, from one row to the next: knees are rounder
 ALONE = 2.0  # times the changes before and after it: a line that rings rises as fast, but longer
 SHORTEST_WINDOW, LONGEST_WINDOW = 8, 60  # rows
+MOST_MISSING = 0.5  # of a line's rows
 SETTLED = 20e-3  # s after the valve's response before a knee can be one
 
 # What the finder remembers from row to row.
@@ -83,13 +84,30 @@ def expected_knees(theta: Theta, noise: float) -> Knees:
 
 @compiled
 def _line(pressure, start, rows):  # type: ignore[no-untyped-def]
-    """Slope (Pa per row) and mean of a straight line through ``rows`` values from ``start``."""
-    mean, moment = 0.0, 0.0
+    """Slope (Pa per row) and middle of a straight line through ``rows`` values from ``start``.
+
+    A few that are not usable (NaN) are left out; too many make it NaN.
+    """
+    total, moment, missing = 0.0, 0.0, 0
     middle = 0.5 * (rows - 1)
     for i in range(rows):
-        mean += pressure[start + i]
-        moment += (i - middle) * pressure[start + i]
-    return moment * 12.0 / (rows * (rows * rows - 1.0)), mean / rows
+        if math.isnan(pressure[start + i]):
+            missing += 1
+        else:
+            total += pressure[start + i]
+            moment += (i - middle) * pressure[start + i]
+    if missing == 0:
+        return moment * 12.0 / (rows * (rows * rows - 1.0)), total / rows
+    if missing > MOST_MISSING * rows:
+        return math.nan, math.nan
+    places, squares = 0.0, 0.0  # of those that are there, about the middle
+    for i in range(rows):
+        if not math.isnan(pressure[start + i]):
+            places += i - middle
+            squares += (i - middle) ** 2
+    there = rows - missing
+    slope = (there * moment - places * total) / (there * squares - places * places)
+    return slope, (total - slope * places) / there
 
 
 @compiled
