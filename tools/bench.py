@@ -25,6 +25,7 @@ from benchmarks import (
     log,
     machine,
     opcua,
+    plant,
     polling,
     replay,
 )
@@ -85,6 +86,25 @@ BENCHMARKS = (
         "The same beside node-opcua's server, which serves cycles of the simulated rig.",
         _over_opcua("node-opcua"),
         long=True,
+    ),
+    Benchmark(
+        "page",
+        plant.watched,
+        "The same run with key figures, alarms and live rows kept as well, and `twin serve` on the "
+        "PLC's core with one browser connected, which takes all it is told.",
+        (
+            Figure("all on, a page open: CPU of the live process", "% of a core", limit=15.0),
+            Figure("all on, a page open: CPU of the page's process", "% of a core"),
+        ),
+    ),
+    Benchmark(
+        "together",
+        plant.together,
+        "`twin run` with eight configurations, each with a simulated PLC and a log of its own.",
+        (
+            Figure("eight ejectors in one process: lost samples", "", limit=0),
+            Figure("eight ejectors in one process: CPU", "% of a core"),
+        ),
     ),
     Benchmark(
         "polling",

@@ -39,15 +39,15 @@ def _acquire(run: Run, what: str, slices: int, stop_s: float) -> Sequence[Measur
         run.tell(f"{what}: the floor")
         with on_core(TWIN_CORE):
             floors = [_bare_share(port) for _ in range(3)]
-        with live(port, log) as process:
+        with live(log, port=port) as process:
             shares = []
             for number in range(slices):
                 run.tell(f"{what}: slice {number + 1} of {slices}")
                 shares.append(_share(process, stop_s))
-    lost, rows = _lost(log)
+    missing, rows = lost(log)
     note = f"of {rows:,} samples"
     return (
-        Measured([lost], note=note),
+        Measured([missing], note=note),
         Measured(shares, floors),
         Measured([log.stat().st_size / rows]),
     )
@@ -69,7 +69,7 @@ def _share(process: "subprocess.Popen[bytes]", stop_s: float) -> float:
     return 100.0 * (after.user + after.system - times.user - times.system) / wall
 
 
-def _lost(log: Path) -> tuple[int, int]:
+def lost(log: Path) -> tuple[int, int]:
     """Sequence numbers that are missing in the log, and its rows; a repeated one is an error."""
     sequence = np.concatenate([samples["sequence"] for samples, _ in open_log(log).blocks()])
     steps = np.diff(sequence)

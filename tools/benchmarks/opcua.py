@@ -152,7 +152,7 @@ def _acquire(run: Run, what: str, server: AbstractContextManager[int]) -> Sequen
         run.tell(f"{what}: the floor")
         with on_core(TWIN_CORE):
             floors = [_bare_share(port) for _ in range(3)]
-        with live(port, log, CONFIG, subprocess.PIPE) as process:
+        with live(log, [CONFIG], port=port, stdout=subprocess.PIPE) as process:
             heard = _Heard(process)
             listening = heard.listen()
             shares, stops = [], []

@@ -4,7 +4,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
@@ -38,16 +38,25 @@ def plc() -> Iterator[int]:
 
 @contextmanager
 def live(
-    port: int, log: Path, config: Path = CONFIG, stdout: int | IO[bytes] = subprocess.DEVNULL
+    log: Path,
+    configs: Sequence[Path] = (CONFIG,),
+    logs: Sequence[Path] = (),
+    port: int | None = None,
+    stdout: int | IO[bytes] = subprocess.DEVNULL,
 ) -> Iterator["subprocess.Popen[bytes]"]:
-    """Run ``twin run`` beside the PLC at ``port``, logging; given once samples are logged."""
-    address = ["--address", f"127.0.0.1:{port}"]
-    command = [TWIN, "run", config, *address, "--log", log]
+    """Run ``twin run``, logging; given once samples are logged.
+
+    ``port`` is that of the PLC, where the configuration has another one; ``logs`` what several
+    ejectors' logs are called.
+    """
+    address = [] if port is None else ["--address", f"127.0.0.1:{port}"]
+    command = [TWIN, "run", *configs, *address, "--log", log]
     with on_core(TWIN_CORE):
         process = subprocess.Popen(command, stdout=stdout)
     with process:
         try:
-            _wait_for_samples(process, log)
+            for one in logs or [log]:
+                _wait_for_samples(process, one)
             yield process
         finally:
             process.send_signal(signal.SIGINT)

@@ -1,0 +1,106 @@
+"""What a plant has: one ejector with everything on and its page open, and eight in one process."""
+
+import json
+import subprocess
+import threading
+import time
+import tomllib
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+import psutil
+import tomli_w
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from benchmarks.acquisition import lost
+from benchmarks.figures import Measured, Run
+from benchmarks.machine import PLC_CORE, on_core
+from benchmarks.processes import CONFIG, TWIN, live, plc
+
+EJECTORS = 8
+SLICE_S, SLICES, LONG_SLICES = 10.0, 3, 60
+KEPT = {"figures": {"keep": True}, "alarms": {"keep": True}, "page": {"keep": True}}
+
+
+def watched(run: Run) -> Sequence[Measured]:
+    """CPU shares of a run that keeps everything, and of its page with one browser."""
+    with ExitStack() as open_now:
+        config = _config(run.folder / "watched", "rig-01", open_now.enter_context(plc()), KEPT)
+        process = open_now.enter_context(live(run.folder / "watched.mcap", [config]))
+        page = open_now.enter_context(_page(config))
+        shares = _shares(run, "a page open", [process.pid, page])
+    return tuple(Measured(one) for one in zip(*shares, strict=True))
+
+
+def together(run: Run) -> Sequence[Measured]:
+    """Lost samples and CPU share of eight ejectors, each with a PLC of its own."""
+    names = [f"rig-{number + 1:02}" for number in range(EJECTORS)]
+    folder, log = run.folder / "together", run.folder / "together.mcap"
+    with ExitStack() as open_now:
+        ports = [open_now.enter_context(plc()) for _ in names]
+        pairs = zip(names, ports, strict=True)
+        configs = [_config(folder / name, name, port, {}) for name, port in pairs]
+        logs = [log.with_suffix(f".{name}.mcap") for name in names]
+        process = open_now.enter_context(live(log, configs, logs))
+        shares = _shares(run, "eight ejectors", [process.pid])
+    found = [lost(one) for one in logs]
+    note = f"of {sum(rows for _, rows in found):,} samples"
+    return (
+        Measured([sum(missing for missing, _ in found)], note=note),
+        Measured([share for (share,) in shares]),
+    )
+
+
+def _config(folder: Path, name: str, port: int, more: dict[str, dict[str, bool]]) -> Path:
+    """The test rig's configuration for another ejector, in a folder of its own."""
+    tables = tomllib.loads(CONFIG.read_text(encoding="utf-8")) | more
+    tables["asset"]["id"], tables["driver"]["port"] = name, port
+    folder.mkdir(parents=True)
+    path = folder / "rig.toml"
+    path.write_text(tomli_w.dumps(tables), encoding="utf-8")
+    return path
+
+
+def _shares(run: Run, what: str, numbers: Sequence[int]) -> list[list[float]]:
+    """CPU times (% of a core) of some processes over each slice."""
+    slices = LONG_SLICES if run.long else SLICES
+    processes = [psutil.Process(number) for number in numbers]
+    found = []
+    for number in range(slices):
+        run.tell(f"{what}: slice {number + 1} of {slices}")
+        for process in processes:
+            process.cpu_percent()
+        time.sleep(SLICE_S)
+        found.append([process.cpu_percent() for process in processes])
+    return found
+
+
+@contextmanager
+def _page(config: Path) -> Iterator[int]:
+    """``twin serve`` with somebody who takes all it tells; gives its process."""
+    command = [TWIN, "serve", "--port", "0", "--config", config]
+    with on_core(PLC_CORE):
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    with process:
+        try:
+            assert process.stdout is not None
+            url = process.stdout.readline().removeprefix("the page is at ").strip().rstrip("/")
+            with connect(f"ws{url.removeprefix('http')}/live", origin=url) as browser:
+                browser.send("0")
+                while "rows" not in json.loads(browser.recv()):
+                    pass
+                taking = threading.Thread(target=_take, args=(browser,))
+                taking.start()
+                yield process.pid
+            taking.join()
+        finally:
+            process.terminate()
+
+
+def _take(browser: object) -> None:
+    """All that comes, until the connection is closed."""
+    with suppress(ConnectionClosed):
+        for _ in browser:  # type: ignore[attr-defined]
+            pass
