@@ -17,6 +17,7 @@ from tools.calibration_coverage import recorded
 from twin.config import Config
 from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.diagnosis.evidence import HEALTHY, collect, thinned
+from twin.diagnosis.search import tried_in_or_out
 from twin.diagnosis.weights import levels
 from twin.errors import ConfigError
 from twin.model.courses import Cause
@@ -215,6 +216,21 @@ def test_a_step_in_a_long_log_begins_when_all_cycles_say(monkeypatch: pytest.Mon
     assert cause["onset_s"] == pytest.approx(31.3, abs=0.1)
     assert cause["onset_low95_s"] <= cause["onset_s"] <= cause["onset_high95_s"]
     assert cause["onset_high95_s"] - cause["onset_low95_s"] < 0.5
+
+
+def test_cycles_that_only_lead_to_others_do_not_come_and_go_alone() -> None:
+    """Where a long log is cut, the model swings in anew, and a cause there could look true."""
+    whole = collect(CONFIG, record(60.0, seed=26))
+    assert tried_in_or_out(whole) == [frozenset({int(number)}) for number in whole.numbers]
+    part = thinned(whole, whole.judged, 6)
+    judged = {int(number) for number in part.numbers[part.judged]}
+    first, *others = tried_in_or_out(part)
+    assert first == {int(part.numbers[0])}
+    assert [max(one) for one in others] == sorted(judged)
+    assert [sorted(one) for one in others if len(one) > 1] == [
+        [number - 1, number] for number in sorted(judged)[2::2]
+    ]
+    assert first.union(*others) == set(part.numbers.tolist())
 
 
 def test_too_few_cycles_are_insufficient() -> None:

@@ -6,7 +6,7 @@ is worth its price, then the search begins anew about it. Backward: each cause m
 its price beside the others.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -321,18 +321,40 @@ def _with_cycles(evidence: Evidence, judged: Weights, hypothesis: Hypothesis) ->
     Also those that are not judged: what acts there shows in the gas of the one after.
     """
     *others, cause = hypothesis
+    units = tried_in_or_out(evidence)
+    cause = replace(cause, cycles=_union(one for one in units if max(one) in cause.cycles))
     for _ in range(MOST_FLIPS):
-        flipped = [replace(cause, cycles=cause.cycles ^ {int(n)}) for n in evidence.numbers]
-        tried = [cause, *flipped]
+        tried = [cause, *(replace(cause, cycles=cause.cycles ^ one) for one in units)]
         chi2 = np.sum(white(evidence, judged, [(*others, one) for one in tried]) ** 2, axis=0)
-        better = evidence.numbers[chi2[1:] < chi2[0] - WORTH_FLIPPING]
-        if not len(better):
+        gains = chi2[0] - chi2[1:]
+        better = _union(
+            one for one, gain in zip(units, gains, strict=True) if gain > WORTH_FLIPPING
+        )
+        if not better:
             break
-        together = replace(cause, cycles=cause.cycles ^ frozenset(better.tolist()))
+        together = replace(cause, cycles=cause.cycles ^ better)
         both = [together, tried[int(np.argmin(chi2))]]
         chi2 = np.sum(white(evidence, judged, [(*others, one) for one in both]) ** 2, axis=0)
         cause = both[int(np.argmin(chi2))]
     return (*others, cause)
+
+
+def tried_in_or_out(evidence: Evidence) -> list[frozenset[int]]:
+    """Each cycle; in part of a log with the one before it, in which the model only swings in."""
+    numbers = [int(number) for number in evidence.numbers]
+    units, before = [], frozenset[int]()
+    for place, number in enumerate(numbers):
+        follows_a_gap = place > 0 and number > numbers[place - 1] + 1
+        if follows_a_gap and place not in evidence.judged:
+            before = frozenset({number})
+        else:
+            units.append(before | {number})
+            before = frozenset()
+    return units
+
+
+def _union(cycles: Iterable[frozenset[int]]) -> frozenset[int]:
+    return frozenset[int]().union(*cycles)
 
 
 _PLACED = {Course.STEP: _with_onset, Course.INTERMITTENT: _with_cycles}
