@@ -68,17 +68,14 @@ def opcua(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OpcuaPlc]:
         yield running
 
 
-@pytest.fixture(scope="session")
-def postgresql() -> Iterator[Path]:
-    """The folder of the socket of a PostgreSQL server."""
+@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
+def server(request: pytest.FixtureRequest) -> Iterator[Path | None]:
+    """The folder of PostgreSQL's socket, or None for SQLite."""
+    if request.param == "sqlite":
+        yield None
+        return
     with postgres_server() as folder:
         yield folder
-
-
-@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
-def server(request: pytest.FixtureRequest) -> Path | None:
-    """The folder of PostgreSQL's socket, or None for SQLite."""
-    return None if request.param == "sqlite" else request.getfixturevalue("postgresql")
 
 
 @pytest.fixture
