@@ -1,5 +1,7 @@
 """Causes named while the loop runs: from a rig with a small fault that begins, and is mended."""
 
+import gc
+import weakref
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,7 +13,7 @@ from twin.monitor.bank import SUSPECTS, Bank, hypotheses
 from twin.monitor.detect import Monitor, MonitorSettings
 from twin.monitor.healthy import Healthy
 from twin.monitor.isolation import Isolation
-from twin.signals import Samples, Ticks
+from twin.signals import SAMPLE, TICK, Samples, Ticks
 
 BEGINS, CYCLES = 30, 42
 SECONDS = {"test_rig": 3.2, "gripper": 2.3}  # of a cycle, at most
@@ -173,6 +175,16 @@ def test_what_the_bank_draws_does_not_depend_on_blocks(size: int) -> None:
         cut.push(rows[begin : begin + size], ticks[begin : begin + size])
     for one, other in zip(whole.take(len(rows)), cut.take(len(rows)), strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_a_plc_that_is_silent_for_days_fills_no_memory() -> None:
+    watched = rigs.isolating("gripper")
+    nothing, none = np.empty(0, SAMPLE), np.empty(0, TICK)
+    gone = weakref.ref(nothing)
+    watched.update(nothing, none)
+    del nothing
+    gc.collect()
+    assert gone() is None
 
 
 def test_rows_and_ticks_of_the_bank_go_with_cycles_through_a_gap() -> None:

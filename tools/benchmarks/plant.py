@@ -12,7 +12,7 @@ from pathlib import Path
 import psutil
 import tomli_w
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
 
 from benchmarks.acquisition import lost
 from benchmarks.figures import Measured, Run
@@ -99,8 +99,8 @@ def _page(config: Path) -> Iterator[int]:
             process.terminate()
 
 
-def _take(browser: object) -> None:
+def _take(browser: ClientConnection) -> None:
     """All that comes, until the connection is closed."""
     with suppress(ConnectionClosed):
-        for _ in browser:  # type: ignore[attr-defined]
+        for _ in browser:
             pass

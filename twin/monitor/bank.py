@@ -109,7 +109,9 @@ class Bank:
         self._expected = np.empty((0, self._theta.shape[1]))
 
     def push(self, samples: Samples, ticks: Ticks) -> None:
-        """Step on by the twin's rows, some time."""
+        """Step on by the twin's rows, some time; nothing is kept of a silence."""
+        if not len(samples):
+            return
         self._parts.append((samples, ticks))
         self._fresh += len(samples)
         if self._fresh >= BATCH:

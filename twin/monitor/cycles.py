@@ -22,7 +22,6 @@ from twin.signals import (
 LONGEST_PIECE = 10_000  # rows; a longer cycle is judged in pieces so that alarms do not wait
 FEWEST_ROWS = 20  # of a phase, to judge it
 H2 = 550.0 * MBAR  # Pa below ambient: part present, the field's default
-_IDLE, _SUCTION, _HOLD, _BLOW_OFF = (int(phase) for phase in Phase)
 PAPER_VACUUM = 600.0 * MBAR  # Pa below ambient: what the founding paper times evacuation to
 
 
@@ -113,8 +112,8 @@ class CycleCutter:
         """Mark the rows at which suction begins."""
         before = np.concatenate([[np.uint8(self._phase)], phase])
         self._phase = int(before[-1])
-        edges: npt.NDArray[np.bool_] = before[1:] == _SUCTION
-        edges &= (before[:-1] == _IDLE) | (before[:-1] == _BLOW_OFF)
+        edges: npt.NDArray[np.bool_] = before[1:] == Phase.SUCTION
+        edges &= (before[:-1] == Phase.IDLE) | (before[:-1] == Phase.BLOW_OFF)
         return edges
 
     def _keep(self, samples: Samples, ticks: Ticks) -> None:
@@ -132,7 +131,7 @@ class CycleCutter:
         samples, ticks = (joined(*column) for column in zip(*self._parts, strict=True))
         self._parts, self._count = [], 0
         self._index += begins
-        whole = begins and ticks["phase"][-1] in (_IDLE, _BLOW_OFF)
+        whole = begins and ticks["phase"][-1] in (Phase.IDLE, Phase.BLOW_OFF)
         cut_short = not self._at_edge and len(samples) < LONGEST_PIECE
         return Cycle(self._index, samples, ticks, bool(whole), cut_short, settled)
 
