@@ -25,7 +25,7 @@ def cosines(groups: int) -> Floats:
 
 def run_length(scores: Floats, cycles: float, groups: int) -> float:
     """Cycles until the sums are beyond the limit for one false alarm in ``cycles``."""
-    changes = Changes(np.arange(SUSPECTS) % 3 == 0)
+    changes = Changes(np.arange(SUSPECTS) % 3 == 0, np.ones(SUSPECTS))
     changes.weigh(cosines(groups))
     for count, normal in enumerate(scores, 1):
         changes.take(normal)
@@ -60,12 +60,12 @@ def test_a_change_is_found_nearly_as_soon_as_by_who_knows_what_to_look_for(
 
 
 def test_a_change_to_less_is_found_only_where_it_can_be() -> None:
-    changes = Changes(np.array([True, False]))
+    changes = Changes(np.array([True, False]), np.ones(2))
     for _ in range(30):
         changes.take(np.array([-2.0, -2.0]))
     assert changes.log_sum > 20.0
     assert changes.foremost() == (0, -1)
-    one_way = Changes(np.array([False, False]))
+    one_way = Changes(np.array([False, False]), np.ones(2))
     for _ in range(30):
         one_way.take(np.array([-2.0, -2.0]))
     assert one_way.log_sum < 1.0
@@ -101,9 +101,9 @@ def test_what_cycles_do_not_show_is_left_out() -> None:
     assert some.count.tolist() == [40.0, 10.0]
     seen = np.array([5.0, 5.0])
     assert some.standard(seen)[0] == all_of.standard(seen)[0]
-    changes = Changes(np.array([False, False]))
+    changes = Changes(np.array([False, False]), np.ones(2))
     changes.take(np.array([3.0, np.nan]))
-    alone = Changes(np.array([False, False]))
+    alone = Changes(np.array([False, False]), np.ones(2))
     alone.take(np.array([3.0, -30.0]))
     assert changes.log_sum == pytest.approx(alone.log_sum)
 

@@ -148,18 +148,20 @@ BENCHMARKS = (
         "--long, 10 400 without): alarms over those asked for. Then the limit for one in 30 days "
         "of 3 s cycles, a change in five effects one by one put into these cycles, and the median "
         "delays of the five; the floor is the mean delay of a simulated CUSUM that looks for "
-        "nothing but that effect and size.",
+        "nothing but that effect and size. Both begin in a device that runs, after healthy cycles, "
+        "or from rest.",
         (
             Figure("detection: false alarms over asked for, one in 1 000 cycles", "", limit=2.0),
             Figure("detection: false alarms over asked for, one in 10 000 cycles", "", limit=2.0),
             *(
                 Figure(
-                    f"detection: delay for {shift:g} sigma a cycle",
+                    f"detection: delay for {shift:g} sigma a cycle, {state}",
                     "cycles",
                     "CUSUM for that alone",
                     1.3,
                     limits_ratio=True,
                 )
+                for state in ("running", "from rest")
                 for shift in detection.SHIFTS
             ),
         ),

@@ -2,12 +2,15 @@
 
 Healthy cycles of the simulated rig go through twin, bank and isolation as they do in the loop. A
 change of so many sigmas is put into the scores of the same cycles, drawn at random: into an
-effect's own, and by the cosine of their signatures into those of the others.
+effect's own, and by the cosine of their signatures into those of the others. It is put in after so
+many healthy cycles that the sums are what they usually are, and into sums that begin with it; the
+optimum is told of the same.
 """
 
 import os
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from copy import deepcopy
 from multiprocessing import get_context
 
 import numpy as np
@@ -24,7 +27,7 @@ from twin.model import theta as c
 from twin.monitor.bank import SUSPECTS
 from twin.monitor.change import Changes, limit
 from twin.monitor.cycles import CycleCutter, figures
-from twin.monitor.isolation import Isolation
+from twin.monitor.isolation import Isolation, looked_for
 from twin.settings import Document
 
 Floats = npt.NDArray[np.float64]
@@ -39,18 +42,25 @@ MONTH = 30 * 86_400.0 / 3.0  # the same in 30 days of 3 s cycles
 SHIFTS = (0.5, 1.0, 2.0)  # sigmas a cycle
 EFFECTS = ("leakage", "suction_loss", "filter_clogging", "threshold_drift", "sensor_lag")
 DRAWS = 400
+RUN_IN = 300  # healthy cycles, after which sums are what they usually are
+APART = 25  # further ones between the beginnings of two changes
 NEVER = 4000  # cycles
 
 
 def sums(run: Run) -> Sequence[Measured]:
-    """False alarms at two wanted rates, and delays for three sizes, beside the optimum."""
+    """False alarms at two wanted rates, and delays for three sizes, beside the optimum.
+
+    Delays are told of sums that run already first, then of such that begin with the change.
+    """
     devices = LONG_DEVICES if run.long else DEVICES
     scores, alike = _simulated(run, devices)
     false = [_false_alarms(scores, alike, cycles) for cycles in ASKED]
     pool = np.concatenate([one[SETTLED:] for one in scores])
     run.tell("detection: delays")
-    late = [_late(pool, alike, shift) for shift in SHIFTS]
-    return (*false, *late)
+    running, fresh = _running(pool, alike), [_changes(alike)] * DRAWS
+    late = [_late(pool, alike, shift, running, RUN_IN) for shift in SHIFTS]
+    later = [_late(pool, alike, shift, fresh, 0) for shift in SHIFTS]
+    return (*false, *late, *later)
 
 
 def _simulated(run: Run, devices: int) -> tuple[list[Floats], Floats]:
@@ -85,7 +95,7 @@ def _device(seed: int) -> tuple[Floats, Floats]:
 
 
 def _changes(alike: Floats) -> Changes:
-    changes = Changes(np.array([one.both_ways for one in SUSPECTS]))
+    changes = looked_for()
     changes.weigh(alike)
     return changes
 
@@ -105,19 +115,33 @@ def _false_alarms(devices: Sequence[Floats], alike: Floats, asked: float) -> Mea
     return Measured([alarms * asked / cycles], note=note)
 
 
-def _late(pool: Floats, alike: Floats, shift: float) -> Measured:
+def _running(pool: Floats, alike: Floats) -> list[Changes]:
+    """Sums in healthy cycles, as they are when a change begins; an alarm begins them anew."""
+    changes, found, rng = _changes(alike), [], np.random.default_rng(0)
+    for cycle in range(1, RUN_IN + APART * DRAWS):
+        changes.take(pool[rng.integers(len(pool))])
+        if changes.log_sum >= limit(MONTH):
+            changes.begin()
+        if cycle >= RUN_IN and (cycle - RUN_IN) % APART == 0:
+            found.append(deepcopy(changes))
+    return found
+
+
+def _late(
+    pool: Floats, alike: Floats, shift: float, begins: Sequence[Changes], healthy: int
+) -> Measured:
     """Median delay for each effect, and the mean one of a CUSUM that looks for nothing else."""
     names = [one.effect for one in SUSPECTS]
     medians = []
     for effect in EFFECTS:
         added = shift * alike[names.index(effect)]
         rng = np.random.default_rng(names.index(effect))
-        medians.append(float(np.median([_delay(pool, alike, added, rng) for _ in range(DRAWS)])))
-    return Measured(medians, [_optimum(shift)])
+        delays = [_delay(pool, deepcopy(begin), added, rng) for begin in begins]
+        medians.append(float(np.median(delays)))
+    return Measured(medians, [_optimum(shift, healthy)])
 
 
-def _delay(pool: Floats, alike: Floats, added: Floats, rng: np.random.Generator) -> int:
-    changes = _changes(alike)
+def _delay(pool: Floats, changes: Changes, added: Floats, rng: np.random.Generator) -> int:
     for cycle in range(1, NEVER):
         changes.take(pool[rng.integers(len(pool))] + added)
         if changes.log_sum >= limit(MONTH):
@@ -125,18 +149,24 @@ def _delay(pool: Floats, alike: Floats, added: Floats, rng: np.random.Generator)
     return NEVER
 
 
-def _optimum(shift: float) -> float:
+def _optimum(shift: float, healthy: int) -> float:
     """Mean delay of the CUSUM for one known shift, upwards; its limit after Siegmund."""
     k = 0.5 * shift
     height = brentq(lambda h: _run_length(k, h) - MONTH, 0.1, 100.0)
     rng, delays = np.random.default_rng(1), []
     for _ in range(10 * DRAWS):
-        steps = rng.normal(shift, 1.0, NEVER) - k
-        # The sum since its least value so far, as it is from zero on.
-        total = np.concatenate([[0.0], np.cumsum(steps)])
-        above = total - np.minimum.accumulate(total)
-        delays.append(int(np.argmax(above >= height)))
+        before = _above(rng.normal(-k, 1.0, healthy)) if healthy else np.zeros(1)
+        steps = rng.normal(k, 1.0, NEVER)
+        steps[0] += before[-1]
+        delays.append(int(np.argmax(_above(steps) >= height)))
     return float(np.mean(delays))
+
+
+def _above(steps: Floats) -> Floats:
+    """The sums of steps, from zero on and never below it."""
+    total = np.concatenate([[0.0], np.cumsum(steps)])
+    result: Floats = total - np.minimum.accumulate(total)
+    return result
 
 
 def _run_length(k: float, height: float) -> float:

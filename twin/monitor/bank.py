@@ -21,6 +21,10 @@ from twin.signals import MS, NS, Samples, Ticks, joined
 BATCH = 250  # rows that are stepped together: what many calls cost is spared
 STEP = 0.25  # of a parameter's typical size
 GROSS = 1.5  # the same for those that are not linear in it for long: what delays
+# What changes with the weather or another set-up, and is nothing to mend: looked for as well, and
+# not so that all else is found later.
+NO_WEAR = ("ambient_pressure", "heat_exchange")
+SELDOM = 0.2
 
 Floats = npt.NDArray[np.float64]
 _ROW = np.dtype(
@@ -46,6 +50,11 @@ class Suspect:
     def both_ways(self) -> bool:
         """Whether it can be less than nothing as well."""
         return self.parameter.low < 0.0 or self.parameter.coefficient is not None
+
+    @property
+    def often(self) -> float:
+        """How frequent it is thought to be, beside what wears."""
+        return SELDOM if self.effect in NO_WEAR else 1.0
 
     @property
     def step(self) -> float:

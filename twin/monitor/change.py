@@ -17,9 +17,12 @@ from scipy.special import ndtri, stdtr
 Floats = npt.NDArray[np.float64]
 
 SIZES = np.array([0.5, 1.0, 2.0])  # sigmas a cycle that a change is looked for in
-SHARES = np.array([0.33, 0.27, 0.40])  # of the weight, of each size
-ALIKE = 4  # power of the cosine by which suspects that look alike share one weight
-OVERSHOOT = 0.6  # the limit over the cycles to a false alarm, for these sizes (tools/bench.py)
+SHARES = np.array([0.30, 0.25, 0.45])  # of the weight, of each size
+# Power of the cosine by which suspects that look alike share one weight. When the sum of one is at
+# its limit, exp(14), that of its neighbour is at exp(14 cos^2): below 0.9 it hardly helps.
+ALIKE = 10
+# The limit over the cycles to a false alarm: sums of normal scores jump over it (Siegmund).
+OVERSHOOT = float(SHARES @ np.exp(-0.583 * SIZES))
 FARTHEST = 30.0  # sigmas; beyond, a probability is no number any more
 
 
@@ -62,9 +65,13 @@ class Reference:
 
 
 class Changes:
-    """Sums of likelihood ratios, for each suspect, sign and size."""
+    """Sums of likelihood ratios, for each suspect, sign and size.
 
-    def __init__(self, both_ways: npt.NDArray[np.bool_]) -> None:
+    ``often`` is how frequent each suspect is thought to be beside the others.
+    """
+
+    def __init__(self, both_ways: npt.NDArray[np.bool_], often: Floats) -> None:
+        self._often = often
         self._signs = np.stack([np.ones(len(both_ways)), -1.0 * both_ways], axis=1)  # 0: not so
         self._shift = self._signs[:, :, None] * SIZES
         self.weigh(np.eye(len(both_ways)))
@@ -72,7 +79,7 @@ class Changes:
 
     def weigh(self, alike: Floats) -> None:
         """Share the weight by the cosines between signatures; 0 with all: it is not shown."""
-        shares = _weights(self._signs, alike)[:, :, None] * SHARES
+        shares = _weights(self._signs, self._often, alike)[:, :, None] * SHARES
         self._weight = np.log(shares + np.finfo(float).tiny)
 
     def begin(self) -> None:
@@ -98,16 +105,17 @@ class Changes:
         return int(suspect), 1 - 2 * int(sign)
 
 
-def _weights(signs: Floats, alike: Floats) -> Floats:
+def _weights(signs: Floats, often: Floats, alike: Floats) -> Floats:
     """Of each suspect and sign, together 1: what is unlike all others weighs as much as any group.
 
     So what is found late is found no later than it must be.
     """
-    ways = signs.ravel()
+    ways, often = signs.ravel(), np.repeat(often, 2)
     cosines = np.kron(alike, np.ones((2, 2))) * np.outer(ways, ways)
-    others = np.sum(np.maximum(cosines, 0.0) ** ALIKE, axis=1)
-    shown = others > 0.0
-    weights = np.where(shown, 1.0 / np.maximum(others, 1.0), 0.0)
+    shown = np.diag(cosines) > 0.0
+    shared = np.maximum(cosines, 0.0) ** ALIKE * often
+    np.fill_diagonal(shared, 1.0)
+    weights = np.where(shown, often / shared.sum(axis=1), 0.0)
     weights /= max(weights.sum(), 1.0)
     result: Floats = weights.reshape(signs.shape)
     return result

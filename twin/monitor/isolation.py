@@ -162,7 +162,7 @@ class Isolation:
             alike = said.alike()
             self._alike = np.where(alike != 0.0, alike, self._alike)
         if self._learned == LEARNED:
-            self._changes = Changes(np.array([one.both_ways for one in SUSPECTS]))
+            self._changes = looked_for()
         if self._changes and (new.any() or self._learned == LEARNED):
             self._changes.weigh(self._alike)
 
@@ -277,6 +277,12 @@ class Isolation:
             total = first.probability + float(share[number])
             found[one.effect] = Likely(one.effect, total, first.size, first.unit)
         return sorted(found.values(), key=lambda likely: -likely.probability)
+
+
+def looked_for() -> Changes:
+    """Sums for all suspects, with nothing seen yet."""
+    both_ways = np.array([one.both_ways for one in SUSPECTS])
+    return Changes(both_ways, np.array([one.often for one in SUSPECTS]))
 
 
 def _fitted(off: Floats, signature: Floats, covariance: Floats, bounds: Floats) -> Floats:
