@@ -198,3 +198,10 @@ def test_rows_and_ticks_of_the_bank_go_with_cycles_through_a_gap() -> None:
     assert watched.isolation is not None
     assert len(watched.isolation._bank.take(0)[0]) == 0
     assert watched.isolation._bank._count == 0
+
+
+def test_a_change_that_begins_is_not_learned_as_usual() -> None:
+    # Some sigmas a cycle: were the first such cycles learned, the next would look less strange.
+    first = raised(events("gripper", ["weak_blow_off=1.5@c20"], 30))[0]
+    assert first.data["effect"] == "weak_blow_off"
+    assert 20 <= first.data["cycle"] <= 25

@@ -21,6 +21,7 @@ from benchmarks import (
     acquisition,
     calibration,
     detection,
+    isolation,
     kernel,
     log,
     machine,
@@ -165,6 +166,15 @@ BENCHMARKS = (
                 for shift in detection.SHIFTS
             ),
         ),
+    ),
+    Benchmark(
+        "isolation",
+        isolation.causes,
+        "The simulated rigs with one effect each, drawn by seed, that begins at cycle 30, at twice "
+        "the size that a CUSUM for it alone finds within three cycles and that is apart from all "
+        "other effects: how many are not told, alone or as one of at most three, by the third "
+        "cycle.",
+        (Figure("isolation: 60 causes, not told within three cycles", "%", limit=10.0),),
     ),
     Benchmark(
         "log",

@@ -1,0 +1,148 @@
+"""Isolation while the loop runs: whether the right cause is told soon after it began.
+
+A simulated rig with one effect that begins at a known cycle goes through twin, bank and monitor as
+in the loop. The size is twice the least that could be told within three cycles: that a CUSUM which
+looks for nothing else finds by then, and that is apart from every other effect, re-fitted.
+"""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+
+import numpy as np
+
+from benchmarks.figures import Measured, Run
+from benchmarks.processes import ROOT
+from drivers.plc.faults import parse_fault
+from drivers.plc.settings import PlcSettings
+from drivers.plc.simulate import blocks
+from twin.config import Config
+from twin.events import Event, Kind
+from twin.live import Twin
+from twin.model import theta as c
+from twin.model.dataset import coefficients
+from twin.model.effects import EFFECTS
+from twin.monitor.bank import SUSPECTS
+from twin.monitor.cycles import CycleCutter, figures
+from twin.monitor.detect import RIVAL, Monitor
+from twin.monitor.isolation import Isolation
+from twin.monitor.statistics import Said
+from twin.settings import Document
+
+SYSTEMS = ("test_rig", "gripper")
+RUNS = 60
+BEGINS, WITHIN = 30, 3  # cycles
+HEALTHY = 60  # cycles, of which it is learned how they scatter
+APART = 100_000  # between the seeds of these and of those with the effect
+CYCLE_S = {"test_rig": 3.2, "gripper": 2.3}  # at most
+FOUND = 3.2  # sigmas a cycle, that the best CUSUM for one false alarm in 30 days finds by then
+REJECTED = 10.8  # chi-square at which one of a thousand says so by chance
+TIMES = 2.0  # the least size that can be told
+MOST_NAMED = 3
+FIRST_SEED = 6000
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What was hidden in a run, and what was told of it: the foremost first."""
+
+    system: str
+    effect: str
+    size: float
+    unit: str
+    told: Sequence[str]
+
+    @property
+    def right(self) -> bool:
+        """Whether the cause is among those told, and these are few enough."""
+        return self.effect in self.told and len(self.told) <= MOST_NAMED
+
+
+def causes(run: Run) -> Sequence[Measured]:
+    """Of all runs, those in which the right cause is named within three cycles."""
+    outcomes = []
+    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as workers:
+        for one in workers.map(outcome, range(FIRST_SEED, FIRST_SEED + RUNS)):
+            outcomes.append(one)
+            run.tell(f"isolation: {len(outcomes)} of {RUNS} runs")
+    right = [one for one in outcomes if one.right]
+    alone = sum(len(one.told) == 1 for one in right)
+    missed = ", ".join(f"{one.effect} ({one.system})" for one in outcomes if not one.right)
+    note = f"({alone} alone; not: {missed or 'none'})"
+    return [Measured([100.0 * (1.0 - len(right) / RUNS)], note=note)]
+
+
+def outcome(seed: int) -> Outcome:
+    """One run: system, effect and sign drawn by seed."""
+    rng = np.random.default_rng(seed)
+    system = SYSTEMS[int(rng.integers(len(SYSTEMS)))]
+    effect = EFFECTS[str(rng.choice(list(EFFECTS)))]
+    number = next(i for i, one in enumerate(SUSPECTS) if one.effect == effect.name)
+    suspect = SUSPECTS[number]
+    document = Document.read(ROOT / "configs" / f"{system}.toml")
+    config, rig = Config.of(document), document.section(PlcSettings, "plc")
+    sign = rng.choice([-1.0, 1.0]) if suspect.both_ways else 1.0
+    healthy = _healthy(config, rig, CYCLE_S[system] * HEALTHY, seed + APART)
+    steps = sign * TIMES * least(healthy, number)
+    parameter = suspect.parameter
+    size = parameter.neutral(coefficients(config.data)) + steps * suspect.step
+    size = float(np.clip(size, parameter.low, parameter.high))
+    fault = f"{effect.name}={size:.6g}@c{BEGINS}"
+    events = _watched(config, rig, CYCLE_S[system] * (BEGINS + WITHIN + 1), fault, seed)
+    return Outcome(system, effect.name, size, parameter.unit, _told(events))
+
+
+def least(healthy: Sequence[Said], number: int) -> float:
+    """Steps of a suspect that some cycles can show and tell from every other effect."""
+    effect = SUSPECTS[number].effect
+    others = [i for i, one in enumerate(SUSPECTS) if one.effect != effect]
+    last = healthy[-1]
+    signature = last.signatures[:, number]
+    power = float(signature @ np.linalg.solve(last.alone, signature))
+    scatter = float(np.nanstd([one.scores()[number] for one in healthy]))
+    nearest = float(np.max(np.abs(last.alike()[number, others])))
+    apart = np.sqrt(REJECTED / WITHIN / (1.0 - nearest**2))
+    return max(FOUND, float(apart)) * scatter / np.sqrt(power)
+
+
+def _healthy(config: Config, rig: PlcSettings, seconds: float, seed: int) -> list[Said]:
+    """What each cycle of the rig says without the effect."""
+    twin, cutter, found = Twin.of(config.data), CycleCutter(), []
+    isolation = Isolation.of(config.data, config.monitor.healthy, days=1e9)
+    ambient = float(twin.theta[c.AMBIENT])
+    for block in blocks(rig, seconds, seed=seed):
+        rows, ticks = twin.advance(block)
+        isolation.push(rows, ticks)
+        for cycle in cutter.push(rows, ticks):
+            fit = cycle.complete and cycle.settled
+            if isolation.judge(cycle, fit, figures(cycle, ambient)) is not None:
+                found.append(isolation.heard[0])
+    return found
+
+
+def _watched(
+    config: Config, rig: PlcSettings, seconds: float, fault: str, seed: int
+) -> list[Event]:
+    """All that is told of a rig with a fault."""
+    twin, told = Twin.of(config.data), []
+    isolation = Isolation.of(config.data, config.monitor.healthy, config.monitor.false_alarm_days)
+    monitor = Monitor(config.monitor, coefficients(config.data), isolation=isolation)
+    for block in blocks(rig, seconds, [parse_fault(fault)], seed=seed):
+        told += monitor.update(*twin.advance(block))
+    return told
+
+
+def _told(events: Sequence[Event]) -> list[str]:
+    """The effects named within the cycles after the change, once there is an alarm."""
+    last = BEGINS + WITHIN - 1
+    since = [event for event in events if BEGINS <= event.data.get("cycle", -1) <= last]
+    alarms = [event for event in since if event.kind is Kind.DEVIATION]
+    if not alarms:
+        return []
+    shares = [event.data["probabilities"] for event in since if "probabilities" in event.data]
+    if shares:
+        likely = sorted(shares[-1].items(), key=lambda one: -one[1])
+        return [effect for effect, share in likely if effect != "none" and share >= RIVAL]
+    return [alarms[-1].data["effect"], *filter(None, alarms[-1].data["also"].split(","))]
