@@ -640,11 +640,17 @@ def latency_ms(model: Samples, plc: Samples) -> np.ndarray:
     return np.array(late)
 
 
-def status(port: int) -> int:
-    link = Link(driver(port))
+def status(port: int, unit: int = 1) -> int:
+    link = Link(driver(port).model_copy(update={"unit": unit}))
     link.open()
     with closing(link):
         return int(link.read(Address("input", 4), 1)[0])
+
+
+def commands(port: int, unit: int) -> int:
+    """The same, asked no more often than a PLC has time to answer."""
+    time.sleep(0.05)
+    return status(port, unit)
 
 
 @pytest.mark.parametrize("name", ["test_rig", "test_rig_opcua"])
@@ -682,6 +688,38 @@ def test_a_plcs_program_runs_on_the_models_answers(name: str, tmp_path: Path) ->
         end = start + int(np.flatnonzero(np.diff(suction[start:]) == -1)[0])
         saw = int(seen["sequence"][end]) - 400
         assert 0 <= saw - present[present <= saw][-1] < 200
+
+
+def test_two_ejectors_of_one_plc_are_each_in_the_loop_with_a_model_of_their_own(
+    tmp_path: Path,
+) -> None:
+    def behind(port: int) -> list[Path]:
+        paths = []
+        for unit, system in enumerate(("test_rig", "gripper"), 1):
+
+            def change(tables: dict[str, Any], unit: int = unit, system: str = system) -> None:
+                tables["asset"]["id"] = system
+                tables["driver"] |= {"port": port, "unit": unit}
+                tables["plc"]["server"]["unit"] = unit
+
+            paths.append(configured(tmp_path, system, change))
+        return paths
+
+    first, second = behind(1)
+    with start_plc(first, str(second)) as plc:
+        assert [status(plc.port, unit) for unit in (1, 2)] == [TRIPPED, TRIPPED]
+        with running(*behind(plc.port), "--hil", "--log", tmp_path / "a.mcap") as process:
+            for unit in (1, 2):  # each program goes on when it sees its part present
+                until(lambda unit=unit: commands(plc.port, unit) == Command.SUCTION, PATIENCE_S)
+                until(lambda unit=unit: commands(plc.port, unit) == Command.BLOW_OFF, PATIENCE_S)
+            process.send_signal(signal.SIGINT)
+            _, complaints = process.communicate(timeout=PATIENCE_S)
+            assert process.returncode == 130, complaints
+    for system in ("test_rig", "gripper"):
+        log = open_log(tmp_path / f"a.{system}.mcap")
+        rows = np.concatenate([samples for samples, _ in log.blocks()])
+        anew, _ = Plant(rigs.theta(system)).run(rows)
+        assert anew.astype(np.float32).tobytes() == rows["pressure"].tobytes()
 
 
 def test_the_log_of_a_loop_replays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
