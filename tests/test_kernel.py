@@ -1,5 +1,8 @@
 """The compiled path: valves, silences, synchronisation, and the same bits however it is called."""
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -239,6 +242,34 @@ def test_the_models_own_air_saving_keeps_between_its_levels() -> None:
     assert (vacuum[off - 1] < theta[c.H1]).all()
     assert (vacuum[on] < theta[c.H1_LOW]).all()
     assert (vacuum[on - 1] >= theta[c.H1_LOW]).all()
+
+
+@pytest.mark.parametrize("mode", [c.EXTERNAL, c.INTERNAL, c.TIMED])
+@pytest.mark.parametrize("hypotheses", [1, 3])
+@settings(deadline=None, max_examples=15)
+@given(cuts=st.sets(st.integers(1, 3699), max_size=6))
+def test_a_free_run_goes_on_to_the_bit_wherever_it_is_cut(
+    hypotheses: int, mode: int, cuts: set[int]
+) -> None:
+    """Switchings, the switches before them and a timed pulse fall on either side of a cut."""
+    theta = np.stack([rigs.theta("gripper")] * hypotheses, axis=1)
+    theta[c.LEAK] *= 5.0 + np.arange(hypotheses)  # it protects its valve within three seconds
+    theta[c.H1_LOW] = theta[c.H1] - 20 * MBAR
+    theta[[c.BLOW_OFF_MODE, c.BLOW_OFF_TIME]] = np.array([[mode], [0.2]])
+    commands = np.repeat(np.array([0, 1, 2, 0, 1], "u1"), [100, 2600, 100, 300, 600])
+
+    def run(pieces: Sequence[int]) -> bytes:
+        state, control = kernel.at_rest(theta), kernel.Control.anew(hypotheses)
+        phase, expected, signals = (
+            np.empty((3700, hypotheses), kind) for kind in ("u1", "f8", "u1")
+        )
+        for rows in (slice(*ends) for ends in pairwise([0, *pieces, 3700])):
+            dt, out = np.full(len(commands[rows]), MS), (phase[rows], expected[rows], signals[rows])
+            kernel.run_on(state, control, theta, dt, commands[rows], out)
+        assert len(np.flatnonzero(np.diff(phase[:, 0].astype(int)))) > 8
+        return phase.tobytes() + expected.tobytes() + signals.tobytes()
+
+    assert run(sorted(cuts)) == run([])
 
 
 def test_many_run_free_as_each_does_alone() -> None:

@@ -10,13 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-# Not the decorator alone: a change of this file changes nothing that the others compile.
-from twin.model import compiled as compiler
 from twin.model import kernel
 from twin.model import theta as c
-from twin.model.control import new_timer, nothing_done, timed
-from twin.model.kernel import TOLERANCE, _control, _read, _step
-from twin.model.plant import prepare
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
 from twin.signals import BREAK, NS, Samples, Signal
@@ -28,27 +23,6 @@ PRESENT, SAVING = Signal.PART_PRESENT, Signal.AIR_SAVING
 LONGEST_GAP_S = 0.1  # without commands; after a longer one the model begins anew at ambient
 
 Outputs = Callable[[float, bool, bool], None]  # pressure (Pa), part present (H2), air saving (H1)
-
-
-@compiler.compiled
-def run_on(state, control, theta, dt, commands, out):  # type: ignore[no-untyped-def]
-    """Run free from where ``state`` and ``control`` stand, and leave them where it ends.
-
-    As ``kernel.simulate``, whose control begins anew with every call, with one hypothesis:
-    ``state`` (STATE, 1), ``control`` (1, CONTROL) with the blow-off timer, ``theta``
-    (coefficients, 1). Into ``out`` go phase, pressure (Pa) and ``Signal`` bits, row by row.
-    """
-    (controls, timer), (phase, expected, signals) = control, out
-    k = prepare(theta)
-    told, on = np.empty(len(dt), np.uint8), np.empty(1, np.uint8)
-    said, handed = np.empty(1), np.empty(1, np.uint8)
-    timed(timer, commands, dt, k[c.BLOW_OFF_MODE, 0], k[c.BLOW_OFF_TIME, 0], told)
-    for row in range(len(dt)):
-        if dt[row] > 0.0:
-            _step(state, k, dt[row], TOLERANCE)
-        _control(state, controls, told[row : row + 1], dt[row], k, on)
-        _read(state, k, said, handed)
-        phase[row], expected[row], signals[row] = on[0], said[0], handed[0]
 
 
 @dataclass
@@ -66,8 +40,7 @@ class Plant:
 
     def _begin(self) -> None:
         """Stand at ambient, nothing commanded."""
-        self._state = kernel.at_rest(self.theta).reshape(kernel.STATE, 1)
-        self._control = nothing_done().reshape(1, -1), new_timer()
+        self._state, self._control = kernel.at_rest(self.theta), kernel.Control.anew()
 
     def run(self, block: Samples) -> tuple[Floats, Bytes]:
         """Pressures (Pa, absolute, as the PLC's sensor reads them) and ``Signal`` bits, per row."""
@@ -87,8 +60,9 @@ class Plant:
     def _stretch(self, dt: Floats, commands: Bytes) -> tuple[Floats, Bytes]:
         """Rows that go on from the last ones."""
         expected, phase = np.empty(len(dt)), np.empty(len(dt), np.uint8)
-        signals, theta = np.empty(len(dt), np.uint8), self.theta.reshape(-1, 1)
-        run_on(self._state, self._control, theta, dt, commands, (phase, expected, signals))
+        signals = np.empty(len(dt), np.uint8)
+        out = phase, expected, signals
+        kernel.run_on(self._state, self._control, self.theta, dt, commands, out)
         self._terms.add(phase, expected)
         return expected, signals
 

@@ -7,6 +7,7 @@ a pascal of itself alone.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -100,6 +101,19 @@ def advance(
     )
 
 
+@dataclass
+class Control:
+    """Where the ejectors' own controls stand: all that a free run carries on beside ``State``."""
+
+    air_saving: Floats  # (hypotheses, CONTROL)
+    timer: Floats  # of the blow-off, (hypotheses, 2)
+
+    @classmethod
+    def anew(cls, hypotheses: int = 1) -> "Control":
+        """Controls that have not done anything for long."""
+        return cls(*(np.tile(one, (hypotheses, 1)) for one in (nothing_done(), new_timer())))
+
+
 def simulate(
     state: State,
     theta: c.Theta,
@@ -114,14 +128,33 @@ def simulate(
     ``commands`` per row are those of ``Command``. ``state`` must stand on something (``at_rest``);
     the control begins anew with every call. Many hypotheses as with ``advance``.
     """
+    out = phase, expected, np.empty(expected.shape, np.uint8)
+    run_on(state, Control.anew(state[0].size), theta, dt, commands, out, tolerance)
+
+
+def run_on(
+    state: State,
+    control: Control,
+    theta: c.Theta,
+    dt: Floats,
+    commands: Bytes,
+    out: tuple[Bytes, Floats, Bytes],
+    tolerance: float = TOLERANCE,
+) -> None:
+    """Run free as ``simulate``, from where ``control`` stands too, and leave both where it ends.
+
+    So the same rows give the same to the last bit however they are cut. Into ``out`` go phase,
+    pressure (Pa) and ``Signal`` bits, each (rows,) or (rows, hypotheses).
+    """
+    if len(dt) == 0:
+        return
+    phase, expected, signals = (one.reshape(len(dt), -1) for one in out)
     _simulate(
         state.reshape(STATE, -1),
-        (nothing_done(), new_timer()),
+        (control.air_saving, control.timer),
         theta.reshape(len(c.COEFFICIENTS), -1),
-        dt,
-        commands,
-        phase.reshape(len(dt), -1),
-        expected.reshape(len(dt), -1),
+        (dt, np.ascontiguousarray(commands)),
+        (phase, expected, signals),
         tolerance,
     )
 
@@ -441,17 +474,18 @@ def _control(state, controls, told, dt, k, phases):  # type: ignore[no-untyped-d
 @inlined
 def _free(state, all_k, driven, out, first, width, tolerance):  # type: ignore[no-untyped-def]
     """Let ``width`` hypotheses from ``first`` on run free, copied as in ``_together``."""
-    (dt, commands, control, timer), (phase, expected) = driven, out
+    (dt, commands, control, timer), (phase, expected, signals) = driven, out
     last = state.shape[1] - 1
     mine, k = np.empty((STATE, width)), np.empty((PREPARED, width))
     said, handed, phases = np.empty(width), np.empty(width, np.uint8), np.empty(width, np.uint8)
-    controls, told = np.empty((width, len(control))), np.empty((len(dt), width), np.uint8)
+    controls, timers = np.empty((width, control.shape[1])), np.empty((width, timer.shape[1]))
+    told = np.empty((len(dt), width), np.uint8)
     for i in range(width):
         mine[:, i] = state[:, min(first + i, last)]
         k[:, i] = all_k[:, min(first + i, last)]
-        controls[i] = control
+        controls[i], timers[i] = control[min(first + i, last)], timer[min(first + i, last)]
         mode, pulse = k[c.BLOW_OFF_MODE, i], k[c.BLOW_OFF_TIME, i]
-        timed(timer.copy(), commands, dt, mode, pulse, told[:, i])
+        timed(timers[i], commands, dt, mode, pulse, told[:, i])
     for row in range(dt.shape[0]):
         if dt[row] > 0.0:
             _step(mine, k, dt[row], tolerance)
@@ -460,16 +494,17 @@ def _free(state, all_k, driven, out, first, width, tolerance):  # type: ignore[n
         for i in range(width):
             phase[row, min(first + i, last)] = phases[i]
             expected[row, min(first + i, last)] = said[i]
+            signals[row, min(first + i, last)] = handed[i]
     for i in range(width):
         state[:, min(first + i, last)] = mine[:, i]
+        control[min(first + i, last)], timer[min(first + i, last)] = controls[i], timers[i]
 
 
 @compiled
-def _simulate(state, controlled, theta, dt, commands, phase, expected, tolerance):  # type: ignore[no-untyped-def]
-    control, timer = controlled
-    k, driven, out = prepare(theta), (dt, commands, control, timer), (phase, expected)
+def _simulate(state, control, theta, driven, out, tolerance):  # type: ignore[no-untyped-def]
+    k = prepare(theta)
     if state.shape[1] == 1:
-        _free(state, k, driven, out, 0, 1, tolerance)
+        _free(state, k, driven + control, out, 0, 1, tolerance)
     else:
         for first in range(0, state.shape[1], LANES):
-            _free(state, k, driven, out, first, LANES, tolerance)
+            _free(state, k, driven + control, out, first, LANES, tolerance)
