@@ -1,7 +1,7 @@
 """From cycles to their key figures: measured and expected side by side, and the warnings."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,6 +36,7 @@ _TOLD = {
     "leakage": "leakage",
     "free_flow": "free-flow vacuum",
 }
+AHEAD = 250  # rows over which the model runs at once: what many calls cost is spared
 MOST_PIECES = 30  # of a long cycle, five minutes; beyond, its end is not waited for
 
 
@@ -97,11 +98,26 @@ class KeyFigures:
     settings: FigureSettings = field(default_factory=FigureSettings)
     _pieces: list[Cycle] = field(default_factory=list)  # of a long cycle that is not over
     _index: int = -1  # of the cycle that was last given or begun
+    _ran: int = 0  # rows of the next piece over which the model has run already
 
     def __post_init__(self) -> None:
         self._unit = Unit(self.data, self.settings.energy_kwh_m3)
         self._limits = limits(self.settings, self.data)
         self._expectation = Expectation(self.data)
+
+    def ahead(self, parts: Sequence[tuple[Samples, Ticks]], at_edge: bool) -> None:
+        """Let the model run over the rows of the next piece, as far as they have come."""
+        rows = sum(len(samples) for samples, _ in parts)
+        if rows - self._ran < AHEAD:
+            return
+        if at_edge or (self._pieces and not parts[0][0]["quality"][0] & BREAK):
+            samples, ticks = (joined(*column) for column in zip(*parts, strict=True))
+            self._run(samples, ticks)
+
+    def _run(self, samples: Samples, ticks: Ticks) -> None:
+        """Let the model run over the rows of a piece, without those that it has run over."""
+        fresh, self._ran = slice(self._ran, None), len(samples)
+        self._expectation.go_on(samples[fresh], ticks[fresh], at_edge=not self._pieces)
 
     def take(self, piece: Cycle) -> CycleFigures | None:
         """Take the next piece; give the key figures of the cycle that it completes, if it does."""
@@ -110,6 +126,8 @@ class KeyFigures:
         if not at_edge and not goes_on:
             return self._broken_off(piece)
         self._index = piece.index
+        self._run(piece.samples, piece.ticks)
+        self._ran = 0
         self._pieces.append(piece)
         over = piece.ticks["phase"][-1] in _OVER
         if not over and len(piece.samples) == LONGEST_PIECE and len(self._pieces) < MOST_PIECES:
@@ -142,7 +160,7 @@ class KeyFigures:
             int(samples["time_ns"][-1]),
             int(samples["host_ns"][0]),
             measured,
-            self._expected(samples, ticks, *seen, np.isfinite(measured["free_flow"])),
+            self._expected(samples, *seen, np.isfinite(measured["free_flow"])),
             warnings(measured, self._limits),
             self._limits,
             bool(ended),
@@ -164,10 +182,10 @@ class KeyFigures:
         )
 
     def _expected(
-        self, samples: Samples, ticks: Ticks, ended: bool, blown: bool, is_open: bool
+        self, samples: Samples, ended: bool, blown: bool, is_open: bool
     ) -> dict[str, float]:
         """As the model has the same cycle; where a cup was open, with its cups open."""
-        found = self._expectation.over(samples, ticks, at_edge=True)
+        found = self._expectation.end(at_edge=True)
         if found is None:
             return dict.fromkeys(FIGURES, UNKNOWN)
         vacuum, phase = found

@@ -5,7 +5,7 @@ the measured one, and before H1 they end where the measurement got to. As the tw
 takes over the measured level at each suction edge, and what the gas has kept of the cycle before.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -24,37 +24,60 @@ SWUNG_IN = 2  # suction edges without a break, from which on the gas is as warm 
 
 @dataclass
 class Expectation:
-    """The model of one unit, running free over the rows of a stream."""
+    """The model of one unit, running free over the rows of a stream.
+
+    It may run as they come (``go_on``), so that little is left to do when a cycle ends (``end``);
+    what it expects is the same to the last bit.
+    """
 
     data: DataSet
     _state: kernel.State | None = None  # None until there is a level to begin at
+    _control: kernel.Control = field(default_factory=kernel.Control.anew)
     _last_ns: int | None = None
     _edges: int = 0  # since it began
+    _rows: int = 0  # of the cycle so far
+    _stale: bool = False  # in this cycle: nobody knows what was commanded
+    _parts: list[tuple[Floats, Bytes]] = field(default_factory=list)  # pressure (Pa) and phase
 
     def __post_init__(self) -> None:
         self._theta = coefficients(self.data)
         self._terms = Terms(self.data.terms, float(self._theta[c.AMBIENT]))
 
     def over(self, samples: Samples, ticks: Ticks, at_edge: bool) -> tuple[Floats, Bytes] | None:
-        """Expected vacuum (mbar) and phase of the next rows, a whole cycle if they begin with one.
+        """What ``end`` gives after rows that have come at once."""
+        self.go_on(samples, ticks, at_edge)
+        return self.end(at_edge)
 
-        None until the model has swung in. ``at_edge`` says that suction begins at the first row.
-        """
-        stale = bool((samples["quality"] & Quality.STALE).any())  # nobody knows the commands
-        if stale or samples["quality"][0] & BREAK:
+    def go_on(self, samples: Samples, ticks: Ticks, at_edge: bool) -> None:
+        """Run over the next rows of a cycle; ``at_edge``: suction begins at its first row."""
+        if not len(samples):
+            return
+        first, self._rows = self._rows == 0, self._rows + len(samples)
+        dt, self._last_ns = steps(samples, self._last_ns), int(samples["time_ns"][-1])
+        self._stale |= bool((samples["quality"] & Quality.STALE).any())
+        if self._stale or (first and samples["quality"][0] & BREAK):
             self.lose()
-        begin = 0 if self._state is not None else _first_level(ticks, at_edge)
-        if begin is None or stale:
-            return None
-        dt = steps(samples, self._last_ns)
+        begin = 0 if self._state is not None else _first_level(ticks, first and at_edge)
+        if begin is None or self._stale:
+            return
         if self._state is None:
-            self._state, dt[begin] = kernel.new_state(), -1.0
-        self._edges += at_edge
-        self._last_ns = int(samples["time_ns"][-1])
+            self._state, dt[begin], first = kernel.new_state(), -1.0, True
         rows = slice(begin, None)
-        pressure, phase = self._run(self._state, dt[rows], samples[rows], ticks[begin])
+        level = ticks[begin] if first else None
+        self._parts.append(self._run(self._state, dt[rows], samples[rows], level))
+
+    def end(self, at_edge: bool) -> tuple[Floats, Bytes] | None:
+        """Expected vacuum (mbar) and phase of the rows since the last end: one cycle.
+
+        None until the model has swung in, and of rows that did not begin at a suction edge.
+        """
+        parts, self._parts, self._rows, self._stale = self._parts, [], 0, False
+        if self._state is None:
+            return None
+        self._edges += at_edge
         if self._edges < SWUNG_IN or not at_edge:
             return None
+        pressure, phase = (np.concatenate(column) for column in zip(*parts, strict=True))
         return (self._theta[c.AMBIENT] - pressure) / MBAR, phase
 
     def lose(self) -> None:
@@ -75,16 +98,18 @@ class Expectation:
         return float(opened[c.AMBIENT] - expected[-1]) / MBAR
 
     def _run(
-        self, state: kernel.State, dt: Floats, samples: Samples, first: np.void
+        self, state: kernel.State, dt: Floats, samples: Samples, first: np.void | None
     ) -> tuple[Floats, Bytes]:
-        """Pressure (Pa) and phase: the first row as the twin has it, the others free."""
+        """Pressure (Pa) and phase: the ``first`` row as the twin has it, all others free."""
         phase, pressure = np.empty(len(dt), np.uint8), np.empty(len(dt))
-        phase[:1], level = first["phase"], np.array([first["level"]], np.float64)
-        kernel.advance(state, self._theta, dt[:1], phase[:1], level, pressure[:1])
-        commands = samples["commands"][1:]
-        if len(commands):
-            free = phase[1:], pressure[1:]
-            kernel.simulate(state, self._theta, dt[1:], commands, *free, kernel.ROUGHLY)
+        free = slice(0 if first is None else 1, None)
+        if first is not None:
+            phase[0], level = first["phase"], np.array([first["level"]], np.float64)
+            kernel.advance(state, self._theta, dt[:1], phase[:1], level, pressure[:1])
+            self._control = kernel.Control.anew()
+        driven = self._theta, dt[free], samples["commands"][free]
+        out = phase[free], pressure[free], np.empty(len(dt[free]), np.uint8)
+        kernel.run_on(state, self._control, *driven, out, kernel.ROUGHLY)
         self._terms.add(phase, pressure)
         return pressure, phase
 

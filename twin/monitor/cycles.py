@@ -1,6 +1,6 @@
 """Cycles cut out of the stream, and the figures each one gives."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -70,6 +70,12 @@ class Told(Protocol):
 class Teller(Protocol):
     """Whoever tells more of cycles than ``figures`` does: the key figures."""
 
+    def ahead(self, parts: Sequence[tuple[Samples, Ticks]], at_edge: bool) -> None:
+        """See the rows so far of the next piece, to have less to do when it comes.
+
+        ``at_edge`` says that they begin with a suction edge.
+        """
+
     def take(self, piece: Cycle) -> Told | None:
         """Take what a CycleCutter gives, in order; tell of the cycle that is over with it."""
 
@@ -101,6 +107,11 @@ class CycleCutter:
             if end < len(samples) and self._count:
                 yield self._cut(bool(edges[end]), bool(breaks[end]))
             begin = end
+
+    @property
+    def begun(self) -> tuple[Sequence[tuple[Samples, Ticks]], bool]:
+        """Rows of the cycle that has not ended, and whether they begin with a suction edge."""
+        return self._parts, self._at_edge
 
     def flush(self) -> Iterator[Cycle]:
         """Give what is left; it is complete if it had come to idle."""

@@ -86,6 +86,8 @@ class Monitor:
                 found += self._judge(cycle, silent and cycle.cut_short)
             found += self.clocks.push(samples[rows]) if self.clocks else []
             events += sorted(found, key=_order)  # as if row by row
+        if self.teller:
+            self.teller.ahead(*self._cutter.begun)
         return events
 
     def silent(self, last: np.void, now_ns: int) -> list[Event]:
