@@ -10,6 +10,7 @@ from scipy.ndimage import median_filter
 from twin.signals import Phase
 
 SMOOTH = 5  # readings; their median moves no edge, and one reading alone reaches nothing
+ENDS = (0.01, 0.99)  # quantiles that stand for the lowest and the highest reading
 LONGEST_HOLE = 0.01  # s without a reading, beyond which a switching may have been missed
 
 Floats = npt.NDArray[np.float64]
@@ -37,8 +38,8 @@ class Course:
     @cached_property
     def suction_rows(self) -> int:
         """Rows until suction is not commanded any more."""
-        over = np.flatnonzero(~np.isin(self.phase, (Phase.SUCTION, Phase.HOLD)))
-        return int(over[0]) if len(over) else len(self.phase)
+        over = (self.phase != Phase.SUCTION) & (self.phase != Phase.HOLD)
+        return int(np.argmax(over)) if over.any() else len(self.phase)
 
     @cached_property
     def suction_s(self) -> float:
@@ -86,6 +87,18 @@ class Course:
             return np.empty(0), np.empty(0)
         smoothed: Floats = median_filter(vacuum[there], SMOOTH, mode="nearest")
         return self.time[: self.suction_rows][there], smoothed
+
+    @cached_property
+    def supplies(self) -> Floats:
+        """What the supply read while the nozzle was on (bar)."""
+        there: Floats = self.supply[(self.phase == Phase.SUCTION) & np.isfinite(self.supply)]
+        return there
+
+    @cached_property
+    def supply_ends(self) -> Floats:
+        """The lowest and the highest of it (bar), but for one reading in a hundred each."""
+        ends = np.quantile(self.supplies, ENDS) if len(self.supplies) else np.full(2, np.nan)
+        return np.asarray(ends)
 
     def reached(self, level: float) -> float:
         """Time (s) at which the vacuum comes to ``level`` (mbar); NaN if it does not, or unseen."""

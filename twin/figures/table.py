@@ -162,27 +162,17 @@ def quick_switchings(course: Course, _unit: Unit) -> float:
 
 def supply(course: Course, _unit: Unit) -> float:
     """Mean operating pressure while the nozzle was on (bar)."""
-    there = _supplies(course)
-    return float(there.mean()) if len(there) else UNKNOWN
+    return float(course.supplies.mean()) if len(course.supplies) else UNKNOWN
 
 
 def lowest_supply(course: Course, _unit: Unit) -> float:
     """Lowest operating pressure while the nozzle was on (bar)."""
-    there = _supplies(course)
-    return float(np.quantile(there, 0.01)) if len(there) else UNKNOWN
+    return float(course.supply_ends[0])
 
 
 def highest_supply(course: Course, _unit: Unit) -> float:
     """Highest operating pressure while the nozzle was on (bar)."""
-    there = _supplies(course)
-    return float(np.quantile(there, 0.99)) if len(there) else UNKNOWN
-
-
-def _supplies(course: Course) -> Floats:
-    """What the supply read while the nozzle was on (bar)."""
-    on = course.phase == Phase.SUCTION
-    there: Floats = course.supply[on & np.isfinite(course.supply)]
-    return there
+    return float(course.supply_ends[1])
 
 
 def _nozzle_s(course: Course) -> float:

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import block_diag
 
 from twin.model.theta import Theta
 from twin.monitor.bank import DELAYS, SUSPECTS, UNSURE_OF, hypotheses
@@ -121,7 +120,6 @@ class Listener:
         covariance = from_cycle_to_cycle(bins, first, alone, moves, self.noise)
         shown = [number for number, name in enumerate(LEVELS) if name in figures]
         level = np.array([figures[LEVELS[number]] for number in shown]) - self._means[shown]
-        alone_too = np.diag(self._sigmas[shown] ** 2)
         moved = np.concatenate([signatures[first], self._levels[shown]])
         suspects, gross, ways = np.split(moved, np.cumsum([len(SUSPECTS), len(DELAYS)]), axis=1)
         numbers = np.array(shown, np.int64) - len(LEVELS)
@@ -133,7 +131,7 @@ class Listener:
             suspects,
             gross,
             ways - suspects[:, [UNSURE_OF]],
-            block_diag(covariance * self.healthy.leftover**2, alone_too),
+            _beside(covariance * self.healthy.leftover**2, self._sigmas[shown] ** 2),
             np.concatenate([common, self._sigmas[shown]]),
         )
 
@@ -146,3 +144,11 @@ class Listener:
                 sigma = self.healthy.scatter.get(one.effect, usual)
                 columns.append(signatures[:, [number]] * (sigma / one.step))
         return np.hstack(columns)
+
+
+def _beside(covariance: Floats, variances: Floats) -> Floats:
+    """The same with further values beside it, each on its own."""
+    known = len(covariance)
+    both = np.diag(np.concatenate([np.zeros(known), variances]))
+    both[:known, :known] = covariance
+    return both
