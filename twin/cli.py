@@ -140,13 +140,14 @@ def run(
             begun, file = _begun(source), _file_of(log, label)
             rotate = round(settings.log.rotate_mb * 1e6)
             header = _header(settings, hil)
+            # The log comes last: what people are told does not wait for the disk.
             sinks = _opened(
-                (lambda: Recorder(file, header, rotate_bytes=rotate)) if file else None,
+                lambda: Console(label.ljust(max(map(len, ejectors))) if label else "", events),
                 (lambda: shown) if shown else None,
                 keeper_of(settings, _complain),
                 live_rows_of(settings, _complain),
                 view_of(name),
-                lambda: Console(label.ljust(max(map(len, ejectors))) if label else "", events),
+                (lambda: Recorder(file, header, rotate_bytes=rotate)) if file else None,
             )
             status = _status if alone else _unsaid
             adviser = LiveDiagnosis(
@@ -158,7 +159,7 @@ def run(
             )
             # What is not measured has no faults. Alarms come last: they hear the diagnosis.
             advisers: list[Adviser] = [] if hil else [adviser, board := alarms()]
-            sinks += [] if hil else _told(board.standing(), shown, outlets)
+            sinks = [*([] if hil else _told(board.standing(), shown, outlets)), *sinks]
             run_loop(_until(stopped, begun), twin, monitor, sinks, advisers=advisers)
 
     failed: list[str] = []
