@@ -45,7 +45,7 @@ LONGEST_BRIDGE = 0.1  # s; after a longer silence the model waits for the next s
 NEVER = 1e9  # s, an age that is past every delay
 # A step in which a valve moves, a cup opens or blow-off passes ambient pressure (the exhaust opens)
 # is done in the most steps; any other in as many as keep each within the tolerance.
-FINEST = 24  # steps
+FINEST = 24  # steps, within TOLERANCE; as many fewer where it is wider as any step then needs
 SQUEEZES = 6  # rounds of Newton's method, from a pressure at most ten times off
 TOLERANCE = 0.02  # Pa, of a step, by which a scheme of second order may be off
 ROUGHLY = 1.0  # Pa, the same where many hypotheses are tried: far below what a sensor resolves
@@ -268,11 +268,12 @@ def _passes(state, k, h, i):  # type: ignore[no-untyped-def]
 def _finer(state, k, h, tolerance):  # type: ignore[no-untyped-def]
     """In how many steps the next ``h`` is to be done, for the sake of any hypothesis."""
     rough = 0.0
+    finest = math.ceil(FINEST * (TOLERANCE / tolerance) ** (1.0 / 3.0))
     for i in range(state.shape[1]):
         if _jumps(state, k, h, i) or _passes(state, k, h, i):
-            return FINEST
+            return finest
         rough = max(rough, state[ROUGH, i])
-    return min(max(math.ceil(h * (rough / tolerance) ** (1.0 / 3.0)), 1), FINEST)
+    return min(max(math.ceil(h * (rough / tolerance) ** (1.0 / 3.0)), 1), finest)
 
 
 @inlined
