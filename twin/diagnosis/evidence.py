@@ -79,6 +79,16 @@ class Evidence:
         """Number of the cycle of each row."""
         return np.repeat(self.numbers, np.diff(self.starts))
 
+    @cached_property
+    def _times(self) -> Floats:
+        """The same as the kernel counts it: less by 1 where time does not run on."""
+        return np.cumsum(steps(self.samples, None))
+
+    @cached_property
+    def _measured(self) -> Floats:
+        """Mean measured pressure (Pa) of each bin."""
+        return self.bins.mean(self.samples["pressure"].astype(np.float64))
+
     def course(self, hypothesis: Hypothesis, base: Theta | None = None) -> Schedule:
         """The coefficients under a hypothesis, from which row on which."""
         base = self.theta if base is None else base
@@ -108,14 +118,13 @@ class Evidence:
         sensing = self._sensing(bases, courses)
         if late is not None:
             sensing = [_later(*both) for both in zip(sensing, late, strict=True)]
-        measured = self.bins.mean(self.samples["pressure"].astype(np.float64))
         lanes = [slice(i, i + kernel.LANES) for i in range(0, len(courses), kernel.LANES)]
 
         def run(lane: slice) -> Floats:
             phase, level = self._switched(courses[lane], sensing[lane])
             rows = self._drawn(courses[lane], phase)
             expected = self._run(courses[lane], phase, level, rows, kernel.ROUGHLY)
-            off: Floats = (measured[:, None] - self.bins.through(rows) @ expected) / MBAR
+            off: Floats = (self._measured[:, None] - self.bins.through(rows, expected)) / MBAR
             return off
 
         found = np.empty((len(self.bins.count), len(courses)))
@@ -145,8 +154,7 @@ class Evidence:
         tolerance: float,
     ) -> Floats:
         """Expected pressures (Pa) at ``rows``, (rows, courses)."""
-        times = np.cumsum(steps(self.samples, None))[rows]
-        dt = np.diff(times, prepend=0.0)
+        dt = np.diff(self._times[rows], prepend=0.0)
         phase, level = phase[rows], level[rows]
         expected = np.empty((len(rows), len(courses)))
         state, before = kernel.new_state(len(courses)), None
@@ -157,7 +165,7 @@ class Evidence:
             before = theta
             driven = dt[part], phase[part], level[part]
             kernel.advance(state, theta, *driven, expected[part], tolerance=tolerance)
-        for phases, one in zip(phase.T, expected.T, strict=True):
+        for phases, one in zip(np.broadcast_to(phase, expected.shape).T, expected.T, strict=True):
             Terms(self.terms, float(self.theta[c.AMBIENT])).add(phases, one)
         return expected
 
@@ -190,13 +198,19 @@ class Evidence:
     def _switched(
         self, courses: Sequence[Schedule], sensing: Sequence[tuple["Sensing", ...]]
     ) -> tuple[npt.NDArray[np.uint8], Floats]:
-        """Phases and levels, (rows, n), as the nozzle must have switched to be seen as it was."""
-        phase = np.repeat(self.ticks["phase"][:, None], len(sensing), axis=1)
-        level = np.repeat(self.ticks["level"].astype(np.float64)[:, None], len(sensing), axis=1)
+        """Phases and levels as the nozzle must have switched to be seen as it was.
+
+        Both are (rows, n), or (rows, 1) where they are the same for all.
+        """
+        changed, moved = any(len(course) > 1 for course in courses), any(sensing)
+        phase = np.repeat(self.ticks["phase"][:, None], len(sensing) if moved else 1, axis=1)
+        width = len(sensing) if changed or moved else 1
+        level = np.repeat(self.ticks["level"].astype(np.float64)[:, None], width, axis=1)
         for i, (course, some) in enumerate(zip(courses, sensing, strict=True)):
             if some:
                 self._move(phase[:, i], level[:, i], some)
-            self._read_anew(level[:, i], course)
+            if len(course) > 1:
+                self._read_anew(level[:, i], course)
         return phase, level
 
     def _read_anew(self, level: Floats, course: Schedule) -> None:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_array
 
+from twin.model.compiled import compiled
 from twin.model.term import kinds
 from twin.signals import MS
 
@@ -41,17 +41,31 @@ class Bins:
         sums: Floats = np.add.reduceat(values[used], first, axis=0)
         return sums / self.count.reshape(-1, *[1] * (values.ndim - 1))
 
-    def through(self, kept: Ints) -> csr_array:
-        """The mean over each bin of straight lines through the rows ``kept``, (bins, kept)."""
-        used = np.flatnonzero(self.number >= 0)
-        after = np.searchsorted(kept, used)
-        before = np.maximum(after - 1, 0)
-        share = (kept[after] - used) / np.maximum(kept[after] - kept[before], 1)
-        bins, weight = self.number[used], 1.0 / self.count[self.number[used]]
-        parts = np.concatenate([weight * share, weight * (1.0 - share)])
-        there = parts > 0.0
-        where = np.tile(bins, 2)[there], np.concatenate([before, after])[there]
-        return csr_array((parts[there], where), shape=(len(self.count), len(kept)))
+    def through(self, kept: Ints, values: Floats) -> Floats:
+        """The mean over each bin of straight lines through ``values`` at the rows ``kept``.
+
+        From (kept, n) to (bins, n); what is in a bin lies between the first and the last kept row.
+        """
+        sums = np.zeros((len(self.count), values.shape[1]))
+        _add_lines(self.number, kept, values, sums)
+        return sums / self.count[:, None]
+
+
+@compiled
+def _add_lines(number, kept, values, sums):  # type: ignore[no-untyped-def]
+    """Add what lines through ``values`` are at each row to the sum of its bin."""
+    for after in range(len(kept)):
+        before = max(after - 1, 0)
+        first, last = kept[before], kept[after]
+        for row in range(first + 1, last):
+            if number[row] >= 0:
+                share = (last - row) / (last - first)
+                for i in range(values.shape[1]):
+                    line = share * values[before, i] + (1.0 - share) * values[after, i]
+                    sums[number[row], i] += line
+        if number[last] >= 0:  # whatever is beside it
+            for i in range(values.shape[1]):
+                sums[number[last], i] += values[after, i]
 
 
 def warped(seconds: Floats) -> Floats:
