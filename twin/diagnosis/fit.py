@@ -14,8 +14,11 @@ from twin.monitor.bins import Floats
 MOST_ROUNDS = 10
 STEP = 0.1  # typical sizes, for derivatives
 LONGEST = 6.0  # typical sizes that one round may move
-CONVERGED = 0.05  # chi-square that one more round would gain
+CONVERGED = 0.05  # chi-square that one more round would gain, in times what a residual has
 HOPELESS = 3.0  # times the chi-square of the best, after some rounds: not worth going on
+# Where only the best is asked for: what a fit may still gain, in times its last step's gain, and
+# how far above the best, in chi-square per residual of that, it need not go on from there.
+PACE, FAR = 3.0, 60.0
 BACK = 0.3  # of a step that made it worse
 
 
@@ -53,7 +56,18 @@ class _Trial:
     residual: Floats = field(default_factory=lambda: np.empty(0))
     jacobian: Floats = field(default_factory=lambda: np.empty((0, 0)))
     next: Floats = field(default_factory=lambda: np.empty(0))
+    gained: float = np.inf  # in chi-square, by the last step that helped
     done: bool = False
+
+    @property
+    def scale(self) -> float:
+        """Chi-square per residual, 1 where it is less: what is left is as wide as that."""
+        return max(self.chi2 / max(len(self.residual), 1), 1.0)
+
+    @property
+    def kind(self) -> frozenset[object]:
+        """What it is a fit of, whatever the sizes."""
+        return frozenset((c.effect, c.course, c.onset_s, c.cycles) for c in self.hypothesis)
 
     def moves(self) -> Floats:
         """Steps for derivatives at the next point, one per size, away from the nearer bound."""
@@ -67,6 +81,7 @@ class _Trial:
             self.done = bool(np.abs(self.next - self.x).max(initial=0.0) < 0.01)
             self.next = back
             return
+        self.gained = self.chi2 - chi2
         self.x, self.chi2, self.residual = self.next, chi2, residual
         self.jacobian = (white[:, 1:] - white[:, :1]) / self.moves()
         q, r = np.linalg.qr(self.jacobian)
@@ -77,7 +92,7 @@ class _Trial:
         step = lsq_linear(r, -np.concatenate([pull, np.zeros(len(low))]), (low, high)).x
         gain = float(pull @ pull - np.sum((pull + r[: len(low)] @ step) ** 2))
         self.next = np.clip(self.x + step, self.low, self.high)
-        self.done = gain < CONVERGED
+        self.done = gain < CONVERGED * self.scale
 
 
 def white(evidence: Evidence, weights: Weights, hypotheses: Sequence[Hypothesis]) -> Floats:
@@ -85,12 +100,24 @@ def white(evidence: Evidence, weights: Weights, hypotheses: Sequence[Hypothesis]
     return weights.white(evidence.off(hypotheses), levels(evidence, weights.cycles, hypotheses))
 
 
-def fit(evidence: Evidence, weights: Weights, hypotheses: Sequence[Hypothesis]) -> list[Fitted]:
-    """Fit the sizes of hypotheses, from those they have."""
+def fit(
+    evidence: Evidence,
+    weights: Weights,
+    hypotheses: Sequence[Hypothesis],
+    *,
+    best_only: bool = False,
+) -> list[Fitted]:
+    """Fit the sizes of hypotheses, from those they have.
+
+    What is given up on the way keeps its best point: its score is at least that of its best fit.
+    Where only the best is asked for, what will not come near it is given up as well.
+    """
     trials = [_trial(evidence, one) for one in hypotheses]
     for turn in range(MOST_ROUNDS):
         if turn >= 2:
             _give_up(trials)
+            if best_only:
+                _give_up_behind(trials)
         going = [trial for trial in trials if not trial.done]
         if not going:
             break
@@ -112,6 +139,15 @@ def _give_up(trials: Sequence[_Trial]) -> None:
     best = min(trial.chi2 for trial in trials)
     for trial in trials:
         trial.done = trial.done or trial.chi2 > HOPELESS * best + HOPELESS * len(trial.residual)
+
+
+def _give_up_behind(trials: Sequence[_Trial]) -> None:
+    """Give up what will not come near the best, and what is behind another fit of its kind."""
+    trials = sorted(trials, key=lambda one: one.chi2)
+    near, ahead = trials[0].chi2 + FAR * trials[0].scale, set[frozenset[object]]()
+    for trial in trials:
+        trial.done |= trial.chi2 - PACE * trial.gained > near or trial.kind in ahead
+        ahead.add(trial.kind)
 
 
 def _trial(evidence: Evidence, hypothesis: Hypothesis) -> _Trial:

@@ -212,7 +212,7 @@ def _best_addition(
         candidates += _linear_pairs(evidence, judged)
         candidates += _fitted_pairs(evidence, weights, singles[:TRIED_PAIRS], found)
     candidates = _timed(evidence, judged, candidates)
-    tried = _ranked(evidence, judged, fit(evidence, weights, candidates))
+    tried = _ranked(evidence, judged, fit(evidence, weights, candidates, best_only=True))
     for one in tried:
         if _worth(healthy, found.chi2, found.chi2 - found.score, one):
             return one
