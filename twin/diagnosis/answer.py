@@ -68,21 +68,23 @@ def diagnose(
         return Diagnosis(evidence, config.data.hash, None, HEALTHY, (), None, None, [], answer)
     whole, evidence = evidence, thinned(evidence, evidence.judged, MOST_JUDGED)
     fitted, held_out = split(evidence)
-    searched = search(evidence, fitted, progress)
+    healthy = covariance(evidence)
+    searched = search(evidence, fitted, healthy, progress)
     if searched.found and whole.cycles > evidence.cycles:
         progress("looking for when it began")
         searched = sharpened(whole, evidence, searched)
     found = searched.found.hypothesis if searched.found else HEALTHY
     progress("judging on the cycles it has not seen")
-    before = judge(evidence, covariance(evidence).of(held_out), HEALTHY)
-    after = judge(evidence, covariance(evidence, found).of(held_out), found)
+    known = covariance(evidence, found) if found else healthy
+    before = judge(evidence, healthy.of(held_out), HEALTHY)
+    after = judge(evidence, known.of(held_out), found)
     progress("looking for what nobody listed")
-    strange = look(evidence, found, fitted, held_out)
+    strange = look(known, found, fitted, held_out)
     terms: tuple[Term, ...] = ()
     if (verdict := _verdict(found, before, after, strange)) == "unlisted":
         if not _sure(found, before, after):
             searched, found = replace(searched, found=None), HEALTHY
-            strange = look(evidence, found, fitted, held_out)
+            strange = look(healthy, found, fitted, held_out)
         terms = strange.terms
         with_terms = extended(evidence, terms)
         after = judge(with_terms, covariance(with_terms, found).of(held_out), found)

@@ -5,11 +5,12 @@ measured minus expected pressure, averaged over short bins, and the vacuum at wh
 switched against the vacuum at which the hypothesis would.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain, pairwise
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -40,6 +41,16 @@ SUPPLY_UNKNOWN = {"end_pressure_slope": 0.5, "curvature": 0.5, "optimum_bar": 0.
 
 Hypothesis = tuple[Cause, ...]
 HEALTHY: Hypothesis = ()
+One = TypeVar("One")
+Other = TypeVar("Other")
+
+
+def at_once(run: Callable[[One], Other], over: Sequence[One]) -> list[Other]:
+    """What ``run`` gives for each, in order; on all cores, as compiled code lets others run."""
+    if len(over) < 2:
+        return [run(one) for one in over]
+    with ThreadPoolExecutor(WORKERS) as pool:
+        return list(pool.map(run, over))
 
 
 @dataclass(frozen=True)
@@ -128,9 +139,8 @@ class Evidence:
             return off
 
         found = np.empty((len(self.bins.count), len(courses)))
-        with ThreadPoolExecutor(WORKERS) as pool:
-            for lane, off in zip(lanes, pool.map(run, lanes), strict=True):
-                found[:, lane] = off
+        for lane, off in zip(lanes, at_once(run, lanes), strict=True):
+            found[:, lane] = off
         return found
 
     def _drawn(self, courses: Sequence[Schedule], phase: npt.NDArray[np.uint8]) -> Ints:
@@ -267,9 +277,8 @@ class Evidence:
         rows = min(int(LATER * suction), LONGEST_SUCTION)
         thetas = list(new.values())
         lanes = [thetas[i : i + kernel.LANES] for i in range(0, len(thetas), kernel.LANES)]
-        with ThreadPoolExecutor(WORKERS) as pool:
-            found = pool.map(lambda lane: seen(lane, rows, self.knees), lanes)
-            self._seen.update(zip(new, chain.from_iterable(found), strict=True))
+        found = at_once(lambda lane: seen(lane, rows, self.knees), lanes)
+        self._seen.update(zip(new, chain.from_iterable(found), strict=True))
 
 
 @dataclass(frozen=True)

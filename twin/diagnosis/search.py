@@ -12,11 +12,11 @@ from itertools import combinations
 
 import numpy as np
 
-from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, thinned
+from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, at_once, thinned
 from twin.diagnosis.fit import Fitted, fit, white
 from twin.diagnosis.hypotheses import bounds, parameters, sized, sizes
 from twin.diagnosis.screen import columns, pairs, promises
-from twin.diagnosis.weights import Weights, covariance
+from twin.diagnosis.weights import Covariance, Weights, covariance
 from twin.model.courses import Cause, Course
 from twin.monitor.bins import Floats
 from twin.signals import MS
@@ -61,13 +61,16 @@ class Search:
     onsets: list[tuple[float, float]]  # 95 % interval of each cause's onset
 
 
-def search(evidence: Evidence, fitted: Sequence[int], progress: Progress) -> Search:
+def search(
+    evidence: Evidence, fitted: Sequence[int], known: Covariance, progress: Progress
+) -> Search:
     """Find up to three causes; sizes and ranking of effects from the ``fitted`` cycles only.
 
     When a cause acts (course, onset, which cycles) is taken from all of them: no other shows it.
+    ``known`` is about the healthy twin.
     """
     progress("screening all effects and courses")
-    judged, weights = _weights(evidence, fitted, HEALTHY)
+    judged, weights = known.of(evidence.judged), known.of(fitted)
     tried = _fit_singles(evidence, judged, weights, progress)
     singles = _ranked(evidence, judged, tried)
     healthy = _healthy(evidence, weights)
@@ -154,17 +157,21 @@ def _likeliest(evidence: Evidence, fitted: Sequence[int], tried: Sequence[Fitted
     What scatters moves with the causes: about the healthy twin, a valve's half millisecond is not
     where a delay of ten has put its edge. All cycles choose the course, the fitted ones the effect.
     """
-    best: dict[tuple[str, ...], tuple[float, float, Fitted]] = {}
     least = min(one.score for one in tried)
     near = [one for one in sorted(tried, key=lambda one: one.score) if one.score < NEAR * least]
-    for first in near[:TRIED_ALONE]:
+
+    def alone(first: Fitted) -> tuple[float, float, Fitted]:
         judged, weights = _weights(evidence, fitted, first.hypothesis)
         (one,) = fit(evidence, weights, [first.hypothesis])
         chi2 = float(np.sum(white(evidence, judged, [one.hypothesis]) ** 2))
         price = one.score - one.chi2
-        everywhere, unseen = chi2 + judged.volume + price, one.score + weights.volume
+        return chi2 + judged.volume + price, one.score + weights.volume, one
+
+    best: dict[tuple[str, ...], tuple[float, float, Fitted]] = {}
+    for each in at_once(alone, near[:TRIED_ALONE]):
+        everywhere, _, one = each
         if one.effects not in best or everywhere < best[one.effects][0]:
-            best[one.effects] = everywhere, unseen, one
+            best[one.effects] = each
     return min(best.values(), key=lambda each: each[1])[2]
 
 
@@ -274,9 +281,9 @@ def _rivals(
     evidence: Evidence, judged: Weights, weights: Weights, found: Fitted, singles: list[Fitted]
 ) -> list[list[Fitted]]:
     """For each cause: what fits as well in its place, re-fitted with the others."""
-    result = []
     margin = SAME * max(found.leftover**2, 1.0)
-    for left in range(len(found.hypothesis)):
+
+    def instead_of(left: int) -> list[Fitted]:
         others = tuple(c for i, c in enumerate(found.hypothesis) if i != left)
         if others:
             promised = promises(evidence, judged, columns(evidence, judged, others), each=1)
@@ -290,8 +297,9 @@ def _rivals(
             fitted = _ranked(evidence, judged, fit(evidence, weights, timed))
         else:
             fitted = [one for one in singles if one.effects != found.effects]
-        result.append([one for one in fitted if one.score - found.score < margin])
-    return result
+        return [one for one in fitted if one.score - found.score < margin]
+
+    return at_once(instead_of, range(len(found.hypothesis)))
 
 
 # --- when -----------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
-from twin.diagnosis.weights import Weights, covariance, levels
+from twin.diagnosis.weights import Covariance, Weights, levels
 from twin.model import theta as c
 from twin.model.courses import Cause
 from twin.model.term import KINDS, Term
@@ -63,10 +63,13 @@ class _Left:
 
 
 def look(
-    evidence: Evidence, hypothesis: Hypothesis, fitted: Sequence[int], held_out: Sequence[int]
+    known: Covariance, hypothesis: Hypothesis, fitted: Sequence[int], held_out: Sequence[int]
 ) -> Unlisted:
-    """Fit terms to what a hypothesis leaves on the fitted cycles; judge on the others."""
-    known = covariance(evidence, hypothesis)
+    """Fit terms to what a hypothesis leaves on the fitted cycles; judge on the others.
+
+    ``known`` is about the same hypothesis.
+    """
+    evidence = known.evidence
     off = evidence.off([hypothesis])
     here, there = (
         _Left(weights, off[:, 0], weights.white(off, levels(evidence, cycles, [hypothesis]))[:, 0])
