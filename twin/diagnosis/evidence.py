@@ -263,7 +263,8 @@ class Evidence:
 
     def seen(self, theta: Theta) -> Seen:
         """How the air saving would be seen to switch, by the finder that found it in the log."""
-        self.look([theta])
+        if theta.tobytes() not in self._seen:
+            self.look([theta])
         return self._seen[theta.tobytes()]
 
     def look(self, thetas: Iterable[Theta]) -> None:

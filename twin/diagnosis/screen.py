@@ -4,7 +4,7 @@ The signature of each effect in each cycle is one whitened column; a course is a
 cycle. So thousands of combinations cost some products of small matrices.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, combinations
 
@@ -21,6 +21,7 @@ from twin.monitor.bins import Floats, Ints
 # one's signature looks nothing like a great one's.
 SHARES = (0.5,)
 SHARES_OF_TIMES = (0.5, 1.5, 3.0)
+LEAST_POWER = 1e-9  # of a signature, in sigmas squared: less is nothing
 ALIKE = 1e-6  # of their lengths' product: two columns are the same
 
 
@@ -62,6 +63,15 @@ class _Option:
     weights: Floats  # of each cycle
 
 
+@dataclass(frozen=True)
+class _Gain:
+    """What an option gains in the linear model (chi-square, price included), at its best size."""
+
+    gain: float
+    size: float
+    option: _Option
+
+
 def columns(evidence: Evidence, weights: Weights, about: Hypothesis = HEALTHY) -> Columns:
     """Signatures of all parameters about a hypothesis."""
     taken = [
@@ -95,16 +105,19 @@ def _sign(evidence: Evidence, p: Parameter) -> float:
 
 def promises(evidence: Evidence, weights: Weights, found: Columns, each: int) -> list[Promise]:
     """The best courses (``each`` of them) of every parameter, the most promising first."""
-    best: dict[tuple[str, str], dict[Course, Promise]] = {}
+    best: dict[tuple[str, str], dict[Course, _Gain]] = {}
+    shares = list(_shares(evidence, weights))
     for number, (name, p) in enumerate(found.names):
         mine = best.setdefault((name, p.name), {})
-        for option in _options(evidence, weights, found, number):
-            promise = _alone(evidence, found, option)
+        for option in _options(evidence, weights, found, number, shares):
+            gain = _gain(evidence, found, option)
             before = mine.get(option.cause.course)
-            if before is None or promise.gain > before.gain:
-                mine[option.cause.course] = promise
-    chosen = [sorted(one.values(), key=_loss)[:each] for one in best.values()]
-    return sorted(chain.from_iterable(chosen), key=_loss)
+            if before is None or gain.gain > before.gain:
+                mine[option.cause.course] = gain
+    chosen = chain.from_iterable(
+        sorted(one.values(), key=lambda gain: -gain.gain)[:each] for one in best.values()
+    )
+    return sorted((_promised(evidence, found, one) for one in chosen), key=_loss)
 
 
 def _loss(promise: Promise) -> float:
@@ -141,31 +154,46 @@ def pairs(
     return sorted(result, key=_loss)
 
 
-def _alone(evidence: Evidence, found: Columns, option: _Option) -> Promise:
+def _gain(evidence: Evidence, found: Columns, option: _Option) -> _Gain:
     """What one parameter with one course gains."""
     power = option.weights @ found.gram[option.number, :, option.number] @ option.weights
     pull = float(option.weights @ found.pull[option.number])
-    size = pull / max(float(power), 1e-9)
+    size = pull / max(float(power), LEAST_POWER)
     if not found.allowed(option.number, size):
         size = 0.0
-    p = found.names[option.number][1]
-    hypothesis = (_with_size(evidence, option.cause, p, size),)
-    return Promise(hypothesis, size * pull - price(evidence, hypothesis), option.number)
+    return _Gain(size * pull - price(evidence, (option.cause,)), size, option)
+
+
+def _promised(evidence: Evidence, found: Columns, gain: _Gain) -> Promise:
+    p = found.names[gain.option.number][1]
+    hypothesis = (_with_size(evidence, gain.option.cause, p, gain.size),)
+    return Promise(hypothesis, gain.gain, gain.option.number)
+
+
+def _shares(evidence: Evidence, weights: Weights) -> Iterator[tuple[Course, float, Floats]]:
+    """Course, onset and weight of each cycle, of all courses but those in some cycles only."""
+    courses = [(Course.CONSTANT, 0.0), (Course.RAMP, 0.0)]
+    for onset in evidence.seconds[evidence.starts[np.array(weights.cycles)[1:]]]:
+        courses += [(Course.STEP, float(onset)), (Course.RAMP, float(onset))]
+    for course, onset in courses:
+        yield course, onset, share_of_cycles(evidence, weights, Cause("", {}, course, onset))
 
 
 def _options(
-    evidence: Evidence, weights: Weights, found: Columns, number: int
+    evidence: Evidence,
+    weights: Weights,
+    found: Columns,
+    number: int,
+    shares: Iterable[tuple[Course, float, Floats]],
 ) -> Iterator[_Option]:
     """All courses of a parameter that the cycles can tell apart."""
     name = found.names[number][0]
+    for course, onset, share in shares:
+        yield _Option(number, Cause(name, {}, course, onset), share)
     cycles = np.array(weights.cycles)
-    causes = [Cause(name, {}), Cause(name, {}, Course.RAMP)]
-    for onset in evidence.seconds[evidence.starts[cycles[1:]]]:
-        causes += [Cause(name, {}, course, float(onset)) for course in (Course.STEP, Course.RAMP)]
     for chosen in _striking(found, number):
         struck = frozenset(int(n) for n in evidence.numbers[cycles[chosen]])
-        causes.append(Cause(name, {}, Course.INTERMITTENT, cycles=struck))
-    for cause in causes:
+        cause = Cause(name, {}, Course.INTERMITTENT, cycles=struck)
         yield _Option(number, cause, share_of_cycles(evidence, weights, cause))
 
 
@@ -177,7 +205,7 @@ def _striking(found: Columns, number: int) -> Iterator[Ints]:
     """
     square = found.gram[number, :, number]
     cycles = len(square)
-    steady = 1e-3 * np.trace(square) / cycles * np.eye(cycles)
+    steady = max(1e-3 * np.trace(square) / cycles, LEAST_POWER) * np.eye(cycles)
     sizes = np.linalg.solve(square + steady, found.pull[number])
     for sign in (1.0, -1.0):
         if not found.allowed(number, sign):

@@ -163,12 +163,14 @@ def levels(evidence: Evidence, cycles: Sequence[int], hypotheses: Sequence[Hypot
         for course, rows in zip(map(evidence.course, hypotheses), nodes, strict=True)
     ]
     evidence.look(theta for some in there for theta in some)
+    number = np.array([number for _, number in shown], np.int64)
+    beside = np.array([_beside_the_twin(evidence, *one) for one in shown])
     found = np.empty((len(shown), len(hypotheses)))
     for i, (rows, some) in enumerate(zip(nodes, there, strict=True)):
-        seen = np.array([evidence.seen(one).levels for one in some]).reshape(-1, 2)
-        for j, (cycle, number) in enumerate(shown):
-            expected = float(np.interp(at[j], rows, seen[:, number])) if len(rows) else 0.0
-            found[j, i] = _level(evidence, cycle, number, expected)
+        seen = np.array([evidence.seen(one).levels for one in some])
+        for which in np.unique(number):
+            mine = number == which
+            found[mine, i] = beside[mine] - np.interp(at[mine], rows, seen[:, which])
     return found
 
 
@@ -204,12 +206,13 @@ def _at(course: Schedule, row: int) -> Theta:
     return course[bisect_right(course, row, key=lambda one: one[0]) - 1][1]
 
 
-def _level(evidence: Evidence, cycle: int, number: int, expected: float) -> float:
-    """Measured minus expected level (mbar)."""
-    base = evidence.seen(evidence.theta)
-    if healthy := evidence.healthy.figures.get(LEVELS[number]):
-        expected += healthy.mean - base.levels[number]
-    return evidence.figures[cycle][LEVELS[number]] - expected
+def _beside_the_twin(evidence: Evidence, cycle: int, number: int) -> float:
+    """Measured level (mbar), less by how much healthy ones are above the calibrated twin's."""
+    measured = evidence.figures[cycle][LEVELS[number]]
+    healthy = evidence.healthy.figures.get(LEVELS[number])
+    if healthy is None:
+        return measured
+    return measured - (healthy.mean - evidence.seen(evidence.theta).levels[number])
 
 
 def _level_sigmas(evidence: Evidence, cycles: Sequence[int]) -> Floats:
