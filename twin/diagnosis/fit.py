@@ -9,6 +9,7 @@ from scipy.optimize import lsq_linear
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.hypotheses import bounds, price, sized, sizes
 from twin.diagnosis.weights import Weights, levels
+from twin.model.courses import Course
 from twin.monitor.bins import Floats
 
 MOST_ROUNDS = 10
@@ -42,6 +43,11 @@ class Fitted:
     def effects(self) -> tuple[str, ...]:
         """Names of the effects in it."""
         return tuple(cause.effect for cause in self.hypothesis)
+
+    @property
+    def kind(self) -> frozenset[tuple[str, Course]]:
+        """Its effects with their courses, whatever their sizes and times."""
+        return frozenset((cause.effect, cause.course) for cause in self.hypothesis)
 
 
 @dataclass

@@ -22,7 +22,7 @@ from twin.monitor.bins import Floats
 from twin.signals import MS
 
 MOST_CAUSES = 3
-MOST_ROUNDS = 4  # of adding and pruning: with other weights what was pruned could come back
+MOST_ROUNDS = 4  # of adding and pruning
 SIGNIFICANT = 20.0  # chi-square, beyond its price, that a cause must gain before it is named
 SHARE = (
     0.005  # of what is explained already, that one more cause must gain: else it mends the model
@@ -85,9 +85,12 @@ def search(
     others = [one.hypothesis for one in singles if one.effects != found.effects]
     found, *rest = fit(evidence, weights, [found.hypothesis, *others])
     singles = [found, *sorted(rest, key=lambda one: one.score)]
+    before: set[frozenset[tuple[str, Course]]] = set()
     for _ in range(MOST_ROUNDS):
-        if len(found.hypothesis) == MOST_CAUSES:
+        # With other weights what was pruned comes back: then the search goes round.
+        if len(found.hypothesis) == MOST_CAUSES or found.kind in before:
             break
+        before.add(found.kind)
         progress(f"looking for what else there is beside {', '.join(found.effects)}")
         more = _best_addition(evidence, judged, weights, found, singles, healthy)
         if more is None:
