@@ -103,9 +103,18 @@ def test_what_cycles_do_not_show_is_left_out() -> None:
     assert some.standard(seen)[0] == all_of.standard(seen)[0]
     changes = Changes(np.array([False, False]), np.ones(2))
     changes.take(np.array([3.0, np.nan]))
-    alone = Changes(np.array([False, False]), np.ones(2))
-    alone.take(np.array([3.0, -30.0]))
-    assert changes.log_sum == pytest.approx(alone.log_sum)
+    alone = Changes(np.array([False]), np.ones(1))
+    alone.take(np.array([3.0]))
+    assert changes.log_sum == pytest.approx(alone.log_sum - np.log(2.0))  # it has half the weight
+
+
+def test_one_cycle_alone_is_no_change_however_far_out_it_is() -> None:
+    changes = Changes(np.array([True, False]), np.ones(2))
+    changes.take(np.array([0.0, 30.0]))
+    assert changes.log_sum < limit(10_000.0)
+    for _ in range(2):
+        changes.take(np.array([0.0, 30.0]))
+    assert changes.log_sum > limit(10_000.0)
 
 
 def test_far_off_is_a_number_still() -> None:

@@ -41,9 +41,9 @@ ASKED = (1000.0, 10_000.0)  # cycles to a false alarm
 MONTH = 30 * 86_400.0 / 3.0  # the same in 30 days of 3 s cycles
 SHIFTS = (0.5, 1.0, 2.0)  # sigmas a cycle
 EFFECTS = ("leakage", "suction_loss", "filter_clogging", "threshold_drift", "sensor_lag")
-DRAWS = 400
+DRAWS = 1000
 RUN_IN = 300  # healthy cycles, after which sums are what they usually are
-APART = 25  # further ones between the beginnings of two changes
+APART = 20  # further ones between the beginnings of two changes
 NEVER = 4000  # cycles
 
 
@@ -130,7 +130,7 @@ def _running(pool: Floats, alike: Floats) -> list[Changes]:
 def _late(
     pool: Floats, alike: Floats, shift: float, begins: Sequence[Changes], healthy: int
 ) -> Measured:
-    """Median delay for each effect, and the mean one of a CUSUM that looks for nothing else."""
+    """Mean of the effects' median delays, and the mean delay of a CUSUM for one of them alone."""
     names = [one.effect for one in SUSPECTS]
     medians = []
     for effect in EFFECTS:
@@ -138,7 +138,8 @@ def _late(
         rng = np.random.default_rng(names.index(effect))
         delays = [_delay(pool, deepcopy(begin), added, rng) for begin in begins]
         medians.append(float(np.median(delays)))
-    return Measured(medians, [_optimum(shift, healthy)])
+    note = f"({', '.join(f'{one:g}' for one in medians)})"
+    return Measured([float(np.mean(medians))], [_optimum(shift, healthy)], note=note)
 
 
 def _delay(pool: Floats, changes: Changes, added: Floats, rng: np.random.Generator) -> int:
@@ -154,7 +155,7 @@ def _optimum(shift: float, healthy: int) -> float:
     k = 0.5 * shift
     height = brentq(lambda h: _run_length(k, h) - MONTH, 0.1, 100.0)
     rng, delays = np.random.default_rng(1), []
-    for _ in range(10 * DRAWS):
+    for _ in range(4 * DRAWS):
         before = _above(rng.normal(-k, 1.0, healthy)) if healthy else np.zeros(1)
         steps = rng.normal(k, 1.0, NEVER)
         steps[0] += before[-1]

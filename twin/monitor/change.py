@@ -17,12 +17,15 @@ from scipy.special import ndtri, stdtr
 Floats = npt.NDArray[np.float64]
 
 SIZES = np.array([0.5, 1.0, 2.0])  # sigmas a cycle that a change is looked for in
-SHARES = np.array([0.30, 0.25, 0.45])  # of the weight, of each size
+SHARES = np.array([0.32, 0.26, 0.42])  # of the weight, of each size
 # Power of the cosine by which suspects that look alike share one weight. When the sum of one is at
 # its limit, exp(14), that of its neighbour is at exp(14 cos^2): below 0.9 it hardly helps.
 ALIKE = 10
 # The limit over the cycles to a false alarm: sums of normal scores jump over it (Siegmund).
 OVERSHOOT = float(SHARES @ np.exp(-0.583 * SIZES))
+# Sigmas that a cycle counts for at most, unless its own figures are out: an edge that was misread
+# is no change.
+MOST = 5.0
 FARTHEST = 30.0  # sigmas; beyond, a probability is no number any more
 
 
@@ -86,11 +89,15 @@ class Changes:
         """Forget everything."""
         self._log = np.full(self._shift.shape, -np.inf)
 
-    def take(self, normal: Floats) -> None:
-        """Take the standard normal scores of a cycle; where there is none (NaN) all stays."""
+    def take(self, normal: Floats, most: float = MOST) -> None:
+        """Take the standard normal scores of a cycle; where there is none (NaN) all stays.
+
+        None counts for more than ``most``.
+        """
         there = np.isfinite(normal)
         shift = self._shift[there]
-        ratio = shift * normal[there, None, None] - 0.5 * shift**2
+        counted = np.clip(normal[there], -most, most)
+        ratio = shift * counted[:, None, None] - 0.5 * shift**2
         self._log[there] = np.logaddexp(0.0, self._log[there]) + ratio
 
     @property

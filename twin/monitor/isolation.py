@@ -15,7 +15,7 @@ import numpy as np
 from twin.model.dataset import DataSet, coefficients
 from twin.monitor.bank import DELAYS, GROSS, STEP, SUSPECTS, UNSURE_OF, Bank
 from twin.monitor.bins import Floats
-from twin.monitor.change import Changes, Reference, began, limit
+from twin.monitor.change import FARTHEST, MOST, Changes, Reference, began, limit
 from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import Healthy
 from twin.monitor.phases import expected_knees
@@ -183,7 +183,7 @@ class Isolation:
             self._changes.weigh(self._alike)
 
     def _conclude(self, changes: Changes, normal: Floats, far: float) -> Verdict:
-        changes.take(normal)
+        changes.take(normal, FARTHEST if far else MOST)
         cycles = self._wanted_s / (self._seconds / self._cycles)
         log_odds = changes.log_sum - np.log(cycles)  # a fault is as rare as a false alarm
         none = float(1.0 / (1.0 + np.exp(min(log_odds, 700.0))))
