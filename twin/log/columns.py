@@ -5,79 +5,235 @@ near), laid out byte plane by byte plane, most bytes are zero or repeat, and the
 compression takes them away. The coding is written down in twin.log.schema.
 """
 
-import struct
 from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
 
 from twin.log.schema import ADDED, COLUMNS, SAMPLES
+from twin.model.compiled import compiled, inlined
 from twin.signals import SAMPLE, TICK, Samples, Ticks
 
-_INT64 = struct.Struct("<q")  # the first row's bits
+_Places = npt.NDArray[np.int64]
+
+_FIRST = 8  # bytes of the first row's bits
+_MOST = 8  # byte planes
+_TILE = 512  # rows that are unpacked at a time: with all their columns they stay in the cache
 _ONE = np.uint64(1)
+_FIELDS = SAMPLES.message.DESCRIPTOR.fields_by_name
+_NUMBERS = np.array([_FIELDS[name].number for name in COLUMNS])
+_HIGHEST = int(_NUMBERS.max())
+_VARINT, _BYTES = 0, 2  # how protobuf says what comes
 
 
-def _as_integers(rows: np.dtype[np.void]) -> np.dtype[np.void]:
-    return np.dtype([(name, f"<i{rows[name].itemsize}") for name in rows.names or ()])
+def _places(rows: np.dtype[np.void]) -> _Places:
+    """Offset and width of each field; in bytes."""
+    fields = (rows.fields or {}).values()
+    return np.array([(offset, field.itemsize) for field, offset, *_ in fields])
 
 
-_SAMPLE_BITS, _TICK_BITS = _as_integers(SAMPLE), _as_integers(TICK)
-
-
-def _columns(samples: Samples, ticks: Ticks) -> list[npt.NDArray[np.signedinteger]]:
-    """Views of the fields' bits."""
-    sample_bits, tick_bits = samples.view(_SAMPLE_BITS), ticks.view(_TICK_BITS)
-    return [
-        *(sample_bits[name] for name in _SAMPLE_BITS.names or ()),
-        *(tick_bits[name] for name in _TICK_BITS.names or ()),
-    ]
+_SAMPLE_PLACES, _TICK_PLACES = _places(SAMPLE), _places(TICK)
 
 
 def encode(samples: Samples, ticks: Ticks) -> bytes:
     """Pack n > 0 row-aligned rows into a serialised ``ejector_twin.Samples``."""
-    bits = np.empty((len(COLUMNS), len(samples)), np.int64)
-    for row, column in zip(bits, _columns(samples, ticks), strict=True):
-        row[:] = column
-    steps = np.zeros_like(bits)
-    np.subtract(bits[:, 1:], bits[:, :-1], out=steps[:, 1:])  # wraps, and wraps back
-    zigzag = ((steps << 1) ^ (steps >> 63)).view(np.uint64)
-    planes = zigzag.view(np.uint8).reshape(*bits.shape, 8)
     message = SAMPLES.message(count=len(samples))
-    for index, (name, largest) in enumerate(zip(COLUMNS, zigzag.max(axis=1), strict=True)):
-        kept = (int(largest).bit_length() + 7) // 8
-        first = bits[index, :1].tobytes()
-        setattr(message, name, first + planes[index, :, :kept].T.tobytes())
+    space = np.empty(_FIRST + _MOST * len(samples), np.uint8)
+    columns = iter(COLUMNS)
+    for rows, places in ((samples, _SAMPLE_PLACES), (ticks, _TICK_PLACES)):
+        raw = np.ascontiguousarray(rows).view(np.uint8)
+        raw.flags.writeable = False  # as rows of a file are: one type to compile for
+        for offset, width in places.tolist():
+            used = _pack(raw, rows.itemsize, offset, width, space)
+            setattr(message, next(columns), space[:used].tobytes())
     packed: bytes = message.SerializeToString()
     return packed
 
 
-def decode(packed: bytes) -> tuple[Samples, Ticks]:
-    """Reverse ``encode``; ValueError, struct.error or DecodeError if it is something else."""
-    message = SAMPLES.message.FromString(packed)
-    planes = np.zeros((len(COLUMNS), message.count, 8), np.uint8)
-    first = np.zeros((len(COLUMNS), 1), np.int64)
-    for index, name in enumerate(COLUMNS):
-        column = getattr(message, name)
-        if not column and name in ADDED:
+def decode(packed: bytes | memoryview) -> tuple[Samples, Ticks]:
+    """Reverse ``encode``; ValueError if it is something else.
+
+    Protobuf's own classes would copy each column twice.
+    """
+    raw = np.frombuffer(packed, np.uint8)
+    spans = np.zeros((_HIGHEST + 1, 2), np.int64)
+    count = _find(raw, spans)
+    if count < 1:
+        raise ValueError("it is no message of rows")
+    spans = spans[_NUMBERS]
+    for name, (start, end) in zip(COLUMNS, spans.tolist(), strict=True):
+        if start == end and name in ADDED:
             continue
-        first[index] = _INT64.unpack_from(column)
-        if len(column) > _INT64.size:
-            kept = np.frombuffer(column, np.uint8, offset=_INT64.size).reshape(-1, message.count)
-            planes[index, :, : len(kept)] = kept.T
-    zigzag = planes.view(np.uint64)[..., 0]
-    steps = (zigzag >> _ONE).view(np.int64)
-    steps ^= -(zigzag & _ONE).view(np.int64)
-    bits = steps.cumsum(axis=1, out=steps)
-    bits += first
-    return _rows(bits)
-
-
-def _rows(bits: npt.NDArray[np.int64]) -> tuple[Samples, Ticks]:
-    samples, ticks = np.empty(bits.shape[1], SAMPLE), np.empty(bits.shape[1], TICK)
-    for column, row in zip(_columns(samples, ticks), bits, strict=True):
-        column[:] = row
+        kept, rest = divmod(end - start - _FIRST, count)
+        if rest or not 0 <= kept <= _MOST:
+            raise ValueError(f"{name} is not packed for {count} rows")
+    samples, ticks = np.empty(count, SAMPLE), np.empty(count, TICK)
+    of_samples, of_ticks = spans[: len(_SAMPLE_PLACES)], spans[len(_SAMPLE_PLACES) :]
+    _unpack(raw, of_samples, _SAMPLE_PLACES, count, samples.view(np.uint8))
+    _unpack(raw, of_ticks, _TICK_PLACES, count, ticks.view(np.uint8))
     return samples, ticks
+
+
+# Compiled. Places in a row are counted in unsigned integers: then what is done byte by byte below
+# becomes one instruction for the whole field.
+
+
+@inlined
+def _read(raw, at, width):  # type: ignore[no-untyped-def]
+    """Little-endian bytes, not extended."""
+    bits = np.uint64(0)
+    for j in range(width):
+        bits |= np.uint64(raw[at + np.uint64(j)]) << np.uint64(8 * j)
+    return bits
+
+
+@compiled
+def _pack(rows, size, offset, width, packed):  # type: ignore[no-untyped-def]
+    """Pack one field of all rows into the first bytes of ``packed``; gives how many."""
+    n = len(rows) // size
+    zigzag = np.empty(n, np.uint64)
+    at = np.uint64(offset)
+    before = any_bits = np.uint64(0)
+    for i in range(n):
+        if width == 8:
+            bits = _read(rows, at, 8)
+        elif width == 4:
+            bits = np.uint64(np.int32(_read(rows, at, 4)))
+        else:
+            bits = np.uint64(np.int8(rows[at]))
+        at += np.uint64(size)
+        if i == 0:
+            before = bits
+            for j in range(_FIRST):
+                packed[j] = bits >> np.uint64(8 * j)
+        step = bits - before  # wraps, and wraps back
+        zigzag[i] = (step << _ONE) ^ (np.uint64(0) - (step >> np.uint64(63)))
+        any_bits |= zigzag[i]
+        before = bits
+    kept = 0
+    while kept < _MOST and any_bits >> np.uint64(8 * kept):
+        plane = packed[_FIRST + kept * n :]
+        for i in range(n):
+            plane[i] = zigzag[i] >> np.uint64(8 * kept)
+        kept += 1
+    return _FIRST + kept * n
+
+
+@inlined
+def _varint(packed, at):  # type: ignore[no-untyped-def]
+    """A number of protobuf and where it ends: past the end where it is broken off."""
+    number = np.int64(0)
+    for j in range(10):
+        if at >= len(packed):
+            break
+        byte = np.int64(packed[at])
+        at += 1
+        number |= (byte & 0x7F) << (7 * j)
+        if byte < 0x80:
+            return number, at
+    return number, len(packed) + 1
+
+
+@compiled
+def _find(packed, spans):  # type: ignore[no-untyped-def]
+    """Begin and end of each field by its number; gives the count, or -1 if it is no ``Samples``."""
+    count = at = 0
+    while at < len(packed):
+        tag, at = _varint(packed, at)
+        number, at = _varint(packed, at)
+        if tag & 7 == _VARINT:
+            count = number if tag >> 3 == 1 else count
+        elif tag & 7 == _BYTES and 0 <= number <= len(packed) - at:
+            if 0 <= tag >> 3 < len(spans):
+                spans[tag >> 3] = at, at + number
+            at += number
+        else:
+            return -1
+    return count if at == len(packed) else -1
+
+
+@compiled
+def _steps(packed, at, n, kept, steps):  # type: ignore[no-untyped-def]
+    """Differences of some rows; ``at`` is where the first one stands in planes of ``n`` bytes.
+
+    For one to four planes, that is nearly always: several rows in one instruction.
+    """
+    m = len(steps)
+    none = np.zeros(m, np.uint8)
+    a = packed[at : at + m]
+    b = packed[at + n : at + n + m] if kept > 1 else none
+    c = packed[at + 2 * n : at + 2 * n + m] if kept > 2 else none
+    d = packed[at + 3 * n : at + 3 * n + m] if kept > 3 else none
+    for i in range(m):
+        low = np.uint32(a[i]) | np.uint32(b[i]) << np.uint32(8)
+        high = np.uint32(c[i]) | np.uint32(d[i]) << np.uint32(8)
+        z = low | high << np.uint32(16)
+        steps[i] = np.int32((z >> np.uint32(1)) ^ (np.uint32(0) - (z & np.uint32(1))))
+
+
+@compiled
+def _long_steps(packed, at, n, kept, steps):  # type: ignore[no-untyped-def]
+    """As ``_steps``, for any number of planes."""
+    for i in range(len(steps)):
+        z = np.uint64(0)
+        for j in range(kept):
+            z |= np.uint64(packed[at + j * n + i]) << np.uint64(8 * j)
+        steps[i] = np.int64((z >> _ONE) ^ (np.uint64(0) - (z & _ONE)))
+
+
+@inlined
+def _write(bits, rows, at, width):  # type: ignore[no-untyped-def]
+    for j in range(width):
+        rows[at + np.uint64(j)] = np.uint8(bits >> np.uint64(8 * j))
+
+
+@compiled
+def _sum(bits, steps, rows, size, at, width):  # type: ignore[no-untyped-def]
+    """Write a field of some rows from its bits before them, the first at ``at``; gives the last."""
+    at = np.uint64(at)
+    if width == 8:
+        for step in steps:
+            bits += np.uint64(step)
+            _write(bits, rows, at, 8)
+            at += np.uint64(size)
+    elif width == 4:
+        for step in steps:
+            bits += np.uint64(step)
+            _write(bits, rows, at, 4)
+            at += np.uint64(size)
+    else:
+        for step in steps:
+            bits += np.uint64(step)
+            rows[at] = np.uint8(bits)
+            at += np.uint64(size)
+    return bits
+
+
+@compiled
+def _unpack(packed, spans, places, n, rows):  # type: ignore[no-untyped-def]
+    """Fill ``n`` rows, each field from its packed column; one that is not there is zero."""
+    size = len(rows) // n
+    bits = np.zeros(len(places), np.uint64)
+    for column in range(len(places)):
+        if spans[column, 1] > spans[column, 0]:
+            bits[column] = _read(packed, np.uint64(spans[column, 0]), 8)
+    short, long = np.empty(_TILE, np.int32), np.empty(_TILE, np.int64)
+    for row in range(0, n, _TILE):
+        m = min(_TILE, n - row)
+        for column in range(len(places)):
+            start, end = spans[column]
+            offset, width = places[column]
+            kept = max(end - start - _FIRST, 0) // n
+            first, at = start + _FIRST + row, row * size + offset
+            if kept > 4:
+                _long_steps(packed, first, n, kept, long[:m])
+                bits[column] = _sum(bits[column], long[:m], rows, size, at, width)
+                continue
+            if kept > 0:
+                _steps(packed, first, n, kept, short[:m])
+            else:
+                short[:] = 0
+            bits[column] = _sum(bits[column], short[:m], rows, size, at, width)
 
 
 class Tray:
@@ -91,7 +247,10 @@ class Tray:
         self._ticks = np.empty(size, (np.void, TICK.itemsize))
 
     def add(self, samples: Samples, ticks: Ticks) -> Iterator[tuple[Samples, Ticks]]:
-        """Take rows in; hand out each block as it fills up."""
+        """Take rows in; hand out each block as it fills up, what is one already as it is."""
+        if not self._filled and len(samples) == self._size:
+            yield samples, ticks
+            return
         rows, beside = samples.view(self._samples.dtype), ticks.view(self._ticks.dtype)
         start = 0
         while start < len(rows):

@@ -78,7 +78,7 @@ def encode_event(event: Event) -> bytes:
     return packed
 
 
-def decode_event(packed: bytes) -> Event:
+def decode_event(packed: bytes | memoryview) -> Event:
     """Reverse ``encode_event``; ValueError for a kind that is not known here."""
     message = EVENTS.message.FromString(packed)
     time_ns = message.timestamp.seconds * _SECOND + message.timestamp.nanos

@@ -58,7 +58,7 @@ def _refuse(damage: Damage) -> None:
         raise SourceError(str(damage), hint)
 
 
-def decode_rows(part: Path, packed: bytes) -> tuple[Samples, Ticks]:
+def decode_rows(part: Path, packed: memoryview) -> tuple[Samples, Ticks]:
     """Rows of a message of /samples; SourceError if it is not of this format."""
     try:
         return decode(packed)
@@ -66,7 +66,7 @@ def decode_rows(part: Path, packed: bytes) -> tuple[Samples, Ticks]:
         raise _other_version(part, error) from error
 
 
-def decode_happening(part: Path, packed: bytes) -> Event:
+def decode_happening(part: Path, packed: memoryview) -> Event:
     """Event of a message of /events; SourceError if it is not of this format."""
     try:
         return decode_event(packed)
