@@ -1,7 +1,6 @@
 """Rows and events as the small messages that other tools draw, and events back."""
 
 import json
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -16,9 +15,52 @@ SCALAR_NS = 20_000_000  # 50 Hz
 _SECOND = 1_000_000_000  # ns
 _LEVEL = {Severity.INFO: 2, Severity.WARNING: 3, Severity.ALARM: 4}  # as foxglove.Log has them
 
+# Every field of a message of /scalars is written, zeros too, and in a fixed length: then messages
+# are rows of an array. By name: how protobuf says what comes, and as what it comes.
+_VARINT, _FIXED64, _BYTES = 0, 1, 2
+_SECONDS, _NANOS = 10, 5  # bytes; before 1970 all of them are needed
+_FORMS: dict[str, tuple[int, Any]] = {
+    "timestamp": (_BYTES, "u1"),  # its length; it consists of the two that follow
+    "seconds": (_VARINT, ("u1", _SECONDS)),
+    "nanos": (_VARINT, ("u1", _NANOS)),
+    "vacuum_mbar": (_FIXED64, "<f8"),
+    "expected_vacuum_mbar": (_FIXED64, "<f8"),
+    "deviation_mbar": (_FIXED64, "<f8"),
+    "supply_bar": (_FIXED64, "<f8"),
+    "suction": (_VARINT, "u1"),
+    "blow_off": (_VARINT, "u1"),
+    "phase": (_VARINT, ("u1", 2)),
+}
+
 
 def _stamp(message: Any, time_ns: int) -> None:
     message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, _SECOND)
+
+
+def _blank() -> npt.NDArray[np.void]:
+    """``ejector_twin.Scalars`` as protobuf lays it out, keys filled in, in one element."""
+    message = SCALARS.message.DESCRIPTOR.fields_by_name
+    fields = {**message, **message["timestamp"].message_type.fields_by_name}
+    pairs = [((f"{name} key", "u1"), (name, form)) for name, (_, form) in _FORMS.items()]
+    blank = np.zeros((), [field for pair in pairs for field in pair])
+    for name, (wire_type, _) in _FORMS.items():
+        blank[f"{name} key"] = fields[name].number << 3 | wire_type
+    blank["timestamp"] = 1 + _SECONDS + 1 + _NANOS
+    return blank
+
+
+def _varint(numbers: npt.NDArray[np.integer], length: int) -> npt.NDArray[np.uint8]:
+    """Protobuf's numbers in ``length`` bytes each, as many as the longest needs: (n, length).
+
+    Seven bits a byte, the lowest first; longer than need be is allowed.
+    """
+    bits = numbers.astype(np.int64).view(np.uint64)[:, np.newaxis]
+    digits = (bits >> (7 * np.arange(length, dtype=np.uint64)) & 0x7F).astype(np.uint8)
+    digits[:, :-1] |= 0x80  # more to come
+    return digits
+
+
+_BLANK = _blank()
 
 
 class Scalars:
@@ -37,31 +79,26 @@ class Scalars:
         picked: npt.NDArray[np.bool_] = (now != before).any(axis=0)
         return picked
 
-    def messages(self, samples: Samples, ticks: Ticks) -> Iterator[tuple[int, int, bytes]]:
+    def messages(
+        self, samples: Samples, ticks: Ticks
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.void]]:
         """Receipt and PLC time in ns, and the message, of each row picked from n > 0 rows."""
         picked = self.pick(samples, ticks)
-        columns = self._columns(samples[picked], ticks[picked])
-        m = SCALARS.message()  # one for all: making one costs more than filling it
-        stamp = m.timestamp
-        for host, plc, *values in zip(*(column.tolist() for column in columns), strict=True):
-            stamp.seconds, stamp.nanos = divmod(plc, _SECOND)
-            m.vacuum_mbar, m.expected_vacuum_mbar, m.deviation_mbar, m.supply_bar = values[:4]
-            m.suction, m.blow_off, m.phase = values[4:]
-            yield host, plc, m.SerializeToString()
-
-    def _columns(self, samples: Samples, ticks: Ticks) -> list[npt.NDArray[np.generic]]:
+        samples, ticks = samples[picked], ticks[picked]
+        messages = np.full(len(samples), _BLANK)
+        seconds, nanos = np.divmod(samples["time_ns"], _SECOND)
+        messages["seconds"] = _varint(seconds, 10)
+        messages["nanos"] = _varint(nanos, 5)
         with np.errstate(invalid="ignore"):  # a NaN may be of the kind that signals
-            return [
-                samples["host_ns"],
-                samples["time_ns"],
-                (self._ambient - samples["pressure"].astype(float)) / MBAR,
-                (self._ambient - ticks["expected"].astype(float)) / MBAR,
-                deviation(samples, ticks) / MBAR,
-                samples["supply"].astype(float) / BAR,
-                np.sign(samples["commands"] & Command.SUCTION),
-                np.sign(samples["commands"] & Command.BLOW_OFF),
-                ticks["phase"],
-            ]
+            messages["vacuum_mbar"] = (self._ambient - samples["pressure"].astype(float)) / MBAR
+            expected = ticks["expected"].astype(float)
+            messages["expected_vacuum_mbar"] = (self._ambient - expected) / MBAR
+            messages["deviation_mbar"] = deviation(samples, ticks) / MBAR
+            messages["supply_bar"] = samples["supply"].astype(float) / BAR
+        messages["suction"] = (samples["commands"] & Command.SUCTION) != 0
+        messages["blow_off"] = (samples["commands"] & Command.BLOW_OFF) != 0
+        messages["phase"] = _varint(ticks["phase"], 2)
+        return samples["host_ns"], samples["time_ns"], messages
 
 
 def encode_event(event: Event) -> bytes:

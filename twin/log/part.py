@@ -1,13 +1,11 @@
 """The files of one log: their names, and what stands at the head of each."""
 
 from pathlib import Path
-from typing import IO, cast
-
-from mcap.writer import Writer
 
 from twin.log.header import Identity, LogHeader, to_metadata
 from twin.log.output import Output
 from twin.log.schema import CHANNELS, LIBRARY
+from twin.log.writer import Writer
 
 OWN_METADATA = "ejector-twin"
 FREE_METADATA = "run"
@@ -21,13 +19,10 @@ def part_path(path: Path, number: int) -> Path:
 
 def write_head(output: Output, header: LogHeader, identity: Identity) -> Writer:
     """Begin a file that says all about itself before its first chunk."""
-    writer = Writer(cast(IO[bytes], output))  # it uses no more of a file than Output has
-    writer.start(library=LIBRARY)
+    writer = Writer(output, LIBRARY)
     writer.add_metadata(OWN_METADATA, to_metadata(header, identity))
     writer.add_metadata(FREE_METADATA, header.metadata)
-    config = header.config_text.encode()
-    writer.add_attachment(0, 0, header.config_name, "application/toml", config)
+    writer.add_attachment(header.config_name, "application/toml", header.config_text.encode())
     for channel in CHANNELS.values():  # numbered from 1
-        schema = writer.register_schema(channel.schema, "protobuf", channel.files)
-        writer.register_channel(channel.topic, "protobuf", schema)
+        writer.register_channel(channel.topic, channel.schema, channel.files)
     return writer

@@ -109,7 +109,7 @@ class Recorder:
     def _flush(self, now: float) -> None:
         self._add_rows(*self._tray.take())
         self._add_events()
-        self._writer.flush()  # type: ignore[no-untyped-call]
+        self._writer.flush()
         self._flushed = now
         if now - self._synced >= SYNC_S:
             self._output.sync()
@@ -119,9 +119,8 @@ class Recorder:
         if not len(samples):
             return
         host, plc = int(samples["host_ns"][0]), int(samples["time_ns"][0])
-        self._add(_SAMPLES, host, plc, encode(samples, ticks))
-        for host, plc, message in self._scalars.messages(samples, ticks):
-            self._add(_SCALARS, host, plc, message)
+        self._writer.add_message(_SAMPLES, host, plc, encode(samples, ticks))
+        self._writer.add_messages(_SCALARS, *self._scalars.messages(samples, ticks))
         if self._rotate_bytes is not None and self._output.tell() >= self._rotate_bytes:
             self._finish()
             self._number += 1
@@ -129,13 +128,9 @@ class Recorder:
 
     def _add_events(self) -> None:
         for host_ns, event in self._events:
-            self._add(_EVENTS, host_ns, event.time_ns, encode_event(event))
-            self._add(_LOG, host_ns, event.time_ns, encode_log(event))
+            self._writer.add_message(_EVENTS, host_ns, event.time_ns, encode_event(event))
+            self._writer.add_message(_LOG, host_ns, event.time_ns, encode_log(event))
         self._events.clear()
-
-    def _add(self, channel: int, host_ns: int, plc_ns: int, message: bytes) -> None:
-        # MCAP has no times before 1970; the messages themselves keep them.
-        self._writer.add_message(channel, max(host_ns, 0), message, max(plc_ns, 0))
 
     def _received(self, event: Event, samples: Samples) -> int:
         """When the row was received with which it happened: in a long block not the last one."""
@@ -162,7 +157,7 @@ class Recorder:
     def _finish(self) -> None:
         if self._clocks:
             self._writer.add_metadata(CLOCK_METADATA, self._clocks)
-        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._writer.finish()
         self._output.finish()
 
     def _fail(self, error: OSError) -> SourceError:

@@ -1,0 +1,233 @@
+"""An MCAP file, written as the library's Writer does but many messages at once.
+
+The records are the library's; only messages and their indexes, of which an hour has 185 000, are
+laid out here as arrays. Its Writer takes one message at a time and has no other way in.
+"""
+
+import struct
+import zlib
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from mcap.writer import MCAP0_MAGIC as MAGIC
+
+from twin.log.output import Output
+
+CHUNK = 1 << 20  # bytes; one that has become longer is completed
+
+_HEAD = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),  # of what follows
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
+_BEFORE_LENGTH = 9  # bytes of a record up to where its length counts from
+_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])  # of a message index
+_INDEX = struct.Struct("<BQHI")  # opcode, length, channel and length of the entries
+_FOOTER = struct.Struct("<BQQQ")  # opcode, length and the two offsets, all that its checksum covers
+
+Times: TypeAlias = npt.NDArray[np.int64]  # ns since 1970; those before are written as 0
+
+
+class _Open:
+    """The chunk under way: records, and for each channel the entries of its index."""
+
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+        self.size = 0
+        self.entries: dict[int, list[npt.NDArray[np.void]]] = {}
+
+    def add(self, part: bytes) -> None:
+        self.parts.append(part)
+        self.size += len(part)
+
+
+class Writer:
+    """Writes to ``output`` from its beginning; in memory are a chunk and the index of all."""
+
+    def __init__(self, output: Output, library: str) -> None:
+        self._output = output
+        self._compressor = zstandard.ZstdCompressor()
+        self._open = _Open()
+        self._schemas: list[McapRecord] = []
+        self._channels: list[McapRecord] = []
+        self._chunks: list[McapRecord] = []
+        self._attachments: list[McapRecord] = []
+        self._metadata: list[McapRecord] = []
+        self._counts: dict[int, int] = {}  # messages by channel
+        self._first = self._last = 0  # log times
+        output.write(MAGIC)
+        output.write(_bytes(Header("", library)))
+
+    def add_metadata(self, name: str, data: dict[str, str]) -> None:
+        """Write a named table of strings."""
+        offset, raw = self._output.tell(), _bytes(Metadata(name, data))
+        self._metadata.append(MetadataIndex(offset, len(raw), name))
+        self._output.write(raw)
+
+    def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
+        """Write a file into the file; it has no times."""
+        offset = self._output.tell()
+        raw = _bytes(Attachment(0, 0, name, media_type, data))
+        index = AttachmentIndex(offset, len(raw), 0, 0, len(data), name, media_type)
+        self._attachments.append(index)
+        self._output.write(raw)
+
+    def register_channel(self, topic: str, schema: str, files: bytes) -> int:
+        """Give a topic a number, from 1, and protobuf messages; ``files`` define them."""
+        number = len(self._channels) + 1
+        self._schemas.append(Schema(number, files, "protobuf", schema))
+        self._channels.append(Channel(number, topic, "protobuf", {}, number))
+        self._open.add(_bytes(self._schemas[-1]) + _bytes(self._channels[-1]))
+        return number
+
+    def add_message(self, channel: int, log_ns: int, publish_ns: int, message: bytes) -> None:
+        """Write one message."""
+        one = np.frombuffer(message, (np.void, len(message)))
+        self.add_messages(channel, np.array([log_ns]), np.array([publish_ns]), one)
+
+    def add_messages(
+        self, channel: int, log_ns: Times, publish_ns: Times, messages: npt.NDArray[np.void]
+    ) -> None:
+        """Write n messages of one length; each element of ``messages`` is one as it is."""
+        n = len(messages)
+        if not n:
+            return
+        whole = np.dtype((np.void, messages.itemsize))
+        records = np.empty(n, [("head", _HEAD), ("message", whole)])
+        head = records["head"]
+        head["opcode"] = Opcode.MESSAGE
+        head["length"] = records.itemsize - _BEFORE_LENGTH
+        head["channel"] = channel
+        head["sequence"] = 0
+        head["log_time"] = np.maximum(log_ns, 0)
+        head["publish_time"] = np.maximum(publish_ns, 0)
+        records["message"] = messages.view(whole)
+        entries = np.empty(n, _ENTRY)
+        entries["log_time"] = head["log_time"]
+        entries["offset"] = self._open.size + records.itemsize * np.arange(n)
+        self._open.entries.setdefault(channel, []).append(entries)
+        self._open.add(records.tobytes())
+        if self._open.size > CHUNK:
+            self.flush()
+
+    def flush(self) -> None:
+        """Complete the chunk under way, if it has messages: then it is in the file."""
+        if not self._open.entries:
+            return
+        contents, indexes = b"".join(self._open.parts), self._open.entries
+        self._open = _Open()
+        joined = {channel: np.concatenate(entries) for channel, entries in indexes.items()}
+        times = np.concatenate([entries["log_time"] for entries in joined.values()])
+        first, last = int(times.min()), int(times.max())
+        self._first = min(self._first, first) if self._counts else first
+        self._last = max(self._last, last)
+        for channel, entries in joined.items():
+            self._counts[channel] = self._counts.get(channel, 0) + len(entries)
+        packed = self._compressor.compress(contents)
+        chunk = Chunk("zstd", packed, last, first, zlib.crc32(contents), len(contents))
+        self._write_chunk(chunk, {channel: _index(channel, joined[channel]) for channel in joined})
+
+    def _write_chunk(self, chunk: Chunk, indexes: dict[int, bytes]) -> None:
+        start, raw = self._output.tell(), _bytes(chunk)
+        self._output.write(raw)
+        lengths = [len(index) for index in indexes.values()]
+        offsets = self._output.tell() + np.cumsum([0, *lengths])
+        self._output.write(b"".join(indexes.values()))
+        self._chunks.append(
+            ChunkIndex(
+                chunk_length=len(raw),
+                chunk_start_offset=start,
+                compression=chunk.compression,
+                compressed_size=len(chunk.data),
+                message_end_time=chunk.message_end_time,
+                message_index_length=sum(lengths),
+                message_index_offsets=dict(zip(indexes, offsets.tolist(), strict=False)),
+                message_start_time=chunk.message_start_time,
+                uncompressed_size=chunk.uncompressed_size,
+            )
+        )
+
+    def finish(self) -> None:
+        """Write what is under way and the summary; ``output`` stays open."""
+        self.flush()
+        self._output.write(_bytes(DataEnd(0)))
+        start = self._output.tell()
+        summary, offsets = RecordBuilder(), []
+        for opcode, records in self._groups():
+            begin = summary.count
+            for record in records:
+                record.write(summary)
+            offsets.append(SummaryOffset(opcode, start + begin, summary.count - begin))
+        offset_start = start + summary.count
+        for offset in offsets:
+            offset.write(summary)
+        raw: bytes = summary.end()  # type: ignore[no-untyped-call]
+        checked = _FOOTER.pack(Opcode.FOOTER, 20, start, offset_start)
+        self._output.write(raw)
+        self._output.write(
+            _bytes(Footer(start, offset_start, zlib.crc32(checked, zlib.crc32(raw))))
+        )
+        self._output.write(MAGIC)
+
+    def _groups(self) -> list[tuple[Opcode, Sequence[McapRecord]]]:
+        return [
+            (Opcode.SCHEMA, self._schemas),
+            (Opcode.CHANNEL, self._channels),
+            (Opcode.STATISTICS, [self._statistics()]),
+            (Opcode.CHUNK_INDEX, self._chunks),
+            (Opcode.ATTACHMENT_INDEX, self._attachments),
+            (Opcode.METADATA_INDEX, self._metadata),
+        ]
+
+    def _statistics(self) -> Statistics:
+        return Statistics(
+            attachment_count=len(self._attachments),
+            channel_count=len(self._channels),
+            channel_message_counts=self._counts,
+            chunk_count=len(self._chunks),
+            message_count=sum(self._counts.values()),
+            message_end_time=self._last,
+            message_start_time=self._first,
+            metadata_count=len(self._metadata),
+            schema_count=len(self._schemas),
+        )
+
+
+def _bytes(record: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    raw: bytes = builder.end()  # type: ignore[no-untyped-call]
+    return raw
+
+
+def _index(channel: int, entries: npt.NDArray[np.void]) -> bytes:
+    """A message index; the library's takes one entry at a time."""
+    length = entries.nbytes
+    head = _INDEX.pack(Opcode.MESSAGE_INDEX, length + 6, channel, length)
+    return head + entries.tobytes()
