@@ -23,6 +23,7 @@ _ONE = np.uint64(1)
 _FIELDS = SAMPLES.message.DESCRIPTOR.fields_by_name
 _NUMBERS = np.array([_FIELDS[name].number for name in COLUMNS])
 _HIGHEST = int(_NUMBERS.max())
+_ADDED = np.array([name in ADDED for name in COLUMNS])
 _VARINT, _BYTES = 0, 2  # how protobuf says what comes
 
 
@@ -61,12 +62,8 @@ def decode(packed: bytes | memoryview) -> tuple[Samples, Ticks]:
     if count < 1:
         raise ValueError("it is no message of rows")
     spans = spans[_NUMBERS]
-    for name, (start, end) in zip(COLUMNS, spans.tolist(), strict=True):
-        if start == end and name in ADDED:
-            continue
-        kept, rest = divmod(end - start - _FIRST, count)
-        if rest or not 0 <= kept <= _MOST:
-            raise ValueError(f"{name} is not packed for {count} rows")
+    if (wrong := _misfit(spans, count, _ADDED)) >= 0:
+        raise ValueError(f"{COLUMNS[wrong]} is not packed for {count} rows")
     samples, ticks = np.empty(count, SAMPLE), np.empty(count, TICK)
     of_samples, of_ticks = spans[: len(_SAMPLE_PLACES)], spans[len(_SAMPLE_PLACES) :]
     _unpack(raw, of_samples, _SAMPLE_PLACES, count, samples.view(np.uint8))
@@ -153,14 +150,31 @@ def _find(packed, spans):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _misfit(spans, count, added):  # type: ignore[no-untyped-def]
+    """The first column whose length is not that of whole planes, -1 if there is none."""
+    for column in range(len(spans)):
+        length = spans[column, 1] - spans[column, 0]
+        planes = length - _FIRST
+        fits = 0 <= planes <= _MOST * count and planes % count == 0
+        if not fits and not (added[column] and length == 0):
+            return column
+    return -1
+
+
+@compiled
 def _steps(packed, at, n, kept, steps):  # type: ignore[no-untyped-def]
     """Differences of some rows; ``at`` is where the first one stands in planes of ``n`` bytes.
 
     For one to four planes, that is nearly always: several rows in one instruction.
     """
     m = len(steps)
-    none = np.zeros(m, np.uint8)
     a = packed[at : at + m]
+    if kept == 1:
+        for i in range(m):
+            z = np.uint32(a[i])
+            steps[i] = np.int32((z >> np.uint32(1)) ^ (np.uint32(0) - (z & np.uint32(1))))
+        return
+    none = np.zeros(m, np.uint8)
     b = packed[at + n : at + n + m] if kept > 1 else none
     c = packed[at + 2 * n : at + 2 * n + m] if kept > 2 else none
     d = packed[at + 3 * n : at + 3 * n + m] if kept > 3 else none
