@@ -17,7 +17,7 @@ from twin.log.messages import Scalars, encode_event, encode_log
 from twin.log.output import Output
 from twin.log.part import CLOCK_METADATA, part_path, write_head
 from twin.log.schema import CHANNELS
-from twin.signals import Samples, Ticks
+from twin.signals import SAMPLE, TICK, Samples, Ticks
 
 FLUSH_S = 0.25  # after this much a chunk is completed; a killed process loses no more than it
 SYNC_S = 1.0  # after this much the disk is asked to keep it
@@ -55,6 +55,7 @@ class Recorder:
         self._closed = False
         self._series = uuid.uuid4().hex
         self._number = 0
+        encode(np.zeros(1, SAMPLE), np.zeros(1, TICK))  # compiled, not to fall into a block
         self._begin()
 
     def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event] = ()) -> None:
