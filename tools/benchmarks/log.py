@@ -3,37 +3,70 @@
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
+import pyarrow as pa
 import zstandard
+from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
+from pyarrow import parquet
 
 from benchmarks.figures import Measured, Run
 from benchmarks.machine import TWIN_CORE, on_core
 from benchmarks.recording import hour
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
+from twin.log.schema import CHANNELS, SAMPLES
 
 REPEATS = 3
 
 
+class _Way(NamedTuple):
+    """One way to keep the hour: how it is written to a path, and read from it."""
+
+    write: Callable[[Path], object]
+    read: Callable[[Path], object]
+
+
+class _Taken(NamedTuple):
+    """Repetitions of one way: bytes per sample, time (s) to write and to read."""
+
+    sizes: list[float]
+    written: list[float]
+    read: list[float]
+
+
 def files(run: Run) -> Sequence[Measured]:
-    """Bytes per sample, time (s) to write an hour, time (s) to read it."""
+    """Bytes per sample, time (s) to write an hour and to read it; the same of other ways."""
     run.tell("log: simulating the rig")
-    rows = len(hour().samples)
-    log, bare = hour_log(run.folder), run.folder / "bare.zst"
+    log = hour_log(run.folder)
     chunks = packed(log)
+    ours, bare = _by_turns(run, _Way(write, read), _Way(_write_bare, lambda _: unpack(chunks)))
+    messages, table = _messages(log), _table()  # 200 MB, beside which nothing of ours is measured
+    others = _by_turns(
+        run,
+        _Way(lambda path: _write_by_library(path, messages), _read_by_library),
+        _Way(lambda path: _write_parquet(path, table), _read_parquet),
+    )
+    pairs = [(ours, bare), *((other, ours) for other in others)]
+    return [Measured(*both) for pair in pairs for both in zip(*pair, strict=True)]
+
+
+def _by_turns(run: Run, *ways: _Way) -> list[_Taken]:
+    taken = [_Taken([], [], []) for _ in ways]
+    path = run.folder / "again"
     run.tell("log: writing and reading")
     with on_core(TWIN_CORE):
-        bare_written = [_timed(lambda: _write_bare(bare)) for _ in range(REPEATS)]
-        written = [
-            _timed(lambda path=run.folder / f"again-{number}.mcap": write(path))
-            for number in range(REPEATS)
-        ]
-        unpacked = [_timed(lambda: unpack(chunks)) for _ in range(REPEATS)]
-        was_read = [_timed(lambda: read(log)) for _ in range(REPEATS)]
-    sizes = [log.stat().st_size / rows], [bare.stat().st_size / rows]
-    return Measured(*sizes), Measured(written, bare_written), Measured(was_read, unpacked)
+        for _ in range(REPEATS):
+            for way, times in zip(ways, taken, strict=True):
+                times.written.append(_timed(way.write, path))
+                times.read.append(_timed(way.read, path))
+                times.sizes[:] = [path.stat().st_size / len(hour().samples)]
+                path.unlink()
+    return taken
 
 
 def hour_log(folder: Path) -> Path:
@@ -78,7 +111,49 @@ def _write_bare(path: Path) -> None:
             file.write(compressor.compress(samples.tobytes() + ticks.tobytes()))
 
 
-def _timed(work: Callable[[], None]) -> float:
+def _messages(path: Path) -> list[tuple[int, int, bytes, int]]:
+    """Channel, log time, data and publish time of each message of a log, in written order."""
+    with path.open("rb") as file:
+        messages = make_reader(file).iter_messages(log_time_order=False)
+        return [(m.channel_id, m.log_time, m.data, m.publish_time) for _, _, m in messages]
+
+
+def _write_by_library(path: Path, messages: list[tuple[int, int, bytes, int]]) -> None:
+    """The log's own messages, made beforehand, through the MCAP library's writer."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for channel in CHANNELS.values():
+            schema = writer.register_schema(channel.schema, "protobuf", channel.files)
+            writer.register_channel(channel.topic, "protobuf", schema)
+        for message in messages:
+            writer.add_message(*message)
+        writer.finish()
+
+
+def _read_by_library(path: Path) -> None:
+    """Rows of a log, found by the MCAP library's reader and decoded by protobuf's classes."""
+    with path.open("rb") as file:
+        for _, _, message in make_reader(file).iter_messages([SAMPLES.topic]):
+            SAMPLES.message.FromString(message.data)
+
+
+def _table() -> pa.Table:
+    """The hour as columns, which are the same bytes."""
+    samples, ticks = hour().samples, hour().ticks
+    names = [(rows, name) for rows in (samples, ticks) for name in rows.dtype.names]
+    return pa.table({name: np.ascontiguousarray(rows[name]) for rows, name in names})
+
+
+def _write_parquet(path: Path, table: pa.Table) -> None:
+    parquet.write_table(table, path, compression="zstd", row_group_size=1 << 20)
+
+
+def _read_parquet(path: Path) -> None:
+    parquet.read_table(path, use_threads=False)
+
+
+def _timed(work: Callable[[Path], object], path: Path) -> float:
     begin = time.perf_counter()
-    work()
+    work(path)
     return time.perf_counter() - begin
