@@ -1,6 +1,7 @@
 """Effects hidden in the simulated rig's data are found, and nothing is found where nothing is."""
 
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -17,10 +18,11 @@ from tools.calibration_coverage import recorded
 from twin.config import Config
 from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.diagnosis.evidence import HEALTHY, collect, thinned
+from twin.diagnosis.hypotheses import price
 from twin.diagnosis.search import tried_in_or_out
 from twin.diagnosis.weights import levels
 from twin.errors import ConfigError
-from twin.model.courses import Cause
+from twin.model.courses import Cause, Course
 from twin.settings import Document
 from twin.signals import Command, Quality, Samples
 
@@ -231,6 +233,19 @@ def test_cycles_that_only_lead_to_others_do_not_come_and_go_alone() -> None:
         [number - 1, number] for number in sorted(judged)[2::2]
     ]
     assert first.union(*others) == set(part.numbers.tolist())
+
+
+def test_cycles_that_only_lead_to_others_change_no_price() -> None:
+    """Else what is in all of the last cycles would not be the step that it is."""
+    whole = collect(CONFIG, record(60.0, seed=26))
+    part = thinned(whole, whole.judged, 6)
+    judged = [int(number) for number in part.numbers[part.judged]]
+    some = Cause("leakage", {}, Course.INTERMITTENT, cycles=frozenset(judged[3:]))
+    led = replace(some, cycles=frozenset(int(one) for one in part.numbers if one >= judged[3] - 1))
+    assert len(led.cycles) > len(some.cycles)
+    assert price(part, (led,)) == price(part, (some,))
+    every = replace(some, cycles=frozenset(judged))
+    assert price(part, (some,)) - price(part, (every,)) == pytest.approx(2 * math.log(20))
 
 
 def test_too_few_cycles_are_insufficient() -> None:

@@ -81,5 +81,6 @@ def _price(evidence: Evidence, cause: Cause) -> float:
     elif cause.course == Course.RAMP:
         ways *= 2.0 if cause.onset_s <= 0.0 else 2.0 * cycles
     elif cause.course == Course.INTERMITTENT:
-        ways *= 2.0 * math.comb(cycles, min(len(cause.cycles), cycles))
+        acts = sum(int(evidence.numbers[one]) in cause.cycles for one in evidence.judged)
+        ways *= 2.0 * math.comb(cycles, acts)
     return 2.0 * len(effect.parameters) + 2.0 * math.log(ways)
