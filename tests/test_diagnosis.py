@@ -240,12 +240,12 @@ def test_cycles_that_only_lead_to_others_change_no_price() -> None:
     whole = collect(CONFIG, record(60.0, seed=26))
     part = thinned(whole, whole.judged, 6)
     judged = [int(number) for number in part.numbers[part.judged]]
-    some = Cause("leakage", {}, Course.INTERMITTENT, cycles=frozenset(judged[3:]))
-    led = replace(some, cycles=frozenset(int(one) for one in part.numbers if one >= judged[3] - 1))
+    some = Cause("leakage", {}, Course.INTERMITTENT, cycles=frozenset(judged[4:]))
+    led = replace(some, cycles=frozenset(int(one) for one in part.numbers if one >= judged[4] - 1))
     assert len(led.cycles) > len(some.cycles)
     assert price(part, (led,)) == price(part, (some,))
     every = replace(some, cycles=frozenset(judged))
-    assert price(part, (some,)) - price(part, (every,)) == pytest.approx(2 * math.log(20))
+    assert price(part, (some,)) - price(part, (every,)) == pytest.approx(2 * math.log(15))
 
 
 def test_too_few_cycles_are_insufficient() -> None:
