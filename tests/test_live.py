@@ -1,5 +1,7 @@
 """The loop: what comes in goes through twin and monitor to every sink, live and from a log."""
 
+import subprocess
+import sys
 from collections.abc import Iterator, Sequence
 from itertools import takewhile
 from pathlib import Path
@@ -206,3 +208,11 @@ def test_beside_a_plc_nothing_is_lost_and_the_twin_follows(plc: PlcProcess) -> N
     in_suction = (samples["commands"] == Command.SUCTION) & np.isfinite(ticks["expected"])
     assert in_suction.sum() > 1000
     assert np.median(follows[in_suction]) < 1500  # Pa
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_nothing_is_compiled_while_the_loop_runs(name: str) -> None:
+    """It would take seconds, in which nothing is read and nobody is told anything."""
+    command = [sys.executable, Path(__file__).with_name("compiling.py"), name]
+    told = subprocess.run(command, capture_output=True, text=True, check=True, cwd=rigs.ROOT)
+    assert told.stdout.strip() == "{}"

@@ -93,8 +93,8 @@ def advance(
         state.reshape(STATE, -1),
         theta.reshape(len(c.COEFFICIENTS), -1),
         dt,
-        phase.reshape(len(dt), -1),
-        level.reshape(len(dt), -1),
+        np.ascontiguousarray(phase).reshape(len(dt), -1),  # one kind to be compiled for
+        np.ascontiguousarray(level).reshape(len(dt), -1),
         expected.reshape(len(dt), -1),
         signals.reshape(len(dt), -1),
         tolerance,

@@ -14,7 +14,7 @@ import numpy as np
 
 from twin.model.dataset import DataSet, coefficients
 from twin.monitor.bank import DELAYS, GROSS, STEP, SUSPECTS, UNSURE_OF, Bank
-from twin.monitor.bins import Floats
+from twin.monitor.bins import Floats, binned
 from twin.monitor.change import FARTHEST, MOST, Changes, Reference, began, limit
 from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import Healthy
@@ -131,7 +131,9 @@ class Isolation:
         listener = Listener(theta, healthy, noise, expected_knees(theta, noise * MBAR))
         first = Bank(theta)
         first.push(np.zeros(2, SAMPLE), np.zeros(2, TICK))
-        first.take(2)
+        drawn, _ = first.take(2)
+        nothing = np.zeros((len(drawn), len(SUSPECTS)))
+        binned(np.zeros(2, np.uint8), np.ones(2, np.bool_), drawn[:1]).through(drawn, nothing)
         return cls(Bank(theta), listener, days)
 
     def judge(

@@ -329,7 +329,9 @@ class PhaseFinder:
         times = np.concatenate([self._rows["time_ns"][-1:], stretch["time_ns"]])
         dt = np.diff(times, prepend=times[:1])[-len(stretch) :] * NS
         told = np.empty(len(stretch), "u1")
-        timed(self._timer, stretch["commands"], dt, *self.knees.blow_off, told)
+        timed(
+            self._timer, np.ascontiguousarray(stretch["commands"]), dt, *self.knees.blow_off, told
+        )
         return told
 
     def _run(self, window: int) -> int:

@@ -1,0 +1,31 @@
+"""Run as a program: says what is compiled while the loop of a configuration runs, if anything."""
+
+import gc
+import sys
+
+import rigs
+from numba.core.dispatcher import Dispatcher
+
+from twin import cli
+
+
+def compiled() -> dict[str, int]:
+    """For how many kinds of arguments each function is."""
+    found = [one for one in gc.get_objects() if isinstance(one, Dispatcher)]
+    return {one.py_func.__qualname__: len(one.signatures) for one in found}
+
+
+def main(name: str) -> None:
+    """Run it over cycles with a gross fault, which brings everything about that can happen."""
+    samples, _ = rigs.recorded(name, 30.0, ("leakage=3@c6",), 3)
+    twin, monitor = cli._pair(rigs.config(name))
+    before = compiled()
+    for block in rigs.cut(samples, 50):
+        monitor.update(*twin.advance(block))
+    assert monitor.active
+    sys.stdout.write(
+        str({what: count for what, count in compiled().items() if count != before.get(what)})
+    )
+
+
+main(sys.argv[1])
