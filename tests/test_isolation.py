@@ -205,3 +205,15 @@ def test_a_change_that_begins_is_not_learned_as_usual() -> None:
     first = raised(events("gripper", ["weak_blow_off=1.5@c20"], 30))[0]
     assert first.data["effect"] == "weak_blow_off"
     assert 20 <= first.data["cycle"] <= 25
+
+
+@pytest.mark.parametrize(
+    ("name", "effect", "size"), [("test_rig", "leakage", 0.8), ("gripper", "suction_loss", 4.0)]
+)
+def test_a_slow_drift_is_found_while_it_is_small(name: str, effect: str, size: float) -> None:
+    begin_s = SECONDS[name] * BEGINS
+    told = events(name, [f"{effect}={size}@{begin_s}/ramp:300"], 80)
+    first = raised(told)[0]
+    assert BEGINS - 3 <= first.data["cycle"] <= BEGINS + 20
+    last = probabilities(told)[max(probabilities(told))]
+    assert last[effect] > 0.9
