@@ -5,7 +5,7 @@ import numpy.typing as npt
 import pytest
 from scipy.stats import kstest
 
-from twin.monitor.change import Changes, Reference, began, limit
+from twin.monitor.change import MOST_WAITING, WAITS, Changes, Patience, Reference, began, limit
 
 Floats = npt.NDArray[np.float64]
 SUSPECTS = 12
@@ -135,3 +135,22 @@ def test_when_it_began_is_found(since: int) -> None:
 def test_what_was_less_before_is_not_taken_for_what_is_more_now() -> None:
     scores = np.concatenate([np.full(400, -0.3), np.full(3, 4.2)])
     assert began(scores) == 3
+
+
+def test_nothing_is_learned_until_it_is_clear_that_no_change_began() -> None:
+    calm, strange = np.array([0.5, np.nan]), np.array([0.1, -4.0])
+    patience = Patience[int]()
+    assert patience.take(0, calm) == [0]
+    assert patience.take(1, strange) == []
+    for cycle in range(2, 1 + WAITS):
+        assert patience.take(cycle, calm) == []
+    assert patience.take(1 + WAITS, calm) == list(range(1, 2 + WAITS))
+    assert patience.take(9, strange) == []
+    patience.forget()
+    assert patience.take(10, calm) == [10]
+
+
+def test_what_is_strange_again_and_again_is_learned_in_the_end() -> None:
+    patience, strange = Patience[int](), np.array([4.0])
+    learned = [patience.take(cycle, strange) for cycle in range(3 * MOST_WAITING)]
+    assert [cycle for some in learned for cycle in some] == list(range(3 * MOST_WAITING))

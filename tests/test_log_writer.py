@@ -1,6 +1,7 @@
 """The writer of many messages at once: to the byte what the library's own writes one by one."""
 
 import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any, cast
 
@@ -19,9 +20,21 @@ from twin.log.writer import CHUNK, Writer
 from twin.signals import SAMPLE, TICK
 
 PIECE = np.dtype((np.void, 7))
+Chunks = list[list[tuple[int, int, int, bytes]]]  # channel, log and publish time, message
 
 
-def by_library(path: Path, chunks: list[list[tuple[int, int, int, bytes]]]) -> bytes:
+def filled(output: Output, writer: Any, add: Callable[..., None], chunks: Chunks) -> None:
+    """Write chunks, one message at a time, and what ends a file."""
+    for chunk in chunks:
+        for message in chunk:
+            add(*message)
+        writer.flush()
+    writer.add_metadata("end", {})
+    writer.finish()
+    output.finish()
+
+
+def by_library(path: Path, chunks: Chunks) -> bytes:
     output = Output(path)
     writer: Any = LibraryWriter(cast(IO[bytes], output))
     writer.start(library="x")
@@ -30,13 +43,12 @@ def by_library(path: Path, chunks: list[list[tuple[int, int, int, bytes]]]) -> b
     for channel in CHANNELS.values():
         schema = writer.register_schema(channel.schema, "protobuf", channel.files)
         writer.register_channel(channel.topic, "protobuf", schema)
-    for chunk in chunks:
-        for number, log_ns, publish_ns, message in chunk:
-            writer.add_message(number, log_ns, message, publish_ns)
-        writer.flush()
-    writer.add_metadata("end", {})
-    writer.finish()
-    output.finish()
+    filled(
+        output,
+        writer,
+        lambda channel, log, plc, m: writer.add_message(channel, log, m, plc),
+        chunks,
+    )
     return path.read_bytes()
 
 
@@ -57,17 +69,11 @@ MESSAGE = st.tuples(
 
 @given(chunks=st.lists(st.lists(MESSAGE, max_size=5), max_size=3))
 def test_one_by_one_it_is_the_librarys_file(
-    tmp_path_factory: pytest.TempPathFactory, chunks: list[list[tuple[int, int, int, bytes]]]
+    tmp_path_factory: pytest.TempPathFactory, chunks: Chunks
 ) -> None:
     folder = tmp_path_factory.mktemp("files")
     output, writer = begun(folder / "ours.mcap")
-    for chunk in chunks:
-        for number, log_ns, publish_ns, message in chunk:
-            writer.add_message(number, log_ns, publish_ns, message)
-        writer.flush()
-    writer.add_metadata("end", {})
-    writer.finish()
-    output.finish()
+    filled(output, writer, writer.add_message, chunks)
     assert (folder / "ours.mcap").read_bytes() == by_library(folder / "library.mcap", chunks)
 
 
@@ -79,11 +85,7 @@ def test_many_at_once_are_the_same_as_one_by_one(tmp_path: Path) -> None:
     writer.add_message(3, 5, 6, b"event")
     writer.add_messages(2, log_ns, publish_ns, messages)
     writer.add_messages(2, log_ns[:0], publish_ns[:0], messages[:0])
-    writer.add_message(1, 2, 3, b"rows")
-    writer.flush()
-    writer.add_metadata("end", {})
-    writer.finish()
-    output.finish()
+    filled(output, writer, writer.add_message, [[(1, 2, 3, b"rows")]])
     many = zip(log_ns.tolist(), publish_ns.tolist(), messages.tolist(), strict=True)
     chunk = [(3, 5, 6, b"event"), *((2, *message) for message in many), (1, 2, 3, b"rows")]
     assert (tmp_path / "ours.mcap").read_bytes() == by_library(tmp_path / "library.mcap", [chunk])

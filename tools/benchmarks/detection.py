@@ -18,16 +18,13 @@ import numpy.typing as npt
 from scipy.optimize import brentq
 
 from benchmarks.figures import Measured, Run
+from benchmarks.isolation import heard
 from benchmarks.processes import ROOT
 from drivers.plc.settings import PlcSettings
-from drivers.plc.simulate import blocks
 from twin.config import Config
-from twin.live import Twin
-from twin.model import theta as c
 from twin.monitor.bank import SUSPECTS
 from twin.monitor.change import Changes, limit
-from twin.monitor.cycles import CycleCutter, figures
-from twin.monitor.isolation import Isolation, looked_for
+from twin.monitor.isolation import looked_for
 from twin.settings import Document
 
 Floats = npt.NDArray[np.float64]
@@ -78,19 +75,10 @@ def _device(seed: int) -> tuple[Floats, Floats]:
     document = Document.read(CONFIG)
     config, rig = Config.of(document), document.section(PlcSettings, "plc")
     rig = rig.model_copy(update={"program": rig.program.model_copy(update=PROGRAM)})
-    twin = Twin.of(config.data)
-    isolation = Isolation.of(config.data, config.monitor.healthy, days=1e9)
-    cutter, scores, alike = CycleCutter(), [], np.eye(len(SUSPECTS))
-    ambient = float(twin.theta[c.AMBIENT])
-    for block in blocks(rig, CYCLES * CYCLE_S, seed=seed, block=20_000):
-        rows, ticks = twin.advance(block)
-        isolation.push(rows, ticks)
-        for cycle in cutter.push(rows, ticks):
-            fit = cycle.complete and cycle.settled
-            if isolation.judge(cycle, fit, figures(cycle, ambient)) is not None:
-                said, normal = isolation.heard
-                scores.append(normal)
-                alike = said.alike()
+    scores, alike = [], np.eye(len(SUSPECTS))
+    for said, normal in heard(config, rig, CYCLES * CYCLE_S, seed):
+        scores.append(normal)
+        alike = said.alike()
     return np.array(scores), alike
 
 

@@ -6,7 +6,7 @@ looks for nothing else finds by then, and that is apart from every other effect,
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -25,6 +25,7 @@ from twin.model import theta as c
 from twin.model.dataset import coefficients
 from twin.model.effects import EFFECTS
 from twin.monitor.bank import SUSPECTS
+from twin.monitor.bins import Floats
 from twin.monitor.cycles import CycleCutter, figures
 from twin.monitor.detect import RIVAL, Monitor
 from twin.monitor.isolation import Isolation
@@ -84,8 +85,8 @@ def outcome(seed: int) -> Outcome:
     document = Document.read(ROOT / "configs" / f"{system}.toml")
     config, rig = Config.of(document), document.section(PlcSettings, "plc")
     sign = rng.choice([-1.0, 1.0]) if suspect.both_ways else 1.0
-    healthy = _healthy(config, rig, CYCLE_S[system] * HEALTHY, seed + APART)
-    steps = sign * TIMES * least(healthy, number)
+    healthy = heard(config, rig, CYCLE_S[system] * HEALTHY, seed + APART)
+    steps = sign * TIMES * least([said for said, _ in healthy], number)
     parameter = suspect.parameter
     size = parameter.neutral(coefficients(config.data)) + steps * suspect.step
     size = float(np.clip(size, parameter.low, parameter.high))
@@ -107,19 +108,20 @@ def least(healthy: Sequence[Said], number: int) -> float:
     return max(FOUND, float(apart)) * scatter / np.sqrt(power)
 
 
-def _healthy(config: Config, rig: PlcSettings, seconds: float, seed: int) -> list[Said]:
-    """What each cycle of the rig says without the effect."""
-    twin, cutter, found = Twin.of(config.data), CycleCutter(), []
+def heard(
+    config: Config, rig: PlcSettings, seconds: float, seed: int
+) -> Iterator[tuple[Said, Floats]]:
+    """What each cycle of a healthy rig says, and its scores as standard normal variables."""
+    twin, cutter = Twin.of(config.data), CycleCutter()
     isolation = Isolation.of(config.data, config.monitor.healthy, days=1e9)
     ambient = float(twin.theta[c.AMBIENT])
-    for block in blocks(rig, seconds, seed=seed):
+    for block in blocks(rig, seconds, seed=seed, block=20_000):
         rows, ticks = twin.advance(block)
         isolation.push(rows, ticks)
         for cycle in cutter.push(rows, ticks):
             fit = cycle.complete and cycle.settled
             if isolation.judge(cycle, fit, figures(cycle, ambient)) is not None:
-                found.append(isolation.heard[0])
-    return found
+                yield isolation.heard
 
 
 def _watched(

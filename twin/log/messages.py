@@ -18,7 +18,7 @@ _LEVEL = {Severity.INFO: 2, Severity.WARNING: 3, Severity.ALARM: 4}  # as foxglo
 # Every field of a message of /scalars is written, zeros too, and in a fixed length: then messages
 # are rows of an array. By name: how protobuf says what comes, and as what it comes.
 _VARINT, _FIXED64, _BYTES = 0, 1, 2
-_SECONDS, _NANOS = 10, 5  # bytes; before 1970 all of them are needed
+_SECONDS, _NANOS, _PHASE = 10, 5, 2  # bytes; before 1970 all of the seconds' are needed
 _FORMS: dict[str, tuple[int, Any]] = {
     "timestamp": (_BYTES, "u1"),  # its length; it consists of the two that follow
     "seconds": (_VARINT, ("u1", _SECONDS)),
@@ -29,7 +29,7 @@ _FORMS: dict[str, tuple[int, Any]] = {
     "supply_bar": (_FIXED64, "<f8"),
     "suction": (_VARINT, "u1"),
     "blow_off": (_VARINT, "u1"),
-    "phase": (_VARINT, ("u1", 2)),
+    "phase": (_VARINT, ("u1", _PHASE)),
 }
 
 
@@ -87,8 +87,8 @@ class Scalars:
         samples, ticks = samples[picked], ticks[picked]
         messages = np.full(len(samples), _BLANK)
         seconds, nanos = np.divmod(samples["time_ns"], _SECOND)
-        messages["seconds"] = _varint(seconds, 10)
-        messages["nanos"] = _varint(nanos, 5)
+        messages["seconds"] = _varint(seconds, _SECONDS)
+        messages["nanos"] = _varint(nanos, _NANOS)
         with np.errstate(invalid="ignore"):  # a NaN may be of the kind that signals
             messages["vacuum_mbar"] = (self._ambient - samples["pressure"].astype(float)) / MBAR
             expected = ticks["expected"].astype(float)
@@ -97,7 +97,7 @@ class Scalars:
             messages["supply_bar"] = samples["supply"].astype(float) / BAR
         messages["suction"] = (samples["commands"] & Command.SUCTION) != 0
         messages["blow_off"] = (samples["commands"] & Command.BLOW_OFF) != 0
-        messages["phase"] = _varint(ticks["phase"], 2)
+        messages["phase"] = _varint(ticks["phase"], _PHASE)
         return samples["host_ns"], samples["time_ns"], messages
 
 

@@ -9,12 +9,14 @@ to a false alarm, but for the overshoot.
 """
 
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri, stdtr
 
 Floats = npt.NDArray[np.float64]
+T = TypeVar("T")
 
 SIZES = np.array([0.5, 1.0, 2.0])  # sigmas a cycle that a change is looked for in
 SHARES = np.array([0.32, 0.26, 0.42])  # of the weight, of each size
@@ -26,6 +28,9 @@ OVERSHOOT = float(SHARES @ np.exp(-0.583 * SIZES))
 # Sigmas that a cycle counts for at most, unless its own figures are out: an edge that was misread
 # is no change.
 MOST = 5.0
+STRANGE = 3.5  # sigmas of a score, from which on it is not learned at once: a change may begin
+WAITS = 4  # cycles for which nothing is learned then; the sums alarm by that time if it is great
+MOST_WAITING = 20  # cycles: what is strange again and again without an alarm is usual
 FARTHEST = 30.0  # sigmas; beyond, a probability is no number any more
 
 
@@ -65,6 +70,29 @@ class Reference:
         off = np.where(shown, scores - self.mean, 0.0)
         self.mean = self.mean + off / np.maximum(self.count, 1.0)
         self.squares = self.squares + np.where(shown, off * (scores - self.mean), 0.0)
+
+
+class Patience(Generic[T]):
+    """Keeps cycles from being learned as usual while a change may be beginning."""
+
+    def __init__(self) -> None:
+        self._waiting: list[T] = []
+        self._cycles = 0  # for which they wait still
+
+    def take(self, cycle: T, normal: Floats) -> list[T]:
+        """Take a cycle with its standard normal scores; give those to be learned now."""
+        self._waiting.append(cycle)
+        strange = np.nanmax(np.abs(normal), initial=0.0) > STRANGE
+        self._cycles = WAITS if strange else self._cycles - 1
+        if self._cycles > 0 and len(self._waiting) < MOST_WAITING:
+            return []
+        ready = self._waiting
+        self.forget()
+        return ready
+
+    def forget(self) -> None:
+        """Learn none of those that wait: a change had begun."""
+        self._waiting, self._cycles = [], 0
 
 
 class Changes:

@@ -15,7 +15,15 @@ import numpy as np
 from twin.model.dataset import DataSet, coefficients
 from twin.monitor.bank import DELAYS, GROSS, STEP, SUSPECTS, UNSURE_OF, Bank
 from twin.monitor.bins import Floats, binned
-from twin.monitor.change import FARTHEST, MOST, Changes, Reference, began, limit
+from twin.monitor.change import (
+    FARTHEST,
+    MOST,
+    Changes,
+    Patience,
+    Reference,
+    began,
+    limit,
+)
 from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import Healthy
 from twin.monitor.phases import expected_knees
@@ -26,8 +34,6 @@ DAY_S = 86_400.0
 KEPT = 400  # cycles that are remembered: a change is not sought further back
 RECENT = 60  # of them, the last ones from which a cause is named
 LEARNED = 10  # cycles before which nothing is said
-STRANGE = 3.5  # sigmas of a score, from which on it is not learned at once: a change may begin
-WAITS = 4  # cycles for which nothing is learned then; the sums alarm by that time if it is great
 GREW = 2.0  # times as far out as before: something else may have begun
 MISMATCH = 0.08  # of what a suspect explains, is off in its signature
 DOUBTED = 0.05  # probability that anything differs, from which on it is asked what
@@ -93,8 +99,7 @@ class Isolation:
         self._wanted_s = days * DAY_S
         self._reference, self._usual = Reference.of(len(SUSPECTS)), _Usual()
         self._learned = 0  # cycles
-        self._waiting: list[tuple[Said, Floats]] = []  # to be learned, with their scores
-        self._waits = 0  # cycles
+        self._patience = Patience[tuple[Said, Floats]]()  # with their scores
         self._changes: Changes | None = None  # once it is known which suspects look alike
         self._kept: deque[tuple[Said, Floats]] = deque(maxlen=KEPT)  # with the normal scores
         self._cycles, self._seconds = 0, 0.0
@@ -154,21 +159,14 @@ class Isolation:
         normal = self._reference.standard(scores)
         self._kept.append((said, normal))
         verdict = self._conclude(self._changes, normal, far) if self._changes else None
-        if not far and not self.stands and (verdict is None or not verdict.causes):
-            self._wait(said, scores, normal)
-        elif self.stands:
-            self._waiting.clear()  # they differed already
-        return verdict
-
-    def _wait(self, said: Said, scores: Floats, normal: Floats) -> None:
-        """Take a cycle as usual, or keep it until it is clear that no change began."""
-        self._waiting.append((said, scores))
-        strange = self._changes is not None and np.nanmax(np.abs(normal), initial=0.0) > STRANGE
-        self._waits = WAITS if strange else self._waits - 1
-        if self._waits <= 0:
-            for one in self._waiting:
+        if self.stands:
+            self._patience.forget()
+        elif self._changes is None and not far:
+            self._learn(said, scores)
+        elif not far and (verdict is None or not verdict.causes):
+            for one in self._patience.take((said, scores), normal):
                 self._learn(*one)
-            self._waiting.clear()
+        return verdict
 
     def _learn(self, said: Said, scores: Floats) -> None:
         """Take a cycle as usual; what is shown for the first time is looked for from now on."""

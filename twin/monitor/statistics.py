@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import block_diag
 
 from twin.model.theta import Theta
 from twin.monitor.bank import DELAYS, SUSPECTS, UNSURE_OF, hypotheses
@@ -131,7 +132,7 @@ class Listener:
             suspects,
             gross,
             ways - suspects[:, [UNSURE_OF]],
-            _beside(covariance * self.healthy.leftover**2, self._sigmas[shown] ** 2),
+            block_diag(covariance * self.healthy.leftover**2, np.diag(self._sigmas[shown] ** 2)),
             np.concatenate([common, self._sigmas[shown]]),
         )
 
@@ -144,11 +145,3 @@ class Listener:
                 sigma = self.healthy.scatter.get(one.effect, usual)
                 columns.append(signatures[:, [number]] * (sigma / one.step))
         return np.hstack(columns)
-
-
-def _beside(covariance: Floats, variances: Floats) -> Floats:
-    """The same with further values beside it, each on its own."""
-    known = len(covariance)
-    both = np.diag(np.concatenate([np.zeros(known), variances]))
-    both[:known, :known] = covariance
-    return both
