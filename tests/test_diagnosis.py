@@ -53,6 +53,15 @@ def with_leak() -> Diagnosis:
     return of(record(27.0, "leakage=1.7@14.4", seed=21))
 
 
+def test_a_log_whose_clock_begins_at_zero_is_told_in_seconds_since_its_beginning() -> None:
+    late = list(record(8.0, seed=2))
+    early = [block.copy() for block in late]
+    for block in early:
+        block["time_ns"] -= late[0]["time_ns"][0]
+    assert early[0]["time_ns"][0] == 0
+    assert np.array_equal(collect(CONFIG, early).seconds, collect(CONFIG, late).seconds)
+
+
 # Hidden where the twin's own physics are not looked at: in the simulated rig. More of them, with
 # sizes and courses by seed, are in tools/battery.py.
 

@@ -430,13 +430,14 @@ def _complete_cycles(twin: Twin, blocks: Iterable[Samples]) -> tuple[list[Cycle]
     """The complete cycles of a stream in order, and the PLC time of its first row."""
     cutter = CycleCutter()
     cycles: list[Cycle] = []
-    begin_ns = 0
+    begin_ns: int | None = None
     for block in blocks:
-        begin_ns = begin_ns or int(block["time_ns"][:1].sum())
+        if begin_ns is None and len(block):
+            begin_ns = int(block["time_ns"][0])
         cycles += cutter.push(*twin.advance(block))
     cycles += cutter.push(*twin.flush())
     cycles += cutter.flush()
-    return [cycle for cycle in cycles if cycle.complete], begin_ns
+    return [cycle for cycle in cycles if cycle.complete], begin_ns or 0
 
 
 def _binned(
