@@ -13,7 +13,6 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from threading import Lock
@@ -280,7 +279,7 @@ def diagnose(
     recorded = open_log(log)
     settings = _settings_of(recorded.header, log, config, assets, unit, as_of)
     if not unit:
-        _refuse_another(recorded.header, log, settings)
+        settings.refuse_another(recorded.header, str(log))
     with _status() as say:
         diagnosis = find_cause(settings, (rows for rows, _ in recorded.blocks()), str(log), say)
     print(in_words(diagnosis))
@@ -540,15 +539,12 @@ def _header(settings: "Config", hil: bool = False) -> "LogHeader":
     )
 
 
-def _configured(document: "Document", assets: str, unit: str, as_of: str = "") -> "Config":
+def _configured(document: "Document", assets: str, unit: str) -> "Config":
     """The configuration with what is known of its unit; says so if one that is named is unknown."""
-    from twin.assets.file import parse_time
     from twin.config import Config
 
-    known = parse_time(as_of) if as_of else None
-    settings = Config.of(document, assets, unit, as_of_ns=known)
-    if unit and settings.instead:
-        print(f"twin: {settings.instead}", file=sys.stderr)
+    settings = Config.of(document, assets, unit)
+    _say_instead(settings, unit)
     return settings
 
 
@@ -556,30 +552,21 @@ def _settings_of(
     header: "LogHeader", log: Path, instead: Path | None, assets: str, unit: str, as_of: str
 ) -> "Config":
     """The configuration a log carries, with the data set it was made with; or another one."""
-    from twin.config import Asset, Config
+    from twin.assets.file import parse_time
+    from twin.config import Config
     from twin.settings import Document
 
-    if instead is not None:
-        return _configured(Document.read(instead), assets, unit, as_of)
-    document = Document.parse(header.config_text, header.config_name)
-    if unit or assets or as_of:
-        return _configured(document, assets, unit, as_of)
-    settings = Config.of_log(document, header.metadata, str(log))
-    # --id may have named another unit than the configuration does.
-    return replace(settings, asset=Asset(type=header.asset_type, id=header.asset_id))
+    document = Document.read(instead) if instead is not None else None
+    known = parse_time(as_of) if as_of else None
+    settings = Config.of_recorded(header, str(log), document, assets, unit, known)
+    _say_instead(settings, unit)
+    return settings
 
 
-def _refuse_another(header: "LogHeader", log: Path, settings: "Config") -> None:
-    """ConfigError if the configuration is that of another asset than the log."""
-    recorded = header.asset_type, header.asset_id
-    asked = settings.asset.type, settings.asset.id
-    if all((*recorded, *asked)) and recorded != asked:
-        raise ConfigError(
-            f"{log} is a log of {' '.join(recorded)}, {settings.document.name} is for"
-            f" {' '.join(asked)}",
-            "take the log's own configuration (no --config), or say with --id which unit to"
-            " compare it with",
-        )
+def _say_instead(settings: "Config", unit: str) -> None:
+    """Say so if a unit that is named is unknown."""
+    if unit and settings.instead:
+        print(f"twin: {settings.instead}", file=sys.stderr)
 
 
 def _save(diagnosis: "Diagnosis", settings: "Config", unit: str, assets: str, log: Path) -> None:

@@ -50,14 +50,12 @@ def _read(path: Path) -> "Side":
     from twin.figures.cycle import compiled
     from twin.figures.settings import FigureSettings
     from twin.log.reader import open_log
-    from twin.settings import Document
 
     log = open_log(path)
     if not log.complete:
         print(f"twin: {path} is not complete; what can be read is compared", file=sys.stderr)
-    document = Document.parse(log.header.config_text, log.header.config_name)
-    settings = Config.of_log(document, log.header.metadata, str(path))
-    figures = compiled(settings.data, document.section(FigureSettings, "figures"))
+    settings = Config.of_recorded(log.header, str(path))
+    figures = compiled(settings.data, settings.document.section(FigureSettings, "figures"))
     return side_of(log, settings, figures)
 
 

@@ -247,11 +247,8 @@ def _of_log(recorded: "Log", log: Path, instead: Path | None) -> "Config":
     from twin.config import Config
     from twin.settings import Document
 
-    if instead is not None:
-        return Config.of(Document.read(instead))
-    header = recorded.header
-    document = Document.parse(header.config_text, header.config_name)
-    return Config.of_log(document, header.metadata, str(log))
+    document = Document.read(instead) if instead is not None else None
+    return Config.of_recorded(recorded.header, str(log), document)
 
 
 def _chosen(store: "Store", config: Path | None, unit: str) -> "Unit":

@@ -19,6 +19,7 @@ from twin.assets.diagram import FLOW, SUPPLY, VACUUM
 from twin.assets.place import open_chosen
 from twin.assets.record import Record
 from twin.errors import ConfigError, SourceError
+from twin.log.header import LogHeader
 from twin.model.dataset import DataSet
 from twin.model.diagram import reduce
 from twin.monitor.detect import MonitorSettings
@@ -120,6 +121,39 @@ class Config:
         asset = document.section(Asset, "asset")
         known = _of_log(metadata, log)
         return cls._checked(document, asset, known, metadata.get("origin", "the log"))
+
+    @classmethod
+    def of_recorded(
+        cls,
+        header: LogHeader,
+        log: str,
+        instead: Document | None = None,
+        assets: str = "",
+        unit: str = "",
+        as_of_ns: int | None = None,
+    ) -> "Config":
+        """The configuration a log carries, with the data set it was made with; or ``instead``.
+
+        Where a database, a unit or a time is named the data set is looked up anew, as in ``of``.
+        """
+        document = instead or Document.parse(header.config_text, header.config_name)
+        if instead is not None or assets or unit or as_of_ns is not None:
+            return cls.of(document, assets, unit, as_of_ns=as_of_ns)
+        config = cls.of_log(document, header.metadata, log)
+        # --id may have named another unit than the configuration does.
+        return replace(config, asset=Asset(type=header.asset_type, id=header.asset_id))
+
+    def refuse_another(self, header: LogHeader, log: str) -> None:
+        """ConfigError if this is the configuration of another asset than the log's."""
+        recorded = header.asset_type, header.asset_id
+        asked = self.asset.type, self.asset.id
+        if all((*recorded, *asked)) and recorded != asked:
+            raise ConfigError(
+                f"{log} is a log of {' '.join(recorded)}, {self.document.name} is for"
+                f" {' '.join(asked)}",
+                "take the log's own configuration (no --config), or say with --id which unit to"
+                " compare it with",
+            )
 
     @classmethod
     def _checked(cls, document: Document, asset: Asset, known: Known, origin: str) -> "Config":

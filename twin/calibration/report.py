@@ -39,24 +39,29 @@ def _scatter(calibration: Calibration) -> list[str]:
 
 def as_json(calibration: Calibration, record: Record) -> dict[str, Any]:
     """The same for programs, with the data set as it was stored."""
+    return {
+        "format": "ejector-twin-calibration/1",
+        "asset": {"type": record.type, "id": record.name},
+        "record": record.id,
+        "cycles": calibration.cycles,
+        "left_mbar": calibration.fitted.left / MBAR,
+        "parameters": parameters(calibration),
+        "healthy": dict(record.healthy),
+        "data": dict(record.data),
+    }
+
+
+def parameters(calibration: Calibration) -> dict[str, dict[str, Any]]:
+    """Each parameter's value with its unit, 95 % interval, and whether the log determines it."""
     fitted = calibration.fitted
-    parameters = {}
+    found = {}
     for free, known in zip(FREE, fitted.determined, strict=True):
         low, high = fitted.interval(free.name)
-        parameters[free.name] = {
+        found[free.name] = {
             "value": free.of(fitted.data),
             "unit": free.unit,
             "low95": low,
             "high95": high,
             "determined": bool(known),
         }
-    return {
-        "format": "ejector-twin-calibration/1",
-        "asset": {"type": record.type, "id": record.name},
-        "record": record.id,
-        "cycles": calibration.cycles,
-        "left_mbar": fitted.left / MBAR,
-        "parameters": parameters,
-        "healthy": dict(record.healthy),
-        "data": dict(record.data),
-    }
+    return found

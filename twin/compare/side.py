@@ -11,7 +11,7 @@ from twin.errors import SourceError
 from twin.figures.cycle import MOST_PIECES, CycleFigures, KeyFigures
 from twin.log.header import LogHeader
 from twin.log.reader import Log
-from twin.monitor.cycles import Cycle, CycleCutter
+from twin.monitor.cycles import Cycle, cut
 from twin.monitor.cycles import figures as judged
 from twin.signals import BREAK, MBAR, MS, NS, UNUSABLE, Phase, Samples, Ticks, deviation
 
@@ -120,7 +120,7 @@ def whole(blocks: Iterable[tuple[Samples, Ticks]]) -> Iterator[Cycle]:
     """Cut rows into cycles, in one piece up to some minutes; and what belongs to none."""
     pieces: list[Cycle] = []
     before = -1  # index of what was given last
-    for piece in _pieces(blocks):
+    for piece in cut(blocks):
         if pieces and (piece.index > pieces[0].index or piece.samples["quality"][0] & BREAK):
             yield _joined(pieces, before)
             before, pieces = pieces[0].index, []
@@ -130,13 +130,6 @@ def whole(blocks: Iterable[tuple[Samples, Ticks]]) -> Iterator[Cycle]:
             before, pieces = pieces[0].index, []
     if pieces:
         yield _joined(pieces, before)
-
-
-def _pieces(blocks: Iterable[tuple[Samples, Ticks]]) -> Iterator[Cycle]:
-    cutter = CycleCutter()
-    for samples, ticks in blocks:
-        yield from cutter.push(samples, ticks)
-    yield from cutter.flush()
 
 
 def _joined(pieces: list[Cycle], before: int) -> Cycle:

@@ -6,20 +6,13 @@ from typing import Any
 from twin.figures.cycle import CycleFigures, KeyFigures
 from twin.figures.keeper import Alarms
 from twin.log.reader import Log
-from twin.monitor.cycles import Cycle, CycleCutter
+from twin.monitor.cycles import cut
 
 
 def of_log(log: Log, key_figures: KeyFigures) -> Iterator[tuple[CycleFigures, Mapping[str, Any]]]:
     """Every cycle of a log with its key figures, and as a database keeps them, alarms included."""
     alarms = Alarms()
     alarms.see(log.events())
-    for piece in _pieces(log):
+    for piece in cut(log.blocks()):
         if (told := key_figures.take(piece)) is not None:
             yield told, {**told.plain(), "alarms": alarms.until(told.end_ns)}
-
-
-def _pieces(log: Log) -> Iterator[Cycle]:
-    cutter = CycleCutter()
-    for samples, ticks in log.blocks():
-        yield from cutter.push(samples, ticks)
-    yield from cutter.flush()

@@ -1,6 +1,6 @@
 """Cycles cut out of the stream, and the figures each one gives."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -145,6 +145,14 @@ class CycleCutter:
         whole = begins and ticks["phase"][-1] in (Phase.IDLE, Phase.BLOW_OFF)
         cut_short = not self._at_edge and len(samples) < LONGEST_PIECE
         return Cycle(self._index, samples, ticks, bool(whole), cut_short, settled)
+
+
+def cut(blocks: Iterable[tuple[Samples, Ticks]]) -> Iterator[Cycle]:
+    """All that a CycleCutter gives of rows from their beginning to their end."""
+    cutter = CycleCutter()
+    for samples, ticks in blocks:
+        yield from cutter.push(samples, ticks)
+    yield from cutter.flush()
 
 
 def time_to_vacuum(
