@@ -10,5 +10,5 @@ lock() {
         --no-emit-index-url --no-annotate --no-header --quiet --output-file "$out" "$@"
 }
 lock requirements.lock --group build
-lock requirements-dev.lock --extra aas --extra notebook --extra serve --extra view \
+lock requirements-dev.lock --extra aas --extra dask --extra notebook --extra serve --extra view \
     --group build --group dev --group docs --constraint requirements.lock
