@@ -24,7 +24,7 @@ from twin.live import Twin
 from twin.model import theta as c
 from twin.model.dataset import coefficients
 from twin.model.effects import EFFECTS
-from twin.monitor.bank import SUSPECTS
+from twin.monitor.bank import SUSPECTS, UNSURE_OF
 from twin.monitor.bins import Floats
 from twin.monitor.cycles import CycleCutter, figures
 from twin.monitor.detect import RIVAL, Monitor
@@ -88,7 +88,8 @@ def outcome(seed: int) -> Outcome:
     healthy = heard(config, rig, CYCLE_S[system] * HEALTHY, seed + APART)
     steps = sign * TIMES * least([said for said, _ in healthy], number)
     parameter = suspect.parameter
-    size = parameter.neutral(coefficients(config.data)) + steps * suspect.step
+    healthy_is = 0.0 if parameter.coefficient is None else rig.rig.vessel_film
+    size = healthy_is + steps * suspect.step
     size = float(np.clip(size, parameter.low, parameter.high))
     fault = f"{effect.name}={size:.6g}@c{BEGINS}"
     events = _watched(config, rig, CYCLE_S[system] * (BEGINS + WITHIN + 1), fault, seed)
@@ -101,11 +102,18 @@ def least(healthy: Sequence[Said], number: int) -> float:
     others = [i for i, one in enumerate(SUSPECTS) if one.effect != effect]
     last = healthy[-1]
     signature = last.signatures[:, number]
-    power = float(signature @ np.linalg.solve(last.alone, signature))
+    power = float(signature @ np.linalg.solve(_unknown(last, number), signature))
     scatter = float(np.nanstd([one.scores()[number] for one in healthy]))
     nearest = float(np.max(np.abs(last.alike()[number, others])))
     apart = np.sqrt(REJECTED / WITHIN / (1.0 - nearest**2))
     return max(FOUND, float(apart)) * scatter / np.sqrt(power)
+
+
+def _unknown(said: Said, number: int) -> Floats:
+    """Covariance (mbar²) of what a suspect is to be told from; a low supply may be another."""
+    ways = said.unsure if number == UNSURE_OF else said.unsure[:, :0]
+    covariance: Floats = said.alone + ways @ ways.T
+    return covariance
 
 
 def heard(

@@ -16,11 +16,13 @@ from twin.model.effects import EFFECTS, Parameter, apply
 from twin.model.theta import Theta
 from twin.monitor.bins import drawn
 from twin.monitor.signatures import steps
-from twin.signals import MS, NS, Samples, Ticks, joined
+from twin.signals import MS, NS, Phase, Samples, Ticks, joined
 
 BATCH = 250  # rows that are stepped together: what many calls cost is spared
 STEP = 0.25  # of a parameter's typical size
-GROSS = 1.5  # the same for those that are not linear in it for long: what delays
+# What delays moves steep edges: they differ in proportion to it only while it is shorter than they
+# are. So it has a smaller step, and larger sizes beside it.
+DELAY_STEPS = (0.05, 0.25, 1.5)
 # What changes with the weather or another set-up, and is nothing to mend: looked for as well, and
 # not so that all else is found later.
 NO_WEAR = ("ambient_pressure", "heat_exchange")
@@ -33,6 +35,7 @@ _ROW = np.dtype(
         ("dt", "f8"),
         ("level", "f8"),
         ("phase", "u1"),
+        ("next", "u1"),  # the phase of the row after it
         ("bends", "?"),  # here a bend of what is expected begins
         ("since", "i8"),  # rows, then
     ]
@@ -57,9 +60,14 @@ class Suspect:
         return SELDOM if self.effect in NO_WEAR else 1.0
 
     @property
+    def delays(self) -> bool:
+        """Whether it is a time by which something is late."""
+        return self.parameter.unit == "ms"
+
+    @property
     def step(self) -> float:
         """The size it has in the bank."""
-        return STEP * self.parameter.typical
+        return (DELAY_STEPS[0] if self.delays else STEP) * self.parameter.typical
 
     def of(self, theta: Theta, steps: float = 1.0) -> Theta:
         """Coefficients of an ejector that has it."""
@@ -78,13 +86,16 @@ SUSPECTS: Sequence[Suspect] = tuple(
 # measured; of its value, one sigma. So it is not known well what a low supply does.
 UNSURE = {c.END_SLOPE: 0.5, c.SUPPLY_CURVATURE: 0.5, c.SUPPLY_OPTIMUM: 0.03}
 UNSURE_OF = next(i for i, one in enumerate(SUSPECTS) if one.effect == "supply_pressure_drop")
-DELAYS = tuple(i for i, one in enumerate(SUSPECTS) if one.parameter.unit == "ms")
+DELAYS = tuple(i for i, one in enumerate(SUSPECTS) if one.delays)
+LARGER = len(DELAY_STEPS) - 1  # sizes beside the step
+# With a step of these the air saving's switching off, or on, is seen a row later than it acts.
+SEEN_LATER = {Phase.HOLD: ("sensor_lag",), Phase.SUCTION: ("sensor_lag", "slow_ramp_up")}
 
 
 def hypotheses(theta: Theta) -> list[Theta]:
     """The unchanged data set, each suspect, and further ones.
 
-    These are what delays once more, grossly, and a low supply in each way it is unsure.
+    These are the larger sizes of what delays, and a low supply in each way it is unsure.
     """
     low = SUSPECTS[UNSURE_OF].of(theta)
     ways = []
@@ -92,8 +103,9 @@ def hypotheses(theta: Theta) -> list[Theta]:
         way = low.copy()
         way[number] *= 1.0 + share
         ways.append(way)
-    gross = [SUSPECTS[number].of(theta, GROSS / STEP) for number in DELAYS]
-    return [theta, *(one.of(theta) for one in SUSPECTS), *gross, *ways]
+    steps = [size / DELAY_STEPS[0] for size in DELAY_STEPS[1:]]
+    larger = [SUSPECTS[number].of(theta, some) for number in DELAYS for some in steps]
+    return [theta, *(one.of(theta) for one in SUSPECTS), *larger, *ways]
 
 
 class Bank:
@@ -146,6 +158,7 @@ class Bank:
         drawn_now = drawn(rows["since"][:-1]) | rows["bends"][1:]
         first = self._count - len(self._waits)
         self._count += len(samples)
+        rows["next"][:-1] = rows["phase"][1:]
         self._waits = rows[-1:]
         self._step(rows[:-1][drawn_now], first + np.flatnonzero(drawn_now))
 
@@ -155,7 +168,7 @@ class Bank:
         before = np.concatenate([[self._drawn_ns], rows["time_ns"][:-1]])
         dt = np.where(rows["dt"] < 0.0, -1.0, (rows["time_ns"] - before) * NS)
         expected = np.empty((len(rows), self._theta.shape[1]))
-        phase, level = (np.ascontiguousarray(rows[name]) for name in ("phase", "level"))
+        phase, level = _phases(rows, self._theta.shape[1]), np.ascontiguousarray(rows["level"])
         kernel.advance(
             self._state, self._theta, dt, phase, level, expected, tolerance=kernel.ROUGHLY
         )
@@ -170,6 +183,7 @@ class Bank:
         """
         self._step_on()
         if count == self._count and len(self._waits):
+            self._waits["next"] = self._waits["phase"]
             self._step(self._waits, np.array([count - 1]))
             self._waits = self._waits[:0]
         mine = self._rows < count
@@ -177,3 +191,13 @@ class Bank:
         self._rows, self._expected = self._rows[~mine] - count, self._expected[~mine]
         self._count -= count
         return taken
+
+
+def _phases(rows: npt.NDArray[np.void], count: int) -> npt.NDArray[np.uint8]:
+    """Phases (rows, hypotheses): what is seen a row later than it acts was a row earlier."""
+    phases = np.repeat(rows["phase"][:, None], count, axis=1)
+    for into, before in ((Phase.HOLD, Phase.SUCTION), (Phase.SUCTION, Phase.HOLD)):
+        switches = np.flatnonzero((rows["next"] == into) & (rows["phase"] == before))
+        later = [1 + i for i, one in enumerate(SUSPECTS) if one.effect in SEEN_LATER[into]]
+        phases[switches[:, None], later] = into
+    return phases

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from twin.model.dataset import DataSet, coefficients
-from twin.monitor.bank import DELAYS, GROSS, STEP, SUSPECTS, UNSURE_OF, Bank
+from twin.model.dataset import DataSet
+from twin.monitor.bank import DELAY_STEPS, DELAYS, SUSPECTS, UNSURE_OF, Bank
 from twin.monitor.bins import Floats, binned
 from twin.monitor.change import (
     FARTHEST,
@@ -26,9 +26,8 @@ from twin.monitor.change import (
 )
 from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import Healthy
-from twin.monitor.phases import expected_knees
 from twin.monitor.statistics import Listener, Said
-from twin.signals import MBAR, NS, SAMPLE, TICK, Samples, Ticks
+from twin.signals import NS, SAMPLE, TICK, Samples, Ticks
 
 DAY_S = 86_400.0
 KEPT = 400  # cycles that are remembered: a change is not sought further back
@@ -131,15 +130,13 @@ class Isolation:
     @classmethod
     def of(cls, data: DataSet, healthy: Healthy, days: float) -> "Isolation":
         """The isolation beside the twin of a data set; compiled, not to fall into a block."""
-        theta = coefficients(data)
-        noise = data.sensor.noise_mbar
-        listener = Listener(theta, healthy, noise, expected_knees(theta, noise * MBAR))
-        first = Bank(theta)
+        listener = Listener.of(data, healthy)
+        first = Bank(listener.theta)
         first.push(np.zeros(2, SAMPLE), np.zeros(2, TICK))
         drawn, _ = first.take(2)
         nothing = np.zeros((len(drawn), len(SUSPECTS)))
         binned(np.zeros(2, np.uint8), np.ones(2, np.bool_), drawn[:1]).through(drawn, nothing)
-        return cls(Bank(theta), listener, days)
+        return cls(Bank(listener.theta), listener, days)
 
     def judge(
         self, cycle: Cycle, fit: bool, figures: Mapping[str, float], far: float = 0.0
@@ -244,11 +241,9 @@ class Isolation:
             _fitted(mean.off, signature, covariance, bounds)
             for signature, bounds in zip(mean.signatures.T, self._bounds, strict=True)
         ]
-        for number, signature in zip(DELAYS, mean.gross.T, strict=True):
-            bounds = self._bounds[number] * STEP / GROSS
-            size, left = _fitted(mean.off, signature, covariance, bounds)
-            if left < fitted[number][1]:
-                fitted[number] = np.array([size * GROSS / STEP, left])
+        for number, larger in zip(DELAYS, np.split(mean.larger, len(DELAYS), axis=1), strict=True):
+            sizes = np.column_stack([mean.signatures[:, number], larger])
+            fitted[number] = _fitted_along(mean.off, sizes, covariance, self._bounds[number])
         # What a low supply does is not known well: in proportion to how low it is.
         ways = fitted[UNSURE_OF][0] * mean.unsure
         signature = mean.signatures[:, UNSURE_OF]
@@ -264,16 +259,16 @@ class Isolation:
         some = [said for said, _ in list(self._kept)[-since:]]
         often = np.mean([np.isin(last.place, said.place) for said in some], axis=0) > 0.5
         last = last.at(often)
-        columns = np.column_stack([last.off, last.signatures, last.gross]) * 0.0
+        columns = np.column_stack([last.off, last.signatures, last.larger]) * 0.0
         counts = np.zeros(len(last.place))
         for said in some:
             _, mine, theirs = np.intersect1d(last.place, said.place, True, True)
-            columns[mine] += np.column_stack([said.off, said.signatures, said.gross])[theirs]
+            columns[mine] += np.column_stack([said.off, said.signatures, said.larger])[theirs]
             counts[mine] += 1.0
         columns /= counts[:, None]
         usual, seen = self._usual.of(last)
         off = columns[:, 0] - usual
-        signatures, gross = np.split(columns[:, 1:], [len(SUSPECTS)], axis=1)
+        signatures, larger = np.split(columns[:, 1:], [len(SUSPECTS)], axis=1)
         own = np.hypot(last.common / np.sqrt(1.0 + seen), MISMATCH * off)
         together = np.exp(-np.abs(last.time[:, None] - last.time)) * (
             last.kind[:, None] == last.kind
@@ -281,7 +276,7 @@ class Isolation:
         usually = 1.0 / np.sqrt(1.0 + seen)
         scatter = last.alone / len(some) + last.alone * np.outer(usually, usually)
         covariance = scatter + np.outer(own, own) * together
-        return replace(last, off=off, signatures=signatures, gross=gross), covariance
+        return replace(last, off=off, signatures=signatures, larger=larger), covariance
 
     def _by_effect(self, share: Floats, sizes: Floats) -> list[Likely]:
         """Parameters of one effect belong together; the most probable one gives the size."""
@@ -308,3 +303,17 @@ def _fitted(off: Floats, signature: Floats, covariance: Floats, bounds: Floats) 
     size = float(np.clip(signature @ weighed[:, 0] / power, *bounds))
     left = float((off - size * signature) @ (weighed[:, 0] - size * weighed[:, 1]))
     return np.array([size, left + float(np.linalg.slogdet(covariance)[1])])
+
+
+def _fitted_along(off: Floats, signatures: Floats, covariance: Floats, bounds: Floats) -> Floats:
+    """The same for what delays: its signatures (places, sizes), straight from size to size."""
+    at = np.array([0.0, *DELAY_STEPS]) / DELAY_STEPS[0]
+    ends = np.column_stack([np.zeros(len(off)), signatures]).T
+    reach = np.ones(len(DELAY_STEPS))
+    reach[-1] = (bounds[1] - at[-2]) / (at[-1] - at[-2])
+    found = []
+    for piece, most in enumerate(reach):
+        along, wide = ends[piece + 1] - ends[piece], at[piece + 1] - at[piece]
+        share, left = _fitted(off - ends[piece], along, covariance, np.array([0.0, most]))
+        found.append(np.array([at[piece] + share * wide, left]))
+    return min(found, key=lambda one: float(one[1]))

@@ -11,12 +11,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import block_diag
 
+from twin.model.dataset import DataSet, coefficients
 from twin.model.theta import Theta
-from twin.monitor.bank import DELAYS, SUSPECTS, UNSURE_OF, hypotheses
+from twin.monitor.bank import DELAYS, LARGER, SUSPECTS, UNSURE_OF, hypotheses
 from twin.monitor.bins import Bins, Floats, Ints, binned
 from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import Healthy
-from twin.monitor.phases import Knees
+from twin.monitor.phases import Knees, expected_knees
 from twin.monitor.switching import seen
 from twin.monitor.weights import SCATTER, from_cycle_to_cycle, model_error
 from twin.signals import MBAR, UNUSABLE, deviation
@@ -37,7 +38,7 @@ class Said:
     time: Floats  # warped, since the stretch began
     off: Floats  # mbar, measured less expected
     signatures: Floats  # mbar, by each suspect's step, (places, suspects)
-    gross: Floats  # mbar, by a gross size of what delays, (places, DELAYS)
+    larger: Floats  # mbar, by the larger sizes of what delays, (places, DELAYS · LARGER)
     unsure: Floats  # mbar, by which that of a low supply may be another, (places, ways)
     alone: Floats  # mbar², covariance of what differs from cycle to cycle
     common: Floats  # mbar, one sigma of what is off in all cycles
@@ -54,6 +55,12 @@ class Said:
         weighed, power = self._weighed()
         scores: Floats = self.off @ weighed / np.sqrt(np.where(power > 0.0, power, np.nan))
         return scores
+
+    def sizes(self) -> Floats:
+        """Steps of each suspect that fit best, were nothing else wrong; NaN as in ``scores``."""
+        weighed, power = self._weighed()
+        sizes: Floats = self.off @ weighed / np.where(power > 0.0, power, np.nan)
+        return sizes
 
     def alike(self) -> Floats:
         """Cosines between the signatures, whitened; 0 for what this cycle does not show."""
@@ -81,6 +88,12 @@ class Listener:
     _levels: Floats = field(init=False)  # mbar, by which each level moves, (levels, hypotheses)
     _means: Floats = field(init=False)  # mbar, of each level in healthy cycles
     _sigmas: Floats = field(init=False)
+
+    @classmethod
+    def of(cls, data: DataSet, healthy: Healthy) -> "Listener":
+        """The one for cycles beside the twin of a data set."""
+        theta, noise = coefficients(data), data.sensor.noise_mbar
+        return cls(theta, healthy, noise, expected_knees(theta, noise * MBAR))
 
     def __post_init__(self) -> None:
         found = seen(hypotheses(self.theta), SUCTION_ROWS, self.knees)
@@ -122,7 +135,8 @@ class Listener:
         shown = [number for number, name in enumerate(LEVELS) if name in figures]
         level = np.array([figures[LEVELS[number]] for number in shown]) - self._means[shown]
         moved = np.concatenate([signatures[first], self._levels[shown]])
-        suspects, gross, ways = np.split(moved, np.cumsum([len(SUSPECTS), len(DELAYS)]), axis=1)
+        known = np.cumsum([len(SUSPECTS), len(DELAYS) * LARGER])
+        suspects, larger, ways = np.split(moved, known, axis=1)
         numbers = np.array(shown, np.int64) - len(LEVELS)
         return Said(
             np.concatenate([place, numbers]),
@@ -130,7 +144,7 @@ class Listener:
             np.concatenate([bins.time[first], np.zeros(len(shown))]),
             np.concatenate([off[first], level]),
             suspects,
-            gross,
+            larger,
             ways - suspects[:, [UNSURE_OF]],
             block_diag(covariance * self.healthy.leftover**2, np.diag(self._sigmas[shown] ** 2)),
             np.concatenate([common, self._sigmas[shown]]),
