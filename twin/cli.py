@@ -26,6 +26,7 @@ from twin.cli_assets import assets_app
 from twin.cli_cert import cert
 from twin.cli_compare import compare
 from twin.cli_figures import figures_app, keeper_of, key_figures_of
+from twin.cli_fleet import fleet_app
 from twin.cli_outlets import outlets_of
 from twin.cli_serve import live_rows_of, reports_of, serve
 from twin.errors import ConfigError, SourceError, TwinError
@@ -56,6 +57,7 @@ app = typer.Typer(
 app.add_typer(assets_app, name="assets")
 app.add_typer(figures_app, name="figures")
 app.add_typer(alarms_app, name="alarms")
+app.add_typer(fleet_app, name="fleet")
 log_app = typer.Typer(help="Look after logs.", no_args_is_help=True)
 app.add_typer(log_app, name="log")
 app.command()(cert)

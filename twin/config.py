@@ -55,6 +55,7 @@ class Asset(Settings):
 
     type: str = NO_TYPE
     id: str = ""
+    batch: str = ""  # of production, as on the nameplate: what fleets are compared by
 
 
 class LogSettings(Settings):
@@ -141,7 +142,8 @@ class Config:
             return cls.of(document, assets, unit, as_of_ns=as_of_ns)
         config = cls.of_log(document, header.metadata, log)
         # --id may have named another unit than the configuration does.
-        return replace(config, asset=Asset(type=header.asset_type, id=header.asset_id))
+        named = {"type": header.asset_type, "id": header.asset_id}
+        return replace(config, asset=config.asset.model_copy(update=named))
 
     def refuse_another(self, header: LogHeader, log: str) -> None:
         """ConfigError if this is the configuration of another asset than the log's."""

@@ -25,14 +25,19 @@ def open_chosen(
     writes makes a file: to read where the default is not there, the shipped ones are enough.
     ``shipped`` as in ``open_assets``.
     """
+    where = chosen(named, document)
+    if named or (document and document.section(AssetsSettings, "assets").url):
+        return open_assets(where, create=write, shipped=shipped)
+    return open_assets(where if write or Path(where).exists() else MEMORY, shipped=shipped)
+
+
+def chosen(named: str, document: Document | None) -> str | Path:
+    """The URL or file of that database."""
     if named:
-        return open_assets(named, create=write, shipped=shipped)
+        return named
     folder = Path(document.name).parent if document else Path()
     url = document.section(AssetsSettings, "assets").url if document else ""
-    if url:
-        return open_assets(_beside(folder, url), create=write, shipped=shipped)
-    default = folder / FILE
-    return open_assets(default if write or default.exists() else MEMORY, shipped=shipped)
+    return _beside(folder, url) if url else folder / FILE
 
 
 def _beside(folder: Path, url: str) -> str | Path:

@@ -12,12 +12,15 @@ from twin.signals import MBAR
 
 
 def store(calibration: Calibration, config: Config, assets: str, log: Path) -> tuple[Record, str]:
-    """Add the unit's data set to the database; give the record and the database's name.
+    """Add the unit's data set to the database; give the record and the database's name."""
+    with open_chosen(assets, config.document, write=True) as database:
+        return database.add(record_of(calibration, config, log)), database.name
 
-    It holds from the time the log was recorded on.
-    """
+
+def record_of(calibration: Calibration, config: Config, log: Path) -> Record:
+    """The unit's data set as it is stored; it holds from the time the log was recorded on."""
     fitted = calibration.fitted
-    record = Record(
+    return Record(
         kind="instance",
         name=config.asset.id,
         type=config.asset.type,
@@ -36,5 +39,3 @@ def store(calibration: Calibration, config: Config, assets: str, log: Path) -> t
         },
         valid_from_ns=provenance.valid_from(calibration.first_ns),
     )
-    with open_chosen(assets, config.document, write=True) as database:
-        return database.add(record), database.name

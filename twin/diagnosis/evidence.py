@@ -7,6 +7,7 @@ switched against the vacuum at which the hypothesis would.
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain, pairwise
@@ -33,7 +34,7 @@ from twin.monitor.signatures import steps
 from twin.monitor.switching import Seen, seen
 from twin.signals import MBAR, MS, NS, SAMPLE, TICK, UNUSABLE, Command, Phase, Samples, Ticks
 
-WORKERS = 2
+CORES: ContextVar[int] = ContextVar("CORES", default=2)  # on which a diagnosis runs
 LATER, LONGEST_SUCTION = 1.3, 10_000  # cycles' suction, rows: until when H1 may be reached
 
 # How suction and end pressure follow the supply is the type's; of its value, one sigma.
@@ -46,10 +47,10 @@ Other = TypeVar("Other")
 
 
 def at_once(run: Callable[[One], Other], over: Sequence[One]) -> list[Other]:
-    """What ``run`` gives for each, in order; on all cores, as compiled code lets others run."""
-    if len(over) < 2:
+    """What ``run`` gives for each, in order; on several cores, as compiled code lets others run."""
+    if len(over) < 2 or CORES.get() == 1:
         return [run(one) for one in over]
-    with ThreadPoolExecutor(WORKERS) as pool:
+    with ThreadPoolExecutor(CORES.get()) as pool:
         return list(pool.map(run, over))
 
 

@@ -17,6 +17,19 @@ def part_path(path: Path, number: int) -> Path:
     return path if number == 0 else path.with_name(f"{path.stem}.{number:04d}{path.suffix}")
 
 
+def first_parts(folder: Path) -> list[Path]:
+    """The logs of a folder by their first files, in the order of their names."""
+    files = sorted(folder.glob("*.mcap"))
+    return [path for path in files if not _follows(path, set(files))]
+
+
+def _follows(path: Path, files: set[Path]) -> bool:
+    """Whether it is a later part of a log that is there."""
+    stem, _, number = path.stem.rpartition(".")
+    first = path.with_name(f"{stem}{path.suffix}")
+    return number.isdigit() and first in files and path == part_path(first, int(number))
+
+
 def write_head(output: Output, header: LogHeader, identity: Identity) -> Writer:
     """Begin a file that says all about itself before its first chunk."""
     writer = Writer(output, LIBRARY)

@@ -1,0 +1,168 @@
+"""Fleets of logs: each worked on once, whatever happens to the others, here or on a cluster."""
+
+import json
+import os
+import signal
+from collections.abc import Iterator
+from concurrent.futures import Future
+from multiprocessing import resource_tracker
+from pathlib import Path
+from typing import Any
+
+import fleets
+import pytest
+from command_line import twin
+
+from twin.fleet import go as going
+from twin.fleet.works import Done, Job, run
+
+UNITS = ("A1", "A2", "A3")
+DIES = "dies"  # in the name of a log
+
+
+@pytest.fixture(scope="module", autouse=True)
+def tracker() -> Iterator[None]:
+    """What processes leave to the next ones outlives a test; it ends with the module."""
+    resource_tracker.ensure_running()
+    yield
+    resource_tracker._resource_tracker._stop()
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three units, the last one with a leak."""
+    folder = tmp_path_factory.mktemp("logs")
+    for seed, unit in enumerate(UNITS):
+        fleets.write(folder, unit, seed, ("leakage=2.0",) if unit == "A3" else ())
+    return folder
+
+
+def answers(path: Path) -> dict[str, Any]:
+    """By log's name."""
+    return {Path(one["log"]).name: one for one in json.loads(path.read_text())["logs"]}
+
+
+def test_each_log_is_worked_on_once(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    database, first, second = (tmp_path / name for name in ("f.sqlite", "1.json", "2.json"))
+    asked = ("fleet", "diagnose", logs, "--assets", database, "--workers", "2", "--json")
+    assert twin(monkeypatch, *asked, first) == 0
+    assert "3 of 3 logs done, 0 were known" in capsys.readouterr().out
+    assert twin(monkeypatch, *asked, second) == 0
+    assert "0 of 3 logs done, 3 were known" in capsys.readouterr().out
+    before, after = answers(first), answers(second)
+    assert {one["state"] for one in after.values()} == {"known"}
+    assert [one["answer"] for one in before.values()] == [one["answer"] for one in after.values()]
+    verdicts = {name: one["answer"]["verdict"] for name, one in before.items()}
+    assert verdicts == {
+        "A1-0.mcap": "consistent",
+        "A2-1.mcap": "consistent",
+        "A3-2.mcap": "explained",
+    }
+    # The same as one log alone.
+    alone = tmp_path / "alone.json"
+    assert twin(monkeypatch, "diagnose", logs / "A3-2.mcap", "--json", alone) == 0
+    found = json.loads(alone.read_text())
+    assert found["causes"][0]["effect"] == before["A3-2.mcap"]["answer"]["causes"][0]["effect"]
+    assert found["extended"] == before["A3-2.mcap"]["answer"]["extended"]
+
+
+def test_other_code_answers_anew(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ("fleet", "replay", logs / "A1-0.mcap", "--assets", tmp_path / "f.sqlite")
+    assert twin(monkeypatch, *asked) == 0
+    monkeypatch.setattr("twin.fleet.store.code", lambda: "another")
+    capsys.readouterr()
+    assert twin(monkeypatch, *asked) == 0
+    assert "1 of 1 logs done, 0 were known" in capsys.readouterr().out
+
+
+def test_a_broken_log_costs_only_itself(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = (logs / "A1-0.mcap").read_bytes()
+    damaged, foreign, good = (tmp_path / f"{name}.mcap" for name in ("damaged", "foreign", "good"))
+    at = len(whole) // 2
+    damaged.write_bytes(
+        whole[:at] + bytes(255 - one for one in whole[at : at + 4000]) + whole[at + 4000 :]
+    )
+    foreign.write_text("time,pressure\n")
+    good.write_bytes(whole)
+    asked = ("fleet", "replay", tmp_path, "--assets", tmp_path / "f.sqlite", "--workers", "1")
+    assert twin(monkeypatch, *asked) == 0
+    said = capsys.readouterr()
+    assert "1 of 3 logs done, 0 were known, 2 could not be" in said.out
+    assert str(damaged) in said.err
+    assert str(foreign) in said.err
+    assert "Traceback" not in said.err
+
+
+def at_a_loss(job: Job) -> Done:
+    """As ``run``; but at one log its process dies."""
+    if DIES in job.log.name:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return run(job)
+
+
+def test_a_killed_process_costs_only_its_log(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number in range(3):
+        (tmp_path / f"{number}.mcap").write_bytes(
+            (logs / f"A{number + 1}-{number}.mcap").read_bytes()
+        )
+    fleets.write(tmp_path, DIES, 9)
+    monkeypatch.setattr(going, "run", at_a_loss)
+    asked = ("fleet", "replay", tmp_path, "--assets", tmp_path / "f.sqlite", "--workers", "2")
+    assert twin(monkeypatch, *asked) == 0
+    said = capsys.readouterr()
+    assert "3 of 4 logs done, 0 were known, 1 could not be" in said.out
+    assert f"{DIES}-9.mcap: the process that worked on it was killed" in said.err
+
+
+def test_a_cluster_gives_the_same_though_a_worker_is_killed(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    here, there = tmp_path / "here.json", tmp_path / "there.json"
+    asked = ("fleet", "replay", logs, "--assets")
+    assert twin(monkeypatch, *asked, tmp_path / "1.sqlite", "--workers", "1", "--json", here) == 0
+    with fleets.cluster(2) as cluster:
+        keep = going._keep
+
+        def killing(future: "Future[Done]", *rest: Any) -> going.Told:
+            cluster.workers[0].kill()  # with what it is at, and what it has done
+            return keep(future, *rest)
+
+        monkeypatch.setattr(going, "_keep", killing)
+        on = ("--engine", "dask", "--scheduler", cluster.address, "--json", there)
+        assert twin(monkeypatch, *asked, tmp_path / "2.sqlite", *on) == 0
+        assert cluster.workers[0].wait(10) == -signal.SIGKILL
+    alike = [{n: one["answer"] for n, one in answers(path).items()} for path in (here, there)]
+    assert alike[0] == alike[1]
+    assert len(alike[0]) == len(UNITS)
+    assert "3 of 3 logs done" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "says"),
+    [
+        (("--engine", "dask"), 2, "no scheduler is named"),
+        (("--engine", "dask", "--scheduler", "tcp://127.0.0.1:1"), 3, "no Dask scheduler answers"),
+        (("--scheduler", "tcp://127.0.0.1:1"), 2, "a scheduler is Dask's"),
+    ],
+)
+def test_engines_are_refused_in_words(
+    logs: Path,
+    tmp_path: Path,
+    options: tuple[str, ...],
+    code: int,
+    says: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("twin.fleet.engines.CONNECT_S", 0.5)
+    asked = ("fleet", "replay", logs, "--assets", tmp_path / "f.sqlite", *options)
+    assert twin(monkeypatch, *asked) == code
+    assert says in capsys.readouterr().err

@@ -1,0 +1,207 @@
+"""A fleet's report: who stands out, who drifts, and what the units say of their type."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from twin.assets.record import Record
+from twin.calibration.parameters import FREE
+from twin.errors import SourceError
+from twin.fleet.kinds import estimates
+from twin.fleet.peers import DAY_NS, FEWEST_PEERS, standings
+from twin.fleet.report import Report, report
+from twin.fleet.store import Key, Result
+from twin.fleet.words import headline, in_words, write_page
+
+EFFECTS = {"leakage": "sl/min", "suction_loss": "%", "sensor_offset": "mbar"}
+STEP = 0.1  # of size, in a sigma
+
+
+def watched(unit: str, sigmas: Mapping[str, float], day: float = 0.0, kind: str = "T") -> Result:
+    effects = {
+        name: {
+            "sigmas": at,
+            "scatter": 1.0,
+            "cycles": 100,
+            "size": STEP * at,
+            "unit": EFFECTS[name],
+        }
+        for name, at in sigmas.items()
+    }
+    return result("replay", unit, {"effects": effects}, day, kind)
+
+
+def result(work: str, unit: str, answer: Any, day: float = 0.0, kind: str = "T") -> Result:
+    key = Key(work, f"{unit} {day}", "code", "basis")
+    return Result(key, kind, unit, "b1", f"{unit}.mcap", int(day * DAY_NS), 0, answer)
+
+
+def fleet(rng: np.random.Generator, units: int, scatter: float = 2.0) -> list[dict[str, float]]:
+    """Sigmas of units that differ from their type, by more than their logs are uncertain."""
+    return [{name: float(rng.normal(1.0, scatter)) for name in EFFECTS} for _ in range(units)]
+
+
+def diagnosis(verdict: str, *effects: str, rms: float = 1.0) -> dict[str, Any]:
+    return {
+        "verdict": verdict,
+        "causes": [{"effect": one} for one in effects],
+        "baseline": {"rms_mbar": rms},
+    }
+
+
+def test_one_that_is_far_from_the_others_is_first() -> None:
+    units = fleet(np.random.default_rng(1), 200)
+    units[17]["leakage"] = 21.0
+    first, second, *_ = standings([watched(f"U{n}", one) for n, one in enumerate(units)])
+    assert (first.id, first.effect) == ("U17", "leakage")
+    assert first.beyond == pytest.approx(10.0, rel=0.2)  # of the others' two sigmas
+    assert first.size == pytest.approx(2.0, rel=0.15)
+    assert second.beyond < 4.5
+
+
+def test_what_can_only_grow_does_not_stand_out_by_less() -> None:
+    units = fleet(np.random.default_rng(2), 50)
+    units[3]["leakage"] = -30.0
+    assert standings([watched(f"U{n}", one) for n, one in enumerate(units)])[0].id != "U3"
+
+
+def test_a_unit_is_compared_with_what_it_was() -> None:
+    rng = np.random.default_rng(3)
+    results = []
+    for number, one in enumerate(fleet(rng, 60, scatter=20.0)):
+        changed = {name: at + rng.normal(0.5, 0.3) for name, at in one.items()}
+        if number == 5:
+            changed["sensor_offset"] += 6.0
+        results += [watched(f"U{number}", one), watched(f"U{number}", changed, day=90.0)]
+    first, second, *_ = standings(results)
+    assert (first.id, first.effect) == ("U5", "sensor_offset")
+    assert first.size == pytest.approx(0.6, rel=0.25)
+    assert first.beyond > 10.0
+    assert second.beyond < 4.5
+
+
+def test_of_few_units_the_diagnosis_counts() -> None:
+    few = [watched(f"U{n}", {"leakage": 9.0}) for n in range(FEWEST_PEERS - 1)]
+    found = report([*few, result("diagnose", "U2", diagnosis("explained", "leakage"))], [], 0)
+    assert [row.id for row in found.rows if row.noticed] == ["U2"]
+    assert found.rows[0].id == "U2"
+
+
+def test_without_watching_the_worst_diagnosis_is_first() -> None:
+    found = report(
+        [
+            result("diagnose", "U1", diagnosis("consistent")),
+            result("diagnose", "U2", diagnosis("explained", "leakage", rms=3.0)),
+            result("diagnose", "U3", diagnosis("unlisted", rms=8.0)),
+        ],
+        [],
+        0,
+    )
+    assert [row.id for row in found.rows] == ["U3", "U2", "U1"]
+    assert [row.noticed for row in found.rows] == [True, True, False]
+    assert found.groups() == [
+        {
+            "type": "T",
+            "batch": "b1",
+            "units": 3,
+            "noticed": 2,
+            "causes": {"unlisted": 1, "leakage": 1},
+        }
+    ]
+
+
+def test_the_newest_diagnosis_holds() -> None:
+    mended = [
+        result("diagnose", "U1", diagnosis("explained", "leakage"), day=1.0),
+        result("diagnose", "U1", diagnosis("consistent"), day=2.0),
+    ]
+    assert not report(mended, [], 0).rows[0].noticed
+
+
+def test_one_that_drifts_is_told_with_its_rate() -> None:
+    rng = np.random.default_rng(4)
+    results = []
+    for unit in range(20):
+        for day in range(0, 100, 10):
+            grows = 0.3 * day if unit == 7 else 0.0
+            sigmas = {name: float(rng.normal(0.0, 1.0)) for name in EFFECTS}
+            sigmas["leakage"] += grows
+            results.append(watched(f"U{unit}", sigmas, float(day)))
+    found = report(sorted(results, key=lambda one: one.begin_ns), [], 0)
+    assert found.rows[0].id == "U7"
+    drift = found.rows[0].drifts[0]
+    assert drift.effect == "leakage"
+    assert drift.per_day == pytest.approx(0.03, rel=0.2)
+    assert sum(bool(row.drifts) for row in found.rows) <= 2
+
+
+def calibrated(unit: str, value: float, sigma: float, known: bool = True) -> Record:
+    number = next(i for i, free in enumerate(FREE) if free.key == "suction_capacity_sl_min")
+    covariance = np.zeros((len(FREE), len(FREE)))
+    covariance[number, number] = sigma**2
+    return Record(
+        "instance",
+        unit,
+        "T",
+        {"ejector": {"suction_capacity_sl_min": value}},
+        arrays={"covariance": covariance},
+        provenance={
+            "parameters": [free.name for free in FREE],
+            "determined": ["ejector.suction_capacity_sl_min"] if known else [],
+        },
+    )
+
+
+def test_a_types_data_come_from_its_units_with_their_spread() -> None:
+    rng = np.random.default_rng(5)
+    sigmas = rng.uniform(0.1, 1.0, 400)
+    values = rng.normal(35.0, 0.7, 400) + sigmas * rng.normal(size=400)
+    units = [calibrated(f"U{n}", v, s) for n, (v, s) in enumerate(zip(values, sigmas, strict=True))]
+    base = Record("type", "T", "T", {"ejector": {"suction_capacity_sl_min": 34.0}})
+    (one,) = estimates([base, *units, calibrated("left out", 90.0, 0.1, known=False)], 0)["T"]
+    assert (one.parameter, one.units, one.type_has) == (
+        "ejector.suction_capacity_sl_min",
+        400,
+        34.0,
+    )
+    assert one.mean == pytest.approx(35.0, abs=3.0 * one.sigma)
+    assert one.spread == pytest.approx(0.7, rel=0.15)
+    assert one.sigma == pytest.approx(np.std(values) / 20.0, rel=0.2)
+
+
+def test_units_that_differ_by_no_more_than_is_known_have_no_spread() -> None:
+    units = [calibrated("U1", 35.0, 1.0), calibrated("U2", 35.5, 1.0)]
+    (one,) = estimates(units, 0)["T"]
+    assert (one.mean, one.spread, one.type_has) == (35.25, 0.0, None)
+
+
+@pytest.fixture
+def some() -> Report:
+    units = fleet(np.random.default_rng(6), 30)
+    units[4]["leakage"] = 40.0
+    results = [watched(f"<U{n}>", one) for n, one in enumerate(units)]
+    return report(results, [calibrated("U1", 35.0, 0.1), calibrated("U2", 35.5, 0.1)], 0)
+
+
+def test_words_say_who_first(some: Report) -> None:
+    assert headline(some) == "30 units, 1 to look at"
+    said = in_words(some)
+    assert said.splitlines()[3].split()[:2] == ["1", "<U4>"]
+    assert "leakage +" in said
+    assert "twin fleet diagnose" in said
+    assert "ejector.suction_capacity_sl_min" in said
+
+
+def test_the_page_is_whole_and_escaped(some: Report, tmp_path: Path) -> None:
+    page = tmp_path / "fleet.html"
+    write_page(some, page)
+    text = page.read_text(encoding="utf-8")
+    assert "&lt;U4&gt;" in text
+    assert "<U4>" not in text
+    assert "<svg" in text
+    assert "http://" not in text.replace("http://www.w3.org", "")
+    with pytest.raises(SourceError, match="cannot be written"):
+        write_page(some, tmp_path / "absent" / "fleet.html")

@@ -1,0 +1,253 @@
+"""``twin fleet``: thousands of logs, each worked on once, and compared."""
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from twin.errors import ConfigError, SourceError
+
+if TYPE_CHECKING:
+    from twin.config import Config
+    from twin.fleet.engines import Submit
+    from twin.fleet.go import Told
+    from twin.log.reader import Log
+    from twin.settings import Document
+
+fleet_app = typer.Typer(help="Many logs: work on each once, and compare.", no_args_is_help=True)
+
+
+class EngineName(StrEnum):
+    """Who does the work."""
+
+    LOCAL = "local"
+    DASK = "dask"
+
+
+Logs = Annotated[list[Path], typer.Argument(metavar="LOGS...", help="Logs, or folders of them.")]
+SomeLogs = Annotated[
+    list[Path] | None, typer.Argument(metavar="[LOGS...]", help="Of all that were worked on.")
+]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="Instead of each log's own.")]
+Assets = Annotated[
+    str, typer.Option("--assets", metavar="URL", help="Asset database; it keeps the answers.")
+]
+Engine = Annotated[EngineName, typer.Option(help="Processes here, or a Dask cluster.")]
+Scheduler = Annotated[str, typer.Option(metavar="ADDRESS", help="Of Dask, as tcp://host:8786.")]
+Workers = Annotated[int | None, typer.Option(min=1, help="Processes here; else one for each core.")]
+JsonFile = Annotated[Path | None, typer.Option("--json", metavar="F", help="The answer.")]
+Page = Annotated[Path | None, typer.Option("--html", metavar="F.html", help="With a picture.")]
+
+_WHAT = {
+    "calibrate": "Fit every unit to its log of healthy cycles, and store its data set.",
+    "diagnose": "Say of every log what the simulation gets wrong, and why.",
+    "replay": "Run the twin over every log: mean key figures, and how much of every effect.",
+}
+
+
+def _command(work: str) -> Callable[..., None]:
+    """The command of one kind of work."""
+
+    def command(
+        logs: Logs,
+        config: ConfigFile = None,
+        assets: Assets = "",
+        engine: Engine = EngineName.LOCAL,
+        scheduler: Scheduler = "",
+        workers: Workers = None,
+        json_file: JsonFile = None,
+    ) -> None:
+        _refuse_before_work(json_file)
+        fleet = _Fleet.of(config, assets)
+        told = _done(work, logs, fleet, _Engine(engine, scheduler, workers))
+        if json_file is not None:
+            _write(json_file, {"work": work, "logs": _plain(told, fleet)})
+
+    return command
+
+
+for _name, _help in _WHAT.items():
+    fleet_app.command(_name, help=_help)(_command(_name))
+
+
+@fleet_app.command()
+def report(
+    logs: SomeLogs = None,
+    config: ConfigFile = None,
+    assets: Assets = "",
+    engine: Engine = EngineName.LOCAL,
+    scheduler: Scheduler = "",
+    workers: Workers = None,
+    json_file: JsonFile = None,
+    page: Page = None,
+) -> None:
+    """Say which units stand out or drift, and in what, worst first; new logs are replayed."""
+    from twin.assets.database import open_assets
+    from twin.fleet.report import report as put_together
+    from twin.fleet.store import open_store
+    from twin.fleet.words import in_words, write_page
+
+    _refuse_before_work(json_file, page)
+    fleet = _Fleet.of(config, assets)
+    told = _done("replay", logs, fleet, _Engine(engine, scheduler, workers)) if logs else []
+    with open_store(fleet.assets) as store, open_assets(fleet.assets) as database:
+        results, records = store.newest(), database.records()
+    if logs:
+        named = {one.key.log_sha256 for one in told if one.key}
+        results = [one for one in results if one.key.log_sha256 in named]
+    if not results:
+        raise SourceError(f"{fleet.name}: no log was worked on", "name logs, or folders of them")
+    found = put_together(results, records, time.time_ns())
+    print(in_words(found))
+    if json_file is not None:
+        _write(json_file, found.plain())
+    if page is not None:
+        write_page(found, page)
+        print(f"drawn in {page}")
+
+
+@dataclass(frozen=True)
+class _Engine:
+    """Who is to do the work, as the command line has it."""
+
+    name: EngineName
+    scheduler: str
+    workers: int | None
+
+    @contextmanager
+    def open(self) -> "Iterator[Submit]":
+        """The one that was asked for; ConfigError where options do not go together."""
+        from twin.fleet.engines import cores, dask, local
+
+        if self.name is EngineName.LOCAL:
+            if self.scheduler:
+                raise ConfigError("a scheduler is Dask's", "add --engine dask")
+            with local(self.workers or cores()) as submit:
+                yield submit
+            return
+        if self.workers is not None:
+            raise ConfigError("a cluster has the workers it has", "leave --workers away")
+        if not self.scheduler:
+            raise ConfigError("no scheduler is named", "give --scheduler tcp://HOST:8786")
+        with dask(self.scheduler) as submit:
+            yield submit
+
+
+@dataclass(frozen=True)
+class _Fleet:
+    """What judges every log, and where answers go."""
+
+    document: "Document | None"
+    assets: str | Path
+    name: str
+
+    @classmethod
+    def of(cls, config: Path | None, assets: str) -> "_Fleet":
+        """The database is made where it is missing."""
+        from twin.assets.place import chosen, open_chosen
+        from twin.settings import Document
+
+        document = None if config is None else Document.read(config)
+        with open_chosen(assets, document, write=True) as database:
+            return cls(document, chosen(assets, document), database.name)
+
+    def config_of(self, log: "Log", work: str) -> "Config":
+        """What is known now of the unit of a log, or of its type."""
+        from twin.config import Config
+        from twin.settings import Document
+
+        header = log.header
+        document = self.document or Document.parse(header.config_text, header.config_name)
+        unit = header.asset_id
+        if work == "calibrate" and not unit:
+            raise ConfigError(f"{log.path}: a log of no unit", "record it with [asset] id, or --id")
+        config = Config.of(document, str(self.assets), unit, calibrated=work != "calibrate")
+        config.refuse_another(header, str(log.path))
+        return config
+
+
+def _done(work: str, logs: Sequence[Path], fleet: _Fleet, engine: _Engine) -> "list[Told]":
+    """Do what is missing; say what became of each log, and of all."""
+    from twin.fleet.go import Told, ask, go
+    from twin.fleet.store import open_store
+
+    asked = list(ask(work, _files(logs), lambda log: fleet.config_of(log, work)))
+    wanted = [one for one in asked if not isinstance(one, Told)]
+    told = [one for one in asked if isinstance(one, Told)]
+    for one in told:
+        print(f"twin: {one.error}", file=sys.stderr)
+    with open_store(fleet.assets) as store, engine.open() as submit:
+        for one in _progress(go(wanted, submit, store, fleet.assets), len(wanted), work):
+            told.append(one)
+            if one.error:
+                print(f"twin: {one.error}", file=sys.stderr)
+    count = {
+        state: sum(one.state == state for one in told) for state in ("done", "known", "failed")
+    }
+    print(
+        f"{work}: {count['done']} of {len(told)} logs done, {count['known']} were known,"
+        f" {count['failed']} could not be; in {fleet.name}"
+    )
+    return told
+
+
+def _files(logs: Sequence[Path]) -> list[Path]:
+    """The logs that are named, and all in the folders that are."""
+    from twin.log.part import first_parts
+
+    found: list[Path] = []
+    for path in logs:
+        found += first_parts(path) if path.is_dir() else [path]
+    if not found:
+        raise SourceError(f"{logs[0]}: no log in it", "name logs, or folders with *.mcap")
+    return list(dict.fromkeys(found))
+
+
+def _progress(told: "Iterable[Told]", total: int, what: str) -> "Iterator[Told]":
+    """Show how far it is and how long it will take, where somebody looks."""
+    from rich.console import Console
+    from rich.progress import track
+
+    console = Console(stderr=True)
+    yield from track(
+        told, what, total, console=console, transient=True, disable=not console.is_terminal
+    )
+
+
+def _plain(told: "Iterable[Told]", fleet: _Fleet) -> list[dict[str, object]]:
+    """As JSON: what became of every log, with its answer."""
+    from twin.fleet.store import open_store
+
+    with open_store(fleet.assets) as store:
+        return [
+            {
+                "log": str(one.log),
+                "state": one.state,
+                "error": one.error or None,
+                "answer": store.answer(one.key) if one.key else None,
+            }
+            for one in told
+        ]
+
+
+def _refuse_before_work(*paths: Path | None) -> None:
+    """Say what cannot be written before logs have been worked on."""
+    for path in paths:
+        if path is not None and not path.parent.is_dir():
+            raise SourceError(f"{path}: cannot be written: no such folder", "check the path")
+
+
+def _write(path: Path, document: object) -> None:
+    try:
+        path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise SourceError(
+            f"{path}: cannot be written: {error.strerror}", "choose another"
+        ) from error

@@ -1,0 +1,1 @@
+"""Thousands of logs: each judged once, what was found kept, and all compared."""

@@ -1,0 +1,65 @@
+"""Who does the jobs: processes on this machine, or the workers of a Dask cluster.
+
+Either takes a function with its argument and gives a future. A process that dies costs the job it
+was at: Pebble tells it from the others, Dask gives it to another worker first.
+"""
+
+import os
+import socket
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
+from multiprocessing import get_context
+from urllib.parse import urlsplit
+
+from pebble import ProcessExpired, ProcessPool
+
+from twin.errors import ConfigError, SourceError
+from twin.fleet.works import Done, Job
+
+Submit = Callable[[Callable[[Job], Done], Job], Future[Done]]
+CONNECT_S = 10.0
+PORT = 8786  # Dask's
+_MISSING = "pip install 'ejector-twin[dask]', or take --engine local"
+
+
+def cores() -> int:
+    """How many this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def local(workers: int) -> Iterator[Submit]:
+    """Processes of this machine; those that run are ended where the block is left by an error."""
+    pool = ProcessPool(max_workers=workers, context=get_context("spawn"))
+    try:
+        yield lambda function, job: pool.schedule(function, args=(job,))
+        pool.close()  # type: ignore[no-untyped-call]
+    except BaseException:
+        pool.stop()  # type: ignore[no-untyped-call]
+        raise
+    finally:
+        pool.join()
+
+
+@contextmanager
+def dask(scheduler: str) -> Iterator[Submit]:
+    """The workers of the scheduler at an address; ConfigError where Dask is not installed."""
+    try:
+        from distributed import Client  # noqa: PLC0415  # an extra
+    except ImportError as error:
+        raise ConfigError(f"a Dask cluster needs Dask, not installed: {error}", _MISSING) from error
+    address = urlsplit(scheduler)
+    try:  # first, as a client that does not come about leaves a thread behind
+        socket.create_connection((address.hostname or "", address.port or PORT), CONNECT_S).close()
+        client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        hint = "check the address (tcp://HOST:8786), and that 'dask scheduler' runs there"
+        raise SourceError(f"{scheduler}: no Dask scheduler answers", hint) from error
+    with client, client.get_executor(pure=False) as executor:  # type: ignore[no-untyped-call]
+        yield executor.submit
+
+
+def died(error: BaseException) -> bool:
+    """Whether this is how an engine says that the process of a job is gone."""
+    return isinstance(error, ProcessExpired) or type(error).__name__ == "KilledWorker"

@@ -1,0 +1,93 @@
+"""What one log says of its ejector: mean key figures, and how much of every effect there may be."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from twin.config import Config
+from twin.figures.cycle import CycleFigures, compiled
+from twin.figures.settings import FigureSettings
+from twin.figures.table import FIGURES
+from twin.live import Twin
+from twin.model import theta as c
+from twin.monitor.bank import SUSPECTS, Bank, Suspect
+from twin.monitor.cycles import CycleCutter, figures
+from twin.monitor.statistics import Listener, Said
+from twin.signals import Samples, Ticks
+
+FORMAT = "ejector-twin-watched/1"
+
+
+def watched(config: Config, blocks: Iterable[Samples]) -> dict[str, Any]:
+    """Run twin and hypotheses over a log; give what its cycles say on average."""
+    listener, cutter = Listener.of(config.data, config.monitor.healthy), CycleCutter()
+    bank, ambient = Bank(listener.theta), float(listener.theta[c.AMBIENT])
+    teller = compiled(config.data, config.document.section(FigureSettings, "figures"))
+    told: list[CycleFigures] = []
+    heard: list[Said] = []
+    for rows, ticks in _beside(Twin.of(config.data), blocks):
+        bank.push(rows, ticks)
+        for cycle in cutter.push(rows, ticks):
+            drawn = bank.take(len(cycle.samples))
+            if (one := teller.take(cycle)) is not None:
+                told.append(one)
+            if cycle.complete and cycle.settled:
+                said = listener.hear(cycle, *drawn, figures(cycle, ambient))
+                heard += [] if said is None else [said]
+    return {
+        "format": FORMAT,
+        "asset": {"type": config.asset.type, "id": config.asset.id, "batch": config.asset.batch},
+        "data_set": config.data.hash,
+        "cycles": len(heard),
+        "begin_ns": told[0].host_ns if told else None,
+        "figures": _figures(told),
+        "effects": _effects(heard),
+    }
+
+
+def name_of(suspect: Suspect) -> str:
+    """As answers have it: an effect with several parameters has one for each."""
+    alone = sum(one.effect == suspect.effect for one in SUSPECTS) == 1
+    return suspect.effect if alone else f"{suspect.effect}.{suspect.parameter.name}"
+
+
+def _beside(twin: Twin, blocks: Iterable[Samples]) -> Iterator[tuple[Samples, Ticks]]:
+    for block in blocks:
+        yield twin.advance(block)
+    yield twin.flush()
+
+
+def _figures(told: Sequence[CycleFigures]) -> dict[str, dict[str, float]]:
+    """Mean of every key figure over the cycles that tell it, of both sides where both are told."""
+    means = {}
+    for name in FIGURES:
+        both = np.array([(one.measured[name], one.expected[name]) for one in told]).reshape(-1, 2)
+        known = both[np.all(np.isfinite(both), axis=1)]
+        if len(known):
+            means[name] = dict(
+                zip(("measured", "expected"), known.mean(axis=0).tolist(), strict=True)
+            )
+    return means
+
+
+def _effects(heard: Sequence[Said]) -> dict[str, dict[str, Any]]:
+    """Of every effect on its own: sigmas a cycle, how they scatter, the size that fits best."""
+    if not heard:
+        return {}
+    scores = np.array([said.scores() for said in heard])
+    sizes = np.array([said.sizes() for said in heard])
+    found = {}
+    for number, suspect in enumerate(SUSPECTS):
+        shown = np.isfinite(scores[:, number])
+        if not shown.any():
+            continue
+        mean = scores[shown, number]
+        found[name_of(suspect)] = {
+            "sigmas": float(mean.mean()),
+            "scatter": float(mean.std(ddof=1)) if len(mean) > 1 else None,
+            "cycles": len(mean),
+            "size": float(sizes[shown, number].mean()) * suspect.step,
+            "unit": suspect.parameter.unit,
+        }
+    return found
