@@ -1,8 +1,9 @@
-"""Block mode over OPC UA: the ring of scans as arrays, read whole by one request.
+"""Block mode over OPC UA: the header, and then the ring of scans as arrays, read whole.
 
-The server may answer for one node earlier than for another, in any order. So a record is believed
-if it was complete before we asked and not overwritten until the answer was here: as long as the
-answer took is kept clear of both ends of the ring. What is too fresh comes with the next block.
+The server may answer for one node of a request earlier than for another, in any order. So the
+arrays are asked for once the header is here: what it announces was complete before, whenever each
+array is read, and however the scans come. What is fresher comes with the next block. At the old end
+as much is kept clear as may have been overwritten until the arrays were here.
 """
 
 from dataclasses import dataclass, replace
@@ -44,7 +45,7 @@ Integers = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Ring:
-    """One answer: where the ring stands, and all that is in it."""
+    """Where the ring stood, and all that was in it after that."""
 
     header: Header
     sequences: Integers
@@ -52,7 +53,8 @@ class Ring:
     pressures: Floats  # NaN where there is none
     supply: float  # NaN where there is none
     quality: int  # Quality bits that the server gives to all of it
-    margin: int  # scans that may have gone by while it was read
+    apart: int  # scans that may have gone by while the header was read
+    overwritten: int  # records up to this one, counted from the header's, may be
 
 
 class NodeTrace(Follower[Header, OpcuaLink]):
@@ -67,16 +69,16 @@ class NodeTrace(Follower[Header, OpcuaLink]):
         self._supply = () if supply is None else (supply.node,)
 
     @property
-    def nodes(self) -> tuple[Node, ...]:
-        """All that is read at once."""
-        return self._header_nodes + self._arrays + self._supply
+    def requests(self) -> tuple[tuple[Node, ...], tuple[Node, ...]]:
+        """What is read, one after the other: the header, and all else."""
+        return self._header_nodes, self._arrays + self._supply
 
     def start(self, link: OpcuaLink) -> Header:
         """Begin at the newest record; SourceError if there is no ring as configured."""
         ring = self._steady(self.ask(link))
         self.refuse_other(ring.header)
         newest = ring.header.sequence
-        announced = np.arange(max(0, newest - 2 * RESERVE), max(0, newest - ring.margin) + 1)
+        announced = np.arange(max(0, newest - 2 * RESERVE), newest + 1)
         if not (ring.sequences[announced % ring.header.depth] == announced).any():
             raise SourceError(
                 f"{self._settings.where}: {self._settings.trace.sequences} does not hold the "
@@ -101,26 +103,32 @@ class NodeTrace(Follower[Header, OpcuaLink]):
 
         Those that come later are LostErrors too: a PLC that starts has none of what it will have.
         """
+        header, rest = self.requests
         asked_ns = self._clock.now_ns()
-        values = link.read(self.nodes)
+        values = link.read(header)
+        header_ns = self._clock.now_ns() - asked_ns
+        values += link.read(rest)
         took_ns = self._clock.now_ns() - asked_ns
         try:
-            return self._ring(dict(zip(self.nodes, values, strict=True)), took_ns)
+            given = dict(zip(header + rest, values, strict=True))
+            return self._ring(given, header_ns, took_ns)
         except SourceError as error:
             if self._header is None:
                 raise
             raise passing(error) from error
 
-    def _ring(self, given: dict[Node, Any], took_ns: int) -> Ring:
+    def _ring(self, given: dict[Node, Any], header_ns: int, took_ns: int) -> Ring:
         self._refuse_bad(given)
         arrays = self._columns(given)
         header = self._parse(given, len(arrays[0]))
+        period_ns = max(header.period_ns, 1)
         return Ring(
             header,
             *arrays,
             supply=self._supply_of(given),
             quality=self._quality(given),
-            margin=-(-took_ns // max(header.period_ns, 1)),
+            apart=-(-header_ns // period_ns),
+            overwritten=-(-took_ns // period_ns) + 1 - header.depth,  # one is being written
         )
 
     def _refuse_bad(self, given: dict[Node, Any]) -> None:
@@ -171,7 +179,7 @@ class NodeTrace(Follower[Header, OpcuaLink]):
         return float("nan")
 
     def _read(self, link: OpcuaLink) -> Samples:
-        """Whatever is new and has settled."""
+        """Whatever is new and was announced."""
         assert self._header is not None
         ring = self._steady(self.ask(link))
         if not ring.header.follows(self._header):  # it may have been torn
@@ -179,16 +187,16 @@ class NodeTrace(Follower[Header, OpcuaLink]):
         if not ring.header.ready:
             return EMPTY
         self._place(ring.header)
-        first, depth = self._next, ring.header.depth
-        wanted = np.arange(first, max(first, self._newest - ring.margin + 1))
-        slots = wanted % WRAP % depth
+        first, newest = self._next, self._newest
+        wanted = np.arange(first, max(first, newest + 1))
+        slots = wanted % WRAP % ring.header.depth
         valid = ring.sequences[slots] == wanted % WRAP
-        valid &= wanted > self._newest + ring.margin - depth
+        valid &= wanted > newest + ring.overwritten
         sequence = self._pass(first, valid)
         return self._stamp(self._decode(ring, slots[valid]), ring.header, sequence)
 
     def _steady(self, ring: Ring) -> Ring:
-        return replace(ring, header=self._steadied(ring.header, ring.margin))
+        return replace(ring, header=self._steadied(ring.header, ring.apart))
 
     def _decode(self, ring: Ring, slots: Integers) -> Samples:
         tags, ambient = self._settings.tags, self._settings.ambient_mbar * MBAR

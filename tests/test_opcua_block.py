@@ -33,10 +33,15 @@ def settings_for(**changes: Any) -> OpcuaSettings:
     return OpcuaSettings.model_validate(table | changes)
 
 
+NODES = [f"Trace.{name}" for name in ("Sequence", "Time", "Boot", "Period")]
+NODES += ["Trace.Sequences", "Trace.Statuses", "Trace.Pressures", "Supply"]
+
+
 class TornServer:
     """A PLC and its server, which reads each node at a time of its own while it answers.
 
-    ``order`` says in which order, ``pauses`` how many scans go by after each.
+    ``order`` says in which order (by NODES), ``pauses`` how many scans go by after each. The server
+    sees the PLC's memory as an image that is renewed every ``image`` scans.
     """
 
     def __init__(self, depth: int = DEPTH, sequence: int = 10) -> None:
@@ -48,6 +53,7 @@ class TornServer:
         self.replaced: dict[str, ua.Variant] = {}
         self.order: list[int] = []
         self.pauses: list[int] = []
+        self.image, self.unseen = 1, 0
         self.clock: PlcTime | None = None
         self.sequences = np.zeros(depth, np.int64)
         self.pressures = np.zeros(depth)
@@ -60,6 +66,12 @@ class TornServer:
         return 200.0 + sequence % 997  # never the same at the same place of the ring
 
     def scan(self, scans: int) -> None:
+        self.unseen += scans
+        seen = self.unseen - self.unseen % self.image
+        self.unseen -= seen
+        self.show(seen)
+
+    def show(self, scans: int) -> None:
         self.sequence += scans
         self.time_ns += scans * 1_000_000
         for sequence in range(self.sequence - min(scans, self.depth) + 1, self.sequence + 1):
@@ -108,14 +120,15 @@ class TornServer:
         if self.broken:
             self.broken -= 1
             raise LostError("lost")
-        values: list[ua.DataValue] = [ua.DataValue()] * len(nodes)
-        order = self.order or range(len(nodes))
-        for place, pause in zip(order, self.pauses or [0] * len(nodes), strict=True):
-            values[place] = self.value(nodes[place])
-            assert self.clock is not None
-            if pause:
-                self.clock.sleep(pause * 1e-3)
-        return values
+        assert self.clock is not None
+        values: dict[Node, ua.DataValue] = {}
+        asked = {node.identifier.removeprefix("s="): node for node in nodes}
+        for number, place in enumerate(self.order or range(len(NODES))):
+            if (node := asked.get(NODES[place])) is not None:
+                values[node] = self.value(node)
+                if self.pauses and self.pauses[number]:
+                    self.clock.sleep(self.pauses[number] * 1e-3)
+        return [values[node] for node in nodes]
 
 
 class Rig:
@@ -178,6 +191,41 @@ def test_in_whatever_order_nodes_are_read_no_wrong_value_is_taken(
     assert (np.diff(samples["sequence"]) == 1).all()  # the ring is deeper than any of the stalls
     assert not flags(samples, Quality.GAP | Quality.CLOCK | Quality.RESTART)
     assert (np.diff(samples["time_ns"]) > 0).all()
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    order=st.permutations(range(8)),
+    pauses=st.lists(st.integers(0, 4), min_size=8, max_size=8),
+    image=st.integers(2, 40),
+)
+def test_scans_that_the_server_sees_in_bursts_are_not_torn(
+    order: list[int], pauses: list[int], image: int
+) -> None:
+    rig = Rig(TornServer())
+    rig.take(2)
+    rig.server.order, rig.server.pauses, rig.server.image = order, pauses, image
+    samples = rig.take(12)
+    assert len(samples) > 300
+    assert_true(rig, samples)
+    assert (np.diff(samples["sequence"]) == 1).all()
+    assert not flags(samples, Quality.GAP | Quality.RESTART)
+
+
+def test_a_record_that_is_just_being_overwritten_is_not_believed(rig: Rig) -> None:
+    rig.take(3)
+    server = rig.server
+
+    def begin_the_next(scans: int) -> None:
+        TornServer.show(server, scans)
+        slot = (server.sequence + 1) % DEPTH
+        server.pressures[slot] = server.pressure(server.sequence + 1)  # its sequence comes last
+
+    server.show = begin_the_next  # type: ignore[method-assign]
+    rig.time.sleep(0.95)
+    server.order, server.pauses = list(range(8)), [0, 0, 0, 0, 0, 100, 0, 0]
+    rig.time.ns += 999_500 - rig.time.ns % 1_000_000  # the next scan is due as we ask
+    assert_true(rig, rig.take(1))
 
 
 @settings(max_examples=40, deadline=None)

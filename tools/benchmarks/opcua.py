@@ -29,7 +29,7 @@ from benchmarks.machine import PLC_CORE, TWIN_CORE, on_core
 from benchmarks.processes import ROOT, live
 from drivers import certificates
 from drivers.lasting import REAL
-from drivers.opcua_settings import OpcuaSettings
+from drivers.opcua_settings import Node, OpcuaSettings
 from drivers.opcua_trace import NodeTrace
 from drivers.plc.settings import PlcSettings
 from drivers.plc.simulate import blocks
@@ -232,22 +232,25 @@ def _apart(begin: Integers, end: Integers, spoilt: Sequence[Span]) -> Floats:
 
 
 def _bare_share(port: int) -> float:
-    """CPU time (% of a core) of asyncua alone, reading the same nodes as often."""
+    """CPU time (% of a core) of asyncua alone, reading the same nodes by the same requests."""
     return asyncio.run(_bare(port))
 
 
 async def _bare(port: int) -> float:
     settings = Document.read(CONFIG).section(OpcuaSettings, "driver")
-    names = [node.identifier for node in NodeTrace(settings, REAL).nodes]
     async with Client(f"opc.tcp://127.0.0.1:{port}") as client:
         index = await client.get_namespace_index(settings.namespace)
-        wanted = [
-            ua.ReadValueId(ua.NodeId.from_string(f"ns={index};{name}"), ua.AttributeIds.Value)
-            for name in names
-        ]
-        request = ua.ReadParameters(NodesToRead=wanted)
+        requests = [_request(nodes, index) for nodes in NodeTrace(settings, REAL).requests]
         begin, cpu = time.monotonic(), time.process_time()
         while time.monotonic() - begin < 3.0:
             await asyncio.sleep(settings.interval_ms * 1e-3)
-            await client.uaclient.read(request)
+            for request in requests:
+                await client.uaclient.read(request)
         return 100.0 * (time.process_time() - cpu) / (time.monotonic() - begin)
+
+
+def _request(nodes: Sequence[Node], index: int) -> ua.ReadParameters:
+    """What reads ``nodes``, which are in the namespace of this index."""
+    ids = [ua.NodeId.from_string(f"ns={index};{node.identifier}") for node in nodes]
+    wanted = [ua.ReadValueId(one, ua.AttributeIds.Value) for one in ids]
+    return ua.ReadParameters(NodesToRead=wanted)
