@@ -5,7 +5,7 @@ from pathlib import Path
 
 from typer.main import get_command
 
-from tools.readme import filled
+from tools.readme import PAGES, filled
 from twin.cli import app
 
 ROOT = Path(__file__).parent.parent
@@ -13,7 +13,9 @@ README = (ROOT / "README.md").read_text()
 
 
 def test_generated_tables_are_those_of_the_code() -> None:
-    assert filled(README) == README, "run: python tools/readme.py"
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        assert filled(text) == text, f"{page.name}: run python tools/readme.py"
 
 
 def test_every_command_is_described_and_every_described_command_exists() -> None:

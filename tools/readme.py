@@ -12,7 +12,10 @@ from twin.model.courses import table as courses_table
 from twin.model.effects import table as effects_table
 
 ROOT = Path(__file__).parent.parent
-PAGES = (ROOT / "README.md", ROOT / "docs" / "key-figures.md", ROOT / "docs" / "alarms.md")
+PAGES = (
+    ROOT / "README.md",
+    *(ROOT / "docs" / name for name in ("alarms.md", "effects.md", "key-figures.md")),
+)
 TABLES = {
     "register map": register_table,
     "effects": effects_table,

@@ -1,1 +1,42 @@
-"""A live digital twin of pneumatic vacuum ejectors."""
+"""A live digital twin of pneumatic vacuum ejectors.
+
+For notebooks: ``open`` a log, ``simulate``, ``calibrate``, ``diagnose``. They come with their first
+use, so that ``import twin`` costs nothing.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from twin.api import (
+        Answer,
+        Calibrated,
+        Log,
+        TwinError,
+        calibrate,
+        diagnose,
+        open,  # noqa: A004
+        simulate,
+    )
+
+__all__ = [
+    "Answer",
+    "Calibrated",
+    "Log",
+    "TwinError",
+    "calibrate",
+    "diagnose",
+    "open",
+    "simulate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from twin import api  # noqa: PLC0415  (with its first use)
+
+    return getattr(api, name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

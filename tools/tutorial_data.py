@@ -1,0 +1,70 @@
+"""Write the trace exports for the tutorial: one of a healthy unit, one with something wrong in it.
+
+    python tools/tutorial_data.py [FOLDER] [--seed SEED]
+
+Unit, effect, size and onset are drawn by seed. What was hidden is said only with --tell.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from drivers.plc.faults import parse_fault
+from tools.calibration_coverage import drawn, recorded, rig_of, shipped
+from twin.signals import BAR, MBAR, NS, Command, Samples
+
+CYCLES = 8
+AMBIENT = 1013.0  # mbar, as configs/test_rig.toml has it
+# Clear sizes of what may be hidden, in the unit of the effect's parameter.
+SIZES = {
+    "leakage": (1.5, 4.0),
+    "filter_clogging": (60.0, 150.0),
+    "added_volume": (80.0, 200.0),
+    "weak_blow_off": (20.0, 50.0),
+    "response_delay": (15.0, 40.0),
+}
+
+
+def write_data(folder: Path, seed: int) -> str:
+    """Write ``healthy.csv`` and ``today.csv``; gives what is hidden in the second."""
+    rng = np.random.default_rng(seed)
+    plc = drawn(rig_of(shipped("test_rig")), seed)
+    effect = str(rng.choice(list(SIZES)))
+    hidden = f"{effect}={rng.uniform(*SIZES[effect]):.3g}@{rng.uniform(9.0, 15.0):.1f}"
+    write_csv(folder / "healthy.csv", recorded(plc, CYCLES, 2 * seed))
+    write_csv(folder / "today.csv", recorded(plc, CYCLES, 2 * seed + 1, [parse_fault(hidden)]))
+    return hidden
+
+
+def write_csv(path: Path, samples: Samples) -> None:
+    """As a PLC tool exports a trace."""
+    since = (samples["time_ns"] - samples["time_ns"][0]) * NS
+    columns = {
+        "time_s": (since, "%.3f"),
+        "suction": ((samples["commands"] & Command.SUCTION) != 0, "%d"),
+        "blow_off": ((samples["commands"] & Command.BLOW_OFF) != 0, "%d"),
+        "vacuum_mbar": (AMBIENT - samples["pressure"].astype(float) / MBAR, "%.2f"),
+        "supply_bar": (samples["supply"].astype(float) / BAR, "%.3f"),
+    }
+    table = np.column_stack([column for column, _ in columns.values()])
+    formats = [form for _, form in columns.values()]
+    np.savetxt(path, table, formats, ",", header=",".join(columns), comments="")
+
+
+def main() -> None:
+    """Write the files and say where they are."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, nargs="?", default=Path())
+    parser.add_argument("--seed", type=int, default=11)
+    parser.add_argument("--tell", action="store_true", help="say what is hidden")
+    asked = parser.parse_args()
+    asked.folder.mkdir(parents=True, exist_ok=True)
+    hidden = write_data(asked.folder, asked.seed)
+    print(f"healthy.csv and today.csv are in {asked.folder.resolve()}")
+    if asked.tell:
+        print(hidden)
+
+
+if __name__ == "__main__":
+    main()
