@@ -1,0 +1,98 @@
+"""The documentation's pages: built without a warning, and read from a disk without a network."""
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+import rigs
+from independent import missing
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+PATIENCE_MS = 30_000
+
+
+@dataclass
+class Reader:
+    """A browser's tab on the site, with all that it asks for and complains of."""
+
+    folder: Path
+    page: Page
+    asked: list[str] = field(default_factory=list)
+    complaints: list[str] = field(default_factory=list)
+
+    def open(self, name: str) -> None:
+        self.page.goto((self.folder / name).as_uri())
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    options = ["--fail-on-warning", "--keep-going", "--quiet", "--doctree-dir"]
+    command = [sys.executable, "-m", "sphinx", *options, folder / "trees"]
+    command += [rigs.ROOT / "docs", folder / "site"]
+    built = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    return folder / "site"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    path = shutil.which("chromium")
+    if path is None:
+        missing("chromium", "on Debian or Ubuntu: apt install chromium")
+    # A process that it keeps ready for the next page would count as left behind.
+    options = ["--disable-features=SpareRendererForSitePerProcess"]
+    with sync_playwright() as playwright:
+        found = playwright.chromium.launch(executable_path=path, args=options)
+        found.new_page().context.close()
+        yield found
+        found.close()
+
+
+@pytest.fixture
+def reader(site: Path, browser: Browser) -> Iterator[Reader]:
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page.set_default_timeout(PATIENCE_MS)
+    tab = Reader(site, page)
+    page.on("request", lambda request: tab.asked.append(request.url))
+    page.on("pageerror", lambda error: tab.complaints.append(str(error)))
+    yield tab
+    page.context.close()
+
+
+def test_every_page_is_there(site: Path) -> None:
+    pages = {path.relative_to(rigs.ROOT / "docs") for path in (rigs.ROOT / "docs").rglob("*.md")}
+    assert [page for page in pages if not (site / page).with_suffix(".html").exists()] == []
+
+
+def test_pages_ask_for_nothing_but_files(reader: Reader) -> None:
+    for name in ("index.html", "tutorial.html", "api.html", "decisions/0008-assets-only-grow.html"):
+        reader.open(name)
+        expect(reader.page.locator("article h1").first).to_be_visible()
+    reader.page.evaluate("document.fonts.ready")
+    assert [url for url in reader.asked if not url.startswith(("file:", "data:"))] == []
+    assert reader.complaints == []
+
+
+def test_a_reader_goes_from_the_first_page_to_the_tutorial(reader: Reader) -> None:
+    reader.open("index.html")
+    reader.page.get_by_role("link", name="From a CSV to a named cause").first.click()
+    expect(reader.page.locator("h1")).to_contain_text("in ten minutes")
+    expect(reader.page.locator("article img, article pre").first).to_be_visible()
+
+
+def test_the_reference_has_the_functions_with_what_they_take(reader: Reader) -> None:
+    reader.open("api.html")
+    for name in ("open", "simulate", "calibrate", "diagnose"):
+        signature = reader.page.locator(f"[id='twin.{name}']")
+        expect(signature).to_contain_text(f"twin.{name}(")
+
+
+def test_the_search_finds_a_page_without_a_server(reader: Reader) -> None:
+    reader.page.goto(f"{(reader.folder / 'search.html').as_uri()}?q=outbox")
+    expect(reader.page.locator("#search-results li a").first).to_be_visible()
+    assert [url for url in reader.asked if not url.startswith(("file:", "data:"))] == []
