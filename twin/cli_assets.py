@@ -3,7 +3,7 @@
 import json
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,8 +13,13 @@ import typer
 from twin.errors import ConfigError, SourceError
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
     from twin.assets.database import Assets
     from twin.assets.record import Record
+    from twin.exchange.fmu import Fmu
+
+AASX = ".aasx"
 
 assets_app = typer.Typer(help="The asset database: type and ID to data sets.", no_args_is_help=True)
 
@@ -104,31 +109,64 @@ def add(
 @assets_app.command("import")
 def import_(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="What `export` wrote.")],
+    fmu: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the FMU of an .aasx to a file.")
+    ] = None,
     assets: Url = "",
     config: ConfigFile = None,
 ) -> None:
-    """Take over the records of an exported database that are not here yet."""
-    document = _read_json(file)
+    """Take over the records of an exported database that are not here yet: JSON or .aasx."""
+    if file.suffix.lower() == AASX:
+        package = _shells().read_package(file)
+        document, fmus = package.document, package.fmus
+    else:
+        document, fmus = _read_json(file), {}
+    model = _only_fmu(file, fmus) if fmu is not None else b""
     with _open(assets, config, write=True, shipped=False) as database:
         new = database.import_(document)
         print(f"{new} new of {len(document['records'])} records, in {database.name}")
+    if fmu is not None:
+        _write_whole(fmu, model)
+        print(f"the FMU in {fmu}")
+    elif fmus:
+        print(f"not taken: {', '.join(sorted(fmus))}; --fmu FILE writes it", file=sys.stderr)
 
 
 @assets_app.command()
 def export(
     output: Annotated[Path | None, typer.Option("-o", metavar="FILE", help="Not stdout.")] = None,
+    aasx: Annotated[
+        Path | None,
+        typer.Option("--aasx", metavar="FILE.aasx", help="As Asset Administration Shells."),
+    ] = None,
+    unit: Annotated[
+        str, typer.Option("--id", metavar="ID", help="Of this unit and its type only.")
+    ] = "",
+    fmu: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The unit's simulation model, for --aasx.")
+    ] = None,
+    logs: Annotated[str, typer.Option(metavar="URL", help="Where logs are kept, for --aasx.")] = "",
     assets: Url = "",
     config: ConfigFile = None,
 ) -> None:
-    """Write the whole database as one JSON document."""
+    """Write the database as one JSON document, or as shells in an AASX package."""
+    _require_options(output, aasx, unit, fmu, logs)
     with _open(assets, config, write=False) as database:
-        document = database.export()
-    text = json.dumps(document, indent=1, ensure_ascii=False)
+        records = _of_unit(database, unit) if unit else database.records()
+    if aasx is not None:
+        models = {unit: _read_fmu(fmu)} if fmu is not None else {}
+        content = _shells().write_package(records, time.time_ns(), models, logs)
+        _write_whole(aasx, content)
+        print(f"{len(records)} records in {aasx}")
+        return
+    from twin.assets.exchange import to_export
+
+    text = json.dumps(to_export(records), indent=1, ensure_ascii=False)
     if output is None:
         print(text)
     else:
-        _write_whole(output, text + "\n")
-        print(f"{len(document['records'])} records in {output}")
+        _write_whole(output, f"{text}\n".encode())
+        print(f"{len(records)} records in {output}")
 
 
 # --- what the commands share --------------------------------------------------------------------
@@ -213,12 +251,67 @@ def _read_json(file: Path) -> dict[str, Any]:
     return document
 
 
-def _write_whole(output: Path, text: str) -> None:
+def _write_whole(output: Path, content: bytes) -> None:
     """The file is there complete, or as it was before."""
     part = output.with_name(output.name + ".part")
     try:
-        part.write_text(text, encoding="utf-8")
+        part.write_bytes(content)
         part.replace(output)
     except OSError as error:
         part.unlink(missing_ok=True)
         raise SourceError(f"{output}: cannot be written: {error}", "check the folder") from error
+
+
+def _require_options(
+    output: Path | None, aasx: Path | None, unit: str, fmu: Path | None, logs: str
+) -> None:
+    """ConfigError for options that mean nothing together."""
+    if aasx is not None and output is not None:
+        raise ConfigError("-o and --aasx exclude each other", "export twice")
+    if aasx is not None and aasx.suffix.lower() != AASX:
+        raise ConfigError(f"{aasx}: not a package of shells", f"let it end in {AASX}")
+    if aasx is None and (fmu is not None or logs):
+        raise ConfigError("--fmu and --logs are for shells", "say --aasx FILE.aasx as well")
+    if fmu is not None and not unit:
+        raise ConfigError("the FMU is of one unit", "say which one with --id ID")
+
+
+def _of_unit(database: "Assets", unit: str) -> "list[Record]":
+    """The records of a unit and of its type, in the order of recording."""
+    own = database.records("instance", unit)
+    _require(own, unit, database)
+    types = {record.type for record in own}
+    return [
+        record
+        for record in database.records()
+        if record.name in (types if record.kind == "type" else {unit})
+    ]
+
+
+def _only_fmu(file: Path, fmus: Mapping[str, bytes]) -> bytes:
+    if len(fmus) != 1:
+        there = ", ".join(sorted(fmus)) or "none"
+        raise ConfigError(f"{file}: --fmu writes one FMU, and in it are: {there}", "leave it out")
+    return next(iter(fmus.values()))
+
+
+def _shells() -> "ModuleType":
+    """What reads and writes shells; ConfigError says what to install where it is missing."""
+    try:
+        from twin.exchange import aas
+    except ImportError as error:
+        raise _not_installed(error) from error
+    return aas
+
+
+def _read_fmu(path: Path) -> "Fmu":
+    try:
+        from twin.exchange.fmu import read_fmu
+    except ImportError as error:
+        raise _not_installed(error) from error
+    return read_fmu(path)
+
+
+def _not_installed(error: ImportError) -> ConfigError:
+    what = f"shells need the Eclipse BaSyx SDK, which is not installed: {error}"
+    return ConfigError(what, "pip install 'ejector-twin[aas]'")

@@ -1,0 +1,1 @@
+"""The model and its data in the forms other tools take."""

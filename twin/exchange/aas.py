@@ -1,0 +1,263 @@
+"""The asset database as Asset Administration Shells, in one AASX package, and back.
+
+A type has a shell, and so has each unit, derived from its type's. What a shell shows is the data
+set that holds; the submodel ``DataSets`` has all records of its asset as a file, so that nothing is
+lost.
+"""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+from uuid import UUID, uuid5
+
+from basyx.aas import model
+from basyx.aas.adapter.aasx import AASXReader, AASXWriter, DictSupplementaryFileContainer
+from basyx.aas.adapter.json import AASToJsonEncoder
+
+from twin.assets.exchange import FORMAT, parse_export, to_export
+from twin.assets.record import Kind, Record, holding
+from twin.errors import ConfigError, SourceError
+from twin.exchange.elements import link, meaning, short, submodel, text
+from twin.exchange.fmu import MEDIA_TYPE, Fmu
+from twin.exchange.submodels import (
+    nameplate,
+    simulation_models,
+    technical_areas,
+    technical_data,
+    time_series,
+)
+
+JSON = "application/json"
+HINT = "take a package that twin assets export --aasx wrote, as it was written"
+_AREAS = "TechnicalPropertyAreas"
+
+Store = model.DictIdentifiableStore[model.Identifiable]
+
+
+@dataclass(frozen=True)
+class Package:
+    """What a package brings: an export of a database, and FMUs by the names of their files."""
+
+    document: dict[str, Any]
+    fmus: dict[str, bytes]
+
+
+@dataclass(frozen=True)
+class _Asset:
+    """A type or a unit with all its records, oldest first."""
+
+    records: Sequence[Record]
+    now_ns: int
+
+    @property
+    def shown(self) -> Record:
+        """What holds; of one that is yet to hold, what was recorded last."""
+        return holding(self.records, self.now_ns) or self.records[-1]
+
+    def id(self, what: str) -> str:
+        """The same whenever this asset is exported: it hangs on its first record."""
+        return uuid5(UUID(hex=self.records[0].id), what).urn
+
+    def place(self, file: str) -> str:
+        """Where a file of it stands in the package."""
+        return f"/aasx/files/{UUID(self.id('shell')).hex}/{file}"
+
+
+def write_package(
+    records: Iterable[Record], now_ns: int, fmus: Mapping[str, Fmu], logs: str
+) -> bytes:
+    """The records as an AASX package, each asset showing what holds at a time (UTC).
+
+    ``fmus`` are the simulation models by the name of their unit or type; ``logs`` is the address
+    under which logs are kept, or empty. ConfigError where a shell cannot hold a name.
+    """
+    store, files = _nothing()
+    assets = _by_asset(records, now_ns)
+    try:
+        shells = [_shell(asset, assets, fmus, logs, store, files) for asset in assets.values()]
+    except (ValueError, model.AASConstraintViolation) as error:
+        raise ConfigError(
+            f"a shell cannot hold what the asset database has: {error}",
+            "export it as JSON: twin assets export",
+        ) from error
+    written = BytesIO()
+    with AASXWriter(written, failsafe=False) as writer:
+        writer.write_aas([shell.id for shell in shells], store, files, write_json=True)
+    return written.getvalue()
+
+
+def _nothing() -> tuple[Store, DictSupplementaryFileContainer]:
+    return model.DictIdentifiableStore(), DictSupplementaryFileContainer()  # type: ignore[no-untyped-call]
+
+
+def _by_asset(records: Iterable[Record], now_ns: int) -> dict[tuple[Kind, str], _Asset]:
+    found: dict[tuple[Kind, str], list[Record]] = {}
+    for record in records:
+        found.setdefault((record.kind, record.name), []).append(record)
+    return {key: _Asset(of, now_ns) for key, of in found.items()}
+
+
+def _shell(
+    asset: _Asset,
+    assets: Mapping[tuple[Kind, str], _Asset],
+    fmus: Mapping[str, Fmu],
+    logs: str,
+    store: Store,
+    files: DictSupplementaryFileContainer,
+) -> model.AssetAdministrationShell:
+    """The shell of an asset; it and its submodels go to ``store``, their files to ``files``."""
+    record = asset.shown
+    submodels = [
+        nameplate(asset.id("Nameplate"), asset.id("asset"), record),
+        technical_data(asset.id("TechnicalData"), record),
+        _data_sets(asset, files),
+    ]
+    if of_logs := [one for one in asset.records if "log_sha256" in one.provenance]:
+        submodels.append(time_series(asset.id("TimeSeries"), of_logs, logs))
+    if fmu := fmus.get(record.name):
+        place = asset.place(f"{short(Path(fmu.name).stem)}.fmu")
+        files.add_file(place, BytesIO(fmu.content), MEDIA_TYPE)
+        submodels.append(simulation_models(asset.id("SimulationModels"), fmu, place))
+    shell = model.AssetAdministrationShell(
+        _information(asset, assets),
+        asset.id("shell"),
+        short(record.name),
+        submodel={model.ModelReference.from_referable(one) for one in submodels},
+        derived_from=_derived_from(record, assets),
+    )
+    store.update([shell, *submodels])
+    return shell
+
+
+def _information(
+    asset: _Asset, assets: Mapping[tuple[Kind, str], _Asset]
+) -> model.AssetInformation:
+    record = asset.shown
+    if record.kind == "type":
+        return model.AssetInformation(model.AssetKind.TYPE, asset.id("asset"))
+    kind = assets.get(("type", record.type))
+    return model.AssetInformation(
+        model.AssetKind.INSTANCE,
+        asset.id("asset"),
+        specific_asset_id=[model.SpecificAssetId("serialNumber", record.name)],
+        asset_type=kind.id("asset") if kind else None,
+    )
+
+
+def _derived_from(
+    record: Record, assets: Mapping[tuple[Kind, str], _Asset]
+) -> model.ModelReference[model.AssetAdministrationShell] | None:
+    """The shell of a unit's type."""
+    kind = assets.get(("type", record.type))
+    if record.kind == "type" or kind is None:
+        return None
+    key = model.Key(model.KeyTypes.ASSET_ADMINISTRATION_SHELL, kind.id("shell"))
+    return model.ModelReference((key,), model.AssetAdministrationShell)
+
+
+def _data_sets(asset: _Asset, files: DictSupplementaryFileContainer) -> model.Submodel:
+    """All records of an asset, as ``twin assets export`` has them."""
+    content = json.dumps(to_export(asset.records), indent=1).encode()
+    place = files.add_file(asset.place("records.json"), BytesIO(content), JSON)
+    elements = [text("Format", FORMAT, FORMAT), link("Records", place, JSON, FORMAT)]
+    return submodel(asset.id("DataSets"), "DataSets", elements, FORMAT)
+
+
+# --- and back -----------------------------------------------------------------------------------
+
+
+def read_package(path: Path) -> Package:
+    """What an AASX package of ``write_package`` brings.
+
+    SourceError where it cannot be read, ConfigError where it is none, is damaged, or was changed.
+    """
+    store, files = _opened(path)
+    exports, fmus = [], {}
+    for one in store:
+        if not isinstance(one, model.Submodel):
+            continue
+        if one.semantic_id == meaning(FORMAT):
+            exports.append(_export(path, one, files))
+        for place in _places(one, MEDIA_TYPE):
+            fmus[Path(place).name] = _file(path, place, files)
+    if not exports:
+        raise ConfigError(f"{path}: no shell in it has data sets of this program", HINT)
+    records = [record for export in exports for record in export["records"]]
+    records.sort(key=lambda one: (one["recorded_ns"], one["id"]))
+    document = {**exports[0], "records": records}
+    _refuse_changed(path, parse_export(document), store)
+    return Package(document, fmus)
+
+
+def _opened(path: Path) -> tuple[Store, DictSupplementaryFileContainer]:
+    store, files = _nothing()
+    try:
+        content = BytesIO(path.read_bytes())
+    except OSError as error:
+        message = f"{path}: cannot be read: {error.strerror}"
+        raise SourceError(message, "check the path") from error
+    try:
+        with AASXReader(content, failsafe=False) as reader:
+            reader.read_into(store, files)
+    except Exception as error:  # whatever the parsers of ZIP, OPC, XML and JSON have to say
+        what = f"{type(error).__name__}: {error}"
+        raise ConfigError(f"{path}: not a whole AASX package: {what}", HINT) from error
+    return store, files
+
+
+def _export(
+    path: Path, data_sets: model.Submodel, files: DictSupplementaryFileContainer
+) -> dict[str, Any]:
+    """The records of one asset; whether they are what was exported is for the database to say."""
+    for place in _places(data_sets, JSON):
+        try:
+            document = json.loads(_file(path, place, files))
+            parse_export(document)
+        except (ValueError, RecursionError) as error:
+            raise ConfigError(f"{path}: {place}: not valid JSON: {error}", HINT) from error
+        return dict(document)
+    raise ConfigError(f"{path}: the data sets of {data_sets.id} are missing", HINT)
+
+
+def _places(one: model.Submodel, content: str) -> list[str]:
+    """Where the files of a kind stand that a submodel names."""
+    pending: list[Any] = list(one.submodel_element)
+    found = []
+    while pending:
+        element = pending.pop()
+        if isinstance(element, model.File) and element.content_type == content and element.value:
+            found.append(element.value)
+        elif isinstance(element, model.SubmodelElementCollection):
+            pending += element.value
+    return found
+
+
+def _file(path: Path, place: str, files: DictSupplementaryFileContainer) -> bytes:
+    content = BytesIO()
+    try:
+        files.write_file(place, content)
+    except KeyError as error:
+        raise ConfigError(f"{path}: {place} is not in the package", HINT) from error
+    return content.getvalue()
+
+
+def _refuse_changed(path: Path, records: Sequence[Record], store: Store) -> None:
+    """ConfigError where technical data are not those of any record: their change would be lost."""
+    for (_, name), asset in _by_asset(records, 0).items():
+        shown = store.get(asset.id("TechnicalData"))
+        if not isinstance(shown, model.Submodel):
+            continue
+        given = {_plain(one) for one in shown.submodel_element if one.id_short == _AREAS}
+        if given and not given & {_plain(technical_areas(one)) for one in asset.records}:
+            raise ConfigError(
+                f"{path}: the technical data of {name!r} were changed, and are not those of any of"
+                " its data sets",
+                "a package is not to be edited; add a changed data set with twin assets add",
+            )
+
+
+def _plain(element: model.SubmodelElement) -> str:
+    return json.dumps(element, cls=AASToJsonEncoder, sort_keys=True)
