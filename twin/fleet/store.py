@@ -25,7 +25,6 @@ from sqlalchemy import (
     select,
 )
 
-import twin
 from twin.assets.engine import ASSETS, Database
 from twin.config import Config
 from twin.log.reader import Log
@@ -92,7 +91,7 @@ def key_of(work: str, log: Log, config: Config) -> Key:
 @cache
 def code() -> str:
     """16 hex digits over the sources that answer: other ones may answer otherwise."""
-    sources, root = hashlib.sha256(), Path(twin.__file__).parent
+    sources, root = hashlib.sha256(), Path(__file__).parents[1]
     for path in sorted(root.rglob("*.py")):
         sources.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
     return sources.hexdigest()[:16]
