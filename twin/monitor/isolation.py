@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from twin.model.dataset import DataSet
 from twin.monitor.bank import DELAY_STEPS, DELAYS, SUSPECTS, UNSURE_OF, Bank
@@ -237,19 +238,20 @@ class Isolation:
     def _causes(self, since: int, changed: float) -> list[Likely]:
         """How probable each effect is; together as probable as that something ``changed``."""
         mean, covariance = self._mean(min(since, RECENT))
-        fitted = [
-            _fitted(mean.off, signature, covariance, bounds)
-            for signature, bounds in zip(mean.signatures.T, self._bounds, strict=True)
-        ]
-        for number, larger in zip(DELAYS, np.split(mean.larger, len(DELAYS), axis=1), strict=True):
-            sizes = np.column_stack([mean.signatures[:, number], larger])
-            fitted[number] = _fitted_along(mean.off, sizes, covariance, self._bounds[number])
+        white, spread = _whitened(covariance, mean.off, mean.signatures, mean.larger)
+        off, signatures, larger = np.split(white, [1, 1 + len(SUSPECTS)], axis=1)
+        sizes, left = _fitted(off, signatures, self._bounds)
+        for number, some in zip(DELAYS, np.split(larger, len(DELAYS), axis=1), strict=True):
+            grows = np.column_stack([np.zeros(len(off)), signatures[:, number], some])
+            most = float(self._bounds[number, 1])
+            sizes[number], left[number] = _fitted_along(off, grows, most)
+        left += spread
         # What a low supply does is not known well: in proportion to how low it is.
-        ways = fitted[UNSURE_OF][0] * mean.unsure
-        signature = mean.signatures[:, UNSURE_OF]
-        wider, bounds = covariance + ways @ ways.T, self._bounds[UNSURE_OF]
-        fitted[UNSURE_OF] = _fitted(mean.off, signature, wider, bounds)
-        sizes, left = np.array(fitted).T
+        ways, low = sizes[UNSURE_OF] * mean.unsure, slice(UNSURE_OF, UNSURE_OF + 1)
+        wider = covariance + ways @ ways.T
+        white, spread = _whitened(wider, mean.off, mean.signatures[:, low])
+        sizes[low], left[low] = _fitted(white[:, :1], white[:, 1:], self._bounds[low])
+        left[low] += spread
         share = np.exp(0.5 * (left.min() - left))
         return self._by_effect(share * (changed / share.sum()), sizes)
 
@@ -296,24 +298,26 @@ def looked_for() -> Changes:
     return Changes(both_ways, np.array([one.often for one in SUSPECTS]))
 
 
-def _fitted(off: Floats, signature: Floats, covariance: Floats, bounds: Floats) -> Floats:
-    """Size (in steps) that fits a deviation best, and twice what the likelihood is less."""
-    weighed = np.linalg.solve(covariance, np.column_stack([off, signature]))
-    power = max(float(signature @ weighed[:, 1]), 1e-12)
-    size = float(np.clip(signature @ weighed[:, 0] / power, *bounds))
-    left = float((off - size * signature) @ (weighed[:, 0] - size * weighed[:, 1]))
-    return np.array([size, left + float(np.linalg.slogdet(covariance)[1])])
+def _whitened(covariance: Floats, *columns: Floats) -> tuple[Floats, float]:
+    """Columns beside each other, whitened; and the logarithm of the covariance's determinant."""
+    factor = np.linalg.cholesky(covariance)
+    white: Floats = solve_triangular(factor, np.column_stack(columns), lower=True)
+    return white, 2.0 * float(np.sum(np.log(np.diag(factor))))
 
 
-def _fitted_along(off: Floats, signatures: Floats, covariance: Floats, bounds: Floats) -> Floats:
-    """The same for what delays: its signatures (places, sizes), straight from size to size."""
+def _fitted(off: Floats, signatures: Floats, bounds: Floats) -> tuple[Floats, Floats]:
+    """Of each signature the size within bounds that fits best, and the squares that are left."""
+    power = np.maximum(np.sum(signatures**2, axis=0), 1e-12)
+    sizes = np.clip(np.sum(signatures * off, axis=0) / power, *bounds.T)
+    return sizes, np.sum((off - sizes * signatures) ** 2, axis=0)
+
+
+def _fitted_along(off: Floats, grows: Floats, most: float) -> tuple[float, float]:
+    """The same for what delays: from nothing on through its sizes, straight between them."""
     at = np.array([0.0, *DELAY_STEPS]) / DELAY_STEPS[0]
-    ends = np.column_stack([np.zeros(len(off)), signatures]).T
-    reach = np.ones(len(DELAY_STEPS))
-    reach[-1] = (bounds[1] - at[-2]) / (at[-1] - at[-2])
-    found = []
-    for piece, most in enumerate(reach):
-        along, wide = ends[piece + 1] - ends[piece], at[piece + 1] - at[piece]
-        share, left = _fitted(off - ends[piece], along, covariance, np.array([0.0, most]))
-        found.append(np.array([at[piece] + share * wide, left]))
-    return min(found, key=lambda one: float(one[1]))
+    wide, reach = np.diff(at), np.ones(len(DELAY_STEPS))
+    reach[-1] = (most - at[-2]) / wide[-1]
+    bounds = np.column_stack([np.zeros(len(reach)), reach])
+    shares, left = _fitted(off - grows[:, :-1], np.diff(grows, axis=1), bounds)
+    best = int(np.argmin(left))
+    return float(at[best] + shares[best] * wide[best]), float(left[best])
