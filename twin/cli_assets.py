@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from twin.assets.database import Assets
     from twin.assets.record import Record
-    from twin.exchange.fmu import Fmu
+    from twin.exchange.fmu_file import Fmu
 
 AASX = ".aasx"
 
@@ -306,7 +306,7 @@ def _shells() -> "ModuleType":
 
 def _read_fmu(path: Path) -> "Fmu":
     try:
-        from twin.exchange.fmu import read_fmu
+        from twin.exchange.fmu_file import read_fmu
     except ImportError as error:
         raise _not_installed(error) from error
     return read_fmu(path)

@@ -21,7 +21,7 @@ from twin.assets.exchange import FORMAT, parse_export, to_export
 from twin.assets.record import Kind, Record, holding
 from twin.errors import ConfigError, SourceError
 from twin.exchange.elements import link, meaning, short, submodel, text
-from twin.exchange.fmu import MEDIA_TYPE, Fmu
+from twin.exchange.fmu_file import MEDIA_TYPE, Fmu
 from twin.exchange.submodels import (
     nameplate,
     simulation_models,
@@ -39,7 +39,7 @@ Store = model.DictIdentifiableStore[model.Identifiable]
 
 @dataclass(frozen=True)
 class Package:
-    """What a package brings: an export of a database, and FMUs by the names of their files."""
+    """What a package brings: an export of a database, and FMUs by their places in the package."""
 
     document: dict[str, Any]
     fmus: dict[str, bytes]
@@ -71,8 +71,8 @@ def write_package(
 ) -> bytes:
     """The records as an AASX package, each asset showing what holds at a time (UTC).
 
-    ``fmus`` are the simulation models by the name of their unit or type; ``logs`` is the address
-    under which logs are kept, or empty. ConfigError where a shell cannot hold a name.
+    ``fmus`` are simulation models by the name of their unit; ``logs`` is the address under which
+    logs are kept, or empty. ConfigError where a shell cannot hold a name.
     """
     store, files = _nothing()
     assets = _by_asset(records, now_ns)
@@ -117,7 +117,7 @@ def _shell(
     ]
     if of_logs := [one for one in asset.records if "log_sha256" in one.provenance]:
         submodels.append(time_series(asset.id("TimeSeries"), of_logs, logs))
-    if fmu := fmus.get(record.name):
+    if record.kind == "instance" and (fmu := fmus.get(record.name)):
         place = asset.place(f"{short(Path(fmu.name).stem)}.fmu")
         files.add_file(place, BytesIO(fmu.content), MEDIA_TYPE)
         submodels.append(simulation_models(asset.id("SimulationModels"), fmu, place))
@@ -182,7 +182,7 @@ def read_package(path: Path) -> Package:
         if one.semantic_id == meaning(FORMAT):
             exports.append(_export(path, one, files))
         for place in _places(one, MEDIA_TYPE):
-            fmus[Path(place).name] = _file(path, place, files)
+            fmus[place] = _file(path, place, files)
     if not exports:
         raise ConfigError(f"{path}: no shell in it has data sets of this program", HINT)
     records = [record for export in exports for record in export["records"]]

@@ -30,7 +30,7 @@ from twin.exchange.elements import (
     typed,
     words,
 )
-from twin.exchange.fmu import MEDIA_TYPE, Fmu
+from twin.exchange.fmu_file import MEDIA_TYPE, Fmu
 
 MCAP = "application/x-mcap"
 DESIGNATION = "Pneumatic vacuum ejector"
