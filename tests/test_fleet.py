@@ -13,6 +13,7 @@ import fleets
 import pytest
 from command_line import twin
 
+from tools.dask_cluster import cluster
 from twin.fleet import go as going
 from twin.fleet.works import Done, Job, run
 
@@ -128,17 +129,17 @@ def test_a_cluster_gives_the_same_though_a_worker_is_killed(
     here, there = tmp_path / "here.json", tmp_path / "there.json"
     asked = ("fleet", "replay", logs, "--assets")
     assert twin(monkeypatch, *asked, tmp_path / "1.sqlite", "--workers", "1", "--json", here) == 0
-    with fleets.cluster(2) as cluster:
+    with cluster(2) as started:
         keep = going._keep
 
         def killing(future: "Future[Done]", *rest: Any) -> going.Told:
-            cluster.workers[0].kill()  # with what it is at, and what it has done
+            started.workers[0].kill()  # with what it is at, and what it has done
             return keep(future, *rest)
 
         monkeypatch.setattr(going, "_keep", killing)
-        on = ("--engine", "dask", "--scheduler", cluster.address, "--json", there)
+        on = ("--engine", "dask", "--scheduler", started.address, "--json", there)
         assert twin(monkeypatch, *asked, tmp_path / "2.sqlite", *on) == 0
-        assert cluster.workers[0].wait(10) == -signal.SIGKILL
+        assert started.workers[0].wait(10) == -signal.SIGKILL
     alike = [{n: one["answer"] for n, one in answers(path).items()} for path in (here, there)]
     assert alike[0] == alike[1]
     assert len(alike[0]) == len(UNITS)

@@ -1,0 +1,62 @@
+"""Diagnose the same logs on one Dask worker and on two: how much faster, and whether alike.
+
+    python tools/fleet_speed.py [--logs 40] [--first SEED]
+
+Half of the logs of 12 cycles hide a fault. Each worker is warmed up with two logs of its own.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from tools.dask_cluster import cluster
+from tools.fleet_trial import TODAY, TWIN, hidden, record
+
+ASKED = 1.8
+
+
+def answers(logs: Sequence[Path], scheduler: str, folder: Path, name: str) -> tuple[Any, float]:
+    """What was found in all logs, and in how many seconds."""
+    found = folder / f"{name}.json"
+    database = ["--assets", str(folder / f"{name}.sqlite"), "--json", str(found)]
+    on = ["--engine", "dask", "--scheduler", scheduler]
+    begun = time.perf_counter()
+    subprocess.run([*TWIN, "fleet", "diagnose", *map(str, logs), *database, *on], check=True)
+    seconds = time.perf_counter() - begun
+    return [one["answer"] for one in json.loads(found.read_text())["logs"]], seconds
+
+
+def main() -> None:
+    """Record, diagnose on one and on two, compare."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--logs", type=int, default=40)
+    parser.add_argument("--first", type=int, default=0, help="seed")
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        units = asked.logs + 4  # the last four warm up
+        faults = hidden(units, units // 2, asked.first)
+        for unit in range(units):
+            record(unit, faults, folder, asked.first)
+        every = sorted(folder.glob(f"*-{TODAY:03d}.mcap"))
+        found, took = [], []
+        for workers in (1, 2):
+            with cluster(workers) as started:
+                answers(every[-4:], started.address, folder, f"warm{workers}")
+                one, seconds = answers(every[:-4], started.address, folder, f"on{workers}")
+            found.append(one)
+            took.append(seconds)
+            print(f"{workers} of one thread: {seconds:.1f} s for {len(one)} logs", flush=True)
+    same, ratio = found[0] == found[1], took[0] / took[1]
+    print(f"{ratio:.2f} times as fast, answers {'the same' if same else 'NOT the same'}")
+    sys.exit(not same or ratio < ASKED)
+
+
+if __name__ == "__main__":
+    main()
