@@ -77,7 +77,10 @@ def switch(control, asked, vacuum, dt, k, i):  # type: ignore[no-untyped-def]
 @compiled
 def _protect(control):  # type: ignore[no-untyped-def]
     """Remember a switching; give up saving air when there were too many."""
-    oldest = SWITCHES + int(np.argmin(control[SWITCHES:]))
+    oldest = SWITCHES
+    for one in range(SWITCHES + 1, CONTROL):
+        if control[one] < control[oldest]:
+            oldest = one
     if control[TIME] - control[oldest] < PROTECTED_S:
         control[CONTINUOUS], control[SAVING] = 1.0, 0.0
     control[oldest] = control[TIME]
@@ -89,24 +92,30 @@ def new_timer() -> npt.NDArray[np.float64]:
 
 
 @compiled
+def told(timer, commands, dt, mode, duration):  # type: ignore[no-untyped-def]
+    """What the valves are told (``Command`` bits), as ``timed`` for one row."""
+    command, before = commands & (_SUCTION | _BLOW_OFF), int(timer[_BEFORE])
+    timer[_LEFT] -= max(dt, 0.0)
+    ended = mode == c.INTERNAL and before & _SUCTION and not command & _SUCTION
+    started = mode == c.TIMED and command & _BLOW_OFF and not before & _BLOW_OFF
+    if ended or started:
+        timer[_LEFT] = duration
+    timer[_BEFORE] = command
+    if mode == c.TIMED:
+        command &= _SUCTION
+    if timer[_LEFT] > 1e-9:
+        command |= _BLOW_OFF
+    return command
+
+
+@compiled
 def timed(timer, commands, dt, mode, duration, effective):  # type: ignore[no-untyped-def]
     """Write into ``effective`` what the valves are told, given what the PLC commands, row by row.
 
     ``dt`` are seconds since the row before, ``mode`` the blow-off mode, ``duration`` its pulse (s).
     """
     for row in range(commands.shape[0]):
-        command, before = int(commands[row]) & (_SUCTION | _BLOW_OFF), int(timer[_BEFORE])
-        timer[_LEFT] -= max(dt[row], 0.0)
-        ended = mode == c.INTERNAL and before & _SUCTION and not command & _SUCTION
-        started = mode == c.TIMED and command & _BLOW_OFF and not before & _BLOW_OFF
-        if ended or started:
-            timer[_LEFT] = duration
-        timer[_BEFORE] = command
-        if mode == c.TIMED:
-            command &= _SUCTION
-        if timer[_LEFT] > 1e-9:
-            command |= _BLOW_OFF
-        effective[row] = command
+        effective[row] = told(timer, int(commands[row]), dt[row], mode, duration)
 
 
 def nothing_done() -> npt.NDArray[np.float64]:

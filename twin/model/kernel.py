@@ -162,11 +162,7 @@ def run_on(
 def at_rest(theta: c.Theta) -> State:
     """Return a model that stands at ambient pressure and temperature, nothing commanded."""
     state = new_state(*theta.shape[1:])
-    for i in range(state[0].size):
-        both = state.reshape(STATE, -1), theta.reshape(len(c.COEFFICIENTS), -1)
-        _settle(*both, i, both[1][c.AMBIENT, i])
-    state[OPEN] = np.where(theta[c.RELEASE] >= 0.0, 1.0, 0.0)
-    state[VALID] = 1.0
+    _rest(state.reshape(STATE, -1), theta.reshape(len(c.COEFFICIENTS), -1))
     return state
 
 
@@ -180,7 +176,8 @@ def take_over(state: State, before: c.Theta, after: c.Theta) -> None:
     room = _room(state[VESSEL], before)
     joined = room + (after[c.VOLUME] - before[c.VOLUME])
     state[VESSEL_MASS] *= joined / room
-    walls = (after[[c.COMPLIANCE, c.AMBIENT]] != before[[c.COMPLIANCE, c.AMBIENT]]).any(axis=0)
+    walls = after[c.COMPLIANCE] != before[c.COMPLIANCE]
+    walls |= after[c.AMBIENT] != before[c.AMBIENT]
     moved = walls & (state[VALID] > 0.0)
     if moved.any():
         vessel = np.where(moved, state[VESSEL], LOWEST)
@@ -361,6 +358,16 @@ def _settle(state, k, i, pressure):  # type: ignore[no-untyped-def]
     state[LINE_MASS, i] = pressure * k[c.LINE_VOLUME, i] / (R * temperature)
     state[NEAR, i] = state[FAR, i] = 0.0
     state[SUPPLIED, i] = k[c.SUPPLY, i]
+
+
+@compiled
+def _rest(state, k):  # type: ignore[no-untyped-def]
+    """Let all stand at ambient pressure, valves at rest for long, cups open."""
+    for i in range(state.shape[1]):
+        _settle(state, k, i, k[c.AMBIENT, i])
+        state[NOZZLE_AGE, i] = state[BLOW_AGE, i] = NEVER
+        state[OPEN, i] = 1.0 if k[c.RELEASE, i] >= 0.0 else 0.0
+        state[VALID, i] = 1.0
 
 
 @compiled

@@ -79,23 +79,29 @@ ORDER = len(Gas._fields) + len(Lags._fields)
 
 
 @compiled
+def prepare_one(k, i):  # type: ignore[no-untyped-def]
+    """Write what follows from the coefficients of hypothesis ``i`` below them."""
+    ambient, nominal = k[c.AMBIENT, i], k[c.AMBIENT_NOMINAL, i]
+    off = k[c.SUPPLY_NOMINAL, i] / k[c.SUPPLY_OPTIMUM, i] - 1.0
+    peak = max(1.0 - k[c.SUPPLY_CURVATURE, i] * off * off, 1e-3)
+    k[_SUCTION, i] = k[c.SUCTION, i] * (ambient / nominal) / peak
+    k[_END, i] = k[c.END_RATIO, i] * ambient
+    k[_BLOW_OFF, i] = k[c.BLOW_OFF, i] / (k[c.SUPPLY_NOMINAL, i] + nominal)
+    k[_FLATTER, i] = 1.0 / k[c.SUPPLY_OPTIMUM, i]
+    k[_HEAT, i] = k[c.FILM, i] * k[c.AREA, i] / CP
+    k[_PORT_HEAT, i] = k[c.PORT_HEAT, i] / CP
+    k[_LINE_HEAT, i] = k[c.LINE_HEAT, i] / CP
+    friction = k[c.NEAR_RESISTANCE, i] + k[c.RESISTANCE, i]
+    k[_PLACE, i] = min(k[c.PLACE, i] / friction, 1.0) if friction > 0.0 else 0.0
+
+
+@compiled
 def prepare(theta):  # type: ignore[no-untyped-def]
     """Coefficients, one column per hypothesis, with what follows from them alone below."""
     k = np.empty((PREPARED, theta.shape[1]))
     k[: theta.shape[0]] = theta
     for i in range(theta.shape[1]):
-        ambient, nominal = theta[c.AMBIENT, i], theta[c.AMBIENT_NOMINAL, i]
-        off = theta[c.SUPPLY_NOMINAL, i] / theta[c.SUPPLY_OPTIMUM, i] - 1.0
-        peak = max(1.0 - theta[c.SUPPLY_CURVATURE, i] * off * off, 1e-3)
-        k[_SUCTION, i] = theta[c.SUCTION, i] * (ambient / nominal) / peak
-        k[_END, i] = theta[c.END_RATIO, i] * ambient
-        k[_BLOW_OFF, i] = theta[c.BLOW_OFF, i] / (theta[c.SUPPLY_NOMINAL, i] + nominal)
-        k[_FLATTER, i] = 1.0 / theta[c.SUPPLY_OPTIMUM, i]
-        k[_HEAT, i] = theta[c.FILM, i] * theta[c.AREA, i] / CP
-        k[_PORT_HEAT, i] = theta[c.PORT_HEAT, i] / CP
-        k[_LINE_HEAT, i] = theta[c.LINE_HEAT, i] / CP
-        friction = theta[c.NEAR_RESISTANCE, i] + theta[c.RESISTANCE, i]
-        k[_PLACE, i] = min(theta[c.PLACE, i] / friction, 1.0) if friction > 0.0 else 0.0
+        prepare_one(k, i)
     return k
 
 
