@@ -229,7 +229,14 @@ def test_every_coefficient_is_filled_in() -> None:
     theta = coefficients(data.model_copy(update={"system": system}))
     assert len(theta) == len(COEFFICIENTS)
     zero = {name for name, value in zip(COEFFICIENTS, theta, strict=True) if value == 0.0}
-    effects = {"LAMINAR_LEAK", "BACK_FLOW", "SENSOR_OFFSET", "SLOW_RAMP_UP", "SLOW_SENSOR"}
+    effects = {
+        "LAMINAR_LEAK",
+        "INFLOW",
+        "BACK_FLOW",
+        "SENSOR_OFFSET",
+        "SLOW_RAMP_UP",
+        "SLOW_SENSOR",
+    }
     modes = {"CONTROL_SENSOR", "BLOW_OFF_MODE"}  # the first of each
     assert zero == {"COMPLIANCE"} | effects | modes
 

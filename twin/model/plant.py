@@ -179,13 +179,14 @@ def at_port(p, driven, k, i):  # type: ignore[no-untyped-def]
 def at_vessel(p, driven, k, i):  # type: ignore[no-untyped-def]
     """Flow from ambient into the vessel (kg/s) at ``p``, as a tangent: level and slope.
 
-    An opening, a porous part, and the rim of a cup without a part.
+    An opening, a porous part, the rim of a cup without a part, and what else flows in.
     """
     ambient = k[c.AMBIENT, i]
     laminar = k[c.LAMINAR_LEAK, i] + driven.open * k[c.OPENING, i]
     share, rise = opening(p, ambient)
     slope = k[c.LEAK, i] * rise - laminar
-    return k[c.LEAK, i] * (share - rise * p) + laminar * ambient, slope
+    level = k[c.LEAK, i] * (share - rise * p) + laminar * ambient
+    return level + k[c.INFLOW, i], slope
 
 
 @inlined
