@@ -25,6 +25,7 @@ from twin.cli_alarms import alarms_app, alarms_of, asker_of
 from twin.cli_assets import assets_app
 from twin.cli_cert import cert
 from twin.cli_compare import compare
+from twin.cli_exchange import export_fmu
 from twin.cli_figures import figures_app, keeper_of, key_figures_of
 from twin.cli_fleet import fleet_app
 from twin.cli_outlets import outlets_of
@@ -62,6 +63,7 @@ log_app = typer.Typer(help="Look after logs.", no_args_is_help=True)
 app.add_typer(log_app, name="log")
 app.command()(cert)
 app.command()(compare)
+app.command()(export_fmu)
 app.command()(serve)
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML configuration.")]

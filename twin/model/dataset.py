@@ -31,18 +31,18 @@ SHORTEST_SWING = 5e-3  # s, of a line's gas that can be seen at a sample each mi
 RIPPLE = 1e-3  # of suction capacity, from one hundredth of the range to the next: still monotonic
 
 # The modes of the configuration as the coefficients hold them.
-_AIR_SAVING = {
+AIR_SAVING_MODES = {
     "off": c.OFF,
     "on": c.ON,
     "leak_monitoring": c.LEAK_MONITORING,
     "without_continuous": c.WITHOUT_CONTINUOUS,
 }
-_BLOW_OFF = {
+BLOW_OFF_MODES = {
     "external": c.EXTERNAL,
     "internal": c.INTERNAL,
     "timed": c.TIMED,
 }
-_CONTROL_SENSOR = {"own": c.OWN, "plc": c.PLC}
+CONTROL_SENSORS = {"own": c.OWN, "plc": c.PLC}
 
 
 class Ambient(Settings):
@@ -248,11 +248,11 @@ def _set_ejector(theta: Theta, ejector: Ejector, end_ratio: float) -> None:
     theta[[c.H1, c.H2]] = ejector.h1_mbar * MBAR, ejector.h2_mbar * MBAR
     theta[c.H1_LOW] = (ejector.h1_mbar - ejector.h1_hysteresis_mbar) * MBAR
     theta[c.H2_LOW] = (ejector.h2_mbar - ejector.h2_hysteresis_mbar) * MBAR
-    theta[c.AIR_SAVING] = _AIR_SAVING[ejector.air_saving]
+    theta[c.AIR_SAVING] = AIR_SAVING_MODES[ejector.air_saving]
     theta[c.PERMITTED_LEAKAGE] = ejector.permitted_leakage_mbar_s * MBAR
-    theta[c.BLOW_OFF_MODE] = _BLOW_OFF[ejector.blow_off]
+    theta[c.BLOW_OFF_MODE] = BLOW_OFF_MODES[ejector.blow_off]
     theta[c.BLOW_OFF_TIME] = ejector.blow_off_time_ms * MS
-    theta[c.CONTROL_SENSOR] = _CONTROL_SENSOR[ejector.control_sensor]
+    theta[c.CONTROL_SENSOR] = CONTROL_SENSORS[ejector.control_sensor]
 
 
 def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:

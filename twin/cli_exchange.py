@@ -1,0 +1,119 @@
+"""``twin export-fmu``: the model of one ejector for other people's simulations."""
+
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from twin.errors import ConfigError
+
+if TYPE_CHECKING:
+    from twin.config import Config
+    from twin.settings import Document
+
+PACKAGES = (".fmu", ".ssp")
+
+
+class Vessel(StrEnum):
+    """Whose the vessel is."""
+
+    INSIDE = "inside"
+    OUTSIDE = "outside"
+
+
+class Fmi(StrEnum):
+    """Version of the standard."""
+
+    THREE = "3"
+    TWO = "2"
+
+
+def export_fmu(
+    config: Annotated[
+        Path | None, typer.Option(metavar="CONFIG", help="Its unit, [data] and [assets] url.")
+    ] = None,
+    unit: Annotated[
+        str, typer.Option("--id", metavar="ID", help="Unit or type; default: of the configuration.")
+    ] = "",
+    assets: Annotated[
+        str, typer.Option("--assets", metavar="URL", help="Asset database, instead of the default.")
+    ] = "",
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", metavar="FILE", help="*.fmu, or *.ssp with parameter sets. Default: ID.fmu"
+        ),
+    ] = None,
+    fmi: Annotated[Fmi, typer.Option(help="3.0, or 2.0 for older tools.")] = Fmi.THREE,
+    vessel: Annotated[
+        Vessel, typer.Option(help="Part of the FMU, or somebody else's at its port.")
+    ] = Vessel.INSIDE,
+    sources_only: Annotated[bool, typer.Option("--sources-only", help="Compile nothing.")] = False,
+) -> None:
+    """Write an ejector as an FMU for co-simulation: C from the twin's model, no Python inside.
+
+    An .ssp has the FMU and two parameter sets: the type's, and over it what is the unit's own.
+    """
+    from importlib.metadata import version
+
+    from twin.config import Config
+    from twin.exchange.fmu import make_fmu, write_whole
+    from twin.exchange.ssp import make_ssp
+    from twin.exchange.variables import Component
+
+    document = _document(config, unit, assets)
+    known = Config.of(document, assets, unit if config else "")
+    name = known.asset.id or known.asset.type
+    program = f"ejector-twin {version('ejector-twin')}"
+    component = Component.of(known.data, vessel.value)
+    fmu = make_fmu(
+        component, name, known.origin, program, int(fmi.value), compiled=not sources_only
+    )
+    target = output or Path(fmu.name)
+    if target.suffix not in PACKAGES:
+        raise ConfigError(f"{target}: neither an FMU nor an SSP", "call it *.fmu or *.ssp")
+    content = fmu.content
+    if target.suffix == ".ssp":
+        kind = Config.of(document, assets, unit if config else "", calibrated=False)
+        content = make_ssp(fmu, name, component, Component.of(kind.data, vessel.value))
+    write_whole(target, content)
+    _remark(known, binary=fmu.binary, wanted=not sources_only)
+    print(f"{name} in {target}: FMI {fmi.value}.0, {known.origin}")
+
+
+def _document(config: Path | None, unit: str, assets: str) -> "Document":
+    """The configuration; without one what names a unit or type that the database knows."""
+    from twin.assets.place import open_chosen
+    from twin.settings import Document
+
+    if config is not None:
+        return Document.read(config)
+    if not unit:
+        raise ConfigError("of which ejector?", "name it with --id, or give a --config")
+    with open_chosen(assets, None, write=False) as database:
+        records = database.records(name=unit)
+        if not records:
+            known = sorted({record.name for record in database.records()})
+            raise ConfigError(
+                f"{database.name}: no type or unit is called {unit!r}", f"known: {', '.join(known)}"
+            )
+    newest = max(records, key=lambda record: record.recorded_ns)
+    asset = {"type": newest.type, "id": unit if newest.kind == "instance" else ""}
+    return Document("", "", {"asset": asset})
+
+
+def _remark(known: "Config", *, binary: str, wanted: bool) -> None:
+    """Say what else is to be known of the FMU."""
+    if known.instead:
+        print(known.instead, file=sys.stderr)
+    if known.data.terms:
+        print(
+            "the data set's terms are left out: what data gave and no physics explains is not in"
+            " the FMU",
+            file=sys.stderr,
+        )
+    if wanted:
+        said = f"compiled: {binary}" if binary else "no C compiler for this platform: sources alone"
+        print(said, file=sys.stderr)

@@ -1,0 +1,137 @@
+"""The C sources of an FMU: the physics translated from the model, and tables of its variables.
+
+``model.h`` is generated; ``component.h`` and the functions of the standard are templates.
+"""
+
+from collections.abc import Mapping
+from importlib.resources import files
+from uuid import NAMESPACE_URL, uuid5
+
+from twin.exchange.c import INDEX, LANE, NUMBER, ROWS, TABLES, WHOLE, literal
+from twin.exchange.translate import Program
+from twin.exchange.variables import Component, Role, Variable, reference
+from twin.model import control, kernel, plant
+from twin.model import theta as c
+from twin.model.control import new_timer, nothing_done
+
+# What component.h calls, with the kinds of the arguments.
+_CALLED = (
+    (plant.prepare_one, ROWS, INDEX),
+    (kernel._rest, ROWS, ROWS),
+    (control.told, ROWS, WHOLE, NUMBER, NUMBER, NUMBER),
+    (kernel._control, ROWS, TABLES, LANE, NUMBER, ROWS, LANE),
+    (kernel._step, ROWS, ROWS, NUMBER, NUMBER),
+    (kernel._read, ROWS, ROWS, LANE, LANE),
+    (kernel.take_over, ROWS, ROWS, ROWS),
+)
+# And the numbers it reads.
+_READ = (
+    (plant, "PREPARED", "R"),
+    (kernel, "STATE", "TOLERANCE", "PORT", "LINE", "LINE_MASS", "VESSEL", "VESSEL_MASS", "FAR"),
+    (kernel, "PHASE", "_PART_PRESENT", "_AIR_SAVING"),
+    (control, "CONTROL", "_SUCTION", "_BLOW_OFF"),
+    (c, "LINE_VOLUME", "VOLUME", "BLOW_OFF_MODE", "BLOW_OFF_TIME"),
+)
+HEAD = """\
+/* Generated from the digital twin's own model, function by function: the same equations. */
+
+#include <math.h>
+"""
+_SETTABLE = {Role.DATA: "BEFORE", Role.OUTPUT: "NEVER", Role.SIGNAL: "NEVER"}
+
+
+def sources(component: Component, version: int) -> tuple[Mapping[str, str], str]:
+    """The files in ``sources/`` by name, and the token that ties binary and description together.
+
+    The token follows from the content: the same component and model give the same FMU.
+    """
+    model, templates = _model(component), files("twin.exchange") / "templates"
+    token = str(uuid5(NAMESPACE_URL, f"ejector-twin FMI {version}\n{model}"))
+    ties = f'#define TOKEN "{token}"\n#define STAMP {int(token[:8], 16)}.0\n'
+    texts = {"model.h": f"{HEAD}\n{ties}{model}"}
+    for name in ("component.h", main_source(version)):
+        texts[name] = (templates / name).read_text(encoding="utf-8")
+    for header in (templates / f"fmi{version}").iterdir():
+        texts[header.name] = header.read_text(encoding="utf-8")
+    return texts, token
+
+
+def main_source(version: int) -> str:
+    """The one file to compile; it includes the others."""
+    return f"fmi{version}.c"
+
+
+def _model(component: Component) -> str:
+    program = Program()
+    for called, *kinds in _CALLED:
+        program.function(called, *kinds)
+    acting = [
+        (program.function(effect.act, ROWS, *[NUMBER] * len(effect.parameters)).name, effect)
+        for effect in component.effects
+    ]
+    for module, *names in _READ:
+        for name in names:
+            program.declarations.constant(module.__name__, name, getattr(module, name))
+    for number, name in enumerate(c.COEFFICIENTS):
+        program.declarations.constant(c.__name__, name, number)
+    given = [f"    theta[THETA_{name}] = {component.sources[name]};" for name in c.COEFFICIENTS]
+    for function, effect in acting:
+        values = [
+            f"v[{reference(f'effect.{effect.name}.{one.name}')}]" for one in effect.parameters
+        ]
+        given.append(f"    {function}({', '.join(['theta', *values])});")
+    return "\n".join(
+        [
+            f"#define VESSEL_OUTSIDE {int(component.where == 'outside')}",
+            f"#define CONTROL_TIMER {len(new_timer())}",
+            "",
+            program.text(),
+            _at_rest(),
+            "",
+            _variables(component),
+            "",
+            "/* Coefficients from values; effects act on them as they do in the twin. */",
+            "static void coefficients(const double *v, double *theta) {",
+            *given,
+            "}",
+            "",
+        ]
+    )
+
+
+def _at_rest() -> str:
+    values = ", ".join(literal(float(one)) for one in nothing_done())
+    return f"static const double NOTHING_DONE[] = {{{values}}};"
+
+
+def _variables(component: Component) -> str:
+    """References by name and the table of variables; time comes last."""
+    names = [one.reference for one in component.variables]
+    rows = [_row(one) for one in component.variables]
+    return "\n".join(
+        [
+            "enum { REAL, TRUTH, CHOICE };",
+            "enum { NEVER, BEFORE, ALWAYS };",
+            f"enum {{ {', '.join([*names, 'V_TIME', 'VARIABLES'])} }};",
+            "",
+            "struct Variable {",
+            "    const char *name;",
+            "    int kind;",
+            "    int settable;",
+            "    double low;",
+            "    double high;",
+            "    double start;",
+            "};",
+            "",
+            "static const struct Variable VARIABLE[] = {",
+            *rows,
+            '    {"time", REAL, NEVER, -INFINITY, INFINITY, 0.0},',
+            "};",
+        ]
+    )
+
+
+def _row(one: Variable) -> str:
+    kind = "TRUTH" if one.truth else "CHOICE" if one.choices else "REAL"
+    numbers = ", ".join(literal(float(value)) for value in (one.low, one.high, one.start))
+    return f'    {{"{one.name}", {kind}, {_SETTABLE.get(one.role, "ALWAYS")}, {numbers}}},'

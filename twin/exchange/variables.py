@@ -1,0 +1,255 @@
+"""The variables of an FMU: ports, settings, effects, and the coefficients of the data set.
+
+One table, from which the description, the C sources, the page and the parameter sets are made.
+Effects and coefficients come from the model's own tables.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Literal
+
+from twin.exchange.units import plain
+from twin.model.dataset import (
+    AIR_SAVING_MODES,
+    BLOW_OFF_MODES,
+    CONTROL_SENSORS,
+    DataSet,
+    coefficients,
+)
+from twin.model.effects import EFFECTS, Effect
+from twin.model.plant import COLDEST, HIGHEST, HOTTEST, LOWEST
+from twin.model.theta import COEFFICIENTS, Theta
+from twin.signals import Phase
+
+Where = Literal["inside", "outside"]  # the vessel: part of the FMU, or somebody else's
+
+PHASES = {phase.name.lower(): int(phase) for phase in Phase}
+# What acts on the vessel alone, and goes with it.
+OF_THE_VESSEL = ("added_volume", "cup_compliance", "heat_exchange")
+# Coefficients that are ports and settings, in C over the values ``v``.
+_PORTS = {
+    "AMBIENT": "v[V_AMBIENT_PRESSURE]",
+    "SUPPLY": "v[V_SUPPLY_PRESSURE]",
+    "H1": "v[V_THRESHOLD_H1]",
+    "H1_LOW": "v[V_THRESHOLD_H1] - v[V_THRESHOLD_H1_HYSTERESIS]",
+    "H2": "v[V_THRESHOLD_H2]",
+    "H2_LOW": "v[V_THRESHOLD_H2] - v[V_THRESHOLD_H2_HYSTERESIS]",
+    "AIR_SAVING": "v[V_CONTROL_AIR_SAVING]",
+    "PERMITTED_LEAKAGE": "v[V_CONTROL_PERMITTED_LEAKAGE]",
+    "BLOW_OFF_MODE": "v[V_CONTROL_BLOW_OFF]",
+    "BLOW_OFF_TIME": "v[V_CONTROL_BLOW_OFF_TIME]",
+    "CONTROL_SENSOR": "v[V_CONTROL_SENSOR]",
+}
+_VESSEL: Mapping[Where, Mapping[str, str]] = {
+    "inside": {
+        "INFLOW": "v[V_VESSEL_INFLOW]",
+        "RELEASE": "v[V_CUPS_RELEASE] >= 0.0 ? v[V_CUPS_RELEASE] : NAN",
+    },
+    # A vessel so large that its pressure stays what the port says for a millisecond.
+    "outside": {
+        "VOLUME": "1e3",
+        "COMPLIANCE": "0.0",
+        "FILM": "0.0",
+        "AREA": "0.0",
+        "OPENING": "0.0",
+        "RELEASE": "NAN",
+        "INFLOW": "0.0",
+    },
+}
+
+
+def reference(name: str) -> str:
+    """The value reference of a variable by name, in C."""
+    return f"V_{name.upper().replace('.', '_')}"
+
+
+class Role(Enum):
+    """What a variable is to the importing tool: causality, variability, when it may be set."""
+
+    INPUT = ("input", "continuous")
+    COMMAND = ("input", "discrete")
+    OUTPUT = ("output", "continuous")
+    SIGNAL = ("output", "discrete")
+    DATA = ("parameter", "fixed")
+    SETTING = ("parameter", "tunable")
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One variable; ``choices`` make it an enumeration, ``truth`` a Boolean."""
+
+    name: str
+    words: str
+    role: Role
+    unit: str = ""
+    start: float = 0.0
+    low: float = -math.inf
+    high: float = math.inf
+    shown: str = ""  # unit to show it in
+    truth: bool = False
+    choices: Mapping[str, int] | None = None
+
+    @property
+    def reference(self) -> str:
+        """Its value reference by name, in C."""
+        return reference(self.name)
+
+    @property
+    def type_name(self) -> str:
+        """The name of an enumeration's type."""
+        return "".join(part.capitalize() for part in self.name.replace(".", "_").split("_"))
+
+    @property
+    def is_output(self) -> bool:
+        """Whether the FMU works it out."""
+        return self.role in (Role.OUTPUT, Role.SIGNAL)
+
+    @property
+    def is_parameter(self) -> bool:
+        """Whether a parameter set may hold it."""
+        return self.role in (Role.DATA, Role.SETTING)
+
+
+@dataclass(frozen=True)
+class Component:
+    """What an FMU is made from: its variables, and where each coefficient comes from in C."""
+
+    where: Where
+    variables: tuple[Variable, ...]
+    sources: Mapping[str, str]  # coefficient -> expression over v, the values
+    effects: tuple[Effect, ...]  # in the order in which they act
+
+    @classmethod
+    def of(cls, data: DataSet, where: Where) -> "Component":
+        """The component of a data set; what it has of effects is where the effects start."""
+        theta = coefficients(data.model_copy(update={"effects": {}}))
+        names = [*data.effects, *(name for name in EFFECTS if name not in data.effects)]
+        kept = [name for name in names if where == "inside" or name not in OF_THE_VESSEL]
+        acting = _acting(theta, data.effects, kept)
+        sources = {**_PORTS, **_VESSEL[where]}
+        for variable, number in acting:
+            if number is not None:  # it stands for a coefficient
+                sources.setdefault(list(COEFFICIENTS)[number], f"v[{variable.reference}]")
+        held = [_held(name, float(theta[n])) for n, name in enumerate(COEFFICIENTS)]
+        rest = {
+            name: one for name, one in zip(COEFFICIENTS, held, strict=True) if name not in sources
+        }
+        sources |= {name: f"v[{one.reference}]" for name, one in rest.items()}
+        variables = (*_ports(theta, where), *(one for one, _ in acting), *rest.values())
+        return cls(where, variables, sources, tuple(EFFECTS[name] for name in kept))
+
+    @property
+    def parameters(self) -> tuple[Variable, ...]:
+        """What a parameter set holds."""
+        return tuple(one for one in self.variables if one.is_parameter)
+
+
+def _acting(
+    theta: Theta, given: Mapping[str, Mapping[str, float]], names: Sequence[str]
+) -> list[tuple[Variable, int | None]]:
+    """The parameters of effects, in the order of their table, and what coefficient they are."""
+    acting = []
+    for effect in (effect for effect in EFFECTS.values() if effect.name in names):
+        for one in effect.parameters:
+            start = given.get(effect.name, {}).get(one.name, one.neutral(theta))
+            name, unit = f"effect.{effect.name}.{one.name}", plain(one.unit)
+            bounds = min(one.low, start), max(one.high, start)
+            variable = Variable(name, effect.sentence, Role.SETTING, unit, start, *bounds)
+            acting.append((variable, one.coefficient))
+    return acting
+
+
+def _held(name: str, value: float) -> Variable:
+    unit, words = COEFFICIENTS[name]
+    return Variable(f"coefficient.{name.lower()}", words, Role.DATA, plain(unit), value)
+
+
+def _ports(theta: Theta, where: Where) -> list[Variable]:
+    """Inputs, outputs and settings."""
+    k = {name: float(theta[number]) for number, name in enumerate(COEFFICIENTS)}
+    temperature = k["TEMPERATURE"]
+    vessel: Mapping[Where, list[Variable]] = {
+        "inside": [
+            _pressure("vessel.pressure", "absolute", Role.OUTPUT),
+            _flow("vessel.mass_flow", "out of the vessel towards the ejector", Role.OUTPUT),
+            _flow("vessel.inflow", "into the vessel from what else hangs on it", Role.INPUT),
+            Variable(
+                "cups.release",
+                "vacuum at which blow-off lets the part go; negative: nothing is let go",
+                Role.DATA,
+                "Pa",
+                -1.0 if math.isnan(k["RELEASE"]) else k["RELEASE"],
+                -1.0,
+                1e5,
+                "mbar",
+            ),
+        ],
+        "outside": [
+            _pressure(
+                "vessel.pressure", "absolute, of the vessel outside", Role.INPUT, k["AMBIENT"]
+            ),
+            _temperature("vessel.temperature", "of the gas in it", Role.INPUT, temperature),
+            _flow("vessel.mass_flow", "out of it, mean of the last step", Role.OUTPUT),
+            _temperature("line.temperature", "of gas that flows into it", Role.OUTPUT),
+        ],
+    }
+    return [
+        _pressure("supply.pressure", "gauge, at the regulator", Role.INPUT, k["SUPPLY"], "bar"),
+        _pressure("ambient.pressure", "absolute", Role.INPUT, k["AMBIENT"]),
+        _truth("command.suction", "suction is commanded", Role.COMMAND),
+        _truth("command.blow_off", "blow-off is commanded; it wins over suction", Role.COMMAND),
+        *vessel[where],
+        _pressure("port.pressure", "absolute, at the ejector's vacuum port", Role.OUTPUT),
+        _pressure("sensor.pressure", "absolute, as the PLC's sensor reads it", Role.OUTPUT),
+        _truth("signal.part_present", "H2 is reached", Role.SIGNAL),
+        _truth("signal.air_saving", "H1 is reached", Role.SIGNAL),
+        _choice("signal.phase", "what the ejector does", PHASES, 0.0, Role.SIGNAL),
+        _vacuum("threshold.h1", "nozzle off: air is saved", k["H1"]),
+        _vacuum("threshold.h1_hysteresis", "nozzle on again so far below", k["H1"] - k["H1_LOW"]),
+        _vacuum("threshold.h2", "part present", k["H2"]),
+        _vacuum("threshold.h2_hysteresis", "no more so far below", k["H2"] - k["H2_LOW"]),
+        _choice("control.air_saving", "air saving", AIR_SAVING_MODES, k["AIR_SAVING"]),
+        Variable(
+            "control.permitted_leakage",
+            "more of it ends the air saving, with leak monitoring",
+            Role.SETTING,
+            "Pa/s",
+            k["PERMITTED_LEAKAGE"],
+            0.0,
+        ),
+        _choice("control.blow_off", "what starts blow-off", BLOW_OFF_MODES, k["BLOW_OFF_MODE"]),
+        Variable("control.blow_off_time", "a pulse", Role.SETTING, "s", k["BLOW_OFF_TIME"], 0.0),
+        _choice("control.sensor", "whose it acts on", CONTROL_SENSORS, k["CONTROL_SENSOR"]),
+    ]
+
+
+def _pressure(
+    name: str, words: str, role: Role, start: float = 0.0, shown: str = "mbar"
+) -> Variable:
+    low = 0.0 if name.startswith("supply") else LOWEST
+    return Variable(name, words, role, "Pa", start, low, HIGHEST, shown)
+
+
+def _temperature(name: str, words: str, role: Role, start: float = 0.0) -> Variable:
+    return Variable(name, words, role, "K", start, COLDEST, HOTTEST)
+
+
+def _flow(name: str, words: str, role: Role) -> Variable:
+    return Variable(name, words, role, "kg/s", 0.0, -1.0, 1.0, "sl/min")
+
+
+def _vacuum(name: str, words: str, start: float) -> Variable:
+    return Variable(name, words, Role.SETTING, "Pa", start, 0.0, HIGHEST, "mbar")
+
+
+def _truth(name: str, words: str, role: Role) -> Variable:
+    return Variable(name, words, role, low=0.0, high=1.0, truth=True)
+
+
+def _choice(
+    name: str, words: str, choices: Mapping[str, int], start: float, role: Role = Role.SETTING
+) -> Variable:
+    low, high = min(choices.values()), max(choices.values())
+    return Variable(name, words, role, start=start, low=low, high=high, choices=choices)
