@@ -1,0 +1,154 @@
+"""``twin export-fmu`` on the command line, and the system structures that it writes."""
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rigs
+from command_line import twin
+from fmpy import extract, read_model_description, simulate_fmu
+from fmpy.ssp.ssd import ParameterSet, build_path, get_connections, read_ssd, read_ssv
+from fmpy.validation import validate_fmu
+from fmus import by_twin
+
+from twin.config import Config
+from twin.model.dataset import coefficients
+from twin.settings import Document
+from twin.signals import MS, Command
+
+UNIT = '[asset]\ntype = "compact-ejector-35"\nid = "paper-unit"\n'
+
+
+def exported(monkeypatch: pytest.MonkeyPatch, folder: Path, *options: str | Path) -> int:
+    monkeypatch.chdir(folder)
+    return twin(monkeypatch, "export-fmu", *options)
+
+
+def values(parameters: ParameterSet) -> dict[str, str]:
+    return {one.name: one.value for one in parameters.parameters}
+
+
+def test_a_unit_of_the_database_is_written_under_its_name(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert exported(monkeypatch, tmp_path, "--id", "paper-unit") == 0
+    said = capsys.readouterr()
+    assert "paper-unit in paper_unit.fmu: FMI 3.0, instance-specific data" in said.out
+    assert "compiled: binaries/" in said.err
+    path = str(tmp_path / "paper_unit.fmu")
+    assert validate_fmu(path) == []
+    assert read_model_description(path).modelName == "paper-unit"
+
+
+def test_a_configuration_says_which_and_what(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    options = ("--config", rigs.path_of("gripper"), "--fmi", "2", "--vessel", "outside")
+    assert exported(monkeypatch, tmp_path, *options, "--sources-only", "-o", "a.fmu") == 0
+    described = read_model_description(str(tmp_path / "a.fmu"))
+    known = {one.name: one for one in described.modelVariables}
+    assert described.fmiVersion == "2.0"
+    assert known["vessel.pressure"].causality == "input"
+    assert "vessel.inflow" not in known
+    assert "effect.added_volume.volume" not in known  # the vessel is somebody else's
+    assert float(known["supply.pressure"].start) == 5e5
+    assert (known["effect.leakage.sonic_flow"].min, known["effect.leakage.sonic_flow"].max) == (
+        "0.0",
+        "60.0",
+    )
+    with zipfile.ZipFile(tmp_path / "a.fmu") as archive:
+        assert not [name for name in archive.namelist() if name.startswith("binaries")]
+        page = archive.read("documentation/index.html").decode()
+    assert all(f"<code>{name}</code>" in page for name in known)
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ((), "of which ejector?"),
+        (("--id", "nobody"), "no type or unit is called 'nobody'"),
+        (("--id", "paper-unit", "-o", "a.zip"), "neither an FMU nor an SSP"),
+        (("--id", "paper-unit", "--fmi", "1"), "Invalid value for '--fmi'"),
+    ],
+)
+def test_a_wrong_wish_is_refused(
+    options: tuple[str, ...],
+    what: str,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert exported(monkeypatch, tmp_path, *options) == 2
+    assert what in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_cannot_be_written_is_said(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ("--id", "paper-unit", "--sources-only", "-o", tmp_path / "none" / "a.fmu")
+    assert exported(monkeypatch, tmp_path, *options) == 3
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_the_unit_lies_over_its_type_in_a_system_structure(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    assert exported(monkeypatch, tmp_path, "--id", "paper-unit", "-o", "a.ssp") == 0
+    path = str(tmp_path / "a.ssp")
+    component = read_ssd(path).system.elements[0]  # validated against the schema
+    sources = [one.source for one in component.parameterBindings]
+    assert sources == ["resources/type.ssv", "resources/unit.ssv"]  # the later one holds
+    kind, unit = (values(read_ssv(path, resource=one)) for one in sources)
+    extract(path, tmp_path / "all")
+    fmu = str(tmp_path / "all" / component.source)
+    described = read_model_description(fmu)
+    own = {one.name: one for one in described.modelVariables if one.causality == "parameter"}
+    assert set(kind) == set(own)
+    assert 0 < len(unit) < len(kind)
+    for name, value in unit.items():
+        assert kind[name] != value
+        assert own[name].start == value
+    # Both bindings as they are said to be laid, into a tool that knows nothing of the data sets.
+    commands = np.repeat(np.array([0, Command.SUCTION], np.uint8), [50, 800])
+    given = [("time", float), ("command.suction", bool)]
+    rows = np.zeros(len(commands), given)
+    rows["time"], rows["command.suction"] = np.arange(len(commands)) * MS, commands
+    for bindings, whose in ((kind, ""), ({**kind, **unit}, "paper-unit")):
+        start = {k: v for k, v in bindings.items() if own[k].type != "Enumeration"}
+        result = simulate_fmu(
+            fmu, stop_time=rows["time"][-1], step_size=MS, output_interval=MS,
+            input=rows, start_values=start, output=["sensor.pressure"],
+        )  # fmt: skip
+        document = Document.parse(UNIT.replace("paper-unit", whose), "")
+        theta = coefficients(Config.of(document).data)
+        assert np.abs(result["sensor.pressure"] - by_twin(theta, commands)).max() < 0.1
+
+
+@pytest.mark.parametrize("where", ["inside", "outside"])
+def test_every_port_leads_out_of_the_system(
+    where: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    config = rigs.path_of("gripper")
+    options = ("--config", config, "--sources-only", "--vessel", where, "-o", "a.ssp")
+    assert exported(monkeypatch, tmp_path, *options) == 0
+    system = read_ssd(str(tmp_path / "a.ssp")).system
+    ports = {one.name: one.kind for one in system.connectors}
+    led = {(build_path(start), build_path(end)) for start, end in get_connections(system)}
+    for name, kind in ports.items():
+        ends = (f"system.{name}", f"system.ejector.{name}")
+        assert (ends if kind == "input" else ends[::-1]) in led
+    assert len(led) == len(ports)
+    assert {"supply.pressure", "vessel.pressure", "vessel.mass_flow"} <= set(ports)
+
+
+def test_a_data_set_with_terms_says_that_they_are_left_out(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    term = '\n[[data.terms]]\nwhere = "hold"\nover = "time"\nat = [0.0]\nmbar = [3.0]\n'
+    path = tmp_path / "cell.toml"
+    path.write_text(rigs.path_of("gripper").read_text() + term)
+    options = ("--config", path, "--sources-only", "-o", "a.fmu")
+    assert exported(monkeypatch, tmp_path, *options) == 0
+    assert "terms are left out" in capsys.readouterr().err

@@ -1,0 +1,277 @@
+"""The FMU: what FMPy says of it, and that it is the twin to the last tenth of a pascal."""
+
+import re
+import shutil
+import subprocess
+import zipfile
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+
+import fmus
+import numpy as np
+import pytest
+import rigs
+from fmpy import extract, read_model_description
+from fmpy.build import build_platform_binary
+from fmpy.validation import validate_fmu
+from fmus import by_twin, cycles, made, stepped
+
+from twin.exchange.fmu import make_fmu
+from twin.exchange.variables import Component, Where
+from twin.model import kernel
+from twin.model import theta as c
+from twin.model.dataset import coefficients
+from twin.model.effects import EFFECTS, apply
+from twin.model.gas import GAMMA, R
+from twin.signals import MS, SL_MIN
+
+BOUND = 0.1  # Pa
+FAULT = {
+    "leakage": {"sonic_flow": 2.0},
+    "response_delay": {"delay": 7.3},
+    "filter_clogging": {"pressure_drop_at_nominal": 40.0},
+    "weak_blow_off": {"loss": 30.0},
+}
+ALL = [(version, where) for version in (2, 3) for where in ("inside", "outside")]
+
+
+def parts(fmu: fmus.Fmu) -> dict[str, bytes]:
+    with zipfile.ZipFile(BytesIO(fmu.content)) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+@pytest.mark.parametrize(("version", "where"), ALL)
+def test_fmpy_finds_nothing(version: int, where: Where) -> None:
+    with fmus.as_file(made("gripper", version, where)) as path:
+        assert validate_fmu(path) == []
+        assert read_model_description(path).coSimulation.canGetAndSetFMUstate
+
+
+@pytest.mark.parametrize(
+    ("name", "version", "fault"),
+    [("test_rig", 3, {}), ("test_rig", 2, FAULT), ("gripper", 2, {}), ("gripper", 3, FAULT)],
+)
+def test_ten_cycles_are_those_of_the_twin(
+    name: str,
+    version: int,
+    fault: dict[str, dict[str, float]],
+    record_property: Callable[[str, object], None],
+) -> None:
+    theta, commands = rigs.theta(name), cycles(name, 10)
+    for effect, values in fault.items():
+        theta = apply(theta, effect, values)
+    given = {f"effect.{e}.{p}": value for e, of in fault.items() for p, value in of.items()}
+    off = np.abs(fmus.simulated(made(name, version), commands, given) - by_twin(theta, commands))
+    record_property("at most off, Pa", off.max())
+    assert off.max() < BOUND
+
+
+@pytest.mark.parametrize("effect", EFFECTS.values(), ids=lambda effect: effect.name)
+def test_every_effect_acts_as_in_the_twin(effect) -> None:  # type: ignore[no-untyped-def]
+    theta, commands = rigs.theta("gripper"), cycles("gripper", 1)
+    values = {one.name: one.neutral(theta) + one.typical for one in effect.parameters}
+    with stepped(made("gripper")) as (one,):
+        one.begin(**{f"effect__{effect.name}__{key}": value for key, value in values.items()})
+        seen = one.run(commands[:-1])
+    faulty = by_twin(apply(theta, effect.name, values), commands)[1:]
+    assert np.abs(seen - faulty).max() < BOUND
+    assert np.abs(seen - by_twin(theta, commands)[1:]).max() > 10 * BOUND  # it can be seen
+
+
+def test_an_effect_may_begin_while_time_runs() -> None:
+    theta, commands = rigs.theta("gripper"), cycles("gripper", 2)
+    values = {"cup_compliance": {"volume_at_full_vacuum": 8.0}, "leakage": {"sonic_flow": 1.0}}
+    after, half = theta, len(commands) // 2
+    for name, of in values.items():
+        after = apply(after, name, of)
+    state, control = kernel.at_rest(theta), kernel.Control.anew()
+    dt, expected = np.full(len(commands), MS), np.empty(len(commands))
+    dt[0] = 0.0
+    other = np.empty((2, len(commands)), np.uint8)
+    for rows, of in ((slice(0, half + 1), theta), (slice(half + 1, None), after)):
+        if of is after:
+            kernel.take_over(state, theta, after)
+        out = other[0][rows], expected[rows], other[1][rows]
+        kernel.run_on(state, control, of, dt[rows], commands[rows], out)
+    with stepped(made("gripper")) as (one,):
+        one.begin()
+        before = one.run(commands[:half])
+        one.set(effect__cup_compliance__volume_at_full_vacuum=8.0, effect__leakage__sonic_flow=1.0)
+        seen = np.concatenate([before, one.run(commands[half:-1])])
+    assert np.abs(seen - expected[1:]).max() < BOUND
+
+
+def test_what_a_diagnosis_found_is_where_the_effects_start() -> None:
+    found = {"filter_clogging": {"pressure_drop_at_nominal": 60.0}, "suction_loss": {"loss": 20.0}}
+    data, other = (
+        rigs.config("gripper").data.model_copy(update={"effects": effects})
+        for effects in (found, dict(reversed(found.items())))
+    )
+    commands = cycles("gripper", 1)
+    with stepped(fmus.of_data(data)) as (one,):
+        assert one.get("effect.suction_loss.loss") == 20.0
+        one.begin()
+        seen = one.run(commands[:-1])
+        one.fmu.reset()
+        one.time = 0.0
+        one.begin(
+            effect__filter_clogging__pressure_drop_at_nominal=0.0, effect__suction_loss__loss=0.0
+        )
+        mended = one.run(commands[:-1])
+    expected, turned = (by_twin(coefficients(one), commands)[1:] for one in (data, other))
+    assert np.abs(seen - expected).max() < BOUND
+    assert np.abs(expected - turned).max() > 10 * BOUND  # their order matters
+    assert np.abs(mended - by_twin(rigs.theta("gripper"), commands)[1:]).max() < BOUND
+
+
+def test_steps_may_be_of_any_length() -> None:
+    commands = cycles("gripper", 1)  # all edges at 50 ms
+    with stepped(made("gripper"), 3) as (fine, coarse, odd):
+        for one in (fine, coarse, odd):
+            one.begin()
+        each = fine.run(commands)
+        assert (coarse.run(commands, 50) == each[49::50]).all()
+        for told in commands[::50]:
+            odd.set(command__suction=bool(told & 1), command__blow_off=bool(told & 2))
+            for step in (0.0004, 0.0107, 0.0389):
+                odd.step(step)
+        assert abs(odd.get("sensor.pressure") - each[-1]) < 20.0
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_state_is_saved_and_restored_to_the_last_bit(version: int) -> None:
+    commands = cycles("gripper", 2)
+    with stepped(made("gripper", version), 2) as (one, other):
+        one.begin(effect__leakage__sonic_flow=1.0)
+        other.begin()
+        one.run(commands[:500])
+        saved = one.saved()
+        first = one.run(commands[500:2500])
+        for instance in (one, other):
+            instance.restore(saved, 500 * MS)
+        again, elsewhere = one.run(commands[500:2500]), other.run(commands[500:2500])
+    assert (again == first).all()
+    assert (elsewhere == first).all()
+
+
+def test_instances_do_not_disturb_each_other() -> None:
+    commands = cycles("gripper", 1)
+    with stepped(made("gripper"), 3) as (alone, one, other):
+        for instance in (alone, one):
+            instance.begin()
+        other.begin(effect__suction_loss__loss=30.0)
+        undisturbed, turns = alone.run(commands), []
+        for row in range(len(commands)):
+            turns.append(one.run(commands[row : row + 1])[0])
+            other.run(commands[-row - 1 :][:1])
+    assert (np.array(turns) == undisturbed).all()
+
+
+def test_gas_from_elsewhere_comes_in_at_the_port() -> None:
+    theta, commands = rigs.theta("test_rig"), cycles("test_rig", 1)
+    theta[c.INFLOW] = 5.0 * SL_MIN
+    with stepped(made("test_rig")) as (one,):
+        one.begin(vessel__inflow=5.0 * SL_MIN)
+        seen = one.run(commands[:-1])
+    assert np.abs(seen - by_twin(theta, commands)[1:]).max() < BOUND
+    assert np.abs(seen - by_twin(rigs.theta("test_rig"), commands)[1:]).max() > 1e3
+
+
+def test_a_vessel_outside_closes_the_open_port(
+    record_property: Callable[[str, object], None],
+) -> None:
+    """Mass and energy of a tank by explicit steps of 1 ms: about the twin's own curve."""
+    theta, commands = rigs.theta("test_rig"), cycles("test_rig", 1)
+    volume, film = theta[c.VOLUME], theta[c.FILM] * theta[c.AREA]
+    pressure, wall = theta[c.AMBIENT], theta[c.TEMPERATURE]
+    mass, seen = pressure * volume / (R * wall), []
+    with stepped(made("test_rig", 3, "outside")) as (one,):
+        one.begin()
+        for told in commands[:-1]:
+            warm = pressure * volume / (R * mass)
+            one.set(command__suction=bool(told & 1), command__blow_off=bool(told & 2))
+            one.set(vessel__pressure=pressure, vessel__temperature=warm)
+            one.step(MS)
+            flow = one.get("vessel.mass_flow")
+            carried = warm if flow > 0.0 else one.get("line.temperature")
+            gain = (GAMMA - 1.0) * film * (wall - warm) - GAMMA * R * flow * carried
+            pressure, mass = pressure + gain * MS / volume, mass - flow * MS
+            seen.append(one.get("sensor.pressure"))
+    off = np.abs(np.array(seen) - by_twin(theta, commands)[1:])
+    record_property("at most off, Pa", off.max())
+    assert off.max() < 500.0
+    assert np.sqrt((off**2).mean()) < 100.0
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_what_cannot_be_is_refused_in_words(version: int) -> None:
+    with stepped(made("gripper", version)) as (one,):
+        with pytest.raises(Exception, match="rror"):
+            one.set(effect__leakage__sonic_flow=61.0)
+        one.begin()
+        with pytest.raises(Exception, match="rror"):
+            one.set(coefficient__suction=1e-3)
+        with pytest.raises(Exception, match="rror"):
+            one.set(sensor__pressure=1e5)
+        with pytest.raises(Exception, match="rror"):
+            one.set(ambient__pressure=float("nan"))
+        with pytest.raises(Exception, match="rror"):
+            one.step(-1.0)
+    assert re.search(r"leakage.sonic_flow = 61 is out of bounds: between 0 and 60", one.said[0])
+    assert "coefficient.suction cannot be set once time runs" in one.said[1]
+    assert "sensor.pressure cannot be set from outside" in one.said[2]
+    assert "ambient.pressure = nan" in one.said[3]
+    assert "time ahead" in one.said[4]
+
+
+def test_a_state_of_another_fmu_is_refused() -> None:
+    with stepped(made("gripper")) as (one,), stepped(made("test_rig")) as (other,):
+        one.begin()
+        other.begin()
+        with pytest.raises(Exception, match="rror"):
+            other.restore(one.saved(), 0.0)
+    assert other.said == ["the state is not one of this FMU"]
+
+
+@pytest.mark.parametrize(("version", "where"), ALL)
+def test_sources_compile_without_a_warning(version: int, where: Where, tmp_path: Path) -> None:
+    for name, content in parts(made("gripper", version, where)).items():
+        if name.startswith("sources/"):
+            (tmp_path / Path(name).name).write_bytes(content)
+    command = ["cc", "-std=c99", "-Wall", "-Wextra", "-Werror", "-O1", "-c", f"fmi{version}.c"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_another_tool_compiles_the_sources(tmp_path: Path) -> None:
+    component = Component.of(rigs.config("gripper").data, "inside")
+    bare = make_fmu(component, "cell 1", "a test", "tests", 3, compiled=False)
+    assert bare.binary == ""
+    with fmus.as_file(bare) as path:
+        extract(path, tmp_path / "fmu")
+    (tmp_path / "build").mkdir()
+    build_platform_binary(tmp_path / "fmu", tmp_path / "build", all_warnings=True)
+    one = fmus.Stepped(str(tmp_path / "fmu"), str(tmp_path / "fmu"))
+    one.begin()
+    commands = cycles("gripper", 1)[:400]
+    seen = one.run(commands[:-1])
+    one.fmu.freeInstance()
+    assert np.abs(seen - by_twin(rigs.theta("gripper"), commands)[1:]).max() < BOUND
+
+
+def test_without_a_compiler_there_are_sources_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    component = Component.of(rigs.config("gripper").data, "inside")
+    bare = make_fmu(component, "cell 1", "a test", "tests", 3, compiled=True)
+    assert bare.binary == ""
+    assert not [name for name in parts(bare) if name.startswith("binaries/")]
+    with fmus.as_file(bare) as path:
+        assert validate_fmu(path) == []
+
+
+def test_the_same_data_give_the_same_file_and_no_python_is_in_it() -> None:
+    once, twice = made("gripper"), fmus.of_data(rigs.config("gripper").data)
+    assert once.content == twice.content
+    assert b"libpython" not in parts(once)[once.binary]
+    assert made("test_rig").content != once.content
