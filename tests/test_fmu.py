@@ -1,10 +1,11 @@
 """The FMU: what FMPy says of it, and that it is the twin to the last tenth of a pascal."""
 
+import os
 import re
 import shutil
 import subprocess
+import sys
 import zipfile
-from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
 
@@ -53,17 +54,14 @@ def test_fmpy_finds_nothing(version: int, where: Where) -> None:
     [("test_rig", 3, {}), ("test_rig", 2, FAULT), ("gripper", 2, {}), ("gripper", 3, FAULT)],
 )
 def test_ten_cycles_are_those_of_the_twin(
-    name: str,
-    version: int,
-    fault: dict[str, dict[str, float]],
-    record_property: Callable[[str, object], None],
+    name: str, version: int, fault: dict[str, dict[str, float]]
 ) -> None:
     theta, commands = rigs.theta(name), cycles(name, 10)
     for effect, values in fault.items():
         theta = apply(theta, effect, values)
     given = {f"effect.{e}.{p}": value for e, of in fault.items() for p, value in of.items()}
     off = np.abs(fmus.simulated(made(name, version), commands, given) - by_twin(theta, commands))
-    record_property("at most off, Pa", off.max())
+    print(f"at most {off.max():.3g} Pa")  # noqa: T201 - for pytest -s
     assert off.max() < BOUND
 
 
@@ -132,11 +130,14 @@ def test_steps_may_be_of_any_length() -> None:
             one.begin()
         each = fine.run(commands)
         assert (coarse.run(commands, 50) == each[49::50]).all()
+        uneven = []
         for told in commands[::50]:
             odd.set(command__suction=bool(told & 1), command__blow_off=bool(told & 2))
             for step in (0.0004, 0.0107, 0.0389):
                 odd.step(step)
-        assert abs(odd.get("sensor.pressure") - each[-1]) < 20.0
+            uneven.append(odd.get("sensor.pressure"))
+        off = np.abs(np.array(uneven) - each[49::50])
+        assert off.max() < 1.0  # the control has decided at other times, too
 
 
 @pytest.mark.parametrize("version", [2, 3])
@@ -178,9 +179,7 @@ def test_gas_from_elsewhere_comes_in_at_the_port() -> None:
     assert np.abs(seen - by_twin(rigs.theta("test_rig"), commands)[1:]).max() > 1e3
 
 
-def test_a_vessel_outside_closes_the_open_port(
-    record_property: Callable[[str, object], None],
-) -> None:
+def test_a_vessel_outside_closes_the_open_port() -> None:
     """Mass and energy of a tank by explicit steps of 1 ms: about the twin's own curve."""
     theta, commands = rigs.theta("test_rig"), cycles("test_rig", 1)
     volume, film = theta[c.VOLUME], theta[c.FILM] * theta[c.AREA]
@@ -199,7 +198,7 @@ def test_a_vessel_outside_closes_the_open_port(
             pressure, mass = pressure + gain * MS / volume, mass - flow * MS
             seen.append(one.get("sensor.pressure"))
     off = np.abs(np.array(seen) - by_twin(theta, commands)[1:])
-    record_property("at most off, Pa", off.max())
+    print(f"at most {off.max():.3g} Pa")  # noqa: T201 - for pytest -s
     assert off.max() < 500.0
     assert np.sqrt((off**2).mean()) < 100.0
 
@@ -244,7 +243,9 @@ def test_sources_compile_without_a_warning(version: int, where: Where, tmp_path:
     assert done.returncode == 0, done.stderr
 
 
-def test_another_tool_compiles_the_sources(tmp_path: Path) -> None:
+def test_another_tool_compiles_the_sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fmus.need("cc", "c++", "make")  # its project asks for C++, whatever the sources are
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")  # CMake's
     component = Component.of(rigs.config("gripper").data, "inside")
     bare = make_fmu(component, "cell 1", "a test", "tests", 3, compiled=False)
     assert bare.binary == ""

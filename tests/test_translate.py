@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import fmus
 import numpy as np
 import pytest
 
@@ -52,6 +53,7 @@ def swapped(a, b):  # type: ignore[no-untyped-def]
 def counted(a, b):  # type: ignore[no-untyped-def]
     total = 0
     for n in range(1, 4):
+        total += 1
         for _ in range(n):
             total += n * a
     for factor, power in ((2, b), (LOW, a)):
@@ -90,6 +92,7 @@ def lanes(state, out):  # type: ignore[no-untyped-def]
 
 
 def loaded(text: str, folder: Path) -> ctypes.CDLL:
+    fmus.need("cc")
     (folder / "all.c").write_text(f"#include <math.h>\n{text}")
     command = ["cc", "-std=c99", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", "all.c"]
     done = subprocess.run(

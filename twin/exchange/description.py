@@ -80,6 +80,10 @@ def _common(component: Component, who: Identity) -> dict[str, str]:
 
 
 def _experiment(root: Element) -> None:
+    categories = SubElement(root, "LogCategories")
+    SubElement(
+        categories, "Category", name="logStatusError", description="what was refused, and why"
+    )
     SubElement(root, "DefaultExperiment", startTime="0.0", stopTime="10.0", stepSize=number(MS))
 
 
