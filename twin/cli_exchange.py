@@ -32,7 +32,7 @@ class Fmi(StrEnum):
 
 def export_fmu(
     config: Annotated[
-        Path | None, typer.Option(metavar="CONFIG", help="Its unit, [data] and [assets] url.")
+        Path | None, typer.Option(metavar="CONFIG", help="Its unit, data and asset database.")
     ] = None,
     unit: Annotated[
         str, typer.Option("--id", metavar="ID", help="Unit or type; default: of the configuration.")
