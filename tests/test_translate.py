@@ -23,7 +23,9 @@ class Pair(NamedTuple):
 
 
 def precedence(a, b):  # type: ignore[no-untyped-def]
-    return a - (b - a) - a / (b / a) * -b + (a + b) * (a - b) ** 2 - abs(a - 3.0) ** (1.0 / 3.0)
+    negative = -a
+    twice = -(-negative)  # noqa: B002 - what C would take for a decrement
+    return twice - (b - a) - a / (b / a) * -b + (a + b) * (a - b) ** 2 - abs(a - 3.0) ** (1.0 / 3.0)
 
 
 def extremes(a, b):  # type: ignore[no-untyped-def]
@@ -51,7 +53,8 @@ def swapped(a, b):  # type: ignore[no-untyped-def]
 
 
 def counted(a, b):  # type: ignore[no-untyped-def]
-    total = 0
+    total = 3
+    total /= 2
     for n in range(1, 4):
         total += 1
         for _ in range(n):
@@ -168,7 +171,38 @@ def _chained(a):  # type: ignore[no-untyped-def]
     return 1.0 if 0.0 < a < 1.0 else 2.0
 
 
-@pytest.mark.parametrize("function", [_while, _text, _floored, _rounded, _chained])
+def _powered(a):  # type: ignore[no-untyped-def]
+    a **= 3.0
+    return a
+
+
+def _strode(a):  # type: ignore[no-untyped-def]
+    for _ in range(1, 9, 2): a += 1.0  # noqa: E701  # fmt: skip
+    return a
+
+
+def _skipped(a):  # type: ignore[no-untyped-def]
+    for n in (1.0, 2.0):  # fmt: skip
+        if a > n:
+            continue
+        a += n
+    return a
+
+
+def _is(a):  # type: ignore[no-untyped-def]
+    return 1.0 if a is None else a
+
+
+def _keyword(a):  # type: ignore[no-untyped-def]
+    return Pair(one=a, two=a)
+
+
+REFUSED = (
+    _while, _text, _floored, _rounded, _chained, _powered, _strode, _skipped, _is, _keyword,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("function", REFUSED)
 def test_what_has_no_translation_is_refused_with_its_place(function: Any) -> None:
     line = function.__code__.co_firstlineno + 1
     with pytest.raises(Untranslatable, match=rf"test_translate\.py:{line}: no translation"):

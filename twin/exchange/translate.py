@@ -200,7 +200,11 @@ class _Body:
 
     def _changed(self, node: ast.AugAssign) -> list[str]:
         """``x += v`` and the like; several rows at once get the same ``v``."""
+        if type(node.op) not in _BINARY:
+            raise self._refused(node)
         given, (sign, _) = self._value(node.value), _BINARY[type(node.op)]
+        if isinstance(node.op, ast.Div):
+            given = Value(given.text, NUMBER)  # and so becomes what is divided
         match node.target:
             case ast.Subscript(value=of, slice=ast.List(elts=rows)):
                 name = self._held(given.kind)
@@ -213,14 +217,16 @@ class _Body:
             case ast.Call(func=ast.Name(id="range"), args=[ast.Subscript()]), ast.Name(id=name):
                 self._parameters[name] = INDEX  # over hypotheses, of which there is one
                 return ["do {", *self._block(node.body), "} while (0);"]
-            case ast.Call(func=ast.Name(id="range"), args=bounds), ast.Name(id=name):
+            case ast.Call(func=ast.Name(id="range"), args=[_] | [_, _] as bounds), ast.Name(
+                id=name
+            ):
                 values = [self._value(one).text for one in bounds]
                 start, end = ["0", *values][-2:]
                 counter = f"n{self._next()}" if name == "_" else name
                 self._local(counter, WHOLE)
                 head = f"for ({counter} = {start}; {counter} < {end}; {counter}++) {{"
                 return [head, *self._block(node.body), "}"]
-            case ast.Tuple(elts=items), target:
+            case ast.Tuple(elts=items), target if not _continues(node.body):
                 lines = []
                 for item in items:  # written out one after the other
                     given: list[ast.stmt] = [ast.Assign([target], item, lineno=node.lineno)]
@@ -279,20 +285,20 @@ class _Body:
                 return self._binary(node)
             case ast.UnaryOp(op=ast.USub(), operand=operand):
                 given = self._value(operand)
-                return Value(f"-{given.inside(4)}", given.kind, 4)
+                return Value(f"-{given.inside(5)}", given.kind, 4)
             case ast.UnaryOp(op=ast.Not(), operand=operand):
                 return Value(f"!({self._truth(operand)})", WHOLE)
             case ast.BoolOp(op=op, values=values):
                 sign = " && " if isinstance(op, ast.And) else " || "
                 return Value(sign.join(f"({self._truth(one)})" for one in values), WHOLE, 0)
-            case ast.Compare(left=left, ops=[op], comparators=[right]):
+            case ast.Compare(left=left, ops=[op], comparators=[right]) if type(op) in _COMPARED:
                 pair = self._value(left).inside(2), self._value(right).inside(2)
                 return Value(f"{pair[0]} {_COMPARED[type(op)]} {pair[1]}", WHOLE, 1)
             case ast.IfExp(test=test, body=body, orelse=other):
                 return self._choice(test, body, other)
             case ast.Tuple(elts=parts):
                 return self._tuple([self._value(one) for one in parts])
-            case ast.Call():
+            case ast.Call(keywords=[]):
                 return self._call(node)
         raise self._refused(node)
 
@@ -398,6 +404,10 @@ class _Body:
             self._line + getattr(node, "lineno", 1) - 1,
         )
         return Untranslatable(f"{file}:{line}: no translation into C: {ast.unparse(node)}")
+
+
+def _continues(body: list[ast.stmt]) -> bool:
+    return any(isinstance(one, ast.Continue) for line in body for one in ast.walk(line))
 
 
 def _names(node: ast.AST) -> list[ast.Name]:
