@@ -5,17 +5,19 @@ import os
 import signal
 from collections.abc import Iterator
 from concurrent.futures import Future
+from dataclasses import replace
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
 import fleets
 import pytest
+import rigs
 from command_line import twin
 
 from tools.dask_cluster import cluster
 from twin.fleet import go as going
-from twin.fleet.works import Done, Job, run
+from twin.fleet.works import Done, Job, code, run
 
 UNITS = ("A1", "A2", "A3")
 DIES = "dies"  # in the name of a log
@@ -74,7 +76,9 @@ def test_other_code_answers_anew(
 ) -> None:
     asked = ("fleet", "replay", logs / "A1-0.mcap", "--assets", tmp_path / "f.sqlite")
     assert twin(monkeypatch, *asked) == 0
-    monkeypatch.setattr("twin.fleet.store.code", lambda: "another")
+    for module in ("store", "go", "works"):
+        monkeypatch.setattr(f"twin.fleet.{module}.code", lambda: "another")
+    monkeypatch.setattr(going, "run", here)
     capsys.readouterr()
     assert twin(monkeypatch, *asked) == 0
     assert "1 of 1 logs done, 0 were known" in capsys.readouterr().out
@@ -98,6 +102,19 @@ def test_a_broken_log_costs_only_itself(
     assert str(damaged) in said.err
     assert str(foreign) in said.err
     assert "Traceback" not in said.err
+
+
+def here(job: Job) -> Done:
+    """As ``run``, by the code that asks."""
+    return run(replace(job, code=code()))
+
+
+def test_a_worker_with_other_code_is_refused(logs: Path) -> None:
+    log = logs / "A1-0.mcap"
+    done = run(Job("replay", log, rigs.config("test_rig"), "another"))
+    assert done.answer is None
+    assert str(log) in done.error
+    assert "another version" in done.error
 
 
 def at_a_loss(job: Job) -> Done:

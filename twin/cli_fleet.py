@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from twin.settings import Document
 
 fleet_app = typer.Typer(help="Many logs: work on each once, and compare.", no_args_is_help=True)
+
+
+One = TypeVar("One")
 
 
 class EngineName(StrEnum):
@@ -178,7 +181,9 @@ def _done(work: str, logs: Sequence[Path], fleet: _Fleet, engine: _Engine) -> "l
     from twin.fleet.go import Told, ask, go
     from twin.fleet.store import open_store
 
-    asked = list(ask(work, _files(logs), lambda log: fleet.config_of(log, work)))
+    files = _files(logs)
+    asking = ask(work, files, lambda log: fleet.config_of(log, work))
+    asked = list(_progress(asking, len(files), "reading logs"))
     wanted = [one for one in asked if not isinstance(one, Told)]
     told = [one for one in asked if isinstance(one, Told)]
     for one in told:
@@ -210,14 +215,14 @@ def _files(logs: Sequence[Path]) -> list[Path]:
     return list(dict.fromkeys(found))
 
 
-def _progress(told: "Iterable[Told]", total: int, what: str) -> "Iterator[Told]":
+def _progress(over: "Iterable[One]", total: int, what: str) -> "Iterator[One]":
     """Show how far it is and how long it will take, where somebody looks."""
     from rich.console import Console
     from rich.progress import track
 
     console = Console(stderr=True)
     yield from track(
-        told, what, total, console=console, transient=True, disable=not console.is_terminal
+        over, what, total, console=console, transient=True, disable=not console.is_terminal
     )
 
 

@@ -10,7 +10,7 @@ from twin.config import Config
 from twin.errors import TwinError
 from twin.fleet.engines import Submit, died
 from twin.fleet.store import Key, Store, key_of
-from twin.fleet.works import Done, Job, run
+from twin.fleet.works import Done, Job, code, run
 from twin.log.reader import Log, open_log
 
 Configure = Callable[[Log], Config]
@@ -41,7 +41,7 @@ def ask(work: str, logs: Iterable[Path], configure: Configure) -> Iterator[Wante
         try:
             log = open_log(path)
             config = configure(log)
-            yield Wanted(Job(work, path, config), key_of(work, log, config), _begin_ns(log))
+            yield Wanted(Job(work, path, config, code()), key_of(work, log, config), _begin_ns(log))
         except (TwinError, OSError) as error:
             yield Told(path, "failed", error=str(error))
 

@@ -9,7 +9,6 @@ import json
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ from sqlalchemy import (
 
 from twin.assets.engine import ASSETS, Database
 from twin.config import Config
+from twin.fleet.works import code
 from twin.log.reader import Log
 
 PIECE = 1 << 20
@@ -86,15 +86,6 @@ def key_of(work: str, log: Log, config: Config) -> Key:
     judged_with += [config.asset.type, config.asset.id, config.asset.batch]
     basis = hashlib.sha256(json.dumps(judged_with).encode()).hexdigest()[:16]
     return Key(work, content.hexdigest(), code(), basis)
-
-
-@cache
-def code() -> str:
-    """16 hex digits over the sources that answer: other ones may answer otherwise."""
-    sources, root = hashlib.sha256(), Path(__file__).parents[1]
-    for path in sorted(root.rglob("*.py")):
-        sources.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
-    return sources.hexdigest()[:16]
 
 
 def open_store(

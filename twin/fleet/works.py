@@ -4,8 +4,10 @@ A worker reads its log and computes; what it finds goes back to who asked, who a
 database. So a worker that dies costs its log and nothing else.
 """
 
+import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,7 @@ class Job:
     work: str  # of WORKS
     log: Path
     config: Config
+    code: str  # of who asks
 
 
 @dataclass(frozen=True)
@@ -40,8 +43,19 @@ class Done:
     record: Record | None = None  # for the asset database
 
 
+@cache
+def code() -> str:
+    """16 hex digits over the sources that answer: other ones may answer otherwise."""
+    sources, root = hashlib.sha256(), Path(__file__).parents[1]
+    for path in sorted(root.rglob("*.py")):
+        sources.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
+    return sources.hexdigest()[:16]
+
+
 def run(job: Job) -> Done:
     """Do a job on one core; whatever goes wrong is said of this log and stops no other one."""
+    if job.code != code():
+        return Done(None, f"{job.log}: {_OTHER}")
     CORES.set(1)
     try:
         answer, record = WORKS[job.work](job)
@@ -65,6 +79,8 @@ def _diagnose(job: Job) -> tuple[dict[str, Any], Record | None]:
 def _replay(job: Job) -> tuple[dict[str, Any], Record | None]:
     return watched(job.config, _samples(job)), None
 
+
+_OTHER = "the worker has another version of ejector-twin; install the same one there as here"
 
 WORKS: Mapping[str, Callable[[Job], tuple[dict[str, Any], Record | None]]] = {
     "calibrate": _calibrate,
