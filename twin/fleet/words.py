@@ -12,10 +12,9 @@ from twin.diagnosis.words import spoken
 from twin.errors import SourceError
 from twin.fleet.kinds import Estimate
 from twin.fleet.peers import FEWEST_PEERS
-from twin.fleet.report import STANDS_OUT, Report, Row, cause_of
+from twin.fleet.report import STANDS_OUT, Report, Row
 
 MOST_LISTED = 15  # units, in the terminal
-MOST_NAMED = 12  # units in the picture
 GOOD, BAD = "#2e7d4f", "#b3261e"
 HEAD = ("unit", "batch", "stands out by", "most like", "drift", "diagnosis")
 
@@ -137,10 +136,6 @@ def _drawn(report: Report) -> list[str]:
             place = range(first, first + len(some))
             axes.plot(place, [_beyond(row) for row in some], ".", color=colour, label=label)
         axes.axhline(STANDS_OUT, color=QUIET, lw=0.8, ls="--")
-        for rank, row in enumerate(ranked[: min(noticed, MOST_NAMED)], 1):
-            says = f"{row.id}: like {spoken(cause_of(row))}"
-            at = (rank, _beyond(row))
-            axes.annotate(says, at, (5, 0), textcoords="offset points", fontsize=7, va="center")
         logarithmic(axes)
         axes.set_yscale("symlog", linthresh=STANDS_OUT)
         axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
