@@ -11,10 +11,12 @@ from twin.config import Config
 CYCLES = 5
 
 
-def write(folder: Path, unit: str, seed: int, faults: tuple[str, ...] = ()) -> Path:
+def write(
+    folder: Path, unit: str, seed: int, faults: tuple[str, ...] = (), cycles: int = CYCLES
+) -> Path:
     """A log of a unit on the tank rig."""
     config = Config.of(shipped("test_rig"), unit=unit)
-    samples, _ = rigs.recorded("test_rig", 3.1 * (CYCLES + 1.2), faults, seed)
+    samples, _ = rigs.recorded("test_rig", 3.1 * (cycles + 1.2), faults, seed)
     path = folder / f"{unit}-{seed}.mcap"
     write_log(path, config, samples)
     return path

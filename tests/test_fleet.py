@@ -16,6 +16,7 @@ import rigs
 from command_line import twin
 
 from tools.dask_cluster import cluster
+from twin.assets.database import open_assets
 from twin.fleet import go as going
 from twin.fleet.works import Done, Job, code, run
 
@@ -102,6 +103,24 @@ def test_a_broken_log_costs_only_itself(
     assert str(damaged) in said.err
     assert str(foreign) in said.err
     assert "Traceback" not in said.err
+
+
+def test_units_are_calibrated_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, database = fleets.write(tmp_path, "A1", 3, cycles=8), tmp_path / "f.sqlite"
+    short = fleets.write(tmp_path, "A2", 4, cycles=1)
+    asked = ("fleet", "calibrate", tmp_path, "--assets", database, "--workers", "1")
+    assert twin(monkeypatch, *asked) == 0
+    said = capsys.readouterr()
+    assert "1 of 2 logs done, 0 were known, 1 could not be" in said.out
+    assert f"{short}: the log has 1 complete cycles" in said.err
+    assert twin(monkeypatch, *asked) == 0
+    assert "0 of 2 logs done, 1 were known" in capsys.readouterr().out
+    with open_assets(database) as assets:
+        (record,) = assets.records("instance", "A1")
+    assert record.provenance["log"] == log.name
+    assert "ejector.suction_capacity_sl_min" in record.provenance["determined"]
 
 
 def here(job: Job) -> Done:

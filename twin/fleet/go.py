@@ -43,7 +43,7 @@ def ask(work: str, logs: Iterable[Path], configure: Configure) -> Iterator[Wante
             config = configure(log)
             yield Wanted(Job(work, path, config, code()), key_of(work, log, config), _begin_ns(log))
         except (TwinError, OSError) as error:
-            yield Told(path, "failed", error=str(error))
+            yield _failed(path, str(error))
 
 
 def go(
@@ -70,15 +70,19 @@ def _keep(future: Future[Done], one: Wanted, store: Store, assets: str | Path) -
     except Exception as error:
         if not died(error):
             raise
-        gone = f"{log}: the process that worked on it was killed: {error}"
-        return Told(log, "failed", error=gone)
+        return _failed(log, f"the process that worked on it was killed: {error}")
     if done.answer is None:
-        return Told(log, "failed", error=done.error)
+        return _failed(log, done.error)
     if done.record is not None:
         with open_assets(assets) as database:
             database.add(done.record)
     store.add(one.key, one.job.config, log, one.begin_ns, done.answer)
     return Told(log, "done", one.key)
+
+
+def _failed(log: Path, why: str) -> Told:
+    """Of which log it is said, where that is not said yet."""
+    return Told(log, "failed", error=why if str(log) in why else f"{log}: {why}")
 
 
 def _begin_ns(log: Log) -> int:
