@@ -211,6 +211,7 @@ class Fake:
 
     def __init__(self) -> None:
         self.taken: list[Message] = []
+        self.topics: list[str] = []  # of each batch
         self.tries = 0
         self.down = False
         self.forgets = False
@@ -227,8 +228,9 @@ class Fake:
         forgotten, self._connected = self.forgets and not self._connected, True
         return forgotten
 
-    def send(self, messages: Sequence[Message]) -> Sent:
+    def send(self, messages: Sequence[Message], topic: str = sender.ALARM) -> Sent:
         sent = Sent()
+        self.topics.append(topic)
         for one in messages[: self.most]:
             if why := self.take(one):
                 sent.refused[one.id] = why
@@ -505,7 +507,7 @@ def test_what_there_is_no_room_for_is_counted(monkeypatch: pytest.MonkeyPatch) -
         one.start()
     outlets._thread.start()
     outlets.close()
-    assert "5 changes of alarms could not be put into the outbox" in said
+    assert "5 messages could not be put into the outbox" in said
 
 
 def test_the_end_does_not_wait_for_who_does_not_answer(

@@ -9,9 +9,10 @@ from twin.errors import ConfigError
 
 if TYPE_CHECKING:
     from twin.config import Config
+    from twin.outlets.data import Teller
     from twin.outlets.dispatch import Outlets
-    from twin.outlets.sender import Channel
-    from twin.outlets.settings import Outlet
+    from twin.outlets.sender import Channel, Lane
+    from twin.outlets.settings import MqttSettings, Outlet
 
 Say = Callable[[str], None]
 Standing = Sequence[Mapping[str, Any]]  # alarms as they are
@@ -47,22 +48,45 @@ def outlets_of(settings: "Config", say: Say) -> Begin | None:
     folder, unit = Path(document.name).parent, Unit(settings.asset.type, settings.asset.id)
     outbox = partial(open_outbox, place_of(document), unit)
     channels: dict[str, tuple[Channel, Outlet]] = {}
-    show_cycle = None
     if mqtt.host:
-        broker = Mqtt(mqtt, unit, folder, say)
-        channels["mqtt"] = broker, mqtt
-        show_cycle = broker.show_cycle if mqtt.cycles else None
+        channels["mqtt"] = Mqtt(mqtt, unit, folder, say, batch=settings.asset.batch), mqtt
     if webhook.url:
         channels["webhook"] = Webhook(webhook, folder, say), webhook
 
     def begin(standing: Standing) -> "Outlets":
+        tellers = {"mqtt": _tellers_of(settings, mqtt)} if mqtt.host else {}
+        lanes = {"mqtt": _lanes_of(mqtt)}
         senders = [
-            Sender(name, channel, outbox, limits, say)
+            Sender(name, channel, outbox, limits, say, lanes=lanes.get(name, ()))
             for name, (channel, limits) in channels.items()
         ]
         restating = [name for name in channels if name == "mqtt"]
-        outlets = Outlets(unit, outbox, senders, say, restating=restating, show_cycle=show_cycle)
+        outlets = Outlets(unit, outbox, senders, say, restating=restating, tellers=tellers)
         outlets.begin(standing)
         return outlets
 
     return begin
+
+
+def _tellers_of(settings: "Config", mqtt: "MqttSettings") -> "list[Teller]":
+    """What goes to the broker beside alarms."""
+    from twin.assets.unit import Unit
+    from twin.outlets.data import Cycles, Values
+    from twin.outlets.message import asset_of
+    from twin.signals import MBAR
+
+    asset = asset_of(Unit(settings.asset.type, settings.asset.id), settings.asset.batch)
+    tellers: list[Teller] = [Cycles(asset)] if mqtt.cycles else []
+    if mqtt.values is not None:
+        ambient = settings.data.ambient.pressure_mbar * MBAR
+        tellers.append(Values(asset, mqtt.values.period_s, ambient))
+    return tellers
+
+
+def _lanes_of(mqtt: "MqttSettings") -> "list[Lane]":
+    """How that waits: also what an earlier run has left of what is not told any more."""
+    from twin.outlets.data import CYCLE, VALUES
+    from twin.outlets.sender import Lane
+
+    what = {CYCLE: "key figures", VALUES: "values"}
+    return [Lane(topic, words, mqtt.keep_hours) for topic, words in what.items()]

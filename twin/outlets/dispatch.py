@@ -1,4 +1,4 @@
-"""A sink that puts changes of alarms into the outbox for all destinations; never waited for."""
+"""A sink that puts what is told into the outbox for all destinations; never waited for."""
 
 import queue
 import threading
@@ -8,10 +8,11 @@ from typing import Any
 
 from twin.assets.unit import Unit
 from twin.errors import TwinError
-from twin.events import Event, Kind
-from twin.outlets.message import Message, of_cycle, of_event, restated
+from twin.events import Event
+from twin.outlets.data import Teller
+from twin.outlets.message import Message, of_event, restated
 from twin.outlets.outbox import Outbox
-from twin.outlets.sender import Sender
+from twin.outlets.sender import Sender, box_of
 from twin.signals import Samples, Ticks
 
 MOST_IN_MEMORY = 10_000  # messages, while the database is away
@@ -22,10 +23,10 @@ Letter = tuple[str, Message]  # to whom, and what
 
 
 class Outlets:
-    """Where the alarms of a unit go (``twin.live.Sink``).
+    """Where the alarms of a unit go (``twin.live.Sink``), and what is told beside them.
 
     A thread writes into the outbox, and one for each destination delivers. ``restating`` are the
-    destinations that are to know every alarm as it is; ``show_cycle`` takes key figures as JSON.
+    destinations that are to know every alarm as it is; ``tellers`` say what else goes to each.
     """
 
     def __init__(
@@ -36,10 +37,15 @@ class Outlets:
         say: Callable[[str], None],
         *,
         restating: Sequence[str] = (),
-        show_cycle: Callable[[str], None] | None = None,
+        tellers: Mapping[str, Sequence[Teller]] | None = None,
     ) -> None:
         self._unit, self._open_outbox, self._senders = unit, open_outbox, senders
-        self._say, self._restating, self._show_cycle = say, restating, show_cycle
+        self._say, self._restating = say, restating
+        self._tellers = [
+            (box_of(name, one.topic), one)
+            for name, those in (tellers or {}).items()
+            for one in those
+        ]
         self._outbox: Outbox | None = None
         self._failed = False
         self._lost = 0  # that there was no room for
@@ -59,14 +65,25 @@ class Outlets:
         for sender in self._senders:
             sender.start()
 
-    def write(self, _samples: Samples, _ticks: Ticks, events: Sequence[Event]) -> None:
+    def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
         """Take what happened."""
         for event in events:
             for message in of_event(self._unit, event):
                 for sender in self._senders:
                     self._put(sender.name, message)
-            if event.kind is Kind.CYCLE and self._show_cycle:
-                self._show_cycle(of_cycle(self._unit, event))
+        for box, teller in self._tellers:
+            for message in teller.tell(samples, ticks, events):
+                self.tell(box, message)
+
+    def tell(self, box: str, message: Message) -> None:
+        """Put what is told beside alarms into the outbox; from any thread.
+
+        It leaves room for alarms where the database is away.
+        """
+        if self._letters.qsize() < MOST_IN_MEMORY // 2:
+            self._put(box, message)
+        else:
+            self._lost += 1
 
     def close(self) -> None:
         """Write and deliver what can be at once; the rest waits for the next run.
@@ -74,6 +91,9 @@ class Outlets:
         Whoever still waits for an answer then is left behind, and that is said.
         """
         end = time.monotonic() + CLOSE_S
+        for box, teller in self._tellers:
+            for message in teller.rest():
+                self.tell(box, message)
         self._ending.set()
         self._news.set()
         self._thread.join(CLOSE_S)
@@ -114,7 +134,7 @@ class Outlets:
         self._write_all()
         left = len(self._waiting) + self._letters.qsize() + self._lost
         if left:
-            self._say(f"{left} changes of alarms could not be put into the outbox")
+            self._say(f"{left} messages could not be put into the outbox")
 
     def _write_all(self) -> bool:
         while self._waiting or not self._letters.empty():

@@ -1,4 +1,4 @@
-"""What is told of alarms: one JSON document for each change, the same wherever it goes."""
+"""What is told: one JSON document for each change of an alarm, the same wherever it goes."""
 
 import json
 import math
@@ -12,8 +12,8 @@ from twin.assets.unit import Unit
 from twin.events import Event, Kind
 
 ALARM_FORMAT = "ejector-twin-alarm/1"
-CYCLE_FORMAT = "ejector-twin-cycle/1"
 STATUS_FORMAT = "ejector-twin-status/1"
+Asset = Mapping[str, str]  # type, id and batch
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -22,7 +22,7 @@ class Message:
     """A change of one alarm on its way; the ID stays the same however often it is sent."""
 
     id: str
-    alarm: str
+    alarm: str  # empty of what is told beside alarms
     body: str  # JSON
 
 
@@ -57,18 +57,24 @@ def again(message: Message, now_ns: int) -> Message:
     return Message(number, message.alarm, encoded({**json.loads(message.body), **later}))
 
 
-def of_cycle(unit: Unit, event: Event) -> str:
-    """The key figures of a cycle."""
-    told = {name: value for name, value in event.data.items() if name != "answer"}
-    at = moment(event.time_ns)
-    return encoded({"format": CYCLE_FORMAT, "asset": unit._asdict(), "plc_time": at, **told})
-
-
-def of_status(unit: Unit, status: str, since_ns: int | None, program: str) -> str:
+def of_status(asset: Asset, status: str, since_ns: int | None, program: str) -> str:
     """Whether the twin is there, since when; who dies cannot say when."""
     since = None if since_ns is None else moment(since_ns)
-    told = {"asset": unit._asdict(), "status": status, "since": since, "program": program}
+    told = {"asset": asset, "status": status, "since": since, "program": program}
     return encoded({"format": STATUS_FORMAT, **told})
+
+
+def beside(form: str, asset: Asset, time_ns: int, told: Mapping[str, Any]) -> Message:
+    """What is told beside alarms; ``time_ns`` is by the clock here."""
+    number = new_id()
+    head = {"format": form, "id": number, "asset": asset}
+    at = {"time": moment(time_ns), "time_ns": time_ns}
+    return Message(number, "", encoded({**head, **at, **told}))
+
+
+def asset_of(unit: Unit, batch: str) -> Asset:
+    """Whose it is, as messages beside alarms have it; the batch where it is known."""
+    return unit._asdict() | ({"batch": batch} if batch else {})
 
 
 def moment(ns: int) -> str:

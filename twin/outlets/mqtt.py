@@ -1,4 +1,4 @@
-"""Alarms to an MQTT 5 broker: a retained topic for each, and whether the twin is there.
+"""To an MQTT 5 broker: a retained topic for each alarm, whether the twin is there, and more.
 
 The library's network loop runs in the sender's thread, between messages. Every connection has a
 client of its own, which knows nothing of before: what the broker has not taken is in the outbox.
@@ -15,28 +15,30 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from paho.mqtt.client import Client, ConnectFlags, MQTTv5
+from paho.mqtt.client import Client, ConnectFlags, MQTTMessage, MQTTv5
 from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
+from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from twin.assets.unit import Unit
-from twin.outlets.message import Message, of_status
-from twin.outlets.sender import BATCH, LostError, Sent
+from twin.outlets.message import Message, asset_of, of_status
+from twin.outlets.sender import ALARM, BATCH, LostError, Sent
 from twin.outlets.settings import MqttSettings, Say
 
 CONNECT_S = 5.0  # to connect, and then to be let in
 ANSWER_S = 20.0  # to take a batch
 LISTEN_S = 0.1  # to the network, before looking for something to send
+REQUEST = "request"  # the topic on which the twin of a unit is asked
 SESSION_S = 86_400  # for which the broker knows us: whether it has lost everything meanwhile
 
 
 class Mqtt:
-    """A channel (``twin.outlets.sender.Channel``) for the alarms of one unit.
+    """A channel (``twin.outlets.sender.Channel``) for what is told of one unit.
 
     ``folder`` is where relative paths are from. ConfigError where a secret or certificate cannot
-    be used.
+    be used. What ``hear_request`` does not raise on is taken from the broker for good.
     """
 
     def __init__(
@@ -46,8 +48,11 @@ class Mqtt:
         folder: Path,
         say: Say,
         clock: Callable[[], int] = time.time_ns,
+        batch: str = "",
+        hear_request: Callable[[bytes], None] | None = None,
     ) -> None:
         self._settings, self._unit, self._clock = settings, unit, clock
+        self._asset, self._hear_request = asset_of(unit, batch), hear_request
         secret = settings.password
         self._password = secret.read("[mqtt] password", folder, say) if secret else None
         self._tls: ssl.SSLContext | None = None
@@ -61,13 +66,9 @@ class Mqtt:
         self._let_in: tuple[ConnectFlags, ReasonCode, Properties] | None = None
         self._awaited: set[int] = set()  # packets; each connection numbers them anew
         self._answers: dict[int, ReasonCode] = {}  # by packet
+        self._say, self._is_deaf = say, False
         self._largest = 0  # bytes of a message that the broker takes; 0 is any
         self._at_once = BATCH
-        self._cycle: str | None = None
-
-    def show_cycle(self, body: str) -> None:
-        """Tell the key figures of the newest cycle, when there is time; others are skipped."""
-        self._cycle = body
 
     def open(self) -> bool:
         """Connect, with the last will, and say that the twin is there."""
@@ -92,25 +93,24 @@ class Mqtt:
         with suppress(LostError):  # whoever is not let in is told so, and then hung up on
             self._listen_until(lambda: self._let_in is not None, CONNECT_S)
         forgotten = self._settle()
+        if self._hear_request is not None:
+            self._ask_for_requests(client)
         self._say_status("online")
         self._is_first, was_first = False, self._is_first
         return forgotten and not was_first
 
-    def send(self, messages: Sequence[Message]) -> Sent:
+    def send(self, messages: Sequence[Message], topic: str = ALARM) -> Sent:
         """Publish, retained, and wait until the broker has taken each."""
         sent = Sent()
         try:
             for begin in range(0, len(messages), self._at_once):
-                self._send(messages[begin : begin + self._at_once], sent)
+                self._send(messages[begin : begin + self._at_once], topic, sent)
         except LostError as error:
             sent.lost = error
         return sent
 
     def idle(self, wake: threading.Event) -> None:
-        """Tell the newest cycle, and listen to the network."""
-        if (cycle := self._cycle) is not None:
-            self._cycle = None
-            self._publish(self.topic("cycle"), cycle, qos=0)
+        """Listen to the network."""
         if not wake.is_set():
             self._listen(LISTEN_S)
 
@@ -146,7 +146,7 @@ class Mqtt:
             client.username_pw_set(self._settings.user, self._password)
         if self._tls is not None:
             client.tls_set_context(self._tls)
-        will = of_status(self._unit, "offline", None, _program())
+        will = of_status(self._asset, "offline", None, _program())
         client.will_set(self.topic("status"), will, qos=1, retain=True)
         client.on_connect = self._on_connect
         client.on_publish = self._on_publish
@@ -177,12 +177,32 @@ class Mqtt:
     def _on_publish(
         self, _client: Client, _userdata: Any, packet: int, reason: ReasonCode, _properties: Any
     ) -> None:
-        if packet in self._awaited:  # it comes for what nobody answers too
+        if packet in self._awaited:
             self._awaited.discard(packet)
             self._answers[packet] = reason
 
+    def _ask_for_requests(self, client: Client) -> None:
+        """Hear what is asked of this unit, also what was asked while it was away for a day.
+
+        A retained request is none: it would be asked again and again.
+        """
+        answers: list[ReasonCode] = []
+        client.on_subscribe = lambda _c, _u, _packet, reasons, _p: answers.extend(reasons)
+        client.on_message = self._on_message
+        options = SubscribeOptions(qos=1, retainHandling=SubscribeOptions.RETAIN_DO_NOT_SEND)
+        client.subscribe(self.topic(REQUEST), options=options)
+        self._listen_until(lambda: bool(answers), CONNECT_S)
+        if answers[0].is_failure and not self._is_deaf:
+            self._say(f"MQTT broker {self._where}: requests cannot be heard: {answers[0]}")
+        self._is_deaf = answers[0].is_failure
+
+    def _on_message(self, _client: Client, _userdata: Any, message: MQTTMessage) -> None:
+        """An error goes through the library's loop, before the broker is told that it arrived."""
+        if self._hear_request is not None and not message.retain:
+            self._hear_request(bytes(message.payload))
+
     def _say_status(self, status: str) -> None:
-        body = of_status(self._unit, status, self._clock(), _program())
+        body = of_status(self._asset, status, self._clock(), _program())
         packet = self._publish(self.topic("status"), body)
         self._listen_until(lambda: packet in self._answers, CONNECT_S)
         reason = self._answers.pop(packet)
@@ -191,15 +211,15 @@ class Mqtt:
 
     # --- sending --------------------------------------------------------------------------------
 
-    def _send(self, messages: Sequence[Message], sent: Sent) -> None:
+    def _send(self, messages: Sequence[Message], topic: str, sent: Sent) -> None:
         packets: dict[int, Message] = {}
         try:
             for one in messages:
-                topic = self.topic("alarm", one.alarm)
-                if why := self._too_large(topic, one):
+                where = self.topic(topic, one.alarm) if one.alarm else self.topic(topic)
+                if why := self._too_large(where, one):
                     sent.refused[one.id] = why
                 else:
-                    packets[self._publish(topic, one.body)] = one
+                    packets[self._publish(where, one.body)] = one
             self._listen_until(lambda: packets.keys() <= self._answers.keys(), ANSWER_S)
         finally:
             for packet, one in packets.items():
@@ -217,13 +237,12 @@ class Mqtt:
             return ""
         return f"{self._where}: {size} bytes are more than the {self._largest} that it takes"
 
-    def _publish(self, topic: str, body: str, qos: int = 1) -> int:
+    def _publish(self, topic: str, body: str) -> int:
         assert self._client is not None
-        info = self._client.publish(topic, body, qos=qos, retain=True)
+        info = self._client.publish(topic, body, qos=1, retain=True)
         if info.rc != MQTTErrorCode.MQTT_ERR_SUCCESS:
             raise self._lost(info.rc.name)
-        if qos:
-            self._awaited.add(info.mid)
+        self._awaited.add(info.mid)
         return int(info.mid)
 
     def _listen_until(self, is_done: Callable[[], bool], patience_s: float) -> None:

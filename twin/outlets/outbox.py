@@ -14,6 +14,7 @@ from sqlalchemy import (
     Column,
     ColumnElement,
     Connection,
+    Index,
     Integer,
     MetaData,
     Row,
@@ -21,6 +22,7 @@ from sqlalchemy import (
     Text,
     func,
     inspect,
+    or_,
     select,
 )
 
@@ -44,6 +46,10 @@ OUTBOX = Table(
     Column("made_ns", BigInteger, nullable=False),
     Column("refused", Text),  # why the destination will not have it; then it is not sent again
     sqlite_autoincrement=True,
+)
+ORDER = Index(
+    "alarm_outbox_order",
+    *(OUTBOX.c[one] for one in ("destination", "asset_type", "asset_id", "number")),
 )
 
 
@@ -74,12 +80,14 @@ class Outbox(Database):
         self._unit = unit
 
     def prepare(self) -> None:
-        """Make the table if it is not there."""
+        """Make the table if it is not there, and its index."""
         with self._reading() as connection:
-            there = inspect(connection).has_table(OUTBOX.name)
-        if not there:
+            there = inspect(connection)
+            whole = there.has_table(OUTBOX.name) and there.has_index(OUTBOX.name, str(ORDER.name))
+        if not whole:
             with self._writing() as connection:
                 metadata.create_all(connection)
+                ORDER.create(connection, checkfirst=True)
 
     def put(self, letters: Iterable[tuple[str, Message]]) -> None:
         """Take messages, each for the destination it is with."""
@@ -153,6 +161,27 @@ class Outbox(Database):
                 for which in ((*waiting, gone), old):
                     connection.execute(OUTBOX.delete().where(*which))
         return lost
+
+    def forget(self, destination: str, most: int, since_ns: int) -> int:
+        """Let go of all beyond the newest ``most`` or from before a time.
+
+        Gives how many of them waited.
+        """
+        own, number = self._own(destination), OUTBOX.c.number
+        newest = select(number).where(*own).order_by(number.desc()).offset(most).limit(1)
+        oldest = select(OUTBOX.c.made_ns).where(*own).order_by(number).limit(1)
+        with self._reading() as connection:
+            limit = connection.execute(newest).scalar()
+            first_ns = connection.execute(oldest).scalar()
+        if limit is None and (first_ns is None or first_ns >= since_ns):
+            return 0
+        gone = or_(OUTBOX.c.made_ns < since_ns, number <= (-1 if limit is None else limit))
+        waited = select(func.count()).select_from(OUTBOX)
+        waited = waited.where(*self._waiting(destination), gone)
+        with self._writing() as connection:
+            count = int(connection.execute(waited).scalar_one())
+            connection.execute(OUTBOX.delete().where(*own, gone))
+        return count
 
     def _own(self, destination: str) -> tuple[ColumnElement[bool], ...]:
         return OUTBOX.c.destination == destination, *self._whose()

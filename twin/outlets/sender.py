@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -14,8 +15,11 @@ from twin.outlets.settings import Outlet
 BATCH = 20  # messages on their way at once: what MQTT brokers take
 FIRST_PAUSE_S = 1.0  # after a failure; the next ones are twice as long each
 LONGEST_PAUSE_S = 60.0
+BOUND_NS = 10 * 1_000_000_000  # between looks whether more waits than is to
 LOOK_S = 30.0  # into the outbox, where nobody has said that there is something
 GRACE_S = 3.0  # to deliver what is left when the program ends
+ALARM = "alarm"  # the topic of alarms
+HOUR_NS = 3600 * 1_000_000_000
 DAY_NS = 86_400 * 1_000_000_000
 
 
@@ -32,13 +36,23 @@ class Sent:
     lost: LostError | None = None
 
 
+@dataclass(frozen=True)
+class Lane:
+    """What goes to a destination beside alarms: after them, in an order of its own."""
+
+    topic: str
+    what: str  # in words
+    hours: float  # for which it waits
+    most: int = 1_000_000  # messages that wait
+
+
 class Channel(Protocol):
     """A way to a destination; one thread alone uses it."""
 
     def open(self) -> bool:
         """Be connected. True if the other side has forgotten what it was told; LostError if not."""
 
-    def send(self, messages: Sequence[Message]) -> Sent:
+    def send(self, messages: Sequence[Message], topic: str = ALARM) -> Sent:
         """Deliver in this order, waiting until they are taken."""
 
     def idle(self, wake: threading.Event) -> None:
@@ -51,10 +65,16 @@ class Channel(Protocol):
         """Say good-bye; nothing comes after it."""
 
 
+def box_of(destination: str, topic: str) -> str:
+    """Under what name a lane's messages wait in the outbox."""
+    return f"{destination} {topic}"
+
+
 class Sender:
     """Delivers the messages of a unit to one destination, each at least once and in order.
 
-    What goes wrong is said once, until it goes well again.
+    ``lanes`` are what goes there beside alarms. What goes wrong is said once, until it goes well
+    again.
     """
 
     def __init__(
@@ -65,8 +85,12 @@ class Sender:
         limits: Outlet,
         say: Callable[[str], None],
         clock: Callable[[], int] = time.time_ns,
+        lanes: Sequence[Lane] = (),
     ) -> None:
         self.name = name
+        self._lanes = {box_of(name, one.topic): one for one in lanes}
+        self._bounded_ns = 0
+        self._gone: Counter[str] = Counter()  # by lane: what was given up and is not yet said
         self._channel, self._open_outbox = channel, open_outbox
         self._limits, self._say, self._clock = limits, say, clock
         self._outbox: Outbox | None = None
@@ -119,32 +143,46 @@ class Sender:
 
     def _go_on(self) -> bool:
         """Deliver the next messages; False if there are none."""
-        self._to_restate |= self._channel.open()
         self._wake.clear()
         self._outbox = self._outbox or self._open_outbox()
+        self._bound(self._outbox)
+        self._to_restate |= self._channel.open()
         self._give_up(self._outbox)
-        messages = self._outbox.next(self.name, BATCH)
-        if messages:
-            self._deliver(self._outbox, messages)
-        elif self._to_restate:
-            self._restate()
+        is_more = self._deliver_next(self._outbox)
         self._succeed()
-        return bool(messages)
+        return is_more
+
+    def _deliver_next(self, outbox: Outbox) -> bool:
+        """Alarms first, then what is beside them; False if there is nothing."""
+        if messages := outbox.next(self.name, BATCH):
+            self._deliver(outbox, messages)
+            return True
+        if self._to_restate:
+            self._restate()
+        for box, lane in self._lanes.items():
+            if messages := outbox.next(box, BATCH):
+                self._settle(outbox, box, lane.what, self._channel.send(messages, lane.topic))
+                return True
+        return False
 
     def _rest(self) -> None:
         """Keep the connection until there is something to do."""
         end = time.monotonic() + LOOK_S
-        while not self._wake.is_set() and time.monotonic() < end:
+        while not (self._wake.is_set() or self._ending.is_set()) and time.monotonic() < end:
             self._channel.idle(self._wake)
 
     def _deliver(self, outbox: Outbox, messages: Sequence[Message]) -> None:
         sent = self._channel.send(messages)
-        outbox.delivered(self.name, [one.id for one in sent.delivered])
         self._told |= {one.alarm: one for one in sent.delivered}
+        self._settle(outbox, self.name, "alarms", sent)
+
+    def _settle(self, outbox: Outbox, box: str, what: str, sent: Sent) -> None:
+        """Note what has become of messages; LostError if the connection is lost."""
+        outbox.delivered(box, [one.id for one in sent.delivered])
         for number, why in sent.refused.items():
-            outbox.refuse(self.name, number, why)
+            outbox.refuse(box, number, why)
             if why != self._refusal:
-                self._say(f"{self.name} refuses alarms, which are set aside: {why}")
+                self._say(f"{self.name} refuses {what}, which are set aside: {why}")
             self._refusal = why
         if sent.lost is not None:
             raise sent.lost
@@ -171,6 +209,29 @@ class Sender:
                 f" {self._limits.longest_days:g} days"
             )
 
+    def _bound(self, outbox: Outbox) -> None:
+        """Hold what waits beside alarms within its bounds, also while nobody takes it."""
+        now = self._clock()
+        if abs(now - self._bounded_ns) < BOUND_NS:
+            return
+        self._bounded_ns = now
+        for box, lane in self._lanes.items():
+            gone = outbox.forget(box, lane.most, now - round(lane.hours * HOUR_NS))
+            if gone and not self._gone[box]:
+                self._say(
+                    f"{lane.what} wait for {self.name} for longer than {lane.hours:g} hours:"
+                    " the oldest are given up"
+                )
+            self._gone[box] += gone
+
+    def _say_gone(self) -> None:
+        for box, lane in self._lanes.items():
+            if gone := self._gone.pop(box, 0):
+                self._say(
+                    f"{gone} messages with {lane.what} were never delivered to {self.name}"
+                    " and are given up"
+                )
+
     # --- when it goes wrong, and well again -----------------------------------------------------
 
     def _fail(self, error: TwinError) -> None:
@@ -185,6 +246,7 @@ class Sender:
     def _succeed(self) -> None:
         if self._complaint:
             self._say(f"alarms go to {self.name} again")
+        self._say_gone()
         self._complaint, self._pause_s = "", FIRST_PAUSE_S
 
     def _let_go(self) -> None:
@@ -205,7 +267,8 @@ class Sender:
         with_why = f": {self._complaint}" if self._complaint else ""
         try:
             self._outbox = self._outbox or self._open_outbox()
-            if left := self._outbox.count(self.name):
+            self._say_gone()
+            if left := sum(self._outbox.count(box) for box in (self.name, *self._lanes)):
                 self._say(f"{left} messages to {self.name} wait for the next run{with_why}")
         except TwinError as error:
             self._say(f"what waits for {self.name} is not known: {error}")

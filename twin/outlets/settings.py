@@ -86,6 +86,12 @@ class Outlet(Settings):
     longest_days: float = Field(default=30.0, gt=0.0)
 
 
+class ValueSettings(Settings):
+    """Values at a slower pace than the loop's."""
+
+    period_s: float = Field(default=1.0, ge=0.01, le=600.0)  # PLC time that one row stands for
+
+
 class MqttSettings(Outlet):
     """An MQTT broker; none while ``host`` is empty."""
 
@@ -98,6 +104,8 @@ class MqttSettings(Outlet):
     prefix: str = Field(default="ejector-twin", pattern=r"^[^+#\x00/]+(/[^+#\x00/]+)*$")
     keepalive_s: int = Field(default=30, ge=5, le=3600)  # gone for 1.5 of it, the twin is offline
     cycles: bool = False  # the key figures of each cycle too
+    values: ValueSettings | None = None  # and lowest, mean and highest vacuum of each period
+    keep_hours: float = Field(default=72.0, gt=0.0, le=8784.0)  # of both; the older ones go
 
     @model_validator(mode="after")
     def _is_protected(self) -> Self:

@@ -13,7 +13,7 @@ from urllib3.response import HTTPResponse
 
 from twin.errors import ConfigError
 from twin.outlets.message import Message
-from twin.outlets.sender import LostError, Sent
+from twin.outlets.sender import ALARM, LostError, Sent
 from twin.outlets.settings import Say, Secret, WebhookSettings
 
 LATER = (408, 425, 429)  # of the client's errors those that say: not now
@@ -48,7 +48,7 @@ class Webhook:
         """There is a connection for each request, if need be."""
         return False
 
-    def send(self, messages: Sequence[Message]) -> Sent:
+    def send(self, messages: Sequence[Message], _topic: str = ALARM) -> Sent:
         """Post each, until one does not come through."""
         sent = Sent()
         for message in messages:
