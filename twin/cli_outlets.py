@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from twin.outlets.dispatch import Outlets
     from twin.outlets.sender import Channel, Lane
     from twin.outlets.settings import MqttSettings, Outlet
+    from twin.outlets.uploader import Uploader
 
 Say = Callable[[str], None]
 Standing = Sequence[Mapping[str, Any]]  # alarms as they are
@@ -27,10 +28,11 @@ def outlets_of(settings: "Config", say: Say) -> Begin | None:
     from twin.alarms.place import place_of
     from twin.alarms.settings import AlarmSettings
     from twin.assets.unit import Unit
-    from twin.outlets.settings import chosen
+    from twin.outlets.settings import chosen, chosen_upload
 
     document = settings.document
     mqtt, webhook = chosen(document)
+    chosen_upload(document)
     if not (mqtt.host or webhook.url):
         return None
     if not document.section(AlarmSettings, "alarms").keep:
@@ -48,8 +50,10 @@ def outlets_of(settings: "Config", say: Say) -> Begin | None:
     folder, unit = Path(document.name).parent, Unit(settings.asset.type, settings.asset.id)
     outbox = partial(open_outbox, place_of(document), unit)
     channels: dict[str, tuple[Channel, Outlet]] = {}
+    uploader = _uploader_of(settings, say)
     if mqtt.host:
-        channels["mqtt"] = Mqtt(mqtt, unit, folder, say, batch=settings.asset.batch), mqtt
+        batch, hear = settings.asset.batch, uploader.hear if uploader else None
+        channels["mqtt"] = Mqtt(mqtt, unit, folder, say, batch=batch, hear_request=hear), mqtt
     if webhook.url:
         channels["webhook"] = Webhook(webhook, folder, say), webhook
 
@@ -61,11 +65,47 @@ def outlets_of(settings: "Config", say: Say) -> Begin | None:
             for name, (channel, limits) in channels.items()
         ]
         restating = [name for name in channels if name == "mqtt"]
-        outlets = Outlets(unit, outbox, senders, say, restating=restating, tellers=tellers)
+        outlets = Outlets(
+            unit,
+            outbox,
+            senders,
+            say,
+            restating=restating,
+            tellers=tellers,
+            uploader=uploader,
+        )
         outlets.begin(standing)
         return outlets
 
     return begin
+
+
+def _uploader_of(settings: "Config", say: Say) -> "Uploader | None":
+    """What uploads logs when asked, where ``[outlets.upload]`` is there."""
+    import threading
+
+    from twin.alarms.place import place_of as database_of
+    from twin.assets.unit import Unit
+    from twin.outlets.asked import open_uploads
+    from twin.outlets.logs import find
+    from twin.outlets.message import asset_of
+    from twin.outlets.places import place_of
+    from twin.outlets.settings import chosen_upload
+    from twin.outlets.uploader import Uploader
+
+    upload = chosen_upload(settings.document)
+    if upload is None:
+        return None
+    folder, ending = Path(settings.document.name).parent, threading.Event()
+    unit = Unit(settings.asset.type, settings.asset.id)
+    return Uploader(
+        asset_of(unit, settings.asset.batch),
+        partial(open_uploads, database_of(settings.document), unit),
+        partial(find, folder / upload.logs, unit),
+        place_of(upload, unit, folder, ending, say),
+        ending,
+        say,
+    )
 
 
 def _tellers_of(settings: "Config", mqtt: "MqttSettings") -> "list[Teller]":
@@ -87,6 +127,8 @@ def _lanes_of(mqtt: "MqttSettings") -> "list[Lane]":
     """How that waits: also what an earlier run has left of what is not told any more."""
     from twin.outlets.data import CYCLE, VALUES
     from twin.outlets.sender import Lane
+    from twin.outlets.uploader import UPLOAD
 
+    answers = Lane(UPLOAD, "answers about uploads", mqtt.keep_hours, most=1000)
     what = {CYCLE: "key figures", VALUES: "values"}
-    return [Lane(topic, words, mqtt.keep_hours) for topic, words in what.items()]
+    return [answers, *(Lane(topic, words, mqtt.keep_hours) for topic, words in what.items())]

@@ -38,6 +38,7 @@ TABLES = {
     "log",
     "monitor",
     "mqtt",
+    "outlets",
     "page",
     "plc",
     "results",

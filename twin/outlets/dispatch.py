@@ -4,6 +4,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from twin.assets.unit import Unit
@@ -13,6 +14,7 @@ from twin.outlets.data import Teller
 from twin.outlets.message import Message, of_event, restated
 from twin.outlets.outbox import Outbox
 from twin.outlets.sender import Sender, box_of
+from twin.outlets.uploader import UPLOAD, Uploader
 from twin.signals import Samples, Ticks
 
 MOST_IN_MEMORY = 10_000  # messages, while the database is away
@@ -38,9 +40,10 @@ class Outlets:
         *,
         restating: Sequence[str] = (),
         tellers: Mapping[str, Sequence[Teller]] | None = None,
+        uploader: Uploader | None = None,
     ) -> None:
         self._unit, self._open_outbox, self._senders = unit, open_outbox, senders
-        self._say, self._restating = say, restating
+        self._say, self._restating, self._uploader = say, restating, uploader
         self._tellers = [
             (box_of(name, one.topic), one)
             for name, those in (tellers or {}).items()
@@ -62,6 +65,8 @@ class Outlets:
             for name in self._restating:
                 self._put(name, message)
         self._thread.start()
+        if self._uploader is not None:
+            self._uploader.start(partial(self.tell, box_of("mqtt", UPLOAD)))
         for sender in self._senders:
             sender.start()
 
@@ -91,6 +96,10 @@ class Outlets:
         Whoever still waits for an answer then is left behind, and that is said.
         """
         end = time.monotonic() + CLOSE_S
+        if self._uploader is not None:
+            self._uploader.end()
+            if not self._uploader.join(CLOSE_S / 2):
+                self._say("an upload does not end: it begins anew with the next run")
         for box, teller in self._tellers:
             for message in teller.rest():
                 self.tell(box, message)

@@ -134,18 +134,34 @@ class WebhookSettings(Outlet):
     def _is_protected(self) -> Self:
         if not self.url:
             return self
-        where = urlsplit(self.url)
-        if where.scheme not in ("http", "https") or not where.hostname:
-            raise ValueError(f'url: "{self.url}" is no address: https://HOST/PATH')
-        if where.password:
-            raise ValueError("url: a password does not stand in it; give it in headers")
-        clear = where.scheme == "http" and not _is_loopback(where.hostname)
-        if self.headers and clear and not self.unprotected:
-            raise ValueError(
-                f'"{where.hostname}" is beyond this machine, and headers are secrets: take https,'
-                " or say unprotected = true"
-            )
+        _check_url(self.url, has_secrets=bool(self.headers) and not self.unprotected)
         return self
+
+
+class UploadSettings(Settings):
+    """Where logs go when they are asked for, and the folder that they are taken from."""
+
+    logs: Path  # where twin run writes them; nothing else is ever uploaded
+    url: str = ""  # takes PUT of what lies below it
+    folder: Path | None = None  # or a folder, which may be a share
+    headers: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9-]+$")], Secret] = Field(default={})
+    tls: Tls = Tls()
+    timeout_s: float = Field(default=60.0, gt=0.0, le=600.0)  # without a word
+    unprotected: bool = False  # headers without https beyond this machine all the same
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Self:
+        if (self.folder is None) == (not self.url):
+            raise ValueError("needs one place: url or folder")
+        if self.url:
+            _check_url(self.url, has_secrets=bool(self.headers) and not self.unprotected)
+        return self
+
+
+class OutletsSettings(Settings):
+    """The table ``[outlets]``."""
+
+    upload: UploadSettings | None = None  # without it nobody can ask for logs
 
 
 def chosen(document: Document) -> tuple[MqttSettings, WebhookSettings]:
@@ -159,6 +175,31 @@ def chosen(document: Document) -> tuple[MqttSettings, WebhookSettings]:
                 f"{document.name}: [{table}] has no {key}", "write where, or leave the table out"
             )
     return mqtt, webhook
+
+
+def chosen_upload(document: Document) -> UploadSettings | None:
+    """Whether logs are uploaded when asked; ConfigError names file, line and key."""
+    upload = document.section(OutletsSettings, "outlets").upload
+    if upload is not None and "mqtt" not in document.tables:
+        raise ConfigError(
+            f"{document.name}: [outlets.upload] is asked over MQTT, and there is no [mqtt]",
+            "say where the broker is, or leave the table out",
+        )
+    return upload
+
+
+def _check_url(url: str, *, has_secrets: bool) -> None:
+    """ValueError for what is no address, or would show secrets."""
+    where = urlsplit(url)
+    if where.scheme not in ("http", "https") or not where.hostname:
+        raise ValueError(f'url: "{url}" is no address: https://HOST/PATH')
+    if where.password:
+        raise ValueError("url: a password does not stand in it; give it in headers")
+    if has_secrets and where.scheme == "http" and not _is_loopback(where.hostname):
+        raise ValueError(
+            f'"{where.hostname}" is beyond this machine, and headers are secrets: take https,'
+            " or say unprotected = true"
+        )
 
 
 def _read(key: str, path: Path, say: Say) -> str:

@@ -30,7 +30,7 @@ class Webhook:
     def __init__(self, settings: WebhookSettings, folder: Path, say: Say) -> None:
         self._settings = settings
         self._headers = {"Content-Type": "application/json"} | {
-            name: _sendable(f"[webhook] headers.{name}", secret, folder, say)
+            name: sendable(f"[webhook] headers.{name}", secret, folder, say)
             for name, secret in settings.headers.items()
         }
         where = urlsplit(settings.url)
@@ -133,8 +133,8 @@ class _Secured(urllib3.HTTPSConnectionPool):
     ConnectionCls = _InTimeTls
 
 
-def _sendable(key: str, secret: Secret, folder: Path, say: Say) -> str:
-    """The secret, if a header can have it; ConfigError if not."""
+def sendable(key: str, secret: Secret, folder: Path, say: Say) -> str:
+    """The secret of a header, if a header can have it; ConfigError if not."""
     found = secret.read(key, folder, say)
     try:
         found.encode("latin-1")
