@@ -20,6 +20,7 @@ from statistics import median
 from benchmarks import (
     acquisition,
     calibration,
+    clients,
     detection,
     isolation,
     kernel,
@@ -73,6 +74,26 @@ BENCHMARKS = (
         ),
     ),
     Benchmark(
+        "clients",
+        clients.modbus,
+        "The driver alone, which decodes, checks and stamps what it fetches, and clients that only "
+        "fetch the same registers as often, by turns of 2 s at the same PLC; processor time. What "
+        "else one would take has ours as its floor.",
+        (
+            Figure("driver alone: CPU", "% of a core", "bare socket in C"),
+            *(
+                Figure(f"{name} fetches the same: CPU", "% of a core", "our driver")
+                for name in ("bare socket in Python", "pymodbus alone", "libmodbus alone")
+            ),
+        ),
+    ),
+    Benchmark(
+        "clients-opcua",
+        clients.over_opcua,
+        "The same over OPC UA, every 50 ms.",
+        (Figure("OPC UA driver alone: CPU", "% of a core", BARE_OPCUA),),
+    ),
+    Benchmark(
         "opcua",
         opcua.ours,
         "`twin run` with its log reads the trace's arrays every 50 ms, and gets SIGSTOP for 300 ms "
@@ -123,7 +144,8 @@ BENCHMARKS = (
         "The first rows of the rig's cycles through `kernel.advance` and through "
         "tools/benchmarks/kernel.c by turns, in processor time: 100 000 rows for one hypothesis, "
         "10 000 for 64, which are the data set with each effect at several sizes. They go through "
-        "`kernel.advance` together, through the C one after another, and count per hypothesis.",
+        "`kernel.advance` together, through the C one after another, then (gcc -O3 -march=native) "
+        "eight at once in vectors, and count per hypothesis.",
         (
             Figure("model: one row of 1 ms", "ns", "the same in C, -O2", 1.5, limits_ratio=True),
             Figure(
@@ -133,6 +155,7 @@ BENCHMARKS = (
                 0.5,
                 limits_ratio=True,
             ),
+            Figure("model: one row for each of 64 hypotheses", "ns", "in C, eight to a vector"),
         ),
     ),
     Benchmark(
@@ -235,17 +258,20 @@ def main() -> int:
     """Measure, print, write; gives the exit code."""
     given = _arguments()
     before, load = machine.noise(), machine.Load.now()
-    results = []
+    results, seconds = [], {}
     with tempfile.TemporaryDirectory(prefix="ejector-twin-bench-") as folder:
         run = Run(given.long, Path(folder), _tell, given.seconds)
         for benchmark in BENCHMARKS:
             if _wanted(benchmark, given):
+                begin = time.monotonic()
                 results += zip(benchmark.figures, benchmark.measure(run), strict=True)
+                seconds[benchmark.name] = time.monotonic() - begin
     _tell("")
     notes = [
         _kind(given.long),
         f"Machine: {machine.description()}; {machine.Load.now().since(load)}.",
         f"Noise: {before}; after the run {machine.noise()}.",
+        f"Seconds: {', '.join(f'{name} {taken:.0f}' for name, taken in seconds.items())}.",
     ]
     print(_page(results, notes))
     if not given.only:

@@ -5,7 +5,9 @@ import socket
 import struct
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ from benchmarks.processes import live, plc
 from twin.log.reader import open_log
 
 SLICE_S = 10.0
+BARE_S = 3.0
 STOP_S = 0.3  # SIGSTOP at the beginning of each slice: a client that does not get to run
 INTERVAL_S = 0.03  # between blocks, as configs/test_rig.toml has it
 HEADER, RING, DEPTH = (100, 12), 1000, 4096  # of the PLC's trace; a record has 4 words
@@ -79,26 +82,40 @@ def lost(log: Path) -> tuple[int, int]:
 
 def _bare_share(port: int) -> float:
     """CPU time (% of a core) of a bare socket that fetches the same registers as often."""
-    with socket.create_connection(("127.0.0.1", port)) as connection:
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        seen = _newest(connection)
+    with connected(port) as connection:
         begin, cpu = time.monotonic(), time.process_time()
-        while time.monotonic() - begin < 3.0:
-            time.sleep(INTERVAL_S)
-            newest = _newest(connection)
-            while seen < newest:
-                first = (seen + 1) % DEPTH
-                count = min(newest - seen, RECORDS_AT_ONCE, DEPTH - first)
-                _read(connection, RING + 4 * first, 4 * count)
-                seen += count
+        fetch(partial(read, connection), BARE_S)
         return 100.0 * (time.process_time() - cpu) / (time.monotonic() - begin)
 
 
-def _newest(connection: socket.socket) -> int:
-    return int.from_bytes(_read(connection, *HEADER)[:4], "big")
+@contextmanager
+def connected(port: int) -> Iterator[socket.socket]:
+    """A bare connection to the PLC."""
+    with socket.create_connection(("127.0.0.1", port)) as connection:
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        yield connection
 
 
-def _read(connection: socket.socket, address: int, words: int) -> bytes:
+def fetch(words: Callable[[int, int], bytes], seconds: float) -> int:
+    """Fetch the ring as the driver does, by a function that reads registers; gives the records."""
+    first = seen = _newest(words)
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        time.sleep(INTERVAL_S)
+        newest = _newest(words)
+        while seen < newest:
+            at = (seen + 1) % DEPTH
+            count = min(newest - seen, RECORDS_AT_ONCE, DEPTH - at)
+            words(RING + 4 * at, 4 * count)
+            seen += count
+    return seen - first
+
+
+def _newest(words: Callable[[int, int], bytes]) -> int:
+    return int.from_bytes(words(*HEADER)[:4], "big")
+
+
+def read(connection: socket.socket, address: int, words: int) -> bytes:
     """Words of holding registers, as they come."""
     connection.sendall(struct.pack(">HHHBBHH", 1, 0, 6, 1, 3, address, words))
     answer = connection.recv(9 + 2 * words, socket.MSG_WAITALL)

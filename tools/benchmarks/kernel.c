@@ -1,9 +1,18 @@
 /* The model's step in C: twin/model gas.py, plant.py and kernel.py, the same scheme line for line.
 
    It is the floor for the compiled Python beside it, and follows it: whoever changes the physics
-   there changes them here, or the benchmark says that the results differ. */
+   there changes them here, or the benchmark says that the results differ. With LANES it runs so
+   many hypotheses at once, side by side in every row of the arrays, for vector instructions. */
 #include <math.h>
 #include <stdint.h>
+
+#ifndef LANES
+#define LANES 1
+#endif
+#define K(row) k[(row) * LANES] /* of one hypothesis: its pointers are to its own column */
+#define S(row) state[(row) * LANES]
+#define T(row) theta[(row) * LANES]
+#define INLINED static inline __attribute__((always_inline)) /* only so loops become vectors */
 
 enum { /* twin.model.theta.COEFFICIENTS */
     AMBIENT, AMBIENT_NOMINAL, TEMPERATURE, SUPPLY, DROOP, SUPPLY_LAG, SUPPLY_NOMINAL,
@@ -28,8 +37,8 @@ enum { /* the state of twin.model.kernel */
 enum { IDLE_PHASE, SUCTION_PHASE, HOLD_PHASE, BLOW_OFF_PHASE }; /* twin.signals.Phase */
 enum { PART_PRESENT_SIGNAL = 1, AIR_SAVING_SIGNAL = 2 }; /* twin.signals.Signal */
 
-static inline double max(double a, double b) { return a > b ? a : b; }
-static inline double min(double a, double b) { return a < b ? a : b; }
+INLINED double max(double a, double b) { return a > b ? a : b; }
+INLINED double min(double a, double b) { return a < b ? a : b; }
 
 /* --- gas.py -------------------------------------------------------------------------------- */
 
@@ -43,7 +52,7 @@ static inline double min(double a, double b) { return a < b ? a : b; }
 
 typedef struct { double level, slope; } Tangent;
 
-static inline Tangent orifice(double ratio)
+INLINED Tangent orifice(double ratio)
 {
     double below = min(max((ratio - CRITICAL_RATIO) / (1.0 - CRITICAL_RATIO), 0.0), EDGE);
     double share = sqrt(1.0 - below * below);
@@ -52,7 +61,7 @@ static inline Tangent orifice(double ratio)
     return (Tangent){laminar ? -LAMINAR_SLOPE * (1.0 - ratio) : share, slope};
 }
 
-static inline Tangent opening(double p, double ambient)
+INLINED Tangent opening(double p, double ambient)
 {
     int inwards = p <= ambient;
     Tangent flow = orifice(inwards ? p / ambient : ambient / p);
@@ -91,35 +100,35 @@ typedef struct { Gas gas; Lags lags; double off; } Advanced;
 static void prepare(const double *theta, double *k)
 {
     for (int j = 0; j < COEFFICIENTS; j++)
-        k[j] = theta[j];
-    double ambient = theta[AMBIENT], nominal = theta[AMBIENT_NOMINAL];
-    double off = theta[SUPPLY_NOMINAL] / theta[SUPPLY_OPTIMUM] - 1.0;
-    double peak = max(1.0 - theta[SUPPLY_CURVATURE] * off * off, 1e-3);
-    k[K_SUCTION] = theta[SUCTION] * (ambient / nominal) / peak;
-    k[K_END] = theta[END_RATIO] * ambient;
-    k[K_BLOW_OFF] = theta[BLOW_OFF] / (theta[SUPPLY_NOMINAL] + nominal);
-    k[K_FLATTER] = 1.0 / theta[SUPPLY_OPTIMUM];
-    k[K_HEAT] = theta[FILM] * theta[AREA] / CP;
-    k[K_PORT_HEAT] = theta[PORT_HEAT] / CP;
-    k[K_LINE_HEAT] = theta[LINE_HEAT] / CP;
-    double friction = theta[NEAR_RESISTANCE] + theta[RESISTANCE];
-    k[K_PLACE] = friction > 0.0 ? min(theta[PLACE] / friction, 1.0) : 0.0;
+        K(j) = T(j);
+    double ambient = T(AMBIENT), nominal = T(AMBIENT_NOMINAL);
+    double off = T(SUPPLY_NOMINAL) / T(SUPPLY_OPTIMUM) - 1.0;
+    double peak = max(1.0 - T(SUPPLY_CURVATURE) * off * off, 1e-3);
+    K(K_SUCTION) = T(SUCTION) * (ambient / nominal) / peak;
+    K(K_END) = T(END_RATIO) * ambient;
+    K(K_BLOW_OFF) = T(BLOW_OFF) / (T(SUPPLY_NOMINAL) + nominal);
+    K(K_FLATTER) = 1.0 / T(SUPPLY_OPTIMUM);
+    K(K_HEAT) = T(FILM) * T(AREA) / CP;
+    K(K_PORT_HEAT) = T(PORT_HEAT) / CP;
+    K(K_LINE_HEAT) = T(LINE_HEAT) / CP;
+    double friction = T(NEAR_RESISTANCE) + T(RESISTANCE);
+    K(K_PLACE) = friction > 0.0 ? min(T(PLACE) / friction, 1.0) : 0.0;
 }
 
-static inline Supplied at_supply(double supply, const double *k)
+INLINED Supplied at_supply(double supply, const double *k)
 {
-    double ambient = k[AMBIENT];
-    double off = supply * k[K_FLATTER] - 1.0;
-    double suction = k[K_SUCTION] * max(1.0 - k[SUPPLY_CURVATURE] * off * off, 0.0);
-    double missing = k[SUPPLY_NOMINAL] - supply;
-    double end = k[K_END] * (1.0 + k[END_SLOPE] * missing);
-    double blow_off = k[K_BLOW_OFF] * (supply + ambient);
+    double ambient = K(AMBIENT);
+    double off = supply * K(K_FLATTER) - 1.0;
+    double suction = K(K_SUCTION) * max(1.0 - K(SUPPLY_CURVATURE) * off * off, 0.0);
+    double missing = K(SUPPLY_NOMINAL) - supply;
+    double end = K(K_END) * (1.0 + K(END_SLOPE) * missing);
+    double blow_off = K(K_BLOW_OFF) * (supply + ambient);
     return (Supplied){suction, min(max(end, 0.0), 0.98 * ambient), blow_off};
 }
 
-static inline Tangent characteristic(double x, const double *k)
+INLINED Tangent characteristic(double x, const double *k)
 {
-    double b0 = k[BULGE], b1 = k[SKEW], b2 = k[BEND_2], b3 = k[BEND_3];
+    double b0 = K(BULGE), b1 = K(SKEW), b2 = K(BEND_2), b3 = K(BEND_3);
     x = min(max(x, 0.0), 1.2);
     double bend = b0 + x * (b1 + x * (b2 + x * b3));
     double slope = b1 + x * (2.0 * b2 + x * 3.0 * b3);
@@ -128,16 +137,16 @@ static inline Tangent characteristic(double x, const double *k)
     return (Tangent){share, x > 0.0 ? max(rise, 0.0) : 0.0};
 }
 
-static inline Port at_port(double p, const Driven *driven, const double *k)
+INLINED Port at_port(double p, const Driven *driven, const double *k)
 {
-    double ambient = k[AMBIENT];
+    double ambient = K(AMBIENT);
     double span = ambient - driven->end;
     Tangent curve = characteristic(driven->jet - (ambient - p) / span, k);
     double out_slope = driven->jet * driven->suction * curve.slope / span;
     double out = driven->jet * driven->suction * curve.level - out_slope * p;
-    double relief = p > ambient ? k[RELIEF] : 0.0;
+    double relief = p > ambient ? K(RELIEF) : 0.0;
     Tangent flow = opening(p, ambient);
-    double back = k[BACK_FLOW] * (1.0 - min(driven->jet, 1.0));
+    double back = K(BACK_FLOW) * (1.0 - min(driven->jet, 1.0));
     back = p < ambient ? back : 0.0;
     return (Port){
         out - relief * ambient,
@@ -147,16 +156,16 @@ static inline Port at_port(double p, const Driven *driven, const double *k)
     };
 }
 
-static inline Tangent at_vessel(double p, const Driven *driven, const double *k)
+INLINED Tangent at_vessel(double p, const Driven *driven, const double *k)
 {
-    double ambient = k[AMBIENT];
-    double laminar = k[LAMINAR_LEAK] + driven->open * k[OPENING];
+    double ambient = K(AMBIENT);
+    double laminar = K(LAMINAR_LEAK) + driven->open * K(OPENING);
     Tangent flow = opening(p, ambient);
-    double slope = k[LEAK] * flow.slope - laminar;
-    return (Tangent){k[LEAK] * (flow.level - flow.slope * p) + laminar * ambient, slope};
+    double slope = K(LEAK) * flow.slope - laminar;
+    return (Tangent){K(LEAK) * (flow.level - flow.slope * p) + laminar * ambient, slope};
 }
 
-static inline double through(double rest, double fall, double before, double rise,
+INLINED double through(double rest, double fall, double before, double rise,
                              double quadratic, double linear, double pushed)
 {
     double difference = rest * rest - before * before + pushed;
@@ -167,24 +176,24 @@ static inline double through(double rest, double fall, double before, double ris
     return 2.0 * difference / (slope + root);
 }
 
-static inline double kept(double mass, double work)
+INLINED double kept(double mass, double work)
 {
     return min(max(mass, work / (R * HOTTEST)), work / (R * COLDEST));
 }
 
-static Gas solve(Gas y, const Gas *known, double step, const Driven *driven, const double *k)
+INLINED Gas solve(Gas y, const Gas *known, double step, const Driven *driven, const double *k)
 {
-    double ambient = k[AMBIENT], outside = k[TEMPERATURE];
+    double ambient = K(AMBIENT), outside = K(TEMPERATURE);
     double per_pa = 1.0 / (GAMMA * R * step);
     Port at = at_port(y.port, driven, k);
     double out = at.out, out_slope = at.out_slope, blown = at.in, blown_slope = at.in_slope;
     Tangent leaking = at_vessel(y.vessel, driven, k);
     double leak = leaking.level, leak_slope = leaking.slope;
-    double stretch = k[COMPLIANCE] / ambient;
-    double volume = k[VOLUME] - stretch * (ambient - y.vessel);
-    double port_stored = k[PORT_VOLUME] * per_pa, line_stored = k[LINE_VOLUME] * per_pa;
+    double stretch = K(COMPLIANCE) / ambient;
+    double volume = K(VOLUME) - stretch * (ambient - y.vessel);
+    double port_stored = K(PORT_VOLUME) * per_pa, line_stored = K(LINE_VOLUME) * per_pa;
     double vessel_stored = (volume + GAMMA * y.vessel * stretch) * per_pa;
-    double warmth = k[K_HEAT], port_warmth = k[K_PORT_HEAT], line_warmth = k[K_LINE_HEAT];
+    double warmth = K(K_HEAT), port_warmth = K(K_PORT_HEAT), line_warmth = K(K_LINE_HEAT);
 
     /* Gas leaves a node at the node's temperature. */
     double vessel_t = y.vessel * volume / (R * y.vessel_mass);
@@ -192,7 +201,7 @@ static Gas solve(Gas y, const Gas *known, double step, const Driven *driven, con
     double held = port_stored * known->port + (entering + port_warmth) * outside;
     double leaving =
         y.port_mass / (GAMMA * step) + max(out + out_slope * y.port, 0.0) + port_warmth;
-    double line_t = y.line * k[LINE_VOLUME] / (R * y.line_mass);
+    double line_t = y.line * K(LINE_VOLUME) / (R * y.line_mass);
     double port_t = (held + max(y.near, 0.0) * line_t) / (leaving + max(-y.near, 0.0));
     held = line_stored * known->line + line_warmth * outside;
     held += max(y.far, 0.0) * vessel_t + max(-y.near, 0.0) * port_t;
@@ -203,11 +212,11 @@ static Gas solve(Gas y, const Gas *known, double step, const Driven *driven, con
     double leak_t = y.vessel <= ambient ? outside : vessel_t;
 
     /* Pressures as rest and slope over the flows. */
-    double cooling = port_warmth * k[PORT_VOLUME] / (R * y.port_mass);
+    double cooling = port_warmth * K(PORT_VOLUME) / (R * y.port_mass);
     double weight = 1.0 / (port_stored + out_slope * port_t - blown_slope * outside + cooling);
     double gained = port_stored * known->port + (blown + port_warmth) * outside - out * port_t;
     double port_rest = gained * weight, port_rise = near_t * weight;
-    cooling = line_warmth * k[LINE_VOLUME] / (R * y.line_mass);
+    cooling = line_warmth * K(LINE_VOLUME) / (R * y.line_mass);
     weight = 1.0 / (line_stored + cooling);
     double line_rest = (line_stored * known->line + line_warmth * outside) * weight;
     double line_fall = near_t * weight, line_rise = far_t * weight;
@@ -216,9 +225,9 @@ static Gas solve(Gas y, const Gas *known, double step, const Driven *driven, con
     gained = vessel_stored * known->vessel + leak * leak_t + warmth * outside;
     double vessel_rest = gained * weight, vessel_fall = far_t * weight;
 
-    double inertia = k[NEAR_INERTANCE] * (y.line + y.port) / step;
+    double inertia = K(NEAR_INERTANCE) * (y.line + y.port) / step;
     double warm = near_t / outside;
-    double quadratic = warm * k[NEAR_RESISTANCE], linear = warm * k[NEAR_LAMINAR] + inertia;
+    double quadratic = warm * K(NEAR_RESISTANCE), linear = warm * K(NEAR_LAMINAR) + inertia;
     double pushed = inertia * known->near;
     double near = through(y.line, 0.0, port_rest, port_rise, quadratic, linear, pushed);
     double slope =
@@ -229,10 +238,10 @@ static Gas solve(Gas y, const Gas *known, double step, const Driven *driven, con
     line_rest = (line_rest - line_fall * near) * weight;
     line_rise = line_rise * weight;
 
-    inertia = k[INERTANCE] * (y.vessel + y.line) / step;
+    inertia = K(INERTANCE) * (y.vessel + y.line) / step;
     warm = far_t / outside;
-    quadratic = warm * k[RESISTANCE];
-    linear = warm * k[LAMINAR] + inertia;
+    quadratic = warm * K(RESISTANCE);
+    linear = warm * K(LAMINAR) + inertia;
     pushed = inertia * known->far;
     double far = through(vessel_rest, vessel_fall, line_rest, line_rise, quadratic, linear, pushed);
 
@@ -243,9 +252,9 @@ static Gas solve(Gas y, const Gas *known, double step, const Driven *driven, con
     double net = near - (out + out_slope * port) + blown + blown_slope * port;
     return (Gas){
         port,
-        kept(known->port_mass + step * net, port * k[PORT_VOLUME]),
+        kept(known->port_mass + step * net, port * K(PORT_VOLUME)),
         line,
-        kept(known->line_mass + step * (far - near), line * k[LINE_VOLUME]),
+        kept(known->line_mass + step * (far - near), line * K(LINE_VOLUME)),
         vessel,
         kept(known->vessel_mass + step * (leak + leak_slope * vessel - far), vessel * volume),
         min(max(near, -MOST), MOST),
@@ -253,38 +262,38 @@ static Gas solve(Gas y, const Gas *known, double step, const Driven *driven, con
     };
 }
 
-static inline double lag(double known, double target, double ratio)
+INLINED double lag(double known, double target, double ratio)
 {
     return (known + ratio * target) / (1.0 + ratio);
 }
 
-static Stage stage(const Gas *guess, const Gas *known, const Lags *lags, double step,
+INLINED Stage stage(const Gas *guess, const Gas *known, const Lags *lags, double step,
                    const Valves *valves, int far_off, const double *k)
 {
-    double rise = k[RAMP_UP], fall = k[RAMP_DOWN];
-    double first = rise + k[SLOW_RAMP_UP];
+    double rise = K(RAMP_UP), fall = K(RAMP_DOWN);
+    double first = rise + K(SLOW_RAMP_UP);
     int rising = valves->nozzle > lags->drive;
     double drive = lag(lags->drive, valves->nozzle, step / (rising ? first : fall));
     double jet = lag(lags->jet, drive, step / (rising ? rise : fall));
-    double valve = lag(lags->valve, valves->blow, step / k[BLOW_OFF_RAMP]);
-    double regulated = max(k[SUPPLY] - k[DROOP] * max(valves->nozzle, valves->blow), 0.0);
-    double supply = lag(lags->supply, regulated, step / k[SUPPLY_LAG]);
+    double valve = lag(lags->valve, valves->blow, step / K(BLOW_OFF_RAMP));
+    double regulated = max(K(SUPPLY) - K(DROOP) * max(valves->nozzle, valves->blow), 0.0);
+    double supply = lag(lags->supply, regulated, step / K(SUPPLY_LAG));
     Supplied at = at_supply(supply, k);
     Driven driven = {jet, at.suction, at.end, at.blow_off * valve, valves->open};
     Gas gas = solve(*guess, known, step, &driven, k);
     gas = solve(gas, known, step, &driven, k);
     if (far_off)
         gas = solve(gas, known, step, &driven, k);
-    double there = gas.port + k[K_PLACE] * (gas.vessel - gas.port);
-    double slow = k[SENSOR_LAG];
+    double there = gas.port + K(K_PLACE) * (gas.vessel - gas.port);
+    double slow = K(SENSOR_LAG);
     double felt = lag(lags->felt, there, step / slow);
-    double sensed = lag(lags->sensed, felt, step / (slow + k[SLOW_SENSOR]));
+    double sensed = lag(lags->sensed, felt, step / (slow + K(SLOW_SENSOR)));
     return (Stage){gas, {drive, jet, valve, supply, felt, sensed}};
 }
 
 #define ON(of) start->of + share * (end->of - begin->of)
 
-static inline Gas gas_on(const Gas *start, const Gas *begin, const Gas *end, double share)
+INLINED Gas gas_on(const Gas *start, const Gas *begin, const Gas *end, double share)
 {
     return (Gas){
         ON(port), ON(port_mass), ON(line), ON(line_mass),
@@ -292,12 +301,12 @@ static inline Gas gas_on(const Gas *start, const Gas *begin, const Gas *end, dou
     };
 }
 
-static inline Lags lags_on(const Lags *start, const Lags *begin, const Lags *end, double share)
+INLINED Lags lags_on(const Lags *start, const Lags *begin, const Lags *end, double share)
 {
     return (Lags){ON(drive), ON(jet), ON(valve), ON(supply), ON(felt), ON(sensed)};
 }
 
-static inline Gas positive(Gas gas)
+INLINED Gas positive(Gas gas)
 {
     return (Gas){
         max(gas.port, LOWEST), max(gas.port_mass, LIGHTEST),
@@ -307,12 +316,12 @@ static inline Gas positive(Gas gas)
     };
 }
 
-static inline double bent(double first, double second, double third)
+INLINED double bent(double first, double second, double third)
 {
     return fabs(first - 2.0 * second + third);
 }
 
-static inline Lags ended(Lags lags)
+INLINED Lags ended(Lags lags)
 {
     return (Lags){
         lags.drive > FAINTEST ? lags.drive : 0.0,
@@ -322,7 +331,7 @@ static inline Lags ended(Lags lags)
     };
 }
 
-static Advanced advance_gas(const Gas *gas, const Lags *lags, double h, const Valves *valves,
+INLINED Advanced advance_gas(const Gas *gas, const Lags *lags, double h, const Valves *valves,
                             const double *k)
 {
     double step = G * h;
@@ -348,14 +357,14 @@ static Advanced advance_gas(const Gas *gas, const Lags *lags, double h, const Va
 
 static double reading(double sensed, const double *k)
 {
-    double vacuum = k[AMBIENT] - sensed;
-    return sensed - (k[SENSOR_GAIN] - 1.0) * vacuum + k[SENSOR_OFFSET];
+    double vacuum = K(AMBIENT) - sensed;
+    return sensed - (K(SENSOR_GAIN) - 1.0) * vacuum + K(SENSOR_OFFSET);
 }
 
 static double sensed_at(double value, const double *k)
 {
-    double gain = k[SENSOR_GAIN];
-    return (value - k[SENSOR_OFFSET] + (gain - 1.0) * k[AMBIENT]) / gain;
+    double gain = K(SENSOR_GAIN);
+    return (value - K(SENSOR_OFFSET) + (gain - 1.0) * K(AMBIENT)) / gain;
 }
 
 /* --- kernel.py ----------------------------------------------------------------------------- */
@@ -366,36 +375,36 @@ static double sensed_at(double value, const double *k)
 #define FINEST 24
 #define TOLERANCE 0.02
 
-static double valve_over(double *state, int position, double h, const double *k, int response)
+INLINED double valve_over(double *state, int position, double h, const double *k, int response)
 {
-    double before = state[position], command = state[position + 1], age = state[position + 2];
-    double late = (command > 0.5 ? k[response] : k[response + 1]) - age;
+    double before = S(position), command = S(position + 1), age = S(position + 2);
+    double late = (command > 0.5 ? K(response) : K(response + 1)) - age;
     int acts = late < h;
-    state[position] = acts ? command : before;
-    state[position + 2] = age + h;
+    S(position) = acts ? command : before;
+    S(position + 2) = age + h;
     return acts ? command + (before - command) * max(late, 0.0) / h : before;
 }
 
 static int release(const double *state, const double *k, double h)
 {
-    double filling = -GAMMA * state[S_FAR] * state[S_VESSEL] / state[S_VESSEL_MASS];
-    double left = k[AMBIENT] - state[S_VESSEL] - k[RELEASE]; /* NaN where nothing is let go */
-    int soon = state[BLOW_COMMAND] > 0.0 && left < 1.5 * h * filling;
-    return state[OPEN] == 0.0 ? soon : state[OPEN] > 1.0;
+    double filling = -GAMMA * S(S_FAR) * S(S_VESSEL) / S(S_VESSEL_MASS);
+    double left = K(AMBIENT) - S(S_VESSEL) - K(RELEASE); /* NaN where nothing is let go */
+    int soon = S(BLOW_COMMAND) > 0.0 && left < 1.5 * h * filling;
+    return S(OPEN) == 0.0 ? soon : S(OPEN) > 1.0;
 }
 
-static double opened(double before, const Gas *gas, double commanded, const double *k)
+INLINED double opened(double before, const Gas *gas, double commanded, const double *k)
 {
-    double beyond = gas->vessel - (k[AMBIENT] - k[RELEASE]);
+    double beyond = gas->vessel - (K(AMBIENT) - K(RELEASE));
     double missed = min(beyond / max(gas->vessel - before, 1e-9), 1.0);
     return beyond >= 0.0 && commanded > 0.0 ? 1.0 + missed : 0.0;
 }
 
 static int moves(const double *state, int position, double h, const double *k, int response)
 {
-    double command = state[position + 1];
-    double late = k[command > 0.5 ? response : response + 1] - state[position + 2];
-    return late < h && (state[position] != command || late > -h);
+    double command = S(position + 1);
+    double late = K(command > 0.5 ? response : response + 1) - S(position + 2);
+    return late < h && (S(position) != command || late > -h);
 }
 
 static int jumps(const double *state, const double *k, double h)
@@ -406,120 +415,125 @@ static int jumps(const double *state, const double *k, double h)
 
 static int passes(const double *state, const double *k, double h)
 {
-    double moved = fabs(state[S_PORT] - state[S_FELT]) / k[SENSOR_LAG] * h;
-    return state[S_BLOWING] > 0.01 && fabs(state[S_PORT] - k[AMBIENT]) < moved;
+    double moved = fabs(S(S_PORT) - S(S_FELT)) / K(SENSOR_LAG) * h;
+    return S(S_BLOWING) > 0.01 && fabs(S(S_PORT) - K(AMBIENT)) < moved;
 }
 
 static int finer(const double *state, const double *k, double h)
 {
     if (jumps(state, k, h) || passes(state, k, h))
         return FINEST;
-    double steps = ceil(h * pow(max(0.0, state[ROUGH]) / TOLERANCE, 1.0 / 3.0));
+    double steps = ceil(h * pow(max(0.0, S(ROUGH)) / TOLERANCE, 1.0 / 3.0));
     return (int)min(max(steps, 1.0), FINEST);
 }
 
-static void substep(double *state, const double *k, double h)
+INLINED void substep(double *state, const double *k, double h)
 {
     double nozzle = valve_over(state, NOZZLE, h, k, RESPONSE);
     double blow = valve_over(state, BLOW, h, k, BLOW_OFF_RESPONSE);
     Gas gas = {
-        state[S_PORT], state[S_PORT_MASS], state[S_LINE], state[S_LINE_MASS],
-        state[S_VESSEL], state[S_VESSEL_MASS], state[S_NEAR], state[S_FAR],
+        S(S_PORT), S(S_PORT_MASS), S(S_LINE), S(S_LINE_MASS),
+        S(S_VESSEL), S(S_VESSEL_MASS), S(S_NEAR), S(S_FAR),
     };
     Lags lags = {
-        state[S_DRIVE], state[S_JET], state[S_BLOWING],
-        state[S_SUPPLIED], state[S_FELT], state[S_SENSED],
+        S(S_DRIVE), S(S_JET), S(S_BLOWING),
+        S(S_SUPPLIED), S(S_FELT), S(S_SENSED),
     };
-    double before = gas.vessel, open_cup = state[OPEN];
+    double before = gas.vessel, open_cup = S(OPEN);
     Advanced next = advance_gas(&gas, &lags, h, &(Valves){nozzle, blow, open_cup}, k);
-    state[S_PORT] = next.gas.port, state[S_PORT_MASS] = next.gas.port_mass;
-    state[S_VESSEL] = next.gas.vessel, state[S_VESSEL_MASS] = next.gas.vessel_mass;
-    state[S_LINE] = next.gas.line, state[S_LINE_MASS] = next.gas.line_mass;
-    state[S_NEAR] = next.gas.near, state[S_FAR] = next.gas.far;
-    state[S_DRIVE] = next.lags.drive, state[S_JET] = next.lags.jet;
-    state[S_BLOWING] = next.lags.valve, state[S_SUPPLIED] = next.lags.supply;
-    state[S_FELT] = next.lags.felt, state[S_SENSED] = next.lags.sensed;
-    double now = opened(before, &next.gas, state[BLOW_COMMAND], k);
-    state[OPEN] = open_cup > 0.0 ? min(open_cup, 1.0) : now;
-    state[ROUGH] = next.off / (h * h * h);
+    S(S_PORT) = next.gas.port, S(S_PORT_MASS) = next.gas.port_mass;
+    S(S_VESSEL) = next.gas.vessel, S(S_VESSEL_MASS) = next.gas.vessel_mass;
+    S(S_LINE) = next.gas.line, S(S_LINE_MASS) = next.gas.line_mass;
+    S(S_NEAR) = next.gas.near, S(S_FAR) = next.gas.far;
+    S(S_DRIVE) = next.lags.drive, S(S_JET) = next.lags.jet;
+    S(S_BLOWING) = next.lags.valve, S(S_SUPPLIED) = next.lags.supply;
+    S(S_FELT) = next.lags.felt, S(S_SENSED) = next.lags.sensed;
+    double now = opened(before, &next.gas, S(BLOW_COMMAND), k);
+    S(OPEN) = open_cup > 0.0 ? min(open_cup, 1.0) : now;
+    S(ROUGH) = next.off / (h * h * h);
 }
 
-static void step(double *state, const double *k, double dt)
+static void step(double *restrict state, const double *restrict k, double dt)
 {
     int count = (int)max(ceil(dt / LONGEST_STEP - 1e-6), 1);
     double h = dt / count;
     for (int i = 0; i < count; i++) {
-        int steps = finer(state, k, h);
-        for (int j = 0; j < steps; j++)
-            substep(state, k, h / steps);
+        int steps = 1;
+        for (int lane = 0; lane < LANES; lane++)
+            steps = (int)max(steps, finer(state + lane, k + lane, h));
+        for (int j = 0; j < steps; j++) {
+#pragma omp simd
+            for (int lane = 0; lane < LANES; lane++)
+                substep(state + lane, k + lane, h / steps);
+        }
     }
 }
 
 static void command(double *state, int position, double value)
 {
-    if (state[position + 1] != value) {
-        state[position + 1] = value;
-        state[position + 2] = 0.0;
+    if (S(position + 1) != value) {
+        S(position + 1) = value;
+        S(position + 2) = 0.0;
     }
 }
 
 static void enter(double *state, int phase, const double *k)
 {
-    int before = (int)state[PHASE];
+    int before = (int)S(PHASE);
     if (phase == before)
         return;
-    state[PHASE] = phase;
+    S(PHASE) = phase;
     command(state, NOZZLE, phase == SUCTION_PHASE);
     command(state, BLOW, phase == BLOW_OFF_PHASE);
     if ((before == HOLD_PHASE && phase == SUCTION_PHASE) ||
         (before == SUCTION_PHASE && phase == HOLD_PHASE))
-        state[NOZZLE_AGE] = NEVER;
+        S(NOZZLE_AGE) = NEVER;
     if (phase == SUCTION_PHASE && before != HOLD_PHASE)
-        state[OPEN] = 0.0;
-    if (phase == IDLE_PHASE && before == BLOW_OFF_PHASE && k[RELEASE] >= 0.0)
-        state[OPEN] = 1.0;
+        S(OPEN) = 0.0;
+    if (phase == IDLE_PHASE && before == BLOW_OFF_PHASE && K(RELEASE) >= 0.0)
+        S(OPEN) = 1.0;
 }
 
 static void settle(double *state, const double *k, double pressure)
 {
-    double temperature = k[TEMPERATURE];
-    double volume = k[VOLUME] - k[COMPLIANCE] * (1.0 - pressure / k[AMBIENT]);
-    state[S_PORT] = state[S_LINE] = state[S_VESSEL] = pressure;
-    state[S_FELT] = state[S_SENSED] = pressure;
-    state[S_PORT_MASS] = pressure * k[PORT_VOLUME] / (R * temperature);
-    state[S_VESSEL_MASS] = pressure * volume / (R * temperature);
-    state[S_LINE_MASS] = pressure * k[LINE_VOLUME] / (R * temperature);
-    state[S_NEAR] = state[S_FAR] = 0.0;
-    state[S_SUPPLIED] = k[SUPPLY];
+    double temperature = K(TEMPERATURE);
+    double volume = K(VOLUME) - K(COMPLIANCE) * (1.0 - pressure / K(AMBIENT));
+    S(S_PORT) = S(S_LINE) = S(S_VESSEL) = pressure;
+    S(S_FELT) = S(S_SENSED) = pressure;
+    S(S_PORT_MASS) = pressure * K(PORT_VOLUME) / (R * temperature);
+    S(S_VESSEL_MASS) = pressure * volume / (R * temperature);
+    S(S_LINE_MASS) = pressure * K(LINE_VOLUME) / (R * temperature);
+    S(S_NEAR) = S(S_FAR) = 0.0;
+    S(S_SUPPLIED) = K(SUPPLY);
 }
 
 static void shift_by(double *state, double shift)
 {
     for (int node = S_PORT; node <= S_VESSEL; node += 2) {
-        double moved = max(state[node] + shift, 100.0);
-        state[node + 1] *= moved / state[node];
-        state[node] = moved;
+        double moved = max(S(node) + shift, 100.0);
+        S(node + 1) *= moved / S(node);
+        S(node) = moved;
     }
-    state[S_FELT] += shift;
-    state[S_SENSED] += shift;
+    S(S_FELT) += shift;
+    S(S_SENSED) += shift;
 }
 
 static void synchronise(double *state, double level, const double *k)
 {
-    int idle = state[PHASE] == IDLE_PHASE;
-    if (k[RELEASE] >= 0.0 && (idle || state[OPEN] > 0.0)) {
-        settle(state, k, k[AMBIENT]);
-        state[OPEN] = 1.0;
-    } else if (state[VALID] > 0.0) {
-        shift_by(state, sensed_at(level, k) - state[S_SENSED]);
+    int idle = S(PHASE) == IDLE_PHASE;
+    if (K(RELEASE) >= 0.0 && (idle || S(OPEN) > 0.0)) {
+        settle(state, k, K(AMBIENT));
+        S(OPEN) = 1.0;
+    } else if (S(VALID) > 0.0) {
+        shift_by(state, sensed_at(level, k) - S(S_SENSED));
     } else {
         settle(state, k, sensed_at(level, k));
     }
-    if (state[VALID] == 0.0) {
-        state[S_DRIVE] = state[S_JET] = state[NOZZLE] = state[NOZZLE_COMMAND];
-        state[S_BLOWING] = state[BLOW] = state[BLOW_COMMAND];
+    if (S(VALID) == 0.0) {
+        S(S_DRIVE) = S(S_JET) = S(NOZZLE) = S(NOZZLE_COMMAND);
+        S(S_BLOWING) = S(BLOW) = S(BLOW_COMMAND);
     }
-    state[VALID] = 1.0;
+    S(VALID) = 1.0;
 }
 
 /* control.py */
@@ -530,28 +544,33 @@ static int two_point(int before, double vacuum, double high, double low)
 
 static void read_out(double *state, const double *k, double *expected, uint8_t *signals)
 {
-    *expected = state[VALID] > 0.0 ? reading(state[S_SENSED], k) : NAN;
-    double vacuum = k[AMBIENT] - state[S_PORT];
-    int before = (int)state[SIGNALS];
-    int present = two_point((before & PART_PRESENT_SIGNAL) != 0, vacuum, k[H2], k[H2_LOW]);
-    int reached = two_point((before & AIR_SAVING_SIGNAL) != 0, vacuum, k[H1], k[H1_LOW]);
+    *expected = S(VALID) > 0.0 ? reading(S(S_SENSED), k) : NAN;
+    double vacuum = K(AMBIENT) - S(S_PORT);
+    int before = (int)S(SIGNALS);
+    int present = two_point((before & PART_PRESENT_SIGNAL) != 0, vacuum, K(H2), K(H2_LOW));
+    int reached = two_point((before & AIR_SAVING_SIGNAL) != 0, vacuum, K(H1), K(H1_LOW));
     *signals = (uint8_t)(present * PART_PRESENT_SIGNAL + reached * AIR_SAVING_SIGNAL);
-    state[SIGNALS] = *signals;
+    S(SIGNALS) = *signals;
 }
 
 void advance(double *state, const double *theta, const double *dt, const uint8_t *phase,
              const double *level, double *expected, uint8_t *signals, int64_t rows)
 {
-    double k[PREPARED];
-    prepare(theta, k);
+    double k[PREPARED * LANES];
+    for (int lane = 0; lane < LANES; lane++)
+        prepare(theta + lane, k + lane);
     for (int64_t row = 0; row < rows; row++) {
-        if (dt[row] < 0.0 || dt[row] > LONGEST_BRIDGE)
-            state[VALID] = 0.0;
-        else if (state[VALID] > 0.0 && dt[row] > 0.0)
+        if (S(VALID) > 0.0 && dt[row] > 0.0 && dt[row] <= LONGEST_BRIDGE)
             step(state, k, dt[row]);
-        enter(state, phase[row], k);
-        if (!isnan(level[row]))
-            synchronise(state, level[row], k);
-        read_out(state, k, &expected[row], &signals[row]);
+        for (int lane = 0; lane < LANES; lane++) {
+            double *mine = state + lane;
+            const double *its = k + lane;
+            if (dt[row] < 0.0 || dt[row] > LONGEST_BRIDGE)
+                mine[VALID * LANES] = 0.0;
+            enter(mine, phase[row], its);
+            if (!isnan(level[row]))
+                synchronise(mine, level[row], its);
+            read_out(mine, its, &expected[row * LANES + lane], &signals[row * LANES + lane]);
+        }
     }
 }

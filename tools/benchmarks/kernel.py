@@ -1,4 +1,4 @@
-"""The compiled model beside the same scheme in C: one hypothesis, and many at once."""
+"""The compiled model beside the same scheme in C, one hypothesis and many, and beside SciPy."""
 
 import ctypes
 import time
@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from benchmarks.figures import Measured, Run
 from benchmarks.machine import TWIN_CORE, on_core
-from benchmarks.native import library
+from benchmarks.native import PLAIN, library
 from benchmarks.recording import Recording, hour
 from twin.model import kernel
 from twin.model.effects import EFFECTS, Effect, apply
@@ -26,6 +26,9 @@ BANK_ROWS = 10_000  # three cycles
 BANK_REPEATS = 9
 SIZES = (1.0, 0.5, 2.0, 4.0)  # of an effect, in its typical size
 AGREE = 1e-9  # relative
+# Not even now does gcc make vectors of the loop unless values stay where they are used.
+VECTORS = ("-O3", "-march=native", "-fopenmp-simd", "-fno-math-errno", "-fno-trapping-math")
+VECTORS += ("-fno-tree-pre", f"-DLANES={kernel.LANES}")
 
 Floats = npt.NDArray[np.float64]
 Bytes = npt.NDArray[np.uint8]
@@ -34,22 +37,25 @@ Driven = tuple[Floats, Bytes, Floats]  # time steps, phases, levels
 
 
 def speed(run: Run) -> Sequence[Measured]:
-    """Processor time (ns) of a row for one hypothesis, and for each of 64 advanced together."""
+    """Processor time (ns) of a row for one hypothesis, and for each of 64 advanced together.
+
+    The latter beside each alone in C, and beside as many at once in C.
+    """
     run.tell("kernel: simulating the rig")
     theta, bank = hour().theta, hypotheses(hour().theta)
-    one, few = _rows(hour(), ROWS), _rows(hour(), BANK_ROWS)
-    native = in_c(run.folder)
+    one, few = first_rows(hour(), ROWS), first_rows(hour(), BANK_ROWS)
+    native, vectors = in_c(run.folder), in_c(run.folder, VECTORS)
     with on_core(TWIN_CORE):
         run.tell("kernel: one hypothesis")
         single = _one(theta, one, native)
         run.tell(f"kernel: {HYPOTHESES} hypotheses")
-        return single, _many(bank, few, native)
+        return single, *_many(bank, few, native, vectors)
 
 
-def hypotheses(theta: Theta) -> list[Theta]:
+def hypotheses(theta: Theta, count: int = HYPOTHESES) -> list[Theta]:
     """The data set with each effect of the table at its typical size, then at other sizes."""
     every = (_changed(theta, effect, size) for size in SIZES for effect in EFFECTS.values())
-    return list(islice(every, HYPOTHESES))
+    return list(islice(every, count))
 
 
 def _changed(theta: Theta, effect: Effect, size: float) -> Theta:
@@ -61,34 +67,45 @@ def _changed(theta: Theta, effect: Effect, size: float) -> Theta:
 
 
 def _one(theta: Theta, driven: Driven, native: Advance | None) -> Measured:
-    expected = _timed(kernel.advance, theta, driven)[1]
+    expected = timed(kernel.advance, theta, driven)[1]
     if native is None:
-        ours = [_timed(kernel.advance, theta, driven)[0] for _ in range(REPEATS)]
+        ours = [timed(kernel.advance, theta, driven)[0] for _ in range(REPEATS)]
         return Measured(ours, note="no C compiler")
-    note = _compared(expected, _timed(native, theta, driven)[1])
+    note = _compared(expected, timed(native, theta, driven)[1])
     turns = [
-        (_timed(kernel.advance, theta, driven)[0], _timed(native, theta, driven)[0])
+        (timed(kernel.advance, theta, driven)[0], timed(native, theta, driven)[0])
         for _ in range(REPEATS)
     ]
     ours, c = zip(*turns, strict=True)
     return Measured(ours, c, note)
 
 
-def _many(bank: Sequence[Theta], driven: Driven, native: Advance | None) -> Measured:
-    """All of ``bank`` in one call by turns with the C, which takes them one after another."""
+def _many(
+    bank: Sequence[Theta], rows: Driven, native: Advance | None, vectors: Advance | None
+) -> tuple[Measured, Measured]:
+    """All of ``bank`` in one call by turns with the C: one after another, then in its lanes."""
     together = np.ascontiguousarray(np.transpose(bank))
-    expected = _timed(kernel.advance, together, driven)[1]
-    alone = np.transpose([_timed(kernel.advance, theta, driven)[1] for theta in bank])
+    expected = timed(kernel.advance, together, rows)[1]
+    alone = np.transpose([timed(kernel.advance, theta, rows)[1] for theta in bank])
     note = f"each within {np.nanmax(np.abs(expected - alone)):.1g} Pa of itself alone"
-    if native is None:
-        ours = [_timed(kernel.advance, together, driven)[0] for _ in range(BANK_REPEATS)]
-        return Measured(ours, note=f"{note}; no C compiler")
-    _compared(alone, np.transpose([_timed(native, theta, driven)[1] for theta in bank]))
-    ours, c = [], []
+    if native is None or vectors is None:
+        ours = [timed(kernel.advance, together, rows)[0] for _ in range(BANK_REPEATS)]
+        return Measured(ours, note=f"{note}; no C compiler"), Measured(ours)
+    _compared(alone, np.transpose([timed(native, theta, rows)[1] for theta in bank]))
+    lanes = in_lanes(bank)
+    at_once = _compared(expected, np.hstack([timed(vectors, eight, rows)[1] for eight in lanes]))
+    ours, c, simd = [], [], []
     for _ in range(BANK_REPEATS):
-        ours.append(_timed(kernel.advance, together, driven)[0])
-        c.append(float(np.mean([_timed(native, theta, driven)[0] for theta in bank])))
-    return Measured(ours, c, note)
+        ours.append(timed(kernel.advance, together, rows)[0])
+        c.append(float(np.mean([timed(native, theta, rows)[0] for theta in bank])))
+        simd.append(float(np.mean([timed(vectors, eight, rows)[0] for eight in lanes])))
+    return Measured(ours, c, note), Measured(ours, simd, at_once)
+
+
+def in_lanes(bank: Sequence[Theta]) -> list[Theta]:
+    """Hypotheses as the C takes them that runs many at once: (coefficients, lanes) each."""
+    starts = range(0, len(bank), kernel.LANES)
+    return [np.ascontiguousarray(np.transpose(bank[at : at + kernel.LANES])) for at in starts]
 
 
 def _compared(expected: Floats, native: Floats) -> str:
@@ -103,23 +120,26 @@ def _compared(expected: Floats, native: Floats) -> str:
 def over_hour(native: Advance) -> float:
     """Processor time (s) of ``native`` for every row of the hour."""
     rows = len(hour().samples)
-    return _timed(native, hour().theta, _rows(hour(), rows))[0] * 1e-9 * rows
+    return timed(native, hour().theta, first_rows(hour(), rows))[0] * 1e-9 * rows
 
 
-def in_c(folder: Path) -> Advance | None:
-    """``kernel.advance`` for one hypothesis in C; None where there is no compiler."""
-    compiled = library("kernel", folder)
+def in_c(folder: Path, options: Sequence[str] = PLAIN) -> Advance | None:
+    """``kernel.advance`` in C for one hypothesis, or for ``LANES`` with VECTORS.
+
+    None where there is no compiler.
+    """
+    compiled = library("kernel", folder, options)
     return None if compiled is None else partial(_advance, compiled)
 
 
-def _rows(recording: Recording, rows: int) -> Driven:
+def first_rows(recording: Recording, rows: int) -> Driven:
     """Time steps, phases and levels of the first ``rows``."""
     samples, ticks = recording.samples[:rows], recording.ticks[:rows]
     phase = np.ascontiguousarray(ticks["phase"])
     return steps(samples, None), phase, ticks["level"].astype(np.float64)
 
 
-def _timed(advance: Advance, theta: Theta, driven: Driven) -> tuple[float, Floats]:
+def timed(advance: Advance, theta: Theta, driven: Driven) -> tuple[float, Floats]:
     """Processor time (ns) per row and hypothesis of a fresh model, and what it expects (Pa).
 
     Both only compute, so the time that others take on the machine can be left out.

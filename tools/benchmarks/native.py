@@ -3,17 +3,25 @@
 import ctypes
 import shutil
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 
 HERE = Path(__file__).parent
+PLAIN = ("-O2",)
 
 
-def library(name: str, folder: Path) -> ctypes.CDLL | None:
-    """Compile ``name``.c with -O2 into ``folder`` and load it; None where there is no compiler."""
+def library(
+    name: str, folder: Path, options: Sequence[str] = PLAIN, libraries: Sequence[str] = ()
+) -> ctypes.CDLL | None:
+    """Compile ``name``.c into ``folder`` and load it; None where there is no compiler.
+
+    A library that is linked to has to be there.
+    """
     compiler = shutil.which("gcc") or shutil.which("cc")
     if compiler is None:
         return None
-    target = folder / f"{name}.so"
-    options = ["-O2", "-ffp-contract=off", "-shared", "-fPIC", "-o", target]
-    subprocess.run([compiler, *options, HERE / f"{name}.c", "-lm"], check=True)
+    target = folder / f"{name}{len(list(folder.glob(f'{name}*.so')))}.so"  # never one that is open
+    always = ["-ffp-contract=off", "-shared", "-fPIC", "-o", target]
+    sources = [HERE / f"{name}.c", *libraries, "-lm"]
+    subprocess.run([compiler, *options, *always, *sources], check=True)
     return ctypes.CDLL(str(target))

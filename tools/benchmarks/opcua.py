@@ -41,6 +41,7 @@ CONFIG = ROOT / "configs" / "test_rig_opcua.toml"
 PEERS = ROOT / "tests" / "peers"
 SLICE_S = 10.0
 STOP_S = 0.3  # SIGSTOP at the beginning of each slice: a client that does not get to run
+BARE_S = 3.0
 LONG_S, SHORT_S = 600.0, 30.0
 SIGNAL_S = 65.0  # of the rig's cycles, which node-opcua serves over and over
 LATE = 99  # percentile
@@ -49,7 +50,7 @@ LINE = re.compile(rb"\d\d:\d\d:\d\d\.\d{3}  ")
 
 def ours(run: Run) -> Sequence[Measured]:
     """Beside the simulated PLC."""
-    return _acquire(run, "OPC UA, our PLC", _plc(run.folder))
+    return _acquire(run, "OPC UA, our PLC", plc(run.folder))
 
 
 def other(run: Run) -> Sequence[Measured]:
@@ -61,7 +62,7 @@ def other(run: Run) -> Sequence[Measured]:
 
 
 @contextmanager
-def _plc(folder: Path) -> Iterator[int]:
+def plc(folder: Path) -> Iterator[int]:
     """Run the simulated PLC; gives the port of its OPC UA server."""
     tables = tomllib.loads(CONFIG.read_text(encoding="utf-8"))
     tables["plc"]["opcua"]["port"] = 0
@@ -151,7 +152,7 @@ def _acquire(run: Run, what: str, server: AbstractContextManager[int]) -> Sequen
     with server as port:
         run.tell(f"{what}: the floor")
         with on_core(TWIN_CORE):
-            floors = [_bare_share(port) for _ in range(3)]
+            floors = [bare_share(port) for _ in range(3)]
         with live(log, [CONFIG], port=port, stdout=subprocess.PIPE) as process:
             heard = _Heard(process)
             listening = heard.listen()
@@ -231,18 +232,18 @@ def _apart(begin: Integers, end: Integers, spoilt: Sequence[Span]) -> Floats:
 # --- the floor ------------------------------------------------------------------------------------
 
 
-def _bare_share(port: int) -> float:
+def bare_share(port: int, seconds: float = BARE_S) -> float:
     """CPU time (% of a core) of asyncua alone, reading the same nodes by the same requests."""
-    return asyncio.run(_bare(port))
+    return asyncio.run(_bare(port, seconds))
 
 
-async def _bare(port: int) -> float:
+async def _bare(port: int, seconds: float) -> float:
     settings = Document.read(CONFIG).section(OpcuaSettings, "driver")
     async with Client(f"opc.tcp://127.0.0.1:{port}") as client:
         index = await client.get_namespace_index(settings.namespace)
         requests = [_request(nodes, index) for nodes in NodeTrace(settings, REAL).requests]
         begin, cpu = time.monotonic(), time.process_time()
-        while time.monotonic() - begin < 3.0:
+        while time.monotonic() - begin < seconds:
             await asyncio.sleep(settings.interval_ms * 1e-3)
             for request in requests:
                 await client.uaclient.read(request)
