@@ -3,6 +3,7 @@
 import getpass
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,9 +12,10 @@ import typer
 from twin.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from twin.config import Config
+    from twin.page.hall import Hall
     from twin.page.ring import LiveRows
     from twin.page.server import Place
     from twin.page.users import Users
@@ -25,6 +27,12 @@ def serve(
     *,
     configs: Annotated[
         list[Path] | None, typer.Option("--config", metavar="CONFIG", help="One for each ejector.")
+    ] = None,
+    broker: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="CONFIG", help="Show all ejectors of the broker that its [mqtt] names."
+        ),
     ] = None,
     host: Annotated[str, typer.Option(help="Address to listen on; others reach it there.")] = (
         "127.0.0.1"
@@ -55,7 +63,8 @@ def serve(
     """Show traffic light, alarms, live pressure and trends in a browser; Ctrl-C ends it.
 
     A process of its own: it shows what twin run leaves, and stays when that ends. To acknowledge
-    needs a login, and so does everything where others than this machine reach it.
+    needs a login, and so does everything where others than this machine reach it. With --broker
+    it shows what all ejectors publish, beside those of --config or alone.
     """
     _require_extra()
     from twin.config import Config
@@ -63,21 +72,51 @@ def serve(
     from twin.page.users import FILE, Users
     from twin.settings import Document
 
-    known = Users(users or (configs[0].parent if configs else Path()) / FILE)
+    first = configs[0] if configs else broker
+    known = Users(users or (first.parent if first else Path()) / FILE)
     if add_user or remove_user:
         _change(known, add_user, remove_user)
         return
-    if not configs:
-        raise ConfigError("no ejector to show", "name its configuration: --config CONFIG")
+    if first is None:
+        hint = "name its configuration: --config CONFIG, or that of a broker: --broker CONFIG"
+        raise ConfigError("no ejector to show", hint)
     if (certificate is None) != (key is None):
         raise ConfigError("--certificate and --key belong together", "give both, as PEM files")
     place = Place(host, port, certificate, key)
     _require_users(place, known)
-    settings = [Config.of(Document.read(one), assets) for one in configs]
-    _serve(place, settings, known, names or [])
+    settings = [Config.of(Document.read(one), assets) for one in configs or []]
+    with _heard_of(broker) as hall:
+        _serve(place, settings, known, names or [], hall)
 
 
-def _serve(place: "Place", settings: "list[Config]", users: "Users", names: list[str]) -> None:
+@contextmanager
+def _heard_of(broker: Path | None) -> "Iterator[Hall | None]":
+    """What all ejectors publish, while it is listened to; None without a broker."""
+    if broker is None:
+        yield None
+        return
+    from twin.config import TABLES
+    from twin.outlets.settings import chosen
+    from twin.page.hall import Hall
+    from twin.page.hall_line import listening
+    from twin.settings import Document
+
+    document, hall = Document.read(broker), Hall()
+    document.refuse_unknown_tables(TABLES)
+    mqtt, _ = chosen(document)
+    if not mqtt.host:
+        raise ConfigError(f"{broker}: no [mqtt] in it", 'say where the broker is: host = "..."')
+    with listening(mqtt, broker.parent, hall, lambda what: print(f"twin: {what}", file=sys.stderr)):
+        yield hall
+
+
+def _serve(
+    place: "Place",
+    settings: "list[Config]",
+    users: "Users",
+    names: list[str],
+    hall: "Hall | None",
+) -> None:
     import socket
 
     from twin.page.app import Access, Page
@@ -87,7 +126,7 @@ def _serve(place: "Place", settings: "list[Config]", users: "Users", names: list
 
     ours = {one.lower() for one in (*names, place.host, socket.gethostname()) if one}
     access = Access(frozenset(ours), place.scheme == "https", place.is_loopback)
-    page = Page([Ejector(one) for one in settings], users, Sessions(users), access)
+    page = Page([Ejector(one) for one in settings], users, Sessions(users), access, hall)
     server = make_server(page.app(), place)
     with listen(place) as listening:
         print(f"the page is at {address(place, listening)}", flush=True)

@@ -24,12 +24,14 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection, Request
 from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
-from starlette.routing import Route, WebSocketRoute
+from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from twin.errors import TwinError
 from twin.page.ejector import Ejector
+from twin.page.hall import Hall
+from twin.page.hall_app import ALL, AllEjectors
 from twin.page.sessions import SESSION_S, Session, Sessions, Tries
 from twin.page.users import Users
 
@@ -46,6 +48,8 @@ SLOWEST_S = 20.0  # for a browser to take one message
 
 STATIC = {
     "icon.svg": "image/svg+xml",
+    "common.js": "text/javascript",
+    "all.js": "text/javascript",
     "page.js": "text/javascript",
     "page.css": "text/css",
     "uPlot.iife.min.js": "text/javascript",
@@ -104,8 +108,14 @@ class Page:
     """All that the page does."""
 
     def __init__(
-        self, ejectors: Sequence[Ejector], users: Users, sessions: Sessions, access: Access
+        self,
+        ejectors: Sequence[Ejector],
+        users: Users,
+        sessions: Sessions,
+        access: Access,
+        hall: Hall | None = None,
     ) -> None:
+        self.hall = hall
         self.ejectors, self.users, self.sessions, self.access = ejectors, users, sessions, access
         self._states = [_Remembered(one.state) for one in ejectors]
         self._by_address, self._by_name = Tries(60.0), Tries(10.0)
@@ -115,13 +125,13 @@ class Page:
         self._static = {name: files.joinpath(name).read_bytes() for name in STATIC}
         self._pages = {
             name: Template(files.joinpath(name).read_text(encoding="utf-8"))
-            for name in ("index.html", "login.html", "error.html")
+            for name in ("index.html", "all.html", "login.html", "error.html")
         }
 
     def app(self) -> ASGIApp:
         """As uvicorn takes it."""
         one = "/api/ejectors/{number}"
-        routes = [
+        routes: list[BaseRoute] = [
             Route("/", self.index),
             Route("/login", self.login_page),
             Route("/login", self.login, methods=["POST"]),
@@ -135,6 +145,9 @@ class Page:
             Route("/reports/{number}/{name}", self.report),
             WebSocketRoute("/live", self.live),
         ]
+        if self.hall is not None:
+            routes += AllEjectors(self.hall, self._require_sight).routes()
+            routes.append(Route(ALL, self.all_page))
         handlers: dict[Any, Any] = {HTTPException: self.refused, TwinError: self.trouble}
 
         app = Starlette(routes=routes, exception_handlers=handlers)
@@ -220,8 +233,9 @@ class Page:
         session = self._session(request)
         own = {"user": session.user, "csrf": session.csrf} if session else {"user": ""}
         ejectors = [{"name": one.name, "type": one.config.asset.type} for one in self.ejectors]
-        figures = self.ejectors[0].figures()
-        return JSONResponse({**own, "ejectors": ejectors, "figures": figures})
+        figures = self.ejectors[0].figures() if self.ejectors else []
+        known = {"ejectors": ejectors, "figures": figures, "all": self.hall is not None}
+        return JSONResponse({**own, **known})
 
     # --- pages ----------------------------------------------------------------------------------
 
@@ -229,7 +243,15 @@ class Page:
         """The page itself; the rest it asks for."""
         if not self._may_see(request):
             return RedirectResponse("/login", HTTPStatus.SEE_OTHER)
+        if not self.ejectors:
+            return RedirectResponse(ALL, HTTPStatus.SEE_OTHER)
         return HTMLResponse(self._pages["index.html"].substitute())
+
+    async def all_page(self, request: Request) -> Response:
+        """The page over all ejectors of a broker."""
+        if not self._may_see(request):
+            return RedirectResponse("/login", HTTPStatus.SEE_OTHER)
+        return HTMLResponse(self._pages["all.html"].substitute())
 
     async def static(self, request: Request) -> Response:
         """What the page is made of."""
@@ -294,7 +316,7 @@ class Page:
         A browser that is slow gets what is newest then; nothing waits for it here.
         """
         allowed = self.access.is_own_origin(socket.headers) and self._may_see(socket)
-        if not allowed:
+        if not (allowed and self.ejectors):
             await socket.close(1008)
             return
         await socket.accept()

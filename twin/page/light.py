@@ -77,7 +77,7 @@ def _alarm(alarm: Alarm, episode: Episode | None, waiting: Sequence[Request]) ->
         "consequence": rule.consequence,
         "action": rule.action,
         "asked": [_asked(one) for one in waiting if one.alarm == rule.name],
-        **(told(episode, rule.value) if episode else _named(rule.name, rule.value)),
+        **(told(episode, rule.value) if episode else named(rule.name, rule.value)),
     }
 
 
@@ -88,17 +88,17 @@ def _asked(request: Request) -> dict[str, Any]:
 def told(episode: Episode, value: str) -> dict[str, Any]:
     """One time that an alarm was active: what, since when, what speaks for it and how sure."""
     return {
-        **_named(episode.alarm, value),
+        **named(episode.alarm, value),
         "raised": episode.raised_ns / S_NS,
         "cleared": episode.cleared_ns and episode.cleared_ns / S_NS,
         "seen": episode.acknowledged_ns and episode.acknowledged_ns / S_NS,
         "seen_by": episode.acknowledged_by,
-        "facts": [[name, text] for name, text in _facts(episode.evidence)],
+        "facts": [[name, text] for name, text in facts(episode.evidence)],
         "report": episode.evidence.get("report", ""),
     }
 
 
-def _named(alarm: str, value: str) -> dict[str, Any]:
+def named(alarm: str, value: str) -> dict[str, Any]:
     """What it is, and where to look, as people say it."""
     cause = _CAUSE_OF.get(value, "")
     if cause in EFFECTS:
@@ -112,7 +112,7 @@ def _named(alarm: str, value: str) -> dict[str, Any]:
     return {"what": title[:1].upper() + title[1:], "sentence": "", "where": ""}
 
 
-def _facts(evidence: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
+def facts(evidence: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
     """What speaks for it, a name and a text each."""
     sizes = evidence.get("parameters", {}).values()
     if sizes:

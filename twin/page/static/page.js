@@ -3,83 +3,19 @@
 
 const PHASES = ["idle", "suction", "hold", "blow-off"];
 const PHASE_COLOURS = ["--idle", "--suction", "--hold", "--blow"];
-const STATES = {
-  unacknowledged: "not acknowledged", acknowledged: "acknowledged",
-  returned: "gone, not acknowledged", shelved: "kept quiet",
-  suppressed: "explained by another alarm", out_of_service: "out of service",
-};
 const DEEDS = {
   acknowledged: "Acknowledge", shelved: "Keep quiet", unshelved: "Let it speak",
   out_of_service: "Take out of service", in_service: "Back into service",
 };
 const TIMES = [[900, "15 minutes"], [3600, "1 hour"], [4 * 3600, "4 hours"], [8 * 3600, "8 hours"]];
 const WINDOW_S = 10;
-const SILENT_MS = 5000; // without a word from the page's own server
 const SHOWN = ["size", "how sure"]; // of what speaks for an alarm, at first sight
 const QUIET = ["shelved", "suppressed", "out_of_service"];
 
-const $ = (id) => document.getElementById(id);
 let me = { user: "", csrf: "", ejectors: [], figures: [] };
 let states = [];
 let chosen = 0;
-let skew = 0; // seconds that the server's clock is ahead of the one here
 const mine = new Map(); // alarm -> what has become of what was asked here
-
-// --- small things --------------------------------------------------------------------------------
-
-function element(tag, attributes = {}, ...children) {
-  const made = document.createElement(tag);
-  for (const [name, value] of Object.entries(attributes)) {
-    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
-    else if (value !== false && value !== null) made.setAttribute(name, value === true ? "" : value);
-  }
-  made.append(...children.filter((one) => one !== null));
-  return made;
-}
-
-function icon(name) {
-  const space = "http://www.w3.org/2000/svg";
-  const svg = document.createElementNS(space, "svg");
-  const use = document.createElementNS(space, "use");
-  svg.setAttribute("aria-hidden", "true");
-  svg.setAttribute("viewBox", "0 0 48 48");
-  use.setAttribute("href", `#icon-${name}`);
-  svg.append(use);
-  return svg;
-}
-
-function clock(seconds) {
-  const then = new Date(seconds * 1000);
-  const time = then.toLocaleTimeString("en-GB");
-  const today = then.toDateString() === new Date(now() * 1000).toDateString();
-  return today ? time : `${then.toLocaleDateString("en-GB")} ${time}`;
-}
-
-function lasting(seconds, digits = 0) {
-  const s = Math.max(0, Math.round(seconds));
-  if (seconds < 9.95) return `${Math.max(0, seconds).toFixed(digits)} s`;
-  if (s < 120) return `${s} s`;
-  if (s < 7200) return `${Math.round(s / 60)} min`;
-  if (s < 172800) return `${Math.round(s / 3600)} h`;
-  return `${Math.round(s / 86400)} days`;
-}
-
-function number(value, digits) {
-  if (value === null) return "–";
-  const text = value.toFixed(digits);
-  return Number(text) === 0 ? text.replace("-", "") : text.replace("-", "−");
-}
-
-const now = () => Date.now() / 1000 + skew;
-const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-
-async function get(path) {
-  const answer = await fetch(path, { headers: { accept: "application/json" } });
-  if (answer.status === 401) location.assign("/login");
-  const told = await answer.json();
-  if (!answer.ok) throw new Error(told.error);
-  return told;
-}
 
 async function post(path, what) {
   const headers = { "content-type": "application/json", "x-csrf-token": me.csrf };
@@ -200,12 +136,6 @@ function alarmCard(alarm, open) {
     deeds(alarm),
     ...asked(alarm),
   );
-}
-
-function rows(pairs) {
-  const filled = pairs.filter(([, text]) => text);
-  return element("dl", { class: "rows" }, ...filled.flatMap(
-    ([name, text]) => [element("dt", {}, name), element("dd", {}, text)]));
 }
 
 function evidence(alarm, open) {
@@ -402,13 +332,6 @@ const live = {
   },
 };
 
-function axis(more = {}) {
-  return {
-    stroke: colour("--ink"), font: "15px system-ui, sans-serif",
-    grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line") }, ...more,
-  };
-}
-
 // --- trends --------------------------------------------------------------------------------------
 
 let trendPlot = null;
@@ -463,21 +386,6 @@ function drawTrend(trend) {
     series: series.slice(0, data.length),
     bands: [{ series: [3, 4], fill: colour("--blue") + "40" }],
   }, data, box);
-}
-
-function dates(ticks) {
-  const days = ticks.length > 1 && ticks[1] - ticks[0] >= 43200;
-  return ticks.map((tick) => {
-    const then = new Date(tick * 1000);
-    const midnight = then.getHours() === 0 && then.getMinutes() === 0;
-    return days || midnight ? then.toLocaleDateString("en-GB", { day: "numeric", month: "short" })
-      : then.toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit" });
-  });
-}
-
-function trendRange(low, high) {
-  const room = Math.max((high - low) * 0.08, Math.abs(high) * 0.02, 1e-6);
-  return [low - room, high + room];
 }
 
 // --- history -------------------------------------------------------------------------------------
@@ -582,6 +490,7 @@ function resize() {
 async function begin() {
   me = await get("/api/me");
   $("who").textContent = me.user;
+  $("all").hidden = !me.all;
   $("login").hidden = Boolean(me.user);
   $("logout").hidden = !me.user;
   if (!$("figure").children.length) {

@@ -1,0 +1,254 @@
+// The page over all ejectors of a broker. What comes from the server is put in as text.
+"use strict";
+
+const LOOK_MS = 2000;
+const LIGHTS = { red: "with an alarm", grey: "not known", yellow: "to be looked after", green: "all right" };
+
+let me = { user: "", csrf: "" };
+let told = null; // what the server said last
+let heardMs = 0;
+let one = null; // the ejector that is shown by itself
+const plots = { rows: null, figure: null };
+
+// --- the table -----------------------------------------------------------------------------------
+
+function hrefOf(ejector) {
+  return `#${encodeURIComponent(ejector.type)}/${encodeURIComponent(ejector.id)}`;
+}
+
+function isWanted(ejector) {
+  const words = $("search").value.trim().toLowerCase().split(/\s+/);
+  const { type, id, batch, words: light, what } = ejector;
+  const text = [type, id, batch, light, what].join(" ").toLowerCase();
+  return words.every((word) => text.includes(word));
+}
+
+function showList() {
+  const shown = told.ejectors.filter(isWanted);
+  const box = $("all-rows");
+  const focused = document.activeElement && document.activeElement.getAttribute("href");
+  box.replaceChildren(...shown.map(line));
+  const again = focused && box.querySelector(`a[href="${CSS.escape(focused)}"]`);
+  if (again) again.focus({ preventScroll: true });
+  $("counts").textContent = Object.entries(LIGHTS).filter(([light]) => told.counts[light])
+    .map(([light, words]) => `${told.counts[light]} ${words}`).join(", ");
+  $("none").hidden = shown.length > 0;
+  $("none").textContent = told.ejectors.length ? "No ejector is like that."
+    : "No ejector has published anything to this broker yet.";
+}
+
+function line(ejector) {
+  const name = element("a", { href: hrefOf(ejector) }, ejector.name);
+  const batch = ejector.batch ? `, batch ${ejector.batch}` : "";
+  const row = element("tr", { class: ejector.light, "data-light": ejector.light, "data-name": ejector.name },
+    element("td", { class: "light" }, icon(ejector.light), element("b", {}, ejector.words)),
+    element("th", { scope: "row" }, name, element("span", { class: "dim" }, ejector.type + batch)),
+    element("td", {}, ...what(ejector)),
+    element("td", {}, ...seen(ejector)),
+    element("td", { class: "figures" }, ...ejector.figures.map(figure)),
+    element("td", { class: "spark" }, spark(ejector.spark)));
+  row.addEventListener("click", () => { location.hash = hrefOf(ejector); });
+  return row;
+}
+
+function what(ejector) {
+  const more = ejector.alarms_count > 1 ? ` and ${ejector.alarms_count - 1} more` : "";
+  const since = ejector.since ? `since ${clock(ejector.since)}, ${lasting(now() - ejector.since)}` : "";
+  return [element("b", {}, ejector.what + more),
+    element("span", { class: "dim" }, since)];
+}
+
+function seen(ejector) {
+  const ago = ejector.seen ? `${lasting(Math.max(0, now() - ejector.seen))} ago` : "never";
+  const behind = ejector.behind ? `values ${lasting(ejector.behind)} behind` : "";
+  return [element("span", {}, ago), element("span", { class: "dim" }, behind)];
+}
+
+function figure({ name, unit, measured, expected }) {
+  const beside = expected === null ? "" : ` (${brief(expected)})`;
+  return element("span", {}, `${name.replaceAll("_", " ")} ${brief(measured)}${beside} ${unit}`);
+}
+
+function brief(value) {
+  if (value === null) return "–";
+  return number(value, Math.abs(value) >= 100 ? 0 : Math.abs(value) >= 1 ? 1 : 3);
+}
+
+function spark({ low, high }) {
+  const space = "http://www.w3.org/2000/svg";
+  const svg = document.createElementNS(space, "svg");
+  svg.setAttribute("viewBox", "0 0 120 40");
+  svg.setAttribute("preserveAspectRatio", "none");
+  svg.setAttribute("role", "img");
+  const there = high.filter((value) => value !== null);
+  const top = Math.max(100, ...there);
+  const last = there.length ? there[there.length - 1] : null;
+  svg.setAttribute("aria-label", last === null ? "no vacuum yet" : `vacuum up to ${Math.max(...there)} mbar`);
+  const x = (i) => (120 * i) / Math.max(1, high.length - 1);
+  const y = (value) => 39 - (38 * Math.max(0, value)) / top;
+  let d = "";
+  high.forEach((value, i) => {
+    if (value === null || low[i] === null) return;
+    const gap = i === 0 || high[i - 1] === null;
+    d += `${gap ? "M" : "L"}${x(i).toFixed(1)} ${y(value).toFixed(1)}L${x(i).toFixed(1)} ${y(low[i]).toFixed(1)}`;
+  });
+  const path = document.createElementNS(space, "path");
+  path.setAttribute("d", d);
+  svg.append(path);
+  return svg;
+}
+
+// --- one by itself -------------------------------------------------------------------------------
+
+function showOne() {
+  $("one-name").textContent = `${one.type} ${one.id}`;
+  const light = $("one-light");
+  light.className = `ejector ${one.light}`;
+  light.dataset.light = one.light;
+  const since = one.since ? `since ${clock(one.since)}` : "";
+  light.replaceChildren(icon(one.light), element("b", {}, one.words), element("span", {}, since));
+  $("one-alarms").replaceChildren(...(one.alarms.length ? one.alarms.map(card)
+    : [element("p", { class: "nothing" }, "No alarm stands.")]));
+  const known = [["batch", one.batch], ["last seen", one.seen ? clock(one.seen) : "never"],
+    ["twin", one.status], ["program", one.program]];
+  $("one-facts").replaceChildren(...rows(known).childNodes);
+  showPlots();
+}
+
+function card(alarm) {
+  const since = alarm.since ? `since ${clock(alarm.since)}, ${lasting(now() - alarm.since)}` : "";
+  return element("article", { class: `alarm ${alarm.state} ${alarm.priority}`, "data-alarm": alarm.alarm },
+    element("div", { class: "top" }, element("h3", {}, alarm.what),
+      element("span", { class: "chip" }, `${alarm.priority} priority`),
+      element("span", { class: "chip state" }, STATES[alarm.state] || alarm.state)),
+    element("p", { class: "since" }, since),
+    element("p", { class: "todo" }, alarm.action),
+    rows([["where", alarm.where], ...alarm.facts, ["if nobody acts", alarm.consequence]]));
+}
+
+function showPlots() {
+  const { time, low, high, expected } = one.rows;
+  const side = (name, width, dash) => ({ stroke: colour(name), width, dash, points: { show: false } });
+  draw("rows", $("one-plot"), [time, expected, low, high],
+    [{}, side("--orange", 2, [8, 5]), side("--blue", 2), side("--blue", 2)],
+    { bands: [{ series: [3, 2], fill: colour("--blue") + "55" }] }, 0);
+  const select = $("figure");
+  const names = one.trends.map((trend) => trend.name);
+  if ([...select.options].map((option) => option.value).join() !== names.join()) {
+    const before = select.value;
+    select.replaceChildren(...names.map((name) => element("option", { value: name }, name.replaceAll("_", " "))));
+    select.value = names.includes(before) ? before : names[0] || "";
+  }
+  const trend = one.trends.find((each) => each.name === select.value);
+  $("figure-what").textContent = trend ? `${trend.what}, ${trend.unit}` : "No cycle has been told yet.";
+  const none = { time: [], measured: [], expected: [] };
+  const { time: at, measured, expected: model } = trend || none;
+  const dots = { stroke: colour("--grey"), paths: () => null,
+    points: { show: true, size: 5, fill: colour("--grey"), width: 0 } };
+  draw("figure", $("figure-plot"), [at, measured, model], [{}, dots, side("--orange", 2, [8, 5])], {});
+}
+
+function draw(name, box, data, series, more, lowest) {
+  if (plots[name]) {
+    plots[name].setData(data);
+    return;
+  }
+  const bottom = (low) => (lowest === undefined ? trendRange(low ?? 0, low ?? 1)[0] : lowest);
+  plots[name] = new uPlot({
+    width: box.clientWidth, height: box.clientHeight, legend: { show: false }, cursor: { show: false },
+    scales: { x: { range: (_plot, first, last) => moments(first, last) }, y: { range: (_plot, low, high) => [bottom(low), trendRange(low ?? 0, high ?? 100)[1]] } },
+    axes: [axis({ space: 90, values: (_plot, ticks) => dates(ticks) }), axis({ size: 70 })],
+    series, ...more,
+  }, data, box);
+}
+
+function moments(first, last) { // at least a minute, also around one point alone
+  const room = Math.max(0, 60 - (last - first)) / 2;
+  return first === null ? [now() - 60, now()] : [first - room, last + room];
+}
+
+function clearPlots() {
+  for (const name of Object.keys(plots)) {
+    if (plots[name]) plots[name].destroy();
+    plots[name] = null;
+  }
+}
+
+// --- looking -------------------------------------------------------------------------------------
+
+function wanted() {
+  const [type, id] = location.hash.slice(1).split("/");
+  return type && id !== undefined ? { type: decodeURIComponent(type), id: decodeURIComponent(id) } : null;
+}
+
+async function look() {
+  const asked = wanted();
+  try {
+    const now = await get("/api/all");
+    const detail = asked && await get(`/api/all/one?${new URLSearchParams(asked)}`);
+    if (location.hash.length > 1 !== Boolean(asked)) return;
+    skew = now.now - Date.now() / 1000;
+    told = now;
+    one = detail;
+    heardMs = performance.now();
+  } catch (error) {
+    if (asked) showBanner(error.message);
+  }
+  show();
+}
+
+function show() {
+  if (!told) return;
+  const silent = performance.now() - heardMs > SILENT_MS;
+  if (silent) {
+    const lost = (ejector) => ({ ...ejector, light: "grey", words: "No connection" });
+    told = { ...told, ejectors: told.ejectors.map(lost), counts: { grey: told.ejectors.length } };
+    one = one && lost(one);
+  }
+  const said = silent ? "No connection to the page: nothing here is up to date" : "connected";
+  $("connection").classList.toggle("bad", silent);
+  if ($("connection").textContent !== said) $("connection").textContent = said;
+  if (!wanted() || one) {
+    const since = told.trouble_since ? ` since ${clock(told.trouble_since)}` : "";
+    showBanner(told.trouble ? `${told.trouble}${since}. What follows is as it was then.` : "");
+  }
+  $("list").hidden = Boolean(wanted());
+  $("one").hidden = !wanted() || !one;
+  if (!wanted()) showList();
+  else if (one) showOne();
+}
+
+function showBanner(said) {
+  $("banner").hidden = !said;
+  if ($("banner").textContent !== said) $("banner").textContent = said;
+}
+
+async function lookOn() {
+  await look();
+  setTimeout(lookOn, LOOK_MS);
+}
+
+async function begin() {
+  me = await get("/api/me");
+  $("who").textContent = me.user;
+  $("login").hidden = Boolean(me.user);
+  $("logout").hidden = !me.user;
+  $("own").hidden = !me.ejectors.length;
+}
+
+async function logout() {
+  await fetch("/api/logout", { method: "POST", headers: { "x-csrf-token": me.csrf } });
+  location.reload();
+}
+
+$("search").addEventListener("input", () => { if (told) showList(); });
+$("figure").addEventListener("change", () => {
+  if (plots.figure) plots.figure.destroy();
+  plots.figure = null;
+  showPlots();
+});
+$("logout").addEventListener("click", logout);
+addEventListener("hashchange", () => { clearPlots(); one = null; scrollTo(0, 0); look(); });
+addEventListener("resize", () => { clearPlots(); show(); });
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { clearPlots(); show(); });
+begin().then(lookOn, (error) => { $("connection").textContent = error.message; });

@@ -1,0 +1,99 @@
+// What the pages share. What comes from the server is put in as text, never as markup.
+"use strict";
+
+const STATES = {
+  unacknowledged: "not acknowledged", acknowledged: "acknowledged",
+  returned: "gone, not acknowledged", shelved: "kept quiet",
+  suppressed: "explained by another alarm", out_of_service: "out of service",
+};
+const SILENT_MS = 5000; // without a word from the page's own server
+
+const $ = (id) => document.getElementById(id);
+let skew = 0; // seconds that the server's clock is ahead of the one here
+
+// --- small things --------------------------------------------------------------------------------
+
+function element(tag, attributes = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
+    else if (value !== false && value !== null) made.setAttribute(name, value === true ? "" : value);
+  }
+  made.append(...children.filter((one) => one !== null));
+  return made;
+}
+
+function icon(name) {
+  const space = "http://www.w3.org/2000/svg";
+  const svg = document.createElementNS(space, "svg");
+  const use = document.createElementNS(space, "use");
+  svg.setAttribute("aria-hidden", "true");
+  svg.setAttribute("viewBox", "0 0 48 48");
+  use.setAttribute("href", `#icon-${name}`);
+  svg.append(use);
+  return svg;
+}
+
+function clock(seconds) {
+  const then = new Date(seconds * 1000);
+  const time = then.toLocaleTimeString("en-GB");
+  const today = then.toDateString() === new Date(now() * 1000).toDateString();
+  return today ? time : `${then.toLocaleDateString("en-GB")} ${time}`;
+}
+
+function lasting(seconds, digits = 0) {
+  const s = Math.max(0, Math.round(seconds));
+  if (seconds < 9.95) return `${Math.max(0, seconds).toFixed(digits)} s`;
+  if (s < 120) return `${s} s`;
+  if (s < 7200) return `${Math.round(s / 60)} min`;
+  if (s < 172800) return `${Math.round(s / 3600)} h`;
+  return `${Math.round(s / 86400)} days`;
+}
+
+function number(value, digits) {
+  if (value === null) return "–";
+  const text = value.toFixed(digits);
+  return Number(text) === 0 ? text.replace("-", "") : text.replace("-", "−");
+}
+
+const now = () => Date.now() / 1000 + skew;
+const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+
+async function get(path) {
+  const answer = await fetch(path, { headers: { accept: "application/json" } });
+  if (answer.status === 401) location.assign("/login");
+  const told = await answer.json();
+  if (!answer.ok) throw new Error(told.error);
+  return told;
+}
+
+function rows(pairs) {
+  const filled = pairs.filter(([, text]) => text);
+  return element("dl", { class: "rows" }, ...filled.flatMap(
+    ([name, text]) => [element("dt", {}, name), element("dd", {}, text)]));
+}
+
+// --- plots ---------------------------------------------------------------------------------------
+
+function axis(more = {}) {
+  return {
+    stroke: colour("--ink"), font: "15px system-ui, sans-serif",
+    grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line") }, ...more,
+  };
+}
+
+function dates(ticks) {
+  const days = ticks.length > 1 && ticks[1] - ticks[0] >= 43200;
+  const seconds = ticks.length > 1 && ticks[1] - ticks[0] < 60 ? { second: "2-digit" } : {};
+  return ticks.map((tick) => {
+    const then = new Date(tick * 1000);
+    const midnight = then.getHours() === 0 && then.getMinutes() === 0;
+    return days || midnight ? then.toLocaleDateString("en-GB", { day: "numeric", month: "short" })
+      : then.toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit", ...seconds });
+  });
+}
+
+function trendRange(low, high) {
+  const room = Math.max((high - low) * 0.08, Math.abs(high) * 0.02, 1e-6);
+  return [low - room, high + room];
+}
