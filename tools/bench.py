@@ -8,31 +8,30 @@ to be there: npm ci --prefix tests/peers), where --seconds says for how long.
 """
 
 import argparse
-import json
 import signal
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
-from statistics import median
 
 from benchmarks import (
     acquisition,
     calibration,
     clients,
     detection,
+    diagnosis,
+    growth,
     isolation,
     kernel,
     log,
     machine,
     opcua,
+    page,
     plant,
     polling,
     replay,
 )
-from benchmarks.figures import Benchmark, Figure, Measured, Run, kept
-from benchmarks.processes import ROOT
+from benchmarks.figures import Benchmark, Figure, Run
 
 INTERRUPTED, TERMINATED = 130, 143
 BARE_FETCH = "bare socket that fetches the same registers"
@@ -121,11 +120,14 @@ BENCHMARKS = (
     ),
     Benchmark(
         "together",
-        plant.together,
-        "`twin run` with eight configurations, each with a simulated PLC and a log of its own.",
+        growth.ejectors,
+        "`twin run` with one, two, four and eight configurations, each with a simulated PLC and a "
+        "log of its own.",
         (
             Figure("eight ejectors in one process: lost samples", "", limit=0),
             Figure("eight ejectors in one process: CPU", "% of a core"),
+            Figure("one more ejector: CPU", "% of a core", BARE_FETCH),
+            Figure("one more ejector: memory", "MB"),
         ),
     ),
     Benchmark(
@@ -241,6 +243,39 @@ BENCHMARKS = (
         ),
     ),
     Benchmark(
+        "length",
+        growth.length,
+        "`twin replay` in a process of its own over the first minutes of that log and over all of "
+        "it; 24 hours with --long, else by the line. Peak memory is what the process had resident.",
+        (
+            Figure("replay of one more hour: time", "s", "decompression and the model in C"),
+            Figure("replay of one more hour: memory", "MB"),
+            Figure("replay of 24 hours: peak memory", "MB", STARTED, 500.0),
+        ),
+    ),
+    Benchmark(
+        "hypotheses",
+        growth.hypotheses,
+        "10 000 rows through `kernel.advance` for 8 to 64 hypotheses, in processor time; memory is "
+        "that of the arrays of the call.",
+        (
+            Figure("one more hypothesis: a row of 1 ms", "ns", "in C, eight to a vector"),
+            Figure("one more hypothesis: memory for 10 000 rows", "MB"),
+        ),
+    ),
+    Benchmark(
+        "diagnosis",
+        diagnosis.end_to_end,
+        "`twin diagnose` in a process of its own, start included, on all cores: 12 cycles with a "
+        "leak, and an hour in which one begins half-way; each has to name it.",
+        (
+            Figure("diagnosis: 12 cycles", "s", "SciPy's least squares for that cause alone"),
+            Figure("diagnosis: 12 cycles, peak memory", "MB", "twin replay"),
+            Figure("diagnosis: an hour", "s", "twin replay"),
+            Figure("diagnosis: an hour, peak memory", "MB", "twin replay"),
+        ),
+    ),
+    Benchmark(
         "starts",
         replay.starts,
         "Whole processes, by turns with their floors, everything in the page cache.",
@@ -250,8 +285,6 @@ BENCHMARKS = (
         ),
     ),
 )
-
-Result = tuple[Figure, Measured]
 
 
 def main() -> int:
@@ -273,9 +306,9 @@ def main() -> int:
         f"Noise: {before}; after the run {machine.noise()}.",
         f"Seconds: {', '.join(f'{name} {taken:.0f}' for name, taken in seconds.items())}.",
     ]
-    print(_page(results, notes))
+    print(page.table(results, notes))
     if not given.only:
-        _write(results, notes)
+        page.write(results, notes, BENCHMARKS)
     return 0
 
 
@@ -301,44 +334,6 @@ def _tell(text: str) -> None:
 def _kind(long: bool) -> str:
     pinned = "PLC and twin each on its own core" if machine.can_pin() else "not pinned to cores"
     return f"{'Long' if long else 'Short'} run of {time.strftime('%Y-%m-%d')}; {pinned}."
-
-
-def _page(results: list[Result], notes: list[str]) -> str:
-    rows = ["| figure | measured | floor | ratio | limit | kept |", "|" + " --- |" * 6]
-    rows += [_row(figure, measured) for figure, measured in results]
-    return "\n".join([*(f"- {note}" for note in notes), "", *rows])
-
-
-def _row(figure: Figure, measured: Measured) -> str:
-    floor = f"{_spread(measured.floors, figure.unit)}: {figure.floor}" if measured.floors else ""
-    ratio = "" if measured.ratio is None else f"{measured.ratio:.2f}"
-    limit = "" if figure.limit is None else f"{figure.limit:g} {figure.unit}".strip()
-    if figure.limits_ratio:
-        limit = f"ratio {figure.limit:g}"
-    verdict = {None: "", True: "yes", False: "**no**"}[kept(figure, measured)]
-    value = " ".join(filter(None, (_spread(measured.values, figure.unit), measured.note)))
-    return f"| {figure.name} | {value} | {floor} | {ratio} | {limit} | {verdict} |"
-
-
-def _spread(values: Sequence[float], unit: str) -> str:
-    """Median, and from least to most where there are several."""
-    spread = f" ({_number(min(values))}–{_number(max(values))})" if len(values) > 1 else ""
-    return f"{_number(median(values))}{spread} {unit}".strip()
-
-
-def _number(value: float) -> str:
-    return f"{value:.3g}" if abs(value) < 999.5 else f"{value:,.0f}"
-
-
-def _write(results: list[Result], notes: list[str]) -> None:
-    page = ["# Benchmarks", "", "Written by `make bench` (tools/bench.py). Every figure stands"]
-    page += ["beside its floor, measured in the same run on the same machine: use the ratios."]
-    page += ["Median of the repetitions, least to most in brackets.", "", _page(results, notes), ""]
-    page += [*(f"- **{one.name}**: {one.how}" for one in BENCHMARKS), ""]
-    (ROOT / "docs" / "bench.md").write_text("\n".join(page), encoding="utf-8")
-    figures = [vars(figure) | vars(measured) for figure, measured in results]
-    text = json.dumps({"circumstances": notes, "figures": figures}, indent=1, ensure_ascii=False)
-    (ROOT / "docs" / "bench.json").write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -41,7 +41,7 @@ def _acquire(run: Run, what: str, slices: int, stop_s: float) -> Sequence[Measur
     with plc() as port:
         run.tell(f"{what}: the floor")
         with on_core(TWIN_CORE):
-            floors = [_bare_share(port) for _ in range(3)]
+            floors = [bare_share(port) for _ in range(3)]
         with live(log, port=port) as process:
             shares = []
             for number in range(slices):
@@ -80,7 +80,7 @@ def lost(log: Path) -> tuple[int, int]:
     return int((steps - 1).sum()), len(sequence)
 
 
-def _bare_share(port: int) -> float:
+def bare_share(port: int) -> float:
     """CPU time (% of a core) of a bare socket that fetches the same registers as often."""
     with connected(port) as connection:
         begin, cpu = time.monotonic(), time.process_time()

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
+from statistics import linear_regression, median
 
 
 @dataclass(frozen=True)
@@ -18,6 +18,42 @@ class Figure:
 
 
 @dataclass(frozen=True)
+class Line:
+    """What something costs at several sizes, and the straight line through that."""
+
+    what: str  # and its unit
+    of: str  # what the sizes are
+    sizes: Sequence[float]
+    costs: Sequence[float]  # medians
+    most: float | None = None  # that there is to spend
+    spent: str = ""  # what that is
+
+    @property
+    def slope(self) -> float:
+        """Cost of one more."""
+        return linear_regression(self.sizes, self.costs).slope
+
+    @property
+    def rest(self) -> float:
+        """Cost of none, by the line."""
+        return linear_regression(self.sizes, self.costs).intercept
+
+    @property
+    def off(self) -> float:
+        """Furthest that a cost is from the line, % of the largest cost."""
+        pairs = zip(self.sizes, self.costs, strict=True)
+        far = max(abs(cost - self.rest - self.slope * size) for size, cost in pairs)
+        return 100.0 * far / max(self.costs)
+
+    @property
+    def limit(self) -> float | None:
+        """Size at which all is spent, by the line; None where it is never reached."""
+        if self.most is None or self.slope <= 0.0:
+            return None
+        return (self.most - self.rest) / self.slope
+
+
+@dataclass(frozen=True)
 class Measured:
     """Repetitions of a figure and of its floor, in the figure's unit.
 
@@ -28,6 +64,7 @@ class Measured:
     floors: Sequence[float] = ()
     note: str = ""
     valid: bool = True
+    line: Line | None = None  # where the figure is its slope
 
     @property
     def ratio(self) -> float | None:

@@ -16,7 +16,7 @@ from pyarrow import parquet
 
 from benchmarks.figures import Measured, Run
 from benchmarks.machine import TWIN_CORE, on_core
-from benchmarks.recording import hour
+from benchmarks.recording import BLOCK, Recording, hour
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
 from twin.log.schema import CHANNELS, SAMPLES
@@ -79,9 +79,15 @@ def hour_log(folder: Path) -> Path:
 
 def write(path: Path) -> None:
     """Write the hour as a replay would."""
-    with Recorder(path, hour().header()) as recorder:
-        for samples, ticks in hour().blocks():
+    keep(path, hour())
+
+
+def keep(path: Path, recording: Recording, rows: int | None = None) -> Path:
+    """Write a recording, or about its first ``rows``, as a replay would."""
+    with Recorder(path, recording.header()) as recorder:
+        for samples, ticks in recording.blocks()[: rows and rows // BLOCK]:
             recorder.write(samples, ticks)
+    return path
 
 
 def read(path: Path) -> None:

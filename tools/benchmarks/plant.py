@@ -1,4 +1,4 @@
-"""What a plant has: one ejector with everything on and its page open, and eight in one process."""
+"""What a plant has: one ejector with everything on and its page open, several in one process."""
 
 import json
 import subprocess
@@ -14,12 +14,10 @@ import tomli_w
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from benchmarks.acquisition import lost
 from benchmarks.figures import Measured, Run
 from benchmarks.machine import PLC_CORE, on_core
 from benchmarks.processes import CONFIG, TWIN, live, plc
 
-EJECTORS = 8
 SLICE_S, SLICES, LONG_SLICES = 10.0, 3, 60
 KEPT = {"figures": {"keep": True}, "alarms": {"keep": True}, "page": {"keep": True}}
 
@@ -34,23 +32,19 @@ def watched(run: Run) -> Sequence[Measured]:
     return tuple(Measured(one) for one in zip(*shares, strict=True))
 
 
-def together(run: Run) -> Sequence[Measured]:
-    """Lost samples and CPU share of eight ejectors, each with a PLC of its own."""
-    names = [f"rig-{number + 1:02}" for number in range(EJECTORS)]
-    folder, log = run.folder / "together", run.folder / "together.mcap"
+@contextmanager
+def together(run: Run, count: int) -> Iterator[tuple["subprocess.Popen[bytes]", list[Path]]]:
+    """So many ejectors in one process, each with a PLC of its own; gives it, and their logs."""
+    names = [f"rig-{number + 1:02}" for number in range(count)]
+    folder = run.folder / f"{count} together"
+    log = folder / "log.mcap"
     with ExitStack() as open_now:
         ports = [open_now.enter_context(plc()) for _ in names]
         pairs = zip(names, ports, strict=True)
         configs = [_config(folder / name, name, port, {}) for name, port in pairs]
-        logs = [log.with_suffix(f".{name}.mcap") for name in names]
-        process = open_now.enter_context(live(log, configs, logs))
-        shares = _shares(run, "eight ejectors", [process.pid])
-    found = [lost(one) for one in logs]
-    note = f"of {sum(rows for _, rows in found):,} samples"
-    return (
-        Measured([sum(missing for missing, _ in found)], note=note),
-        Measured([share for (share,) in shares]),
-    )
+        # One alone is called as it is told.
+        logs = [log.with_suffix(f".{name}.mcap") for name in names] if count > 1 else [log]
+        yield open_now.enter_context(live(log, configs, logs)), logs
 
 
 def _config(folder: Path, name: str, port: int, more: dict[str, dict[str, bool]]) -> Path:

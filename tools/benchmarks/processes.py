@@ -1,5 +1,6 @@
 """The processes that the benchmarks start: simulated PLC and live twin, each on its own core."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -63,6 +64,18 @@ def live(
             process.wait()  # leaving it closes what it still writes to
     if process.returncode != INTERRUPTED:
         sys.exit(f"twin run ended with exit code {process.returncode}")
+
+
+def usage(command: Sequence[str | Path]) -> tuple[float, float]:
+    """Run a command to its end: time (s), and the most memory it had resident (MB)."""
+    begin = time.perf_counter()
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        _, status, used = os.wait4(process.pid, 0)
+        seconds = time.perf_counter() - begin
+        process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        sys.exit(f"{command[0]} {command[1]} ended with exit code {process.returncode}")
+    return seconds, used.ru_maxrss * 1024 * 1e-6
 
 
 def _wait_for_samples(process: "subprocess.Popen[bytes]", log: Path) -> None:

@@ -1,11 +1,13 @@
 """An hour of the test rig, simulated, with what the twin says to it: made once, used by many."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 
 from benchmarks.processes import CONFIG
+from drivers.plc.faults import parse_fault
 from drivers.plc.settings import PlcSettings
 from drivers.plc.simulate import blocks
 from twin.config import Config
@@ -49,10 +51,16 @@ def new_twin(config: Config) -> Twin:
 @cache
 def hour() -> Recording:
     """3.6 million rows, received as a live driver would: in blocks, a little late."""
+    return recorded(HOUR_S)
+
+
+def recorded(seconds: float, faults: Sequence[str] = ()) -> Recording:
+    """The same for another while, with faults."""
     document = Document.read(CONFIG)
     config = Config.of(document)
     rig = document.section(PlcSettings, "plc")
-    simulated = np.concatenate(list(blocks(rig, HOUR_S, seed=1, block=BLOCK)))
+    hidden = [parse_fault(fault) for fault in faults]
+    simulated = np.concatenate(list(blocks(rig, seconds, hidden, seed=1, block=BLOCK)))
     simulated["host_ns"] = _received(simulated["time_ns"])
     twin = new_twin(config)
     starts = range(0, len(simulated), BLOCK)
