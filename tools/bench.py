@@ -30,6 +30,7 @@ from benchmarks import (
     plant,
     polling,
     replay,
+    solver,
 )
 from benchmarks.figures import Benchmark, Figure, Run
 
@@ -159,6 +160,13 @@ BENCHMARKS = (
             ),
             Figure("model: one row for each of 64 hypotheses", "ns", "in C, eight to a vector"),
         ),
+    ),
+    Benchmark(
+        "solver",
+        solver.evacuation,
+        "0.3 s of suction from rest by `scipy.integrate.solve_ivp` (Radau, tolerance 1e-6) "
+        "with the same equations in Python, and by `kernel.advance`; processor time.",
+        (Figure("SciPy's solver: one row of 1 ms", "ns", "our model"),),
     ),
     Benchmark(
         "calibration",
