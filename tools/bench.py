@@ -253,8 +253,8 @@ BENCHMARKS = (
     Benchmark(
         "length",
         growth.length,
-        "`twin replay` in a process of its own over the first minutes of that log and over all of "
-        "it; 24 hours with --long, else by the line. Peak memory is what the process had resident.",
+        "`twin replay` in a process of its own over the first 5, 10, 20 and 30 minutes of that "
+        "log; 24 hours with --long, else by the line. Peak memory is what was resident.",
         (
             Figure("replay of one more hour: time", "s", "decompression and the model in C"),
             Figure("replay of one more hour: memory", "MB"),

@@ -18,7 +18,7 @@ from twin.log.reader import open_log
 from twin.model import kernel
 from twin.model.effects import apply
 
-REPEATS, LONG_REPEATS = 3, 7
+REPEATS, LONG_REPEATS = 2, 7
 SHORT_S = 2.0 + 13.2 * 3.2  # 12 complete cycles
 LEAK, PARAMETER, SIZE = "leakage", "sonic_flow", 2.0  # sl/min
 

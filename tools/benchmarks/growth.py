@@ -21,7 +21,7 @@ from twin.log.recorder import Recorder
 from twin.model import kernel as model
 
 REPEATS = 3
-MINUTES = (6, 15, 30, 60)
+MINUTES = (5, 10, 20, 30)
 DAY_H = 24
 MOST_MB = 500.0  # that a replay may have
 HYPOTHESES = (8, 16, 32, 64)

@@ -1,6 +1,5 @@
 """The processes that the benchmarks start: simulated PLC and live twin, each on its own core."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -14,6 +13,7 @@ from benchmarks.machine import PLC_CORE, TWIN_CORE, on_core
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / "configs" / "test_rig.toml"
+LAUNCHER = Path(__file__).with_name("launcher.py")
 TWIN = Path(sys.executable).with_name("twin")
 
 INTERRUPTED = 130
@@ -68,14 +68,13 @@ def live(
 
 def usage(command: Sequence[str | Path]) -> tuple[float, float]:
     """Run a command to its end: time (s), and the most memory it had resident (MB)."""
-    begin = time.perf_counter()
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-        _, status, used = os.wait4(process.pid, 0)
-        seconds = time.perf_counter() - begin
-        process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        sys.exit(f"{command[0]} {command[1]} ended with exit code {process.returncode}")
-    return seconds, used.ru_maxrss * 1024 * 1e-6
+    told = subprocess.run(
+        [sys.executable, "-S", LAUNCHER, *command], stdout=subprocess.PIPE, text=True, check=True
+    )
+    seconds, most, code = told.stdout.split()
+    if code != "0":
+        sys.exit(f"{command[0]} {command[1]} ended with exit code {code}")
+    return float(seconds), float(most)
 
 
 def _wait_for_samples(process: "subprocess.Popen[bytes]", log: Path) -> None:
