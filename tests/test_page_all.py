@@ -1,16 +1,26 @@
 """The page over all ejectors: what a broker tells, who is worst, and a real browser before it."""
 
 import json
+import re
+import subprocess
+import sys
+import threading
 import time
-from collections.abc import Iterator
+import tomllib
+import urllib.request
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
+import rigs
+import tomli_w
+from command_line import twin
 from mosquitto import Broker, broker
 from page_site import config, write_config
 from playwright.sync_api import Browser, expect
+from plc_process import start_plc
 from starlette.testclient import TestClient
 from test_alarms_loop import LEAK
 from test_page_browser import Server, _is_fit, browser  # noqa: F401 - a fixture
@@ -307,8 +317,6 @@ def test_it_is_seen_by_whom_the_other_page_is(tmp_path: Path, told: Told) -> Non
 
 @contextmanager
 def site(folder: Path, port: int) -> Iterator[str]:
-    import threading
-
     users, place, hall = Users(folder / "users.toml"), Place("127.0.0.1", 0), Hall()
     inner = make_server(Page([], users, Sessions(users), Access(), hall).app(), place)
     wanted = MqttSettings(host="127.0.0.1", port=port)
@@ -408,3 +416,84 @@ def test_it_is_fit_for_gloves_on_every_screen(
             expect(page.locator("#one-alarms article")).to_have_count(1)
             _is_fit(page)
             context.close()
+
+
+# --- on the command line ------------------------------------------------------------------------
+
+
+def test_twin_run_is_on_the_page_of_twin_serve(tmp_path: Path) -> None:
+    """A real PLC's process, the edge's, the broker's and the page's; the edge is killed."""
+    tables = tomllib.loads(rigs.path_of("gripper").read_text(encoding="utf-8"))
+    with broker(tmp_path) as running:
+        tables |= {"alarms": {"keep": True}}
+        tables["asset"]["batch"] = "2026-07"
+        at = {"host": "127.0.0.1", "port": running.port}
+        tables["mqtt"] = at | {"cycles": True, "values": {"period_s": 0.2}}
+        edge, hall = tmp_path / "edge.toml", tmp_path / "hall.toml"
+        edge.write_text(tomli_w.dumps(tables), encoding="utf-8")
+        hall.write_text(tomli_w.dumps({"mqtt": at}), encoding="utf-8")
+        with (
+            start_plc(edge) as plc,
+            started("run", edge, "--address", f"127.0.0.1:{plc.port}") as run,
+            started("serve", "--broker", hall, "--port", "0") as served,
+        ):
+            assert served.stdout is not None
+            url = served.stdout.readline().removeprefix("the page is at ").strip()
+
+            def line() -> dict[str, Any]:
+                with urllib.request.urlopen(f"{url}api/all") as answer:
+                    ejectors = json.load(answer)["ejectors"]
+                return ejectors[0] if ejectors else {"light": "", "figures": [], "spark": {}}
+
+            until(lambda: line()["figures"] and line()["spark"]["high"])
+            found = line()
+            assert (found["name"], found["light"], found["batch"]) == (
+                "gripper-01",
+                "green",
+                "2026-07",
+            )
+            assert found["figures"][0]["measured"] == pytest.approx(189.0, abs=15.0)
+            assert max(found["spark"]["high"]) > 500
+            run.kill()
+            until(lambda: line()["what"] == "gone without a word")
+
+
+def until(is_so: Callable[[], Any]) -> None:
+    end = time.monotonic() + 60.0
+    while not is_so():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+@contextmanager
+def started(*words: object) -> Iterator["subprocess.Popen[str]"]:
+    command = [sys.executable, "-m", "twin.cli", *map(str, words)]
+    with subprocess.Popen(command, cwd=rigs.ROOT, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[data]", r"no \[mqtt\] in it"),
+        ("[mqtt]\nport = 1", r"\[mqtt\] has no host"),
+        ("[mqqt]\nport = 1", r"unknown table \[mqqt\]"),
+    ],
+)
+def test_a_configuration_without_a_broker_is_refused(
+    tmp_path: Path,
+    text: str,
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / "hall.toml"
+    path.write_text(text, encoding="utf-8")
+    assert twin(monkeypatch, "serve", "--broker", path, "--port", "0") == 2
+    assert re.search(said, capsys.readouterr().err)
+    path.write_text('[mqtt]\nhost = "127.0.0.1"', encoding="utf-8")
+    assert twin(monkeypatch, "serve", "--broker", path, "--host", "0.0.0.0") == 2
+    assert "it has no users" in capsys.readouterr().err
