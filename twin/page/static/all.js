@@ -156,6 +156,7 @@ function draw(name, box, data, series, more, lowest) {
   const bottom = (low) => (lowest === undefined ? trendRange(low ?? 0, low ?? 1)[0] : lowest);
   plots[name] = new uPlot({
     width: box.clientWidth, height: box.clientHeight, legend: { show: false }, cursor: { show: false },
+    padding: [null, 30, null, null],
     scales: { x: { range: (_plot, first, last) => moments(first, last) }, y: { range: (_plot, low, high) => [bottom(low), trendRange(low ?? 0, high ?? 100)[1]] } },
     axes: [axis({ space: 90, values: (_plot, ticks) => dates(ticks) }), axis({ size: 70 })],
     series, ...more,
