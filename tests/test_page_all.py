@@ -386,7 +386,7 @@ def test_forty_ejectors_and_one_that_dies(tmp_path: Path, browser: Browser) -> N
         page.go_back()
         expect(lines).to_have_count(40)
         running.kill()
-        expect(page.locator("#banner")).to_contain_text("the connection is lost")
+        expect(page.locator("#banner")).to_contain_text("What follows is as it was then")
         expect(page.locator("#counts")).to_have_text("40 not known")
         assert said == []
         assert [one for one in asked if not one.startswith(url)] == []
