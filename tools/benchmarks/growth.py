@@ -71,14 +71,14 @@ def length(run: Run) -> Sequence[Measured]:
         spent = f"{MOST_MB:g} MB"
         costs = _medians(memories)
         line = Line("replay, MB", "hours of log", hours, costs, MOST_MB, spent)
-        day, note = line.rest + DAY_H * line.slope, "by the line"
+        day, note = line.rest + DAY_H * line.slope, "by the line, which short logs make too steep"
         if run.long:
             run.tell("length: a day")
             day, note = usage([TWIN, "replay", _day(run.folder / "day.mcap")])[1], "measured"
     return (
         _grown(hours, times, time_line, floors),
         _grown(hours, memories, line, ()),
-        Measured([day], imports, note=note),
+        Measured([day], imports, note=note, valid=run.long),
     )
 
 
