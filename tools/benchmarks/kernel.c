@@ -20,7 +20,7 @@ enum { /* twin.model.theta.COEFFICIENTS */
     RESPONSE, RESPONSE_OFF, RAMP_UP, SLOW_RAMP_UP, RAMP_DOWN, BLOW_OFF, BLOW_OFF_RESPONSE,
     BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, RELIEF, PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT,
     VOLUME, COMPLIANCE, FILM, AREA, NEAR_RESISTANCE, NEAR_LAMINAR, NEAR_INERTANCE, RESISTANCE,
-    LAMINAR, INERTANCE, PLACE, LEAK, LAMINAR_LEAK, BACK_FLOW, OPENING, SENSOR_LAG, SLOW_SENSOR,
+    LAMINAR, INERTANCE, PLACE, LEAK, LAMINAR_LEAK, INFLOW, BACK_FLOW, OPENING, SENSOR_LAG, SLOW_SENSOR,
     SENSOR_OFFSET, SENSOR_GAIN, H1, H1_LOW, H2, H2_LOW, RELEASE, CONTROL_SENSOR, AIR_SAVING,
     PERMITTED_LEAKAGE, BLOW_OFF_MODE, BLOW_OFF_TIME, COEFFICIENTS
 };
@@ -162,7 +162,8 @@ INLINED Tangent at_vessel(double p, const Driven *driven, const double *k)
     double laminar = K(LAMINAR_LEAK) + driven->open * K(OPENING);
     Tangent flow = opening(p, ambient);
     double slope = K(LEAK) * flow.slope - laminar;
-    return (Tangent){K(LEAK) * (flow.level - flow.slope * p) + laminar * ambient, slope};
+    double level = K(LEAK) * (flow.level - flow.slope * p) + laminar * ambient;
+    return (Tangent){level + K(INFLOW), slope};
 }
 
 INLINED double through(double rest, double fall, double before, double rise,
