@@ -17,7 +17,6 @@ from sqlalchemy import (
     Row,
     Table,
     Text,
-    inspect,
     select,
 )
 
@@ -106,12 +105,7 @@ class Store(Database):
 
     def prepare(self) -> None:
         """Make the tables that are not there."""
-        with self._reading() as connection:
-            there = set(inspect(connection).get_table_names())
-        if there >= set(metadata.tables):
-            return
-        with self._writing() as connection:
-            metadata.create_all(connection)
+        self._make_missing(metadata)
 
     # --- a run ----------------------------------------------------------------------------------
 

@@ -14,7 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url
+from sqlalchemy import (
+    URL,
+    Connection,
+    Engine,
+    MetaData,
+    create_engine,
+    event,
+    inspect,
+    make_url,
+)
 from sqlalchemy.engine.interfaces import DBAPIConnection
 from sqlalchemy.exc import ArgumentError, DBAPIError, OperationalError
 from sqlalchemy.pool import ConnectionPoolEntry, NullPool, StaticPool
@@ -112,6 +121,14 @@ class Database:
         except BaseException:
             self.close()
             raise
+
+    def _make_missing(self, tables: MetaData) -> None:
+        """Make the tables that are not there; where all are, nothing is written."""
+        with self._reading() as connection:
+            there = set(inspect(connection).get_table_names())
+        if not there >= set(tables.tables):
+            with self._writing() as connection:
+                tables.create_all(connection)
 
     @contextmanager
     def _reading(self) -> Iterator[Connection]:

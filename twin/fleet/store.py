@@ -20,7 +20,6 @@ from sqlalchemy import (
     Row,
     Table,
     Text,
-    inspect,
     select,
 )
 
@@ -103,11 +102,7 @@ class Store(Database):
 
     def prepare(self) -> None:
         """Make the table where it is missing."""
-        with self._reading() as connection:
-            if inspect(connection).has_table(RESULT.name):
-                return
-        with self._writing() as connection:
-            metadata.create_all(connection)
+        self._make_missing(metadata)
 
     def known(self, keys: Iterable[Key]) -> set[Key]:
         """Of some answers, those that are there."""

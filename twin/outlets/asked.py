@@ -17,7 +17,6 @@ from sqlalchemy import (
     Table,
     Text,
     func,
-    inspect,
     select,
 )
 
@@ -134,11 +133,7 @@ class Uploads(Database):
 
     def prepare(self) -> None:
         """Make the table if it is not there."""
-        with self._reading() as connection:
-            there = inspect(connection).has_table(UPLOADS.name)
-        if not there:
-            with self._writing() as connection:
-                metadata.create_all(connection)
+        self._make_missing(metadata)
 
     def find(self, number: str) -> Asked | None:
         """What was asked under an ID, as far as that is remembered."""
