@@ -19,7 +19,7 @@ from opcua_plc import OpcuaPlc, start_opcua
 from plc_process import PlcProcess, start_plc
 from postgres import make_schema, postgres_server
 
-from twin.live import compiled
+from twin.cli import pair_of
 
 _ME = psutil.Process()
 _SCHEMAS = itertools.count()
@@ -89,4 +89,4 @@ def url(server: Path | None, tmp_path: Path) -> str:
 @pytest.fixture(scope="session", autouse=True)
 def compiled_once() -> None:
     """Compile before a child process has to: tests wait for what it does, not for a compiler."""
-    compiled(rigs.config("test_rig").data)
+    pair_of(rigs.config("gripper"))  # all that a live loop needs

@@ -126,7 +126,7 @@ def run(
             "leave it out, and give each configuration its own under [asset]",
         )
     ejectors = _named([_configured(Document.read(one), assets, unit) for one in configs])
-    pairs = {name: _pair(one) for name, one in ejectors.items()}  # compiled before time counts
+    pairs = {name: pair_of(one) for name, one in ejectors.items()}  # compiled before time counts
     events: list[Event] = []
     lines = Lines()
 
@@ -207,7 +207,7 @@ def replay(
     _require_writable(json_file)
     recorded = open_log(log)
     settings = _settings_of(recorded.header, log, config, assets, unit, as_of)
-    twin, monitor = _pair(settings)
+    twin, monitor = pair_of(settings)
     alarms = alarms_of(settings)()
     with _views_of({"": settings}, view, rrd) as view_of, _stop_on_signal(None) as stopped:
         console = Console()
@@ -346,7 +346,7 @@ def import_(
     table = open_table(file, wanted, settings.data.ambient.pressure_mbar * MBAR)
     if table.ignored:
         print(f"twin: columns not taken: {', '.join(table.ignored)}", file=sys.stderr)
-    twin, monitor = _pair(settings)
+    twin, monitor = pair_of(settings)
     console = Console()
     with _whole(output) as part, _stop_on_signal(None) as stopped:
         sinks = _opened(lambda: Recorder(part, _header(settings)), lambda: console)
@@ -482,7 +482,7 @@ def _file_of(path: Path | None, name: str) -> Path | None:
     return path.with_name(f"{path.stem}.{name}{path.suffix}") if path and name else path
 
 
-def _pair(settings: "Config") -> tuple["Twin", "Monitor"]:
+def pair_of(settings: "Config") -> tuple["Twin", "Monitor"]:
     """The twin of a configuration and its monitor."""
     from twin.live import compiled
     from twin.monitor.detect import Monitor

@@ -23,7 +23,7 @@ from twin.model import kernel
 from twin.model import theta as c
 from twin.model.courses import Cause, Schedule, schedule
 from twin.model.dataset import coefficients
-from twin.model.plant import reading, sensed_at
+from twin.model.plant import reading_of, sensed_of
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, binned, sparse
@@ -228,8 +228,7 @@ class Evidence:
         """Where coefficients change at a cycle's start, the level is what was read before that."""
         for (_, before), (row, after) in pairwise(course):
             if np.isfinite(level[row]) and self.ticks["phase"][row - 1] == Phase.IDLE:
-                sensed = sensed_at(level[row], before.reshape(-1, 1), 0)
-                level[row] = reading(sensed, after.reshape(-1, 1), 0)
+                level[row] = reading_of(sensed_of(level[row], before), after)
 
     def _move(
         self, phase: npt.NDArray[np.uint8], level: Floats, sensing: Sequence["Sensing"]

@@ -6,6 +6,7 @@ or hold constants for it.
 """
 
 import hashlib
+import logging
 import os
 import shutil
 import tempfile
@@ -14,9 +15,11 @@ from pathlib import Path
 
 import llvmlite.binding as llvm
 import numba
+from numba.core import event
 from numba.core.codegen import get_host_cpu_features
 
 DAY_S = 86_400.0
+_log = logging.getLogger(__name__)
 _PACKAGE = Path(__file__).parent.parent
 
 
@@ -51,6 +54,23 @@ for _limit in ("runtime-memory-check-threshold", "vectorize-memory-check-thresho
 # takes three times as long; four at a time it runs everywhere.
 _features = get_host_cpu_features().replace("+avx512", "-avx512")  # type: ignore[no-untyped-call]
 numba.config.CPU_FEATURES = _features  # type: ignore[attr-defined]
+
+
+class _Waiting(event.Listener):
+    """Says what a process waits for, the first time something is not found in the cache."""
+
+    said = False
+
+    def on_start(self, event: object) -> None:
+        if not self.said:
+            self.said = True
+            _log.warning("compiling the model for this processor: a minute, only the first time")
+
+    def on_end(self, event: object) -> None:
+        pass
+
+
+event.register("numba:compile", _Waiting())  # type: ignore[no-untyped-call]
 
 # Results stay the same to the last bit: no fast-math. Dividing by zero gives inf as in NumPy.
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import least_squares
+import scipy
 
 from twin.errors import ConfigError
 
@@ -57,7 +57,8 @@ def reduce(vacuum: Floats, supply: Floats, flow: Floats, nominal: float, ambient
     start = np.array([top, 150.0, 0.3, 0.0, 0.0, 0.0, float(supply[flow[:, 0].argmax()]), 0.5, 0.1])
     low = [0.1 * top, 1.0, -0.9, -5.0, -10.0, -10.0, 0.1, 0.0, 0.0]
     high = [3.0 * top, 0.97 * ambient, 3.0, 5.0, 10.0, 10.0, 10.0, 20.0, 5.0]
-    found = least_squares(residual, np.clip(start, low, high), bounds=(low, high), x_scale="jac")
+    fit = scipy.optimize.least_squares  # imported with its first use: few data sets have diagrams
+    found = fit(residual, np.clip(start, low, high), bounds=(low, high), x_scale="jac")
     off = np.abs(missed(found.x))
     if off.max() > WORST * top:
         raise ConfigError(

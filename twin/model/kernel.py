@@ -23,6 +23,7 @@ from twin.model.plant import (
     Gas,
     Lags,
     prepare,
+    put,
     reading,
     sensed_at,
 )
@@ -427,8 +428,8 @@ def _together(state, all_k, driven, out, first, width, tolerance):  # type: igno
     said, handed = np.empty(width), np.empty(width, np.uint8)
     phases, levels = np.empty(width, np.uint8), np.empty(width)
     for i in range(width):
-        mine[:, i] = state[:, min(first + i, last)]
-        k[:, i] = all_k[:, min(first + i, last)]
+        put(mine, i, state, min(first + i, last))
+        put(k, i, all_k, min(first + i, last))
     for row in range(dt.shape[0]):
         if dt[row] < 0.0 or dt[row] > LONGEST_BRIDGE:
             mine[VALID] = 0.0
@@ -444,7 +445,7 @@ def _together(state, all_k, driven, out, first, width, tolerance):  # type: igno
             expected[row, min(first + i, last)] = said[i]
             signals[row, min(first + i, last)] = handed[i]
     for i in range(width):
-        state[:, min(first + i, last)] = mine[:, i]
+        put(state, min(first + i, last), mine, i)
 
 
 @compiled
@@ -489,8 +490,8 @@ def _free(state, all_k, driven, out, first, width, tolerance):  # type: ignore[n
     controls, timers = np.empty((width, control.shape[1])), np.empty((width, timer.shape[1]))
     told = np.empty((len(dt), width), np.uint8)
     for i in range(width):
-        mine[:, i] = state[:, min(first + i, last)]
-        k[:, i] = all_k[:, min(first + i, last)]
+        put(mine, i, state, min(first + i, last))
+        put(k, i, all_k, min(first + i, last))
         controls[i], timers[i] = control[min(first + i, last)], timer[min(first + i, last)]
         mode, pulse = k[c.BLOW_OFF_MODE, i], k[c.BLOW_OFF_TIME, i]
         timed(timers[i], commands, dt, mode, pulse, told[:, i])
@@ -504,7 +505,7 @@ def _free(state, all_k, driven, out, first, width, tolerance):  # type: ignore[n
             expected[row, min(first + i, last)] = said[i]
             signals[row, min(first + i, last)] = handed[i]
     for i in range(width):
-        state[:, min(first + i, last)] = mine[:, i]
+        put(state, min(first + i, last), mine, i)
         control[min(first + i, last)], timer[min(first + i, last)] = controls[i], timers[i]
 
 

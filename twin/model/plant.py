@@ -17,6 +17,7 @@ import numpy as np
 from twin.model import theta as c
 from twin.model.compiled import compiled, inlined
 from twin.model.gas import CP, GAMMA, R, opening
+from twin.model.theta import Theta
 
 # What a step needs and a call computes only once, in rows behind the coefficients.
 (_SUCTION, _END, _BLOW_OFF, _FLATTER, _HEAT, _PORT_HEAT, _LINE_HEAT, _PLACE) = range(
@@ -96,11 +97,21 @@ def prepare_one(k, i):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def put(to, i, source, j):  # type: ignore[no-untyped-def]
+    """Copy column ``j`` of ``source`` into the first rows of column ``i``.
+
+    In a loop: for slices, numba compiles seconds' worth of what to say where they do not fit.
+    """
+    for row in range(source.shape[0]):
+        to[row, i] = source[row, j]
+
+
+@compiled
 def prepare(theta):  # type: ignore[no-untyped-def]
     """Coefficients, one column per hypothesis, with what follows from them alone below."""
     k = np.empty((PREPARED, theta.shape[1]))
-    k[: theta.shape[0]] = theta
     for i in range(theta.shape[1]):
+        put(k, i, theta, i)
         prepare_one(k, i)
     return k
 
@@ -137,7 +148,7 @@ def characteristic(x, k, i):  # type: ignore[no-untyped-def]
     return share, (max(rise, 0.0) if x > 0.0 else 0.0)
 
 
-def suction_at(theta: c.Theta, p: float) -> float:
+def suction_at(theta: Theta, p: float) -> float:
     """Suction flow (kg/s) at port pressure ``p`` (Pa), nominal supply and full jet."""
     return float(_suction_at(prepare(theta.reshape(-1, 1)), p))
 
@@ -438,3 +449,15 @@ def sensed_at(value, theta, i):  # type: ignore[no-untyped-def]
     """Pressure (Pa) at the sensor when it reads ``value``: the inverse of ``reading``."""
     gain = theta[c.SENSOR_GAIN, i]
     return (value - theta[c.SENSOR_OFFSET, i] + (gain - 1.0) * theta[c.AMBIENT, i]) / gain
+
+
+def reading_of(sensed: float, theta: Theta) -> float:
+    """``reading`` for one hypothesis from Python, where nothing has to be compiled for it."""
+    found: float = reading.py_func(sensed, theta.reshape(-1, 1), 0)  # type: ignore[no-untyped-call]
+    return found
+
+
+def sensed_of(value: float, theta: Theta) -> float:
+    """As ``reading_of``."""
+    found: float = sensed_at.py_func(value, theta.reshape(-1, 1), 0)  # type: ignore[no-untyped-call]
+    return found

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from twin.model import kernel
 from twin.model import theta as c
-from twin.model.plant import reading
+from twin.model.plant import reading_of
 from twin.model.theta import Theta
 from twin.monitor.bins import Floats
 from twin.monitor.phases import Knees, PhaseFinder
@@ -97,5 +97,5 @@ def _read_at(theta: Theta, threshold: int) -> float:
     vacuum = float(theta[threshold])
     if theta[c.CONTROL_SENSOR] == c.OWN:
         at = float(theta[c.AMBIENT]) - vacuum
-        vacuum = float(theta[c.AMBIENT_NOMINAL]) - float(reading(at, theta.reshape(-1, 1), 0))
+        vacuum = float(theta[c.AMBIENT_NOMINAL]) - reading_of(at, theta)
     return vacuum / MBAR
