@@ -23,7 +23,8 @@ from twin.config import Config
 from twin.diagnosis.answer import Diagnosis
 from twin.diagnosis.answer import diagnose as find_cause
 from twin.diagnosis.report import in_words, write_report
-from twin.errors import ConfigError, TwinError
+from twin.errors import ConfigError
+from twin.errors import TwinError as TwinError  # noqa: PLC0414 (``import twin`` has it)
 from twin.figures.cycle import compiled as key_figures
 from twin.figures.settings import FigureSettings
 from twin.hil import Plant
@@ -48,17 +49,6 @@ from twin.signals import (
 )
 from twin.tables.reader import Table, open_table
 from twin.tables.settings import ImportSettings
-
-__all__ = [
-    "Answer",
-    "Calibrated",
-    "Log",
-    "TwinError",
-    "calibrate",
-    "diagnose",
-    "open",
-    "simulate",
-]
 
 Columns = dict[str, npt.NDArray[Any]]
 Place = str | Path

@@ -5,8 +5,6 @@ stdout, what it has to say about its work to stderr.
 """
 
 import gc
-import json
-import os
 import re
 import signal
 import sys
@@ -32,6 +30,7 @@ from twin.cli_outlets import outlets_of
 from twin.cli_serve import live_rows_of, reports_of, serve
 from twin.errors import ConfigError, SourceError, TwinError
 from twin.events import Event, Severity
+from twin.files import require_writable, write_json
 
 if TYPE_CHECKING:
     from drivers.results_state import Results
@@ -204,7 +203,7 @@ def replay(
     from twin.log.reader import open_log
     from twin.log.recorder import Recorder
 
-    _require_writable(json_file)
+    require_writable(json_file)
     recorded = open_log(log)
     settings = _settings_of(recorded.header, log, config, assets, unit, as_of)
     twin, monitor = pair_of(settings)
@@ -220,7 +219,7 @@ def replay(
         run_loop(_until(stopped, blocks), twin, monitor, sinks, advisers=[alarms])
     if json_file is not None:
         events = [_plain(event) for event in console.events]
-        _write_json(json_file, {"log": str(log), "events": events})
+        write_json(json_file, {"log": str(log), "events": events})
     _leave(console.events, fail_on_alarm, interrupted=stopped() == "interrupted")
 
 
@@ -279,7 +278,7 @@ def diagnose(
     from twin.diagnosis.report import in_words, write_report
     from twin.log.reader import open_log
 
-    _require_writable(json_file, report)
+    require_writable(json_file, report)
     recorded = open_log(log)
     settings = _settings_of(recorded.header, log, config, assets, unit, as_of)
     if not unit:
@@ -288,7 +287,7 @@ def diagnose(
         diagnosis = find_cause(settings, (rows for rows, _ in recorded.blocks()), str(log), say)
     print(in_words(diagnosis))
     if json_file is not None:
-        _write_json(json_file, diagnosis.json)
+        write_json(json_file, diagnosis.json)
     if report is not None:
         write_report(diagnosis, report)
     if save_as:
@@ -311,7 +310,7 @@ def calibrate(
     from twin.log.reader import open_log
     from twin.settings import Document
 
-    _require_writable(json_file)
+    require_writable(json_file)
     settings = Config.of(Document.read(config), assets, unit, calibrated=False)
     if not settings.asset.id:
         raise ConfigError("no unit is named", "give --id ID, or [asset] id in the configuration")
@@ -322,7 +321,7 @@ def calibrate(
     print(in_words(calibration))
     print(f"stored as {settings.asset.id} in {where}, record {record.id[:8]}")
     if json_file is not None:
-        _write_json(json_file, as_json(calibration, record))
+        write_json(json_file, as_json(calibration, record))
 
 
 @app.command("import")
@@ -389,7 +388,7 @@ def paper(
 ) -> None:
     """Recompute the founding paper's tables 2 and 4, and say what they can tell."""
     from twin.paper.separation import separate
-    from twin.paper.tables import late_by, recomputed, write_json
+    from twin.paper.tables import late_by, recomputed
     from twin.paper.words import in_words
 
     rows = recomputed()
@@ -399,7 +398,7 @@ def paper(
 
         draw(rows, separation, picture)
     if json_file is not None:
-        write_json(rows, json_file)
+        write_json(json_file, [row.json for row in rows])
     print(in_words(rows, separation))
 
 
@@ -586,26 +585,6 @@ def _save(diagnosis: "Diagnosis", settings: "Config", unit: str, assets: str, lo
         return
     record, where = store(known, diagnosis, settings, unit, assets, log)
     print(f"stored as {unit} in {where}, record {record.id[:8]}; use it: --id {unit}")
-
-
-def _require_writable(*paths: Path | None) -> None:
-    """SourceError before the work is done, if its answer could not be written."""
-    for path in paths:
-        if path is not None and (path.is_dir() or not os.access(path.parent, os.W_OK)):
-            raise _unwritable(path, "it is a folder" if path.is_dir() else "no folder to write to")
-
-
-def _write_json(path: Path, document: object) -> None:
-    """SourceError if it cannot be written."""
-    try:
-        path.write_text(json.dumps(document, indent=1, ensure_ascii=False), encoding="utf-8")
-    except OSError as error:
-        raise _unwritable(path, str(error.strerror)) from error
-
-
-def _unwritable(path: Path, why: str) -> SourceError:
-    hint = "check that the folder exists, may be written to and has space"
-    return SourceError(f"{path}: cannot be written: {why}", hint)
 
 
 @contextmanager

@@ -1,7 +1,6 @@
 """``twin alarms``: what stands, what was, and what people do about it, beside a run or after it."""
 
 import getpass
-import json
 import sys
 import time
 from functools import partial
@@ -10,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from twin.errors import ConfigError, SourceError
+from twin.errors import ConfigError
+from twin.files import write_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -58,7 +58,7 @@ def list_(
     if not plain:
         print(f"no alarm of {whose.id or whose.type}")
     if json_file is not None:
-        _write_json(json_file, plain)
+        write_json(json_file, plain)
 
 
 @alarms_app.command()
@@ -79,7 +79,7 @@ def history(
     for one in episodes:
         print(_episode_in_words(one))
     if json_file is not None:
-        _write_json(json_file, [_plain_episode(one) for one in episodes])
+        write_json(json_file, [_plain_episode(one) for one in episodes])
 
 
 @alarms_app.command()
@@ -387,12 +387,3 @@ def _episode_in_words(episode: "Episode") -> str:
 
 def _time(ns: int) -> str:
     return time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(ns // 1_000_000_000))
-
-
-def _write_json(path: Path, document: Any) -> None:
-    try:
-        text = json.dumps(document, indent=1, ensure_ascii=False)
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        message = f"{path}: cannot be written: {error.strerror}"
-        raise SourceError(message, "check that the folder exists and has space") from error

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from twin.errors import ConfigError, SourceError
+from twin.files import write_whole
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -126,7 +127,7 @@ def import_(
         new = database.import_(document)
         print(f"{new} new of {len(document['records'])} records, in {database.name}")
     if fmu is not None:
-        _write_whole(fmu, model)
+        write_whole(fmu, model)
         print(f"the FMU in {fmu}")
     elif fmus:
         print(f"not taken: {', '.join(sorted(fmus))}; --fmu FILE writes it", file=sys.stderr)
@@ -156,7 +157,7 @@ def export(
     if aasx is not None:
         models = {unit: _read_fmu(fmu)} if fmu is not None else {}
         content = _shells().write_package(records, time.time_ns(), models, logs)
-        _write_whole(aasx, content)
+        write_whole(aasx, content)
         print(f"{len(records)} records in {aasx}")
         return
     from twin.assets.exchange import to_export
@@ -165,7 +166,7 @@ def export(
     if output is None:
         print(text)
     else:
-        _write_whole(output, f"{text}\n".encode())
+        write_whole(output, f"{text}\n".encode())
         print(f"{len(records)} records in {output}")
 
 
@@ -249,17 +250,6 @@ def _read_json(file: Path) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise ConfigError(f"{file}: not an export of an asset database")
     return document
-
-
-def _write_whole(output: Path, content: bytes) -> None:
-    """The file is there complete, or as it was before."""
-    part = output.with_name(output.name + ".part")
-    try:
-        part.write_bytes(content)
-        part.replace(output)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise SourceError(f"{output}: cannot be written: {error}", "check the folder") from error
 
 
 def _require_options(

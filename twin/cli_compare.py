@@ -1,13 +1,13 @@
 """``twin compare``: two logs beside each other, aligned at the suction edge."""
 
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.errors import ConfigError, SourceError
+from twin.errors import ConfigError
+from twin.files import require_writable, write_json
 
 if TYPE_CHECKING:
     from twin.compare.side import Side
@@ -32,7 +32,7 @@ def compare(
         print(f"twin: {remark}", file=sys.stderr)
     print(in_words(found))
     if json_file is not None:
-        _write_json(json_file, plain(found))
+        write_json(json_file, plain(found))
     if picture is not None:
         from twin.compare.picture import draw
 
@@ -65,19 +65,8 @@ def _refuse_before_work(json_file: Path | None, picture: Path | None, rrd: Path 
 
     if picture is not None and picture.suffix not in FORMATS:
         raise ConfigError(f"{picture}: not a picture", f"let it end in {' or '.join(FORMATS)}")
-    for path in (json_file, picture, rrd):
-        if path is not None and not path.parent.is_dir():
-            raise SourceError(f"{path}: cannot be written: no such folder", "check the path")
+    require_writable(json_file, picture, rrd)
     if rrd is not None:
         from twin.view import import_rerun
 
         import_rerun()
-
-
-def _write_json(path: Path, document: object) -> None:
-    text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        message = f"{path}: cannot be written: {error.strerror}"
-        raise SourceError(message, "check that the folder exists and has space") from error

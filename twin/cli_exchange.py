@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.errors import ConfigError
+from twin.files import write_whole
 
 if TYPE_CHECKING:
     from twin.config import Config
@@ -59,7 +60,7 @@ def export_fmu(
     from importlib.metadata import version
 
     from twin.config import Config
-    from twin.exchange.fmu import make_fmu, write_whole
+    from twin.exchange.fmu import make_fmu
     from twin.exchange.ssp import make_ssp
     from twin.exchange.variables import Component
 

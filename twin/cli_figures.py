@@ -1,15 +1,15 @@
 """``twin figures``: key figures of a log, and of what the database has kept."""
 
-import json
 import sys
 import time
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.errors import ConfigError, SourceError
+from twin.errors import ConfigError
+from twin.files import write_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -68,7 +68,7 @@ def show(
     print(cycles_table(plain))
     unit, data_set = Unit(recorded.header.asset_type, recorded.header.asset_id), settings.data.hash
     if json_file is not None:
-        _write_json(json_file, {"log": str(log), "cycles": plain})
+        write_json(json_file, {"log": str(log), "cycles": plain})
     if output is not None:
         with open_store("sqlite://") as store:
             store.add(unit, data_set, log.name, plain)
@@ -112,7 +112,7 @@ def trend(
 
             draw(history, figure, line, limit, comes, picture)
     if json_file is not None:
-        _write_json(json_file, plain)
+        write_json(json_file, plain)
 
 
 @figures_app.command()
@@ -286,12 +286,3 @@ def _wanted(names: list[str] | None, picture: Path | None) -> "list[Figure]":
     if picture is not None and len(names or []) != 1:
         raise ConfigError("--picture draws one figure", "name one: twin figures trend leakage")
     return [FIGURES[name] for name in names or FIGURES]
-
-
-def _write_json(path: Path, document: Any) -> None:
-    try:
-        text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        message = f"{path}: cannot be written: {error.strerror}"
-        raise SourceError(message, "check that the folder exists and has space") from error

@@ -1,6 +1,5 @@
 """``twin fleet``: thousands of logs, each worked on once, and compared."""
 
-import json
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 from twin.errors import ConfigError, SourceError
+from twin.files import require_writable, write_json
 
 if TYPE_CHECKING:
     from twin.config import Config
@@ -67,11 +67,11 @@ def _command(work: str) -> Callable[..., None]:
         workers: Workers = None,
         json_file: JsonFile = None,
     ) -> None:
-        _refuse_before_work(json_file)
+        require_writable(json_file)
         fleet = _Fleet.of(config, assets)
         told = _done(work, logs, fleet, _Engine(engine, scheduler, workers))
         if json_file is not None:
-            _write(json_file, {"work": work, "logs": _plain(told, fleet)})
+            write_json(json_file, {"work": work, "logs": _plain(told, fleet)})
 
     return command
 
@@ -97,7 +97,7 @@ def report(
     from twin.fleet.store import open_store
     from twin.fleet.words import in_words, write_page
 
-    _refuse_before_work(json_file, page)
+    require_writable(json_file, page)
     fleet = _Fleet.of(config, assets)
     told = _done("replay", logs, fleet, _Engine(engine, scheduler, workers)) if logs else []
     with open_store(fleet.assets) as store, open_assets(fleet.assets) as database:
@@ -110,7 +110,7 @@ def report(
     found = put_together(results, records, time.time_ns())
     print(in_words(found))
     if json_file is not None:
-        _write(json_file, found.plain())
+        write_json(json_file, found.plain())
     if page is not None:
         write_page(found, page)
         print(f"drawn in {page}")
@@ -240,19 +240,3 @@ def _plain(told: "Iterable[Told]", fleet: _Fleet) -> list[dict[str, object]]:
             }
             for one in told
         ]
-
-
-def _refuse_before_work(*paths: Path | None) -> None:
-    """Say what cannot be written before logs have been worked on."""
-    for path in paths:
-        if path is not None and not path.parent.is_dir():
-            raise SourceError(f"{path}: cannot be written: no such folder", "check the path")
-
-
-def _write(path: Path, document: object) -> None:
-    try:
-        path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise SourceError(
-            f"{path}: cannot be written: {error.strerror}", "choose another"
-        ) from error

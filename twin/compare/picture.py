@@ -12,7 +12,7 @@ from twin.compare.compare import Comparison
 from twin.compare.side import BIN_S, LONGEST_S, Curve, Floats, Side
 from twin.compare.words import conclusion
 from twin.diagnosis.drawing import ANONYMOUS, STYLE
-from twin.errors import SourceError
+from twin.files import said_plainly
 
 FORMATS = {".svg": ANONYMOUS, ".png": {"Software": None}}
 COLOURS = {"A": "#0a62a8", "B": "#c8500a"}
@@ -37,10 +37,8 @@ def draw(comparison: Comparison, path: Path) -> None:
         off.set_xlabel("time since the suction edge (s)")
         off.set_xlim(0.0, _end(comparison))
         figure.suptitle(fill(conclusion(comparison), TITLE), x=0.01, ha="left", fontsize=10.5)
-        try:
+        with said_plainly(path):
             figure.savefig(path, metadata=FORMATS[path.suffix], dpi=110)
-        except OSError as error:
-            raise SourceError(f"{path}: cannot be written: {error}", "check the path") from error
 
 
 def bins() -> Floats:

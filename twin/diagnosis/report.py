@@ -42,7 +42,7 @@ from twin.diagnosis.words import (
     to_do,
     when,
 )
-from twin.errors import SourceError
+from twin.files import write_text
 from twin.model import theta as c
 from twin.model.courses import Course
 from twin.model.effects import EFFECTS
@@ -65,12 +65,7 @@ def in_words(diagnosis: Diagnosis) -> str:
 
 def write_report(diagnosis: Diagnosis, path: Path) -> None:
     """Write the answer with pictures as one HTML file; SourceError if it cannot be written."""
-    text = _page(diagnosis)
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        hint = "check that the directory is there and may be written to"
-        raise SourceError(f"{path}: cannot be written: {error.strerror}", hint) from error
+    write_text(path, _page(diagnosis))
 
 
 def _page(diagnosis: Diagnosis) -> str:

@@ -5,9 +5,7 @@ import re
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
-from twin.errors import SourceError
 from twin.exchange.binary import binary
 from twin.exchange.description import Identity, build_description, model_description
 from twin.exchange.page import page
@@ -66,14 +64,3 @@ def packed(parts: Mapping[str, bytes]) -> bytes:
             info.compress_type = zipfile.ZIP_DEFLATED
             archive.writestr(info, content)
     return memory.getvalue()
-
-
-def write_whole(output: Path, content: bytes) -> None:
-    """The file is there complete, or as it was before; SourceError if it cannot be written."""
-    part = output.with_name(output.name + ".part")
-    try:
-        part.write_bytes(content)
-        part.replace(output)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise SourceError(f"{output}: cannot be written: {error}", "check the folder") from error

@@ -9,7 +9,7 @@ from matplotlib.ticker import FuncFormatter
 from twin.diagnosis.drawing import AFTER, BEFORE, QUIET, as_svg, empty, legend, logarithmic
 from twin.diagnosis.page import PAGE, paragraph, picture, section, table
 from twin.diagnosis.words import spoken
-from twin.errors import SourceError
+from twin.files import write_text
 from twin.fleet.kinds import Estimate
 from twin.fleet.peers import FEWEST_PEERS
 from twin.fleet.report import STANDS_OUT, Report, Row
@@ -69,12 +69,7 @@ def write_page(report: Report, path: Path) -> None:
             f"its newest log; of a type with fewer than {FEWEST_PEERS} units the diagnosis counts."
         ),
     )
-    try:
-        path.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise SourceError(
-            f"{path}: cannot be written: {error.strerror}", "choose another"
-        ) from error
+    write_text(path, page)
 
 
 _DIAGNOSE = "What stands out says little of the cause: twin fleet diagnose LOGS names it."

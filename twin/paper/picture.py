@@ -9,7 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from twin.diagnosis.drawing import ANONYMOUS, MEASURED, STYLE
-from twin.errors import ConfigError, SourceError
+from twin.errors import ConfigError
+from twin.files import said_plainly
 from twin.paper.evacuation import (
     END_MBAR,
     INSTANCE_SL_MIN,
@@ -44,10 +45,8 @@ def draw(rows: Sequence[Row], separation: Separation, path: Path) -> None:
         left, right = figure.subplots(1, 2)
         _draw_tables(left, rows, separation)
         _draw_pairs(right, separation)
-        try:
+        with said_plainly(path):
             figure.savefig(path, metadata=FORMATS[path.suffix], dpi=110)
-        except OSError as error:
-            raise SourceError(f"{path}: cannot be written: {error}", "check the path") from error
 
 
 def _draw_tables(axes: Axes, rows: Sequence[Row], separation: Separation) -> None:

@@ -1,11 +1,8 @@
 """Tables 2 and 4 of the paper: each printed figure with the recomputed one."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
-from twin.errors import SourceError
 from twin.paper.evacuation import (
     APPLICATION,
     INSTANCE_SL_MIN,
@@ -71,14 +68,6 @@ def late_by(rows: Sequence[Row]) -> float:
     """By how many ms the rig's model, with the unit's data, is printed later than recomputed."""
     (row,) = (row for row in rows if row.setup is RIG and row.quantity == QUANTITIES[-1])
     return row.paper_ms - row.twin_ms
-
-
-def write_json(rows: Sequence[Row], path: Path) -> None:
-    """Write the rows as a list; SourceError if that cannot be done."""
-    try:
-        path.write_text(json.dumps([row.json for row in rows], indent=1), encoding="utf-8")
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be written: {error}", "check the path") from error
 
 
 def _times(setup: Setup) -> tuple[float, float, float, float]:
