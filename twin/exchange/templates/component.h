@@ -116,7 +116,7 @@ static double component_row(struct Component *c, double dt) {
 }
 
 /* Advance to ``end`` (s) in the model's own rows; 0 if the model cannot. */
-static int component_step(struct Component *c, double end) {
+static int component_advance(struct Component *c, double end) {
     double gas = 0.0, begun = c->rows * ROW + c->since, passed;
     if (c->changed != 0.0) {
         component_take_over(c);
@@ -138,6 +138,17 @@ static int component_step(struct Component *c, double end) {
     passed = c->rows * ROW + c->since - begun;
     component_outputs(c, passed > 0.0 ? gas / passed : 0.0);
     return isfinite(c->values[V_SENSOR_PRESSURE]) && isfinite(c->state[KERNEL_VESSEL_MASS]);
+}
+
+/* Advance from ``begin`` by ``step`` (s). Gives NULL, or what is wrong. */
+static const char *component_do_step(struct Component *c, double begin, double step) {
+    if (c->mode != STEPPING || !(step >= 0.0)) {
+        return "a step needs a time ahead, after the initialization";
+    }
+    if (!component_advance(c, begin + step)) {
+        return "the model has no number for this: look at inputs and parameters";
+    }
+    return NULL;
 }
 
 /* Set a value; 0, and what is wrong in ``said``, if it cannot be. */
@@ -179,4 +190,45 @@ static int component_get(struct Component *c, size_t reference, int kind, double
     }
     *value = c->values[reference];
     return 1;
+}
+
+/* --- saved components --------------------------------------------------------------------------- */
+
+/* What can go wrong gives NULL, or what it is. */
+
+static const char *component_save(const struct Component *c, void **saved) {
+    if (*saved == NULL) {
+        *saved = malloc(sizeof *c);
+    }
+    if (*saved == NULL) {
+        return "no memory";
+    }
+    memcpy(*saved, c, sizeof *c);
+    return NULL;
+}
+
+static void component_forget(void **saved) {
+    if (saved != NULL) {
+        free(*saved);
+        *saved = NULL;
+    }
+}
+
+static const char *component_serialize(const void *saved, void *bytes, size_t size) {
+    if (size < sizeof(struct Component)) {
+        return "more room is needed for the state";
+    }
+    memcpy(bytes, saved, sizeof(struct Component));
+    return NULL;
+}
+
+static const char *component_deserialize(const void *bytes, size_t size, void **saved) {
+    struct Component read;
+    if (size == sizeof read) {
+        memcpy(&read, bytes, size);
+    }
+    if (size != sizeof read || read.stamp != STAMP) {
+        return "the state is not one of this FMU";
+    }
+    return component_save(&read, saved);
 }

@@ -29,6 +29,11 @@ static fmi2Status failed(fmi2Component instance, const char *said) {
     return fmi2Error;
 }
 
+/* What is wrong, if anything, said. */
+static fmi2Status done(fmi2Component instance, const char *wrong) {
+    return wrong == NULL ? fmi2OK : failed(instance, wrong);
+}
+
 const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
 
 const char *fmi2GetVersion(void) { return fmi2Version; }
@@ -173,13 +178,7 @@ fmi2Status fmi2DoStep(fmi2Component instance, fmi2Real currentCommunicationPoint
                       fmi2Boolean noSetFMUStatePriorToCurrentPoint) {
     struct Component *c = &((Instance *)instance)->component;
     UNUSED(noSetFMUStatePriorToCurrentPoint);
-    if (c->mode != STEPPING || !(communicationStepSize >= 0.0)) {
-        return failed(instance, "a step needs a time ahead, after the initialization");
-    }
-    if (!component_step(c, currentCommunicationPoint + communicationStepSize)) {
-        return failed(instance, "the model has no number for this: look at inputs and parameters");
-    }
-    return fmi2OK;
+    return done(instance, component_do_step(c, currentCommunicationPoint, communicationStepSize));
 }
 
 fmi2Status fmi2CancelStep(fmi2Component instance) {
@@ -189,27 +188,17 @@ fmi2Status fmi2CancelStep(fmi2Component instance) {
 /* --- states ------------------------------------------------------------------------------------ */
 
 fmi2Status fmi2GetFMUstate(fmi2Component instance, fmi2FMUstate *state) {
-    if (*state == NULL) {
-        *state = malloc(sizeof(struct Component));
-    }
-    if (*state == NULL) {
-        return failed(instance, "no memory");
-    }
-    memcpy(*state, &((Instance *)instance)->component, sizeof(struct Component));
-    return fmi2OK;
+    return done(instance, component_save(&((Instance *)instance)->component, state));
 }
 
 fmi2Status fmi2SetFMUstate(fmi2Component instance, fmi2FMUstate state) {
-    memcpy(&((Instance *)instance)->component, state, sizeof(struct Component));
+    ((Instance *)instance)->component = *(struct Component *)state;
     return fmi2OK;
 }
 
 fmi2Status fmi2FreeFMUstate(fmi2Component instance, fmi2FMUstate *state) {
     UNUSED(instance);
-    if (state != NULL) {
-        free(*state);
-        *state = NULL;
-    }
+    component_forget(state);
     return fmi2OK;
 }
 
@@ -222,30 +211,12 @@ fmi2Status fmi2SerializedFMUstateSize(fmi2Component instance, fmi2FMUstate state
 
 fmi2Status fmi2SerializeFMUstate(fmi2Component instance, fmi2FMUstate state,
                                  fmi2Byte serialized[], size_t size) {
-    if (size < sizeof(struct Component)) {
-        return failed(instance, "more room is needed for the state");
-    }
-    memcpy(serialized, state, sizeof(struct Component));
-    return fmi2OK;
+    return done(instance, component_serialize(state, serialized, size));
 }
 
 fmi2Status fmi2DeSerializeFMUstate(fmi2Component instance, const fmi2Byte serialized[],
                                    size_t size, fmi2FMUstate *state) {
-    struct Component saved;
-    if (size == sizeof saved) {
-        memcpy(&saved, serialized, size);
-    }
-    if (size != sizeof saved || saved.stamp != STAMP) {
-        return failed(instance, "the state is not one of this FMU");
-    }
-    if (*state == NULL) {
-        *state = malloc(sizeof saved);
-    }
-    if (*state == NULL) {
-        return failed(instance, "no memory");
-    }
-    memcpy(*state, &saved, sizeof saved);
-    return fmi2OK;
+    return done(instance, component_deserialize(serialized, size, state));
 }
 
 /* --- what this FMU has not --------------------------------------------------------------------- */

@@ -21,6 +21,11 @@ static fmi3Status failed(fmi3Instance instance, const char *said) {
     return fmi3Error;
 }
 
+/* What is wrong, if anything, said. */
+static fmi3Status done(fmi3Instance instance, const char *wrong) {
+    return wrong == NULL ? fmi3OK : failed(instance, wrong);
+}
+
 const char *fmi3GetVersion(void) { return fmi3Version; }
 
 fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean loggingOn, size_t nCategories,
@@ -222,44 +227,32 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 currentCommunicationPoi
                       fmi3Boolean *eventHandlingNeeded, fmi3Boolean *terminateSimulation,
                       fmi3Boolean *earlyReturn, fmi3Float64 *lastSuccessfulTime) {
     struct Component *c = &((Instance *)instance)->component;
-    double end = currentCommunicationPoint + communicationStepSize;
+    const char *wrong;
     UNUSED(noSetFMUStatePriorToCurrentPoint);
     *eventHandlingNeeded = *terminateSimulation = *earlyReturn = fmi3False;
     *lastSuccessfulTime = currentCommunicationPoint;
-    if (c->mode != STEPPING || !(communicationStepSize >= 0.0)) {
-        return failed(instance, "a step needs a time ahead, after the initialization");
+    wrong = component_do_step(c, currentCommunicationPoint, communicationStepSize);
+    if (wrong == NULL) {
+        *lastSuccessfulTime += communicationStepSize;
+        c->values[V_TIME] = *lastSuccessfulTime;
     }
-    if (!component_step(c, end)) {
-        return failed(instance, "the model has no number for this: look at inputs and parameters");
-    }
-    c->values[V_TIME] = *lastSuccessfulTime = end;
-    return fmi3OK;
+    return done(instance, wrong);
 }
 
 /* --- states ------------------------------------------------------------------------------------ */
 
 fmi3Status fmi3GetFMUState(fmi3Instance instance, fmi3FMUState *state) {
-    if (*state == NULL) {
-        *state = malloc(sizeof(struct Component));
-    }
-    if (*state == NULL) {
-        return failed(instance, "no memory");
-    }
-    memcpy(*state, &((Instance *)instance)->component, sizeof(struct Component));
-    return fmi3OK;
+    return done(instance, component_save(&((Instance *)instance)->component, state));
 }
 
 fmi3Status fmi3SetFMUState(fmi3Instance instance, fmi3FMUState state) {
-    memcpy(&((Instance *)instance)->component, state, sizeof(struct Component));
+    ((Instance *)instance)->component = *(struct Component *)state;
     return fmi3OK;
 }
 
 fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *state) {
     UNUSED(instance);
-    if (state != NULL) {
-        free(*state);
-        *state = NULL;
-    }
+    component_forget(state);
     return fmi3OK;
 }
 
@@ -272,30 +265,12 @@ fmi3Status fmi3SerializedFMUStateSize(fmi3Instance instance, fmi3FMUState state,
 
 fmi3Status fmi3SerializeFMUState(fmi3Instance instance, fmi3FMUState state,
                                  fmi3Byte serialized[], size_t size) {
-    if (size < sizeof(struct Component)) {
-        return failed(instance, "more room is needed for the state");
-    }
-    memcpy(serialized, state, sizeof(struct Component));
-    return fmi3OK;
+    return done(instance, component_serialize(state, serialized, size));
 }
 
 fmi3Status fmi3DeserializeFMUState(fmi3Instance instance, const fmi3Byte serialized[],
                                    size_t size, fmi3FMUState *state) {
-    struct Component saved;
-    if (size == sizeof saved) {
-        memcpy(&saved, serialized, size);
-    }
-    if (size != sizeof saved || saved.stamp != STAMP) {
-        return failed(instance, "the state is not one of this FMU");
-    }
-    if (*state == NULL) {
-        *state = malloc(sizeof saved);
-    }
-    if (*state == NULL) {
-        return failed(instance, "no memory");
-    }
-    memcpy(*state, &saved, sizeof saved);
-    return fmi3OK;
+    return done(instance, component_deserialize(serialized, size, state));
 }
 
 /* --- what this FMU has not --------------------------------------------------------------------- */
