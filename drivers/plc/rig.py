@@ -12,12 +12,12 @@ Their arguments p, s and row are records: ``plant.plant``, ``plant.at_rest`` and
 import math
 from typing import Any
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from drivers.plc.faults import Rows
 from drivers.plc.plant import CV, R_GAS, Record
+from twin.processor import njit
 from twin.signals import MBAR
 
 SCAN = 1e-3  # s, period of the PLC's task
@@ -34,7 +34,7 @@ THAW = 0.5  # 1/s, ice in the nozzle recovers
 NOISES = 5  # columns of normal draws: PLC sensor, own sensor, supply, suction and blow-off valve
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def nozzle_ratio(r: float) -> float:
     """Give the ISO 6358 flow function of downstream over upstream pressure, straight near 1."""
     if r <= CRITICAL:
@@ -45,7 +45,7 @@ def nozzle_ratio(r: float) -> float:
     return psi * (1.0 - r) / (1.0 - s) if r > straight else psi
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def orifice(conductance: float, outside: float, inside: float, temperature: float) -> float:
     """Mass flow inwards in kg/s; ``conductance`` in kg/(s·Pa) at the outside's temperature.
 
@@ -56,7 +56,7 @@ def orifice(conductance: float, outside: float, inside: float, temperature: floa
     return -conductance * inside * nozzle_ratio(outside / inside) / math.sqrt(temperature)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def bulging(x: float, bulge: float) -> float:
     """Suction over relative pressure: 0 at the end pressure (x = 0), 1 at ambient (x = 1)."""
     if x <= 0.0:
@@ -65,7 +65,7 @@ def bulging(x: float, bulge: float) -> float:
     return float(0.8 * saturating + 0.2 * x**1.3)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def suction(p: Any, s: Any, row: Any, ambient: float) -> float:
     """Mass flow in kg/s that the jet draws out of the port; the check valve lets none back."""
     r = max(s.supply, 0.0) / p.optimum
@@ -81,7 +81,7 @@ def suction(p: Any, s: Any, row: Any, ambient: float) -> float:
     return float(p.nominal_flow * strength * shape)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def line_flow(p: Any, flow: float, difference: float, density: float, filter_drop: float) -> float:
     """Step a mass flow in kg/s; friction implicit, inertia explicit."""
     clogged = filter_drop * p.nominal_density / p.nominal_flow**2
@@ -90,13 +90,13 @@ def line_flow(p: Any, flow: float, difference: float, density: float, filter_dro
     return float(pushed / (1.0 + DT * friction / p.inertance))
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def enthalpy(flow: float, upstream: float, downstream: float) -> float:
     """Enthalpy in W that ``flow`` carries from an upstream to a downstream temperature in K."""
     return CP * flow * (upstream if flow >= 0.0 else downstream)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def move_lines(p: Any, s: Any, row: Any) -> None:
     """Step the gas columns on both sides of the line and carry mass and energy over."""
     port = s.port_energy / (CV * s.port_mass)
@@ -121,7 +121,7 @@ def move_lines(p: Any, s: Any, row: Any) -> None:
     s.vessel_energy += DT * (film * (p.wall - vessel) + far)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def exchange_port(p: Any, s: Any, row: Any, ambient: float) -> None:
     """Step what enters and leaves at the port: jet, back-flow, relief and blow-off."""
     temperature = s.port_energy / (CV * s.port_mass)
@@ -135,7 +135,7 @@ def exchange_port(p: Any, s: Any, row: Any, ambient: float) -> None:
     s.port_energy += DT * CP * (into * p.wall - out * temperature)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def vessel_inflow(p: Any, s: Any, row: Any, ambient: float) -> float:
     """Mass flow in kg/s from ambient into the vessel; negative where the open cup lets gas out."""
     vacuum = ambient - s.vessel_pressure
@@ -149,7 +149,7 @@ def vessel_inflow(p: Any, s: Any, row: Any, ambient: float) -> float:
     return float(orifice(hole / p.ambient, ambient, s.vessel_pressure, relative) + porous + vapour)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def exchange_vessel(p: Any, s: Any, row: Any, ambient: float) -> None:
     """Step the vessel's inflow and its volume; a shrinking wall does work on the gas."""
     temperature = s.vessel_energy / (CV * s.vessel_mass)
@@ -170,7 +170,7 @@ def exchange_vessel(p: Any, s: Any, row: Any, ambient: float) -> None:
     s.vessel_energy += s.vessel_pressure * change
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def settle_pressures(p: Any, s: Any) -> None:
     """Pressures from mass and energy."""
     s.port_pressure = s.port_energy * R_GAS / (CV * p.port_volume)
@@ -178,7 +178,7 @@ def settle_pressures(p: Any, s: Any) -> None:
     s.vessel_pressure = s.vessel_energy * R_GAS / (CV * s.vessel_volume)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def drive(p: Any, s: Any, row: Any, time: float) -> None:
     """Step the valves, the jet behind them and the supply line before them."""
     if time >= s.suction_due:
@@ -199,7 +199,7 @@ def drive(p: Any, s: Any, row: Any, time: float) -> None:
     s.open += (s.open_wanted - s.open) * DT / OPENING_LAG
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def sense(p: Any, s: Any, row: Any) -> None:
     """Step both sensors."""
     quick = DT / (p.sensor_lag + DT)
@@ -214,7 +214,7 @@ def sense(p: Any, s: Any, row: Any) -> None:
     s.own += (s.port_pressure - s.own) * DT / OWN_LAG
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def save_air(p: Any, s: Any, row: Any, asked: bool, noise: float) -> None:
     """Switch the nozzle between two points of vacuum, and signal a part, on its own sensor."""
     vacuum = p.ambient + row.ambient_pressure_shift - s.own + p.own_noise * noise
@@ -225,7 +225,7 @@ def save_air(p: Any, s: Any, row: Any, asked: bool, noise: float) -> None:
     s.part_present = 1.0 if vacuum >= (p.h2_back if s.part_present > 0.0 else p.h2) else 0.0
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def switch_valves(p: Any, s: Any, row: Any, asked: bool, blow_off: bool, noise: Any) -> None:
     """Give the valves their new positions, which they take after their delays."""
     nozzle = 1.0 if asked and s.saving == 0.0 else 0.0
@@ -240,7 +240,7 @@ def switch_valves(p: Any, s: Any, row: Any, asked: bool, blow_off: bool, noise: 
         s.blow_off_due = s.scan * SCAN + delay + row.blow_off_delay_delay
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def handle_part(p: Any, s: Any, asked: bool, blow_off: bool, ambient: float) -> None:
     """Let the part leave an opening gripper, and bring the next one."""
     s.suctioned = s.suctioned + SCAN if asked else 0.0
@@ -250,7 +250,7 @@ def handle_part(p: Any, s: Any, asked: bool, blow_off: bool, ambient: float) -> 
         s.open_wanted = 1.0
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def read(p: Any, s: Any, row: Any, noise: Any, reading: Any) -> None:
     """Sample the sensors as the PLC's input card does."""
     vacuum = (p.ambient - s.sensed) * (1.0 + row.sensor_gain_error)
@@ -262,7 +262,7 @@ def read(p: Any, s: Any, row: Any, noise: Any, reading: Any) -> None:
     reading.supply = min(max(supply, -32768), 32767) * MBAR
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def observe(s: Any, truth: Any) -> None:
     """Write down the truth, for tests."""
     truth.port, truth.vessel = s.port_pressure, s.vessel_pressure
@@ -274,7 +274,7 @@ def observe(s: Any, truth: Any) -> None:
     truth.open = s.open_wanted
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def run(
     plant: Record,
     state: Record,

@@ -16,9 +16,11 @@ from pathlib import Path
 import llvmlite.binding as llvm
 import numba
 from numba.core import event
-from numba.core.codegen import get_host_cpu_features
+
+from twin.processor import njit
 
 DAY_S = 86_400.0
+SHARED = ("signals.py", "processor.py")
 _log = logging.getLogger(__name__)
 _PACKAGE = Path(__file__).parent.parent
 
@@ -27,7 +29,7 @@ def _cache_folder() -> Path:
     sources = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*.py")):
         text = path.read_bytes()
-        if path.parent.name == "model" or path.name == "signals.py" or b"model.compiled" in text:
+        if path.parent.name == "model" or path.name in SHARED or b"model.compiled" in text:
             sources.update(text)
     writable = os.access(_PACKAGE, os.W_OK)
     root = _PACKAGE if writable else Path(tempfile.gettempdir()) / f"ejector-twin-{os.getuid()}"
@@ -50,11 +52,6 @@ numba.config.CACHE_DIR = str(_FOLDER)  # type: ignore[attr-defined]
 for _limit in ("runtime-memory-check-threshold", "vectorize-memory-check-threshold"):
     llvm.set_option("", f"--{_limit}=100000")
 
-# Where a processor has vectors of 512 bits, LLVM gives such a loop up altogether and a hypothesis
-# takes three times as long; four at a time it runs everywhere.
-_features = get_host_cpu_features().replace("+avx512", "-avx512")  # type: ignore[no-untyped-call]
-numba.config.CPU_FEATURES = _features  # type: ignore[attr-defined]
-
 
 class _Waiting(event.Listener):
     """Says what a process waits for, the first time something is not found in the cache."""
@@ -73,7 +70,7 @@ class _Waiting(event.Listener):
 event.register("numba:compile", _Waiting())  # type: ignore[no-untyped-call]
 
 # Results stay the same to the last bit: no fast-math. Dividing by zero gives inf as in NumPy.
-compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 # For functions called inside a loop over hypotheses: only loops without calls are vectorised.
-inlined = numba.njit(forceinline=True, error_model="numpy")
+inlined = njit(forceinline=True, error_model="numpy")
