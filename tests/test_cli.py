@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 import time
+import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import count
@@ -19,7 +20,8 @@ from plc_process import PlcProcess, start_plc
 
 from twin.alarms.loop import Alarms
 from twin.alarms.settings import board_rules
-from twin.events import Kind
+from twin.cli import Console
+from twin.events import Event, Kind
 from twin.figures.cycle import KeyFigures
 from twin.live import run
 from twin.log.header import LogHeader
@@ -27,6 +29,7 @@ from twin.log.reader import open_log
 from twin.log.recorder import Recorder
 from twin.model.courses import table as courses
 from twin.model.effects import table
+from twin.signals import SAMPLE, TICK
 
 GRIPPER = rigs.path_of("gripper")
 PATIENCE_S = 30.0  # for a busy machine; nothing waits that long otherwise
@@ -198,6 +201,20 @@ def test_an_alarm_is_exit_code_1_only_where_that_is_asked_for(
     assert twin(monkeypatch, "replay", faulty_log) == 0
     assert twin(monkeypatch, "replay", faulty_log, "--fail-on-alarm") == 1
     assert twin(monkeypatch, "replay", healthy_log, "--fail-on-alarm") == 0
+
+
+def test_what_was_printed_is_let_go_of() -> None:
+    """A loop runs for months, and a cycle's event has some kilobytes."""
+
+    class Data(dict[str, float]):
+        """What can be watched going."""
+
+    data = Data(cycle=0)
+    gone = weakref.ref(data)
+    console = Console()
+    console.write(np.empty(0, SAMPLE), np.empty(0, TICK), [Event(0, Kind.CYCLE, "cycle 0", data)])
+    del data
+    assert gone() is None
 
 
 def test_a_replay_into_a_new_log_holds_the_same_rows(

@@ -126,7 +126,8 @@ def run(
         )
     ejectors = _named([_configured(Document.read(one), assets, unit) for one in configs])
     pairs = {name: pair_of(one) for name, one in ejectors.items()}  # compiled before time counts
-    events: list[Event] = []
+    width = 0 if alone else max(map(len, ejectors))
+    consoles = {name: Console("" if alone else name.ljust(width)) for name in ejectors}
     lines = Lines()
 
     def beside(name: str, settings: "Config") -> None:
@@ -145,7 +146,7 @@ def run(
             header = _header(settings, hil)
             # The log comes last: what people are told does not wait for the disk.
             sinks = _opened(
-                lambda: Console(label.ljust(max(map(len, ejectors))) if label else "", events),
+                lambda: consoles[name],
                 (lambda: shown) if shown else None,
                 keeper_of(settings, _complain),
                 live_rows_of(settings, _complain),
@@ -181,7 +182,8 @@ def run(
             failed = run_together(loops, lambda name, why: _complain(f"{name}: {why}"))
         if failed:
             raise SourceError(f"{len(failed)} of {len(loops)} ejectors failed: {', '.join(failed)}")
-        _leave(events, fail_on_alarm, interrupted=stopped() == "interrupted")
+        alarmed = any(console.alarmed for console in consoles.values())
+        _leave(fail_on_alarm and alarmed, interrupted=stopped() == "interrupted")
 
 
 @app.command()
@@ -209,18 +211,19 @@ def replay(
     twin, monitor = pair_of(settings)
     alarms = alarms_of(settings)()
     with _views_of({"": settings}, view, rrd) as view_of, _stop_on_signal(None) as stopped:
-        console = Console()
+        console, kept = Console(), _Kept() if json_file else None
         sinks = _opened(
             (lambda: Recorder(output, _header(settings))) if output else None,
             view_of(""),
             lambda: console,
+            (lambda: kept) if kept else None,
         )
         blocks = _progress((samples for samples, _ in recorded.blocks()), "replaying")
         run_loop(_until(stopped, blocks), twin, monitor, sinks, advisers=[alarms])
-    if json_file is not None:
-        events = [_plain(event) for event in console.events]
-        write_json(json_file, {"log": str(log), "events": events})
-    _leave(console.events, fail_on_alarm, interrupted=stopped() == "interrupted")
+    if json_file is not None and kept is not None:
+        write_json(json_file, {"log": str(log), "events": kept.events})
+    alarmed = fail_on_alarm and console.alarmed
+    _leave(alarmed, interrupted=stopped() == "interrupted")
 
 
 @app.command()
@@ -346,12 +349,11 @@ def import_(
     if table.ignored:
         print(f"twin: columns not taken: {', '.join(table.ignored)}", file=sys.stderr)
     twin, monitor = pair_of(settings)
-    console = Console()
     with _whole(output) as part, _stop_on_signal(None) as stopped:
-        sinks = _opened(lambda: Recorder(part, _header(settings)), lambda: console)
+        sinks = _opened(lambda: Recorder(part, _header(settings)), Console)
         blocks = _until(stopped, _progress(table.blocks(), "importing"))
         run_loop(blocks, twin, monitor, sinks)
-    _leave(console.events, False, interrupted=stopped() == "interrupted")
+    _leave(interrupted=stopped() == "interrupted")
 
 
 @app.command()
@@ -437,21 +439,35 @@ def main() -> None:
 
 
 class Console:
-    """A sink that prints what happens, one line each, with whose loop says it; and keeps it."""
+    """A sink that prints what happens, one line each, with whose loop says it."""
 
-    def __init__(self, name: str = "", events: list[Event] | None = None) -> None:
-        self.events: list[Event] = [] if events is None else events
+    def __init__(self, name: str = "") -> None:
+        self.alarmed = False  # all it keeps: a loop runs for months
         self._name = f"{name}  " if name else ""
 
     def write(self, _samples: "Samples", _ticks: "Ticks", events: Sequence[Event]) -> None:
         """Print what happened."""
         for event in events:
-            self.events.append(event)
+            self.alarmed |= event.severity is Severity.ALARM
             stamp = time.strftime("%H:%M:%S", time.gmtime(event.time_ns // 1_000_000_000))
             milli = event.time_ns // 1_000_000 % 1000
             what = f"{event.severity:<7}  {event.kind:<17}  {event.text}"
             # In one piece, since others may be printing too.
             print(f"{stamp}.{milli:03d}  {self._name}{what}\n", end="", flush=True)
+
+    def close(self) -> None:
+        """Nothing to finish."""
+
+
+class _Kept:
+    """A sink that keeps what happens, as JSON has it."""
+
+    def __init__(self) -> None:
+        self.events: list[dict[str, object]] = []
+
+    def write(self, _samples: "Samples", _ticks: "Ticks", events: Sequence[Event]) -> None:
+        """Keep what happened."""
+        self.events += map(_plain, events)
 
     def close(self) -> None:
         """Nothing to finish."""
@@ -768,11 +784,11 @@ def _unsaid() -> Iterator[Callable[[str], None]]:
     yield lambda _what: None
 
 
-def _leave(events: Iterable[Event], fail_on_alarm: bool, *, interrupted: bool) -> None:
+def _leave(alarmed: bool = False, *, interrupted: bool) -> None:
     """Exit as the contract of the command line has it."""
     if interrupted:
         raise typer.Exit(INTERRUPTED)
-    if fail_on_alarm and any(event.severity is Severity.ALARM for event in events):
+    if alarmed:
         raise typer.Exit(ALARMED)
 
 
