@@ -1,6 +1,7 @@
 """A Dask cluster of real processes on this machine: a scheduler, and workers of one thread."""
 
 import contextlib
+import os
 import re
 import subprocess
 import sys
@@ -36,7 +37,10 @@ def cluster(workers: int) -> Iterator[Cluster]:
 
 
 def _start(ending: contextlib.ExitStack, *arguments: str) -> "subprocess.Popen[str]":
-    process = subprocess.Popen([*_DASK, *arguments], stderr=subprocess.PIPE, text=True)
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # as Dask's nannies have it
+    process = subprocess.Popen(
+        [*_DASK, *arguments], stderr=subprocess.PIPE, text=True, env=environment
+    )
     ending.callback(_end, process)
     return process
 

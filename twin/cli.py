@@ -5,6 +5,7 @@ stdout, what it has to say about its work to stderr.
 """
 
 import gc
+import os
 import re
 import signal
 import sys
@@ -426,6 +427,8 @@ def recover(
 
 def main() -> None:
     """Run the command line; errors become one message with a hint, and the exit code."""
+    # Matrices are small here: more threads only wait for each other, on cores that others need.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when a command imports NumPy
     try:
         app()
     except KeyboardInterrupt:
