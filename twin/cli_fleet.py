@@ -177,7 +177,7 @@ class _Fleet:
 
 
 def _done(work: str, logs: Sequence[Path], fleet: _Fleet, engine: _Engine) -> "list[Told]":
-    """Do what is missing; say what became of each log, and of all."""
+    """Do what is missing; say what became of each log, and of all; gives them as they are named."""
     from twin.fleet.go import Told, ask, go
     from twin.fleet.store import open_store
 
@@ -200,7 +200,8 @@ def _done(work: str, logs: Sequence[Path], fleet: _Fleet, engine: _Engine) -> "l
         f"{work}: {count['done']} of {len(told)} logs done, {count['known']} were known,"
         f" {count['failed']} could not be; in {fleet.name}"
     )
-    return told
+    place = {log: number for number, log in enumerate(files)}
+    return sorted(told, key=lambda one: place[one.log])
 
 
 def _files(logs: Sequence[Path]) -> list[Path]:
