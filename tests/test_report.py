@@ -436,7 +436,7 @@ def test_same_diagnosis_gives_the_same_bytes(pages: dict[str, str], tmp_path: Pa
 def test_a_report_that_cannot_be_written_is_an_error_for_people(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=r"missing/report\.html: cannot be written") as caught:
         write_report(insufficient(), tmp_path / "missing" / "report.html")
-    assert "directory" in caught.value.hint
+    assert "folder" in caught.value.hint
 
 
 # --- the pictures ---------------------------------------------------------------------------------
