@@ -41,7 +41,7 @@ ROUGH, PHASE, OPEN, VALID, SIGNALS = range(ORDER + 6, ORDER + 11)
 STATE = ORDER + 11
 
 LANES = 8  # hypotheses that are run together, with a step that suits them all
-LONGEST_STEP = 0.05  # s
+LONGEST_STEP = 0.01  # s
 LONGEST_BRIDGE = 0.1  # s; after a longer silence the model waits for the next sync
 NEVER = 1e9  # s, an age that is past every delay
 # A step in which a valve moves, a cup opens or blow-off passes ambient pressure (the exhaust opens)

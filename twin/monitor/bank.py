@@ -14,12 +14,10 @@ from twin.model import kernel
 from twin.model import theta as c
 from twin.model.effects import EFFECTS, Parameter, apply
 from twin.model.theta import Theta
-from twin.monitor.bins import Spacing, drawn
+from twin.monitor.bins import drawn
 from twin.monitor.signatures import steps
 from twin.signals import MS, NS, Phase, Samples, Ticks, joined
 
-# Long after a bend signatures are smooth: with these rows they are what they are with FINE's.
-COARSE = Spacing(20, 40)
 BATCH = 250  # rows that are stepped together: what many calls cost is spared
 STEP = 0.25  # of a parameter's typical size
 # What delays moves steep edges: they differ in proportion to it only while it is shorter than they
@@ -157,7 +155,7 @@ class Bank:
         self._last_ns, self._phase = int(samples["time_ns"][-1]), int(ticks["phase"][-1])
         self._since = int(fresh["since"][-1])
         rows = joined(self._waits, fresh)
-        drawn_now = drawn(rows["since"][:-1], COARSE) | rows["bends"][1:]
+        drawn_now = drawn(rows["since"][:-1]) | rows["bends"][1:]
         first = self._count - len(self._waits)
         self._count += len(samples)
         rows["next"][:-1] = rows["phase"][1:]

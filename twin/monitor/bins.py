@@ -4,9 +4,7 @@ What a model gets wrong after a switching goes on for about as long as the switc
 bins, correlations and all else run in warped time: logarithmic from an edge on, then uniform.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -17,27 +15,9 @@ from twin.signals import MS
 
 EARLIEST_S, LATEST_S = 5e-3, 0.3  # how long an error goes on, at an edge and long after it
 PER_UNIT = 4  # bins in each unit of warped time
+SPARSE, FARTHEST = 20, 10  # rows kept: one in as many as a SPARSEth of those past, at most FARTHEST
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class Spacing:
-    """Rows that draw a curve: one in as many as a ``share``th of those past, at most ``most``."""
-
-    share: int
-    most: int
-
-    @cached_property
-    def early(self) -> Sequence[int]:
-        """The first of them, until they are as far apart as they get."""
-        offsets = [0]
-        while offsets[-1] < self.share * self.most:
-            offsets.append(offsets[-1] + max(offsets[-1] // self.share, 1))
-        return offsets
-
-
-FINE = Spacing(20, 10)
 
 
 @dataclass(frozen=True)
@@ -142,10 +122,19 @@ def sparse(begins: npt.NDArray[np.bool_]) -> Ints:
     return np.flatnonzero(kept)
 
 
-def drawn(since: Ints, spacing: Spacing = FINE) -> npt.NDArray[np.bool_]:
+def drawn(since: Ints) -> npt.NDArray[np.bool_]:
     """Whether a row is one of those, by how many rows ago a bend began."""
-    late = since - spacing.early[-1]
-    found: npt.NDArray[np.bool_] = np.isin(since, spacing.early) | (late > 0) & (
-        late % spacing.most == 0
-    )
+    late = since - _EARLY[-1]
+    found: npt.NDArray[np.bool_] = np.isin(since, _EARLY) | (late > 0) & (late % FARTHEST == 0)
     return found
+
+
+def _early() -> list[int]:
+    """The first of them, until they are as far apart as they get."""
+    offsets = [0]
+    while offsets[-1] < SPARSE * FARTHEST:
+        offsets.append(offsets[-1] + max(offsets[-1] // SPARSE, 1))
+    return offsets
+
+
+_EARLY = _early()
