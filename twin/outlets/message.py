@@ -1,7 +1,6 @@
 """What is told: one JSON document for each change of an alarm, the same wherever it goes."""
 
 import json
-import math
 import uuid
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from typing import Any
 
 from twin.assets.unit import Unit
 from twin.events import Event, Kind
+from twin.files import finite
 
 ALARM_FORMAT = "ejector-twin-alarm/1"
 STATUS_FORMAT = "ejector-twin-status/1"
@@ -85,7 +85,7 @@ def moment(ns: int) -> str:
 
 def encoded(document: Mapping[str, Any]) -> str:
     """JSON that every reader takes: without NaN, which is null."""
-    return json.dumps(_finite(document), ensure_ascii=False, allow_nan=False)
+    return json.dumps(finite(document), ensure_ascii=False, allow_nan=False)
 
 
 def new_id() -> str:
@@ -130,13 +130,3 @@ def _episode(plain: Mapping[str, Any]) -> str | None:
 
 def _moment(ns: int | None) -> str | None:
     return None if ns is None else moment(ns)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _finite(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(one) for one in value]
-    if hasattr(value, "item"):  # NumPy's numbers
-        value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value
