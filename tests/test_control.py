@@ -236,3 +236,18 @@ def test_signals_are_each_hypothesis_own() -> None:
     one, phase = np.full(1, MS), np.full(1, Phase.SUCTION, "u1")
     kernel.advance(state, thetas, one, phase, np.full(1, np.nan), np.empty((1, 2)), signals)
     assert signals.tolist() == [[Signal.PART_PRESENT, 0]]
+
+
+@pytest.mark.parametrize("silence", [-1.0, 3.0])
+def test_what_waits_for_a_sync_hands_out_nothing(silence: float) -> None:
+    """Before the first one no pressure is known, and after a break none any more."""
+    theta = rigs.theta("test_rig")
+    inside = theta[c.AMBIENT] - (theta[c.H2] + theta[c.H2_LOW]) / 2.0  # kept only if it was there
+    dt, phase = np.full(60, MS), np.full(60, Phase.IDLE, "u1")
+    level, signals = np.full(60, np.nan), np.empty(60, "u1")
+    dt[40], level[20], level[30] = silence, theta[c.AMBIENT] - 600.0 * MBAR, inside
+    level[50] = inside
+    kernel.advance(kernel.new_state(), theta, dt, phase, level, np.empty(60), signals)
+    on = (signals & Signal.PART_PRESENT) > 0
+    assert (np.flatnonzero(on) == np.arange(20, 40)).all()
+    assert not (signals & Signal.AIR_SAVING).any()

@@ -9,9 +9,10 @@ from typing import Protocol
 import numpy as np
 
 from twin.events import Event
-from twin.model import kernel
+from twin.model import strides
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
+from twin.model.strides import Strides
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
 from twin.monitor.detect import Monitor
@@ -50,7 +51,7 @@ class Twin:
     theta: Theta
     knees: Knees
     terms: Sequence[Term] = ()
-    _state: kernel.State = field(default_factory=kernel.new_state)
+    _strides: Strides = field(default_factory=Strides)
     _last_ns: int | None = None
 
     def __post_init__(self) -> None:
@@ -78,7 +79,7 @@ class Twin:
         expected = np.empty(len(samples))
         dt = steps(samples, self._last_ns)
         level, signals = ticks["level"].astype("f8"), np.empty(len(samples), "u1")
-        kernel.advance(self._state, self.theta, dt, phase, level, expected, signals)
+        strides.advance(self._strides, self.theta, dt, phase, level, expected, signals)
         self._terms.add(phase, expected)
         ticks["expected"], ticks["signals"] = expected, signals
         if len(samples):

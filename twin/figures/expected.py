@@ -11,9 +11,10 @@ from functools import cached_property
 import numpy as np
 
 from twin.figures.course import Bytes, Floats
-from twin.model import kernel
+from twin.model import kernel, strides
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
+from twin.model.strides import Strides
 from twin.model.term import Terms
 from twin.monitor.signatures import steps
 from twin.signals import BREAK, MBAR, MS, Command, Phase, Quality, Samples, Ticks
@@ -31,7 +32,7 @@ class Expectation:
     """
 
     data: DataSet
-    _state: kernel.State | None = None  # None until there is a level to begin at
+    _strides: Strides | None = None  # None until there is a level to begin at
     _control: kernel.Control = field(default_factory=kernel.Control.anew)
     _last_ns: int | None = None
     _edges: int = 0  # since it began
@@ -57,14 +58,14 @@ class Expectation:
         self._stale |= bool((samples["quality"] & Quality.STALE).any())
         if self._stale or (first and samples["quality"][0] & BREAK):
             self.lose()
-        begin = 0 if self._state is not None else _first_level(ticks, first and at_edge)
+        begin = 0 if self._strides is not None else _first_level(ticks, first and at_edge)
         if begin is None or self._stale:
             return
-        if self._state is None:
-            self._state, dt[begin], first = kernel.new_state(), -1.0, True
+        if self._strides is None:
+            self._strides, dt[begin], first = Strides(), -1.0, True
         rows = slice(begin, None)
         level = ticks[begin] if first else None
-        self._parts.append(self._run(self._state, dt[rows], samples[rows], level))
+        self._parts.append(self._run(self._strides, dt[rows], samples[rows], level))
 
     def end(self, at_edge: bool) -> tuple[Floats, Bytes] | None:
         """Expected vacuum (mbar) and phase of the rows since the last end: one cycle.
@@ -72,7 +73,7 @@ class Expectation:
         None until the model has swung in, and of rows that did not begin at a suction edge.
         """
         parts, self._parts, self._rows, self._stale = self._parts, [], 0, False
-        if self._state is None:
+        if self._strides is None:
             return None
         self._edges += at_edge
         if self._edges < SWUNG_IN or not at_edge:
@@ -82,7 +83,7 @@ class Expectation:
 
     def lose(self) -> None:
         """Begin anew: what comes does not follow what was."""
-        self._state, self._edges = None, 0
+        self._strides, self._edges = None, 0
 
     @cached_property
     def free_flow(self) -> float:
@@ -91,25 +92,26 @@ class Expectation:
             return float("nan")
         opened = self._theta.copy()
         opened[c.LAMINAR_LEAK] += opened[c.OPENING]
-        state, rows = kernel.at_rest(opened), round(FREE_S * 1e3)
-        phase, expected = np.empty(rows, np.uint8), np.empty(rows)
+        rows = round(FREE_S * 1e3)
         commands = np.full(rows, Command.SUCTION, np.uint8)
-        kernel.simulate(state, opened, np.full(rows, MS), commands, phase, expected)
+        _, expected = strides.simulate(opened, np.full(rows, MS), commands)
         return float(opened[c.AMBIENT] - expected[-1]) / MBAR
 
     def _run(
-        self, state: kernel.State, dt: Floats, samples: Samples, first: np.void | None
+        self, model: Strides, dt: Floats, samples: Samples, first: np.void | None
     ) -> tuple[Floats, Bytes]:
         """Pressure (Pa) and phase: the ``first`` row as the twin has it, all others free."""
         phase, pressure = np.empty(len(dt), np.uint8), np.empty(len(dt))
+        signals = np.empty(len(dt), np.uint8)
         free = slice(0 if first is None else 1, None)
         if first is not None:
             phase[0], level = first["phase"], np.array([first["level"]], np.float64)
-            kernel.advance(state, self._theta, dt[:1], phase[:1], level, pressure[:1])
+            one = pressure[:1], signals[:1]
+            strides.advance(model, self._theta, dt[:1], phase[:1], level, *one)
             self._control = kernel.Control.anew()
         driven = self._theta, dt[free], samples["commands"][free]
-        out = phase[free], pressure[free], np.empty(len(dt[free]), np.uint8)
-        kernel.run_on(state, self._control, *driven, out, kernel.ROUGHLY)
+        out = phase[free], pressure[free], signals[free]
+        strides.run_on(model, self._control, *driven, out, strides.ROUGHLY)
         self._terms.add(phase, pressure)
         return pressure, phase
 

@@ -90,7 +90,8 @@ def advance(
         return
     if signals is None:
         signals = np.empty(expected.shape, np.uint8)
-    _advance(
+    run = _advance_one if state[0].size == 1 else _advance
+    run(
         state.reshape(STATE, -1),
         theta.reshape(len(c.COEFFICIENTS), -1),
         dt,
@@ -150,7 +151,8 @@ def run_on(
     if len(dt) == 0:
         return
     phase, expected, signals = (one.reshape(len(dt), -1) for one in out)
-    _simulate(
+    run = _simulate_one if state[0].size == 1 else _simulate
+    run(
         state.reshape(STATE, -1),
         (control.air_saving, control.timer),
         theta.reshape(len(c.COEFFICIENTS), -1),
@@ -405,10 +407,11 @@ def _synchronise(state, levels, k):  # type: ignore[no-untyped-def]
 
 @compiled
 def _read(state, k, expected, signals):  # type: ignore[no-untyped-def]
-    """Write what each hypothesis expects, and the signals it hands out."""
+    """Write what each hypothesis expects, and the signals it hands out: none where it waits."""
     for i in range(state.shape[1]):
-        expected[i] = reading(state[SENSED, i], k, i) if state[VALID, i] > 0.0 else math.nan
-        vacuum = k[c.AMBIENT, i] - state[PORT, i]
+        known = state[VALID, i] > 0.0
+        expected[i] = reading(state[SENSED, i], k, i) if known else math.nan
+        vacuum = k[c.AMBIENT, i] - state[PORT, i] if known else 0.0
         before = int(state[SIGNALS, i])
         present = part_present(1 if before & _PART_PRESENT else 0, vacuum, k, i)
         reached = air_saving(1 if before & _AIR_SAVING else 0, vacuum, k, i)
@@ -448,14 +451,18 @@ def _together(state, all_k, driven, out, first, width, tolerance):  # type: igno
         put(state, min(first + i, last), mine, i)
 
 
+# One hypothesis and many are compiled apart: who needs only one of them waits for no other.
+@compiled
+def _advance_one(state, theta, dt, phase, level, expected, signals, tolerance):  # type: ignore[no-untyped-def]
+    driven, out = (dt, phase, level), (expected, signals)
+    _together(state, prepare(theta), driven, out, 0, 1, tolerance)
+
+
 @compiled
 def _advance(state, theta, dt, phase, level, expected, signals, tolerance):  # type: ignore[no-untyped-def]
     k, driven, out = prepare(theta), (dt, phase, level), (expected, signals)
-    if state.shape[1] == 1:
-        _together(state, k, driven, out, 0, 1, tolerance)
-    else:
-        for first in range(0, state.shape[1], LANES):
-            _together(state, k, driven, out, first, LANES, tolerance)
+    for first in range(0, state.shape[1], LANES):
+        _together(state, k, driven, out, first, LANES, tolerance)
 
 
 @compiled
@@ -467,17 +474,29 @@ def _seen_by_control(state, k, i):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _control(state, controls, told, dt, k, phases):  # type: ignore[no-untyped-def]
-    """Let the ejectors' own controls switch the nozzle, and enter the phases that result."""
+def _decide(state, controls, told, dt, k, phases):  # type: ignore[no-untyped-def]
+    """Say which phases the ejectors' own controls make of what the valves are told."""
     for i in range(state.shape[1]):
         asked = told[i] == _SUCTION_COMMAND  # blow-off wins
         on = switch(controls[i], asked, _seen_by_control(state, k, i), max(dt, 0.0), k, i)
         phases[i] = _SUCTION if on else _HOLD if asked else _BLOW_OFF if told[i] else _IDLE
+
+
+@compiled
+def _act(state, k, phases):  # type: ignore[no-untyped-def]
+    """Enter the phases that the ejectors' own controls made."""
     before = state[PHASE].copy()
     _enter(state, phases, k)
     for i in range(state.shape[1]):
         if phases[i] + before[i] == _SUCTION + _HOLD and phases[i] != before[i]:
             state[NOZZLE_AGE, i] = 0.0  # nothing was measured yet: the valve takes its response
+
+
+@compiled
+def _control(state, controls, told, dt, k, phases):  # type: ignore[no-untyped-def]
+    """Let the ejectors' own controls switch the nozzle, and enter the phases that result."""
+    _decide(state, controls, told, dt, k, phases)
+    _act(state, k, phases)
 
 
 @inlined
@@ -510,10 +529,12 @@ def _free(state, all_k, driven, out, first, width, tolerance):  # type: ignore[n
 
 
 @compiled
+def _simulate_one(state, control, theta, driven, out, tolerance):  # type: ignore[no-untyped-def]
+    _free(state, prepare(theta), driven + control, out, 0, 1, tolerance)
+
+
+@compiled
 def _simulate(state, control, theta, driven, out, tolerance):  # type: ignore[no-untyped-def]
     k = prepare(theta)
-    if state.shape[1] == 1:
-        _free(state, k, driven + control, out, 0, 1, tolerance)
-    else:
-        for first in range(0, state.shape[1], LANES):
-            _free(state, k, driven + control, out, first, LANES, tolerance)
+    for first in range(0, state.shape[1], LANES):
+        _free(state, k, driven + control, out, first, LANES, tolerance)

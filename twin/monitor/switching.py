@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from twin.model import kernel
+from twin.model import strides
 from twin.model import theta as c
 from twin.model.plant import reading_of
 from twin.model.theta import Theta
@@ -52,17 +52,13 @@ def seen(thetas: Sequence[Theta], rows: int, knees: Knees) -> list[Seen]:
     """Command suction for ``rows`` from rest, let the model run free and look for its knees."""
     commands = np.full(IDLE_ROWS + rows, Command.SUCTION, np.uint8)
     commands[:IDLE_ROWS] = 0
-    together = np.stack(thetas, axis=1)
-    phase = np.empty((len(commands), len(thetas)), np.uint8)
-    expected = np.empty(phase.shape)
-    driven = np.full(len(commands), MS), commands
-    state = kernel.at_rest(together)
-    kernel.simulate(state, together, *driven, phase, expected, kernel.ROUGHLY)
+    dt = np.full(len(commands), MS)
     samples = np.zeros(len(commands), SAMPLE)
     samples["sequence"] = np.arange(len(commands))
     samples["time_ns"] = np.arange(len(commands)) * 1_000_000
     samples["commands"] = commands
-    return [_seen(samples, *each, knees) for each in zip(thetas, phase.T, expected.T, strict=True)]
+    runs = ((theta, *strides.simulate(theta, dt, commands)) for theta in thetas)
+    return [_seen(samples, *each, knees) for each in runs]
 
 
 def _seen(samples: Samples, theta: Theta, phase: Bytes, expected: Floats, knees: Knees) -> Seen:

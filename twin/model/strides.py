@@ -1,0 +1,249 @@
+"""One unit's model in strides: steps as long as it allows, and rows that are read between them.
+
+The kernel steps from row to row, as whoever looks at its state needs. Where one model runs beside a
+stream, rows are mostly closer together than its steps have to be. Here a step may reach beyond the
+newest row, and rows at which nothing happens are read from the course between its ends. At a row
+where something does (another phase, a level to be set on, a break) the step is done anew from its
+beginning, to end there. A step under way is carried on, so the same samples give the same to the
+last bit however they are cut into blocks.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from twin.model import kernel
+from twin.model import theta as c
+from twin.model.compiled import compiled, inlined
+from twin.model.control import timed
+from twin.model.kernel import (
+    BLOW,
+    FELT,
+    LONGEST_BRIDGE,
+    LONGEST_STEP,
+    NEVER,
+    NOZZLE,
+    PHASE,
+    PORT,
+    ROUGH,
+    SENSED,
+    SIGNALS,
+    STATE,
+    VALID,
+    Bytes,
+    Floats,
+    State,
+)
+from twin.model.plant import prepare, put
+
+TOLERANCE = 0.05  # Pa, of a step; the kernel's, whose steps are shorter, gives errors as small
+ROUGHLY = 0.3  # Pa, the same where a fraction of a pascal does not matter
+SHORTEST_STEP = 40e-6  # s, after a jump of a valve or a cup, and where the exhaust opens
+LONGER = 2.0  # at most so many times as long as the step before
+SURE = 0.9  # of the length at which the error should be just within tolerance
+TOO_FAR = 1.5  # times the tolerance: the step is done again, shorter
+
+# The clock of a step under way: how long ago it began, its length, that of the last one (s), and
+# the course of what is read, as polynomials of how much of the step has passed (0 to 1).
+_SINCE, _LENGTH, _BEFORE = range(3)
+_SENSED, _PORT = 3, 7
+CLOCK = 9
+
+
+def _nowhere() -> State:
+    return kernel.new_state(1)
+
+
+@dataclass
+class Strides:
+    """A model, and what it carries from call to call; by itself it waits for its first sync."""
+
+    now: State = field(default_factory=_nowhere)  # at the newest row, as far as it is read
+    begin: State = field(default_factory=_nowhere)  # of the step under way
+    end: State = field(default_factory=_nowhere)
+    clock: Floats = field(default_factory=lambda: np.zeros(CLOCK))
+
+    @classmethod
+    def at_rest(cls, theta: c.Theta) -> "Strides":
+        """A model that stands at ambient pressure and temperature, nothing commanded."""
+        state = kernel.at_rest(theta.reshape(-1, 1))
+        return cls(state, state.copy(), state.copy())
+
+
+def advance(
+    strides: Strides,
+    theta: c.Theta,
+    dt: Floats,
+    phase: Bytes,
+    level: Floats,
+    expected: Floats,
+    signals: Bytes,
+    tolerance: float = TOLERANCE,
+) -> None:
+    """Step over a block as ``kernel.advance`` does, within ``tolerance`` (Pa) per step."""
+    driven = dt, np.ascontiguousarray(phase), level
+    _advance(_carried(strides), theta.reshape(-1, 1), driven, (expected, signals), tolerance)
+
+
+def run_on(
+    strides: Strides,
+    control: kernel.Control,
+    theta: c.Theta,
+    dt: Floats,
+    commands: Bytes,
+    out: tuple[Bytes, Floats, Bytes],
+    tolerance: float = TOLERANCE,
+) -> None:
+    """Run free over a block as ``kernel.run_on`` does; its control sees what the rows show."""
+    driven = dt, np.ascontiguousarray(commands)
+    controls = control.air_saving, control.timer
+    _run_on(_carried(strides), controls, theta.reshape(-1, 1), driven, out, tolerance)
+
+
+def simulate(theta: c.Theta, dt: Floats, commands: Bytes) -> tuple[Bytes, Floats]:
+    """Phase and expected pressure (Pa) of a free run from rest, where little precision matters."""
+    phase, expected, signals = (np.empty(len(dt), kind) for kind in ("u1", "f8", "u1"))
+    out = phase, expected, signals
+    run_on(Strides.at_rest(theta), kernel.Control.anew(), theta, dt, commands, out, ROUGHLY)
+    return phase, expected
+
+
+def _carried(strides: Strides) -> tuple[State, State, State, Floats]:
+    return strides.now, strides.begin, strides.end, strides.clock
+
+
+@inlined
+def _until_jump(state, k):  # type: ignore[no-untyped-def]
+    """Seconds until the next valve acts."""
+    first = NEVER
+    for position, response in ((NOZZLE, c.RESPONSE), (BLOW, c.BLOW_OFF_RESPONSE)):
+        command = state[position + 1, 0]
+        late = k[response if command > 0.5 else response + 1, 0] - state[position + 2, 0]
+        first = min(first, max(late, 0.0)) if state[position, 0] != command else first
+    return first
+
+
+@inlined
+def _planned(begin, k, before, tolerance):  # type: ignore[no-untyped-def]
+    """Length of the next step (s): smooth within, and ending where a valve acts."""
+    rough = begin[ROUGH, 0]
+    h = min(LONGEST_STEP, LONGER * before)
+    h = min(h, SURE * (tolerance / rough) ** (1.0 / 3.0)) if rough > 0.0 else h
+    while h > SHORTEST_STEP and (kernel._passes(begin, k, h, 0) or kernel._release(begin, k, h, 0)):
+        h *= 0.5
+    h = max(h, SHORTEST_STEP)
+    jump = _until_jump(begin, k)
+    if jump < 1e-9:
+        return SHORTEST_STEP
+    return jump if jump < h else 0.5 * jump if jump < 1.5 * h else h
+
+
+@compiled
+def _stride(begin, end, clock, k, longest, tolerance):  # type: ignore[no-untyped-def]
+    """Make a step of at most ``longest`` seconds from ``end`` on, which becomes its beginning."""
+    put(begin, 0, end, 0)
+    mine = np.empty((STATE, 1))  # its shape is known to the compiler
+    h = min(_planned(begin, k, clock[_BEFORE], tolerance), longest)
+    while True:
+        put(mine, 0, begin, 0)
+        kernel._substep(mine, k, h)
+        off = mine[ROUGH, 0] * h * h * h
+        if off <= TOO_FAR * tolerance or h <= SHORTEST_STEP:
+            break
+        h = max(h * SURE * (tolerance / off) ** (1.0 / 3.0), SHORTEST_STEP)
+    put(end, 0, mine, 0)
+    clock[_LENGTH] = clock[_BEFORE] = h
+
+
+@inlined
+def _drawn(begin, end, clock, k):  # type: ignore[no-untyped-def]
+    """Draw the course over a step of what is read: a cubic, and a straight line at the port."""
+    lag = (k[c.SENSOR_LAG, 0] + k[c.SLOW_SENSOR, 0]) / clock[_LENGTH]
+    first, last = begin[SENSED, 0], end[SENSED, 0]
+    leaving, arriving = (begin[FELT, 0] - first) / lag, (end[FELT, 0] - last) / lag
+    clock[_SENSED], clock[_SENSED + 1] = first, leaving
+    clock[_SENSED + 2] = 3.0 * (last - first) - 2.0 * leaving - arriving
+    clock[_SENSED + 3] = 2.0 * (first - last) + leaving + arriving
+    clock[_PORT], clock[_PORT + 1] = begin[PORT, 0], end[PORT, 0] - begin[PORT, 0]
+
+
+@inlined
+def _on(carried, k, dt, tolerance):  # type: ignore[no-untyped-def]
+    """Go on by ``dt`` seconds, and read."""
+    now, begin, end, clock = carried
+    clock[_SINCE] += dt
+    while clock[_SINCE] > clock[_LENGTH]:
+        clock[_SINCE] -= clock[_LENGTH]
+        _stride(begin, end, clock, k, LONGEST_STEP, tolerance)
+        _drawn(begin, end, clock, k)
+    if clock[_LENGTH] > 0.0:
+        x = clock[_SINCE] / clock[_LENGTH]
+        bent = clock[_SENSED + 2] + x * clock[_SENSED + 3]
+        now[SENSED, 0] = clock[_SENSED] + x * (clock[_SENSED + 1] + x * bent)
+        now[PORT, 0] = clock[_PORT] + x * clock[_PORT + 1]
+
+
+@compiled
+def _arrive(carried, k, tolerance):  # type: ignore[no-untyped-def]
+    """Let all of the state stand at the newest row, by steps that end there."""
+    now, begin, end, clock = carried
+    signals, left = now[SIGNALS, 0], clock[_SINCE]
+    put(end, 0, begin, 0)
+    while left > 0.0:
+        _stride(begin, end, clock, k, left, tolerance)
+        left -= clock[_LENGTH]
+    put(now, 0, end, 0)
+    now[SIGNALS, 0] = signals
+    clock[_SINCE] = clock[_LENGTH] = 0.0
+
+
+@inlined
+def _set_out(carried):  # type: ignore[no-untyped-def]
+    """Go on from where ``now`` was put, as roughly as it may be there."""
+    now, begin, end, clock = carried
+    now[ROUGH, 0] = 0.0
+    put(begin, 0, now, 0)
+    put(end, 0, now, 0)
+    clock[_SINCE] = clock[_LENGTH] = 0.0
+    clock[_BEFORE] = SHORTEST_STEP
+
+
+@compiled
+def _advance(carried, theta, driven, out, tolerance):  # type: ignore[no-untyped-def]
+    k, now = prepare(theta), carried[0]
+    (dt, phase, level), (expected, signals) = driven, out
+    said, handed = np.empty(1), np.empty(1, np.uint8)
+    for row in range(dt.shape[0]):
+        broken = dt[row] < 0.0 or dt[row] > LONGEST_BRIDGE
+        if not broken and now[VALID, 0] > 0.0 and dt[row] > 0.0:
+            _on(carried, k, dt[row], tolerance)
+        if broken or phase[row] != now[PHASE, 0] or not math.isnan(level[row]):
+            _arrive(carried, k, tolerance)
+            now[VALID, 0] = 0.0 if broken else now[VALID, 0]
+            kernel._enter(now, phase[row : row + 1], k)
+            kernel._synchronise(now, level[row : row + 1], k)
+            _set_out(carried)
+        kernel._read(now, k, said, handed)
+        expected[row], signals[row] = said[0], handed[0]
+
+
+@compiled
+def _run_on(carried, controls, theta, driven, out, tolerance):  # type: ignore[no-untyped-def]
+    k, now = prepare(theta), carried[0]
+    (air_saving, timer), (dt, commands), (phase, expected, signals) = controls, driven, out
+    told, mode, pulse = np.empty(len(dt), np.uint8), k[c.BLOW_OFF_MODE, 0], k[c.BLOW_OFF_TIME, 0]
+    timed(timer[0], commands, dt, mode, pulse, told)
+    said, handed = np.empty(1), np.empty(1, np.uint8)
+    asked, decided = np.empty(1, np.uint8), np.empty(1, np.uint8)
+    for row in range(dt.shape[0]):
+        if dt[row] > 0.0:
+            _on(carried, k, dt[row], tolerance)
+        asked[0] = told[row]
+        kernel._decide(now, air_saving, asked, dt[row], k, decided)
+        if decided[0] != now[PHASE, 0]:
+            _arrive(carried, k, tolerance)
+            kernel._act(now, k, decided)
+            _set_out(carried)
+        kernel._read(now, k, said, handed)
+        phase[row], expected[row], signals[row] = decided[0], said[0], handed[0]
