@@ -35,6 +35,7 @@ high = 2
 class Tag(Settings):
     delay_ms: float = Field(1.0, ge=0.0, le=100.0)
     unit: Literal["mbar", "Pa"] = "Pa"
+    span: float = 1.0
 
 
 class Limits(Settings):
@@ -86,6 +87,8 @@ def test_settings_are_frozen() -> None:
         ('host = "10.0.0.5"', "", "cell.toml:2: driver.host: Field required"),
         ('host = "10.0.0.5"', "host = 5", "cell.toml:3: driver.host: "),
         ("[ driver . limits ]", "[driver.limit]", "cell.toml:10: driver.limit: unknown key"),
+        ("delay_ms = 5.0", "span = nan", "cell.toml:7: driver.tags.pressure.span: Input should"),
+        ("delay_ms = 5.0", "span = -inf", "cell.toml:7: driver.tags.pressure.span: Input should"),
     ],
 )
 def test_what_is_wrong_is_named_with_its_line(old: str, new: str, wanted: str) -> None:
@@ -212,7 +215,11 @@ TUBE = {"kind": "tube", "length_mm": 100.0, "diameter_mm": 6.0}
         ({"supply": {"pressure_bar": 1.0, "droop_bar": 1.5}}, "below ambient"),
         ({"sensor": {"lag_ms": 0.0}}, "greater than or equal to 0.5"),
         ({"system": {"parts": [TUBE, VESSEL | {"volume_ml": 0.0}]}}, "greater than 0"),
-        ({"system": {"parts": [TUBE, VESSEL | {"volume_ml": float("nan")}]}}, "greater than 0"),
+        ({"system": {"parts": [TUBE, VESSEL | {"volume_ml": float("nan")}]}}, "finite number"),
+        ({"system": {"parts": [TUBE, VESSEL | {"volume_ml": float("inf")}]}}, "finite number"),
+        ({"system": {"parts": [TUBE | {"diameter_mm": 1e-300}, VESSEL]}}, "too large or too small"),
+        ({"system": {"parts": [TUBE | {"diameter_mm": 1e300}, VESSEL]}}, "too large or too small"),
+        ({"ejector": {"suction_capacity_sl_min": 1e300}}, "too large or too small"),
         ({"system": {"parts": [TUBE]}}, "nothing to evacuate"),
         ({"system": {"parts": [VESSEL]}}, "need a tube"),
         ({"system": {"parts": [TUBE, VESSEL, *[{"kind": "sensor"}] * 2]}}, "more than one sensor"),

@@ -19,9 +19,9 @@ from twin.errors import ConfigError, SourceError
 
 
 class Settings(BaseModel):
-    """A table of the configuration: immutable, checked, without unknown keys."""
+    """A table of the configuration: immutable, checked, finite numbers, without unknown keys."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 S = TypeVar("S", bound=Settings)

@@ -15,7 +15,7 @@ VACUUM, SUPPLY, FLOW = "diagram_vacuum_mbar", "diagram_supply_bar", "diagram_flo
 
 Vacuum = Annotated[float, Field(ge=0.0, lt=1100.0)]
 Supply = Annotated[float, Field(gt=0.0, le=16.0)]
-Flow = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Flow = Annotated[float, Field(ge=0.0)]
 
 
 class Diagram(Settings):

@@ -18,7 +18,7 @@ class ArrayForm(Settings):
     """An array: its shape, and its values with the last axis running fastest."""
 
     shape: list[Annotated[int, Field(ge=0)]]
-    values: list[Annotated[float, Field(allow_inf_nan=False)]]
+    values: list[float]
 
     def array(self) -> Array:
         """The array itself; ValueError if the shape does not fit."""

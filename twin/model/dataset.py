@@ -184,11 +184,14 @@ class DataSet(Settings):
     terms: tuple[Term, ...] = ()
 
     @model_validator(mode="after")
-    def _effects_fit(self) -> "DataSet":
+    def _model_can_be_made(self) -> "DataSet":
         try:
-            coefficients(self)
+            with np.errstate(over="raise", divide="raise", invalid="raise"):
+                coefficients(self)
         except ConfigError as error:
             raise ValueError(f"effects: {error}") from error
+        except ArithmeticError as error:
+            raise ValueError("a value is too large or too small to calculate with") from error
         return self
 
     @model_validator(mode="after")
