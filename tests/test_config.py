@@ -1,6 +1,7 @@
 """Where the data set of a unit comes from: type, [data] and unit in layers, and who is to blame."""
 
 import json
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from twin.assets.database import Assets, open_assets
 from twin.assets.record import Record
 from twin.config import Config
 from twin.errors import ConfigError, SourceError
+from twin.log.header import LogHeader
 from twin.model.dataset import DataSet
 from twin.model.diagram import capacity
 from twin.monitor.healthy import Healthy
@@ -338,6 +340,8 @@ def test_a_logs_data_set_of_another_shape_is_named_with_its_key(
     ("text", "problem"),
     [
         ("{", "line 1 column 2"),
+        ('{"a":' * 100_000, "recursion"),
+        (whole_json(supply={"pressure_bar": math.inf}), "pressure_bar: Input should be a finite"),
         ("5", "data: Input should be a valid dictionary"),
         (
             "{}",
@@ -365,3 +369,28 @@ def test_nothing_is_made_up_that_a_log_does_not_say(text: str, problem: str) -> 
         of_log(data=text)
     assert problem in str(caught.value)
     assert "of unknown version" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("[asset\n", "cell.toml: not valid TOML: "),
+        (CELL + "[colours]\n", "cell.toml:20: unknown table [colours]"),
+        (CELL.replace("monitor.healthy", "monitor.heathy"), "monitor.heathy: unknown key"),
+        (CELL.replace("id =", "ib ="), "cell.toml:3: asset.ib: unknown key (is 'unit-1')"),
+    ],
+)
+def test_a_logs_configuration_of_another_shape_is_said_to_stand_in_it(
+    text: str, problem: str
+) -> None:
+    """No file of that name need be there: what is wrong is the log, or too old a program."""
+    metadata = {"data": whole_json(), "program": "9.8.7"}
+    header = LogHeader(TYPE, UNIT, "cell.toml", text, metadata)
+    with pytest.raises(SourceError) as caught:
+        Config.of_recorded(header, "day.mcap")
+    assert str(caught.value).startswith("day.mcap: the configuration in it cannot be used: ")
+    assert problem in str(caught.value)
+    assert "--config" in caught.value.hint
+    assert "9.8.7" in caught.value.hint
+    other = Document.parse(CELL.replace(TYPE, "other"), "cell.toml")
+    assert Config.of_recorded(header, "day.mcap", other).asset.type == "other"

@@ -7,6 +7,7 @@ asset database. Where they came from is kept.
 
 import json
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from textwrap import shorten
@@ -115,14 +116,15 @@ class Config:
     def of_log(cls, document: Document, metadata: Mapping[str, str], log: str) -> "Config":
         """The configuration of a log, with the data set it was recorded beside.
 
-        SourceError names ``log`` and the key where this program cannot take that data set.
+        SourceError names ``log`` and the key where this program cannot take either of them.
         """
         if "data" not in metadata:
             return cls.of(document)
-        document.refuse_unknown_tables(TABLES)
-        asset = document.section(Asset, "asset")
         known = _of_log(metadata, log)
-        return cls._checked(document, asset, known, metadata.get("origin", "the log"))
+        with _in_log(metadata, log):
+            document.refuse_unknown_tables(TABLES)
+            asset = document.section(Asset, "asset")
+            return cls._checked(document, asset, known, metadata.get("origin", "the log"))
 
     @classmethod
     def of_recorded(
@@ -138,7 +140,8 @@ class Config:
 
         Where a database, a unit or a time is named the data set is looked up anew, as in ``of``.
         """
-        document = instead or Document.parse(header.config_text, header.config_name)
+        with _in_log(header.metadata, log):
+            document = instead or Document.parse(header.config_text, header.config_name)
         if instead is not None or assets or unit or as_of_ns is not None:
             return cls.of(document, assets, unit, as_of_ns=as_of_ns)
         config = cls.of_log(document, header.metadata, log)
@@ -310,6 +313,23 @@ def _in_record(record: Record, where: str, tables: Tables) -> Known:
         ) from error
 
 
+@contextmanager
+def _in_log(metadata: Mapping[str, str], log: str) -> Iterator[None]:
+    """Say of a configuration's faults that it stands in a log: there is no file to mend."""
+    try:
+        yield
+    except ConfigError as error:
+        message = f"{log}: the configuration in it cannot be used: {error}"
+        raise SourceError(message, _instead_of_its_own(metadata)) from error
+
+
+def _instead_of_its_own(metadata: Mapping[str, str]) -> str:
+    return (
+        "give another one with --config CONFIG, or use the ejector-twin that made the log"
+        f" ({metadata.get('program', 'of unknown version')})"
+    )
+
+
 def _of_log(metadata: Mapping[str, str], log: str) -> Known:
     """All that a log says of the data set; nothing is made up where it leaves something out."""
     try:
@@ -319,14 +339,11 @@ def _of_log(metadata: Mapping[str, str], log: str) -> Known:
         problem = f"{', '.join(missing)}: missing" if missing else ""
     except ValidationError as error:
         problem = _in_words(error)
-    except ValueError as error:  # no JSON
+    except (ValueError, RecursionError) as error:  # no JSON
         problem = str(error)
     if problem:
-        raise SourceError(
-            f"{log}: its data set cannot be used: {problem}",
-            "give another one with --config CONFIG, or use the ejector-twin that made the log"
-            f" ({metadata.get('program', 'of unknown version')})",
-        )
+        message = f"{log}: its data set cannot be used: {problem}"
+        raise SourceError(message, _instead_of_its_own(metadata))
     return known
 
 
