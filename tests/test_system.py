@@ -81,6 +81,17 @@ def test_the_nodes_share_out_all_there_is(name: str) -> None:
     assert nodes == pytest.approx(room(of) + data.ejector.port_volume_ml * ML)
 
 
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_wherever_gas_is_stored_there_is_a_wall_and_each_wall_counts_once(name: str) -> None:
+    data, theta = rigs.config(name).data, rigs.theta(name)
+    of = lumped(data.system.parts, theta[c.SUCTION], theta[c.AMBIENT], theta[c.TEMPERATURE])
+    tubes = theta[[c.PORT_HEAT, c.LINE_HEAT]] / data.system.tube_film_coefficient
+    walls = np.append(tubes, theta[c.AREA])
+    assert (walls > 0.0).all()
+    assert theta[c.FILM] > 0.0
+    assert walls.sum() == pytest.approx(of.port_area + of.line_area + of.vessel_area)
+
+
 def test_a_wall_that_is_not_given_is_that_of_a_cylinder_as_long_as_wide() -> None:
     diameter = (4.0 * 750e-6 / math.pi) ** (1 / 3)
     wall = 1.5 * math.pi * diameter**2
