@@ -124,8 +124,9 @@ def sparse(begins: npt.NDArray[np.bool_]) -> Ints:
 
 def drawn(since: Ints) -> npt.NDArray[np.bool_]:
     """Whether a row is one of those, by how many rows ago a bend began."""
-    late = since - _EARLY[-1]
-    found: npt.NDArray[np.bool_] = np.isin(since, _EARLY) | (late > 0) & (late % FARTHEST == 0)
+    late = since - _LAST
+    found: npt.NDArray[np.bool_] = _IS_EARLY[np.minimum(since, _LAST + 1)]
+    found |= (late > 0) & (late % FARTHEST == 0)
     return found
 
 
@@ -137,4 +138,5 @@ def _early() -> list[int]:
     return offsets
 
 
-_EARLY = _early()
+_LAST = _early()[-1]
+_IS_EARLY = np.isin(np.arange(_LAST + 2), _early())  # and one that is late
