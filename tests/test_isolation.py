@@ -10,6 +10,7 @@ import rigs
 
 from twin.events import Event, Kind
 from twin.monitor.bank import SUSPECTS, Bank, hypotheses
+from twin.monitor.cycles import Cycle
 from twin.monitor.detect import Monitor, MonitorSettings
 from twin.monitor.healthy import Healthy
 from twin.monitor.isolation import Isolation
@@ -27,6 +28,11 @@ def events(
     for block in rigs.cut(samples, size):
         told += watched.update(*twin.advance(block))
     return told + watched.update(*twin.flush()) + watched.close()
+
+
+def piece(rows: Samples, ticks: Ticks) -> Cycle:
+    """Rows that are no whole cycle."""
+    return Cycle(0, rows, ticks, complete=False)
 
 
 def raised(told: Sequence[Event]) -> list[Event]:
@@ -151,9 +157,9 @@ def test_the_bank_expects_what_the_twin_expects_where_it_is_drawn() -> None:
     samples, _ = rigs.recorded("gripper", 6.0)
     rows, ticks = rigs.expectation(rigs.twin("gripper"), [samples])
     bank = Bank(rigs.theta("gripper"))
-    for begin in range(0, len(rows), 700):
-        bank.push(rows[begin : begin + 700], ticks[begin : begin + 700])
-    drawn, together = bank.take(len(rows))
+    for end in range(700, len(rows), 700):
+        bank.ahead([(rows[:end], ticks[:end])], at_edge=False)
+    drawn, together = bank.take(piece(rows, ticks))
     assert together.shape == (len(drawn), len(hypotheses(rigs.theta("gripper"))))
     assert 0.1 < len(drawn) / len(rows) < 0.35
     known = np.isfinite(ticks["expected"][drawn])
@@ -170,10 +176,10 @@ def test_what_the_bank_draws_does_not_depend_on_blocks(size: int) -> None:
     samples, _ = rigs.recorded("gripper", 3.0)
     rows, ticks = rigs.expectation(rigs.twin("gripper"), [samples])
     whole, cut = Bank(rigs.theta("gripper")), Bank(rigs.theta("gripper"))
-    whole.push(rows, ticks)
-    for begin in range(0, len(rows), size):
-        cut.push(rows[begin : begin + size], ticks[begin : begin + size])
-    for one, other in zip(whole.take(len(rows)), cut.take(len(rows)), strict=True):
+    for end in range(size, len(rows), size):
+        cut.ahead([(rows[:end], ticks[:end])], at_edge=False)
+    all_of_it = piece(rows, ticks)
+    for one, other in zip(whole.take(all_of_it), cut.take(all_of_it), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
@@ -196,8 +202,9 @@ def test_rows_and_ticks_of_the_bank_go_with_cycles_through_a_gap() -> None:
         watched.update(rows, ticks)
     watched.close()
     assert watched.isolation is not None
-    assert len(watched.isolation._bank.take(0)[0]) == 0
-    assert watched.isolation._bank._count == 0
+    bank = watched.isolation._bank
+    assert len(bank._rows) == len(bank._expected) == bank._stepped == 0
+    assert bank._last_ns == int(samples["time_ns"][-1])
 
 
 def test_a_change_that_begins_is_not_learned_as_usual() -> None:

@@ -125,7 +125,6 @@ def heard(
     ambient = float(twin.theta[c.AMBIENT])
     for block in blocks(rig, seconds, seed=seed, block=20_000):
         rows, ticks = twin.advance(block)
-        isolation.push(rows, ticks)
         for cycle in cutter.push(rows, ticks):
             fit = cycle.complete and cycle.settled
             if isolation.judge(cycle, fit, figures(cycle, ambient)) is not None:

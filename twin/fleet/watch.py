@@ -27,9 +27,8 @@ def watched(config: Config, blocks: Iterable[Samples]) -> dict[str, Any]:
     told: list[CycleFigures] = []
     heard: list[Said] = []
     for rows, ticks in _beside(Twin.of(config.data), blocks):
-        bank.push(rows, ticks)
         for cycle in cutter.push(rows, ticks):
-            drawn = bank.take(len(cycle.samples))
+            drawn = bank.take(cycle)
             if (one := teller.take(cycle)) is not None:
                 told.append(one)
             if cycle.complete and cycle.settled:

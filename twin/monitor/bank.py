@@ -14,11 +14,14 @@ from twin.model import kernel
 from twin.model import theta as c
 from twin.model.effects import EFFECTS, Parameter, apply
 from twin.model.theta import Theta
-from twin.monitor.bins import drawn
+from twin.monitor.bins import Floats, Ints, drawn
+from twin.monitor.cycles import Cycle
+from twin.monitor.drawings import Drawing, Drawings, Stretches
 from twin.monitor.signatures import steps
 from twin.signals import MS, NS, Phase, Samples, Ticks, joined
 
-BATCH = 250  # rows that are stepped together: what many calls cost is spared
+BATCH = 250  # rows that are looked at together: what many calls cost is spared
+SWUNG_IN = 2  # cycles after which nothing shows any more where the models came from
 STEP = 0.25  # of a parameter's typical size
 # What delays moves steep edges: they differ in proportion to it only while it is shorter than they
 # are. So it has a smaller step, and larger sizes beside it.
@@ -28,15 +31,15 @@ DELAY_STEPS = (0.05, 0.25, 1.5)
 NO_WEAR = ("ambient_pressure", "heat_exchange")
 SELDOM = 0.2
 
-Floats = npt.NDArray[np.float64]
+Bytes = npt.NDArray[np.uint8]
 _ROW = np.dtype(
     [
         ("time_ns", "i8"),
         ("dt", "f8"),
         ("level", "f8"),
         ("phase", "u1"),
-        ("next", "u1"),  # the phase of the row after it
         ("bends", "?"),  # here a bend of what is expected begins
+        ("odd", "?"),  # something is wrong with it, or time does not run on evenly
         ("since", "i8"),  # rows, then
     ]
 )
@@ -109,95 +112,119 @@ def hypotheses(theta: Theta) -> list[Theta]:
 
 
 class Bank:
-    """Takes the rows of the twin, and keeps what each hypothesis expects until it is taken.
+    """Takes the twin's cycles, and says what each hypothesis expects in them.
 
     Signatures are smooth but where a phase or a stretch begins, so the bank steps from one to the
-    next of the rows that suffice to draw them (``bins.drawn``); to know them it is one row behind.
+    next of the rows that suffice to draw them (``bins.drawn``). Where a cycle goes as one that is
+    known, nothing is stepped: what was drawn then is given again (``drawings``), and the models
+    stand where that one ended.
     """
 
     def __init__(self, theta: Theta) -> None:
         self._theta = np.stack(hypotheses(theta), axis=1)
         self._state = kernel.new_state(self._theta.shape[1])
-        self._parts: list[tuple[Samples, Ticks]] = []  # rows that are not stepped yet
-        self._fresh = 0  # how many
-        self._waits = np.empty(0, _ROW)  # the newest row: the one after it is not known yet
+        self._drawings = Drawings()
         self._last_ns: int | None = None  # PLC time of the newest row
         self._phase = -1  # and its phase
         self._since = 0  # rows since a bend began, of the newest one
         self._drawn_ns = 0  # PLC time of the newest row that was drawn
-        self._count = 0  # rows that were pushed and not taken
-        self._rows = np.empty(0, np.int64)  # of these, that were drawn
-        self._expected = np.empty((0, self._theta.shape[1]))
+        self._whole = 0  # cycles in a row in which nothing was wrong
+        self._rows = np.empty(0, _ROW)  # of the next piece, as far as they were seen
+        self._stepped = 0  # how many of them were stepped over
+        self._expected = np.empty((0, self._theta.shape[1]))  # at those of them that were drawn
 
-    def push(self, samples: Samples, ticks: Ticks) -> None:
-        """Step on by the twin's rows, some time; nothing is kept of a silence."""
+    def ahead(self, parts: Sequence[tuple[Samples, Ticks]], at_edge: bool) -> None:
+        """See the rows so far of the next piece, to have less to do when it is taken.
+
+        ``at_edge`` says that they begin with a suction edge. While it may still turn out to go as
+        a known cycle, nothing is stepped.
+        """
+        if sum(len(samples) for samples, _ in parts) - len(self._rows) < BATCH:
+            return
+        samples, ticks = (joined(*column) for column in zip(*parts, strict=True))
+        self._see(samples, ticks)
+        may_be = at_edge and not self._rows["odd"].any()
+        if not (may_be and self._drawings.may_be(Stretches.of(self._rows))):
+            self._step_to(len(self._rows) - 1)  # the row after the last is not known yet
+
+    def take(self, cycle: Cycle) -> tuple[Ints, Floats]:
+        """Of the rows of a cycle or piece those that are drawn, and what is expected there (Pa).
+
+        These are (drawn, hypotheses). In a cycle that goes as a known one it is what was expected
+        in that: right is what one hypothesis expects less what another does.
+        """
+        self._see(cycle.samples, cycle.ticks)
+        drawn = np.flatnonzero(_drawn(self._rows))
+        plain = cycle.complete and not self._rows["odd"].any()
+        stretches = Stretches.of(self._rows) if plain else None
+        known = self._drawings.like(stretches) if stretches else None
+        if stretches and known:
+            expected, self._state = known.at(stretches, drawn), known.state.copy()
+            self._drawn_ns = int(self._rows["time_ns"][-1])
+        else:
+            self._step_to(len(self._rows))
+            expected = self._expected
+            if stretches and self._whole >= SWUNG_IN:
+                self._drawings.add(Drawing(stretches, drawn, expected, self._state.copy()))
+        self._whole = self._whole + 1 if plain else 0
+        self._rows, self._stepped, self._expected = self._rows[:0], 0, self._expected[:0]
+        return drawn, expected
+
+    def _see(self, samples: Samples, ticks: Ticks) -> None:
+        """Look at the rows of a piece, without those that were seen."""
+        seen = len(self._rows)
+        samples, ticks = samples[seen:], ticks[seen:]
         if not len(samples):
             return
-        self._parts.append((samples, ticks))
-        self._fresh += len(samples)
-        if self._fresh >= BATCH:
-            self._step_on()
-
-    def _step_on(self) -> None:
-        if not self._fresh:
-            return
-        samples, ticks = (joined(*column) for column in zip(*self._parts, strict=True))
-        self._parts, self._fresh = [], 0
         fresh = np.empty(len(samples), _ROW)
         fresh["time_ns"], fresh["level"] = samples["time_ns"], ticks["level"]
         fresh["phase"], fresh["dt"] = ticks["phase"], steps(samples, self._last_ns)
-        fresh["bends"] = np.diff(ticks["phase"], prepend=self._phase) != 0
-        fresh["bends"] |= np.isfinite(ticks["level"]) | (fresh["dt"] < 0.5 * MS)
-        fresh["bends"] |= fresh["dt"] > 1.5 * MS
+        jumps = (fresh["dt"] < 0.5 * MS) | (fresh["dt"] > 1.5 * MS)
+        fresh["odd"] = jumps | (samples["quality"] != 0)
+        fresh["bends"] = jumps | np.isfinite(ticks["level"])
+        fresh["bends"] |= np.diff(ticks["phase"], prepend=self._phase) != 0
         number = np.arange(len(fresh))
         begun = np.where(fresh["bends"], number, -1 - self._since)
         fresh["since"] = number - np.maximum.accumulate(begun)
         self._last_ns, self._phase = int(samples["time_ns"][-1]), int(ticks["phase"][-1])
         self._since = int(fresh["since"][-1])
-        rows = joined(self._waits, fresh)
-        drawn_now = drawn(rows["since"][:-1]) | rows["bends"][1:]
-        first = self._count - len(self._waits)
-        self._count += len(samples)
-        rows["next"][:-1] = rows["phase"][1:]
-        self._waits = rows[-1:]
-        self._step(rows[:-1][drawn_now], first + np.flatnonzero(drawn_now))
+        self._rows = joined(self._rows, fresh)
 
-    def _step(self, rows: npt.NDArray[np.void], numbers: npt.NDArray[np.int64]) -> None:
+    def _step_to(self, end: int) -> None:
+        """Step over the rows of a piece that come before ``end``."""
+        ahead = self._rows[self._stepped : end + 1]  # and the one after them
+        count = end - self._stepped
+        some = _drawn(ahead)[:count]
+        after = np.append(ahead["phase"][1:], ahead["phase"][-1:])[:count][some]
+        rows, self._stepped = ahead[:count][some], end
         if not len(rows):
             return
         before = np.concatenate([[self._drawn_ns], rows["time_ns"][:-1]])
         dt = np.where(rows["dt"] < 0.0, -1.0, (rows["time_ns"] - before) * NS)
         expected = np.empty((len(rows), self._theta.shape[1]))
-        phase, level = _phases(rows, self._theta.shape[1]), np.ascontiguousarray(rows["level"])
+        phase = _phases(rows["phase"], after, self._theta.shape[1])
+        level = np.ascontiguousarray(rows["level"])
         kernel.advance(
             self._state, self._theta, dt, phase, level, expected, tolerance=kernel.ROUGHLY
         )
         self._drawn_ns = int(rows["time_ns"][-1])
-        self._rows = np.concatenate([self._rows, numbers])
         self._expected = np.concatenate([self._expected, expected])
 
-    def take(self, count: int) -> tuple[npt.NDArray[np.int64], Floats]:
-        """Of the oldest ``count`` rows those that were drawn, and what is expected there (Pa).
 
-        These are (drawn, hypotheses).
-        """
-        self._step_on()
-        if count == self._count and len(self._waits):
-            self._waits["next"] = self._waits["phase"]
-            self._step(self._waits, np.array([count - 1]))
-            self._waits = self._waits[:0]
-        mine = self._rows < count
-        taken = self._rows[mine], self._expected[mine]
-        self._rows, self._expected = self._rows[~mine] - count, self._expected[~mine]
-        self._count -= count
-        return taken
+def _drawn(rows: npt.NDArray[np.void]) -> npt.NDArray[np.bool_]:
+    """Which of a piece's rows are drawn: also the last before a bend, and the very last."""
+    last: npt.NDArray[np.bool_] = np.append(rows["bends"][1:], True)
+    return drawn(rows["since"]) | last
 
 
-def _phases(rows: npt.NDArray[np.void], count: int) -> npt.NDArray[np.uint8]:
-    """Phases (rows, hypotheses): what is seen a row later than it acts was a row earlier."""
-    phases = np.repeat(rows["phase"][:, None], count, axis=1)
+def _phases(phase: Bytes, after: Bytes, count: int) -> Bytes:
+    """Phases (rows, hypotheses): what is seen a row later than it acts was a row earlier.
+
+    ``after`` is the phase of the row after each.
+    """
+    phases = np.repeat(phase[:, None], count, axis=1)
     for into, before in ((Phase.HOLD, Phase.SUCTION), (Phase.SUCTION, Phase.HOLD)):
-        switches = np.flatnonzero((rows["next"] == into) & (rows["phase"] == before))
+        switches = np.flatnonzero((after == into) & (phase == before))
         later = [1 + i for i, one in enumerate(SUSPECTS) if one.effect in SEEN_LATER[into]]
         phases[switches[:, None], later] = into
     return phases

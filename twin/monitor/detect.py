@@ -80,14 +80,14 @@ class Monitor:
             rows = slice(begin, end)
             found = list(self._stream_events(samples[rows]))
             silent = any(event.kind is Kind.PLC_BACK for event in found)
-            if self.isolation:
-                self.isolation.push(samples[rows], ticks[rows])
             for cycle in self._cutter.push(samples[rows], ticks[rows]):
                 found += self._judge(cycle, silent and cycle.cut_short)
             found += self.clocks.push(samples[rows]) if self.clocks else []
             events += sorted(found, key=_order)  # as if row by row
         if self.teller:
             self.teller.ahead(*self._cutter.begun)
+        if self.isolation:
+            self.isolation.ahead(*self._cutter.begun)
         return events
 
     def silent(self, last: np.void, now_ns: int) -> list[Event]:

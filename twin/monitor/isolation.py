@@ -124,17 +124,16 @@ class Isolation:
         """What the last cycle said, and its scores as standard normal variables."""
         return self._kept[-1]
 
-    def push(self, samples: Samples, ticks: Ticks) -> None:
-        """Step the bank by the twin's rows."""
-        self._bank.push(samples, ticks)
+    def ahead(self, parts: Sequence[tuple[Samples, Ticks]], at_edge: bool) -> None:
+        """See the rows so far of the next cycle, to have less to do when it comes."""
+        self._bank.ahead(parts, at_edge)
 
     @classmethod
     def of(cls, data: DataSet, healthy: Healthy, days: float) -> "Isolation":
         """The isolation beside the twin of a data set; compiled, not to fall into a block."""
         listener = Listener.of(data, healthy)
         first = Bank(listener.theta)
-        first.push(np.zeros(2, SAMPLE), np.zeros(2, TICK))
-        drawn, _ = first.take(2)
+        drawn, _ = first.take(Cycle(0, np.zeros(2, SAMPLE), np.zeros(2, TICK), complete=False))
         nothing = np.zeros((len(drawn), len(SUSPECTS)))
         binned(np.zeros(2, np.uint8), np.ones(2, np.bool_), drawn[:1]).through(drawn, nothing)
         return cls(Bank(listener.theta), listener, days)
@@ -147,7 +146,7 @@ class Isolation:
         ``far`` are the sigmas by which this cycle alone is out, if it is: from such a one nothing
         is learned, and if it is much farther than those before, the cause is sought from it on.
         """
-        drawn = self._bank.take(len(cycle.samples))
+        drawn = self._bank.take(cycle)
         said = self._listener.hear(cycle, *drawn, figures) if fit and cycle.complete else None
         if said is None:
             return None

@@ -1,0 +1,109 @@
+"""What was drawn of some cycles, kept for later ones that go alike: these need not be stepped.
+
+A signature follows from how a cycle goes: its phases, how long each lasts, and the levels that the
+model is set on. Where these hardly differ, it is the same, counted from the beginning of a phase.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from twin.model import kernel
+from twin.monitor.bins import Floats, Ints
+from twin.signals import MBAR, MS, NS
+
+KEPT = 8  # drawings: a program or two, with what jitters
+LONGER = 0.02  # of how long a stretch lasts; signatures differ by about as large a share of them
+LONGER_MS = 6.0  # or so much, in a short one
+LEVEL = 3.0 * MBAR  # Pa, by which a level may differ
+
+
+@dataclass(frozen=True)
+class Stretches:
+    """How a cycle goes, or has gone so far: from one bend of what is expected to the next."""
+
+    first: Ints  # row of each
+    phases: bytes
+    # From its first row to its last: rows, and ms of PLC time; and the level (Pa) that the model is
+    # set on where it begins, 0 for none. (stretches, 3)
+    how: Floats
+    may_differ: Floats  # by which those of another cycle may differ, (stretches, 3)
+
+    @classmethod
+    def of(cls, rows: npt.NDArray[np.void]) -> "Stretches":
+        """Those of the bank's rows of a cycle, of which the first begins one."""
+        first = np.flatnonzero(rows["bends"])
+        last = np.append(first[1:], len(rows)) - 1
+        ms = (rows["time_ns"][last] - rows["time_ns"][first]) * (NS / MS)
+        how = np.column_stack([last - first, ms, np.nan_to_num(rows["level"][first])])
+        may_differ = np.maximum(LONGER * how, LONGER_MS)
+        may_differ[:, 2] = LEVEL
+        return cls(first, rows["phase"][first].tobytes(), how, may_differ)
+
+    def go_as(self, known: "Stretches", whole: bool) -> bool:
+        """Whether a cycle goes as a known one; if it is not ``whole`` yet, whether it still may.
+
+        What does not go alike so far never will: no later row makes it alike again.
+        """
+        if not known.phases.startswith(self.phases):
+            return False
+        more = self.how - known.how[: len(self.how)]
+        if not whole:
+            more[-1, :2] = np.maximum(more[-1, :2], 0.0)  # the last goes on
+        elif len(self.how) < len(known.how):
+            return False
+        return bool(np.all(np.abs(more) <= known.may_differ[: len(more)]))
+
+    def far(self, known: "Stretches") -> float:
+        """How much a whole cycle differs from a known one that it goes as."""
+        return float(np.sum(np.abs(self.how - known.how) / known.may_differ))
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What each hypothesis expects in a cycle, and where the models stand at its end."""
+
+    stretches: Stretches
+    drawn: Ints  # rows; the last of every stretch is one of them
+    expected: Floats  # Pa, (drawn, hypotheses)
+    state: kernel.State
+
+    def at(self, stretches: Stretches, drawn: Ints) -> Floats:
+        """What is expected (Pa) at rows of another cycle that goes alike.
+
+        As many rows after the beginning of the stretch; what lasts longer stays as at its end.
+        """
+        number = np.searchsorted(stretches.first, drawn, "right") - 1
+        since = np.minimum(drawn - stretches.first[number], self.stretches.how[number, 0])
+        rows = self.stretches.first[number] + since.astype(np.int64)
+        there: Floats = self.expected[np.searchsorted(self.drawn, rows)]
+        return there
+
+
+class Drawings:
+    """The last few that were of use."""
+
+    def __init__(self) -> None:
+        self._kept: list[Drawing] = []  # the last used comes last
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def add(self, drawing: Drawing) -> None:
+        """Keep one more; the one that was of no use for longest goes."""
+        self._kept = [*self._kept, drawing][-KEPT:]
+
+    def may_be(self, stretches: Stretches) -> bool:
+        """Whether a cycle that has gone like this so far may yet turn out to go as a known one."""
+        return any(stretches.go_as(one.stretches, whole=False) for one in self._kept)
+
+    def like(self, stretches: Stretches) -> Drawing | None:
+        """The drawing of the cycle that a whole one goes most alike, if there is one."""
+        alike = [one for one in self._kept if stretches.go_as(one.stretches, whole=True)]
+        if not alike:
+            return None
+        nearest = min(alike, key=lambda one: stretches.far(one.stretches))
+        self._kept = [one for one in self._kept if one is not nearest]
+        self.add(nearest)
+        return nearest
