@@ -5,16 +5,17 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import median_filter
 
 from twin.signals import Phase
 
-SMOOTH = 5  # readings; their median moves no edge, and one reading alone reaches nothing
 ENDS = (0.01, 0.99)  # quantiles that stand for the lowest and the highest reading
 LONGEST_HOLE = 0.01  # s without a reading, beyond which a switching may have been missed
 
 Floats = npt.NDArray[np.float64]
 Bytes = npt.NDArray[np.uint8]
+
+# As plain numbers: with an enumeration NumPy makes eight bytes of every phase to compare it.
+_SUCTION, _HOLD, _BLOW_OFF = int(Phase.SUCTION), int(Phase.HOLD), int(Phase.BLOW_OFF)
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Course:
     @cached_property
     def suction_rows(self) -> int:
         """Rows until suction is not commanded any more."""
-        over = (self.phase != Phase.SUCTION) & (self.phase != Phase.HOLD)
+        over = (self.phase != _SUCTION) & (self.phase != _HOLD)
         return int(np.argmax(over)) if over.any() else len(self.phase)
 
     @cached_property
@@ -50,16 +51,14 @@ class Course:
     def blow_off_s(self) -> float:
         """How long blow-off was on."""
         steps = np.diff(self.time, append=self._at(len(self.time)))
-        return float(steps[self.phase == Phase.BLOW_OFF].sum())
+        return float(steps[self.phase == _BLOW_OFF].sum())
 
     @cached_property
     def nozzle(self) -> list[tuple[float, float]]:
         """When the nozzle was switched on and off (s), while suction was commanded."""
-        on = self.phase[: self.suction_rows] == Phase.SUCTION
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(np.int8)))
+        edges = _edges(self.phase[: self.suction_rows] == _SUCTION)
         times = [
-            self._end(int(row)) if number % 2 else self._begin(int(row))
-            for number, row in enumerate(edges)
+            self._end(row) if number % 2 else self._begin(row) for number, row in enumerate(edges)
         ]
         in_order = np.maximum.accumulate(times) if times else np.empty(0)
         return [(float(on), float(off)) for on, off in in_order.reshape(-1, 2)]
@@ -67,9 +66,8 @@ class Course:
     @cached_property
     def hold(self) -> slice:
         """Rows of the first stretch with the nozzle off; empty where there is none."""
-        held = self.phase[: self.suction_rows] == Phase.HOLD
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], held, [False]]).astype(np.int8)))
-        return slice(int(edges[0]), int(edges[1])) if len(edges) else slice(0, 0)
+        edges = _edges(self.phase[: self.suction_rows] == _HOLD)
+        return slice(edges[0], edges[1]) if edges else slice(0, 0)
 
     @cached_property
     def seamless(self) -> bool:
@@ -85,14 +83,18 @@ class Course:
         there = np.isfinite(vacuum)
         if not there.any():
             return np.empty(0), np.empty(0)
-        smoothed: Floats = median_filter(vacuum[there], SMOOTH, mode="nearest")
-        return self.time[: self.suction_rows][there], smoothed
+        return self.time[: self.suction_rows][there], _smoothed(vacuum[there])
 
     @cached_property
     def supplies(self) -> Floats:
         """What the supply read while the nozzle was on (bar)."""
-        there: Floats = self.supply[(self.phase == Phase.SUCTION) & np.isfinite(self.supply)]
+        there: Floats = self.supply[(self.phase == _SUCTION) & np.isfinite(self.supply)]
         return there
+
+    @cached_property
+    def mean_supply(self) -> float:
+        """The mean of it (bar); NaN where there is none."""
+        return float(self.supplies.mean()) if len(self.supplies) else float("nan")
 
     @cached_property
     def supply_ends(self) -> Floats:
@@ -131,3 +133,23 @@ class Course:
         if row < len(self.time):
             return float(self.time[row])
         return float(self.time[-1] + (self.time[-1] - self.time[-2] if row > 1 else 0.0))
+
+
+def _edges(on: npt.NDArray[np.bool_]) -> list[int]:
+    """Rows from which on it is on, and from which on it is not, in turn."""
+    changes = (np.flatnonzero(on[1:] != on[:-1]) + 1).tolist()
+    return [*([0] if on[:1].any() else []), *changes, *([len(on)] if on[-1:].any() else [])]
+
+
+def _smoothed(values: Floats) -> Floats:
+    """The median of five neighbours: it moves no edge, and one reading alone reaches nothing.
+
+    Of four the least and the greatest cannot be it, so it is that of the other two and the fifth.
+    """
+    padded = np.concatenate([values[:1], values[:1], values, values[-1:], values[-1:]])
+    a, b, middle, c, d = (padded[first : first + len(values)] for first in range(5))
+    low = np.maximum(np.minimum(a, b), np.minimum(c, d))
+    high = np.minimum(np.maximum(a, b), np.maximum(c, d))
+    low, high = np.minimum(low, high), np.maximum(low, high)
+    result: Floats = np.maximum(low, np.minimum(high, middle))
+    return result

@@ -162,7 +162,7 @@ def quick_switchings(course: Course, _unit: Unit) -> float:
 
 def supply(course: Course, _unit: Unit) -> float:
     """Mean operating pressure while the nozzle was on (bar)."""
-    return float(course.supplies.mean()) if len(course.supplies) else UNKNOWN
+    return course.mean_supply
 
 
 def lowest_supply(course: Course, _unit: Unit) -> float:
