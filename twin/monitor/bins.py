@@ -57,15 +57,17 @@ def _add_lines(number, kept, values, sums):  # type: ignore[no-untyped-def]
     for after in range(len(kept)):
         before = max(after - 1, 0)
         first, last = kept[before], kept[after]
+        left, right = values[before], values[after]
         for row in range(first + 1, last):
             if number[row] >= 0:
                 share = (last - row) / (last - first)
-                for i in range(values.shape[1]):
-                    line = share * values[before, i] + (1.0 - share) * values[after, i]
-                    sums[number[row], i] += line
+                total = sums[number[row]]
+                for i in range(len(total)):
+                    total[i] += share * left[i] + (1.0 - share) * right[i]
         if number[last] >= 0:  # whatever is beside it
-            for i in range(values.shape[1]):
-                sums[number[last], i] += values[after, i]
+            total = sums[number[last]]
+            for i in range(len(total)):
+                total[i] += right[i]
 
 
 def warped(seconds: Floats) -> Floats:
@@ -93,21 +95,20 @@ def binned(
 
     What comes before the first of them belongs to cycle -1.
     """
-    rows = np.arange(len(phase))
     begins = np.diff(phase, prepend=255) != 0
-    begins[starts[starts < len(rows)]] = True
+    begins[starts[starts < len(phase)]] = True
     first = np.flatnonzero(begins)
     stretch = np.cumsum(begins) - 1
-    time = warped((rows - first[stretch]) * MS)
+    time = warped((np.arange(len(phase)) - first[stretch]) * MS)
     step = np.floor(time * per_unit).astype(np.int64)
     place = (stretch << 16) + step
-    _, at, number, count = np.unique(
-        place[usable], return_index=True, return_inverse=True, return_counts=True
-    )
-    here = rows[usable][at]
+    used = np.flatnonzero(usable)
+    new = np.diff(place[used], prepend=-1) != 0  # places only grow
+    at = np.flatnonzero(new)
+    here, count = used[at], np.diff(at, append=len(used))
     kind = kinds(phase[first], phase[np.maximum(first - 1, 0)])[stretch[here]]
     result = np.full(len(phase), -1)
-    result[usable] = number
+    result[used] = np.cumsum(new) - 1
     cycle = np.searchsorted(starts, here, "right") - 1
     alike = (kind << 16) + step[here]
     return Bins(result, count, cycle, stretch[here], kind, time[here], alike)

@@ -6,10 +6,10 @@ and both are held against each suspect's signature, weighed by what healthy cycl
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import block_diag
 
 from twin.model.dataset import DataSet, coefficients
 from twin.model.theta import Theta
@@ -146,16 +146,31 @@ class Listener:
             suspects,
             larger,
             ways - suspects[:, [UNSURE_OF]],
-            block_diag(covariance * self.healthy.leftover**2, np.diag(self._sigmas[shown] ** 2)),
+            _beside(covariance * self.healthy.leftover**2, self._sigmas[shown] ** 2),
             np.concatenate([common, self._sigmas[shown]]),
         )
 
     def _moves(self, signatures: Floats) -> Floats:
         """By how much (mbar) what scatters moves each bin, one sigma of it, (bins, scatters)."""
-        columns = [np.empty((len(signatures), 0))]
+        numbers, sigmas = self._scatters
+        moves: Floats = signatures[:, numbers] * sigmas
+        return moves
+
+    @cached_property
+    def _scatters(self) -> tuple[list[int], list[float]]:
+        """Which suspects scatter in healthy cycles, and one sigma of each in its steps."""
+        numbers, sigmas = [], []
         for number, one in enumerate(SUSPECTS):
             parameter, usual = SCATTER.get(one.effect, ("", 0.0))
             if parameter == one.parameter.name:
-                sigma = self.healthy.scatter.get(one.effect, usual)
-                columns.append(signatures[:, [number]] * (sigma / one.step))
-        return np.hstack(columns)
+                numbers.append(number)
+                sigmas.append(self.healthy.scatter.get(one.effect, usual) / one.step)
+        return numbers, sigmas
+
+
+def _beside(covariance: Floats, variances: Floats) -> Floats:
+    """The covariance together with what varies by itself."""
+    count = len(covariance)
+    whole = np.diag(np.concatenate([np.zeros(count), variances]))
+    whole[:count, :count] = covariance
+    return whole

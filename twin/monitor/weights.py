@@ -19,7 +19,7 @@ SCATTER: Mapping[str, tuple[str, float]] = {
 }
 KNEE_MBAR = 0.7  # the level at a knee is not found better, and the model is set onto it
 FIRST_ERROR = ModelError(after_ms=(0.0,), common_mbar=(2.0,), alone_mbar=(0.5,))  # nothing known
-_AFTER_KNEE = [KINDS.index("hold"), AGAIN]
+_HOLD = KINDS.index("hold")  # it begins with a knee, as AGAIN does
 _ERRORS = ("common_mbar", "alone_mbar")
 
 
@@ -31,6 +31,8 @@ def model_error(known: Mapping[str, ModelError], kind: Ints, time: Floats) -> tu
     common, alone = np.empty(len(kind)), np.empty(len(kind))
     for number, name in enumerate(KINDS):
         here = kind == number
+        if not here.any():
+            continue
         error = known.get(name) or _like(known)
         knots = warped(np.array(error.after_ms) * MS)
         common[here] = np.interp(time[here], knots, error.common_mbar)
@@ -60,6 +62,6 @@ def from_cycle_to_cycle(
     same = stretch[:, None] == stretch
     covariance: Floats = moves @ moves.T * (cycle[:, None] == cycle)
     covariance += np.outer(alone, alone) * (np.exp(-np.abs(time[:, None] - time)) * same)
-    covariance += KNEE_MBAR**2 * (same * np.isin(kind, _AFTER_KNEE))
+    covariance += KNEE_MBAR**2 * (same * ((kind == _HOLD) | (kind == AGAIN)))
     covariance[np.diag_indices_from(covariance)] += noise**2 / bins.count[here]
     return covariance
