@@ -51,6 +51,15 @@ class Estimate:
         )
 
 
+def _compared(newest: Samples) -> Integers:
+    """Receipts that can tell anything: where it is PLC time itself, there is one clock only.
+
+    A row each, of PLC time, receipt and sequence.
+    """
+    newest = newest[newest["host_ns"] != newest["time_ns"]]
+    return np.stack([newest[name] for name in ("time_ns", "host_ns", "sequence")], axis=1)
+
+
 def _long(ms: float) -> str:
     return f"{ms:.2f} ms" if ms < 1e4 else f"{ms / 1e3:.1f} s"
 
@@ -62,11 +71,13 @@ def line(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> tuple[float,
     """
     n = len(x)
     i, j = np.triu_indices(n, 1)
-    slopes = np.sort((y[j] - y[i]) / (x[j] - x[i]))
-    slope = float(np.median(slopes))
+    slopes = (y[j] - y[i]) / (x[j] - x[i])
+    middle = [(len(slopes) - 1) // 2, len(slopes) // 2]
     reach = 1.96 * np.sqrt(n * (n - 1) * (2 * n + 5) / 18)
     low = max(round((len(slopes) - reach) / 2) - 1, 0)
     high = min(round((len(slopes) + reach) / 2), len(slopes) - 1)
+    slopes.partition([low, *middle, high])  # of thousands only these need be in their places
+    slope = float(np.mean(slopes[middle]))
     at_end = float(np.median(y - slope * (x - x[-1])))
     return slope, float(slopes[high] - slopes[low]) / 2, at_end
 
@@ -101,8 +112,13 @@ class ClockWatch:
         rows = joined(self._receipt, samples)
         self._receipt = rows[-1:].copy()
         self._learn(samples)
-        for time_ns, host_ns, sequence in self._compared(rows[:-1][np.diff(rows["host_ns"]) != 0]):
-            events += self._take(time_ns, host_ns, sequence)
+        receipts = _compared(rows[:-1][np.diff(rows["host_ns"]) != 0])
+        while len(receipts):
+            if plain := self._plain(receipts):
+                self._take_plain(receipts[:plain])
+            else:
+                events += self._take(*receipts[0].tolist())
+            receipts = receipts[max(plain, 1) :]
         return events
 
     def close(self) -> list[Event]:
@@ -127,11 +143,32 @@ class ClockWatch:
             us = np.median(np.diff(self._lead["time_ns"]) / scans) / 1e3
             self._period = max(float(np.rint(us)), 1.0) * 1e3
 
-    def _compared(self, newest: Samples) -> Iterator[tuple[int, int, int]]:
-        """Receipts that can tell anything: where it is PLC time itself, there is one clock only."""
-        newest = newest[newest["host_ns"] != newest["time_ns"]]
-        columns = (newest[name].tolist() for name in ("time_ns", "host_ns", "sequence"))
-        return zip(*columns, strict=True)
+    def _plain(self, receipts: Integers) -> int:
+        """How many of the first receipts only say how fast they were: nearly always all.
+
+        In the window under way, and no clock was set, as ``_was_set`` would find one by one.
+        """
+        if self._zero is None or self._apart or self._aside:
+            return 0
+        time_ns, _, sequence = receipts.T
+        scans = np.diff(sequence, prepend=self._last[1])
+        counted = (scans > 0) & (scans <= FARTHEST) & (self._period > 0.0)
+        apart = np.diff(time_ns, prepend=self._last[0]) - scans * self._period
+        here = (time_ns - self._zero[0]) // WINDOW_NS == self._window
+        plain = here & ~(counted & (np.abs(apart) >= self._far))
+        return len(plain) if plain.all() else int(np.argmin(plain))
+
+    def _take_plain(self, receipts: Integers) -> None:
+        """The same as ``_take`` of each, where it is only how fast they were."""
+        assert self._zero is not None
+        time_ns, host_ns, sequence = receipts.T
+        since = time_ns - self._zero[0]
+        ways = host_ns - sum(self._zero) - since
+        first = int(np.argmin(ways))
+        if self._fastest is None or ways[first] < self._fastest[1]:
+            self._fastest = int(since[first]), int(ways[first])
+        self._ways += ways.tolist()
+        self._last = int(time_ns[-1]), int(sequence[-1])
 
     def _take(self, time_ns: int, host_ns: int, sequence: int) -> Iterator[Event]:
         way = host_ns - time_ns
@@ -153,6 +190,11 @@ class ClockWatch:
 
     # --- a clock that was set -------------------------------------------------------------------
 
+    @property
+    def _far(self) -> float:
+        """From how much (ns) on PLC time may have been set."""
+        return max(SET_NS, 2 * self._period)
+
     def _was_set(self, time_ns: int, sequence: int) -> float | None:
         """By how much (ns) PLC time moved against the count some receipts ago, if it stayed so."""
         scans = sequence - self._last[1]
@@ -161,7 +203,7 @@ class ClockWatch:
             self._aside.clear()
             return None
         self._apart += time_ns - self._last[0] - scans * self._period
-        if abs(self._apart) < max(SET_NS, 2 * self._period):
+        if abs(self._apart) < self._far:
             self._apart = 0.0  # the count's own clock may run a little differently
             self._aside.clear()
             return None
