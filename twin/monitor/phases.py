@@ -143,15 +143,18 @@ def _break_at(pressure, row, window, noise, nozzle_on):  # type: ignore[no-untyp
     Nozzle off: pressure fell and now does not fall any more. Nozzle on: it did not fall, now does.
     Slopes across a jump (a sensor that has come loose) differ as well.
     """
-    left, left_mean = _line(pressure, row - window, window + 1)
-    right, _ = _line(pressure, row, window + 1)
     sigma = noise * math.sqrt(12.0 / float(window + 1) ** 3)
+    right, _ = _line(pressure, row, window + 1)
+    may_follow = right > -3.0 * sigma if nozzle_on else right < -3.0 * sigma
+    if not may_follow:  # so it is on nearly all rows: what was before need not be known
+        return 0.0, math.nan
+    left, left_mean = _line(pressure, row - window, window + 1)
     significance = (right - left) / (math.sqrt(2.0) * sigma)
     if nozzle_on:
-        is_knee = left < 3.0 * sigma and right > -3.0 * sigma
+        is_knee = left < 3.0 * sigma
     else:
         significance = -significance
-        is_knee = left > -3.0 * sigma and right < -3.0 * sigma
+        is_knee = left > -3.0 * sigma
     level = left_mean + left * window / 2.0  # what follows may ring
     if not is_knee or significance < SIGNIFICANT:
         return 0.0, level
@@ -171,12 +174,15 @@ def _find(state, pressure, commands, first, look, phase, level):  # type: ignore
     stretch, where the rows after are missing). A knee reaches back by its shift.
     """
     window, settled = int(look[0]), look[3]
+    end = first  # of the rows with the same command
     for row in range(first, len(pressure)):
+        if row == end:
+            end = _end_of(commands, row)
         suction = commands[row] & 1 and not commands[row] & 2
         starts = suction and state[_AGE] < 0.0
         may_bend = suction and window > 0 and state[_AGE] >= settled + window
-        same = _unchanged(commands, row, window) if may_bend else 0
-        if may_bend and same < window and row + same + 1 == len(commands):
+        same = end - row - 1
+        if may_bend and same < window and end == len(commands):
             return row
         if suction:
             state[_AGE] = 0.0 if starts else state[_AGE] + 1.0
@@ -196,19 +202,17 @@ def _find(state, pressure, commands, first, look, phase, level):  # type: ignore
             if suction and state[_NOZZLE] > 0.0:
                 phase[row] = _SUCTION
         if suction and window > 0:
-            _look(state, pressure, row, look, may_bend and same == window, phase, level)
+            _look(state, pressure, row, look, may_bend and same >= window, phase, level)
     return len(pressure)
 
 
 @compiled
-def _unchanged(commands, row, most):  # type: ignore[no-untyped-def]
-    """How many rows after ``row`` have its command, up to ``most`` or to the end."""
-    rows = 0
-    while rows < most and row + rows + 1 < len(commands):
-        if commands[row + rows + 1] != commands[row]:
-            break
-        rows += 1
-    return rows
+def _end_of(commands, row):  # type: ignore[no-untyped-def]
+    """The first row after ``row`` that has not its command."""
+    end = row + 1
+    while end < len(commands) and commands[end] == commands[row]:
+        end += 1
+    return end
 
 
 @compiled
