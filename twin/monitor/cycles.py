@@ -175,10 +175,12 @@ def figures(cycle: Cycle, ambient: float) -> dict[str, float]:
     off = deviation(cycle.samples, cycle.ticks) / MBAR
     result: dict[str, float] = {}
     broken_off = cycle.ticks["phase"][-1] if cycle.cut_short else None
+    known = np.isfinite(off)
+    off, phases = off[known], cycle.ticks["phase"][known]
     for phase in Phase:
-        there = off[(cycle.ticks["phase"] == phase) & np.isfinite(off)]
         if phase == broken_off:  # its beginning is no measure of all of it
             continue
+        there = off[phases == int(phase)]
         if len(there) >= FEWEST_ROWS:
             name = phase.name.lower()
             result[f"{name}_mean"] = float(np.mean(there))
