@@ -6,8 +6,11 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from twin.model.control import LEAK_SETTLE_S
 from twin.signals import Phase
 
+LEAK_WINDOW_S = 1.0  # after the settling, in which leakage is judged
+LEAST_WINDOW_S = 0.05  # noise of 0.3 mbar then gives 3 mbar/s
 ENDS = (0.01, 0.99)  # quantiles that stand for the lowest and the highest reading
 LONGEST_HOLE = 0.01  # s without a reading, beyond which a switching may have been missed
 
@@ -102,6 +105,18 @@ class Course:
         ends = np.quantile(self.supplies, ENDS) if len(self.supplies) else np.full(2, np.nan)
         return np.asarray(ends)
 
+    @cached_property
+    def leakage(self) -> float:
+        """Vacuum lost per time (mbar/s) in the first stretch of hold; NaN where it cannot tell."""
+        if not self.went_off or not self.seamless:
+            return float("nan")
+        time, vacuum = self.time[self.hold], self.vacuum[self.hold]
+        since = time - time[0] - LEAK_SETTLE_S
+        rows = (since >= 0.0) & (since <= LEAK_WINDOW_S) & np.isfinite(vacuum)
+        if not rows.any() or since[rows][-1] < LEAST_WINDOW_S:
+            return float("nan")
+        return -slope(time[rows], vacuum[rows])
+
     def reached(self, level: float) -> float:
         """Time (s) at which the vacuum comes to ``level`` (mbar); NaN if it does not, or unseen."""
         time, vacuum = self.smooth
@@ -133,6 +148,12 @@ class Course:
         if row < len(self.time):
             return float(self.time[row])
         return float(self.time[-1] + (self.time[-1] - self.time[-2] if row > 1 else 0.0))
+
+
+def slope(time: Floats, values: Floats) -> float:
+    """Of a straight line through the values, per second."""
+    centred = time - time.mean()
+    return float(centred @ values / (centred @ centred))
 
 
 def _edges(on: npt.NDArray[np.bool_]) -> list[int]:

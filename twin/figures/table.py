@@ -10,13 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.figures.course import Course, Floats
-from twin.model.control import LEAK_SETTLE_S, PROTECTED_S
+from twin.figures.course import Course, slope
+from twin.model.control import PROTECTED_S
 from twin.model.dataset import DataSet
 from twin.signals import BAR, MBAR, Phase
 
-LEAK_WINDOW_S = 1.0  # after the settling, in which leakage is judged
-LEAST_WINDOW_S = 0.05  # noise of 0.3 mbar then gives 3 mbar/s
 BANDS = (67.0, 133.0, 200.0)  # mbar/s, of leakage
 WORST_LEAKAGE = 500.0  # mbar/s: quality 0
 FREE_SUCTION_S = 1.0  # at least, for a free-flow vacuum
@@ -72,14 +70,7 @@ def t1(course: Course, unit: Unit) -> float:
 
 def leakage(course: Course, _unit: Unit) -> float:
     """Vacuum lost per time (mbar/s), by a straight line through the first stretch of hold."""
-    if not course.went_off or not course.seamless:
-        return UNKNOWN
-    time, vacuum = course.time[course.hold], course.vacuum[course.hold]
-    since = time - time[0] - LEAK_SETTLE_S
-    rows = (since >= 0.0) & (since <= LEAK_WINDOW_S) & np.isfinite(vacuum)
-    if not rows.any() or since[rows][-1] < LEAST_WINDOW_S:
-        return UNKNOWN
-    return -_slope(time[rows], vacuum[rows])
+    return course.leakage
 
 
 def leakage_band(course: Course, unit: Unit) -> float:
@@ -99,7 +90,7 @@ def free_flow(course: Course, unit: Unit) -> float:
         return UNKNOWN
     time, vacuum = course.smooth
     last = time >= course.suction_s - STEADY_S
-    if course.suction_s < FREE_SUCTION_S or abs(_slope(time[last], vacuum[last])) > STEADY:
+    if course.suction_s < FREE_SUCTION_S or abs(slope(time[last], vacuum[last])) > STEADY:
         return UNKNOWN
     found = float(vacuum[last].mean())
     return found if LEAST_FREE_FLOW <= found < unit.h1 and vacuum.max() < unit.h1 else UNKNOWN
@@ -186,12 +177,6 @@ def _pressed(course: Course, unit: Unit) -> float:
     ambient, nominal = unit.data.ambient.pressure_mbar * MBAR / BAR, unit.data.supply.nozzle_bar
     there = supply(course, unit)
     return 1.0 if math.isnan(there) else (there + ambient) / (nominal + ambient)
-
-
-def _slope(time: Floats, values: Floats) -> float:
-    """Of a straight line through the values, per second."""
-    centred = time - time.mean()
-    return float(centred @ values / (centred @ centred))
 
 
 def _percent(share: float) -> float:
