@@ -95,7 +95,7 @@ def binned(
 
     What comes before the first of them belongs to cycle -1.
     """
-    begins = np.diff(phase, prepend=255) != 0
+    begins = _changes(phase)
     begins[starts[starts < len(phase)]] = True
     first = np.flatnonzero(begins)
     stretch = np.cumsum(begins) - 1
@@ -103,15 +103,22 @@ def binned(
     step = np.floor(time * per_unit).astype(np.int64)
     place = (stretch << 16) + step
     used = np.flatnonzero(usable)
-    new = np.diff(place[used], prepend=-1) != 0  # places only grow
+    new = _changes(place[used])  # places only grow
     at = np.flatnonzero(new)
-    here, count = used[at], np.diff(at, append=len(used))
+    here, count = used[at], np.diff(np.append(at, len(used)))
     kind = kinds(phase[first], phase[np.maximum(first - 1, 0)])[stretch[here]]
     result = np.full(len(phase), -1)
     result[used] = np.cumsum(new) - 1
     cycle = np.searchsorted(starts, here, "right") - 1
     alike = (kind << 16) + step[here]
     return Bins(result, count, cycle, stretch[here], kind, time[here], alike)
+
+
+def _changes(values: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
+    """Where a value is not the one before it; so is the first one."""
+    changes = np.ones(len(values), np.bool_)
+    np.not_equal(values[1:], values[:-1], out=changes[1:])
+    return changes
 
 
 def sparse(begins: npt.NDArray[np.bool_]) -> Ints:

@@ -122,7 +122,8 @@ class Listener:
             return None
         bins = binned(cycle.ticks["phase"], usable, np.zeros(1, np.int64), PER_UNIT)
         moved = (expected[:, 1:] - expected[:, :1]) / MBAR
-        signatures = bins.through(drawn, np.where(known[:, None], moved, 0.0))
+        moved[~known] = 0.0
+        signatures = bins.through(drawn, moved)
         return self._with_levels(bins, bins.mean(off), signatures, figures)
 
     def _with_levels(
