@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from twin.signals import Samples, Ticks
     from twin.view import Screen
 
+GARBAGE = 20_000  # objects made and not let go of, after which Python looks for garbage
 INTERRUPTED = 130
 ALARMED = 1
 
@@ -429,6 +430,7 @@ def main() -> None:
     """Run the command line; errors become one message with a hint, and the exit code."""
     # Matrices are small here: more threads only wait for each other, on cores that others need.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when a command imports NumPy
+    gc.set_threshold(GARBAGE)  # of what is imported nothing is: looking is a tenth of the start
     try:
         app()
     except KeyboardInterrupt:
