@@ -148,8 +148,10 @@ class KeyFigures:
 
     def _given(self) -> CycleFigures:
         pieces, self._pieces = self._pieces, []
-        samples = joined(*(piece.samples for piece in pieces))
-        ticks = joined(*(piece.ticks for piece in pieces))
+        samples, ticks = pieces[0].samples, pieces[0].ticks
+        if len(pieces) > 1:
+            samples = joined(*(piece.samples for piece in pieces))
+            ticks = joined(*(piece.ticks for piece in pieces))
         last = ticks["phase"][-1]
         ended = last in _OVER
         seen = ended, bool(ended and not (pieces[-1].cut_short and last == Phase.BLOW_OFF))
