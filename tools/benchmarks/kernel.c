@@ -370,7 +370,7 @@ static double sensed_at(double value, const double *k)
 
 /* --- kernel.py ----------------------------------------------------------------------------- */
 
-#define LONGEST_STEP 1e-3
+#define LONGEST_STEP 0.01
 #define LONGEST_BRIDGE 0.1
 #define NEVER 1e9
 #define FINEST 24
