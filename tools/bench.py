@@ -172,8 +172,8 @@ BENCHMARKS = (
     Benchmark(
         "fmu",
         fmu.in_fmpy,
-        "Six cycles by `fmpy.simulate_fmu`, from the unpacked FMU to its last row, and by "
-        "`kernel.simulate`; processor time.",
+        "Six cycles by `fmpy.simulate_fmu`, from the unpacked FMU to its last row, driven by its "
+        "commands alone, and by `kernel.simulate`; processor time.",
         (Figure("exported FMU in FMPy: one row of 1 ms", "ns", "our model"),),
     ),
     Benchmark(
