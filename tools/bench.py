@@ -38,6 +38,7 @@ from benchmarks.figures import Benchmark, Figure, Run
 INTERRUPTED, TERMINATED = 130, 143
 BARE_FETCH = "bare socket that fetches the same registers"
 STARTED = "Python that imports numba, numpy, pydantic, typer"
+BARE_REPLAY = "decompression, the model in C, and the rows through zstd"
 
 BARE_OPCUA = "asyncua alone that reads the same arrays"
 
@@ -249,10 +250,11 @@ BENCHMARKS = (
     Benchmark(
         "replay",
         replay.end_to_end,
-        "`twin replay` over that log in a process of its own, start included; then its parts in "
-        "this process.",
+        "`twin replay` over that log into another in a process of its own, start included; the "
+        "floor decompresses, runs the model in C and writes the rows through zstd. Then its parts "
+        "in this process, over ten minutes, told for an hour.",
         (
-            Figure("replay: an hour, start to end", "s", "decompression and the model in C", 4.0),
+            Figure("replay: an hour, start to end", "s", BARE_REPLAY, 4.0),
             Figure("replay: speed", "× real time"),
             Figure("replay: phases and model", "s", "the model in C"),
             Figure("replay: monitor", "s"),
@@ -261,10 +263,11 @@ BENCHMARKS = (
     Benchmark(
         "length",
         growth.length,
-        "`twin replay` in a process of its own over the first 5, 10, 20 and 30 minutes of that "
-        "log; 24 hours with --long, else by the line. Peak memory is what was resident.",
+        "The same over the first 5 and 30 minutes of that log and all of it; with --long over 24 "
+        "hours, which are that hour again and again, else by the line. Peak memory is what was "
+        "resident.",
         (
-            Figure("replay of one more hour: time", "s", "decompression and the model in C"),
+            Figure("replay of one more hour: time", "s", BARE_REPLAY),
             Figure("replay of one more hour: memory", "MB"),
             Figure("replay of 24 hours: peak memory", "MB", STARTED, 500.0),
         ),
@@ -283,7 +286,8 @@ BENCHMARKS = (
         "diagnosis",
         diagnosis.end_to_end,
         "`twin diagnose` in a process of its own, start included, on all cores: 12 cycles with a "
-        "leak, and an hour in which one begins half-way; each has to name it.",
+        "leak, and an hour in which one begins half-way; each has to name it. Beside the hour "
+        "stands the replay of the one without a leak.",
         (
             Figure("diagnosis: 12 cycles", "s", "SciPy's least squares for that cause alone", 6.0),
             Figure("diagnosis: 12 cycles, peak memory", "MB", "twin replay"),

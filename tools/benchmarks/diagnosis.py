@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
-from benchmarks import log
+from benchmarks import log, replay
 from benchmarks.figures import Measured, Run
 from benchmarks.kernel import Driven, first_rows, timed
 from benchmarks.processes import TWIN, usage
@@ -18,7 +18,7 @@ from twin.log.reader import open_log
 from twin.model import kernel
 from twin.model.effects import apply
 
-REPEATS, LONG_REPEATS = 2, 7
+REPEATS, LONG_REPEATS = 3, 7
 SHORT_S = 2.0 + 13.2 * 3.2  # 12 complete cycles
 LEAK, PARAMETER, SIZE = "leakage", "sonic_flow", 2.0  # sl/min
 
@@ -32,26 +32,40 @@ def end_to_end(run: Run) -> Sequence[Measured]:
         run.folder / "leak in an hour.mcap",
         recorded(HOUR_S, [f"{LEAK}={SIZE}@{HOUR_S / 2}"]),
     )
-    return (*_measured(run, few, short), *_measured(run, many, None))
+    return (*_cycles(run, few, short), *_hour(run, many))
 
 
-def _measured(run: Run, path: Path, fitted: Recording | None) -> tuple[Measured, Measured]:
-    """The floor of the time is a fit where there is a recording for it, else the replay's."""
+def _cycles(run: Run, path: Path, recording: Recording) -> tuple[Measured, Measured]:
+    """Beside a fit of the leak alone, and the memory of a replay."""
+    _diagnosed(run, path)  # compiles what is not compiled yet
+    ours, replays, fits = [], [], []
     repeats = LONG_REPEATS if run.long else REPEATS
+    for number in range(repeats):
+        run.tell(f"diagnosis: 12 cycles, {number + 1} of {repeats}")
+        ours.append(_diagnosed(run, path))
+        replays.append(usage([TWIN, "replay", path])[1])
+        fits.append(_fit(path, recording))
+    times, memories = zip(*ours, strict=True)
+    return Measured(times, fits), Measured(memories, replays)
+
+
+def _hour(run: Run, path: Path) -> tuple[Measured, Measured]:
+    """Beside the replay of an hour without the leak."""
+    floor, ours = replay.replays(run, 60), []
+    for number in range(REPEATS):
+        run.tell(f"diagnosis: an hour, {number + 1} of {REPEATS}")
+        ours.append(_diagnosed(run, path))
+    times, memories = zip(*ours, strict=True)
+    return Measured(times, floor.times), Measured(memories, floor.memories)
+
+
+def _diagnosed(run: Run, path: Path) -> tuple[float, float]:
+    """Time (s) and peak memory (MB) of a diagnosis, which has to be right."""
     answer = run.folder / "answer.json"
-    usage([TWIN, "diagnose", path, "--json", answer])  # compiles what is not compiled yet
+    used = usage([TWIN, "diagnose", path, "--json", answer])
     named = [cause["effect"] for cause in json.loads(answer.read_text())["causes"]]
     assert named == [LEAK], f"the diagnosis named {named}"
-    ours, replays, fits = [], [], []
-    for number in range(repeats):
-        run.tell(f"diagnosis: {path.stem}, {number + 1} of {repeats}")
-        ours.append(usage([TWIN, "diagnose", path, "--json", answer]))
-        replays.append(usage([TWIN, "replay", path]))
-        if fitted is not None:
-            fits.append(_fit(path, fitted))
-    times, memories = zip(*ours, strict=True)
-    replay_times, replay_memories = zip(*replays, strict=True)
-    return Measured(times, fits or replay_times), Measured(memories, replay_memories)
+    return used
 
 
 def _fit(path: Path, recording: Recording) -> float:

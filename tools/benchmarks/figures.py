@@ -53,6 +53,11 @@ class Line:
         return (self.most - self.rest) / self.slope
 
 
+def medians(runs: Sequence[Sequence[float]]) -> list[float]:
+    """Costs at several sizes from repeated runs over all of them."""
+    return [median(column) for column in zip(*runs, strict=True)]
+
+
 @dataclass(frozen=True)
 class Measured:
     """Repetitions of a figure and of its floor, in the figure's unit.

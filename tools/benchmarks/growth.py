@@ -6,22 +6,21 @@ import time
 import tracemalloc
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import median
 
 import numpy as np
 import psutil
 
-from benchmarks import kernel, log, plant
+from benchmarks import kernel, plant, replay
 from benchmarks.acquisition import bare_share, lost
-from benchmarks.figures import Line, Measured, Run
+from benchmarks.figures import Line, Measured, Run, medians
 from benchmarks.machine import TWIN_CORE, on_core
 from benchmarks.processes import TWIN, plc, usage
-from benchmarks.recording import HOUR_S, hour
+from benchmarks.recording import hour
 from twin.log.recorder import Recorder
 from twin.model import kernel as model
 
 REPEATS = 3
-MINUTES = (5, 10, 20, 30)
+MINUTES = (5, 30, 60)
 DAY_H = 24
 MOST_MB = 500.0  # that a replay may have
 HYPOTHESES = (8, 16, 32, 64)
@@ -39,57 +38,40 @@ def _grown(
     return Measured(slopes, floors, note=f"{line.off:.1f} % from a line at most", line=line)
 
 
-def _medians(runs: Sequence[Sequence[float]]) -> list[float]:
-    return [median(column) for column in zip(*runs, strict=True)]
-
-
 # --- the length of a log --------------------------------------------------------------------------
 
 
 def length(run: Run) -> Sequence[Measured]:
     """Time and peak memory of replays of logs of several lengths, and of one of a day."""
-    run.tell("length: writing logs")
     hours = [minutes / 60.0 for minutes in MINUTES]
-    paths = [
-        log.keep(run.folder / f"{minutes} min.mcap", hour(), minutes * 60_000)
-        for minutes in MINUTES
-    ]
-    native = kernel.in_c(run.folder)
-    times, memories, floors, imports = [], [], [], []
+    each = [replay.replays(run, minutes) for minutes in MINUTES]
+    times, floors, memories = (
+        list(zip(*columns, strict=True))
+        for columns in zip(*((one.times, one.floors, one.memories) for one in each), strict=True)
+    )
+    time_line = Line("replay, s", "hours of log", hours, medians(times))
+    spent = f"{MOST_MB:g} MB"
+    line = Line("replay, MB", "hours of log", hours, medians(memories), MOST_MB, spent)
+    day, note = line.rest + DAY_H * line.slope, "by the line, which short logs make too steep"
     with on_core(TWIN_CORE):
-        usage([TWIN, "replay", paths[0]])  # compiles what is not compiled yet
-        for number in range(REPEATS):
-            run.tell(f"length: {number + 1} of {REPEATS}")
-            used = [usage([TWIN, "replay", path]) for path in paths]
-            times.append([seconds for seconds, _ in used])
-            memories.append([most for _, most in used])
-            imports.append(usage(IMPORTS)[1])
-            if native is not None:
-                bare = [_bare(path, native, part) for path, part in zip(paths, hours, strict=True)]
-                floors.append(Line("", "", hours, bare).slope)
-        time_line = Line("replay, s", "hours of log", hours, _medians(times))
-        spent = f"{MOST_MB:g} MB"
-        costs = _medians(memories)
-        line = Line("replay, MB", "hours of log", hours, costs, MOST_MB, spent)
-        day, note = line.rest + DAY_H * line.slope, "by the line, which short logs make too steep"
+        imports = [usage(IMPORTS)[1] for _ in range(REPEATS)]
         if run.long:
             run.tell("length: a day")
-            day, note = usage([TWIN, "replay", _day(run.folder / "day.mcap")])[1], "measured"
+            day, note = _replay_of_a_day(run.folder)
     return (
-        _grown(hours, times, time_line, floors),
+        _grown(hours, times, time_line, [Line("", "", hours, one).slope for one in floors]),
         _grown(hours, memories, line, ()),
         Measured([day], imports, note=note, valid=run.long),
     )
 
 
-def _bare(path: Path, native: kernel.Advance, hours: float) -> float:
-    """Time (s) to decompress a log, and of the model in C for its rows."""
-    begin = time.perf_counter()
-    log.unpack(log.packed(path))
-    seconds = time.perf_counter() - begin
-    rows = round(hours * HOUR_S * 1000)
-    one = kernel.timed(native, hour().theta, kernel.first_rows(hour(), rows))[0]
-    return seconds + one * 1e-9 * rows
+def _replay_of_a_day(folder: Path) -> tuple[float, str]:
+    """Peak memory (MB) of it, and how long it took."""
+    path, again = _day(folder / "day.mcap"), folder / "day again.mcap"
+    seconds, most = usage([TWIN, "replay", path, "-o", again])
+    path.unlink()
+    again.unlink()
+    return most, f"measured, in {seconds:.0f} s"
 
 
 def _day(path: Path) -> Path:
@@ -126,7 +108,7 @@ def hypotheses(run: Run) -> Sequence[Measured]:
                 floors.append(_slope_in_c(vectors, banks, rows))
     memories = [[_memory(theta, rows) for theta in together]]
     spent = "a row each ms, on one core"
-    line = Line("a row, ns", "hypotheses", HYPOTHESES, _medians(times), A_ROW_NS, spent)
+    line = Line("a row, ns", "hypotheses", HYPOTHESES, medians(times), A_ROW_NS, spent)
     memory = Line("10 000 rows, MB", "hypotheses", HYPOTHESES, memories[0])
     return _grown(HYPOTHESES, times, line, floors), _grown(HYPOTHESES, memories, memory, ())
 
@@ -165,7 +147,7 @@ def ejectors(run: Run) -> Sequence[Measured]:
     with plc() as port, on_core(TWIN_CORE):
         floors = [bare_share(port) for _ in range(SLICES)]
     runs = list(zip(*shares, strict=True))
-    line = Line("CPU, %", "ejectors", EJECTORS, _medians(runs), 100.0, "a core")
+    line = Line("CPU, %", "ejectors", EJECTORS, medians(runs), 100.0, "a core")
     memory = Line("memory, MB", "ejectors", EJECTORS, memories)
     return (
         Measured(

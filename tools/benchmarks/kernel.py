@@ -117,12 +117,6 @@ def _compared(expected: Floats, native: Floats) -> str:
     return f"with results up to {worst:.0e} from the C's: is kernel.c behind?"
 
 
-def over_hour(native: Advance) -> float:
-    """Processor time (s) of ``native`` for every row of the hour."""
-    rows = len(hour().samples)
-    return timed(native, hour().theta, first_rows(hour(), rows))[0] * 1e-9 * rows
-
-
 def in_c(folder: Path, options: Sequence[str] = PLAIN) -> Advance | None:
     """``kernel.advance`` in C for one hypothesis, or for ``LANES`` with VECTORS.
 

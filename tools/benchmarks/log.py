@@ -16,7 +16,7 @@ from pyarrow import parquet
 
 from benchmarks.figures import Measured, Run
 from benchmarks.machine import TWIN_CORE, on_core
-from benchmarks.recording import BLOCK, Recording, hour
+from benchmarks.recording import BLOCK, MINUTE, Recording, hour
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
 from twin.log.schema import CHANNELS, SAMPLES
@@ -42,9 +42,9 @@ class _Taken(NamedTuple):
 def files(run: Run) -> Sequence[Measured]:
     """Bytes per sample, time (s) to write an hour and to read it; the same of other ways."""
     run.tell("log: simulating the rig")
-    log = hour_log(run.folder)
+    log = part_log(run.folder)
     chunks = packed(log)
-    ours, bare = _by_turns(run, _Way(write, read), _Way(_write_bare, lambda _: unpack(chunks)))
+    ours, bare = _by_turns(run, _Way(write, read), _Way(write_bare, lambda _: unpack(chunks)))
     messages, table = _messages(log), _table()  # 200 MB, beside which nothing of ours is measured
     others = _by_turns(
         run,
@@ -69,12 +69,10 @@ def _by_turns(run: Run, *ways: _Way) -> list[_Taken]:
     return taken
 
 
-def hour_log(folder: Path) -> Path:
-    """A log of the hour; written when it is first asked for."""
-    path = folder / "hour.mcap"
-    if not path.exists():
-        write(path)
-    return path
+def part_log(folder: Path, minutes: int = 60) -> Path:
+    """A log of the hour, or of its first minutes; written when it is first asked for."""
+    path = folder / f"{minutes} min.mcap"
+    return path if path.exists() else keep(path, hour(), minutes * MINUTE)
 
 
 def write(path: Path) -> None:
@@ -109,11 +107,11 @@ def unpack(chunks: list[tuple[bytes, int]]) -> None:
         decompressor.decompress(data, max_output_size=size)
 
 
-def _write_bare(path: Path) -> None:
-    """The rows as they lie in memory, through zstd to the file."""
+def write_bare(path: Path, rows: int | None = None) -> None:
+    """The rows as they lie in memory, or about the first ``rows``, through zstd to the file."""
     compressor = zstandard.ZstdCompressor()
     with path.open("wb") as file:
-        for samples, ticks in hour().blocks():
+        for samples, ticks in hour().blocks()[: rows and rows // BLOCK]:
             file.write(compressor.compress(samples.tobytes() + ticks.tobytes()))
 
 

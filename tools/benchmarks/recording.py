@@ -18,6 +18,7 @@ from twin.settings import Document
 from twin.signals import MBAR, MS, NS, Samples, Ticks
 
 HOUR_S = 3600.0
+MINUTE = 60_000  # rows
 BLOCK = 10_000  # rows, as a replay takes them
 LIVE_BLOCK = 30  # rows that a live driver receives at once
 

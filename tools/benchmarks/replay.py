@@ -4,62 +4,102 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from benchmarks import log
 from benchmarks.figures import Measured, Run
-from benchmarks.kernel import in_c, over_hour
+from benchmarks.kernel import Advance, first_rows, in_c, timed
 from benchmarks.machine import TWIN_CORE, on_core
-from benchmarks.processes import TWIN
-from benchmarks.recording import HOUR_S, hour, new_twin
+from benchmarks.processes import TWIN, usage
+from benchmarks.recording import BLOCK, HOUR_S, MINUTE, hour, new_twin
 from twin.log.recorder import Recorder
 from twin.monitor.detect import Monitor
+from twin.signals import Samples, Ticks
 
 REPEATS = 3
 STARTS = 7
+HOUR_MIN, PART_MIN = 60, 10  # the parts of a replay are measured over some minutes
+
+
+@dataclass(frozen=True)
+class Replays:
+    """Repeated replays of one log: time (s), the floor of it (s), and peak memory (MB)."""
+
+    times: Sequence[float]
+    floors: Sequence[float]
+    memories: Sequence[float]
 
 
 def end_to_end(run: Run) -> Sequence[Measured]:
     """Time (s) of ``twin replay`` over an hour, its speed, and the twin's and monitor's parts."""
-    run.tell("replay: simulating the rig")
-    path = log.hour_log(run.folder)
-    chunks, native = log.packed(path), in_c(run.folder)
-    whole, floors, model, expecting, monitoring = [], [], [], [], []
+    whole, native = replays(run, HOUR_MIN), in_c(run.folder)
+    model, expecting, monitoring = [], [], []
+    part = hour().blocks()[: PART_MIN * MINUTE // BLOCK]
     with on_core(TWIN_CORE):
-        _seconds([TWIN, "replay", path])  # compiles what is not compiled yet
         for number in range(REPEATS):
-            run.tell(f"replay: {number + 1} of {REPEATS}")
-            whole.append(_seconds([TWIN, "replay", path]))
+            run.tell(f"replay: its parts, {number + 1} of {REPEATS}")
             if native is not None:
-                begin = time.perf_counter()
-                log.unpack(chunks)
-                model.append(over_hour(native))
-                floors.append(time.perf_counter() - begin)
-            expecting.append(_expect())
-            monitoring.append(_monitor())
-    speeds = [HOUR_S / seconds for seconds in whole]
+                model.append(_in_c(native, PART_MIN) * HOUR_MIN / PART_MIN)
+            expecting.append(_expect(part) * HOUR_MIN / PART_MIN)
+            monitoring.append(_monitor(part) * HOUR_MIN / PART_MIN)
+    speeds = [HOUR_S / seconds for seconds in whole.times]
     return (
-        Measured(whole, floors),
+        Measured(whole.times, whole.floors),
         Measured(speeds),
         Measured(expecting, model),
         Measured(monitoring),
     )
 
 
-def _expect() -> float:
-    """Time (s) of phases and model for the hour."""
+@cache
+def replays(run: Run, minutes: int) -> Replays:
+    """``twin replay`` of the hour's first minutes into a new log, by turns with its floor.
+
+    Done once, whoever asks for it.
+    """
+    run.tell("replay: simulating the rig")
+    path, native = log.part_log(run.folder, minutes), in_c(run.folder)
+    rows, packed, again = minutes * MINUTE, log.packed(path), run.folder / "again.mcap"
+    times, floors, memories = [], [], []
+    with on_core(TWIN_CORE):
+        usage([TWIN, "replay", log.part_log(run.folder, 1)])  # compiles what is not compiled yet
+        for number in range(REPEATS):
+            run.tell(f"replay: {minutes} minutes, {number + 1} of {REPEATS}")
+            seconds, most = usage([TWIN, "replay", path, "-o", again])
+            times.append(seconds)
+            memories.append(most)
+            if native is not None:
+                begin = time.perf_counter()
+                log.unpack(packed)
+                log.write_bare(again, rows)
+                bare = time.perf_counter() - begin
+                floors.append(bare + _in_c(native, minutes))
+            again.unlink()  # a log is never overwritten
+    return Replays(times, floors, memories)
+
+
+def _in_c(native: Advance, minutes: int) -> float:
+    """Processor time (s) of the model in C for the hour's first minutes."""
+    rows = minutes * MINUTE
+    return timed(native, hour().theta, first_rows(hour(), rows))[0] * 1e-9 * rows
+
+
+def _expect(blocks: Sequence[tuple[Samples, Ticks]]) -> float:
+    """Time (s) of phases and model."""
     twin = new_twin(hour().config)
     begin = time.perf_counter()
-    for samples, _ in hour().blocks():
+    for samples, _ in blocks:
         twin.advance(samples)
     return time.perf_counter() - begin
 
 
-def _monitor() -> float:
-    """Time (s) of the monitor for the hour."""
+def _monitor(blocks: Sequence[tuple[Samples, Ticks]]) -> float:
+    """Time (s) of the monitor."""
     monitor = Monitor(hour().config.monitor, hour().theta)
     begin = time.perf_counter()
-    for samples, ticks in hour().blocks():
+    for samples, ticks in blocks:
         monitor.update(samples, ticks)
     return time.perf_counter() - begin
 
