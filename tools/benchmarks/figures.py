@@ -69,7 +69,7 @@ class Measured:
     floors: Sequence[float] = ()
     note: str = ""
     valid: bool = True
-    line: Line | None = None  # where the figure is its slope
+    line: Line | None = None  # where the figure is its slope, or what it leaves for a size of none
 
     @property
     def ratio(self) -> float | None:

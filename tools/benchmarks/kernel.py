@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.figures import Measured, Run
+from benchmarks.figures import Line, Measured, Run, medians
 from benchmarks.machine import TWIN_CORE, on_core
 from benchmarks.native import PLAIN, library
 from benchmarks.recording import Recording, hour
@@ -24,6 +24,9 @@ REPEATS = 25
 HYPOTHESES = 64
 BANK_ROWS = 10_000  # three cycles
 BANK_REPEATS = 9
+CUT_ROWS = 10_000
+CUTS = (1, 2, 5, 10, 20, 50)  # rows of a call
+CUT_REPEATS = 9
 SIZES = (1.0, 0.5, 2.0, 4.0)  # of an effect, in its typical size
 AGREE = 1e-9  # relative
 # Not even now does gcc make vectors of the loop unless values stay where they are used.
@@ -39,7 +42,8 @@ Driven = tuple[Floats, Bytes, Floats]  # time steps, phases, levels
 def speed(run: Run) -> Sequence[Measured]:
     """Processor time (ns) of a row for one hypothesis, and for each of 64 advanced together.
 
-    The latter beside each alone in C, and beside as many at once in C.
+    The latter beside each alone in C, and beside as many at once in C. Then that (µs) of a call
+    beyond its rows.
     """
     run.tell("kernel: simulating the rig")
     theta, bank = hour().theta, hypotheses(hour().theta)
@@ -49,7 +53,9 @@ def speed(run: Run) -> Sequence[Measured]:
         run.tell("kernel: one hypothesis")
         single = _one(theta, one, native)
         run.tell(f"kernel: {HYPOTHESES} hypotheses")
-        return single, *_many(bank, few, native, vectors)
+        many = _many(bank, few, native, vectors)
+        run.tell("kernel: calls of few rows")
+        return single, *many, _calls(theta, first_rows(hour(), CUT_ROWS))
 
 
 def hypotheses(theta: Theta, count: int = HYPOTHESES) -> list[Theta]:
@@ -100,6 +106,29 @@ def _many(
         c.append(float(np.mean([timed(native, theta, rows)[0] for theta in bank])))
         simd.append(float(np.mean([timed(vectors, eight, rows)[0] for eight in lanes])))
     return Measured(ours, c, note), Measured(ours, simd, at_once)
+
+
+def _calls(theta: Theta, driven: Driven) -> Measured:
+    """What a call costs (µs) beyond its rows: the same rows, cut into calls of several lengths."""
+    whole = timed(kernel.advance, theta, driven)[1]
+    runs = [[_cut(theta, driven, rows, whole) for rows in CUTS] for _ in range(CUT_REPEATS)]
+    rests = [Line("", "", CUTS, run).rest for run in runs]
+    line = Line("a call, µs", "rows of it", CUTS, medians(runs))
+    return Measured(rests, note=f"{line.off:.1f} % from a line at most", line=line)
+
+
+def _cut(theta: Theta, driven: Driven, rows: int, whole: Floats) -> float:
+    """Processor time (µs) of a call of so many rows; they give what they give in one call."""
+    state, expected, signals = kernel.new_state(), np.empty_like(whole), np.empty(len(whole), "u1")
+    parts = [slice(at, at + rows) for at in range(0, len(whole), rows)]
+    dt, phase, level = driven
+    calls = [(dt[p], phase[p], level[p], expected[p], signals[p]) for p in parts]
+    begin = time.thread_time()
+    for call in calls:
+        kernel.advance(state, theta, *call)
+    spent = 1e6 * (time.thread_time() - begin) / len(calls)
+    np.testing.assert_array_equal(expected, whole)
+    return spent
 
 
 def in_lanes(bank: Sequence[Theta]) -> list[Theta]:
