@@ -57,8 +57,8 @@ BENCHMARKS = (
     Benchmark(
         "acquisition",
         acquisition.steady,
-        "`twin run` with its log beside the simulated PLC in another process; slices of 10 s; "
-        "lost samples are numbers missing in the log.",
+        "`twin run` with its log beside the simulated PLC in another process; slices of 5 s, of "
+        "10 s with --long; lost samples are numbers missing in the log.",
         (
             Figure("block mode: lost samples", "", limit=0),
             Figure("block mode: CPU of the live process", "% of a core", BARE_FETCH, 8.0),
@@ -68,8 +68,8 @@ BENCHMARKS = (
     Benchmark(
         "stops",
         acquisition.stopped,
-        "The same while the live process gets SIGSTOP for 300 ms in every slice; ten minutes "
-        "with --long.",
+        "The same while the live process gets SIGSTOP for 300 ms in every slice, of 10 s; ten "
+        "minutes with --long.",
         (
             Figure("stopped for 300 ms every 10 s: lost samples", "", limit=0),
             Figure("stopped for 300 ms every 10 s: CPU", "% of a core", BARE_FETCH, 8.0),
@@ -79,8 +79,8 @@ BENCHMARKS = (
         "clients",
         clients.modbus,
         "The driver alone, which decodes, checks and stamps what it fetches, and clients that only "
-        "fetch the same registers as often, by turns of 2 s at the same PLC; processor time. What "
-        "else one would take has ours as its floor.",
+        "fetch the same registers as often, by turns of 1.5 s at the same PLC; processor time. "
+        "What else one would take has ours as its floor.",
         (
             Figure("driver alone: CPU", "% of a core", "bare socket in C"),
             *(

@@ -18,8 +18,8 @@ from benchmarks.machine import TWIN_CORE, on_core
 from benchmarks.processes import live, plc
 from twin.log.reader import open_log
 
-SLICE_S = 10.0
-BARE_S = 3.0
+SLICE_S, SHORT_SLICE_S = 10.0, 5.0
+BARE_S = 2.0
 STOP_S = 0.3  # SIGSTOP at the beginning of each slice: a client that does not get to run
 INTERVAL_S = 0.03  # between blocks, as configs/test_rig.toml has it
 HEADER, RING, DEPTH = (100, 12), 1000, 4096  # of the PLC's trace; a record has 4 words
@@ -28,15 +28,15 @@ RECORDS_AT_ONCE = 31
 
 def steady(run: Run) -> Sequence[Measured]:
     """Lost samples, CPU share and bytes per sample, nobody in the way."""
-    return _acquire(run, "acquisition", slices=3, stop_s=0.0)
+    return _acquire(run, "acquisition", [SLICE_S if run.long else SHORT_SLICE_S] * 3, stop_s=0.0)
 
 
 def stopped(run: Run) -> Sequence[Measured]:
     """Lost samples and CPU share with a stop of 300 ms every 10 s; ``--long``: ten minutes."""
-    return _acquire(run, "acquisition with stops", 60 if run.long else 3, STOP_S)[:2]
+    return _acquire(run, "acquisition with stops", [SLICE_S] * (60 if run.long else 3), STOP_S)[:2]
 
 
-def _acquire(run: Run, what: str, slices: int, stop_s: float) -> Sequence[Measured]:
+def _acquire(run: Run, what: str, slices: Sequence[float], stop_s: float) -> Sequence[Measured]:
     log = run.folder / f"{what}.mcap"
     with plc() as port:
         run.tell(f"{what}: the floor")
@@ -44,9 +44,9 @@ def _acquire(run: Run, what: str, slices: int, stop_s: float) -> Sequence[Measur
             floors = [bare_share(port) for _ in range(3)]
         with live(log, port=port) as process:
             shares = []
-            for number in range(slices):
-                run.tell(f"{what}: slice {number + 1} of {slices}")
-                shares.append(_share(process, stop_s))
+            for number, slice_s in enumerate(slices):
+                run.tell(f"{what}: slice {number + 1} of {len(slices)}")
+                shares.append(_share(process, slice_s, stop_s))
     missing, rows = lost(log)
     note = f"of {rows:,} samples"
     return (
@@ -56,7 +56,7 @@ def _acquire(run: Run, what: str, slices: int, stop_s: float) -> Sequence[Measur
     )
 
 
-def _share(process: "subprocess.Popen[bytes]", stop_s: float) -> float:
+def _share(process: "subprocess.Popen[bytes]", slice_s: float, stop_s: float) -> float:
     """CPU time (% of a core) over one slice."""
     times = psutil.Process(process.pid).cpu_times()
     begin = time.monotonic()
@@ -66,7 +66,7 @@ def _share(process: "subprocess.Popen[bytes]", stop_s: float) -> float:
             time.sleep(stop_s)
         finally:
             process.send_signal(signal.SIGCONT)
-    time.sleep(SLICE_S - stop_s)
+    time.sleep(slice_s - stop_s)
     wall = time.monotonic() - begin
     after = psutil.Process(process.pid).cpu_times()
     return 100.0 * (after.user + after.system - times.user - times.system) / wall

@@ -25,8 +25,8 @@ from drivers.sources import open_source
 from twin.settings import Document
 from twin.signals import Samples
 
-TURNS, LONG_TURNS = 4, 12
-TURN_S = 2.0
+TURNS, LONG_TURNS = 3, 12
+TURN_S = 1.5
 ENOUGH = 0.9  # of the samples there are in a turn: a client that gets fewer does something else
 RATE = 1000.0  # samples a second
 

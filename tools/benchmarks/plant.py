@@ -18,7 +18,7 @@ from benchmarks.figures import Measured, Run
 from benchmarks.machine import PLC_CORE, on_core
 from benchmarks.processes import CONFIG, TWIN, live, plc
 
-SLICE_S, SLICES, LONG_SLICES = 10.0, 3, 60
+SLICE_S, SHORT_SLICE_S, SLICES, LONG_SLICES = 10.0, 5.0, 3, 60
 KEPT = {"figures": {"keep": True}, "alarms": {"keep": True}, "page": {"keep": True}}
 
 
@@ -59,14 +59,14 @@ def _config(folder: Path, name: str, port: int, more: dict[str, dict[str, bool]]
 
 def _shares(run: Run, what: str, numbers: Sequence[int]) -> list[list[float]]:
     """CPU times (% of a core) of some processes over each slice."""
-    slices = LONG_SLICES if run.long else SLICES
+    slices, slice_s = (LONG_SLICES, SLICE_S) if run.long else (SLICES, SHORT_SLICE_S)
     processes = [psutil.Process(number) for number in numbers]
     found = []
     for number in range(slices):
         run.tell(f"{what}: slice {number + 1} of {slices}")
         for process in processes:
             process.cpu_percent()
-        time.sleep(SLICE_S)
+        time.sleep(slice_s)
         found.append([process.cpu_percent() for process in processes])
     return found
 

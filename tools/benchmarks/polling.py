@@ -16,6 +16,7 @@ from benchmarks.processes import CONFIG, plc
 from drivers.sources import open_source
 from twin.settings import Document
 
+TURNS, LONG_TURNS = 6, 30
 SLOTS = 2000  # in a turn: short, so that what else goes on meets all alike
 BUSY = 3.0  # %; a bare poller that misses more says that the machine had no time, nothing of ours
 SLOT_NS = 1_000_000
@@ -27,7 +28,7 @@ ANSWER_SIZE = 9 + 2 * 4
 
 def missed(run: Run) -> Sequence[Measured]:
     """Missed slots (%) of the driver against the poller in Python, then against that in C."""
-    turns = 30 if run.long else 12
+    turns = LONG_TURNS if run.long else TURNS
     native = library("poll", run.folder)
     ways = [_driver, _in_python]
     if native is not None:
