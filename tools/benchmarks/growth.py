@@ -5,6 +5,7 @@ import sys
 import time
 import tracemalloc
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -138,14 +139,16 @@ def _memory(theta: kernel.Theta, rows: kernel.Driven) -> float:
 def ejectors(run: Run) -> Sequence[Measured]:
     """Lost samples and CPU share of the most ejectors; CPU and memory of one more."""
     shares, memories = [], []
-    for count in EJECTORS:
-        with plant.together(run, count) as (process, logs):
-            run.tell(f"together: {count}")
-            shares.append([_share(process) for _ in range(SLICES)])
-            memories.append(psutil.Process(process.pid).memory_info().rss * 1e-6)
+    with ExitStack() as open_now:
+        ports = [open_now.enter_context(plc()) for _ in range(max(EJECTORS))]
+        for count in EJECTORS:
+            with plant.together(run, ports[:count]) as (process, logs):
+                run.tell(f"together: {count}")
+                shares.append([_share(process) for _ in range(SLICES)])
+                memories.append(psutil.Process(process.pid).memory_info().rss * 1e-6)
+        with on_core(TWIN_CORE):
+            floors = [bare_share(ports[0]) for _ in range(SLICES)]
     found = [lost(one) for one in logs]
-    with plc() as port, on_core(TWIN_CORE):
-        floors = [bare_share(port) for _ in range(SLICES)]
     runs = list(zip(*shares, strict=True))
     line = Line("CPU, %", "ejectors", EJECTORS, medians(runs), 100.0, "a core")
     memory = Line("memory, MB", "ejectors", EJECTORS, memories)

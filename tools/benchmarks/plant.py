@@ -33,18 +33,19 @@ def watched(run: Run) -> Sequence[Measured]:
 
 
 @contextmanager
-def together(run: Run, count: int) -> Iterator[tuple["subprocess.Popen[bytes]", list[Path]]]:
-    """So many ejectors in one process, each with a PLC of its own; gives it, and their logs."""
-    names = [f"rig-{number + 1:02}" for number in range(count)]
-    folder = run.folder / f"{count} together"
+def together(
+    run: Run, ports: Sequence[int]
+) -> Iterator[tuple["subprocess.Popen[bytes]", list[Path]]]:
+    """One process with an ejector for each of these PLCs; gives it, and their logs."""
+    names = [f"rig-{number + 1:02}" for number in range(len(ports))]
+    folder = run.folder / f"{len(ports)} together"
     log = folder / "log.mcap"
-    with ExitStack() as open_now:
-        ports = [open_now.enter_context(plc()) for _ in names]
-        pairs = zip(names, ports, strict=True)
-        configs = [_config(folder / name, name, port, {}) for name, port in pairs]
-        # One alone is called as it is told.
-        logs = [log.with_suffix(f".{name}.mcap") for name in names] if count > 1 else [log]
-        yield open_now.enter_context(live(log, configs, logs)), logs
+    pairs = zip(names, ports, strict=True)
+    configs = [_config(folder / name, name, port, {}) for name, port in pairs]
+    # One alone is called as it is told.
+    logs = [log.with_suffix(f".{name}.mcap") for name in names] if len(ports) > 1 else [log]
+    with live(log, configs, logs) as process:
+        yield process, logs
 
 
 def _config(folder: Path, name: str, port: int, more: dict[str, dict[str, bool]]) -> Path:
