@@ -60,7 +60,7 @@ def medians(runs: Sequence[Sequence[float]]) -> list[float]:
 
 @dataclass(frozen=True)
 class Measured:
-    """Repetitions of a figure and of its floor, in the figure's unit.
+    """Repetitions of a figure and of its floor, in the figure's unit; none where none was made.
 
     ``valid`` is False where the machine was too busy for the figure to say anything.
     """
@@ -75,7 +75,7 @@ class Measured:
     def ratio(self) -> float | None:
         """Median over median of the floor; None where there is no floor or it is zero."""
         floor = median(self.floors) if self.floors else 0.0
-        return median(self.values) / floor if floor else None
+        return median(self.values) / floor if self.values and floor else None
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class Benchmark:
 
 def kept(figure: Figure, measured: Measured) -> bool | None:
     """Whether the limit is kept; None where there is none or nothing to judge."""
-    value = measured.ratio if figure.limits_ratio else median(measured.values)
-    if figure.limit is None or value is None or not measured.valid:
+    if figure.limit is None or not measured.values or not measured.valid:
         return None
-    return value <= figure.limit
+    value = measured.ratio if figure.limits_ratio else median(measured.values)
+    return None if value is None else value <= figure.limit

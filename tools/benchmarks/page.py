@@ -1,6 +1,7 @@
 """What the bench writes: docs/bench.md with the pictures of its lines, docs/bench.json."""
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 from math import ceil
@@ -20,18 +21,47 @@ Result = tuple[Figure, Measured]
 
 def write(results: Sequence[Result], notes: Sequence[str], benchmarks: Sequence[Benchmark]) -> None:
     """Write page, picture and JSON."""
-    page = ["# Benchmarks", "", "Written by `make bench` (tools/bench.py). Every figure stands"]
+    page = ["# Benchmarks", "", *_summary(results), ""]
+    page += ["Written by `make bench` (tools/bench.py). Every figure stands"]
     page += ["beside its floor, measured in the same run on the same machine: use the ratios."]
     page += ["Median of the repetitions, least to most in brackets.", "", table(results, notes), ""]
-    page += [*(f"- **{one.name}**: {one.how}" for one in benchmarks), ""]
     if lines := _lines(results):
         page += [f"![Costs against sizes, with straight lines]({PICTURE})", ""]
         _draw(lines)
+    page += ["## How it is measured", ""]
+    page += [*(f"- **{one.name}**: {one.how}" for one in benchmarks), ""]
     (DOCS / "bench.md").write_text("\n".join(page), encoding="utf-8")
     figures = [asdict(figure) | asdict(measured) for figure, measured in results]
     written = {"circumstances": notes, "figures": figures}
     text = json.dumps(written, indent=1, ensure_ascii=False)
     (DOCS / "bench.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _summary(results: Sequence[Result]) -> list[str]:
+    """How many limits are kept; which are not, and by how much; which could not be judged."""
+    verdicts = [
+        (figure, one, kept(figure, one)) for figure, one in results if figure.limit is not None
+    ]
+    good = sum(verdict is True for *_, verdict in verdicts)
+    lines = [f"**{good} of {len(verdicts)} limits are kept.**", ""]
+    broken = [(figure, one) for figure, one, verdict in verdicts if verdict is False]
+    lines += [f"- Not kept: {figure.name}, {_beyond(figure, one)}." for figure, one in broken]
+    untold: dict[str, Counter[str]] = {}
+    for figure, one, verdict in verdicts:
+        if verdict is None:
+            of = figure.name.partition(":")[0]
+            untold.setdefault(one.note or "no floor", Counter())[of] += 1
+    for why, counts in untold.items():
+        names = (f"{count} of {of}" for of, count in counts.items())
+        lines.append(f"- Not judged ({why}): {'; '.join(names)}.")
+    return lines
+
+
+def _beyond(figure: Figure, measured: Measured) -> str:
+    """A figure and its limit."""
+    if figure.limits_ratio and measured.ratio is not None:
+        return f"{measured.ratio:.2f} × {figure.floor}, limit {figure.limit:g} ×"
+    return f"{_spread(measured.values, figure.unit)}, limit {figure.limit:g} {figure.unit}".strip()
 
 
 def table(results: Sequence[Result], notes: Sequence[str]) -> str:
@@ -55,7 +85,9 @@ def _row(figure: Figure, measured: Measured) -> str:
 
 
 def _spread(values: Sequence[float], unit: str) -> str:
-    """Median, and from least to most where there are several."""
+    """Median, and from least to most where there are several; nothing of none."""
+    if not values:
+        return ""
     spread = f" ({_number(min(values))}–{_number(max(values))})" if len(values) > 1 else ""
     return f"{_number(median(values))}{spread} {unit}".strip()
 
