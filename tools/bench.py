@@ -126,7 +126,7 @@ BENCHMARKS = (
     Benchmark(
         "together",
         growth.ejectors,
-        "`twin run` with one, two, four and eight configurations, each with a simulated PLC and a "
+        "`twin run` with one, four and eight configurations, each with a simulated PLC and a "
         "log of its own.",
         (
             Figure("eight ejectors in one process: lost samples", "", limit=0),
@@ -269,7 +269,7 @@ BENCHMARKS = (
     Benchmark(
         "length",
         growth.length,
-        "The same over the first 5 and 30 minutes of that log and all of it; with --long over 24 "
+        "The same over the first 5 and 20 minutes of that log and all of it; with --long over 24 "
         "hours, which are that hour again and again, else by the line. Peak memory is what was "
         "resident.",
         (

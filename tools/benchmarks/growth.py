@@ -21,13 +21,13 @@ from twin.log.recorder import Recorder
 from twin.model import kernel as model
 
 REPEATS = 3
-MINUTES = (5, 30, 60)
+MINUTES = (5, 20, 60)
 DAY_H = 24
 MOST_MB = 500.0  # that a replay may have
 HYPOTHESES = (8, 16, 32, 64)
 A_ROW_NS = 1e6  # there are, if the bank is to keep up
-EJECTORS = (1, 2, 4, 8)
-SLICE_S, SLICES = 5.0, 3
+EJECTORS = (1, 4, 8)
+SLICE_S, SLICES = 4.0, 3
 IMPORTS = (sys.executable, "-c", "import numba, numpy, pydantic, typer")
 
 

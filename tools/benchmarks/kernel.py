@@ -20,10 +20,10 @@ from twin.model.theta import Theta
 from twin.monitor.signatures import steps
 
 ROWS = 100_000
-REPEATS = 25
+REPEATS = 11
 HYPOTHESES = 64
 BANK_ROWS = 10_000  # three cycles
-BANK_REPEATS = 9
+BANK_REPEATS = 5
 CUT_ROWS = 10_000
 CUTS = (1, 2, 5, 10, 20, 50)  # rows of a call
 CUT_REPEATS = 9

@@ -19,8 +19,9 @@ from twin.monitor.detect import Monitor
 from twin.signals import Samples, Ticks
 
 REPEATS = 3
-STARTS = 7
-HOUR_MIN, PART_MIN = 60, 10  # the parts of a replay are measured over some minutes
+STARTS = 5
+HOUR_MIN = 60
+PART_MIN = 10  # over which the parts of a replay are measured, and the model in C
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ def end_to_end(run: Run) -> Sequence[Measured]:
         for number in range(REPEATS):
             run.tell(f"replay: its parts, {number + 1} of {REPEATS}")
             if native is not None:
-                model.append(_in_c(native, PART_MIN) * HOUR_MIN / PART_MIN)
+                model.append(_in_c(native, HOUR_MIN))
             expecting.append(_expect(part) * HOUR_MIN / PART_MIN)
             monitoring.append(_monitor(part) * HOUR_MIN / PART_MIN)
     speeds = [HOUR_S / seconds for seconds in whole.times]
@@ -81,9 +82,9 @@ def replays(run: Run, minutes: int) -> Replays:
 
 
 def _in_c(native: Advance, minutes: int) -> float:
-    """Processor time (s) of the model in C for the hour's first minutes."""
-    rows = minutes * MINUTE
-    return timed(native, hour().theta, first_rows(hour(), rows))[0] * 1e-9 * rows
+    """Processor time (s) of the model in C for so many minutes, told from some."""
+    rows = first_rows(hour(), min(minutes, PART_MIN) * MINUTE)
+    return timed(native, hour().theta, rows)[0] * 1e-9 * minutes * MINUTE
 
 
 def _expect(blocks: Sequence[tuple[Samples, Ticks]]) -> float:
