@@ -271,7 +271,7 @@ BENCHMARKS = (
         growth.length,
         "The same over the first 5 and 20 minutes of that log and all of it; with --long over 24 "
         "hours, which are that hour again and again, else by the line. Peak memory is what was "
-        "resident.",
+        "resident; its line leaves out the shortest log, in which it still rises.",
         (
             Figure("replay of one more hour: time", "s", BARE_REPLAY),
             Figure("replay of one more hour: memory", "MB"),

@@ -51,17 +51,20 @@ def length(run: Run) -> Sequence[Measured]:
         for columns in zip(*((one.times, one.floors, one.memories) for one in each), strict=True)
     )
     time_line = Line("replay, s", "hours of log", hours, medians(times))
-    spent = f"{MOST_MB:g} MB"
-    line = Line("replay, MB", "hours of log", hours, medians(memories), MOST_MB, spent)
-    day, note = line.rest + DAY_H * line.slope, "by the line, which short logs make too steep"
+    sizes, costs = hours[1:], [list(one[1:]) for one in memories]  # the first has not settled
+    most, note = None, "by the line, which an hour and less make too steep"
     with on_core(TWIN_CORE):
         imports = [usage(IMPORTS)[1] for _ in range(REPEATS)]
         if run.long:
             run.tell("length: a day")
             day, note = _replay_of_a_day(run.folder)
+            sizes, costs, most = [*sizes, DAY_H], [[*one, day] for one in costs], MOST_MB
+    line = Line("replay, MB", "hours of log", sizes, medians(costs), most, f"{MOST_MB:g} MB")
+    if not run.long:
+        day = line.rest + DAY_H * line.slope
     return (
         _grown(hours, times, time_line, [Line("", "", hours, one).slope for one in floors]),
-        _grown(hours, memories, line, ()),
+        _grown(sizes, costs, line, ()),
         Measured([day], imports, note=note, valid=run.long),
     )
 
