@@ -80,12 +80,15 @@ def finely(theta: Theta, driven: tuple[Rows, Signals, Rows], parts: int = 20) ->
 @few
 @given(st.integers(0, 10_000), st.sampled_from(rigs.NAMES))
 def test_a_troubled_stream_is_read_as_finer_rows_would_be(seed: int, name: str) -> None:
-    """Also where valves move between rows that are far apart, and where levels do not fit."""
+    """Also where valves move between rows that are far apart, and where levels do not fit.
+
+    Shifted by hundreds of millibar while it draws, a hose swings: then it is a fifth of one off.
+    """
     theta = rigs.theta(name)
     driven = stream(theta, seed)
     expected, exact = read(Strides(), theta, driven)[0], finely(theta, driven)
     assert (np.isnan(expected) == np.isnan(exact)).all()
-    assert np.nanmax(np.abs(expected - exact), initial=0.0) < 5.0  # 60 streams: 3.4 at most
+    assert np.nanmax(np.abs(expected - exact), initial=0.0) < 0.5 * MBAR
 
 
 @few

@@ -405,7 +405,7 @@ def _synchronise(state, levels, k):  # type: ignore[no-untyped-def]
         state[VALID, i] = 1.0
 
 
-@compiled
+@inlined
 def _read(state, k, expected, signals):  # type: ignore[no-untyped-def]
     """Write what each hypothesis expects, and the signals it hands out: none where it waits."""
     for i in range(state.shape[1]):
@@ -465,7 +465,7 @@ def _advance(state, theta, dt, phase, level, expected, signals, tolerance):  # t
         _together(state, k, driven, out, first, LANES, tolerance)
 
 
-@compiled
+@inlined
 def _seen_by_control(state, k, i):  # type: ignore[no-untyped-def]
     """Vacuum (Pa) at the sensor that the ejector's own control acts on."""
     if k[c.CONTROL_SENSOR, i] == c.PLC:
@@ -473,7 +473,7 @@ def _seen_by_control(state, k, i):  # type: ignore[no-untyped-def]
     return k[c.AMBIENT, i] - state[PORT, i]
 
 
-@compiled
+@inlined
 def _decide(state, controls, told, dt, k, phases):  # type: ignore[no-untyped-def]
     """Say which phases the ejectors' own controls make of what the valves are told."""
     for i in range(state.shape[1]):
