@@ -17,7 +17,7 @@ from twin.model import kernel, strides
 from twin.model import theta as c
 from twin.model.strides import Strides
 from twin.model.theta import Theta
-from twin.signals import MBAR, MS, Phase
+from twin.signals import MBAR, MS, Phase, Signal
 
 Rows = npt.NDArray[np.float64]
 Signals = npt.NDArray[np.uint8]
@@ -151,3 +151,15 @@ def test_a_command_shorter_than_the_response_is_not_acted_on() -> None:
         Strides.at_rest(theta), theta, (np.full(154, MS), phase, np.full(154, np.nan))
     )
     assert expected == pytest.approx(expected[0], abs=1e-6)
+
+
+def test_a_signal_outlives_a_step_that_is_done_anew() -> None:
+    """It came after the step had begun, and vacuum is within its hysteresis where that ends."""
+    theta = rigs.theta("test_rig")
+    theta[c.H2_LOW], theta[c.H2] = 1 * MBAR, 900 * MBAR
+    model = Strides.at_rest(theta)
+    driven = np.full(400, MS), phase_rows([(SUCTION, 399), (HOLD, 1)]), np.full(400, np.nan)
+    read(model, theta, tuple(one[:399] for one in driven))  # type: ignore[arg-type]
+    model.now[kernel.SIGNALS] = Signal.PART_PRESENT
+    _, signals = read(model, theta, tuple(one[399:] for one in driven))  # type: ignore[arg-type]
+    assert signals.tolist() == [Signal.PART_PRESENT]
