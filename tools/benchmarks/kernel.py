@@ -14,7 +14,7 @@ from benchmarks.figures import Line, Measured, Run, medians
 from benchmarks.machine import TWIN_CORE, on_core
 from benchmarks.native import PLAIN, library
 from benchmarks.recording import Recording, hour
-from twin.model import kernel
+from twin.model import kernel, strides
 from twin.model.effects import EFFECTS, Effect, apply
 from twin.model.theta import Theta
 from twin.monitor.signatures import steps
@@ -40,9 +40,9 @@ Driven = tuple[Floats, Bytes, Floats]  # time steps, phases, levels
 
 
 def speed(run: Run) -> Sequence[Measured]:
-    """Processor time (ns) of a row for one hypothesis, and for each of 64 advanced together.
+    """Processor time (ns) of a row: from row to row, in strides, for each of 64 together.
 
-    The latter beside each alone in C, and beside as many at once in C. Then that (µs) of a call
+    The last beside each alone in C, and beside as many at once in C. Then that (µs) of a call
     beyond its rows.
     """
     run.tell("kernel: simulating the rig")
@@ -54,8 +54,13 @@ def speed(run: Run) -> Sequence[Measured]:
         single = _one(theta, one, native)
         run.tell(f"kernel: {HYPOTHESES} hypotheses")
         many = _many(bank, few, native, vectors)
-        run.tell("kernel: calls of few rows")
-        return single, *many, _calls(theta, first_rows(hour(), CUT_ROWS))
+        run.tell("kernel: strides, and calls of few rows")
+        return (
+            single,
+            _strided(theta, one, native),
+            *many,
+            _calls(theta, first_rows(hour(), CUT_ROWS)),
+        )
 
 
 def hypotheses(theta: Theta, count: int = HYPOTHESES) -> list[Theta]:
@@ -84,6 +89,29 @@ def _one(theta: Theta, driven: Driven, native: Advance | None) -> Measured:
     ]
     ours, c = zip(*turns, strict=True)
     return Measured(ours, c, note)
+
+
+def _strided(theta: Theta, driven: Driven, native: Advance | None) -> Measured:
+    """One hypothesis as the twin goes, beside the C from row to row."""
+    expected, row_by_row = (timed(way, theta, driven)[1] for way in (_in_strides, kernel.advance))
+    note = f"within {np.nanmax(np.abs(expected - row_by_row)):.1g} Pa of the kernel's"
+    ours, c = [], []
+    for _ in range(REPEATS):
+        ours.append(timed(_in_strides, theta, driven)[0])
+        c += [timed(native, theta, driven)[0]] if native else []
+    return Measured(ours, c, note)
+
+
+def _in_strides(
+    _: Floats,
+    theta: Theta,
+    dt: Floats,
+    phase: Bytes,
+    level: Floats,
+    expected: Floats,
+    signals: Bytes,
+) -> None:
+    strides.advance(strides.Strides(), theta, dt, phase, level, expected, signals)
 
 
 def _many(
