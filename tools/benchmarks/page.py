@@ -43,7 +43,8 @@ def _summary(results: Sequence[Result]) -> list[str]:
         (figure, one, kept(figure, one)) for figure, one in results if figure.limit is not None
     ]
     good = sum(verdict is True for *_, verdict in verdicts)
-    lines = [f"**{good} of {len(verdicts)} limits are kept.**", ""]
+    judged = sum(verdict is not None for *_, verdict in verdicts)
+    lines = [f"**{good} of the {judged} limits that were judged are kept.**", ""]
     broken = [(figure, one) for figure, one, verdict in verdicts if verdict is False]
     lines += [f"- Not kept: {figure.name}, {_beyond(figure, one)}." for figure, one in broken]
     untold: dict[str, Counter[str]] = {}
