@@ -143,19 +143,22 @@ def test_a_broker_that_lost_nothing_is_told_nothing_twice(tmp_path: Path, runnin
 
 
 def test_a_thousand_changes_wait_through_an_outage(tmp_path: Path, running: Broker) -> None:
-    bench = At(tmp_path / "a.sqlite", running.port)
-    bench.put(message(-1))
-    bench.drained()
-    running.kill()
-    alarms = [f"deviation_{n}" for n in range(7)]
-    bench.put(*(message(n, alarms[n % 7]) for n in range(1000)))
-    running.start()
-    with Listener(running.port) as listener:
+    with Relay(running.port) as relay:
+        bench = At(tmp_path / "a.sqlite", relay.port)
+        bench.put(message(-1))
         bench.drained()
-        listener.until(f"alarm/{alarms[999 % 7]}", number=999)
-        for n, alarm in enumerate(alarms):
-            assert numbers(listener.on(f"alarm/{alarm}")) == list(range(n, 1000, 7))
-    bench.end()
+        relay.refuses.set()  # until somebody listens
+        running.kill()
+        alarms = [f"deviation_{n}" for n in range(7)]
+        bench.put(*(message(n, alarms[n % 7]) for n in range(1000)))
+        running.start()
+        with Listener(running.port) as listener:
+            relay.refuses.clear()
+            bench.drained()
+            listener.until(f"alarm/{alarms[999 % 7]}", number=999)
+            for n, alarm in enumerate(alarms):
+                assert numbers(listener.on(f"alarm/{alarm}")) == list(range(n, 1000, 7))
+        bench.end()
 
 
 def test_what_was_not_answered_comes_again_in_order(
