@@ -259,7 +259,8 @@ BENCHMARKS = (
         replay.end_to_end,
         "`twin replay` over that log into another in a process of its own, start included; the "
         "floor decompresses, runs the model in C and writes the rows through zstd. Then its parts "
-        "in this process, over ten minutes, told for an hour.",
+        "in this process, over ten minutes, told for an hour; the monitor with bank and key "
+        "figures, as in a replay.",
         (
             Figure("replay: an hour, start to end", "s", BARE_REPLAY, 4.0),
             Figure("replay: speed", "× real time"),

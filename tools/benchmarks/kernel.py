@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -102,16 +103,8 @@ def _strided(theta: Theta, driven: Driven, native: Advance | None) -> Measured:
     return Measured(ours, c, note)
 
 
-def _in_strides(
-    _: Floats,
-    theta: Theta,
-    dt: Floats,
-    phase: Bytes,
-    level: Floats,
-    expected: Floats,
-    signals: Bytes,
-) -> None:
-    strides.advance(strides.Strides(), theta, dt, phase, level, expected, signals)
+def _in_strides(_: Floats, *given: Any) -> None:
+    strides.advance(strides.Strides(), *given)
 
 
 def _many(

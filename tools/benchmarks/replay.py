@@ -14,8 +14,8 @@ from benchmarks.kernel import Advance, first_rows, in_c, timed
 from benchmarks.machine import TWIN_CORE, on_core
 from benchmarks.processes import TWIN, usage
 from benchmarks.recording import BLOCK, HOUR_S, MINUTE, hour, new_twin
+from twin.cli import pair_of
 from twin.log.recorder import Recorder
-from twin.monitor.detect import Monitor
 from twin.signals import Samples, Ticks
 
 REPEATS = 3
@@ -97,8 +97,8 @@ def _expect(blocks: Sequence[tuple[Samples, Ticks]]) -> float:
 
 
 def _monitor(blocks: Sequence[tuple[Samples, Ticks]]) -> float:
-    """Time (s) of the monitor."""
-    monitor = Monitor(hour().config.monitor, hour().theta)
+    """Time (s) of the monitor, with all that a replay has it do."""
+    monitor = pair_of(hour().config)[1]
     begin = time.perf_counter()
     for samples, ticks in blocks:
         monitor.update(samples, ticks)

@@ -200,7 +200,7 @@ def _arrive(carried, k, tolerance):  # type: ignore[no-untyped-def]
 
 @inlined
 def _set_out(carried):  # type: ignore[no-untyped-def]
-    """Go on from where ``now`` was put, as roughly as it may be there."""
+    """Go on from where ``now`` was put, by the shortest steps first."""
     now, begin, end, clock = carried
     now[ROUGH, 0] = 0.0
     put(begin, 0, now, 0)
