@@ -85,6 +85,7 @@ INLINED Tangent opening(double p, double ambient)
 #define FURTHER ((1.0 + G) / 2.0 / G)
 #define B1 (-(6.0 * G * G - 16.0 * G + 1.0) / 4.0 / G)
 #define B2 ((6.0 * G * G - 20.0 * G + 5.0) / 4.0 / G)
+#define PORT_COUNTS 0.3
 
 typedef struct {
     double port, port_mass, line, line_mass, vessel, vessel_mass, near, far;
@@ -351,9 +352,11 @@ INLINED Advanced advance_gas(const Gas *gas, const Lags *lags, double h, const V
                        three.gas.port - last.port);
     double vessel = bent(one.gas.vessel - gas->vessel, two.gas.vessel - known.vessel,
                          three.gas.vessel - last.vessel);
+    double felt = bent(one.lags.felt - lags->felt, two.lags.felt - held.felt,
+                       three.lags.felt - late.felt);
     double sensed = bent(one.lags.sensed - lags->sensed, two.lags.sensed - held.sensed,
                          three.lags.sensed - late.sensed);
-    return (Advanced){three.gas, ended(three.lags), max(max(port, vessel), sensed)};
+    return (Advanced){three.gas, ended(three.lags), max(max(PORT_COUNTS * port, vessel), max(felt, sensed))};
 }
 
 static double reading(double sensed, const double *k)

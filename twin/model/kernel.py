@@ -22,6 +22,7 @@ from twin.model.plant import (
     PREPARED,
     Gas,
     Lags,
+    positive,
     prepare,
     put,
     reading,
@@ -277,21 +278,29 @@ def _finer(state, k, h, tolerance):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _substep(state, k, h):  # type: ignore[no-untyped-def]
-    """Advance every hypothesis by ``h`` seconds; this loop is run on several of them at once."""
+def _gas(state, i):  # type: ignore[no-untyped-def]
+    return Gas(
+        state[PORT, i],
+        state[PORT_MASS, i],
+        state[LINE, i],
+        state[LINE_MASS, i],
+        state[VESSEL, i],
+        state[VESSEL_MASS, i],
+        state[NEAR, i],
+        state[FAR, i],
+    )
+
+
+@inlined
+def _substep(state, k, h, guess, far_off):  # type: ignore[no-untyped-def]
+    """Advance every hypothesis by ``h`` seconds; this loop is run on several of them at once.
+
+    The rows of gas in ``guess`` are where it may stand a little later; or, ``far_off``, now.
+    """
     for i in range(state.shape[1]):
         nozzle = _valve(state, NOZZLE, h, k, c.RESPONSE, i)
         blow = _valve(state, BLOW, h, k, c.BLOW_OFF_RESPONSE, i)
-        gas = Gas(
-            state[PORT, i],
-            state[PORT_MASS, i],
-            state[LINE, i],
-            state[LINE_MASS, i],
-            state[VESSEL, i],
-            state[VESSEL_MASS, i],
-            state[NEAR, i],
-            state[FAR, i],
-        )
+        gas, ahead = _gas(state, i), positive(_gas(guess, i))
         lags = Lags(
             state[DRIVE, i],
             state[JET, i],
@@ -301,7 +310,8 @@ def _substep(state, k, h):  # type: ignore[no-untyped-def]
             state[SENSED, i],
         )
         before, open_cup = gas.vessel, state[OPEN, i]
-        gas, lags, off = advance_gas(gas, lags, h, (nozzle, blow, open_cup), k, i)
+        valves = nozzle, blow, open_cup
+        gas, lags, off = advance_gas(gas, lags, ahead, far_off, h, valves, k, i)
         state[PORT, i], state[PORT_MASS, i] = gas.port, gas.port_mass
         state[VESSEL, i], state[VESSEL_MASS, i] = gas.vessel, gas.vessel_mass
         state[LINE, i], state[LINE_MASS, i] = gas.line, gas.line_mass
@@ -321,7 +331,7 @@ def _step(state, k, dt, tolerance):  # type: ignore[no-untyped-def]
     for _ in range(count):
         finer = _finer(state, k, h, tolerance)
         for _ in range(finer):
-            _substep(state, k, h / finer)
+            _substep(state, k, h / finer, state, True)
 
 
 @compiled

@@ -35,7 +35,7 @@ from twin.model.kernel import (
     Floats,
     State,
 )
-from twin.model.plant import prepare, put
+from twin.model.plant import G, Gas, prepare, put
 
 TOLERANCE = 0.05  # Pa, of a step; the kernel's, whose steps are shorter, gives errors as small
 ROUGHLY = 0.3  # Pa, the same where a fraction of a pascal does not matter
@@ -49,10 +49,17 @@ TOO_FAR = 1.5  # times the tolerance: the step is done again, shorter
 _SINCE, _LENGTH, _BEFORE = range(3)
 _SENSED, _PORT = 3, 7
 CLOCK = 9
+GAS = len(Gas._fields)  # rows of the state, the first ones
 
 
 def _nowhere() -> State:
     return kernel.new_state(1)
+
+
+def _clock() -> Floats:
+    clock = np.zeros(CLOCK)
+    clock[_BEFORE] = SHORTEST_STEP
+    return clock
 
 
 @dataclass
@@ -62,7 +69,7 @@ class Strides:
     now: State = field(default_factory=_nowhere)  # at the newest row, as far as it is read
     begin: State = field(default_factory=_nowhere)  # of the step under way
     end: State = field(default_factory=_nowhere)
-    clock: Floats = field(default_factory=lambda: np.zeros(CLOCK))
+    clock: Floats = field(default_factory=_clock)
 
     @classmethod
     def at_rest(cls, theta: c.Theta) -> "Strides":
@@ -141,13 +148,21 @@ def _planned(begin, k, before, tolerance):  # type: ignore[no-untyped-def]
 
 @compiled
 def _stride(begin, end, clock, k, longest, tolerance):  # type: ignore[no-untyped-def]
-    """Make a step of at most ``longest`` seconds from ``end`` on, which becomes its beginning."""
+    """Make a step of at most ``longest`` seconds from ``end`` on, which becomes its beginning.
+
+    Where the gas stands at its first stage is guessed by going on as in the step before.
+    """
+    mine, guess = np.empty((STATE, 1)), np.empty((GAS, 1))  # shapes that the compiler knows
+    rate = np.empty(GAS)
+    for row in range(GAS):
+        rate[row] = (end[row, 0] - begin[row, 0]) / clock[_BEFORE]
     put(begin, 0, end, 0)
-    mine = np.empty((STATE, 1))  # its shape is known to the compiler
     h = min(_planned(begin, k, clock[_BEFORE], tolerance), longest)
     while True:
         put(mine, 0, begin, 0)
-        kernel._substep(mine, k, h)
+        for row in range(GAS):
+            guess[row, 0] = begin[row, 0] + G * h * rate[row]
+        kernel._substep(mine, k, h, guess, False)
         off = mine[ROUGH, 0] * h * h * h
         if off <= TOO_FAR * tolerance or h <= SHORTEST_STEP:
             break
