@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 
 from twin.events import Event, Kind, Severity
 from twin.model.effects import EFFECTS
+from twin.monitor import detect
 from twin.monitor.detect import Monitor, MonitorSettings
 from twin.monitor.healthy import Healthy, Scatter
+from twin.monitor.signatures import likenesses
 from twin.signals import MBAR, NS, SAMPLE, TICK, Phase, Quality, Samples, Ticks
 
 STREAM = (
@@ -334,6 +336,15 @@ def test_a_fault_that_stays_is_one_alarm(name: str, fault: str) -> None:
     seen = rigs.watch(name, rigs.cut(samples, 1000))
     events = seen.of(Kind.DEVIATION, Kind.DEVIATION_CLEARED)
     assert kinds(events) == [Kind.DEVIATION]
+
+
+def test_the_cause_of_a_fault_that_stays_is_sought_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To seek it takes longer than all else that is done for a cycle."""
+    sought = []
+    monkeypatch.setattr(detect, "likenesses", lambda *given: sought.append(0) or likenesses(*given))
+    samples = rigs.recorded("test_rig", 35.0, ("leakage=2@c3",), 6)[0]
+    rigs.watch("test_rig", rigs.cut(samples, 1000))
+    assert len(sought) == 1
 
 
 def test_a_cause_that_changes_is_named_anew() -> None:

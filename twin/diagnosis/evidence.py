@@ -26,13 +26,13 @@ from twin.model.dataset import coefficients
 from twin.model.plant import reading_of, sensed_of
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
-from twin.monitor.bins import Bins, Floats, Ints, binned, sparse
+from twin.monitor.bins import Bins, Floats, Ints, binned
 from twin.monitor.cycles import Cycle, CycleCutter, figures
 from twin.monitor.healthy import Healthy
 from twin.monitor.phases import Knees, expected_knees
-from twin.monitor.signatures import steps
+from twin.monitor.signatures import drawn_rows, steps
 from twin.monitor.switching import Seen, seen
-from twin.signals import MBAR, MS, NS, SAMPLE, TICK, UNUSABLE, Command, Phase, Samples, Ticks
+from twin.signals import MBAR, NS, SAMPLE, TICK, UNUSABLE, Command, Phase, Samples, Ticks
 
 CORES: ContextVar[int] = ContextVar("CORES", default=2)  # on which a diagnosis runs
 LATER, LONGEST_SUCTION = 1.3, 10_000  # cycles' suction, rows: until when H1 may be reached
@@ -374,7 +374,7 @@ def of_log(beside: Evidence, blocks: Iterable[Samples]) -> Evidence:
         judged=judged,
         figures=[figures(cycle, beside.theta[c.AMBIENT]) for cycle in cycles],
         bins=_binned(samples, ticks, starts, judged, beside.knees),
-        rows=_rows(samples, ticks),
+        rows=drawn_rows(samples, ticks),
     )
 
 
@@ -422,7 +422,7 @@ def of_cycles(evidence: Evidence, cycles: Sequence[int]) -> Evidence:
         judged=judged,
         figures=[evidence.figures[k] for k in kept],
         bins=_binned(samples, ticks, starts, judged, evidence.knees),
-        rows=_rows(samples, ticks),
+        rows=drawn_rows(samples, ticks),
     )
 
 
@@ -460,14 +460,3 @@ def _unsettled(phase: npt.NDArray[np.uint8], knees: Knees) -> npt.NDArray[np.boo
     inside = [Phase.SUCTION, Phase.HOLD]
     soon = np.isin(kind, inside) & np.isin(before, inside) & (lengths < knees.settles)
     return np.repeat(soon, lengths)
-
-
-def _rows(samples: Samples, ticks: Ticks) -> Ints:
-    """Rows that suffice to draw what is expected: every one where something changes."""
-    begins = np.diff(ticks["phase"], prepend=255) != 0
-    begins |= np.isfinite(ticks["level"])
-    known = np.isfinite(ticks["expected"])
-    begins |= np.diff(known, prepend=False) != 0
-    dt = steps(samples, None)
-    begins |= (dt < 0.5 * MS) | (dt > 1.5 * MS)
-    return sparse(begins)

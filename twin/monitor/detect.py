@@ -30,6 +30,7 @@ _UNFIT = Quality.OUT_OF_RANGE | Quality.OVERFLOW | Quality.STALE | Quality.BAD
 FEWEST_SHARE = 0.95  # of a cycle's samples, to judge it: commands seen late look like a deviation
 RIVAL = 0.05  # probability from which on another cause is named as well
 STANDING = 0.8  # of the best fit's gain: then the name of a standing alarm still holds
+ALIKE = 0.2  # of how far out a cycle is: by so much its figures may move before the cause is sought
 
 
 class MonitorSettings(Settings):
@@ -66,6 +67,7 @@ class Monitor:
     clocks: ClockWatch | None = field(default_factory=ClockWatch)  # None: the PLC has none
     _cutter: CycleCutter = field(default_factory=CycleCutter)
     _before: Cycle | None = None
+    _sought: Mapping[str, float] = field(default_factory=dict)  # figures, as the cause was sought
     _quiet_cycles: int = 0
     _last: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # row of the stream
     _fresh: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # the last that was
@@ -200,8 +202,9 @@ class Monitor:
             return events
         if worst and far >= self.settings.raise_sigma:
             self._quiet_cycles = 0
-            if (raised := self._deviation(worst, before, cycle, verdict)) is not None:
-                events.append(raised)
+            if not self._stands(cycle, worst, found, verdict):
+                self._sought = found
+                events += self._deviation(worst, before, cycle, verdict)
         elif verdict and verdict.raised and verdict.causes and not self.active:
             self._quiet_cycles = 0
             events.append(self._change(cycle, verdict))
@@ -273,16 +276,33 @@ class Monitor:
         }
         return Event(cycle.end_ns, Kind.DEVIATION, text, data)
 
+    def _stands(
+        self, cycle: Cycle, worst: Outlier, found: Mapping[str, float], verdict: "Verdict | None"
+    ) -> bool:
+        """Whether the standing alarm holds for a cycle without its cause being sought again.
+
+        So it does in one that was cut short, and in one that is off as that was in which it was
+        last sought: no other would be found, and to seek it takes long. What the isolation says is
+        there already.
+        """
+        if not self.active or cycle.cut_short:
+            return bool(self.active)
+        if (verdict and verdict.causes) or found.keys() != self._sought.keys():
+            return False
+        names = [name for name in self.settings.healthy.figures if name in found]
+        moved = max(abs(found[name] - self._sought[name]) for name in names)
+        return moved < ALIKE * abs(worst.excess)
+
     def _deviation(
         self, worst: Outlier, before: Cycle | None, cycle: Cycle, verdict: "Verdict | None"
-    ) -> Event | None:
+    ) -> list[Event]:
         """Raise the alarm, or raise it anew when another cause than the standing one fits."""
         ranking = self._name(worst, before, cycle, verdict)
         best = ranking[0]
         also = look_alikes(ranking)
         standing = max((one.share for one in ranking if one.effect == self.active), default=0.0)
-        if self.active and (cycle.cut_short or standing >= STANDING * best.share):
-            return None
+        if self.active and standing >= STANDING * best.share:
+            return []
         self.active = best.effect
         where = worst.figure.rsplit("_", 1)[0].replace("_", "-")
         text = (
@@ -302,7 +322,7 @@ class Monitor:
             "share": best.share,
             "also": ",".join(also),
         }
-        return Event(cycle.end_ns, Kind.DEVIATION, text, data)
+        return [Event(cycle.end_ns, Kind.DEVIATION, text, data)]
 
     def _name(
         self, worst: Outlier, before: Cycle | None, cycle: Cycle, verdict: "Verdict | None"

@@ -7,14 +7,15 @@ from one cycle and without a price for look-alikes; the diagnosis does it proper
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from twin.model import kernel
 from twin.model.effects import EFFECTS, Effect, apply
 from twin.model.theta import Theta
-from twin.signals import BREAK, MBAR, NS, Samples, Ticks, deviation
+from twin.monitor.bins import Floats, Ints, sparse
+from twin.signals import BREAK, MBAR, MS, NS, Samples, Ticks, deviation
 
 LOOK_ALIKE = 0.9  # of the best fit's gain
+NOTHING = 0.02  # mbar rms: what moves the pressure by less in its typical size is not seen in it
 
 
 @dataclass(frozen=True)
@@ -27,25 +28,24 @@ class Likeness:
     share: float
 
 
-def expect(
-    theta: Theta, samples: Samples, phase: npt.NDArray[np.uint8], level: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
-    """Expected pressure (Pa) of fresh models over rows whose phases and levels are known.
-
-    ``theta`` is (coefficients, n), one column for each of n hypotheses; the result is (rows, n).
-    """
-    state, expected = kernel.new_state(theta.shape[1]), np.empty((len(samples), theta.shape[1]))
-    kernel.advance(state, theta, steps(samples, None), phase, level, expected)
-    return expected
-
-
-def steps(samples: Samples, before_ns: int | None) -> npt.NDArray[np.float64]:
+def steps(samples: Samples, before_ns: int | None) -> Floats:
     """Seconds from row to row, −1 where time does not run on; ``before_ns`` is the row before."""
     times = samples["time_ns"]
     first = times[:1] if before_ns is None else np.array([before_ns])
-    dt: npt.NDArray[np.float64] = np.diff(np.concatenate([first[: len(times)], times])) * NS
+    dt: Floats = np.diff(np.concatenate([first[: len(times)], times])) * NS
     dt[(samples["quality"] & BREAK) != 0] = -1.0
     return dt
+
+
+def drawn_rows(samples: Samples, ticks: Ticks) -> Ints:
+    """Rows that suffice to draw what is expected: every one where something changes."""
+    begins = np.diff(ticks["phase"], prepend=255) != 0
+    begins |= np.isfinite(ticks["level"])
+    known = np.isfinite(ticks["expected"])
+    begins |= np.diff(known, prepend=False) != 0
+    dt = steps(samples, None)
+    begins |= (dt < 0.5 * MS) | (dt > 1.5 * MS)
+    return sparse(begins)
 
 
 def likenesses(theta: Theta, samples: Samples, ticks: Ticks, begin: int) -> list[Likeness]:
@@ -54,15 +54,16 @@ def likenesses(theta: Theta, samples: Samples, ticks: Ticks, begin: int) -> list
     The rows before ``begin`` let the model swing in.
     """
     changed = np.stack([theta, *(_typical(theta, effect) for effect in EFFECTS.values())], axis=1)
-    expected = expect(changed, samples, ticks["phase"], ticks["level"].astype(np.float64)) / MBAR
+    drawn = drawn_rows(samples, ticks)
+    expected = _expect(changed, samples, ticks, drawn) / MBAR
+    signatures, number = expected[:, 1:] - expected[:, :1], np.arange(len(samples))
     off = deviation(samples, ticks) / MBAR
-    rows = np.isfinite(off) & np.isfinite(expected[:, 0])
+    rows = np.isfinite(off) & np.isfinite(np.interp(number, drawn, expected[:, 0]))
     rows[:begin] = False
     if not rows.any():
         return []
-    signatures = expected[rows, 1:] - expected[rows, :1]
     found = [
-        _fit(effect, off[rows], signature)
+        _fit(effect, off[rows], np.interp(number[rows], drawn, signature))
         for effect, signature in zip(EFFECTS.values(), signatures.T, strict=True)
     ]
     return sorted(found, key=lambda likeness: -likeness.share)
@@ -73,18 +74,28 @@ def look_alikes(ranking: list[Likeness]) -> list[str]:
     return [one.effect for one in ranking[1:] if one.share >= LOOK_ALIKE * ranking[0].share > 0.0]
 
 
+def _expect(theta: Theta, samples: Samples, ticks: Ticks, rows: Ints) -> Floats:
+    """Pressure (Pa) expected at some rows, (rows, n); ``theta`` is (coefficients, n)."""
+    breaks = steps(samples, None)[rows] < 0.0
+    dt = np.where(breaks, -1.0, np.diff(samples["time_ns"][rows], prepend=0) * NS)
+    dt[:1] = 0.0
+    driven = dt, ticks["phase"][rows], ticks["level"][rows].astype(np.float64)
+    state, expected = kernel.new_state(theta.shape[1]), np.empty((len(rows), theta.shape[1]))
+    kernel.advance(state, theta, *driven, expected, tolerance=kernel.ROUGHLY)
+    return expected
+
+
 def _typical(theta: Theta, effect: Effect) -> Theta:
     sizes = {p.name: p.neutral(theta) + p.typical for p in effect.parameters}
     return apply(theta, effect.name, sizes)
 
 
-def _fit(
-    effect: Effect, off: npt.NDArray[np.float64], signature: npt.NDArray[np.float64]
-) -> Likeness:
+def _fit(effect: Effect, off: Floats, signature: Floats) -> Likeness:
     """Fit ``off`` by a multiple of the signature, of a sign the effect can have."""
     first = effect.parameters[0]
     power = float(signature @ signature)
-    times = float(off @ signature) / power if power > 0.0 else 0.0
+    moves = power > NOTHING**2 * len(signature)
+    times = float(off @ signature) / power if moves else 0.0
     if first.low == 0.0 and first.coefficient is None:
         times = max(times, 0.0)
     share = times * times * power / max(float(off @ off), 1e-12)

@@ -1,0 +1,49 @@
+"""The first answer while the loop runs: few rows drawn, and the same said of them."""
+
+import numpy as np
+import pytest
+import rigs
+
+from twin.model import kernel
+from twin.model.effects import EFFECTS
+from twin.model.theta import Theta
+from twin.monitor import signatures
+from twin.monitor.signatures import drawn_rows, likenesses, steps
+from twin.signals import Quality, Samples, Ticks
+
+BEGIN = 3600  # rows that let the models swing in
+
+
+def beside(name: str, fault: str) -> tuple[Theta, Samples, Ticks]:
+    """Three cycles with something wrong, a gap in the last one."""
+    samples, _ = rigs.recorded(name, 10.0, (fault,))
+    kept = np.delete(samples, slice(7000, 7030))
+    kept["quality"][7000] = Quality.GAP
+    samples, ticks = rigs.expectation(rigs.twin(name), rigs.cut(kept, 1000))
+    return rigs.theta(name), samples, ticks
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+@pytest.mark.parametrize("fault", ["leakage=2.0", "response_delay=20.0"])
+def test_a_tenth_of_the_rows_say_what_all_of_them_do(
+    name: str, fault: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    theta, samples, ticks = beside(name, fault)
+    assert len(drawn_rows(samples, ticks)) < 0.3 * len(samples)
+    few = {one.effect: one for one in likenesses(theta, samples, ticks, BEGIN)}
+    monkeypatch.setattr(signatures, "drawn_rows", lambda samples, _: np.arange(len(samples)))
+    monkeypatch.setattr(kernel, "ROUGHLY", kernel.TOLERANCE)
+    every = {one.effect: one for one in likenesses(theta, samples, ticks, BEGIN)}
+    assert few.keys() == every.keys() == EFFECTS.keys()
+    for effect, one in every.items():
+        assert few[effect].share == pytest.approx(one.share, abs=0.01)
+        if one.share > 0.1:
+            assert few[effect].size == pytest.approx(one.size, rel=0.02)
+
+
+def test_time_that_stands_still_or_jumps_is_drawn() -> None:
+    _, samples, ticks = beside("test_rig", "leakage=2.0")
+    dt = steps(samples, None)
+    odd = np.flatnonzero((dt < 0.0005) | (dt > 0.0015))
+    assert len(odd)
+    assert np.isin(odd, drawn_rows(samples, ticks)).all()
