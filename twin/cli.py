@@ -145,7 +145,7 @@ def run(
             # A PLC that does not answer is said before a log is begun.
             begun, file = _begun(source), _file_of(log, label)
             rotate = round(settings.log.rotate_mb * 1e6)
-            header = _header(settings, hil)
+            header = settings.log_header(hil=hil)
             # The log comes last: what people are told does not wait for the disk.
             sinks = _opened(
                 lambda: consoles[name],
@@ -215,7 +215,7 @@ def replay(
     with _views_of({"": settings}, view, rrd) as view_of, _stop_on_signal(None) as stopped:
         console, kept = Console(), _Kept() if json_file else None
         sinks = _opened(
-            (lambda: Recorder(output, _header(settings))) if output else None,
+            (lambda: Recorder(output, settings.log_header())) if output else None,
             view_of(""),
             lambda: console,
             (lambda: kept) if kept else None,
@@ -352,7 +352,7 @@ def import_(
         print(f"twin: columns not taken: {', '.join(table.ignored)}", file=sys.stderr)
     twin, monitor = pair_of(settings)
     with _whole(output) as part, _stop_on_signal(None) as stopped:
-        sinks = _opened(lambda: Recorder(part, _header(settings)), Console)
+        sinks = _opened(lambda: Recorder(part, settings.log_header()), Console)
         blocks = _until(stopped, _progress(table.blocks(), "importing"))
         run_loop(blocks, twin, monitor, sinks)
     _leave(interrupted=stopped() == "interrupted")
@@ -533,34 +533,6 @@ def _answering(
     plant = Plant(coefficients(settings.data), settings.data.terms)
     with open_writer(settings.document, address, lines) as writer:
         yield from in_place(source, plant, lambda *values: writer.put(Outputs(*values)))
-
-
-def _header(settings: "Config", hil: bool = False) -> "LogHeader":
-    """What a log must carry to be replayed alone."""
-    from importlib.metadata import version
-
-    from twin.log.header import LogHeader
-    from twin.signals import MBAR
-
-    return LogHeader(
-        asset_type=settings.asset.type,
-        asset_id=settings.asset.id,
-        config_name=Path(settings.document.name).name,
-        config_text=settings.document.text,
-        metadata={
-            "program": version("ejector-twin"),
-            "data_set": settings.data.hash,
-            "origin": settings.origin,
-            "data": settings.data.model_dump_json(),
-            "healthy": settings.monitor.healthy.model_dump_json(),
-            **(
-                {"hil": "the pressure is the model's own, as it was written to the PLC"}
-                if hil
-                else {}
-            ),
-        },
-        ambient=settings.data.ambient.pressure_mbar * MBAR,
-    )
 
 
 def _configured(document: "Document", assets: str, unit: str) -> "Config":

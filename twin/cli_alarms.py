@@ -212,13 +212,8 @@ def alarms_of(
     They are kept where ``[alarms]`` asks for it and there is somebody to ``say`` troubles to; a
     replay has nobody, and no clock.
     """
-    from twin.alarms.keeper import Keeper
     from twin.alarms.loop import Alarms
-    from twin.alarms.place import open_chosen
     from twin.alarms.settings import AlarmSettings, board_rules
-    from twin.alarms.store import ALARM_DATABASE
-    from twin.assets.engine import parse_url
-    from twin.assets.unit import Unit
 
     document = settings.document
     by_cause, wanted = board_rules(document), document.section(AlarmSettings, "alarms")
@@ -226,6 +221,13 @@ def alarms_of(
         return lambda: Alarms(by_cause, None)
     if not wanted.keep:
         return lambda: Alarms(by_cause, time.time_ns)
+
+    from twin.alarms.keeper import Keeper  # its SQLAlchemy is only loaded for who keeps them
+    from twin.alarms.place import open_chosen
+    from twin.alarms.store import ALARM_DATABASE
+    from twin.assets.engine import parse_url
+    from twin.assets.unit import Unit
+
     parse_url(wanted.url, ALARM_DATABASE)
     opened = partial(open_chosen, "", document, write=True)
     keeper = Keeper(opened, Unit(settings.asset.type, settings.asset.id), say)

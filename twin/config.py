@@ -10,15 +10,15 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.metadata import version
+from pathlib import Path
 from textwrap import shorten
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field, ValidationError
 
-from twin.assets.database import Assets, Found, UnknownAssetError
 from twin.assets.diagram import FLOW, SUPPLY, VACUUM
-from twin.assets.place import open_chosen
-from twin.assets.record import Record
+from twin.assets.record import Found, Record, UnknownAssetError
 from twin.errors import ConfigError, SourceError
 from twin.log.header import LogHeader
 from twin.model.dataset import DataSet
@@ -26,6 +26,10 @@ from twin.model.diagram import reduce
 from twin.monitor.detect import MonitorSettings
 from twin.monitor.healthy import Healthy
 from twin.settings import Document, Settings
+from twin.signals import MBAR
+
+if TYPE_CHECKING:  # a log brings its own data set, and need not wait for its SQLAlchemy
+    from twin.assets.database import Assets
 
 TABLES = {
     "alarms",
@@ -101,6 +105,8 @@ class Config:
         its own. Not ``calibrated`` is the unit as its type has it, whatever is known of itself.
         ``as_of_ns`` (UTC) takes what the database knew then.
         """
+        from twin.assets.place import open_chosen
+
         document.refuse_unknown_tables(TABLES)
         asset = _asset(document, unit)
         with open_chosen(assets, document, write=False) as database:
@@ -149,6 +155,29 @@ class Config:
         named = {"type": header.asset_type, "id": header.asset_id}
         return replace(config, asset=config.asset.model_copy(update=named))
 
+    def log_header(self, *, hil: bool = False) -> LogHeader:
+        """What a log of this unit must carry to be replayed alone.
+
+        ``hil``: its pressure is the model's own.
+        """
+        metadata = {
+            "program": version("ejector-twin"),
+            "data_set": self.data.hash,
+            "origin": self.origin,
+            "data": self.data.model_dump_json(),
+            "healthy": self.monitor.healthy.model_dump_json(),
+        }
+        if hil:
+            metadata["hil"] = "the pressure is the model's own, as it was written to the PLC"
+        return LogHeader(
+            asset_type=self.asset.type,
+            asset_id=self.asset.id,
+            config_name=Path(self.document.name).name,
+            config_text=self.document.text,
+            metadata=metadata,
+            ambient=self.data.ambient.pressure_mbar * MBAR,
+        )
+
     def refuse_another(self, header: LogHeader, log: str) -> None:
         """ConfigError if this is the configuration of another asset than the log's."""
         recorded = header.asset_type, header.asset_id
@@ -170,7 +199,7 @@ class Config:
         return cls(document, asset, known.data, monitor, log, origin)
 
 
-def check_asset(document: Document, record: Record, database: Assets) -> None:
+def check_asset(document: Document, record: Record, database: "Assets") -> None:
     """ConfigError with file, line and key if a record read from a file would be of no use.
 
     A unit is checked over what the database has of its type.
@@ -198,7 +227,7 @@ def _asset(document: Document, unit: str) -> Asset:
 
 
 def _find(
-    database: Assets, document: Document, type_name: str, unit: str, as_of_ns: int | None
+    database: "Assets", document: Document, type_name: str, unit: str, as_of_ns: int | None
 ) -> Found | None:
     """What the database has; None where it knows neither unit nor type, but [data] does."""
     try:

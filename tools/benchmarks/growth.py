@@ -81,7 +81,7 @@ def _replay_of_a_day(folder: Path) -> tuple[float, str]:
 def _day(path: Path) -> Path:
     """The hour again and again, its clock and numbers running on."""
     rows = len(hour().samples)
-    with Recorder(path, hour().header()) as recorder:
+    with Recorder(path, hour().config.log_header()) as recorder:
         for number in range(DAY_H):
             for samples, ticks in hour().blocks():
                 later = samples.copy()

@@ -82,7 +82,7 @@ def write(path: Path) -> None:
 
 def keep(path: Path, recording: Recording, rows: int | None = None) -> Path:
     """Write a recording, or about its first ``rows``, as a replay would."""
-    with Recorder(path, recording.header()) as recorder:
+    with Recorder(path, recording.config.log_header()) as recorder:
         for samples, ticks in recording.blocks()[: rows and rows // BLOCK]:
             recorder.write(samples, ticks)
     return path

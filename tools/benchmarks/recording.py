@@ -12,10 +12,9 @@ from drivers.plc.settings import PlcSettings
 from drivers.plc.simulate import blocks
 from twin.config import Config
 from twin.live import Twin
-from twin.log.header import LogHeader
 from twin.model.theta import Theta
 from twin.settings import Document
-from twin.signals import MBAR, MS, NS, Samples, Ticks
+from twin.signals import MS, NS, Samples, Ticks
 
 HOUR_S = 3600.0
 MINUTE = 60_000  # rows
@@ -36,12 +35,6 @@ class Recording:
         """Views of the rows, ``BLOCK`` at a time."""
         starts = range(0, len(self.samples), BLOCK)
         return [(self.samples[at : at + BLOCK], self.ticks[at : at + BLOCK]) for at in starts]
-
-    def header(self) -> LogHeader:
-        """What a log of it says about itself."""
-        asset, document = self.config.asset, self.config.document
-        ambient = self.config.data.ambient.pressure_mbar * MBAR
-        return LogHeader(asset.type, asset.id, "test_rig.toml", document.text, {}, ambient=ambient)
 
 
 def new_twin(config: Config) -> Twin:

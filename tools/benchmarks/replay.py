@@ -127,7 +127,7 @@ def _by_turns(ours: Sequence[str | Path], floor: Sequence[str | Path]) -> Measur
 
 def _small_log(folder: Path) -> Path:
     path = folder / "small.mcap"
-    with Recorder(path, hour().header()) as recorder:
+    with Recorder(path, hour().config.log_header()) as recorder:
         recorder.write(*hour().blocks()[0])
     return path
 

@@ -9,7 +9,7 @@ import time
 import uuid
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,29 +18,22 @@ from sqlalchemy import ColumnElement, Connection, Row, func, select
 
 from twin.assets.engine import ASSETS, Database
 from twin.assets.exchange import parse_export, to_export
-from twin.assets.record import Array, Kind, Record, checked, content_hash, holding, to_json
+from twin.assets.record import (
+    Array,
+    Found,
+    Kind,
+    Record,
+    UnknownAssetError,
+    checked,
+    content_hash,
+    holding,
+    to_json,
+)
 from twin.assets.schema import ARRAY, RECORD, is_made, make
 from twin.assets.shipped import shipped_records
 from twin.errors import ConfigError, SourceError
 
 Conditions = Sequence[ColumnElement[bool]]
-
-
-class UnknownAssetError(ConfigError):
-    """Neither a unit nor its type is in the database."""
-
-
-@dataclass(frozen=True)
-class Found:
-    """What ``Assets.get`` found: the unit's own data set or its type's."""
-
-    record: Record
-    base: Record | None = None  # of a unit: what holds of its type
-
-    @property
-    def used(self) -> Kind:
-        """Whether it is the unit's own or its type's."""
-        return self.record.kind
 
 
 def open_assets(

@@ -38,6 +38,23 @@ class Record:
     hash: str = ""
 
 
+@dataclass(frozen=True)
+class Found:
+    """What the database has of an asset: the unit's own data set, or its type's."""
+
+    record: Record
+    base: Record | None = None  # of a unit: what holds of its type
+
+    @property
+    def used(self) -> Kind:
+        """Whether it is the unit's own or its type's."""
+        return self.record.kind
+
+
+class UnknownAssetError(ConfigError):
+    """Neither a unit nor its type is in the database."""
+
+
 def content_hash(record: Record) -> str:
     """16 hex digits over data set, healthy scatter and arrays: same hash, same content."""
     shapes = {name: array.shape for name, array in record.arrays.items()}

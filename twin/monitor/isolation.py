@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from twin.model.dataset import DataSet
 from twin.monitor.bank import DELAY_STEPS, DELAYS, SUSPECTS, UNSURE_OF, Bank
@@ -300,7 +299,7 @@ def looked_for() -> Changes:
 def _whitened(covariance: Floats, *columns: Floats) -> tuple[Floats, float]:
     """Columns beside each other, whitened; and the logarithm of the covariance's determinant."""
     factor = np.linalg.cholesky(covariance)
-    white: Floats = solve_triangular(factor, np.column_stack(columns), lower=True)
+    white: Floats = np.linalg.solve(factor, np.column_stack(columns))
     return white, 2.0 * float(np.sum(np.log(np.diag(factor))))
 
 
