@@ -83,7 +83,7 @@ def test_the_scheme_is_of_third_order(parts: object) -> None:
     def after(steps: int) -> Rows:
         state, k = start.copy().reshape(-1, 1), prepare(theta.reshape(-1, 1))
         for _ in range(steps):
-            kernel._substep(state, k, 0.064 / steps, state, True)
+            kernel._substep(state, k, 0.064 / steps, 0)
         return state[[*PRESSURES, kernel.SENSED], 0]
 
     fine = after(2048)

@@ -22,7 +22,6 @@ from twin.model.plant import (
     PREPARED,
     Gas,
     Lags,
-    positive,
     prepare,
     put,
     reading,
@@ -278,29 +277,25 @@ def _finer(state, k, h, tolerance):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _gas(state, i):  # type: ignore[no-untyped-def]
-    return Gas(
-        state[PORT, i],
-        state[PORT_MASS, i],
-        state[LINE, i],
-        state[LINE_MASS, i],
-        state[VESSEL, i],
-        state[VESSEL_MASS, i],
-        state[NEAR, i],
-        state[FAR, i],
-    )
-
-
-@inlined
-def _substep(state, k, h, guess, far_off):  # type: ignore[no-untyped-def]
+def _substep(state, k, h, guess):  # type: ignore[no-untyped-def]
     """Advance every hypothesis by ``h`` seconds; this loop is run on several of them at once.
 
-    The rows of gas in ``guess`` are where it may stand a little later; or, ``far_off``, now.
+    From row ``guess`` on is the gas as it may be at the step's first stage: 0 is as it is now. Were
+    it in another array, LLVM would run the loop on one at a time.
     """
     for i in range(state.shape[1]):
         nozzle = _valve(state, NOZZLE, h, k, c.RESPONSE, i)
         blow = _valve(state, BLOW, h, k, c.BLOW_OFF_RESPONSE, i)
-        gas, ahead = _gas(state, i), positive(_gas(guess, i))
+        gas = Gas(
+            state[PORT, i],
+            state[PORT_MASS, i],
+            state[LINE, i],
+            state[LINE_MASS, i],
+            state[VESSEL, i],
+            state[VESSEL_MASS, i],
+            state[NEAR, i],
+            state[FAR, i],
+        )
         lags = Lags(
             state[DRIVE, i],
             state[JET, i],
@@ -309,9 +304,19 @@ def _substep(state, k, h, guess, far_off):  # type: ignore[no-untyped-def]
             state[FELT, i],
             state[SENSED, i],
         )
+        ahead = Gas(
+            state[guess + PORT, i],
+            state[guess + PORT_MASS, i],
+            state[guess + LINE, i],
+            state[guess + LINE_MASS, i],
+            state[guess + VESSEL, i],
+            state[guess + VESSEL_MASS, i],
+            state[guess + NEAR, i],
+            state[guess + FAR, i],
+        )
         before, open_cup = gas.vessel, state[OPEN, i]
         valves = nozzle, blow, open_cup
-        gas, lags, off = advance_gas(gas, lags, ahead, far_off, h, valves, k, i)
+        gas, lags, off = advance_gas(gas, lags, ahead, guess == 0, h, valves, k, i)
         state[PORT, i], state[PORT_MASS, i] = gas.port, gas.port_mass
         state[VESSEL, i], state[VESSEL_MASS, i] = gas.vessel, gas.vessel_mass
         state[LINE, i], state[LINE_MASS, i] = gas.line, gas.line_mass
@@ -331,7 +336,7 @@ def _step(state, k, dt, tolerance):  # type: ignore[no-untyped-def]
     for _ in range(count):
         finer = _finer(state, k, h, tolerance)
         for _ in range(finer):
-            _substep(state, k, h / finer, state, True)
+            _substep(state, k, h / finer, 0)
 
 
 @compiled

@@ -100,11 +100,11 @@ def prepare_one(k, i):  # type: ignore[no-untyped-def]
 
 @compiled
 def put(to, i, source, j):  # type: ignore[no-untyped-def]
-    """Copy column ``j`` of ``source`` into the first rows of column ``i``.
+    """Copy column ``j`` of ``source`` into column ``i``: the rows that both have.
 
     In a loop: for slices, numba compiles seconds' worth of what to say where they do not fit.
     """
-    for row in range(source.shape[0]):
+    for row in range(min(to.shape[0], source.shape[0])):
         to[row, i] = source[row, j]
 
 
@@ -405,7 +405,7 @@ def advance(gas, lags, guess, far_off, h, valves, k, i):  # type: ignore[no-unty
     ``guess`` is of the gas at the first stage, and may be ``far_off``: where the step begins.
     """
     step = G * h
-    gas_1, lags_1 = stage(guess, gas, lags, step, valves, far_off, k, i)
+    gas_1, lags_1 = stage(positive(guess), gas, lags, step, valves, far_off, k, i)
     known, held = gas_on(gas, gas, gas_1, _A21), lags_on(lags, lags, lags_1, _A21)
     guess = positive(gas_on(gas, gas, gas_1, _FURTHER))
     gas_2, lags_2 = stage(guess, known, held, step, valves, False, k, i)

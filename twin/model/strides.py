@@ -152,8 +152,7 @@ def _stride(begin, end, clock, k, longest, tolerance):  # type: ignore[no-untype
 
     Where the gas stands at its first stage is guessed by going on as in the step before.
     """
-    mine, guess = np.empty((STATE, 1)), np.empty((GAS, 1))  # shapes that the compiler knows
-    rate = np.empty(GAS)
+    mine, rate = np.empty((STATE + GAS, 1)), np.empty(GAS)  # shapes that the compiler knows
     for row in range(GAS):
         rate[row] = (end[row, 0] - begin[row, 0]) / clock[_BEFORE]
     put(begin, 0, end, 0)
@@ -161,8 +160,8 @@ def _stride(begin, end, clock, k, longest, tolerance):  # type: ignore[no-untype
     while True:
         put(mine, 0, begin, 0)
         for row in range(GAS):
-            guess[row, 0] = begin[row, 0] + G * h * rate[row]
-        kernel._substep(mine, k, h, guess, False)
+            mine[STATE + row, 0] = begin[row, 0] + G * h * rate[row]
+        kernel._substep(mine, k, h, STATE)
         off = mine[ROUGH, 0] * h * h * h
         if off <= TOO_FAR * tolerance or h <= SHORTEST_STEP:
             break
