@@ -102,8 +102,11 @@ class Course:
     @cached_property
     def supply_ends(self) -> Floats:
         """The lowest and the highest of it (bar), but for one reading in a hundred each."""
-        ends = np.quantile(self.supplies, ENDS) if len(self.supplies) else np.full(2, np.nan)
-        return np.asarray(ends)
+        if not len(self.supplies):
+            return np.full(2, np.nan)
+        places = [round(share * (len(self.supplies) - 1)) for share in ENDS]
+        ends: Floats = np.partition(self.supplies, places)[places]
+        return ends
 
     @cached_property
     def leakage(self) -> float:

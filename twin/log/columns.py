@@ -246,7 +246,8 @@ def _unpack(packed, spans, places, n, rows):  # type: ignore[no-untyped-def]
             if kept > 0:
                 _steps(packed, first, n, kept, short[:m])
             else:
-                short[:] = 0
+                for i in range(m):  # numba compiles seconds' worth of what a slice may not fit
+                    short[i] = 0
             bits[column] = _sum(bits[column], short[:m], rows, size, at, width)
 
 

@@ -18,6 +18,7 @@ from twin.signals import MBAR, MS, Phase
 # What a stretch of one phase is: after the air saving suction begins at another pressure.
 KINDS = ("idle", "suction", "hold", "blow_off", "suction_again")
 AGAIN = KINDS.index("suction_again")
+_SUCTION, _HOLD = int(Phase.SUCTION), int(Phase.HOLD)  # plain: NumPy compares bytes with these
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -43,7 +44,7 @@ class Term(Settings):
 
 def kinds(phase: Bytes, before: Bytes) -> Ints:
     """What stretches are, by their phase and the one before: indices into KINDS."""
-    again = (phase == Phase.SUCTION) & (before == Phase.HOLD)
+    again = (phase == _SUCTION) & (before == _HOLD)
     return np.where(again, AGAIN, phase).astype(np.int64)
 
 

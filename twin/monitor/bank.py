@@ -30,6 +30,7 @@ DELAY_STEPS = (0.05, 0.25, 1.5)
 # not so that all else is found later.
 NO_WEAR = ("ambient_pressure", "heat_exchange")
 SELDOM = 0.2
+NO_PHASE = 255  # before the first row
 
 Bytes = npt.NDArray[np.uint8]
 _ROW = np.dtype(
@@ -125,7 +126,7 @@ class Bank:
         self._state = kernel.new_state(self._theta.shape[1])
         self._drawings = Drawings()
         self._last_ns: int | None = None  # PLC time of the newest row
-        self._phase = -1  # and its phase
+        self._phase = NO_PHASE  # and its phase
         self._since = 0  # rows since a bend began, of the newest one
         self._drawn_ns = 0  # PLC time of the newest row that was drawn
         self._whole = 0  # cycles in a row in which nothing was wrong
@@ -182,13 +183,14 @@ class Bank:
         jumps = (fresh["dt"] < 0.5 * MS) | (fresh["dt"] > 1.5 * MS)
         fresh["odd"] = jumps | (samples["quality"] != 0)
         fresh["bends"] = jumps | np.isfinite(ticks["level"])
-        fresh["bends"] |= np.diff(ticks["phase"], prepend=self._phase) != 0
+        before = np.append(np.uint8(self._phase), fresh["phase"][:-1])
+        fresh["bends"] |= fresh["phase"] != before
         number = np.arange(len(fresh))
         begun = np.where(fresh["bends"], number, -1 - self._since)
         fresh["since"] = number - np.maximum.accumulate(begun)
         self._last_ns, self._phase = int(samples["time_ns"][-1]), int(ticks["phase"][-1])
         self._since = int(fresh["since"][-1])
-        self._rows = joined(self._rows, fresh)
+        self._rows = joined(self._rows, fresh) if seen else fresh
 
     def _step_to(self, end: int) -> None:
         """Step over the rows of a piece that come before ``end``."""

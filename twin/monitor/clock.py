@@ -8,6 +8,8 @@ that was set shows against the count, whatever the way does meanwhile.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
+from statistics import median
 
 import numpy as np
 import numpy.typing as npt
@@ -70,7 +72,7 @@ def line(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> tuple[float,
     Theil and Sen's line, as SciPy has it, whose import alone would take longer than a block may.
     """
     n = len(x)
-    i, j = np.triu_indices(n, 1)
+    i, j = _pairs(n)
     slopes = (y[j] - y[i]) / (x[j] - x[i])
     middle = [(len(slopes) - 1) // 2, len(slopes) // 2]
     reach = 1.96 * np.sqrt(n * (n - 1) * (2 * n + 5) / 18)
@@ -78,8 +80,13 @@ def line(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> tuple[float,
     high = min(round((len(slopes) + reach) / 2), len(slopes) - 1)
     slopes.partition([low, *middle, high])  # of thousands only these need be in their places
     slope = float(np.mean(slopes[middle]))
-    at_end = float(np.median(y - slope * (x - x[-1])))
+    at_end = median((y - slope * (x - x[-1])).tolist())
     return slope, float(slopes[high] - slopes[low]) / 2, at_end
+
+
+@lru_cache(maxsize=2)  # most of the time there are as many as are kept
+def _pairs(n: int) -> tuple[Integers, Integers]:
+    return np.triu_indices(n, 1)
 
 
 @dataclass
@@ -211,7 +218,7 @@ class ClockWatch:
         if len(self._aside) <= CONFIRMED:
             return None
         least, most = min(self._aside), max(self._aside)
-        return float(np.median(self._aside)) if least * most > 0 else None
+        return median(self._aside) if least * most > 0 else None
 
     def _moved(self, time_ns: int, by_ns: float, text: str) -> Iterator[Event]:
         """A clock was set: what was known is told, and the estimate begins anew."""
@@ -240,7 +247,7 @@ class ClockWatch:
             return 0.0
         off = self._beyond(self._fastest)
         self._off = 0 if not off else int(np.sign(off)) + (self._off if off * self._off > 0 else 0)
-        late = float(np.median(self._ways)) - self._fastest[1]
+        late = median(self._ways) - self._fastest[1]
         self._points = [*self._points[-KEPT + 1 :], self._fastest]
         self._late = [*self._late[-KEPT + 1 :], late]
         self._since, self._fastest, self._ways = self._since + 1, None, []
@@ -252,8 +259,8 @@ class ClockWatch:
         x, y = self._columns()
         slope, _, at_end = line(x, y)
         off = point[1] - at_end - slope * (point[0] - x[-1])
-        scatter = 1.4826 * float(np.median(np.abs(y - at_end - slope * (x - x[-1]))))
-        unsteady = UNSTEADY * float(np.median(self._late[: len(x)]))
+        scatter = 1.4826 * median(np.abs(y - at_end - slope * (x - x[-1])).tolist())
+        unsteady = UNSTEADY * median(self._late[: len(x)])
         return off if abs(off) > max(SET_NS, 8.0 * scatter, unsteady) else 0.0
 
     def _report(self, time_ns: int) -> Iterator[Event]:
@@ -269,7 +276,7 @@ class ClockWatch:
         """At ``now``, which the line is drawn out to."""
         x, y = self._columns()
         slope, slope_pm, at_end = line(x, y)
-        scatter = 1.4826 * float(np.median(np.abs(y - at_end - slope * (x - x[-1]))))
+        scatter = 1.4826 * median(np.abs(y - at_end - slope * (x - x[-1])).tolist())
         offset_pm = 1.96 * scatter + slope_pm * float(x[-1] - x[0]) / 2
         here = at_end + slope * (now - x[-1])
         return Estimate(-(zero + here) * 1e-6, offset_pm * 1e-6, -slope * 1e6, slope_pm * 1e6)

@@ -1,5 +1,6 @@
 """Cycles cut out of the stream, and the figures each one gives."""
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -183,8 +184,8 @@ def figures(cycle: Cycle, ambient: float) -> dict[str, float]:
         there = off[phases == int(phase)]
         if len(there) >= FEWEST_ROWS:
             name = phase.name.lower()
-            result[f"{name}_mean"] = float(np.mean(there))
-            result[f"{name}_rms"] = float(np.sqrt(np.mean(there**2)))
+            result[f"{name}_mean"] = float(there.sum()) / len(there)
+            result[f"{name}_rms"] = math.sqrt(float(there @ there) / len(there))
     result |= _switching(cycle, ambient)
     if cycle.complete:
         usable = (cycle.samples["quality"] & UNUSABLE) == 0
@@ -202,8 +203,8 @@ def _switching(cycle: Cycle, ambient: float) -> dict[str, float]:
     rows = np.flatnonzero(np.isfinite(cycle.ticks["level"]))
     rows = rows[rows > 0]
     vacuum = (ambient - cycle.ticks["level"][rows].astype(np.float64)) / MBAR
-    off = cycle.ticks["phase"][rows] == Phase.HOLD
-    on = (cycle.ticks["phase"][rows] == Phase.SUCTION) & ~off
+    phase = cycle.ticks["phase"][rows]
+    off, on = phase == int(Phase.HOLD), phase == int(Phase.SUCTION)
     levels = {}
     if off.any():
         levels["h1_level"] = float(vacuum[off].mean())

@@ -36,7 +36,8 @@ class Stretches:
         first = np.flatnonzero(rows["bends"])
         last = np.append(first[1:], len(rows)) - 1
         ms = (rows["time_ns"][last] - rows["time_ns"][first]) * (NS / MS)
-        how = np.column_stack([last - first, ms, np.nan_to_num(rows["level"][first])])
+        level = rows["level"][first]
+        how = np.column_stack([last - first, ms, np.where(np.isnan(level), 0.0, level)])
         may_differ = np.maximum(LONGER * how, LONGER_MS)
         may_differ[:, 2] = LEVEL
         return cls(first, rows["phase"][first].tobytes(), how, may_differ)

@@ -1,6 +1,7 @@
 """What differs from cycle to cycle in a healthy ejector, as a covariance over bins."""
 
 from collections.abc import Mapping
+from functools import cache
 
 import numpy as np
 
@@ -34,10 +35,16 @@ def model_error(known: Mapping[str, ModelError], kind: Ints, time: Floats) -> tu
         if not here.any():
             continue
         error = known.get(name) or _like(known)
-        knots = warped(np.array(error.after_ms) * MS)
+        knots = _knots(error.after_ms)
         common[here] = np.interp(time[here], knots, error.common_mbar)
         alone[here] = np.interp(time[here], knots, error.alone_mbar)
     return common, alone
+
+
+@cache
+def _knots(after_ms: tuple[float, ...]) -> Floats:
+    """The times at which an error is known, warped."""
+    return warped(np.array(after_ms) * MS)
 
 
 def _like(known: Mapping[str, ModelError]) -> ModelError:
@@ -63,5 +70,5 @@ def from_cycle_to_cycle(
     covariance: Floats = moves @ moves.T * (cycle[:, None] == cycle)
     covariance += np.outer(alone, alone) * (np.exp(-np.abs(time[:, None] - time)) * same)
     covariance += KNEE_MBAR**2 * (same * ((kind == _HOLD) | (kind == AGAIN)))
-    covariance[np.diag_indices_from(covariance)] += noise**2 / bins.count[here]
+    np.einsum("ii->i", covariance)[:] += noise**2 / bins.count[here]  # a view of the diagonal
     return covariance
