@@ -82,7 +82,7 @@ def finely(theta: Theta, driven: tuple[Rows, Signals, Rows], parts: int = 20) ->
 def test_a_troubled_stream_is_read_as_finer_rows_would_be(seed: int, name: str) -> None:
     """Also where valves move between rows that are far apart, and where levels do not fit.
 
-    Shifted by hundreds of millibar while it draws, a hose swings: then it is a fifth of one off.
+    Shifted by hundreds of millibar while it draws, a hose swings: then it is a quarter of one off.
     """
     theta = rigs.theta(name)
     driven = stream(theta, seed)
