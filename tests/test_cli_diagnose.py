@@ -7,7 +7,6 @@ import pytest
 import rigs
 from command_line import twin
 
-from twin.cli import _header
 from twin.config import Config
 from twin.live import run
 from twin.log.header import LogHeader
@@ -18,7 +17,7 @@ GRIPPER = rigs.path_of("gripper")
 
 
 def logged(path: Path, samples: Samples, header: LogHeader | None = None) -> Path:
-    sinks = [Recorder(path, header or _header(rigs.config("gripper")))]
+    sinks = [Recorder(path, header or rigs.config("gripper").log_header())]
     run([samples], rigs.twin("gripper"), rigs.monitor("gripper"), sinks)
     return path
 
@@ -141,7 +140,7 @@ def test_the_answer_names_the_unit_that_the_log_is_of(
     """Not the one of the configuration, where --id named another as it was recorded."""
     config = rigs.config("gripper")
     asset = config.asset.model_copy(update={"id": "gripper-09"})
-    known = _header(Config(config.document, asset, config.data, config.monitor, config.log))
+    known = Config(config.document, asset, config.data, config.monitor, config.log).log_header()
     log = logged(here / "a.mcap", rigs.recorded("gripper", 6.0)[0], known)
     assert twin(monkeypatch, "diagnose", log, "--json", "a.json") == 0
     answer = json.loads((here / "a.json").read_text())

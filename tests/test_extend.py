@@ -11,7 +11,6 @@ import rigs
 from command_line import twin
 
 from twin.assets.database import open_assets
-from twin.cli import _header
 from twin.config import Config
 from twin.diagnosis.answer import Diagnosis
 from twin.diagnosis.evidence import Evidence, collect
@@ -36,7 +35,7 @@ SURE = 0.03  # of a size, one sigma
 def logged(path: Path, seed: int) -> Path:
     config = rigs.config("test_rig")
     samples, _ = rigs.recorded("test_rig", SECONDS, LEAK, seed)
-    sinks = [Recorder(path, _header(config))]
+    sinks = [Recorder(path, config.log_header())]
     run(rigs.cut(samples, 1000), rigs.twin("test_rig"), rigs.monitor("test_rig"), sinks)
     return path
 
@@ -316,7 +315,7 @@ def test_too_short_a_log_stores_nothing(
 ) -> None:
     config, log = rigs.config("test_rig"), tmp_path / "short.mcap"
     samples = rigs.recorded("test_rig", SECONDS, LEAK, 5)[0][:7000]
-    sinks = [Recorder(log, _header(config))]
+    sinks = [Recorder(log, config.log_header())]
     run([samples], rigs.twin("test_rig"), rigs.monitor("test_rig"), sinks)
     monkeypatch.chdir(tmp_path)
     assert twin(monkeypatch, "diagnose", log, "--save-as", "leaky") == 0
