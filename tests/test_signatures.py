@@ -25,7 +25,7 @@ def beside(name: str, fault: str) -> tuple[Theta, Samples, Ticks]:
 
 @pytest.mark.parametrize("name", rigs.NAMES)
 @pytest.mark.parametrize("fault", ["leakage=2.0", "response_delay=20.0"])
-def test_a_tenth_of_the_rows_say_what_all_of_them_do(
+def test_few_rows_say_what_all_of_them_do(
     name: str, fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     theta, samples, ticks = beside(name, fault)

@@ -356,7 +356,8 @@ INLINED Advanced advance_gas(const Gas *gas, const Lags *lags, double h, const V
                        three.lags.felt - late.felt);
     double sensed = bent(one.lags.sensed - lags->sensed, two.lags.sensed - held.sensed,
                          three.lags.sensed - late.sensed);
-    return (Advanced){three.gas, ended(three.lags), max(max(PORT_COUNTS * port, vessel), max(felt, sensed))};
+    double off = max(max(PORT_COUNTS * port, vessel), max(felt, sensed));
+    return (Advanced){three.gas, ended(three.lags), off};
 }
 
 static double reading(double sensed, const double *k)

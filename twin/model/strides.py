@@ -37,7 +37,7 @@ from twin.model.kernel import (
 )
 from twin.model.plant import G, Gas, prepare, put
 
-TOLERANCE = 0.05  # Pa, of a step; the kernel's, whose steps are shorter, gives errors as small
+TOLERANCE = 0.05  # Pa, of a step: within 0.4 of the exact solution on the shipped rigs
 ROUGHLY = 0.3  # Pa, the same where a fraction of a pascal does not matter
 SHORTEST_STEP = 40e-6  # s, after a jump of a valve or a cup, and where the exhaust opens
 LONGER = 2.0  # at most so many times as long as the step before
@@ -58,7 +58,7 @@ def _nowhere() -> State:
 
 def _clock() -> Floats:
     clock = np.zeros(CLOCK)
-    clock[_BEFORE] = SHORTEST_STEP
+    clock[_BEFORE] = SHORTEST_STEP  # rates are taken over it
     return clock
 
 

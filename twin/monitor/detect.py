@@ -285,8 +285,10 @@ class Monitor:
         last sought: no other would be found, and to seek it takes long. What the isolation says is
         there already.
         """
-        if not self.active or cycle.cut_short:
-            return bool(self.active)
+        if not self.active:
+            return False
+        if cycle.cut_short:
+            return True
         if (verdict and verdict.causes) or found.keys() != self._sought.keys():
             return False
         names = [name for name in self.settings.healthy.figures if name in found]

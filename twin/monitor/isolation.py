@@ -299,6 +299,7 @@ def looked_for() -> Changes:
 def _whitened(covariance: Floats, *columns: Floats) -> tuple[Floats, float]:
     """Columns beside each other, whitened; and the logarithm of the covariance's determinant."""
     factor = np.linalg.cholesky(covariance)
+    # A triangle: but to import scipy.linalg for it takes longer than it would save.
     white: Floats = np.linalg.solve(factor, np.column_stack(columns))
     return white, 2.0 * float(np.sum(np.log(np.diag(factor))))
 
