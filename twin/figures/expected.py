@@ -111,7 +111,7 @@ class Expectation:
             self._control = kernel.Control.anew()
         driven = self._theta, dt[free], samples["commands"][free]
         out = phase[free], pressure[free], signals[free]
-        strides.run_on(model, self._control, *driven, out, strides.ROUGHLY)
+        strides.run_on(model, self._control, *driven, out, kernel.ROUGHLY)
         self._terms.add(phase, pressure)
         return pressure, phase
 

@@ -49,7 +49,7 @@ NEVER = 1e9  # s, an age that is past every delay
 FINEST = 24  # steps, within TOLERANCE; as many fewer where it is wider as any step then needs
 SQUEEZES = 6  # rounds of Newton's method, from a pressure at most ten times off
 TOLERANCE = 0.02  # Pa, of a step, by which a scheme of second order may be off
-ROUGHLY = 1.0  # Pa, the same where many hypotheses are tried: far below what a sensor resolves
+ROUGHLY = 1.0  # Pa, the same where less would not be seen: far below what a sensor resolves
 
 _IDLE, _SUCTION, _HOLD, _BLOW_OFF = (int(phase) for phase in Phase)
 _SUCTION_COMMAND = int(Command.SUCTION)

@@ -19,6 +19,7 @@ from twin.model.compiled import compiled, inlined
 from twin.model.control import timed
 from twin.model.kernel import (
     BLOW,
+    BLOWING,
     FELT,
     LONGEST_BRIDGE,
     LONGEST_STEP,
@@ -38,7 +39,6 @@ from twin.model.kernel import (
 from twin.model.plant import G, Gas, prepare, put
 
 TOLERANCE = 0.05  # Pa, of a step: within 0.4 of the exact solution on the shipped rigs
-ROUGHLY = 0.3  # Pa, the same where a fraction of a pascal does not matter
 SHORTEST_STEP = 40e-6  # s, after a jump of a valve or a cup, and where the exhaust opens
 LONGER = 2.0  # at most so many times as long as the step before
 SURE = 0.9  # of the length at which the error should be just within tolerance
@@ -112,7 +112,7 @@ def simulate(theta: c.Theta, dt: Floats, commands: Bytes) -> tuple[Bytes, Floats
     """Phase and expected pressure (Pa) of a free run from rest, where little precision matters."""
     phase, expected, signals = (np.empty(len(dt), kind) for kind in ("u1", "f8", "u1"))
     out = phase, expected, signals
-    run_on(Strides.at_rest(theta), kernel.Control.anew(), theta, dt, commands, out, ROUGHLY)
+    run_on(Strides.at_rest(theta), kernel.Control.anew(), theta, dt, commands, out, kernel.ROUGHLY)
     return phase, expected
 
 
@@ -132,13 +132,20 @@ def _until_jump(state, k):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _planned(begin, k, before, tolerance):  # type: ignore[no-untyped-def]
-    """Length of the next step (s): smooth within, and ending where a valve acts."""
+def _planned(begin, k, moving, before, tolerance):  # type: ignore[no-untyped-def]
+    """Length of the next step (s): smooth within, and ending where a valve acts.
+
+    So it ends where blow-off brings the port, ``moving`` by so much (Pa/s), to ambient pressure:
+    there the exhaust opens.
+    """
     rough = begin[ROUGH, 0]
     h = min(LONGEST_STEP, LONGER * before)
     h = min(h, SURE * (tolerance / rough) ** (1.0 / 3.0)) if rough > 0.0 else h
-    while h > SHORTEST_STEP and (kernel._passes(begin, k, h, 0) or kernel._release(begin, k, h, 0)):
+    while h > SHORTEST_STEP and kernel._release(begin, k, h, 0):
         h *= 0.5
+    opens = (k[c.AMBIENT, 0] - begin[PORT, 0]) / moving
+    if begin[BLOWING, 0] > 0.01 and 0.0 < opens < h:
+        h = opens
     h = max(h, SHORTEST_STEP)
     jump = _until_jump(begin, k)
     if jump < 1e-9:
@@ -156,7 +163,7 @@ def _stride(begin, end, clock, k, longest, tolerance):  # type: ignore[no-untype
     for row in range(GAS):
         rate[row] = (end[row, 0] - begin[row, 0]) / clock[_BEFORE]
     put(begin, 0, end, 0)
-    h = min(_planned(begin, k, clock[_BEFORE], tolerance), longest)
+    h = min(_planned(begin, k, rate[PORT], clock[_BEFORE], tolerance), longest)
     while True:
         put(mine, 0, begin, 0)
         for row in range(GAS):
