@@ -42,6 +42,7 @@ clean:
 .venv/run: .venv/bin/python requirements.lock pyproject.toml
 	$(PIP) --require-hashes -r requirements.lock
 	$(PIP) --no-build-isolation --no-deps --editable .
+	$(BIN)/python -m compileall -q twin drivers
 	touch $@
 
 .venv/dev: .venv/run requirements-dev.lock

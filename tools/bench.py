@@ -9,6 +9,7 @@ for how long; it replays a day, and counts false alarms and causes that are told
 """
 
 import argparse
+import os
 import signal
 import sys
 import tempfile
@@ -318,6 +319,8 @@ BENCHMARKS = (
 def main() -> int:
     """Measure, print, write; gives the exit code."""
     given = _arguments()
+    # As after a first start, whatever this shell says: what is measured is not to be parsed anew.
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     before, load = machine.noise(), machine.Load.now()
     results, seconds = [], {}
     with tempfile.TemporaryDirectory(prefix="ejector-twin-bench-") as folder:
