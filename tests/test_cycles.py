@@ -65,7 +65,7 @@ def test_what_begins_or_ends_in_the_middle_is_not_complete() -> None:
     assert lengths(found) == [(-1, 39, False), (0, 30, False)]
 
 
-@pytest.mark.parametrize("flag", BREAK)
+@pytest.mark.parametrize("flag", Quality(BREAK))
 def test_a_break_ends_a_cycle(flag: Quality) -> None:
     samples, ticks = rows((IDLE, 10), *CYCLE, *CYCLE)
     samples["quality"][10 + 30] = flag

@@ -294,7 +294,7 @@ def test_suction_without_end_is_told_after_a_while() -> None:
 # What breaks a cycle.
 
 
-@pytest.mark.parametrize("flag", BREAK)
+@pytest.mark.parametrize("flag", Quality(BREAK))
 def test_a_break_leaves_what_was_known_before_it(flag: Quality) -> None:
     samples, ticks = (rows.copy() for rows in seen("test_rig"))
     begin = int(np.flatnonzero(samples["commands"] == 1)[0])

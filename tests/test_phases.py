@@ -224,7 +224,7 @@ def test_rows_before_a_break_say_nothing_about_those_after_it() -> None:
     assert np.flatnonzero(np.isfinite(level)).tolist() == [IDLE_ROWS - 1]
 
 
-@pytest.mark.parametrize("flag", BREAK)
+@pytest.mark.parametrize("flag", Quality(BREAK))
 def test_a_break_is_no_knee(flag: Quality) -> None:
     falling = 1e5 - 100.0 * np.arange(300)
     samples = stream([1] * 600, np.concatenate([falling, np.full(300, falling[-1])]))

@@ -79,8 +79,9 @@ class Quality(IntFlag):
     BAD = 64  # the PLC or the server says itself that the value is bad
 
 
-UNUSABLE = Quality.OVERFLOW | Quality.STALE | Quality.BAD  # no pressure to compare with
-BREAK = Quality.GAP | Quality.RESTART | Quality.CLOCK  # time does not run on from the row before
+# Plain numbers: with an IntFlag NumPy makes 64 bits of every byte.
+UNUSABLE = int(Quality.OVERFLOW | Quality.STALE | Quality.BAD)  # no pressure to compare with
+BREAK = int(Quality.GAP | Quality.RESTART | Quality.CLOCK)  # time does not run on from before
 
 
 class Phase(IntEnum):
