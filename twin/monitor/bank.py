@@ -4,6 +4,7 @@ Each hypothesis is the data set with a little of one parameter of one effect. Wh
 expects less what the unchanged one does is the effect's signature in the cycles as they are now.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,9 +13,10 @@ import numpy.typing as npt
 
 from twin.model import kernel
 from twin.model import theta as c
+from twin.model.compiled import compiled
 from twin.model.effects import EFFECTS, Parameter, apply
 from twin.model.theta import Theta
-from twin.monitor.bins import Floats, Ints, drawn
+from twin.monitor.bins import Floats, Ints, sparse
 from twin.monitor.cycles import Cycle
 from twin.monitor.drawings import Drawing, Drawings, Stretches
 from twin.monitor.signatures import steps
@@ -116,7 +118,7 @@ class Bank:
     """Takes the twin's cycles, and says what each hypothesis expects in them.
 
     Signatures are smooth but where a phase or a stretch begins, so the bank steps from one to the
-    next of the rows that suffice to draw them (``bins.drawn``). Where a cycle goes as one that is
+    next of the rows that suffice to draw them (``bins.sparse``). Where a cycle goes as one that is
     known, nothing is stepped: what was drawn then is given again (``drawings``), and the models
     stand where that one ended.
     """
@@ -155,7 +157,7 @@ class Bank:
         in that: right is what one hypothesis expects less what another does.
         """
         self._see(cycle.samples, cycle.ticks)
-        drawn = np.flatnonzero(_drawn(self._rows))
+        drawn = _drawn(self._rows)
         plain = cycle.complete and not self._rows["odd"].any()
         stretches = Stretches.of(self._rows) if plain else None
         known = self._drawings.like(stretches) if stretches else None
@@ -178,16 +180,8 @@ class Bank:
         if not len(samples):
             return
         fresh = np.empty(len(samples), _ROW)
-        fresh["time_ns"], fresh["level"] = samples["time_ns"], ticks["level"]
-        fresh["phase"], fresh["dt"] = ticks["phase"], steps(samples, self._last_ns)
-        jumps = (fresh["dt"] < 0.5 * MS) | (fresh["dt"] > 1.5 * MS)
-        fresh["odd"] = jumps | (samples["quality"] != 0)
-        fresh["bends"] = jumps | np.isfinite(ticks["level"])
-        before = np.append(np.uint8(self._phase), fresh["phase"][:-1])
-        fresh["bends"] |= fresh["phase"] != before
-        number = np.arange(len(fresh))
-        begun = np.where(fresh["bends"], number, -1 - self._since)
-        fresh["since"] = number - np.maximum.accumulate(begun)
+        dt = steps(samples, self._last_ns)
+        _look_at(samples, ticks, dt, self._phase, self._since, fresh)
         self._last_ns, self._phase = int(samples["time_ns"][-1]), int(ticks["phase"][-1])
         self._since = int(fresh["since"][-1])
         self._rows = joined(self._rows, fresh) if seen else fresh
@@ -195,10 +189,10 @@ class Bank:
     def _step_to(self, end: int) -> None:
         """Step over the rows of a piece that come before ``end``."""
         ahead = self._rows[self._stepped : end + 1]  # and the one after them
-        count = end - self._stepped
-        some = _drawn(ahead)[:count]
-        after = np.append(ahead["phase"][1:], ahead["phase"][-1:])[:count][some]
-        rows, self._stepped = ahead[:count][some], end
+        some = _drawn(ahead)
+        some = some[some < end - self._stepped]
+        after = ahead["phase"][np.minimum(some + 1, len(ahead) - 1)]
+        rows, self._stepped = ahead[some], end
         if not len(rows):
             return
         before = np.concatenate([[self._drawn_ns], rows["time_ns"][:-1]])
@@ -213,10 +207,26 @@ class Bank:
         self._expected = np.concatenate([self._expected, expected])
 
 
-def _drawn(rows: npt.NDArray[np.void]) -> npt.NDArray[np.bool_]:
+@compiled
+def _look_at(samples, ticks, dt, phase, since, rows):  # type: ignore[no-untyped-def]
+    """Fill the bank's ``rows`` for some that came ``dt`` after those before.
+
+    ``phase`` and ``since`` are those of the row before the first.
+    """
+    for i in range(len(rows)):
+        row, here = rows[i], ticks[i].phase
+        jumps = dt[i] < 0.5 * MS or dt[i] > 1.5 * MS
+        row.time_ns, row.dt = samples[i].time_ns, dt[i]
+        row.level, row.phase = ticks[i].level, here
+        row.bends = jumps or math.isfinite(ticks[i].level) or here != phase
+        row.odd = jumps or samples[i].quality != 0
+        phase, since = here, 0 if row.bends else since + 1
+        row.since = since
+
+
+def _drawn(rows: npt.NDArray[np.void]) -> Ints:
     """Which of a piece's rows are drawn: also the last before a bend, and the very last."""
-    last: npt.NDArray[np.bool_] = np.append(rows["bends"][1:], True)
-    return drawn(rows["since"]) | last
+    return sparse(rows["bends"], int(rows["since"][0]) - 1)
 
 
 def _phases(phase: Bytes, after: Bytes, count: int) -> Bytes:

@@ -5,11 +5,12 @@ bins, correlations and all else run in warped time: logarithmic from an edge on,
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
-from twin.model.compiled import compiled
+from twin.model.compiled import compiled, inlined
 from twin.model.term import kinds
 from twin.signals import MS
 
@@ -57,17 +58,23 @@ def _add_lines(number, kept, values, sums):  # type: ignore[no-untyped-def]
     for after in range(len(kept)):
         before = max(after - 1, 0)
         first, last = kept[before], kept[after]
-        left, right = values[before], values[after]
-        for row in range(first + 1, last):
-            if number[row] >= 0:
-                share = (last - row) / (last - first)
-                total = sums[number[row]]
-                for i in range(len(total)):
-                    total[i] += share * left[i] + (1.0 - share) * right[i]
+        row = first + 1
+        while row < last:
+            here, rows, share = number[row], 0, 0.0
+            while row < last and number[row] == here:  # of one bin they are summed together
+                rows, share, row = rows + 1, share + (last - row) / (last - first), row + 1
+            if here >= 0:
+                _add(sums[here], share, values[before])
+                _add(sums[here], rows - share, values[after])
         if number[last] >= 0:  # whatever is beside it
-            total = sums[number[last]]
-            for i in range(len(total)):
-                total[i] += right[i]
+            _add(sums[number[last]], 1.0, values[after])
+
+
+@inlined
+def _add(total, times, values):  # type: ignore[no-untyped-def]
+    """Add so many times the values."""
+    for i in range(len(total)):
+        total[i] += times * values[i]
 
 
 def warped(seconds: Floats) -> Floats:
@@ -95,56 +102,75 @@ def binned(
 
     What comes before the first of them belongs to cycle -1.
     """
-    begins = _changes(phase)
-    begins[starts[starts < len(phase)]] = True
-    first = np.flatnonzero(begins)
-    stretch = np.cumsum(begins) - 1
-    time = warped((np.arange(len(phase)) - first[stretch]) * MS)
-    step = np.floor(time * per_unit).astype(np.int64)
-    place = (stretch << 16) + step
-    used = np.flatnonzero(usable)
-    new = _changes(place[used])  # places only grow
-    at = np.flatnonzero(new)
-    here, count = used[at], np.diff(np.append(at, len(used)))
-    kind = kinds(phase[first], phase[np.maximum(first - 1, 0)])[stretch[here]]
-    result = np.full(len(phase), -1)
-    result[used] = np.cumsum(new) - 1
-    cycle = np.searchsorted(starts, here, "right") - 1
-    alike = (kind << 16) + step[here]
-    return Bins(result, count, cycle, stretch[here], kind, time[here], alike)
+    number = np.empty(len(phase), np.int64)
+    last_step = int(warped(np.array(len(phase) * MS)) * per_unit)
+    found = _number(np.array(phase), usable, starts, _begins(last_step + 1, per_unit), number)
+    count, cycle, stretch, begin, since, step = found
+    kind = kinds(phase[begin], phase[np.maximum(begin - 1, 0)])
+    return Bins(number, count, cycle, stretch, kind, warped(since * MS), (kind << 16) + step)
 
 
-def _changes(values: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
-    """Where a value is not the one before it; so is the first one."""
-    changes = np.ones(len(values), np.bool_)
-    np.not_equal(values[1:], values[:-1], out=changes[1:])
-    return changes
+@lru_cache(maxsize=16)
+def _begins(steps: int, per_unit: int) -> Ints:
+    """After how many rows of a stretch each step of warped time begins; and what comes after."""
+    return np.ceil(unwarped(np.arange(steps + 1) / per_unit) / MS).astype(np.int64)
 
 
-def sparse(begins: npt.NDArray[np.bool_]) -> Ints:
-    """Rows that suffice to draw a curve whose bends begin at some rows: fewer, the later after."""
-    rows = np.arange(len(begins))
-    since = rows - np.maximum.accumulate(np.where(begins, rows, 0))
-    kept = drawn(since) | np.roll(begins, -1)  # the last ones before as well
-    kept[-1:] = True
-    return np.flatnonzero(kept)
+@compiled
+def _number(phase, usable, starts, begins, number):  # type: ignore[no-untyped-def]
+    """Number the bin of each row, and tell of each bin, (6, bins).
+
+    Rows, cycle, stretch, the stretch's first row, rows from there on, and steps in warped time.
+    """
+    found = np.empty((6, len(phase)), np.int64)
+    bins, cycle, stretch, first = 0, -1, -1, 0
+    step, used = 0, -1  # the last that has a bin
+    for row in range(len(phase)):
+        begun = row == 0 or phase[row] != phase[row - 1]
+        while cycle + 1 < len(starts) and starts[cycle + 1] <= row:
+            cycle, begun = cycle + 1, True
+        if begun:
+            stretch, first, step, used = stretch + 1, row, 0, -1
+        while begins[step + 1] <= row - first:
+            step += 1
+        number[row] = -1
+        if usable[row]:
+            if step != used:
+                found[:, bins] = 0, cycle, stretch, first, row - first, step
+                bins, used = bins + 1, step
+            found[0, bins - 1] += 1
+            number[row] = bins - 1
+    return found[:, :bins].copy()
 
 
-def drawn(since: Ints) -> npt.NDArray[np.bool_]:
-    """Whether a row is one of those, by how many rows ago a bend began."""
-    late = since - _LAST
-    found: npt.NDArray[np.bool_] = _IS_EARLY[np.minimum(since, _LAST + 1)]
-    found |= (late > 0) & (late % FARTHEST == 0)
-    return found
+def sparse(begins: npt.NDArray[np.bool_], since: int = -1) -> Ints:
+    """Rows that suffice to draw a curve whose bends begin at some rows: fewer, the later after.
+
+    Before the first row the last bend began ``since`` rows ago.
+    """
+    kept: Ints = _sparse(np.ascontiguousarray(begins), since)
+    return kept
 
 
-def _early() -> list[int]:
-    """The first of them, until they are as far apart as they get."""
-    offsets = [0]
-    while offsets[-1] < SPARSE * FARTHEST:
-        offsets.append(offsets[-1] + max(offsets[-1] // SPARSE, 1))
-    return offsets
+@compiled
+def _sparse(begins, since):  # type: ignore[no-untyped-def]
+    kept = np.empty(len(begins), np.int64)
+    count, due = 0, 0  # rows after a bend
+    while due <= since:
+        due += _apart(due)
+    for row in range(len(begins)):
+        since += 1
+        if begins[row]:
+            since = due = 0
+        if since == due or row + 1 == len(begins) or begins[row + 1]:  # the last before as well
+            kept[count] = row
+            count += 1
+        if since == due:
+            due += _apart(due)
+    return kept[:count].copy()
 
 
-_LAST = _early()[-1]
-_IS_EARLY = np.isin(np.arange(_LAST + 2), _early())  # and one that is late
+@inlined
+def _apart(since):  # type: ignore[no-untyped-def]
+    """Rows from one that is kept so many rows after a bend to the next."""
+    return min(max(since // SPARSE, 1), FARTHEST)
