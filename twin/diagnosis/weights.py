@@ -17,7 +17,7 @@ from twin.model import theta as c
 from twin.model.courses import Cause, Course, Schedule
 from twin.model.theta import Theta
 from twin.monitor.bins import Floats, Ints
-from twin.monitor.weights import SCATTER, from_cycle_to_cycle, model_error
+from twin.monitor.weights import SCATTER, from_cycle_to_cycle, lasting, model_error
 from twin.signals import MS, Phase
 
 # When a valve acts: an edge that moves is not linear in that.
@@ -75,7 +75,8 @@ class Covariance:
         common = np.hypot(common, self.mismatch[here])
         moves, left_open = self.moves[here] * float(scattered), self.left_open[here]
         apart = np.exp(-np.abs(time[:, None] - time))
-        covariance = from_cycle_to_cycle(bins, here, alone, moves, evidence.noise)
+        goes_on = lasting(bins, here, alone)
+        covariance = from_cycle_to_cycle(bins, here, goes_on, moves, evidence.noise)
         covariance += np.outer(common, common) * (apart * (kind[:, None] == kind))
         usual = _usual(np.diag(covariance), bins.count[here], evidence.noise)
         at_supply = np.sum(left_open[:, : len(SUPPLY_UNKNOWN)] ** 2, axis=1)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -51,6 +52,11 @@ class Cycle:
     def end_ns(self) -> int:
         """PLC time of the last row."""
         return int(self.samples["time_ns"][-1])
+
+    @cached_property
+    def off(self) -> npt.NDArray[np.float64]:
+        """Measured less expected pressure (mbar), row by row; NaN where either cannot be used."""
+        return deviation(self.samples, self.ticks) / MBAR
 
 
 class Told(Protocol):
@@ -173,7 +179,7 @@ def figures(cycle: Cycle, ambient: float) -> dict[str, float]:
     Deviation per phase as mean and rms; the vacuum at which the air saving switched; evacuation
     times to H2 measured and expected; the highest vacuum. What a cycle cannot say is left out.
     """
-    off = deviation(cycle.samples, cycle.ticks) / MBAR
+    off = cycle.off
     result: dict[str, float] = {}
     broken_off = cycle.ticks["phase"][-1] if cycle.cut_short else None
     known = np.isfinite(off)

@@ -19,12 +19,13 @@ from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import Healthy
 from twin.monitor.phases import Knees, expected_knees
 from twin.monitor.switching import seen
-from twin.monitor.weights import SCATTER, from_cycle_to_cycle, model_error
-from twin.signals import MBAR, UNUSABLE, deviation
+from twin.monitor.weights import SCATTER, from_cycle_to_cycle, lasting, model_error
+from twin.signals import MBAR
 
 PER_UNIT = 2  # bins in each unit of warped time
 LEVELS = ("h1_level", "h1_low_level")
 UNKNOWN_LEVEL_MBAR = 3.0  # one sigma of a level that healthy cycles do not show
+PLACES = 8  # that are remembered: of a program or two, with what jitters
 SUCTION_ROWS = 4000  # commanded, to see where each suspect switches
 WEAK = 1e-4  # sigmas² of a step: nothing in the cycle depends on it
 
@@ -71,8 +72,8 @@ class Said:
 
     def _weighed(self) -> tuple[Floats, Floats]:
         """Signatures by the inverse covariance, and the sigmas² of each; 0 where there are none."""
-        weighed = np.linalg.solve(self.alone, self.signatures).astype(np.float64)
-        power = np.sum(self.signatures * weighed, axis=0)
+        weighed = np.linalg.solve(self.alone, self.signatures).astype(np.float64, copy=False)
+        power = np.einsum("ij,ij->j", self.signatures, weighed)
         power[power < WEAK] = 0.0
         return weighed, power
 
@@ -88,6 +89,7 @@ class Listener:
     _levels: Floats = field(init=False)  # mbar, by which each level moves, (levels, hypotheses)
     _means: Floats = field(init=False)  # mbar, of each level in healthy cycles
     _sigmas: Floats = field(init=False)
+    _seen: dict[bytes, "_Places"] = field(default_factory=dict)  # by where the bins are
 
     @classmethod
     def of(cls, data: DataSet, healthy: Healthy) -> "Listener":
@@ -111,45 +113,50 @@ class Listener:
 
         ``figures`` are the monitor's.
         """
-        off = deviation(cycle.samples, cycle.ticks) / MBAR
-        known: npt.NDArray[np.bool_] = np.all(np.isfinite(expected), axis=1)
+        known = np.isfinite(expected.sum(axis=1))
         if not known.any():
             return None
-        between = np.interp(np.arange(len(off)), drawn, known.astype(float), 0.0, 0.0)
-        usable = np.isfinite(off) & (between == 1.0)
-        usable &= (cycle.samples["quality"] & UNUSABLE) == 0
+        usable = _between(drawn, known, cycle.off)
         if not usable.any():
             return None
         bins = binned(cycle.ticks["phase"], usable, np.zeros(1, np.int64), PER_UNIT)
-        moved = (expected[:, 1:] - expected[:, :1]) / MBAR
-        moved[~known] = 0.0
-        signatures = bins.through(drawn, moved)
-        return self._with_levels(bins, bins.mean(off), signatures, figures)
+        through = bins.through(drawn, expected)
+        signatures = (through[:, 1:] - through[:, :1]) / MBAR
+        return self._with_levels(bins, bins.mean(cycle.off), signatures, figures)
 
     def _with_levels(
         self, bins: Bins, off: Floats, signatures: Floats, figures: Mapping[str, float]
     ) -> Said:
-        place, first = np.unique(bins.place, return_index=True)  # what comes again counts once
-        common, alone = model_error(self.healthy.error, bins.kind[first], bins.time[first])
-        moves = self._moves(signatures[first])
-        covariance = from_cycle_to_cycle(bins, first, alone, moves, self.noise)
+        at = self._places(bins)
+        off, signatures = off[at.first], signatures[at.first]
+        moves = self._moves(signatures)
+        covariance = from_cycle_to_cycle(bins, at.first, at.goes_on, moves, self.noise)
         shown = [number for number, name in enumerate(LEVELS) if name in figures]
         level = np.array([figures[LEVELS[number]] for number in shown]) - self._means[shown]
-        moved = np.concatenate([signatures[first], self._levels[shown]])
-        known = np.cumsum([len(SUSPECTS), len(DELAYS) * LARGER])
-        suspects, larger, ways = np.split(moved, known, axis=1)
+        moved = np.concatenate([signatures, self._levels[shown]])
+        larger = len(SUSPECTS) + len(DELAYS) * LARGER
+        suspects, ways = moved[:, : len(SUSPECTS)], moved[:, larger:]
         numbers = np.array(shown, np.int64) - len(LEVELS)
         return Said(
-            np.concatenate([place, numbers]),
-            np.concatenate([bins.kind[first], numbers]),
-            np.concatenate([bins.time[first], np.zeros(len(shown))]),
-            np.concatenate([off[first], level]),
+            np.concatenate([at.place, numbers]),
+            np.concatenate([at.kind, numbers]),
+            np.concatenate([at.time, np.zeros(len(shown))]),
+            np.concatenate([off, level]),
             suspects,
-            larger,
+            moved[:, len(SUSPECTS) : larger],
             ways - suspects[:, [UNSURE_OF]],
             _beside(covariance * self.healthy.leftover**2, self._sigmas[shown] ** 2),
-            np.concatenate([common, self._sigmas[shown]]),
+            np.concatenate([at.common, self._sigmas[shown]]),
         )
+
+    def _places(self, bins: Bins) -> "_Places":
+        """Where the bins are, with what follows from it; most cycles have theirs at the same."""
+        key = b"".join(of.tobytes() for of in (bins.stretch, bins.kind, bins.time))
+        if key not in self._seen:
+            if len(self._seen) == PLACES:
+                self._seen.clear()
+            self._seen[key] = _Places.of(bins, self.healthy)
+        return self._seen[key]
 
     def _moves(self, signatures: Floats) -> Floats:
         """By how much (mbar) what scatters moves each bin, one sigma of it, (bins, scatters)."""
@@ -167,6 +174,35 @@ class Listener:
                 numbers.append(number)
                 sigmas.append(self.healthy.scatter.get(one.effect, usual) / one.step)
         return numbers, sigmas
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Where the bins of a cycle are, and what is the same for all that have theirs there."""
+
+    first: Ints  # bins; what comes again counts once
+    place: Ints  # of those, as are all of these
+    kind: Ints
+    time: Floats
+    common: Floats  # mbar, by which the model is off in all cycles
+    goes_on: Floats  # mbar², covariance of what does so for a while, and differs between cycles
+
+    @classmethod
+    def of(cls, bins: Bins, healthy: Healthy) -> "_Places":
+        place, first = np.unique(bins.place, return_index=True)
+        kind, time = bins.kind[first], bins.time[first]
+        common, alone = model_error(healthy.error, kind, time)
+        return cls(first, place, kind, time, common, lasting(bins, first, alone))
+
+
+def _between(drawn: Ints, known: npt.NDArray[np.bool_], off: Floats) -> npt.NDArray[np.bool_]:
+    """Where there is a deviation and the drawn rows on either side are all known."""
+    found: npt.NDArray[np.bool_] = np.isfinite(off)
+    found[: drawn[0]] = found[drawn[-1] + 1 :] = False
+    edges = np.concatenate([[-1], drawn, [len(off)]])
+    for unknown in np.flatnonzero(~known):
+        found[edges[unknown] + 1 : edges[unknown + 2]] = False
+    return found
 
 
 def _beside(covariance: Floats, variances: Floats) -> Floats:

@@ -55,20 +55,27 @@ def _like(known: Mapping[str, ModelError]) -> ModelError:
     return ModelError(after_ms=(0.0,), common_mbar=(worst[0],), alone_mbar=(worst[1],))
 
 
+def lasting(bins: Bins, here: Ints, alone: Floats) -> Floats:
+    """Covariance (mbar²) between the bins ``here`` of what goes on for a while.
+
+    The model's error from cycle to cycle, ``alone`` (mbar) in each, and the level found at a knee.
+    """
+    stretch, kind, time = (of[here] for of in (bins.stretch, bins.kind, bins.time))
+    same = stretch[:, None] == stretch
+    covariance: Floats = np.outer(alone, alone) * (np.exp(-np.abs(time[:, None] - time)) * same)
+    covariance += KNEE_MBAR**2 * (same * ((kind == _HOLD) | (kind == AGAIN)))
+    return covariance
+
+
 def from_cycle_to_cycle(
-    bins: Bins, here: Ints, alone: Floats, moves: Floats, noise: float
+    bins: Bins, here: Ints, goes_on: Floats, moves: Floats, noise: float
 ) -> Floats:
     """Covariance (mbar²) between the bins ``here`` of what is not the same in all cycles.
 
-    Noise (mbar, of a row), the model's error from cycle to cycle, the level found at a knee, and
-    what scatters: by how much (mbar) each bin ``moves`` with one sigma of it, (bins, scatters).
+    Noise (mbar, of a row), what ``goes_on`` for a while (see ``lasting``), and what scatters: by
+    how much (mbar) each bin ``moves`` with one sigma of it, (bins, scatters).
     """
-    cycle, stretch, kind, time = (
-        of[here] for of in (bins.cycle, bins.stretch, bins.kind, bins.time)
-    )
-    same = stretch[:, None] == stretch
-    covariance: Floats = moves @ moves.T * (cycle[:, None] == cycle)
-    covariance += np.outer(alone, alone) * (np.exp(-np.abs(time[:, None] - time)) * same)
-    covariance += KNEE_MBAR**2 * (same * ((kind == _HOLD) | (kind == AGAIN)))
+    cycle = bins.cycle[here]
+    covariance: Floats = moves @ moves.T * (cycle[:, None] == cycle) + goes_on
     np.einsum("ii->i", covariance)[:] += noise**2 / bins.count[here]  # a view of the diagonal
     return covariance
