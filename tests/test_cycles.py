@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from twin.model import theta as c
-from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, figures
+from twin.monitor.cycles import FEWEST_ROWS, LONGEST_PIECE, Cycle, CycleCutter, figures
 from twin.signals import BREAK, MBAR, SAMPLE, TICK, Phase, Quality, Samples, Ticks
 
 AMBIENT = 1e5
@@ -196,3 +196,23 @@ def test_a_healthy_cycle_of_the_rig(name: str) -> None:
         assert one["h1_level"] == pytest.approx(750, abs=10)
         assert one["max_vacuum"] == pytest.approx(750, abs=15)
         assert one["suction_rms"] < 8
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 300), st.sampled_from([0.0, 0.3, 1.0]))
+def test_deviations_by_phase_are_numpys(seed: int, rows: int, missing: float) -> None:
+    random = np.random.default_rng(seed)
+    samples, ticks = np.zeros(rows, SAMPLE), np.zeros(rows, TICK)
+    ticks["phase"] = random.integers(0, len(Phase), rows)
+    ticks["level"] = np.nan
+    ticks["expected"] = random.uniform(1e4, 1e5, rows)
+    samples["pressure"] = ticks["expected"] + random.normal(size=rows) * MBAR
+    ticks["expected"][random.random(rows) < missing] = np.nan
+    cycle = Cycle(0, samples, ticks, complete=False)
+    found = figures(cycle, AMBIENT)
+    for phase in Phase:
+        off = cycle.off[np.isfinite(cycle.off) & (ticks["phase"] == phase)]
+        name = phase.name.lower()
+        assert (f"{name}_mean" in found) == (len(off) >= FEWEST_ROWS)
+        if f"{name}_mean" in found:
+            assert found[f"{name}_mean"] == pytest.approx(off.mean())
+            assert found[f"{name}_rms"] == pytest.approx(np.sqrt(np.mean(off**2)))

@@ -8,13 +8,13 @@ that was set shows against the count, whatever the way does meanwhile.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import lru_cache
 from statistics import median
 
 import numpy as np
 import numpy.typing as npt
 
 from twin.events import Event, Kind
+from twin.model.compiled import compiled
 from twin.signals import SAMPLE, Quality, Samples, joined
 
 WINDOW_NS = 5_000_000_000  # of PLC time; the fastest receipt of each counts
@@ -32,6 +32,7 @@ SHORTER, LONGER = 2, 12  # windows after which a way that is shorter, or longer,
 _NEW = int(Quality.RESTART | Quality.CLOCK)  # after these another time begins
 
 Integers = npt.NDArray[np.int64]
+Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -66,14 +67,13 @@ def _long(ms: float) -> str:
     return f"{ms:.2f} ms" if ms < 1e4 else f"{ms / 1e3:.1f} s"
 
 
-def line(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> tuple[float, float, float]:
+def line(x: Floats, y: Floats) -> tuple[float, float, float]:
     """Slope, half of its 95 % interval, and value at the last ``x``; a third may be wild.
 
     Theil and Sen's line, as SciPy has it, whose import alone would take longer than a block may.
     """
     n = len(x)
-    i, j = _pairs(n)
-    slopes = (y[j] - y[i]) / (x[j] - x[i])
+    slopes = _slopes(x, y)
     middle = [(len(slopes) - 1) // 2, len(slopes) // 2]
     reach = 1.96 * np.sqrt(n * (n - 1) * (2 * n + 5) / 18)
     low = max(round((len(slopes) - reach) / 2) - 1, 0)
@@ -84,9 +84,33 @@ def line(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> tuple[float,
     return slope, float(slopes[high] - slopes[low]) / 2, at_end
 
 
-@lru_cache(maxsize=2)  # most of the time there are as many as are kept
-def _pairs(n: int) -> tuple[Integers, Integers]:
-    return np.triu_indices(n, 1)
+@compiled
+def _slopes(x, y):  # type: ignore[no-untyped-def]
+    """Slopes of the lines through any two points."""
+    slopes, first = np.empty(len(x) * (len(x) - 1) // 2), 0
+    for i in range(len(x) - 1):
+        to = slopes[first : first + len(x) - 1 - i]
+        for j in range(len(to)):
+            to[j] = (y[i + 1 + j] - y[i]) / (x[i + 1 + j] - x[i])
+        first += len(to)
+    return slopes
+
+
+@compiled
+def _first_plain(receipts, last, zero_ns, window, period, far):  # type: ignore[no-untyped-def]
+    """How many of the first receipts lie in a window, with no clock set by ``far`` (ns) or more.
+
+    ``last`` is the receipt before, PLC time and sequence.
+    """
+    time_ns, sequence = last
+    for i in range(len(receipts)):
+        scans = receipts[i, 2] - sequence
+        apart = receipts[i, 0] - time_ns - scans * period
+        was_set = period > 0.0 and 0 < scans <= FARTHEST and abs(apart) >= far
+        time_ns, sequence = receipts[i, 0], receipts[i, 2]
+        if was_set or (time_ns - zero_ns) // WINDOW_NS != window:
+            return i
+    return len(receipts)
 
 
 @dataclass
@@ -108,6 +132,11 @@ class ClockWatch:
     _since: int = 0  # windows since the last report
     _off: int = 0  # windows in a row that are off the line, below zero where they are too early
 
+    def __post_init__(self) -> None:
+        """Have what is compiled at hand, not to fall into a block."""
+        _slopes(np.zeros(2), np.zeros(2))
+        _first_plain(np.zeros((1, 3), np.int64), self._last, 0, 0, 0.0, 0.0)
+
     def push(self, samples: Samples) -> list[Event]:
         """Take rows without a break, but maybe before the first one."""
         if not len(samples):
@@ -116,10 +145,11 @@ class ClockWatch:
         if samples["quality"][0] & _NEW:
             events += self.close()
             self._begin()
-        rows = joined(self._receipt, samples)
-        self._receipt = rows[-1:].copy()
+        before = self._receipt[self._receipt["host_ns"] != samples["host_ns"][0]]
+        newest = samples[:-1][np.diff(samples["host_ns"]) != 0]
+        self._receipt = samples[-1:].copy()
         self._learn(samples)
-        receipts = _compared(rows[:-1][np.diff(rows["host_ns"]) != 0])
+        receipts = _compared(joined(before, newest))
         while len(receipts):
             if plain := self._plain(receipts):
                 self._take_plain(receipts[:plain])
@@ -157,13 +187,9 @@ class ClockWatch:
         """
         if self._zero is None or self._apart or self._aside:
             return 0
-        time_ns, _, sequence = receipts.T
-        scans = np.diff(sequence, prepend=self._last[1])
-        counted = (scans > 0) & (scans <= FARTHEST) & (self._period > 0.0)
-        apart = np.diff(time_ns, prepend=self._last[0]) - scans * self._period
-        here = (time_ns - self._zero[0]) // WINDOW_NS == self._window
-        plain = here & ~(counted & (np.abs(apart) >= self._far))
-        return len(plain) if plain.all() else int(np.argmin(plain))
+        zero_ns, period = self._zero[0], self._period
+        plain = _first_plain(receipts, self._last, zero_ns, self._window, period, self._far)
+        return int(plain)
 
     def _take_plain(self, receipts: Integers) -> None:
         """The same as ``_take`` of each, where it is only how fast they were."""
@@ -200,7 +226,7 @@ class ClockWatch:
     @property
     def _far(self) -> float:
         """From how much (ns) on PLC time may have been set."""
-        return max(SET_NS, 2 * self._period)
+        return max(float(SET_NS), 2.0 * self._period)
 
     def _was_set(self, time_ns: int, sequence: int) -> float | None:
         """By how much (ns) PLC time moved against the count some receipts ago, if it stayed so."""
@@ -286,6 +312,6 @@ class ClockWatch:
         """Windows without the last ones, if these are off the line: it may be another one."""
         return self._points[: len(self._points) - abs(self._off)]
 
-    def _columns(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        x, y = np.array(self._sure, np.float64).T
-        return x, y
+    def _columns(self) -> tuple[Floats, Floats]:
+        x, y = zip(*self._sure, strict=True)
+        return np.array(x, np.float64), np.array(y, np.float64)

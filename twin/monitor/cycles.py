@@ -9,12 +9,14 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from twin.model.compiled import compiled
 from twin.signals import (
     BREAK,
     MBAR,
     NS,
     UNUSABLE,
     Phase,
+    Quality,
     Samples,
     Ticks,
     deviation,
@@ -23,6 +25,8 @@ from twin.signals import (
 
 LONGEST_PIECE = 10_000  # rows; a longer cycle is judged in pieces so that alarms do not wait
 FEWEST_ROWS = 20  # of a phase, to judge it
+STALE = int(Quality.STALE)  # plain: NumPy makes masks of bytes with these, and compares them
+SUCTION, BLOW_OFF, IDLE = int(Phase.SUCTION), int(Phase.BLOW_OFF), int(Phase.IDLE)
 H2 = 550.0 * MBAR  # Pa below ambient: part present, the field's default
 PAPER_VACUUM = 600.0 * MBAR  # Pa below ambient: what the founding paper times evacuation to
 
@@ -57,6 +61,11 @@ class Cycle:
     def off(self) -> npt.NDArray[np.float64]:
         """Measured less expected pressure (mbar), row by row; NaN where either cannot be used."""
         return deviation(self.samples, self.ticks) / MBAR
+
+    @cached_property
+    def stale(self) -> bool:
+        """Whether nobody knows what was commanded during some of it: the model may be anywhere."""
+        return bool((self.samples["quality"] & STALE).any())
 
 
 class Told(Protocol):
@@ -130,8 +139,8 @@ class CycleCutter:
         """Mark the rows at which suction begins."""
         before = np.concatenate([[np.uint8(self._phase)], phase])
         self._phase = int(before[-1])
-        edges: npt.NDArray[np.bool_] = before[1:] == Phase.SUCTION
-        edges &= (before[:-1] == Phase.IDLE) | (before[:-1] == Phase.BLOW_OFF)
+        edges: npt.NDArray[np.bool_] = before[1:] == SUCTION
+        edges &= (before[:-1] == IDLE) | (before[:-1] == BLOW_OFF)
         return edges
 
     def _keep(self, samples: Samples, ticks: Ticks) -> None:
@@ -179,19 +188,15 @@ def figures(cycle: Cycle, ambient: float) -> dict[str, float]:
     Deviation per phase as mean and rms; the vacuum at which the air saving switched; evacuation
     times to H2 measured and expected; the highest vacuum. What a cycle cannot say is left out.
     """
-    off = cycle.off
     result: dict[str, float] = {}
     broken_off = cycle.ticks["phase"][-1] if cycle.cut_short else None
-    known = np.isfinite(off)
-    off, phases = off[known], cycle.ticks["phase"][known]
+    rows, sums, squares = _by_phase(cycle.off, cycle.ticks)
     for phase in Phase:
-        if phase == broken_off:  # its beginning is no measure of all of it
-            continue
-        there = off[phases == int(phase)]
-        if len(there) >= FEWEST_ROWS:
+        # Of the last one of a cycle cut short the beginning is no measure of all of it.
+        if phase != broken_off and rows[phase] >= FEWEST_ROWS:
             name = phase.name.lower()
-            result[f"{name}_mean"] = float(there.sum()) / len(there)
-            result[f"{name}_rms"] = math.sqrt(float(there @ there) / len(there))
+            result[f"{name}_mean"] = float(sums[phase] / rows[phase])
+            result[f"{name}_rms"] = math.sqrt(squares[phase] / rows[phase])
     result |= _switching(cycle, ambient)
     if cycle.complete:
         usable = (cycle.samples["quality"] & UNUSABLE) == 0
@@ -202,6 +207,19 @@ def figures(cycle: Cycle, ambient: float) -> dict[str, float]:
         result["t0_measured"] = time_to_vacuum(H2, measured, times, ambient) * 1e3
         result["t0_expected"] = time_to_vacuum(H2, expected, times, ambient) * 1e3
     return {name: value for name, value in result.items() if np.isfinite(value)}
+
+
+@compiled
+def _by_phase(off, ticks):  # type: ignore[no-untyped-def]
+    """Rows with a deviation, its sum and that of its squares, by phase: (3, all that a byte is)."""
+    sums = np.zeros((3, 256))
+    for row in range(len(off)):
+        if math.isfinite(off[row]):
+            phase = ticks[row].phase
+            sums[0, phase] += 1.0
+            sums[1, phase] += off[row]
+            sums[2, phase] += off[row] * off[row]
+    return sums
 
 
 def _switching(cycle: Cycle, ambient: float) -> dict[str, float]:

@@ -21,12 +21,12 @@ from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, Teller, Told,
 from twin.monitor.healthy import Healthy
 from twin.monitor.signatures import Likeness, likenesses, look_alikes
 from twin.settings import Settings
-from twin.signals import BREAK, NS, SAMPLE, Quality, Samples, Ticks, joined
+from twin.signals import BREAK, NS, SAMPLE, TICK, Quality, Samples, Ticks, joined
 
 if TYPE_CHECKING:  # its SciPy would be imported with every configuration
     from twin.monitor.isolation import Isolation, Verdict
 
-_UNFIT = Quality.OUT_OF_RANGE | Quality.OVERFLOW | Quality.STALE | Quality.BAD
+_UNFIT = int(Quality.OUT_OF_RANGE | Quality.OVERFLOW | Quality.STALE | Quality.BAD)
 FEWEST_SHARE = 0.95  # of a cycle's samples, to judge it: commands seen late look like a deviation
 RIVAL = 0.05  # probability from which on another cause is named as well
 STANDING = 0.8  # of the best fit's gain: then the name of a standing alarm still holds
@@ -73,6 +73,11 @@ class Monitor:
     _fresh: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # the last that was
     _silences: set[int] = field(default_factory=set)  # told of, by PLC time of the row before
     _unfit: int = 0  # quality bits that stand
+
+    def __post_init__(self) -> None:
+        """Have what is compiled at hand, not to fall into a block."""
+        nothing = Cycle(0, np.zeros(1, SAMPLE), np.zeros(1, TICK), complete=False)
+        figures(nothing, self.theta[c.AMBIENT])
 
     def update(self, samples: Samples, ticks: Ticks) -> list[Event]:
         """Take rows with the twin's ticks; give what they make happen."""
@@ -192,7 +197,7 @@ class Monitor:
         found = figures(cycle, self.theta[c.AMBIENT])
         told = self.teller.take(cycle) if self.teller else None
         whole = cycle.complete or len(cycle.samples) >= LONGEST_PIECE
-        stale = silent or any(map(_has_stale, (cycle, before or cycle)))
+        stale = silent or cycle.stale or (before is not None and before.stale)
         judged = whole and cycle.settled and cycle.coverage >= FEWEST_SHARE and not stale
         worst = self._worst(found) if judged else None
         far = abs(worst.sigmas) if worst else 0.0
@@ -346,11 +351,6 @@ class Monitor:
 def _order(event: Event) -> int:
     """Where an event belongs among others; silence before what ends it, though rows fill it."""
     return int(event.data["since_ns"]) if event.kind is Kind.PLC_STALE else event.time_ns
-
-
-def _has_stale(cycle: Cycle) -> bool:
-    """Whether nobody knows what was commanded during some of it: the model may be anywhere."""
-    return bool((cycle.samples["quality"] & Quality.STALE).any())
 
 
 def _gap(before: np.void, row: np.void) -> Event:

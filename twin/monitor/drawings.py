@@ -49,16 +49,16 @@ class Stretches:
         """
         if not known.phases.startswith(self.phases):
             return False
+        if whole and len(self.how) < len(known.how):
+            return False
         more = self.how - known.how[: len(self.how)]
         if not whole:
             more[-1, :2] = np.maximum(more[-1, :2], 0.0)  # the last goes on
-        elif len(self.how) < len(known.how):
-            return False
-        return bool(np.all(np.abs(more) <= known.may_differ[: len(more)]))
+        return bool((np.abs(more) <= known.may_differ[: len(more)]).all())
 
     def far(self, known: "Stretches") -> float:
         """How much a whole cycle differs from a known one that it goes as."""
-        return float(np.sum(np.abs(self.how - known.how) / known.may_differ))
+        return float((np.abs(self.how - known.how) / known.may_differ).sum())
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Drawing:
         number = np.searchsorted(stretches.first, drawn, "right") - 1
         since = np.minimum(drawn - stretches.first[number], self.stretches.how[number, 0])
         rows = self.stretches.first[number] + since.astype(np.int64)
-        there: Floats = self.expected[np.searchsorted(self.drawn, rows)]
+        there: Floats = np.take(self.expected, np.searchsorted(self.drawn, rows), axis=0)
         return there
 
 

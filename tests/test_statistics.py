@@ -1,0 +1,88 @@
+"""What a cycle says: between rows that are known, and whatever cycles were heard before it."""
+
+from dataclasses import fields
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import rigs
+from hypothesis import given
+from hypothesis import strategies as st
+
+from twin.model import theta as c
+from twin.monitor.bank import Bank
+from twin.monitor.cycles import Cycle, cut, figures
+from twin.monitor.statistics import PLACES, Listener, Said, _between
+
+Floats = npt.NDArray[np.float64]
+Heard = tuple[Cycle, npt.NDArray[np.int64], Floats, dict[str, float]]
+
+
+def listener() -> Listener:
+    return Listener.of(rigs.config("gripper").data, rigs.config("gripper").monitor.healthy)
+
+
+@pytest.fixture(scope="module")
+def heard() -> list[Heard]:
+    """Cycles that have swung in, with what a bank and the monitor say of them."""
+    rows = rigs.expectation(rigs.twin("gripper"), [rigs.recorded("gripper", 20.0)[0]])
+    bank, ambient = Bank(rigs.theta("gripper")), float(rigs.theta("gripper")[c.AMBIENT])
+    found = [(cycle, *bank.take(cycle), figures(cycle, ambient)) for cycle in cut([rows])]
+    return [one for one in found if one[0].complete and one[0].settled]
+
+
+def without(one: Heard, rows: slice) -> Heard:
+    """The same cycle with no deviation in some rows."""
+    cycle, drawn, expected, found = one
+    ticks = cycle.ticks.copy()
+    ticks["expected"][rows] = np.nan
+    return Cycle(0, cycle.samples, ticks, complete=True), drawn, expected, found
+
+
+def assert_same(one: Said | None, other: Said | None) -> None:
+    assert one
+    assert other
+    for name in (field.name for field in fields(Said)):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+
+
+def test_a_cycle_says_the_same_whichever_were_heard_before(heard: list[Heard]) -> None:
+    old = listener()
+    for one in heard * 2:
+        for other in (one, without(one, slice(300, 350)), without(one, slice(0, 3))):
+            assert_same(old.hear(*other), listener().hear(*other))
+
+
+def test_where_bins_are_is_remembered_of_few_cycles(heard: list[Heard]) -> None:
+    old = listener()
+    for gap in range(2 * PLACES):
+        old.hear(*without(heard[0], slice(0, 10 * gap)))
+        assert 1 <= len(old._seen) <= PLACES
+
+
+def test_what_no_hypothesis_knows_is_not_heard(heard: list[Heard]) -> None:
+    cycle, drawn, expected, found = heard[0]
+    all_there = listener().hear(cycle, drawn, expected, found)
+    expected = expected.copy()
+    expected[:, 3] = np.nan
+    assert listener().hear(cycle, drawn, expected, found) is None
+    expected[:, 3] = expected[:, 4]
+    expected[drawn < 400, 3] = np.nan  # one hypothesis, for a while
+    said = listener().hear(cycle, drawn, expected, found)
+    assert all_there
+    assert said
+    assert 0 < len(said.place) < len(all_there.place)
+    assert set(said.place) <= set(all_there.place)
+    assert np.isfinite(said.signatures).all()
+
+
+@given(st.data(), st.integers(1, 40))
+def test_only_between_known_rows_there_is_something_to_hear(data: st.DataObject, rows: int) -> None:
+    def chosen(count: int) -> npt.NDArray[np.bool_]:
+        return np.array(data.draw(st.lists(st.booleans(), min_size=count, max_size=count)))
+
+    drawn = np.flatnonzero(chosen(rows) | (np.arange(rows) == data.draw(st.integers(0, rows - 1))))
+    known, off = chosen(len(drawn)), np.where(chosen(rows), 1.0, np.nan)
+    lines = np.interp(np.arange(rows), drawn, known.astype(float), 0.0, 0.0)
+    expected = np.isfinite(off) & (lines == 1.0)
+    np.testing.assert_array_equal(_between(drawn, known, off), expected)
