@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from twin.model import theta as c
-from twin.monitor.bank import Bank
+from twin.monitor.bank import SUSPECTS, Bank
 from twin.monitor.cycles import Cycle, cut, figures
 from twin.monitor.statistics import PLACES, Listener, Said, _between
 
@@ -44,6 +44,17 @@ def assert_same(one: Said | None, other: Said | None) -> None:
     assert other
     for name in (field.name for field in fields(Said)):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+
+
+def test_of_what_a_cycle_does_not_depend_on_it_says_nothing(heard: list[Heard]) -> None:
+    """Else its scores are what steps make of nothing, and false alarms are three times as many."""
+    names = [one.parameter.name for one in SUSPECTS]
+    for one in heard:
+        assert "h1_low_level" not in one[3]  # the nozzle stays off
+        said = listener().hear(*one)
+        assert said
+        shown = np.isfinite(said.scores())
+        assert [names[i] for i in np.flatnonzero(~shown)] == ["h2_shift"]
 
 
 def test_a_cycle_says_the_same_whichever_were_heard_before(heard: list[Heard]) -> None:

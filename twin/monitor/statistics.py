@@ -27,7 +27,9 @@ LEVELS = ("h1_level", "h1_low_level")
 UNKNOWN_LEVEL_MBAR = 3.0  # one sigma of a level that healthy cycles do not show
 PLACES = 8  # that are remembered: of a program or two, with what jitters
 SUCTION_ROWS = 4000  # commanded, to see where each suspect switches
-WEAK = 1e-4  # sigmas² of a step: nothing in the cycle depends on it
+# Sigmas² of a step: nothing in the cycle depends on it. Hypotheses that are stepped apart from each
+# other are a pascal apart, which looks like some 0.002; the least that depends has 3.
+WEAK = 0.01
 
 
 @dataclass(frozen=True)
