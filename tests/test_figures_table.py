@@ -12,11 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tools.readme import filled
-from twin.figures.course import LONGEST_HOLE, Course, Floats
+from twin.figures.course import LAST_S, LEAK_WINDOW_S, LEAST_WINDOW_S, LONGEST_HOLE, Floats, Rows
+from twin.figures.course import course as found_in
 from twin.figures.settings import FigureSettings, Limits, limits
 from twin.figures.table import FIGURES, Unit, figures, table
 from twin.figures.warnings import CAUTIONS, in_words, warnings
-from twin.model.control import PROTECTED_SWITCHES
+from twin.model.control import LEAK_SETTLE_S, PROTECTED_S, PROTECTED_SWITCHES
 from twin.model.dataset import DataSet, Ejector, Supply
 from twin.signals import Phase
 
@@ -35,7 +36,7 @@ def course(
     supply: float = 4.8,
     off_lag: float = 0.0,
     on_lag: float = 0.0,
-) -> Course:
+) -> Rows:
     """Rows of 1 ms: of each stretch its phase, its length (s) and the vacuum it leads to (mbar)."""
     phase, vacuum = [], [np.zeros(1)]
     for kind, seconds, target in stretches:
@@ -43,7 +44,7 @@ def course(
         phase += [kind] * rows
         vacuum.append(np.linspace(vacuum[-1][-1], target, rows + 1)[1:])
     values = np.concatenate(vacuum)[:-1]
-    return Course(
+    return Rows(
         time=np.arange(len(phase)) * 1e-3,
         vacuum=values,
         supply=np.full(len(phase), supply),
@@ -63,11 +64,11 @@ def unknown(found: dict[str, float], *names: str) -> bool:
     return all(math.isnan(found[name]) for name in names)
 
 
-def of(shape: Course) -> dict[str, float]:
+def of(shape: Rows) -> dict[str, float]:
     return figures(shape, UNIT)
 
 
-def changed(shape: Course, rows: slice, vacuum: float) -> Course:
+def changed(shape: Rows, rows: slice, vacuum: float) -> Rows:
     values = shape.vacuum.copy()
     values[rows] = vacuum
     return replace(shape, vacuum=values)
@@ -105,7 +106,7 @@ def test_the_levels_are_those_of_the_data_set() -> None:
 def test_the_valves_lags_are_taken_from_where_the_pressure_shows_a_switching() -> None:
     again = ((SUCTION, 0.75, 750.0), (HOLD, 0.5, 600.0), (SUCTION, 0.25, 750.0), (HOLD, 0.5, 740.0))
     shape = course(*again, (IDLE, 1.0, 0.0), off_lag=0.012, on_lag=0.007)
-    assert np.array(shape.nozzle) == pytest.approx(np.array([[0.0, 0.738], [1.243, 1.488]]))
+    assert of(shape)["nozzle_share"] == pytest.approx(100 * (0.738 + 1.488 - 1.243) / 2.0)
     assert of(shape)["t1"] == pytest.approx(188.0, abs=0.01)
     assert of(shape)["switchings"] == 2
     assert of(shape)["quick_switchings"] == 3
@@ -114,7 +115,6 @@ def test_the_valves_lags_are_taken_from_where_the_pressure_shows_a_switching() -
 def test_a_hold_shorter_than_the_lags_takes_no_time_twice() -> None:
     blip = ((SUCTION, 0.1, 100.0), (HOLD, 0.002, 100.0), (SUCTION, 0.1, 200.0))
     shape = course(*blip, (IDLE, 1.0, 0.0), on_lag=0.02)
-    assert np.array(shape.nozzle) == pytest.approx(np.array([[0.0, 0.1], [0.1, 0.202]]))
     assert of(shape)["nozzle_share"] == pytest.approx(100.0)
 
 
@@ -231,7 +231,7 @@ def test_single_readings_of_the_supply_are_no_extremes() -> None:
 # Valve protection.
 
 
-def swinging(times: int, half_s: float) -> Course:
+def swinging(times: int, half_s: float) -> Rows:
     swings = [(HOLD, half_s, 600.0), (SUCTION, half_s, 750.0)] * times
     return course((SUCTION, 0.75, 750.0), *swings, (IDLE, 1.0, 0.0))
 
@@ -241,6 +241,8 @@ def test_switchings_within_the_time_of_valve_protection_are_counted() -> None:
     assert of(swinging(5, 0.7))["quick_switchings"] == 5  # 0, 0.7, ... 2.8 s of ten
     assert of(swinging(5, 0.4))["quick_switchings"] == 8
     assert of(swinging(5, 0.4))["switchings"] == 6
+    assert of(swinging(3, 1.499))["quick_switchings"] == 3
+    assert of(swinging(3, 1.5))["quick_switchings"] == 2
 
 
 def test_a_cycle_that_never_saves_air_switches_once() -> None:
@@ -259,6 +261,12 @@ def test_a_hole_in_the_readings_may_hide_a_switching() -> None:
     assert found["t0"] == pytest.approx(550.0, abs=0.01)  # it is not in the hole
     for name in NEEDS_ALL:
         assert unknown(found, name), name
+
+
+def test_so_may_one_at_the_end_of_the_suction() -> None:
+    shape = course((SUCTION, 0.7, 700.0), (IDLE, 1.0, 0.0))
+    assert unknown(of(changed(shape, slice(689, 800), math.nan)), *NEEDS_ALL)
+    assert of(changed(shape, slice(695, 800), math.nan))["switchings"] == 1
 
 
 def test_a_few_bad_readings_hide_nothing() -> None:
@@ -323,6 +331,119 @@ def test_any_course_gives_finite_figures_or_none(
     assert not [name for name, value in found.items() if math.isinf(value)]
     for name in ("quality", "performance", "nozzle_share"):
         assert math.isnan(found[name]) or -1e-6 < found[name] < 100.0 + 1e-6
+
+
+# As NumPy has it.
+
+
+@st.composite
+def any_rows(draw: st.DrawFn) -> Rows:
+    """Of any phases, with noise and holes in both signals, and a supply that may fall."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    shape = course((SUCTION, 0.001, 0.0), *((one, n / 1000, 600.0) for one, n in draw(phases)))
+    count = len(shape.time)
+    swing = 300.0 * np.sin(np.arange(count) / draw(st.integers(20, 2000)))
+    vacuum = 500.0 + swing + rng.normal(0.0, draw(st.floats(0.0, 100.0)), count)
+    supply = 4.8 + np.round(rng.normal(0.0, 0.1, count), draw(st.integers(0, 3)))
+    supply -= draw(st.floats(0.0, 1e-3)) * np.arange(count)
+    for values in (vacuum, supply):
+        for first, length in draw(holes):
+            values[first : first + length] = math.nan
+    return replace(shape, vacuum=vacuum, supply=supply)
+
+
+def about(expected: float, *, scale: float = 1.0) -> object:
+    return pytest.approx(expected, rel=1e-9, abs=1e-9 * scale, nan_ok=True)
+
+
+def line_through(time: Floats, values: Floats) -> tuple[float, float]:
+    """Mean and slope."""
+    if len(time) < 2:
+        return float(values.mean()) if len(time) else math.nan, math.nan
+    return float(values.mean()), float(np.polyfit(time - time.mean(), values, 1)[0])
+
+
+@given(any_rows())
+def test_how_the_nozzle_was_switched_is_as_numpy_has_it(rows: Rows) -> None:
+    found = found_in(rows, 550.0, 750.0)
+    over = np.flatnonzero(~np.isin(rows.phase, (SUCTION, HOLD)))
+    suction = rows.phase[: over[0]] if len(over) else rows.phase
+    on = suction == SUCTION
+    edges = np.flatnonzero(np.diff(on, prepend=False, append=False)) * 1e-3
+    times = edges[1:-1] if on[-1] else edges[1:]
+    within = [np.sum((times >= t) & (times < t + PROTECTED_S)) for t in times]
+    if len(rows.time) > 1:
+        assert found.suction_s == about(len(suction) * 1e-3)
+        assert found.blow_off_s == about(np.sum(rows.phase == BLOW_OFF) * 1e-3)
+        assert found.nozzle.on_s == about(on.sum() * 1e-3)
+        assert found.nozzle.off_s == about(edges[1])
+    assert found.nozzle.switchings == len(edges) / 2
+    assert found.nozzle.quick_switchings == max(within, default=0)
+    assert found.nozzle.went_off == (HOLD in suction)
+
+
+@given(any_rows())
+def test_what_the_vacuum_did_is_as_numpy_has_it(rows: Rows) -> None:
+    course = found_in(rows, 550.0, 750.0)
+    found = course.vacuum
+    over = np.flatnonzero(~np.isin(rows.phase, (SUCTION, HOLD)))
+    suction = slice(over[0] if len(over) else None)
+    there = np.isfinite(rows.vacuum[suction])
+    time, vacuum = rows.time[suction][there], rows.vacuum[suction][there]
+    hole = np.diff([0.0, *time, course.suction_s]).max()
+    assert found.seamless == (len(time) > 0 and bool(hole <= LONGEST_HOLE))
+    if not len(time):
+        assert unknown(found._asdict(), "h2_s", "h1_s", "highest", "last", "last_slope", "leakage")
+        return
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(vacuum, 2, "edge"), 5)
+    smooth = np.median(windows, axis=1)
+    assert found.highest == smooth.max()
+    for level, reached in ((550.0, found.h2_s), (750.0, found.h1_s)):
+        row = int(np.argmax(smooth >= level))
+        ends = max(row - 1, 0), row + 1
+        before = time[row - 1] if row else 0.0
+        if smooth[row] < level or time[row] - before > LONGEST_HOLE:
+            assert math.isnan(reached)
+        else:
+            assert reached == about(np.interp(level, smooth[slice(*ends)], time[slice(*ends)]))
+    last = time >= course.suction_s - LAST_S
+    mean, slope = line_through(time[last], smooth[last])
+    assert (found.last, found.last_slope) == (about(mean), about(slope, scale=1e6))
+    held = np.flatnonzero(rows.phase[suction] == HOLD)
+    if not len(held) or not found.seamless:
+        assert math.isnan(found.leakage)
+        return
+    longest = np.flatnonzero(np.diff(held, append=len(rows.phase) + 1) > 1)[0] + 1
+    first = slice(held[0], held[0] + longest)
+    since = rows.time[first] - rows.time[held[0]] - LEAK_SETTLE_S
+    judged = (since >= 0.0) & (since <= LEAK_WINDOW_S) & np.isfinite(rows.vacuum[first])
+    if not judged.any() or since[judged][-1] < LEAST_WINDOW_S:
+        assert math.isnan(found.leakage)
+    else:
+        _, slope = line_through(since[judged], rows.vacuum[first][judged])
+        assert found.leakage == about(-slope, scale=1e3)
+
+
+@given(any_rows())
+def test_the_supply_is_as_numpy_has_it(rows: Rows) -> None:
+    found = found_in(rows, 550.0, 750.0).supply
+    read = rows.supply[(rows.phase == SUCTION) & np.isfinite(rows.supply)]
+    if not len(read):
+        assert unknown(found._asdict(), *found._fields)
+        return
+    assert found.mean == about(read.mean())
+    ends = np.sort(read)[[round(0.01 * (len(read) - 1)), round(0.99 * (len(read) - 1))]]
+    assert [found.lowest, found.highest] == ends.tolist()
+
+
+def test_the_mean_of_a_supply_that_stands_still_is_that_supply() -> None:
+    assert of(course(*PICK, supply=4.7))["supply"] == 4.7
+
+
+def test_one_row_is_a_course() -> None:
+    found = of(course((SUCTION, 0.001, 0.0)))
+    assert unknown(found, *FIGURES.keys() - {"supply", "lowest_supply", "highest_supply"})
+    assert found["lowest_supply"] == found["highest_supply"] == 4.8
 
 
 @given(st.floats(20.0, 400.0), st.floats(0.05, 0.5), st.integers(0, 2**32 - 1))

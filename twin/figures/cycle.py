@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from twin.figures.course import Course, Floats
+from twin.figures.course import Rows, measured
 from twin.figures.expected import Expectation
 from twin.figures.settings import FigureSettings, Limits, limits
 from twin.figures.table import FIGURES, UNKNOWN, Unit, figures
@@ -15,14 +15,11 @@ from twin.figures.warnings import in_words, warnings
 from twin.model.dataset import DataSet
 from twin.monitor.cycles import LONGEST_PIECE, Cycle
 from twin.signals import (
-    BAR,
     BREAK,
     MBAR,
     MS,
-    NS,
     SAMPLE,
     TICK,
-    UNUSABLE,
     Phase,
     Samples,
     Ticks,
@@ -85,8 +82,9 @@ class CycleFigures:
 def compiled(data: DataSet, settings: FigureSettings) -> "KeyFigures":
     """Key figures whose path is compiled, which may take seconds: not to fall into the loop."""
     samples, ticks = np.zeros(3, SAMPLE), np.zeros(3, TICK)
+    ticks["phase"] = Phase.SUCTION, Phase.HOLD, Phase.IDLE  # a cycle that is over
     ticks["level"] = data.ambient.pressure_mbar * MBAR
-    Expectation(data).over(samples, ticks, at_edge=False)
+    KeyFigures(data, settings).take(Cycle(0, samples, ticks, True, False, True))
     return KeyFigures(data, settings)
 
 
@@ -129,7 +127,7 @@ class KeyFigures:
         self._run(piece.samples, piece.ticks)
         self._ran = 0
         self._pieces.append(piece)
-        over = piece.ticks["phase"][-1] in _OVER
+        over = int(piece.ticks["phase"][-1]) in _OVER
         if not over and len(piece.samples) == LONGEST_PIECE and len(self._pieces) < MOST_PIECES:
             return None
         return self._given()
@@ -152,56 +150,39 @@ class KeyFigures:
         if len(pieces) > 1:
             samples = joined(*(piece.samples for piece in pieces))
             ticks = joined(*(piece.ticks for piece in pieces))
-        last = ticks["phase"][-1]
+        last = int(ticks["phase"][-1])
         ended = last in _OVER
-        seen = ended, bool(ended and not (pieces[-1].cut_short and last == Phase.BLOW_OFF))
-        measured = figures(self._measured(samples, ticks, *seen), self._unit)
+        seen = ended, ended and not (pieces[-1].cut_short and last == Phase.BLOW_OFF)
+        rows = self._measured(samples, ticks, *seen)
+        found = figures(rows, self._unit)
         return CycleFigures(
             self._index,
             int(samples["time_ns"][0]),
             int(samples["time_ns"][-1]),
             int(samples["host_ns"][0]),
-            measured,
-            self._expected(samples, *seen, np.isfinite(measured["free_flow"])),
-            warnings(measured, self._limits),
+            found,
+            self._expected(rows, math.isfinite(found["free_flow"])),
+            warnings(found, self._limits),
             self._limits,
-            bool(ended),
+            ended,
         )
 
-    def _measured(self, samples: Samples, ticks: Ticks, ended: bool, blown: bool) -> Course:
+    def _measured(self, samples: Samples, ticks: Ticks, ended: bool, blown: bool) -> Rows:
         ejector = self.data.ejector
-        usable = (samples["quality"] & UNUSABLE) == 0
-        pressure = np.where(usable, samples["pressure"], np.nan).astype(np.float64) / MBAR
-        return Course(
-            time=_since_begin(samples),
-            vacuum=self.data.ambient.pressure_mbar - pressure,
-            supply=samples["supply"].astype(np.float64) / BAR,
-            phase=ticks["phase"],
-            ended=ended,
-            blown=blown,
-            off_lag=ejector.response_off_ms * MS,
-            on_lag=ejector.response_ms * MS,
-        )
+        columns = measured(samples, ticks, self.data.ambient.pressure_mbar)
+        return Rows(*columns, ended, blown, ejector.response_off_ms * MS, ejector.response_ms * MS)
 
-    def _expected(
-        self, samples: Samples, ended: bool, blown: bool, is_open: bool
-    ) -> dict[str, float]:
+    def _expected(self, beside: Rows, is_open: bool) -> dict[str, float]:
         """As the model has the same cycle; where a cup was open, with its cups open."""
         found = self._expectation.end(at_edge=True)
         if found is None:
             return dict.fromkeys(FIGURES, UNKNOWN)
         vacuum, phase = found
         supply = np.full(len(vacuum), self.data.supply.nozzle_bar)
-        course = Course(_since_begin(samples), vacuum, supply, phase, ended, blown)
-        expected = figures(course, self._unit)
+        rows = Rows(beside.time, vacuum, supply, phase, beside.ended, beside.blown)
+        expected = figures(rows, self._unit)
         if is_open:
             share = self._expectation.free_flow / self._unit.h1
             expected["free_flow"] = self._expectation.free_flow
             expected["performance"] = 100.0 * (1.0 - share)
         return expected
-
-
-def _since_begin(samples: Samples) -> Floats:
-    """Time of each row (s) since the first."""
-    since: Floats = (samples["time_ns"] - samples["time_ns"][0]) * NS
-    return since

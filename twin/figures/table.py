@@ -5,20 +5,18 @@ figure that a cycle cannot tell is NaN; none is guessed.
 """
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
-from twin.figures.course import Course, slope
-from twin.model.control import PROTECTED_S
+from twin.figures.course import Course, Rows, course
 from twin.model.dataset import DataSet
-from twin.signals import BAR, MBAR, Phase
+from twin.signals import BAR, MBAR
 
 BANDS = (67.0, 133.0, 200.0)  # mbar/s, of leakage
 WORST_LEAKAGE = 500.0  # mbar/s: quality 0
 FREE_SUCTION_S = 1.0  # at least, for a free-flow vacuum
-STEADY_S, STEADY = 0.5, 10.0  # s at the end of it, in which it moves by less (mbar/s)
+STEADY = 10.0  # mbar/s: at the end of it the vacuum moves by less
 LEAST_FREE_FLOW = 5.0  # mbar: below it is not told from nothing
 UNKNOWN = math.nan
 
@@ -54,29 +52,29 @@ class Figure:
     of: Of
 
 
-def t0(course: Course, unit: Unit) -> float:
+def t0(course: Course, _unit: Unit) -> float:
     """Evacuation time to H2 (ms)."""
-    return course.reached(unit.h2) * 1e3
+    return course.vacuum.h2_s * 1e3
 
 
-def t1(course: Course, unit: Unit) -> float:
+def t1(course: Course, _unit: Unit) -> float:
     """Evacuation time from H2 to H1 (ms): the switching of the air saving, where there is one."""
-    if not course.seamless:
+    if not course.vacuum.seamless:
         return UNKNOWN
-    h1 = course.nozzle[0][1] if course.went_off else course.reached(unit.h1)
-    passed = h1 - course.reached(unit.h2)
+    h1 = course.nozzle.off_s if course.nozzle.went_off else course.vacuum.h1_s
+    passed = h1 - course.vacuum.h2_s
     return passed * 1e3 if passed > 0.0 else UNKNOWN  # a sensor so slow that it says nothing of it
 
 
 def leakage(course: Course, _unit: Unit) -> float:
     """Vacuum lost per time (mbar/s), by a straight line through the first stretch of hold."""
-    return course.leakage
+    return course.vacuum.leakage
 
 
 def leakage_band(course: Course, unit: Unit) -> float:
     """In which of the field's bands leakage is: 0 is good, 3 beyond the last."""
     found = leakage(course, unit)
-    return UNKNOWN if math.isnan(found) else float(np.searchsorted(BANDS, found, "right"))
+    return UNKNOWN if math.isnan(found) else float(bisect_right(BANDS, found))
 
 
 def quality(course: Course, unit: Unit) -> float:
@@ -86,14 +84,12 @@ def quality(course: Course, unit: Unit) -> float:
 
 def free_flow(course: Course, unit: Unit) -> float:
     """Vacuum (mbar) at which suction stands still short of H1, as with the cup open."""
-    if not (course.ended and course.seamless) or course.went_off:
+    if not course.is_whole or course.nozzle.went_off:
         return UNKNOWN
-    time, vacuum = course.smooth
-    last = time >= course.suction_s - STEADY_S
-    if course.suction_s < FREE_SUCTION_S or abs(slope(time[last], vacuum[last])) > STEADY:
+    if course.suction_s < FREE_SUCTION_S or abs(course.vacuum.last_slope) > STEADY:
         return UNKNOWN
-    found = float(vacuum[last].mean())
-    return found if LEAST_FREE_FLOW <= found < unit.h1 and vacuum.max() < unit.h1 else UNKNOWN
+    free = course.vacuum.last >= LEAST_FREE_FLOW and course.vacuum.highest < unit.h1
+    return course.vacuum.last if free else UNKNOWN
 
 
 def performance(course: Course, unit: Unit) -> float:
@@ -103,13 +99,12 @@ def performance(course: Course, unit: Unit) -> float:
 
 def max_vacuum(course: Course, _unit: Unit) -> float:
     """Highest vacuum (mbar)."""
-    known = course.ended and course.seamless
-    return float(course.smooth[1].max()) if known else UNKNOWN
+    return course.vacuum.highest if course.is_whole else UNKNOWN
 
 
 def h1_not_reached(course: Course, unit: Unit) -> float:
     """1 if suction ended before H1 was reached, else 0."""
-    if course.seamless and course.went_off:
+    if course.vacuum.seamless and course.nozzle.went_off:
         return 0.0
     highest = max_vacuum(course, unit)
     return UNKNOWN if math.isnan(highest) else float(highest < unit.h1)
@@ -137,39 +132,32 @@ def energy(course: Course, unit: Unit) -> float:
 
 def switchings(course: Course, _unit: Unit) -> float:
     """How often the nozzle was switched on."""
-    return float(len(course.nozzle)) if course.ended and course.seamless else UNKNOWN
+    return float(course.nozzle.switchings) if course.is_whole else UNKNOWN
 
 
 def quick_switchings(course: Course, _unit: Unit) -> float:
     """Most switchings of the air saving, on or off, within the time that valve protection has."""
-    if not (course.ended and course.seamless):
-        return UNKNOWN
-    edges = np.array(course.nozzle).ravel()[1:]
-    commanded = course.phase[course.suction_rows - 1] == Phase.SUCTION  # the last one
-    times = edges[:-1] if commanded else edges
-    within = np.searchsorted(times, times + PROTECTED_S, "left") - np.arange(len(times))
-    return float(within.max(initial=0))
+    return float(course.nozzle.quick_switchings) if course.is_whole else UNKNOWN
 
 
 def supply(course: Course, _unit: Unit) -> float:
     """Mean operating pressure while the nozzle was on (bar)."""
-    return course.mean_supply
+    return course.supply.mean
 
 
 def lowest_supply(course: Course, _unit: Unit) -> float:
     """Lowest operating pressure while the nozzle was on (bar)."""
-    return float(course.supply_ends[0])
+    return course.supply.lowest
 
 
 def highest_supply(course: Course, _unit: Unit) -> float:
     """Highest operating pressure while the nozzle was on (bar)."""
-    return float(course.supply_ends[1])
+    return course.supply.highest
 
 
 def _nozzle_s(course: Course) -> float:
     """How long the nozzle was on (s), where nothing was missed."""
-    known = course.ended and course.seamless
-    return sum(off - on for on, off in course.nozzle) if known else UNKNOWN
+    return course.nozzle.on_s if course.is_whole else UNKNOWN
 
 
 def _pressed(course: Course, unit: Unit) -> float:
@@ -234,9 +222,10 @@ FIGURES = {
 }
 
 
-def figures(course: Course, unit: Unit) -> dict[str, float]:
+def figures(rows: Rows, unit: Unit) -> dict[str, float]:
     """All key figures of one side of a cycle; NaN where it cannot tell."""
-    return {name: figure.of(course, unit) for name, figure in FIGURES.items()}
+    found = course(rows, unit.h2, unit.h1)
+    return {name: figure.of(found, unit) for name, figure in FIGURES.items()}
 
 
 def table() -> str:
