@@ -345,30 +345,6 @@ def _supply(supply, phase):  # type: ignore[no-untyped-def]
     if count == 0:
         return Supply(math.nan, math.nan, math.nan)
     mean = there[0] + beyond / count
-    there = there[:count]
     low, high = round(ENDS[0] * (count - 1)), round(ENDS[1] * (count - 1))
-    return Supply(mean, _lowest(there, low + 1), -_lowest(-there, count - high))
-
-
-@compiled
-def _lowest(values, count):  # type: ignore[no-untyped-def]
-    """The greatest of the ``count`` lowest values."""
-    kept = np.full(count, math.inf)  # a heap: none is greater than that at half its place
-    for value in values:
-        if value < kept[0]:
-            _replace_greatest(kept, value)
-    return kept[0]
-
-
-@compiled
-def _replace_greatest(heap, value):  # type: ignore[no-untyped-def]
-    """Put a value in the place of the greatest of a heap, which is its first."""
-    place, below = 0, 1
-    while below < len(heap):
-        if below + 1 < len(heap) and heap[below + 1] > heap[below]:
-            below += 1
-        if heap[below] <= value:
-            break
-        heap[place] = heap[below]
-        place, below = below, 2 * below + 1
-    heap[place] = value
+    in_place = np.partition(there[:count], np.array([low, high]))
+    return Supply(mean, in_place[low], in_place[high])
