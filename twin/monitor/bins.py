@@ -17,6 +17,7 @@ from twin.signals import MS
 EARLIEST_S, LATEST_S = 5e-3, 0.3  # how long an error goes on, at an edge and long after it
 PER_UNIT = 4  # bins in each unit of warped time
 SPARSE, FARTHEST = 20, 10  # rows kept: one in as many as a SPARSEth of those past, at most FARTHEST
+ROWS = 10_000  # of a stretch; where bins begin in so many is looked up
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
@@ -103,17 +104,18 @@ def binned(
     What comes before the first of them belongs to cycle -1.
     """
     number = np.empty(len(phase), np.int64)
-    last_step = int(warped(np.array(len(phase) * MS)) * per_unit)
-    found = _number(np.array(phase), usable, starts, _begins(last_step + 1, per_unit), number)
+    begins = _begins(len(phase) // ROWS + 1, per_unit)
+    found = _number(np.array(phase), usable, starts, begins, number)
     count, cycle, stretch, begin, since, step = found
     kind = kinds(phase[begin], phase[np.maximum(begin - 1, 0)])
     return Bins(number, count, cycle, stretch, kind, warped(since * MS), (kind << 16) + step)
 
 
 @lru_cache(maxsize=16)
-def _begins(steps: int, per_unit: int) -> Ints:
-    """After how many rows of a stretch each step of warped time begins; and what comes after."""
-    return np.ceil(unwarped(np.arange(steps + 1) / per_unit) / MS).astype(np.int64)
+def _begins(times: int, per_unit: int) -> Ints:
+    """Rows of a stretch before each step of warped time, up to so many ``times`` ROWS or more."""
+    steps = np.arange(int(warped(np.array(times * ROWS * MS)) * per_unit) + 2)
+    return np.ceil(unwarped(steps / per_unit) / MS).astype(np.int64)
 
 
 @compiled

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from statistics import fmean
 from typing import Any, Protocol
 
 import numpy as np
@@ -189,13 +190,13 @@ def figures(cycle: Cycle, ambient: float) -> dict[str, float]:
     times to H2 measured and expected; the highest vacuum. What a cycle cannot say is left out.
     """
     result: dict[str, float] = {}
-    broken_off = cycle.ticks["phase"][-1] if cycle.cut_short else None
-    rows, sums, squares = _by_phase(cycle.off, cycle.ticks)
+    broken_off = int(cycle.ticks["phase"][-1]) if cycle.cut_short else None
+    rows, sums, squares = _by_phase(cycle.off, cycle.ticks)[:, : len(Phase)].tolist()
     for phase in Phase:
         # Of the last one of a cycle cut short the beginning is no measure of all of it.
         if phase != broken_off and rows[phase] >= FEWEST_ROWS:
             name = phase.name.lower()
-            result[f"{name}_mean"] = float(sums[phase] / rows[phase])
+            result[f"{name}_mean"] = sums[phase] / rows[phase]
             result[f"{name}_rms"] = math.sqrt(squares[phase] / rows[phase])
     result |= _switching(cycle, ambient)
     if cycle.complete:
@@ -206,7 +207,7 @@ def figures(cycle: Cycle, ambient: float) -> dict[str, float]:
         result["max_vacuum"] = float((ambient - np.fmin.reduce(measured)) / MBAR)
         result["t0_measured"] = time_to_vacuum(H2, measured, times, ambient) * 1e3
         result["t0_expected"] = time_to_vacuum(H2, expected, times, ambient) * 1e3
-    return {name: value for name, value in result.items() if np.isfinite(value)}
+    return {name: value for name, value in result.items() if math.isfinite(value)}
 
 
 @compiled
@@ -225,13 +226,10 @@ def _by_phase(off, ticks):  # type: ignore[no-untyped-def]
 def _switching(cycle: Cycle, ambient: float) -> dict[str, float]:
     """Mean vacuum (mbar) at the knees: where the nozzle went off (H1) and on again."""
     rows = np.flatnonzero(np.isfinite(cycle.ticks["level"]))
-    rows = rows[rows > 0]
-    vacuum = (ambient - cycle.ticks["level"][rows].astype(np.float64)) / MBAR
-    phase = cycle.ticks["phase"][rows]
-    off, on = phase == int(Phase.HOLD), phase == int(Phase.SUCTION)
+    set_on = cycle.ticks[["level", "phase"]][rows[rows > 0]].tolist()
     levels = {}
-    if off.any():
-        levels["h1_level"] = float(vacuum[off].mean())
-    if on.any():
-        levels["h1_low_level"] = float(vacuum[on].mean())
+    for name, into in (("h1_level", Phase.HOLD), ("h1_low_level", Phase.SUCTION)):
+        vacuum = [(ambient - level) / MBAR for level, phase in set_on if phase == into]
+        if vacuum:
+            levels[name] = fmean(vacuum)
     return levels

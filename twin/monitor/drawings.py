@@ -34,13 +34,15 @@ class Stretches:
     def of(cls, rows: npt.NDArray[np.void]) -> "Stretches":
         """Those of the bank's rows of a cycle, of which the first begins one."""
         first = np.flatnonzero(rows["bends"])
-        last = np.append(first[1:], len(rows)) - 1
-        ms = (rows["time_ns"][last] - rows["time_ns"][first]) * (NS / MS)
-        level = rows["level"][first]
-        how = np.column_stack([last - first, ms, np.where(np.isnan(level), 0.0, level)])
+        last = np.concatenate([first[1:], [len(rows)]]) - 1
+        begin, end = rows[first], rows[last]
+        how = np.empty((len(first), 3))
+        how[:, 0] = last - first
+        how[:, 1] = (end["time_ns"] - begin["time_ns"]) * (NS / MS)
+        how[:, 2] = np.where(np.isnan(begin["level"]), 0.0, begin["level"])
         may_differ = np.maximum(LONGER * how, LONGER_MS)
         may_differ[:, 2] = LEVEL
-        return cls(first, rows["phase"][first].tobytes(), how, may_differ)
+        return cls(first, begin["phase"].tobytes(), how, may_differ)
 
     def go_as(self, known: "Stretches", whole: bool) -> bool:
         """Whether a cycle goes as a known one; if it is not ``whole`` yet, whether it still may.

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.model import kernel
+from twin.model.compiled import compiled
 from twin.model.effects import EFFECTS, Effect, apply
 from twin.model.theta import Theta
 from twin.monitor.bins import Floats, Ints, sparse
@@ -30,11 +31,18 @@ class Likeness:
 
 def steps(samples: Samples, before_ns: int | None) -> Floats:
     """Seconds from row to row, −1 where time does not run on; ``before_ns`` is the row before."""
-    times = samples["time_ns"]
-    first = times[:1] if before_ns is None else np.array([before_ns])
-    dt: Floats = np.diff(np.concatenate([first[: len(times)], times])) * NS
-    dt[(samples["quality"] & BREAK) != 0] = -1.0
+    dt = np.empty(len(samples))
+    if len(dt):
+        _steps(samples, int(samples["time_ns"][0]) if before_ns is None else before_ns, dt)
     return dt
+
+
+@compiled
+def _steps(samples, before_ns, dt):  # type: ignore[no-untyped-def]
+    for row in range(len(dt)):
+        time_ns = samples[row].time_ns
+        dt[row] = -1.0 if samples[row].quality & BREAK else (time_ns - before_ns) * NS
+        before_ns = time_ns
 
 
 def drawn_rows(samples: Samples, ticks: Ticks) -> Ints:

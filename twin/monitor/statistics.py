@@ -115,7 +115,7 @@ class Listener:
 
         ``figures`` are the monitor's.
         """
-        known = np.isfinite(expected.sum(axis=1))
+        known = np.isfinite(expected @ np.ones(expected.shape[1]))  # BLAS sums fastest
         if not known.any():
             return None
         usable = _between(drawn, known, cycle.off)
@@ -210,6 +210,7 @@ def _between(drawn: Ints, known: npt.NDArray[np.bool_], off: Floats) -> npt.NDAr
 def _beside(covariance: Floats, variances: Floats) -> Floats:
     """The covariance together with what varies by itself."""
     count = len(covariance)
-    whole = np.diag(np.concatenate([np.zeros(count), variances]))
+    whole = np.zeros((count + len(variances), count + len(variances)))
     whole[:count, :count] = covariance
+    np.fill_diagonal(whole[count:, count:], variances)
     return whole
