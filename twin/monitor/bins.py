@@ -106,7 +106,7 @@ def binned(
     number = np.empty(len(phase), np.int64)
     begins = _begins(len(phase) // ROWS + 1, per_unit)
     found = _number(np.array(phase), usable, starts, begins, number)
-    count, cycle, stretch, begin, since, step = found
+    count, cycle, stretch, begin, since, step = found.T
     kind = kinds(phase[begin], phase[np.maximum(begin - 1, 0)])
     return Bins(number, count, cycle, stretch, kind, warped(since * MS), (kind << 16) + step)
 
@@ -120,11 +120,11 @@ def _begins(times: int, per_unit: int) -> Ints:
 
 @compiled
 def _number(phase, usable, starts, begins, number):  # type: ignore[no-untyped-def]
-    """Number the bin of each row, and tell of each bin, (6, bins).
+    """Number the bin of each row, and tell of each bin, (bins, 6).
 
     Rows, cycle, stretch, the stretch's first row, rows from there on, and steps in warped time.
     """
-    found = np.empty((6, len(phase)), np.int64)
+    found = np.empty((len(phase), 6), np.int64)
     bins, cycle, stretch, first = 0, -1, -1, 0
     step, used = 0, -1  # the last that has a bin
     for row in range(len(phase)):
@@ -138,11 +138,11 @@ def _number(phase, usable, starts, begins, number):  # type: ignore[no-untyped-d
         number[row] = -1
         if usable[row]:
             if step != used:
-                found[:, bins] = 0, cycle, stretch, first, row - first, step
+                found[bins] = 0, cycle, stretch, first, row - first, step
                 bins, used = bins + 1, step
-            found[0, bins - 1] += 1
+            found[bins - 1, 0] += 1
             number[row] = bins - 1
-    return found[:, :bins].copy()
+    return found[:bins].copy()
 
 
 def sparse(begins: npt.NDArray[np.bool_], since: int = -1) -> Ints:

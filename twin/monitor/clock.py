@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from twin.events import Event, Kind
 from twin.model.compiled import compiled
-from twin.signals import SAMPLE, Quality, Samples, joined
+from twin.signals import SAMPLE, Quality, Samples
 
 WINDOW_NS = 5_000_000_000  # of PLC time; the fastest receipt of each counts
 KEPT = 120  # windows: ten minutes, over which the drift of a quartz is steady
@@ -54,15 +54,6 @@ class Estimate:
         )
 
 
-def _compared(newest: Samples) -> Integers:
-    """Receipts that can tell anything: where it is PLC time itself, there is one clock only.
-
-    A row each, of PLC time, receipt and sequence.
-    """
-    newest = newest[newest["host_ns"] != newest["time_ns"]]
-    return np.stack([newest[name] for name in ("time_ns", "host_ns", "sequence")], axis=1)
-
-
 def _long(ms: float) -> str:
     return f"{ms:.2f} ms" if ms < 1e4 else f"{ms / 1e3:.1f} s"
 
@@ -94,6 +85,22 @@ def _slopes(x, y):  # type: ignore[no-untyped-def]
             to[j] = (y[i + 1 + j] - y[i]) / (x[i + 1 + j] - x[i])
         first += len(to)
     return slopes
+
+
+@compiled
+def _receipts(before, samples):  # type: ignore[no-untyped-def]
+    """The newest row of each receipt that another one follows: PLC time, receipt and sequence.
+
+    ``before`` is the row before these, or none. Where it was received at PLC time itself, there is
+    one clock only, and nothing to tell.
+    """
+    found, count = np.empty((len(samples), 3), np.int64), 0
+    for row in range(1 - len(before), len(samples)):
+        newest = samples[row - 1] if row else before[0]
+        if newest.host_ns != samples[row].host_ns and newest.host_ns != newest.time_ns:
+            found[count] = newest.time_ns, newest.host_ns, newest.sequence
+            count += 1
+    return found[:count].copy()
 
 
 @compiled
@@ -135,7 +142,8 @@ class ClockWatch:
     def __post_init__(self) -> None:
         """Have what is compiled at hand, not to fall into a block."""
         _slopes(np.zeros(2), np.zeros(2))
-        _first_plain(np.zeros((1, 3), np.int64), self._last, 0, 0, 0.0, 0.0)
+        row = np.zeros(1, SAMPLE)
+        _first_plain(_receipts(row, row), self._last, 0, 0, 0.0, 0.0)
 
     def push(self, samples: Samples) -> list[Event]:
         """Take rows without a break, but maybe before the first one."""
@@ -145,11 +153,9 @@ class ClockWatch:
         if samples["quality"][0] & _NEW:
             events += self.close()
             self._begin()
-        before = self._receipt[self._receipt["host_ns"] != samples["host_ns"][0]]
-        newest = samples[:-1][np.diff(samples["host_ns"]) != 0]
+        receipts = _receipts(self._receipt, samples)
         self._receipt = samples[-1:].copy()
         self._learn(samples)
-        receipts = _compared(joined(before, newest))
         while len(receipts):
             if plain := self._plain(receipts):
                 self._take_plain(receipts[:plain])

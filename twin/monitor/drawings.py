@@ -4,6 +4,7 @@ A signature follows from how a cycle goes: its phases, how long each lasts, and 
 model is set on. Where these hardly differ, it is the same, counted from the beginning of a phase.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,23 +45,23 @@ class Stretches:
         may_differ[:, 2] = LEVEL
         return cls(first, begin["phase"].tobytes(), how, may_differ)
 
-    def go_as(self, known: "Stretches", whole: bool) -> bool:
-        """Whether a cycle goes as a known one; if it is not ``whole`` yet, whether it still may.
+    def may_go_as(self, known: "Stretches") -> bool:
+        """Whether a cycle that is not over yet may still turn out to go as a known one.
 
         What does not go alike so far never will: no later row makes it alike again.
         """
         if not known.phases.startswith(self.phases):
             return False
-        if whole and len(self.how) < len(known.how):
-            return False
         more = self.how - known.how[: len(self.how)]
-        if not whole:
-            more[-1, :2] = np.maximum(more[-1, :2], 0.0)  # the last goes on
+        more[-1, :2] = np.maximum(more[-1, :2], 0.0)  # the last goes on
         return bool((np.abs(more) <= known.may_differ[: len(more)]).all())
 
-    def far(self, known: "Stretches") -> float:
-        """How much a whole cycle differs from a known one that it goes as."""
-        return float((np.abs(self.how - known.how) / known.may_differ).sum())
+    def far(self, known: Sequence["Stretches"]) -> Floats:
+        """How much a whole cycle differs from known ones of the same phases; inf: it goes apart."""
+        more = np.abs(self.how - np.array([one.how for one in known]))
+        share = more / np.array([one.may_differ for one in known])
+        far: Floats = np.where(share.max(axis=(1, 2)) <= 1.0, share.sum(axis=(1, 2)), np.inf)
+        return far
 
 
 @dataclass(frozen=True)
@@ -99,14 +100,17 @@ class Drawings:
 
     def may_be(self, stretches: Stretches) -> bool:
         """Whether a cycle that has gone like this so far may yet turn out to go as a known one."""
-        return any(stretches.go_as(one.stretches, whole=False) for one in self._kept)
+        return any(stretches.may_go_as(one.stretches) for one in self._kept)
 
     def like(self, stretches: Stretches) -> Drawing | None:
         """The drawing of the cycle that a whole one goes most alike, if there is one."""
-        alike = [one for one in self._kept if stretches.go_as(one.stretches, whole=True)]
+        alike = [one for one in self._kept if one.stretches.phases == stretches.phases]
         if not alike:
             return None
-        nearest = min(alike, key=lambda one: stretches.far(one.stretches))
+        far = stretches.far([one.stretches for one in alike])
+        nearest = alike[int(far.argmin())]
+        if not np.isfinite(far.min()):
+            return None
         self._kept = [one for one in self._kept if one is not nearest]
         self.add(nearest)
         return nearest
