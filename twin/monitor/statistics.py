@@ -122,8 +122,7 @@ class Listener:
         if not usable.any():
             return None
         bins = binned(cycle.ticks["phase"], usable, np.zeros(1, np.int64), PER_UNIT)
-        through = bins.through(drawn, expected)
-        signatures = (through[:, 1:] - through[:, :1]) / MBAR
+        signatures = bins.through(drawn, expected[:, 1:] - expected[:, :1]) / MBAR
         return self._with_levels(bins, bins.mean(cycle.off), signatures, figures)
 
     def _with_levels(
