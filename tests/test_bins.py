@@ -39,7 +39,8 @@ def test_what_is_not_known_beside_a_bin_does_not_spoil_its_mean() -> None:
 def recorded(draw: st.DrawFn) -> tuple[Bytes, Bools, Ints]:
     """Phases, usable rows, and where cycles start."""
     random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    runs = draw(st.lists(st.tuples(st.sampled_from(Phase), st.integers(1, 900)), max_size=8))
+    lengths = st.integers(1, 3) | st.integers(1, 900)
+    runs = draw(st.lists(st.tuples(st.sampled_from(Phase), lengths), max_size=8))
     phase = np.repeat([one for one, _ in runs], [rows for _, rows in runs]).astype(np.uint8)
     usable = random.random(len(phase)) < draw(st.sampled_from([0.0, 0.1, 0.9, 1.0]))
     starts = draw(st.lists(st.integers(0, 3000), max_size=4, unique=True))
