@@ -171,11 +171,8 @@ class Alarms:
 
     def _deviating(self) -> list[str]:
         """The causes whose alarms are active."""
-        return [
-            cause
-            for cause in CAUSES
-            if any(alarm.active for alarm in self.board.watching(value_of(cause)))
-        ]
+        active = {alarm.rule.value for alarm in self.board.alarms.values() if alarm.active}
+        return [cause for cause in CAUSES if value_of(cause) in active]
 
     def _standing(self, event: Event) -> str:
         """The cause of a deviation: one that stands already, if this looks like it, or its own."""
