@@ -148,8 +148,8 @@ def rig() -> Rig:
     return Rig(TornServer())
 
 
-def flags(samples: Samples, quality: Quality) -> list[int]:
-    return [int(row) for row in np.flatnonzero(samples["quality"] & quality.value)]
+def flags(samples: Samples, quality: int) -> list[int]:
+    return [int(row) for row in np.flatnonzero(samples["quality"] & quality)]
 
 
 def assert_true(rig: Rig, samples: Samples) -> None:

@@ -26,7 +26,6 @@ Bytes = npt.NDArray[np.uint8]
 
 # As plain numbers: enumerations are slow to compare.
 _SUCTION, _HOLD, _BLOW_OFF = int(Phase.SUCTION), int(Phase.HOLD), int(Phase.BLOW_OFF)
-_UNUSABLE = int(UNUSABLE)
 
 
 @dataclass(frozen=True)
@@ -128,7 +127,7 @@ def _measured(samples, ticks, ambient):  # type: ignore[no-untyped-def]
     phase = np.empty(count, np.uint8)
     for row in range(count):
         one = samples[row]
-        usable = (one.quality & _UNUSABLE) == 0
+        usable = (one.quality & UNUSABLE) == 0
         time[row] = (one.time_ns - samples[0].time_ns) * NS
         vacuum[row] = ambient - one.pressure / MBAR if usable else math.nan
         supply[row] = one.supply / BAR
