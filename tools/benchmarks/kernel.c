@@ -47,17 +47,18 @@ INLINED double min(double a, double b) { return a < b ? a : b; }
 #define CP (GAMMA * R / (GAMMA - 1.0))
 #define CRITICAL_RATIO 0.528
 #define LAMINAR_RATIO 0.999
-#define EDGE ((LAMINAR_RATIO - CRITICAL_RATIO) / (1.0 - CRITICAL_RATIO))
+#define STEEP (1.0 / (1.0 - CRITICAL_RATIO))
+#define EDGE ((LAMINAR_RATIO - CRITICAL_RATIO) * STEEP)
 #define LAMINAR_SLOPE (-sqrt(1.0 - EDGE * EDGE) / (1.0 - LAMINAR_RATIO))
 
 typedef struct { double level, slope; } Tangent;
 
 INLINED Tangent orifice(double ratio)
 {
-    double below = min(max((ratio - CRITICAL_RATIO) / (1.0 - CRITICAL_RATIO), 0.0), EDGE);
+    double below = min(max((ratio - CRITICAL_RATIO) * STEEP, 0.0), EDGE);
     double share = sqrt(1.0 - below * below);
     int laminar = ratio > LAMINAR_RATIO;
-    double slope = laminar ? LAMINAR_SLOPE : -below / (share * (1.0 - CRITICAL_RATIO));
+    double slope = laminar ? LAMINAR_SLOPE : -STEEP * below / share;
     return (Tangent){laminar ? -LAMINAR_SLOPE * (1.0 - ratio) : share, slope};
 }
 
@@ -78,6 +79,8 @@ INLINED Tangent opening(double p, double ambient)
 #define HIGHEST 1e7
 #define COLDEST 60.0
 #define HOTTEST 2000.0
+#define PER_COLDEST (1.0 / (R * COLDEST))
+#define PER_HOTTEST (1.0 / (R * HOTTEST))
 #define MOST 100.0
 #define FAINTEST 1e-12
 #define G 0.435866521508459
@@ -141,9 +144,9 @@ INLINED Tangent characteristic(double x, const double *k)
 INLINED Port at_port(double p, const Driven *driven, const double *k)
 {
     double ambient = K(AMBIENT);
-    double span = ambient - driven->end;
-    Tangent curve = characteristic(driven->jet - (ambient - p) / span, k);
-    double out_slope = driven->jet * driven->suction * curve.slope / span;
+    double per_pa = 1.0 / (ambient - driven->end);
+    Tangent curve = characteristic(driven->jet - (ambient - p) * per_pa, k);
+    double out_slope = driven->jet * driven->suction * per_pa * curve.slope;
     double out = driven->jet * driven->suction * curve.level - out_slope * p;
     double relief = p > ambient ? K(RELIEF) : 0.0;
     Tangent flow = opening(p, ambient);
@@ -180,13 +183,18 @@ INLINED double through(double rest, double fall, double before, double rise,
 
 INLINED double kept(double mass, double work)
 {
-    return min(max(mass, work / (R * HOTTEST)), work / (R * COLDEST));
+    return min(max(mass, work * PER_HOTTEST), work * PER_COLDEST);
+}
+
+INLINED double per_joule(double mass)
+{
+    return 1.0 / (R * mass);
 }
 
 INLINED Gas solve(Gas y, const Gas *known, double step, const Driven *driven, const double *k)
 {
     double ambient = K(AMBIENT), outside = K(TEMPERATURE);
-    double per_pa = 1.0 / (GAMMA * R * step);
+    double per_s = 1.0 / step, per_pa = 1.0 / (GAMMA * R * step), per_k = 1.0 / outside;
     Port at = at_port(y.port, driven, k);
     double out = at.out, out_slope = at.out_slope, blown = at.in, blown_slope = at.in_slope;
     Tangent leaking = at_vessel(y.vessel, driven, k);
@@ -198,37 +206,37 @@ INLINED Gas solve(Gas y, const Gas *known, double step, const Driven *driven, co
     double warmth = K(K_HEAT), port_warmth = K(K_PORT_HEAT), line_warmth = K(K_LINE_HEAT);
 
     /* Gas leaves a node at the node's temperature. */
-    double vessel_t = y.vessel * volume / (R * y.vessel_mass);
+    double vessel_t = y.vessel * volume * per_joule(y.vessel_mass);
     double entering = blown + blown_slope * y.port;
     double held = port_stored * known->port + (entering + port_warmth) * outside;
     double leaving =
-        y.port_mass / (GAMMA * step) + max(out + out_slope * y.port, 0.0) + port_warmth;
-    double line_t = y.line * K(LINE_VOLUME) / (R * y.line_mass);
+        y.port_mass * R * per_pa + max(out + out_slope * y.port, 0.0) + port_warmth;
+    double line_t = y.line * K(LINE_VOLUME) * per_joule(y.line_mass);
     double port_t = (held + max(y.near, 0.0) * line_t) / (leaving + max(-y.near, 0.0));
     held = line_stored * known->line + line_warmth * outside;
     held += max(y.far, 0.0) * vessel_t + max(-y.near, 0.0) * port_t;
-    leaving = y.line_mass / (GAMMA * step) + line_warmth;
+    leaving = y.line_mass * R * per_pa + line_warmth;
     line_t = held / (leaving + max(y.near, 0.0) + max(-y.far, 0.0));
     double near_t = y.near >= 0.0 ? line_t : port_t;
     double far_t = y.far >= 0.0 ? vessel_t : line_t;
     double leak_t = y.vessel <= ambient ? outside : vessel_t;
 
     /* Pressures as rest and slope over the flows. */
-    double cooling = port_warmth * K(PORT_VOLUME) / (R * y.port_mass);
+    double cooling = port_warmth * K(PORT_VOLUME) * per_joule(y.port_mass);
     double weight = 1.0 / (port_stored + out_slope * port_t - blown_slope * outside + cooling);
     double gained = port_stored * known->port + (blown + port_warmth) * outside - out * port_t;
     double port_rest = gained * weight, port_rise = near_t * weight;
-    cooling = line_warmth * K(LINE_VOLUME) / (R * y.line_mass);
+    cooling = line_warmth * K(LINE_VOLUME) * per_joule(y.line_mass);
     weight = 1.0 / (line_stored + cooling);
     double line_rest = (line_stored * known->line + line_warmth * outside) * weight;
     double line_fall = near_t * weight, line_rise = far_t * weight;
-    cooling = warmth * volume / (R * y.vessel_mass);
+    cooling = warmth * volume * per_joule(y.vessel_mass);
     weight = 1.0 / (vessel_stored - leak_slope * leak_t + cooling);
     gained = vessel_stored * known->vessel + leak * leak_t + warmth * outside;
     double vessel_rest = gained * weight, vessel_fall = far_t * weight;
 
-    double inertia = K(NEAR_INERTANCE) * (y.line + y.port) / step;
-    double warm = near_t / outside;
+    double inertia = K(NEAR_INERTANCE) * (y.line + y.port) * per_s;
+    double warm = near_t * per_k;
     double quadratic = warm * K(NEAR_RESISTANCE), linear = warm * K(NEAR_LAMINAR) + inertia;
     double pushed = inertia * known->near;
     double near = through(y.line, 0.0, port_rest, port_rise, quadratic, linear, pushed);
@@ -236,12 +244,12 @@ INLINED Gas solve(Gas y, const Gas *known, double step, const Driven *driven, co
         2.0 * (port_rise * (port_rest + port_rise * near) + quadratic * fabs(near)) + linear;
     double near_slope = 2.0 * y.line / slope;
     near -= near_slope * y.line;
-    weight = 1.0 / (1.0 + line_fall * near_slope);
+    weight = slope / (slope + 2.0 * y.line * line_fall);
     line_rest = (line_rest - line_fall * near) * weight;
     line_rise = line_rise * weight;
 
-    inertia = K(INERTANCE) * (y.vessel + y.line) / step;
-    warm = far_t / outside;
+    inertia = K(INERTANCE) * (y.vessel + y.line) * per_s;
+    warm = far_t * per_k;
     quadratic = warm * K(RESISTANCE);
     linear = warm * K(LAMINAR) + inertia;
     pushed = inertia * known->far;
@@ -264,9 +272,9 @@ INLINED Gas solve(Gas y, const Gas *known, double step, const Driven *driven, co
     };
 }
 
-INLINED double lag(double known, double target, double ratio)
+INLINED double lag(double known, double target, double step, double slow)
 {
-    return (known + ratio * target) / (1.0 + ratio);
+    return known + step / (slow + step) * (target - known);
 }
 
 INLINED Stage stage(const Gas *guess, const Gas *known, const Lags *lags, double step,
@@ -275,11 +283,11 @@ INLINED Stage stage(const Gas *guess, const Gas *known, const Lags *lags, double
     double rise = K(RAMP_UP), fall = K(RAMP_DOWN);
     double first = rise + K(SLOW_RAMP_UP);
     int rising = valves->nozzle > lags->drive;
-    double drive = lag(lags->drive, valves->nozzle, step / (rising ? first : fall));
-    double jet = lag(lags->jet, drive, step / (rising ? rise : fall));
-    double valve = lag(lags->valve, valves->blow, step / K(BLOW_OFF_RAMP));
+    double drive = lag(lags->drive, valves->nozzle, step, rising ? first : fall);
+    double jet = lag(lags->jet, drive, step, rising ? rise : fall);
+    double valve = lag(lags->valve, valves->blow, step, K(BLOW_OFF_RAMP));
     double regulated = max(K(SUPPLY) - K(DROOP) * max(valves->nozzle, valves->blow), 0.0);
-    double supply = lag(lags->supply, regulated, step / K(SUPPLY_LAG));
+    double supply = lag(lags->supply, regulated, step, K(SUPPLY_LAG));
     Supplied at = at_supply(supply, k);
     Driven driven = {jet, at.suction, at.end, at.blow_off * valve, valves->open};
     Gas gas = solve(*guess, known, step, &driven, k);
@@ -288,8 +296,8 @@ INLINED Stage stage(const Gas *guess, const Gas *known, const Lags *lags, double
         gas = solve(gas, known, step, &driven, k);
     double there = gas.port + K(K_PLACE) * (gas.vessel - gas.port);
     double slow = K(SENSOR_LAG);
-    double felt = lag(lags->felt, there, step / slow);
-    double sensed = lag(lags->sensed, felt, step / (slow + K(SLOW_SENSOR)));
+    double felt = lag(lags->felt, there, step, slow);
+    double sensed = lag(lags->sensed, felt, step, slow + K(SLOW_SENSOR));
     return (Stage){gas, {drive, jet, valve, supply, felt, sensed}};
 }
 

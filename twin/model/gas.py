@@ -15,7 +15,8 @@ VISCOSITY = 1.82e-5  # Pa s, of air at 20 °C
 CRITICAL_RATIO = 0.528  # ISO 6358 critical pressure ratio of a well rounded opening
 LAMINAR_RATIO = 0.999  # above it ISO 6358 flow runs linearly to zero: no infinite slope, no chatter
 
-_EDGE = (LAMINAR_RATIO - CRITICAL_RATIO) / (1.0 - CRITICAL_RATIO)
+_STEEP = 1.0 / (1.0 - CRITICAL_RATIO)
+_EDGE = (LAMINAR_RATIO - CRITICAL_RATIO) * _STEEP
 _LAMINAR_SLOPE = -math.sqrt(1.0 - _EDGE * _EDGE) / (1.0 - LAMINAR_RATIO)
 
 
@@ -26,10 +27,10 @@ def orifice(ratio):  # type: ignore[no-untyped-def]
     ISO 6358-1 with critical ratio 0.528; ``ratio`` is downstream over upstream absolute pressure,
     between 0 and 1.
     """
-    below = min(max((ratio - CRITICAL_RATIO) / (1.0 - CRITICAL_RATIO), 0.0), _EDGE)
+    below = min(max((ratio - CRITICAL_RATIO) * _STEEP, 0.0), _EDGE)
     share = math.sqrt(1.0 - below * below)
     laminar = ratio > LAMINAR_RATIO
-    slope = _LAMINAR_SLOPE if laminar else -below / (share * (1.0 - CRITICAL_RATIO))
+    slope = _LAMINAR_SLOPE if laminar else -_STEEP * below / share
     return (-_LAMINAR_SLOPE * (1.0 - ratio) if laminar else share), slope
 
 

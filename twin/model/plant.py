@@ -29,6 +29,7 @@ PREPARED = len(c.COEFFICIENTS) + 8
 LIGHTEST = 1e-15  # kg
 LOWEST, HIGHEST = 1.0, 1e7  # Pa
 COLDEST, HOTTEST = 60.0, 2000.0  # K
+_PER_COLDEST, _PER_HOTTEST = 1.0 / (R * COLDEST), 1.0 / (R * HOTTEST)  # kg/J
 MOST = 100.0  # kg/s
 FAINTEST = 1e-12  # of a jet that fades; less is none, and slow to calculate with
 
@@ -171,9 +172,9 @@ def at_port(p, driven, k, i):  # type: ignore[no-untyped-def]
     nozzle is off.
     """
     ambient = k[c.AMBIENT, i]
-    span = ambient - driven.end
-    share, rise = characteristic(driven.jet - (ambient - p) / span, k, i)
-    out_slope = driven.jet * driven.suction * rise / span
+    per_pa = 1.0 / (ambient - driven.end)
+    share, rise = characteristic(driven.jet - (ambient - p) * per_pa, k, i)
+    out_slope = driven.jet * driven.suction * per_pa * rise
     out = driven.jet * driven.suction * share - out_slope * p
     relief = k[c.RELIEF, i]
     relief = relief if p > ambient else 0.0
@@ -221,7 +222,13 @@ def through(rest, fall, before, rise, quadratic, linear, pushed):  # type: ignor
 @inlined
 def kept(mass, work):  # type: ignore[no-untyped-def]
     """Mass (kg) within what pressure times volume (J) allows for."""
-    return min(max(mass, work / (R * HOTTEST)), work / (R * COLDEST))
+    return min(max(mass, work * _PER_HOTTEST), work * _PER_COLDEST)
+
+
+@inlined
+def per_joule(mass):  # type: ignore[no-untyped-def]
+    """How warm (K) gas of a mass is for each joule of pressure times volume."""
+    return 1.0 / (R * mass)
 
 
 @inlined
@@ -234,14 +241,14 @@ def temperatures(y, known, step, entering, drawn, k, i):  # type: ignore[no-unty
     """
     outside, per_pa = k[c.TEMPERATURE, i], 1.0 / (GAMMA * R * step)
     volume = k[c.VOLUME, i] - k[c.COMPLIANCE, i] / k[c.AMBIENT, i] * (k[c.AMBIENT, i] - y.vessel)
-    vessel_t = y.vessel * volume / (R * y.vessel_mass)
-    line_t = y.line * k[c.LINE_VOLUME, i] / (R * y.line_mass)
+    vessel_t = y.vessel * volume * per_joule(y.vessel_mass)
+    line_t = y.line * k[c.LINE_VOLUME, i] * per_joule(y.line_mass)
     held = k[c.PORT_VOLUME, i] * per_pa * known.port + (entering + k[_PORT_HEAT, i]) * outside
-    leaving = y.port_mass / (GAMMA * step) + drawn + k[_PORT_HEAT, i]
+    leaving = y.port_mass * R * per_pa + drawn + k[_PORT_HEAT, i]
     port_t = (held + max(y.near, 0.0) * line_t) / (leaving + max(-y.near, 0.0))
     held = k[c.LINE_VOLUME, i] * per_pa * known.line + k[_LINE_HEAT, i] * outside
     held += max(y.far, 0.0) * vessel_t + max(-y.near, 0.0) * port_t
-    leaving = y.line_mass / (GAMMA * step) + k[_LINE_HEAT, i]
+    leaving = y.line_mass * R * per_pa + k[_LINE_HEAT, i]
     return port_t, held / (leaving + max(y.near, 0.0) + max(-y.far, 0.0)), vessel_t
 
 
@@ -254,7 +261,7 @@ def solve(y, known, step, driven, k, i):  # type: ignore[no-untyped-def]
     the near flow is made a tangent over the line's pressure, the far one is solved for.
     """
     ambient, outside = k[c.AMBIENT, i], k[c.TEMPERATURE, i]
-    per_pa = 1.0 / (GAMMA * R * step)
+    per_s, per_pa, per_k = 1.0 / step, 1.0 / (GAMMA * R * step), 1.0 / outside
     out, out_slope, blown, blown_slope = at_port(y.port, driven, k, i)
     leak, leak_slope = at_vessel(y.vessel, driven, k, i)
     stretch = k[c.COMPLIANCE, i] / ambient
@@ -270,32 +277,32 @@ def solve(y, known, step, driven, k, i):  # type: ignore[no-untyped-def]
     leak_t = outside if y.vessel <= ambient else vessel_t
 
     # Pressures as rest and slope over the flows.
-    cooling = port_warmth * k[c.PORT_VOLUME, i] / (R * y.port_mass)
+    cooling = port_warmth * k[c.PORT_VOLUME, i] * per_joule(y.port_mass)
     weight = 1.0 / (port_stored + out_slope * port_t - blown_slope * outside + cooling)
     gained = port_stored * known.port + (blown + port_warmth) * outside - out * port_t
     port_rest, port_rise = gained * weight, near_t * weight
-    cooling = line_warmth * k[c.LINE_VOLUME, i] / (R * y.line_mass)
+    cooling = line_warmth * k[c.LINE_VOLUME, i] * per_joule(y.line_mass)
     weight = 1.0 / (line_stored + cooling)
     line_rest = (line_stored * known.line + line_warmth * outside) * weight
     line_fall, line_rise = near_t * weight, far_t * weight
-    cooling = warmth * volume / (R * y.vessel_mass)
+    cooling = warmth * volume * per_joule(y.vessel_mass)
     weight = 1.0 / (vessel_stored - leak_slope * leak_t + cooling)
     gained = vessel_stored * known.vessel + leak * leak_t + warmth * outside
     vessel_rest, vessel_fall = gained * weight, far_t * weight
 
-    inertia = k[c.NEAR_INERTANCE, i] * (y.line + y.port) / step
-    warm = near_t / outside
+    inertia = k[c.NEAR_INERTANCE, i] * (y.line + y.port) * per_s
+    warm = near_t * per_k
     quadratic, linear = warm * k[c.NEAR_RESISTANCE, i], warm * k[c.NEAR_LAMINAR, i] + inertia
     pushed = inertia * known.near
     near = through(y.line, 0.0, port_rest, port_rise, quadratic, linear, pushed)
     slope = 2.0 * (port_rise * (port_rest + port_rise * near) + quadratic * abs(near)) + linear
     near_slope = 2.0 * y.line / slope
     near -= near_slope * y.line
-    weight = 1.0 / (1.0 + line_fall * near_slope)
+    weight = slope / (slope + 2.0 * y.line * line_fall)
     line_rest, line_rise = (line_rest - line_fall * near) * weight, line_rise * weight
 
-    inertia = k[c.INERTANCE, i] * (y.vessel + y.line) / step
-    warm = far_t / outside
+    inertia = k[c.INERTANCE, i] * (y.vessel + y.line) * per_s
+    warm = far_t * per_k
     quadratic, linear = warm * k[c.RESISTANCE, i], warm * k[c.LAMINAR, i] + inertia
     pushed = inertia * known.far
     far = through(vessel_rest, vessel_fall, line_rest, line_rise, quadratic, linear, pushed)
@@ -318,9 +325,9 @@ def solve(y, known, step, driven, k, i):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def lag(known, target, ratio):  # type: ignore[no-untyped-def]
-    """Implicit stage of a first-order lag; ``ratio`` is the step over the time constant."""
-    return (known + ratio * target) / (1.0 + ratio)
+def lag(known, target, step, slow):  # type: ignore[no-untyped-def]
+    """Implicit stage of a first-order lag with the time constant ``slow`` (s)."""
+    return known + step / (slow + step) * (target - known)
 
 
 @inlined
@@ -336,11 +343,11 @@ def stage(guess, known, lags, step, valves, far_off, k, i):  # type: ignore[no-u
     rise, fall = k[c.RAMP_UP, i], k[c.RAMP_DOWN, i]
     first = rise + k[c.SLOW_RAMP_UP, i]
     rising = nozzle > lags.drive
-    drive = lag(lags.drive, nozzle, step / (first if rising else fall))
-    jet = lag(lags.jet, drive, step / (rise if rising else fall))
-    valve = lag(lags.valve, blow, step / k[c.BLOW_OFF_RAMP, i])
+    drive = lag(lags.drive, nozzle, step, first if rising else fall)
+    jet = lag(lags.jet, drive, step, rise if rising else fall)
+    valve = lag(lags.valve, blow, step, k[c.BLOW_OFF_RAMP, i])
     regulated = max(k[c.SUPPLY, i] - k[c.DROOP, i] * max(nozzle, blow), 0.0)
-    supply = lag(lags.supply, regulated, step / k[c.SUPPLY_LAG, i])
+    supply = lag(lags.supply, regulated, step, k[c.SUPPLY_LAG, i])
     suction, end, blow_off = at_supply(supply, k, i)
     driven = Driven(jet, suction, end, blow_off * valve, open_cup)
     gas = solve(guess, known, step, driven, k, i)
@@ -349,8 +356,8 @@ def stage(guess, known, lags, step, valves, far_off, k, i):  # type: ignore[no-u
         gas = solve(gas, known, step, driven, k, i)
     there = gas.port + k[_PLACE, i] * (gas.vessel - gas.port)
     slow = k[c.SENSOR_LAG, i]
-    felt = lag(lags.felt, there, step / slow)
-    sensed = lag(lags.sensed, felt, step / (slow + k[c.SLOW_SENSOR, i]))
+    felt = lag(lags.felt, there, step, slow)
+    sensed = lag(lags.sensed, felt, step, slow + k[c.SLOW_SENSOR, i])
     return gas, Lags(drive, jet, valve, supply, felt, sensed)
 
 
