@@ -139,7 +139,8 @@ def _planned(begin, k, moving, before, tolerance):  # type: ignore[no-untyped-de
     there the exhaust opens.
     """
     rough = begin[ROUGH, 0]
-    h = min(LONGEST_STEP, LONGER * before)
+    longest = LONGEST_STEP * math.sqrt(math.sqrt(tolerance / TOLERANCE))  # for what is read
+    h = min(longest, LONGER * before)
     h = min(h, SURE * (tolerance / rough) ** (1.0 / 3.0)) if rough > 0.0 else h
     while h > SHORTEST_STEP and kernel._release(begin, k, h, 0):
         h *= 0.5
@@ -196,7 +197,7 @@ def _on(carried, k, dt, tolerance):  # type: ignore[no-untyped-def]
     clock[_SINCE] += dt
     while clock[_SINCE] > clock[_LENGTH]:
         clock[_SINCE] -= clock[_LENGTH]
-        _stride(begin, end, clock, k, LONGEST_STEP, tolerance)
+        _stride(begin, end, clock, k, NEVER, tolerance)
         _drawn(begin, end, clock, k)
     if clock[_LENGTH] > 0.0:
         x = clock[_SINCE] / clock[_LENGTH]
