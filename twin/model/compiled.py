@@ -72,5 +72,6 @@ event.register("numba:compile", _Waiting())  # type: ignore[no-untyped-call]
 # Results stay the same to the last bit: no fast-math. Dividing by zero gives inf as in NumPy.
 compiled = njit(cache=True, nogil=True, error_model="numpy")
 
-# For functions called inside a loop over hypotheses: only loops without calls are vectorised.
+# For functions called inside a loop: over hypotheses only one without calls is vectorised, and over
+# rows a call costs as much as a few lines.
 inlined = njit(forceinline=True, error_model="numpy")

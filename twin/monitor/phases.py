@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.model import theta as c
-from twin.model.compiled import compiled
+from twin.model.compiled import compiled, inlined
 from twin.model.control import new_timer, timed
 from twin.model.gas import GAMMA, R
 from twin.model.plant import suction_at
@@ -82,22 +82,28 @@ def expected_knees(theta: Theta, noise: float) -> Knees:
     )
 
 
-@compiled
+@inlined
 def _line(pressure, start, rows):  # type: ignore[no-untyped-def]
     """Slope (Pa per row) and middle of a straight line through ``rows`` values from ``start``.
 
     A few that are not usable (NaN) are left out; too many make it NaN.
     """
     total, moment, missing = 0.0, 0.0, 0
-    middle = 0.5 * (rows - 1)
+    middle, half = 0.5 * (rows - 1), rows // 2
+    for i in range(half):  # from both ends inwards
+        early, late = pressure[start + i], pressure[start + rows - 1 - i]
+        total += early + late
+        moment += (middle - i) * (late - early)
+    total += pressure[start + half] if rows % 2 else 0.0
+    if not math.isnan(total):
+        return moment * 12.0 / (rows * (rows * rows - 1.0)), total / rows
+    total, moment = 0.0, 0.0
     for i in range(rows):
         if math.isnan(pressure[start + i]):
             missing += 1
         else:
             total += pressure[start + i]
             moment += (i - middle) * pressure[start + i]
-    if missing == 0:
-        return moment * 12.0 / (rows * (rows * rows - 1.0)), total / rows
     if missing > MOST_MISSING * rows:
         return math.nan, math.nan
     places, squares = 0.0, 0.0  # of those that are there, about the middle
@@ -136,7 +142,7 @@ def _bends_at(pressure, first, jump, last, noise):  # type: ignore[no-untyped-de
     return (right - left) / (noise * math.sqrt(12.0 / before**3 + 12.0 / after**3))
 
 
-@compiled
+@inlined
 def _break_at(pressure, row, window, noise, nozzle_on):  # type: ignore[no-untyped-def]
     """Significance of the slope's break at ``row`` and the level there; 0 where it is no knee.
 
@@ -224,7 +230,7 @@ def _unsettled(state, look):  # type: ignore[no-untyped-def]
     return reach + (int(state[_BEST_AGE]) + 1 if state[_BEST] > 0.0 else 0)
 
 
-@compiled
+@inlined
 def _idle(state, pressure, row, level):  # type: ignore[no-untyped-def]
     """Keep the mean of the last idle rows; the first of a stretch anchor the model."""
     if math.isnan(pressure[row]):
@@ -250,7 +256,7 @@ def _idle_level(state, pressure, row):  # type: ignore[no-untyped-def]
     return mean if math.isnan(level) else level
 
 
-@compiled
+@inlined
 def _look(state, pressure, row, look, may_bend, phase, level):  # type: ignore[no-untyped-def]
     """Follow the break's significance over the rows and settle on its peak."""
     window, noise, nozzle_on = int(look[0]), look[1], state[_NOZZLE] > 0.0
