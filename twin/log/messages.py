@@ -68,24 +68,26 @@ class Scalars:
 
     def __init__(self, ambient: float) -> None:
         self._ambient = ambient  # Pa
-        self._before = np.full((3, 1), -1)  # time slot, commands and phase of the row before
+        self._before = [-1, -1, -1]  # time slot, commands and phase of the row before
 
     def pick(self, samples: Samples, ticks: Ticks) -> npt.NDArray[np.bool_]:
-        """True for one row in 20 ms, and where a command or the phase changes."""
-        slot = samples["time_ns"] // SCALAR_NS
-        now = np.stack((slot, samples["commands"], ticks["phase"]))
-        before = np.concatenate((self._before, now[:, :-1]), axis=1)
-        self._before = now[:, -1:]
-        picked: npt.NDArray[np.bool_] = (now != before).any(axis=0)
+        """True for one row in 20 ms, and where a command or the phase changes, of n > 0 rows."""
+        columns = samples["time_ns"] // SCALAR_NS, samples["commands"], ticks["phase"]
+        picked = np.zeros(len(samples), np.bool_)
+        for column, before in zip(columns, self._before, strict=True):
+            picked[0] |= int(column[0]) != before
+            picked[1:] |= column[1:] != column[:-1]
+        self._before = [int(column[-1]) for column in columns]
         return picked
 
     def messages(
         self, samples: Samples, ticks: Ticks
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.void]]:
         """Receipt and PLC time in ns, and the message, of each row picked from n > 0 rows."""
-        picked = self.pick(samples, ticks)
-        samples, ticks = samples[picked], ticks[picked]
-        messages = np.full(len(samples), _BLANK)
+        rows = np.flatnonzero(self.pick(samples, ticks))
+        # NumPy goes through rows field by field to index them, and to fill an array with one.
+        samples, ticks = samples.take(rows), ticks.take(rows)
+        messages = np.repeat(_BLANK, len(rows))
         seconds, nanos = np.divmod(samples["time_ns"], _SECOND)
         messages["seconds"] = _varint(seconds, _SECONDS)
         messages["nanos"] = _varint(nanos, _NANOS)
