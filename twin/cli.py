@@ -4,6 +4,7 @@ Imports stand inside the commands so that ``twin --help`` is quick. What a comma
 stdout, what it has to say about its work to stderr.
 """
 
+import atexit
 import gc
 import os
 import re
@@ -432,6 +433,7 @@ def main() -> None:
     # Matrices are small here: more threads only wait for each other, on cores that others need.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when a command imports NumPy
     gc.set_threshold(GARBAGE)  # of what is imported nothing is: looking is a tenth of the start
+    atexit.register(gc.freeze)  # what is left ends with the process: no 0.2 s for its garbage
     try:
         app()
     except KeyboardInterrupt:
@@ -439,8 +441,6 @@ def main() -> None:
     except TwinError as error:
         _complain(f"{error}\n  {error.hint}" if error.hint else str(error))
         sys.exit(error.exit_code)
-    finally:
-        gc.freeze()  # what is left ends with the process: to look for garbage in it takes 0.2 s
 
 
 # --- what the commands share --------------------------------------------------------------------

@@ -75,11 +75,11 @@ class _Open:
         return self._memory[: self.size].data
 
     def room(self, length: int) -> npt.NDArray[np.uint8]:
-        """The next bytes, to be filled."""
-        start, self.size = self.size, self.size + length
-        if self.size > len(self._memory):
-            self._memory = np.resize(self._memory, 2 * self.size)
-        return self._memory[start : self.size]
+        """The next bytes, to be filled and then counted: half a record would spoil the chunk."""
+        end = self.size + length
+        if end > len(self._memory):
+            self._memory = np.resize(self._memory, 2 * end)
+        return self._memory[self.size : end]
 
 
 class Writer:
@@ -120,6 +120,7 @@ class Writer:
         self._channels.append(Channel(number, topic, "protobuf", {}, number))
         both = _bytes(self._schemas[-1]) + _bytes(self._channels[-1])
         self._open.room(len(both))[:] = np.frombuffer(both, np.uint8)
+        self._open.size += len(both)
         return number
 
     def add_message(self, channel: int, log_ns: int, publish_ns: int, message: bytes) -> None:
@@ -136,8 +137,8 @@ class Writer:
             return
         whole = np.dtype((np.void, messages.itemsize))
         record = np.dtype([("head", _HEAD), ("message", whole)])
-        start = self._open.size
-        records = self._open.room(n * record.itemsize).view(record)
+        room = self._open.room(n * record.itemsize)
+        records = room.view(record)
         head = records["head"]
         head["opcode"] = Opcode.MESSAGE
         head["length"] = record.itemsize - _BEFORE_LENGTH
@@ -148,8 +149,9 @@ class Writer:
         records["message"] = messages.view(whole)
         entries = np.empty(n, _ENTRY)
         entries["log_time"] = head["log_time"]
-        entries["offset"] = start + record.itemsize * np.arange(n)
+        entries["offset"] = self._open.size + record.itemsize * np.arange(n)
         self._open.entries.setdefault(channel, []).append(entries)
+        self._open.size += len(room)
         if self._open.size > CHUNK:
             self.flush()
 
