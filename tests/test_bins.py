@@ -6,7 +6,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from twin.model.term import AGAIN
-from twin.monitor.bins import FARTHEST, PER_UNIT, SPARSE, Ints, binned, sparse, warped
+from twin.monitor.bins import (
+    FARTHEST,
+    PER_UNIT,
+    SPARSE,
+    Ints,
+    _between,
+    averaged,
+    binned,
+    sparse,
+    warped,
+)
 from twin.signals import MS, Phase
 
 Bytes = npt.NDArray[np.uint8]
@@ -93,6 +103,36 @@ def test_a_mean_of_lines_between_any_rows(found: tuple[Bytes, Bools, Ints], apar
     np.testing.assert_allclose(
         bins.through(kept, values), np.stack(means, axis=1), rtol=1e-9, atol=1e-9
     )
+
+
+@given(recorded(), st.integers(1, 400))
+def test_a_cycle_is_averaged_as_its_bins_are(found: tuple[Bytes, Bools, Ints], apart: int) -> None:
+    phase, usable, _ = found
+    drawn = np.union1d(np.arange(0, len(phase), apart), np.arange(len(phase))[-1:])
+    random = np.random.default_rng(apart)
+    expected = random.normal(size=(len(drawn), 3))
+    off = np.where(usable, random.normal(size=len(phase)), np.nan)
+    bins, means = averaged(phase, off, drawn, expected)
+    apart_from = binned(phase, usable, np.zeros(1, np.int64))
+    np.testing.assert_array_equal(bins.number, apart_from.number)
+    np.testing.assert_array_equal(bins.found, apart_from.found)
+    np.testing.assert_allclose(means[:, 0], apart_from.mean(off))
+    np.testing.assert_allclose(means[:, 1:], apart_from.through(drawn, expected), atol=1e-12)
+
+
+@given(st.data(), st.integers(1, 40))
+def test_only_between_known_rows_there_is_something_to_average(
+    data: st.DataObject, rows: int
+) -> None:
+    def chosen(count: int) -> Bools:
+        return np.array(data.draw(st.lists(st.booleans(), min_size=count, max_size=count)))
+
+    drawn = np.flatnonzero(chosen(rows) | (np.arange(rows) == data.draw(st.integers(0, rows - 1))))
+    known, off = chosen(len(drawn)), np.where(chosen(rows), 1.0, np.nan)
+    expected = np.zeros((len(drawn), 3))
+    expected[~known, data.draw(st.integers(0, 2))] = np.nan  # one is enough
+    lines = np.interp(np.arange(rows), drawn, known.astype(float), 0.0, 0.0)
+    np.testing.assert_array_equal(_between(drawn, expected, off), np.isfinite(off) & (lines == 1.0))
 
 
 def test_rows_are_kept_ever_farther_apart_from_a_bend_on() -> None:

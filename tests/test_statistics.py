@@ -6,13 +6,19 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import rigs
-from hypothesis import given
-from hypothesis import strategies as st
 
 from twin.model import theta as c
 from twin.monitor.bank import SUSPECTS, Bank
+from twin.monitor.bins import averaged
 from twin.monitor.cycles import Cycle, cut, figures
-from twin.monitor.statistics import PLACES, Listener, Said, _between
+from twin.monitor.statistics import LEVELS, PER_UNIT, PLACES, WEAK, Listener, Said
+from twin.monitor.weights import (
+    SCATTER,
+    from_cycle_to_cycle,
+    lasting,
+    model_error,
+    whitened,
+)
 
 Floats = npt.NDArray[np.float64]
 Heard = tuple[Cycle, npt.NDArray[np.int64], Floats, dict[str, float]]
@@ -37,6 +43,52 @@ def without(one: Heard, rows: slice) -> Heard:
     ticks = cycle.ticks.copy()
     ticks["expected"][rows] = np.nan
     return Cycle(0, cycle.samples, ticks, complete=True), drawn, expected, found
+
+
+def test_scores_and_sizes_are_those_of_the_inverse_covariance(heard: list[Heard]) -> None:
+    said = listener().hear(*heard[0])
+    assert said
+    inverse = np.linalg.inv(said.alone)
+    power = np.diag(said.signatures.T @ inverse @ said.signatures)
+    along = said.off @ inverse @ said.signatures
+    shown = np.isfinite(said.scores())
+    np.testing.assert_array_equal(shown, power >= WEAK)
+    np.testing.assert_allclose(said.scores()[shown], (along / np.sqrt(power))[shown], rtol=1e-9)
+    np.testing.assert_allclose(said.sizes()[shown], (along / power)[shown], rtol=1e-9)
+    np.testing.assert_allclose(np.diag(said.alike())[shown], 1.0)
+
+
+def test_what_differs_from_cycle_to_cycle_is_as_a_diagnosis_has_it(heard: list[Heard]) -> None:
+    """Levels beside it vary by themselves."""
+    cycle, drawn, expected, found = heard[0]
+    ear, healthy = listener(), rigs.config("gripper").monitor.healthy
+    said = ear.hear(*heard[0])
+    assert said
+    bins, _ = averaged(cycle.ticks["phase"], cycle.off, drawn, expected, PER_UNIT)
+    here = np.unique(bins.place, return_index=True)[1]
+    goes_on = lasting(bins, here, model_error(healthy.error, bins.kind[here], bins.time[here])[1])
+    sizes = {(e, p): healthy.scatter.get(e, usual) for e, (p, usual) in SCATTER.items()}
+    moves = said.signatures[: len(here)] * [
+        sizes.get((one.effect, one.parameter.name), 0.0) / one.step for one in SUSPECTS
+    ]
+    alone = from_cycle_to_cycle(bins, here, goes_on, moves, ear.noise) * healthy.leftover**2
+    np.testing.assert_allclose(said.alone[: len(here), : len(here)], alone, rtol=1e-9)
+    beside = said.alone[len(here) :]
+    assert len(beside) == len(found.keys() & set(LEVELS)) == 1
+    assert np.count_nonzero(beside) == 1
+
+
+def test_whitened_columns_have_the_products_of_the_inverse_covariance() -> None:
+    random = np.random.default_rng(3)
+    columns, half = random.normal(size=(9, 3)), random.normal(size=(9, 9))
+    covariance = half @ half.T + np.eye(9)
+    before = covariance.copy(), columns.copy()
+    white, log_det = whitened(covariance, columns)
+    products = columns.T @ np.linalg.inv(covariance) @ columns
+    np.testing.assert_allclose(white.T @ white, products, rtol=1e-9)
+    assert log_det == pytest.approx(np.linalg.slogdet(covariance)[1], rel=1e-9)
+    np.testing.assert_array_equal(covariance, before[0])
+    np.testing.assert_array_equal(columns, before[1])
 
 
 def assert_same(one: Said | None, other: Said | None) -> None:
@@ -85,15 +137,3 @@ def test_what_no_hypothesis_knows_is_not_heard(heard: list[Heard]) -> None:
     assert 0 < len(said.place) < len(all_there.place)
     assert set(said.place) <= set(all_there.place)
     assert np.isfinite(said.signatures).all()
-
-
-@given(st.data(), st.integers(1, 40))
-def test_only_between_known_rows_there_is_something_to_hear(data: st.DataObject, rows: int) -> None:
-    def chosen(count: int) -> npt.NDArray[np.bool_]:
-        return np.array(data.draw(st.lists(st.booleans(), min_size=count, max_size=count)))
-
-    drawn = np.flatnonzero(chosen(rows) | (np.arange(rows) == data.draw(st.integers(0, rows - 1))))
-    known, off = chosen(len(drawn)), np.where(chosen(rows), 1.0, np.nan)
-    lines = np.interp(np.arange(rows), drawn, known.astype(float), 0.0, 0.0)
-    expected = np.isfinite(off) & (lines == 1.0)
-    np.testing.assert_array_equal(_between(drawn, known, off), expected)

@@ -4,22 +4,26 @@ What a model gets wrong after a switching goes on for about as long as the switc
 bins, correlations and all else run in warped time: logarithmic from an edge on, then uniform.
 """
 
+import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
 from twin.model.compiled import compiled, inlined
-from twin.model.term import kinds
-from twin.signals import MS
+from twin.model.term import AGAIN
+from twin.signals import MS, Phase
 
 EARLIEST_S, LATEST_S = 5e-3, 0.3  # how long an error goes on, at an edge and long after it
 PER_UNIT = 4  # bins in each unit of warped time
 SPARSE, FARTHEST = 20, 10  # rows kept: one in as many as a SPARSEth of those past, at most FARTHEST
 ROWS = 10_000  # of a stretch; where bins begin in so many is looked up
+Bytes = npt.NDArray[np.uint8]
+Bools = npt.NDArray[np.bool_]
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+_SUCTION, _HOLD = int(Phase.SUCTION), int(Phase.HOLD)  # plain: enumerations are slow to compare
 
 
 @dataclass(frozen=True)
@@ -27,12 +31,37 @@ class Bins:
     """What each bin is, in order of time; no bin crosses a phase change."""
 
     number: Ints  # of the bin of each row; -1 where nothing can be compared
-    count: Ints  # rows
-    cycle: Ints
-    stretch: Ints  # of one phase, counted over all rows
-    kind: Ints  # of stretch, index into KINDS
-    time: Floats  # warped, since the stretch began
-    place: Ints  # the same number for what is alike from cycle to cycle: kind and time
+    found: Ints  # of each bin, (bins, 6), as ``_number`` tells
+
+    @property
+    def count(self) -> Ints:
+        """Rows."""
+        return self.found[:, 0]
+
+    @property
+    def cycle(self) -> Ints:
+        """Number of the cycle."""
+        return self.found[:, 1]
+
+    @property
+    def stretch(self) -> Ints:
+        """Number of the stretch of one phase, counted over all rows."""
+        return self.found[:, 2]
+
+    @property
+    def kind(self) -> Ints:
+        """What the stretch is, index into KINDS."""
+        return self.found[:, 3]
+
+    @cached_property
+    def time(self) -> Floats:
+        """Warped, since the stretch began."""
+        return warped(self.found[:, 4] * np.float64(MS))
+
+    @property
+    def place(self) -> Ints:
+        """The same number for what is alike from cycle to cycle: kind and time."""
+        return (self.kind << 16) + self.found[:, 5]
 
     def mean(self, values: Floats) -> Floats:
         """Mean over each bin of row-by-row ``values``, (rows, ...) to (bins, ...)."""
@@ -53,12 +82,90 @@ class Bins:
         return sums / self.count[:, None]
 
 
+def warped(seconds: Floats) -> Floats:
+    """Warped time: it passes by 1 while an error goes on being about the same."""
+    early = np.minimum(seconds, LATEST_S - EARLIEST_S)
+    late: Floats = (seconds - early) / LATEST_S
+    return np.log1p(early / EARLIEST_S) + late
+
+
+def unwarped(time: Floats) -> Floats:
+    """Seconds after which warped time is ``time``."""
+    turn = np.log1p((LATEST_S - EARLIEST_S) / EARLIEST_S)
+    early = EARLIEST_S * np.expm1(np.minimum(time, turn))
+    seconds: Floats = early + np.maximum(time - turn, 0.0) * LATEST_S
+    return seconds
+
+
+def binned(phase: Bytes, usable: Bools, starts: Ints, per_unit: int = PER_UNIT) -> Bins:
+    """Bins of rows whose phases are given; ``starts`` are the first rows of cycles.
+
+    What comes before the first of them belongs to cycle -1.
+    """
+    number = np.empty(len(phase), np.int64)
+    begins = _begins(len(phase) // ROWS + 1, per_unit)
+    return Bins(number, _number(np.array(phase), usable, starts, begins, number))
+
+
+def averaged(
+    phase: Bytes, off: Floats, drawn: Ints, expected: Floats, per_unit: int = PER_UNIT
+) -> tuple[Bins, Floats]:
+    """Bins of the rows of one cycle, and the means over each, (bins, 1 + n).
+
+    First that of ``off``, then those of straight lines through what is ``expected``, (drawn, n).
+    What is not known, or lies beside drawn rows at which something is not, is in no bin.
+    """
+    number = np.empty(len(phase), np.int64)
+    begins = _begins(len(phase) // ROWS + 1, per_unit)
+    found, means = _averaged(np.array(phase), off, drawn, expected, begins, number)
+    return Bins(number, found), means
+
+
+@lru_cache(maxsize=16)
+def _begins(times: int, per_unit: int) -> Ints:
+    """Rows of a stretch before each step of warped time, up to so many ``times`` ROWS or more."""
+    steps = np.arange(int(warped(np.array(times * ROWS * MS)) * per_unit) + 2)
+    return np.ceil(unwarped(steps / per_unit) / MS).astype(np.int64)
+
+
 @compiled
-def _add_lines(number, kept, values, sums):  # type: ignore[no-untyped-def]
+def _averaged(phase, off, drawn, expected, begins, number):  # type: ignore[no-untyped-def]
+    """What each bin is, and the means of what is off and of what is expected in it."""
+    usable = _between(drawn, expected, off)
+    found = _number(phase, usable, np.zeros(1, np.int64), begins, number)
+    means = np.zeros((len(found), 1 + expected.shape[1]))
+    for row in range(len(number)):
+        if number[row] >= 0:
+            means[number[row], 0] += off[row]
+    _add_lines(number, drawn, expected, means[:, 1:])
+    for one in range(len(found)):
+        means[one] /= found[one, 0]
+    return found, means
+
+
+@compiled
+def _between(drawn, expected, off):  # type: ignore[no-untyped-def]
+    """Where there is a deviation and all is known at the drawn rows on either side."""
+    usable = np.zeros(len(off), np.bool_)
+    before, first = False, len(off)
+    for i in range(len(drawn)):
+        unknown = 0
+        for one in expected[i]:
+            unknown += one - one != 0.0
+        last, known = drawn[i], unknown == 0
+        for row in range(first, last if before and known else first):
+            usable[row] = math.isfinite(off[row])
+        usable[last] = known and math.isfinite(off[last])
+        before, first = known, last + 1
+    return usable
+
+
+@compiled
+def _add_lines(number, drawn, values, sums):  # type: ignore[no-untyped-def]
     """Add what lines through ``values`` are at each row to the sum of its bin."""
-    for after in range(len(kept)):
+    for after in range(len(drawn)):
         before = max(after - 1, 0)
-        first, last = kept[before], kept[after]
+        first, last = drawn[before], drawn[after]
         row = first + 1
         while row < last:
             here, rows, share = number[row], 0, 0.0
@@ -78,67 +185,29 @@ def _add(total, times, values):  # type: ignore[no-untyped-def]
         total[i] += times * values[i]
 
 
-def warped(seconds: Floats) -> Floats:
-    """Warped time: it passes by 1 while an error goes on being about the same."""
-    early = np.minimum(seconds, LATEST_S - EARLIEST_S)
-    late: Floats = (seconds - early) / LATEST_S
-    return np.log1p(early / EARLIEST_S) + late
-
-
-def unwarped(time: Floats) -> Floats:
-    """Seconds after which warped time is ``time``."""
-    turn = np.log1p((LATEST_S - EARLIEST_S) / EARLIEST_S)
-    early = EARLIEST_S * np.expm1(np.minimum(time, turn))
-    seconds: Floats = early + np.maximum(time - turn, 0.0) * LATEST_S
-    return seconds
-
-
-def binned(
-    phase: npt.NDArray[np.uint8],
-    usable: npt.NDArray[np.bool_],
-    starts: Ints,
-    per_unit: int = PER_UNIT,
-) -> Bins:
-    """Bins of rows whose phases are given; ``starts`` are the first rows of cycles.
-
-    What comes before the first of them belongs to cycle -1.
-    """
-    number = np.empty(len(phase), np.int64)
-    begins = _begins(len(phase) // ROWS + 1, per_unit)
-    found = _number(np.array(phase), usable, starts, begins, number)
-    count, cycle, stretch, begin, since, step = found.T
-    kind = kinds(phase[begin], phase[np.maximum(begin - 1, 0)])
-    return Bins(number, count, cycle, stretch, kind, warped(since * MS), (kind << 16) + step)
-
-
-@lru_cache(maxsize=16)
-def _begins(times: int, per_unit: int) -> Ints:
-    """Rows of a stretch before each step of warped time, up to so many ``times`` ROWS or more."""
-    steps = np.arange(int(warped(np.array(times * ROWS * MS)) * per_unit) + 2)
-    return np.ceil(unwarped(steps / per_unit) / MS).astype(np.int64)
-
-
 @compiled
 def _number(phase, usable, starts, begins, number):  # type: ignore[no-untyped-def]
     """Number the bin of each row, and tell of each bin, (bins, 6).
 
-    Rows, cycle, stretch, the stretch's first row, rows from there on, and steps in warped time.
+    Rows, cycle, stretch, its kind, rows since it began, and steps in warped time.
     """
     found = np.empty((len(phase), 6), np.int64)
-    bins, cycle, stretch, first = 0, -1, -1, 0
+    bins, cycle, stretch, first, again = 0, -1, -1, 0, False
     step, used = 0, -1  # the last that has a bin
     for row in range(len(phase)):
         begun = row == 0 or phase[row] != phase[row - 1]
         while cycle + 1 < len(starts) and starts[cycle + 1] <= row:
             cycle, begun = cycle + 1, True
         if begun:
+            again = row > 0 and phase[row] == _SUCTION and phase[row - 1] == _HOLD
             stretch, first, step, used = stretch + 1, row, 0, -1
         while begins[step + 1] <= row - first:
             step += 1
         number[row] = -1
         if usable[row]:
             if step != used:
-                found[bins] = 0, cycle, stretch, first, row - first, step
+                kind = AGAIN if again else phase[row]
+                found[bins] = 0, cycle, stretch, kind, row - first, step
                 bins, used = bins + 1, step
             found[bins - 1, 0] += 1
             number[row] = bins - 1

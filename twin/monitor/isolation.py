@@ -13,8 +13,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from twin.model.dataset import DataSet
+from twin.model.term import KINDS
 from twin.monitor.bank import DELAY_STEPS, DELAYS, SUSPECTS, UNSURE_OF, Bank
-from twin.monitor.bins import Floats, binned
+from twin.monitor.bins import Floats, averaged
 from twin.monitor.change import (
     FARTHEST,
     MOST,
@@ -27,6 +28,7 @@ from twin.monitor.change import (
 from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import Healthy
 from twin.monitor.statistics import Listener, Said
+from twin.monitor.weights import whitened
 from twin.signals import NS, SAMPLE, TICK, Samples, Ticks
 
 DAY_S = 86_400.0
@@ -71,20 +73,17 @@ class Verdict:
 class _Usual:
     """Mean deviation at each place in the cycles so far."""
 
-    count: dict[int, int] = field(default_factory=dict)
-    mean: dict[int, float] = field(default_factory=dict)
+    count: Floats = field(default_factory=lambda: np.zeros(len(KINDS) << 16))  # by place
+    mean: Floats = field(default_factory=lambda: np.zeros(len(KINDS) << 16))
 
     def add(self, said: Said) -> None:
-        for place, off in zip(said.place.tolist(), said.off.tolist(), strict=True):
-            count = self.count[place] = self.count.get(place, 0) + 1
-            before = self.mean.get(place, 0.0)
-            self.mean[place] = before + (off - before) / count
+        at = said.place  # levels, which are below zero, at the end
+        self.count[at] += 1.0
+        self.mean[at] += (said.off - self.mean[at]) / self.count[at]
 
     def of(self, said: Said) -> tuple[Floats, Floats]:
         """Mean (mbar) at the places of a cycle, and in how many cycles they were seen."""
-        places = said.place.tolist()
-        mean = np.array([self.mean.get(place, 0.0) for place in places])
-        return mean, np.array([float(self.count.get(place, 0)) for place in places])
+        return self.mean[said.place], self.count[said.place]
 
 
 class Isolation:
@@ -132,9 +131,11 @@ class Isolation:
         """The isolation beside the twin of a data set; compiled, not to fall into a block."""
         listener = Listener.of(data, healthy)
         first = Bank(listener.theta)
-        drawn, _ = first.take(Cycle(0, np.zeros(2, SAMPLE), np.zeros(2, TICK), complete=False))
-        nothing = np.zeros((len(drawn), len(SUSPECTS)))
-        binned(np.zeros(2, np.uint8), np.ones(2, np.bool_), drawn[:1]).through(drawn, nothing)
+        drawn, expected = first.take(
+            Cycle(0, np.zeros(2, SAMPLE), np.zeros(2, TICK), complete=False)
+        )
+        averaged(np.zeros(2, np.uint8), np.zeros(2), drawn, expected)
+        whitened(np.eye(1), np.zeros((1, 1)))
         return cls(Bank(listener.theta), listener, days)
 
     def judge(
@@ -236,7 +237,8 @@ class Isolation:
     def _causes(self, since: int, changed: float) -> list[Likely]:
         """How probable each effect is; together as probable as that something ``changed``."""
         mean, covariance = self._mean(min(since, RECENT))
-        white, spread = _whitened(covariance, mean.off, mean.signatures, mean.larger)
+        columns = np.column_stack([mean.off, mean.signatures, mean.larger])
+        white, spread = whitened(covariance, columns)
         off, signatures, larger = np.split(white, [1, 1 + len(SUSPECTS)], axis=1)
         sizes, left = _fitted(off, signatures, self._bounds)
         for number, some in zip(DELAYS, np.split(larger, len(DELAYS), axis=1), strict=True):
@@ -247,7 +249,7 @@ class Isolation:
         # What a low supply does is not known well: in proportion to how low it is.
         ways, low = sizes[UNSURE_OF] * mean.unsure, slice(UNSURE_OF, UNSURE_OF + 1)
         wider = covariance + ways @ ways.T
-        white, spread = _whitened(wider, mean.off, mean.signatures[:, low])
+        white, spread = whitened(wider, np.column_stack([mean.off, mean.signatures[:, low]]))
         sizes[low], left[low] = _fitted(white[:, :1], white[:, 1:], self._bounds[low])
         left[low] += spread
         share = np.exp(0.5 * (left.min() - left))
@@ -294,14 +296,6 @@ def looked_for() -> Changes:
     """Sums for all suspects, with nothing seen yet."""
     both_ways = np.array([one.both_ways for one in SUSPECTS])
     return Changes(both_ways, np.array([one.often for one in SUSPECTS]))
-
-
-def _whitened(covariance: Floats, *columns: Floats) -> tuple[Floats, float]:
-    """Columns beside each other, whitened; and the logarithm of the covariance's determinant."""
-    factor = np.linalg.cholesky(covariance)
-    # A triangle: but to import scipy.linalg for it takes longer than it would save.
-    white: Floats = np.linalg.solve(factor, np.column_stack(columns))
-    return white, 2.0 * float(np.sum(np.log(np.diag(factor))))
 
 
 def _fitted(off: Floats, signatures: Floats, bounds: Floats) -> tuple[Floats, Floats]:

@@ -4,7 +4,7 @@ The deviation is averaged into bins, the levels at which the air saving switched
 and both are held against each suspect's signature, weighed by what healthy cycles scatter.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 
@@ -14,12 +14,12 @@ import numpy.typing as npt
 from twin.model.dataset import DataSet, coefficients
 from twin.model.theta import Theta
 from twin.monitor.bank import DELAYS, LARGER, SUSPECTS, UNSURE_OF, hypotheses
-from twin.monitor.bins import Bins, Floats, Ints, binned
+from twin.monitor.bins import Bins, Floats, Ints, averaged
 from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import Healthy
 from twin.monitor.phases import Knees, expected_knees
 from twin.monitor.switching import seen
-from twin.monitor.weights import SCATTER, from_cycle_to_cycle, lasting, model_error
+from twin.monitor.weights import SCATTER, lasting, model_error, whitened
 from twin.signals import MBAR
 
 PER_UNIT = 2  # bins in each unit of warped time
@@ -30,6 +30,7 @@ SUCTION_ROWS = 4000  # commanded, to see where each suspect switches
 # Sigmas² of a step: nothing in the cycle depends on it. Hypotheses that are stepped apart from each
 # other are a pascal apart, which looks like some 0.002; the least that depends has 3.
 WEAK = 0.01
+_COLUMNS = (len(SUSPECTS), len(SUSPECTS) + len(DELAYS) * LARGER)  # of hypotheses: what ends where
 
 
 @dataclass(frozen=True)
@@ -55,29 +56,30 @@ class Said:
 
     def scores(self) -> Floats:
         """How many sigmas of each signature there are; NaN for what this cycle does not show."""
-        weighed, power = self._weighed()
-        scores: Floats = self.off @ weighed / np.sqrt(np.where(power > 0.0, power, np.nan))
+        off, signatures, power = self._whitened()
+        scores: Floats = off @ signatures / np.sqrt(np.where(power > 0.0, power, np.nan))
         return scores
 
     def sizes(self) -> Floats:
         """Steps of each suspect that fit best, were nothing else wrong; NaN as in ``scores``."""
-        weighed, power = self._weighed()
-        sizes: Floats = self.off @ weighed / np.where(power > 0.0, power, np.nan)
+        off, signatures, power = self._whitened()
+        sizes: Floats = off @ signatures / np.where(power > 0.0, power, np.nan)
         return sizes
 
     def alike(self) -> Floats:
         """Cosines between the signatures, whitened; 0 for what this cycle does not show."""
-        weighed, power = self._weighed()
+        _, signatures, power = self._whitened()
         unit = 1.0 / np.sqrt(np.where(power > 0.0, power, np.inf))
-        cosines: Floats = self.signatures.T @ weighed * np.outer(unit, unit)
+        cosines: Floats = signatures.T @ signatures * np.outer(unit, unit)
         return cosines
 
-    def _weighed(self) -> tuple[Floats, Floats]:
-        """Signatures by the inverse covariance, and the sigmas² of each; 0 where there are none."""
-        weighed = np.linalg.solve(self.alone, self.signatures).astype(np.float64, copy=False)
-        power = np.einsum("ij,ij->j", self.signatures, weighed)
+    def _whitened(self) -> tuple[Floats, Floats, Floats]:
+        """What is off and the signatures, and the sigmas² of each of these; 0 where none are."""
+        white, _ = whitened(self.alone, np.column_stack([self.off, self.signatures]))
+        off, signatures = white[:, 0], white[:, 1:]
+        power = np.einsum("ij,ij->j", signatures, signatures)
         power[power < WEAK] = 0.0
-        return weighed, power
+        return off, signatures, power
 
 
 @dataclass
@@ -115,66 +117,58 @@ class Listener:
 
         ``figures`` are the monitor's.
         """
-        known = np.isfinite(expected @ np.ones(expected.shape[1]))  # BLAS sums fastest
-        if not known.any():
+        bins, means = averaged(cycle.ticks["phase"], cycle.off, drawn, expected, PER_UNIT)
+        if not len(means):
             return None
-        usable = _between(drawn, known, cycle.off)
-        if not usable.any():
-            return None
-        bins = binned(cycle.ticks["phase"], usable, np.zeros(1, np.int64), PER_UNIT)
-        signatures = bins.through(drawn, expected[:, 1:] - expected[:, :1]) / MBAR
-        return self._with_levels(bins, bins.mean(cycle.off), signatures, figures)
-
-    def _with_levels(
-        self, bins: Bins, off: Floats, signatures: Floats, figures: Mapping[str, float]
-    ) -> Said:
-        at = self._places(bins)
-        off, signatures = off[at.first], signatures[at.first]
-        moves = self._moves(signatures)
-        covariance = from_cycle_to_cycle(bins, at.first, at.goes_on, moves, self.noise)
         shown = [number for number, name in enumerate(LEVELS) if name in figures]
         level = np.array([figures[LEVELS[number]] for number in shown]) - self._means[shown]
-        moved = np.concatenate([signatures, self._levels[shown]])
-        larger = len(SUSPECTS) + len(DELAYS) * LARGER
-        suspects, ways = moved[:, : len(SUSPECTS)], moved[:, larger:]
-        numbers = np.array(shown, np.int64) - len(LEVELS)
+        at = self._places(bins, shown)
+        means = means[at.first]
+        moved = np.concatenate([(means[:, 2:] - means[:, 1:2]) / MBAR, self._levels[shown]])
+        suspects, larger, ways = np.split(moved, _COLUMNS, axis=1)
         return Said(
-            np.concatenate([at.place, numbers]),
-            np.concatenate([at.kind, numbers]),
-            np.concatenate([at.time, np.zeros(len(shown))]),
-            np.concatenate([off, level]),
+            at.place,
+            at.kind,
+            at.time,
+            np.concatenate([means[:, 0], level]),
             suspects,
-            moved[:, len(SUSPECTS) : larger],
-            ways - suspects[:, [UNSURE_OF]],
-            _beside(covariance * self.healthy.leftover**2, self._sigmas[shown] ** 2),
-            np.concatenate([at.common, self._sigmas[shown]]),
+            larger,
+            ways - suspects[:, UNSURE_OF : UNSURE_OF + 1],
+            self._covariance(at, bins.count[at.first], moved),
+            at.common,
         )
 
-    def _places(self, bins: Bins) -> "_Places":
-        """Where the bins are, with what follows from it; most cycles have theirs at the same."""
-        key = b"".join(of.tobytes() for of in (bins.stretch, bins.kind, bins.time))
+    def _places(self, bins: Bins, shown: Sequence[int]) -> "_Places":
+        """Where a cycle says something, with what follows from it; most say it at the same."""
+        key = bins.found[:, 2:].tobytes() + bytes(shown)
         if key not in self._seen:
             if len(self._seen) == PLACES:
                 self._seen.clear()
-            self._seen[key] = _Places.of(bins, self.healthy)
+            self._seen[key] = _Places.of(bins, shown, self._sigmas[shown], self.healthy)
         return self._seen[key]
 
-    def _moves(self, signatures: Floats) -> Floats:
-        """By how much (mbar) what scatters moves each bin, one sigma of it, (bins, scatters)."""
+    def _covariance(self, at: "_Places", rows: Ints, moved: Floats) -> Floats:
+        """Covariance (mbar²) of what differs from cycle to cycle; bins have so many ``rows``."""
         numbers, sigmas = self._scatters
-        moves: Floats = signatures[:, numbers] * sigmas
-        return moves
+        moves = moved[:, numbers] * sigmas
+        moves[len(rows) :] = 0.0  # a level varies by itself
+        covariance: Floats = at.lasting + moves @ moves.T
+        np.einsum("ii->i", covariance)[: len(rows)] += (
+            self.noise * self.healthy.leftover
+        ) ** 2 / rows
+        return covariance
 
     @cached_property
-    def _scatters(self) -> tuple[list[int], list[float]]:
+    def _scatters(self) -> tuple[list[int], Floats]:
         """Which suspects scatter in healthy cycles, and one sigma of each in its steps."""
         numbers, sigmas = [], []
         for number, one in enumerate(SUSPECTS):
             parameter, usual = SCATTER.get(one.effect, ("", 0.0))
             if parameter == one.parameter.name:
                 numbers.append(number)
-                sigmas.append(self.healthy.scatter.get(one.effect, usual) / one.step)
-        return numbers, sigmas
+                size = self.healthy.scatter.get(one.effect, usual) * self.healthy.leftover
+                sigmas.append(size / one.step)
+        return numbers, np.array(sigmas)
 
 
 @dataclass(frozen=True)
@@ -182,28 +176,27 @@ class _Places:
     """Where the bins of a cycle are, and what is the same for all that have theirs there."""
 
     first: Ints  # bins; what comes again counts once
-    place: Ints  # of those, as are all of these
+    place: Ints  # of those and of the levels, as are all of these
     kind: Ints
     time: Floats
     common: Floats  # mbar, by which the model is off in all cycles
-    goes_on: Floats  # mbar², covariance of what does so for a while, and differs between cycles
+    lasting: Floats  # mbar², covariance of what goes on for a while, and differs between cycles
 
     @classmethod
-    def of(cls, bins: Bins, healthy: Healthy) -> "_Places":
+    def of(cls, bins: Bins, shown: Sequence[int], sigmas: Floats, healthy: Healthy) -> "_Places":
+        """Those of bins and of the levels ``shown``, whose ``sigmas`` (mbar) are given."""
         place, first = np.unique(bins.place, return_index=True)
         kind, time = bins.kind[first], bins.time[first]
         common, alone = model_error(healthy.error, kind, time)
-        return cls(first, place, kind, time, common, lasting(bins, first, alone))
-
-
-def _between(drawn: Ints, known: npt.NDArray[np.bool_], off: Floats) -> npt.NDArray[np.bool_]:
-    """Where there is a deviation and the drawn rows on either side are all known."""
-    found: npt.NDArray[np.bool_] = np.isfinite(off)
-    found[: drawn[0]] = found[drawn[-1] + 1 :] = False
-    edges = np.concatenate([[-1], drawn, [len(off)]])
-    for unknown in np.flatnonzero(~known):
-        found[edges[unknown] + 1 : edges[unknown + 2]] = False
-    return found
+        numbers = np.array(shown, np.int64) - len(LEVELS)
+        return cls(
+            first,
+            np.concatenate([place, numbers]),
+            np.concatenate([kind, numbers]),
+            np.concatenate([time, np.zeros(len(shown))]),
+            np.concatenate([common, sigmas]),
+            _beside(lasting(bins, first, alone) * healthy.leftover**2, sigmas**2),
+        )
 
 
 def _beside(covariance: Floats, variances: Floats) -> Floats:
