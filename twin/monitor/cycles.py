@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from statistics import fmean
 from typing import Any, Protocol
 
 import numpy as np
@@ -28,6 +27,8 @@ LONGEST_PIECE = 10_000  # rows; a longer cycle is judged in pieces so that alarm
 FEWEST_ROWS = 20  # of a phase, to judge it
 STALE = int(Quality.STALE)  # plain: NumPy makes masks of bytes with these, and compares them
 SUCTION, BLOW_OFF, IDLE = int(Phase.SUCTION), int(Phase.BLOW_OFF), int(Phase.IDLE)
+HOLD = int(Phase.HOLD)
+_NAMES = tuple((int(phase), phase.name.lower()) for phase in Phase)
 H2 = 550.0 * MBAR  # Pa below ambient: part present, the field's default
 PAPER_VACUUM = 600.0 * MBAR  # Pa below ambient: what the founding paper times evacuation to
 
@@ -159,9 +160,9 @@ class CycleCutter:
         samples, ticks = (joined(*column) for column in zip(*self._parts, strict=True))
         self._parts, self._count = [], 0
         self._index += begins
-        whole = begins and ticks["phase"][-1] in (Phase.IDLE, Phase.BLOW_OFF)
+        whole = begins and int(ticks["phase"][-1]) in (IDLE, BLOW_OFF)
         cut_short = not self._at_edge and len(samples) < LONGEST_PIECE
-        return Cycle(self._index, samples, ticks, bool(whole), cut_short, settled)
+        return Cycle(self._index, samples, ticks, whole, cut_short, settled)
 
 
 def cut(blocks: Iterable[tuple[Samples, Ticks]]) -> Iterator[Cycle]:
@@ -191,45 +192,49 @@ def figures(cycle: Cycle, ambient: float) -> dict[str, float]:
     """
     result: dict[str, float] = {}
     broken_off = int(cycle.ticks["phase"][-1]) if cycle.cut_short else None
-    rows, sums, squares = _by_phase(cycle.off, cycle.ticks)[:, : len(Phase)].tolist()
-    for phase in Phase:
+    by_phase, lowest, passed = _passed(cycle.samples, cycle.ticks, ambient)
+    rows, sums, squares, knees, levels = by_phase[:, : len(Phase)].tolist()
+    for phase, name in _NAMES:
         # Of the last one of a cycle cut short the beginning is no measure of all of it.
         if phase != broken_off and rows[phase] >= FEWEST_ROWS:
-            name = phase.name.lower()
             result[f"{name}_mean"] = sums[phase] / rows[phase]
             result[f"{name}_rms"] = math.sqrt(squares[phase] / rows[phase])
-    result |= _switching(cycle, ambient)
+    for name, into in (("h1_level", HOLD), ("h1_low_level", SUCTION)):
+        if knees[into]:
+            result[name] = levels[into] / knees[into]
     if cycle.complete:
-        usable = (cycle.samples["quality"] & UNUSABLE) == 0
-        measured = np.where(usable, cycle.samples["pressure"], np.nan).astype(np.float64)
-        expected = cycle.ticks["expected"].astype(np.float64)
-        times = cycle.samples["time_ns"]
-        result["max_vacuum"] = float((ambient - np.fmin.reduce(measured)) / MBAR)
-        result["t0_measured"] = time_to_vacuum(H2, measured, times, ambient) * 1e3
-        result["t0_expected"] = time_to_vacuum(H2, expected, times, ambient) * 1e3
+        result["max_vacuum"] = (ambient - lowest) / MBAR
+        result["t0_measured"], result["t0_expected"] = passed
     return {name: value for name, value in result.items() if math.isfinite(value)}
 
 
 @compiled
-def _by_phase(off, ticks):  # type: ignore[no-untyped-def]
-    """Rows with a deviation, its sum and that of its squares, by phase: (3, all that a byte is)."""
-    sums = np.zeros((3, 256))
-    for row in range(len(off)):
-        if math.isfinite(off[row]):
-            phase = ticks[row].phase
+def _passed(samples, ticks, ambient):  # type: ignore[no-untyped-def]
+    """Sums by phase, (5, all that a byte is), the lowest pressure, and two times in ms.
+
+    Rows with a deviation, it and its square; rows with a level, and its vacuum, both of what it is
+    set on for. The times are those to H2, measured and expected.
+    """
+    sums = np.zeros((5, 256))
+    lowest, measured_ms, expected_ms = math.inf, math.nan, math.nan
+    for row in range(len(samples)):
+        phase, level = ticks[row].phase, np.float64(ticks[row].level)
+        expected = np.float64(ticks[row].expected)
+        usable = samples[row].quality & UNUSABLE == 0
+        pressure = np.float64(samples[row].pressure) if usable else math.nan
+        off = (pressure - expected) / MBAR
+        if math.isfinite(off):
             sums[0, phase] += 1.0
-            sums[1, phase] += off[row]
-            sums[2, phase] += off[row] * off[row]
-    return sums
-
-
-def _switching(cycle: Cycle, ambient: float) -> dict[str, float]:
-    """Mean vacuum (mbar) at the knees: where the nozzle went off (H1) and on again."""
-    rows = np.flatnonzero(np.isfinite(cycle.ticks["level"]))
-    set_on = cycle.ticks[["level", "phase"]][rows[rows > 0]].tolist()
-    levels = {}
-    for name, into in (("h1_level", Phase.HOLD), ("h1_low_level", Phase.SUCTION)):
-        vacuum = [(ambient - level) / MBAR for level, phase in set_on if phase == into]
-        if vacuum:
-            levels[name] = fmean(vacuum)
-    return levels
+            sums[1, phase] += off
+            sums[2, phase] += off * off
+        if row > 0 and math.isfinite(level):
+            sums[3, phase] += 1.0
+            sums[4, phase] += (ambient - level) / MBAR
+        if math.isfinite(pressure):
+            lowest = min(lowest, pressure)
+        since_ms = (samples[row].time_ns - samples[0].time_ns) * NS * 1e3
+        if math.isnan(measured_ms) and ambient - pressure >= H2:
+            measured_ms = since_ms
+        if math.isnan(expected_ms) and ambient - expected >= H2:
+            expected_ms = since_ms
+    return sums, lowest, (measured_ms, expected_ms)
