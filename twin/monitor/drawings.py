@@ -56,11 +56,14 @@ class Stretches:
         more[-1, :2] = np.maximum(more[-1, :2], 0.0)  # the last goes on
         return bool((np.abs(more) <= known.may_differ[: len(more)]).all())
 
-    def far(self, known: Sequence["Stretches"]) -> Floats:
-        """How much a whole cycle differs from known ones of the same phases; inf: it goes apart."""
-        more = np.abs(self.how - np.array([one.how for one in known]))
-        share = more / np.array([one.may_differ for one in known])
-        far: Floats = np.where(share.max(axis=(1, 2)) <= 1.0, share.sum(axis=(1, 2)), np.inf)
+    def far(self, known: Floats, may_differ: Floats) -> Floats:
+        """How much a whole cycle differs from ``known`` ones; inf: it goes apart.
+
+        They are of the same phases, each as ``how`` here, and so is what they ``may_differ`` by.
+        """
+        share = np.abs(self.how - known) / may_differ
+        share = share.reshape(len(share), -1)
+        far: Floats = np.where(share.max(axis=1) <= 1.0, share.sum(axis=1), np.inf)
         return far
 
 
@@ -90,6 +93,7 @@ class Drawings:
 
     def __init__(self) -> None:
         self._kept: list[Drawing] = []  # the last used comes last
+        self._alike: dict[bytes, _Alike] = {}  # by their phases, as far as asked for
 
     def __len__(self) -> int:
         return len(self._kept)
@@ -97,6 +101,7 @@ class Drawings:
     def add(self, drawing: Drawing) -> None:
         """Keep one more; the one that was of no use for longest goes."""
         self._kept = [*self._kept, drawing][-KEPT:]
+        self._alike.clear()
 
     def may_be(self, stretches: Stretches) -> bool:
         """Whether a cycle that has gone like this so far may yet turn out to go as a known one."""
@@ -104,13 +109,35 @@ class Drawings:
 
     def like(self, stretches: Stretches) -> Drawing | None:
         """The drawing of the cycle that a whole one goes most alike, if there is one."""
-        alike = [one for one in self._kept if one.stretches.phases == stretches.phases]
-        if not alike:
+        phases = stretches.phases
+        if phases not in self._alike:
+            self._alike[phases] = _Alike.of(
+                [one for one in self._kept if one.stretches.phases == phases]
+            )
+        alike = self._alike[phases]
+        if not alike.drawings:
             return None
-        far = stretches.far([one.stretches for one in alike])
-        nearest = alike[int(far.argmin())]
-        if not np.isfinite(far.min()):
+        far = stretches.far(alike.how, alike.may_differ)
+        least = int(far.argmin())
+        if far[least] == np.inf:
             return None
-        self._kept = [one for one in self._kept if one is not nearest]
-        self.add(nearest)
+        nearest = alike.drawings[least]
+        self._kept = [*(one for one in self._kept if one is not nearest), nearest]
         return nearest
+
+
+@dataclass(frozen=True)
+class _Alike:
+    """Drawings of cycles of the same phases, and their stretches together."""
+
+    drawings: Sequence[Drawing]
+    how: Floats  # (drawings, stretches, 3)
+    may_differ: Floats
+
+    @classmethod
+    def of(cls, drawings: Sequence[Drawing]) -> "_Alike":
+        known = [one.stretches for one in drawings]
+        together = (
+            np.array([getattr(one, name) for one in known]) for name in ("how", "may_differ")
+        )
+        return cls(drawings, *together)
