@@ -70,7 +70,7 @@ def line(x: Floats, y: Floats) -> tuple[float, float, float]:
     low = max(round((len(slopes) - reach) / 2) - 1, 0)
     high = min(round((len(slopes) + reach) / 2), len(slopes) - 1)
     slopes.partition([low, *middle, high])  # of thousands only these need be in their places
-    slope = float(np.mean(slopes[middle]))
+    slope = float(slopes[middle].sum()) / 2
     at_end = median((y - slope * (x - x[-1])).tolist())
     return slope, float(slopes[high] - slopes[low]) / 2, at_end
 
@@ -134,8 +134,8 @@ class ClockWatch:
     _window: int = 0
     _fastest: tuple[int, int] | None = None  # of the window: time and way, ns
     _ways: list[int] = field(default_factory=list)  # of the window's receipts, ns
-    _points: list[tuple[int, int]] = field(default_factory=list)  # of the windows before
-    _late: list[float] = field(default_factory=list)  # of their middle receipts after these, ns
+    # Of the windows before: their fastest, and how long after it their middle receipt came, ns.
+    _points: Floats = field(default_factory=lambda: np.empty((3, 0)))
     _since: int = 0  # windows since the last report
     _off: int = 0  # windows in a row that are off the line, below zero where they are too early
 
@@ -280,23 +280,25 @@ class ClockWatch:
         off = self._beyond(self._fastest)
         self._off = 0 if not off else int(np.sign(off)) + (self._off if off * self._off > 0 else 0)
         late = median(self._ways) - self._fastest[1]
-        self._points = [*self._points[-KEPT + 1 :], self._fastest]
-        self._late = [*self._late[-KEPT + 1 :], late]
+        self._points = np.column_stack([self._points[:, -KEPT + 1 :], [*self._fastest, late]])
         self._since, self._fastest, self._ways = self._since + 1, None, []
         return off
 
     def _beyond(self, point: tuple[int, int]) -> float:
-        if len(self._sure) < FEWEST:
+        """How far (ns) a window's fastest is off the line of those before, where that is far."""
+        if self._sure.shape[1] < FEWEST:
             return 0.0
-        x, y = self._columns()
+        x, y, late = self._sure
         slope, _, at_end = line(x, y)
         off = point[1] - at_end - slope * (point[0] - x[-1])
+        if abs(off) <= SET_NS:  # nearly always
+            return 0.0
         scatter = 1.4826 * median(np.abs(y - at_end - slope * (x - x[-1])).tolist())
-        unsteady = UNSTEADY * median(self._late[: len(x)])
-        return off if abs(off) > max(SET_NS, 8.0 * scatter, unsteady) else 0.0
+        unsteady = UNSTEADY * median(late.tolist())
+        return off if abs(off) > max(8.0 * scatter, unsteady) else 0.0
 
     def _report(self, time_ns: int) -> Iterator[Event]:
-        if len(self._sure) < FEWEST or not self._since or self._zero is None:
+        if self._sure.shape[1] < FEWEST or not self._since or self._zero is None:
             return
         self._since = 0
         estimate = self._estimate(time_ns - self._zero[0], self._zero[1])
@@ -306,7 +308,7 @@ class ClockWatch:
 
     def _estimate(self, now: int, zero: int) -> Estimate:
         """At ``now``, which the line is drawn out to."""
-        x, y = self._columns()
+        x, y, _ = self._sure
         slope, slope_pm, at_end = line(x, y)
         scatter = 1.4826 * median(np.abs(y - at_end - slope * (x - x[-1])).tolist())
         offset_pm = 1.96 * scatter + slope_pm * float(x[-1] - x[0]) / 2
@@ -314,10 +316,6 @@ class ClockWatch:
         return Estimate(-(zero + here) * 1e-6, offset_pm * 1e-6, -slope * 1e6, slope_pm * 1e6)
 
     @property
-    def _sure(self) -> list[tuple[int, int]]:
+    def _sure(self) -> Floats:
         """Windows without the last ones, if these are off the line: it may be another one."""
-        return self._points[: len(self._points) - abs(self._off)]
-
-    def _columns(self) -> tuple[Floats, Floats]:
-        x, y = zip(*self._sure, strict=True)
-        return np.array(x, np.float64), np.array(y, np.float64)
+        return self._points[:, : self._points.shape[1] - abs(self._off)]
