@@ -4,11 +4,10 @@ Alarms live in the time in which rows were received, which goes on through a res
 replay has it in its log.
 """
 
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
-
-import numpy as np
 
 from twin.alarms.board import Board, Diary, Episode, joined
 from twin.alarms.causes import CAUSES, UNLISTED, known, value_of
@@ -277,7 +276,7 @@ class Alarms:
 
 def _received(samples: Samples, time_ns: int, else_ns: int) -> int:
     """When the row of a PLC time was received; what lies outside of the rows, now."""
-    row = int(np.searchsorted(samples["time_ns"], time_ns))
+    row = bisect_left(samples["time_ns"], time_ns)  # NumPy would copy the column
     return int(samples["host_ns"][row]) if row < len(samples) else else_ns
 
 

@@ -16,8 +16,9 @@ from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.model.strides import Strides
 from twin.model.term import Terms
+from twin.monitor.cycles import STALE
 from twin.monitor.signatures import steps
-from twin.signals import BREAK, MBAR, MS, Command, Phase, Quality, Samples, Ticks
+from twin.signals import BREAK, MBAR, MS, Command, Phase, Samples, Ticks
 
 FREE_S = 1.0  # of suction with the cup open, until its vacuum is read
 SWUNG_IN = 2  # suction edges without a break, from which on the gas is as warm as it should be
@@ -55,7 +56,7 @@ class Expectation:
             return
         first, self._rows = self._rows == 0, self._rows + len(samples)
         dt, self._last_ns = steps(samples, self._last_ns), int(samples["time_ns"][-1])
-        self._stale |= bool((samples["quality"] & Quality.STALE).any())
+        self._stale |= bool((samples["quality"] & STALE).any())
         if self._stale or (first and samples["quality"][0] & BREAK):
             self.lose()
         begin = 0 if self._strides is not None else _first_level(ticks, first and at_edge)
