@@ -11,7 +11,7 @@ import rigs
 from twin.model import kernel
 from twin.monitor.bank import SUSPECTS, SWUNG_IN, Bank
 from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, cut
-from twin.monitor.drawings import KEPT, LONGER_MS, Drawing, Drawings, Stretches
+from twin.monitor.drawings import KEPT, LONGER_MS, Drawing, Drawings
 from twin.signals import MBAR, MS, NS, Phase, Quality, Samples, Ticks
 
 Floats = npt.NDArray[np.float64]
@@ -233,11 +233,10 @@ def test_what_went_differently_never_goes_alike_again(what: str) -> None:
     if what == "cut off":
         return  # that is seen at its end
     cycle = later(DIFFERENT[what](known), known)
-    bank._see(cycle.samples, cycle.ticks)
-    may = [
-        not rows["odd"].any() and bank._drawings.may_be(Stretches.of(rows))
-        for rows in (bank._rows[:end] for end in range(1, len(bank._rows) + 1))
-    ]
+    may = []
+    for end in range(1, len(cycle.samples) + 1):
+        _, stretches, _ = bank._look(cycle.samples[:end], cycle.ticks[:end])
+        may.append(stretches is not None and bank._drawings.may_be(stretches))
     assert may == sorted(may, reverse=True)
     assert may[-1] == (what == "shorter idle")  # that is seen only at its end
 
@@ -315,7 +314,7 @@ def test_few_drawings_are_kept_and_the_last_ones_used() -> None:
     assert first in kept
     assert sorted(kept)[1:] == [first + 30 * (3 * KEPT - n) for n in reversed(range(KEPT - 1))]
     assert all(len(one.drawn) <= LONGEST_PIECE for one in bank._drawings._kept)
-    assert len(bank._rows) == len(bank._expected) == 0
+    assert bank._seen == len(bank._expected) == 0
 
 
 @pytest.mark.parametrize("broken", [Quality.GAP, Quality.BAD])

@@ -203,7 +203,7 @@ def test_rows_and_ticks_of_the_bank_go_with_cycles_through_a_gap() -> None:
     watched.close()
     assert watched.isolation is not None
     bank = watched.isolation._bank
-    assert len(bank._rows) == len(bank._expected) == bank._stepped == 0
+    assert bank._seen == len(bank._expected) == bank._stepped == 0
     assert bank._last_ns == int(samples["time_ns"][-1])
 
 

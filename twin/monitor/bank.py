@@ -16,11 +16,10 @@ from twin.model import theta as c
 from twin.model.compiled import compiled
 from twin.model.effects import EFFECTS, Parameter, apply
 from twin.model.theta import Theta
-from twin.monitor.bins import Floats, Ints, sparse
+from twin.monitor.bins import Floats, Ints, sparse_rows
 from twin.monitor.cycles import Cycle
 from twin.monitor.drawings import Drawing, Drawings, Stretches
-from twin.monitor.signatures import steps
-from twin.signals import MS, NS, Phase, Samples, Ticks, joined
+from twin.signals import BREAK, MS, NS, Phase, Samples, Ticks, joined
 
 BATCH = 250  # rows that are looked at together: what many calls cost is spared
 SWUNG_IN = 2  # cycles after which nothing shows any more where the models came from
@@ -35,17 +34,6 @@ SELDOM = 0.2
 NO_PHASE = 255  # before the first row
 
 Bytes = npt.NDArray[np.uint8]
-_ROW = np.dtype(
-    [
-        ("time_ns", "i8"),
-        ("dt", "f8"),
-        ("level", "f8"),
-        ("phase", "u1"),
-        ("bends", "?"),  # here a bend of what is expected begins
-        ("odd", "?"),  # something is wrong with it, or time does not run on evenly
-        ("since", "i8"),  # rows, then
-    ]
-)
 
 
 @dataclass(frozen=True)
@@ -132,7 +120,7 @@ class Bank:
         self._since = 0  # rows since a bend began, of the newest one
         self._drawn_ns = 0  # PLC time of the newest row that was drawn
         self._whole = 0  # cycles in a row in which nothing was wrong
-        self._rows = np.empty(0, _ROW)  # of the next piece, as far as they were seen
+        self._seen = 0  # rows of the next piece
         self._stepped = 0  # how many of them were stepped over
         self._expected = np.empty((0, self._theta.shape[1]))  # at those of them that were drawn
 
@@ -142,13 +130,14 @@ class Bank:
         ``at_edge`` says that they begin with a suction edge. While it may still turn out to go as
         a known cycle, nothing is stepped.
         """
-        if sum(len(samples) for samples, _ in parts) - len(self._rows) < BATCH:
+        rows = sum(len(samples) for samples, _ in parts)
+        if rows - self._seen < BATCH:
             return
+        self._seen = rows
         samples, ticks = (joined(*column) for column in zip(*parts, strict=True))
-        self._see(samples, ticks)
-        may_be = at_edge and not self._rows["odd"].any()
-        if not (may_be and self._drawings.may_be(Stretches.of(self._rows))):
-            self._step_to(len(self._rows) - 1)  # the row after the last is not known yet
+        drawn, stretches, _ = self._look(samples, ticks)
+        if not (at_edge and stretches and self._drawings.may_be(stretches)):
+            self._step_to(rows - 1, samples, ticks, drawn)  # what comes after is not known yet
 
     def take(self, cycle: Cycle) -> tuple[Ints, Floats]:
         """Of the rows of a cycle or piece those that are drawn, and what is expected there (Pa).
@@ -156,77 +145,80 @@ class Bank:
         These are (drawn, hypotheses). In a cycle that goes as a known one it is what was expected
         in that: right is what one hypothesis expects less what another does.
         """
-        self._see(cycle.samples, cycle.ticks)
-        drawn = _drawn(self._rows)
-        plain = cycle.complete and not self._rows["odd"].any()
-        stretches = Stretches.of(self._rows) if plain else None
+        samples, ticks = cycle.samples, cycle.ticks
+        drawn, stretches, since = self._look(samples, ticks)
+        if not cycle.complete:
+            stretches = None
         known = self._drawings.like(stretches) if stretches else None
         if stretches and known:
             expected, self._state = known.at(stretches, drawn), known.state.copy()
-            self._drawn_ns = int(self._rows["time_ns"][-1])
+            self._drawn_ns = cycle.end_ns
         else:
-            self._step_to(len(self._rows))
+            self._step_to(len(samples), samples, ticks, drawn)
             expected = self._expected
             if stretches and self._whole >= SWUNG_IN:
                 self._drawings.add(Drawing(stretches, drawn, expected, self._state.copy()))
-        self._whole = self._whole + 1 if plain else 0
-        self._rows, self._stepped, self._expected = self._rows[:0], 0, self._expected[:0]
+        self._whole = self._whole + 1 if stretches else 0
+        self._last_ns, self._phase, self._since = cycle.end_ns, int(ticks["phase"][-1]), since
+        self._seen, self._stepped, self._expected = 0, 0, self._expected[:0]
         return drawn, expected
 
-    def _see(self, samples: Samples, ticks: Ticks) -> None:
-        """Look at the rows of a piece, without those that were seen."""
-        seen = len(self._rows)
-        samples, ticks = samples[seen:], ticks[seen:]
-        if not len(samples):
-            return
-        fresh = np.empty(len(samples), _ROW)
-        dt = steps(samples, self._last_ns)
-        _look_at(samples, ticks, dt, self._phase, self._since, fresh)
-        self._last_ns, self._phase = int(samples["time_ns"][-1]), int(ticks["phase"][-1])
-        self._since = int(fresh["since"][-1])
-        self._rows = joined(self._rows, fresh) if seen else fresh
+    def _look(self, samples: Samples, ticks: Ticks) -> tuple[Ints, Stretches | None, int]:
+        """Which rows of a piece are drawn, how it goes, and how long the newest bend is ago.
 
-    def _step_to(self, end: int) -> None:
-        """Step over the rows of a piece that come before ``end``."""
-        ahead = self._rows[self._stepped : end + 1]  # and the one after them
-        some = _drawn(ahead)
-        some = some[some < end - self._stepped]
-        after = ahead["phase"][np.minimum(some + 1, len(ahead) - 1)]
-        rows, self._stepped = ahead[some], end
+        It is None how it goes where something is wrong with a row, or time does not run on evenly.
+        """
+        last_ns = int(samples["time_ns"][0]) if self._last_ns is None else self._last_ns
+        found = _look_at(samples, ticks, last_ns, self._phase, self._since)
+        drawn, odd, first, how, since = found
+        phases = ticks["phase"][first].tobytes()
+        return drawn, None if odd else Stretches(first, phases, how), since
+
+    def _step_to(self, end: int, samples: Samples, ticks: Ticks, drawn: Ints) -> None:
+        """Step over the rows of a piece that come before ``end``; some are ``drawn``."""
+        rows = drawn[(drawn >= self._stepped) & (drawn < end)]
+        self._stepped = end
         if not len(rows):
             return
-        before = np.concatenate([[self._drawn_ns], rows["time_ns"][:-1]])
-        dt = np.where(rows["dt"] < 0.0, -1.0, (rows["time_ns"] - before) * NS)
+        samples, after = samples[rows], ticks["phase"][np.minimum(rows + 1, len(ticks) - 1)]
+        dt = np.diff(samples["time_ns"], prepend=self._drawn_ns) * NS
+        dt[(dt < 0.0) | (samples["quality"] & BREAK != 0)] = -1.0
         expected = np.empty((len(rows), self._theta.shape[1]))
-        phase = _phases(rows["phase"], after, self._theta.shape[1])
-        level = np.ascontiguousarray(rows["level"])
+        phase = _phases(ticks["phase"][rows], after, self._theta.shape[1])
+        level = ticks["level"][rows].astype(np.float64)
         kernel.advance(
             self._state, self._theta, dt, phase, level, expected, tolerance=kernel.ROUGHLY
         )
-        self._drawn_ns = int(rows["time_ns"][-1])
+        self._drawn_ns = int(samples["time_ns"][-1])
         self._expected = np.concatenate([self._expected, expected])
 
 
 @compiled
-def _look_at(samples, ticks, dt, phase, since, rows):  # type: ignore[no-untyped-def]
-    """Fill the bank's ``rows`` for some that came ``dt`` after those before.
+def _look_at(samples, ticks, last_ns, phase, since):  # type: ignore[no-untyped-def]
+    """Rows that are drawn, whether one is odd, and the stretches between bends.
 
-    ``phase`` and ``since`` are those of the row before the first.
+    Of each the first row, and how it goes (``Stretches``); then how many rows ago the last began.
+    Given are time and phase of the row before, and how many rows before it a bend began.
     """
-    for i in range(len(rows)):
-        row, here = rows[i], ticks[i].phase
-        jumps = dt[i] < 0.5 * MS or dt[i] > 1.5 * MS
-        row.time_ns, row.dt = samples[i].time_ns, dt[i]
-        row.level, row.phase = ticks[i].level, here
-        row.bends = jumps or math.isfinite(ticks[i].level) or here != phase
-        row.odd = jumps or samples[i].quality != 0
-        phase, since = here, 0 if row.bends else since + 1
-        row.since = since
-
-
-def _drawn(rows: npt.NDArray[np.void]) -> Ints:
-    """Which of a piece's rows are drawn: also the last before a bend, and the very last."""
-    return sparse(rows["bends"], int(rows["since"][0]) - 1)
+    bends, first = np.empty(len(samples), np.bool_), np.empty(len(samples), np.int64)
+    how = np.empty((len(samples), 3))
+    odd, count, ago = False, 0, since
+    for i in range(len(samples)):
+        row, here, level = samples[i], ticks[i].phase, ticks[i].level
+        dt = (row.time_ns - last_ns) * NS
+        jumps = row.quality & BREAK != 0 or dt < 0.5 * MS or dt > 1.5 * MS
+        bends[i] = jumps or math.isfinite(level) or here != phase
+        odd |= jumps or row.quality != 0
+        ago += 1
+        if bends[i]:
+            first[count], how[count, 2] = i, level if math.isfinite(level) else 0.0
+            count, ago = count + 1, 0
+        if count > 0:
+            begin = first[count - 1]
+            how[count - 1, 0] = i - begin
+            how[count - 1, 1] = (row.time_ns - samples[begin].time_ns) * (NS / MS)
+        last_ns, phase = row.time_ns, here
+    return sparse_rows(bends, since), odd, first[:count].copy(), how[:count].copy(), ago
 
 
 def _phases(phase: Bytes, after: Bytes, count: int) -> Bytes:

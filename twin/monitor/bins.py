@@ -219,12 +219,13 @@ def sparse(begins: npt.NDArray[np.bool_], since: int = -1) -> Ints:
 
     Before the first row the last bend began ``since`` rows ago.
     """
-    kept: Ints = _sparse(np.ascontiguousarray(begins), since)
+    kept: Ints = sparse_rows(np.ascontiguousarray(begins), since)
     return kept
 
 
 @compiled
-def _sparse(begins, since):  # type: ignore[no-untyped-def]
+def sparse_rows(begins, since):  # type: ignore[no-untyped-def]
+    """The same, compiled."""
     kept = np.empty(len(begins), np.int64)
     count, due = 0, 0  # rows after a bend
     while due <= since:

@@ -8,6 +8,7 @@ by 1 a cycle on average, however alike their signatures are: a limit on it is th
 to a false alarm, but for the overshoot.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -158,7 +159,7 @@ def _weights(signs: Floats, often: Floats, alike: Floats) -> Floats:
 
 def limit(cycles: float) -> float:
     """What the logarithm of the sum is compared with, for a false alarm in so many cycles."""
-    return float(np.log(OVERSHOOT * cycles))
+    return math.log(OVERSHOOT * cycles)
 
 
 def began(normal: Floats) -> int:

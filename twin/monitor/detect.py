@@ -5,6 +5,7 @@ scatter. An alarm is raised when one figure is far out, or when the isolation sa
 differ where no single one does. It is cleared, with hysteresis, when all are back for some cycles.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -19,7 +20,7 @@ from twin.model.theta import Theta
 from twin.monitor.clock import ClockWatch
 from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, Teller, Told, figures
 from twin.monitor.healthy import Healthy
-from twin.monitor.signatures import Likeness, likenesses, look_alikes
+from twin.monitor.signatures import Likeness, drawn_rows, likenesses, look_alikes
 from twin.settings import Settings
 from twin.signals import BREAK, NS, SAMPLE, TICK, Quality, Samples, Ticks, joined
 
@@ -78,6 +79,7 @@ class Monitor:
         """Have what is compiled at hand, not to fall into a block."""
         nothing = Cycle(0, np.zeros(1, SAMPLE), np.zeros(1, TICK), complete=False)
         figures(nothing, self.theta[c.AMBIENT])
+        drawn_rows(nothing.samples, nothing.ticks)  # where a cause is sought
 
     def update(self, samples: Samples, ticks: Ticks) -> list[Event]:
         """Take rows with the twin's ticks; give what they make happen."""
@@ -247,7 +249,7 @@ class Monitor:
                 if figure.endswith("_rms"):
                     excess = max(excess, 0.0)  # less than usual is no deviation
                 beyond = max(abs(excess) - self.settings.smallest_mbar, 0.0)
-                sigmas = float(np.copysign(beyond / healthy.sigma, excess))
+                sigmas = math.copysign(beyond / healthy.sigma, excess)
                 outliers.append(Outlier(figure, excess, sigmas))
         return max(outliers, key=self._weight, default=None)
 

@@ -6,13 +6,13 @@ model is set on. Where these hardly differ, it is the same, counted from the beg
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from twin.model import kernel
 from twin.monitor.bins import Floats, Ints
-from twin.signals import MBAR, MS, NS
+from twin.signals import MBAR
 
 KEPT = 8  # drawings: a program or two, with what jitters
 LONGER = 0.02  # of how long a stretch lasts; signatures differ by about as large a share of them
@@ -29,21 +29,13 @@ class Stretches:
     # From its first row to its last: rows, and ms of PLC time; and the level (Pa) that the model is
     # set on where it begins, 0 for none. (stretches, 3)
     how: Floats
-    may_differ: Floats  # by which those of another cycle may differ, (stretches, 3)
 
-    @classmethod
-    def of(cls, rows: npt.NDArray[np.void]) -> "Stretches":
-        """Those of the bank's rows of a cycle, of which the first begins one."""
-        first = np.flatnonzero(rows["bends"])
-        last = np.concatenate([first[1:], [len(rows)]]) - 1
-        begin, end = rows[first], rows[last]
-        how = np.empty((len(first), 3))
-        how[:, 0] = last - first
-        how[:, 1] = (end["time_ns"] - begin["time_ns"]) * (NS / MS)
-        how[:, 2] = np.where(np.isnan(begin["level"]), 0.0, begin["level"])
-        may_differ = np.maximum(LONGER * how, LONGER_MS)
-        may_differ[:, 2] = LEVEL
-        return cls(first, begin["phase"].tobytes(), how, may_differ)
+    @cached_property
+    def may_differ(self) -> Floats:
+        """By how much those of another cycle may differ, (stretches, 3)."""
+        differ = np.maximum(LONGER * self.how, LONGER_MS)
+        differ[:, 2] = LEVEL
+        return differ
 
     def may_go_as(self, known: "Stretches") -> bool:
         """Whether a cycle that is not over yet may still turn out to go as a known one.

@@ -6,6 +6,7 @@ likelihood tells how probable it is. Cycle-to-cycle scatter averages out of that
 model has wrong about a signature does not, so a share of what is explained counts as error.
 """
 
+import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -181,10 +182,11 @@ class Isolation:
 
     def _conclude(self, changes: Changes, normal: Floats, far: float) -> Verdict:
         changes.take(normal, FARTHEST if far else MOST)
+        log_sum = changes.log_sum
         cycles = self._wanted_s / (self._seconds / self._cycles)
-        log_odds = changes.log_sum - np.log(cycles)  # a fault is as rare as a false alarm
-        none = float(1.0 / (1.0 + np.exp(min(log_odds, 700.0))))
-        raised = self._raised is None and changes.log_sum >= limit(cycles)
+        log_odds = log_sum - math.log(cycles)  # a fault is as rare as a false alarm
+        none = 1.0 / (1.0 + math.exp(min(log_odds, 700.0)))
+        raised = self._raised is None and log_sum >= limit(cycles)
         if raised:
             self._raise(changes, far)
         elif self._raised is not None:
