@@ -64,7 +64,7 @@ def test_what_differs_from_cycle_to_cycle_is_as_a_diagnosis_has_it(heard: list[H
     ear, healthy = listener(), rigs.config("gripper").monitor.healthy
     said = ear.hear(*heard[0])
     assert said
-    bins, _ = averaged(cycle.ticks["phase"], cycle.off, drawn, expected, PER_UNIT)
+    bins, *_ = averaged(cycle.ticks["phase"], cycle.off, drawn, expected, PER_UNIT)
     here = np.unique(bins.place, return_index=True)[1]
     goes_on = lasting(bins, here, model_error(healthy.error, bins.kind[here], bins.time[here])[1])
     sizes = {(e, p): healthy.scatter.get(e, usual) for e, (p, usual) in SCATTER.items()}

@@ -109,16 +109,16 @@ def binned(phase: Bytes, usable: Bools, starts: Ints, per_unit: int = PER_UNIT) 
 
 def averaged(
     phase: Bytes, off: Floats, drawn: Ints, expected: Floats, per_unit: int = PER_UNIT
-) -> tuple[Bins, Floats]:
-    """Bins of the rows of one cycle, and the means over each, (bins, 1 + n).
+) -> tuple[Bins, Floats, Floats]:
+    """Bins of the rows of one cycle, and over each the means of ``off`` and of what is expected.
 
-    First that of ``off``, then those of straight lines through what is ``expected``, (drawn, n).
-    What is not known, or lies beside drawn rows at which something is not, is in no bin.
+    The latter goes straight between rows that are ``drawn``: from (drawn, n) to (bins, n). What is
+    not known, or lies beside drawn rows at which something is not, is in no bin.
     """
     number = np.empty(len(phase), np.int64)
     begins = _begins(len(phase) // ROWS + 1, per_unit)
-    found, means = _averaged(np.array(phase), off, drawn, expected, begins, number)
-    return Bins(number, found), means
+    found, *means = _averaged(np.array(phase), off, drawn, expected, begins, number)
+    return Bins(number, found), *means
 
 
 @lru_cache(maxsize=16)
@@ -133,14 +133,16 @@ def _averaged(phase, off, drawn, expected, begins, number):  # type: ignore[no-u
     """What each bin is, and the means of what is off and of what is expected in it."""
     usable = _between(drawn, expected, off)
     found = _number(phase, usable, np.zeros(1, np.int64), begins, number)
-    means = np.zeros((len(found), 1 + expected.shape[1]))
+    mean, through = np.zeros(len(found)), np.zeros((len(found), expected.shape[1]))
     for row in range(len(number)):
         if number[row] >= 0:
-            means[number[row], 0] += off[row]
-    _add_lines(number, drawn, expected, means[:, 1:])
+            mean[number[row]] += off[row]
+    _add_lines(number, drawn, expected, through)
     for one in range(len(found)):
-        means[one] /= found[one, 0]
-    return found, means
+        mean[one] /= found[one, 0]
+        for i in range(expected.shape[1]):
+            through[one, i] /= found[one, 0]
+    return found, mean, through
 
 
 @compiled
@@ -150,8 +152,8 @@ def _between(drawn, expected, off):  # type: ignore[no-untyped-def]
     before, first = False, len(off)
     for i in range(len(drawn)):
         unknown = 0
-        for one in expected[i]:
-            unknown += one - one != 0.0
+        for j in range(expected.shape[1]):  # so written, several at a time
+            unknown += 0 if expected[i, j] - expected[i, j] == 0.0 else 1
         last, known = drawn[i], unknown == 0
         for row in range(first, last if before and known else first):
             usable[row] = math.isfinite(off[row])

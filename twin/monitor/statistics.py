@@ -117,20 +117,20 @@ class Listener:
 
         ``figures`` are the monitor's.
         """
-        bins, means = averaged(cycle.ticks["phase"], cycle.off, drawn, expected, PER_UNIT)
-        if not len(means):
+        bins, off, through = averaged(cycle.ticks["phase"], cycle.off, drawn, expected, PER_UNIT)
+        if not len(off):
             return None
         shown = [number for number, name in enumerate(LEVELS) if name in figures]
         level = np.array([figures[LEVELS[number]] for number in shown]) - self._means[shown]
         at = self._places(bins, shown)
-        means = means[at.first]
-        moved = np.concatenate([(means[:, 2:] - means[:, 1:2]) / MBAR, self._levels[shown]])
+        through = through[at.first]
+        moved = np.concatenate([(through[:, 1:] - through[:, :1]) / MBAR, self._levels[shown]])
         suspects, larger, ways = np.split(moved, _COLUMNS, axis=1)
         return Said(
             at.place,
             at.kind,
             at.time,
-            np.concatenate([means[:, 0], level]),
+            np.concatenate([off[at.first], level]),
             suspects,
             larger,
             ways - suspects[:, UNSURE_OF : UNSURE_OF + 1],
@@ -159,7 +159,7 @@ class Listener:
         return covariance
 
     @cached_property
-    def _scatters(self) -> tuple[list[int], Floats]:
+    def _scatters(self) -> tuple[Ints, Floats]:
         """Which suspects scatter in healthy cycles, and one sigma of each in its steps."""
         numbers, sigmas = [], []
         for number, one in enumerate(SUSPECTS):
@@ -168,7 +168,7 @@ class Listener:
                 numbers.append(number)
                 size = self.healthy.scatter.get(one.effect, usual) * self.healthy.leftover
                 sigmas.append(size / one.step)
-        return numbers, np.array(sigmas)
+        return np.array(numbers, np.int64), np.array(sigmas)
 
 
 @dataclass(frozen=True)
