@@ -1,5 +1,6 @@
 """All alarms of one ejector together: values in, changes out; and episodes made of changes."""
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -16,12 +17,14 @@ class Board:
 
     def __init__(self, rules: Sequence[Rule]) -> None:
         self.alarms = {rule.name: Alarm(rule) for rule in rules}
+        self._suppressible = [one for one in self.alarms.values() if one.rule.suppressed_by]
 
     def see(self, now: int, values: Mapping[str, float]) -> list[Change]:
         """Take what is new, by name; of what is not in it only time goes on."""
         changes: list[Change] = []
         for alarm in self.alarms.values():
-            changes += alarm.see(now, values.get(alarm.rule.value, float("nan")))
+            if alarm.rule.value in values or not alarm.rests:
+                changes += alarm.see(now, values.get(alarm.rule.value, math.nan))
         designed = list(self._designed(now))
         suppressed = {change.alarm for change in designed if change.deed is Deed.SUPPRESSED}
         # What suppresses another alarm does so from the moment on in which both are raised.
@@ -73,7 +76,7 @@ class Board:
     def _designed(self, now: int) -> Iterator[Change]:
         """Suppress what is quiet by design while another alarm is active."""
         active = {name for name, alarm in self.alarms.items() if alarm.active}
-        for alarm in self.alarms.values():
+        for alarm in self._suppressible:
             yield from alarm.suppress(now, bool(active & set(alarm.rule.suppressed_by)))
 
 

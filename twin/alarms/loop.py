@@ -171,7 +171,7 @@ class Alarms:
     def _deviating(self) -> list[str]:
         """The causes whose alarms are active."""
         active = {alarm.rule.value for alarm in self.board.alarms.values() if alarm.active}
-        return [cause for cause in CAUSES if value_of(cause) in active]
+        return [cause for cause in CAUSES if value_of(cause) in active] if active else []
 
     def _standing(self, event: Event) -> str:
         """The cause of a deviation: one that stands already, if this looks like it, or its own."""

@@ -108,6 +108,11 @@ class Alarm:
         """Whether its value is beyond the limit, but not yet for long enough."""
         return self._beyond and not self.active
 
+    @property
+    def rests(self) -> bool:
+        """Whether nothing comes of it while only time goes on."""
+        return self._since is None and self._beyond == self.active and self.shelved_until is None
+
     def see(self, now: int, value: float = math.nan) -> Iterator[Change]:
         """Take the newest value; NaN where there is none, then only time goes on."""
         if self.shelved_until is not None:
