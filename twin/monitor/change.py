@@ -83,7 +83,7 @@ class Patience(Generic[T]):
     def take(self, cycle: T, normal: Floats) -> list[T]:
         """Take a cycle with its standard normal scores; give those to be learned now."""
         self._waiting.append(cycle)
-        strange = np.nanmax(np.abs(normal), initial=0.0) > STRANGE
+        strange = (np.abs(normal) > STRANGE).any()
         self._cycles = WAITS if strange else self._cycles - 1
         if self._cycles > 0 and len(self._waiting) < MOST_WAITING:
             return []
@@ -106,6 +106,7 @@ class Changes:
         self._often = often
         self._signs = np.stack([np.ones(len(both_ways)), -1.0 * both_ways], axis=1)  # 0: not so
         self._shift = self._signs[:, :, None] * SIZES
+        self._half = 0.5 * self._shift**2
         self.weigh(np.eye(len(both_ways)))
         self.begin()
 
@@ -123,11 +124,9 @@ class Changes:
 
         None counts for more than ``most``.
         """
-        there = np.isfinite(normal)
-        shift = self._shift[there]
-        counted = np.clip(normal[there], -most, most)
-        ratio = shift * counted[:, None, None] - 0.5 * shift**2
-        self._log[there] = np.logaddexp(0.0, self._log[there]) + ratio
+        counted = np.clip(normal, -most, most)[:, None, None]
+        after = np.logaddexp(0.0, self._log) + (self._shift * counted - self._half)
+        self._log = np.where(np.isnan(counted), self._log, after)
 
     @property
     def log_sum(self) -> float:
