@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -47,8 +47,7 @@ class MonitorSettings(Settings):
     healthy: Healthy = Healthy()
 
 
-@dataclass(frozen=True)
-class Outlier:
+class Outlier(NamedTuple):
     """The figure of a cycle that is farthest from healthy."""
 
     figure: str
