@@ -9,16 +9,9 @@ import rigs
 
 from twin.model import theta as c
 from twin.monitor.bank import SUSPECTS, Bank
-from twin.monitor.bins import averaged
 from twin.monitor.cycles import Cycle, cut, figures
-from twin.monitor.statistics import LEVELS, PER_UNIT, PLACES, WEAK, Listener, Said
-from twin.monitor.weights import (
-    SCATTER,
-    from_cycle_to_cycle,
-    lasting,
-    model_error,
-    whitened,
-)
+from twin.monitor.statistics import PLACES, WEAK, Listener, Said
+from twin.monitor.weights import whitened
 
 Floats = npt.NDArray[np.float64]
 Heard = tuple[Cycle, npt.NDArray[np.int64], Floats, dict[str, float]]
@@ -56,26 +49,6 @@ def test_scores_and_sizes_are_those_of_the_inverse_covariance(heard: list[Heard]
     np.testing.assert_allclose(said.scores()[shown], (along / np.sqrt(power))[shown], rtol=1e-9)
     np.testing.assert_allclose(said.sizes()[shown], (along / power)[shown], rtol=1e-9)
     np.testing.assert_allclose(np.diag(said.alike())[shown], 1.0)
-
-
-def test_what_differs_from_cycle_to_cycle_is_as_a_diagnosis_has_it(heard: list[Heard]) -> None:
-    """Levels beside it vary by themselves."""
-    cycle, drawn, expected, found = heard[0]
-    ear, healthy = listener(), rigs.config("gripper").monitor.healthy
-    said = ear.hear(*heard[0])
-    assert said
-    bins, *_ = averaged(cycle.ticks["phase"], cycle.off, drawn, expected, PER_UNIT)
-    here = np.unique(bins.place, return_index=True)[1]
-    goes_on = lasting(bins, here, model_error(healthy.error, bins.kind[here], bins.time[here])[1])
-    sizes = {(e, p): healthy.scatter.get(e, usual) for e, (p, usual) in SCATTER.items()}
-    moves = said.signatures[: len(here)] * [
-        sizes.get((one.effect, one.parameter.name), 0.0) / one.step for one in SUSPECTS
-    ]
-    alone = from_cycle_to_cycle(bins, here, goes_on, moves, ear.noise) * healthy.leftover**2
-    np.testing.assert_allclose(said.alone[: len(here), : len(here)], alone, rtol=1e-9)
-    beside = said.alone[len(here) :]
-    assert len(beside) == len(found.keys() & set(LEVELS)) == 1
-    assert np.count_nonzero(beside) == 1
 
 
 def test_whitened_columns_have_the_products_of_the_inverse_covariance() -> None:

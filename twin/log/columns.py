@@ -16,7 +16,6 @@ from twin.signals import SAMPLE, TICK, Samples, Ticks
 
 _Places = npt.NDArray[np.int64]
 
-_KEYS = 16  # bytes, more than a column's number and length take
 _FIRST = 8  # bytes of the first row's bits
 _MOST = 8  # byte planes
 _TILE = 512  # rows that are unpacked at a time: with all their columns they stay in the cache
@@ -38,25 +37,18 @@ _SAMPLE_PLACES, _TICK_PLACES = _places(SAMPLE), _places(TICK)
 
 
 def encode(samples: Samples, ticks: Ticks) -> bytes:
-    """Pack n > 0 row-aligned rows into a serialised ``ejector_twin.Samples``.
-
-    Protobuf's own classes would copy each column three times.
-    """
-    count = len(samples)
-    head = SAMPLES.message(count=count).SerializeToString()
-    packed = np.empty(len(head) + len(COLUMNS) * (_KEYS + _FIRST + _MOST * count), np.uint8)
-    end = len(head)
-    packed[:end] = np.frombuffer(head, np.uint8)
-    of_samples, of_ticks = _NUMBERS[: len(_SAMPLE_PLACES)], _NUMBERS[len(_SAMPLE_PLACES) :]
-    end = _pack(_raw(samples), _SAMPLE_PLACES, of_samples, count, packed, end)
-    end = _pack(_raw(ticks), _TICK_PLACES, of_ticks, count, packed, end)
-    return packed[:end].tobytes()
-
-
-def _raw(rows: npt.NDArray[np.void]) -> npt.NDArray[np.uint8]:
-    raw = np.ascontiguousarray(rows).view(np.uint8)
-    raw.flags.writeable = False  # as rows of a file are: one type to compile for
-    return raw
+    """Pack n > 0 row-aligned rows into a serialised ``ejector_twin.Samples``."""
+    message = SAMPLES.message(count=len(samples))
+    space = np.empty(_FIRST + _MOST * len(samples), np.uint8)
+    columns = iter(COLUMNS)
+    for rows, places in ((samples, _SAMPLE_PLACES), (ticks, _TICK_PLACES)):
+        raw = np.ascontiguousarray(rows).view(np.uint8)
+        raw.flags.writeable = False  # as rows of a file are: one type to compile for
+        for offset, width in places.tolist():
+            used = _pack(raw, rows.itemsize, offset, width, space)
+            setattr(message, next(columns), space[:used].tobytes())
+    packed: bytes = message.SerializeToString()
+    return packed
 
 
 def decode(packed: bytes | memoryview) -> tuple[Samples, Ticks]:
@@ -92,18 +84,14 @@ def _read(raw, at, width):  # type: ignore[no-untyped-def]
     return bits
 
 
-@inlined
-def _write(bits, rows, at, width):  # type: ignore[no-untyped-def]
-    for j in range(width):
-        rows[at + np.uint64(j)] = np.uint8(bits >> np.uint64(8 * j))
-
-
-@inlined
-def _differences(rows, size, offset, width, zigzag):  # type: ignore[no-untyped-def]
-    """Fill ``zigzag`` for one field; gives the first row's bits, and all that are set anywhere."""
+@compiled
+def _pack(rows, size, offset, width, packed):  # type: ignore[no-untyped-def]
+    """Pack one field of all rows into the first bytes of ``packed``; gives how many."""
+    n = len(rows) // size
+    zigzag = np.empty(n, np.uint64)
     at = np.uint64(offset)
-    first = before = any_bits = np.uint64(0)
-    for i in range(len(zigzag)):
+    before = any_bits = np.uint64(0)
+    for i in range(n):
         if width == 8:
             bits = _read(rows, at, 8)
         elif width == 4:
@@ -112,45 +100,20 @@ def _differences(rows, size, offset, width, zigzag):  # type: ignore[no-untyped-
             bits = np.uint64(np.int8(rows[at]))
         at += np.uint64(size)
         if i == 0:
-            first = before = bits
+            before = bits
+            for j in range(_FIRST):
+                packed[j] = bits >> np.uint64(8 * j)
         step = bits - before  # wraps, and wraps back
         zigzag[i] = (step << _ONE) ^ (np.uint64(0) - (step >> np.uint64(63)))
         any_bits |= zigzag[i]
         before = bits
-    return first, any_bits
-
-
-@inlined
-def _write_varint(number, packed, at):  # type: ignore[no-untyped-def]
-    """Write a number as protobuf does; gives where it ends."""
-    while number > 0x7F:
-        packed[at] = number & 0x7F | 0x80
-        number >>= 7
-        at += 1
-    packed[at] = number
-    return at + 1
-
-
-@compiled
-def _pack(rows, places, numbers, n, packed, at):  # type: ignore[no-untyped-def]
-    """Pack each field of ``n`` rows under its number, from ``at`` on; gives where they end."""
-    zigzag = np.empty(n, np.uint64)
-    for column in range(len(places)):
-        offset, width = places[column]
-        first, any_bits = _differences(rows, len(rows) // n, offset, width, zigzag)
-        kept = 0
-        while kept < _MOST and any_bits >> np.uint64(8 * kept):
-            kept += 1
-        at = _write_varint(numbers[column] << 3 | _BYTES, packed, at)
-        at = _write_varint(_FIRST + kept * n, packed, at)
-        _write(first, packed, np.uint64(at), _FIRST)
-        at += _FIRST
-        for j in range(kept):
-            plane = packed[at : at + n]
-            for i in range(n):
-                plane[i] = zigzag[i] >> np.uint64(8 * j)
-            at += n
-    return at
+    kept = 0
+    while kept < _MOST and any_bits >> np.uint64(8 * kept):
+        plane = packed[_FIRST + kept * n :]
+        for i in range(n):
+            plane[i] = zigzag[i] >> np.uint64(8 * kept)
+        kept += 1
+    return _FIRST + kept * n
 
 
 @inlined
@@ -230,6 +193,12 @@ def _long_steps(packed, at, n, kept, steps):  # type: ignore[no-untyped-def]
         for j in range(kept):
             z |= np.uint64(packed[at + j * n + i]) << np.uint64(8 * j)
         steps[i] = np.int64((z >> _ONE) ^ (np.uint64(0) - (z & _ONE)))
+
+
+@inlined
+def _write(bits, rows, at, width):  # type: ignore[no-untyped-def]
+    for j in range(width):
+        rows[at + np.uint64(j)] = np.uint8(bits >> np.uint64(8 * j))
 
 
 @compiled

@@ -31,37 +31,22 @@ class Bins:
     """What each bin is, in order of time; no bin crosses a phase change."""
 
     number: Ints  # of the bin of each row; -1 where nothing can be compared
-    found: Ints  # of each bin, (bins, 6), as ``_number`` tells
-
-    @property
-    def count(self) -> Ints:
-        """Rows."""
-        return self.found[:, 0]
-
-    @property
-    def cycle(self) -> Ints:
-        """Number of the cycle."""
-        return self.found[:, 1]
-
-    @property
-    def stretch(self) -> Ints:
-        """Number of the stretch of one phase, counted over all rows."""
-        return self.found[:, 2]
-
-    @property
-    def kind(self) -> Ints:
-        """What the stretch is, index into KINDS."""
-        return self.found[:, 3]
+    count: Ints  # rows
+    cycle: Ints
+    stretch: Ints  # of one phase, counted over all rows
+    kind: Ints  # of stretch, index into KINDS
+    since: Ints  # rows since the stretch began
+    step: Ints  # in warped time, counted in it
 
     @cached_property
     def time(self) -> Floats:
         """Warped, since the stretch began."""
-        return warped(self.found[:, 4] * np.float64(MS))
+        return warped(self.since * np.float64(MS))
 
     @property
     def place(self) -> Ints:
         """The same number for what is alike from cycle to cycle: kind and time."""
-        return (self.kind << 16) + self.found[:, 5]
+        return (self.kind << 16) + self.step
 
     def mean(self, values: Floats) -> Floats:
         """Mean over each bin of row-by-row ``values``, (rows, ...) to (bins, ...)."""
@@ -104,7 +89,7 @@ def binned(phase: Bytes, usable: Bools, starts: Ints, per_unit: int = PER_UNIT) 
     """
     number = np.empty(len(phase), np.int64)
     begins = _begins(len(phase) // ROWS + 1, per_unit)
-    return Bins(number, _number(np.array(phase), usable, starts, begins, number))
+    return Bins(number, *_number(np.array(phase), usable, starts, begins, number).T)
 
 
 def averaged(
@@ -118,7 +103,7 @@ def averaged(
     number = np.empty(len(phase), np.int64)
     begins = _begins(len(phase) // ROWS + 1, per_unit)
     found, *means = _averaged(np.array(phase), off, drawn, expected, begins, number)
-    return Bins(number, found), *means
+    return Bins(number, *found.T), *means
 
 
 @lru_cache(maxsize=16)

@@ -192,8 +192,8 @@ def figures(cycle: Cycle, ambient: float) -> dict[str, float]:
     """
     result: dict[str, float] = {}
     broken_off = int(cycle.ticks["phase"][-1]) if cycle.cut_short else None
-    by_phase, lowest, passed = _passed(cycle.samples, cycle.ticks, ambient)
-    rows, sums, squares, knees, levels = by_phase[:, : len(Phase)].tolist()
+    by_phase = _by_phase(cycle.off, cycle.ticks, ambient)[:, : len(Phase)]
+    rows, sums, squares, knees, levels = by_phase.tolist()
     for phase, name in _NAMES:
         # Of the last one of a cycle cut short the beginning is no measure of all of it.
         if phase != broken_off and rows[phase] >= FEWEST_ROWS:
@@ -203,38 +203,31 @@ def figures(cycle: Cycle, ambient: float) -> dict[str, float]:
         if knees[into]:
             result[name] = levels[into] / knees[into]
     if cycle.complete:
-        result["max_vacuum"] = (ambient - lowest) / MBAR
-        result["t0_measured"], result["t0_expected"] = passed
+        usable = (cycle.samples["quality"] & UNUSABLE) == 0
+        measured = np.where(usable, cycle.samples["pressure"], np.nan).astype(np.float64)
+        expected = cycle.ticks["expected"].astype(np.float64)
+        times = cycle.samples["time_ns"]
+        result["max_vacuum"] = float((ambient - np.fmin.reduce(measured)) / MBAR)
+        result["t0_measured"] = time_to_vacuum(H2, measured, times, ambient) * 1e3
+        result["t0_expected"] = time_to_vacuum(H2, expected, times, ambient) * 1e3
     return {name: value for name, value in result.items() if math.isfinite(value)}
 
 
 @compiled
-def _passed(samples, ticks, ambient):  # type: ignore[no-untyped-def]
-    """Sums by phase, (5, all that a byte is), the lowest pressure, and two times in ms.
+def _by_phase(off, ticks, ambient):  # type: ignore[no-untyped-def]
+    """Sums by phase, (5, all that a byte is).
 
     Rows with a deviation, it and its square; rows with a level, and its vacuum, both of what it is
-    set on for. The times are those to H2, measured and expected.
+    set on for.
     """
     sums = np.zeros((5, 256))
-    lowest, measured_ms, expected_ms = math.inf, math.nan, math.nan
-    for row in range(len(samples)):
+    for row in range(len(off)):
         phase, level = ticks[row].phase, np.float64(ticks[row].level)
-        expected = np.float64(ticks[row].expected)
-        usable = samples[row].quality & UNUSABLE == 0
-        pressure = np.float64(samples[row].pressure) if usable else math.nan
-        off = (pressure - expected) / MBAR
-        if math.isfinite(off):
+        if math.isfinite(off[row]):
             sums[0, phase] += 1.0
-            sums[1, phase] += off
-            sums[2, phase] += off * off
+            sums[1, phase] += off[row]
+            sums[2, phase] += off[row] * off[row]
         if row > 0 and math.isfinite(level):
             sums[3, phase] += 1.0
             sums[4, phase] += (ambient - level) / MBAR
-        if math.isfinite(pressure):
-            lowest = min(lowest, pressure)
-        since_ms = (samples[row].time_ns - samples[0].time_ns) * NS * 1e3
-        if math.isnan(measured_ms) and ambient - pressure >= H2:
-            measured_ms = since_ms
-        if math.isnan(expected_ms) and ambient - expected >= H2:
-            expected_ms = since_ms
-    return sums, lowest, (measured_ms, expected_ms)
+    return sums

@@ -48,14 +48,11 @@ class Stretches:
         more[-1, :2] = np.maximum(more[-1, :2], 0.0)  # the last goes on
         return bool((np.abs(more) <= known.may_differ[: len(more)]).all())
 
-    def far(self, known: Floats, may_differ: Floats) -> Floats:
-        """How much a whole cycle differs from ``known`` ones; inf: it goes apart.
-
-        They are of the same phases, each as ``how`` here, and so is what they ``may_differ`` by.
-        """
-        share = np.abs(self.how - known) / may_differ
-        share = share.reshape(len(share), -1)
-        far: Floats = np.where(share.max(axis=1) <= 1.0, share.sum(axis=1), np.inf)
+    def far(self, known: Sequence["Stretches"]) -> Floats:
+        """How much a whole cycle differs from known ones of the same phases; inf: it goes apart."""
+        share = np.abs(self.how - np.array([one.how for one in known]))
+        share /= np.array([one.may_differ for one in known])
+        far: Floats = np.where(share.max(axis=(1, 2)) <= 1.0, share.sum(axis=(1, 2)), np.inf)
         return far
 
 
@@ -85,7 +82,6 @@ class Drawings:
 
     def __init__(self) -> None:
         self._kept: list[Drawing] = []  # the last used comes last
-        self._alike: dict[bytes, _Alike] = {}  # by their phases, as far as asked for
 
     def __len__(self) -> int:
         return len(self._kept)
@@ -93,7 +89,6 @@ class Drawings:
     def add(self, drawing: Drawing) -> None:
         """Keep one more; the one that was of no use for longest goes."""
         self._kept = [*self._kept, drawing][-KEPT:]
-        self._alike.clear()
 
     def may_be(self, stretches: Stretches) -> bool:
         """Whether a cycle that has gone like this so far may yet turn out to go as a known one."""
@@ -101,35 +96,13 @@ class Drawings:
 
     def like(self, stretches: Stretches) -> Drawing | None:
         """The drawing of the cycle that a whole one goes most alike, if there is one."""
-        phases = stretches.phases
-        if phases not in self._alike:
-            self._alike[phases] = _Alike.of(
-                [one for one in self._kept if one.stretches.phases == phases]
-            )
-        alike = self._alike[phases]
-        if not alike.drawings:
+        alike = [one for one in self._kept if one.stretches.phases == stretches.phases]
+        if not alike:
             return None
-        far = stretches.far(alike.how, alike.may_differ)
-        least = int(far.argmin())
-        if far[least] == np.inf:
+        far = stretches.far([one.stretches for one in alike])
+        nearest = alike[int(far.argmin())]
+        if not np.isfinite(far.min()):
             return None
-        nearest = alike.drawings[least]
-        self._kept = [*(one for one in self._kept if one is not nearest), nearest]
+        self._kept = [one for one in self._kept if one is not nearest]
+        self.add(nearest)
         return nearest
-
-
-@dataclass(frozen=True)
-class _Alike:
-    """Drawings of cycles of the same phases, and their stretches together."""
-
-    drawings: Sequence[Drawing]
-    how: Floats  # (drawings, stretches, 3)
-    may_differ: Floats
-
-    @classmethod
-    def of(cls, drawings: Sequence[Drawing]) -> "_Alike":
-        known = [one.stretches for one in drawings]
-        together = (
-            np.array([getattr(one, name) for one in known]) for name in ("how", "may_differ")
-        )
-        return cls(drawings, *together)

@@ -136,7 +136,6 @@ class Isolation:
             Cycle(0, np.zeros(2, SAMPLE), np.zeros(2, TICK), complete=False)
         )
         averaged(np.zeros(2, np.uint8), np.zeros(2), drawn, expected)
-        whitened(np.eye(1), np.zeros((1, 1)))
         return cls(Bank(listener.theta), listener, days)
 
     def judge(

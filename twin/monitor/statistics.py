@@ -19,7 +19,13 @@ from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import Healthy
 from twin.monitor.phases import Knees, expected_knees
 from twin.monitor.switching import seen
-from twin.monitor.weights import SCATTER, lasting, model_error, whitened
+from twin.monitor.weights import (
+    SCATTER,
+    from_cycle_to_cycle,
+    lasting,
+    model_error,
+    whitened,
+)
 from twin.signals import MBAR
 
 PER_UNIT = 2  # bins in each unit of warped time
@@ -126,6 +132,8 @@ class Listener:
         through = through[at.first]
         moved = np.concatenate([(through[:, 1:] - through[:, :1]) / MBAR, self._levels[shown]])
         suspects, larger, ways = np.split(moved, _COLUMNS, axis=1)
+        moves = self._moves(suspects[: len(at.first)])
+        covariance = from_cycle_to_cycle(bins, at.first, at.goes_on, moves, self.noise)
         return Said(
             at.place,
             at.kind,
@@ -134,41 +142,35 @@ class Listener:
             suspects,
             larger,
             ways - suspects[:, UNSURE_OF : UNSURE_OF + 1],
-            self._covariance(at, bins.count[at.first], moved),
+            _beside(covariance * self.healthy.leftover**2, self._sigmas[shown] ** 2),
             at.common,
         )
 
     def _places(self, bins: Bins, shown: Sequence[int]) -> "_Places":
         """Where a cycle says something, with what follows from it; most say it at the same."""
-        key = bins.found[:, 2:].tobytes() + bytes(shown)
+        key = b"".join(of.tobytes() for of in (bins.stretch, bins.kind, bins.since)) + bytes(shown)
         if key not in self._seen:
             if len(self._seen) == PLACES:
                 self._seen.clear()
             self._seen[key] = _Places.of(bins, shown, self._sigmas[shown], self.healthy)
         return self._seen[key]
 
-    def _covariance(self, at: "_Places", rows: Ints, moved: Floats) -> Floats:
-        """Covariance (mbar²) of what differs from cycle to cycle; bins have so many ``rows``."""
+    def _moves(self, signatures: Floats) -> Floats:
+        """By how much (mbar) what scatters moves each bin, one sigma of it, (bins, scatters)."""
         numbers, sigmas = self._scatters
-        moves = moved[:, numbers] * sigmas
-        moves[len(rows) :] = 0.0  # a level varies by itself
-        covariance: Floats = at.lasting + moves @ moves.T
-        np.einsum("ii->i", covariance)[: len(rows)] += (
-            self.noise * self.healthy.leftover
-        ) ** 2 / rows
-        return covariance
+        moves: Floats = signatures[:, numbers] * sigmas
+        return moves
 
     @cached_property
-    def _scatters(self) -> tuple[Ints, Floats]:
+    def _scatters(self) -> tuple[list[int], list[float]]:
         """Which suspects scatter in healthy cycles, and one sigma of each in its steps."""
         numbers, sigmas = [], []
         for number, one in enumerate(SUSPECTS):
             parameter, usual = SCATTER.get(one.effect, ("", 0.0))
             if parameter == one.parameter.name:
                 numbers.append(number)
-                size = self.healthy.scatter.get(one.effect, usual) * self.healthy.leftover
-                sigmas.append(size / one.step)
-        return np.array(numbers, np.int64), np.array(sigmas)
+                sigmas.append(self.healthy.scatter.get(one.effect, usual) / one.step)
+        return numbers, sigmas
 
 
 @dataclass(frozen=True)
@@ -180,7 +182,7 @@ class _Places:
     kind: Ints
     time: Floats
     common: Floats  # mbar, by which the model is off in all cycles
-    lasting: Floats  # mbar², covariance of what goes on for a while, and differs between cycles
+    goes_on: Floats  # mbar², covariance of bins: what does so for a while, and differs by cycle
 
     @classmethod
     def of(cls, bins: Bins, shown: Sequence[int], sigmas: Floats, healthy: Healthy) -> "_Places":
@@ -195,7 +197,7 @@ class _Places:
             np.concatenate([kind, numbers]),
             np.concatenate([time, np.zeros(len(shown))]),
             np.concatenate([common, sigmas]),
-            _beside(lasting(bins, first, alone) * healthy.leftover**2, sigmas**2),
+            lasting(bins, first, alone),
         )
 
 

@@ -1,12 +1,11 @@
 """What differs from cycle to cycle in a healthy ejector, as a covariance over bins."""
 
-import math
 from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
+from scipy.linalg.lapack import dtrtrs
 
-from twin.model.compiled import compiled
 from twin.model.term import AGAIN, KINDS
 from twin.monitor.bins import Bins, Floats, Ints, warped
 from twin.monitor.healthy import ModelError
@@ -85,26 +84,7 @@ def from_cycle_to_cycle(
 
 def whitened(covariance: Floats, columns: Floats) -> tuple[Floats, float]:
     """Columns beside each other, whitened; and the logarithm of the covariance's determinant."""
-    found: tuple[Floats, float] = _whitened(covariance.copy(), columns.copy())
-    return found
-
-
-@compiled
-def _whitened(rest, white):  # type: ignore[no-untyped-def]
-    """Cholesky's factor row by row, and columns solved by it as it goes; both in place.
-
-    For some fifty bins this takes a quarter of what NumPy does without a solver for triangles.
-    """
-    log_det = 0.0
-    for k in range(len(rest)):
-        pivot = math.sqrt(rest[k, k])
-        log_det += 2.0 * math.log(pivot)
-        rest[k] /= pivot
-        white[k] /= pivot
-        for i in range(k + 1, len(rest)):
-            share = rest[k, i]
-            for j in range(i, len(rest)):
-                rest[i, j] -= share * rest[k, j]
-            for j in range(white.shape[1]):
-                white[i, j] -= share * white[k, j]
-    return white, log_det
+    factor = np.linalg.cholesky(covariance)
+    # Its wrapper, solve_triangular, takes as long again: some 80 µs for each cycle.
+    white, _ = dtrtrs(factor, columns, lower=1)
+    return white, 2.0 * float(np.log(np.diag(factor)).sum())
