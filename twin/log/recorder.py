@@ -95,7 +95,8 @@ class Recorder:
     def _take(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
         if len(samples):
             self._host_ns = int(samples["host_ns"][-1])
-        self._events.extend((self._received(event, samples), event) for event in events)
+        if events:
+            self._events += zip(self._received(events, samples), events, strict=True)
         for event in events:
             if event.kind is Kind.CLOCK:
                 at = {"time_ns": str(event.time_ns)}
@@ -133,12 +134,17 @@ class Recorder:
             self._writer.add_message(_LOG, host_ns, event.time_ns, encode_log(event))
         self._events.clear()
 
-    def _received(self, event: Event, samples: Samples) -> int:
-        """When the row was received with which it happened: in a long block not the last one."""
-        rows = np.flatnonzero(samples["time_ns"] <= event.time_ns)
-        if len(rows):
-            return int(samples["host_ns"][rows[-1]])
-        return event.time_ns if self._host_ns is None else self._host_ns
+    def _received(self, events: Sequence[Event], samples: Samples) -> list[int]:
+        """When the rows were received with which they happened: in a long block not the last."""
+        times = np.array([event.time_ns for event in events], np.int64)
+        host = times if self._host_ns is None else np.full(len(times), self._host_ns)
+        if len(samples):
+            # The PLC's clock may jump back: of the rows that are not later, the last one.
+            earliest = np.minimum.accumulate(samples["time_ns"][::-1])[::-1]
+            rows = np.searchsorted(earliest, times, "right") - 1
+            host = np.where(rows >= 0, samples["host_ns"][rows], host)
+        received: list[int] = host.tolist()
+        return received
 
     def _begin(self) -> None:
         path = part_path(self._path, self._number)
