@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.log.schema import ADDED, COLUMNS, SAMPLES
-from twin.model.compiled import compiled, inlined
+from twin.model.compiled import compiled, per_row
 from twin.signals import SAMPLE, TICK, Samples, Ticks
 
 _Places = npt.NDArray[np.int64]
@@ -75,7 +75,7 @@ def decode(packed: bytes | memoryview) -> tuple[Samples, Ticks]:
 # becomes one instruction for the whole field.
 
 
-@inlined
+@per_row
 def _read(raw, at, width):  # type: ignore[no-untyped-def]
     """Little-endian bytes, not extended."""
     bits = np.uint64(0)
@@ -116,7 +116,7 @@ def _pack(rows, size, offset, width, packed):  # type: ignore[no-untyped-def]
     return _FIRST + kept * n
 
 
-@inlined
+@per_row
 def _varint(packed, at):  # type: ignore[no-untyped-def]
     """A number of protobuf and where it ends: past the end where it is broken off."""
     number = np.int64(0)
@@ -195,7 +195,7 @@ def _long_steps(packed, at, n, kept, steps):  # type: ignore[no-untyped-def]
         steps[i] = np.int64((z >> _ONE) ^ (np.uint64(0) - (z & _ONE)))
 
 
-@inlined
+@per_row
 def _write(bits, rows, at, width):  # type: ignore[no-untyped-def]
     for j in range(width):
         rows[at + np.uint64(j)] = np.uint8(bits >> np.uint64(8 * j))

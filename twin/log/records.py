@@ -33,7 +33,7 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from twin.log.schema import CHANNELS, LIBRARY
-from twin.model.compiled import compiled, inlined
+from twin.model.compiled import compiled, per_row
 
 _HEAD = struct.Struct("<BQ")  # opcode and length of a record
 _HEAD_SIZE = _HEAD.size
@@ -234,7 +234,7 @@ def _wanted(names: dict[int, str], topics: Collection[str]) -> npt.NDArray[np.bo
     return wanted
 
 
-@inlined
+@per_row
 def _span(records, position):  # type: ignore[no-untyped-def]
     """Where the data of the record at ``position`` begins and ends."""
     length = np.int64(0)

@@ -69,9 +69,15 @@ class _Waiting(event.Listener):
 
 event.register("numba:compile", _Waiting())  # type: ignore[no-untyped-call]
 
-# Results stay the same to the last bit: no fast-math. Dividing by zero gives inf as in NumPy.
-compiled = njit(cache=True, nogil=True, error_model="numpy")
+# Results stay the same to the last bit: no fast-math. Dividing by zero gives inf as in NumPy. What
+# is called from ``per_row`` may have arrays of its own (numba would pass that on).
+compiled = njit(cache=True, nogil=True, error_model="numpy", _nrt=True)  # type: ignore[call-overload]
 
 # For functions called inside a loop: over hypotheses only one without calls is vectorised, and over
 # rows a call costs as much as a few lines.
 inlined = njit(forceinline=True, error_model="numpy")
+
+# The same for what runs over rows, with no arrays of its own. It does not count the references to
+# those it is given: two atomic additions for each, at every row. Over hypotheses nothing is counted
+# in any case, and so compiled LLVM takes them one at a time.
+per_row = njit(forceinline=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]

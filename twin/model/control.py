@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.model import theta as c
-from twin.model.compiled import compiled, inlined
+from twin.model.compiled import compiled, per_row
 from twin.signals import Command
 
 PROTECTED_SWITCHES = 6  # within ...
@@ -29,24 +29,24 @@ _BEFORE, _LEFT = range(2)
 _SUCTION, _BLOW_OFF = int(Command.SUCTION), int(Command.BLOW_OFF)
 
 
-@inlined
+@per_row
 def _two_point(before, vacuum, high, low):  # type: ignore[no-untyped-def]
     return 1 if vacuum >= high else (0 if vacuum < low else before)
 
 
-@inlined
+@per_row
 def air_saving(before, vacuum, k, i):  # type: ignore[no-untyped-def]
     """H1: reached from its switching point on, until vacuum is below it by the hysteresis."""
     return _two_point(before, vacuum, k[c.H1, i], k[c.H1_LOW, i])
 
 
-@inlined
+@per_row
 def part_present(before, vacuum, k, i):  # type: ignore[no-untyped-def]
     """H2: the part is there from the switching point on, with its hysteresis."""
     return _two_point(before, vacuum, k[c.H2, i], k[c.H2_LOW, i])
 
 
-@compiled
+@per_row
 def switch(control, asked, vacuum, dt, k, i):  # type: ignore[no-untyped-def]
     """Say whether the nozzle is to be on: suction is ``asked`` for and air is not being saved.
 
@@ -74,7 +74,7 @@ def switch(control, asked, vacuum, dt, k, i):  # type: ignore[no-untyped-def]
     return control[SAVING] == 0.0
 
 
-@compiled
+@per_row
 def _protect(control):  # type: ignore[no-untyped-def]
     """Remember a switching; give up saving air when there were too many."""
     oldest = SWITCHES
@@ -91,7 +91,7 @@ def new_timer() -> npt.NDArray[np.float64]:
     return np.zeros(2)
 
 
-@compiled
+@per_row
 def told(timer, commands, dt, mode, duration):  # type: ignore[no-untyped-def]
     """What the valves are told (``Command`` bits), as ``timed`` for one row."""
     command, before = commands & (_SUCTION | _BLOW_OFF), int(timer[_BEFORE])

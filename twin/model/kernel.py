@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.model import theta as c
-from twin.model.compiled import compiled, inlined
+from twin.model.compiled import compiled, inlined, per_row
 from twin.model.control import air_saving, new_timer, nothing_done, part_present, switch, timed
 from twin.model.gas import GAMMA, R
 from twin.model.plant import (
@@ -420,7 +420,7 @@ def _synchronise(state, levels, k):  # type: ignore[no-untyped-def]
         state[VALID, i] = 1.0
 
 
-@inlined
+@per_row
 def _read(state, k, expected, signals):  # type: ignore[no-untyped-def]
     """Write what each hypothesis expects, and the signals it hands out: none where it waits."""
     for i in range(state.shape[1]):
@@ -480,7 +480,7 @@ def _advance(state, theta, dt, phase, level, expected, signals, tolerance):  # t
         _together(state, k, driven, out, first, LANES, tolerance)
 
 
-@inlined
+@per_row
 def _seen_by_control(state, k, i):  # type: ignore[no-untyped-def]
     """Vacuum (Pa) at the sensor that the ejector's own control acts on."""
     if k[c.CONTROL_SENSOR, i] == c.PLC:
@@ -488,7 +488,7 @@ def _seen_by_control(state, k, i):  # type: ignore[no-untyped-def]
     return k[c.AMBIENT, i] - state[PORT, i]
 
 
-@inlined
+@per_row
 def _decide(state, controls, told, dt, k, phases):  # type: ignore[no-untyped-def]
     """Say which phases the ejectors' own controls make of what the valves are told."""
     for i in range(state.shape[1]):

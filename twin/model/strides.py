@@ -15,7 +15,7 @@ import numpy as np
 
 from twin.model import kernel
 from twin.model import theta as c
-from twin.model.compiled import compiled, inlined
+from twin.model.compiled import compiled, per_row
 from twin.model.control import timed
 from twin.model.kernel import (
     BLOW,
@@ -120,7 +120,7 @@ def _carried(strides: Strides) -> tuple[State, State, State, Floats]:
     return strides.now, strides.begin, strides.end, strides.clock
 
 
-@inlined
+@per_row
 def _until_jump(state, k):  # type: ignore[no-untyped-def]
     """Seconds until the next valve acts."""
     first = NEVER
@@ -131,7 +131,7 @@ def _until_jump(state, k):  # type: ignore[no-untyped-def]
     return first
 
 
-@inlined
+@per_row
 def _planned(begin, k, moving, before, tolerance):  # type: ignore[no-untyped-def]
     """Length of the next step (s): smooth within, and ending where a valve acts.
 
@@ -178,7 +178,7 @@ def _stride(begin, end, clock, k, longest, tolerance):  # type: ignore[no-untype
     clock[_LENGTH] = clock[_BEFORE] = h
 
 
-@inlined
+@per_row
 def _drawn(begin, end, clock, k):  # type: ignore[no-untyped-def]
     """Draw the course over a step of what is read: a cubic, and a straight line at the port."""
     lag = (k[c.SENSOR_LAG, 0] + k[c.SLOW_SENSOR, 0]) / clock[_LENGTH]
@@ -190,7 +190,7 @@ def _drawn(begin, end, clock, k):  # type: ignore[no-untyped-def]
     clock[_PORT], clock[_PORT + 1] = begin[PORT, 0], end[PORT, 0] - begin[PORT, 0]
 
 
-@inlined
+@per_row
 def _on(carried, k, dt, tolerance):  # type: ignore[no-untyped-def]
     """Go on by ``dt`` seconds, and read."""
     now, begin, end, clock = carried
@@ -220,7 +220,7 @@ def _arrive(carried, k, tolerance):  # type: ignore[no-untyped-def]
     clock[_SINCE] = clock[_LENGTH] = 0.0
 
 
-@inlined
+@per_row
 def _set_out(carried):  # type: ignore[no-untyped-def]
     """Go on from where ``now`` was put, by the shortest steps first."""
     now, begin, end, clock = carried

@@ -11,7 +11,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from twin.model.compiled import compiled, inlined
+from twin.model.compiled import compiled, per_row
 from twin.model.term import AGAIN
 from twin.signals import MS, Phase
 
@@ -165,7 +165,7 @@ def _add_lines(number, drawn, values, sums):  # type: ignore[no-untyped-def]
             _add(sums[number[last]], 1.0, values[after])
 
 
-@inlined
+@per_row
 def _add(total, times, values):  # type: ignore[no-untyped-def]
     """Add so many times the values."""
     for i in range(len(total)):
@@ -229,7 +229,7 @@ def sparse_rows(begins, since):  # type: ignore[no-untyped-def]
     return kept[:count].copy()
 
 
-@inlined
+@per_row
 def _apart(since):  # type: ignore[no-untyped-def]
     """Rows from one that is kept so many rows after a bend to the next."""
     return min(max(since // SPARSE, 1), FARTHEST)

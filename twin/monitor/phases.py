@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.model import theta as c
-from twin.model.compiled import compiled, inlined
+from twin.model.compiled import compiled, per_row
 from twin.model.control import new_timer, timed
 from twin.model.gas import GAMMA, R
 from twin.model.plant import suction_at
@@ -82,7 +82,7 @@ def expected_knees(theta: Theta, noise: float) -> Knees:
     )
 
 
-@inlined
+@per_row
 def _line(pressure, start, rows):  # type: ignore[no-untyped-def]
     """Slope (Pa per row) and middle of a straight line through ``rows`` values from ``start``.
 
@@ -142,7 +142,7 @@ def _bends_at(pressure, first, jump, last, noise):  # type: ignore[no-untyped-de
     return (right - left) / (noise * math.sqrt(12.0 / before**3 + 12.0 / after**3))
 
 
-@inlined
+@per_row
 def _break_at(pressure, row, window, noise, nozzle_on):  # type: ignore[no-untyped-def]
     """Significance of the slope's break at ``row`` and the level there; 0 where it is no knee.
 
@@ -230,7 +230,7 @@ def _unsettled(state, look):  # type: ignore[no-untyped-def]
     return reach + (int(state[_BEST_AGE]) + 1 if state[_BEST] > 0.0 else 0)
 
 
-@inlined
+@per_row
 def _idle(state, pressure, row, level):  # type: ignore[no-untyped-def]
     """Keep the mean of the last idle rows; the first of a stretch anchor the model."""
     if math.isnan(pressure[row]):
@@ -256,7 +256,7 @@ def _idle_level(state, pressure, row):  # type: ignore[no-untyped-def]
     return mean if math.isnan(level) else level
 
 
-@inlined
+@per_row
 def _look(state, pressure, row, look, may_bend, phase, level):  # type: ignore[no-untyped-def]
     """Follow the break's significance over the rows and settle on its peak."""
     window, noise, nozzle_on = int(look[0]), look[1], state[_NOZZLE] > 0.0
