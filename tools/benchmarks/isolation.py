@@ -26,7 +26,7 @@ from twin.model.dataset import coefficients
 from twin.model.effects import EFFECTS
 from twin.monitor.bank import SUSPECTS, UNSURE_OF
 from twin.monitor.bins import Floats
-from twin.monitor.cycles import CycleCutter, figures
+from twin.monitor.cycles import CycleCutter, Look, figures
 from twin.monitor.detect import RIVAL, Monitor
 from twin.monitor.isolation import Isolation
 from twin.monitor.statistics import Said
@@ -125,9 +125,12 @@ def heard(
     ambient = float(twin.theta[c.AMBIENT])
     for block in blocks(rig, seconds, seed=seed, block=20_000):
         rows, ticks = twin.advance(block)
-        for cycle in cutter.push(rows, ticks):
-            fit = cycle.complete and cycle.settled
-            if isolation.judge(cycle, fit, figures(cycle, ambient)) is not None:
+        looks = [
+            Look(one, None, figures(one, ambient), one.complete and one.settled)
+            for one in cutter.push(rows, ticks)
+        ]
+        for said in isolation.hear(looks):
+            if said and isolation.judge(said) is not None:
                 yield isolation.heard
 
 

@@ -1,10 +1,10 @@
 """Cycles cut out of the stream, and the figures each one gives."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -59,6 +59,11 @@ class Cycle:
         """PLC time of the last row."""
         return int(self.samples["time_ns"][-1])
 
+    @property
+    def seconds(self) -> float:
+        """PLC time from the first row to the last (s)."""
+        return float(self.end_ns - int(self.samples["time_ns"][0])) * NS
+
     @cached_property
     def off(self) -> npt.NDArray[np.float64]:
         """Measured less expected pressure (mbar), row by row; NaN where either cannot be used."""
@@ -68,6 +73,15 @@ class Cycle:
     def stale(self) -> bool:
         """Whether nobody knows what was commanded during some of it: the model may be anywhere."""
         return bool((self.samples["quality"] & STALE).any())
+
+
+class Look(NamedTuple):
+    """What is seen of a cycle before anything is judged."""
+
+    cycle: Cycle
+    before: Cycle | None
+    figures: Mapping[str, float]
+    fit: bool  # to be judged
 
 
 class Told(Protocol):

@@ -6,7 +6,7 @@ differ where no single one does. It is cleared, with hysteresis, when all are ba
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -18,14 +18,14 @@ from twin.events import Event, Kind
 from twin.model import theta as c
 from twin.model.theta import Theta
 from twin.monitor.clock import ClockWatch
-from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, Teller, Told, figures
+from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, Look, Teller, Told, figures
 from twin.monitor.healthy import Healthy
 from twin.monitor.signatures import Likeness, drawn_rows, likenesses, look_alikes
 from twin.settings import Settings
 from twin.signals import BREAK, NS, SAMPLE, TICK, Quality, Samples, Ticks, joined
 
 if TYPE_CHECKING:  # its SciPy would be imported with every configuration
-    from twin.monitor.isolation import Isolation, Verdict
+    from twin.monitor.isolation import Heard, Isolation, Verdict
 
 _UNFIT = int(Quality.OUT_OF_RANGE | Quality.OVERFLOW | Quality.STALE | Quality.BAD)
 FEWEST_SHARE = 0.95  # of a cycle's samples, to judge it: commands seen late look like a deviation
@@ -88,8 +88,8 @@ class Monitor:
             rows = slice(begin, end)
             found = list(self._stream_events(samples[rows]))
             silent = any(event.kind is Kind.PLC_BACK for event in found)
-            for cycle in self._cutter.push(samples[rows], ticks[rows]):
-                found += self._judge(cycle, silent and cycle.cut_short)
+            cycles = list(self._cutter.push(samples[rows], ticks[rows]))
+            found += self._judge(cycles, silent)
             found += self.clocks.push(samples[rows]) if self.clocks else []
             events += sorted(found, key=_order)  # as if row by row
         if self.teller:
@@ -109,7 +109,7 @@ class Monitor:
     def close(self) -> list[Event]:
         """Judge the cycle that the end cut off, and say what is still to be said of the clocks."""
         stale = bool(self._silences)
-        events = [event for one in self._cutter.flush() for event in self._judge(one, stale)]
+        events = self._judge(list(self._cutter.flush()), stale)
         return events + (self.clocks.close() if self.clocks else [])
 
     # --- the stream -----------------------------------------------------------------------------
@@ -192,17 +192,32 @@ class Monitor:
 
     # --- the cycles -----------------------------------------------------------------------------
 
-    def _judge(self, cycle: Cycle, silent: bool) -> list[Event]:
-        """Its figures, and an alarm; none of one that a silent PLC cut off."""
+    def _judge(self, cycles: Sequence[Cycle], silent: bool) -> list[Event]:
+        """Their figures, and alarms; none of one that a ``silent`` PLC cut off.
+
+        Each step is taken for all of them before the next one. So its code stays in the processor's
+        caches, and what a cycle costs while a log is replayed is a third less.
+        """
+        looks = [self._look(cycle, silent and cycle.cut_short) for cycle in cycles]
+        told = [self.teller.take(one) if self.teller else None for one in cycles]
+        heard = self.isolation.hear(looks) if self.isolation else [None] * len(cycles)
+        found = map(self._conclude, looks, told, heard)
+        return [event for events in found for event in events]
+
+    def _look(self, cycle: Cycle, silent: bool) -> Look:
+        """Its figures, and whether it can be judged."""
         before, self._before = self._before, cycle
-        found = figures(cycle, self.theta[c.AMBIENT])
-        told = self.teller.take(cycle) if self.teller else None
         whole = cycle.complete or len(cycle.samples) >= LONGEST_PIECE
         stale = silent or cycle.stale or (before is not None and before.stale)
-        judged = whole and cycle.settled and cycle.coverage >= FEWEST_SHARE and not stale
+        fit = whole and cycle.settled and cycle.coverage >= FEWEST_SHARE and not stale
+        return Look(cycle, before, figures(cycle, self.theta[c.AMBIENT]), fit)
+
+    def _conclude(self, look: Look, told: Told | None, heard: "Heard | None") -> list[Event]:
+        """What there is to say of a cycle, and an alarm if it is one."""
+        cycle, before, found, judged = look
         worst = self._worst(found) if judged else None
         far = abs(worst.sigmas) if worst else 0.0
-        verdict = self._isolate(cycle, judged, found, far)
+        verdict = self._isolate(heard, far)
         events = [_summary(cycle, found, told, verdict)] if cycle.complete or told else []
         if not judged or (worst is None and verdict is None):
             return events
@@ -231,14 +246,11 @@ class Monitor:
         """Whether cycles differ together, if no single one does."""
         return self.isolation is not None and self.isolation.stands
 
-    def _isolate(
-        self, cycle: Cycle, judged: bool, found: Mapping[str, float], far: float
-    ) -> "Verdict | None":
+    def _isolate(self, heard: "Heard | None", far: float) -> "Verdict | None":
         """What the isolation holds; it does not learn what is usual from what is far out."""
-        if self.isolation is None:
+        if self.isolation is None or heard is None:
             return None
-        far = far if far >= self.settings.raise_sigma else 0.0
-        return self.isolation.judge(cycle, judged, found, far)
+        return self.isolation.judge(heard, far if far >= self.settings.raise_sigma else 0.0)
 
     def _worst(self, found: Mapping[str, float]) -> Outlier | None:
         outliers = []

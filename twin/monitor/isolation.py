@@ -8,8 +8,9 @@ model has wrong about a signature does not, so a share of what is explained coun
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,11 +27,11 @@ from twin.monitor.change import (
     began,
     limit,
 )
-from twin.monitor.cycles import Cycle
+from twin.monitor.cycles import Cycle, Look
 from twin.monitor.healthy import Healthy
 from twin.monitor.statistics import Listener, Said
 from twin.monitor.weights import whitened
-from twin.signals import NS, SAMPLE, TICK, Samples, Ticks
+from twin.signals import SAMPLE, TICK, Samples, Ticks
 
 DAY_S = 86_400.0
 KEPT = 400  # cycles that are remembered: a change is not sought further back
@@ -41,6 +42,14 @@ MISMATCH = 0.08  # of what a suspect explains, is off in its signature
 DOUBTED = 0.05  # probability that anything differs, from which on it is asked what
 RETURNED = float(np.log(1000.0))  # of the odds that it is as before, for it to be over
 FEWEST_BACK = 3  # cycles to be sure of that, however far it was
+
+
+class Heard(NamedTuple):
+    """What a cycle that is fit to be judged says."""
+
+    said: Said
+    scores: Floats
+    seconds: float  # how long it was
 
 
 @dataclass(frozen=True)
@@ -138,21 +147,29 @@ class Isolation:
         averaged(np.zeros(2, np.uint8), np.zeros(2), drawn, expected)
         return cls(Bank(listener.theta), listener, days)
 
-    def judge(
-        self, cycle: Cycle, fit: bool, figures: Mapping[str, float], far: float = 0.0
-    ) -> Verdict | None:
-        """Take the rows of a cycle or piece, in order; say what is held if it is ``fit`` to say.
+    def hear(self, looks: Sequence[Look]) -> list[Heard | None]:
+        """Take cycles and pieces, in order, and what the monitor has of them; say what they say."""
+        drawn = [self._bank.take(look.cycle) for look in looks]
+        said = [
+            self._listener.hear(look.cycle, *rows, look.figures)
+            if look.fit and look.cycle.complete
+            else None
+            for look, rows in zip(looks, drawn, strict=True)
+        ]
+        return [
+            Heard(one, one.scores(), look.cycle.seconds) if one else None
+            for look, one in zip(looks, said, strict=True)
+        ]
 
-        ``far`` are the sigmas by which this cycle alone is out, if it is: from such a one nothing
-        is learned, and if it is much farther than those before, the cause is sought from it on.
+    def judge(self, heard: Heard, far: float = 0.0) -> Verdict | None:
+        """Say what is held after a cycle, the next one in order.
+
+        ``far`` are the sigmas by which it alone is out, if it is: from such a one nothing is
+        learned, and if it is much farther than those before, the cause is sought from it on.
         """
-        drawn = self._bank.take(cycle)
-        said = self._listener.hear(cycle, *drawn, figures) if fit and cycle.complete else None
-        if said is None:
-            return None
+        said, scores, seconds = heard
         self._cycles += 1
-        self._seconds += float(cycle.end_ns - int(cycle.samples["time_ns"][0])) * NS
-        scores = said.scores()
+        self._seconds += seconds
         normal = self._reference.standard(scores)
         self._kept.append((said, normal))
         verdict = self._conclude(self._changes, normal, far) if self._changes else None
