@@ -113,9 +113,9 @@ def run(
             closing.callback(close)
         for block in source:
             silent: list[Event] = []
-            fresh = block[(block["quality"] & Quality.STALE) == 0]
+            fresh = np.flatnonzero((block["quality"] & Quality.STALE) == 0)
             if len(fresh):
-                last = fresh[-1].copy()
+                last = block[fresh[-1]].copy()
             elif last is not None:
                 silent = monitor.silent(last, clock())
             samples, ticks = twin.advance(block)

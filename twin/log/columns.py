@@ -256,29 +256,33 @@ class Tray:
 
     def __init__(self, size: int) -> None:
         self._size = size
-        self._filled = 0
+        self._begin()
+
+    def _begin(self) -> None:
         # As raw bytes: NumPy copies structured rows field by field, 20 times slower.
-        self._samples = np.empty(size, (np.void, SAMPLE.itemsize))
-        self._ticks = np.empty(size, (np.void, TICK.itemsize))
+        self._samples = np.empty(self._size, (np.void, SAMPLE.itemsize))
+        self._ticks = np.empty(self._size, (np.void, TICK.itemsize))
+        self._filled = 0
 
     def add(self, samples: Samples, ticks: Ticks) -> Iterator[tuple[Samples, Ticks]]:
         """Take rows in; hand out each block as it fills up, what is one already as it is."""
-        if not self._filled and len(samples) == self._size:
-            yield samples, ticks
-            return
         rows, beside = samples.view(self._samples.dtype), ticks.view(self._ticks.dtype)
         start = 0
         while start < len(rows):
-            stop = start + min(self._size - self._filled, len(rows) - start)
-            end = self._filled + stop - start
-            self._samples[self._filled : end] = rows[start:stop]
-            self._ticks[self._filled : end] = beside[start:stop]
-            start, self._filled = stop, end
+            stop = min(start + self._size - self._filled, len(rows))
+            if stop - start == self._size:
+                yield samples[start:stop], ticks[start:stop]
+            else:
+                end = self._filled + stop - start
+                self._samples[self._filled : end] = rows[start:stop]
+                self._ticks[self._filled : end] = beside[start:stop]
+                self._filled = end
+            start = stop
             if self._filled == self._size:
                 yield self.take()
 
     def take(self) -> tuple[Samples, Ticks]:
         """Hand out what is in it, maybe nothing; it is empty afterwards."""
-        samples, ticks = self._samples[: self._filled].copy(), self._ticks[: self._filled].copy()
-        self._filled = 0
+        samples, ticks = self._samples[: self._filled], self._ticks[: self._filled]
+        self._begin()
         return samples.view(SAMPLE), ticks.view(TICK)
