@@ -205,6 +205,7 @@ def replay(
 ) -> None:
     """Run the same loop over a recorded log, as fast as it goes."""
     with _unwatched():
+        from twin.live import REPLAYED
         from twin.live import run as run_loop
         from twin.log.reader import open_log
         from twin.log.recorder import Recorder
@@ -222,7 +223,7 @@ def replay(
             lambda: console,
             (lambda: kept) if kept else None,
         )
-        blocks = _progress((samples for samples, _ in recorded.blocks()), "replaying")
+        blocks = _progress((samples for samples, _ in recorded.blocks(REPLAYED)), "replaying")
         run_loop(_until(stopped, blocks), twin, monitor, sinks, advisers=[alarms])
     if json_file is not None and kept is not None:
         write_json(json_file, {"log": str(log), "events": kept.events})

@@ -20,6 +20,8 @@ from twin.monitor.phases import Found, Knees, PhaseFinder, expected_knees
 from twin.monitor.signatures import steps
 from twin.signals import MBAR, SAMPLE, TICK, Quality, Samples, Ticks
 
+REPLAYED = 60_000  # rows that a replay takes at once: what is done to many cycles stays in caches
+
 
 class Sink(Protocol):
     """Whatever takes the result: a log, a view, an alarm output."""

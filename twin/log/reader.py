@@ -19,7 +19,6 @@ from twin.log.records import Damage, is_complete, messages, records
 from twin.log.schema import EVENTS, SAMPLES
 from twin.signals import Samples, Ticks
 
-MINUTE = 60_000  # rows: what is done to many cycles at once finds its code in the caches
 _UNDECODABLE = (ValueError, struct.error, DecodeError)
 
 
@@ -36,7 +35,7 @@ class Log:
     parts: tuple[Path, ...]
     complete: bool  # every part was finished by its writer
 
-    def blocks(self, size: int = MINUTE) -> Iterator[tuple[Samples, Ticks]]:
+    def blocks(self, size: int = 10_000) -> Iterator[tuple[Samples, Ticks]]:
         """Rows of SAMPLE and TICK in written order, ``size`` at a time and the rest at the end."""
         tray = Tray(size)
         for part in self.parts:
