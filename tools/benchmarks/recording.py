@@ -18,7 +18,7 @@ from twin.signals import MS, NS, Samples, Ticks
 
 HOUR_S = 3600.0
 MINUTE = 60_000  # rows
-BLOCK = 10_000  # rows, as a replay takes them
+BLOCK = 10_000  # rows of a message in a log
 LIVE_BLOCK = 30  # rows that a live driver receives at once
 
 
@@ -31,10 +31,10 @@ class Recording:
     samples: Samples
     ticks: Ticks
 
-    def blocks(self) -> list[tuple[Samples, Ticks]]:
-        """Views of the rows, ``BLOCK`` at a time."""
-        starts = range(0, len(self.samples), BLOCK)
-        return [(self.samples[at : at + BLOCK], self.ticks[at : at + BLOCK]) for at in starts]
+    def blocks(self, size: int = BLOCK) -> list[tuple[Samples, Ticks]]:
+        """Views of the rows, ``size`` at a time."""
+        starts = range(0, len(self.samples), size)
+        return [(self.samples[at : at + size], self.ticks[at : at + size]) for at in starts]
 
 
 def new_twin(config: Config) -> Twin:

@@ -13,8 +13,9 @@ from benchmarks.figures import Measured, Run
 from benchmarks.kernel import Advance, first_rows, in_c, timed
 from benchmarks.machine import TWIN_CORE, on_core
 from benchmarks.processes import TWIN, usage
-from benchmarks.recording import BLOCK, HOUR_S, MINUTE, hour, new_twin
+from benchmarks.recording import HOUR_S, MINUTE, hour, new_twin
 from twin.cli import pair_of
+from twin.live import REPLAYED
 from twin.log.recorder import Recorder
 from twin.signals import Samples, Ticks
 
@@ -37,7 +38,7 @@ def end_to_end(run: Run) -> Sequence[Measured]:
     """Time (s) of ``twin replay`` over an hour, its speed, and the twin's and monitor's parts."""
     whole, native = replays(run, HOUR_MIN), in_c(run.folder)
     model, expecting, monitoring = [], [], []
-    part = hour().blocks()[: PART_MIN * MINUTE // BLOCK]
+    part = hour().blocks(REPLAYED)[: PART_MIN * MINUTE // REPLAYED]
     with on_core(TWIN_CORE):
         for number in range(REPEATS):
             run.tell(f"replay: its parts, {number + 1} of {REPEATS}")
