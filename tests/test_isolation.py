@@ -90,7 +90,7 @@ def test_probabilities_are_of_one_cause_or_none() -> None:
 
 def test_what_is_told_does_not_depend_on_blocks() -> None:
     assert events("gripper", [f"leakage=0.5@c{BEGINS}"], size=47) == events(
-        "gripper", [f"leakage=0.5@c{BEGINS}"], size=5000
+        "gripper", [f"leakage=0.5@c{BEGINS}"], size=60_000
     )
 
 
