@@ -205,6 +205,20 @@ def test_events_are_shown_when_they_happened(tmp_path: Path) -> None:
     assert (log[1].level, log[1].message, log[1].name) == (3, "12 samples are missing", "gap")
 
 
+def test_an_event_was_received_with_the_last_row_that_is_not_later(tmp_path: Path) -> None:
+    samples, ticks = course(60)
+    samples["host_ns"] = START_NS + 10**9 + np.arange(60)
+    samples["time_ns"][40:] -= 30_000_000  # the PLC's clock was set back by thirty rows
+    # By microseconds; of what was before all of them, the last one.
+    rows = {-1000: 59, 0: 0, 5000: 5, 5500: 5, 20_000: 50, 35_000: 59}
+    events = [Event(START_NS + us * 1000, Kind.CYCLE, "") for us in rows]
+    with Recorder(tmp_path / "a.mcap", HEADER) as recorder:
+        recorder.write(samples, ticks, events)
+    found = [message for message, _ in messages(tmp_path / "a.mcap", "/events")]
+    received = {(one.publish_time - START_NS) // 1000: one.log_time for one in found}
+    assert received == {us: samples["host_ns"][row] for us, row in rows.items()}
+
+
 def test_times_before_1970_are_kept_in_the_columns(tmp_path: Path) -> None:
     record(tmp_path / "a.mcap", *awkward())
     assert rows_of(open_log(tmp_path / "a.mcap"))[0] == awkward()[0].tobytes()
