@@ -9,8 +9,9 @@ import pytest
 import rigs
 
 from twin.events import Event, Kind
+from twin.model import theta as c
 from twin.monitor.bank import SUSPECTS, Bank, hypotheses
-from twin.monitor.cycles import Cycle
+from twin.monitor.cycles import Cycle, Look, cut, figures
 from twin.monitor.detect import Monitor, MonitorSettings
 from twin.monitor.healthy import Healthy
 from twin.monitor.isolation import Isolation
@@ -117,6 +118,22 @@ def _edge(samples: Samples, cycle: int) -> int:
     """The row at which a cycle's suction begins."""
     edges = np.flatnonzero(np.diff((samples["commands"] == 1).astype(int)) == 1) + 1
     return int(edges[cycle])
+
+
+def test_only_what_is_fit_to_be_judged_says_something() -> None:
+    samples, _ = rigs.recorded("gripper", 12.0)
+    cycles = list(cut([rigs.expectation(rigs.twin("gripper"), [samples])]))
+    ambient = float(rigs.theta("gripper")[c.AMBIENT])
+    looks = [Look(one, None, figures(one, ambient), fit=one.index != 2) for one in cycles]
+    isolation = rigs.isolating("gripper").isolation
+    assert isolation
+    heard = isolation.hear(looks)
+    saying = {one.index: said for one, said in zip(cycles, heard, strict=True) if said}
+    assert list(saying) == [one.index for one in cycles if one.complete and one.index != 2]
+    for one in cycles:
+        if one.index in saying:
+            lasted = np.ptp(one.samples["time_ns"]) * 1e-9
+            assert saying[one.index].seconds == pytest.approx(lasted)
 
 
 def test_what_is_far_out_is_not_learned_as_usual() -> None:
