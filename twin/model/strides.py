@@ -22,7 +22,6 @@ from twin.model.kernel import (
     BLOWING,
     FELT,
     LONGEST_BRIDGE,
-    LONGEST_STEP,
     NEVER,
     NOZZLE,
     PHASE,
@@ -32,13 +31,15 @@ from twin.model.kernel import (
     SIGNALS,
     STATE,
     VALID,
+    VESSEL,
     Bytes,
     Floats,
     State,
 )
-from twin.model.plant import G, Gas, prepare, put
+from twin.model.plant import G, Gas, at_sensor, prepare, put
 
 TOLERANCE = 0.05  # Pa, of a step: within 0.4 of the exact solution on the shipped rigs
+LONGEST_STEP = 15e-3  # s; the course between its ends does not follow further
 SHORTEST_STEP = 40e-6  # s, after a jump of a valve or a cup, and where the exhaust opens
 LONGER = 2.0  # at most so many times as long as the step before
 SURE = 0.9  # of the length at which the error should be just within tolerance
@@ -47,9 +48,11 @@ TOO_FAR = 1.5  # times the tolerance: the step is done again, shorter
 # The clock of a step under way: how long ago it began, its length, that of the last one (s), and
 # the course of what is read, as polynomials of how much of the step has passed (0 to 1).
 _SINCE, _LENGTH, _BEFORE = range(3)
-_SENSED, _PORT = 3, 7
-CLOCK = 9
+_SENSED, _PORT = 3, 9
+CLOCK = 11
 GAS = len(Gas._fields)  # rows of the state, the first ones
+# While a step is made there are behind the state where the gas may be and how it moved before.
+_GUESS, _RATE = STATE, STATE + GAS
 
 
 def _nowhere() -> State:
@@ -89,8 +92,8 @@ def advance(
     tolerance: float = TOLERANCE,
 ) -> None:
     """Step over a block as ``kernel.advance`` does, within ``tolerance`` (Pa) per step."""
-    driven = dt, np.ascontiguousarray(phase), level
-    _advance(_carried(strides), theta.reshape(-1, 1), driven, (expected, signals), tolerance)
+    driven, out = (dt, np.ascontiguousarray(phase), level), (expected, signals)
+    _advance(_carried(strides), theta.reshape(-1, 1), driven, out, tolerance)
 
 
 def run_on(
@@ -139,7 +142,7 @@ def _planned(begin, k, moving, before, tolerance):  # type: ignore[no-untyped-de
     there the exhaust opens.
     """
     rough = begin[ROUGH, 0]
-    longest = LONGEST_STEP * math.sqrt(math.sqrt(tolerance / TOLERANCE))  # for what is read
+    longest = LONGEST_STEP * (tolerance / TOLERANCE) ** (1.0 / 6.0)  # for what is read
     h = min(longest, LONGER * before)
     h = min(h, SURE * (tolerance / rough) ** (1.0 / 3.0)) if rough > 0.0 else h
     while h > SHORTEST_STEP and kernel._release(begin, k, h, 0):
@@ -160,16 +163,16 @@ def _stride(begin, end, clock, k, longest, tolerance):  # type: ignore[no-untype
 
     Where the gas stands at its first stage is guessed by going on as in the step before.
     """
-    mine, rate = np.empty((STATE + GAS, 1)), np.empty(GAS)  # shapes that the compiler knows
+    mine = np.empty((_RATE + GAS, 1))  # a shape that the compiler knows
     for row in range(GAS):
-        rate[row] = (end[row, 0] - begin[row, 0]) / clock[_BEFORE]
+        mine[_RATE + row, 0] = (end[row, 0] - begin[row, 0]) / clock[_BEFORE]
     put(begin, 0, end, 0)
-    h = min(_planned(begin, k, rate[PORT], clock[_BEFORE], tolerance), longest)
+    h = min(_planned(begin, k, mine[_RATE + PORT, 0], clock[_BEFORE], tolerance), longest)
     while True:
         put(mine, 0, begin, 0)
         for row in range(GAS):
-            mine[STATE + row, 0] = begin[row, 0] + G * h * rate[row]
-        kernel._substep(mine, k, h, STATE)
+            mine[_GUESS + row, 0] = begin[row, 0] + G * h * mine[_RATE + row, 0]
+        kernel._substep(mine, k, h, _GUESS)
         off = mine[ROUGH, 0] * h * h * h
         if off <= TOO_FAR * tolerance or h <= SHORTEST_STEP:
             break
@@ -179,14 +182,29 @@ def _stride(begin, end, clock, k, longest, tolerance):  # type: ignore[no-untype
 
 
 @per_row
+def _moving(state, length, k):  # type: ignore[no-untyped-def]
+    """How the sensor's reading moves, and how that changes, for steps of ``length`` seconds.
+
+    It follows, by way of what it feels, the pressure where it sits.
+    """
+    first = k[c.SENSOR_LAG, 0] / length
+    second = first + k[c.SLOW_SENSOR, 0] / length
+    felt, sensed = state[FELT, 0], state[SENSED, 0]
+    there = at_sensor(state[PORT, 0], state[VESSEL, 0], k, 0)
+    moving = (felt - sensed) / second
+    return moving, ((there - felt) / first - moving) / second
+
+
+@per_row
 def _drawn(begin, end, clock, k):  # type: ignore[no-untyped-def]
-    """Draw the course over a step of what is read: a cubic, and a straight line at the port."""
-    lag = (k[c.SENSOR_LAG, 0] + k[c.SLOW_SENSOR, 0]) / clock[_LENGTH]
-    first, last = begin[SENSED, 0], end[SENSED, 0]
-    leaving, arriving = (begin[FELT, 0] - first) / lag, (end[FELT, 0] - last) / lag
-    clock[_SENSED], clock[_SENSED + 1] = first, leaving
-    clock[_SENSED + 2] = 3.0 * (last - first) - 2.0 * leaving - arriving
-    clock[_SENSED + 3] = 2.0 * (first - last) + leaving + arriving
+    """Draw the course over a step of what is read: of fifth order, and straight at the port."""
+    first, rise = begin[SENSED, 0], end[SENSED, 0] - begin[SENSED, 0]
+    leaving, bends = _moving(begin, clock[_LENGTH], k)
+    arriving, bent = _moving(end, clock[_LENGTH], k)
+    clock[_SENSED], clock[_SENSED + 1], clock[_SENSED + 2] = first, leaving, 0.5 * bends
+    clock[_SENSED + 3] = 10.0 * rise - 6.0 * leaving - 4.0 * arriving - 1.5 * bends + 0.5 * bent
+    clock[_SENSED + 4] = -15.0 * rise + 8.0 * leaving + 7.0 * arriving + 1.5 * bends - bent
+    clock[_SENSED + 5] = 6.0 * rise - 3.0 * leaving - 3.0 * arriving - 0.5 * bends + 0.5 * bent
     clock[_PORT], clock[_PORT + 1] = begin[PORT, 0], end[PORT, 0] - begin[PORT, 0]
 
 
@@ -201,8 +219,10 @@ def _on(carried, k, dt, tolerance):  # type: ignore[no-untyped-def]
         _drawn(begin, end, clock, k)
     if clock[_LENGTH] > 0.0:
         x = clock[_SINCE] / clock[_LENGTH]
-        bent = clock[_SENSED + 2] + x * clock[_SENSED + 3]
-        now[SENSED, 0] = clock[_SENSED] + x * (clock[_SENSED + 1] + x * bent)
+        sensed = clock[_PORT - 1]
+        for power in range(_PORT - 2, _SENSED - 1, -1):
+            sensed = clock[power] + x * sensed
+        now[SENSED, 0] = sensed
         now[PORT, 0] = clock[_PORT] + x * clock[_PORT + 1]
 
 
