@@ -58,21 +58,26 @@ def _long(ms: float) -> str:
     return f"{ms:.2f} ms" if ms < 1e4 else f"{ms / 1e3:.1f} s"
 
 
-def line(x: Floats, y: Floats) -> tuple[float, float, float]:
-    """Slope, half of its 95 % interval, and value at the last ``x``; a third may be wild.
+def line(x: Floats, y: Floats) -> tuple[float, float]:
+    """Slope, and value at the last ``x``, of a line of which a third of the points may be off.
 
     Theil and Sen's line, as SciPy has it, whose import alone would take longer than a block may.
     """
-    n = len(x)
     slopes = _slopes(x, y)
     middle = [(len(slopes) - 1) // 2, len(slopes) // 2]
+    slopes.partition(middle)  # of thousands only these need be in their places
+    slope = float(slopes[middle].sum()) / 2
+    return slope, median((y - slope * (x - x[-1])).tolist())
+
+
+def slope_pm(x: Floats, y: Floats) -> float:
+    """Half of the 95 % interval of the line's slope (Sen's, without ties)."""
+    n, slopes = len(x), _slopes(x, y)
     reach = 1.96 * np.sqrt(n * (n - 1) * (2 * n + 5) / 18)
     low = max(round((len(slopes) - reach) / 2) - 1, 0)
     high = min(round((len(slopes) + reach) / 2), len(slopes) - 1)
-    slopes.partition([low, *middle, high])  # of thousands only these need be in their places
-    slope = float(slopes[middle].sum()) / 2
-    at_end = median((y - slope * (x - x[-1])).tolist())
-    return slope, float(slopes[high] - slopes[low]) / 2, at_end
+    slopes.partition([low, high])
+    return float(slopes[high] - slopes[low]) / 2
 
 
 @compiled
@@ -289,7 +294,7 @@ class ClockWatch:
         if self._sure.shape[1] < FEWEST:
             return 0.0
         x, y, late = self._sure
-        slope, _, at_end = line(x, y)
+        slope, at_end = line(x, y)
         off = point[1] - at_end - slope * (point[0] - x[-1])
         if abs(off) <= SET_NS:  # nearly always
             return 0.0
@@ -309,11 +314,12 @@ class ClockWatch:
     def _estimate(self, now: int, zero: int) -> Estimate:
         """At ``now``, which the line is drawn out to."""
         x, y, _ = self._sure
-        slope, slope_pm, at_end = line(x, y)
+        slope, at_end = line(x, y)
+        drift_pm = slope_pm(x, y)
         scatter = 1.4826 * median(np.abs(y - at_end - slope * (x - x[-1])).tolist())
-        offset_pm = 1.96 * scatter + slope_pm * float(x[-1] - x[0]) / 2
+        offset_pm = 1.96 * scatter + drift_pm * float(x[-1] - x[0]) / 2
         here = at_end + slope * (now - x[-1])
-        return Estimate(-(zero + here) * 1e-6, offset_pm * 1e-6, -slope * 1e6, slope_pm * 1e6)
+        return Estimate(-(zero + here) * 1e-6, offset_pm * 1e-6, -slope * 1e6, drift_pm * 1e6)
 
     @property
     def _sure(self) -> Floats:
