@@ -46,7 +46,7 @@ _HEAD = np.dtype(
         ("publish_time", "<u8"),
     ]
 )
-_BEFORE_LENGTH = 9  # bytes of a record up to where its length counts from
+_AFTER_LENGTH = _HEAD.itemsize - 9  # bytes of the head that its length counts
 _ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])  # of a message index
 _INDEX = struct.Struct("<BQHI")  # opcode, length, channel and length of the entries
 _FOOTER = struct.Struct("<BQQQ")  # opcode, length and the two offsets, all that its checksum covers
@@ -125,8 +125,12 @@ class Writer:
 
     def add_message(self, channel: int, log_ns: int, publish_ns: int, message: bytes) -> None:
         """Write one message."""
-        one = np.frombuffer(message, (np.void, len(message)))
-        self.add_messages(channel, np.array([log_ns]), np.array([publish_ns]), one)
+        length = _AFTER_LENGTH + len(message)
+        fields = Opcode.MESSAGE, length, channel, 0, max(log_ns, 0), max(publish_ns, 0)
+        head = np.array(fields, _HEAD)
+        record = head.tobytes() + message
+        self._open.room(len(record))[:] = np.frombuffer(record, np.uint8)
+        self._count(channel, head["log_time"][np.newaxis], len(record))
 
     def add_messages(
         self, channel: int, log_ns: Times, publish_ns: Times, messages: npt.NDArray[np.void]
@@ -137,21 +141,24 @@ class Writer:
             return
         whole = np.dtype((np.void, messages.itemsize))
         record = np.dtype([("head", _HEAD), ("message", whole)])
-        room = self._open.room(n * record.itemsize)
-        records = room.view(record)
+        records = self._open.room(n * record.itemsize).view(record)
         head = records["head"]
         head["opcode"] = Opcode.MESSAGE
-        head["length"] = record.itemsize - _BEFORE_LENGTH
+        head["length"] = _AFTER_LENGTH + messages.itemsize
         head["channel"] = channel
         head["sequence"] = 0
         head["log_time"] = np.maximum(log_ns, 0)
         head["publish_time"] = np.maximum(publish_ns, 0)
         records["message"] = messages.view(whole)
-        entries = np.empty(n, _ENTRY)
-        entries["log_time"] = head["log_time"]
-        entries["offset"] = self._open.size + record.itemsize * np.arange(n)
+        self._count(channel, head["log_time"], record.itemsize)
+
+    def _count(self, channel: int, times: npt.NDArray[np.uint64], length: int) -> None:
+        """Take in records of one ``length`` (bytes) that have been laid out."""
+        entries = np.empty(len(times), _ENTRY)
+        entries["log_time"] = times
+        entries["offset"] = self._open.size + length * np.arange(len(times))
         self._open.entries.setdefault(channel, []).append(entries)
-        self._open.size += len(room)
+        self._open.size += length * len(times)
         if self._open.size > CHUNK:
             self.flush()
 
