@@ -303,7 +303,7 @@ def test_while_a_cycle_may_go_as_a_known_one_nothing_is_stepped(
 def test_few_drawings_are_kept_and_the_last_ones_used() -> None:
     bank, _, known = beside("gripper")
     before = known
-    for number in range(3 * KEPT):
+    for number in range(2 * KEPT):
         other = later(longer(known, Phase.SUCTION, 30 * (number + 1)), before)
         bank.take(other)
         assert len(bank._drawings) <= KEPT
@@ -312,7 +312,7 @@ def test_few_drawings_are_kept_and_the_last_ones_used() -> None:
     kept = [one.stretches.how[0, 0] for one in bank._drawings._kept]
     first = int(np.sum(known.ticks["phase"] == Phase.SUCTION)) - 1
     assert first in kept
-    assert sorted(kept)[1:] == [first + 30 * (3 * KEPT - n) for n in reversed(range(KEPT - 1))]
+    assert sorted(kept)[1:] == [first + 30 * (2 * KEPT - n) for n in reversed(range(KEPT - 1))]
     assert all(len(one.drawn) <= LONGEST_PIECE for one in bank._drawings._kept)
     assert bank._seen == len(bank._expected) == 0
 

@@ -14,7 +14,7 @@ from twin.model import kernel
 from twin.monitor.bins import Floats, Ints
 from twin.signals import MBAR
 
-KEPT = 8  # drawings: a program or two, with what jitters
+KEPT = 16  # drawings: a few programs, with what jitters
 LONGER = 0.02  # of how long a stretch lasts; signatures differ by about as large a share of them
 LONGER_MS = 6.0  # or so much, in a short one
 LEVEL = 3.0 * MBAR  # Pa, by which a level may differ
