@@ -280,8 +280,8 @@ def _finer(state, k, h, tolerance):  # type: ignore[no-untyped-def]
 def _substep(state, k, h, guess):  # type: ignore[no-untyped-def]
     """Advance every hypothesis by ``h`` seconds; this loop is run on several of them at once.
 
-    From row ``guess`` on is the gas as it may be at the step's first stage: 0 is as it is now. Were
-    it in another array, LLVM would run the loop on one at a time.
+    From row ``guess`` on is the gas as it may be at the step's first stage: 0 is as it is now, and
+    far off. Were it in another array, LLVM would run the loop on one at a time.
     """
     for i in range(state.shape[1]):
         nozzle = _valve(state, NOZZLE, h, k, c.RESPONSE, i)
@@ -315,8 +315,8 @@ def _substep(state, k, h, guess):  # type: ignore[no-untyped-def]
             state[guess + FAR, i],
         )
         before, open_cup = gas.vessel, state[OPEN, i]
-        valves = nozzle, blow, open_cup
-        gas, lags, off = advance_gas(gas, lags, ahead, guess == 0, h, valves, k, i)
+        valves, passes = (nozzle, blow, open_cup), 1 if guess else 3
+        gas, lags, off = advance_gas(gas, lags, ahead, passes, h, valves, k, i)
         state[PORT, i], state[PORT_MASS, i] = gas.port, gas.port_mass
         state[VESSEL, i], state[VESSEL_MASS, i] = gas.vessel, gas.vessel_mass
         state[LINE, i], state[LINE_MASS, i] = gas.line, gas.line_mass

@@ -43,6 +43,8 @@ _B1 = -(6.0 * G * G - 16.0 * G + 1.0) / 4.0 / G
 _B2 = (6.0 * G * G - 20.0 * G + 5.0) / 4.0 / G
 # A port is so small that nearly all of what its stages are off by is gone at the end of the step.
 PORT_COUNTS = 0.1
+# What a pass leaves unsolved is the less of what it moved (Pa) the shorter the stage (s) is.
+CLOSE = 5e-5  # Pa s
 
 
 class Gas(NamedTuple):
@@ -337,11 +339,12 @@ def at_sensor(port, vessel, k, i):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def stage(guess, known, lags, step, valves, far_off, k, i):  # type: ignore[no-untyped-def]
+def stage(guess, known, lags, step, valves, passes, k, i):  # type: ignore[no-untyped-def]
     """Solve one implicit stage of ``step`` seconds from ``known`` gas and ``lags``.
 
-    A pass brings the guess nearer by about one order in the step, so a ``far_off`` guess, which is
-    no more than where the step began, takes three for a scheme of third order, others two.
+    A pass brings the guess nearer by about one order in the step. So for a scheme of third order
+    one that is no more than where the step began takes three ``passes``, others two; or one, and
+    another only where that moved a pressure by more than is ``CLOSE``.
     ``valves`` are the positions of nozzle and blow-off valve and whether the cup stands open, each
     0 to 1. The jet builds up in two stages: the valve opens, then the jet gathers strength.
     """
@@ -357,8 +360,10 @@ def stage(guess, known, lags, step, valves, far_off, k, i):  # type: ignore[no-u
     suction, end, blow_off = at_supply(supply, k, i)
     driven = Driven(jet, suction, end, blow_off * valve, open_cup)
     gas = solve(guess, known, step, driven, k, i)
-    gas = solve(gas, known, step, driven, k, i)
-    if far_off:
+    moved = max(abs(gas.port - guess.port), abs(gas.vessel - guess.vessel))
+    if passes > 1 or moved * step > CLOSE:
+        gas = solve(gas, known, step, driven, k, i)
+    if passes > 2:
         gas = solve(gas, known, step, driven, k, i)
     slow = k[c.SENSOR_LAG, i]
     felt = lag(lags.felt, at_sensor(gas.port, gas.vessel, k, i), step, slow)
@@ -410,21 +415,21 @@ def positive(gas):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def advance(gas, lags, guess, far_off, h, valves, k, i):  # type: ignore[no-untyped-def]
+def advance(gas, lags, guess, passes, h, valves, k, i):  # type: ignore[no-untyped-def]
     """Gas and lags after ``h`` seconds, and how far (Pa) a scheme of second order is from them.
 
     The stages stand at equal distances, so that is the second difference of what each adds.
-    ``guess`` is of the gas at the first stage, and may be ``far_off``: where the step begins.
+    ``guess`` is of the gas at the first stage, which takes ``passes``; the others two at most.
     """
     step = G * h
-    gas_1, lags_1 = stage(positive(guess), gas, lags, step, valves, far_off, k, i)
+    gas_1, lags_1 = stage(positive(guess), gas, lags, step, valves, passes, k, i)
     known, held = gas_on(gas, gas, gas_1, _A21), lags_on(lags, lags, lags_1, _A21)
     guess = positive(gas_on(gas, gas, gas_1, _FURTHER))
-    gas_2, lags_2 = stage(guess, known, held, step, valves, False, k, i)
+    gas_2, lags_2 = stage(guess, known, held, step, valves, min(passes, 2), k, i)
     last = gas_on(gas_on(gas, gas, gas_1, _B1), known, gas_2, _B2)
     late = lags_on(lags_on(lags, lags, lags_1, _B1), held, lags_2, _B2)
     guess = positive(gas_on(gas_1, gas_1, gas_2, 2.0))
-    gas_3, lags_3 = stage(guess, last, late, step, valves, False, k, i)
+    gas_3, lags_3 = stage(guess, last, late, step, valves, min(passes, 2), k, i)
     port = bent(gas_1.port - gas.port, gas_2.port - known.port, gas_3.port - last.port)
     off = (
         bent(gas_1.vessel - gas.vessel, gas_2.vessel - known.vessel, gas_3.vessel - last.vessel),
