@@ -18,6 +18,7 @@ class Board:
     def __init__(self, rules: Sequence[Rule]) -> None:
         self.alarms = {rule.name: Alarm(rule) for rule in rules}
         self._suppressible = [one for one in self.alarms.values() if one.rule.suppressed_by]
+        self._suppressing = {name for one in self._suppressible for name in one.rule.suppressed_by}
 
     def see(self, now: int, values: Mapping[str, float]) -> list[Change]:
         """Take what is new, by name; of what is not in it only time goes on."""
@@ -75,7 +76,7 @@ class Board:
 
     def _designed(self, now: int) -> Iterator[Change]:
         """Suppress what is quiet by design while another alarm is active."""
-        active = {name for name, alarm in self.alarms.items() if alarm.active}
+        active = {name for name in self._suppressing if self.alarms[name].active}
         for alarm in self._suppressible:
             yield from alarm.suppress(now, bool(active & set(alarm.rule.suppressed_by)))
 
