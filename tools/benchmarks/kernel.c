@@ -88,7 +88,7 @@ INLINED Tangent opening(double p, double ambient)
 #define FURTHER ((1.0 + G) / 2.0 / G)
 #define B1 (-(6.0 * G * G - 16.0 * G + 1.0) / 4.0 / G)
 #define B2 ((6.0 * G * G - 20.0 * G + 5.0) / 4.0 / G)
-#define PORT_COUNTS 0.3
+#define PORT_COUNTS 0.1
 
 typedef struct {
     double port, port_mass, line, line_mass, vessel, vessel_mass, near, far;
