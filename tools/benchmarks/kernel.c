@@ -558,7 +558,7 @@ static int two_point(int before, double vacuum, double high, double low)
 static void read_out(double *state, const double *k, double *expected, uint8_t *signals)
 {
     *expected = S(VALID) > 0.0 ? reading(S(S_SENSED), k) : NAN;
-    double vacuum = K(AMBIENT) - S(S_PORT);
+    double vacuum = S(VALID) > 0.0 ? K(AMBIENT) - S(S_PORT) : 0.0;
     int before = (int)S(SIGNALS);
     int present = two_point((before & PART_PRESENT_SIGNAL) != 0, vacuum, K(H2), K(H2_LOW));
     int reached = two_point((before & AIR_SAVING_SIGNAL) != 0, vacuum, K(H1), K(H1_LOW));
