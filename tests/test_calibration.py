@@ -179,6 +179,13 @@ def test_a_unit_that_is_ill_from_the_start_is_refused(
     assert parameter in said
 
 
+def test_a_sensor_far_slower_than_it_is_said_to_be_is_refused() -> None:
+    plc = rig("test_rig")
+    sensor = plc.sensor.model_copy(update={"lag_ms": 50.0})
+    said = refused("test_rig", recorded(plc.model_copy(update={"sensor": sensor}), FEW, 1))
+    assert "too round" in said
+
+
 def test_a_leak_that_begins_half_way_is_refused() -> None:
     said = refused("gripper", log_of("gripper", faults=("leakage=2.0@c5",)))
     assert "not alike" in said or "not that of a healthy unit" in said

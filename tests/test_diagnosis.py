@@ -100,6 +100,21 @@ def test_a_leak_that_opens_half_way_is_a_step_with_its_onset() -> None:
     assert answer["gain"]["share_of_achievable_pct"] > 90
 
 
+@pytest.mark.parametrize(
+    ("config", "plc", "lag"), [(CONFIG, PLC, 60.0), (GRIPPER, GRIPPER_PLC, 100.0)]
+)
+def test_a_sensor_too_slow_for_the_live_twin_to_see_every_knee_is_found_whole(
+    config: Config, plc: PlcSettings, lag: float
+) -> None:
+    stream = blocks(plc, 27.0, [parse_fault(f"sensor_lag={lag}")], seed=23)
+    answer = of(stream, config).json
+    assert (answer["verdict"], answer["causes"][0]["effect"]) == ("explained", "sensor_lag")
+    assert answer["causes"][0]["parameters"]["time_constant"]["value"] == pytest.approx(
+        lag, rel=0.1
+    )
+    assert answer["gain"]["share_of_achievable_pct"] > 90
+
+
 def test_an_effect_outside_the_table_gets_a_term_that_takes_it_away() -> None:
     diagnosis = of(record(27.0, "lip_lift=5", seed=22))
     answer = diagnosis.json

@@ -16,6 +16,7 @@ from twin.monitor.phases import (
     SHORTEST_WINDOW,
     Knees,
     PhaseFinder,
+    as_wide_as_needed,
     expected_knees,
 )
 from twin.signals import BREAK, MBAR, SAMPLE, Command, Phase, Quality, Samples
@@ -128,7 +129,7 @@ def test_the_level_at_a_knee_is_that_of_the_control(name: str) -> None:
 # What commands say.
 
 
-KNEES = Knees(window=10, noise=30.0, on_shift=4, settled=30)
+KNEES = Knees(window=10, noise=30.0, on_shift=4, settled=30, longest=60)
 
 
 def stream(commands: npt.ArrayLike, pressure: float | npt.ArrayLike = 1e5) -> Samples:
@@ -251,7 +252,7 @@ def test_a_line_that_rings_does_not_hide_the_knee() -> None:
     falling = -0.42 * np.arange(-300, 1)
     mbar = 261.0 + np.concatenate([falling, ringing])
     noise = np.random.default_rng(0).normal(0.0, 0.31, len(mbar))
-    knees = Knees(window=11, noise=31.0, on_shift=9, settled=36)
+    knees = Knees(window=11, noise=31.0, on_shift=9, settled=36, longest=60)
     _, phase, _ = find(stream([1] * len(mbar), 100.0 * (mbar + noise)), knees)
     (knee,) = np.flatnonzero(np.diff(phase)) + 1
     assert phase[knee] == Phase.HOLD
@@ -301,3 +302,30 @@ def test_no_row_is_held_back_longer_than_the_lag(name: str) -> None:
         if part["commands"][-1] != Command.SUCTION:
             assert given_out == pushed
     assert finder.knees.window <= longest <= finder.knees.lag
+
+
+def test_a_slow_sensor_takes_a_longer_window() -> None:
+    theta = rigs.theta("test_rig")
+    as_built = expected_knees(theta, 31.0).window
+    theta[c.SENSOR_LAG] = 25e-3
+    assert as_built + 5 < expected_knees(theta, 31.0).window <= LONGEST_WINDOW
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_as_it_should_be_the_window_is_as_wide_as_needed(name: str) -> None:
+    samples, _ = rigs.recorded(name, SECONDS)
+    assert as_wide_as_needed(rigs.knees(name), rigs.cut(samples, 1000)) == rigs.knees(name)
+
+
+@pytest.mark.parametrize(("name", "lag"), [("test_rig", 50), ("gripper", 100)])
+def test_where_a_sensor_is_too_slow_for_its_window_a_wider_one_sees_more(
+    name: str, lag: int
+) -> None:
+    samples, _ = rigs.recorded(name, SECONDS, (f"sensor_lag={lag}",))
+    wider = as_wide_as_needed(rigs.knees(name), [samples])
+    assert rigs.knees(name).window < wider.window <= rigs.knees(name).longest
+    few, most = (
+        int(np.count_nonzero((phase[1:] == Phase.HOLD) & (phase[:-1] == Phase.SUCTION)))
+        for _, phase, _ in (find(samples, knees) for knees in (rigs.knees(name), wider))
+    )
+    assert few < most >= SECONDS // 3.2 - 1  # cycles are 3.2 s long

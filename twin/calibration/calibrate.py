@@ -19,6 +19,7 @@ from twin.model.dataset import DataSet, coefficients
 from twin.model.theta import AMBIENT
 from twin.monitor.cycles import Cycle, CycleCutter, figures
 from twin.monitor.healthy import Healthy, Scatter
+from twin.monitor.phases import as_wide_as_needed
 from twin.signals import BREAK, MBAR, SAMPLE, UNUSABLE, Command, Phase, Samples
 
 FEWEST = 5  # complete cycles
@@ -54,6 +55,7 @@ def calibrate(
     samples = samples[samples["time_ns"] <= before[-1].end_ns]
     used = samples["time_ns"] <= before[:MOST_FITTED][-1].end_ns
     fitted = fit(samples[used], config.data, progress)
+    refuse_rounded(fitted.data, samples)
     progress("what healthy cycles scatter")
     cycles = complete(fitted.data, samples)
     refuse_unalike(fitted.data, samples, cycles)
@@ -91,6 +93,18 @@ def refuse_insufficient(samples: Samples, cycles: Sequence[Cycle]) -> None:
         raise ConfigError(
             f"the log has {len(cycles)} complete cycles that count; a calibration needs {FEWEST}",
             "record suction, blow-off and idle again and again without a gap",
+        )
+
+
+def refuse_rounded(data: DataSet, samples: Samples) -> None:
+    """ConfigError if a twin of ``data`` would not see in each cycle that the nozzle goes off."""
+    knees = Twin.of(data).knees
+    if as_wide_as_needed(knees, [samples]) != knees:
+        raise ConfigError(
+            "the air saving's switching is too round in this log to be seen in each cycle: the"
+            f" pressure comes slower than a lag of {data.sensor.lag_ms:.3g} ms explains",
+            "set [data.sensor] lag_ms to that of sensor and PLC input together, or choose a faster"
+            " input filter and record again",
         )
 
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from twin.model import kernel
 from twin.model.dataset import DataSet, coefficients
 from twin.monitor.bins import Bins, Floats, Ints, binned
-from twin.monitor.phases import PhaseFinder, expected_knees
+from twin.monitor.phases import PhaseFinder, as_wide_as_needed, expected_knees
 from twin.monitor.signatures import steps
 from twin.signals import MBAR, UNUSABLE, Phase, Samples
 
@@ -30,7 +30,8 @@ class Cycles:
     def found(cls, samples: Samples, data: DataSet) -> "Cycles":
         """Find the phases as the twin of ``data`` does."""
         theta = coefficients(data)
-        finder = PhaseFinder(expected_knees(theta, data.sensor.noise_mbar * MBAR))
+        knees = expected_knees(theta, data.sensor.noise_mbar * MBAR)
+        finder = PhaseFinder(as_wide_as_needed(knees, [samples]))
         early, late = finder.push(samples), finder.flush()
         rows, phase = (np.concatenate([early[i], late[i]]) for i in (0, 1))
         level = np.concatenate([early[2], late[2]]).astype(np.float32).astype(np.float64)

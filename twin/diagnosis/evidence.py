@@ -29,7 +29,7 @@ from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, binned
 from twin.monitor.cycles import Cycle, CycleCutter, figures
 from twin.monitor.healthy import Healthy
-from twin.monitor.phases import Knees, expected_knees
+from twin.monitor.phases import Knees, as_wide_as_needed, expected_knees
 from twin.monitor.signatures import drawn_rows, steps
 from twin.monitor.switching import Seen, seen
 from twin.signals import MBAR, NS, SAMPLE, TICK, UNUSABLE, Command, Phase, Samples, Ticks
@@ -359,7 +359,9 @@ def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
 
 def of_log(beside: Evidence, blocks: Iterable[Samples]) -> Evidence:
     """What another log says beside the same twin."""
-    cycles, begin_ns = _complete_cycles(Twin(beside.theta, beside.knees, beside.terms), blocks)
+    blocks = list(blocks)
+    knees = as_wide_as_needed(beside.knees, blocks)
+    cycles, begin_ns = _complete_cycles(Twin(beside.theta, knees, beside.terms), blocks)
     samples = np.concatenate([np.empty(0, SAMPLE), *(cycle.samples for cycle in cycles)])
     ticks = np.concatenate([np.empty(0, TICK), *(cycle.ticks for cycle in cycles)])
     starts = np.cumsum([0, *(len(cycle.samples) for cycle in cycles)])
@@ -373,8 +375,10 @@ def of_log(beside: Evidence, blocks: Iterable[Samples]) -> Evidence:
         numbers=np.arange(len(cycles)),
         judged=judged,
         figures=[figures(cycle, beside.theta[c.AMBIENT]) for cycle in cycles],
-        bins=_binned(samples, ticks, starts, judged, beside.knees),
+        bins=_binned(samples, ticks, starts, judged, knees),
         rows=drawn_rows(samples, ticks),
+        knees=knees,
+        _seen={},  # by a finder with other knees
     )
 
 

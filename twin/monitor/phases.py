@@ -8,7 +8,8 @@ each knee. Rows that cannot be at a knee are given out at once.
 """
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -25,6 +26,8 @@ from twin.signals import BREAK, MS, NS, SAMPLE, UNUSABLE, Phase, Samples, joined
 IDLE_ROWS = 20  # rows of idle that give the level before a cycle
 FEWEST_IDLE_ROWS = 5
 SIGNIFICANT = 7.0  # sigmas of slope difference that make a knee
+SHARP, ROUNDED = 2.5, 2.0  # times that, which the window is to show of a knee; lags round it
+ROUNDS = 8  # until its rows are known
 JUMP = 8.0  # times the noise, from one row to the next: knees are rounder
 ALONE = 2.0  # times the changes before and after it: a line that rings rises as fast, but longer
 SHORTEST_WINDOW, LONGEST_WINDOW = 8, 60  # rows
@@ -43,13 +46,15 @@ class Knees:
     """How knees look in this system: rows of the window, noise (Pa), rows from valve to knee.
 
     The nozzle's opening shows when jet and sensor have followed; its closing shows at once, because
-    the step at the port pulls the knee forward by as much as the two delay it.
+    the step at the port pulls the knee forward by as much as the two delay it. A window of
+    more than ``longest`` rows could take the way to the end pressure for a knee.
     """
 
     window: int
     noise: float
     on_shift: int
     settled: int
+    longest: int
     blow_off: tuple[float, float] = (float(c.EXTERNAL), 0.0)  # the ejector's own: mode, pulse (s)
 
     @property
@@ -67,19 +72,51 @@ def expected_knees(theta: Theta, noise: float) -> Knees:
     """Derive the knees' window from how sharply the slope breaks at H1 in this system.
 
     The slope of a straight line over n rows of noise s has the deviation s √(12/n³); the window is
-    chosen so that the break is SIGNIFICANT against the difference of two such slopes.
+    chosen so that the break is SIGNIFICANT against the difference of two such slopes. A lag of the
+    sensor leaves 1 / (1 + lag / n) of that difference.
     """
     h1 = theta[c.AMBIENT] - theta[c.H1]
     suction = suction_at(theta, h1) * R * theta[c.TEMPERATURE]
     bend = max(GAMMA * suction / (theta[c.VOLUME] + theta[c.PORT_VOLUME]) * MS, 1e-3)  # Pa per row
-    rows = (24.0 * (2.5 * SIGNIFICANT * noise / bend) ** 2) ** (1.0 / 3.0)
+    sharp = rows = (24.0 * (SHARP * SIGNIFICANT * noise / bend) ** 2) ** (1.0 / 3.0)
+    lag = math.hypot(theta[c.SENSOR_LAG], theta[c.SENSOR_LAG] + theta[c.SLOW_SENSOR]) / MS
+    for _ in range(ROUNDS):
+        rows = max(sharp, sharp * (ROUNDED / SHARP * (1.0 + lag / rows)) ** (2.0 / 3.0))
+    window = int(min(max(math.ceil(rows), SHORTEST_WINDOW), LONGEST_WINDOW))
+    to_the_end = (h1 - theta[c.END_RATIO] * theta[c.AMBIENT]) / bend  # if it went on like this
     return Knees(
-        window=int(min(max(math.ceil(rows), SHORTEST_WINDOW), LONGEST_WINDOW)),
+        window=window,
+        longest=int(min(max(to_the_end, window), LONGEST_WINDOW)),
         noise=noise,
         on_shift=round((2.0 * theta[c.RAMP_UP] + 2.0 * theta[c.SENSOR_LAG]) / MS),
         settled=round((theta[c.RESPONSE] + SETTLED) / MS),
         blow_off=(float(theta[c.BLOW_OFF_MODE]), float(theta[c.BLOW_OFF_TIME])),
     )
+
+
+def as_wide_as_needed(knees: Knees, blocks: Sequence[Samples]) -> Knees:
+    """The same with the window in which most suctions of a whole record show the nozzle go off.
+
+    The narrowest of these: a wider one finds out more where a sensor, slower than anybody knew, has
+    rounded the knees, but is further behind and needs longer stretches.
+    """
+    best, (most, suctions) = knees, _nozzle_off(knees, blocks)
+    window = knees.window
+    while most < suctions and window < knees.longest:
+        window = min(2 * window, knees.longest)
+        wider = replace(knees, window=window)
+        if (found := _nozzle_off(wider, blocks)[0]) > most:
+            best, most = wider, found
+    return best
+
+
+def _nozzle_off(knees: Knees, blocks: Sequence[Samples]) -> tuple[int, int]:
+    """In how many suctions the nozzle is seen to go off, and of how many."""
+    finder = PhaseFinder(knees)
+    phase = np.concatenate([*(finder.push(block)[1] for block in blocks), finder.flush()[1]])
+    inside = np.isin(phase, (Phase.SUCTION, Phase.HOLD))
+    number = np.cumsum(np.diff(inside, prepend=False) & inside)
+    return len(np.unique(number[phase == Phase.HOLD])), int(number[-1]) if len(number) else 0
 
 
 @per_row
