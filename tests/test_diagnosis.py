@@ -115,6 +115,15 @@ def test_a_sensor_too_slow_for_the_live_twin_to_see_every_knee_is_found_whole(
     assert answer["gain"]["share_of_achievable_pct"] > 90
 
 
+@pytest.mark.parametrize("seed", [41, 42])
+def test_where_the_nozzle_goes_off_several_times_each_knee_is_off_by_itself(seed: int) -> None:
+    """A gripper's leak has it go off twice a suction, which no healthy cycle shows."""
+    stream = blocks(GRIPPER_PLC, 27.0, [parse_fault("porous_leakage=2.5")], seed)
+    answer = of(stream, GRIPPER).json
+    assert (answer["verdict"], answer["causes"][0]["effect"]) == ("explained", "porous_leakage")
+    assert answer["extended"]["leftover_sigma"] < 1.0
+
+
 def test_an_effect_outside_the_table_gets_a_term_that_takes_it_away() -> None:
     diagnosis = of(record(27.0, "lip_lift=5", seed=22))
     answer = diagnosis.json

@@ -25,6 +25,8 @@ _ACTS = {"response_delay": c.RESPONSE, "blow_off_delay": c.BLOW_OFF_RESPONSE}
 _CLOSES = (c.RESPONSE_OFF, c.BLOW_OFF_RESPONSE_OFF)
 CLOSING_MS = 0.5  # by which a valve's closing differs, one sigma
 KNEE_WINDOWS = 10  # a knee is found to a tenth of its window
+# What that moves, of the columns of ``moved``: each knee by itself, where a cycle has several.
+KNEES = [len(SCATTER) + len(_CLOSES), -1]
 MISMATCH = 0.08  # of what a hypothesis explains, is off in its waveform
 LEVELS = ("h1_level", "h1_low_level")
 _INTO = (Phase.HOLD, Phase.SUCTION)  # what begins at each
@@ -74,8 +76,11 @@ class Covariance:
         common, alone = model_error(evidence.healthy.error, kind, time)
         common = np.hypot(common, self.mismatch[here])
         moves, left_open = self.moves[here] * float(scattered), self.left_open[here]
+        of_knees = moves[:, KNEES]
         apart = np.exp(-np.abs(time[:, None] - time))
         goes_on = lasting(bins, here, alone)
+        goes_on += of_knees @ of_knees.T * (bins.stretch[here][:, None] == bins.stretch[here])
+        moves = np.delete(moves, KNEES, axis=1)
         covariance = from_cycle_to_cycle(bins, here, goes_on, moves, evidence.noise)
         covariance += np.outer(common, common) * (apart * (kind[:, None] == kind))
         usual = _usual(np.diag(covariance), bins.count[here], evidence.noise)
