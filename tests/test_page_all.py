@@ -23,7 +23,7 @@ from playwright.sync_api import Browser, expect
 from plc_process import start_plc
 from starlette.testclient import TestClient
 from test_alarms_loop import LEAK
-from test_page_browser import Server, _is_fit, browser  # noqa: F401 - a fixture
+from test_page_browser import Server, _is_fit
 
 from twin.assets.unit import Unit
 from twin.outlets.message import Message, asset_of, beside, encoded, of_status
@@ -345,7 +345,7 @@ def publishers(running: Broker, count: int, closing: ExitStack) -> list[Mqtt]:
     return made
 
 
-def test_forty_ejectors_and_one_that_dies(tmp_path: Path, browser: Browser) -> None:  # noqa: F811
+def test_forty_ejectors_and_one_that_dies(tmp_path: Path, browser: Browser) -> None:
     leak = Message("1", LEAK, alarm(Unit(TYPE, "cell-17")))
     with ExitStack() as closing:
         running = closing.enter_context(broker(tmp_path))
@@ -395,7 +395,7 @@ def test_forty_ejectors_and_one_that_dies(tmp_path: Path, browser: Browser) -> N
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_it_is_fit_for_gloves_on_every_screen(
     tmp_path: Path,
-    browser: Browser,  # noqa: F811
+    browser: Browser,
     scheme: Any,
 ) -> None:
     with ExitStack() as closing:

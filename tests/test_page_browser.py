@@ -1,6 +1,5 @@
 """The page in a real Chromium: what a technician sees and does."""
 
-import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -11,9 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import uvicorn
-from independent import missing
 from page_site import LEAK, Run, S, config, write_config
-from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Locator, Page, expect
 
 from twin.alarms import keeper as keeper_module
 from twin.assets.unit import Unit
@@ -111,21 +109,6 @@ def serving(configs: list[Path]) -> Iterator[tuple[str, Server]]:
             yield address(place, listening), server
         finally:
             server.stop()
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    path = shutil.which("chromium")
-    if path is None:
-        missing("chromium", "on Debian or Ubuntu: apt install chromium")
-    expect.set_options(timeout=PATIENCE_S * 1e3)
-    # A process that it keeps ready for the next page would count as left behind.
-    options = ["--disable-features=SpareRendererForSitePerProcess"]
-    with sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=path, args=options)
-        found.new_page().context.close()
-        yield found
-        found.close()
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """The documentation's pages: built without a warning, and read from a disk without a network."""
 
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -9,8 +8,7 @@ from pathlib import Path
 
 import pytest
 import rigs
-from independent import missing
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
 
 PATIENCE_MS = 30_000
 
@@ -37,20 +35,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     built = subprocess.run(command, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr
     return folder / "site"
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    path = shutil.which("chromium")
-    if path is None:
-        missing("chromium", "on Debian or Ubuntu: apt install chromium")
-    # A process that it keeps ready for the next page would count as left behind.
-    options = ["--disable-features=SpareRendererForSitePerProcess"]
-    with sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=path, args=options)
-        found.new_page().context.close()
-        yield found
-        found.close()
 
 
 @pytest.fixture
