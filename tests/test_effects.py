@@ -138,6 +138,14 @@ def test_effects_add_up() -> None:
     assert both[c.SENSOR_OFFSET] == 7 * MBAR
 
 
+def test_cups_that_give_way_keep_a_volume() -> None:
+    """A search tries 100 ml on cups of 30 ml, too: nothing may be less than empty there."""
+    theta = rigs.theta("gripper")
+    theta[c.VOLUME] = 30e-6
+    soft = apply(theta, "cup_compliance", {"volume_at_full_vacuum": 100.0})
+    assert 0.5 * theta[c.VOLUME] < soft[c.COMPLIANCE] < theta[c.VOLUME]
+
+
 # What an effect does where it can be said in one number.
 
 

@@ -12,6 +12,8 @@ from twin.model import theta as c
 from twin.model.theta import Theta
 from twin.signals import BAR, MBAR, ML, MS, SL_MIN
 
+FLATTEST = 0.9  # of the volume: cups that give way do not vanish
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -81,7 +83,7 @@ def _added_volume(theta: Theta, volume: float) -> None:
 
 
 def _cup_compliance(theta: Theta, volume: float) -> None:
-    theta[c.COMPLIANCE] += volume * ML
+    theta[c.COMPLIANCE] = min(theta[c.COMPLIANCE] + volume * ML, FLATTEST * theta[c.VOLUME])
 
 
 def _heat_exchange(theta: Theta, film_coefficient: float) -> None:
