@@ -9,6 +9,8 @@ import rigs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivers.plc.settings import PlcSettings
+from drivers.plc.simulate import blocks
 from twin.model import theta as c
 from twin.monitor.phases import (
     IDLE_ROWS,
@@ -268,7 +270,21 @@ def test_the_window_has_its_bounds(noise: float, name: str) -> None:
     knees = expected_knees(rigs.theta(name), noise)
     assert SHORTEST_WINDOW <= knees.window <= LONGEST_WINDOW
     assert knees.noise == noise
-    assert knees.lag < 200
+    assert knees.lag < 2 * LONGEST_WINDOW
+
+
+def test_the_knee_of_a_large_tank_is_flat_but_seen() -> None:
+    """Ten times the volume, and a noisy sensor: the slope breaks by 0.04 mbar a row."""
+    plc = rigs.config("test_rig").document.section(PlcSettings, "plc").model_dump()
+    plc["rig"]["vessel_ml"] *= 10.0
+    plc["sensor"]["noise_mbar"] = 0.5
+    plc["program"] |= {"suction_ms": 26_000.0, "blow_off_ms": 3000.0}
+    theta = rigs.theta("test_rig")
+    theta[c.VOLUME] *= 10.0
+    stream = list(blocks(PlcSettings.model_validate(plc), 58.0))
+    _, phase, _ = find(np.concatenate(stream), expected_knees(theta, 50.0))
+    off = np.count_nonzero((phase[1:] == Phase.HOLD) & (phase[:-1] == Phase.SUCTION))
+    assert off == 2
 
 
 def test_more_noise_takes_a_longer_window() -> None:

@@ -30,7 +30,7 @@ SHARP, ROUNDED = 2.5, 2.0  # times that, which the window is to show of a knee; 
 ROUNDS = 8  # until its rows are known
 JUMP = 8.0  # times the noise, from one row to the next: knees are rounder
 ALONE = 2.0  # times the changes before and after it: a line that rings rises as fast, but longer
-SHORTEST_WINDOW, LONGEST_WINDOW = 8, 60  # rows
+SHORTEST_WINDOW, LONGEST_WINDOW = 8, 240  # rows
 MOST_MISSING = 0.5  # of a line's rows
 SETTLED = 20e-3  # s after the valve's response before a knee can be one
 
