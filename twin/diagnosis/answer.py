@@ -85,9 +85,13 @@ def diagnose(
         if not _sure(found, before, after):
             searched, found = replace(searched, found=None), HEALTHY
             strange = look(healthy, found, fitted, held_out)
-        terms = strange.terms
-        with_terms = extended(evidence, terms)
-        after = judge(with_terms, covariance(with_terms, found).of(held_out), found)
+            after = before
+        with_terms = extended(evidence, strange.terms)
+        mended = judge(with_terms, covariance(with_terms, found).of(held_out), found)
+        if mended.rms < after.rms:
+            terms, after = strange.terms, mended
+        else:  # less in sigmas, but not in mbar, is no better model
+            strange = replace(strange, terms=())
     answer = head | {
         "verdict": verdict,
         "causes": _causes(evidence, searched, before) if found else [],
