@@ -79,7 +79,7 @@ def write_log(path: Path, config: Config, samples: Samples) -> None:
         config.data.ambient.pressure_mbar * MBAR,
     )
     recorder, twin = Recorder(path, header), Twin.of(config.data)
-    for rows, ticks in (twin.advance(samples), twin.flush()):
+    for rows, ticks in twin.over([samples]):
         recorder.write(rows, ticks)
     recorder.close()
 

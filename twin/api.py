@@ -6,7 +6,7 @@ gives the same answer. Columns are in SI units, which end their names; what the 
 """
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -133,7 +133,7 @@ class Log:
     def _rows(self) -> Iterator[tuple[Samples, Ticks]]:
         """The same with what the twin says to it."""
         if isinstance(self._source, Table):
-            return _beside(Twin.of(self.config.data), self._source.blocks())
+            return Twin.of(self.config.data).over(self._source.blocks())
         return self._source.blocks()
 
 
@@ -305,13 +305,6 @@ def _table(path: Path, settings: Config) -> Table:
     """A table whose columns are as the configuration says."""
     wanted = settings.document.section(ImportSettings, "import")
     return open_table(path, wanted, settings.data.ambient.pressure_mbar * MBAR)
-
-
-def _beside(twin: Twin, blocks: Iterable[Samples]) -> Iterator[tuple[Samples, Ticks]]:
-    """Rows with what a twin says to them."""
-    for block in blocks:
-        yield twin.advance(block)
-    yield twin.flush()
 
 
 def _bits(flags: npt.NDArray[np.uint8], bits: Mapping[str, int]) -> Columns:

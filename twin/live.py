@@ -1,7 +1,7 @@
 """The loop: blocks in, twin, monitor, sinks out. All of the path is on this page."""
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -73,6 +73,12 @@ class Twin:
     def flush(self) -> tuple[Samples, Ticks]:
         """Give the rows still held back at the end of the stream."""
         return self._expect(self._finder.flush())
+
+    def over(self, blocks: Iterable[Samples]) -> Iterator[tuple[Samples, Ticks]]:
+        """Advance over all of a stream to its end."""
+        for block in blocks:
+            yield self.advance(block)
+        yield self.flush()
 
     def _expect(self, found: Found) -> tuple[Samples, Ticks]:
         samples, phase, level = found

@@ -17,7 +17,7 @@ from twin.errors import ConfigError
 from twin.live import Twin
 from twin.model.dataset import DataSet, coefficients
 from twin.model.theta import AMBIENT
-from twin.monitor.cycles import Cycle, CycleCutter, figures
+from twin.monitor.cycles import Cycle, figures, whole
 from twin.monitor.healthy import Healthy, Scatter
 from twin.monitor.phases import as_wide_as_needed
 from twin.signals import BREAK, MBAR, SAMPLE, UNUSABLE, Command, Phase, Samples
@@ -67,10 +67,7 @@ def calibrate(
 
 def complete(data: DataSet, samples: Samples) -> list[Cycle]:
     """Complete cycles beside the twin of ``data``, but for the first, in which it swings in."""
-    twin = Twin.of(data)
-    cutter = CycleCutter()
-    cycles = [*cutter.push(*twin.advance(samples)), *cutter.push(*twin.flush()), *cutter.flush()]
-    return [cycle for cycle in cycles if cycle.complete and cycle.settled]
+    return [cycle for cycle in whole(Twin.of(data).over([samples])) if cycle.settled]
 
 
 def refuse_insufficient(samples: Samples, cycles: Sequence[Cycle]) -> None:

@@ -27,7 +27,7 @@ from twin.model.plant import reading_of, sensed_of
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, binned
-from twin.monitor.cycles import Cycle, CycleCutter, figures
+from twin.monitor.cycles import figures, whole
 from twin.monitor.healthy import Healthy
 from twin.monitor.phases import Knees, as_wide_as_needed, expected_knees
 from twin.monitor.signatures import drawn_rows, steps
@@ -361,14 +361,14 @@ def of_log(beside: Evidence, blocks: Iterable[Samples]) -> Evidence:
     """What another log says beside the same twin."""
     blocks = list(blocks)
     knees = as_wide_as_needed(beside.knees, blocks)
-    cycles, begin_ns = _complete_cycles(Twin(beside.theta, knees, beside.terms), blocks)
+    cycles = whole(Twin(beside.theta, knees, beside.terms).over(blocks))
     samples = np.concatenate([np.empty(0, SAMPLE), *(cycle.samples for cycle in cycles)])
     ticks = np.concatenate([np.empty(0, TICK), *(cycle.ticks for cycle in cycles)])
     starts = np.cumsum([0, *(len(cycle.samples) for cycle in cycles)])
     judged = [number for number, cycle in enumerate(cycles) if cycle.settled]
     return replace(
         beside,
-        begin_ns=begin_ns,
+        begin_ns=next((int(block["time_ns"][0]) for block in blocks if len(block)), 0),
         samples=samples,
         ticks=ticks,
         starts=starts,
@@ -430,20 +430,6 @@ def of_cycles(evidence: Evidence, cycles: Sequence[int]) -> Evidence:
     )
 
 
-def _complete_cycles(twin: Twin, blocks: Iterable[Samples]) -> tuple[list[Cycle], int]:
-    """The complete cycles of a stream in order, and the PLC time of its first row."""
-    cutter = CycleCutter()
-    cycles: list[Cycle] = []
-    begin_ns: int | None = None
-    for block in blocks:
-        if begin_ns is None and len(block):
-            begin_ns = int(block["time_ns"][0])
-        cycles += cutter.push(*twin.advance(block))
-    cycles += cutter.push(*twin.flush())
-    cycles += cutter.flush()
-    return [cycle for cycle in cycles if cycle.complete], begin_ns or 0
-
-
 def _binned(
     samples: Samples, ticks: Ticks, starts: Ints, judged: Sequence[int], knees: Knees
 ) -> Bins:
@@ -456,11 +442,16 @@ def _binned(
 
 
 def _unsettled(phase: npt.NDArray[np.uint8], knees: Knees) -> npt.NDArray[np.bool_]:
-    """Rows after a knee that suction's end followed too soon for it to be found well."""
+    """Rows after a knee that suction's end followed too soon for it to be found well.
+
+    And the blow-off or idle after them, which begins at a pressure that nobody can tell.
+    """
     begins = np.flatnonzero(np.diff(phase, prepend=255))
     lengths = np.diff(begins, append=len(phase))
     kind = phase[begins]
     before = np.concatenate([[255], kind[:-1]])
-    inside = [Phase.SUCTION, Phase.HOLD]
-    soon = np.isin(kind, inside) & np.isin(before, inside) & (lengths < knees.settles)
+    sucks, sucked = (np.isin(one, [Phase.SUCTION, Phase.HOLD]) for one in (kind, before))
+    after_knee = lengths - knees.on_shift * (kind == Phase.SUCTION)
+    soon = sucks & sucked & (after_knee < knees.settles)
+    soon[1:] |= soon[:-1] & ~sucks[1:]
     return np.repeat(soon, lengths)

@@ -23,7 +23,7 @@ from twin.model.effects import EFFECTS, Parameter, apply
 from twin.model.term import AGAIN
 from twin.model.theta import AMBIENT
 from twin.monitor.bins import Floats
-from twin.monitor.cycles import CycleCutter, figures
+from twin.monitor.cycles import figures, whole
 from twin.monitor.healthy import Healthy, Scatter
 from twin.monitor.weights import SCATTER
 from twin.signals import Phase
@@ -181,11 +181,9 @@ def _healthy(diagnosis: Diagnosis, data: DataSet) -> Healthy:
 
 def _learned(diagnosis: Diagnosis, data: DataSet, healthy: Healthy) -> Healthy:
     """Figures as they are in this log: terms that data gave say nothing of what they leave."""
-    twin, cutter = Twin.of(data), CycleCutter()
-    rows = [twin.advance(diagnosis.evidence.samples), twin.flush()]
-    cycles = [cycle for part in rows for cycle in cutter.push(*part)] + list(cutter.flush())
+    cycles = whole(Twin.of(data).over([diagnosis.evidence.samples]))
     ambient = float(diagnosis.evidence.theta[AMBIENT])
-    found = [figures(one, ambient) for one in cycles if one.complete and one.settled]
+    found = [figures(one, ambient) for one in cycles if one.settled]
     learned = dict(healthy.figures)
     for name, usual in diagnosis.evidence.healthy.figures.items():
         values = [one[name] for one in found if name in one]

@@ -1,6 +1,6 @@
 """What one log says of its ejector: mean key figures, and how much of every effect there may be."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from twin.model import theta as c
 from twin.monitor.bank import SUSPECTS, Bank, Suspect
 from twin.monitor.cycles import CycleCutter, figures
 from twin.monitor.statistics import Listener, Said
-from twin.signals import Samples, Ticks
+from twin.signals import Samples
 
 FORMAT = "ejector-twin-watched/1"
 
@@ -26,7 +26,7 @@ def watched(config: Config, blocks: Iterable[Samples]) -> dict[str, Any]:
     teller = compiled(config.data, config.document.section(FigureSettings, "figures"))
     told: list[CycleFigures] = []
     heard: list[Said] = []
-    for rows, ticks in _beside(Twin.of(config.data), blocks):
+    for rows, ticks in Twin.of(config.data).over(blocks):
         for cycle in cutter.push(rows, ticks):
             drawn = bank.take(cycle)
             if (one := teller.take(cycle)) is not None:
@@ -49,12 +49,6 @@ def name_of(suspect: Suspect) -> str:
     """As answers have it: an effect with several parameters has one for each."""
     alone = sum(one.effect == suspect.effect for one in SUSPECTS) == 1
     return suspect.effect if alone else f"{suspect.effect}.{suspect.parameter.name}"
-
-
-def _beside(twin: Twin, blocks: Iterable[Samples]) -> Iterator[tuple[Samples, Ticks]]:
-    for block in blocks:
-        yield twin.advance(block)
-    yield twin.flush()
 
 
 def _figures(told: Sequence[CycleFigures]) -> dict[str, dict[str, float]]:

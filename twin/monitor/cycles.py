@@ -114,8 +114,12 @@ class Teller(Protocol):
 
 @dataclass
 class CycleCutter:
-    """Takes rows in, gives cycles out as soon as they have ended."""
+    """Takes rows in, gives cycles out as soon as they have ended.
 
+    Cycles with more rows than ``longest`` come in pieces.
+    """
+
+    longest: float = LONGEST_PIECE
     _parts: list[tuple[Samples, Ticks]] = field(default_factory=list)
     _count: int = 0  # rows in them
     _phase: int = Phase.SUCTION  # of the newest row; before the first one none can begin
@@ -130,8 +134,8 @@ class CycleCutter:
         ends = np.flatnonzero(edges | breaks).tolist()
         begin = 0
         for end in [*ends, len(samples)]:
-            while self._count + end - begin > LONGEST_PIECE:
-                cut = begin + LONGEST_PIECE - self._count
+            while self._count + end - begin > self.longest:
+                cut = begin + int(self.longest) - self._count
                 self._keep(samples[begin:cut], ticks[begin:cut])
                 yield self._cut()
                 begin = cut
@@ -175,16 +179,21 @@ class CycleCutter:
         self._parts, self._count = [], 0
         self._index += begins
         whole = begins and int(ticks["phase"][-1]) in (IDLE, BLOW_OFF)
-        cut_short = not self._at_edge and len(samples) < LONGEST_PIECE
+        cut_short = not self._at_edge and len(samples) < self.longest
         return Cycle(self._index, samples, ticks, whole, cut_short, settled)
 
 
-def cut(blocks: Iterable[tuple[Samples, Ticks]]) -> Iterator[Cycle]:
+def cut(blocks: Iterable[tuple[Samples, Ticks]], longest: float = LONGEST_PIECE) -> Iterator[Cycle]:
     """All that a CycleCutter gives of rows from their beginning to their end."""
-    cutter = CycleCutter()
+    cutter = CycleCutter(longest)
     for samples, ticks in blocks:
         yield from cutter.push(samples, ticks)
     yield from cutter.flush()
+
+
+def whole(blocks: Iterable[tuple[Samples, Ticks]]) -> list[Cycle]:
+    """The complete cycles of rows, none in pieces however long a part is held."""
+    return [cycle for cycle in cut(blocks, math.inf) if cycle.complete]
 
 
 def time_to_vacuum(
