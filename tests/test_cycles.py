@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from twin.model import theta as c
-from twin.monitor.cycles import FEWEST_ROWS, LONGEST_PIECE, Cycle, CycleCutter, figures
+from twin.monitor.cycles import FEWEST_ROWS, LONGEST_PIECE, Cycle, CycleCutter, figures, whole
 from twin.signals import BREAK, MBAR, SAMPLE, TICK, Phase, Quality, Samples, Ticks
 
 AMBIENT = 1e5
@@ -81,6 +81,13 @@ def test_a_long_cycle_comes_in_pieces() -> None:
         (0, LONGEST_PIECE, False),
         (0, 5010, False),
     ]
+
+
+def test_a_record_is_judged_in_whole_cycles_however_long_a_part_is_held() -> None:
+    held = [(SUCTION, 1000), (HOLD, 3 * LONGEST_PIECE), (BLOW_OFF, 20), (IDLE, 40)]
+    found = whole([rows((IDLE, 5), *held, *held, *held, (SUCTION, 9))])
+    assert [(one.index, len(one.samples)) for one in found] == [(n, 31_060) for n in range(3)]
+    assert [one.settled for one in found] == [False, True, True]
 
 
 phases = st.lists(st.tuples(st.sampled_from(Phase), st.integers(1, 60)), min_size=1, max_size=25)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,15 +17,18 @@ from drivers.plc.simulate import blocks
 from tools import battery
 from tools.calibration_coverage import recorded
 from twin.config import Config
+from twin.diagnosis import answer as answer_module
 from twin.diagnosis.answer import Diagnosis, diagnose
-from twin.diagnosis.evidence import HEALTHY, collect, thinned
+from twin.diagnosis.evidence import HEALTHY, _unsettled, collect, thinned
 from twin.diagnosis.hypotheses import price
 from twin.diagnosis.search import tried_in_or_out
+from twin.diagnosis.unlisted import Unlisted, look
 from twin.diagnosis.weights import levels
 from twin.errors import ConfigError
 from twin.model.courses import Cause, Course
+from twin.monitor.phases import Knees
 from twin.settings import Document
-from twin.signals import Command, Quality, Samples
+from twin.signals import Command, Phase, Quality, Samples
 
 ROOT = Path(__file__).parent.parent
 DOCUMENT = Document.read(ROOT / "configs" / "test_rig.toml")
@@ -131,6 +135,50 @@ def test_an_effect_outside_the_table_gets_a_term_that_takes_it_away() -> None:
     assert answer["unlisted"]["depends_on"] == ["vacuum"]  # the lip lifts above 500 mbar
     assert {term.where for term in diagnosis.terms} >= {"suction"}
     assert answer["extended"]["rms_mbar"] < 0.5 * answer["baseline"]["rms_mbar"]
+
+
+def test_a_term_that_takes_nothing_away_in_mbar_is_no_extension(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Sigmas can fall while millibars rise, where the log is far from all that is known."""
+
+    def worse(*known: Any) -> Unlisted:
+        found = look(*known)
+        upside_down = ({"mbar": tuple(-mbar for mbar in one.mbar)} for one in found.terms)
+        terms = zip(found.terms, upside_down, strict=True)
+        return replace(found, terms=tuple(one.model_copy(update=mbar) for one, mbar in terms))
+
+    monkeypatch.setattr(answer_module, "look", worse)
+    diagnosis = of(record(27.0, "lip_lift=5", seed=22))
+    answer = diagnosis.json
+    assert (answer["verdict"], diagnosis.terms) == ("unlisted", ())
+    assert answer["unlisted"]["shape"].endswith("no term of the model can take it away")
+    assert answer["extended"]["rms_mbar"] < answer["baseline"]["rms_mbar"]  # by its causes
+
+
+def test_a_knee_that_the_end_of_suction_follows_too_soon_judges_nobody() -> None:
+    """Nor does the blow-off after it: from where it begins is not known."""
+    knees = Knees(window=8, noise=31.0, on_shift=11, settled=30, longest=60)
+
+    def left_out(*phases: tuple[Phase, int]) -> list[Phase]:
+        phase = np.concatenate([np.full(rows, name, np.uint8) for name, rows in phases])
+        ends = np.cumsum([rows for _, rows in phases])
+        names = zip(phases, np.split(_unsettled(phase, knees), ends[:-1]), strict=True)
+        return [name for (name, _), rows in names if rows.all()]
+
+    before, after = (
+        ((Phase.SUCTION, 200), (Phase.HOLD, 300)),
+        ((Phase.BLOW_OFF, 90), (Phase.IDLE, 90)),
+    )
+    assert left_out(*before, *after) == []
+    # The nozzle goes on 11 rows before that is seen.
+    for rows in (12, 11 + knees.settles - 1):
+        assert left_out(*before, (Phase.SUCTION, rows), *after) == [Phase.SUCTION, Phase.BLOW_OFF]
+    assert left_out(*before, (Phase.SUCTION, 11 + knees.settles), *after) == []
+    assert left_out((Phase.SUCTION, 200), (Phase.HOLD, knees.settles - 1), (Phase.IDLE, 90)) == [
+        Phase.HOLD,
+        Phase.IDLE,
+    ]
 
 
 def test_fitted_and_held_out_cycles_have_nothing_in_common() -> None:
