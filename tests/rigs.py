@@ -17,7 +17,8 @@ from twin.model.dataset import coefficients
 from twin.model.theta import Theta
 from twin.monitor.detect import Monitor
 from twin.monitor.isolation import Isolation
-from twin.monitor.phases import Knees, expected_knees
+from twin.monitor.knees import expected_knees
+from twin.monitor.phases import Knees
 from twin.settings import Document
 from twin.signals import MBAR, Quality, Samples, Ticks
 

@@ -158,7 +158,7 @@ def test_a_term_that_takes_nothing_away_in_mbar_is_no_extension(
 
 def test_a_knee_that_the_end_of_suction_follows_too_soon_judges_nobody() -> None:
     """Nor does the blow-off after it: from where it begins is not known."""
-    knees = Knees(window=8, noise=31.0, on_shift=11, settled=30, longest=60)
+    knees = Knees(window=8, noise=31.0, off_shift=0, on_shift=11, settled=30, again=30, longest=60)
 
     def left_out(*phases: tuple[Phase, int]) -> list[Phase]:
         phase = np.concatenate([np.full(rows, name, np.uint8) for name, rows in phases])

@@ -9,18 +9,12 @@ import rigs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivers.plc.faults import parse_fault
 from drivers.plc.settings import PlcSettings
-from drivers.plc.simulate import blocks
+from drivers.plc.simulate import blocks, with_truth
 from twin.model import theta as c
-from twin.monitor.phases import (
-    IDLE_ROWS,
-    LONGEST_WINDOW,
-    SHORTEST_WINDOW,
-    Knees,
-    PhaseFinder,
-    as_wide_as_needed,
-    expected_knees,
-)
+from twin.monitor.knees import LONGEST_WINDOW, as_wide_as_needed, expected_knees
+from twin.monitor.phases import IDLE_ROWS, SHORTEST_WINDOW, Knees, PhaseFinder
 from twin.signals import BREAK, MBAR, SAMPLE, Command, Phase, Quality, Samples
 
 NEAR = 20  # rows between a switch and where it is found, lag of sensor and jet included
@@ -131,7 +125,7 @@ def test_the_level_at_a_knee_is_that_of_the_control(name: str) -> None:
 # What commands say.
 
 
-KNEES = Knees(window=10, noise=30.0, on_shift=4, settled=30, longest=60)
+KNEES = Knees(window=10, noise=30.0, off_shift=0, on_shift=4, settled=30, again=30, longest=60)
 
 
 def stream(commands: npt.ArrayLike, pressure: float | npt.ArrayLike = 1e5) -> Samples:
@@ -254,11 +248,49 @@ def test_a_line_that_rings_does_not_hide_the_knee() -> None:
     falling = -0.42 * np.arange(-300, 1)
     mbar = 261.0 + np.concatenate([falling, ringing])
     noise = np.random.default_rng(0).normal(0.0, 0.31, len(mbar))
-    knees = Knees(window=11, noise=31.0, on_shift=9, settled=36, longest=60)
+    knees = Knees(window=11, noise=31.0, off_shift=0, on_shift=9, settled=36, again=36, longest=60)
     _, phase, _ = find(stream([1] * len(mbar), 100.0 * (mbar + noise)), knees)
     (knee,) = np.flatnonzero(np.diff(phase)) + 1
     assert phase[knee] == Phase.HOLD
     assert abs(int(knee) - 301) <= 4
+
+
+def test_the_nozzle_may_go_off_again_before_a_valve_could_have_followed_a_command() -> None:
+    """It acts at once where the air saving switches; only lines ring."""
+    slopes = np.repeat([-100.0, 20.0, -100.0, 20.0], [300, 100, 35, 200])  # Pa per row
+    samples = stream([1] * len(slopes), 9e4 + np.cumsum(slopes))
+    samples["pressure"] += np.random.default_rng(0).normal(0.0, KNEES.noise, len(slopes))
+    _, phase, level = find(samples, KNEES)
+    knees = np.flatnonzero(np.isfinite(level[1:])) + 1
+    assert phase[knees].tolist() == [Phase.HOLD, Phase.SUCTION, Phase.HOLD]
+    assert knees == pytest.approx([300, 400, 435], abs=3)
+
+
+def found_late(name: str, factor: float) -> tuple[float, float]:
+    """Median rows by which the nozzle is said to go off and on too late, with a slower sensor."""
+    plc = rigs.config(name).document.section(PlcSettings, "plc").model_dump()
+    plc["sensor"]["lag_ms"] *= factor
+    plc["program"]["suction_ms"] = {"gripper": 2500.0, "test_rig": 9000.0}[name]
+    rig, leak = PlcSettings.model_validate(plc), [parse_fault("leakage=2")]
+    parts = zip(*with_truth(rig, 30.0, leak, 1), strict=True)
+    samples, truth = (np.concatenate(column) for column in parts)
+    theta = rigs.theta(name)
+    theta[c.SENSOR_LAG] *= factor
+    _, phase, _ = find(samples, expected_knees(theta, rigs.knees(name).noise))
+    suction = samples["commands"] == Command.SUCTION
+    true, found = (switches(on, suction) for on in (truth["nozzle"] == 1, phase == Phase.SUCTION))
+    off, on = (
+        [min((row - one for one, as_well in true if as_well == to), key=abs) for row in rows]
+        for to in (False, True)
+        for rows in ([row for row, what in found if what == to],)
+    )
+    assert min(len(off), len(on)) >= 6
+    return float(np.median(off)), float(np.median(on))
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_a_slow_sensor_does_not_change_when_the_nozzle_is_said_to_switch(name: str) -> None:
+    assert found_late(name, 6.0) == pytest.approx(found_late(name, 1.0), abs=3.0)
 
 
 # The window.

@@ -16,7 +16,8 @@ from twin.model.strides import Strides
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
 from twin.monitor.detect import Monitor
-from twin.monitor.phases import Found, Knees, PhaseFinder, expected_knees
+from twin.monitor.knees import expected_knees
+from twin.monitor.phases import Found, Knees, PhaseFinder
 from twin.monitor.signatures import steps
 from twin.signals import MBAR, SAMPLE, TICK, Quality, Samples, Ticks
 

@@ -19,7 +19,7 @@ from twin.model.dataset import DataSet, coefficients
 from twin.model.theta import AMBIENT
 from twin.monitor.cycles import Cycle, figures, whole
 from twin.monitor.healthy import Healthy, Scatter
-from twin.monitor.phases import as_wide_as_needed
+from twin.monitor.knees import as_wide_as_needed
 from twin.signals import BREAK, MBAR, SAMPLE, UNUSABLE, Command, Phase, Samples
 
 FEWEST = 5  # complete cycles

@@ -9,7 +9,8 @@ import numpy.typing as npt
 from twin.model import kernel
 from twin.model.dataset import DataSet, coefficients
 from twin.monitor.bins import Bins, Floats, Ints, binned
-from twin.monitor.phases import PhaseFinder, as_wide_as_needed, expected_knees
+from twin.monitor.knees import as_wide_as_needed, expected_knees
+from twin.monitor.phases import PhaseFinder
 from twin.monitor.signatures import steps
 from twin.signals import MBAR, UNUSABLE, Phase, Samples
 

@@ -29,7 +29,8 @@ from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, binned
 from twin.monitor.cycles import figures, whole
 from twin.monitor.healthy import Healthy
-from twin.monitor.phases import Knees, as_wide_as_needed, expected_knees
+from twin.monitor.knees import as_wide_as_needed, expected_knees
+from twin.monitor.phases import Knees
 from twin.monitor.signatures import drawn_rows, steps
 from twin.monitor.switching import Seen, seen
 from twin.signals import MBAR, NS, SAMPLE, TICK, UNUSABLE, Command, Phase, Samples, Ticks
@@ -239,7 +240,8 @@ class Evidence:
             here = sensing[np.searchsorted(begins, knee, "right") - 1]
             name = Phase(int(self.ticks["phase"][knee]))
             closing = name == Phase.HOLD
-            earlier, known = (here.off, 0) if closing else (here.on, self.knees.on_shift)
+            earlier = here.off if closing else here.on
+            known = self.knees.off_shift if closing else self.knees.on_shift
             level[knee] -= here.off_above if closing else here.on_above
             acts = max(knee - known - earlier, 0)
             phase[max(knee - known, 0) : knee] = _OTHER[name]
@@ -451,7 +453,7 @@ def _unsettled(phase: npt.NDArray[np.uint8], knees: Knees) -> npt.NDArray[np.boo
     kind = phase[begins]
     before = np.concatenate([[255], kind[:-1]])
     sucks, sucked = (np.isin(one, [Phase.SUCTION, Phase.HOLD]) for one in (kind, before))
-    after_knee = lengths - knees.on_shift * (kind == Phase.SUCTION)
+    after_knee = lengths - np.where(kind == Phase.SUCTION, knees.on_shift, knees.off_shift)
     soon = sucks & sucked & (after_knee < knees.settles)
     soon[1:] |= soon[:-1] & ~sucks[1:]
     return np.repeat(soon, lengths)

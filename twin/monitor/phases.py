@@ -8,8 +8,7 @@ each knee. Rows that cannot be at a knee are given out at once.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -18,21 +17,15 @@ import numpy.typing as npt
 from twin.model import theta as c
 from twin.model.compiled import compiled, per_row
 from twin.model.control import new_timer, timed
-from twin.model.gas import GAMMA, R
-from twin.model.plant import suction_at
-from twin.model.theta import Theta
-from twin.signals import BREAK, MS, NS, SAMPLE, UNUSABLE, Phase, Samples, joined
+from twin.signals import BREAK, NS, SAMPLE, UNUSABLE, Phase, Samples, joined
 
 IDLE_ROWS = 20  # rows of idle that give the level before a cycle
 FEWEST_IDLE_ROWS = 5
 SIGNIFICANT = 7.0  # sigmas of slope difference that make a knee
-SHARP, ROUNDED = 2.5, 2.0  # times that, which the window is to show of a knee; lags round it
-ROUNDS = 8  # until its rows are known
 JUMP = 8.0  # times the noise, from one row to the next: knees are rounder
 ALONE = 2.0  # times the changes before and after it: a line that rings rises as fast, but longer
-SHORTEST_WINDOW, LONGEST_WINDOW = 8, 240  # rows
+SHORTEST_WINDOW = 8  # rows
 MOST_MISSING = 0.5  # of a line's rows
-SETTLED = 20e-3  # s after the valve's response before a knee can be one
 
 # What the finder remembers from row to row.
 # Ages are in rows; suction's runs anew from a knee, and is −1 while suction is not commanded.
@@ -45,15 +38,17 @@ _IDLE, _SUCTION, _HOLD, _BLOW_OFF = (int(phase) for phase in Phase)
 class Knees:
     """How knees look in this system: rows of the window, noise (Pa), rows from valve to knee.
 
-    The nozzle's opening shows when jet and sensor have followed; its closing shows at once, because
-    the step at the port pulls the knee forward by as much as the two delay it. A window of
-    more than ``longest`` rows could take the way to the end pressure for a knee.
+    The nozzle's closing shows ``off_shift`` rows later, its opening ``on_shift``. No knee is looked
+    for in the rows until suction has ``settled``, nor in those until one can follow ``again``. A
+    window of more than ``longest`` rows could take the way to the end pressure for a knee.
     """
 
     window: int
     noise: float
+    off_shift: int
     on_shift: int
     settled: int
+    again: int
     longest: int
     blow_off: tuple[float, float] = (float(c.EXTERNAL), 0.0)  # the ejector's own: mode, pulse (s)
 
@@ -65,58 +60,7 @@ class Knees:
     @property
     def lag(self) -> int:
         """Rows the finder is behind at most: half a window to see the peak, and the way back."""
-        return self.settles + self.on_shift + 1
-
-
-def expected_knees(theta: Theta, noise: float) -> Knees:
-    """Derive the knees' window from how sharply the slope breaks at H1 in this system.
-
-    The slope of a straight line over n rows of noise s has the deviation s √(12/n³); the window is
-    chosen so that the break is SIGNIFICANT against the difference of two such slopes. A lag of the
-    sensor leaves 1 / (1 + lag / n) of that difference.
-    """
-    h1 = theta[c.AMBIENT] - theta[c.H1]
-    suction = suction_at(theta, h1) * R * theta[c.TEMPERATURE]
-    bend = max(GAMMA * suction / (theta[c.VOLUME] + theta[c.PORT_VOLUME]) * MS, 1e-3)  # Pa per row
-    sharp = rows = (24.0 * (SHARP * SIGNIFICANT * noise / bend) ** 2) ** (1.0 / 3.0)
-    lag = math.hypot(theta[c.SENSOR_LAG], theta[c.SENSOR_LAG] + theta[c.SLOW_SENSOR]) / MS
-    for _ in range(ROUNDS):
-        rows = max(sharp, sharp * (ROUNDED / SHARP * (1.0 + lag / rows)) ** (2.0 / 3.0))
-    window = int(min(max(math.ceil(rows), SHORTEST_WINDOW), LONGEST_WINDOW))
-    to_the_end = (h1 - theta[c.END_RATIO] * theta[c.AMBIENT]) / bend  # if it went on like this
-    return Knees(
-        window=window,
-        longest=int(min(max(to_the_end, window), LONGEST_WINDOW)),
-        noise=noise,
-        on_shift=round((2.0 * theta[c.RAMP_UP] + 2.0 * theta[c.SENSOR_LAG]) / MS),
-        settled=round((theta[c.RESPONSE] + SETTLED) / MS),
-        blow_off=(float(theta[c.BLOW_OFF_MODE]), float(theta[c.BLOW_OFF_TIME])),
-    )
-
-
-def as_wide_as_needed(knees: Knees, blocks: Sequence[Samples]) -> Knees:
-    """The same with the window in which most suctions of a whole record show the nozzle go off.
-
-    The narrowest of these: a wider one finds out more where a sensor, slower than anybody knew, has
-    rounded the knees, but is further behind and needs longer stretches.
-    """
-    best, (most, suctions) = knees, _nozzle_off(knees, blocks)
-    window = knees.window
-    while most < suctions and window < knees.longest:
-        window = min(2 * window, knees.longest)
-        wider = replace(knees, window=window)
-        if (found := _nozzle_off(wider, blocks)[0]) > most:
-            best, most = wider, found
-    return best
-
-
-def _nozzle_off(knees: Knees, blocks: Sequence[Samples]) -> tuple[int, int]:
-    """In how many suctions the nozzle is seen to go off, and of how many."""
-    finder = PhaseFinder(knees)
-    phase = np.concatenate([*(finder.push(block)[1] for block in blocks), finder.flush()[1]])
-    inside = np.isin(phase, (Phase.SUCTION, Phase.HOLD))
-    number = np.cumsum(np.diff(inside, prepend=False) & inside)
-    return len(np.unique(number[phase == Phase.HOLD])), int(number[-1]) if len(number) else 0
+        return self.settles + max(self.off_shift, self.on_shift) + 1
 
 
 @per_row
@@ -213,10 +157,10 @@ def _break_at(pressure, row, window, noise, nozzle_on):  # type: ignore[no-untyp
 def _find(state, pressure, commands, first, look, phase, level):  # type: ignore[no-untyped-def]
     """Fill ``phase`` and ``level`` from ``first`` on; gives the row that needs later ones.
 
-    ``look`` = window, noise, on shift, settled; window 0 looks for no knees (at the end of a
-    stretch, where the rows after are missing). A knee reaches back by its shift.
+    ``look`` = window, noise, off shift, on shift, settled, again; window 0 looks for no knees (at
+    the end of a stretch, where the rows after are missing). A knee reaches back by its shift.
     """
-    window, settled = int(look[0]), look[3]
+    window, settled = int(look[0]), look[4]
     end = first  # of the rows with the same command
     for row in range(first, len(pressure)):
         if row == end:
@@ -263,7 +207,7 @@ def _unsettled(state, look):  # type: ignore[no-untyped-def]
     """How many of the rows that are through the search a knee may still change."""
     if state[_AGE] < 0.0 or look[0] == 0.0:
         return 0
-    reach = 0 if state[_NOZZLE] > 0.0 else int(look[2])
+    reach = int(look[2] if state[_NOZZLE] > 0.0 else look[3])
     return reach + (int(state[_BEST_AGE]) + 1 if state[_BEST] > 0.0 else 0)
 
 
@@ -308,11 +252,11 @@ def _look(state, pressure, row, look, may_bend, phase, level):  # type: ignore[n
     state[_BEST_AGE] += 1.0
     if state[_BEST_AGE] >= window // 2:
         knee = row - int(state[_BEST_AGE])
-        shift = 0 if nozzle_on else int(look[2])
+        shift = int(look[2] if nozzle_on else look[3])
         level[knee] = state[_BEST_LEVEL]
         phase[knee - shift : row + 1] = _HOLD if nozzle_on else _SUCTION
         state[_NOZZLE], state[_BEST] = 0.0 if nozzle_on else 1.0, 0.0
-        state[_AGE] = state[_BEST_AGE]
+        state[_AGE] = state[_BEST_AGE] + window + look[4] - look[5]  # the valve has acted already
 
 
 Found = tuple[Samples, npt.NDArray[np.uint8], npt.NDArray[np.float64]]
@@ -385,7 +329,9 @@ class PhaseFinder:
         """Search as far as the rows reach; gives the first row that may still change."""
         pressure = self._rows["pressure"].astype(np.float64)
         pressure[(self._rows["quality"] & UNUSABLE) != 0] = np.nan
-        look = np.array([window, self.knees.noise, self.knees.on_shift, self.knees.settled])
+        knees = self.knees
+        shifts = knees.off_shift, knees.on_shift
+        look = np.array([window, knees.noise, *shifts, knees.settled, max(knees.again, window)])
         self._seen = _find(
             self._state, pressure, self._told, self._seen, look, self._phase, self._level
         )

@@ -17,7 +17,8 @@ from twin.monitor.bank import DELAYS, LARGER, SUSPECTS, UNSURE_OF, hypotheses
 from twin.monitor.bins import Bins, Floats, Ints, averaged
 from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import Healthy
-from twin.monitor.phases import Knees, expected_knees
+from twin.monitor.knees import expected_knees
+from twin.monitor.phases import Knees
 from twin.monitor.switching import seen
 from twin.monitor.weights import (
     SCATTER,
