@@ -128,6 +128,19 @@ def test_where_the_nozzle_goes_off_several_times_each_knee_is_off_by_itself(seed
     assert answer["extended"]["leftover_sigma"] < 1.0
 
 
+@pytest.mark.parametrize("flow", [4.0, 5.4])
+def test_a_valve_whose_closing_no_healthy_cycle_shows_is_nothing_unlisted(flow: float) -> None:
+    """Suctions of a leaking gripper end with the nozzle on; healthy ones all end in a hold."""
+    unit = battery.unit("gripper", 1)
+    assert unit.config.data.ejector.response_off_ms - unit.plc.valves.suction_off_ms > 2.0
+    log = recorded(unit.plc, 11, 7, [parse_fault(f"porous_leakage={flow}")])
+    answer = diagnose(unit.config, [log], "log.mcap", quiet).json
+    assert (answer["verdict"], answer["causes"][0]["effect"]) == ("explained", "porous_leakage")
+    assert answer["causes"][0]["parameters"]["flow_at_600mbar"]["value"] == pytest.approx(
+        flow, rel=0.04
+    )
+
+
 def test_an_effect_outside_the_table_gets_a_term_that_takes_it_away() -> None:
     diagnosis = of(record(27.0, "lip_lift=5", seed=22))
     answer = diagnosis.json

@@ -5,7 +5,7 @@ measured minus expected pressure, averaged over short bins, and the vacuum at wh
 switched against the vacuum at which the hypothesis would.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
@@ -22,7 +22,7 @@ from twin.live import Twin
 from twin.model import kernel
 from twin.model import theta as c
 from twin.model.courses import Cause, Schedule, schedule
-from twin.model.dataset import coefficients
+from twin.model.dataset import DataSet, coefficients
 from twin.model.plant import reading_of, sensed_of
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
@@ -72,7 +72,7 @@ class Evidence:
     bins: Bins
     terms: tuple[Term, ...]  # that data gave the data set
     knees: Knees  # how they were looked for
-    uncertain: tuple[Theta, ...]  # data sets as likely, a sigma away where no log decided
+    uncertain: tuple[tuple[Theta, Theta], ...]  # a sigma either way where no log decided
     rows: Ints  # that suffice to draw what is expected
     _seen: dict[bytes, Seen] = field(default_factory=dict)  # by coefficients
 
@@ -384,24 +384,33 @@ def of_log(beside: Evidence, blocks: Iterable[Samples]) -> Evidence:
     )
 
 
-def _uncertain(config: Config) -> Iterator[Theta]:
-    """Coefficients one sigma away, each way that calibration left the data set open.
+def _uncertain(config: Config) -> Iterator[tuple[Theta, Theta]]:
+    """Coefficients one sigma to either side, each way that calibration left the data set open.
 
     And each that calibration says nothing about: only one supply was ever measured.
     """
     for key, share in SUPPLY_UNKNOWN.items():
-        supply = config.data.supply
-        moved = supply.model_copy(update={key: getattr(supply, key) * (1.0 + share)})
-        yield coefficients(config.data.model_copy(update={"supply": moved}))
+        known = getattr(config.data.supply, key)
+        yield _aside(config.data, {f"supply.{key}": share * known})
     rows = config.monitor.healthy.uncertain
     for way in range(len(rows)):
-        data = config.data
-        for name, row in list(rows.items())[way:]:
-            table, key = name.split(".")
-            part = getattr(data, table)
-            moved = part.model_copy(update={key: getattr(part, key) + row[way]})
-            data = data.model_copy(update={table: moved})  # unchecked: it need be no ejector
-        yield coefficients(data)
+        yield _aside(config.data, {name: row[way] for name, row in list(rows.items())[way:]})
+
+
+def _aside(data: DataSet, changes: Mapping[str, float]) -> tuple[Theta, Theta]:
+    """Coefficients with values (``table.key``) changed by so much, and by as much less."""
+    up, down = (_changed(data, changes, sign) for sign in (1.0, -1.0))
+    return coefficients(up), coefficients(down)
+
+
+def _changed(data: DataSet, changes: Mapping[str, float], sign: float) -> DataSet:
+    """A data set, unchecked: it need be no ejector."""
+    for name, change in changes.items():
+        table, key = name.split(".")
+        part = getattr(data, table)
+        moved = part.model_copy(update={key: getattr(part, key) + sign * change})
+        data = data.model_copy(update={table: moved})
+    return data
 
 
 def thinned(evidence: Evidence, cycles: Sequence[int], most: int) -> Evidence:

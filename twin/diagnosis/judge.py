@@ -26,7 +26,7 @@ class Judged:
     squares: Floats  # mean square deviation of each held-out cycle, mbar²
     leftover: float  # sigmas
     usual: float  # mbar rms, of healthy cycles like these
-    unmeasured: float  # mbar rms, that may be left because only one supply was ever measured
+    unmeasured: float  # mbar rms, that may be left of what no healthy cycle can have shown
     figures: dict[str, float | None]
 
     @property

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag, solve_triangular
 
-from twin.diagnosis.evidence import HEALTHY, SUPPLY_UNKNOWN, Evidence, Hypothesis
+from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.model import theta as c
 from twin.model.courses import Cause, Course, Schedule
 from twin.model.theta import Theta
@@ -27,6 +27,7 @@ CLOSING_MS = 0.5  # by which a valve's closing differs, one sigma
 KNEE_WINDOWS = 10  # a knee is found to a tenth of its window
 # What that moves, of the columns of ``moved``: each knee by itself, where a cycle has several.
 KNEES = [len(SCATTER) + len(_CLOSES), -1]
+UNSEEN = 3.0  # sigmas in a bin: what the data set leaves open by more, calibration cannot have seen
 MISMATCH = 0.08  # of what a hypothesis explains, is off in its waveform
 LEVELS = ("h1_level", "h1_low_level")
 _INTO = (Phase.HOLD, Phase.SUCTION)  # what begins at each
@@ -42,7 +43,7 @@ class Weights:
     bins: Ints  # of these cycles
     factor: Floats  # lower Cholesky factor of the covariance of bins, then levels
     usual: float  # rms (mbar) over rows of a model that is as right as it was in healthy cycles
-    unmeasured: float  # and of what nobody knows of how suction follows the supply
+    unmeasured: float  # and of what no healthy cycle can have shown
     sigma: Floats  # of each level
     level_cycles: Ints  # of each level, positions
 
@@ -66,7 +67,7 @@ class Covariance:
     evidence: Evidence
     mismatch: Floats  # of what is explained, in each bin
     moves: Floats  # by one sigma of each scatter, (bins, scatters)
-    left_open: Floats  # by one sigma of each way that the data set is uncertain, (bins, ways)
+    left_open: Floats  # by one sigma of each way that the data set is uncertain, and bent by it
 
     def of(self, cycles: Sequence[int], *, scattered: bool = True) -> Weights:
         """Weights of some cycles; where not ``scattered``, that is told apart by somebody else."""
@@ -84,8 +85,8 @@ class Covariance:
         covariance = from_cycle_to_cycle(bins, here, goes_on, moves, evidence.noise)
         covariance += np.outer(common, common) * (apart * (kind[:, None] == kind))
         usual = _usual(np.diag(covariance), bins.count[here], evidence.noise)
-        at_supply = np.sum(left_open[:, : len(SUPPLY_UNKNOWN)] ** 2, axis=1)
-        unmeasured = _usual(at_supply, bins.count[here], 0.0)
+        unseen = left_open**2 * (left_open**2 > UNSEEN**2 * np.diag(covariance)[:, None])
+        unmeasured = _usual(np.sum(unseen, axis=1), bins.count[here], 0.0)
         covariance += left_open @ left_open.T
         sigma = _level_sigmas(evidence, cycles)
         levels = np.diag(sigma**2) + _together(evidence, cycles)
@@ -113,13 +114,13 @@ def moved(
     evidence: Evidence,
     about: Hypothesis,
     sizes: Mapping[str, tuple[str, float]],
-    uncertain: Sequence[Theta] = (),
+    uncertain: Sequence[tuple[Theta, Theta]] = (),
 ) -> tuple[Floats, Floats, Floats]:
     """Deviation of a hypothesis (mbar), and by how much it moves, (bins, ·).
 
     By each scatter's size; then by one sigma of what else differs from cycle to cycle: when the
-    valves close, and where a knee was found; then by what is not linear in such times. Last with
-    each of the ``uncertain`` data sets.
+    valves close, and where a knee was found; then by what is not linear in such times. Last by the
+    ``uncertain`` data sets, in the same way.
     """
     steady = [(*about, Cause(name, {key: size})) for name, (key, size) in sizes.items()]
     acts = [(_ACTS[name], size) for name, (_, size) in sizes.items() if name in _ACTS]
@@ -129,18 +130,22 @@ def moved(
     both = [(_acting(evidence.theta, *one, sign), 0) for sign in (1, -1) for one in times]
     both[len(times) : len(times)] = [(evidence.theta, late)]
     both.append((evidence.theta, -late))
+    both += [(up, 0) for up, _ in uncertain] + [(down, 0) for _, down in uncertain]
     as_it_is = len(steady) + 1
     off = evidence.off(
-        [about, *steady, *[about] * (len(both) + len(uncertain))],
-        [*[evidence.theta] * as_it_is, *(theta for theta, _ in both), *uncertain],
-        [*[0] * as_it_is, *(rows for _, rows in both), *[0] * len(uncertain)],
+        [about, *steady, *[about] * len(both)],
+        [*[evidence.theta] * as_it_is, *(theta for theta, _ in both)],
+        [*[0] * as_it_is, *(rows for _, rows in both)],
     )
-    moves = off[:, 1:] - off[:, :1]
-    linear, plus, minus, left_open = np.split(
-        moves, np.cumsum([len(steady), len(times) + 1, len(times) + 1]), axis=1
-    )
-    bent = (plus + minus) / math.sqrt(2.0)  # of a normal variable's square
-    return off[:, 0], np.hstack([linear, (plus - minus) / 2.0, bent]), left_open
+    ends = np.cumsum([len(steady), *[len(times) + 1] * 2, len(uncertain)])
+    linear, *apart = np.split(off[:, 1:] - off[:, :1], ends, axis=1)
+    moves, left_open = (_either_way(*two) for two in (apart[:2], apart[2:]))
+    return off[:, 0], np.hstack([linear, *moves]), np.hstack(left_open)
+
+
+def _either_way(plus: Floats, minus: Floats) -> tuple[Floats, Floats]:
+    """What one sigma of a normal variable moves, and what its square does."""
+    return (plus - minus) / 2.0, (plus + minus) / math.sqrt(2.0)
 
 
 def _acting(theta: Theta, place: int, size: float, sign: int) -> Theta:
