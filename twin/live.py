@@ -100,7 +100,7 @@ def compiled(data: DataSet) -> Twin:
     """A twin whose path is compiled: seconds where nothing is cached, not to fall into a block."""
     twin = Twin.of(data)
     twin.advance(np.zeros(3 * twin.knees.lag, SAMPLE))
-    return Twin.of(data)
+    return Twin(twin.theta, twin.knees, twin.terms)
 
 
 def run(

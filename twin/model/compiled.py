@@ -11,11 +11,15 @@ import os
 import shutil
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import llvmlite.binding as llvm
 import numba
 from numba.core import event
+from numba.core.caching import FunctionCache
+from numba.core.runtime.nrt import rtsys
 
 from twin.processor import njit
 
@@ -69,9 +73,31 @@ class _Waiting(event.Listener):
 
 event.register("numba:compile", _Waiting())  # type: ignore[no-untyped-call]
 
+
+class _Cache(FunctionCache):
+    """Numba's cache; but what is found in it needs nothing of what numba can compile.
+
+    Numba gets all of that ready before it looks, a sixth of the time that a command takes to start.
+    Where nothing is found, its compiler does the same as it begins.
+    """
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+
+
 # Results stay the same to the last bit: no fast-math. Dividing by zero gives inf as in NumPy. What
 # is called from ``per_row`` may have arrays of its own (numba would pass that on).
-compiled = njit(cache=True, nogil=True, error_model="numpy", _nrt=True)  # type: ignore[call-overload]
+_with_arrays = njit(nogil=True, error_model="numpy", _nrt=True)  # type: ignore[call-overload]
+
+
+def compiled(function: Callable[..., Any]) -> Any:
+    """A function to be called from Python, or where inlining it is not worth it; kept on disk."""
+    dispatcher = _with_arrays(function)
+    dispatcher._cache = _Cache(function)  # type: ignore[no-untyped-call]
+    return dispatcher
+
 
 # For functions called inside a loop: over hypotheses only one without calls is vectorised, and over
 # rows a call costs as much as a few lines.
