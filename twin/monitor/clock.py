@@ -9,6 +9,7 @@ that was set shows against the count, whatever the way does meanwhile.
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from statistics import median
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +26,7 @@ FULL = 20  # receipts, of which one came by the shortest way: for a window that 
 LEAD = 64  # rows from which the scans' period is taken
 SET_NS = 3_000_000  # a clock that was set by less cannot be told from the PLC's jitter
 CONFIRMED = 3  # receipts that must agree that it was set
+OLDEST = 0.1  # of the windows may have come since the line was drawn that says what is far off it
 FARTHEST = 1000  # scans between two receipts; beyond, the period is not known that well
 UNSTEADY = 2.0  # times what the middle receipt came after the fastest: the fastest may be late too
 SHORTER, LONGER = 2, 12  # windows after which a way that is shorter, or longer, is a clock's doing
@@ -33,6 +35,7 @@ _NEW = int(Quality.RESTART | Quality.CLOCK)  # after these another time begins
 
 Integers = npt.NDArray[np.int64]
 Floats = npt.NDArray[np.float64]
+Number = TypeVar("Number", float, Floats)
 
 
 @dataclass(frozen=True)
@@ -143,6 +146,8 @@ class ClockWatch:
     _points: Floats = field(default_factory=lambda: np.empty((3, 0)))
     _since: int = 0  # windows since the last report
     _off: int = 0  # windows in a row that are off the line, below zero where they are too early
+    _line: tuple[float, float, float] = (0.0, 0.0, 0.0)  # its slope, value and time (ns) at its end
+    _undrawn: int = 0  # windows since it was drawn
 
     def __post_init__(self) -> None:
         """Have what is compiled at hand, not to fall into a block."""
@@ -286,21 +291,32 @@ class ClockWatch:
         self._off = 0 if not off else int(np.sign(off)) + (self._off if off * self._off > 0 else 0)
         late = median(self._ways) - self._fastest[1]
         self._points = np.column_stack([self._points[:, -KEPT + 1 :], [*self._fastest, late]])
-        self._since, self._fastest, self._ways = self._since + 1, None, []
+        self._since, self._undrawn = self._since + 1, self._undrawn + 1
+        self._fastest, self._ways = None, []
         return off
 
     def _beyond(self, point: tuple[int, int]) -> float:
         """How far (ns) a window's fastest is off the line of those before, where that is far."""
-        if self._sure.shape[1] < FEWEST:
-            return 0.0
         x, y, late = self._sure
-        slope, at_end = line(x, y)
-        off = point[1] - at_end - slope * (point[0] - x[-1])
-        if abs(off) <= SET_NS:  # nearly always
+        if len(x) < FEWEST:
             return 0.0
-        scatter = 1.4826 * median(np.abs(y - at_end - slope * (x - x[-1])).tolist())
+        if self._undrawn > OLDEST * len(x):
+            self._draw()
+        if abs(self._off_line(*point)) <= SET_NS:  # nearly always
+            return 0.0
+        self._draw()
+        off = self._off_line(*point)
+        scatter = 1.4826 * median(np.abs(self._off_line(x, y)).tolist())
         unsteady = UNSTEADY * median(late.tolist())
-        return off if abs(off) > max(8.0 * scatter, unsteady) else 0.0
+        return off if abs(off) > max(float(SET_NS), 8.0 * scatter, unsteady) else 0.0
+
+    def _draw(self) -> None:
+        x, y, _ = self._sure
+        self._line, self._undrawn = (*line(x, y), float(x[-1])), 0
+
+    def _off_line(self, x: Number, y: Number) -> Number:
+        slope, at_end, end = self._line
+        return y - at_end - slope * (x - end)
 
     def _report(self, time_ns: int) -> Iterator[Event]:
         if self._sure.shape[1] < FEWEST or not self._since or self._zero is None:
@@ -314,9 +330,10 @@ class ClockWatch:
     def _estimate(self, now: int, zero: int) -> Estimate:
         """At ``now``, which the line is drawn out to."""
         x, y, _ = self._sure
-        slope, at_end = line(x, y)
+        self._draw()
+        slope, at_end, _ = self._line
         drift_pm = slope_pm(x, y)
-        scatter = 1.4826 * median(np.abs(y - at_end - slope * (x - x[-1])).tolist())
+        scatter = 1.4826 * median(np.abs(self._off_line(x, y)).tolist())
         offset_pm = 1.96 * scatter + drift_pm * float(x[-1] - x[0]) / 2
         here = at_end + slope * (now - x[-1])
         return Estimate(-(zero + here) * 1e-6, offset_pm * 1e-6, -slope * 1e6, drift_pm * 1e6)
