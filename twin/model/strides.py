@@ -42,7 +42,6 @@ TOLERANCE = 0.05  # Pa, of a step: within 0.4 of the exact solution on the shipp
 LONGEST_STEP = 15e-3  # s; the course between its ends does not follow further
 SHORTEST_STEP = 40e-6  # s, after a jump of a valve or a cup, and where the exhaust opens
 LONGER = 2.0  # at most so many times as long as the step before
-SURE = 0.9  # of the length at which the error should be just within tolerance
 TOO_FAR = 1.5  # times the tolerance: the step is done again, shorter
 
 # The clock of a step under way: how long ago it began, its length, that of the last one (s), and
@@ -144,7 +143,7 @@ def _planned(begin, k, moving, before, tolerance):  # type: ignore[no-untyped-de
     rough = begin[ROUGH, 0]
     longest = LONGEST_STEP * (tolerance / TOLERANCE) ** (1.0 / 6.0)  # for what is read
     h = min(longest, LONGER * before)
-    h = min(h, SURE * (tolerance / rough) ** (1.0 / 3.0)) if rough > 0.0 else h
+    h = min(h, (tolerance / rough) ** (1.0 / 3.0)) if rough > 0.0 else h
     while h > SHORTEST_STEP and kernel._release(begin, k, h, 0):
         h *= 0.5
     opens = (k[c.AMBIENT, 0] - begin[PORT, 0]) / moving
@@ -176,7 +175,7 @@ def _stride(begin, end, clock, k, longest, tolerance):  # type: ignore[no-untype
         off = mine[ROUGH, 0] * h * h * h
         if off <= TOO_FAR * tolerance or h <= SHORTEST_STEP:
             break
-        h = max(h * SURE * (tolerance / off) ** (1.0 / 3.0), SHORTEST_STEP)
+        h = max(h * (tolerance / off) ** (1.0 / 3.0), SHORTEST_STEP)
     put(end, 0, mine, 0)
     clock[_LENGTH] = clock[_BEFORE] = h
 
