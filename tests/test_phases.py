@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 from drivers.plc.faults import parse_fault
 from drivers.plc.settings import PlcSettings
 from drivers.plc.simulate import blocks, with_truth
+from tools.calibration_coverage import drawn
 from twin.model import theta as c
+from twin.model.dataset import DataSet, coefficients
 from twin.monitor.knees import LONGEST_WINDOW, as_wide_as_needed, expected_knees
 from twin.monitor.phases import IDLE_ROWS, SHORTEST_WINDOW, Knees, PhaseFinder
 from twin.signals import BREAK, MBAR, SAMPLE, Command, Phase, Quality, Samples
@@ -55,15 +57,19 @@ def since_edge(suction: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
 def compare(
     name: str, faults: tuple[str, ...], seed: int, air_saving: bool = True, bad: float = 0.0
 ) -> list[int]:
-    """Rows by which each switch is found late; an assertion fails where one is not or is no one.
-
-    A switch just before the end of suction cannot be told from it; one just after its beginning
-    is the valve's answer to the command. A share ``bad`` of the rows has no good pressure.
-    """
+    """Rows by which each switch is found late, with a share ``bad`` of rows without a pressure."""
     samples, truth = rigs.recorded(name, SECONDS, faults, seed, air_saving)
     if bad:
         samples = rigs.spoilt(samples, bad, seed)
-    knees = rigs.knees(name)
+    return found_where_true(samples, truth, rigs.knees(name))
+
+
+def found_where_true(samples: Samples, truth: npt.NDArray[np.void], knees: Knees) -> list[int]:
+    """Rows by which each switch is found late; an assertion fails where one is not or is no one.
+
+    A switch just before the end of suction cannot be told from it; one just after its beginning
+    is the valve's answer to the command.
+    """
     _, phase, _ = find(samples, knees)
     suction = samples["commands"] == Command.SUCTION
     to_end = since_edge(suction[::-1])[::-1]
@@ -264,6 +270,51 @@ def test_the_nozzle_may_go_off_again_before_a_valve_could_have_followed_a_comman
     knees = np.flatnonzero(np.isfinite(level[1:])) + 1
     assert phase[knees].tolist() == [Phase.HOLD, Phase.SUCTION, Phase.HOLD]
     assert knees == pytest.approx([300, 400, 435], abs=3)
+
+
+def on_other_tubes(seed: int) -> tuple[PlcSettings, DataSet]:
+    """The gripper as another unit, on shorter or longer tubes, and its data set."""
+    factor = float(np.random.default_rng([2, seed]).uniform(0.6, 2.5))
+    document = rigs.config("gripper").document
+    plc = drawn(document.section(PlcSettings, "plc"), seed).model_dump()
+    plc["rig"]["line_length_m"] *= factor
+    plc["rig"]["line_ml"] *= factor
+    plc["program"]["start_ms"] = 500.0
+    data = rigs.config("gripper").data.model_dump()
+    for part in data["system"]["parts"]:
+        if part["kind"] == "tube":
+            part["length_mm"] *= factor
+    data["ejector"]["end_pressure_mbar"] = plc["ejector"]["end_pressure_mbar"]
+    return PlcSettings.model_validate(plc), DataSet.model_validate(data)
+
+
+@pytest.mark.parametrize("fault", ["leakage=0", "leakage=2"])
+@pytest.mark.parametrize("seed", range(6))
+def test_a_tube_that_rings_does_not_switch_the_nozzle(seed: int, fault: str) -> None:
+    plc, data = on_other_tubes(seed)
+    parts = zip(*with_truth(plc, SECONDS, [parse_fault(fault)], seed), strict=True)
+    samples, truth = (np.concatenate(column) for column in parts)
+    knees = expected_knees(coefficients(data), data.sensor.noise_mbar * MBAR)
+    assert len(found_where_true(samples, truth, knees)) >= 10
+
+
+def test_no_knee_is_near_the_level_of_the_last() -> None:
+    """The slope breaks as it does where the nozzle goes on, but the pressure has hardly risen."""
+    slopes = np.repeat([-100.0, 100.0, -30.0, 10.0, -100.0], [300, 40, 40, 400, 200])  # Pa per row
+    samples = stream([1] * len(slopes), 9e4 + np.cumsum(slopes))
+    samples["pressure"] += np.random.default_rng(0).normal(0.0, KNEES.noise, len(slopes))
+    for apart, first_on in ((0.0, 340), (5000.0, 780)):
+        _, phase, _ = find(samples, replace(KNEES, on_shift=0, apart=apart))
+        on = np.flatnonzero((phase[1:] == Phase.SUCTION) & (phase[:-1] == Phase.HOLD)) + 1
+        assert on[0] == pytest.approx(first_on, abs=3)
+
+
+def test_knees_are_apart_where_the_line_rings_and_by_less_than_the_hysteresis() -> None:
+    assert rigs.knees("test_rig").apart == 0.0
+    assert rigs.knees("gripper").apart > 20.0 * MBAR
+    theta = rigs.theta("gripper")
+    theta[c.H1_LOW] = theta[c.H1] - 60.0 * MBAR
+    assert expected_knees(theta, rigs.knees("gripper").noise).apart <= 40.0 * MBAR
 
 
 def found_late(name: str, factor: float) -> tuple[float, float]:

@@ -22,6 +22,8 @@ AGAIN = 30e-3  # s after a knee, in which lines ring, before the next can be one
 AT_ONCE = 2  # rows: so few would follow the lag that calibration finds, and that lag them
 HELD = 2.0  # s for which the nozzle is off in the free run
 LONGEST_RUN = 60_000  # rows of it
+RINGS = 1.5  # times as high as in the free run a line may ring
+MOST_APART = 2.0 / 3.0  # of H1's hysteresis: thresholds drift
 
 
 def expected_knees(theta: Theta, noise: float) -> Knees:
@@ -50,13 +52,14 @@ def expected_knees(theta: Theta, noise: float) -> Knees:
         again=round(AGAIN / MS),
         blow_off=(float(theta[c.BLOW_OFF_MODE]), float(theta[c.BLOW_OFF_TIME])),
     )
-    return _as_late_as_seen(at_once, theta, GAMMA * theta[c.H1] / bend)
+    return _as_seen(at_once, theta, GAMMA * theta[c.H1] / bend)
 
 
-def _as_late_as_seen(knees: Knees, theta: Theta, most: float) -> Knees:
-    """The same, seen as much later than they happen as in a free run, which reaches H1 by ``most``.
+def _as_seen(knees: Knees, theta: Theta, most: float) -> Knees:
+    """The same, seen as in a free run, which reaches H1 by ``most`` rows: as late, as far apart.
 
-    Jet and sensor delay a knee; the step at the port pulls it forward. A flow back into another run
+    Jet and sensor delay a knee; the step at the port pulls it forward. As that step swings in the
+    line, the slope breaks as at a knee, but near the last one's level. A flow back into another run
     lets the pressure come down to where the nozzle goes on.
     """
     gas = (theta[c.VOLUME] + theta[c.PORT_VOLUME]) / (R * theta[c.TEMPERATURE])
@@ -70,7 +73,9 @@ def _as_late_as_seen(knees: Knees, theta: Theta, most: float) -> Knees:
         knees = replace(knees, off_shift=tight.off_rows)
     if 0 < leaking.on_rows <= most_rows:
         knees = replace(knees, on_shift=leaking.on_rows)
-    return replace(knees, again=max(knees.again, knees.on_shift, knees.off_shift))
+    apart = min(RINGS * tight.rings, MOST_APART * float(theta[c.H1] - theta[c.H1_LOW]))
+    again = max(knees.again, knees.on_shift, knees.off_shift)
+    return replace(knees, again=again, apart=apart)
 
 
 def as_wide_as_needed(knees: Knees, blocks: Sequence[Samples]) -> Knees:

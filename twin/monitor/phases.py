@@ -29,8 +29,10 @@ MOST_MISSING = 0.5  # of a line's rows
 
 # What the finder remembers from row to row.
 # Ages are in rows; suction's runs anew from a knee, and is −1 while suction is not commanded.
-_NOZZLE, _AGE, _BEST, _BEST_AGE, _BEST_LEVEL, _IDLE_AGE, _IDLE_SUM, _ANCHORED = range(8)
-_BEGINNING = (0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+# The level of the last knee is NaN before a suction's first.
+_NOZZLE, _AGE, _BEST, _BEST_AGE, _BEST_LEVEL, _KNEE_LEVEL = range(6)
+_IDLE_AGE, _IDLE_SUM, _ANCHORED = range(6, 9)
+_BEGINNING = (0.0, -1.0, 0.0, 0.0, 0.0, math.nan, 0.0, 0.0, 0.0)
 _IDLE, _SUCTION, _HOLD, _BLOW_OFF = (int(phase) for phase in Phase)
 
 
@@ -39,8 +41,9 @@ class Knees:
     """How knees look in this system: rows of the window, noise (Pa), rows from valve to knee.
 
     The nozzle's closing shows ``off_shift`` rows later, its opening ``on_shift``. No knee is looked
-    for in the rows until suction has ``settled``, nor in those until one can follow ``again``. A
-    window of more than ``longest`` rows could take the way to the end pressure for a knee.
+    for in the rows until suction has ``settled``, nor in those until one can follow ``again``, nor
+    until the pressure is ``apart`` (Pa) from where the last was. A window of more than ``longest``
+    rows could take the way to the end pressure for a knee.
     """
 
     window: int
@@ -50,6 +53,7 @@ class Knees:
     settled: int
     again: int
     longest: int
+    apart: float = 0.0
     blow_off: tuple[float, float] = (float(c.EXTERNAL), 0.0)  # the ejector's own: mode, pulse (s)
 
     @property
@@ -157,8 +161,9 @@ def _break_at(pressure, row, window, noise, nozzle_on):  # type: ignore[no-untyp
 def _find(state, pressure, commands, first, look, phase, level):  # type: ignore[no-untyped-def]
     """Fill ``phase`` and ``level`` from ``first`` on; gives the row that needs later ones.
 
-    ``look`` = window, noise, off shift, on shift, settled, again; window 0 looks for no knees (at
-    the end of a stretch, where the rows after are missing). A knee reaches back by its shift.
+    ``look`` = window, noise, off shift, on shift, settled, again, apart; window 0 looks for no
+    knees (at the end of a stretch, where the rows after are missing). A knee reaches back by its
+    shift.
     """
     window, settled = int(look[0]), look[4]
     end = first  # of the rows with the same command
@@ -176,7 +181,7 @@ def _find(state, pressure, commands, first, look, phase, level):  # type: ignore
         else:
             state[_AGE] = -1.0
         if starts:
-            state[_NOZZLE], state[_BEST] = 1.0, 0.0
+            state[_NOZZLE], state[_BEST], state[_KNEE_LEVEL] = 1.0, 0.0, math.nan
             if state[_IDLE_AGE] >= FEWEST_IDLE_ROWS:
                 level[row] = _idle_level(state, pressure, row)
                 state[_ANCHORED] = 1.0
@@ -244,6 +249,9 @@ def _look(state, pressure, row, look, may_bend, phase, level):  # type: ignore[n
     significance, here = 0.0, 0.0
     if may_bend:
         significance, here = _break_at(pressure, row, window, noise, nozzle_on)
+        since = here - state[_KNEE_LEVEL]  # up while the nozzle is off, down while it is on
+        if (-since if nozzle_on else since) < look[6]:  # a line that rings
+            significance = 0.0
     if significance > max(state[_BEST], SIGNIFICANT):
         state[_BEST], state[_BEST_AGE], state[_BEST_LEVEL] = significance, 0.0, here
         return
@@ -253,7 +261,7 @@ def _look(state, pressure, row, look, may_bend, phase, level):  # type: ignore[n
     if state[_BEST_AGE] >= window // 2:
         knee = row - int(state[_BEST_AGE])
         shift = int(look[2] if nozzle_on else look[3])
-        level[knee] = state[_BEST_LEVEL]
+        level[knee] = state[_KNEE_LEVEL] = state[_BEST_LEVEL]
         phase[knee - shift : row + 1] = _HOLD if nozzle_on else _SUCTION
         state[_NOZZLE], state[_BEST] = 0.0 if nozzle_on else 1.0, 0.0
         state[_AGE] = state[_BEST_AGE] + window + look[4] - look[5]  # the valve has acted already
@@ -331,7 +339,8 @@ class PhaseFinder:
         pressure[(self._rows["quality"] & UNUSABLE) != 0] = np.nan
         knees = self.knees
         shifts = knees.off_shift, knees.on_shift
-        look = np.array([window, knees.noise, *shifts, knees.settled, max(knees.again, window)])
+        again = max(knees.again, window)
+        look = np.array([window, knees.noise, *shifts, knees.settled, again, knees.apart])
         self._seen = _find(
             self._state, pressure, self._told, self._seen, look, self._phase, self._level
         )

@@ -19,6 +19,7 @@ from twin.monitor.phases import Knees, PhaseFinder
 from twin.signals import MBAR, MS, SAMPLE, Command, Phase, Samples
 
 IDLE_ROWS = 50  # before the cycle
+FALLS = 3.0  # times the noise: so far back a reading comes where a line rings
 Bytes = npt.NDArray[np.uint8]
 
 
@@ -27,7 +28,8 @@ class Seen:
     """Vacuum (mbar) at which the nozzle was seen to go off and on; NaN where it did not switch.
 
     Rows from when the valve acted until it was seen, and how much (Pa) the level found was above
-    what the sensor read then; 0 where it did not switch.
+    what the sensor read then; 0 where it did not switch. How high (Pa) above its reading as the
+    valve closed the line still rang; 0 where the pressure only rose.
     """
 
     off: float
@@ -36,6 +38,7 @@ class Seen:
     on_rows: int = 0
     off_above: float = 0.0
     on_above: float = 0.0
+    rings: float = 0.0
     thresholds: tuple[float, float] = (np.nan, np.nan)  # mbar, what is read at them
 
     @property
@@ -68,8 +71,9 @@ def _seen(samples: Samples, theta: Theta, phase: Bytes, expected: Floats, knees:
     found, level = np.concatenate([early, late]), np.concatenate([low, high])
     off = _one(theta, phase, expected, found, level, Phase.HOLD)
     on = _one(theta, phase, expected, found, level, Phase.SUCTION)
+    rings = _rings(theta, phase, expected, FALLS * knees.noise)
     thresholds = _read_at(theta, c.H1), _read_at(theta, c.H1_LOW)
-    return Seen(off[0], on[0], off[1], on[1], off[2], on[2], thresholds)
+    return Seen(off[0], on[0], off[1], on[1], off[2], on[2], rings, thresholds)
 
 
 def _one(
@@ -86,6 +90,22 @@ def _one(
     rows = int(knees[0] - switched[0] - round(float(response) / MS))
     vacuum = (theta[c.AMBIENT_NOMINAL] - level[knees[0]]) / MBAR
     return float(vacuum), rows, float(level[knees[0]] - expected[knees[0]])
+
+
+def _rings(theta: Theta, phase: Bytes, expected: Floats, falls: float) -> float:
+    """How high (Pa) the line still rings above the reading as the valve first closed.
+
+    It rings as long as the reading comes back by more than ``falls`` (Pa).
+    """
+    off = phase == Phase.HOLD
+    if not off.any():
+        return 0.0
+    first = int(off.argmax())
+    rows = int((~off[first:]).argmax()) or len(off) - first
+    held = expected[first + round(float(theta[c.RESPONSE_OFF]) / MS) : first + rows]
+    highest = np.maximum.accumulate(held)
+    fallen = np.flatnonzero(highest - held > falls)
+    return float(highest[fallen[-1]] - held[0]) if len(fallen) else 0.0
 
 
 def _read_at(theta: Theta, threshold: int) -> float:
