@@ -21,7 +21,7 @@ from twin.log.reader import open_log
 from twin.log.recorder import Recorder
 from twin.log.schema import CHANNELS, SAMPLES
 
-REPEATS = 3
+REPEATS = 5
 
 
 class _Way(NamedTuple):
@@ -43,6 +43,7 @@ def files(run: Run) -> Sequence[Measured]:
     """Bytes per sample, time (s) to write an hour and to read it; the same of other ways."""
     run.tell("log: simulating the rig")
     log = part_log(run.folder)
+    read(log)  # loads what is compiled
     chunks = packed(log)
     ours, bare = _by_turns(run, _Way(write, read), _Way(write_bare, lambda _: unpack(chunks)))
     messages, table = _messages(log), _table()  # 200 MB, beside which nothing of ours is measured

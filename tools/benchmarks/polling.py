@@ -16,7 +16,7 @@ from benchmarks.processes import CONFIG, plc
 from drivers.sources import open_source
 from twin.settings import Document
 
-TURNS, LONG_TURNS = 6, 30
+TURNS, LONG_TURNS = 20, 30
 SLOTS = 2000  # in a turn: short, so that what else goes on meets all alike
 BUSY = 3.0  # %; a bare poller that misses more says that the machine had no time, nothing of ours
 SLOT_NS = 1_000_000
