@@ -88,7 +88,9 @@ class Load:
     def since(self, before: "Load") -> str:
         """What the cores did beside us since ``before``, in a sentence."""
         total = (self.total - before.total) / 100.0
-        others, stolen = self.others - before.others, self.stolen - before.stolen
+        # Counted in ticks: on a quiet machine ours may come to more than all there was.
+        others = max(self.others - before.others, 0.0)
+        stolen = self.stolen - before.stolen
         return (
             f"others took {others / total:.0f} % of the cores' time during the run, "
             f"the host of this virtual machine {stolen / total:.0f} %"
