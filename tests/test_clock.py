@@ -141,6 +141,15 @@ def test_a_clock_here_that_is_set_back_is_told_since_no_way_is_that_short() -> N
     close_to(of(told(samples), Kind.CLOCK)[-1], 38.0, 0.0)
 
 
+def test_what_the_clocks_had_parted_by_does_not_hide_that_one_was_set() -> None:
+    """From where they began neither is 3 ms off."""
+    samples = stream(60.0, 8.0, -120.0, waits_ms=0.3)
+    samples["host_ns"][24_000:] -= round(5.5 * MS)
+    (jump,) = of(told(samples), Kind.CLOCK_JUMPED)
+    assert jump.data["jump_s"] == pytest.approx(0.0055, abs=0.001)
+    assert (jump.time_ns - int(samples["time_ns"][24_000])) / S < 15.0
+
+
 def test_a_way_that_stays_longer_is_told_as_what_it_may_be() -> None:
     samples = stream(200.0, 8.0)
     samples["host_ns"][60_000:] += 30 * MS
