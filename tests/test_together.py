@@ -315,11 +315,11 @@ def test_several_ejectors_of_one_opc_ua_server(tmp_path: Path) -> None:
         assert one.header.asset_id == name
         assert kinds(one) <= {Kind.CYCLE, Kind.CLOCK}
         assert not any((samples["quality"] & BREAK).any() for samples, _ in one.blocks())
-    left, right = (
-        np.concatenate([samples["pressure"] for samples, _ in open_log(one).blocks()])[:1000]
-        for one in logs
-    )
-    assert not np.array_equal(left, right)  # each has the noise of its own rig
+    left, right = (np.concatenate([rows for rows, _ in open_log(one).blocks()]) for one in logs)
+    _, *same = np.intersect1d(left["sequence"], right["sequence"], return_indices=True)
+    assert len(same[0]) > 1000  # scans that both have
+    alike = left["pressure"][same[0]] == right["pressure"][same[1]]
+    assert alike.mean() < 0.5  # each has the noise of its own rig
 
 
 def test_one_that_cannot_begin_leaves_the_others_and_is_exit_code_3(

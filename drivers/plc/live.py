@@ -38,13 +38,15 @@ def run_plc(
     """Run the PLC until SIGINT, SIGTERM or ``duration_s``; call it in the main thread.
 
     Of several ejectors behind it the first says where it listens; the others differ in their unit
-    and, by OPC UA, in the prefix of their nodes. The faults are the first one's.
+    and, by OPC UA, in the prefix of their nodes. The faults are the first one's, and so is the
+    ``seed``; the next ones have those after it.
     ``ready(host, port)`` is called once when it listens, by Modbus and, where there is a table
     for it, by OPC UA. Raises SourceError where it cannot. SIGUSR1 and SIGUSR2 set its clock ahead
     and back by ``SET_NS``. Into ``witness`` goes every scan of the first ejector, as ``WITNESSED``.
     """
     first, *others = [settings] if isinstance(settings, PlcSettings) else settings
-    tasks = [_task(first, faults, seed), *(_task(one, (), seed) for one in others)]
+    tasks = [_task(first, faults, seed)]
+    tasks += [_task(one, (), seed + number) for number, one in enumerate(others, 1)]
     asyncio.run(_run(tasks, duration_s, ready or announce, witness))
 
 
