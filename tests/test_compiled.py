@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-TIMED = """
+LOADING = """
 import sys
 import numpy as np
 from twin.monitor.clock import line
@@ -15,6 +15,6 @@ print(sorted({"numba.typed.typeddict", "numba.np.polynomial"} & sys.modules.keys
 
 def test_a_start_with_all_compiled_gets_no_compiler_ready() -> None:
     for _ in range(2):  # the first one may have to compile it
-        command = [sys.executable, "-c", TIMED]
+        command = [sys.executable, "-c", LOADING]
         said = subprocess.run(command, check=True, capture_output=True, text=True, timeout=100)
     assert said.stdout.strip() == "[]"

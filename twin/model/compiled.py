@@ -95,6 +95,7 @@ _with_arrays = njit(nogil=True, error_model="numpy", _nrt=True)  # type: ignore[
 def compiled(function: Callable[..., Any]) -> Any:
     """A function to be called from Python, or where inlining it is not worth it; kept on disk."""
     dispatcher = _with_arrays(function)
+    # What ``cache=True`` does with numba's own.
     dispatcher._cache = _Cache(function)  # type: ignore[no-untyped-call]
     return dispatcher
 
