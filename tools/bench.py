@@ -1,11 +1,12 @@
 """Measure what the twin costs, each figure beside its floor in the same run.
 
-    python tools/bench.py [--long] [--only NAME ...] [--seconds S]
+    python tools/bench.py [--long] [--only NAME ... [--keep]] [--seconds S]
 
-Prints a table and writes docs/bench.json and docs/bench.md; with --only it prints only. The short
-run takes some ten minutes. --long takes much longer: it acquires for ten minutes, and over
-OPC UA too (twice; node-opcua has to be there: npm ci --prefix tests/peers), where --seconds says
-for how long; it replays a day, and counts false alarms and causes that are told.
+Prints a table and writes docs/bench.json and docs/bench.md; with --only it prints only, unless
+--keep puts these figures in the place of older ones there. The short run takes some ten minutes.
+--long takes much longer: it acquires for ten minutes, and over OPC UA too (twice; node-opcua has
+to be there: npm ci --prefix tests/peers), where --seconds says for how long; it replays a day, and
+counts false alarms and causes that are told.
 """
 
 import argparse
@@ -35,7 +36,9 @@ from benchmarks import (
     replay,
     solver,
 )
-from benchmarks.figures import Benchmark, Figure, Measured, Run
+from benchmarks.figures import Benchmark, Figure, Run
+
+from tools.version import commit
 
 INTERRUPTED, TERMINATED = 130, 143
 BARE_FETCH = "bare socket that fetches the same registers"
@@ -43,7 +46,6 @@ BARE_REPLAY = "decompression, the model in C, and the rows through zstd"
 STARTED = "Python that imports numba, numpy, pydantic, typer"
 
 BARE_OPCUA = "asyncua alone that reads the same arrays"
-LEFT_OUT = Measured((), note="only with --long")
 
 
 def _over_opcua(plc: str) -> tuple[Figure, ...]:
@@ -330,8 +332,6 @@ def main() -> int:
                 begin = time.monotonic()
                 results += zip(benchmark.figures, benchmark.measure(run), strict=True)
                 seconds[benchmark.name] = time.monotonic() - begin
-            elif not given.only:
-                results += [(figure, LEFT_OUT) for figure in benchmark.figures]
     _tell("")
     notes = [
         _kind(given.long),
@@ -339,9 +339,11 @@ def main() -> int:
         f"Noise: {before}; after the run {machine.noise()}.",
         f"Seconds: {', '.join(f'{name} {taken:.0f}' for name, taken in seconds.items())}.",
     ]
-    print(page.table(results, notes))
-    if not given.only:
-        page.write(results, notes, BENCHMARKS)
+    print("\n".join(f"- {note}" for note in notes))
+    print(f"\n{page.table(results)}")
+    if given.keep or not given.only:
+        newer = page.Session(notes, results)
+        page.write(page.with_newer(page.read(BENCHMARKS), newer), BENCHMARKS)
     return 0
 
 
@@ -350,6 +352,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--long", action="store_true", help="also what takes long")
     names = [benchmark.name for benchmark in BENCHMARKS]
     parser.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=", ".join(names))
+    parser.add_argument("--keep", action="store_true", help="with --only: write figures, too")
     parser.add_argument("--seconds", type=float, help="acquire over OPC UA for so long")
     return parser.parse_args()
 
@@ -366,7 +369,8 @@ def _tell(text: str) -> None:
 
 def _kind(long: bool) -> str:
     pinned = "PLC and twin each on its own core" if machine.can_pin() else "not pinned to cores"
-    return f"{'Long' if long else 'Short'} run of {time.strftime('%Y-%m-%d')}; {pinned}."
+    kind, day = "Long" if long else "Short", time.strftime("%Y-%m-%d")
+    return f"{kind} run of {day} at commit {commit()}; {pinned}."
 
 
 if __name__ == "__main__":

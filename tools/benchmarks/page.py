@@ -1,11 +1,12 @@
-"""What the bench writes: docs/bench.md with the pictures of its lines, docs/bench.json."""
+"""What the bench writes: docs/bench.json, and from it docs/bench.md with a picture of its lines."""
 
 import json
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from math import ceil
 from statistics import median
+from typing import Any
 
 from matplotlib.figure import Figure as Picture
 
@@ -13,28 +14,127 @@ from benchmarks.figures import Benchmark, Figure, Line, Measured, kept
 from benchmarks.processes import ROOT
 
 DOCS = ROOT / "docs"
+DATA = DOCS / "bench.json"
 PICTURE = "pictures/growth.svg"
 COLUMNS = 3
+
+NEVER = Measured((), note="not measured")
 
 Result = tuple[Figure, Measured]
 
 
-def write(results: Sequence[Result], notes: Sequence[str], benchmarks: Sequence[Benchmark]) -> None:
-    """Write page, picture and JSON."""
-    page = ["# Benchmarks", "", *_summary(results), ""]
-    page += ["Written by `make bench` (tools/bench.py). Every figure stands"]
-    page += ["beside its floor, measured in the same run on the same machine: use the ratios."]
-    page += ["Median of the repetitions, least to most in brackets.", "", table(results, notes), ""]
-    if lines := _lines(results):
-        page += [f"![Costs against sizes, with straight lines]({PICTURE})", ""]
+@dataclass(frozen=True)
+class Session:
+    """One run of the bench: under which circumstances it measured which figures."""
+
+    circumstances: Sequence[str]
+    results: Sequence[Result]
+
+
+def write(sessions: Sequence[Session], benchmarks: Sequence[Benchmark]) -> None:
+    """Write page, picture and JSON from the runs, the newest first."""
+    text = json.dumps({"runs": _runs(sessions)}, indent=1, ensure_ascii=False)
+    DATA.write_text(text + "\n", encoding="utf-8")
+    (DOCS / "bench.md").write_text(page(sessions, benchmarks), encoding="utf-8")
+    if lines := _lines(_newest(sessions, benchmarks)):
         _draw(lines)
-    page += ["## How it is measured", ""]
-    page += [*(f"- **{one.name}**: {one.how}" for one in benchmarks), ""]
-    (DOCS / "bench.md").write_text("\n".join(page), encoding="utf-8")
-    figures = [asdict(figure) | asdict(measured) for figure, measured in results]
-    written = {"circumstances": notes, "figures": figures}
-    text = json.dumps(written, indent=1, ensure_ascii=False)
-    (DOCS / "bench.json").write_text(text + "\n", encoding="utf-8")
+
+
+def read(benchmarks: Sequence[Benchmark]) -> list[Session]:
+    """The runs that stand in docs/bench.json; figures that the bench no longer has are left out."""
+    figures = {_key(figure): figure for one in benchmarks for figure in one.figures}
+    return [
+        Session(
+            run["circumstances"],
+            [
+                (figures[key], _measured(one))
+                for one in run["figures"]
+                if (key := (one["name"], one["floor"])) in figures
+            ],
+        )
+        for run in json.loads(DATA.read_text(encoding="utf-8"))["runs"]
+    ]
+
+
+def with_newer(sessions: Sequence[Session], newer: Session) -> list[Session]:
+    """A newer run before the others, which keep what it has not measured, and go if that is none.
+
+    What was judged is not replaced by what cannot be.
+    """
+    judged = {
+        _key(figure)
+        for one in sessions
+        for figure, measured in one.results
+        if kept(figure, measured) is not None
+    }
+    newest = [
+        (figure, measured)
+        for figure, measured in newer.results
+        if kept(figure, measured) is not None or _key(figure) not in judged
+    ]
+    taken = {_key(figure) for figure, _ in newest}
+    older = [
+        Session(one.circumstances, [both for both in one.results if _key(both[0]) not in taken])
+        for one in sessions
+    ]
+    return [one for one in (Session(newer.circumstances, newest), *older) if one.results]
+
+
+def page(sessions: Sequence[Session], benchmarks: Sequence[Benchmark]) -> str:
+    """The text of docs/bench.md."""
+    results = _newest(sessions, benchmarks)
+    lines = ["# Benchmarks", "", *_summary(results), ""]
+    lines += ["`python tools/bench.py` writes this page from docs/bench.json. Every figure stands"]
+    lines += ["beside its floor, measured in the same run on the same machine: use the ratios."]
+    lines += ["Median of the repetitions, least to most in brackets.", ""]
+    for one in sessions:
+        lines += [*_circumstances(one, benchmarks), ""]
+    lines += [table(results), ""]
+    if _lines(results):
+        lines += [f"![Costs against sizes, with straight lines]({PICTURE})", ""]
+    lines += ["## How it is measured", ""]
+    lines += [*(f"- **{one.name}**: {one.how}" for one in benchmarks), ""]
+    return "\n".join(lines)
+
+
+def _circumstances(session: Session, benchmarks: Sequence[Benchmark]) -> list[str]:
+    """Which benchmarks a run stands for, and how it was."""
+    measured = {_key(figure) for figure, _ in session.results}
+    names = [
+        one.name for one in benchmarks if any(_key(figure) in measured for figure in one.figures)
+    ]
+    return [
+        f"Measured in this run: {', '.join(names)}.",
+        "",
+        *(f"- {note}" for note in session.circumstances),
+    ]
+
+
+def _newest(sessions: Sequence[Session], benchmarks: Sequence[Benchmark]) -> list[Result]:
+    """Each figure of the bench with what was last measured, in the bench's order."""
+    found = {_key(figure): one for session in sessions[::-1] for figure, one in session.results}
+    figures = [figure for benchmark in benchmarks for figure in benchmark.figures]
+    return [(figure, found.get(_key(figure), NEVER)) for figure in figures]
+
+
+def _key(figure: Figure) -> tuple[str, str]:
+    """What tells a figure from the others: some have two floors."""
+    return figure.name, figure.floor
+
+
+def _runs(sessions: Sequence[Session]) -> list[dict[str, Any]]:
+    return [
+        {
+            "circumstances": one.circumstances,
+            "figures": [asdict(figure) | asdict(measured) for figure, measured in one.results],
+        }
+        for one in sessions
+    ]
+
+
+def _measured(entry: Mapping[str, Any]) -> Measured:
+    line = entry["line"] and Line(**entry["line"])
+    return Measured(entry["values"], entry["floors"], entry["note"], entry["valid"], line)
 
 
 def _summary(results: Sequence[Result]) -> list[str]:
@@ -65,11 +165,10 @@ def _beyond(figure: Figure, measured: Measured) -> str:
     return f"{_spread(measured.values, figure.unit)}, limit {figure.limit:g} {figure.unit}".strip()
 
 
-def table(results: Sequence[Result], notes: Sequence[str]) -> str:
-    """Circumstances and figures in Markdown."""
+def table(results: Sequence[Result]) -> str:
+    """Figures in Markdown."""
     rows = ["| figure | measured | floor | ratio | limit | kept |", "|" + " --- |" * 6]
-    rows += [_row(figure, measured) for figure, measured in results]
-    text = "\n".join([*(f"- {note}" for note in notes), "", *rows])
+    text = "\n".join([*rows, *(_row(figure, measured) for figure, measured in results)])
     lines = _lines(results)
     return f"{text}\n\n{growth(lines)}" if lines else text
 
