@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 
-.PHONY: demo test check format docs bench clean
+.PHONY: demo test check format docs bench battery clean
 
 demo: .venv/run
 	$(BIN)/python tools/demo.py
@@ -29,6 +29,9 @@ docs: .venv/dev
 
 bench: .venv/dev
 	$(BIN)/python tools/bench.py
+
+battery: .venv/dev
+	$(BIN)/python tools/battery.py --write docs/battery.md
 
 clean:
 	rm -rf .venv demo site
