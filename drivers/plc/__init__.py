@@ -1,1 +1,1 @@
-"""A simulated PLC with an ejector behind it; shares no physics with twin.model."""
+"""A simulated PLC with an ejector behind it; shares no code with twin.model (see rig.py)."""

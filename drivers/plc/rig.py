@@ -1,8 +1,11 @@
 """The truth behind the simulated PLC: three gas volumes, lines, an ejector, its control, sensors.
 
-It shares nothing with the twin's model, not even the gas laws. Port (with the sensor), line and
-vessel each keep mass and energy; the gas in the two line halves has inertia, which keeps explicit
-steps of 50 µs stable. Everything is SI and absolute.
+It shares no code with the twin's model: gas laws, ejector, control and steps are written anew. It
+shares assumptions with it: the ideal gas and ISO 6358 with their constants, and the arrangement of
+three volumes with a line between them (all of it: CONTRIBUTING.md, Tests).
+
+Port (with the sensor), line and vessel each keep mass and energy; the gas in the two line halves
+has inertia, which keeps explicit steps of 50 µs stable. Everything is SI and absolute.
 
 All compiled functions stand in this one file: numba's cache does not see changes in other files
 (after a change of ``plant``'s constants, touch this one).
