@@ -84,9 +84,9 @@ def page(sessions: Sequence[Session], benchmarks: Sequence[Benchmark]) -> str:
     """The text of docs/bench.md."""
     results = _newest(sessions, benchmarks)
     lines = ["# Benchmarks", "", *_summary(results), ""]
-    lines += ["`python tools/bench.py` writes this page from docs/bench.json. Every figure stands"]
-    lines += ["beside its floor, measured in the same run on the same machine: use the ratios."]
-    lines += ["Median of the repetitions, least to most in brackets.", ""]
+    lines += ["`python tools/bench.py` writes this page from docs/bench.json. A floor was measured in"]
+    lines += ["the same run as the figure beside it, on the same machine: use the ratios. Figures are"]
+    lines += ["medians of the repetitions, least to most in brackets.", ""]
     for one in sessions:
         lines += [*_circumstances(one, benchmarks), ""]
     lines += [table(results), ""]
