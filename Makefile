@@ -30,8 +30,8 @@ docs: .venv/dev
 bench: .venv/dev
 	$(BIN)/python tools/bench.py
 
-battery: .venv/dev
-	$(BIN)/python tools/battery.py --write docs/battery.md
+battery: .venv/dev  # one thread for matrices, as the command line has it: more wait for each other
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python tools/battery.py --write docs/battery.md
 
 clean:
 	rm -rf .venv demo site

@@ -1,6 +1,7 @@
 """What the documents point to is there: files, names in them, links, commands, keys, targets."""
 
 import ast
+import json
 import re
 import shlex
 import tomllib
@@ -343,3 +344,34 @@ def options_of(command: Any) -> Iterator[str]:
         yield from options_of(below)
     for one in command.params:
         yield from (*one.opts, *one.secondary_opts)
+
+
+# --- the rest -------------------------------------------------------------------------------------
+
+
+def test_documents_that_the_sources_name_are_there() -> None:
+    for folder in ("twin", "drivers", "tools", "tests", "configs"):
+        for path in (ROOT / folder).rglob("*.*"):
+            if path.suffix in (".py", ".toml"):
+                for said in re.findall(r"\bdocs/[\w/-]+(?:\.md)?", path.read_text("utf-8")):
+                    assert (ROOT / said).exists() or list(ROOT.glob(f"{said}*")), f"{path}: {said}"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_decisions_go_by_their_numbers(name: str) -> None:
+    for number, file in re.findall(r"decision (\d+)\]\([\w/]*?(\d{4})-", text_of(name)):
+        assert int(number) == int(file), name
+    if match := re.match(r"docs/decisions/(\d{4})-", name):
+        assert text_of(name).startswith(f"# {int(match[1])}. ")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_json_examples_are_json(name: str) -> None:
+    for code in blocks(name, "json"):
+        json.loads(code)
+
+
+def test_the_readme_says_what_each_package_is_for() -> None:
+    packages = {path.parent.relative_to(ROOT) for path in ROOT.glob("twin/*/__init__.py")}
+    told = set(re.findall(r"`(twin/\w+)/`", text_of("README.md")))
+    assert {str(one) for one in packages} == told

@@ -84,8 +84,12 @@ def page(sessions: Sequence[Session], benchmarks: Sequence[Benchmark]) -> str:
     """The text of docs/bench.md."""
     results = _newest(sessions, benchmarks)
     lines = ["# Benchmarks", "", *_summary(results), ""]
-    lines += ["`python tools/bench.py` writes this page from docs/bench.json. A floor was measured in"]
-    lines += ["the same run as the figure beside it, on the same machine: use the ratios. Figures are"]
+    lines += [
+        "`python tools/bench.py` writes this page from docs/bench.json. A floor was measured in"
+    ]
+    lines += [
+        "the same run as the figure beside it, on the same machine: use the ratios. Figures are"
+    ]
     lines += ["medians of the repetitions, least to most in brackets.", ""]
     for one in sessions:
         lines += [*_circumstances(one, benchmarks), ""]
