@@ -3,7 +3,10 @@
 import ast
 import re
 from dataclasses import replace
+from typing import Any
 
+import doc_examples
+import numpy as np
 import pytest
 import rigs
 
@@ -17,6 +20,8 @@ from twin.figures import course, keeper, table, trend
 from twin.fleet import peers, report
 from twin.hil import LONGEST_GAP_S
 from twin.log import recorder
+from twin.log.columns import encode
+from twin.log.schema import SAMPLES
 from twin.model import gas
 from twin.monitor import change, clock, drawings, knees
 from twin.monitor.bank import SUSPECTS
@@ -24,7 +29,7 @@ from twin.monitor.cycles import LONGEST_PIECE
 from twin.monitor.isolation import LEARNED
 from twin.outlets import data, dispatch, sender, uploader
 from twin.page import hall, hall_words, ring, server, sessions
-from twin.signals import MBAR, MS
+from twin.signals import MBAR, MS, SAMPLE, TICK
 
 DOCS = rigs.ROOT / "docs"
 
@@ -130,6 +135,24 @@ def test_what_is_measured_by_the_bench_is_stated_by_the_bench_alone() -> None:
     pages = [page for page in DOCS.glob("*.md") if page.name != "bench.md"]
     for page in [rigs.ROOT / "README.md", *pages]:
         assert re.findall(r"[\d.]+ % of a core", page.read_text(encoding="utf-8")) == [], page
+
+
+def test_the_example_that_unpacks_a_column_of_a_log_unpacks_it() -> None:
+    (code,) = doc_examples.blocks("log-format.md", "python")
+    names: dict[str, Any] = {"np": np}
+    exec(code, names)
+    rng = np.random.default_rng(1)
+    samples, ticks = np.zeros(500, SAMPLE), np.zeros(500, TICK)
+    samples["sequence"] = np.arange(70_000, 70_500)
+    samples["time_ns"] = rng.integers(-(1 << 62), 1 << 62, 500)
+    samples["pressure"] = rng.normal(50_000.0, 20_000.0, 500)
+    samples["commands"], ticks["phase"] = rng.integers(0, 4, (2, 500))
+    message = SAMPLES.message.FromString(encode(samples, ticks))
+    for rows in (samples, ticks):
+        for name in rows.dtype.names:
+            packed, dtype = getattr(message, name), rows.dtype[name].str.lstrip("|<")
+            unpacked = names["column"](packed, message.count, dtype)
+            np.testing.assert_array_equal(unpacked, rows[name], err_msg=name)
 
 
 # --- rig and model: CONTRIBUTING.md, Tests --------------------------------------------------------
