@@ -13,6 +13,8 @@ from twin.monitor.cycles import FEWEST_ROWS, LONGEST_PIECE, Cycle, CycleCutter, 
 from twin.signals import BREAK, MBAR, SAMPLE, TICK, Phase, Quality, Samples, Ticks
 
 AMBIENT = 1e5
+THETA = rigs.theta("test_rig")
+THETA[[c.AMBIENT, c.H2]] = AMBIENT, 550 * MBAR
 IDLE, SUCTION, HOLD, BLOW_OFF = Phase
 CYCLE = [(SUCTION, 50), (HOLD, 30), (BLOW_OFF, 20), (IDLE, 40)]
 
@@ -124,7 +126,7 @@ def one_cycle() -> Cycle:
 def test_deviations_are_measured_minus_expected_in_mbar_by_phase() -> None:
     cycle = one_cycle()
     cycle.samples["pressure"][:25] += 20 * MBAR  # half of suction reads 30 over expected
-    found = figures(cycle, AMBIENT)
+    found = figures(cycle, THETA)
     assert found["suction_mean"] == pytest.approx(20.0)
     assert found["suction_rms"] == pytest.approx(np.sqrt((30**2 + 10**2) / 2))
     for phase in ("hold", "blow_off", "idle"):
@@ -137,22 +139,22 @@ def test_rows_that_cannot_be_compared_are_left_out() -> None:
     cycle.samples["quality"][10:15] = Quality.BAD
     cycle.ticks["expected"][15:20] = np.nan
     cycle.samples["pressure"][20:25] = np.nan
-    found = figures(cycle, AMBIENT)
+    found = figures(cycle, THETA)
     assert found["suction_mean"] == pytest.approx(10.0)
     assert found["max_vacuum"] == pytest.approx(100.0)
 
 
 def test_a_phase_of_few_rows_is_not_judged() -> None:
     cycle = cycles(*rows((IDLE, 5), (SUCTION, 50), (BLOW_OFF, 19), *CYCLE))[1]
-    assert "suction_mean" in figures(cycle, AMBIENT)
-    assert "blow_off_mean" not in figures(cycle, AMBIENT)
+    assert "suction_mean" in figures(cycle, THETA)
+    assert "blow_off_mean" not in figures(cycle, THETA)
 
 
 def test_a_phase_that_was_cut_short_is_not_judged() -> None:
     cycle = cycles(*rows((IDLE, 5), *CYCLE))[1]
     assert cycle.cut_short
-    assert "blow_off_mean" in figures(cycle, AMBIENT)
-    assert "idle_mean" not in figures(cycle, AMBIENT)
+    assert "blow_off_mean" in figures(cycle, THETA)
+    assert "idle_mean" not in figures(cycle, THETA)
 
 
 @pytest.mark.parametrize("quality", [Quality.BAD, Quality(0)])
@@ -160,7 +162,7 @@ def test_a_cycle_without_one_reading_says_nothing(quality: Quality) -> None:
     cycle = one_cycle()
     cycle.samples["pressure"] = np.nan
     cycle.samples["quality"] = quality
-    found = figures(cycle, AMBIENT)
+    found = figures(cycle, THETA)
     assert not {name for name in found if name.endswith(("mean", "rms"))}
     assert "t0_measured" not in found
     assert "max_vacuum" not in found
@@ -172,14 +174,26 @@ def test_evacuation_is_timed_to_h2() -> None:
     cycle.samples["pressure"][20] = AMBIENT - 700 * MBAR
     cycle.samples["quality"][20] = Quality.OVERFLOW
     cycle.ticks["expected"][41:80] = AMBIENT - 600 * MBAR
-    found = figures(cycle, AMBIENT)
+    found = figures(cycle, THETA)
     assert found["t0_measured"] == pytest.approx(33.0)
     assert found["t0_expected"] == pytest.approx(41.0)
     assert found["max_vacuum"] == pytest.approx(551.0)
 
 
+def test_evacuation_is_timed_to_the_h2_of_the_unit() -> None:
+    cycle = one_cycle()
+    cycle.samples["pressure"][22:33] = AMBIENT - 420 * MBAR
+    cycle.samples["pressure"][33:80] = AMBIENT - 551 * MBAR
+    cycle.ticks["expected"][25:80] = AMBIENT - 430 * MBAR
+    theta = THETA.copy()
+    theta[c.H2] = 400 * MBAR
+    found = figures(cycle, theta)
+    assert found["t0_measured"] == pytest.approx(22.0)
+    assert found["t0_expected"] == pytest.approx(25.0)
+
+
 def test_h2_that_is_not_reached_has_no_time() -> None:
-    assert not {"t0_measured", "t0_expected"} & figures(one_cycle(), AMBIENT).keys()
+    assert not {"t0_measured", "t0_expected"} & figures(one_cycle(), THETA).keys()
 
 
 def test_the_levels_of_the_air_saving_are_its_knees() -> None:
@@ -188,7 +202,7 @@ def test_the_levels_of_the_air_saving_are_its_knees() -> None:
     )
     for row, vacuum in ((5, 3), (36, 750), (66, 600), (97, 752)):  # the first is the cycle's sync
         ticks["level"][row] = AMBIENT - vacuum * MBAR
-    found = figures(cycles(samples, ticks)[1], AMBIENT)
+    found = figures(cycles(samples, ticks)[1], THETA)
     assert found["h1_level"] == pytest.approx(751.0)
     assert found["h1_low_level"] == pytest.approx(600.0)
 
@@ -196,8 +210,7 @@ def test_the_levels_of_the_air_saving_are_its_knees() -> None:
 @pytest.mark.parametrize("name", rigs.NAMES)
 def test_a_healthy_cycle_of_the_rig(name: str) -> None:
     samples, ticks = rigs.expectation(rigs.twin(name), [rigs.recorded(name, 20.0)[0]])
-    ambient = float(rigs.theta(name)[c.AMBIENT])
-    found = [figures(one, ambient) for one in cycles(samples, ticks) if one.complete]
+    found = [figures(one, rigs.theta(name)) for one in cycles(samples, ticks) if one.complete]
     for one in found[1:]:
         assert one["t0_measured"] == pytest.approx(one["t0_expected"], rel=0.03)
         assert one["h1_level"] == pytest.approx(750, abs=10)
@@ -215,7 +228,7 @@ def test_deviations_by_phase_are_numpys(seed: int, rows: int, missing: float) ->
     samples["pressure"] = ticks["expected"] + random.normal(size=rows) * MBAR
     ticks["expected"][random.random(rows) < missing] = np.nan
     cycle = Cycle(0, samples, ticks, complete=False)
-    found = figures(cycle, AMBIENT)
+    found = figures(cycle, THETA)
     for phase in Phase:
         off = cycle.off[np.isfinite(cycle.off) & (ticks["phase"] == phase)]
         name = phase.name.lower()

@@ -21,11 +21,14 @@ from twin.diagnosis import answer as answer_module
 from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.diagnosis.evidence import HEALTHY, _unsettled, collect, thinned
 from twin.diagnosis.hypotheses import price
+from twin.diagnosis.judge import judge
 from twin.diagnosis.search import tried_in_or_out
 from twin.diagnosis.unlisted import Unlisted, look
-from twin.diagnosis.weights import levels
+from twin.diagnosis.weights import covariance, levels
 from twin.errors import ConfigError
+from twin.model import theta as c
 from twin.model.courses import Cause, Course
+from twin.monitor.cycles import PAPER_VACUUM
 from twin.monitor.phases import Knees
 from twin.settings import Document
 from twin.signals import Command, Phase, Quality, Samples
@@ -236,6 +239,17 @@ def test_the_answer_has_the_form_that_others_rely_on() -> None:
     assert set(answer["baseline"]) == set(answer["extended"]) == figures | {"h2_time_error_pct"}
     assert set(answer["gain"]) >= {"rms_reduction_pct", "low95", "high95"}
     assert set(answer["runners_up"][0]) == {"effect", "course", "leftover_sigma"}
+
+
+def test_the_time_to_h2_is_to_that_of_the_unit() -> None:
+    diagnosis = with_leak()
+    theta = diagnosis.evidence.theta.copy()
+    theta[c.H2] = PAPER_VACUUM
+    evidence = replace(diagnosis.evidence, theta=theta)
+    weights = covariance(evidence).of(diagnosis.held_out)
+    figures = judge(evidence, weights, HEALTHY).figures
+    assert figures["h2_time_error_pct"] == figures["evacuation_time_error_pct"]
+    assert figures["h2_time_error_pct"] != diagnosis.json["baseline"]["h2_time_error_pct"]
 
 
 def test_few_rows_draw_the_same_curve_as_all() -> None:

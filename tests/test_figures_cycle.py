@@ -95,10 +95,9 @@ def test_a_healthy_rig_is_as_expected(name: str) -> None:
 @pytest.mark.parametrize("name", rigs.NAMES)
 def test_t0_is_expected_as_the_twin_beside_the_cycle_has_it(name: str) -> None:
     samples, ticks = seen(name)
-    ambient = rigs.config(name).data.ambient.pressure_mbar * MBAR
     pieces = [one for one in CycleCutter().push(samples, ticks) if one.index >= 0]
     for piece, cycle in list(zip(pieces, healthy(name), strict=False))[1:]:
-        beside = old_figures(piece, ambient)["t0_expected"]
+        beside = old_figures(piece, rigs.theta(name))["t0_expected"]
         assert cycle.expected["t0"] == pytest.approx(beside, abs=1.5)
 
 

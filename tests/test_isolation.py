@@ -9,7 +9,6 @@ import pytest
 import rigs
 
 from twin.events import Event, Kind
-from twin.model import theta as c
 from twin.monitor.bank import SUSPECTS, Bank, hypotheses
 from twin.monitor.cycles import Cycle, Look, cut, figures
 from twin.monitor.detect import Monitor, MonitorSettings
@@ -123,8 +122,8 @@ def _edge(samples: Samples, cycle: int) -> int:
 def test_only_what_is_fit_to_be_judged_says_something() -> None:
     samples, _ = rigs.recorded("gripper", 12.0)
     cycles = list(cut([rigs.expectation(rigs.twin("gripper"), [samples])]))
-    ambient = float(rigs.theta("gripper")[c.AMBIENT])
-    looks = [Look(one, None, figures(one, ambient), fit=one.index != 2) for one in cycles]
+    theta = rigs.theta("gripper")
+    looks = [Look(one, None, figures(one, theta), fit=one.index != 2) for one in cycles]
     isolation = rigs.isolating("gripper").isolation
     assert isolation
     heard = isolation.hear(looks)

@@ -7,7 +7,6 @@ import numpy.typing as npt
 import pytest
 import rigs
 
-from twin.model import theta as c
 from twin.monitor.bank import SUSPECTS, Bank
 from twin.monitor.cycles import Cycle, cut, figures
 from twin.monitor.statistics import PLACES, WEAK, Listener, Said
@@ -25,8 +24,9 @@ def listener() -> Listener:
 def heard() -> list[Heard]:
     """Cycles that have swung in, with what a bank and the monitor say of them."""
     rows = rigs.expectation(rigs.twin("gripper"), [rigs.recorded("gripper", 20.0)[0]])
-    bank, ambient = Bank(rigs.theta("gripper")), float(rigs.theta("gripper")[c.AMBIENT])
-    found = [(cycle, *bank.take(cycle), figures(cycle, ambient)) for cycle in cut([rows])]
+    theta = rigs.theta("gripper")
+    bank = Bank(theta)
+    found = [(cycle, *bank.take(cycle), figures(cycle, theta)) for cycle in cut([rows])]
     return [one for one in found if one[0].complete and one[0].settled]
 
 

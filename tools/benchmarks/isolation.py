@@ -21,7 +21,6 @@ from drivers.plc.simulate import blocks
 from twin.config import Config
 from twin.events import Event, Kind
 from twin.live import Twin
-from twin.model import theta as c
 from twin.model.dataset import coefficients
 from twin.model.effects import EFFECTS
 from twin.monitor.bank import SUSPECTS, UNSURE_OF
@@ -122,11 +121,10 @@ def heard(
     """What each cycle of a healthy rig says, and its scores as standard normal variables."""
     twin, cutter = Twin.of(config.data), CycleCutter()
     isolation = Isolation.of(config.data, config.monitor.healthy, days=1e9)
-    ambient = float(twin.theta[c.AMBIENT])
     for block in blocks(rig, seconds, seed=seed, block=20_000):
         rows, ticks = twin.advance(block)
         looks = [
-            Look(one, None, figures(one, ambient), one.complete and one.settled)
+            Look(one, None, figures(one, twin.theta), one.complete and one.settled)
             for one in cutter.push(rows, ticks)
         ]
         for said in isolation.hear(looks):

@@ -16,7 +16,6 @@ from twin.diagnosis.healthy import learned
 from twin.errors import ConfigError
 from twin.live import Twin
 from twin.model.dataset import DataSet, coefficients
-from twin.model.theta import AMBIENT
 from twin.monitor.cycles import Cycle, figures, whole
 from twin.monitor.healthy import Healthy, Scatter
 from twin.monitor.knees import as_wide_as_needed
@@ -128,7 +127,7 @@ def refuse_unlike(fitted: Fitted, data: DataSet) -> None:
 def refuse_unalike(data: DataSet, samples: Samples, cycles: Sequence[Cycle]) -> None:
     """ConfigError if something came or went while the log was recorded."""
     theta = coefficients(data)
-    found = [figures(cycle, theta[AMBIENT]) for cycle in cycles]
+    found = [figures(cycle, theta) for cycle in cycles]
     refuse_changing(Cycles.found(samples, data), theta, data.sensor.noise_mbar * MBAR, found)
 
 
@@ -137,8 +136,8 @@ def scatter(data: DataSet, cycles: Sequence[Cycle]) -> dict[str, Scatter]:
 
     A few cycles show their scatter only roughly; what is given is not exceeded with SURE.
     """
-    ambient = coefficients(data)[AMBIENT]
-    found = [figures(cycle, ambient) for cycle in cycles]
+    theta = coefficients(data)
+    found = [figures(cycle, theta) for cycle in cycles]
     names = [f"{phase.name.lower()}_{kind}" for phase in Phase for kind in ("mean", "rms")]
     result = {}
     for name in [*names, "h1_level", "h1_low_level"]:

@@ -11,6 +11,9 @@ from twin.errors import SourceError
 from twin.figures.cycle import MOST_PIECES, CycleFigures, KeyFigures
 from twin.log.header import LogHeader
 from twin.log.reader import Log
+from twin.model import theta as c
+from twin.model.dataset import coefficients
+from twin.model.theta import Theta
 from twin.monitor.cycles import Cycle, cut
 from twin.monitor.cycles import figures as judged
 from twin.signals import BREAK, MBAR, MS, NS, UNUSABLE, Phase, Samples, Ticks, deviation
@@ -82,12 +85,13 @@ class Side:
         """Type and id, for people."""
         return " ".join(filter(None, (self.header.asset_type, self.header.asset_id)))
 
-    def add(self, cycle: Cycle, told: CycleFigures, ambient: float) -> None:
-        """Take a whole cycle; ``ambient`` in Pa."""
+    def add(self, cycle: Cycle, told: CycleFigures, theta: Theta) -> None:
+        """Take a whole cycle; ``theta`` are the coefficients of the twin beside it."""
+        ambient = float(theta[c.AMBIENT])
         self.cycles.append(cycle.index)
         self.measured.append(dict(told.measured))
         self.expected.append(dict(told.expected))
-        self.deviation.append(judged(cycle, ambient))
+        self.deviation.append(judged(cycle, theta))
         since = (cycle.samples["time_ns"] - cycle.samples["time_ns"][0]) * NS
         usable = (cycle.samples["quality"] & UNUSABLE) == 0
         pressure = np.where(usable, cycle.samples["pressure"], np.nan).astype(np.float64)
@@ -102,12 +106,12 @@ def side_of(log: Log, settings: Config, key_figures: KeyFigures) -> Side:
     The first cycle after the start or a break is left out: its gas, and the model's, is not yet as
     warm as in all others.
     """
-    ambient = settings.data.ambient.pressure_mbar * MBAR
+    theta = coefficients(settings.data)
     side = Side(log.path.name, log.header, settings.data.hash)
     for cycle in whole(log.blocks()):
         told = key_figures.take(cycle)
         if told is not None and told.complete and cycle.complete and cycle.settled:
-            side.add(cycle, told, ambient)
+            side.add(cycle, told, theta)
     if not side.cycles:
         raise SourceError(
             f"{log.path}: no cycle to compare: none is whole, and follows on another",

@@ -376,7 +376,7 @@ def of_log(beside: Evidence, blocks: Iterable[Samples]) -> Evidence:
         starts=starts,
         numbers=np.arange(len(cycles)),
         judged=judged,
-        figures=[figures(cycle, beside.theta[c.AMBIENT]) for cycle in cycles],
+        figures=[figures(cycle, beside.theta) for cycle in cycles],
         bins=_binned(samples, ticks, starts, judged, knees),
         rows=drawn_rows(samples, ticks),
         knees=knees,

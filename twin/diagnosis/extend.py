@@ -21,7 +21,6 @@ from twin.model.courses import Cause, Course
 from twin.model.dataset import DataSet, coefficients
 from twin.model.effects import EFFECTS, Parameter, apply
 from twin.model.term import AGAIN
-from twin.model.theta import AMBIENT
 from twin.monitor.bins import Floats
 from twin.monitor.cycles import figures, whole
 from twin.monitor.healthy import Healthy, Scatter
@@ -182,8 +181,7 @@ def _healthy(diagnosis: Diagnosis, data: DataSet) -> Healthy:
 def _learned(diagnosis: Diagnosis, data: DataSet, healthy: Healthy) -> Healthy:
     """Figures as they are in this log: terms that data gave say nothing of what they leave."""
     cycles = whole(Twin.of(data).over([diagnosis.evidence.samples]))
-    ambient = float(diagnosis.evidence.theta[AMBIENT])
-    found = [figures(one, ambient) for one in cycles if one.settled]
+    found = [figures(one, diagnosis.evidence.theta) for one in cycles if one.settled]
     learned = dict(healthy.figures)
     for name, usual in diagnosis.evidence.healthy.figures.items():
         values = [one[name] for one in found if name in one]

@@ -10,7 +10,7 @@ from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.weights import Weights, levels
 from twin.model import theta as c
 from twin.monitor.bins import Floats, Ints
-from twin.monitor.cycles import H2, PAPER_VACUUM, time_to_vacuum
+from twin.monitor.cycles import PAPER_VACUUM, time_to_vacuum
 from twin.signals import MBAR, MS
 
 RESAMPLES = 2000
@@ -46,11 +46,12 @@ def judge(evidence: Evidence, weights: Weights, hypothesis: Hypothesis) -> Judge
     squares = np.array([float(np.mean(one**2)) for one in deviations])
     binned = off[np.isin(evidence.bins.cycle, weights.cycles)]
     leftover = float(np.sqrt(np.mean(white**2)))
+    h2 = float(evidence.theta[c.H2])
     figures: dict[str, float | None] = {
         "rms_mbar": float(np.sqrt(np.mean(np.concatenate(deviations) ** 2))),
         "max_mbar": float(np.max(np.abs(binned))),
         "evacuation_time_error_pct": _time_error(evidence, expected, weights.cycles, PAPER_VACUUM),
-        "h2_time_error_pct": _time_error(evidence, expected, weights.cycles, H2),
+        "h2_time_error_pct": _time_error(evidence, expected, weights.cycles, h2),
         "leftover_sigma": leftover,
     }
     return Judged(

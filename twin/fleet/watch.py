@@ -10,7 +10,6 @@ from twin.figures.cycle import CycleFigures, compiled
 from twin.figures.settings import FigureSettings
 from twin.figures.table import FIGURES
 from twin.live import Twin
-from twin.model import theta as c
 from twin.monitor.bank import SUSPECTS, Bank, Suspect
 from twin.monitor.cycles import CycleCutter, figures
 from twin.monitor.statistics import Listener, Said
@@ -22,7 +21,7 @@ FORMAT = "ejector-twin-watched/1"
 def watched(config: Config, blocks: Iterable[Samples]) -> dict[str, Any]:
     """Run twin and hypotheses over a log; give what its cycles say on average."""
     listener, cutter = Listener.of(config.data, config.monitor.healthy), CycleCutter()
-    bank, ambient = Bank(listener.theta), float(listener.theta[c.AMBIENT])
+    bank = Bank(listener.theta)
     teller = compiled(config.data, config.document.section(FigureSettings, "figures"))
     told: list[CycleFigures] = []
     heard: list[Said] = []
@@ -32,7 +31,7 @@ def watched(config: Config, blocks: Iterable[Samples]) -> dict[str, Any]:
             if (one := teller.take(cycle)) is not None:
                 told.append(one)
             if cycle.complete and cycle.settled:
-                said = listener.hear(cycle, *drawn, figures(cycle, ambient))
+                said = listener.hear(cycle, *drawn, figures(cycle, listener.theta))
                 heard += [] if said is None else [said]
     return {
         "format": FORMAT,

@@ -9,7 +9,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from twin.model import theta as c
 from twin.model.compiled import compiled
+from twin.model.theta import Theta
 from twin.signals import (
     BREAK,
     MBAR,
@@ -29,7 +31,6 @@ STALE = int(Quality.STALE)  # plain: NumPy makes masks of bytes with these, and 
 SUCTION, BLOW_OFF, IDLE = int(Phase.SUCTION), int(Phase.BLOW_OFF), int(Phase.IDLE)
 HOLD = int(Phase.HOLD)
 _NAMES = tuple((int(phase), phase.name.lower()) for phase in Phase)
-H2 = 550.0 * MBAR  # Pa below ambient: part present, the field's default
 PAPER_VACUUM = 600.0 * MBAR  # Pa below ambient: what the founding paper times evacuation to
 
 
@@ -207,12 +208,14 @@ def time_to_vacuum(
     return float(times[reached[0]] - times[0]) * NS if len(reached) else float("nan")
 
 
-def figures(cycle: Cycle, ambient: float) -> dict[str, float]:
+def figures(cycle: Cycle, theta: Theta) -> dict[str, float]:
     """Return what a cycle says in one number each, pressures in mbar and times in ms.
 
     Deviation per phase as mean and rms; the vacuum at which the air saving switched; evacuation
     times to H2 measured and expected; the highest vacuum. What a cycle cannot say is left out.
+    Ambient pressure and H2 are those of ``theta``.
     """
+    ambient, h2 = float(theta[c.AMBIENT]), float(theta[c.H2])
     result: dict[str, float] = {}
     broken_off = int(cycle.ticks["phase"][-1]) if cycle.cut_short else None
     by_phase = _by_phase(cycle.off, cycle.ticks, ambient)[:, : len(Phase)]
@@ -231,8 +234,8 @@ def figures(cycle: Cycle, ambient: float) -> dict[str, float]:
         expected = cycle.ticks["expected"].astype(np.float64)
         times = cycle.samples["time_ns"]
         result["max_vacuum"] = float((ambient - np.fmin.reduce(measured)) / MBAR)
-        result["t0_measured"] = time_to_vacuum(H2, measured, times, ambient) * 1e3
-        result["t0_expected"] = time_to_vacuum(H2, expected, times, ambient) * 1e3
+        result["t0_measured"] = time_to_vacuum(h2, measured, times, ambient) * 1e3
+        result["t0_expected"] = time_to_vacuum(h2, expected, times, ambient) * 1e3
     return {name: value for name, value in result.items() if math.isfinite(value)}
 
 

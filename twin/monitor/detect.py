@@ -15,7 +15,6 @@ import numpy as np
 from pydantic import Field
 
 from twin.events import Event, Kind
-from twin.model import theta as c
 from twin.model.theta import Theta
 from twin.monitor.clock import ClockWatch
 from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, Look, Teller, Told, figures
@@ -77,7 +76,7 @@ class Monitor:
     def __post_init__(self) -> None:
         """Have what is compiled at hand, not to fall into a block."""
         nothing = Cycle(0, np.zeros(1, SAMPLE), np.zeros(1, TICK), complete=False)
-        figures(nothing, self.theta[c.AMBIENT])
+        figures(nothing, self.theta)
         drawn_rows(nothing.samples, nothing.ticks)  # where a cause is sought
 
     def update(self, samples: Samples, ticks: Ticks) -> list[Event]:
@@ -210,7 +209,7 @@ class Monitor:
         whole = cycle.complete or len(cycle.samples) >= LONGEST_PIECE
         stale = silent or cycle.stale or (before is not None and before.stale)
         fit = whole and cycle.settled and cycle.coverage >= FEWEST_SHARE and not stale
-        return Look(cycle, before, figures(cycle, self.theta[c.AMBIENT]), fit)
+        return Look(cycle, before, figures(cycle, self.theta), fit)
 
     def _conclude(self, look: Look, told: Told | None, heard: "Heard | None") -> list[Event]:
         """What there is to say of a cycle, and an alarm if it is one."""
