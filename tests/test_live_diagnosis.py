@@ -128,7 +128,7 @@ def test_it_is_asked_once_enough_cycles_deviate_and_its_answer_is_an_event(
     assert event.time_ns == stream.now_ns - CYCLE_NS // 4  # of the last row
     assert event.data == {"alarm_ns": 6 * CYCLE_NS, "begin_ns": 0, "answer": ANSWER}
     assert event.text == (
-        "leakage (1.9 sl/min), since 00:00:07.5; how sure: more than 99 %; no look-alikes;"
+        "leakage (1.9 sl/min), since 00:00:07.5; how sure: no other listed cause fits as well;"
         " look at hoses, fittings and cups: a cut, or a loose connection"
     )
     stream.cycles(10)

@@ -44,7 +44,7 @@ from twin.diagnosis.pictures import (
 from twin.diagnosis.report import in_words, write_report
 from twin.diagnosis.search import Search
 from twin.diagnosis.weights import covariance
-from twin.diagnosis.words import when
+from twin.diagnosis.words import certainty, when
 from twin.errors import SourceError
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS
@@ -61,6 +61,7 @@ BEFORE = {
     "max_mbar": 34.8,
     "evacuation_time_error_pct": 9.37,
     "h2_time_error_pct": 8.18,
+    "level_rms_mbar": 0.4321,
     "leftover_sigma": 2.99,
 }
 AFTER = {
@@ -68,6 +69,7 @@ AFTER = {
     "max_mbar": 9.038,
     "evacuation_time_error_pct": 0.1574,
     "h2_time_error_pct": 0.1312,
+    "level_rms_mbar": 0.4009,
     "leftover_sigma": 1.161,
 }
 LEAK = {
@@ -397,7 +399,7 @@ def test_tables_carry_the_numbers(pages: dict[str, str]) -> None:
         ["rms deviation", "21.3", "1.13", "mbar"],
         ["error of the time to 600 mbar", "9.37", "0.157", "%"],
         ["error of the time to H2", "8.18", "0.131", "%"],
-        ["its 95 % interval", "", "94.7 to 96", "%"],
+        ["how sure", "", "95 %: 94.7 to 96", "%"],
         ["share of what can be gained", "", "98.1", "%"],
         ["sensor gain", "step", "1.78"],
     ):
@@ -668,12 +670,14 @@ def test_words_for_a_cause() -> None:
         "  cause          leakage",
         "  size           sonic flow 1.98 sl/min (95 %: 1.93 to 2.04)",
         "  when           since 10.0 s into the log (95 %: 9.9 s to 10.1 s)",
-        "  how sure       83 %; this log cannot tell it from porous leakage",
+        "  how sure       83 % among the listed causes; this log cannot tell it from"
+        " porous leakage",
         f"  look at        {EFFECTS['leakage'].look_at}",
         f"  or it may be   porous leakage; then look at {EFFECTS['porous_leakage'].look_at}",
         "  next recording hold for 10 s with the nozzle off",
         "  unseen cycles  rms 21.3 → 1.13 mbar, max 34.8 → 9.04 mbar, time to 600 mbar off by"
-        " 9.37 → 0.157 %, time to H2 off by 8.18 → 0.131 %, leftover 2.99 → 1.16 sigma",
+        " 9.37 → 0.157 %, time to H2 off by 8.18 → 0.131 %, switching levels off by"
+        " 0.432 → 0.401 mbar, leftover 2.99 → 1.16 sigma",
         "  gain           95.3 % less rms deviation (95 %: 94.7 to 96), 98.1 % of what can be"
         " gained",
         "  cycles         7; fitted: 1, 3, 5; held out: 2, 4, 6",
@@ -711,7 +715,7 @@ def test_words_for_a_ramp_say_the_rate_and_what_it_has_come_to() -> None:
     said = in_words(two())
     assert "and weak blow-off (10 %, growing from the beginning of the log)." in said
     assert "loss 10 % by the end, growing by 1440 %/h (95 %: 1300 to 1580)" in said
-    assert "  how sure       more than 99 %; no look-alikes" in said
+    assert "  how sure       no other listed cause fits as well" in said
 
 
 def test_words_of_two_parameters_name_them() -> None:
@@ -756,6 +760,42 @@ def test_a_figure_that_no_cycle_shows_is_a_dash() -> None:
     nothing = {"evacuation_time_error_pct": None}
     said = in_words(explained(baseline=BEFORE | nothing, extended=AFTER | nothing))
     assert "time to 600 mbar off by – → – %" in said
+
+
+def test_ends_of_an_interval_are_told_apart() -> None:
+    narrow = {"low95": 94.96, "high95": 95.04}
+    size = {"sonic_flow": {"value": 95.0, "unit": "sl/min"} | narrow}
+    onset = {"onset_s": 9.5, "onset_low95_s": 9.49, "onset_high95_s": 9.51}
+    one = explained(causes=[LEAK | onset | {"parameters": size}], gain=answer()["gain"] | narrow)
+    said = in_words(one)
+    assert "sonic flow 95 sl/min (95 %: 94.96 to 95.04)" in said
+    assert "since 9.5 s into the log (95 %: 9.49 s to 9.51 s)" in said
+    assert "less rms deviation (95 %: 94.96 to 95.04)" in said
+    late = LEAK | {"onset_s": 754.2, "onset_low95_s": 754.1, "onset_high95_s": 754.3}
+    assert when(late, interval=True).endswith("(95 %: 12 min 34.1 s to 12 min 34.3 s)")
+
+
+@pytest.mark.parametrize(
+    ("held_out", "reduction", "why"),
+    [
+        ([2], 95.3, "1 held-out cycle cannot tell how sure that is"),
+        ([2, 4], 95.3, "2 held-out cycles cannot tell how sure that is"),
+        ([2, 4, 6], 0.0, "no cause changes the pressure between switchings"),
+    ],
+)
+def test_a_gain_without_an_interval_says_why(
+    held_out: list[int], reduction: float, why: str, tmp_path: Path
+) -> None:
+    gain = answer()["gain"] | {"rms_reduction_pct": reduction, "low95": None, "high95": None}
+    one = explained(gain=gain, cycles=answer()["cycles"] | {"held_out": held_out})
+    assert f"% less rms deviation ({why})" in in_words(one)
+    assert why in page_of(one, tmp_path)
+
+
+def test_the_only_cause_left_is_no_certainty() -> None:
+    """Causes that are not listed were given no chance."""
+    alone = certainty(LEAK | {"probability": 0.999, "not_separable_from": []})
+    assert alone == "no other listed cause fits as well"
 
 
 def test_words_stay_short_for_a_long_log() -> None:

@@ -32,6 +32,7 @@ MOST_LEFT = 0.5  # of chi-square beyond noise, that a cause may leave and still 
 MOST_SATURATED = 0.05  # share of samples
 MOST_JUDGED = 24  # cycles of a long log that are looked at, evenly spread
 MOST_NAMED = 4  # runners-up
+SUREST = 0.999  # rivals are rejected at one in a thousand, so no answer is surer
 # Of a size, that the data set's own scale is not known better: volume and suction; and how the
 # wall's heat is shared between vessel and line.
 RELATIVE, OF_HEAT = 0.03, 0.1
@@ -219,7 +220,7 @@ def _stranger(rival: Fitted, found: Fitted) -> str:
 def _probability(found: Fitted, rivals: list[Fitted]) -> float:
     temper = 2.0 * max(found.leftover, 1.0) ** 2
     weights = [math.exp(-max(one.score - found.score, 0.0) / temper) for one in rivals]
-    return round(1.0 / (1.0 + sum(weights)), 3)
+    return round(min(1.0 / (1.0 + sum(weights)), SUREST), 3)
 
 
 def _rounded_onset(cause: Cause) -> float | None:
@@ -297,6 +298,7 @@ def _insufficient(evidence: Evidence, reason: str) -> dict[str, Any]:
         "max_mbar",
         "evacuation_time_error_pct",
         "h2_time_error_pct",
+        "level_rms_mbar",
         "leftover_sigma",
     )
     nothing = dict.fromkeys(names)

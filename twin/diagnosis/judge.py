@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import t as student
 
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.weights import Weights, levels
@@ -13,7 +14,8 @@ from twin.monitor.bins import Floats, Ints
 from twin.monitor.cycles import PAPER_VACUUM, time_to_vacuum
 from twin.signals import MBAR, MS
 
-RESAMPLES = 2000
+FEWEST = 3  # held-out cycles, to tell from how they differ how sure a gain is
+SURE = 0.975  # quantile on either side
 LITTLE = 1.25  # times the usual deviation: cycles differ by as much
 
 
@@ -52,6 +54,7 @@ def judge(evidence: Evidence, weights: Weights, hypothesis: Hypothesis) -> Judge
         "max_mbar": float(np.max(np.abs(binned))),
         "evacuation_time_error_pct": _time_error(evidence, expected, weights.cycles, PAPER_VACUUM),
         "h2_time_error_pct": _time_error(evidence, expected, weights.cycles, h2),
+        "level_rms_mbar": float(np.sqrt(np.mean(level**2))) if level.size else None,
         "leftover_sigma": leftover,
     }
     return Judged(
@@ -65,20 +68,37 @@ def judge(evidence: Evidence, weights: Weights, hypothesis: Hypothesis) -> Judge
     )
 
 
-def gain(before: Judged, after: Judged) -> dict[str, float]:
-    """Reduction of the rms deviation (%), its interval from resampling the cycles, its share of
-    what could be reached: healthy cycles are not without deviation either.
+def gain(before: Judged, after: Judged) -> dict[str, float | None]:
+    """Reduction of the rms deviation (%), its 95 % interval, its share of what could be reached.
+
+    Healthy cycles are not without deviation either. The interval is None where held-out cycles are
+    too few to tell, or do not differ.
     """
-    cycles = len(before.squares)
-    drawn = np.random.default_rng(0).integers(cycles, size=(RESAMPLES, cycles))
-    ratio = np.sqrt(after.squares[drawn].sum(axis=1) / before.squares[drawn].sum(axis=1))
-    low, high = np.percentile(100.0 * (1.0 - ratio), [2.5, 97.5])
+    low, high = _interval(before.squares, after.squares)
     return {
         "rms_reduction_pct": rounded(100.0 * (1.0 - after.rms / before.rms)),
-        "low95": rounded(float(low)),
-        "high95": rounded(float(high)),
+        "low95": low,
+        "high95": high,
         "share_of_achievable_pct": rounded(100.0 * _share(before.rms, after.rms, before.usual)),
     }
+
+
+def _interval(before: Floats, after: Floats) -> tuple[float | None, float | None]:
+    """95 % interval (%) of the reduction, from mean squares by cycle; rounded outward.
+
+    That of a ratio of means, linearised, by Student's t: few cycles show their spread only roughly,
+    and resampling them would not tell.
+    """
+    cycles = len(before)
+    if cycles < FEWEST:
+        return None, None
+    ratio = after.sum() / before.sum()
+    sigma = float(np.std(after - ratio * before, ddof=1) / math.sqrt(cycles) / before.mean())
+    if sigma == 0.0:
+        return None, None
+    reach = float(student.ppf(SURE, cycles - 1)) * sigma
+    low, high = (100.0 * (1.0 - math.sqrt(max(ratio + r, 0.0))) for r in (reach, -reach))
+    return math.floor(100.0 * low) / 100.0, math.ceil(100.0 * high) / 100.0
 
 
 def _share(before: float, after: float, usual: float) -> float:

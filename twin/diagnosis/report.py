@@ -30,7 +30,9 @@ from twin.diagnosis.words import (
     Answer,
     about,
     change,
+    ends,
     extended,
+    gain_interval,
     headline,
     left_over,
     lines,
@@ -246,7 +248,7 @@ def _runners_up(answer: Answer) -> Iterator[tuple[str, ...]]:
 def _parameters(answer: Answer) -> Iterator[tuple[str, ...]]:
     for cause in answer["causes"]:
         for name, p in cause["parameters"].items():
-            numbers = [number(p[key]) for key in ("value", "low95", "high95")]
+            numbers = [number(p["value"]), *ends(p["low95"], p["high95"])]
             course = when(cause, interval=True)
             yield spoken(cause["effect"]), course, spoken(name), *numbers, p["unit"]
             if cause["course"] == Course.RAMP:
@@ -265,15 +267,15 @@ def _gain_table(answer: Answer) -> str:
         for key, name, _, unit in FIGURES
     ]
     if extended(answer):
-        rows += _gained(answer["gain"])
+        rows += _gained(answer)
     head = ("", *columns.values(), "unit")
     return page.table(caption, head, rows, range(1, 1 + len(columns)))
 
 
-def _gained(gain: Answer) -> Iterator[tuple[str, ...]]:
-    between = f"{number(gain['low95'])} to {number(gain['high95'])}"
+def _gained(answer: Answer) -> Iterator[tuple[str, ...]]:
+    gain = answer["gain"]
     yield "less rms deviation", "", number(gain["rms_reduction_pct"]), "%"
-    yield "its 95 % interval", "", between, "%"
+    yield "how sure", "", gain_interval(answer), "%" if gain["low95"] is not None else ""
     yield "share of what can be gained", "", number(gain["share_of_achievable_pct"]), "%"
 
 

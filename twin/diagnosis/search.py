@@ -3,7 +3,7 @@
 Forward: what the linear model promises is fitted in the non-linear one, singles and pairs side by
 side, because the members of a true pair may each look poor alone. What explains most is kept if it
 is worth its price, then the search begins anew about it. Backward: each cause must still be worth
-its price beside the others.
+its price beside the others. Last, each must predict cycles that no size was fitted to.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -45,6 +45,7 @@ ONSETS, MANY_ONSETS = 16, 64  # in a round of looking for when a step began
 ONSET_S = 0.01  # to which it is found at first
 FARTHEST_S = 4.0  # from an onset, that its interval may reach
 SURE = 3.84  # chi-square that bounds a 95 % interval
+SIGMAS = 1.96  # that do
 
 Progress = Callable[[str], None]
 
@@ -100,6 +101,16 @@ def search(
         (found,) = fit(evidence, weights, [found.hypothesis])
         healthy = _healthy(evidence, weights)
         found = _pruned(evidence, weights, found, healthy)
+    progress("asking cycles that nothing was fitted to")
+    confirmed = _confirmed(evidence, fitted, weights, found)
+    if confirmed is None:
+        weights = known.of(fitted)
+        return Search(weights, _healthy(evidence, weights), None, singles, [], [])
+    if confirmed is not found:
+        found = confirmed
+        judged, weights = _weights(evidence, fitted, found.hypothesis)
+        (found,) = fit(evidence, weights, [found.hypothesis])
+        healthy = _healthy(evidence, weights)
     if any(cause.course == Course.STEP for cause in found.hypothesis):
         (found,) = fit(evidence, weights, [_finely_timed(evidence, judged, found.hypothesis)])
     progress("looking for what the log cannot tell apart")
@@ -280,6 +291,46 @@ def _pruned(evidence: Evidence, weights: Weights, found: Fitted, healthy: float)
     return found
 
 
+def _confirmed(
+    evidence: Evidence, fitted: Sequence[int], weights: Weights, found: Fitted
+) -> Fitted | None:
+    """Without the causes that do not predict cycles they were not fitted to; None if none is left.
+
+    Each is left out in turn and the others are fitted anew. The least certain goes first.
+    """
+    held_out = [one for one in evidence.judged if one not in fitted]
+    while True:
+        unseen = covariance(evidence, found.hypothesis).of(held_out)
+        without = [
+            tuple(c for i, c in enumerate(found.hypothesis) if i != left)
+            for left in range(len(found.hypothesis))
+        ]
+        others = fit(evidence, weights, without) if without[0] else []
+        without = [one.hypothesis for one in others] or [HEALTHY]
+        gains = [held_out_gain(evidence, unseen, one, found.hypothesis) for one in without]
+        least = min(range(len(gains)), key=lambda left: gains[left][0])
+        if gains[least][0] > 0.0:
+            return found
+        if not others:
+            return None
+        found = others[least]
+
+
+def held_out_gain(
+    evidence: Evidence, unseen: Weights, without: Hypothesis, hypothesis: Hypothesis
+) -> tuple[float, float]:
+    """95 % interval of the chi-square that a hypothesis takes away from another on unseen cycles.
+
+    Where both predict r and r + d, |r + d|² − |r|² = |d|² + 2·d·r, and d·r scatters by |d| times
+    the sigmas that are left: that holds with one cycle as well.
+    """
+    before, after = white(evidence, unseen, [without, hypothesis]).T
+    left = max(float(np.sqrt(np.mean(after**2))), 1.0)
+    gain = float(before @ before - after @ after)
+    reach = SIGMAS * 2.0 * float(np.linalg.norm(before - after)) * left
+    return gain - reach, gain + reach
+
+
 def _rivals(
     evidence: Evidence, judged: Weights, weights: Weights, found: Fitted, singles: list[Fitted]
 ) -> list[list[Fitted]]:
@@ -452,9 +503,11 @@ def _onset_interval(
     if cause.course != Course.STEP:
         return cause.onset_s, cause.onset_s
     others = (*hypothesis[:number], *hypothesis[number + 1 :])
-    reach = np.geomspace(ONSET_S, FARTHEST_S, 10)
+    sampled = float(np.median(np.diff(evidence.seconds)))
+    reach = np.geomspace(max(ONSET_S, sampled), FARTHEST_S, 10)
     onsets = cause.onset_s + np.concatenate([-reach[::-1], [0.0], reach])
     misfit = _misfits(evidence, judged, others, cause, onsets)
     inside = np.flatnonzero(misfit < misfit.min() + SURE * max(leftover**2, 1.0))
+    inside = np.union1d(inside, len(reach))  # the onset itself
     last = len(onsets) - 1  # the first that is rejected bounds it
     return float(onsets[max(inside[0] - 1, 0)]), float(onsets[min(inside[-1] + 1, last)])

@@ -3,7 +3,7 @@
 All of it is read from the answer as the contract has it, which may come from another process.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from twin.model.courses import Course
@@ -11,6 +11,7 @@ from twin.model.effects import EFFECTS
 
 Answer = Mapping[str, Any]
 MOST_LISTED = 12  # cycles named one by one
+MOST_FINER = 3  # digits more than usual, to tell the ends of an interval apart
 LONG_S = 120.0  # from here on times are said in minutes
 COUNTED = ("No", "One", "Two", "Three")
 
@@ -20,6 +21,7 @@ FIGURES = (
     ("max_mbar", "largest deviation", "max", "mbar"),
     ("evacuation_time_error_pct", "error of the time to 600 mbar", "time to 600 mbar off by", "%"),
     ("h2_time_error_pct", "error of the time to H2", "time to H2 off by", "%"),
+    ("level_rms_mbar", "rms error of the switching levels", "switching levels off by", "mbar"),
     ("leftover_sigma", "leftover (healthy: about 1)", "leftover", "sigma"),
 )
 
@@ -77,7 +79,7 @@ def _facts(answer: Answer) -> Iterator[tuple[str, str]]:
         ", ".join(f"{short} {change(answer, key)} {unit}" for key, _, short, unit in FIGURES),
     )
     if extended(answer):
-        yield "gain", gain(answer["gain"])
+        yield "gain", gain(answer)
     cycles = answer["cycles"]
     fitted, held_out = some(cycles["fitted"]), some(cycles["held_out"])
     yield "cycles", f"{cycles['total']}; fitted: {fitted}; held out: {held_out}"
@@ -131,16 +133,16 @@ def _sizes(cause: Answer) -> Iterator[str]:
         grown = ""
         if "at_end" in p:
             grown = f"{number(p['at_end'])} {p['unit'].removesuffix('/h')} by the end, growing by "
-        between = f"95 %: {number(p['low95'])} to {number(p['high95'])}"
-        yield f"{spoken(name)} {grown}{number(p['value'])} {p['unit']} ({between})"
+        low, high = ends(p["low95"], p["high95"])
+        yield f"{spoken(name)} {grown}{number(p['value'])} {p['unit']} (95 %: {low} to {high})"
 
 
 def when(cause: Answer, *, interval: bool = False) -> str:
     """How it runs in time; with the ``interval`` of an onset and the cycles where it is there."""
     match Course(cause["course"]):
         case Course.STEP:
-            low, high = cause["onset_low95_s"], cause["onset_high95_s"]
-            known = f" (95 %: {clock(low)} to {clock(high)})" if interval else ""
+            low, high = _clocks(cause["onset_low95_s"], cause["onset_high95_s"])
+            known = f" (95 %: {low} to {high})" if interval else ""
             return f"since {clock(cause['onset_s'])} into the log{known}"
         case Course.RAMP if cause["onset_s"] > 0.0:
             return f"growing since {clock(cause['onset_s'])} into the log"
@@ -153,11 +155,15 @@ def when(cause: Answer, *, interval: bool = False) -> str:
 
 
 def certainty(cause: Answer) -> str:
-    """How sure it is, with what the log cannot tell from it."""
-    percent = 100.0 * cause["probability"]
-    sure = "more than 99 %" if percent > 99.0 else f"{percent:.0f} %"
+    """How sure it is among the listed causes, with what the log cannot tell from it.
+
+    Nothing is said of causes that are not listed: no chance was given to them.
+    """
     alike = listed([spoken(name) for name in cause["not_separable_from"]], "or")
-    return f"{sure}; " + (f"this log cannot tell it from {alike}" if alike else "no look-alikes")
+    if not alike:
+        return "no other listed cause fits as well"
+    percent = f"{100.0 * cause['probability']:.0f} % among the listed causes"
+    return f"{percent}; this log cannot tell it from {alike}"
 
 
 # --- numbers and lists ----------------------------------------------------------------------------
@@ -174,24 +180,50 @@ def extended(answer: Answer) -> bool:
     return bool(answer["causes"]) or answer["extended"] != answer["baseline"]
 
 
-def gain(known: Answer) -> str:
+def gain(answer: Answer) -> str:
     """How much less deviation there is, and what share of what can be gained at all."""
-    low, high = number(known["low95"]), number(known["high95"])
-    less = f"{number(known['rms_reduction_pct'])} % less rms deviation (95 %: {low} to {high})"
+    known = answer["gain"]
+    less = f"{number(known['rms_reduction_pct'])} % less rms deviation ({gain_interval(answer)})"
     return f"{less}, {number(known['share_of_achievable_pct'])} % of what can be gained"
 
 
-def number(value: float | None) -> str:
+def gain_interval(answer: Answer) -> str:
+    """The interval of the gain, or why there is none."""
+    known, cycles = answer["gain"], len(answer["cycles"]["held_out"])
+    if known["low95"] is not None:
+        low, high = ends(known["low95"], known["high95"])
+        return f"95 %: {low} to {high}"
+    if known["rms_reduction_pct"] == 0.0:
+        return "no cause changes the pressure between switchings"
+    return f"{cycles} held-out cycle{'s' * (cycles != 1)} cannot tell how sure that is"
+
+
+def number(value: float | None, digits: int = 3) -> str:
     """Three significant digits, without an exponent."""
-    return "–" if value is None else f"{float(f'{value:.3g}'):.10g}"
+    return "–" if value is None else f"{float(f'{value:.{digits}g}'):.10g}"
 
 
-def clock(seconds: float) -> str:
-    """A time in the log."""
+def ends(low: float, high: float) -> tuple[str, str]:
+    """Both ends of an interval, with as many digits as tell them apart."""
+    return _apart(lambda finer: (number(low, 3 + finer), number(high, 3 + finer)))
+
+
+def clock(seconds: float, finer: int = 0) -> str:
+    """A time in the log; with ``finer`` more decimals."""
     if seconds < LONG_S:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest} s"
+        return f"{seconds:.{1 + finer}f} s"
+    minutes, rest = divmod(round(seconds, finer), 60)
+    return f"{minutes:.0f} min {rest:.{finer}f} s"
+
+
+def _clocks(low: float, high: float) -> tuple[str, str]:
+    return _apart(lambda finer: (clock(low, finer), clock(high, finer)))
+
+
+def _apart(spelt: Callable[[int], tuple[str, str]]) -> tuple[str, str]:
+    """The first spelling in which two values differ."""
+    every = [spelt(finer) for finer in range(MOST_FINER + 1)]
+    return next((both for both in every if both[0] != both[1]), every[-1])
 
 
 def some(cycles: Sequence[int]) -> str:

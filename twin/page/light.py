@@ -13,7 +13,7 @@ from twin.alarms.requests import Request
 from twin.alarms.rules import Priority
 from twin.alarms.state import Alarm, State
 from twin.alarms.words import STATES
-from twin.diagnosis.words import number, spoken
+from twin.diagnosis.words import certainty, ends, number, spoken
 from twin.model.effects import EFFECTS
 
 S_NS = 1_000_000_000
@@ -126,17 +126,14 @@ def facts(evidence: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
 
 
 def _size(parameter: Mapping[str, Any]) -> str:
-    between = f"{number(parameter['low95'])} to {number(parameter['high95'])}"
-    return f"{number(parameter['value'])} {parameter['unit']} (95 %: {between})"
+    low, high = ends(parameter["low95"], parameter["high95"])
+    return f"{number(parameter['value'])} {parameter['unit']} (95 %: {low} to {high})"
 
 
 def _sureness(evidence: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
     """How sure the cause is: by the diagnosis, or else by the first guess."""
     if "probability" in evidence:
-        percent = 100.0 * float(evidence["probability"])
-        sure = "more than 99 %" if percent > 99.0 else f"{percent:.0f} %"
-        alike = " or ".join(spoken(one) for one in evidence.get("not_separable_from", ()))
-        yield "how sure", f"{sure}, diagnosed" + (f"; it may as well be {alike}" if alike else "")
+        yield "how sure", f"diagnosed: {certainty(evidence)}"
     elif "guess" in evidence:
         also = ", ".join(spoken(one) for one in str(evidence.get("also", "")).split(",") if one)
         sure = "a first guess" + (f"; it may as well be {also}" if also else "")
