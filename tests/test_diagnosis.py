@@ -15,14 +15,16 @@ from drivers.plc.faults import parse_fault
 from drivers.plc.settings import PlcSettings
 from drivers.plc.simulate import blocks
 from tools import battery
-from tools.calibration_coverage import recorded
+from tools.calibration_coverage import as_type, drawn, recorded, rig_of, shipped
+from twin.calibration.calibrate import calibrate
 from twin.config import Config
 from twin.diagnosis import answer as answer_module
 from twin.diagnosis.answer import Diagnosis, diagnose
-from twin.diagnosis.evidence import HEALTHY, _unsettled, collect, thinned
+from twin.diagnosis.evidence import HEALTHY, Hypothesis, _unsettled, collect, thinned
+from twin.diagnosis.fit import fit
 from twin.diagnosis.hypotheses import price
-from twin.diagnosis.judge import judge
-from twin.diagnosis.search import tried_in_or_out
+from twin.diagnosis.judge import gain, judge
+from twin.diagnosis.search import _confirmed, held_out_gain, tried_in_or_out
 from twin.diagnosis.unlisted import Unlisted, look
 from twin.diagnosis.weights import covariance, levels
 from twin.errors import ConfigError
@@ -31,7 +33,7 @@ from twin.model.courses import Cause, Course
 from twin.monitor.cycles import PAPER_VACUUM
 from twin.monitor.phases import Knees
 from twin.settings import Document
-from twin.signals import Command, Phase, Quality, Samples
+from twin.signals import MBAR, NS, Command, Phase, Quality, Samples
 
 ROOT = Path(__file__).parent.parent
 DOCUMENT = Document.read(ROOT / "configs" / "test_rig.toml")
@@ -92,6 +94,97 @@ def test_what_is_hidden_is_found(kind: str, seed: int) -> None:
     )
     assert tally.outcomes[found] == [True], line
     assert not any(tally.outcomes.get("wrong", [])), line
+
+
+def hummed(samples: Samples, seed: int) -> Samples:
+    """The same by an input of 12 bits over 1 bar, with 2 mbar of 50 Hz from the mains."""
+    rng = np.random.default_rng(seed)
+    mains = 2.0 * np.sin(2.0 * np.pi * (50.0 * samples["time_ns"] * NS + rng.random()))
+    steps = np.round((samples["pressure"] / MBAR + mains) * 4096.0 / 1000.0)
+    seen = samples.copy()
+    seen["pressure"] = steps * 1000.0 / 4096.0 * MBAR
+    return seen
+
+
+@cache
+def hummed_unit(name: str) -> battery.Unit:
+    """A unit that was calibrated on such a record."""
+    document = shipped(name)
+    plc, config = drawn(rig_of(document), 1000), as_type(document)
+    found = calibrate(config, [hummed(recorded(plc, 10, 5000), 5000)], quiet)
+    monitor = config.monitor.model_copy(update={"healthy": found.healthy})
+    return battery.Unit(name, plc, replace(config, data=found.fitted.data, monitor=monitor))
+
+
+@pytest.mark.parametrize(("name", "seed"), [("test_rig", 90001), ("gripper", 90001)])
+def test_a_healthy_record_of_a_coarse_input_with_hum_is_consistent(name: str, seed: int) -> None:
+    """Some cycles of it can be mended by chance; cycles that nothing was fitted to are not."""
+    unit = hummed_unit(name)
+    answer = of(iter([hummed(recorded(unit.plc, 11, seed), seed)]), unit.config).json
+    assert (answer["verdict"], answer["causes"]) == ("consistent", [])
+
+
+def confirmed(diagnosis: Diagnosis, *causes: Cause) -> Hypothesis:
+    """What is left of causes, once they were fitted and asked for a gain on unseen cycles."""
+    evidence, held_out = diagnosis.evidence, diagnosis.held_out
+    cycles = [one for one in evidence.judged if one not in held_out]
+    weights = covariance(evidence, causes).of(cycles)
+    (found,) = fit(evidence, weights, [causes])
+    left = _confirmed(evidence, cycles, weights, found)
+    return () if left is None else left.hypothesis
+
+
+def test_a_cause_without_a_gain_on_unseen_cycles_is_none() -> None:
+    """Neither alone nor beside another; whatever it gained on those it was fitted to."""
+    leak = with_leak()
+    (true,) = leak.hypothesis
+    chance = Cause("suction_loss", {"loss": 1.0}, Course.RAMP)
+    assert [one.effect for one in confirmed(leak, true, chance)] == ["leakage"]
+    assert [one.effect for one in confirmed(leak, true)] == ["leakage"]
+    healthy = of(record(27.0, seed=24))
+    some = frozenset(int(one) for one in healthy.evidence.numbers[1:5])
+    for spurious in (chance, replace(chance, course=Course.INTERMITTENT, cycles=some)):
+        assert confirmed(healthy, spurious) == ()
+
+
+def test_a_gain_is_told_by_a_few_unseen_cycles_or_one() -> None:
+    leak = with_leak()
+    for cycles in (leak.held_out[-1:], leak.held_out):
+        unseen = covariance(leak.evidence, leak.hypothesis).of(cycles)
+        low, high = held_out_gain(leak.evidence, unseen, HEALTHY, leak.hypothesis)
+        assert 100.0 < low < high
+        low, high = held_out_gain(leak.evidence, unseen, leak.hypothesis, leak.hypothesis)
+        assert low == high == 0.0  # nothing is gained by nothing
+
+
+@pytest.mark.parametrize("cycles", [1, 2])
+def test_one_or_two_unseen_cycles_give_a_gain_no_interval(cycles: int) -> None:
+    leak = with_leak()
+    assert leak.before
+    assert leak.after
+    two = (replace(one, squares=one.squares[-cycles:]) for one in (leak.before, leak.after))
+    few = gain(*two)
+    assert (few["low95"], few["high95"]) == (None, None)
+    assert few["rms_reduction_pct"] == pytest.approx(leak.json["gain"]["rms_reduction_pct"], abs=9)
+
+
+def test_the_interval_of_a_gain_has_a_width_or_there_is_none() -> None:
+    leak = with_leak()
+    assert leak.before
+    assert leak.after
+    known = leak.json["gain"]
+    assert 0.0 < known["low95"] < known["rms_reduction_pct"] < known["high95"] < 100.0
+    nothing = gain(leak.before, leak.before)
+    assert (nothing["rms_reduction_pct"], nothing["low95"], nothing["high95"]) == (0.0, None, None)
+
+
+def test_drifted_thresholds_gain_in_the_switching_levels() -> None:
+    """The pressure between switchings begins at what was measured there."""
+    answer = of(record(30.0, "threshold_drift=-25", seed=35)).json
+    assert answer["gain"]["low95"] is None
+    before, after = (answer[name]["level_rms_mbar"] for name in ("baseline", "extended"))
+    assert after < 2.0
+    assert before > 20.0
 
 
 def test_a_leak_that_opens_half_way_is_a_step_with_its_onset() -> None:

@@ -86,18 +86,19 @@ def gain(before: Judged, after: Judged) -> dict[str, float | None]:
 def _interval(before: Floats, after: Floats) -> tuple[float | None, float | None]:
     """95 % interval (%) of the reduction, from mean squares by cycle; rounded outward.
 
-    That of a ratio of means, linearised, by Student's t: few cycles show their spread only roughly,
-    and resampling them would not tell.
+    That of a ratio of means, linearised in its logarithm, by Student's t: few cycles show their
+    spread only roughly, and resampling them would not tell.
     """
     cycles = len(before)
     if cycles < FEWEST:
         return None, None
-    ratio = after.sum() / before.sum()
-    sigma = float(np.std(after - ratio * before, ddof=1) / math.sqrt(cycles) / before.mean())
+    each = after / after.mean() - before / before.mean()
+    sigma = float(np.std(each, ddof=1)) / math.sqrt(cycles)
     if sigma == 0.0:
         return None, None
-    reach = float(student.ppf(SURE, cycles - 1)) * sigma
-    low, high = (100.0 * (1.0 - math.sqrt(max(ratio + r, 0.0))) for r in (reach, -reach))
+    reach = float(student.ppf(SURE, cycles - 1)) * sigma / 2.0  # of the rms, not its square
+    ratio = math.sqrt(after.mean() / before.mean())
+    low, high = (100.0 * (1.0 - ratio * math.exp(r)) for r in (reach, -reach))
     return math.floor(100.0 * low) / 100.0, math.ceil(100.0 * high) / 100.0
 
 
