@@ -1,7 +1,7 @@
 """A measured vessel that fills from ambient air through an orifice: pressure and gas temperature.
 
 16.18 l, evacuated to 37 mbar, behind an orifice of 2.71 mm with a discharge coefficient of 0.84
-(validation data of HydDown). One number is chosen, the film coefficient, to fit the temperatures;
+(tests/data/README.md). One number is chosen, the film coefficient, to fit the temperatures;
 the orifice's flow is that of an isentropic nozzle, and below sonic ISO 6358's ellipse.
 """
 
@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import pytest
 from scipy.optimize import minimize_scalar
 from stepping import standing, states, temperature, theta_of
 
@@ -20,12 +19,10 @@ from twin.model.theta import Theta
 from twin.signals import MBAR, SL_MIN, Phase
 
 Floats = npt.NDArray[np.float64]
-DATA = Path(__file__).parents[2] / "shared" / "data" / "vessel_filling"
+DATA = Path(__file__).parent / "data" / "vessel_filling"
 KELVIN, AMBIENT = 295.0, 1000.0  # mbar
 DIAMETER, LENGTH = 0.20, 0.515  # m, of the vessel
 ROW = 0.02  # s
-
-pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"no measured data in {DATA}")
 
 
 def sonic_flow(diameter: float, discharge: float) -> float:
