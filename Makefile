@@ -4,13 +4,17 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 
-.PHONY: demo test check format docs bench battery clean
+.PHONY: demo test peers check format docs bench battery clean
 
 demo: .venv/run
 	$(BIN)/python tools/demo.py
 
 test: .venv/dev
 	$(BIN)/python -m pytest
+
+# What the tests speak to, if it is there: a broker, a browser, PLCs of other make.
+peers:
+	$(PYTHON) tests/needs.py
 
 check: .venv/dev
 	$(BIN)/ruff format --check .

@@ -6,9 +6,12 @@ And what takes long to come by and is shared: a simulated PLC beside the tests o
 import asyncio
 import gc
 import itertools
+import os
 import shutil
+import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +20,7 @@ import psutil
 import pytest
 import rigs
 from hypothesis import settings
-from independent import missing
+from needs import NEEDS, Programs
 from opcua_plc import OpcuaPlc, start_opcua
 from playwright.sync_api import Browser, expect, sync_playwright
 from plc_process import PlcProcess, start_plc
@@ -27,9 +30,70 @@ from twin.cli import pair_of
 
 _ME = psutil.Process()
 _SCHEMAS = itertools.count()
+_PROGRAMS = pytest.StashKey[Programs]()
+_LEFT_OUT = pytest.StashKey[Counter[str]]()
 
 settings.register_profile("untimed", deadline=None)  # what is slow here may be quick elsewhere
 settings.load_profile("untimed")
+
+
+# --- programs of the system ---------------------------------------------------------------------
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--without",
+        action="append",
+        default=[],
+        choices=["all", *NEEDS],
+        help="hide programs of the system, as if they were not installed",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    without = config.getoption("--without")
+    folder = tempfile.TemporaryDirectory(prefix="needs")
+    config.add_cleanup(folder.cleanup)
+    Path(folder.name).chmod(0o755)  # PostgreSQL runs as another user
+    programs = Programs(Path(folder.name), [*NEEDS] if "all" in without else without)
+    config.add_cleanup(programs.close)
+    config.stash[_PROGRAMS], config.stash[_LEFT_OUT] = programs, Counter()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """A test finds the programs that it names; it is skipped without, but fails in CI."""
+    programs = item.config.stash[_PROGRAMS]
+    names = list(dict.fromkeys(name for mark in item.iter_markers("needs") for name in mark.args))
+    missing = [name for name in names if programs.is_missing(name)]
+    if not missing:
+        programs.offer(names)
+        return
+    packages = " ".join(package for name in missing for package in NEEDS[name].packages)
+    reason = f"no {', '.join(missing)} (make peers; on Debian or Ubuntu: apt install {packages})"
+    if os.environ.get("CI") == "true":
+        pytest.fail(reason, pytrace=False)
+    item.config.stash[_LEFT_OUT].update(missing)
+    pytest.skip(reason)
+
+
+def pytest_terminal_summary(
+    terminalreporter: pytest.TerminalReporter, config: pytest.Config
+) -> None:
+    """Say what stayed untested for want of a program."""
+    left_out = config.stash[_LEFT_OUT]
+    if not left_out:
+        return
+    terminalreporter.section("left out: make peers installs what these tests need")
+    rows = [("tests", "need", "Debian packages", "what stays untested")]
+    for name, need in NEEDS.items():
+        if left_out[name]:
+            rows.append((str(left_out[name]), name, " ".join(need.packages), need.tested))
+    for tests, name, packages, tested in rows:
+        terminalreporter.write_line(f"{tests:>5}  {name:<10}  {packages:<25}  {tested}")
+
+
+# --- nothing is left behind ---------------------------------------------------------------------
 
 
 def _alive() -> set[str]:
@@ -72,6 +136,9 @@ def nothing_left_by_what_is_shared() -> Iterator[None]:
         yield
 
 
+# --- what is shared -----------------------------------------------------------------------------
+
+
 @pytest.fixture(scope="module")
 def plc() -> Iterator[PlcProcess]:
     """The gripper's PLC in a process of its own; nobody may write to it or stop it."""
@@ -87,7 +154,10 @@ def opcua(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OpcuaPlc]:
         yield running
 
 
-@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
+@pytest.fixture(
+    scope="module",
+    params=["sqlite", pytest.param("postgresql", marks=pytest.mark.needs("postgresql"))],
+)
 def server(request: pytest.FixtureRequest) -> Iterator[Path | None]:
     """The folder of PostgreSQL's socket, or None for SQLite."""
     if request.param == "sqlite":
@@ -105,12 +175,12 @@ def url(server: Path | None, tmp_path: Path) -> str:
     return make_schema(server, f"test{next(_SCHEMAS)}")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(
+    scope="module", params=[pytest.param("chromium", marks=pytest.mark.needs("chromium"))]
+)
 def browser() -> Iterator[Browser]:
     """A real Chromium; each test opens a page of its own and closes it."""
     path = shutil.which("chromium")
-    if path is None:
-        missing("chromium", "on Debian or Ubuntu: apt install chromium")
     expect.set_options(timeout=30e3)  # ms: the machine may be busy
     with sync_playwright() as playwright, playwright.chromium.launch(executable_path=path) as found:
         yield found

@@ -1,6 +1,5 @@
 """FMUs of the shipped configurations in FMPy: simulated whole, or stepped by hand."""
 
-import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,7 +13,6 @@ import numpy.typing as npt
 import rigs
 from fmpy.fmi2 import FMU2Slave, fmi2CallbackFunctions, fmi2CallbackLoggerTYPE
 from fmpy.fmi3 import FMU3Slave
-from independent import missing
 
 from twin.exchange.fmu import Fmu, make_fmu
 from twin.exchange.variables import Component, Where
@@ -28,13 +26,6 @@ Commands = npt.NDArray[np.uint8]
 PROGRAM = {"test_rig": (2300, 300, 600), "gripper": (1200, 200, 600)}  # suction, blow-off, idle
 
 
-def need(*commands: str) -> None:
-    """What builds C, or the test is skipped."""
-    for command in commands:
-        if shutil.which(command) is None:
-            missing(command, "apt install gcc g++ libc6-dev make")
-
-
 @cache
 def made(name: str, version: int = 3, where: Where = "inside") -> Fmu:
     """The FMU of a configuration, with a binary."""
@@ -42,7 +33,6 @@ def made(name: str, version: int = 3, where: Where = "inside") -> Fmu:
 
 
 def of_data(data: DataSet, version: int = 3, where: Where = "inside") -> Fmu:
-    need("cc")
     return make_fmu(Component.of(data, where), "cell 1", "a test", "tests", version, compiled=True)
 
 

@@ -5,8 +5,6 @@ node-opcua (npm) as an OPC UA server, libmodbus (Debian) as a Modbus server, and
 """
 
 import json
-import os
-import shutil
 import socket
 import subprocess
 import time
@@ -16,11 +14,10 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pytest
 import rigs
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
@@ -59,29 +56,7 @@ def simulated(seed: int) -> Truth:
     return Truth(samples["pressure"].copy(), samples["commands"].copy())
 
 
-# --- what must be there -------------------------------------------------------------------------
-
-
-def missing(what: str, how: str) -> NoReturn:
-    """The test is skipped, but not in CI, where none may be skipped."""
-    reason = f"{what} is not installed ({how})"
-    if os.environ.get("CI") == "true":
-        pytest.fail(reason)
-    pytest.skip(reason)
-
-
-def _tool(name: str, package: str) -> str:
-    if path := shutil.which(name):
-        return path
-    missing(name, f"on Debian or Ubuntu: apt install {package}")
-
-
-def node() -> str:
-    """Path of Node.js, with node-opcua beside the scripts."""
-    path = _tool("node", "nodejs npm")
-    if not (PEERS / "node_modules" / "node-opcua-server").is_dir():
-        missing("node-opcua", f"npm ci --prefix {PEERS}")
-    return path
+# --- processes ----------------------------------------------------------------------------------
 
 
 def modbus_program(folder: Path) -> Path:
@@ -89,19 +64,16 @@ def modbus_program(folder: Path) -> Path:
     program = folder / "modbus_server"
     if program.exists():
         return program
-    compiler, config = _tool("cc", "gcc libc6-dev"), _tool("pkg-config", "pkg-config")
-    found = subprocess.run(
-        [config, "--cflags", "--libs", "libmodbus"], capture_output=True, text=True, check=False
-    )
-    if found.returncode != 0:
-        missing("libmodbus", "on Debian or Ubuntu: apt install libmodbus-dev")
+    flags = subprocess.run(
+        ["pkg-config", "--cflags", "--libs", "libmodbus"],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.split()
     options = ["-O2", "-Wall", "-Wextra", "-Werror", "-pthread", "-o", program]
     source = PEERS / "modbus_server.c"
-    subprocess.run([compiler, *options, source, *found.stdout.split()], check=True, timeout=60)
+    subprocess.run(["cc", *options, source, *flags], check=True, timeout=60)
     return program
-
-
-# --- processes ----------------------------------------------------------------------------------
 
 
 @dataclass
@@ -156,7 +128,6 @@ def libmodbus_in_tls(
     folder: Path, port: int = 0, certificate: Path | None = None, clients: Path | None = None
 ) -> Iterator[Server]:
     """The same behind stunnel, with ``folder/plc`` or another certificate; ``clients`` may come."""
-    stunnel = _tool("stunnel", "stunnel4")
     program, inner = _listening([modbus_program(folder), "0"])
     server = Server(port or free_port(), [program])
     with _until_done(server):
@@ -171,7 +142,7 @@ def libmodbus_in_tls(
         config = folder / f"stunnel-{server.port}.conf"
         config.write_text("\n".join(lines) + "\n", encoding="utf-8")
         server.programs.append(
-            subprocess.Popen([stunnel, config], stderr=subprocess.DEVNULL, text=True)
+            subprocess.Popen(["stunnel", config], stderr=subprocess.DEVNULL, text=True)
         )
         _wait_for(server.port)
         yield server
@@ -190,7 +161,7 @@ def node_opcua(folder: Path, port: int = 0, **options: Any) -> Iterator[Server]:
         "trusted": [str(folder / "ours" / certificates.OWN)],
     }
     script = PEERS / "opcua_server.js"
-    program, port = _listening([node(), script, json.dumps(told | options)])
+    program, port = _listening(["node", script, json.dumps(told | options)])
     with _until_done(Server(port, [program])) as server:
         yield server
 

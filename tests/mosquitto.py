@@ -3,7 +3,6 @@
 import getpass
 import json
 import queue
-import shutil
 import socket
 import subprocess
 import threading
@@ -13,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Self
 
-from independent import free_port, missing
+from independent import free_port
 from paho.mqtt.client import Client, MQTTv5
 from paho.mqtt.enums import CallbackAPIVersion
 
@@ -25,9 +24,6 @@ class Broker:
 
     def __init__(self, folder: Path, lines: Sequence[str] = ("allow_anonymous true",)) -> None:
         self.port = free_port()
-        self._program = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin")
-        if self._program is None:
-            missing("mosquitto", "on Debian or Ubuntu: apt install mosquitto")
         self._config = folder / f"mosquitto-{self.port}.conf"
         own = [f"listener {self.port} 127.0.0.1", "persistence false", "max_queued_messages 0"]
         own.append(f"user {getpass.getuser()}")  # else root becomes one who cannot read our files
@@ -35,8 +31,7 @@ class Broker:
         self.process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        assert self._program is not None
-        command = [self._program, "-c", str(self._config)]
+        command = ["mosquitto", "-c", str(self._config)]
         self.process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
         end = time.monotonic() + PATIENCE_S
         while True:

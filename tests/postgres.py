@@ -2,7 +2,6 @@
 
 import os
 import pwd
-import shutil
 import signal
 import subprocess
 import tempfile
@@ -17,18 +16,6 @@ import pytest
 
 PATIENCE_S = 30.0
 QUIET = ("autovacuum=off", "fsync=off", "listen_addresses=", "max_logical_replication_workers=0")
-
-
-def find_binary(name: str) -> str:
-    """Its path; without it the test is skipped, but not in CI, where none may be skipped."""
-    places = sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)
-    found = next(filter(None, (shutil.which(name, path=str(p)) for p in places)), None)
-    if path := found or shutil.which(name):
-        return path
-    reason = f"PostgreSQL's {name} is not installed (on Debian or Ubuntu: apt install postgresql)"
-    if os.environ.get("CI") == "true":
-        pytest.fail(reason)
-    pytest.skip(reason)
 
 
 def somebody_else() -> dict[str, Any]:
@@ -47,7 +34,7 @@ def somebody_else() -> dict[str, Any]:
 @contextmanager
 def postgres_server() -> Iterator[Path]:
     """Start a server, give the folder of its socket, and stop it."""
-    initdb, postgres, user = find_binary("initdb"), find_binary("postgres"), somebody_else()
+    user = somebody_else()
     with tempfile.TemporaryDirectory(prefix="pg", dir="/tmp") as name:  # short, for the socket
         folder = Path(name)
         if user:
@@ -55,9 +42,11 @@ def postgres_server() -> Iterator[Path]:
         options = ["-A", "trust", "-U", "test", "-E", "UTF8", "--locale=C", "--no-sync"]
         cluster = folder / "cluster"
         started = {"cwd": folder, **user, "stdout": subprocess.DEVNULL}
-        subprocess.run([initdb, "-D", cluster, *options], check=True, timeout=PATIENCE_S, **started)
+        subprocess.run(
+            ["initdb", "-D", cluster, *options], check=True, timeout=PATIENCE_S, **started
+        )
         settings = [part for setting in QUIET for part in ("-c", setting)]
-        command = [postgres, "-D", cluster, "-k", folder, *settings]
+        command = ["postgres", "-D", cluster, "-k", folder, *settings]
         with subprocess.Popen(command, stderr=subprocess.DEVNULL, **started) as server:
             try:
                 _wait_for(folder, server)

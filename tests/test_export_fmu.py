@@ -10,7 +10,7 @@ from command_line import twin
 from fmpy import extract, read_model_description, simulate_fmu
 from fmpy.ssp.ssd import ParameterSet, build_path, get_connections, read_ssd, read_ssv
 from fmpy.validation import validate_fmu
-from fmus import by_twin, need
+from fmus import by_twin
 
 from twin.config import Config
 from twin.model.dataset import coefficients
@@ -29,10 +29,10 @@ def values(parameters: ParameterSet) -> dict[str, str]:
     return {one.name: one.value for one in parameters.parameters}
 
 
+@pytest.mark.needs("cc")
 def test_a_unit_of_the_database_is_written_under_its_name(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    need("cc")
     assert exported(monkeypatch, tmp_path, "--id", "paper-unit") == 0
     said = capsys.readouterr()
     assert "paper-unit in paper_unit.fmu: FMI 3.0, instance-specific data" in said.out
@@ -93,10 +93,10 @@ def test_a_file_that_cannot_be_written_is_said(
     assert "cannot be written" in capsys.readouterr().err
 
 
+@pytest.mark.needs("cc")
 def test_the_unit_lies_over_its_type_in_a_system_structure(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    need("cc")
     assert exported(monkeypatch, tmp_path, "--id", "paper-unit", "-o", "a.ssp") == 0
     path = str(tmp_path / "a.ssp")
     component = read_ssd(path).system.elements[0]  # validated against the schema

@@ -2,7 +2,6 @@
 
 import os
 import re
-import shutil
 import subprocess
 import sys
 import zipfile
@@ -42,6 +41,7 @@ def parts(fmu: fmus.Fmu) -> dict[str, bytes]:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
+@pytest.mark.needs("cc")
 @pytest.mark.parametrize(("version", "where"), ALL)
 def test_fmpy_finds_nothing(version: int, where: Where) -> None:
     with fmus.as_file(made("gripper", version, where)) as path:
@@ -49,6 +49,7 @@ def test_fmpy_finds_nothing(version: int, where: Where) -> None:
         assert read_model_description(path).coSimulation.canGetAndSetFMUstate
 
 
+@pytest.mark.needs("cc")
 @pytest.mark.parametrize(
     ("name", "version", "fault"),
     [("test_rig", 3, {}), ("test_rig", 2, FAULT), ("gripper", 2, {}), ("gripper", 3, FAULT)],
@@ -65,6 +66,7 @@ def test_ten_cycles_are_those_of_the_twin(
     assert off.max() < BOUND
 
 
+@pytest.mark.needs("cc")
 @pytest.mark.parametrize("effect", EFFECTS.values(), ids=lambda effect: effect.name)
 def test_every_effect_acts_as_in_the_twin(effect) -> None:  # type: ignore[no-untyped-def]
     theta, commands = rigs.theta("gripper"), cycles("gripper", 1)
@@ -77,6 +79,7 @@ def test_every_effect_acts_as_in_the_twin(effect) -> None:  # type: ignore[no-un
     assert np.abs(seen - by_twin(theta, commands)[1:]).max() > 10 * BOUND  # it can be seen
 
 
+@pytest.mark.needs("cc")
 def test_an_effect_may_begin_while_time_runs() -> None:
     theta, commands = rigs.theta("gripper"), cycles("gripper", 2)
     values = {"cup_compliance": {"volume_at_full_vacuum": 8.0}, "leakage": {"sonic_flow": 1.0}}
@@ -100,6 +103,7 @@ def test_an_effect_may_begin_while_time_runs() -> None:
     assert np.abs(seen - expected[1:]).max() < BOUND
 
 
+@pytest.mark.needs("cc")
 def test_what_a_diagnosis_found_is_where_the_effects_start() -> None:
     found = {"filter_clogging": {"pressure_drop_at_nominal": 60.0}, "suction_loss": {"loss": 20.0}}
     data, other = (
@@ -123,6 +127,7 @@ def test_what_a_diagnosis_found_is_where_the_effects_start() -> None:
     assert np.abs(mended - by_twin(rigs.theta("gripper"), commands)[1:]).max() < BOUND
 
 
+@pytest.mark.needs("cc")
 def test_steps_may_be_of_any_length() -> None:
     commands = cycles("gripper", 1)  # all edges at 50 ms
     with stepped(made("gripper"), 3) as (fine, coarse, odd):
@@ -140,6 +145,7 @@ def test_steps_may_be_of_any_length() -> None:
         assert off.max() < 1.0  # the control has decided at other times, too
 
 
+@pytest.mark.needs("cc")
 @pytest.mark.parametrize("version", [2, 3])
 def test_a_state_is_saved_and_restored_to_the_last_bit(version: int) -> None:
     commands = cycles("gripper", 2)
@@ -156,6 +162,7 @@ def test_a_state_is_saved_and_restored_to_the_last_bit(version: int) -> None:
     assert (elsewhere == first).all()
 
 
+@pytest.mark.needs("cc")
 def test_instances_do_not_disturb_each_other() -> None:
     commands = cycles("gripper", 1)
     with stepped(made("gripper"), 3) as (alone, one, other):
@@ -169,6 +176,7 @@ def test_instances_do_not_disturb_each_other() -> None:
     assert (np.array(turns) == undisturbed).all()
 
 
+@pytest.mark.needs("cc")
 def test_gas_from_elsewhere_comes_in_at_the_port() -> None:
     theta, commands = rigs.theta("test_rig"), cycles("test_rig", 1)
     theta[c.INFLOW] = 5.0 * SL_MIN
@@ -179,6 +187,7 @@ def test_gas_from_elsewhere_comes_in_at_the_port() -> None:
     assert np.abs(seen - by_twin(rigs.theta("test_rig"), commands)[1:]).max() > 1e3
 
 
+@pytest.mark.needs("cc")
 def test_a_vessel_outside_closes_the_open_port() -> None:
     """Mass and energy of a tank by explicit steps of 1 ms: about the twin's own curve."""
     theta, commands = rigs.theta("test_rig"), cycles("test_rig", 1)
@@ -203,6 +212,7 @@ def test_a_vessel_outside_closes_the_open_port() -> None:
     assert np.sqrt((off**2).mean()) < 100.0
 
 
+@pytest.mark.needs("cc")
 @pytest.mark.parametrize("version", [2, 3])
 def test_what_cannot_be_is_refused_in_words(version: int) -> None:
     with stepped(made("gripper", version)) as (one,):
@@ -224,6 +234,7 @@ def test_what_cannot_be_is_refused_in_words(version: int) -> None:
     assert "time ahead" in one.said[4]
 
 
+@pytest.mark.needs("cc")
 def test_a_state_of_another_fmu_is_refused() -> None:
     with stepped(made("gripper")) as (one,), stepped(made("test_rig")) as (other,):
         one.begin()
@@ -233,6 +244,7 @@ def test_a_state_of_another_fmu_is_refused() -> None:
     assert other.said == ["the state is not one of this FMU"]
 
 
+@pytest.mark.needs("cc")
 @pytest.mark.parametrize(("version", "where"), ALL)
 def test_sources_compile_without_a_warning(version: int, where: Where, tmp_path: Path) -> None:
     for name, content in parts(made("gripper", version, where)).items():
@@ -243,8 +255,8 @@ def test_sources_compile_without_a_warning(version: int, where: Where, tmp_path:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.needs("cc", "c++")
 def test_another_tool_compiles_the_sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fmus.need("cc", "c++", "make")  # its project asks for C++, whatever the sources are
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")  # CMake's
     component = Component.of(rigs.config("gripper").data, "inside")
     bare = make_fmu(component, "cell 1", "a test", "tests", 3, compiled=False)
@@ -261,8 +273,7 @@ def test_another_tool_compiles_the_sources(tmp_path: Path, monkeypatch: pytest.M
     assert np.abs(seen - by_twin(rigs.theta("gripper"), commands)[1:]).max() < BOUND
 
 
-def test_without_a_compiler_there_are_sources_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shutil, "which", lambda _: None)
+def test_without_a_compiler_there_are_sources_alone() -> None:
     component = Component.of(rigs.config("gripper").data, "inside")
     bare = make_fmu(component, "cell 1", "a test", "tests", 3, compiled=True)
     assert bare.binary == ""
@@ -271,6 +282,7 @@ def test_without_a_compiler_there_are_sources_alone(monkeypatch: pytest.MonkeyPa
         assert validate_fmu(path) == []
 
 
+@pytest.mark.needs("cc")
 def test_the_same_data_give_the_same_file_and_no_python_is_in_it() -> None:
     once, twice = made("gripper"), fmus.of_data(rigs.config("gripper").data)
     assert once.content == twice.content

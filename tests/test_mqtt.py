@@ -1,7 +1,6 @@
 """Alarms at a real broker (mosquitto): kept there, through its restarts, cuts and ours."""
 
 import json
-import shutil
 import signal
 import subprocess
 import sys
@@ -13,7 +12,6 @@ from typing import Any
 import pytest
 import rigs
 import tomli_w
-from independent import missing
 from mosquitto import Broker, Listener, Relay, broker
 from plc_process import start_plc
 from test_alarms_loop import LEAK, NONE, UNIT, Stream, deviation
@@ -45,7 +43,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mqtt, "LISTEN_S", 0.01)
 
 
-@pytest.fixture
+@pytest.fixture(params=[pytest.param("mosquitto", marks=pytest.mark.needs("mosquitto"))])
 def running(tmp_path: Path) -> Iterator[Broker]:
     with broker(tmp_path) as one:
         yield one
@@ -208,6 +206,7 @@ def test_only_what_the_broker_has_taken_is_delivered(
         ours.close()
 
 
+@pytest.mark.needs("mosquitto")
 def test_what_is_left_goes_out_with_the_next_program(tmp_path: Path) -> None:
     away = Broker(tmp_path)
     bench = At(tmp_path / "a.sqlite", away.port)
@@ -222,6 +221,7 @@ def test_what_is_left_goes_out_with_the_next_program(tmp_path: Path) -> None:
         assert numbers(listener.on(LEAK)) == [1, 2]
 
 
+@pytest.mark.needs("mosquitto")
 def test_what_the_broker_will_not_have_is_set_aside(tmp_path: Path) -> None:
     """Too large a message would make it hang up, over and over."""
     with broker(tmp_path, "allow_anonymous true", "max_packet_size 2000") as small:
@@ -235,6 +235,7 @@ def test_what_the_broker_will_not_have_is_set_aside(tmp_path: Path) -> None:
     assert "bytes are more than the 2000 that it takes" in why
 
 
+@pytest.mark.needs("mosquitto")
 def test_what_is_forbidden_is_set_aside(tmp_path: Path) -> None:
     (tmp_path / "acl").write_text("topic write ejector-twin/+/+/status\n", encoding="utf-8")
     lines = ("allow_anonymous true", f"acl_file {tmp_path / 'acl'}")
@@ -265,6 +266,7 @@ def with_users(folder: Path) -> tuple[str, str]:
     return "allow_anonymous false", f"password_file {users}"
 
 
+@pytest.mark.needs("mosquitto")
 def test_user_and_password(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("BROKER", "s3cret")
     ann = {"user": "ann", "password": Secret(env="BROKER")}
@@ -280,6 +282,7 @@ def test_user_and_password(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
             ours.hang_up()
 
 
+@pytest.mark.needs("mosquitto", "openssl")
 def test_inside_tls(tmp_path: Path) -> None:
     own = certificate(tmp_path)
     lines = ("allow_anonymous true", f"certfile {own}", f"keyfile {own}")
@@ -296,8 +299,6 @@ def test_inside_tls(tmp_path: Path) -> None:
 def certificate(folder: Path) -> Path:
     """Of 127.0.0.1, with its key, as PEM."""
     path = folder / "own.pem"
-    if shutil.which("openssl") is None:
-        missing("openssl", "on Debian or Ubuntu: apt install openssl")
     command = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2"]
     command += ["-subj", "/CN=broker", "-addext", "subjectAltName=IP:127.0.0.1"]
     key = folder / "key.pem"

@@ -198,6 +198,7 @@ def test_while_nobody_takes_it_the_newest_hours_are_kept_and_the_rest_is_counted
 # --- at a broker --------------------------------------------------------------------------------
 
 
+@pytest.mark.needs("mosquitto")
 def test_no_cycle_is_lost_while_the_broker_is_away(tmp_path: Path) -> None:
     path, said = tmp_path / "a.sqlite", list[str]()
     away = Broker(tmp_path)
@@ -241,6 +242,7 @@ def test_data_leaves_room_for_alarms_where_the_database_is_away(
     assert outlets._lost == 4
 
 
+@pytest.mark.needs("mosquitto")
 def test_the_packets_of_a_lane_have_its_topic(tmp_path: Path) -> None:
     with broker(tmp_path) as running, Listener(running.port) as listener:
         ours = Mqtt(MqttSettings(host="127.0.0.1", port=running.port), UNIT, Path(), pytest.fail)

@@ -345,6 +345,7 @@ def publishers(running: Broker, count: int, closing: ExitStack) -> list[Mqtt]:
     return made
 
 
+@pytest.mark.needs("mosquitto")
 def test_forty_ejectors_and_one_that_dies(tmp_path: Path, browser: Browser) -> None:
     leak = Message("1", LEAK, alarm(Unit(TYPE, "cell-17")))
     with ExitStack() as closing:
@@ -392,6 +393,7 @@ def test_forty_ejectors_and_one_that_dies(tmp_path: Path, browser: Browser) -> N
         assert [one for one in asked if not one.startswith(url)] == []
 
 
+@pytest.mark.needs("mosquitto")
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_it_is_fit_for_gloves_on_every_screen(
     tmp_path: Path,
@@ -421,6 +423,7 @@ def test_it_is_fit_for_gloves_on_every_screen(
 # --- on the command line ------------------------------------------------------------------------
 
 
+@pytest.mark.needs("mosquitto")
 def test_twin_run_is_on_the_page_of_twin_serve(tmp_path: Path) -> None:
     """A real PLC's process, the edge's, the broker's and the page's; the edge is killed."""
     tables = tomllib.loads(rigs.path_of("gripper").read_text(encoding="utf-8"))

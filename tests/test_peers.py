@@ -38,6 +38,8 @@ from twin.signals import SAMPLE, Quality, Samples
 LONGEST_RUN = 40_000  # scans that a PLC makes before its test is over
 PLC = "plc"  # the name in the certificate of the PLC behind TLS
 DriverSettings = ModbusSettings | OpcuaSettings
+NODE, LIBMODBUS = ("node-opcua",), ("cc", "libmodbus")
+STUNNEL = (*LIBMODBUS, "stunnel")
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,7 @@ class Peer:
     truth: Callable[[], Truth] = known_signal
     scans: bool = True  # rows are the PLC's scans; else values at the times they are of
     slack_ms: int = 0  # so far these times may be off
+    needs: tuple[str, ...] = ()  # programs of the system
 
 
 # --- our settings -------------------------------------------------------------------------------
@@ -158,15 +161,23 @@ PEERS = {
         lambda: simulated(3),
         scans=False,
     ),
-    "node-opcua, trace": Peer(node_opcua, lambda _, port: by_opcua(port), NO_TRACE, UNKNOWN),
+    "node-opcua, trace": Peer(
+        node_opcua, lambda _, port: by_opcua(port), NO_TRACE, UNKNOWN, needs=NODE
+    ),
     "node-opcua, subscribed": Peer(
-        node_opcua, lambda _, port: by_opcua(port, mode="subscribe"), NO_NODE, UNKNOWN, scans=False
+        node_opcua,
+        lambda _, port: by_opcua(port, mode="subscribe"),
+        NO_NODE,
+        UNKNOWN,
+        scans=False,
+        needs=NODE,
     ),
     "node-opcua, trace, Basic256Sha256": Peer(
         node_secure,
         lambda folder, port: by_opcua(port, **secured(folder, "Basic256Sha256")),
         NO_TRACE,
         UNKNOWN,
+        needs=NODE,
     ),
     "node-opcua, subscribed, Aes256Sha256RsaPss": Peer(
         node_secure,
@@ -176,8 +187,11 @@ PEERS = {
         NO_NODE,
         UNKNOWN,
         scans=False,
+        needs=NODE,
     ),
-    "libmodbus, ring": Peer(libmodbus, lambda _, port: by_modbus(port), NO_HEADER, REFUSED),
+    "libmodbus, ring": Peer(
+        libmodbus, lambda _, port: by_modbus(port), NO_HEADER, REFUSED, needs=LIBMODBUS
+    ),
     "libmodbus, polled": Peer(
         libmodbus,
         lambda _, port: by_modbus(port, mode="poll"),
@@ -185,12 +199,14 @@ PEERS = {
         REFUSED,
         scans=False,
         slack_ms=100,
+        needs=LIBMODBUS,
     ),
     "libmodbus in TLS, ring": Peer(
         libmodbus_in_tls,
         lambda folder, port: by_modbus(port, **in_tls(folder)),
         NO_HEADER,
         REFUSED,
+        needs=STUNNEL,
     ),
     "libmodbus in TLS, polled": Peer(
         libmodbus_in_tls,
@@ -199,6 +215,7 @@ PEERS = {
         REFUSED,
         scans=False,
         slack_ms=100,
+        needs=STUNNEL,
     ),
 }
 
@@ -215,7 +232,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return furnished(tmp_path_factory.mktemp("peers"))
 
 
-@pytest.fixture(scope="module", params=PEERS.values(), ids=PEERS)
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(peer, id=name, marks=[pytest.mark.needs(*peer.needs)] if peer.needs else [])
+        for name, peer in PEERS.items()
+    ],
+)
 def peer(request: pytest.FixtureRequest) -> Peer:
     kind: Peer = request.param
     return kind
@@ -343,6 +366,7 @@ def out_of_date(folder: Path, begin_days: int) -> Path:
     return path
 
 
+@pytest.mark.needs(*STUNNEL)
 @pytest.mark.parametrize(("begin_days", "said"), [(-3, "has expired"), (3, "is not valid yet")])
 def test_tls_with_a_certificate_out_of_date(folder: Path, begin_days: int, said: str) -> None:
     certificate = out_of_date(folder, begin_days)
@@ -351,7 +375,7 @@ def test_tls_with_a_certificate_out_of_date(folder: Path, begin_days: int, said:
     assert str(error) == f"127.0.0.1:{server.port}: its certificate {said}"
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", params=[pytest.param("tls", marks=pytest.mark.needs(*STUNNEL))])
 def tls(folder: Path) -> Iterator[int]:
     with libmodbus_in_tls(folder) as server:
         yield server.port
@@ -370,6 +394,7 @@ def test_tls_with_a_certificate_of_somebody_else(folder: Path, tls: int) -> None
     assert "set name" in error.hint
 
 
+@pytest.mark.needs(*LIBMODBUS)
 def test_tls_to_a_plc_that_speaks_plain_modbus(folder: Path) -> None:
     with libmodbus(folder) as server:
         error = refused(by_modbus(server.port, **in_tls(folder)))
@@ -383,6 +408,7 @@ def test_plain_modbus_to_a_plc_that_speaks_tls(tls: int) -> None:
     assert "needs [driver.tls]" in error.hint
 
 
+@pytest.mark.needs(*STUNNEL)
 @pytest.mark.parametrize("ours", [None, "ours"])
 def test_tls_to_a_plc_that_wants_another_certificate(folder: Path, ours: str | None) -> None:
     own = {}
@@ -393,6 +419,7 @@ def test_tls_to_a_plc_that_wants_another_certificate(folder: Path, ours: str | N
     assert str(error).endswith("it does not trust our certificate, or wants one")
 
 
+@pytest.mark.needs(*STUNNEL)
 def test_tls_with_a_certificate_of_our_own(folder: Path) -> None:
     own = {"certificate": pem(folder / "ours"), "key": folder / "ours" / certificates.KEY}
     with libmodbus_in_tls(folder, clients=pem(folder / "ours")) as server:
@@ -410,7 +437,7 @@ def test_tls_files_that_cannot_be_used(folder: Path, tls: int, key: str) -> None
     assert f"{folder}/password.txt: cannot be used" in str(error)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", params=[pytest.param("node", marks=pytest.mark.needs(*NODE))])
 def node(folder: Path) -> Iterator[int]:
     with node_secure(folder, 0) as server:
         yield server.port
@@ -447,6 +474,7 @@ def test_node_opcua_without_the_policy(node: int) -> None:
     assert not isinstance(error, LostError)
 
 
+@pytest.mark.needs(*NODE)
 def test_node_opcua_with_another_policy(folder: Path) -> None:
     with node_opcua(folder, policies=["None", "Basic256Sha256"]) as server:
         error = refused(by_opcua(server.port, **secured(folder, "Aes256Sha256RsaPss")))

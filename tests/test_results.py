@@ -19,7 +19,7 @@ import pytest
 import rigs
 import tomli_w
 from asyncua import Client, ua
-from independent import PEERS, free_port, node
+from independent import PEERS, free_port
 from opcua_plc import acquainted
 from plc_process import start_plc
 from pydantic import ValidationError
@@ -435,12 +435,13 @@ def test_a_port_in_use_is_told(server: ResultsServer) -> None:
 
 def by_node(server: ResultsServer, folder: Path, **options: Any) -> dict[str, Any]:
     told = {"url": server.url, "namespace": NAMESPACE, "folder": str(folder / "peer")}
-    command = [node(), PEERS / "opcua_client.js", json.dumps(told | options)]
+    command = ["node", PEERS / "opcua_client.js", json.dumps(told | options)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     answer: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return answer
 
 
+@pytest.mark.needs("node-opcua")
 def test_node_opcua_reads_and_subscribes_and_cannot_write(
     server: ResultsServer, rig: Results, tmp_path: Path
 ) -> None:
@@ -492,12 +493,13 @@ class beating:  # noqa: N801 - it reads as a function
         self._thread.join()
 
 
+@pytest.mark.needs("node-opcua")
 def test_a_client_that_hangs_holds_up_nobody(
     server: ResultsServer, rig: Results, tmp_path: Path
 ) -> None:
     told = {"url": server.url, "namespace": NAMESPACE, "folder": str(tmp_path / "peer")}
     hangs = {"subscribe": ["rig-01.Meas.Pressure"], "seconds": 0.3, "freeze": True}
-    command = [node(), PEERS / "opcua_client.js", json.dumps(told | hangs)]
+    command = ["node", PEERS / "opcua_client.js", json.dumps(told | hangs)]
     with (
         beating(rig) as loop,
         subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as client,
@@ -513,6 +515,7 @@ def test_a_client_that_hangs_holds_up_nobody(
     assert loop.longest_s < 0.005
 
 
+@pytest.mark.needs("node-opcua")
 @pytest.mark.parametrize("policy", ["Basic256Sha256", "Aes256Sha256RsaPss"])
 def test_node_opcua_comes_in_protected(tmp_path: Path, policy: str) -> None:
     acquainted(tmp_path)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import pytest
-from independent import PEERS, node
+from independent import PEERS
 from opcua_plc import acquainted
 from pydantic import ValidationError
 from test_alarms_loop import (
@@ -52,7 +52,7 @@ class Watcher:
 
     def __init__(self, url: str, folder: Path, **options: Any) -> None:
         told = {"url": url, "folder": str(folder / "peer"), **options}
-        command = [node(), PEERS / "opcua_alarms.js", json.dumps(told)]
+        command = ["node", PEERS / "opcua_alarms.js", json.dumps(told)]
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(
             command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True
@@ -108,6 +108,7 @@ def told(sink: Results, stream: Stream) -> None:
     stream.said = []
 
 
+@pytest.mark.needs("node-opcua")
 def test_an_alarm_comes_with_what_is_compared(server: ResultsServer, tmp_path: Path) -> None:
     sink, stream = server.sink("rig", ""), Stream()
     with Watcher(server.url, tmp_path) as watcher:
@@ -146,6 +147,7 @@ def states(one: dict[str, Any]) -> tuple[bool, bool, bool]:
     return one["ActiveState.Id"], one["AckedState.Id"], one["Retain"]
 
 
+@pytest.mark.needs("node-opcua")
 def test_figures_and_the_plc_have_their_own_kinds(server: ResultsServer, tmp_path: Path) -> None:
     sink, stream = server.sink("kinds", ""), Stream()
     with Watcher(server.url, tmp_path) as watcher:
@@ -163,6 +165,7 @@ def test_figures_and_the_plc_have_their_own_kinds(server: ResultsServer, tmp_pat
     assert leak["SuppressedOrShelved"]  # while the PLC is stale
 
 
+@pytest.mark.needs("node-opcua")
 def test_a_renamed_alarm_goes_on_under_its_new_name(server: ResultsServer, tmp_path: Path) -> None:
     sink, stream = server.sink("named", ""), Stream()
     with Watcher(server.url, tmp_path) as watcher:
@@ -174,6 +177,7 @@ def test_a_renamed_alarm_goes_on_under_its_new_name(server: ResultsServer, tmp_p
     assert (now["ConditionName"], states(now)) == ("deviation_suction_loss", (True, False, True))
 
 
+@pytest.mark.needs("node-opcua")
 def test_who_comes_later_is_told_what_stands(server: ResultsServer, tmp_path: Path) -> None:
     before = Stream()
     before.at(5, deviation(5))
@@ -233,6 +237,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(keeper_module, "POLL_S", 0.01)
 
 
+@pytest.mark.needs("node-opcua")
 @pytest.mark.usefixtures("quick")
 def test_who_is_allowed_to_acknowledges_and_others_are_not(tmp_path: Path) -> None:
     acquainted(tmp_path)
@@ -268,6 +273,7 @@ def test_who_is_allowed_to_acknowledges_and_others_are_not(tmp_path: Path) -> No
         assert ann.do("acknowledge", alarm=LEAK) == "BadConditionBranchAlreadyAcked"
 
 
+@pytest.mark.needs("node-opcua")
 @pytest.mark.usefixtures("quick")
 def test_nobody_in_particular_cannot_acknowledge(server: ResultsServer, tmp_path: Path) -> None:
     with Watcher(server.url, tmp_path) as watcher, Beside(tmp_path, server, "open") as beside:

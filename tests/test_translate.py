@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import fmus
 import numpy as np
 import pytest
 
@@ -95,7 +94,6 @@ def lanes(state, out):  # type: ignore[no-untyped-def]
 
 
 def loaded(text: str, folder: Path) -> ctypes.CDLL:
-    fmus.need("cc")
     (folder / "all.c").write_text(f"#include <math.h>\n{text}")
     command = ["cc", "-std=c99", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", "all.c"]
     done = subprocess.run(
@@ -105,7 +103,7 @@ def loaded(text: str, folder: Path) -> ctypes.CDLL:
     return ctypes.CDLL(str(folder / "all.so"))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", params=[pytest.param("cc", marks=pytest.mark.needs("cc"))])
 def library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
     program = Program()
     for one in FUNCTIONS:

@@ -92,7 +92,7 @@ def store() -> Iterator[Store]:
     made.close()
 
 
-@pytest.fixture
+@pytest.fixture(params=[pytest.param("mosquitto", marks=pytest.mark.needs("mosquitto"))])
 def running(tmp_path: Path) -> Iterator[Broker]:
     with broker(tmp_path) as one:
         yield one
