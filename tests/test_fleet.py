@@ -96,9 +96,16 @@ def test_a_broken_log_costs_only_itself(
     )
     foreign.write_text("time,pressure\n")
     good.write_bytes(whole)
-    asked = ("fleet", "replay", tmp_path, "--assets", tmp_path / "f.sqlite", "--workers", "1")
-    assert twin(monkeypatch, *asked) == 0
+    found, page = tmp_path / "f.json", tmp_path / "f.html"
+    asked = ("fleet", "report", tmp_path, "--assets", tmp_path / "f.sqlite", "--workers", "1")
+    assert twin(monkeypatch, *asked, "--json", found, "--html", page) == 3  # as for one log alone
     said = capsys.readouterr()
+    assert "1 unit: none stands out, 1 could not be judged; 2 logs could not be used" in said.out
+    assert [one["log"] for one in json.loads(found.read_text())["refused"]] == [
+        str(damaged),
+        str(foreign),
+    ]
+    assert "not an MCAP file" in page.read_text(encoding="utf-8")
     assert "1 of 3 logs done, 0 were known, 2 could not be" in said.out
     assert str(damaged) in said.err
     assert str(foreign) in said.err
@@ -111,11 +118,11 @@ def test_units_are_calibrated_once(
     log, database = fleets.write(tmp_path, "A1", 3, cycles=8), tmp_path / "f.sqlite"
     short = fleets.write(tmp_path, "A2", 4, cycles=1)
     asked = ("fleet", "calibrate", tmp_path, "--assets", database, "--workers", "1")
-    assert twin(monkeypatch, *asked) == 0
+    assert twin(monkeypatch, *asked) == 3
     said = capsys.readouterr()
     assert "1 of 2 logs done, 0 were known, 1 could not be" in said.out
     assert f"{short}: the log has 1 complete cycles" in said.err
-    assert twin(monkeypatch, *asked) == 0
+    assert twin(monkeypatch, *asked) == 3
     assert "0 of 2 logs done, 1 were known" in capsys.readouterr().out
     with open_assets(database) as assets:
         (record,) = assets.records("instance", "A1")
@@ -153,7 +160,7 @@ def test_a_killed_process_costs_only_its_log(
     fleets.write(tmp_path, DIES, 9)
     monkeypatch.setattr(going, "run", at_a_loss)
     asked = ("fleet", "replay", tmp_path, "--assets", tmp_path / "f.sqlite", "--workers", "2")
-    assert twin(monkeypatch, *asked) == 0
+    assert twin(monkeypatch, *asked) == 3
     said = capsys.readouterr()
     assert "3 of 4 logs done, 0 were known, 1 could not be" in said.out
     assert f"{DIES}-9.mcap: the process that worked on it was killed" in said.err

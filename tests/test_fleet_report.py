@@ -12,7 +12,7 @@ from twin.calibration.parameters import FREE
 from twin.errors import SourceError
 from twin.fleet.kinds import estimates
 from twin.fleet.peers import DAY_NS, FEWEST_PEERS, standings
-from twin.fleet.report import Report, report
+from twin.fleet.report import Refused, Report, State, report
 from twin.fleet.store import Key, Result
 from twin.fleet.words import headline, in_words, write_page
 
@@ -86,7 +86,7 @@ def test_a_unit_is_compared_with_what_it_was() -> None:
 def test_of_few_units_the_diagnosis_counts() -> None:
     few = [watched(f"U{n}", {"leakage": 9.0}) for n in range(FEWEST_PEERS - 1)]
     found = report([*few, result("diagnose", "U2", diagnosis("explained", "leakage"))], [], 0)
-    assert [row.id for row in found.rows if row.noticed] == ["U2"]
+    assert [row.id for row in found.of(State.STANDS_OUT)] == ["U2"]
     assert found.rows[0].id == "U2"
 
 
@@ -101,13 +101,15 @@ def test_without_watching_the_worst_diagnosis_is_first() -> None:
         0,
     )
     assert [row.id for row in found.rows] == ["U3", "U2", "U1"]
-    assert [row.noticed for row in found.rows] == [True, True, False]
+    assert [row.stands_out for row in found.rows] == [True, True, False]
     assert found.groups() == [
         {
             "type": "T",
             "batch": "b1",
             "units": 3,
-            "noticed": 2,
+            "stands_out": 2,
+            "does_not": 1,
+            "not_judged": 0,
             "causes": {"unlisted": 1, "leakage": 1},
         }
     ]
@@ -118,7 +120,84 @@ def test_the_newest_diagnosis_holds() -> None:
         result("diagnose", "U1", diagnosis("explained", "leakage"), day=1.0),
         result("diagnose", "U1", diagnosis("consistent"), day=2.0),
     ]
-    assert not report(mended, [], 0).rows[0].noticed
+    assert report(mended, [], 0).rows[0].state is State.DOES_NOT
+
+
+def few(*diagnosed: Result) -> Report:
+    """Four units far from the twin, too few to compare, of which some are diagnosed."""
+    watched_ones = [watched(f"U{n}", {"leakage": 9.0}) for n in range(4)]
+    return report([*watched_ones, *diagnosed], [], 0, [Refused("bad.mcap", "bad.mcap: is empty")])
+
+
+def test_of_few_units_nobody_is_judged_before_a_diagnosis() -> None:
+    found = few()
+    assert [row.state for row in found.rows] == [State.NOT_JUDGED] * 4
+    assert found.rows[0].reason == "4 to compare, 8 are needed; its newest log is not diagnosed yet"
+    assert headline(found) == (
+        "4 units: none stands out, 4 could not be judged; 1 log could not be used"
+    )
+    said = in_words(found)
+    assert "run twin fleet diagnose LOGS, then this report again" in said
+    assert "bad.mcap  is empty" in said
+    assert "sigma" not in said  # of nobody: there are too few others
+
+
+def test_a_diagnosis_without_an_answer_judges_nobody_and_stops_no_report() -> None:
+    unanswered = {
+        "verdict": "insufficient",
+        "causes": [],
+        "baseline": {"rms_mbar": None},
+        "next_experiment": "record more cycles",
+    }
+    found = few(
+        result("diagnose", "U0", unanswered), result("diagnose", "U1", diagnosis("consistent"))
+    )
+    states = {row.id: (row.state, row.reason) for row in found.rows}
+    assert states["U0"] == (State.NOT_JUDGED, "no diagnosis: record more cycles")
+    assert states["U1"] == (State.DOES_NOT, "")
+    assert "1 does not, 3 could not be judged" in headline(found)
+
+
+def test_what_was_well_in_an_older_log_says_nothing_of_the_newest() -> None:
+    results = [
+        result("diagnose", "U1", diagnosis("consistent"), day=1.0),
+        watched("U1", {"leakage": 9.0}, day=2.0),
+    ]
+    assert report(results, [], 0).rows[0].state is State.NOT_JUDGED
+
+
+def test_a_log_without_a_cycle_judges_nobody() -> None:
+    (row,) = report([result("replay", "U1", {"effects": {}})], [], 0).rows
+    assert (row.state, row.reason) == (
+        State.NOT_JUDGED,
+        "no cycle of its newest log can be compared",
+    )
+
+
+@pytest.mark.parametrize(
+    ("states", "says"),
+    [
+        ("ddd", "3 units: none stands out"),
+        ("dsd", "3 units: 1 stands out, 2 do not"),
+        ("s", "1 unit: 1 stands out"),
+        ("ssn", "3 units: 2 stand out, 1 could not be judged"),
+        ("dn", "2 units: none stands out, 1 does not, 1 could not be judged"),
+    ],
+)
+def test_the_count_is_one_sentence(states: str, says: str, tmp_path: Path) -> None:
+    verdicts = {"d": "consistent", "s": "explained"}
+    results = [
+        result("diagnose", f"U{n}", diagnosis(verdicts[one]))
+        if one in verdicts
+        else watched(f"U{n}", {"leakage": 9.0})
+        for n, one in enumerate(states)
+    ]
+    found, page = report(results, [], 0), tmp_path / "fleet.html"
+    assert headline(found) == says
+    write_page(found, page)
+    text = page.read_text(encoding="utf-8")
+    assert f"<h1>{says}</h1>" in text
+    assert ("✓" in text) == (set(states) == {"d"})  # green only where all are known to be well
 
 
 def test_one_that_drifts_is_told_with_its_rate() -> None:
@@ -187,7 +266,7 @@ def some() -> Report:
 
 
 def test_words_say_who_first(some: Report) -> None:
-    assert headline(some) == "30 units, 1 to look at"
+    assert headline(some) == "30 units: 1 stands out, 29 do not"
     said = in_words(some)
     assert said.splitlines()[3].split()[:2] == ["1", "<U4>"]
     assert "leakage +" in said
@@ -202,6 +281,7 @@ def test_the_page_is_whole_and_escaped(some: Report, tmp_path: Path) -> None:
     assert "&lt;U4&gt;" in text
     assert "<U4>" not in text
     assert "<svg" in text
+    assert "units stand out" not in text  # the headline has the only count
     assert "http://" not in text.replace("http://www.w3.org", "")
     with pytest.raises(SourceError, match="cannot be written"):
         write_page(some, tmp_path / "absent" / "fleet.html")

@@ -72,6 +72,7 @@ def _command(work: str) -> Callable[..., None]:
         told = _done(work, logs, fleet, _Engine(engine, scheduler, workers))
         if json_file is not None:
             write_json(json_file, {"work": work, "logs": _plain(told, fleet)})
+        _leave(told)
 
     return command
 
@@ -93,6 +94,7 @@ def report(
 ) -> None:
     """Say which units stand out or drift, and in what, worst first; new logs are replayed."""
     from twin.assets.database import open_assets
+    from twin.fleet.report import Refused
     from twin.fleet.report import report as put_together
     from twin.fleet.store import open_store
     from twin.fleet.words import in_words, write_page
@@ -107,13 +109,15 @@ def report(
         results = [one for one in results if one.key.log_sha256 in named]
     if not results:
         raise SourceError(f"{fleet.name}: no log was worked on", "name logs, or folders of them")
-    found = put_together(results, records, time.time_ns())
+    refused = [Refused(str(one.log), one.error) for one in told if one.error]
+    found = put_together(results, records, time.time_ns(), refused)
     print(in_words(found))
     if json_file is not None:
         write_json(json_file, found.plain())
     if page is not None:
         write_page(found, page)
         print(f"drawn in {page}")
+    _leave(told)
 
 
 @dataclass(frozen=True)
@@ -202,6 +206,12 @@ def _done(work: str, logs: Sequence[Path], fleet: _Fleet, engine: _Engine) -> "l
     )
     place = {log: number for number, log in enumerate(files)}
     return sorted(told, key=lambda one: place[one.log])
+
+
+def _leave(told: "Iterable[Told]") -> None:
+    """Exit as for a log that could not be read, if there was any; the others are done."""
+    if any(one.error for one in told):
+        raise typer.Exit(SourceError.exit_code)
 
 
 def _files(logs: Sequence[Path]) -> list[Path]:

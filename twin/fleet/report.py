@@ -7,6 +7,7 @@ diagnosed and not watched, by what the diagnosis found.
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from enum import StrEnum
 from typing import Any
 
 from twin.assets.record import Record
@@ -14,49 +15,74 @@ from twin.fleet.kinds import Estimate, estimates
 from twin.fleet.peers import FEWEST_PEERS, Drift, Standing, standings
 from twin.fleet.store import Result
 
-FORMAT = "ejector-twin-fleet/1"
+FORMAT = "ejector-twin-fleet/2"
 STANDS_OUT = 4.5  # sigmas from the others: one of a thousand units by chance, in twenty effects
 DIAGNOSED = {"unlisted": 2, "explained": 2, "insufficient": 1, "consistent": 0}
 
 
+class State(StrEnum):
+    """What is known of a unit."""
+
+    STANDS_OUT = "stands_out"  # somebody should look at it
+    DOES_NOT = "does_not"  # it was judged, and nothing is found
+    NOT_JUDGED = "not_judged"  # nobody knows
+
+
 @dataclass(frozen=True)
 class Row:
-    """One unit."""
+    """One unit. ``reason`` says why it could not be judged, and is empty where it was."""
 
     type: str
     id: str
     batch: str
     log: str  # the newest
     logs: int
+    state: State
+    reason: str
     standing: Standing | None
     verdict: str  # of the newest diagnosis; empty where there is none
     causes: tuple[Mapping[str, Any], ...]
     leftover: float  # mbar rms that the twin is off in the newest diagnosis; 0 where there is none
 
     @property
+    def stands_out(self) -> bool:
+        """Whether somebody should look at it."""
+        return self.state is State.STANDS_OUT
+
+    @property
+    def compared(self) -> Standing | None:
+        """How far it is from the others, where there are enough of them to compare it with."""
+        enough = self.standing is not None and self.standing.peers >= FEWEST_PEERS
+        return self.standing if enough else None
+
+    @property
     def drifts(self) -> tuple[Drift, ...]:
         """What moves from log to log."""
         return self.standing.drifts if self.standing else ()
 
-    @property
-    def noticed(self) -> bool:
-        """Whether somebody should look at it."""
-        if self.drifts:
-            return True
-        if self.standing is not None and self.standing.peers >= FEWEST_PEERS:
-            return self.standing.beyond >= STANDS_OUT
-        return DIAGNOSED.get(self.verdict, 0) == 2
+
+@dataclass(frozen=True)
+class Refused:
+    """A log that nothing could be done with, and why."""
+
+    log: str
+    why: str
 
 
 @dataclass(frozen=True)
 class Report:
-    """All of a fleet, worst first."""
+    """All of a fleet, worst first, and the logs that are missing in it."""
 
     rows: Sequence[Row]
     kinds: Mapping[str, Sequence[Estimate]]
+    refused: Sequence[Refused] = ()
+
+    def of(self, state: State) -> list[Row]:
+        """The units in a state."""
+        return [row for row in self.rows if row.state is state]
 
     def groups(self) -> list[dict[str, Any]]:
-        """By type and batch: how many units, how many of them are noticed, and the causes."""
+        """By type and batch: how many units there are, how many in each state, and the causes."""
         members: dict[tuple[str, str], list[Row]] = defaultdict(list)
         for row in self.rows:
             members[row.type, row.batch].append(row)
@@ -65,8 +91,10 @@ class Report:
                 "type": kind,
                 "batch": batch,
                 "units": len(rows),
-                "noticed": sum(row.noticed for row in rows),
-                "causes": dict(Counter(cause_of(row) for row in rows if row.noticed).most_common()),
+                **{state.value: sum(row.state is state for row in rows) for state in State},
+                "causes": dict(
+                    Counter(cause_of(row) for row in rows if row.stands_out).most_common()
+                ),
             }
             for (kind, batch), rows in sorted(members.items())
         ]
@@ -77,18 +105,24 @@ class Report:
             "format": FORMAT,
             "units": [_plain(rank, row) for rank, row in enumerate(self.rows, 1)],
             "groups": self.groups(),
+            "refused": [asdict(one) for one in self.refused],
             "types": {kind: [asdict(one) for one in every] for kind, every in self.kinds.items()},
         }
 
 
-def report(results: Sequence[Result], records: Sequence[Record], at_ns: int) -> Report:
-    """Put together what is known of a fleet."""
+def report(
+    results: Sequence[Result],
+    records: Sequence[Record],
+    at_ns: int,
+    refused: Sequence[Refused] = (),
+) -> Report:
+    """Put together what is known of a fleet at a time (UTC, ns)."""
     watched = {(s.type, s.id): s for s in standings([r for r in results if r.key.work == "replay"])}
     every: dict[tuple[str, str], list[Result]] = defaultdict(list)
     for one in results:
         every[one.type, one.id].append(one)
     rows = [_row(mine, watched.get(unit)) for unit, mine in every.items()]
-    return Report(sorted(rows, key=_first, reverse=True), estimates(records, at_ns))
+    return Report(sorted(rows, key=_first, reverse=True), estimates(records, at_ns), refused)
 
 
 def cause_of(row: Row) -> str:
@@ -102,26 +136,61 @@ def cause_of(row: Row) -> str:
 
 def _row(mine: Sequence[Result], standing: Standing | None) -> Row:
     answers = [one for one in mine if one.key.work == "diagnose"]
-    answer: Mapping[str, Any] = answers[-1].answer if answers else {}
+    newest = answers[-1] if answers else None
+    answer: Mapping[str, Any] = newest.answer if newest else {}
     last = mine[-1]
+    state, reason = _judged(standing, newest, last)
     return Row(
         last.type,
         last.id,
         last.batch,
         last.log,
         len({one.key.log_sha256 for one in mine}),
+        state,
+        reason,
         standing,
         answer.get("verdict", ""),
         tuple(answer.get("causes", ())),
-        float((answer.get("baseline") or {}).get("rms_mbar", 0.0)),
+        float((answer.get("baseline") or {}).get("rms_mbar") or 0.0),
     )
+
+
+def _judged(standing: Standing | None, newest: Result | None, last: Result) -> tuple[State, str]:
+    """A unit's state by those like it, else by its newest diagnosis; or why it has none.
+
+    What was well in an older log says nothing of the last one.
+    """
+    if standing is not None and standing.drifts:
+        return State.STANDS_OUT, ""
+    current = standing is not None and standing.log == last.log
+    if standing is not None and current and standing.peers >= FEWEST_PEERS:
+        return (State.STANDS_OUT if standing.beyond >= STANDS_OUT else State.DOES_NOT), ""
+    if newest is not None and (found := _diagnosed(newest, last)) is not None:
+        return found
+    if standing is None or not current:
+        return State.NOT_JUDGED, "no cycle of its newest log can be compared"
+    few = f"{standing.peers} to compare, {FEWEST_PEERS} are needed"
+    return State.NOT_JUDGED, f"{few}; its newest log is not diagnosed yet"
+
+
+def _diagnosed(newest: Result, last: Result) -> tuple[State, str] | None:
+    """The same by the newest diagnosis; None where it says nothing of the last log."""
+    verdict = newest.answer["verdict"]
+    if DIAGNOSED[verdict] == 2:
+        return State.STANDS_OUT, ""
+    if newest.key.log_sha256 != last.key.log_sha256:
+        return None
+    if verdict == "consistent":
+        return State.DOES_NOT, ""
+    return State.NOT_JUDGED, f"no diagnosis: {newest.answer['next_experiment']}"
 
 
 def _first(row: Row) -> tuple[float, ...]:
     """The greater, the earlier it is listed."""
     beyond = row.standing.beyond if row.standing else 0.0
     drift = max((one.sigmas for one in row.drifts), default=0.0)
-    return float(row.noticed), max(beyond, drift), DIAGNOSED.get(row.verdict, 0), row.leftover
+    rank = (State.DOES_NOT, State.NOT_JUDGED, State.STANDS_OUT).index(row.state)
+    return float(rank), max(beyond, drift), DIAGNOSED.get(row.verdict, 0), row.leftover
 
 
 def _plain(rank: int, row: Row) -> dict[str, Any]:
@@ -133,8 +202,10 @@ def _plain(rank: int, row: Row) -> dict[str, Any]:
         "batch": row.batch,
         "log": row.log,
         "logs": row.logs,
-        "noticed": row.noticed,
-        "cause": cause_of(row) if row.noticed else "",
+        "state": row.state.value,
+        "reason": row.reason or None,
+        "cause": cause_of(row) if row.stands_out else "",
+        "peers": standing.peers if standing else 0,
         "beyond_sigmas": round(standing.beyond, 2) if standing else None,
         "effect": standing.effect if standing else None,
         "size": standing.size if standing else None,

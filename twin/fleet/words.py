@@ -12,55 +12,66 @@ from twin.diagnosis.words import spoken
 from twin.files import write_text
 from twin.fleet.kinds import Estimate
 from twin.fleet.peers import FEWEST_PEERS
-from twin.fleet.report import STANDS_OUT, Report, Row
+from twin.fleet.report import STANDS_OUT, Report, Row, State
 
 MOST_LISTED = 15  # units, in the terminal
-GOOD, BAD = "#2e7d4f", "#b3261e"
+GOOD, BAD, UNKNOWN = "#2e7d4f", "#b3261e", "#555555"
 HEAD = ("unit", "batch", "stands out by", "most like", "drift", "diagnosis")
+NOT_JUDGED = ("unit", "batch", "why")
+REFUSED = ("log", "why")
+GROUPS = ("type", "batch", "units", "stand out", "do not", "not judged", "causes")
 
 
 def in_words(report: Report) -> str:
-    """Worst units first, then types and batches, then what the units say of their type."""
-    lines = [headline(report), ""]
-    noticed = [row for row in report.rows if row.noticed]
-    listed = noticed[:MOST_LISTED]
-    lines += _columns([("", *HEAD), *((str(n), *_cells(row)) for n, row in enumerate(listed, 1))])
-    if len(noticed) > len(listed):
-        lines.append(f"and {len(noticed) - len(listed)} more; --json and --html have all")
-    if any(not row.verdict for row in noticed):
+    """Worst units first, then what is not known, types and batches, and what units say of types."""
+    lines = [headline(report)]
+    out = [(str(n), *_cells(row)) for n, row in enumerate(report.of(State.STANDS_OUT), 1)]
+    lines += _listed("", ("", *HEAD), out)
+    if any(not row.verdict for row in report.of(State.STANDS_OUT)):
         lines += ["", _DIAGNOSE]
-    lines += ["", *_columns([("type", "batch", "units", "noticed", "causes"), *_groups(report)])]
+    lines += _listed("could not be judged", NOT_JUDGED, _reasons(report))
+    if advice := _advice(report):
+        lines += ["", advice]
+    lines += _listed("could not be used", REFUSED, _refused(report))
+    lines += ["", *_columns([GROUPS, *_groups(report)])]
     for kind, rows in _kinds(report):
         lines += ["", f"{kind} by its calibrated units", *_columns(rows)]
     return "\n".join(lines)
 
 
 def headline(report: Report) -> str:
-    """The whole in one sentence."""
-    noticed = sum(row.noticed for row in report.rows)
-    units = f"{len(report.rows)} unit{'s' * (len(report.rows) != 1)}"
-    if not noticed:
-        return f"{units}, none stands out"
-    return f"{units}, {noticed} to look at"
+    """The whole in one sentence: the only count there is."""
+    out, fine, unknown = (len(report.of(state)) for state in State)
+    said = [f"{out or 'none'} {'stands' if out < 2 else 'stand'} out"]
+    said += [f"{fine} {'does' if fine == 1 else 'do'} not"] if fine and (out or unknown) else []
+    said += [f"{unknown} could not be judged"] if unknown else []
+    lost = len(report.refused)
+    logs = f"; {lost} {_some('log', lost)} could not be used" if lost else ""
+    return f"{len(report.rows)} {_some('unit', len(report.rows))}: {', '.join(said)}{logs}"
 
 
 def write_page(report: Report, path: Path) -> None:
     """Write the report as one HTML file; SourceError if it cannot be written."""
-    noticed = [row for row in report.rows if row.noticed]
+    out = report.of(State.STANDS_OUT)
     parts = []
-    if noticed:
-        rows = [(str(rank), *_cells(row)) for rank, row in enumerate(noticed, 1)]
+    if out:
+        rows = [(str(rank), *_cells(row)) for rank, row in enumerate(out, 1)]
         parts.append(section("Worst first", table("Units to look at", ("", *HEAD), rows, (0,))))
+    if unknown := _reasons(report):
+        advice = paragraph(_advice(report)) if _advice(report) else ""
+        parts.append(section("Could not be judged", table("", NOT_JUDGED, unknown) + advice))
+    if lost := _refused(report):
+        parts.append(section("Logs that could not be used", table("", REFUSED, lost)))
     parts += _drawn(report)
-    head = ("type", "batch", "units", "noticed", "causes")
-    parts.append(section("By type and batch", table("", head, _groups(report), (2, 3))))
+    parts.append(section("By type and batch", table("", GROUPS, _groups(report), range(2, 6))))
     for kind, (top, *values) in _kinds(report):
         body = table("", top, values, range(1, 6))
         parts.append(section(f"{kind}, by its calibrated units", body + paragraph(_MEAN)))
+    colour, mark = (BAD, "▲") if out else (UNKNOWN, "?") if unknown or lost else (GOOD, "✓")
     page = PAGE.substitute(
         title="Fleet",
-        colour=BAD if noticed else GOOD,
-        mark="▲" if noticed else "✓",
+        colour=colour,
+        mark=mark,
         verdict="Fleet",
         headline=html.escape(headline(report)),
         body="\n".join(parts),
@@ -73,20 +84,56 @@ def write_page(report: Report, path: Path) -> None:
 
 
 _DIAGNOSE = "What stands out says little of the cause: twin fleet diagnose LOGS names it."
+_FEW = (
+    f"Fewer than {FEWEST_PEERS} units of a type cannot be compared. Their diagnoses judge them:"
+    " run twin fleet diagnose LOGS, then this report again."
+)
 _MEAN = (
     "Mean of the units, each counting by how well its log determines the value; the spread is from "
     "unit to unit. Values that too few logs determine are left out."
 )
 
 
+def _some(what: str, count: int) -> str:
+    return what if count == 1 else f"{what}s"
+
+
+def _name(row: Row) -> str:
+    return row.id or Path(row.log).stem
+
+
+def _reasons(report: Report) -> list[tuple[str, ...]]:
+    """The units that could not be judged, each with why."""
+    return [(_name(row), row.batch, row.reason) for row in report.of(State.NOT_JUDGED)]
+
+
+def _advice(report: Report) -> str:
+    """What judges units that nobody has judged yet; empty where there is none."""
+    few = (row.standing and not row.compared for row in report.of(State.NOT_JUDGED))
+    return _FEW if any(few) else ""
+
+
+def _refused(report: Report) -> list[tuple[str, ...]]:
+    """The logs that nothing could be done with, each with why."""
+    return [(one.log, one.why.removeprefix(f"{one.log}: ")) for one in report.refused]
+
+
+def _listed(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """A part of the text, as many rows as one reads; nothing where there are none."""
+    if not rows:
+        return []
+    left = len(rows) - MOST_LISTED
+    more = [f"and {left} more; --json and --html have all"] if left > 0 else []
+    return ["", *([title] if title else []), *_columns([head, *rows[:MOST_LISTED]]), *more]
+
+
 def _cells(row: Row) -> tuple[str, ...]:
-    standing, drift = row.standing, row.drifts[0] if row.drifts else None
+    standing, drift = row.compared, row.drifts[0] if row.drifts else None
     beyond = f"{standing.beyond:.1f} sigma" if standing else ""
     what = f"{spoken(standing.effect)} {standing.size:+.3g} {standing.unit}" if standing else ""
     moves = f"{spoken(drift.effect)} {drift.per_day:+.2g} {drift.unit}/day" if drift else ""
     causes = ", ".join(spoken(str(one["effect"])) for one in row.causes) or row.verdict
-    name = row.id or Path(row.log).stem
-    return name, row.batch, beyond, what, moves, causes or "not yet"
+    return _name(row), row.batch, beyond, what, moves, causes or "not yet"
 
 
 def _groups(report: Report) -> list[tuple[str, ...]]:
@@ -95,7 +142,7 @@ def _groups(report: Report) -> list[tuple[str, ...]]:
             group["type"],
             group["batch"],
             str(group["units"]),
-            str(group["noticed"]),
+            *(str(group[state]) for state in State),
             ", ".join(f"{spoken(cause)} ({count})" for cause, count in group["causes"].items()),
         )
         for group in report.groups()
@@ -114,22 +161,21 @@ def _value(one: Estimate) -> tuple[str, ...]:
 
 
 def _drawn(report: Report) -> list[str]:
-    """How far every unit stands from the others, where any was watched."""
-    ranked = [row for row in report.rows if row.standing is not None]
-    if not ranked:
+    """How far units are from the others of their type, where there are enough to compare."""
+    far = [(row, standing.beyond) for row in report.rows if (standing := row.compared)]
+    if not far:
         return []
-    ranked.sort(key=lambda row: -_beyond(row))
-    noticed = sum(_beyond(row) >= STANDS_OUT for row in ranked)
-    title = f"{noticed} of {len(ranked)} units stand out from the others of their type"
+    far.sort(key=lambda one: -one[1])
+    title = f"Furthest from the others: {_name(far[0][0])}, by {far[0][1]:.1f} sigma"
     with empty("fleet", 3.6) as figure:
         axes = figure.subplots()
-        for colour, label, some in (
-            (BEFORE, "stands out", ranked[:noticed]),
-            (AFTER, "as the others", ranked[noticed:]),
+        for colour, label, wanted in (
+            (BEFORE, "stands out", True),
+            (AFTER, "does not", False),
         ):
-            first = 1 if colour == BEFORE else noticed + 1
-            place = range(first, first + len(some))
-            axes.plot(place, [_beyond(row) for row in some], ".", color=colour, label=label)
+            ranks = [n for n, (row, _) in enumerate(far) if row.stands_out is wanted]
+            beyond = [max(far[n][1], 0.0) for n in ranks]
+            axes.plot([n + 1 for n in ranks], beyond, ".", color=colour, label=label)
         axes.axhline(STANDS_OUT, color=QUIET, lw=0.8, ls="--")
         logarithmic(axes)
         axes.set_yscale("symlog", linthresh=STANDS_OUT)
@@ -139,12 +185,11 @@ def _drawn(report: Report) -> list[str]:
         axes.set_ylabel("furthest from the others\n(sigmas of their scatter)")
         legend(figure, [axes])
         svg = as_svg(figure, title)
-    caption = "Each unit by the effect in which it is furthest from the others of its type."
+    caption = (
+        "Each unit by the effect in which it is furthest from the others of its type. The dashed"
+        f" line is at {STANDS_OUT:g} sigma; a unit below it may stand out by its drift."
+    )
     return [picture(title, svg, caption)]
-
-
-def _beyond(row: Row) -> float:
-    return max(row.standing.beyond, 0.0) if row.standing else 0.0
 
 
 def _columns(rows: Iterable[Sequence[str]]) -> list[str]:
