@@ -132,7 +132,9 @@ def few(*diagnosed: Result) -> Report:
 def test_of_few_units_nobody_is_judged_before_a_diagnosis() -> None:
     found = few()
     assert [row.state for row in found.rows] == [State.NOT_JUDGED] * 4
-    assert found.rows[0].reason == "4 to compare, 8 are needed; its newest log is not diagnosed yet"
+    assert found.rows[0].reason == (
+        "4 units to compare, 8 are needed; its newest log is not diagnosed yet"
+    )
     assert headline(found) == (
         "4 units: none stands out, 4 could not be judged; 1 log could not be used"
     )

@@ -169,7 +169,8 @@ def _judged(standing: Standing | None, newest: Result | None, last: Result) -> t
         return found
     if standing is None or not current:
         return State.NOT_JUDGED, "no cycle of its newest log can be compared"
-    few = f"{standing.peers} to compare, {FEWEST_PEERS} are needed"
+    units = "1 unit" if standing.peers == 1 else f"{standing.peers} units"
+    few = f"{units} to compare, {FEWEST_PEERS} are needed"
     return State.NOT_JUDGED, f"{few}; its newest log is not diagnosed yet"
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from matplotlib.ticker import FuncFormatter
 
 from twin.diagnosis.drawing import AFTER, BEFORE, QUIET, as_svg, empty, legend, logarithmic
-from twin.diagnosis.page import PAGE, paragraph, picture, section, table
+from twin.diagnosis.page import PAGE, card, paragraph, picture, section, table
 from twin.diagnosis.words import spoken
 from twin.files import write_text
 from twin.fleet.kinds import Estimate
@@ -61,7 +61,8 @@ def write_page(report: Report, path: Path) -> None:
         advice = paragraph(_advice(report)) if _advice(report) else ""
         parts.append(section("Could not be judged", table("", NOT_JUDGED, unknown) + advice))
     if lost := _refused(report):
-        parts.append(section("Logs that could not be used", table("", REFUSED, lost)))
+        cards = "\n".join(card(log, why, ()) for log, why in lost)
+        parts.append(section("Logs that could not be used", cards))
     parts += _drawn(report)
     parts.append(section("By type and batch", table("", GROUPS, _groups(report), range(2, 6))))
     for kind, (top, *values) in _kinds(report):
@@ -113,7 +114,7 @@ def _advice(report: Report) -> str:
     return _FEW if any(few) else ""
 
 
-def _refused(report: Report) -> list[tuple[str, ...]]:
+def _refused(report: Report) -> list[tuple[str, str]]:
     """The logs that nothing could be done with, each with why."""
     return [(one.log, one.why.removeprefix(f"{one.log}: ")) for one in report.refused]
 
