@@ -1,5 +1,6 @@
 """Clocks of known distance behind a way of unknown length: what is told of them, and when not."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -213,6 +214,14 @@ def test_the_line_is_scipys() -> None:
     assert at_end == pytest.approx(30.0, abs=1.0)
 
 
+def test_transport_is_no_offset_of_the_clocks() -> None:
+    """Clocks that agree: what is read is the transport alone, and it is said to be in it."""
+    report = of(told(stream(75.0)), Kind.CLOCK)[-1]
+    assert report.text.startswith("PLC clock offset −1.0")
+    assert "transport included" in report.text
+    assert "clock is" not in report.text
+
+
 def monitored(samples: Samples, size: int = 500) -> list[Event]:
     monitor = Monitor(MonitorSettings(), rigs.theta("test_rig"))
     events = []
@@ -227,7 +236,11 @@ def test_the_monitor_says_it_and_in_a_replay_the_same() -> None:
     samples = stream(70.0, 8.0)
     events = monitored(samples)
     assert [event.kind for event in events] == [Kind.CLOCK, Kind.CLOCK]
-    assert "ahead of the one here" in events[0].text
+    assert re.fullmatch(
+        r"PLC clock offset \+6\.\d\d ms ± \d\.\d\d ms, transport included;"
+        r" drift [+−]\S+ ± \S+ ppm",
+        events[0].text,
+    )
     assert monitored(samples, 10_000) == events
 
 

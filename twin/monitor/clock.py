@@ -40,7 +40,11 @@ Number = TypeVar("Number", float, Floats)
 
 @dataclass(frozen=True)
 class Estimate:
-    """The PLC's clock less the one here, less the shortest way; ± half of a 95 % interval."""
+    """The PLC's clock less the one here, transport included; ± half of a 95 % interval.
+
+    A sample is received after it was taken. The shortest transport therefore makes the offset that
+    much smaller than the clocks' own: only an offset above zero is surely one of the clocks.
+    """
 
     offset_ms: float
     offset_pm_ms: float
@@ -48,13 +52,16 @@ class Estimate:
     drift_pm_ppm: float
 
     def __str__(self) -> str:
-        ahead = "ahead of" if self.offset_ms > 0 else "behind"
-        runs = "fast" if self.drift_ppm > 0 else "slow"
         return (
-            f"the PLC's clock is {_long(abs(self.offset_ms))} {ahead} the one here"
-            f" (± {_long(self.offset_pm_ms)}) and runs {abs(self.drift_ppm):.2g} ppm {runs}"
-            f" (± {self.drift_pm_ppm:.2g})"
+            f"PLC clock offset {_signed(self.offset_ms)} ± {_long(self.offset_pm_ms)}, transport"
+            f" included; drift {self.drift_ppm:+.2g} ± {self.drift_pm_ppm:.2g} ppm".replace(
+                "-", "−"
+            )
         )
+
+
+def _signed(ms: float) -> str:
+    return f"{'-' if ms < 0 else '+'}{_long(abs(ms))}"
 
 
 def _long(ms: float) -> str:
