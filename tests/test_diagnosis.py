@@ -301,6 +301,19 @@ def test_fitted_and_held_out_cycles_have_nothing_in_common() -> None:
     assert {0} | set(cycles["fitted"]) | set(cycles["held_out"]) == set(range(cycles["total"]))
 
 
+def test_a_part_of_a_log_is_dated_from_the_logs_begin() -> None:
+    """As beside a run, where only the last cycles are diagnosed."""
+    whole = np.concatenate(list(record(27.0, "leakage=1.7@14.4", seed=21)))
+    part = whole[2_000:]
+    answer = diagnose(CONFIG, [part], "log.mcap", quiet, before_s=2.0).json
+    (cause,) = answer["causes"]
+    assert cause["onset_s"] == pytest.approx(14.4, abs=0.1)
+    assert cause["onset_low95_s"] <= cause["onset_s"] <= cause["onset_high95_s"]
+    assert "since 14." in cause["why"]
+    assert answer["cycles"]["begin_s"] == 2.0
+    assert answer["cycles"]["log_begin_ns"] == part["host_ns"][0] - 2_000_000_000
+
+
 def test_the_answer_has_the_form_that_others_rely_on() -> None:
     answer = json.loads(json.dumps(with_leak().json, allow_nan=False))
     assert list(answer) == [

@@ -23,7 +23,7 @@ from twin.events import Event, Kind, Severity
 from twin.live import run
 from twin.log.check import check
 from twin.log.reader import open_log
-from twin.signals import SAMPLE, Samples
+from twin.signals import SAMPLE, Quality, Samples
 
 GRIPPER = rigs.path_of("gripper")
 PATIENCE_S = 60.0
@@ -42,10 +42,17 @@ CAUSE: dict[str, Any] = {
     "not_separable_from": [],
     "why": "",
 }
+BEGIN_NS = 1_790_000_000 * 10**9  # 2026-09-21 14:13:20 UTC, by the clock here
 ANSWER: dict[str, Any] = {
     "verdict": "explained",
     "causes": [CAUSE],
-    "cycles": {"total": 8, "fitted": [], "held_out": []},
+    "cycles": {
+        "total": 8,
+        "fitted": [],
+        "held_out": [],
+        "begin_s": 4.0,
+        "log_begin_ns": BEGIN_NS,
+    },
     "unlisted": None,
     "next_experiment": None,
 }
@@ -78,6 +85,7 @@ class Stream:
     def cycle(self, *, alarm: bool = False) -> None:
         rows = np.zeros(4, SAMPLE)
         rows["time_ns"] = self.now_ns + np.arange(4) * (CYCLE_NS // 4)
+        rows["host_ns"] = BEGIN_NS + rows["time_ns"]
         self.now_ns += CYCLE_NS
         events = [Event(self.now_ns, Kind.CYCLE, "")]
         events += [Event(self.now_ns, Kind.DEVIATION, "leakage")] if alarm else []
@@ -128,7 +136,8 @@ def test_it_is_asked_once_enough_cycles_deviate_and_its_answer_is_an_event(
     assert event.time_ns == stream.now_ns - CYCLE_NS // 4  # of the last row
     assert event.data == {"alarm_ns": 6 * CYCLE_NS, "begin_ns": 0, "answer": ANSWER}
     assert event.text == (
-        "leakage (1.9 sl/min), since 00:00:07.5; how sure: no other listed cause fits as well;"
+        "leakage (1.9 sl/min), since 14:13:27, 8 s ago, 7.5 s into the log;"
+        " how sure: no other listed cause fits as well;"
         " look at hoses, fittings and cups: a cut, or a loose connection"
     )
     stream.cycles(10)
@@ -320,18 +329,60 @@ def test_a_block_is_kept_as_it_was() -> None:
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"course": "constant"}, "leakage (1.9 sl/min), since 00:01:40.0 or longer;"),
-        ({"course": "ramp", "onset_s": 0.0}, "leakage (1.9 sl/min), growing;"),
-        ({"course": "ramp"}, "growing since 00:01:47.5;"),
+        (
+            {"course": "constant"},
+            "leakage (1.9 sl/min), since 14:13:24, 2 min ago, 4.0 s into the log, or longer;",
+        ),
+        (
+            {"course": "ramp", "onset_s": 0.0},
+            "growing since 14:13:24, 2 min ago, 4.0 s into the log, or longer;",
+        ),
+        ({"course": "ramp"}, "growing since 14:13:27, 2 min ago, 7.5 s into the log;"),
         ({"course": "intermittent", "share_pct": 40.0}, "in 40 % of the cycles;"),
         ({"probability": 0.6, "not_separable_from": ["suction_loss"]}, "suction loss"),
         ({"not_separable_from": ["suction_loss"]}, "or the nozzles and the silencer"),
     ],
 )
 def test_a_cause_is_said_with_course_and_certainty(changed: dict[str, Any], said: str) -> None:
-    line = in_a_line(ANSWER | {"causes": [CAUSE | changed]}, 100_000_000_000)
+    line = in_a_line(ANSWER | {"causes": [CAUSE | changed]}, BEGIN_NS + 127_500_000_000)
     assert said in line
     assert "\n" not in line
+
+
+def test_since_counts_from_the_begin_of_the_run(
+    stream: Stream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside a run that is older than the rows that are diagnosed."""
+    asked: list[process.Question] = []
+    begin = process.Asked.__init__
+
+    def noting(self: process.Asked, question: process.Question, *rest: Any) -> None:
+        asked.append(question)
+        begin(self, question, *rest)
+
+    monkeypatch.setattr(process.Asked, "__init__", noting)
+    answering(monkeypatch, ANSWER)
+    stream.cycles(30)
+    stream.cycle(alarm=True)
+    stream.cycles(2)
+    stream.answered()
+    (question,) = asked
+    _, rows, _, _, before_s = question
+    assert before_s == rows["time_ns"][0] / 1e9 > 30.0
+    assert stream.told[0].data["begin_ns"] == 0
+
+
+def test_a_plc_that_began_anew_moves_no_begin(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = LiveDiagnosis(rigs.config("gripper"), "a.mcap", lambda: False, quiet)
+    rows = np.zeros(4, SAMPLE)
+    rows["time_ns"] = 70 * 10**9 + np.arange(4)
+    rows["host_ns"] = BEGIN_NS + np.arange(4)
+    one.follow(rows, [])
+    rows["host_ns"] += 20 * 10**9
+    rows["time_ns"] = np.arange(4)  # it counts from 0 again
+    rows["quality"][0] = Quality.RESTART
+    one.follow(rows, [])
+    assert one._begin_ns == -20 * 10**9
 
 
 def test_other_verdicts_are_said_as_what_they_are() -> None:

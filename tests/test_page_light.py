@@ -2,10 +2,11 @@
 
 import pytest
 
-from twin.alarms.board import Board
+from twin.alarms.board import Board, Episode
 from twin.alarms.rules import Priority, Rule
 from twin.alarms.state import Kept
-from twin.page.light import Light, light_of, listed
+from twin.instants import instant
+from twin.page.light import S_NS, Light, light_of, listed, told
 
 STATES = {
     "normal": (Kept(), Light.GREEN, Light.GREEN),
@@ -50,4 +51,21 @@ def test_what_is_active_and_unseen_is_listed_first() -> None:
             "quiet": Kept(True, False, 9),
         }
     )
-    assert [alarm["alarm"] for alarm in listed(one, [], [])] == ["low", "seen", "gone", "quiet"]
+    assert [alarm["alarm"] for alarm in listed(one, [], [], 0)] == ["low", "seen", "gone", "quiet"]
+
+
+def test_instants_are_worded_as_everywhere() -> None:
+    begin = 1_790_000_000 * S_NS  # 2026-09-21 14:13:20 UTC
+    now = begin + 480 * S_NS
+    episode = Episode("plc_stale", begin, begin + 60 * S_NS, begin + 120 * S_NS, "ann")
+    assert told(episode, "plc_stale", now)["times"] == {
+        "raised": "14:13:20, 8 min ago",
+        "cleared": "14:14:20, 7 min ago",
+        "seen": "14:15:20, 6 min ago",
+        "lasted": "60 s",
+    }
+    assert told(episode, "plc_stale", now)["times"]["raised"] == instant(begin, now)
+    one = board(quiet=Priority.HIGH)
+    one.resume({"quiet": Kept(True, False, now + 1200 * S_NS)})
+    (alarm,) = listed(one, [], [], now)
+    assert alarm["quiet_until"] == "14:41:20, in 20 min"

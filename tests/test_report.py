@@ -44,7 +44,7 @@ from twin.diagnosis.pictures import (
 from twin.diagnosis.report import in_words, write_report
 from twin.diagnosis.search import Search
 from twin.diagnosis.weights import covariance
-from twin.diagnosis.words import certainty, when
+from twin.diagnosis.words import Times, certainty, when
 from twin.errors import SourceError
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS
@@ -662,6 +662,8 @@ def test_ranking_marks_the_cause_and_its_look_alikes() -> None:
 
 # --- in words -------------------------------------------------------------------------------------
 
+NO_CLOCK = Times(begin_s=0.0, log_begin_ns=None, now_ns=0)
+
 
 def test_words_for_a_cause() -> None:
     assert in_words(explained()).splitlines() == [
@@ -707,8 +709,28 @@ def test_words_for_a_cause() -> None:
     ],
 )
 def test_when_says_the_course(cause: dict[str, Any], short: str, long: str) -> None:
-    assert when(cause) == short
-    assert when(cause, interval=True) == long
+    assert when(cause, NO_CLOCK) == short
+    assert when(cause, NO_CLOCK, interval=True) == long
+
+
+@pytest.mark.parametrize(
+    ("cause", "said"),
+    [
+        (LEAK, "since 14:13:30, 8 min ago, 10.0 s into the log (95 %: 9.9 s to 10.1 s)"),
+        (LEAK | {"course": "constant"}, "since 14:13:25, 8 min ago, 5.0 s into the log, or longer"),
+        (
+            BLOW_OFF | {"onset_s": 5.0},
+            "growing since 14:13:25, 8 min ago, 5.0 s into the log, or longer",
+        ),
+        (BLOW_OFF | {"onset_s": 7.0}, "growing since 14:13:27, 8 min ago, 7.0 s into the log"),
+    ],
+)
+def test_since_is_clock_time_and_age_and_counts_from_the_logs_begin(
+    cause: dict[str, Any], said: str
+) -> None:
+    begin_ns = 1_790_000_000 * 10**9
+    times = Times(begin_s=5.0, log_begin_ns=begin_ns, now_ns=begin_ns + 490 * 10**9)
+    assert when(cause, times, interval=True) == said
 
 
 def test_words_for_a_ramp_say_the_rate_and_what_it_has_come_to() -> None:

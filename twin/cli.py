@@ -33,6 +33,7 @@ from twin.cli_serve import live_rows_of, reports_of, serve
 from twin.errors import ConfigError, SourceError, TwinError
 from twin.events import Event, Severity
 from twin.files import require_writable, write_json
+from twin.instants import stamp
 
 if TYPE_CHECKING:
     from drivers.results_state import Results
@@ -458,11 +459,9 @@ class Console:
         """Print what happened."""
         for event in events:
             self.alarmed |= event.severity is Severity.ALARM
-            stamp = time.strftime("%H:%M:%S", time.gmtime(event.time_ns // 1_000_000_000))
-            milli = event.time_ns // 1_000_000 % 1000
             what = f"{event.severity:<7}  {event.kind:<17}  {event.text}"
             # In one piece, since others may be printing too.
-            print(f"{stamp}.{milli:03d}  {self._name}{what}\n", end="", flush=True)
+            print(f"{stamp(event.time_ns)}  {self._name}{what}\n", end="", flush=True)
 
     def close(self) -> None:
         """Nothing to finish."""

@@ -11,6 +11,7 @@ import typer
 
 from twin.errors import ConfigError
 from twin.files import write_json
+from twin.instants import instant
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -53,8 +54,9 @@ def list_(
         whose = _chosen(store, config, unit)
         shown, episodes = _standing(store, whose, config)
     plain = [_plain_alarm(alarm, episodes.get(alarm.rule.name)) for alarm in shown]
+    now_ns = time.time_ns()
     for one in plain:
-        print(_alarm_in_words(one))
+        print(_alarm_in_words(one, now_ns))
     if not plain:
         print(f"no alarm of {whose.id or whose.type}")
     if json_file is not None:
@@ -77,7 +79,7 @@ def history(
     with _open(alarms, config) as store:
         episodes = store.episodes(_chosen(store, config, unit), since)
     for one in episodes:
-        print(_episode_in_words(one))
+        print(_episode_in_words(one, time.time_ns()))
     if json_file is not None:
         write_json(json_file, [_plain_episode(one) for one in episodes])
 
@@ -367,25 +369,23 @@ def _plain_episode(episode: "Episode") -> dict[str, Any]:
     }
 
 
-def _alarm_in_words(plain: dict[str, Any]) -> str:
+def _alarm_in_words(plain: dict[str, Any], now_ns: int) -> str:
     """An alarm on some lines: what, since when, what speaks for it, what to do."""
     head = f"{plain['priority']:<7} {plain['alarm']}  {plain['state'].replace('_', ' ')}"
     if plain["shelved_until_ns"] is not None:
-        head += f" until {_time(plain['shelved_until_ns'])}"
+        head += f" until {instant(plain['shelved_until_ns'], now_ns)}"
     lines = [head]
     if episode := plain["episode"]:
-        lines[0] += f", raised {_time(episode['raised_ns'])}"
+        lines[0] += f", since {instant(episode['raised_ns'], now_ns)}"
         lines.append(episode["evidence"].get("words", ""))
     lines += [plain["consequence"], plain["action"]]
     return "\n        ".join(line for line in lines if line)
 
 
-def _episode_in_words(episode: "Episode") -> str:
+def _episode_in_words(episode: "Episode", now_ns: int) -> str:
     lasted = "still active" if episode.seconds is None else f"{episode.seconds:.1f} s"
     seen = f"seen by {episode.acknowledged_by}" if episode.acknowledged_ns else "not acknowledged"
     words = episode.evidence.get("words", "")
-    return f"{_time(episode.raised_ns)}  {episode.alarm}  {lasted}  {seen}  {words}".rstrip()
-
-
-def _time(ns: int) -> str:
-    return time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(ns // 1_000_000_000))
+    return (
+        f"{instant(episode.raised_ns, now_ns)}  {episode.alarm}  {lasted}  {seen}  {words}".rstrip()
+    )

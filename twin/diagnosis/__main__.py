@@ -17,9 +17,9 @@ MOST_REPORTS = 100  # that a folder keeps, the newest
 
 def main() -> None:
     """Answer; an error is one line on stderr and exit code 1."""
-    config, samples, log, report = pickle.load(sys.stdin.buffer)  # noqa: S301  # from process.Asked
+    config, samples, log, report, before_s = pickle.load(sys.stdin.buffer)  # noqa: S301  # from process.Asked
     try:
-        diagnosis = diagnose(config, [samples], log, lambda _what: None)
+        diagnosis = diagnose(config, [samples], log, lambda _what: None, before_s)
     except TwinError as error:
         sys.exit(str(error))
     json.dump(diagnosis.json, sys.stdout)

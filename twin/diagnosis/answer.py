@@ -1,7 +1,7 @@
 """The answer: what the simulation gets wrong, why, and what knowing it gains on unseen cycles."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from twin.diagnosis.judge import Judged, gain, judge, rounded
 from twin.diagnosis.search import Search, search, sharpened
 from twin.diagnosis.unlisted import STRANGE, Unlisted, extended, look
 from twin.diagnosis.weights import covariance
+from twin.instants import CALENDAR_NS, SECOND_NS
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS
 from twin.model.term import Term
@@ -54,18 +55,27 @@ class Diagnosis:
 
 
 def diagnose(
-    config: Config, blocks: Iterable[Samples], log: str, progress: Callable[[str], None]
+    config: Config,
+    blocks: Iterable[Samples],
+    log: str,
+    progress: Callable[[str], None],
+    before_s: float = 0.0,
 ) -> Diagnosis:
-    """Diagnose a log; raises ConfigError where the twin is not calibrated."""
+    """Diagnose a log, or the part of it that begins ``before_s`` into it.
+
+    Onsets in the answer count from the log's begin. ConfigError where the twin is not calibrated.
+    """
     progress("running the twin over the log")
-    evidence = collect(config, blocks)
+    blocks = [block for block in blocks if len(block)]
+    evidence = replace(collect(config, blocks), before_s=before_s)
     head = {
         "format": FORMAT,
         "log": log,
         "asset": {"type": config.asset.type, "id": config.asset.id},
     }
+    part = _part(blocks, before_s)
     if reason := insufficient(evidence):
-        answer = head | _insufficient(evidence, reason)
+        answer = head | _insufficient(evidence, part, reason)
         return Diagnosis(evidence, config.data.hash, None, HEALTHY, (), None, None, [], answer)
     whole, evidence = evidence, thinned(evidence, evidence.judged, MOST_JUDGED)
     fitted, held_out = split(evidence)
@@ -102,6 +112,7 @@ def diagnose(
             "total": whole.cycles,
             "fitted": [int(evidence.numbers[one]) for one in fitted],
             "held_out": [int(evidence.numbers[one]) for one in held_out],
+            **part,
         },
         "baseline": before.figures,
         "extended": after.figures,
@@ -193,15 +204,15 @@ def _causes(evidence: Evidence, searched: Search, before: Judged) -> list[dict[s
         entry: dict[str, Any] = {
             "effect": cause.effect,
             "course": str(cause.course),
-            "onset_s": _rounded_onset(cause),
+            "onset_s": _rounded_onset(evidence, cause),
             "parameters": values,
             "probability": _probability(found, rivals),
             "not_separable_from": [_stranger(one, found) for one in rivals],
-            "why": _why(cause, values, before),
+            "why": _why(evidence, cause, values, before),
         }
         if cause.course == Course.STEP:
             entry["onset_low95_s"], entry["onset_high95_s"] = (
-                round(one, 3) for one in searched.onsets[number]
+                round(evidence.before_s + one, 3) for one in searched.onsets[number]
             )
         if cause.course == Course.INTERMITTENT:
             entry["cycles"] = sorted(cause.cycles)
@@ -223,10 +234,23 @@ def _probability(found: Fitted, rivals: list[Fitted]) -> float:
     return round(min(1.0 / (1.0 + sum(weights)), SUREST), 3)
 
 
-def _rounded_onset(cause: Cause) -> float | None:
+def _rounded_onset(evidence: Evidence, cause: Cause) -> float | None:
     """When a step or ramp began, s since the log did."""
     timed = cause.course in (Course.STEP, Course.RAMP)
-    return round(cause.onset_s, 3) if timed else None
+    return round(evidence.before_s + cause.onset_s, 3) if timed else None
+
+
+def _part(blocks: Sequence[Samples], before_s: float) -> dict[str, Any]:
+    """Where in the log the cycles begin, and when the log began by the clock here (UTC, ns).
+
+    None for a log of times that no clock gave, such as a table that counts from 0.
+    """
+    first_ns = int(blocks[0]["host_ns"][0]) if blocks else 0
+    known = first_ns >= CALENDAR_NS
+    return {
+        "begin_s": round(before_s, 3),
+        "log_begin_ns": first_ns - round(before_s * SECOND_NS) if known else None,
+    }
 
 
 def _parameters(
@@ -261,7 +285,9 @@ def _parameters(
     return found
 
 
-def _why(cause: Cause, values: dict[str, dict[str, Any]], before: Judged) -> str:
+def _why(
+    evidence: Evidence, cause: Cause, values: dict[str, dict[str, Any]], before: Judged
+) -> str:
     effect = EFFECTS[cause.effect]
     size = ", ".join(
         f"{name.replace('_', ' ')} {one.get('at_end', one['value']):.3g}"
@@ -270,7 +296,7 @@ def _why(cause: Cause, values: dict[str, dict[str, Any]], before: Judged) -> str
     )
     when = {
         Course.CONSTANT: "",
-        Course.STEP: f", since {cause.onset_s:.1f} s",
+        Course.STEP: f", since {evidence.before_s + cause.onset_s:.1f} s",
         Course.RAMP: " by now, and growing",
         Course.INTERMITTENT: f", in {len(cause.cycles)} cycles only",
     }[cause.course]
@@ -292,7 +318,7 @@ def _unlisted(strange: Unlisted) -> dict[str, Any]:
     }
 
 
-def _insufficient(evidence: Evidence, reason: str) -> dict[str, Any]:
+def _insufficient(evidence: Evidence, part: dict[str, Any], reason: str) -> dict[str, Any]:
     names = (
         "rms_mbar",
         "max_mbar",
@@ -307,7 +333,7 @@ def _insufficient(evidence: Evidence, reason: str) -> dict[str, Any]:
         "causes": [],
         "runners_up": [],
         "unlisted": None,
-        "cycles": {"total": evidence.cycles, "fitted": [], "held_out": []},
+        "cycles": {"total": evidence.cycles, "fitted": [], "held_out": [], **part},
         "baseline": nothing,
         "extended": nothing,
         "gain": None,

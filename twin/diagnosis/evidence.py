@@ -60,7 +60,8 @@ class Evidence:
     """The complete cycles of a log in one stretch of rows, with all that judges a hypothesis."""
 
     theta: Theta  # of the calibrated twin as it stands
-    begin_ns: int  # PLC time at which the log begins
+    begin_ns: int  # PLC time of the first row here
+    before_s: float  # of the log, before that row
     samples: Samples
     ticks: Ticks
     starts: Ints  # first row of each cycle, and the row after the last one
@@ -83,7 +84,7 @@ class Evidence:
 
     @cached_property
     def seconds(self) -> Floats:
-        """Time of each row since the log began."""
+        """Time (s) of each row since the first one here."""
         times: Floats = (self.samples["time_ns"] - self.begin_ns) * NS
         return times
 
@@ -342,6 +343,7 @@ def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
     nothing = Evidence(
         theta=theta,
         begin_ns=0,
+        before_s=0.0,
         samples=np.empty(0, SAMPLE),
         ticks=np.empty(0, TICK),
         starts=np.zeros(1, np.int64),

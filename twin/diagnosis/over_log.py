@@ -30,7 +30,7 @@ def draw_log(found: Found, alt: str) -> str:
             _course(axes, found.evidence, cause, known, colour)
             _occurs(top, found.evidence, known, colour)
         scale, unit = _scale(found.evidence)
-        top.set_xlim(*found.evidence.seconds[[0, -1]] / scale)
+        top.set_xlim(*_into_log(found.evidence, found.evidence.seconds[[0, -1]]) / scale)
         panels[-1, 0].set_xlabel(f"time in the log ({unit})")
         legend(figure, [top])
         return as_svg(figure, alt)
@@ -86,8 +86,9 @@ def _course(
             continue  # nothing in this log depends on it
         seconds, (value, low, high) = size_over_log(evidence, cause, p, known["parameters"][p.name])
         label = spoken(p.name) if several else ""
-        axes.fill_between(seconds / scale, low, high, color=colour, alpha=0.2, lw=0)
-        axes.plot(seconds / scale, value, color=colour, lw=1.6, label=label)
+        at = _into_log(evidence, seconds) / scale
+        axes.fill_between(at, low, high, color=colour, alpha=0.2, lw=0)
+        axes.plot(at, value, color=colour, lw=1.6, label=label)
         axes.axhline(p.neutral(evidence.theta), color=QUIET, lw=0.8, ls=":")
         axes.set_ylabel(f"{spoken(cause.effect)}\n({p.unit})")
     if several:
@@ -97,7 +98,10 @@ def _course(
 def size_over_log(
     evidence: Evidence, cause: Cause, parameter: Parameter, known: dict[str, Any]
 ) -> tuple[Floats, Floats]:
-    """Times (s) and how big a cause is then: value and ends of its 95 % interval, (3, times)."""
+    """Times (s) and how big a cause is then: value and ends of its 95 % interval, (3, times).
+
+    Times count from the first row here.
+    """
     seconds = _moments(evidence, cause)
     starts = evidence.seconds[evidence.starts[:-1]]
     cycle = evidence.numbers[np.maximum(np.searchsorted(starts, seconds, "right") - 1, 0)]
@@ -138,9 +142,15 @@ def _occurs(axes: Axes, evidence: Evidence, known: dict[str, Any], colour: str) 
 
 def _scale(evidence: Evidence) -> tuple[float, str]:
     """Seconds in the unit of a time axis over the log."""
-    return (60.0, "min") if evidence.seconds[-1] > LONG_S else (1.0, "s")
+    end = _into_log(evidence, evidence.seconds[-1:])[0]
+    return (60.0, "min") if end > LONG_S else (1.0, "s")
+
+
+def _into_log(evidence: Evidence, seconds: Floats) -> Floats:
+    """Times (s) since the log began, of those since the first row here."""
+    return evidence.before_s + seconds
 
 
 def _middles(evidence: Evidence) -> Floats:
-    middles: Floats = evidence.seconds[(evidence.starts[:-1] + evidence.starts[1:]) // 2]
-    return middles
+    """When the middle of each cycle was (s since the log began)."""
+    return _into_log(evidence, evidence.seconds[(evidence.starts[:-1] + evidence.starts[1:]) // 2])

@@ -23,11 +23,11 @@ from uuid import uuid4
 import numpy as np
 
 from twin.config import Config
-from twin.diagnosis.words import certainty, left_over, listed, sized
+from twin.diagnosis.words import Times, certainty, left_over, listed, sized, when
 from twin.events import Event, Kind
-from twin.model.courses import Course
+from twin.instants import SECOND_NS
 from twin.model.effects import EFFECTS
-from twin.signals import SAMPLE, Samples
+from twin.signals import SAMPLE, Quality, Samples
 
 CYCLES = 13  # that are kept: all but the first are judged, in which the model swings in
 MOST_ROWS = 300_000  # that are kept, however long cycles are
@@ -40,7 +40,8 @@ COMMAND = (sys.executable, "-m", "twin.diagnosis")
 
 REPORT = ".html"
 
-Question = tuple[Config, Samples, str, Path | None]  # rows, whose log, and where to draw the answer
+# Rows, whose log, where to draw the answer, and how much of the log there is before the rows (s).
+Question = tuple[Config, Samples, str, Path | None, float]
 Clock = Callable[[], float]
 Status = Callable[[], AbstractContextManager[Callable[[str], None]]]
 
@@ -64,7 +65,9 @@ class LiveDiagnosis:
         self._config, self._log, self._reports = config, log, reports
         self._stopped, self._status, self._clock = stopped, status, clock
         self._recent = Recent()
-        self._now_ns = 0  # PLC time
+        self._now_ns = self._here_ns = 0  # of the last row: PLC time, and its receipt
+        self._first_ns: int | None = None  # when the first row of all was received
+        self._begin_ns = 0  # PLC time at which the log began, as the PLC counts now
         self._alarm: Event | None = None  # that waits for its diagnosis
         self._since = 0  # cycles since it was raised, its own one included
         self._wanted = DEVIATING  # of these, before the next try
@@ -74,7 +77,7 @@ class LiveDiagnosis:
         """Take rows and what happened; give the answer that has come by now."""
         self._recent.add(samples, sum(_is_whole_cycle(event) for event in events))
         if len(samples):
-            self._now_ns = int(samples["time_ns"][-1])
+            self._count(samples)
         for event in events:
             self._note(event)
         if self._asked is not None:
@@ -105,6 +108,17 @@ class LiveDiagnosis:
             self._asked.close()
             self._asked = None
 
+    def _count(self, samples: Samples) -> None:
+        """Know when the log began in PLC time, also after that was set or began anew."""
+        self._now_ns, self._here_ns = (int(samples[name][-1]) for name in ("time_ns", "host_ns"))
+        if self._first_ns is None:
+            self._first_ns, self._begin_ns = (
+                int(samples[name][0]) for name in ("host_ns", "time_ns")
+            )
+        for row in np.flatnonzero(samples["quality"] & (Quality.RESTART | Quality.CLOCK))[-1:]:
+            since_ns = int(samples["host_ns"][row]) - self._first_ns
+            self._begin_ns = int(samples["time_ns"][row]) - since_ns
+
     def _note(self, event: Event) -> None:
         if _is_whole_cycle(event):
             self._since += 1
@@ -115,7 +129,9 @@ class LiveDiagnosis:
 
     def _ask(self, alarm: Event) -> list[Event]:
         report = self._reports / f"{uuid4().hex}{REPORT}" if self._reports else None
-        question = self._config, self._recent.rows(), self._log, report
+        rows = self._recent.rows()
+        before_s = max((int(rows["time_ns"][0]) - self._begin_ns) / SECOND_NS, 0.0)
+        question = self._config, rows, self._log, report, before_s
         cycles, deadline = min(self._recent.cycles, CYCLES), self._clock() + PATIENCE_S
         try:
             self._asked = Asked(question, alarm, cycles, deadline)
@@ -138,9 +154,9 @@ class LiveDiagnosis:
             self._since, self._wanted = 0, 2 * self._wanted
         else:
             self._settle(asked.alarm)
-        data = {"alarm_ns": asked.alarm.time_ns, "begin_ns": asked.begin_ns, "answer": answer}
+        data = {"alarm_ns": asked.alarm.time_ns, "begin_ns": self._begin_ns, "answer": answer}
         data |= {"report": asked.report.stem} if asked.report else {}
-        return [Event(self._now_ns, Kind.DIAGNOSIS, in_a_line(answer, asked.begin_ns), data)]
+        return [Event(self._now_ns, Kind.DIAGNOSIS, in_a_line(answer, self._here_ns), data)]
 
     def _settle(self, alarm: Event) -> None:
         """The alarm waits no longer; another one may have been raised since."""
@@ -186,7 +202,6 @@ class Asked:
     def __init__(self, question: Question, alarm: Event, cycles: int, deadline: float) -> None:
         self.alarm, self.cycles, self.deadline = alarm, cycles, deadline
         self.report = question[3]
-        self.begin_ns = int(question[1]["time_ns"][0])
         with ExitStack() as opened:
             asking, self._said, self._complaint = (
                 opened.enter_context(tempfile.TemporaryFile()) for _ in range(3)
@@ -234,9 +249,10 @@ class Asked:
 # --- in words -------------------------------------------------------------------------------------
 
 
-def in_a_line(answer: Mapping[str, Any], begin_ns: int) -> str:
-    """The answer in a line; ``begin_ns`` is when the rows begin, in PLC time."""
-    found = "; and ".join(_cause(cause, begin_ns) for cause in answer["causes"])
+def in_a_line(answer: Mapping[str, Any], now_ns: int) -> str:
+    """The answer in a line, as it is read at a time (UTC, ns)."""
+    times = Times.of(answer, now_ns)
+    found = "; and ".join(_cause(cause, times) for cause in answer["causes"])
     match answer["verdict"]:
         case "explained":
             return found
@@ -248,30 +264,10 @@ def in_a_line(answer: Mapping[str, Any], begin_ns: int) -> str:
     return f"no answer yet: {answer['next_experiment']}"
 
 
-def _cause(cause: Mapping[str, Any], begin_ns: int) -> str:
+def _cause(cause: Mapping[str, Any], times: Times) -> str:
     look_at = [EFFECTS[cause["effect"]].look_at]
     look_at += [EFFECTS[name].look_at for name in cause["not_separable_from"]]
     return (
-        f"{sized(cause)}, {_when(cause, begin_ns)}; how sure: {certainty(cause)};"
+        f"{sized(cause)}, {when(cause, times)}; how sure: {certainty(cause)};"
         f" look at {listed(look_at, 'or')}"
     )
-
-
-def _when(cause: Mapping[str, Any], begin_ns: int) -> str:
-    match Course(cause["course"]):
-        case Course.STEP:
-            return f"since {_clock(begin_ns, cause['onset_s'])}"
-        case Course.RAMP if cause["onset_s"] > 0.0:
-            return f"growing since {_clock(begin_ns, cause['onset_s'])}"
-        case Course.RAMP:
-            return "growing"
-        case Course.INTERMITTENT:
-            return f"in {cause['share_pct']:.0f} % of the cycles"
-    return f"since {_clock(begin_ns, 0.0)} or longer"
-
-
-def _clock(begin_ns: int, seconds: float) -> str:
-    """PLC time, as the console has it."""
-    time_ns = begin_ns + round(seconds * 1e9)
-    stamp = time.strftime("%H:%M:%S", time.gmtime(time_ns // 1_000_000_000))
-    return f"{stamp}.{time_ns // 100_000_000 % 10}"

@@ -1,7 +1,8 @@
 """The answer for people: a few lines for the terminal, and a page that can be kept and printed."""
 
 import html
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from twin.diagnosis.pictures import (
 from twin.diagnosis.words import (
     FIGURES,
     Answer,
+    Times,
     about,
     change,
     ends,
@@ -45,11 +47,14 @@ from twin.diagnosis.words import (
     when,
 )
 from twin.files import write_text
+from twin.instants import dated
 from twin.model import theta as c
 from twin.model.courses import Course
 from twin.model.effects import EFFECTS
 from twin.model.theta import Theta
 from twin.signals import BAR, MBAR, ML, SL_MIN
+
+Clock = Callable[[], int]  # UTC, ns
 
 # Colour, mark and words of each verdict's banner.
 BANNER = {
@@ -60,9 +65,9 @@ BANNER = {
 }
 
 
-def in_words(diagnosis: Diagnosis) -> str:
+def in_words(diagnosis: Diagnosis, clock: Clock = time.time_ns) -> str:
     """The answer in a few lines of plain text."""
-    return lines(diagnosis.json)
+    return lines(diagnosis.json, clock())
 
 
 def write_report(diagnosis: Diagnosis, path: Path) -> None:
@@ -71,32 +76,34 @@ def write_report(diagnosis: Diagnosis, path: Path) -> None:
 
 
 def _page(diagnosis: Diagnosis) -> str:
-    answer = diagnosis.json
+    answer, received = diagnosis.json, diagnosis.evidence.samples["host_ns"]
+    now_ns = int(received[-1]) if len(received) else 0  # a page is read when ages are others
     colour, mark, verdict = BANNER[answer["verdict"]]
     asset = f"{answer['asset']['type']} {answer['asset']['id']}"
-    parts = [page.section("What to do", "\n".join(_steps(answer)))]
+    times = Times.of(answer, now_ns)
+    parts = [page.section("What to do", "\n".join(_steps(answer, times)))]
     if answer["verdict"] == "insufficient":
         parts.append(page.section("The log", page.pairs(_cycles(answer))))
     else:
-        parts += _pictures(Found.of(diagnosis))
-        parts.append(page.section("Numbers", "\n".join(_tables(answer))))
+        parts += _pictures(Found.of(diagnosis), times)
+        parts.append(page.section("Numbers", "\n".join(_tables(answer, times))))
     return page.PAGE.substitute(
         title=html.escape(f"Diagnosis of {asset}"),
         colour=colour,
         mark=mark,
         verdict=html.escape(f"{verdict} – {asset}"),
-        headline=html.escape(headline(answer)),
+        headline=html.escape(headline(answer, now_ns)),
         body="\n".join(parts),
-        footer=_footer(diagnosis),
+        footer=_footer(diagnosis, times),
     )
 
 
-def _steps(answer: Answer) -> Iterator[str]:
+def _steps(answer: Answer, times: Times) -> Iterator[str]:
     """A card for each cause and for what is unknown, a box for what to record next."""
     sure = answer["verdict"] == "explained"
     for cause in answer["causes"]:
         title = spoken(cause["effect"]).capitalize()
-        known = [row for row in about(cause, sure=sure) if row[1] != spoken(cause["effect"])]
+        known = [row for row in about(cause, times, sure=sure) if row[1] != spoken(cause["effect"])]
         yield page.card(title, f"{EFFECTS[cause['effect']].sentence}.", known)
     steps = dict(to_do(answer))
     record = {name: steps.pop(name) for name in ("next", "next recording") if name in steps}
@@ -112,9 +119,9 @@ def _steps(answer: Answer) -> Iterator[str]:
 # --- pictures -------------------------------------------------------------------------------------
 
 
-def _pictures(found: Found) -> Iterator[str]:
+def _pictures(found: Found, times: Times) -> Iterator[str]:
     yield _cycle_picture(found)
-    yield _log_picture(found)
+    yield _log_picture(found, times)
     yield _phases_picture(found)
     if found.answer["unlisted"]:
         yield _left_picture(found)
@@ -135,9 +142,9 @@ def _cycle_picture(found: Found) -> str:
     return page.picture(title, draw_cycle(found, worst, alt), caption)
 
 
-def _log_picture(found: Found) -> str:
+def _log_picture(found: Found, times: Times) -> str:
     answer = found.answer
-    said = [f"{spoken(cause['effect'])} {when(cause)}" for cause in answer["causes"]]
+    said = [f"{spoken(cause['effect'])} {when(cause, times)}" for cause in answer["causes"]]
     title = f"Over time: {'; '.join(said) or 'no cause comes or goes'}"
     alt = f"{title}. Rms deviation of each cycle, before and after, and the size of each cause."
     caption = (
@@ -229,10 +236,10 @@ def _ranked(answer: Answer) -> str:
 # --- tables ---------------------------------------------------------------------------------------
 
 
-def _tables(answer: Answer) -> Iterator[str]:
+def _tables(answer: Answer, times: Times) -> Iterator[str]:
     if answer["causes"]:
         head = ("cause", "course", "parameter", "value", "95 % from", "to", "unit")
-        yield page.table("Causes", head, _parameters(answer), numbers=(3, 4, 5))
+        yield page.table("Causes", head, _parameters(answer, times), numbers=(3, 4, 5))
     yield _gain_table(answer)
     if answer["runners_up"]:
         columns = ("effect", "course", "leftover (sigma)")
@@ -245,11 +252,11 @@ def _runners_up(answer: Answer) -> Iterator[tuple[str, ...]]:
         yield spoken(one["effect"]), one["course"], number(one["leftover_sigma"])
 
 
-def _parameters(answer: Answer) -> Iterator[tuple[str, ...]]:
+def _parameters(answer: Answer, times: Times) -> Iterator[tuple[str, ...]]:
     for cause in answer["causes"]:
         for name, p in cause["parameters"].items():
             numbers = [number(p["value"]), *ends(p["low95"], p["high95"])]
-            course = when(cause, interval=True)
+            course = when(cause, times, interval=True)
             yield spoken(cause["effect"]), course, spoken(name), *numbers, p["unit"]
             if cause["course"] == Course.RAMP:
                 numbers = [number(p["at_end"]), "", ""]
@@ -288,7 +295,7 @@ def _cycles(answer: Answer) -> list[tuple[str, str]]:
     return rows
 
 
-def _footer(diagnosis: Diagnosis) -> str:
+def _footer(diagnosis: Diagnosis, times: Times) -> str:
     answer = diagnosis.json
     rows = [
         ("asset", f"{answer['asset']['type']} {answer['asset']['id']}"),
@@ -296,6 +303,9 @@ def _footer(diagnosis: Diagnosis) -> str:
         ("data set", f"{diagnosis.data_set}: {_data_set(diagnosis.evidence.theta)}"),
         ("program", f"ejector-twin {version('ejector-twin')}"),
     ]
+    if times.log_begin_ns is not None:
+        between = f"{dated(times.log_begin_ns)} to {dated(times.now_ns)}"
+        rows.insert(2, ("recorded", f"{between}; ages count back from its end"))
     return page.pairs(rows)
 
 

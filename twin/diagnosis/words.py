@@ -4,8 +4,10 @@ All of it is read from the answer as the contract has it, which may come from an
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+from twin.instants import SECOND_NS, instant
 from twin.model.courses import Course
 from twin.model.effects import EFFECTS
 
@@ -26,25 +28,51 @@ FIGURES = (
 )
 
 
-def lines(answer: Answer) -> str:
+@dataclass(frozen=True)
+class Times:
+    """What the onsets of an answer are, as people read them at a time (UTC, ns).
+
+    ``log_begin_ns`` is by the clock here; None where no clock gave the times of the log.
+    """
+
+    begin_s: float  # of the log, before what was looked at
+    log_begin_ns: int | None
+    now_ns: int
+
+    @classmethod
+    def of(cls, answer: Answer, now_ns: int) -> "Times":
+        """Those of an answer."""
+        cycles = answer["cycles"]
+        return cls(cycles.get("begin_s", 0.0), cycles.get("log_begin_ns"), now_ns)
+
+    def at(self, seconds: float) -> str:
+        """A time in the log: its clock time and age, and how far into the log."""
+        into = f"{clock(seconds)} into the log"
+        if self.log_begin_ns is None:
+            return into
+        ns = self.log_begin_ns + round(seconds * SECOND_NS)
+        return f"{instant(ns, self.now_ns)}, {into}"
+
+
+def lines(answer: Answer, now_ns: int) -> str:
     """The answer in a few lines of plain text."""
-    said = [f"{answer['verdict']}: {headline(answer)}"]
-    said += [f"  {label:<14} {text}" for label, text in _facts(answer)]
+    said = [f"{answer['verdict']}: {headline(answer, now_ns)}"]
+    said += [f"  {label:<14} {text}" for label, text in _facts(answer, now_ns)]
     return "\n".join(said)
 
 
-def headline(answer: Answer) -> str:
+def headline(answer: Answer, now_ns: int) -> str:
     """One sentence for the technician."""
-    causes = answer["causes"]
+    causes, times = answer["causes"], Times.of(answer, now_ns)
     match answer["verdict"]:
         case "consistent":
             left = number(answer["baseline"]["rms_mbar"])
             return f"The ejector does what its twin expects; {left} mbar rms left over are healthy."
         case "explained" if len(causes) == 1:
             (cause,) = causes
-            return f"{EFFECTS[cause['effect']].sentence} – {size(cause)}, {when(cause)}."
+            return f"{EFFECTS[cause['effect']].sentence} – {size(cause)}, {when(cause, times)}."
         case "explained":
-            each = (f"{size(cause)}, {when(cause)}" for cause in causes)
+            each = (f"{size(cause)}, {when(cause, times)}" for cause in causes)
             names = (spoken(cause["effect"]) for cause in causes)
             named = listed([f"{name} ({one})" for name, one in zip(names, each, strict=True)])
             return f"{COUNTED[len(causes)]} causes together: {named}."
@@ -67,10 +95,10 @@ def left_over(answer: Answer) -> str:
     return f"{spoken(unlisted['where'])}: {unlisted['shape']}"
 
 
-def _facts(answer: Answer) -> Iterator[tuple[str, str]]:
+def _facts(answer: Answer, now_ns: int) -> Iterator[tuple[str, str]]:
     """Labelled lines for the terminal."""
     for cause in answer["causes"]:
-        yield from about(cause, sure=answer["verdict"] == "explained")
+        yield from about(cause, Times.of(answer, now_ns), sure=answer["verdict"] == "explained")
     yield from to_do(answer)
     if answer["verdict"] == "insufficient":
         return
@@ -85,11 +113,11 @@ def _facts(answer: Answer) -> Iterator[tuple[str, str]]:
     yield "cycles", f"{cycles['total']}; fitted: {fitted}; held out: {held_out}"
 
 
-def about(cause: Answer, *, sure: bool) -> Iterator[tuple[str, str]]:
+def about(cause: Answer, times: Times, *, sure: bool) -> Iterator[tuple[str, str]]:
     """What is known of one cause, and where to look for it."""
     yield "cause" if sure else "a part of it", spoken(cause["effect"])
     yield "size", "; ".join(_sizes(cause))
-    yield "when", when(cause, interval=True)
+    yield "when", when(cause, times, interval=True)
     if sure:
         yield "how sure", certainty(cause)
     yield "look at", EFFECTS[cause["effect"]].look_at
@@ -137,21 +165,26 @@ def _sizes(cause: Answer) -> Iterator[str]:
         yield f"{spoken(name)} {grown}{number(p['value'])} {p['unit']} (95 %: {low} to {high})"
 
 
-def when(cause: Answer, *, interval: bool = False) -> str:
+def when(cause: Answer, times: Times, *, interval: bool = False) -> str:
     """How it runs in time; with the ``interval`` of an onset and the cycles where it is there."""
     match Course(cause["course"]):
         case Course.STEP:
             low, high = _clocks(cause["onset_low95_s"], cause["onset_high95_s"])
             known = f" (95 %: {low} to {high})" if interval else ""
-            return f"since {clock(cause['onset_s'])} into the log{known}"
-        case Course.RAMP if cause["onset_s"] > 0.0:
-            return f"growing since {clock(cause['onset_s'])} into the log"
+            return f"since {times.at(cause['onset_s'])}{known}"
+        case Course.RAMP if cause["onset_s"] > times.begin_s:
+            return f"growing since {times.at(cause['onset_s'])}"
         case Course.RAMP:
-            return "growing from the beginning of the log"
+            return f"growing {_all_of_it(times, 'from the beginning of the log')}"
         case Course.INTERMITTENT:
             which = f": {some(cause['cycles'])}" if interval else ""
             return f"in {number(cause['share_pct'])} % of the cycles{which}"
-    return "in all of the log"
+    return _all_of_it(times, "in all of the log")
+
+
+def _all_of_it(times: Times, whole: str) -> str:
+    """How long what was there all the time has been: by a part of a log at least that long."""
+    return f"since {times.at(times.begin_s)}, or longer" if times.begin_s > 0.0 else whole
 
 
 def certainty(cause: Answer) -> str:

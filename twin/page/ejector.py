@@ -26,8 +26,9 @@ from twin.figures.store import SIDES
 from twin.figures.table import FIGURES
 from twin.figures.trend import DAY_NS, FARTHEST, Line, Reach
 from twin.figures.words import in_words, trend_of
+from twin.instants import zone
 from twin.page import ring
-from twin.page.light import S_NS, WORDS, Light, light_of, listed, told
+from twin.page.light import S_NS, WORDS, Light, light_of, listed, said, told
 from twin.page.settings import REPORTS, RING, PageSettings, folder_of
 from twin.signals import BREAK, MBAR
 
@@ -70,7 +71,8 @@ class Ejector:
         running = live is not None and live.is_running(now)
         own = {"name": self.name, "type": self.config.asset.type, "now": now / S_NS}
         own |= {"running": running, "last": live and live.last_ns / S_NS, "trouble": ""}
-        own |= {"ended": bool(live and live.ended_ns)}
+        own |= {"ended": bool(live and live.ended_ns), "zone": zone(now)}
+        own |= {"last_seen": said(None if live is None else live.last_ns, now)}
         try:
             with self._alarms() as store:
                 board = self._board(store, now)
@@ -83,19 +85,20 @@ class Ejector:
             return own | grey | {"words": "Alarms unknown", "trouble": _with_hint(error)}
         light = light_of(board, running=running)
         found = {"light": light.value, "words": WORDS[light]}
-        return own | found | {"alarms": listed(board, episodes, waiting)}
+        return own | found | {"alarms": listed(board, episodes, waiting, now)}
 
     def history(self, days: float) -> list[dict[str, Any]]:
         """Every time an alarm was active, the newest first."""
         values = {rule.name: rule.value for rule in self._rules}
         priorities = {rule.name: rule.priority.value for rule in self._rules}
+        now = self._clock()
         with self._alarms() as store:
-            episodes = store.episodes(self._unit, self._clock() - round(days * DAY_NS))
+            episodes = store.episodes(self._unit, now - round(days * DAY_NS))
         return [
             {
                 "alarm": one.alarm,
                 "priority": priorities.get(one.alarm, ""),
-                **told(one, values.get(one.alarm, "")),
+                **told(one, values.get(one.alarm, ""), now),
             }
             for one in reversed(episodes[-MOST_EPISODES:])
         ]

@@ -13,6 +13,7 @@ from twin.alarms.state import State
 from twin.assets.unit import Unit
 from twin.figures.store import SIDES
 from twin.figures.table import FIGURES
+from twin.instants import SECOND_NS, instant, lasting, zone
 from twin.page.hall import COLUMNS, NOT_UNDERSTOOD, Document, Heard, Row
 from twin.page.light import Light, facts, named
 
@@ -38,7 +39,8 @@ def overview(heard: Sequence[Heard], trouble: str, since: float, now: float) -> 
     lines = [_line(one, now, trouble) for one in heard]
     order = [light.value for light in WORST_FIRST]
     lines.sort(key=lambda one: (order.index(one["light"]), one["since"] or 0.0, one["name"]))
-    return {"now": now, "trouble": trouble, "trouble_since": since, "ejectors": lines}
+    told = {"now": now, "zone": zone(_ns(now)), "trouble": trouble, "ejectors": lines}
+    return told | {"trouble_since": _said(since, now) if trouble else ""}
 
 
 def details(heard: Heard, trouble: str, now: float) -> dict[str, Any]:
@@ -47,7 +49,7 @@ def details(heard: Heard, trouble: str, now: float) -> dict[str, Any]:
         **_line(heard, now, trouble),
         "program": heard.program,
         "status": heard.status,
-        "alarms": [_card(one) for one in _standing(heard)],
+        "alarms": [_card(one, now) for one in _standing(heard)],
         "rows": _columns(heard.rows),
         "trends": _trends(heard),
     }
@@ -67,6 +69,11 @@ def _line(heard: Heard, now: float, trouble: str) -> dict[str, Any]:
         "light": light.value,
         "words": words,
         "since": since,
+        "times": {
+            "since": _said(since, now),
+            "seen": _said(heard.seen or None, now),
+            "behind": lasting(late) if late and late > max(BEHIND_S, _patience(heard)) else "",
+        },
         "what": _title(str(worst["alarm"]))["what"] if worst else _without_alarm(heard, words),
         "alarms_count": len(standing),
         "seen": heard.seen or None,
@@ -132,14 +139,24 @@ def _rank(alarm: Document) -> tuple[int, int, float]:
 # --- alarms -------------------------------------------------------------------------------------
 
 
-def _card(alarm: Document) -> dict[str, Any]:
+def _card(alarm: Document, now: float) -> dict[str, Any]:
     """An alarm as a technician reads it."""
     try:
         known = [[name, text] for name, text in facts(alarm["evidence"])]
     except NOT_UNDERSTOOD:  # another program's
         known = []
     kept = {key: alarm[key] for key in alarm if key != "evidence"}
-    return kept | _title(str(alarm["alarm"])) | {"facts": known}
+    times = {"times": {"since": _said(alarm["since"], now)}}
+    return kept | _title(str(alarm["alarm"])) | {"facts": known} | times
+
+
+def _said(seconds: float | None, now: float) -> str:
+    """An instant in words; empty where nobody knows it."""
+    return "" if seconds is None else instant(_ns(seconds), _ns(now))
+
+
+def _ns(seconds: float) -> int:
+    return round(seconds * SECOND_NS)
 
 
 def _title(alarm: str) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from twin.alarms.rules import Priority
 from twin.alarms.state import Alarm, State
 from twin.alarms.words import STATES
 from twin.diagnosis.words import certainty, ends, number, spoken
+from twin.instants import instant, lasting
 from twin.model.effects import EFFECTS
 
 S_NS = 1_000_000_000
@@ -53,16 +54,18 @@ def light_of(board: Board, *, running: bool) -> Light:
 
 
 def listed(
-    board: Board, episodes: Iterable[Episode], waiting: Sequence[Request]
+    board: Board, episodes: Iterable[Episode], waiting: Sequence[Request], now_ns: int
 ) -> list[dict[str, Any]]:
     """What a person is to look at, what is active and the most urgent first; then what is quiet."""
     by_name = {one.alarm: one for one in episodes}
     standing = sorted(board.standing(), key=lambda one: _STANDING.index(one.state))
     shown = [*standing, *board.quiet()]
-    return [_alarm(one, by_name.get(one.rule.name), waiting) for one in shown]
+    return [_alarm(one, by_name.get(one.rule.name), waiting, now_ns) for one in shown]
 
 
-def _alarm(alarm: Alarm, episode: Episode | None, waiting: Sequence[Request]) -> dict[str, Any]:
+def _alarm(
+    alarm: Alarm, episode: Episode | None, waiting: Sequence[Request], now_ns: int
+) -> dict[str, Any]:
     rule = alarm.rule
     until = alarm.shelved_until
     return {
@@ -74,10 +77,11 @@ def _alarm(alarm: Alarm, episode: Episode | None, waiting: Sequence[Request]) ->
         "priority": rule.priority.value,
         "longest_shelving_s": rule.longest_shelving_s,
         "shelved_until": until and until / S_NS,
+        "quiet_until": said(until, now_ns),
         "consequence": rule.consequence,
         "action": rule.action,
         "asked": [_asked(one) for one in waiting if one.alarm == rule.name],
-        **(told(episode, rule.value) if episode else named(rule.name, rule.value)),
+        **(told(episode, rule.value, now_ns) if episode else named(rule.name, rule.value)),
     }
 
 
@@ -85,13 +89,28 @@ def _asked(request: Request) -> dict[str, Any]:
     return {"deed": request.deed.value, "who": request.who, "at": request.asked_ns / S_NS}
 
 
-def told(episode: Episode, value: str) -> dict[str, Any]:
-    """One time that an alarm was active: what, since when, what speaks for it and how sure."""
+def said(ns: int | None, now_ns: int) -> str:
+    """An instant in words; empty for what has not happened."""
+    return "" if ns is None else instant(ns, now_ns)
+
+
+def told(episode: Episode, value: str, now_ns: int) -> dict[str, Any]:
+    """One time that an alarm was active: what, since when, what speaks for it and how sure.
+
+    ``times`` has its instants in words, as they are now.
+    """
+    raised, cleared, seen = episode.raised_ns, episode.cleared_ns, episode.acknowledged_ns
     return {
         **named(episode.alarm, value),
-        "raised": episode.raised_ns / S_NS,
-        "cleared": episode.cleared_ns and episode.cleared_ns / S_NS,
-        "seen": episode.acknowledged_ns and episode.acknowledged_ns / S_NS,
+        "raised": raised / S_NS,
+        "cleared": cleared and cleared / S_NS,
+        "seen": seen and seen / S_NS,
+        "times": {
+            "raised": said(raised, now_ns),
+            "cleared": said(cleared, now_ns),
+            "seen": said(seen, now_ns),
+            "lasted": "" if cleared is None else lasting((cleared - raised) / S_NS),
+        },
         "seen_by": episode.acknowledged_by,
         "facts": [[name, text] for name, text in facts(episode.evidence)],
         "report": episode.evidence.get("report", ""),

@@ -53,15 +53,14 @@ function line(ejector) {
 
 function what(ejector) {
   const more = ejector.alarms_count > 1 ? ` and ${ejector.alarms_count - 1} more` : "";
-  const since = ejector.since ? `since ${clock(ejector.since)}, ${lasting(now() - ejector.since)}` : "";
+  const since = ejector.since ? `since ${ejector.times.since}` : "";
   return [element("b", {}, ejector.what + more),
     element("span", { class: "dim" }, since)];
 }
 
 function seen(ejector) {
-  const ago = ejector.seen ? `${lasting(Math.max(0, now() - ejector.seen))} ago` : "never";
-  const behind = ejector.behind ? `values ${lasting(ejector.behind)} behind` : "";
-  return [element("span", {}, ago), element("span", { class: "dim" }, behind)];
+  const behind = ejector.behind ? `values ${ejector.times.behind} behind` : "";
+  return [element("span", {}, ejector.times.seen || "never"), element("span", { class: "dim" }, behind)];
 }
 
 function figure({ name, unit, measured, expected }) {
@@ -105,18 +104,18 @@ function showOne() {
   const light = $("one-light");
   light.className = `ejector ${one.light}`;
   light.dataset.light = one.light;
-  const since = one.since ? `since ${clock(one.since)}` : "";
+  const since = one.since ? `since ${one.times.since}` : "";
   light.replaceChildren(icon(one.light), element("b", {}, one.words), element("span", {}, since));
   $("one-alarms").replaceChildren(...(one.alarms.length ? one.alarms.map(card)
     : [element("p", { class: "nothing" }, "No alarm stands.")]));
-  const known = [["batch", one.batch], ["last seen", one.seen ? clock(one.seen) : "never"],
+  const known = [["batch", one.batch], ["last seen", one.times.seen || "never"],
     ["twin", one.status], ["program", one.program]];
   $("one-facts").replaceChildren(...rows(known).childNodes);
   showPlots();
 }
 
 function card(alarm) {
-  const since = alarm.since ? `since ${clock(alarm.since)}, ${lasting(now() - alarm.since)}` : "";
+  const since = alarm.since ? `since ${alarm.times.since}` : "";
   return element("article", { class: `alarm ${alarm.state} ${alarm.priority}`, "data-alarm": alarm.alarm },
     element("div", { class: "top" }, element("h3", {}, alarm.what),
       element("span", { class: "chip" }, `${alarm.priority} priority`),
@@ -155,7 +154,7 @@ function draw(name, box, data, series, more, lowest) {
   }
   const bottom = (low) => (lowest === undefined ? trendRange(low ?? 0, low ?? 1)[0] : lowest);
   plots[name] = new uPlot({
-    width: box.clientWidth, height: box.clientHeight, legend: { show: false }, cursor: { show: false },
+    width: box.clientWidth, height: box.clientHeight, legend: { show: false }, cursor: { show: false }, tzDate: there,
     padding: [null, 30, null, null],
     scales: { x: { range: (_plot, first, last) => moments(first, last) }, y: { range: (_plot, low, high) => [bottom(low), trendRange(low ?? 0, high ?? 100)[1]] } },
     axes: [axis({ space: 90, values: (_plot, ticks) => dates(ticks) }), axis({ size: 70 })],
@@ -189,6 +188,7 @@ async function look() {
     const detail = asked && await get(`/api/all/one?${new URLSearchParams(asked)}`);
     if (location.hash.length > 1 !== Boolean(asked)) return;
     skew = now.now - Date.now() / 1000;
+    zone = now.zone;
     told = now;
     one = detail;
     heardMs = performance.now();
@@ -210,7 +210,7 @@ function show() {
   $("connection").classList.toggle("bad", silent);
   if ($("connection").textContent !== said) $("connection").textContent = said;
   if (!wanted() || one) {
-    const since = told.trouble_since ? ` since ${clock(told.trouble_since)}` : "";
+    const since = told.trouble_since ? ` since ${told.trouble_since}` : "";
     showBanner(told.trouble ? `${told.trouble}${since}. What follows is as it was then.` : "");
   }
   $("list").hidden = Boolean(wanted());

@@ -10,6 +10,7 @@ const SILENT_MS = 5000; // without a word from the page's own server
 
 const $ = (id) => document.getElementById(id);
 let skew = 0; // seconds that the server's clock is ahead of the one here
+let zone = null; // seconds that the server's zone is ahead of UTC: all times are told in it
 
 // --- small things --------------------------------------------------------------------------------
 
@@ -34,20 +35,9 @@ function icon(name) {
   return svg;
 }
 
-function clock(seconds) {
-  const then = new Date(seconds * 1000);
-  const time = then.toLocaleTimeString("en-GB");
-  const today = then.toDateString() === new Date(now() * 1000).toDateString();
-  return today ? time : `${then.toLocaleDateString("en-GB")} ${time}`;
-}
-
-function lasting(seconds, digits = 0) {
-  const s = Math.max(0, Math.round(seconds));
-  if (seconds < 9.95) return `${Math.max(0, seconds).toFixed(digits)} s`;
-  if (s < 120) return `${s} s`;
-  if (s < 7200) return `${Math.round(s / 60)} min`;
-  if (s < 172800) return `${Math.round(s / 3600)} h`;
-  return `${Math.round(s / 86400)} days`;
+function there(seconds) { // a date whose hours and days are those of the server's zone
+  const here = new Date(seconds * 1000);
+  return zone === null ? here : new Date((seconds + zone + here.getTimezoneOffset() * 60) * 1000);
 }
 
 function number(value, digits) {
@@ -86,7 +76,7 @@ function dates(ticks) {
   const days = ticks.length > 1 && ticks[1] - ticks[0] >= 43200;
   const seconds = ticks.length > 1 && ticks[1] - ticks[0] < 60 ? { second: "2-digit" } : {};
   return ticks.map((tick) => {
-    const then = new Date(tick * 1000);
+    const then = there(tick);
     const midnight = then.getHours() === 0 && then.getMinutes() === 0;
     return days || midnight ? then.toLocaleDateString("en-GB", { day: "numeric", month: "short" })
       : then.toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit", ...seconds });

@@ -32,7 +32,7 @@ function summary(state) {
   const standing = state.alarms.filter((one) => !QUIET.includes(one.state)).length;
   const quiet = state.alarms.length - standing;
   const parts = [];
-  if (!state.running) parts.push(state.last ? `since ${clock(state.last)}` : "never yet");
+  if (!state.running) parts.push(state.last ? `since ${state.last_seen}` : "never yet");
   if (standing) parts.push(standing === 1 ? "1 alarm" : `${standing} alarms`);
   if (quiet) parts.push(`${quiet} kept quiet`);
   return parts.join(", ") || "no alarm";
@@ -73,7 +73,7 @@ function showBanner() {
   const said = [];
   if (!state.running) {
     const how = state.ended ? "twin run has ended" : "twin run does not answer";
-    said.push(state.last ? `Not running since ${clock(state.last)}: ${how}. What follows is as it was then.`
+    said.push(state.last ? `Not running since ${state.last_seen}: ${how}. What follows is as it was then.`
       : "Not running: twin run has not been started yet.");
   }
   if (state.trouble) said.push(state.trouble);
@@ -98,7 +98,8 @@ function showAlarms() {
   const shown = state.alarms.filter(isShown);
   $("count").textContent = state.alarms.length ? `(${state.alarms.length})` : "";
   const box = $("alarms");
-  const key = JSON.stringify([chosen, me.user, shown, [...mine]]);
+  const ageless = (name, value) => (["times", "quiet_until"].includes(name) ? undefined : value);
+  const key = JSON.stringify([chosen, me.user, shown, [...mine]], ageless);
   if (box.dataset.key !== key) {
     const open = new Set([...box.querySelectorAll("details[open]")].map((one) => one.dataset.alarm));
     const focused = document.activeElement && document.activeElement.dataset.focus;
@@ -108,9 +109,17 @@ function showAlarms() {
     if (again) again.focus();
   }
   for (const one of box.querySelectorAll("[data-since]")) {
-    const since = Number(one.dataset.since);
-    one.textContent = `since ${clock(since)}, ${lasting(now() - since)}`;
+    one.textContent = since(shown.find((alarm) => alarm.alarm === one.dataset.since));
   }
+}
+
+function since(alarm) {
+  const { raised, cleared, seen } = alarm.times || {};
+  const said = raised ? [`since ${raised}`] : [];
+  if (cleared) said.push(`gone since ${cleared}`);
+  if (seen) said.push(`acknowledged ${seen} by ${alarm.seen_by}`);
+  if (alarm.quiet_until) said.push(`quiet until ${alarm.quiet_until}`);
+  return said.join("; ");
 }
 
 function nothing(state) {
@@ -121,15 +130,12 @@ function nothing(state) {
 
 function alarmCard(alarm, open) {
   const where = [states[chosen].name, alarm.where].filter(Boolean).join(": ");
-  const since = alarm.raised ? element("span", { "data-since": String(alarm.raised) }) : "";
-  const gone = alarm.cleared ? `, gone since ${clock(alarm.cleared)}` : "";
-  const until = alarm.shelved_until ? `, quiet until ${clock(alarm.shelved_until)}` : "";
   return element(
     "article", { class: `alarm ${alarm.state} ${alarm.priority}`, "data-alarm": alarm.alarm },
     element("div", { class: "top" }, element("h3", {}, alarm.what),
       element("span", { class: "chip" }, `${alarm.priority} priority`),
       element("span", { class: "chip state" }, STATES[alarm.state])),
-    element("p", { class: "since" }, since, `${gone}${until}`),
+    element("p", { class: "since", "data-since": alarm.alarm }),
     element("p", { class: "todo" }, alarm.action),
     rows([["where", where], ...alarm.facts.filter(([name]) => SHOWN.includes(name))]),
     evidence(alarm, open),
@@ -140,11 +146,10 @@ function alarmCard(alarm, open) {
 
 function evidence(alarm, open) {
   const facts = alarm.facts.filter(([name]) => !SHOWN.includes(name));
-  const seen = alarm.seen ? [["acknowledged", `${clock(alarm.seen)} by ${alarm.seen_by}`]] : [];
   return element(
     "details", { "data-alarm": alarm.alarm, open: open.has(alarm.alarm) },
     element("summary", { "data-focus": `why ${alarm.alarm}` }, "Evidence"),
-    rows([["what it is", alarm.sentence], ["if nobody acts", alarm.consequence], ...facts, ...seen, ["alarm", alarm.alarm]]));
+    rows([["what it is", alarm.sentence], ["if nobody acts", alarm.consequence], ...facts, ["alarm", alarm.alarm]]));
 }
 
 function reportLink(one) {
@@ -380,7 +385,7 @@ function drawTrend(trend) {
   const box = $("trend-plot");
   trendPlot = new uPlot({
     width: box.clientWidth - 18, height: box.clientHeight - 18,
-    legend: { show: false }, cursor: { show: false },
+    legend: { show: false }, cursor: { show: false }, tzDate: there,
     scales: { y: { range: (_plot, low, high) => trendRange(low, high) } },
     axes: [axis({ space: 90, values: (_plot, ticks) => dates(ticks) }), axis({ size: 70, label: trend.unit, labelFont: "15px system-ui" })],
     series: series.slice(0, data.length),
@@ -411,13 +416,12 @@ function showHistory() {
 }
 
 function episodeCard(one) {
-  const end = one.cleared ? `${clock(one.cleared)}, after ${lasting(one.cleared - one.raised, 1)}`
-    : "still active";
-  const seen = one.seen ? `${clock(one.seen)} by ${one.seen_by}` : "not yet";
+  const end = one.cleared ? `${one.times.cleared}, after ${one.times.lasted}` : "still active";
+  const seen = one.seen ? `${one.times.seen} by ${one.seen_by}` : "not yet";
   return element("article", { class: "episode" },
     element("div", { class: "top" }, element("h3", {}, one.what),
       element("span", { class: "chip" }, `${one.priority} priority`)),
-    rows([["raised", clock(one.raised)], ["ended", end], ["acknowledged", seen], ...one.facts]),
+    rows([["raised", one.times.raised], ["ended", end], ["acknowledged", seen], ...one.facts]),
     reportLink(one));
 }
 
@@ -442,6 +446,7 @@ function hear(told) {
   if (told.states) {
     states = told.states;
     skew = states[0].now - Date.now() / 1000;
+    zone = states[0].zone;
     showStates();
   }
   if (told.rows && told.of === chosen) live.take(told.rows);
