@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 from twin.figures.settings import FigureSettings, limits
 from twin.figures.table import FIGURES
-from twin.figures.trend import DAY_NS, FARTHEST, Line, line_through, reach
+from twin.figures.trend import DAY_NS, FARTHEST, Line, Trend, line_through, reach, trend_of
 from twin.figures.words import in_words, limit_of, trend_plain
 from twin.model.dataset import DataSet
 
@@ -157,11 +157,10 @@ LEAKAGE = FIGURES["leakage"]
 
 
 def said(values: "np.ndarray[tuple[int], np.dtype[np.float64]]", limit: float | None) -> str:
-    line = line_through(times(10, len(values)), values)
-    comes = reach(line, limit) if line and limit is not None else None
-    plain = trend_plain(LEAKAGE, line, limit, comes)
-    assert (plain["days_to_limit"] is not None) == (comes is not None)
-    return in_words(LEAKAGE, line, limit, comes)
+    trend = trend_of(times(10, len(values)), values, limit)
+    plain = trend_plain(LEAKAGE, trend)
+    assert (plain["days_to_limit"] is not None) == (trend.comes is not None)
+    return in_words(LEAKAGE, trend, 0)
 
 
 def test_trends_in_words() -> None:
@@ -170,13 +169,120 @@ def test_trends_in_words() -> None:
     assert "no trend (" in said(noise, 250.0)
     rising = said(200 + 5 * days + noise, 250.0)
     words = (
-        r"leakage: 200\S* mbar/s, \+[45]\S* ± 0.0\S+ mbar/s per day, in 9.9 days; its limit of 250"
+        r"leakage: 200\S* mbar/s, \+[45]\S* ± 0.0\S+ mbar/s per day over 10 days; its limit of 250"
     )
     assert re.match(words + r" mbar/s in (9.9|10.0|10.1) days \(9\.\d to 10\.\d\)$", rising)
     assert said(200 - 5 * days + noise, 250.0).endswith("away from its limit of 250 mbar/s")
     assert said(300 + 5 * days + noise, 250.0).endswith("over its limit of 250 mbar/s")
     assert "more than 29" in said(10 + 2 * days + noise, 250.0)
     assert said(200 + 5 * days + noise, None).endswith("days")
+
+
+BEGIN_NS = 1_790_000_000 * 10**9  # 2026-09-21 14:13:20 UTC
+
+
+def minutes(values: "np.ndarray[tuple[int], np.dtype[np.float64]]") -> Trend:
+    """A cycle each three seconds."""
+    return trend_of(BEGIN_NS + 3 * 10**9 * np.arange(len(values)), values, 250.0)
+
+
+@pytest.mark.parametrize("cycles", [40, 200, 2000])
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
+def test_a_step_is_told_with_its_levels_its_time_and_how_sure_that_is(
+    cycles: int, share: float
+) -> None:
+    """A hose that tears between two cycles."""
+    at = round(share * cycles)
+    rng = np.random.default_rng(cycles + at)
+    values = np.where(np.arange(cycles) < at, 75.0, 465.0) + rng.normal(0.0, 6.0, cycles)
+    trend = minutes(values)
+    assert trend.step is not None
+    assert trend.step.host_ns == BEGIN_NS + at * 3 * 10**9
+    assert trend.step.latest_ns - trend.step.earliest_ns == 3 * 10**9
+    assert trend.step.before == pytest.approx(75.0, abs=2.0 * trend.step.before_half)
+    assert trend.step.after == pytest.approx(465.0, abs=2.0 * trend.step.after_half)
+    plain = trend_plain(LEAKAGE, trend)
+    assert plain["step"]["from_95"][0] < trend.step.before < plain["step"]["from_95"][1]
+    assert plain["days_to_limit"] is None
+
+
+def test_the_intervals_of_a_step_hold_what_they_promise() -> None:
+    rng = np.random.default_rng(18)
+    held = []
+    for _ in range(TRIALS):
+        values = np.where(np.arange(300) < 120, 75.0, 100.0) + rng.normal(0.0, 6.0, 300)
+        step = minutes(values).step
+        assert step is not None
+        at_ns = BEGIN_NS + 120 * 3 * 10**9
+        held.append(
+            (
+                abs(step.before - 75.0) < step.before_half,
+                abs(step.after - 100.0) < step.after_half,
+                step.earliest_ns < at_ns <= step.latest_ns,
+            )
+        )
+    assert (np.mean(held, axis=0) > 0.87).all()  # of 0.95, in 150 trials
+
+
+def test_a_step_in_words() -> None:
+    values = np.where(np.arange(100) < 40, 75.0, 465.0)
+    values += np.random.default_rng(12).normal(0.0, 6.0, 100)
+    said = in_words(LEAKAGE, minutes(values), BEGIN_NS + 600 * 10**9)
+    assert re.fullmatch(
+        r"leakage: stepped from 7\d\S* ± \d\S* to 46\d\S* ± \d\S* mbar/s at 14:15:20, 8 min ago"
+        r" \(95 %: 14:15:17 to 14:15:20\); no trend since then \(\S+ ± \S+ mbar/s"
+        r" over 3 min\); over its limit of 250 mbar/s",
+        said,
+    )
+
+
+def test_minutes_have_no_rate_per_day() -> None:
+    noise = np.random.default_rng(13).normal(size=300)
+    for values in (75.0 + noise, 75.0 + np.linspace(0.0, 30.0, 300) + noise):
+        trend = minutes(values)
+        said = in_words(LEAKAGE, trend, BEGIN_NS)
+        assert "per day" not in said
+        assert "mbar/s over 15 min" in said
+        assert trend_plain(LEAKAGE, trend)["line"]["per_day"] is None
+    assert "no trend" not in said  # the last one rises
+    assert trend.comes is None
+
+
+def test_of_two_steps_the_newest_is_told() -> None:
+    levels = np.repeat([75.0, 465.0, 75.0], [60, 80, 60])
+    trend = minutes(levels + np.random.default_rng(14).normal(0.0, 6.0, 200))
+    assert trend.step is not None
+    assert trend.step.host_ns == BEGIN_NS + 140 * 3 * 10**9
+    assert trend.step.after < trend.step.before
+
+
+def test_what_follows_a_step_is_a_record_of_its_own() -> None:
+    """And a limit comes by what it rises since then."""
+    rng, days = np.random.default_rng(15), np.linspace(-10, 0, 2000)
+    values = np.where(days < -6.0, 75.0, 200.0 + 2.0 * days) + rng.normal(size=2000)
+    trend = trend_of(times(10, 2000), values, 220.0)
+    assert trend.step is not None
+    assert trend.line is not None
+    assert trend.line.slope == pytest.approx(2.0, abs=0.2)
+    assert trend.line.span == pytest.approx(6.0, abs=0.2)
+    assert trend.comes is not None
+    assert trend.comes.expected == pytest.approx(10.0, rel=0.1)
+
+
+@pytest.mark.parametrize(("correlation", "most"), [(0.0, 0.04), (0.9, 0.05), (0.99, 0.07)])
+def test_scatter_is_seldom_called_a_step(correlation: float, most: float) -> None:
+    """One in a hundred is what is asked for."""
+    rng = np.random.default_rng(16)
+    record = times(7, 3000)
+    found = [trend_of(record, kept(correlation, 3000, rng)).step for _ in range(TRIALS)]
+    assert np.mean([one is not None for one in found]) <= most
+
+
+@pytest.mark.parametrize("rise", [1.0, 3.0, 10.0, 100.0])
+def test_what_grows_steadily_is_no_step(rise: float) -> None:
+    rng = np.random.default_rng(17)
+    for grown in (np.linspace(0.0, rise, 2000), rise * np.exp(np.linspace(-6.0, 0.0, 2000))):
+        assert trend_of(times(7, 2000), grown + rng.normal(size=2000)).step is None
 
 
 def test_limits_are_of_the_figures_that_have_one() -> None:

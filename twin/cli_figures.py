@@ -93,9 +93,9 @@ def trend(
         Path | None, typer.Option(metavar="F.(png|svg)", help="Of one figure.")
     ] = None,
 ) -> None:
-    """How figures run over days, how sure that is, and when they come to their limits."""
+    """How figures run, whether they stepped or drift, and when they come to their limits."""
     from twin.figures.store import SIDES
-    from twin.figures.words import in_words, trend_of, trend_plain
+    from twin.figures.words import in_words, trend_of_figure, trend_plain
 
     wanted = _wanted(names, picture)
     limits = _limits(config)
@@ -104,13 +104,14 @@ def trend(
         history = _history(store, _chosen(store, config, unit), days, columns)
     plain = []
     for figure in wanted:
-        line, limit, comes = trend_of(history, figure, limits)
-        print(in_words(figure, line, limit, comes))
-        plain.append(trend_plain(figure, line, limit, comes))
+        found = trend_of_figure(history, figure, limits)
+        said = in_words(figure, found, time.time_ns())
+        print(said)
+        plain.append(trend_plain(figure, found))
         if picture is not None:
             from twin.figures.picture import draw
 
-            draw(history, figure, line, limit, comes, picture)
+            draw(history, figure, found, said, picture)
     if json_file is not None:
         write_json(json_file, plain)
 

@@ -1,6 +1,7 @@
 """A picture of a trend: cycles, their medians, the line with its band, expected and limit."""
 
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,46 +11,49 @@ from matplotlib.figure import Figure as Picture
 from twin.errors import SourceError
 from twin.figures.store import History
 from twin.figures.table import Figure
-from twin.figures.trend import DAY_NS, FARTHEST, Line, Reach
-from twin.figures.words import in_words
+from twin.figures.trend import DAY_NS, Trend
 
 MOST_POINTS = 5000  # of cycles
+TITLE = 110  # characters in a line of it
 AHEAD = 0.5  # of the record, drawn after its end where nothing is reached
 
 
-def draw(
-    history: History,
-    figure: Figure,
-    line: Line | None,
-    limit: float | None,
-    comes: Reach | None,
-    path: Path,
-) -> None:
-    """Draw one figure of a unit over days; SourceError if it cannot be written."""
+def draw(history: History, figure: Figure, trend: Trend, title: str, path: Path) -> None:
+    """Draw one figure of a unit over time; SourceError if it cannot be written."""
     days = (history.host_ns - history.host_ns[-1]) / DAY_NS
+    unit, scale = _axis(float(-days[0]))
     values = history.values[f"{figure.name}_measured"]
     every = max(len(days) // MOST_POINTS, 1)
     picture = Picture(figsize=(10.0, 4.5), layout="constrained")
     FigureCanvasAgg(picture)
     axes = picture.subplots()
-    axes.plot(days[::every], values[::every], ".", color="0.75", markersize=3, label="cycles")
+    axes.plot(
+        days[::every] * scale, values[::every], ".", color="0.75", markersize=3, label="cycles"
+    )
     expected = history.values[f"{figure.name}_expected"]
     if np.isfinite(expected).any():
         middle = float(np.nanmedian(expected))
         axes.axhline(middle, color="tab:green", linestyle=":", label=f"expected {middle:.3g}")
-    if line is not None:
-        _draw_line(axes, line, comes)
-    if limit is not None:
-        _draw_limit(axes, limit)
-    axes.set_xlabel("days from the last cycle")
+    if trend.line is not None or trend.step is not None:
+        _draw_course(axes, trend, scale)
+    if trend.limit is not None:
+        _draw_limit(axes, trend.limit)
+    axes.set_xlabel(f"{unit} from the last cycle")
     axes.set_ylabel(f"{figure.name} ({figure.unit})")
-    picture.suptitle(in_words(figure, line, limit, comes), x=0.01, ha="left", fontsize=10)
+    picture.suptitle(fill(title, TITLE), x=0.01, ha="left", fontsize=10)
     picture.legend(loc="outside right upper", fontsize="small")
     axes.margins(x=0.01)
     try:
         picture.savefig(path, dpi=120)
     except (OSError, ValueError) as error:
         raise SourceError(f"{path}: cannot be written: {error}", "as .png or .svg") from error
+
+
+def _axis(days: float) -> tuple[str, float]:
+    """The unit of a time axis over so many days, and how many of it are a day."""
+    if days >= 2.0:
+        return "days", 1.0
+    return ("hours", 24.0) if days * 24.0 >= 2.0 else ("minutes", 1440.0)
 
 
 def _draw_limit(axes: Axes, limit: float) -> None:
@@ -62,16 +66,18 @@ def _draw_limit(axes: Axes, limit: float) -> None:
         axes.plot([], [], color="tab:red", linestyle="--", label=away)
 
 
-def _draw_line(axes: Axes, line: Line, comes: Reach | None) -> None:
-    ahead = AHEAD * line.span
-    if comes is not None:
-        ahead = max(ahead, min(1.2 * comes.expected, FARTHEST * line.span))
-    days = np.linspace(line.days[0], ahead, 300)
-    middle, half = line.at(days), line.half(days)
-    axes.plot(line.days, line.medians, "o", color="tab:blue", markersize=4, label="medians")
-    trend = "line" if line.is_trend else "no trend"
-    axes.plot(days, middle, color="tab:blue", label=f"{trend}, {line.slope:+.3g} per day")
-    axes.fill_between(days, middle - half, middle + half, color="tab:blue", alpha=0.2, lw=0)
+def _draw_course(axes: Axes, trend: Trend, scale: float) -> None:
+    """The levels on either side of a step, the line with its band, and when it meets the limit."""
+    days, middle, half = trend.shape(trend.ahead(AHEAD))
+    line, comes = trend.line, trend.comes
+    if line is not None:
+        at = line.days * scale
+        axes.plot(at, line.medians, "o", color="tab:blue", markersize=4, label="medians")
+    rises = line is not None and line.is_trend
+    label = "trend" if rises else "step" if trend.step is not None else "no trend"
+    axes.plot(days * scale, middle, color="tab:blue", label=label)
+    band = middle - half, middle + half
+    axes.fill_between(days * scale, *band, color="tab:blue", alpha=0.2, lw=0)
     if comes is not None and comes.earliest < days[-1]:
-        end = min(comes.latest, float(days[-1]))
-        axes.axvspan(comes.earliest, end, color="tab:red", alpha=0.15, lw=0, label="limit reached")
+        reached = comes.earliest * scale, min(comes.latest, float(days[-1])) * scale
+        axes.axvspan(*reached, color="tab:red", alpha=0.15, lw=0, label="limit reached")

@@ -7,7 +7,8 @@ from typing import Any
 from twin.figures.settings import Limits
 from twin.figures.store import History
 from twin.figures.table import FIGURES, Figure
-from twin.figures.trend import FARTHEST, FEWEST_BINS, SURE, Line, Reach, line_through, reach
+from twin.figures.trend import FARTHEST, FEWEST_BINS, SURE, Line, Reach, Step, Trend, trend_of
+from twin.instants import clock, instant, lasting
 
 SHOWN = ("t0", "t1", "leakage", "free_flow", "max_vacuum", "nozzle_share", "air", "supply")
 NO_DASH = {"-": "", "0 or 1": "", "0 to 3": ""}
@@ -36,13 +37,10 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
-def trend_of(
-    history: History, figure: Figure, limits: Limits
-) -> tuple[Line | None, float | None, Reach | None]:
-    """The line through a figure's record, its limit, and when it comes to it; None where not."""
-    line = line_through(history.host_ns, history.values[f"{figure.name}_measured"])
-    limit = limit_of(figure.name, limits)
-    return line, limit, reach(line, limit) if line and limit is not None else None
+def trend_of_figure(history: History, figure: Figure, limits: Limits) -> Trend:
+    """How a figure's record runs, with its limit."""
+    values = history.values[f"{figure.name}_measured"]
+    return trend_of(history.host_ns, values, limit_of(figure.name, limits))
 
 
 def limit_of(name: str, limits: Limits) -> float | None:
@@ -50,21 +48,51 @@ def limit_of(name: str, limits: Limits) -> float | None:
     return {"t1": limits.t1, "leakage": limits.leakage, "free_flow": limits.free_flow}.get(name)
 
 
-def in_words(figure: Figure, line: Line | None, limit: float | None, comes: Reach | None) -> str:
-    """A trend in a sentence; that there is none is said as well."""
+def in_words(figure: Figure, trend: Trend, now_ns: int) -> str:
+    """How a figure runs, in a sentence; that it neither stepped nor drifts is said as well."""
     unit = NO_DASH.get(figure.unit, f" {figure.unit}")
-    if line is None:
+    said = []
+    if (step := trend.step) is not None:
+        said.append(_stepped(step, unit, now_ns))
+    if (line := trend.line) is not None:
+        said.append(_runs(line, unit, since=step is not None))
+    elif step is None:
         return f"{figure.name}: not enough to say: fewer than {FEWEST_BINS} stretches with cycles"
-    now = f"{figure.name}: {line.level:.4g}{unit}"
-    slope = f"{line.slope:+.3g} ± {line.slope_half():.2g}{unit} per day"
-    if not line.is_trend:
-        return f"{now}, no trend ({slope} in {line.span:.1f} days)"
-    told = f"{now}, {slope}, in {line.span:.1f} days"
-    if limit is None:
-        return told
-    if line.level >= limit:
-        return f"{told}; over its limit of {limit:.4g}{unit}"
-    return f"{told}; {_comes(comes, line, f'its limit of {limit:.4g}{unit}')}"
+    if trend.limit is not None:
+        said.append(_limited(trend, f"its limit of {trend.limit:.4g}{unit}"))
+    return f"{figure.name}: {'; '.join(filter(None, said))}"
+
+
+def _stepped(step: Step, unit: str, now_ns: int) -> str:
+    levels = (
+        f"{one:.4g} ± {half:.2g}"
+        for one, half in ((step.before, step.before_half), (step.after, step.after_half))
+    )
+    between = f"{clock(step.earliest_ns, now_ns)} to {clock(step.latest_ns, now_ns)}"
+    at = f"at {instant(step.host_ns, now_ns)} (95 %: {between})"
+    return f"stepped from {' to '.join(levels)}{unit} {at}"
+
+
+def _runs(line: Line, unit: str, *, since: bool) -> str:
+    """What a line says; a record of less than a day has no rate per day, but what it changed by."""
+    slope, half = line.slope, line.slope_half()
+    span, per = (1.0, " per day") if line.is_rate else (line.span, "")
+    over = f"over {lasting(line.span * 86_400.0)}"
+    how = f"{slope * span:+.3g} ± {half * span:.2g}{unit}{per} {over}"
+    now, then = ("", " since then") if since else (f"{line.level:.4g}{unit}, ", "")
+    return f"{now}{how}{then}" if line.is_trend else f"{now}no trend{then} ({how})"
+
+
+def _limited(trend: Trend, limit: str) -> str:
+    """How the figure stands to its limit, where there is something to say."""
+    assert trend.limit is not None
+    line, step = trend.line, trend.step
+    level = line.level if line is not None else step.after if step is not None else 0.0
+    if level >= trend.limit and (step is not None or (line is not None and line.is_trend)):
+        return f"over {limit}"
+    if line is None or not line.is_trend or not line.is_rate:
+        return ""
+    return _comes(trend.comes, line, limit)
 
 
 def _comes(comes: Reach | None, line: Line, limit: str) -> str:
@@ -76,22 +104,31 @@ def _comes(comes: Reach | None, line: Line, limit: str) -> str:
     return f"{limit} in {comes.expected:.1f} days ({comes.earliest:.1f} to {latest})"
 
 
-def trend_plain(
-    figure: Figure, line: Line | None, limit: float | None, comes: Reach | None
-) -> dict[str, Any]:
+def trend_plain(figure: Figure, trend: Trend) -> dict[str, Any]:
     """The same as JSON has it; null where there is nothing to say."""
-    plain: dict[str, Any] = {"figure": figure.name, "unit": figure.unit, "limit": limit}
-    plain |= {"line": None, "days_to_limit": None}
-    if line is not None:
+    plain: dict[str, Any] = {"figure": figure.name, "unit": figure.unit, "limit": trend.limit}
+    plain |= {"step": None, "line": None, "days_to_limit": None}
+    if (step := trend.step) is not None:
+        plain["step"] = {
+            "from": step.before,
+            "from_95": [step.before - step.before_half, step.before + step.before_half],
+            "to": step.after,
+            "to_95": [step.after - step.after_half, step.after + step.after_half],
+            "host_ns": step.host_ns,
+            "host_ns_95": [step.earliest_ns, step.latest_ns],
+        }
+    if (line := trend.line) is not None:
+        change, half = line.slope * line.span, line.slope_half() * line.span
         plain["line"] = {
             "level": line.level,
-            "per_day": line.slope,
-            "per_day_95": [line.slope - line.slope_half(), line.slope + line.slope_half()],
+            "change": change,
+            "change_95": [change - half, change + half],
             "days": line.span,
+            "per_day": line.slope if line.is_rate else None,
             "is_trend": line.is_trend,
             "sure": SURE,
         }
-    if comes is not None:
+    if (comes := trend.comes) is not None:
         days = (comes.expected, comes.earliest, comes.latest)
         names = ("expected", "low95", "high95")
         plain["days_to_limit"] = {

@@ -9,8 +9,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from twin.alarms.board import Board
 from twin.alarms.place import open_chosen as open_alarms
 from twin.alarms.requests import ASKABLE
@@ -24,8 +22,8 @@ from twin.figures.place import open_chosen as open_figures
 from twin.figures.settings import FigureSettings, limits
 from twin.figures.store import SIDES
 from twin.figures.table import FIGURES
-from twin.figures.trend import DAY_NS, FARTHEST, Line, Reach
-from twin.figures.words import in_words, trend_of
+from twin.figures.trend import DAY_NS, Trend
+from twin.figures.words import in_words, trend_of_figure
 from twin.instants import zone
 from twin.page import ring
 from twin.page.light import S_NS, WORDS, Light, light_of, listed, said, told
@@ -177,12 +175,13 @@ class Ejector:
         }
         if not len(history.cycle):
             return found | {"words": "no cycles in that time"}
-        line, limit, comes = trend_of(history, figure, self._limits)
+        trend = trend_of_figure(history, figure, self._limits)
         every = max(1, math.ceil(len(history.cycle) / MOST_POINTS))
-        found |= {"words": in_words(figure, line, limit, comes), "limit": limit, "every": every}
+        words = in_words(figure, trend, self._clock())
+        found |= {"words": words, "limit": trend.limit, "every": every}
         found |= {"time": (history.host_ns[::every] / S_NS).tolist()}
         found |= {side: _plain(history.values[f"{name}_{side}"][::every]) for side in SIDES}
-        return found | _drawn(line, comes, int(history.host_ns[-1]))
+        return found | _drawn(trend)
 
     # --- reports --------------------------------------------------------------------------------
 
@@ -217,22 +216,18 @@ def _plain(values: Any) -> list[float | None]:
     return [float(f"{one:.5g}") if math.isfinite(one) else None for one in values.tolist()]
 
 
-def _drawn(line: Line | None, comes: Reach | None, last_ns: int) -> dict[str, Any]:
-    """The line with its band as one draws it, as far ahead as it may come to its limit."""
-    if line is None:
+def _drawn(trend: Trend) -> dict[str, Any]:
+    """The course with its band as one draws it, as far ahead as it may come to its limit."""
+    if trend.step is None and trend.line is None:
         return {}
-    ahead = AHEAD * line.span
-    if comes is not None:
-        ahead = max(ahead, min(1.2 * comes.expected, FARTHEST * line.span))
-    days = np.linspace(line.days[0], ahead, 100)
-    middle, half = line.at(days), line.half(days)
-    at = last_ns / S_NS + days * 86_400.0
+    days, middle, half = trend.shape(trend.ahead(AHEAD))
+    at = trend.end_ns / S_NS + days * 86_400.0
     return {
         "line": {
             "time": at.tolist(),
             "middle": _plain(middle),
             "low": _plain(middle - half),
             "high": _plain(middle + half),
-            "is_trend": line.is_trend,
+            "is_trend": trend.line is not None and trend.line.is_trend,
         }
     }
