@@ -224,6 +224,22 @@ def test_the_intervals_of_a_step_hold_what_they_promise() -> None:
     assert (np.mean(held, axis=0) > 0.87).all()  # of 0.95, in 150 trials
 
 
+@pytest.mark.parametrize("after", [5, 100])
+def test_a_step_is_drawn_as_one(after: int) -> None:
+    """With a line after it or not; between two cycles, and no time twice."""
+    values = np.repeat([75.0, 465.0], [100, after])
+    trend = minutes(values + np.random.default_rng(19).normal(0.0, 6.0, 100 + after))
+    assert trend.step is not None
+    assert (trend.line is None) == (after < 12)
+    days, middle, half = trend.shape(trend.ahead(0.25))
+    assert (np.diff(days) > 0.0).all()
+    (row,) = np.flatnonzero(np.diff(middle) > 200.0)
+    assert (days[row + 1] - days[row]) * DAY_NS == pytest.approx(3e9, rel=1e-3)
+    assert middle[row] == pytest.approx(75.0, abs=5.0)
+    assert middle[row + 1] == pytest.approx(465.0, abs=15.0)
+    assert (half > 0.0).all()
+
+
 def test_a_step_in_words() -> None:
     values = np.where(np.arange(100) < 40, 75.0, 465.0)
     values += np.random.default_rng(12).normal(0.0, 6.0, 100)

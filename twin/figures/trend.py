@@ -92,14 +92,15 @@ class Step:
     """A change from one level to another; halves are those of 95 % intervals.
 
     It was after the cycle received at ``earliest_ns`` (UTC) and by that at ``latest_ns``, most
-    likely just before that at ``host_ns``.
+    likely between those at ``last_ns`` and ``host_ns``.
     """
 
     before: float
     before_half: float
     after: float
     after_half: float
-    host_ns: int
+    last_ns: int  # of the old level
+    host_ns: int  # first of the new one
     earliest_ns: int
     latest_ns: int
     first: int  # cycle of the record that has the new level
@@ -148,14 +149,14 @@ class Trend:
         """
         pieces: list[tuple[Floats, Floats | float, Floats | float]] = []
         if (step := self.step) is not None:
-            ends = np.array([self.begin_ns, step.host_ns])
+            ends = np.array([self.begin_ns, step.last_ns])
             pieces.append(((ends - self.end_ns) / DAY_NS, step.before, step.before_half))
             if self.line is None:
                 ends = np.array([step.host_ns, self.end_ns])
                 pieces.append(((ends - self.end_ns) / DAY_NS, step.after, step.after_half))
         if self.line is not None:
-            first = float(pieces[-1][0][-1]) if pieces else float(self.line.days[0])
-            days = np.linspace(first, ahead, 200)
+            begin = self.begin_ns if self.step is None else self.step.host_ns
+            days = np.linspace((begin - self.end_ns) / DAY_NS, ahead, 200)
             pieces.append((days, self.line.at(days), self.line.half(days)))
         parts = [[np.broadcast_to(one, len(piece[0])) for one in piece] for piece in pieces]
         days, middle, half = (np.concatenate(one) for one in zip(*parts, strict=True))
@@ -256,8 +257,11 @@ def _step(host_ns: npt.NDArray[np.int64], values: Floats, clear: float) -> Step 
         return None
     first, low, high = _where(values, np.searchsorted(days, times[[k - 1, k]]), (before, after))
     half = float(student.ppf(0.5 + CONFIDENCE / 2.0, count - 2)) * error
-    at, earliest, latest = (int(host_ns[one]) for one in (first, low - 1, high))
-    return Step(before, float(half[0]), after, float(half[1]), at, earliest, latest, first)
+    # By their cycles: of few bins the one with the step in it would count too much.
+    before, after = (float(trim_mean(one, TRIMMED)) for one in (values[:first], values[first:]))
+    last, new, earliest, latest = (int(host_ns[one]) for one in (first - 1, first, low - 1, high))
+    levels = before, float(half[0]), after, float(half[1])
+    return Step(*levels, last, new, earliest, latest, first)
 
 
 def _off_levels(medians: Floats, k: int) -> Floats:
