@@ -1,5 +1,6 @@
 """A fleet's report: who stands out, who drifts, and what the units say of their type."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -217,6 +218,30 @@ def test_one_that_drifts_is_told_with_its_rate() -> None:
     assert drift.effect == "leakage"
     assert drift.per_day == pytest.approx(0.03, rel=0.2)
     assert sum(bool(row.drifts) for row in found.rows) <= 2
+
+
+@pytest.mark.parametrize(
+    ("hours", "steps", "says"),
+    [
+        (240.0, False, r"leakage \+0\.0\S+ sl/min/day over 190 days"),
+        (240.0, True, r"leakage stepped \+3\S* sl/min by 1970-04-11 00:00:00"),
+        (0.1, False, ""),
+    ],
+)
+def test_a_step_is_no_drift_and_minutes_have_no_rate(hours: float, steps: bool, says: str) -> None:
+    rng = np.random.default_rng(20)
+    results = []
+    for number in range(20):
+        sigmas = {name: float(rng.normal(0.0, 1.0)) for name in EFFECTS}
+        sigmas["leakage"] += 30.0 * (number >= 10) if steps else 3.0 * number
+        results.append(watched("U1", sigmas, number * hours / 24.0))
+    (row,) = report(results, [], 0).rows
+    if not says:
+        assert row.drifts == ()
+        return
+    assert row.drifts[0].effect == "leakage"
+    assert (row.drifts[0].per_day is None) == steps
+    assert re.search(says, in_words(report(results, [], 0)))
 
 
 def calibrated(unit: str, value: float, sigma: float, known: bool = True) -> Record:

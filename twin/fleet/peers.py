@@ -9,13 +9,14 @@ which the weather and the years have made as well.
 import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import median_abs_deviation, theilslopes
 
+from twin.figures.trend import LEAST_SPAN, trend_of
 from twin.fleet.store import Result
 from twin.fleet.watch import name_of
 from twin.monitor.bank import SUSPECTS
@@ -26,6 +27,7 @@ DAY_NS = 86_400e9
 LEAST_SCATTER = 0.3  # sigmas a cycle: no fleet is more alike than that
 SIGMA = 0.683  # of all, within one sigma
 DRIFTS = 4.0  # sigmas, from which on a unit is said to drift
+STEPS = 8.0  # and to have stepped: that may be in any effect and between any two logs
 
 _ONE_WAY = {name_of(one) for one in SUSPECTS if not one.both_ways}
 
@@ -50,12 +52,19 @@ class Standing:
 
 @dataclass(frozen=True)
 class Drift:
-    """One effect that grows or shrinks from log to log."""
+    """One effect that grows or shrinks from log to log, or stepped between two of them.
+
+    A step has no rate: ``per_day`` is None, ``step`` how much it is, and ``step_ns`` when the first
+    log with it began (UTC).
+    """
 
     effect: str
-    per_day: float
+    per_day: float | None
     unit: str
     sigmas: float
+    days: float  # from the first log to the last
+    step: float | None = None
+    step_ns: int | None = None
 
 
 def standings(watched: Sequence[Result]) -> list[Standing]:
@@ -158,10 +167,10 @@ def _drifts(mine: Sequence[Result]) -> tuple[Drift, ...]:
     if len(mine) < FEWEST_LOGS:
         return ()
     day = (np.array([one.begin_ns for one in mine]) - mine[0].begin_ns) / DAY_NS
-    if not day[-1] > 0.0:
+    if day[-1] < LEAST_SPAN:
         return ()
     found = [_drift(name, day, mine) for name in mine[-1].answer["effects"]]
-    drifting = [one for one in found if one is not None and one.sigmas >= DRIFTS]
+    drifting = [one for one in found if one is not None]
     return tuple(sorted(drifting, key=lambda one: -one.sigmas))
 
 
@@ -174,4 +183,12 @@ def _drift(name: str, day: npt.NDArray[np.float64], mine: Sequence[Result]) -> D
     line = theilslopes(sizes, day[shown], alpha=SIGMA)
     sigma = max(0.5 * float(line.high_slope - line.low_slope), 1e-12)
     unit = mine[-1].answer["effects"][name]["unit"]
-    return Drift(name, float(line.slope), unit, abs(float(line.slope)) / sigma)
+    drift = Drift(name, float(line.slope), unit, abs(float(line.slope)) / sigma, float(day[-1]))
+    step = trend_of(np.array([one.begin_ns for one in mine])[shown], sizes).step
+    if step is None:
+        return drift if drift.sigmas >= DRIFTS else None
+    size = step.after - step.before
+    sigmas = 2.0 * abs(size) / math.hypot(step.before_half, step.after_half)
+    if sigmas < STEPS:
+        return None
+    return replace(drift, per_day=None, sigmas=sigmas, step=size, step_ns=step.host_ns)

@@ -11,8 +11,9 @@ from twin.diagnosis.page import PAGE, card, paragraph, picture, section, table
 from twin.diagnosis.words import spoken
 from twin.files import write_text
 from twin.fleet.kinds import Estimate
-from twin.fleet.peers import FEWEST_PEERS
+from twin.fleet.peers import FEWEST_PEERS, Drift
 from twin.fleet.report import STANDS_OUT, Report, Row, State
+from twin.instants import dated
 
 MOST_LISTED = 15  # units, in the terminal
 GOOD, BAD, UNKNOWN = "#2e7d4f", "#b3261e", "#555555"
@@ -132,9 +133,18 @@ def _cells(row: Row) -> tuple[str, ...]:
     standing, drift = row.compared, row.drifts[0] if row.drifts else None
     beyond = f"{standing.beyond:.1f} sigma" if standing else ""
     what = f"{spoken(standing.effect)} {standing.size:+.3g} {standing.unit}" if standing else ""
-    moves = f"{spoken(drift.effect)} {drift.per_day:+.2g} {drift.unit}/day" if drift else ""
+    moves = _moves(drift) if drift else ""
     causes = ", ".join(spoken(str(one["effect"])) for one in row.causes) or row.verdict
     return _name(row), row.batch, beyond, what, moves, causes or "not yet"
+
+
+def _moves(drift: Drift) -> str:
+    if drift.step is not None and drift.step_ns is not None:
+        size = f"{drift.step:+.2g} {drift.unit}"
+        return f"{spoken(drift.effect)} stepped {size} by {dated(drift.step_ns)}"
+    return (
+        f"{spoken(drift.effect)} {drift.per_day:+.2g} {drift.unit}/day over {drift.days:.0f} days"
+    )
 
 
 def _groups(report: Report) -> list[tuple[str, ...]]:
