@@ -217,7 +217,7 @@ def test_the_oldest_reports_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 def _diagnosed(monkeypatch: pytest.MonkeyPatch, path: Path, verdict: str) -> None:
     """The process, with an answer in place of the search."""
     found = SimpleNamespace(json={"verdict": verdict})
-    question = io.BytesIO(pickle.dumps((None, None, "a.mcap", path)))
+    question = io.BytesIO(pickle.dumps((None, None, "a.mcap", path, 0.0)))
     monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=question))
     monkeypatch.setattr(diagnosing, "diagnose", lambda *_: found)
     monkeypatch.setattr(report, "write_report", lambda _found, file: file.write_text("drawn"))
