@@ -14,11 +14,13 @@ from hypothesis import strategies as st
 from tools.readme import filled
 from twin.figures.course import LAST_S, LEAK_WINDOW_S, LEAST_WINDOW_S, LONGEST_HOLE, Floats, Rows
 from twin.figures.course import course as found_in
+from twin.figures.expected import t1_from_rest
 from twin.figures.settings import FigureSettings, Limits, limits
 from twin.figures.table import FIGURES, Unit, figures, table
 from twin.figures.warnings import CAUTIONS, in_words, warnings
+from twin.figures.words import limit_of
 from twin.model.control import LEAK_SETTLE_S, PROTECTED_S, PROTECTED_SWITCHES
-from twin.model.dataset import DataSet, Ejector, Supply
+from twin.model.dataset import DataSet, Ejector, Supply, System, Vessel
 from twin.signals import Phase
 
 ROOT = Path(__file__).parents[1]
@@ -28,7 +30,7 @@ DATA = DataSet(
     ejector=Ejector(air_consumption_sl_min=60.0, blow_off_sl_min=120.0),
 )
 UNIT = Unit(DATA, energy_kwh_m3=0.12)
-LIMITS = limits(FigureSettings(), DATA)
+LIMITS = limits(FigureSettings(permitted_t1_ms=2000.0), DATA)
 
 
 def course(
@@ -461,12 +463,38 @@ def test_noise_moves_the_figures_by_what_it_must(rate: float, noise: float, seed
 # Warnings.
 
 
+def test_a_slow_unit_has_a_limit_of_its_own() -> None:
+    """A tank that needs more than two seconds is healthy."""
+    hose = DATA.system.parts[0]
+    parts = (hose, Vessel(kind="vessel", volume_ml=3000.0))
+    tank = DATA.model_copy(update={"system": System(parts=parts)})
+    needs = t1_from_rest(tank)
+    assert needs > 2000.0
+    assert limits(FigureSettings(), tank).t1 == pytest.approx(1.25 * needs)
+    assert limits(FigureSettings(permitted_t1_ms=2000.0), tank).t1 == 2000.0
+
+
+def test_a_unit_that_cannot_reach_h1_has_no_limit_of_t1() -> None:
+    weak = DATA.model_copy(update={"effects": {"end_vacuum_loss": {"end_pressure_rise": 300.0}}})
+    assert limits(FigureSettings(), weak).t1 == math.inf
+    assert limit_of("t1", limits(FigureSettings(), weak)) is None
+
+
+def test_a_suction_that_is_to_end_before_h1_is_not_warned_of() -> None:
+    unknown = dict.fromkeys(FIGURES, math.nan)
+    short = unknown | {"h1_not_reached": 1.0, "max_vacuum": 600.0}
+    assert warnings(short, unknown | {"h1_not_reached": 0.0}, LIMITS) == ("h1_not_reached",)
+    assert warnings(short, short, LIMITS) == ()
+
+
 def beyond(**measured: float) -> tuple[str, ...]:
-    return warnings(dict.fromkeys(FIGURES, math.nan) | measured, LIMITS)
+    unknown = dict.fromkeys(FIGURES, math.nan)
+    return warnings(unknown | measured, unknown, LIMITS)
 
 
-def test_limits_are_the_fields_where_nothing_is_set() -> None:
-    assert Limits(2000.0, 250.0, 540.0, (3.0, 6.0)) == LIMITS
+def test_limits_are_the_units_where_nothing_is_set() -> None:
+    t1 = 1.25 * t1_from_rest(DATA)
+    assert Limits(t1, 250.0, 540.0, (3.0, 6.0)) == limits(FigureSettings(), DATA)
     own = FigureSettings(permitted_leakage_mbar_s=90.0, permitted_free_flow_mbar=40.0)
     assert (limits(own, DATA).leakage, limits(own, DATA).free_flow) == (90.0, 40.0)
 

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.errors import ConfigError
+from twin.figures.settings import LEAST_T1_MS, permitted
 from twin.figures.store import History
 
 GOOD_CYCLES = 5  # the last ones; more tell no more of today
-LEAST_T1_MS, LEAST_LEAKAGE = 50.0, 10.0  # over what was measured: below is scatter
+LEAST_LEAKAGE = 10.0  # mbar/s over what was measured: below is scatter
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ def autoset(history: History, tolerance: float) -> Autoset:
         )
     worst_t1, worst_leakage = float(t1[good].max()), max(float(leakage[good].max()), 0.0)
     return Autoset(
-        permitted_t1_ms=worst_t1 + max(tolerance * worst_t1, LEAST_T1_MS),
-        permitted_leakage_mbar_s=worst_leakage + max(tolerance * worst_leakage, LEAST_LEAKAGE),
+        permitted_t1_ms=permitted(worst_t1, tolerance, LEAST_T1_MS),
+        permitted_leakage_mbar_s=permitted(worst_leakage, tolerance, LEAST_LEAKAGE),
         cycles=len(good),
     )

@@ -60,7 +60,13 @@ class CycleFigures:
             if math.isfinite(self.measured[name])
         ]
         told = f"cycle {self.cycle}: {', '.join(parts) or 'nothing to tell'}"
-        return "; ".join([told, *in_words(self.warnings, self.measured, self.limits)])
+        return "; ".join([told, *self._warned.values()])
+
+    @property
+    def _warned(self) -> dict[str, str]:
+        """The warnings for people, by name."""
+        words = in_words(self.warnings, self.measured, self.limits)
+        return dict(zip(self.warnings, words, strict=True))
 
     def _beside(self, name: str) -> str:
         expected = self.expected[name]
@@ -76,7 +82,8 @@ class CycleFigures:
         }
         when = {"begin_ns": self.begin_ns, "end_ns": self.end_ns, "host_ns": self.host_ns}
         own = {"cycle": self.cycle, **when, "complete": self.complete}
-        return {**own, **both, "warnings": list(self.warnings)}
+        warned = {"warned": self._warned} if self.warnings else {}
+        return {**own, **both, "warnings": list(self.warnings), **warned}
 
 
 def compiled(data: DataSet, settings: FigureSettings) -> "KeyFigures":
@@ -155,14 +162,15 @@ class KeyFigures:
         seen = ended, ended and not (pieces[-1].cut_short and last == Phase.BLOW_OFF)
         rows = self._measured(samples, ticks, *seen)
         found = figures(rows, self._unit)
+        expected = self._expected(rows, math.isfinite(found["free_flow"]))
         return CycleFigures(
             self._index,
             int(samples["time_ns"][0]),
             int(samples["time_ns"][-1]),
             int(samples["host_ns"][0]),
             found,
-            self._expected(rows, math.isfinite(found["free_flow"])),
-            warnings(found, self._limits),
+            expected,
+            warnings(found, expected, self._limits),
             self._limits,
             ended,
         )

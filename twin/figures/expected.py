@@ -5,6 +5,7 @@ the measured one, and before H1 they end where the measurement got to. As the tw
 takes over the measured level at each suction edge, and what the gas has kept of the cycle before.
 """
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -20,6 +21,7 @@ from twin.monitor.cycles import STALE
 from twin.monitor.signatures import steps
 from twin.signals import BREAK, MBAR, MS, Command, Phase, Samples, Ticks
 
+LONGEST_SUCTION_S = 60.0  # in which H1 is to be reached from rest
 FREE_S = 1.0  # of suction with the cup open, until its vacuum is read
 SWUNG_IN = 2  # suction edges without a break, from which on the gas is as warm as it should be
 
@@ -115,6 +117,27 @@ class Expectation:
         strides.run_on(model, self._control, *driven, out, kernel.ROUGHLY)
         self._terms.add(phase, pressure)
         return pressure, phase
+
+
+def t1_from_rest(data: DataSet) -> float:
+    """Time (ms) from H2 to H1 that the data set expects of a suction; infinite where it stays off.
+
+    The air saving is off, so that suction goes on to H1 of the data set.
+    """
+    theta = coefficients(data)
+    theta[c.AIR_SAVING] = c.OFF
+    seconds = 1.0
+    while seconds <= LONGEST_SUCTION_S:
+        rows = round(seconds * 1e3)
+        _, pressure = strides.simulate(
+            theta, np.full(rows, MS), np.full(rows, Command.SUCTION, np.uint8)
+        )
+        vacuum = (theta[c.AMBIENT] - pressure) / MBAR
+        reached = np.flatnonzero(vacuum >= data.ejector.h1_mbar)
+        if len(reached):
+            return float(reached[0] - np.argmax(vacuum >= data.ejector.h2_mbar))
+        seconds *= 4.0
+    return math.inf
 
 
 def _first_level(ticks: Ticks, at_edge: bool) -> int | None:

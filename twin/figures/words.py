@@ -45,7 +45,9 @@ def trend_of_figure(history: History, figure: Figure, limits: Limits) -> Trend:
 
 def limit_of(name: str, limits: Limits) -> float | None:
     """The limit of a figure, where the field has one that it may come up to."""
-    return {"t1": limits.t1, "leakage": limits.leakage, "free_flow": limits.free_flow}.get(name)
+    known = {"t1": limits.t1, "leakage": limits.leakage, "free_flow": limits.free_flow}
+    limit = known.get(name, math.inf)
+    return limit if math.isfinite(limit) else None
 
 
 def in_words(figure: Figure, trend: Trend, now_ns: int) -> str:
