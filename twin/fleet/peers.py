@@ -29,6 +29,9 @@ SIGMA = 0.683  # of all, within one sigma
 DRIFTS = 4.0  # sigmas, from which on a unit is said to drift
 STEPS = 8.0  # and to have stepped: that may be in any effect and between any two logs
 
+_MOST = {  # the largest size that it can have
+    name_of(one): max(abs(one.parameter.low), abs(one.parameter.high)) for one in SUSPECTS
+}
 _ONE_WAY = {name_of(one) for one in SUSPECTS if not one.both_ways}
 
 Unit = tuple[str, str]  # type, ID
@@ -43,7 +46,7 @@ class Standing:
     batch: str
     beyond: float  # sigmas of the others' scatter
     effect: str
-    size: float  # more than the others' median
+    size: float | None  # more than the others' median; None where it cannot be that much
     unit: str
     peers: int
     drifts: tuple["Drift", ...]
@@ -145,6 +148,11 @@ class _Usual:
         return far if name in _ONE_WAY else abs(far)
 
 
+def _reported(name: str, size: float) -> float | None:
+    """A size as it is told; None where it has left what the effect can be."""
+    return size if abs(size) < _MOST[name] else None
+
+
 def _standing(mine: Sequence[Result], says: Values, usual: _Usual) -> Standing:
     last, beyond = mine[-1], {name: usual.beyond(name, one) for name, one in says.items()}
     first = max(beyond, key=lambda name: beyond[name])
@@ -154,7 +162,7 @@ def _standing(mine: Sequence[Result], says: Values, usual: _Usual) -> Standing:
         last.batch,
         beyond[first],
         first,
-        says[first].size - usual.middle[first][1],
+        _reported(first, says[first].size - usual.middle[first][1]),
         last.answer["effects"][first]["unit"],
         usual.peers,
         _drifts(mine),

@@ -132,7 +132,9 @@ def _listed(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> l
 def _cells(row: Row) -> tuple[str, ...]:
     standing, drift = row.compared, row.drifts[0] if row.drifts else None
     beyond = f"{standing.beyond:.1f} sigma" if standing else ""
-    what = f"{spoken(standing.effect)} {standing.size:+.3g} {standing.unit}" if standing else ""
+    what = spoken(standing.effect) if standing else ""
+    if standing and standing.size is not None:
+        what += f" {standing.size:+.3g} {standing.unit}"
     moves = _moves(drift) if drift else ""
     causes = ", ".join(spoken(str(one["effect"])) for one in row.causes) or row.verdict
     return _name(row), row.batch, beyond, what, moves, causes or "not yet"
