@@ -11,7 +11,7 @@ import re
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache, partial
 from pathlib import Path
@@ -456,15 +456,22 @@ class Console:
         self._name = f"{name}  " if name else ""
 
     def write(self, _samples: "Samples", _ticks: "Ticks", events: Sequence[Event]) -> None:
-        """Print what happened."""
+        """Print what happened; an alarm does not say again what it is made of."""
+        told = {event.text for event in events}
         for event in events:
             self.alarmed |= event.severity is Severity.ALARM
-            what = f"{event.severity:<7}  {event.kind:<17}  {event.text}"
+            what = f"{event.severity:<7}  {event.kind:<17}  {_short(event, told)}"
             # In one piece, since others may be printing too.
             print(f"{stamp(event.time_ns)}  {self._name}{what}\n", end="", flush=True)
 
     def close(self) -> None:
         """Nothing to finish."""
+
+
+def _short(event: Event, told: Collection[str]) -> str:
+    """The text of an event; of an alarm without its evidence, where that has been ``told``."""
+    words = event.data.get("evidence", {}).get("words")
+    return event.text.replace(f": {words}", "", 1) if words in told else event.text
 
 
 class _Kept:

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from heapq import merge
 from typing import Protocol
 
 import numpy as np
@@ -129,20 +130,26 @@ def run(
                 silent = monitor.silent(last, clock())
             samples, ticks = twin.advance(block)
             events = silent + monitor.update(samples, ticks)
-            hand_out(sinks, samples, ticks, events + _advice(advisers, samples, events))
+            hand_out(sinks, samples, ticks, _advised(advisers, samples, events))
         samples, ticks = twin.flush()
         events = monitor.update(samples, ticks) + monitor.close()
-        hand_out(sinks, samples, ticks, events + _advice(advisers, samples, events))
+        hand_out(sinks, samples, ticks, _advised(advisers, samples, events))
         if last_words := _last_words(advisers, samples[:0]):
             hand_out(sinks, samples[:0], ticks[:0], last_words)
 
 
-def _advice(advisers: Sequence[Adviser], samples: Samples, events: Sequence[Event]) -> list[Event]:
-    """What advisers say; each hears those before it."""
-    said: list[Event] = []
+def _advised(advisers: Sequence[Adviser], samples: Samples, events: list[Event]) -> list[Event]:
+    """What happened with what advisers say to it, in the order of time; each hears those before it.
+
+    Both keep their own order: where the PLC's time jumps, nothing comes before what it follows.
+    """
     for adviser in advisers:
-        said += adviser.follow(samples, [*events, *said])
-    return said
+        events = [*merge(events, adviser.follow(samples, events), key=_time_of)]
+    return events
+
+
+def _time_of(event: Event) -> int:
+    return event.time_ns
 
 
 def _last_words(advisers: Sequence[Adviser], none: Samples) -> list[Event]:
