@@ -11,11 +11,10 @@ import rigs
 from rigs import Collect
 
 from twin.alarms import keeper as module
-from twin.alarms.causes import by_cause
 from twin.alarms.keeper import Keeper
 from twin.alarms.loop import Alarms, Before, News
 from twin.alarms.requests import Request
-from twin.alarms.rules import Rule, default_rules
+from twin.alarms.rules import Rule, by_cause, default_rules
 from twin.alarms.settings import board_rules
 from twin.alarms.state import Deed, Kept, State
 from twin.alarms.store import Store, open_store
@@ -147,6 +146,35 @@ def test_the_diagnosis_renames_it_and_other_causes_have_their_own() -> None:
     assert (other.alarm, other.seconds) == ("deviation_sensor_offset", 2.0)
 
 
+def test_an_alarm_without_a_name_gets_it_and_goes_on() -> None:
+    stream = Stream()
+    assert stream.at(5, deviation(5, "unknown")) == ["deviation_unknown raised"]
+    assert stream.at(8, deviation(8)) == [f"{LEAK} renamed"]
+    assert stream.said[-1].text.startswith("deviation_unknown is deviation_leakage (medium")
+    (episode,) = stream.desk.news.episodes.values()
+    assert (episode.alarm, episode.raised_ns) == (LEAK, APART + 5 * S)
+    assert (episode.evidence["first_cycle"], episode.evidence["guess"]) == (5, "leakage")
+    assert stream.at(9, event(9, Kind.DEVIATION_CLEARED)) == [f"{LEAK} cleared"]
+
+
+def test_what_begins_beside_a_cause_leaves_it_until_it_has_a_name() -> None:
+    stream = Stream()
+    stream.at(5, deviation(5))
+    assert stream.at(8, deviation(8, "unknown")) == ["deviation_unknown raised"]
+    assert stream.state(LEAK) is State.UNACKNOWLEDGED
+    assert stream.at(11, deviation(11, "suction_loss")) == [
+        "deviation_suction_loss renamed",
+        f"{LEAK} cleared",
+    ]
+
+
+def test_what_stood_before_a_restart_is_not_raised_as_something_new() -> None:
+    stream = Stream(acknowledged())
+    assert stream.at(106, cycle(106), deviation(106, "unknown")) == []
+    assert stream.at(109, cycle(109), deviation(109, "suction_loss")) == []
+    assert stream.at(112, deviation(112, "unknown")) == ["deviation_unknown raised"]
+
+
 def test_what_nobody_listed_has_an_alarm_too() -> None:
     stream = Stream()
     stream.at(5, deviation(5))
@@ -183,10 +211,11 @@ def test_a_look_alike_is_not_another_alarm() -> None:
 def test_warnings_of_figures_wait_for_their_delay_and_keep_their_cycles() -> None:
     stream = Stream()
     for second in (0, 3, 6, 9):
-        told = cycle(second, "leakage_over_limit", leakage_measured=300.0 + second)
+        words = {"leakage_over_limit": f"leakage over limit ({300 + second} of 250 mbar/s)"}
+        told = cycle(second, "leakage_over_limit", leakage_measured=300.0 + second, warned=words)
         assert stream.at(second, told) == []
     assert stream.at(10) == ["leakage_over_limit raised"]
-    assert "leakage 309 mbar/s" in stream.said[-1].text
+    assert "leakage over limit (309 of 250 mbar/s)" in stream.said[-1].text
     stream.at(12, cycle(12, "leakage_over_limit", leakage_measured=400.0, leakage_expected=20.0))
     (episode,) = stream.desk.news.episodes.values()
     assert (episode.evidence["first_cycle"], episode.evidence["last_cycle"]) == (0, 12)
@@ -314,11 +343,14 @@ def test_the_loop_keeps_its_episodes_and_goes_on_after_a_restart(url: str) -> No
         return seen
 
     seen = one_run("leakage=2.0@8")
-    (raised,) = [one for one in seen.of(Kind.ALARM) if one.data["alarm"].startswith("deviation")]
-    (deviation,) = seen.of(Kind.DEVIATION)
-    assert raised.time_ns == deviation.time_ns
-    name = raised.data["alarm"]
-    assert name == f"deviation_{deviation.data['effect']}"
+    begun, deviation = seen.of(Kind.DEVIATION)
+    raised, renamed = seen.of(Kind.ALARM)
+    assert (raised.data["alarm"], raised.time_ns) == ("deviation_unknown", begun.time_ns)
+    name = renamed.data["alarm"]
+    assert (name, renamed.time_ns) == (
+        f"deviation_{deviation.data['effect']}",
+        deviation.time_ns,
+    )
     with open_store(url) as store:
         before = store.before(UNIT)
         (episode,) = [one for one in before.going_on if one.alarm == name]

@@ -406,7 +406,8 @@ def test_what_is_found_out_goes_to_every_sink(monkeypatch: pytest.MonkeyPatch) -
     blocks = rigs.cut(samples, 30)
     run(blocks, rigs.twin("gripper"), rigs.monitor("gripper"), [one, other], advisers=[adviser])
     (event,) = one.of(Kind.DIAGNOSIS)
-    assert event.data["alarm_ns"] == one.of(Kind.DEVIATION)[0].time_ns
+    _, named = one.of(Kind.DEVIATION)
+    assert event.data["alarm_ns"] == named.time_ns
     assert other.events == one.events
     assert np.concatenate(one.samples).tobytes() == samples.tobytes()
 
@@ -458,7 +459,7 @@ def test_beside_a_plc_the_alarm_is_diagnosed_without_a_lost_sample(
     assert said.err == ""
     stored = list(open_log(log).events())
     (event,) = (event for event in stored if event.kind is Kind.DIAGNOSIS)
-    alarm = next(event for event in stored if event.kind is Kind.DEVIATION)
+    _, alarm, *_ = (event for event in stored if event.kind is Kind.DEVIATION)
     answer = event.data["answer"]
     assert event.data["alarm_ns"] == alarm.time_ns
     assert answer["log"] == str(log)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from twin.events import Event, Kind, Severity
-from twin.model.effects import EFFECTS
+from twin.model.effects import EFFECTS, UNKNOWN
 from twin.monitor import detect
 from twin.monitor.detect import Monitor, MonitorSettings
 from twin.monitor.healthy import Healthy, Scatter
@@ -282,14 +282,20 @@ def test_a_hidden_effect_is_flagged_within_two_cycles_and_named(
     raised = rigs.watch(name, rigs.cut(samples, 500)).of(Kind.DEVIATION)
     assert raised, f"{fault} was not flagged"
     assert FROM_CYCLE <= raised[0].data["cycle"] <= FROM_CYCLE + 1
-    for event in raised:
+    begun, *named = raised
+    assert begun.data["effect"] == UNKNOWN
+    assert named[0].data["cycle"] == begun.data["cycle"] + 1
+    for event in named:
         assert effect in (event.data["effect"], *str(event.data["also"]).split(",")), event.text
-    assert len(raised) <= 2
+    assert len(named) <= 2
 
 
 def test_an_alarm_has_its_numbers() -> None:
     samples = rigs.recorded("test_rig", 25.0, ("sensor_lag=25@c4",), 1)[0]
-    (event,) = rigs.watch("test_rig", [samples]).of(Kind.DEVIATION)
+    begun, event = rigs.watch("test_rig", [samples]).of(Kind.DEVIATION)
+    assert begun.data["effect"] == UNKNOWN
+    assert "size" not in begun.data
+    assert begun.data["phase"] in ("idle", "suction", "hold", "blow_off")
     assert event.severity is Severity.ALARM
     assert event.data["effect"] == "sensor_lag"
     assert event.data["size"] == pytest.approx(25, rel=0.2)
@@ -298,7 +304,7 @@ def test_an_alarm_has_its_numbers() -> None:
     assert 0.5 < float(event.data["share"]) <= 1
     assert "sensor_lag" in event.text
     last = FROM_CYCLE + 1  # the cycle after it has begun when it is judged
-    cycle_s = (event.time_ns - int(samples["time_ns"][0])) * NS
+    cycle_s = (begun.time_ns - int(samples["time_ns"][0])) * NS
     assert cycle_s == pytest.approx(0.5 + 3.2 * last, abs=0.3)
 
 
@@ -314,7 +320,7 @@ def test_an_alarm_is_cleared_after_some_good_cycles_and_raised_again() -> None:
     events = seen.of(Kind.DEVIATION, Kind.DEVIATION_CLEARED)
     assert [event.data["cycle"] for event in seen.of(Kind.DEVIATION)] == [6, 12]
     assert alternating(events)
-    assert {event.data["effect"] for event in events} == {"blow_off_delay"}
+    assert {event.data["effect"] for event in events} == {UNKNOWN}  # for a cycle at a time only
     cycle_of = {event.time_ns: event.data["cycle"] for event in seen.of(Kind.CYCLE)}
     cleared = [cycle_of[event.time_ns] for event in seen.of(Kind.DEVIATION_CLEARED)]
     wanted = rigs.config("test_rig").monitor.clear_cycles
@@ -326,7 +332,7 @@ def test_a_fault_at_the_edge_of_being_seen_does_not_chatter(size: float) -> None
     samples = rigs.recorded("test_rig", 60.0, (f"response_delay={size}",), 5)[0]
     seen = rigs.watch("test_rig", rigs.cut(samples, 1000))
     events = seen.of(Kind.DEVIATION, Kind.DEVIATION_CLEARED)
-    assert len(events) <= 3
+    assert len([event for event in events if event.data["effect"] != UNKNOWN]) <= 3
 
 
 @pytest.mark.parametrize("name", rigs.NAMES)
@@ -335,7 +341,7 @@ def test_a_fault_that_stays_is_one_alarm(name: str, fault: str) -> None:
     samples = rigs.recorded(name, 35.0, (f"{fault}@c3",), 6)[0]
     seen = rigs.watch(name, rigs.cut(samples, 1000))
     events = seen.of(Kind.DEVIATION, Kind.DEVIATION_CLEARED)
-    assert kinds(events) == [Kind.DEVIATION]
+    assert kinds(events) == [Kind.DEVIATION] * 2  # the second names it
 
 
 @pytest.mark.parametrize(("more", "times"), [((), 1), (("sensor_lag=20@c7",), 2)])
@@ -353,7 +359,7 @@ def test_the_cause_is_sought_again_only_where_cycles_differ_otherwise(
 def test_a_cause_that_changes_is_named_anew() -> None:
     faults = ("blow_off_delay=20@c3", "leakage=3@c8")
     seen = rigs.watch("test_rig", [rigs.recorded("test_rig", 34.0, faults, 2)[0]])
-    first, *others = seen.of(Kind.DEVIATION)
+    _, first, *others = seen.of(Kind.DEVIATION)
     assert first.data["effect"] == "blow_off_delay"
     assert others
     assert others[-1].data["effect"] != "blow_off_delay"

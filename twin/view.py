@@ -27,7 +27,7 @@ import numpy.typing as npt
 
 from twin.errors import ConfigError, SourceError
 from twin.events import Event, Kind, Severity
-from twin.model.effects import EFFECTS
+from twin.model.effects import EFFECTS, UNKNOWN
 from twin.signals import (
     BREAK,
     MBAR,
@@ -67,7 +67,7 @@ _PHASES = {
     Phase.BLOW_OFF: ("blow-off", 0x8E5BB5FF),
 }
 _ALARMS = (Kind.ALARM, Kind.ALARM_CHANGED)
-NO_CAUSE = "no cause: as healthy"
+CAUSES = {"none": "no cause: as healthy", UNKNOWN: "a cause not known yet"}
 _LEVELS = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ALARM: "ERROR"}
 
 _log = logging.getLogger(__name__)
@@ -259,9 +259,11 @@ class View:
     def _send_probabilities(self, time_ns: int, likely: Mapping[str, float]) -> None:
         """Send those of a cycle; what was likely before and is not among them has come to 0."""
         for cause in likely.keys() - self._causes:
-            name = NO_CAUSE if cause == "none" else cause
             style = self._rr.SeriesLines(
-                names=name, colors=_colour_of(cause), widths=2.0, interpolation_mode="StepAfter"
+                names=CAUSES.get(cause, cause),
+                colors=_colour_of(cause),
+                widths=2.0,
+                interpolation_mode="StepAfter",
             )
             self._screen.style(f"{self._at}probabilities/{cause}", style)
         self._causes |= likely.keys()
@@ -277,6 +279,8 @@ def _colour_of(cause: str) -> tuple[int, int, int]:
     """The same for an effect wherever it is drawn; neighbours in the table are far apart."""
     if cause == "none":
         return 230, 230, 230
+    if cause == UNKNOWN:
+        return 130, 130, 130
     hue = list(EFFECTS).index(cause) * 0.618 % 1.0
     red, green, blue = (round(255 * part) for part in colorsys.hsv_to_rgb(hue, 0.6, 0.95))
     return red, green, blue

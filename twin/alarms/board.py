@@ -9,6 +9,7 @@ from twin.alarms.rules import Priority, Rule
 from twin.alarms.state import SECOND_NS, Alarm, Change, Deed, Kept, State
 from twin.errors import ConfigError
 
+SUPPRESSION = "suppression"  # stands for who acknowledges what nobody was told of
 _ORDER = tuple(reversed(Priority))  # the most urgent first
 
 
@@ -151,7 +152,10 @@ def joined(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any
 def _gone_on(episode: Episode, change: Change) -> Episode:
     """The episode after a change to its alarm; who acknowledges has seen all of its episodes."""
     if change.deed is Deed.CLEARED and episode.cleared_ns is None:
-        return replace(episode, cleared_ns=change.time_ns)
+        over = replace(episode, cleared_ns=change.time_ns)
+        if change.untold:
+            over = replace(over, acknowledged_ns=change.time_ns, acknowledged_by=SUPPRESSION)
+        return over
     if change.deed is Deed.ACKNOWLEDGED:
         return replace(episode, acknowledged_ns=change.time_ns, acknowledged_by=change.who)
     if change.deed is Deed.RENAMED:

@@ -1,13 +1,10 @@
-"""Rules on the deviation become one rule for each cause that it can have."""
+"""The causes that a deviation can have: each has an alarm of its own."""
 
-from collections.abc import Iterator, Sequence
-
-from twin.alarms.rules import Rule
-from twin.model.effects import EFFECTS
+from twin.model.effects import EFFECTS, UNKNOWN
 
 DEVIATION = "deviation"
 UNLISTED = "unlisted"  # a deviation that no effect explains
-CAUSES = (*EFFECTS, UNLISTED)
+CAUSES = (*EFFECTS, UNLISTED, UNKNOWN)
 
 
 def value_of(cause: str) -> str:
@@ -17,27 +14,4 @@ def value_of(cause: str) -> str:
 
 def known(effect: str) -> str:
     """The cause that an effect's name stands for; UNLISTED for one that is none."""
-    return effect if effect in EFFECTS else UNLISTED
-
-
-def by_cause(rules: Sequence[Rule]) -> tuple[Rule, ...]:
-    """The rules as a board takes them; whose alarms suppress another, all of theirs do."""
-    made = {rule.name: tuple(_of_causes(rule)) for rule in rules}
-    names = {name: [one.name for one in those] for name, those in made.items()}
-    return tuple(
-        one.model_copy(
-            update={"suppressed_by": tuple(n for name in one.suppressed_by for n in names[name])}
-        )
-        for those in made.values()
-        for one in those
-    )
-
-
-def _of_causes(rule: Rule) -> Iterator[Rule]:
-    if rule.value != DEVIATION:
-        yield rule
-        return
-    for cause in CAUSES:
-        first = f"Look at {EFFECTS[cause].look_at}. " if cause in EFFECTS else ""
-        changed = {"name": f"{rule.name}_{cause}", "value": value_of(cause)}
-        yield rule.model_copy(update={**changed, "action": f"{first}{rule.action}"})
+    return effect if effect in CAUSES else UNLISTED

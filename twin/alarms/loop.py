@@ -15,9 +15,10 @@ from twin.alarms.requests import Request, grant
 from twin.alarms.rules import Rule
 from twin.alarms.state import Alarm, Change, Deed, Kept
 from twin.alarms.watch import STREAM, deviating, evidence, values
-from twin.alarms.words import event_of, plain, worth_saying
+from twin.alarms.words import SUPPRESSIONS, event_of, plain, worth_saying
 from twin.errors import TwinError
 from twin.events import Event, Kind
+from twin.model.effects import UNKNOWN
 from twin.signals import Quality, Samples
 
 # Whole cycles without a deviation: then one that stood before a restart is over. The first ones
@@ -91,6 +92,7 @@ class Alarms:
         self._named = ""  # the cause of the deviation that was raised last
         self._deviation_ns = -1  # when that was, in PLC time
         self._to_agree = AGREEING if self._deviating() else 0
+        self._resumed = bool(self._to_agree)  # nothing is named yet that stood when it began
         self._heard = False  # anything of the PLC
         self._now = self._plc_ns = 0  # of the last row
         self._news = News()
@@ -147,19 +149,36 @@ class Alarms:
     def _take(self, event: Event, now: int) -> list[Event]:
         if event.kind is Kind.DIAGNOSIS:
             return self._diagnosed(event, now)
-        changed = values(event)
         if event.kind is Kind.DEVIATION:
-            self._named = self._standing(event)
-            self._deviation_ns = event.time_ns
-            changed = deviating(self._named)
-        elif event.kind is Kind.CYCLE and self._agrees(event):
+            return self._deviates(event, now)
+        changed = values(event)
+        if event.kind is Kind.CYCLE and self._agrees(event):
             changed |= deviating()
         for value, found in evidence(event).items():
-            self._note(value_of(self._named) if event.kind is Kind.DEVIATION else value, found)
+            self._note(value, found)
         if event.kind is Kind.CYCLE and "cycle" in event.data:
             for cause in self._deviating():
                 self._note(value_of(cause), {"last_cycle": int(event.data["cycle"])})
         return self._say(self.board.see(now, changed), event.time_ns)
+
+    def _deviates(self, event: Event, now: int) -> list[Event]:
+        """Raise the alarm of the cause; one that had no name yet gets it.
+
+        What begins beside a cause that stands has no name at first, and leaves that one alone.
+        """
+        self._named, self._deviation_ns = self._standing(event), event.time_ns
+        standing = self._deviating()
+        (found,) = evidence(event).values()
+        changes: list[Change] = []
+        causes = {self._named}
+        if self._named == UNKNOWN:
+            causes |= set(standing)
+        elif UNKNOWN in standing or self._is_coming(value_of(UNKNOWN)):
+            found = joined(self._evidence.get(value_of(UNKNOWN), {}), found)
+            changes = self.board.rename(now, value_of(UNKNOWN), value_of(self._named))
+        self._note(value_of(self._named), found)
+        said = self._say(changes, event.time_ns)
+        return said + self._say(self.board.see(now, deviating(*causes)), event.time_ns)
 
     def _agrees(self, event: Event) -> bool:
         """Whether with this cycle there are enough since the restart that did not deviate."""
@@ -178,6 +197,9 @@ class Alarms:
         cause = known(str(event.data.get("effect")))
         alike = {cause, *str(event.data.get("also", "")).split(",")}
         standing = self._deviating()
+        self._resumed &= bool(standing) and cause == UNKNOWN
+        if self._resumed:  # it is what stood already, as far as anybody knows
+            return standing[0]
         if cause in standing:
             return cause
         for one in standing:
@@ -201,15 +223,14 @@ class Alarms:
             if cause == found:
                 told = self._evidence.get(value_of(before), {}) | told
             self._note(value_of(cause), told)
-        changes = (
-            [] if found == before else self.board.rename(now, value_of(before), value_of(found))
-        )
+        said = []
+        if found != before:
+            changes = self.board.rename(now, value_of(before), value_of(found))
+            said = self._say(changes, event.time_ns)
         still = any(alarm.active for alarm in self.board.watching(value_of(found)))
         self._named = found
-        said = self._say(changes, event.time_ns)
-        return said + self._say(
-            self.board.see(now, deviating(*causes) if still else {}), event.time_ns
-        )
+        changes = self.board.see(now, deviating(*causes) if still else {})
+        return said + self._say(changes, event.time_ns)
 
     # --- what follows ---------------------------------------------------------------------------
 
@@ -248,7 +269,8 @@ class Alarms:
             elif change.deed is Deed.RENAMED:
                 self._record(self._diary.note(change.to, told))
                 self._keep(self.board[change.alarm])
-            self._keep(alarm)
+            if change.deed not in SUPPRESSIONS:  # that follows from the others
+                self._keep(alarm)
             if worth_saying(change, alarm):
                 said.append(event_of(change, self._plain(change, episodes), alarm, time_ns))
         return said

@@ -1,6 +1,6 @@
 """Alarm rules: when an alarm is raised and cleared, and what a person is to do about it; TOML."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from enum import StrEnum
 from importlib import resources
 from typing import Annotated, Self
@@ -8,7 +8,9 @@ from typing import Annotated, Self
 import tomli_w
 from pydantic import Field, model_validator
 
+from twin.alarms.causes import CAUSES, DEVIATION, value_of
 from twin.errors import ConfigError
+from twin.model.effects import EFFECTS
 from twin.settings import Document, Settings
 
 Seconds = Annotated[float, Field(ge=0.0, le=86_400.0)]
@@ -40,7 +42,7 @@ class Rule(Settings):
     priority: Priority = Priority.LOW
     consequence: str = ""  # what happens if nobody acts
     action: str = ""  # what to do
-    suppressed_by: tuple[str, ...] = ()  # alarms while which this one says nothing, by design
+    suppressed_by: tuple[str, ...] = ()  # rules or alarms while which it says nothing, by design
     longest_shelving_s: Seconds = 8 * 3600.0
 
     @model_validator(mode="after")
@@ -48,6 +50,13 @@ class Rule(Settings):
         if (self.above is None) == (self.below is None):
             raise ValueError("needs one limit: above or below")
         return self
+
+    @property
+    def alarms(self) -> tuple[str, ...]:
+        """The names of its alarms: one for each cause of the deviation, else its own."""
+        if self.value != DEVIATION:
+            return (self.name,)
+        return tuple(f"{self.name}_{cause}" for cause in CAUSES)
 
     def is_beyond(self, value: float, before: bool) -> bool:
         """Whether a value is beyond the limit; back within it only by the dead band."""
@@ -68,8 +77,9 @@ class RuleFile(Settings):
         names = [rule.name for rule in self.alarm]
         if twice := {name for name in names if names.count(name) > 1}:
             raise ValueError(f"several alarms are called {', '.join(sorted(twice))}")
+        known = {*names, *(alarm for rule in self.alarm for alarm in rule.alarms)}
         for rule in self.alarm:
-            if unknown := set(rule.suppressed_by) - set(names):
+            if unknown := set(rule.suppressed_by) - known:
                 raise ValueError(
                     f"{rule.name} is suppressed by {', '.join(sorted(unknown))}: no such alarm"
                 )
@@ -97,3 +107,28 @@ def write_rules(rules: Sequence[Rule]) -> str:
     """The file that would give these rules again."""
     tables = [rule.model_dump(mode="json", exclude_defaults=True) for rule in rules]
     return tomli_w.dumps({"alarm": tables})
+
+
+def by_cause(rules: Sequence[Rule]) -> tuple[Rule, ...]:
+    """The rules as a board takes them, one for each alarm; a rule stands for all of its alarms."""
+    of_name = {rule.name: rule.alarms for rule in rules}
+    return tuple(
+        one.model_copy(update={"suppressed_by": tuple(_alarms(one.suppressed_by, of_name))})
+        for rule in rules
+        for one in _of_causes(rule)
+    )
+
+
+def _alarms(names: Sequence[str], of_name: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    for name in names:
+        yield from of_name.get(name, (name,))
+
+
+def _of_causes(rule: Rule) -> Iterator[Rule]:
+    if rule.value != DEVIATION:
+        yield rule
+        return
+    for cause, name in zip(CAUSES, rule.alarms, strict=True):
+        first = f"Look at {EFFECTS[cause].look_at}. " if cause in EFFECTS else ""
+        changed = {"name": name, "value": value_of(cause)}
+        yield rule.model_copy(update={**changed, "action": f"{first}{rule.action}"})

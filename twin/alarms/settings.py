@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from twin.alarms.causes import by_cause
-from twin.alarms.rules import Rule, default_rules, read_rules
+from twin.alarms.rules import Rule, by_cause, default_rules, read_rules
 from twin.alarms.watch import NAMES
 from twin.errors import ConfigError
 from twin.settings import Document, Settings

@@ -7,7 +7,7 @@ otherwise) keep an alarm from being announced; underneath it goes on.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from twin.alarms.rules import Rule
@@ -48,7 +48,7 @@ class Change:
     """One thing that happened to one alarm; ``who`` is empty where the program did it.
 
     ``announced`` says that people are to be told of the alarm now; one that is renamed goes on as
-    ``to``.
+    ``to``. One that was cleared ``untold`` has nothing to acknowledge.
     """
 
     time_ns: int
@@ -57,6 +57,7 @@ class Change:
     who: str = ""
     announced: bool = False
     to: str = ""
+    untold: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +85,8 @@ class Alarm:
     out_of_service: bool = False
     _beyond: bool = False  # the value is, by the dead band
     _since: int | None = None  # when the value came to where the alarm is not yet
+    _turned: int | None = None  # when it became active, or not any more
+    _untold: bool = False  # it became active while suppressed
 
     @property
     def state(self) -> State:
@@ -134,7 +137,7 @@ class Alarm:
         """Somebody has seen it; a latching one may go now."""
         if self.acknowledged:
             return
-        self.acknowledged = True
+        self.acknowledged, self._untold = True, False
         yield self._done(now, Deed.ACKNOWLEDGED, who)
         if self.rule.latching:
             yield from self.see(now)
@@ -156,10 +159,16 @@ class Alarm:
             yield self._done(now, Deed.UNSHELVED, who)
 
     def suppress(self, now: int, wanted: bool) -> Iterator[Change]:
-        """Keep it quiet by design, or let it speak again."""
-        if wanted != self.suppressed:
-            self.suppressed = wanted
-            yield self._done(now, Deed.SUPPRESSED if wanted else Deed.UNSUPPRESSED)
+        """Keep it quiet by design, or let it speak again, unless its value is back already."""
+        if wanted == self.suppressed:
+            return
+        if wanted:
+            self._untold |= self.active and self._turned == now  # by one that came with it
+        elif self.active and not self._beyond:
+            yield from self._turn(now)
+        self.suppressed = wanted
+        self._untold &= wanted
+        yield self._done(now, Deed.SUPPRESSED if wanted else Deed.UNSUPPRESSED)
 
     def serve(self, now: int, wanted: bool, who: str) -> Iterator[Change]:
         """Take it out of service, or back."""
@@ -192,10 +201,15 @@ class Alarm:
         """Become what the value has been for long enough."""
         if self.active and self.rule.latching and not self.acknowledged:
             return
-        self.active, self._since = not self.active, None
+        self.active, self._since, self._turned = not self.active, None, now
         if self.active:
+            self._untold = self.suppressed and self.acknowledged
             self.acknowledged = False
-        yield self._done(now, Deed.RAISED if self.active else Deed.CLEARED)
+            yield self._done(now, Deed.RAISED)
+            return
+        untold, self._untold = self._untold, False
+        self.acknowledged |= untold
+        yield replace(self._done(now, Deed.CLEARED), untold=untold)
 
     def _done(self, now: int, deed: Deed, who: str = "") -> Change:
         """What happened; an alarm that may speak again announces what it kept to itself."""

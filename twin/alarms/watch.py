@@ -7,6 +7,8 @@ from twin.alarms.causes import CAUSES, DEVIATION, known, value_of
 from twin.events import Event, Kind
 from twin.figures.table import FIGURES
 from twin.figures.warnings import CAUTIONS
+from twin.figures.words import NO_DASH
+from twin.model.effects import UNKNOWN
 
 Evidence = Mapping[str, Any]  # what JSON can hold; "words" for people
 
@@ -18,7 +20,7 @@ _SWITCHED = {  # events that begin and end something
 }
 STREAM = frozenset(name for name, _ in _SWITCHED.values())  # nothing is wrong until it is said
 NAMES = STREAM | {DEVIATION} | set(CAUTIONS)
-_MEASURE = ("figure", "excess_mbar", "sigma", "size", "unit", "also")
+_MEASURE = ("figure", "phase", "excess_mbar", "sigma", "size", "unit", "also")
 
 
 def values(event: Event) -> dict[str, float]:
@@ -62,20 +64,21 @@ def evidence(event: Event) -> dict[str, Evidence]:
     if event.kind is Kind.DEVIATION:
         cause = known(str(event.data.get("effect")))
         measured = {key: event.data[key] for key in _MEASURE if key in event.data}
-        return {value_of(cause): {"words": event.text, "guess": cause, **measured, **_in(event)}}
+        guess = {} if cause == UNKNOWN else {"guess": cause}
+        return {value_of(cause): {"words": event.text, **guess, **measured, **_in(event)}}
     if event.kind is Kind.CYCLE:
         standing = event.data.get("warnings", ())
-        return {name: _figure(CAUTIONS[name].figure, event) for name in standing}
+        return {name: _figure(name, event) for name in standing}
     return {}
 
 
-def _figure(name: str, event: Event) -> Evidence:
-    """What a cycle's figure was, and should have been."""
+def _figure(warning: str, event: Event) -> Evidence:
+    """What a cycle's figure was, and should have been; the words are those of its warning."""
+    name = CAUTIONS[warning].figure
     measured, expected = (event.data.get(f"{name}_{side}") for side in ("measured", "expected"))
-    unit = FIGURES[name].unit
-    words = f"{name} {measured:.4g} {unit}" if measured is not None else name
-    if expected is not None:
-        words += f", expected {expected:.4g}"
+    unit, words = FIGURES[name].unit, str(event.data.get("warned", {}).get(warning, warning))
+    if expected is not None and unit not in NO_DASH:
+        words += f"; expected {expected:.4g} {unit}"
     sizes = {"figure": name, "measured": measured, "expected": expected, "unit": unit}
     return {"words": words, **sizes, **_in(event)}
 

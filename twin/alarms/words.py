@@ -18,6 +18,7 @@ STATES = {
     State.SUPPRESSED: "quiet by design, while an alarm of `suppressed_by` is active",
     State.OUT_OF_SERVICE: "a person keeps it quiet until it is taken into service again",
 }
+SUPPRESSIONS = (Deed.SUPPRESSED, Deed.UNSUPPRESSED)
 _SAID = {
     Deed.RAISED: "raised",
     Deed.CLEARED: "cleared",
@@ -39,8 +40,7 @@ def table() -> str:
 
 def worth_saying(change: Change, alarm: Alarm) -> bool:
     """Suppression of an alarm that has nothing to say is nobody's concern."""
-    silent = change.deed in (Deed.SUPPRESSED, Deed.UNSUPPRESSED)
-    return change.announced or alarm.concerns or not silent
+    return change.announced or alarm.concerns or change.deed not in SUPPRESSIONS
 
 
 def plain(alarm: Alarm, evidence: Evidence, episode: Episode | None) -> dict[str, Any]:
@@ -77,7 +77,8 @@ def _text(change: Change, alarm: Alarm, evidence: Evidence) -> str:
         return said
     rule = alarm.rule
     why = f": {evidence['words']}" if "words" in evidence else ""
-    advice = " ".join(filter(None, (rule.consequence, rule.action)))
+    consequence = "" if change.deed is Deed.RENAMED else rule.consequence  # the same as before
+    advice = " ".join(filter(None, (consequence, rule.action)))
     return f"{said} ({rule.priority} priority){why}. {advice}".rstrip()
 
 

@@ -13,6 +13,7 @@ from twin.model.theta import Theta
 from twin.signals import BAR, MBAR, ML, MS, SL_MIN
 
 FLATTEST = 0.9  # of the volume: cups that give way do not vanish
+UNKNOWN = "unknown"  # stands for an effect where a deviation has no name yet
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,19 @@ class Parameter:
     def neutral(self, theta: Theta) -> float:
         """Return the value at which the effect changes nothing."""
         return 0.0 if self.coefficient is None else float(theta[self.coefficient])
+
+    def range(self, theta: Theta) -> tuple[float, float]:
+        """Return the bounds of a change from neutral."""
+        neutral = self.neutral(theta)
+        return self.low - neutral, self.high - neutral
+
+    def reported(self, change: float, theta: Theta) -> float | None:
+        """Return an estimated change from neutral as it is told; None at or beyond a bound.
+
+        There the estimate has left what the effect can be. The bound itself would be no estimate.
+        """
+        low, high = self.range(theta)
+        return change if low < change < high else None
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from twin.events import Event, Kind
+from twin.model.effects import EFFECTS, UNKNOWN
 from twin.model.theta import Theta
 from twin.monitor.clock import ClockWatch
 from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, Look, Teller, Told, figures
@@ -31,6 +32,9 @@ FEWEST_SHARE = 0.95  # of a cycle's samples, to judge it: commands seen late loo
 RIVAL = 0.05  # probability from which on another cause is named as well
 STANDING = 0.8  # of the best fit's gain: then the name of a standing alarm still holds
 ALIKE = 0.2  # of how far out a cycle is: by so much its figures may move before the cause is sought
+NAMED = 0.5  # of the squares a name explains at least: more than it leaves
+GREW = 2.0  # times as far out as any cycle before: something else has begun
+PHASES = {"h1": "suction", "h1_low": "hold"}  # which a level of the air saving ends
 
 
 class MonitorSettings(Settings):
@@ -53,6 +57,27 @@ class Outlier(NamedTuple):
     excess: float  # mbar
     sigmas: float
 
+    @property
+    def place(self) -> str:
+        """Where in the cycle it is, a phase or a level."""
+        return self.figure.rsplit("_", 1)[0].replace("_", "-")
+
+    @property
+    def phase(self) -> str:
+        """The phase it is measured in, for people."""
+        where = self.figure.rsplit("_", 1)[0]
+        return PHASES.get(where, where).replace("_", "-")
+
+    def plain(self) -> dict[str, float | int | str]:
+        """As JSON has it."""
+        phase = self.phase.replace("-", "_")
+        return {
+            "figure": self.figure,
+            "phase": phase,
+            "excess_mbar": self.excess,
+            "sigma": self.sigmas,
+        }
+
 
 @dataclass
 class Monitor:
@@ -61,12 +86,14 @@ class Monitor:
     settings: MonitorSettings
     theta: Theta
     teller: Teller | None = None  # of key figures, for what is said of each cycle
-    active: str = ""  # the effect named by the standing alarm; empty while there is none
+    active: str = ""  # the standing alarm's effect, or UNKNOWN; empty while there is none
     isolation: "Isolation | None" = None
     clocks: ClockWatch | None = field(default_factory=ClockWatch)  # None: the PLC has none
     _cutter: CycleCutter = field(default_factory=CycleCutter)
     _before: Cycle | None = None
     _sought: Mapping[str, float] = field(default_factory=dict)  # figures, as the cause was sought
+    _mixed: int | None = None  # the cycle in which something may have begun, not yet named
+    _farthest: float = 0.0  # sigmas by which a cycle was out since the alarm was raised
     _quiet_cycles: int = 0
     _last: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # row of the stream
     _fresh: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # the last that was
@@ -216,40 +243,65 @@ class Monitor:
         cycle, before, found, judged = look
         worst = self._worst(found) if judged else None
         far = abs(worst.sigmas) if worst else 0.0
-        verdict = self._isolate(heard, far)
+        begins = far >= self.settings.raise_sigma and self._begins(cycle, far)
+        verdict = self._isolate(heard, far, begins)
         events = [_summary(cycle, found, told, verdict)] if cycle.complete or told else []
         if not judged or (worst is None and verdict is None):
             return events
+        quiet, self._quiet_cycles = self._quiet_cycles, 0
         if worst and far >= self.settings.raise_sigma:
-            self._quiet_cycles = 0
-            if not self._stands(cycle, worst, found, verdict):
+            if begins:
+                events.append(self._begin(worst, cycle))
+            elif not self._stands(cycle, worst, found, verdict):
                 self._sought = found
                 events += self._deviation(worst, before, cycle, verdict)
-        elif verdict and verdict.raised and verdict.causes and not self.active:
-            self._quiet_cycles = 0
+        elif verdict and self._is_to_tell(verdict):
             events.append(self._change(cycle, verdict))
         elif self.active and far < self.settings.clear_sigma and not self._differs:
-            self._quiet_cycles += 1
+            self._quiet_cycles = quiet + 1
             if self._quiet_cycles >= self.settings.clear_cycles:
-                text = f"measurement and model agree again; it had looked like {self.active}"
-                events.append(
-                    Event(cycle.end_ns, Kind.DEVIATION_CLEARED, text, {"effect": self.active})
-                )
+                events.append(self._cleared(cycle))
                 self.active = ""
-        else:
-            self._quiet_cycles = 0
+        if far < self.settings.raise_sigma:
+            self._mixed = None
+        self._farthest = max(self._farthest, far) if self.active else 0.0
         return events
+
+    def _cleared(self, cycle: Cycle) -> Event:
+        was = f"it had looked like {self.active}"
+        if self.active == UNKNOWN:
+            was = "its cause was not named"
+        text = f"measurement and model agree again; {was}"
+        return Event(cycle.end_ns, Kind.DEVIATION_CLEARED, text, {"effect": self.active})
+
+    def _begins(self, cycle: Cycle, far: float) -> bool:
+        """Whether something begins with a cycle that is ``far`` out (sigma).
+
+        So it does where none stands, and where it is much farther out than any since. After the
+        cycle in which it began the next one may be, for that one had a part of it only.
+        """
+        if not self.active:
+            return True
+        grew = far > GREW * max(self._farthest, self.settings.raise_sigma)
+        return grew and self._mixed is None and not cycle.cut_short
+
+    def _is_to_tell(self, verdict: "Verdict") -> bool:
+        """Whether the isolation has an alarm to raise, or a name for one that has none."""
+        if not self.active:
+            return verdict.raised and bool(verdict.causes)
+        return self.active == UNKNOWN and _names(verdict)
 
     @property
     def _differs(self) -> bool:
         """Whether cycles differ together, if no single one does."""
         return self.isolation is not None and self.isolation.stands
 
-    def _isolate(self, heard: "Heard | None", far: float) -> "Verdict | None":
+    def _isolate(self, heard: "Heard | None", far: float, begins: bool) -> "Verdict | None":
         """What the isolation holds; it does not learn what is usual from what is far out."""
         if self.isolation is None or heard is None:
             return None
-        return self.isolation.judge(heard, far if far >= self.settings.raise_sigma else 0.0)
+        far = far if far >= self.settings.raise_sigma else 0.0
+        return self.isolation.judge(heard, far, begins=begins)
 
     def _worst(self, found: Mapping[str, float]) -> Outlier | None:
         outliers = []
@@ -270,28 +322,26 @@ class Monitor:
         return far >= self.settings.raise_sigma, far / 3.0 if level else far
 
     def _change(self, cycle: Cycle, verdict: "Verdict") -> Event:
-        """Raise the alarm for what no single cycle shows."""
+        """Raise the alarm for what no single cycle shows, or name the one that stands."""
         best = verdict.causes[0]
-        self.active = best.effect
-        also = [one.effect for one in verdict.causes[1:] if one.probability >= RIVAL]
-        text = (
-            f"{verdict.since} cycles: {abs(verdict.sigmas):.1f} sigma off in each;"
-            f" fits {best.effect} {best.size:.3g} {best.unit}"
+        self.active, self._sought = best.effect, {}
+        also = [one.effect for one in verdict.causes[1:] if one.share >= RIVAL]
+        what = f"{verdict.since} cycles: {abs(verdict.sigmas):.1f} sigma off in each"
+        measured: dict[str, float | int | str] = {"figure": "cycles", "cycles": verdict.since}
+        measured["sigma"] = verdict.sigmas
+        return self._raised(cycle, what, measured, best, also)
+
+    def _begin(self, worst: Outlier, cycle: Cycle) -> Event:
+        """Raise the alarm with the first cycle that shows it.
+
+        It has no name: nobody knows when in this cycle it began.
+        """
+        self.active, self._mixed, self._sought = UNKNOWN, cycle.index, {}
+        what = (
+            f"something has changed, most in {worst.phase}:"
+            f" {worst.excess:+.1f} mbar from healthy ({worst.sigmas:+.0f} sigma)"
         )
-        if also:
-            text += f", or {', '.join(also)}"
-        data: dict[str, float | int | str] = {
-            "cycle": cycle.index,
-            "figure": "cycles",
-            "cycles": verdict.since,
-            "sigma": verdict.sigmas,
-            "effect": best.effect,
-            "size": best.size,
-            "unit": best.unit,
-            "share": best.probability,
-            "also": ",".join(also),
-        }
-        return Event(cycle.end_ns, Kind.DEVIATION, text, data)
+        return self._raised(cycle, what, worst.plain(), Likeness(UNKNOWN, None, "", 0.0), [])
 
     def _stands(
         self, cycle: Cycle, worst: Outlier, found: Mapping[str, float], verdict: "Verdict | None"
@@ -300,64 +350,79 @@ class Monitor:
 
         So it does in one that was cut short, and in one that is off as that was in which it was
         last sought: no other would be found, and to seek it takes long. What the isolation says is
-        there already.
+        there already. The first cycle that is off in another way may be off in a part of it only:
+        the cause is sought in the next one.
         """
-        if not self.active:
-            return False
-        if cycle.cut_short:
+        if cycle.cut_short or cycle.index == self._mixed:
             return True
-        if (verdict and verdict.causes) or found.keys() != self._sought.keys():
+        if _is_proportional(verdict):
             return False
-        names = [name for name in self.settings.healthy.figures if name in found]
-        moved = max(abs(found[name] - self._sought[name]) for name in names)
-        return moved < ALIKE * abs(worst.excess)
+        if found.keys() == self._sought.keys():
+            names = [name for name in self.settings.healthy.figures if name in found]
+            moved = max(abs(found[name] - self._sought[name]) for name in names)
+            if moved < ALIKE * abs(worst.excess):
+                self._mixed = None
+                return True
+        if self._mixed is not None:
+            return False
+        self._mixed = cycle.index
+        return True
 
     def _deviation(
         self, worst: Outlier, before: Cycle | None, cycle: Cycle, verdict: "Verdict | None"
     ) -> list[Event]:
-        """Raise the alarm, or raise it anew when another cause than the standing one fits."""
+        """Name the alarm, or name it anew when another cause than the standing one fits."""
         ranking = self._name(worst, before, cycle, verdict)
         best = ranking[0]
-        also = look_alikes(ranking)
+        self._mixed = None
+        if best.effect in (self.active, UNKNOWN) or best.share < NAMED:
+            return []
         standing = max((one.share for one in ranking if one.effect == self.active), default=0.0)
-        if self.active and standing >= STANDING * best.share:
+        if standing >= STANDING * best.share:
             return []
         self.active = best.effect
-        where = worst.figure.rsplit("_", 1)[0].replace("_", "-")
-        text = (
-            f"{where}: {worst.excess:+.1f} mbar from healthy ({worst.sigmas:+.0f} sigma); "
-            f"fits {best.effect} {best.size:.3g} {best.unit}"
-        )
-        if also:
-            text += f", or {', '.join(also)}"
-        data: dict[str, float | int | str] = {
-            "cycle": cycle.index,
-            "figure": worst.figure,
-            "excess_mbar": worst.excess,
-            "sigma": worst.sigmas,
-            "effect": best.effect,
-            "size": best.size,
-            "unit": best.unit,
-            "share": best.share,
-            "also": ",".join(also),
-        }
-        return [Event(cycle.end_ns, Kind.DEVIATION, text, data)]
+        what = f"{worst.place}: {worst.excess:+.1f} mbar from healthy ({worst.sigmas:+.0f} sigma)"
+        return [self._raised(cycle, what, worst.plain(), best, look_alikes(ranking))]
+
+    def _raised(
+        self,
+        cycle: Cycle,
+        what: str,
+        measured: Mapping[str, float | int | str],
+        best: Likeness,
+        also: Sequence[str],
+    ) -> Event:
+        """The alarm: ``what`` is off, and what fits it."""
+        text = "; ".join([what, best.words]) + "".join(f", or {', '.join(also)}" for _ in also[:1])
+        data = {"cycle": cycle.index, **measured, **best.plain(), "also": ",".join(also)}
+        return Event(cycle.end_ns, Kind.DEVIATION, text, data)
 
     def _name(
         self, worst: Outlier, before: Cycle | None, cycle: Cycle, verdict: "Verdict | None"
-    ) -> list[Likeness]:
+    ) -> Sequence[Likeness]:
         """Rank the causes of a cycle's deviation; the cycle before lets the model swing in."""
-        if verdict and verdict.causes:
-            named = [(one.effect, one.size, one.unit, one.probability) for one in verdict.causes]
-            return [Likeness(*one) for one in named]
+        if verdict is not None and _is_proportional(verdict):
+            return verdict.causes
         if worst.figure.endswith("_level"):  # and nothing else: only the thresholds moved
-            return [Likeness("threshold_drift", worst.excess, "mbar", 1.0)]
+            shift = EFFECTS["threshold_drift"].parameters[0]
+            size = shift.reported(worst.excess, self.theta)
+            return [Likeness("threshold_drift", size, shift.unit, 1.0)]
         parts = [cycle] if before is None else [before, cycle]
         samples = np.concatenate([part.samples for part in parts])
         ticks = np.concatenate([part.ticks for part in parts])
         begin = len(samples) - len(cycle.samples)
         ranking = likenesses(self.theta, samples, ticks, begin)
-        return ranking or [Likeness("unknown", 0.0, "", 0.0)]  # not one sync in a long piece
+        return ranking or [Likeness(UNKNOWN, None, "", 0.0)]  # not one sync in a long piece
+
+
+def _names(verdict: "Verdict | None") -> bool:
+    """Whether the isolation has a name for what differs."""
+    return bool(verdict and verdict.causes and verdict.causes[0].effect != UNKNOWN)
+
+
+def _is_proportional(verdict: "Verdict | None") -> bool:
+    """Whether the isolation names something as small as its signatures are."""
+    return bool(verdict and verdict.causes and verdict.causes[0].is_small)
 
 
 def _order(event: Event) -> int:

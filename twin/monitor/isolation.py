@@ -2,8 +2,10 @@
 
 That anything differs is judged by sums over cycles (``change``). Which effect it is, by the mean of
 the cycles since it began, less what was usual before: each suspect is fitted to it alone, and its
-likelihood tells how probable it is. Cycle-to-cycle scatter averages out of that mean; what the
-model has wrong about a signature does not, so a share of what is explained counts as error.
+likelihood tells how probable it is. The first of these cycles is left out: the change may have
+begun inside of it, and a part of one effect looks like the whole of another. Cycle-to-cycle scatter
+averages out of that mean; what the model has wrong about a signature does not, so a share of what
+is explained counts as error.
 """
 
 import math
@@ -15,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from twin.model.dataset import DataSet
+from twin.model.effects import UNKNOWN
 from twin.model.term import KINDS
 from twin.monitor.bank import DELAY_STEPS, DELAYS, SUSPECTS, UNSURE_OF, Bank
 from twin.monitor.bins import Floats, averaged
@@ -29,6 +32,7 @@ from twin.monitor.change import (
 )
 from twin.monitor.cycles import Cycle, Look
 from twin.monitor.healthy import Healthy
+from twin.monitor.signatures import Likeness
 from twin.monitor.statistics import Listener, Said
 from twin.monitor.weights import whitened
 from twin.signals import SAMPLE, TICK, Samples, Ticks
@@ -37,7 +41,7 @@ DAY_S = 86_400.0
 KEPT = 400  # cycles that are remembered: a change is not sought further back
 RECENT = 60  # of them, the last ones from which a cause is named
 LEARNED = 10  # cycles before which nothing is said
-GREW = 2.0  # times as far out as before: something else may have begun
+SHOWN = 3.0  # sigmas: less by the cycles after the first, and it is not asked what differs
 MISMATCH = 0.08  # of what a suspect explains, is off in its signature
 DOUBTED = 0.05  # probability that anything differs, from which on it is asked what
 RETURNED = float(np.log(1000.0))  # of the odds that it is as before, for it to be over
@@ -53,28 +57,18 @@ class Heard(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Likely:
-    """One effect, as the cycles since the change have it."""
-
-    effect: str
-    probability: float
-    size: float  # in the unit of the parameter
-    unit: str
-
-
-@dataclass(frozen=True)
 class Verdict:
     """What is held of the causes after a cycle."""
 
     none: float  # probability that nothing differs
-    causes: Sequence[Likely]  # the most probable first; empty while nothing is doubted
+    causes: Sequence[Likeness]  # the most probable first, by share; empty while nothing is doubted
     raised: bool = False  # with this cycle it is beyond the limit
     since: int = 0  # cycles that differ
     sigmas: float = 0.0  # by which a cycle differs, in what is foremost
 
     def plain(self) -> dict[str, float]:
         """The probabilities, of what has at least one in a hundred."""
-        shown = {one.effect: round(one.probability, 3) for one in self.causes}
+        shown = {one.effect: round(one.share, 3) for one in self.causes}
         likely = {effect: share for effect, share in shown.items() if share >= 0.01}
         return {"none": round(self.none, 3), **likely}
 
@@ -114,13 +108,10 @@ class Isolation:
         self._raised: tuple[int, float] | None = None  # suspect, and sigmas a cycle
         self._since = 0  # cycles since it began, while raised
         self._back = 0.0  # logarithm of the odds that it is as before
-        self._farthest = 0.0  # sigmas by which a single cycle was out, while raised
         self._alike = np.zeros((len(SUSPECTS), len(SUSPECTS)))  # cosines, as far as known
-        theta = listener.theta
-        neutral = np.array([one.parameter.neutral(theta) for one in SUSPECTS])
-        ends = [(one.parameter.low, one.parameter.high) for one in SUSPECTS]
+        ends = [one.parameter.range(listener.theta) for one in SUSPECTS]
         steps = np.array([one.step for one in SUSPECTS])
-        self._bounds = (np.array(ends) - neutral[:, None]) / steps[:, None]
+        self._bounds = np.array(ends) / steps[:, None]
 
     @property
     def stands(self) -> bool:
@@ -161,18 +152,18 @@ class Isolation:
             for look, one in zip(looks, said, strict=True)
         ]
 
-    def judge(self, heard: Heard, far: float = 0.0) -> Verdict | None:
+    def judge(self, heard: Heard, far: float = 0.0, *, begins: bool = False) -> Verdict | None:
         """Say what is held after a cycle, the next one in order.
 
         ``far`` are the sigmas by which it alone is out, if it is: from such a one nothing is
-        learned, and if it is much farther than those before, the cause is sought from it on.
+        learned. Where something else ``begins`` with it, the cause is sought from it on.
         """
         said, scores, seconds = heard
         self._cycles += 1
         self._seconds += seconds
         normal = self._reference.standard(scores)
         self._kept.append((said, normal))
-        verdict = self._conclude(self._changes, normal, far) if self._changes else None
+        verdict = self._conclude(self._changes, normal, far, begins) if self._changes else None
         if self.stands:
             self._patience.forget()
         elif self._changes is None and not far:
@@ -196,7 +187,7 @@ class Isolation:
         if self._changes and (new.any() or self._learned == LEARNED):
             self._changes.weigh(self._alike)
 
-    def _conclude(self, changes: Changes, normal: Floats, far: float) -> Verdict:
+    def _conclude(self, changes: Changes, normal: Floats, far: float, begins: bool) -> Verdict:
         changes.take(normal, FARTHEST if far else MOST)
         log_sum = changes.log_sum
         cycles = self._wanted_s / (self._seconds / self._cycles)
@@ -204,9 +195,9 @@ class Isolation:
         none = 1.0 / (1.0 + math.exp(min(log_odds, 700.0)))
         raised = self._raised is None and log_sum >= limit(cycles)
         if raised:
-            self._raise(changes, far)
+            self._raise(changes)
         elif self._raised is not None:
-            self._go_on(far)
+            self._since = 1 if begins else self._since + 1
             if self._is_back(normal):
                 changes.begin()
                 self._kept.clear()
@@ -216,20 +207,12 @@ class Isolation:
         if self._raised is not None and np.isnan(normal[self._raised[0]]):
             return Verdict(none, ())  # this cycle does not show it
         since, sigmas = self._differ(changes)
-        causes = self._causes(since, 1.0 - none)
-        return Verdict(none, causes, raised, since, sigmas)
+        return Verdict(none, self._causes(changes, since, 1.0 - none), raised, since, sigmas)
 
-    def _go_on(self, far: float) -> None:
-        """One cycle more that differs; one that is much farther out begins anew."""
-        self._since += 1
-        if far > GREW * self._farthest:
-            self._since = 1
-        self._farthest = max(self._farthest, far)
-
-    def _raise(self, changes: Changes, far: float) -> None:
+    def _raise(self, changes: Changes) -> None:
         self._since, sigmas = self._differ(changes)
         self._raised = (changes.foremost()[0], sigmas)
-        self._back, self._farthest = 0.0, far
+        self._back = 0.0
 
     def _is_back(self, normal: Floats) -> bool:
         """Whether it is as before, by a likelihood ratio of its own."""
@@ -247,14 +230,28 @@ class Isolation:
     def _differ(self, changes: Changes) -> tuple[int, float]:
         """How many of the last cycles differ, and by how many sigmas each."""
         suspect, sign = changes.foremost()
-        scores = np.array([float(normal[suspect]) for _, normal in self._kept])
+        scores = self._scores(suspect)
         since = min(self._since, len(scores)) if self._raised else began(sign * scores)
         shown = scores[-since:][np.isfinite(scores[-since:])]
         return since, float(np.mean(shown)) if len(shown) else 0.0
 
-    def _causes(self, since: int, changed: float) -> list[Likely]:
+    def _scores(self, suspect: int) -> Floats:
+        """Of the cycles that are kept."""
+        return np.array([float(normal[suspect]) for _, normal in self._kept])
+
+    def _whole(self, changes: Changes, since: int) -> int:
+        """How many of the last cycles have it from their beginning; 0 if they do not show it."""
+        whole = since - 1
+        scores = self._scores(changes.foremost()[0])[-whole:] if whole else np.empty(0)
+        shown = scores[np.isfinite(scores)]
+        return whole if abs(shown.sum()) >= SHOWN * math.sqrt(max(len(shown), 1)) else 0
+
+    def _causes(self, changes: Changes, since: int, changed: float) -> list[Likeness]:
         """How probable each effect is; together as probable as that something ``changed``."""
-        mean, covariance = self._mean(min(since, RECENT))
+        whole = self._whole(changes, since)
+        if not whole:
+            return [Likeness(UNKNOWN, None, "", changed)]
+        mean, covariance = self._mean(min(whole, RECENT))
         columns = np.column_stack([mean.off, mean.signatures, mean.larger])
         white, spread = whitened(covariance, columns)
         off, signatures, larger = np.split(white, [1, 1 + len(SUSPECTS)], axis=1)
@@ -298,16 +295,17 @@ class Isolation:
         covariance = scatter + np.outer(own, own) * together
         return replace(last, off=off, signatures=signatures, larger=larger), covariance
 
-    def _by_effect(self, share: Floats, sizes: Floats) -> list[Likely]:
+    def _by_effect(self, share: Floats, sizes: Floats) -> list[Likeness]:
         """Parameters of one effect belong together; the most probable one gives the size."""
-        found: dict[str, Likely] = {}
+        found: dict[str, Likeness] = {}
         for number in np.argsort(-share).tolist():
-            one = SUSPECTS[number]
-            size = float(sizes[number]) * one.step
-            first = found.get(one.effect, Likely(one.effect, 0.0, size, one.parameter.unit))
-            total = first.probability + float(share[number])
-            found[one.effect] = Likely(one.effect, total, first.size, first.unit)
-        return sorted(found.values(), key=lambda likely: -likely.probability)
+            one, mine = SUSPECTS[number], float(share[number])
+            if first := found.get(one.effect):
+                found[one.effect] = replace(first, share=first.share + mine)
+                continue
+            size = one.parameter.reported(float(sizes[number]) * one.step, self._listener.theta)
+            found[one.effect] = Likeness(one.effect, size, one.parameter.unit, mine)
+        return sorted(found.values(), key=lambda likeness: -likeness.share)
 
 
 def looked_for() -> Changes:

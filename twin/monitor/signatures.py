@@ -1,21 +1,25 @@
 """Which effect's signature fits a deviation best: the first answer, while the loop runs.
 
-A signature is what the expected pressure would change by if the effect were there. It is linear,
-from one cycle and without a price for look-alikes; the diagnosis does it properly.
+A signature is what the expected pressure would change by if the effect were there. It is from one
+cycle and without a price for look-alikes; the diagnosis does it properly.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import repeat
 
 import numpy as np
 
 from twin.model import kernel
 from twin.model.compiled import compiled
-from twin.model.effects import EFFECTS, Effect, apply
+from twin.model.effects import EFFECTS, UNKNOWN, Effect, apply
 from twin.model.theta import Theta
 from twin.monitor.bins import Floats, Ints, sparse
 from twin.signals import BREAK, MBAR, MS, NS, Samples, Ticks, deviation
 
 LOOK_ALIKE = 0.9  # of the best fit's gain
+UNNAMED = "its cause is sought in the first whole cycle"
+ROUNDS = 2  # of fitting: the second one in the sizes that the first has found
 NOTHING = 0.02  # mbar rms: what moves the pressure by less in its typical size is not seen in it
 
 
@@ -24,9 +28,29 @@ class Likeness:
     """How well one effect explains a deviation: its size, and the share of squares it takes."""
 
     effect: str
-    size: float  # in the unit of the effect's first parameter
+    size: float | None  # in the unit of the effect's first parameter; None where it is not known
     unit: str
     share: float
+
+    @property
+    def is_small(self) -> bool:
+        """Whether what it does is about in proportion to its size: typical ones are the limit."""
+        typical = EFFECTS[self.effect].parameters[0].typical if self.effect in EFFECTS else 0.0
+        return self.size is not None and abs(self.size) <= typical
+
+    @property
+    def words(self) -> str:
+        """The effect and its size, or why none is told."""
+        if self.effect == UNKNOWN:
+            return UNNAMED
+        if self.size is None:
+            return f"fits {self.effect}; its size cannot be told, the estimate is out of its bounds"
+        return f"fits {self.effect} {self.size:.3g} {self.unit}"
+
+    def plain(self) -> dict[str, float | int | str]:
+        """The same as JSON has it; without a size where none is known."""
+        told: dict[str, float | int | str] = {"effect": self.effect, "share": self.share}
+        return told if self.size is None else {**told, "size": self.size, "unit": self.unit}
 
 
 def steps(samples: Samples, before_ns: int | None) -> Floats:
@@ -59,25 +83,36 @@ def drawn_rows(samples: Samples, ticks: Ticks) -> Ints:
 def likenesses(theta: Theta, samples: Samples, ticks: Ticks, begin: int) -> list[Likeness]:
     """Rank the effects by how much of the deviation from row ``begin`` on they explain.
 
-    The rows before ``begin`` let the model swing in.
+    The rows before ``begin`` let the model swing in. Each effect is fitted by its typical size, and
+    then by what it does in the size found: what is large is not in proportion to what is typical.
     """
-    changed = np.stack([theta, *(_typical(theta, effect) for effect in EFFECTS.values())], axis=1)
-    drawn = drawn_rows(samples, ticks)
-    expected = _expect(changed, samples, ticks, drawn) / MBAR
-    signatures, number = expected[:, 1:] - expected[:, :1], np.arange(len(samples))
+    drawn, number = drawn_rows(samples, ticks), np.arange(len(samples))
     off = deviation(samples, ticks) / MBAR
-    rows = np.isfinite(off) & np.isfinite(np.interp(number, drawn, expected[:, 0]))
+    rows = np.isfinite(off)
     rows[:begin] = False
-    if not rows.any():
-        return []
+    sizes = np.array([effect.parameters[0].typical for effect in EFFECTS.values()])
+    shares = np.zeros(len(sizes))
+    for _ in range(ROUNDS):
+        thetas = map(_changed, repeat(theta), EFFECTS.values(), sizes.tolist())
+        changed = np.stack([theta, *thetas], axis=1)
+        expected = _expect(changed, samples, ticks, drawn) / MBAR
+        rows &= np.isfinite(np.interp(number, drawn, expected[:, 0]))
+        if not rows.any():
+            return []
+        for i, (effect, course) in enumerate(zip(EFFECTS.values(), expected.T[1:], strict=True)):
+            signature = np.interp(number[rows], drawn, course - expected[:, 0])
+            sizes[i], shares[i] = _fit(theta, effect, sizes[i], off[rows], signature)
     found = [
-        _fit(effect, off[rows], np.interp(number[rows], drawn, signature))
-        for effect, signature in zip(EFFECTS.values(), signatures.T, strict=True)
+        Likeness(effect.name, first.reported(size, theta), first.unit, share)
+        for effect, size, share in zip(
+            EFFECTS.values(), sizes.tolist(), shares.tolist(), strict=True
+        )
+        for first in effect.parameters[:1]
     ]
     return sorted(found, key=lambda likeness: -likeness.share)
 
 
-def look_alikes(ranking: list[Likeness]) -> list[str]:
+def look_alikes(ranking: Sequence[Likeness]) -> list[str]:
     """Name the effects behind the best that explain nearly as much."""
     return [one.effect for one in ranking[1:] if one.share >= LOOK_ALIKE * ranking[0].share > 0.0]
 
@@ -93,18 +128,21 @@ def _expect(theta: Theta, samples: Samples, ticks: Ticks, rows: Ints) -> Floats:
     return expected
 
 
-def _typical(theta: Theta, effect: Effect) -> Theta:
-    sizes = {p.name: p.neutral(theta) + p.typical for p in effect.parameters}
+def _changed(theta: Theta, effect: Effect, size: float) -> Theta:
+    """Coefficients with an effect: its first parameter is ``size`` from neutral."""
+    times = size / effect.parameters[0].typical
+    sizes = {p.name: p.neutral(theta) + times * p.typical for p in effect.parameters}
     return apply(theta, effect.name, sizes)
 
 
-def _fit(effect: Effect, off: Floats, signature: Floats) -> Likeness:
-    """Fit ``off`` by a multiple of the signature, of a sign the effect can have."""
-    first = effect.parameters[0]
-    power = float(signature @ signature)
-    moves = power > NOTHING**2 * len(signature)
-    times = float(off @ signature) / power if moves else 0.0
-    if first.low == 0.0 and first.coefficient is None:
-        times = max(times, 0.0)
-    share = times * times * power / max(float(off @ off), 1e-12)
-    return Likeness(effect.name, times * first.typical, first.unit, share)
+def _fit(
+    theta: Theta, effect: Effect, size: float, off: Floats, signature: Floats
+) -> tuple[float, float]:
+    """Size within bounds, and share of squares, by a ``signature`` that is of a given size."""
+    low, high = effect.parameters[0].range(theta)
+    power, common = float(signature @ signature), float(off @ signature)
+    if size == 0.0 or not power > NOTHING**2 * len(signature):  # NaN: the model has no answer
+        return 0.0, 0.0
+    found = min(max(common / power * size, low), high)
+    times = found / size
+    return found, times * (2.0 * common - times * power) / max(float(off @ off), 1e-12)

@@ -8,18 +8,22 @@ from enum import StrEnum
 from typing import Any
 
 from twin.alarms.board import Board, Episode
-from twin.alarms.causes import CAUSES, value_of
+from twin.alarms.causes import CAUSES, UNLISTED, value_of
 from twin.alarms.requests import Request
 from twin.alarms.rules import Priority
 from twin.alarms.state import Alarm, State
 from twin.alarms.words import STATES
 from twin.diagnosis.words import certainty, ends, number, spoken
 from twin.instants import instant, lasting
-from twin.model.effects import EFFECTS
+from twin.model.effects import EFFECTS, UNKNOWN
 
 S_NS = 1_000_000_000
 _CAUSE_OF = {value_of(cause): cause for cause in CAUSES}
 _STANDING = (State.UNACKNOWLEDGED, State.ACKNOWLEDGED, State.RETURNED)
+_WITHOUT = {  # causes that are no effect
+    UNLISTED: "Something that no listed cause explains",
+    UNKNOWN: "Something has changed; its cause is not known yet",
+}
 _SPELT = {"plc": "PLC", "h1": "H1", "h2": "H2"}
 _URGENT = (Priority.HIGH, Priority.MEDIUM)
 
@@ -127,7 +131,7 @@ def named(alarm: str, value: str) -> dict[str, Any]:
             "where": EFFECTS[cause].look_at.partition(":")[0],
         }
     words = " ".join(_SPELT.get(word, word) for word in spoken(alarm).split())
-    title = "Something that no listed cause explains" if cause else words
+    title = _WITHOUT.get(cause, words)
     return {"what": title[:1].upper() + title[1:], "sentence": "", "where": ""}
 
 
