@@ -46,6 +46,8 @@ class Connection(Protocol):
         """Hang up."""
 
 
+Away = Callable[[LostError], None]  # told that a PLC does not answer yet, and why
+
 C_contra = TypeVar("C_contra", bound=Connection, contravariant=True)
 
 
@@ -58,23 +60,27 @@ class Source(Protocol[C_contra]):
 
 
 def lasting(
-    source: Source[C_contra], link: C_contra, clock: Clock
+    source: Source[C_contra], link: C_contra, clock: Clock, away: Away | None = None
 ) -> Generator[Samples, None, None]:
     """Samples of ``source`` over one connection after the other; empty blocks in between.
 
-    Errors before the first sample come out, and later all but LostError. Closing hangs up.
+    A LostError before the first sample goes to ``away``, once, or comes out where there is none;
+    later ones mean another try. All other errors come out. Closing hangs up.
     """
     begun = False
     try:
-        link.open()
         while True:
             try:
+                link.open()
                 for block in source.samples(link):
                     begun = True
                     yield block
-            except LostError:
+            except LostError as error:
                 if not begun:
-                    raise
+                    if away is None:
+                        raise
+                    away(error)
+                begun = True
                 link.close()  # if it is not yet: what it knows of the PLC may no longer hold
                 yield from _reconnect(link, clock)
     finally:

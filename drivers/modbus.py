@@ -2,7 +2,7 @@
 
 from collections.abc import Generator
 
-from drivers.lasting import REAL, Clock, in_thread, lasting
+from drivers.lasting import REAL, Away, Clock, in_thread, lasting
 from drivers.link import Link, ModbusSettings
 from drivers.poll import Poller
 from drivers.ring import Trace
@@ -13,17 +13,21 @@ __all__ = ["ModbusSettings", "blocks"]
 
 
 def blocks(
-    settings: ModbusSettings, clock: Clock = REAL, lines: Lines | None = None
+    settings: ModbusSettings,
+    clock: Clock = REAL,
+    lines: Lines | None = None,
+    away: Away | None = None,
 ) -> Generator[Samples, None, None]:
     """Samples as they come: a block at least every 0.5 s, empty while there is nothing.
 
     Once there was a sample, a lost connection is retried for ever and shows as empty blocks and
-    flags. SourceError before that, and whenever the PLC refuses an address. Closing releases all.
+    flags. LostError before that goes to ``away``, and is retried too, where there is one. Other
+    SourceErrors come out, and whenever the PLC refuses an address. Closing releases all.
     Blocks come over a connection that they share with others, where there are ``lines``; polling
     has no millisecond to wait for others.
     """
     if settings.mode == "poll":
-        return in_thread(lasting(Poller(settings, clock), Link(settings), clock))
+        return in_thread(lasting(Poller(settings, clock), Link(settings), clock, away))
     link = Link(settings) if lines is None else SharedLink(settings, lines.to(settings))
-    stream = lasting(Trace(settings, clock), link, clock)
+    stream = lasting(Trace(settings, clock), link, clock, away)
     return stream if settings.tls is None else in_thread(stream)  # shaking hands takes time

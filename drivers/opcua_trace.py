@@ -35,6 +35,7 @@ from drivers.trace import (
     WRAP,
     Follower,
     Header,
+    refusal,
 )
 from twin.errors import SourceError
 from twin.signals import MBAR, SAMPLE, UNUSABLE, Quality, Samples
@@ -91,7 +92,7 @@ class NodeTrace(Follower[Header, OpcuaLink]):
     def refuse_other(self, header: Header) -> None:
         """SourceError if ``header`` does not describe a ring that can be followed."""
         if not header.ready:
-            raise SourceError(
+            raise refusal(header)(
                 f"{self._settings.where}: no trace at {self._settings.trace.sequence}: it says "
                 f"{header.depth} records, one every {header.period_ns // 1000} µs; more than "
                 f"{2 * RESERVE} are needed",

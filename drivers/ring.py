@@ -11,7 +11,7 @@ import numpy.typing as npt
 from drivers.lasting import EMPTY, Clock
 from drivers.link import Link, ModbusSettings, span
 from drivers.tags import WordOrder, Words, numbers
-from drivers.trace import COMMANDS, OVERFLOW_BIT, RESERVE, WRAP, Follower
+from drivers.trace import COMMANDS, OVERFLOW_BIT, RESERVE, WRAP, Follower, refusal
 from drivers.trace import Header as AnyHeader
 from twin.errors import SourceError
 from twin.signals import MBAR, SAMPLE, Quality, Samples
@@ -77,7 +77,7 @@ class Trace(Follower[Header, Link]):
         ring = self._settings.ring
         end = ring.records.offset + header.depth * RECORD_WORDS
         if not header.ready or end > 0x10000:
-            raise SourceError(
+            raise refusal(header)(
                 f"{self._settings.where}: no trace header at {span(ring.header, HEADER_WORDS)}: "
                 f"it says {header.depth} records of {header.record_words} words, one every "
                 f"{header.period_ns // 1000} µs; expected are words of {RECORD_WORDS} and more "

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drivers import modbus
+from drivers.lasting import Away
 from drivers.link import ModbusSettings
 from drivers.probe import Line, probe
 from drivers.shared import Lines
@@ -19,19 +20,23 @@ KINDS = ("modbus", "opcua")
 
 
 def open_source(
-    document: Document, address: str = "", lines: Lines | None = None
+    document: Document,
+    address: str = "",
+    lines: Lines | None = None,
+    away: Away | None = None,
 ) -> Iterator[Samples]:
     """The blocks of the source that ``[driver]`` names; ``address`` (host:port) goes before it.
 
     Several that are opened with the same ``lines`` share a connection where that can be done.
-    Raises ConfigError for an unknown kind or bad settings, SourceError if it does not answer.
+    Raises ConfigError for an unknown kind or bad settings, SourceError if it does not answer; with
+    ``away``, which is told why, it is tried until it does.
     """
     settings = settings_of(document, address)
     if isinstance(settings, ModbusSettings):
-        return modbus.blocks(settings, lines=lines)
+        return modbus.blocks(settings, lines=lines, away=away)
     from drivers import opcua  # noqa: PLC0415 - the library takes its time
 
-    return opcua.blocks(settings)
+    return opcua.blocks(settings, away=away)
 
 
 def probe_source(document: Document, address: str = "") -> Iterator[str]:

@@ -12,7 +12,8 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from drivers.lasting import EMPTY, Clock
+from drivers.lasting import EMPTY, Clock, LostError
+from twin.errors import SourceError
 from twin.signals import Quality, Samples
 
 COMMANDS = 0b11  # in the status of a record, as in Command
@@ -39,6 +40,11 @@ class Header:
         """Whether it describes a ring; a PLC that just starts may show zeros."""
         return self.depth > 2 * RESERVE and 0 < self.period_ns <= LONGEST_PERIOD_NS
 
+    @property
+    def blank(self) -> bool:
+        """Whether nothing was written yet: so it is of a PLC that just starts."""
+        return not (self.sequence or self.time_ns or self.period_ns)
+
     def advance(self, earlier: "Header") -> int | None:
         """Scans since ``earlier``; None if the PLC restarted in between."""
         scans = (self.sequence - earlier.sequence) % WRAP
@@ -58,6 +64,11 @@ class Header:
             and scans < self.depth
             and not self.clock_jumped(earlier, scans)
         )
+
+
+def refusal(header: Header) -> type[SourceError]:
+    """The error for a ring that cannot be followed: lost, if the PLC may only be starting."""
+    return LostError if header.blank else SourceError
 
 
 class Paced(Protocol):
@@ -92,7 +103,10 @@ class Follower(ABC, Generic[H, L]):
 
     @abstractmethod
     def refuse_other(self, header: H) -> None:
-        """SourceError if ``header`` does not describe a ring that can be followed."""
+        """SourceError if ``header`` does not describe a ring that can be followed.
+
+        LostError if there may be one once the PLC has started.
+        """
 
     @abstractmethod
     def _read(self, link: L) -> Samples:
@@ -121,7 +135,7 @@ class Follower(ABC, Generic[H, L]):
         scans = header.advance(self._header)
         if scans is None:
             self.refuse_other(header)
-            self._break |= Quality.RESTART
+            self._break |= Quality.RESTART | Quality.GAP  # what ran meanwhile was never seen
             self._newest, self._next, self._last = header.sequence, 0, -1
         else:
             self._newest += scans

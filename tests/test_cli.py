@@ -133,7 +133,7 @@ def test_no_plc_is_exit_code_3(
         nobody.bind(("127.0.0.1", 0))  # and does not listen
         address = f"127.0.0.1:{nobody.getsockname()[1]}"
         log = tmp_path / "run.mcap"
-        command = ("run", GRIPPER, "--address", address, "--log", log)
+        command = ("run", GRIPPER, "--once", "--address", address, "--log", log)
         assert twin(monkeypatch, *command) == 3
     assert not log.exists()  # or the next try would find a log it may not overwrite
     said = capsys.readouterr().err

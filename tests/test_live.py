@@ -1,5 +1,6 @@
 """The loop: what comes in goes through twin and monitor to every sink, live and from a log."""
 
+import itertools
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -18,6 +19,7 @@ from twin.live import run
 from twin.log.header import LogHeader
 from twin.log.reader import Log, open_log
 from twin.log.recorder import Recorder
+from twin.monitor.listening import Listening
 from twin.signals import SAMPLE, Command, Phase, Quality, Samples, Ticks
 
 EMPTY = np.empty(0, SAMPLE)
@@ -112,13 +114,11 @@ def test_silence_is_told_while_it_lasts_and_in_a_replay_the_same() -> None:
         samples[field][3000:] += 2_000_000_000
     samples["sequence"][3000:] += 2000
     samples["quality"][3000] = Quality.GAP
-    now = int(samples["host_ns"][2999])
+    asked = itertools.count()
     told: list[int] = []
 
     def clock() -> int:
-        nonlocal now
-        now += 100_000_000  # an empty block every 0.1 s
-        return now
+        return (next(asked) + 1) // 2 * 100_000_000  # a block every 0.1 s
 
     class Watch(Collect):
         def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
@@ -127,7 +127,7 @@ def test_silence_is_told_while_it_lasts_and_in_a_replay_the_same() -> None:
 
     live = Watch()
     blocks = [samples[:3000], *[EMPTY] * 20, samples[3000:]]
-    run(blocks, rigs.twin("gripper"), rigs.monitor("gripper"), [live], clock)
+    run(blocks, rigs.twin("gripper"), rigs.monitor("gripper"), [live], Listening(clock))
     assert told == [1 + 6]  # with the sixth empty block, 0.6 s after the last sample
     replayed = rigs.watch("gripper", rigs.cut(samples, 700))
     assert replayed.events == live.events
@@ -135,11 +135,9 @@ def test_silence_is_told_while_it_lasts_and_in_a_replay_the_same() -> None:
 
 
 def test_silence_before_the_first_sample_is_not_stale() -> None:
-    def clock() -> int:
-        raise AssertionError("nothing to compare with")
-
-    seen = Collect()
-    run([EMPTY] * 5, rigs.twin("gripper"), rigs.monitor("gripper"), [seen], clock)
+    seen, seconds = Collect(), itertools.count()
+    listening = Listening(lambda: next(seconds) * 1_000_000_000)
+    run([EMPTY] * 5, rigs.twin("gripper"), rigs.monitor("gripper"), [seen], listening)
     assert seen.events == []
 
 

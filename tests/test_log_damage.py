@@ -365,6 +365,8 @@ def test_a_sound_log(file: Path) -> None:
         duration_s=pytest.approx(1.999),
         gaps=0,
         missing=0,
+        unseen_s=0.0,
+        restarts=0,
         time_back=0,
         bytes_per_sample=file.stat().st_size / 2000,
     )
@@ -383,7 +385,7 @@ def test_a_report_is_for_people(file: Path, written: Written) -> None:
     assert "state: unfinished" in str(check(file))
     spoil(file, written.flushed[2][0] + 300)
     said = str(check(file))
-    assert "gaps: 1, 250 rows missing" in said
+    assert "gaps: 1, 250 rows missing, 0.3 s not seen" in said
     assert "state: damaged" in said
     assert f"unreadable: {file}: byte {written.flushed[2][0]}: a chunk is damaged" in said
 
@@ -399,6 +401,21 @@ def test_what_is_in_the_stream_is_counted(tmp_path: Path) -> None:
     report = check(tmp_path / "a.mcap")
     assert (report.gaps, report.missing, report.time_back) == (2, 12, 1)
     assert report.duration_s == pytest.approx(0.298)
+
+
+def test_a_restart_is_a_gap_as_long_as_nothing_came(tmp_path: Path) -> None:
+    """What ran meanwhile was never seen, though the sequence begins anew without a hole."""
+    samples, ticks = course(300)
+    samples["sequence"][100:] -= samples["sequence"][100]
+    for name in ("time_ns", "host_ns"):
+        samples[name][100:] += 5_600_000_000
+    samples["quality"][100] = Quality.RESTART
+    with Recorder(tmp_path / "a.mcap", HEADER) as recorder:
+        recorder.write(samples, ticks)
+    report = check(tmp_path / "a.mcap")
+    assert (report.gaps, report.missing, report.restarts) == (1, 0, 1)
+    assert report.unseen_s == pytest.approx(5.601, abs=2e-3)
+    assert "gaps: 1, 0 rows missing, 5.6 s not seen, 1 of them a restart" in str(report)
 
 
 def test_a_log_in_parts_is_recovered_as_one(tmp_path: Path) -> None:

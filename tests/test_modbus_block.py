@@ -213,7 +213,7 @@ def test_a_restart_while_records_are_read_discards_them(rig: Rig) -> None:
 
     rig.server.hook = restart
     samples = rig.take(3)
-    assert samples["quality"][0] == Quality.RESTART
+    assert samples["quality"][0] == Quality.RESTART | Quality.GAP
     assert samples["sequence"][0] == 0
     assert_whole(samples[1:])
 
@@ -285,7 +285,7 @@ def test_a_restart_is_flagged_and_goes_on_from_zero(rig: Rig, boot: int | None) 
     rig.plc.restart(boot=boot)
     samples = rig.take(3)
     assert samples["sequence"][0] == 0
-    assert samples["quality"][0] == Quality.RESTART
+    assert samples["quality"][0] == Quality.RESTART | Quality.GAP  # what ran meanwhile
     assert_whole(samples[1:])
 
 
@@ -294,7 +294,7 @@ def test_a_restart_that_sets_the_clock_back_is_flagged_as_both(rig: Rig) -> None
     rig.plc.time_ns = 0
     rig.plc.restart()
     samples = rig.take(3)
-    assert samples["quality"][0] == Quality.RESTART | Quality.CLOCK
+    assert samples["quality"][0] == Quality.RESTART | Quality.CLOCK | Quality.GAP
     assert_whole(samples[1:])
 
 
@@ -420,7 +420,25 @@ def test_a_plc_that_starts_with_an_empty_header_is_waited_for(rig: Rig) -> None:
     assert not len(rig.take(5))
     rig.plc.scan = scan  # type: ignore[method-assign]
     rig.plc.restart()
-    assert rig.take(2)["quality"][0] == Quality.RESTART
+    assert rig.take(2)["quality"][0] == Quality.RESTART | Quality.GAP
+
+
+@pytest.mark.parametrize("why", [CUT, "blank header"])
+def test_a_plc_that_is_not_there_yet_is_tried_until_it_is_and_said_once(why: str) -> None:
+    told: list[str] = []
+    with ModbusServer() as server:
+        time = PlcTime(lambda _scans: None)
+        stream = blocks(
+            settings_for(server), clock_of(time), away=lambda error: told.append(str(error))
+        )
+        with closing(stream):
+            if why == CUT:
+                server.hook = lambda *_: CUT
+            assert not any(len(next(stream)) for _ in range(20))
+            server.hook = lambda *_: None
+            time.scan = TracePlc(server).scan
+            assert any(len(next(stream)) for _ in range(8))
+    assert len(told) == 1
 
 
 def test_an_address_refused_later_is_an_error_and_not_retried(rig: Rig) -> None:

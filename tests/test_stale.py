@@ -1,6 +1,7 @@
 """While the PLC is stale one alarm stands, and no other is raised; the clock here is the test's."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import closing
 from itertools import takewhile
 
 import numpy as np
@@ -13,9 +14,10 @@ from rigs import Collect
 
 from twin.diagnosis import process
 from twin.diagnosis.process import LiveDiagnosis
-from twin.events import Event, Kind
+from twin.events import Event, Kind, Severity
 from twin.live import run
 from twin.monitor.detect import Monitor
+from twin.monitor.listening import Listening
 from twin.signals import SAMPLE, Command, Quality, Samples, Ticks
 
 EMPTY = np.empty(0, SAMPLE)
@@ -27,13 +29,26 @@ def kinds(events: Sequence[Event]) -> list[Kind]:
     return [event.kind for event in events]
 
 
+class Timed:
+    """A live source in time of its own: a wait of 0.1 s for each block, longer where it is told."""
+
+    def __init__(self, blocks: Sequence[Samples], waits: Mapping[int, int] | None = None) -> None:
+        self.ns, self.blocks, self.waits = 0, blocks, waits or {}
+        self.listening = Listening(lambda: self.ns)
+
+    def __iter__(self) -> Iterator[Samples]:
+        for number, block in enumerate(self.blocks):
+            self.ns += self.waits.get(number, 100 * MS)
+            yield block
+
+
 # A PLC that answers, and whose program stands still.
 
 
 class Beside:
     """The loop beside a PLC of the test's own time, ended when the PLC is back or time is over."""
 
-    def __init__(self, stream: Iterator[Samples], time: PlcTime) -> None:
+    def __init__(self, stream: Generator[Samples, None, None], time: PlcTime) -> None:
         self.seen = Collect()
         self.time, self.stream = time, stream
 
@@ -41,7 +56,8 @@ class Beside:
         end = self.time.ns + round(seconds * S)
         blocks = takewhile(lambda _: self.time.ns < end, self.stream)
         monitor = Monitor(rigs.config("test_rig").monitor, rigs.theta("test_rig"))
-        run(blocks, rigs.twin("test_rig"), monitor, [self.seen], self.time.wall_ns)
+        with closing(self.stream):
+            run(blocks, rigs.twin("test_rig"), monitor, [self.seen], Listening(self.time.now_ns))
         return self.seen.of(*STALENESS, Kind.PLC_RESTARTED, Kind.GAP)
 
 
@@ -101,6 +117,86 @@ def test_a_silence_that_the_ring_fills_is_told_before_its_end(size: int) -> None
     assert kinds(seen.of(*STALENESS)) == [Kind.PLC_STALE, Kind.PLC_BACK]
 
 
+# A twin that is late itself, and a wall clock that is set.
+
+
+class Slow(Collect):
+    """A sink that takes its time at some blocks, as a view that opens does."""
+
+    def __init__(self, source: Timed, slow: Sequence[int], takes_ns: int) -> None:
+        super().__init__()
+        self.source, self.slow, self.takes_ns = source, slow, takes_ns
+
+    def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
+        super().write(samples, ticks, events)
+        if len(self.samples) in self.slow:
+            self.source.ns += self.takes_ns
+
+
+def received_late(samples: Samples, rows: Sequence[int], by_ns: int) -> Samples:
+    """Each pause before a row is caught up in the next 100 rows, which all come at once."""
+    samples = samples.copy()
+    for row in rows:
+        late = samples["host_ns"][row - 1] + by_ns
+        samples["host_ns"][row:] = np.maximum(samples["host_ns"][row:], late)
+    return samples
+
+
+def beside(blocks: Sequence[Samples], slow: Sequence[int] = (), by_ns: int = 0) -> Collect:
+    source = Timed(blocks)
+    seen = Slow(source, slow, by_ns)
+    run(source, rigs.twin("test_rig"), rigs.monitor("test_rig"), [seen], source.listening)
+    return seen
+
+
+def test_a_twin_that_is_late_says_so_once_and_nothing_is_stale() -> None:
+    late = (30, 40, 50)  # blocks after which it does something else for 2 s
+    samples = received_late(healthy(), [3000, 4000, 5000], 2 * S)
+    seen = beside(rigs.cut(samples, 100), late, 2 * S)
+    (told,) = seen.of(Kind.TWIN_LATE, *STALENESS)
+    assert told.kind is Kind.TWIN_LATE
+    assert told.severity is Severity.WARNING
+    assert told.time_ns == samples["time_ns"][3000]
+    assert told.data["seconds"] == pytest.approx(2.1)
+    again = rigs.watch("test_rig", seen.samples)  # as a log has them
+    assert again.events == [event for event in seen.events if event is not told]
+
+
+def test_a_twin_that_was_late_for_longer_than_the_ring_calls_nothing_stale() -> None:
+    samples = lost(healthy(), 3000, 6.0)
+    seen = beside(rigs.cut(samples, 100), [30], 6 * S)
+    assert kinds(seen.of(Kind.TWIN_LATE, Kind.GAP, *STALENESS)) == [Kind.TWIN_LATE, Kind.GAP]
+    assert rigs.watch("test_rig", seen.samples).of(Kind.GAP, *STALENESS) == seen.of(Kind.GAP)
+
+
+def test_being_late_does_not_count_as_listening() -> None:
+    blocks = rigs.cut(healthy()[:6000], 100)
+    seen = beside([*blocks[:30], EMPTY, *blocks[30:]], [30], 5 * S)
+    assert kinds(seen.of(*STALENESS)) == []
+
+
+@pytest.mark.parametrize("step_s", [-3600, 3600])
+@pytest.mark.parametrize("empty", [0, 2])
+def test_a_wall_clock_that_is_set_is_no_silence(step_s: int, empty: int) -> None:
+    samples = healthy().copy()
+    samples["host_ns"][3000:] += step_s * S
+    blocks = rigs.cut(samples, 100)
+    seen = beside([*blocks[:30], *[EMPTY] * empty, *blocks[30:]])
+    assert seen.of(Kind.TWIN_LATE, *STALENESS) == []
+    assert rigs.watch("test_rig", seen.samples).of(*STALENESS) == []
+
+
+def test_a_silence_that_the_ring_fills_is_over_after_it_began() -> None:
+    """The connection was away: alarms are stamped with the rows, and the rows were all there."""
+    samples = received_late(healthy(), [3000], 2 * S)
+    blocks = rigs.cut(samples, 100)
+    seen = beside([*blocks[:30], *[EMPTY] * 20, *blocks[30:]])
+    stale, back = seen.of(*STALENESS)
+    assert kinds([stale, back]) == [Kind.PLC_STALE, Kind.PLC_BACK]
+    assert stale.time_ns <= back.time_ns
+    assert rigs.watch("test_rig", seen.samples).of(*STALENESS) == [stale, back]
+
+
 # Values that the driver calls stale: a polled PLC whose heartbeat is at rest.
 
 
@@ -147,7 +243,7 @@ def test_what_follows_silence_of_both_kinds_is_one_silence() -> None:
             now = int(block["host_ns"][-1]) if len(block) else now + 100 * MS
             yield block
 
-    run(blocks(), rigs.twin("test_rig"), rigs.monitor("test_rig"), [live], lambda: now)
+    run(blocks(), rigs.twin("test_rig"), rigs.monitor("test_rig"), [live], Listening(lambda: now))
     replayed = rigs.watch("test_rig", rigs.cut(samples, 1000))
     assert kinds(live.of(*STALENESS)) == [Kind.PLC_STALE, Kind.PLC_BACK]
     assert sorted(live.events, key=str) == sorted(replayed.events, key=str)
@@ -204,12 +300,11 @@ def test_commands_that_nobody_saw_are_no_deviation(after_s: float) -> None:
 def test_at_the_end_of_a_silence_that_does_not_end_nothing_is_judged() -> None:
     faulty = rigs.recorded("test_rig", 36.0, ("leakage=4@c4",), 3)[0]
     end = edges(faulty)[5] - 100  # it deviates, and has come to idle
-    now = int(faulty["host_ns"][end - 1]) + S
-    for empty, raises in ((1, 0), (0, 1)):
+    for silent, raises in ((True, 0), (False, 1)):
         seen = Collect()
-        blocks = [*rigs.cut(faulty[:end], 100), *[EMPTY] * empty]
-        run(blocks, rigs.twin("test_rig"), rigs.monitor("test_rig"), [seen], lambda: now)
-        assert len(seen.of(Kind.PLC_STALE)) == empty
+        source = Timed([*rigs.cut(faulty[:end], 100), *[EMPTY] * (20 * silent)])
+        run(source, rigs.twin("test_rig"), rigs.monitor("test_rig"), [seen], source.listening)
+        assert len(seen.of(Kind.PLC_STALE)) == silent
         assert len(seen.of(Kind.DEVIATION)) == raises
 
 
@@ -235,14 +330,13 @@ def test_no_diagnosis_is_asked_for_while_it_is_stale(monkeypatch: pytest.MonkeyP
     rest = lost(faulty, begin, 6.0)
     seen = Watch()
     adviser = Asking(rigs.config("test_rig"), "a", lambda: True, lambda: None)  # type: ignore[arg-type, return-value]
-    blocks = [*rigs.cut(rest[:begin], 100), *[EMPTY] * 20, *rigs.cut(rest[begin:], 100)]
-    now = int(rest["host_ns"][begin - 1]) + S
+    source = Timed([*rigs.cut(rest[:begin], 100), *[EMPTY] * 60, *rigs.cut(rest[begin:], 100)])
     run(
-        blocks,
+        source,
         rigs.twin("test_rig"),
         rigs.monitor("test_rig"),
         [seen],
-        lambda: now,
+        source.listening,
         advisers=[adviser],
     )
     assert len(asked) == 1

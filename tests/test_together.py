@@ -1,6 +1,8 @@
 """Several ejectors in one process: on one PLC and on several, and what one does to the others."""
 
+import itertools
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -9,7 +11,7 @@ import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import psutil
@@ -333,13 +335,49 @@ def test_one_that_cannot_begin_leaves_the_others_and_is_exit_code_3(
     here = configured(tmp_path, "gripper", "here", on(plc.port))
     nowhere = configured(tmp_path, "gripper", "nowhere", on(gone.port))
     log = tmp_path / "a.mcap"
-    assert twin(monkeypatch, "run", here, nowhere, "--log", log, "--duration", "1.5") == 3
+    assert twin(monkeypatch, "run", here, nowhere, "--log", log, "--once", "--duration", "1.5") == 3
     said = capsys.readouterr().err
     assert f"twin: nowhere: 127.0.0.1:{gone.port}: no connection" in said
     assert "1 of 2 ejectors failed: nowhere" in said
     assert open_log(tmp_path / "a.here.mcap").complete
     assert rows(tmp_path / "a.here.mcap") > 500
     assert not (tmp_path / "a.nowhere.mcap").exists()
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return int(free.getsockname()[1])
+
+
+def test_plcs_that_are_off_when_the_twin_starts_are_read_once_they_are_on(tmp_path: Path) -> None:
+    """By Modbus and by OPC UA, as after a power cut that the edge was the first to survive."""
+    modbus, opcua = free_port(), free_port()
+
+    def by_opcua(tables: dict[str, Any]) -> None:
+        tables["driver"]["url"] = f"opc.tcp://127.0.0.1:{opcua}"
+        tables["plc"]["opcua"]["port"] = opcua
+
+    one = configured(tmp_path, "gripper", "one", on(modbus))
+    two = configured(tmp_path, "test_rig_opcua", "two", by_opcua)
+    logs = [tmp_path / "run.one.mcap", tmp_path / "run.two.mcap"]
+    with running(one, two, "--log", tmp_path / "run.mcap") as process:
+        assert process.stderr is not None
+        told = {line.split(":")[1].strip() for line in said_of(process.stderr, "no connection", 2)}
+        assert told == {"one", "two"}
+        with start_plc(one, port=modbus), start_plc(two):
+            until(process, lambda: all(rows(log) > 500 for log in logs))
+            process.send_signal(signal.SIGINT)
+            _, complaints = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 130, complaints
+    assert "no connection" not in complaints  # it was said already
+    for log in logs:
+        assert open_log(log).complete
+        assert kinds(open_log(log)) <= {Kind.CYCLE, Kind.CLOCK, Kind.TWIN_LATE}
+
+
+def said_of(stream: IO[str], what: str, times: int) -> list[str]:
+    """The first lines with it."""
+    return list(itertools.islice((line for line in stream if what in line), times))
 
 
 def test_several_ejectors_are_viewed_in_one_recording(
@@ -362,7 +400,7 @@ def test_nothing_is_viewed_of_a_plc_that_does_not_answer(
     target = tmp_path / "before.rrd"
     target.write_text("of yesterday")
     nowhere = configured(tmp_path, "gripper", "nowhere", on(gone.port))
-    assert twin(monkeypatch, "run", nowhere, "--rrd", target) == 3
+    assert twin(monkeypatch, "run", nowhere, "--once", "--rrd", target) == 3
     assert target.read_text() == "of yesterday"
 
 

@@ -36,6 +36,7 @@ from twin.files import require_writable, write_json
 from twin.instants import stamp
 
 if TYPE_CHECKING:
+    from drivers.lasting import Away
     from drivers.results_state import Results
     from drivers.shared import Lines
     from twin.cli_outlets import Begin, Standing
@@ -94,7 +95,7 @@ def run(
     configs: ConfigFiles,
     *,
     duration: Annotated[
-        float | None, typer.Option(metavar="S", help="Stop after S seconds.")
+        float | None, typer.Option(metavar="S", help="Stop after S seconds with the PLC.")
     ] = None,
     log: Annotated[Path | None, typer.Option(metavar="FILE", help="Write an MCAP log.")] = None,
     view: ViewFlag = False,
@@ -105,12 +106,16 @@ def run(
     hil: Annotated[
         bool, typer.Option("--hil", help="Be the plant of the PLC: write what [hil.tags] lists.")
     ] = False,
+    once: Annotated[
+        bool, typer.Option("--once", help="End if the PLC does not answer at the start.")
+    ] = False,
     fail_on_alarm: FailOnAlarm = False,
 ) -> None:
     """Run the twin beside a PLC: read, expect, compare, log, alarm, diagnose. Ctrl-C ends it.
 
     Several configurations are as many ejectors, each with its own twin and log (FILE gets the
-    asset's id before its suffix). One that fails does not stop the others.
+    asset's id before its suffix). One that fails does not stop the others. A PLC that does not
+    answer yet is tried until it does.
     """
     from drivers.results_settings import open_results
     from drivers.shared import Lines
@@ -118,7 +123,7 @@ def run(
     from twin.diagnosis.process import LiveDiagnosis
     from twin.figures.table import FIGURES
     from twin.live import run as run_loop
-    from twin.log.recorder import Recorder
+    from twin.monitor.listening import Listening
     from twin.settings import Document
     from twin.together import run_together
 
@@ -139,15 +144,12 @@ def run(
         twin, monitor = pairs[name]
         alarms, outlets = alarms_of(settings, _complain), outlets_of(settings, _complain)
         shown = show(name, settings.asset.type, asker_of(settings)) if show else None
-        shared = lines if hil or not alone else None
-        source = open_source(settings.document, address, shared)
-        if hil:
-            source = _answering(source, settings, address, lines)
-        with _closed(shown), _closed(source):
-            # A PLC that does not answer is said before a log is begun.
-            begun, file = _begun(source), _file_of(log, label)
-            rotate = round(settings.log.rotate_mb * 1e6)
-            header = settings.log_header(hil=hil)
+        at = settings.document, address, lines if hil or not alone else None
+        plc = _Plc(partial(open_source, *at), label, once=once)
+        with _closed(shown):
+            if not plc.answers(stopped):  # said before a log is begun
+                return
+            file = _file_of(log, label)
             # The log comes last: what people are told does not wait for the disk.
             sinks = _opened(
                 lambda: consoles[name],
@@ -155,20 +157,24 @@ def run(
                 keeper_of(settings, _complain),
                 live_rows_of(settings, _complain),
                 view_of(name),
-                (lambda: Recorder(file, header, rotate_bytes=rotate)) if file else None,
+                partial(_recorder, file, settings, hil=hil) if file else None,
             )
-            status = _status if alone else _unsaid
             adviser = LiveDiagnosis(
                 settings,
                 str(file or "live"),
                 lambda: stopped() == "interrupted",
-                status,
+                _status if alone else _unsaid,
                 reports=reports_of(settings),
             )
             # What is not measured has no faults. Alarms come last: they hear the diagnosis.
             advisers: list[Adviser] = [] if hil else [adviser, board := alarms()]
             sinks = [*([] if hil else _told(board.standing(), shown, outlets)), *sinks]
-            run_loop(_until(stopped, begun), twin, monitor, sinks, advisers=advisers)
+            # It begins with the newest row: what came while all this was opened is not judged.
+            source = plc.blocks()
+            if hil:
+                source = _answering(source, settings, address, lines)
+            with _closed(source):
+                run_loop(_until(stopped, source), twin, monitor, sinks, Listening(), advisers)
 
     failed: list[str] = []
     units = {figure.name: figure.unit for figure in FIGURES.values()}
@@ -512,6 +518,14 @@ def _file_of(path: Path | None, name: str) -> Path | None:
     return path.with_name(f"{path.stem}.{name}{path.suffix}") if path and name else path
 
 
+def _recorder(file: Path, settings: "Config", *, hil: bool) -> "Sink":
+    """The log of a live run."""
+    from twin.log.recorder import Recorder
+
+    rotate = round(settings.log.rotate_mb * 1e6)
+    return Recorder(file, settings.log_header(hil=hil), rotate_bytes=rotate)
+
+
 def pair_of(settings: "Config") -> tuple["Twin", "Monitor"]:
     """The twin of a configuration and its monitor."""
     from twin.live import compiled
@@ -692,19 +706,41 @@ def _closed(source: object) -> Iterator[None]:
             source.close()
 
 
-def _begun(source: "Iterator[Samples]") -> "Iterator[Samples]":
-    """The same blocks, the first of them already fetched."""
-    first = next(source)
+class _Plc:
+    """The PLC of one ejector: tried until it answers, unless it is to answer at ``once``."""
 
-    def blocks() -> "Iterator[Samples]":
-        yield first
-        yield from source
+    def __init__(
+        self, opened: "Callable[[Away | None], Iterator[Samples]]", name: str, *, once: bool
+    ) -> None:
+        self._opened, self._once = opened, once
+        self._said = f"{name}: " if name else ""
+        self._failure: SourceError | None = None  # why it did not answer
 
-    return blocks()
+    def blocks(self) -> "Iterator[Samples]":
+        """Its samples from now on; errors as from ``drivers.sources.open_source``."""
+        return self._opened(None if self._once else self._away)
+
+    def answers(self, stopped: Callable[..., str]) -> bool:
+        """Wait for a row and hang up; False if the run is interrupted before there is one."""
+        source = self.blocks()
+        with _closed(source):
+            for block in source:
+                if len(block):
+                    break
+                if stopped(begun=False):
+                    return False
+        if self._failure is not None:
+            _complain(f"{self._said}the PLC answers")
+        return True
+
+    def _away(self, error: SourceError) -> None:
+        self._failure = error
+        hint = "it is tried until it answers; with --once the run ends instead"
+        _complain(f"{self._said}{error}\n  {error.hint}\n  {hint}")
 
 
 @contextmanager
-def _stop_on_signal(duration: float | None) -> Iterator[Callable[[], str]]:
+def _stop_on_signal(duration: float | None) -> Iterator[Callable[..., str]]:
     """Give a function that says why to stop: "" (go on), "duration" or "interrupted".
 
     The first Ctrl-C lets the loop finish its block and close the log; the second one is Python's.
@@ -718,9 +754,9 @@ def _stop_on_signal(duration: float | None) -> Iterator[Callable[[], str]]:
             raise KeyboardInterrupt
         reason = "interrupted"
 
-    def why() -> str:
+    def why(*, begun: bool = True) -> str:
         nonlocal reason, end
-        if end is None and duration is not None:
+        if begun and end is None and duration is not None:
             end = time.monotonic() + duration
         if not reason and end is not None and time.monotonic() >= end:
             reason = "duration"

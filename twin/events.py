@@ -23,6 +23,7 @@ class Kind(StrEnum):
     CLOCK = "clock"
     PLC_STALE = "plc_stale"
     PLC_BACK = "plc_back"
+    TWIN_LATE = "twin_late"
     SIGNAL_BAD = "signal_bad"
     SIGNAL_GOOD = "signal_good"
     CYCLE = "cycle"
@@ -40,6 +41,7 @@ SEVERITY: dict[Kind, Severity] = {
     Kind.CLOCK: Severity.INFO,
     Kind.PLC_STALE: Severity.ALARM,
     Kind.PLC_BACK: Severity.INFO,
+    Kind.TWIN_LATE: Severity.WARNING,
     Kind.SIGNAL_BAD: Severity.WARNING,
     Kind.SIGNAL_GOOD: Severity.INFO,
     Kind.CYCLE: Severity.INFO,

@@ -1,7 +1,6 @@
 """The loop: blocks in, twin, monitor, sinks out. All of the path is on this page."""
 
-import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from heapq import merge
@@ -18,9 +17,10 @@ from twin.model.term import Term, Terms
 from twin.model.theta import Theta
 from twin.monitor.detect import Monitor
 from twin.monitor.knees import expected_knees
+from twin.monitor.listening import Listening
 from twin.monitor.phases import Found, Knees, PhaseFinder
 from twin.monitor.signatures import steps
-from twin.signals import MBAR, SAMPLE, TICK, Quality, Samples, Ticks
+from twin.signals import MBAR, SAMPLE, TICK, Samples, Ticks
 
 REPLAYED = 60_000  # rows that a replay takes at once: what is done to many cycles stays in caches
 
@@ -109,27 +109,21 @@ def run(
     twin: Twin,
     monitor: Monitor,
     sinks: Sequence[Sink],
-    clock: Callable[[], int] = time.time_ns,
+    listening: Listening | None = None,
     advisers: Sequence[Adviser] = (),
 ) -> None:
     """Take every block of ``source`` through twin and monitor to the sinks; close them at the end.
 
-    ``clock`` (ns, as the driver stamps receipts) is asked only while nothing arrives. What
-    ``advisers`` say goes to the sinks with what it follows.
+    A live source is timed by ``listening``. What ``advisers`` say goes to the sinks with what it
+    follows.
     """
-    last = None
+    timed = listening.over(source, monitor) if listening else ((block, []) for block in source)
     with ExitStack() as closing:
         for close in [sink.close for sink in sinks] + [adviser.close for adviser in advisers]:
             closing.callback(close)
-        for block in source:
-            silent: list[Event] = []
-            fresh = np.flatnonzero((block["quality"] & Quality.STALE) == 0)
-            if len(fresh):
-                last = block[fresh[-1]].copy()
-            elif last is not None:
-                silent = monitor.silent(last, clock())
+        for block, happened in timed:
             samples, ticks = twin.advance(block)
-            events = silent + monitor.update(samples, ticks)
+            events = happened + monitor.update(samples, ticks)
             hand_out(sinks, samples, ticks, _advised(advisers, samples, events))
         samples, ticks = twin.flush()
         events = monitor.update(samples, ticks) + monitor.close()

@@ -80,11 +80,23 @@ class Quality(IntFlag):
     OVERFLOW = 16  # the input is beyond what it can measure: not a pressure
     STALE = 32  # the PLC answers, but its value is no longer fresh
     BAD = 64  # the PLC or the server says itself that the value is bad
+    OURS = 128  # the pause before its receipt is the twin's: it was late, or its clock was set
 
 
 # Plain numbers: with an IntFlag NumPy makes 64 bits of every byte.
 UNUSABLE = int(Quality.OVERFLOW | Quality.STALE | Quality.BAD)  # no pressure to compare with
 BREAK = int(Quality.GAP | Quality.RESTART | Quality.CLOCK)  # time does not run on from before
+
+
+def unseen_ns(before: Samples | np.void, after: Samples | np.void) -> npt.NDArray[np.int64]:
+    """Time (ns) that passed unseen between rows before and after a gap.
+
+    By PLC time where it runs on; after a restart or a jump of it, by the times of receipt.
+    """
+    runs_on = (after["quality"] & (Quality.RESTART | Quality.CLOCK)) == 0
+    by_plc, by_receipt = (after[name] - before[name] for name in ("time_ns", "host_ns"))
+    passed: npt.NDArray[np.int64] = np.maximum(np.where(runs_on, by_plc, by_receipt), 0)
+    return passed
 
 
 class Phase(IntEnum):

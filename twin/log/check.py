@@ -12,7 +12,7 @@ from twin.log.reader import Log, decode_happening, decode_rows, open_log
 from twin.log.recorder import Recorder
 from twin.log.records import Damage, messages
 from twin.log.schema import EVENTS, SAMPLES
-from twin.signals import NS, SAMPLE, Quality, Samples, Ticks
+from twin.signals import NS, SAMPLE, Quality, Samples, Ticks, unseen_ns
 
 Piece = tuple[Samples, Ticks, list[Event]]
 
@@ -28,8 +28,10 @@ class Report:
     samples: int
     events: int
     duration_s: float  # PLC time, without jumps of the clock and restarts
-    gaps: int  # places where sequence numbers are missing
-    missing: int  # samples missing there
+    gaps: int  # places where samples are missing: sequence numbers, or all of a restart
+    missing: int  # samples missing there, without those of restarts: they are not known
+    unseen_s: float  # how long the gaps are together
+    restarts: int  # gaps after which the sequence begins anew
     time_back: int  # places where PLC time does not go forward
     bytes_per_sample: float  # of the files
 
@@ -42,13 +44,19 @@ class Report:
         """Several lines for people."""
         lines = [
             f"{self.path}: {self.samples} rows, {self.duration_s:.1f} s, {self.events} events",
-            f"gaps: {self.gaps}, {self.missing} rows missing",
+            f"gaps: {self.gaps}, {self.missing} rows missing{self._unseen()}",
             f"size: {self.bytes_per_sample:.1f} bytes a row, parts: {self.parts}",
             f"state: {self._state()}",
         ]
         if self.time_back:
             lines.insert(2, f"PLC time does not go forward at {self.time_back} places")
         return "\n".join([*lines, *(f"unreadable: {damage}" for damage in self.damage)])
+
+    def _unseen(self) -> str:
+        """How long the gaps are, and how many of them are restarts."""
+        seconds = f", {self.unseen_s:.1f} s not seen" if self.gaps else ""
+        what = "a restart" if self.restarts == 1 else "restarts"
+        return seconds + (f", {self.restarts} of them {what} of the PLC" if self.restarts else "")
 
     def _state(self) -> str:
         if any(not damage.torn for damage in self.damage):
@@ -60,8 +68,9 @@ class _Tally:
     """Adds up the rows of a stream, however it is cut."""
 
     def __init__(self) -> None:
-        self.samples = self.events = self.gaps = self.missing = self.time_back = 0
-        self.duration_s = 0.0
+        self.samples = self.events = self.gaps = self.missing = 0
+        self.restarts = self.time_back = 0
+        self.duration_s = self.unseen_s = 0.0
         self._last = np.empty(0, SAMPLE)
 
     def add(self, samples: Samples) -> None:
@@ -69,8 +78,12 @@ class _Tally:
         rows = np.concatenate((self._last, samples))
         self._last = rows[-1:]
         skipped = np.diff(rows["sequence"]) - 1
-        self.gaps += int((skipped > 0).sum())
-        self.missing += int(skipped[skipped > 0].sum())
+        anew = ((rows["quality"][1:] & Quality.RESTART) != 0) | (skipped < 0)
+        gaps = (skipped > 0) | anew
+        self.gaps += int(gaps.sum())
+        self.restarts += int(anew.sum())
+        self.missing += int(skipped[gaps & ~anew].sum())
+        self.unseen_s += float(unseen_ns(rows[:-1][gaps], rows[1:][gaps]).sum() * NS)
         steps = np.diff(rows["time_ns"])
         self.time_back += int((steps <= 0).sum())
         jumps = (rows["quality"][1:] & (Quality.CLOCK | Quality.RESTART)) != 0
@@ -111,6 +124,8 @@ def _go_through(log: Log, take: Callable[[Samples, Ticks, Sequence[Event]], None
         duration_s=tally.duration_s,
         gaps=tally.gaps,
         missing=tally.missing,
+        unseen_s=tally.unseen_s,
+        restarts=tally.restarts,
         time_back=tally.time_back,
         bytes_per_sample=size / max(tally.samples, 1),
     )

@@ -23,8 +23,8 @@ plane j holds byte j of every z; k = (length - 8) / count; planes that would be 
 out. Units: time_ns PLC time and host_ns time of receipt in ns, pressure and expected Pa absolute,
 supply Pa gauge, level Pa absolute on which the model was set anew, commands 1 suction
 + 2 blow-off, quality 1 gap + 2 restart + 4 clock + 8 out of range + 16 overflow + 32 stale
-+ 64 bad, phase 0 idle, 1 suction, 2 hold, 3 blow-off, signals that the model hands out
-1 part present (H2) + 2 air saving (H1)."""
++ 64 bad + 128 received late by the twin itself, phase 0 idle, 1 suction, 2 hold, 3 blow-off,
+signals that the model hands out 1 part present (H2) + 2 air saving (H1)."""
 
 _SCALARS = """About 50 rows a second, and each row where a command or the phase changes, to look at.
 deviation_mbar is measured minus expected absolute pressure: above 0 is less vacuum than expected.

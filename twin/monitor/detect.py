@@ -22,7 +22,7 @@ from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, Look, Teller,
 from twin.monitor.healthy import Healthy
 from twin.monitor.signatures import Likeness, drawn_rows, likenesses, look_alikes
 from twin.settings import Settings
-from twin.signals import BREAK, NS, SAMPLE, TICK, Quality, Samples, Ticks, joined
+from twin.signals import BREAK, NS, SAMPLE, TICK, Quality, Samples, Ticks, joined, unseen_ns
 
 if TYPE_CHECKING:  # its SciPy would be imported with every configuration
     from twin.monitor.isolation import Heard, Isolation, Verdict
@@ -114,6 +114,7 @@ class Monitor:
             rows = slice(begin, end)
             found = list(self._stream_events(samples[rows]))
             silent = any(event.kind is Kind.PLC_BACK for event in found)
+            silent |= bool((samples["quality"][begin : begin + 1] & Quality.OURS).any())
             cycles = list(self._cutter.push(samples[rows], ticks[rows]))
             found += self._judge(cycles, silent)
             found += self.clocks.push(samples[rows]) if self.clocks else []
@@ -124,13 +125,20 @@ class Monitor:
             self.isolation.ahead(*self._cutter.begun)
         return events
 
-    def silent(self, last: np.void, now_ns: int) -> list[Event]:
-        """Nothing arrived: give PLC_STALE once it is too long after the ``last`` fresh row."""
-        time_ns = int(last["time_ns"])
-        silence_ns = now_ns - int(last["host_ns"])
-        if time_ns in self._silences or silence_ns * NS * 1e3 <= self.settings.stale_ms:
+    def silent(self, last: np.void, listened_ns: int) -> list[Event]:
+        """PLC_STALE, once, if the twin has listened too long since the ``last`` fresh row (ns)."""
+        if self.is_stale(last) or listened_ns <= self.stale_ns:
             return []
-        return [self._stale(time_ns)]
+        return [self._stale(int(last["time_ns"]))]
+
+    def is_stale(self, last: np.void) -> bool:
+        """Whether PLC_STALE was said after this fresh row."""
+        return int(last["time_ns"]) in self._silences
+
+    @property
+    def stale_ns(self) -> int:
+        """How long nothing fresh may come."""
+        return round(self.settings.stale_ms * 1e6)
 
     def close(self) -> list[Event]:
         """Judge the cycle that the end cut off, and say what is still to be said of the clocks."""
@@ -155,8 +163,10 @@ class Monitor:
         fresh = (quality & Quality.STALE) == 0
         latest = np.maximum.accumulate(np.where(fresh, np.arange(len(rows)), -1))
         before = np.concatenate([[-1], latest[:-1]])  # the last fresh row before each
-        silence_ms = (rows["host_ns"] - rows["host_ns"][before]) * NS * 1e3
-        silent = (silence_ms > self.settings.stale_ms) & (before >= 0)
+        silent = rows["host_ns"] - rows["host_ns"][before] > self.stale_ns
+        silent &= (quality & Quality.OURS) == 0
+        silent |= np.isin(rows["time_ns"][before], list(self._silences))  # it was said while it was
+        silent &= before >= 0
         changes |= silent & (fresh | ~np.concatenate([[False], (silent & ~fresh)[:-1]]))
         for row in np.flatnonzero(changes):
             if row >= first:
@@ -170,8 +180,7 @@ class Monitor:
         if self._unfit or self._silences or samples["quality"].any():
             return False
         came = np.concatenate([self._fresh["host_ns"], samples["host_ns"]])
-        longest = int(np.diff(came).max(initial=0))
-        return longest * NS * 1e3 <= self.settings.stale_ms
+        return int(np.diff(came).max(initial=0)) <= self.stale_ns
 
     def _row_events(
         self, before: np.void | None, row: np.void, heard: np.void | None
@@ -204,17 +213,20 @@ class Monitor:
         events = [] if since_ns in self._silences else [self._stale(since_ns)]
         if not row["quality"] & Quality.STALE:
             self._silences.remove(since_ns)
-            silence_ms = float(int(row["host_ns"]) - int(heard["host_ns"])) * NS * 1e3
+            silence_ns = max(int(row["host_ns"]) - int(heard["host_ns"]), self.stale_ns)
+            silence_ms = silence_ns * NS * 1e3
             text = f"the PLC is back after {silence_ms / 1e3:.2f} s"
             data = {"silence_ms": silence_ms}
-            events.append(Event(int(row["time_ns"]), Kind.PLC_BACK, text, data))
+            time_ns = int(row["time_ns"])
+            if not row["quality"] & (Quality.RESTART | Quality.CLOCK):
+                time_ns = max(time_ns, since_ns + self.stale_ns)  # a ring may have filled the pause
+            events.append(Event(time_ns, Kind.PLC_BACK, text, data))
         return events
 
     def _stale(self, last_time_ns: int) -> Event:
         self._silences.add(last_time_ns)
-        after_ns = int(self.settings.stale_ms * 1e6)
         text = f"no fresh sample for {self.settings.stale_ms:.0f} ms: check PLC and network"
-        return Event(last_time_ns + after_ns, Kind.PLC_STALE, text, {"since_ns": last_time_ns})
+        return Event(last_time_ns + self.stale_ns, Kind.PLC_STALE, text, {"since_ns": last_time_ns})
 
     # --- the cycles -----------------------------------------------------------------------------
 
@@ -432,10 +444,11 @@ def _order(event: Event) -> int:
 
 def _gap(before: np.void, row: np.void) -> Event:
     missing = int(row["sequence"]) - int(before["sequence"]) - 1
-    seconds = (int(row["time_ns"]) - int(before["time_ns"])) * NS
+    seconds = float(unseen_ns(before, row)) * NS
     text = f"{missing} samples are missing ({seconds:.3f} s)"
-    if missing < 0:
-        missing, text = 0, "samples are missing; how many is not known"
+    if missing < 0 or row["quality"] & Quality.RESTART:
+        missing = 0
+        text = f"samples are missing over {seconds:.3f} s; how many is not known"
     data: dict[str, float | int | str] = {"missing": missing, "seconds": seconds}
     return Event(int(row["time_ns"]), Kind.GAP, text, data)
 
