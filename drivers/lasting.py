@@ -72,6 +72,8 @@ def lasting(
         while True:
             try:
                 link.open()
+                if begun:
+                    yield EMPTY  # connected is not yet answered
                 for block in source.samples(link):
                     begun = True
                     yield block
@@ -82,24 +84,17 @@ def lasting(
                     away(error)
                 begun = True
                 link.close()  # if it is not yet: what it knows of the PLC may no longer hold
-                yield from _reconnect(link, clock)
+                yield from _pause(clock)
     finally:
         link.close()
 
 
-def _reconnect(link: Connection, clock: Clock) -> Iterator[Samples]:
-    """Empty blocks until there is a connection again."""
-    while True:
-        yield EMPTY  # and around whatever may take its time
-        for _ in range(2):
-            clock.sleep(RETRY_S / 2)
-            yield EMPTY
-        try:
-            link.open()
-        except LostError:
-            continue
-        yield EMPTY  # connected is not yet answered
-        return
+def _pause(clock: Clock) -> Iterator[Samples]:
+    """Empty blocks until the next try, and around whatever may take its time."""
+    yield EMPTY
+    for _ in range(2):
+        clock.sleep(RETRY_S / 2)
+        yield EMPTY
 
 
 def in_thread(source: Generator[Samples, None, None]) -> Generator[Samples, None, None]:
