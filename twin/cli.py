@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli_alarms import alarms_app, alarms_of, asker_of
+from twin.cli_app import App
 from twin.cli_assets import assets_app
 from twin.cli_cert import cert
 from twin.cli_compare import compare
@@ -53,26 +54,17 @@ GARBAGE = 20_000  # objects made and not let go of, after which Python looks for
 INTERRUPTED = 130
 ALARMED = 1
 
-app = typer.Typer(
-    help="A live digital twin of pneumatic vacuum ejectors.",
-    add_completion=False,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-)
+app = App("A live digital twin of pneumatic vacuum ejectors.")
 app.add_typer(assets_app, name="assets")
 app.add_typer(figures_app, name="figures")
 app.add_typer(alarms_app, name="alarms")
 app.add_typer(fleet_app, name="fleet")
-log_app = typer.Typer(help="Look after logs.", no_args_is_help=True)
+log_app = App("Look after logs.")
 app.add_typer(log_app, name="log")
-app.command()(cert)
-app.command()(compare)
-app.command()(export_fmu)
-app.command()(serve)
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML configuration.")]
 ConfigFiles = Annotated[
-    list[Path], typer.Argument(metavar="CONFIG...", help="TOML configuration, one per ejector.")
+    list[Path], typer.Argument(metavar="CONFIG", help="TOML configuration, one per ejector.")
 ]
 LogFile = Annotated[Path, typer.Argument(metavar="LOG.mcap", help="A recorded log.")]
 Address = Annotated[
@@ -84,7 +76,9 @@ AssetsUrl = Annotated[
 UnitId = Annotated[str, typer.Option("--id", metavar="ID", help="Unit, instead of [asset] id.")]
 ConfigOption = Annotated[Path | None, typer.Option(help="Instead of the one in the log.")]
 AsOf = Annotated[str, typer.Option(metavar="TIME", help="What the asset database knew then, UTC.")]
-JsonFile = Annotated[Path | None, typer.Option("--json", metavar="F", help="The answer.")]
+JsonFile = Annotated[
+    Path | None, typer.Option("--json", metavar="F", help="Write the answer as JSON.")
+]
 ViewFlag = Annotated[bool, typer.Option("--view", help="Open the Rerun viewer.")]
 RrdFile = Annotated[Path | None, typer.Option(metavar="F.rrd", help="Write the view to a file.")]
 FailOnAlarm = Annotated[bool, typer.Option(help="Exit with 1 if an alarm was raised.")]
@@ -204,8 +198,12 @@ def replay(
     unit: UnitId = "",
     assets: AssetsUrl = "",
     as_of: AsOf = "",
-    output: Annotated[Path | None, typer.Option("-o", metavar="OUT.mcap", help="New log.")] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", metavar="F", help="Events.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", metavar="OUT.mcap", help="Write a new log.")
+    ] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="F", help="Write the events as JSON.")
+    ] = None,
     view: ViewFlag = False,
     rrd: RrdFile = None,
     fail_on_alarm: FailOnAlarm = False,
@@ -246,7 +244,7 @@ def plc(
         typer.Option(metavar="NAME=VALUE[@START][/COURSE]", help="For example leakage=2.0@10."),
     ] = None,
     port: Annotated[int | None, typer.Option(help="Modbus TCP port; 0 takes any free.")] = None,
-    seed: Annotated[int, typer.Option(help="Of everything that is random.")] = 0,
+    seed: Annotated[int, typer.Option(help="For all that is random: same seed, same run.")] = 0,
     duration: Annotated[
         float | None, typer.Option(metavar="S", help="Stop after S seconds.")
     ] = None,
@@ -283,7 +281,9 @@ def diagnose(
     assets: AssetsUrl = "",
     as_of: AsOf = "",
     json_file: JsonFile = None,
-    report: Annotated[Path | None, typer.Option(metavar="F.html", help="With pictures.")] = None,
+    report: Annotated[
+        Path | None, typer.Option(metavar="F.html", help="Write a page with pictures.")
+    ] = None,
     save_as: Annotated[
         str, typer.Option(metavar="NEWID", help="Keep the extended model as that of a unit.")
     ] = "",
@@ -343,7 +343,7 @@ def calibrate(
 def import_(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV or Parquet.")],
     config: Annotated[Path, typer.Option(help="TOML configuration; [import] maps columns.")],
-    output: Annotated[Path, typer.Option("-o", metavar="LOG.mcap", help="New log.")],
+    output: Annotated[Path, typer.Option("-o", metavar="LOG.mcap", help="Write the new log.")],
     unit: UnitId = "",
     assets: AssetsUrl = "",
 ) -> None:
@@ -396,9 +396,12 @@ def effects() -> None:
 @app.command()
 def paper(
     json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="F", help="The recomputed figures.")
+        Path | None,
+        typer.Option("--json", metavar="F", help="Write the recomputed figures as JSON."),
     ] = None,
-    picture: Annotated[Path | None, typer.Option(metavar="F.(svg|png)", help="The curves.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="F.(svg|png)", help="Draw the curves.")
+    ] = None,
 ) -> None:
     """Recompute the founding paper's tables 2 and 4, and say what they can tell."""
     from twin.paper.separation import separate
@@ -428,12 +431,19 @@ def check(log: LogFile) -> None:
 
 @log_app.command()
 def recover(
-    log: LogFile, output: Annotated[Path, typer.Option("-o", metavar="OUT.mcap", help="New log.")]
+    log: LogFile,
+    output: Annotated[Path, typer.Option("-o", metavar="OUT.mcap", help="Write a new log.")],
 ) -> None:
     """Write a complete log of everything that can be read in a damaged or unfinished one."""
     from twin.log.check import recover as recover_log
 
     print(recover_log(log, output))
+
+
+app.command()(compare)
+app.command()(export_fmu)
+app.command()(serve)
+app.command()(cert)
 
 
 def main() -> None:
@@ -443,7 +453,7 @@ def main() -> None:
     gc.set_threshold(GARBAGE)  # of what is imported nothing is: looking is a tenth of the start
     atexit.register(gc.freeze)  # what is left ends with the process: no 0.2 s for its garbage
     try:
-        app()
+        app(prog_name="twin")
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
     except TwinError as error:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from twin.cli_app import App
 from twin.errors import ConfigError
 from twin.files import write_json
 from twin.instants import instant
@@ -27,12 +28,9 @@ if TYPE_CHECKING:
 ANSWER_S = 5.0  # until a run that is there has answered: it looks every second
 LOOK_S = 0.1
 
-alarms_app = typer.Typer(
-    help="Alarms: what stands, what was; acknowledge, shelve, take out of service.",
-    no_args_is_help=True,
-)
+alarms_app = App("Alarms: what stands, what was; acknowledge, shelve, take out of service.")
 
-Names = Annotated[list[str], typer.Argument(metavar="ALARM...", help="As twin alarms list says.")]
+Names = Annotated[list[str], typer.Argument(metavar="ALARM", help="As twin alarms list says.")]
 Url = Annotated[
     str, typer.Option("--alarms", metavar="URL", help="Database: sqlite:///FILE, postgresql://...")
 ]
@@ -42,7 +40,9 @@ ConfigFile = Annotated[
 ]
 UnitId = Annotated[str, typer.Option("--id", metavar="ID", help="Unit, where there are several.")]
 Who = Annotated[str, typer.Option("--by", metavar="NAME", help="Instead of the user's name.")]
-JsonFile = Annotated[Path | None, typer.Option("--json", metavar="F", help="The same as JSON.")]
+JsonFile = Annotated[
+    Path | None, typer.Option("--json", metavar="F", help="Write the same as JSON.")
+]
 
 
 @alarms_app.command("list")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from twin.cli_app import App
 from twin.errors import ConfigError, SourceError
 from twin.files import write_whole
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 AASX = ".aasx"
 
-assets_app = typer.Typer(help="The asset database: type and ID to data sets.", no_args_is_help=True)
+assets_app = App("The asset database: type and ID to data sets.")
 
 Url = Annotated[
     str,
@@ -135,13 +136,15 @@ def import_(
 
 @assets_app.command()
 def export(
-    output: Annotated[Path | None, typer.Option("-o", metavar="FILE", help="Not stdout.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", metavar="FILE", help="Write to a file, not stdout.")
+    ] = None,
     aasx: Annotated[
         Path | None,
-        typer.Option("--aasx", metavar="FILE.aasx", help="As Asset Administration Shells."),
+        typer.Option("--aasx", metavar="FILE.aasx", help="Write Asset Administration Shells."),
     ] = None,
     unit: Annotated[
-        str, typer.Option("--id", metavar="ID", help="Of this unit and its type only.")
+        str, typer.Option("--id", metavar="ID", help="Only this unit and its type.")
     ] = "",
     fmu: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The unit's simulation model, for --aasx.")

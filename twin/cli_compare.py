@@ -16,11 +16,15 @@ if TYPE_CHECKING:
 def compare(
     a: Annotated[Path, typer.Argument(metavar="A.mcap", help="A recorded log, as it was.")],
     b: Annotated[Path, typer.Argument(metavar="B.mcap", help="Another one, as it is.")],
-    json_file: Annotated[Path | None, typer.Option("--json", metavar="F", help="As JSON.")] = None,
-    picture: Annotated[
-        Path | None, typer.Option(metavar="F.(svg|png)", help="Mean courses of a cycle.")
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="F", help="Write the answer as JSON.")
     ] = None,
-    rrd: Annotated[Path | None, typer.Option(metavar="F.rrd", help="The same for Rerun.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="F.(svg|png)", help="Draw the mean courses of a cycle.")
+    ] = None,
+    rrd: Annotated[
+        Path | None, typer.Option(metavar="F.rrd", help="Write the same for Rerun.")
+    ] = None,
 ) -> None:
     """Say what differs between two logs: key figures and courses, from the suction edge on."""
     from twin.compare.compare import compare as beside

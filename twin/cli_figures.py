@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from twin.cli_app import App
 from twin.errors import ConfigError
 from twin.files import write_json
 
@@ -24,10 +25,7 @@ if TYPE_CHECKING:
     from twin.log.reader import Log
     from twin.settings import Document
 
-figures_app = typer.Typer(
-    help="Key figures per cycle: leakage, evacuation times, air, counters, trends.",
-    no_args_is_help=True,
-)
+figures_app = App("Key figures per cycle: leakage, evacuation times, air, counters, trends.")
 
 Url = Annotated[
     str,
@@ -39,7 +37,9 @@ ConfigFile = Annotated[
 ]
 UnitId = Annotated[str, typer.Option("--id", metavar="ID", help="Unit, where there are several.")]
 Days = Annotated[float | None, typer.Option(metavar="N", help="Only the last N days.")]
-JsonFile = Annotated[Path | None, typer.Option("--json", metavar="F", help="The same as JSON.")]
+JsonFile = Annotated[
+    Path | None, typer.Option("--json", metavar="F", help="Write the same as JSON.")
+]
 
 
 @figures_app.command()
@@ -82,7 +82,7 @@ def show(
 @figures_app.command()
 def trend(
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="[FIGURE...]", help="Default: all there are.")
+        list[str] | None, typer.Argument(metavar="FIGURE", help="Default: all there are.")
     ] = None,
     config: ConfigFile = None,
     unit: UnitId = "",
@@ -90,7 +90,7 @@ def trend(
     days: Days = None,
     json_file: JsonFile = None,
     picture: Annotated[
-        Path | None, typer.Option(metavar="F.(png|svg)", help="Of one figure.")
+        Path | None, typer.Option(metavar="F.(png|svg)", help="Draw one figure.")
     ] = None,
 ) -> None:
     """How figures run, whether they stepped or drift, and when they come to their limits."""

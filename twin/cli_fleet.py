@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
+from twin.cli_app import App
 from twin.errors import ConfigError, SourceError
 from twin.files import require_writable, write_json
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from twin.log.reader import Log
     from twin.settings import Document
 
-fleet_app = typer.Typer(help="Many logs: work on each once, and compare.", no_args_is_help=True)
+fleet_app = App("Many logs: work on each once, and compare.")
 
 
 One = TypeVar("One")
@@ -34,19 +35,25 @@ class EngineName(StrEnum):
     DASK = "dask"
 
 
-Logs = Annotated[list[Path], typer.Argument(metavar="LOGS...", help="Logs, or folders of them.")]
+Logs = Annotated[list[Path], typer.Argument(metavar="LOGS", help="Logs, or folders of them.")]
 SomeLogs = Annotated[
-    list[Path] | None, typer.Argument(metavar="[LOGS...]", help="Of all that were worked on.")
+    list[Path] | None, typer.Argument(metavar="LOGS", help="Default: all that were worked on.")
 ]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Instead of each log's own.")]
 Assets = Annotated[
     str, typer.Option("--assets", metavar="URL", help="Asset database; it keeps the answers.")
 ]
 Engine = Annotated[EngineName, typer.Option(help="Processes here, or a Dask cluster.")]
-Scheduler = Annotated[str, typer.Option(metavar="ADDRESS", help="Of Dask, as tcp://host:8786.")]
+Scheduler = Annotated[
+    str, typer.Option(metavar="ADDRESS", help="Where Dask's is: tcp://host:8786.")
+]
 Workers = Annotated[int | None, typer.Option(min=1, help="Processes here; else one for each core.")]
-JsonFile = Annotated[Path | None, typer.Option("--json", metavar="F", help="The answer.")]
-Page = Annotated[Path | None, typer.Option("--html", metavar="F.html", help="With a picture.")]
+JsonFile = Annotated[
+    Path | None, typer.Option("--json", metavar="F", help="Write the answer as JSON.")
+]
+Page = Annotated[
+    Path | None, typer.Option("--html", metavar="F.html", help="Write a page with a picture.")
+]
 
 _WHAT = {
     "calibrate": "Fit every unit to its log of healthy cycles, and store its data set.",

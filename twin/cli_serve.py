@@ -40,12 +40,14 @@ def serve(
     port: Annotated[int, typer.Option(help="0 takes any free.")] = PORT,
     names: Annotated[
         list[str] | None,
-        typer.Option("--name", metavar="NAME", help="By which browsers reach this machine."),
+        typer.Option("--name", metavar="NAME", help="Name by which browsers reach this machine."),
     ] = None,
     certificate: Annotated[
-        Path | None, typer.Option(metavar="F.pem", help="For HTTPS, with its chain.")
+        Path | None, typer.Option(metavar="F.pem", help="Certificate for HTTPS, with its chain.")
     ] = None,
-    key: Annotated[Path | None, typer.Option(metavar="F.pem", help="Of the certificate.")] = None,
+    key: Annotated[
+        Path | None, typer.Option(metavar="F.pem", help="Private key of the certificate.")
+    ] = None,
     users: Annotated[
         Path | None,
         typer.Option(
@@ -55,7 +57,9 @@ def serve(
     add_user: Annotated[
         str, typer.Option(metavar="NAME", help="Ask for a password, keep it, and end.")
     ] = "",
-    remove_user: Annotated[str, typer.Option(metavar="NAME", help="And end.")] = "",
+    remove_user: Annotated[
+        str, typer.Option(metavar="NAME", help="Remove this user, and end.")
+    ] = "",
     assets: Annotated[
         str, typer.Option(metavar="URL", help="Asset database, instead of the configured.")
     ] = "",

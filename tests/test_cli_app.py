@@ -1,0 +1,51 @@
+"""What all commands have in common: help that says what was written, ``-h`` and ``--version``."""
+
+from collections.abc import Iterator
+from importlib.metadata import version
+
+import pytest
+from command_line import twin
+from typer.main import get_command
+
+from twin.cli import app
+
+
+def _commands() -> Iterator[tuple[str, ...]]:
+    yield ()
+    for name, command in get_command(app).commands.items():
+        yield (name,)
+        yield from ((name, below) for below in getattr(command, "commands", ()))
+
+
+COMMANDS = list(_commands())
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_every_command_has_short_help_and_a_version(
+    command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twin(monkeypatch, *command, "-h") == 0
+    short = capsys.readouterr().out
+    assert twin(monkeypatch, *command, "--help") == 0
+    assert capsys.readouterr().out == short
+    assert short.startswith(f"Usage: {' '.join(('twin', *command))} ")
+    assert "..." not in short.partition("Commands:")[2]  # no sentence is cut
+    assert twin(monkeypatch, *command, "--version") == 0
+    assert capsys.readouterr().out.startswith(f"twin {version('ejector-twin')} ")
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("run", "Unit, instead of [asset] id."),
+        ("run", "[hil.tags]"),
+        ("import", "[import] maps columns."),
+        ("serve", "that its [mqtt] names"),
+        ("alarms", "as a file that [alarms] rules can name."),
+    ],
+)
+def test_help_keeps_names_of_tables(
+    command: str, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twin(monkeypatch, command, "--help") == 0
+    assert said in " ".join(capsys.readouterr().out.split())

@@ -1,0 +1,74 @@
+"""What all commands have in common: plain help, ``-h`` and ``--version``."""
+
+import sys
+from collections.abc import Callable
+from importlib.metadata import version
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_command
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        program, python = version("ejector-twin"), sys.version.partition(" ")[0]
+        print(f"twin {program} (ejector-twin, Python {python})")
+        raise typer.Exit
+
+
+_only_version = typer.Typer(add_completion=False)
+
+
+@_only_version.command()
+def _version(
+    _wanted: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_show_version, is_eager=True, help="Show the version and exit."
+        ),
+    ] = False,
+) -> None: ...
+
+
+_VERSION = get_command(_only_version).params[0]
+_VERSION.expose_value = False  # it ends the program: no command takes it
+
+
+class _Common:
+    """Over one of Typer's classes: ``--version``, and a list of commands that cuts no sentence."""
+
+    help: str | None
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        return [_VERSION, *super().get_params(ctx)]  # type: ignore[misc]
+
+    def get_short_help_str(self, limit: int = 0) -> str:
+        return " ".join((self.help or "").partition("\n\n")[0].split())
+
+
+class _Command(_Common, TyperCommand):
+    pass
+
+
+class _Group(_Common, TyperGroup):
+    pass
+
+
+class App(typer.Typer):
+    """Commands whose help is text as it stands: Rich's markup would drop ``[table]`` from it."""
+
+    def __init__(self, help: str) -> None:  # noqa: A002 - Typer's name
+        super().__init__(
+            cls=_Group,
+            help=help,
+            no_args_is_help=True,
+            add_completion=False,
+            rich_markup_mode=None,
+            pretty_exceptions_enable=False,
+            context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+        )
+
+    def command(self, name: str | None = None, **options: Any) -> Callable[..., Any]:
+        """As Typer's, with what all commands have in common."""
+        return super().command(name, cls=_Command, **options)
