@@ -1,6 +1,8 @@
 """Connections that come and go, whatever protocol they speak: retried for ever, in one stream."""
 
+import errno
 import queue
+import socket
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
@@ -22,6 +24,28 @@ EMPTY: Samples = np.empty(0, SAMPLE)
 
 class LostError(SourceError):
     """No connection, no answer, or a broken one: it may come back."""
+
+
+def unreachable(where: str, error: OSError | UnicodeError, server: str) -> LostError:
+    """Say why nobody could be connected to at ``where``; ``server`` is what should listen there.
+
+    A name that nobody knows, a port that nobody listens on and silence want different remedies.
+    """
+    if isinstance(error, socket.gaierror | UnicodeError):
+        what, hint = "no such host", "is the name right, and known here? An IP address always is"
+    elif f"[Errno {errno.ECONNREFUSED}]" in str(error):  # asyncio's may be of several addresses
+        what = "the machine refuses this port"
+        hint = f"is the {server} started there, and is the port right?"
+    elif isinstance(error, TimeoutError):
+        what = "no answer"
+        hint = (
+            "is the PLC on and its cable in, is the address right, does a firewall stand between? "
+            f"Does a {server} listen there?"
+        )
+    else:
+        what = (error.strerror or str(error)).lower() or type(error).__name__
+        hint = "is this machine in the PLC's network, and is the address right?"
+    return LostError(f"{where}: no connection: {what}", hint)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from drivers.lasting import LostError
+from drivers.lasting import LostError, unreachable
 from drivers.tags import Address, Place, Pressure, Tag, WordOrder, Words
 from drivers.telegram import HEAD, Request, Store, belongs, exception
 from drivers.tls import Tls, secured
@@ -123,10 +123,7 @@ class Link:
         try:
             plain = connected(host, port, patience_ms)
         except (OSError, UnicodeError) as error:  # the latter where it cannot be a host's name
-            raise LostError(
-                f"{host}:{port}: no connection",
-                "is the PLC on and reachable, its Modbus TCP server started, host and port right?",
-            ) from error
+            raise unreachable(f"{host}:{port}", error, "Modbus TCP server") from error
         self._socket = plain if tls is None else secured(plain, tls, f"{host}:{port}", patience_ms)
 
     def close(self) -> None:

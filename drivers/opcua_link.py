@@ -13,7 +13,7 @@ from asyncua.crypto import security_policies
 from cryptography import x509
 
 from drivers import certificates
-from drivers.lasting import Clock, LostError
+from drivers.lasting import Clock, LostError, unreachable
 from drivers.opcua_settings import Node, OpcuaSettings
 from drivers.opcua_values import (
     CODE,
@@ -380,10 +380,11 @@ class OpcuaLink:
             raise
         except ua.UaStatusCodeError as error:
             raise self._told(what, int(error.code)) from error
-        except (OSError, TimeoutError) as error:
-            raise self._lost(what, "no connection" if what == "connecting" else "no answer") from (
-                error
-            )
+        except OSError as error:
+            if what == "connecting":
+                self._abandon()
+                raise unreachable(self._settings.where, error, "OPC UA server") from error
+            raise self._lost(what, "no answer") from error
         except Exception as error:  # the library decodes; there is no telling what garbage raises
             raise self._lost(what, f"a broken answer ({error or type(error).__name__})") from error
 

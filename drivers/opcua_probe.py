@@ -9,7 +9,7 @@ from drivers.opcua_settings import Node, OpcuaSettings
 from drivers.opcua_subscribe import Subscription
 from drivers.opcua_trace import NodeTrace
 from drivers.opcua_values import code_of, readable, status_name
-from drivers.probe import TIMES, WATCHED_S, Line, looked_at, scan_rate
+from drivers.probe import TIMES, Line, looked_at, watched
 from twin.errors import SourceError
 
 
@@ -24,7 +24,12 @@ def probe(settings: OpcuaSettings, clock: Clock = REAL) -> list[Line]:
 
 
 def _look(link: OpcuaLink, settings: OpcuaSettings, clock: Clock) -> list[Line]:
-    lines = [looked_at(name, partial(_show, link, tag.node)) for name, tag in settings.tags if tag]
+    lines: list[Line] = []
+    for name, tag in settings.tags:
+        if tag is not None:
+            lines.append(looked_at(name, partial(_show, link, tag.node)))
+            if lines[-1].lost:
+                return lines  # nothing else would be answered, and each question takes its time
     if settings.mode == "subscribe":
         subscription = Subscription(settings, clock)
         return [*lines, looked_at("subscription", lambda: _granted(link, subscription, settings))]
@@ -89,9 +94,6 @@ def _ring(link: OpcuaLink, trace: NodeTrace) -> str:
 
 
 def _rate(link: OpcuaLink, trace: NodeTrace, clock: Clock) -> str:
-    """Scans per second by the clock here; SourceError if the sequence stands still."""
+    """Scans per second by the clock here; SourceError if they are not those of the period."""
     link.open()
-    first, first_ns = trace.ask(link).header, clock.now_ns()
-    clock.sleep(WATCHED_S)
-    last, last_ns = trace.ask(link).header, clock.now_ns()
-    return scan_rate(first, first_ns, last, last_ns)
+    return watched(lambda: trace.ask(link).header, clock)

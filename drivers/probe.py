@@ -7,18 +7,21 @@ from functools import partial
 
 import numpy as np
 
-from drivers.lasting import REAL, Clock
+from drivers.lasting import REAL, Clock, LostError
 from drivers.link import Link, ModbusSettings
 from drivers.poll import plan
-from drivers.ring import RECORDS_AT_ONCE, Header, Trace
+from drivers.ring import RECORDS_AT_ONCE, Trace
 from drivers.tags import Address, Pressure, Tag, WordOrder, Words, numbers
-from drivers.trace import Header as AnyHeader
+from drivers.trace import Header
 from twin.errors import SourceError
 
 TEST_REGISTERS = Address("holding", 0)
 ORDERS: tuple[WordOrder, ...] = ("big", "little")
 TIMES = 20  # requests to measure the round trip with
 WATCHED_S = 0.5  # to measure the scan rate
+# Of the time watched: a clock in a PLC is off by less than a thousandth, a task that misses its
+# period or a sequence with its words swapped by much more.
+RATE_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,8 @@ class Line:
     what: str
     text: str
     good: bool = True
+    hint: str = ""  # what to do where it is not good
+    lost: bool = False  # nothing came at all
 
 
 def probe(settings: ModbusSettings, clock: Clock = REAL) -> list[Line]:
@@ -42,6 +47,8 @@ def probe(settings: ModbusSettings, clock: Clock = REAL) -> list[Line]:
 
 def _look(link: Link, settings: ModbusSettings, clock: Clock) -> list[Line]:
     lines = [looked_at("round trip", lambda: _round_trip(link, settings, clock))]
+    if lines[0].lost:
+        return lines  # nothing else would be answered, and each question takes its time
     for name, tag in settings.tags:
         if tag is not None:
             lines.append(looked_at(name, partial(_show, link, tag, settings)))
@@ -59,7 +66,7 @@ def looked_at(what: str, look: Callable[[], str]) -> Line:
     try:
         return Line(what, look())
     except SourceError as error:
-        return Line(what, f"{error}; {error.hint}" if error.hint else str(error), good=False)
+        return Line(what, str(error), False, error.hint, isinstance(error, LostError))
 
 
 def _connect(link: Link, settings: ModbusSettings, clock: Clock) -> str:
@@ -131,7 +138,7 @@ def _word_order(link: Link, settings: ModbusSettings) -> Line:
     text = f"{order}, by the test registers at {TEST_REGISTERS}"
     if order == settings.word_order:
         return Line("word order", text)
-    return Line("word order", f'{text}; set word_order = "{order}" in [driver]', good=False)
+    return Line("word order", text, False, f'set word_order = "{order}" in [driver]')
 
 
 def _header(link: Link, trace: Trace) -> str:
@@ -151,26 +158,49 @@ def _records(link: Link, trace: Trace) -> str:
 
 
 def _rate(link: Link, trace: Trace, clock: Clock) -> str:
-    """Scans per second by the clock here; SourceError if the sequence stands still."""
+    """Scans per second by the clock here; SourceError if they are not those of the period."""
     link.open()
-    first, first_ns = _timed_header(link, trace, clock)
+    return watched(lambda: trace.header(link), clock)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A header, and between when and when (ns) the PLC sent it."""
+
+    header: Header
+    asked: int
+    answered: int
+
+
+def watched(ask: Callable[[], Header], clock: Clock) -> str:
+    """Scans per second by the clock here; SourceError if they are not those of the period."""
+    first = _seen(ask, clock)
     clock.sleep(WATCHED_S)
-    last, last_ns = _timed_header(link, trace, clock)
-    return scan_rate(first, first_ns, last, last_ns)
+    return scan_rate(first, _seen(ask, clock))
 
 
-def _timed_header(link: Link, trace: Trace, clock: Clock) -> tuple[Header, int]:
-    header = trace.header(link)
-    return header, clock.now_ns()
+def _seen(ask: Callable[[], Header], clock: Clock) -> _Seen:
+    asked = clock.now_ns()
+    header = ask()
+    return _Seen(header, asked, clock.now_ns())
 
 
-def scan_rate(first: AnyHeader, first_ns: int, last: AnyHeader, last_ns: int) -> str:
-    """Scans per second between two headers; SourceError if the sequence stands still."""
-    scans = last.advance(first)
+def scan_rate(first: _Seen, last: _Seen) -> str:
+    """Scans per second between two headers; SourceError if they are not those of the period."""
+    scans = last.header.advance(first.header)
     if not scans:
         raise SourceError(
-            f"the sequence went from {first.sequence} to {last.sequence} in {WATCHED_S} s",
+            f"the sequence went from {first.header.sequence} to {last.header.sequence} in "
+            f"{WATCHED_S} s",
             "does the PLC's program run, or did it restart just now?",
         )
-    nominal = 1e9 / first.period_ns
-    return f"{scans / (last_ns - first_ns) * 1e9:.1f} scans/s, nominal {nominal:.1f}"
+    nominal = 1e9 / first.header.period_ns
+    text = f"{scans / (last.answered - first.answered) * 1e9:.1f} scans/s, nominal {nominal:.1f}"
+    # The requests took their time: at least and at most so many nanoseconds lie between the two.
+    shortest, longest = last.asked - first.answered, last.answered - first.asked
+    due = scans * first.header.period_ns
+    if due > longest * (1.0 + RATE_TOLERANCE):
+        raise SourceError(text, "does word_order fit, and is the scan period that of the task?")
+    if due < shortest * (1.0 - RATE_TOLERANCE):
+        raise SourceError(text, "does the task keep its period, and does each scan make a record?")
+    return text

@@ -9,7 +9,7 @@ from drivers.lasting import Away
 from drivers.link import ModbusSettings
 from drivers.probe import Line, probe
 from drivers.shared import Lines
-from twin.errors import ConfigError
+from twin.errors import ConfigError, SourceError
 from twin.settings import Document
 from twin.signals import Samples
 
@@ -40,9 +40,19 @@ def open_source(
 
 
 def probe_source(document: Document, address: str = "") -> Iterator[str]:
-    """Say, line by line, what the source answers."""
-    for line in _probed(settings_of(document, address)):
+    """Say, line by line, what the source answers; each hint once, behind the line that needs it.
+
+    SourceError after the last line if anything in them is wrong.
+    """
+    said: set[str] = set()
+    lines = _probed(settings_of(document, address))
+    for line in lines:
         yield f"{'ok ' if line.good else '!! '} {line.what:<14} {line.text}"
+        if line.hint and line.hint not in said:
+            said.add(line.hint)
+            yield f"{'':19}{line.hint}"
+    if wrong := [line.what for line in lines if not line.good]:
+        raise SourceError(f"{document.name}: not as configured: {', '.join(wrong)}")
 
 
 def _probed(settings: "ModbusSettings | OpcuaSettings") -> list[Line]:
@@ -59,7 +69,7 @@ def settings_of(document: Document, address: str = "") -> "ModbusSettings | Opcu
     if not address:
         return settings
     host, _, port = address.rpartition(":")
-    if not host or not port.isdecimal():
+    if not host or not port.isdecimal() or not 0 < int(port) <= 0xFFFF:
         raise ConfigError(f"{address!r} is no address", "write it as HOST:PORT, e.g. 10.0.0.5:502")
     return settings.at(host, int(port))
 

@@ -1,10 +1,14 @@
 """What the probe says of a PLC, line by line."""
 
+import socket
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import rigs
+from command_line import edited, twin
 
 from drivers.lasting import Clock
 from drivers.link import ModbusSettings
@@ -54,8 +58,19 @@ def test_the_other_word_order_is_found(plc: TracePlc) -> None:
     plc.test_registers()
     found = lines(plc)
     assert not found["word order"].good
-    assert 'set word_order = "little"' in found["word order"].text
+    assert found["word order"].hint == 'set word_order = "little" in [driver]'
     assert not found["trace records"].good
+    assert not found["scan rate"].good  # with its words swapped the sequence runs at 65 MHz
+    assert "does word_order fit" in found["scan rate"].hint
+
+
+@pytest.mark.parametrize(("per_period", "good"), [(0.5, False), (0.96, True), (1.5, False)])
+def test_the_scan_rate_must_be_that_of_the_period(
+    plc: TracePlc, per_period: float, good: bool
+) -> None:
+    scan = plc.scan
+    plc.scan = lambda scans: scan(round(scans * per_period))  # type: ignore[method-assign]
+    assert lines(plc)["scan rate"].good is good
 
 
 def test_without_test_registers_both_orders_are_shown(plc: TracePlc) -> None:
@@ -80,14 +95,54 @@ def test_a_plc_that_does_not_answer(plc: TracePlc) -> None:
     plc.server.hook = lambda function, address, count: SILENT
     found = lines(plc)
     assert found["connection"].good
-    assert "no answer" in found["trace header"].text
+    assert list(found) == ["connection", "round trip"]  # the rest would say the same
+    assert "no answer" in found["round trip"].text
 
 
 def test_no_plc(plc: TracePlc) -> None:
     plc.server.stop()
     found = lines(plc)
     assert list(found) == ["connection"]
-    assert "no connection" in found["connection"].text
+    assert "no connection: the machine refuses this port" in found["connection"].text
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (socket.gaierror(-2, "Name or service not known"), "no such host"),
+        (TimeoutError("timed out"), "no answer"),
+        (OSError(113, "No route to host"), "no route to host"),
+    ],
+)
+def test_why_there_is_no_connection(
+    plc: TracePlc, monkeypatch: pytest.MonkeyPatch, error: OSError, said: str
+) -> None:
+    def refuse(*_given: object) -> None:
+        raise error
+
+    monkeypatch.setattr(socket, "create_connection", refuse)
+    assert lines(plc)["connection"].text.endswith(f"no connection: {said}")
+
+
+def test_wrong_lines_are_an_error_and_no_hint_is_said_twice(
+    plc: TracePlc,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    plc.server.refused = [range(65536)]
+    config, _ = edited(tmp_path, "port = 5020", f"port = {plc.server.port}")
+    assert twin(monkeypatch, "probe", config) == 3
+    out, err = capsys.readouterr()
+    assert out.count("(Modbus exception 2)") > 5
+    assert out.count("check the addresses in [driver]") == 1
+    assert "not as configured: round trip, pressure, suction" in err
+
+
+@pytest.mark.parametrize("port", ["0", "99999", "abc"])
+def test_a_port_that_is_none(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = rigs.path_of("test_rig")
+    assert twin(monkeypatch, "probe", config, "--address", f"127.0.0.1:{port}") == 2
 
 
 def test_a_plc_that_stands_still(plc: TracePlc) -> None:
