@@ -145,6 +145,23 @@ def test_the_unit_is_found_or_named(run: Run, tmp_path: Path) -> None:
     assert run("history", *where, "--days", "3") == ""
 
 
+def test_several_configurations_are_as_many_ejectors(run: Run, tmp_path: Path) -> None:
+    begun(tmp_path / "alarms.sqlite").close()
+    with open_store("alarms.sqlite") as store:
+        store.before(Unit(UNIT.type, "rig-01"))
+    for name in (UNIT.id, "rig-01"):
+        Path(f"{name}.toml").write_text(f'[asset]\nid = "{name}"\n')
+    both = ("--config", f"{UNIT.id}.toml", "--config", "rig-01.toml")
+    said = run("list", *both, "--json", "l.json").splitlines()
+    assert said[0] == f"{UNIT.id}:"
+    assert said[1].startswith(f"medium  {LEAK}  ")
+    assert said[-2:] == ["rig-01:", "no alarm of rig-01"]
+    (plain,) = json.loads(Path("l.json").read_text())
+    assert plain["asset"] == {"type": UNIT.type, "id": UNIT.id}
+    with pytest.raises(ConfigError, match="--id is for one ejector"):
+        run("list", *both, "--id", "rig-01")
+
+
 def test_the_rules_in_use_are_printed_as_they_can_be_named(run: Run, tmp_path: Path) -> None:
     text = run("rules")
     assert read_rules(Document.parse(text, "rules")) == default_rules()

@@ -49,3 +49,11 @@ def test_help_keeps_names_of_tables(
 ) -> None:
     assert twin(monkeypatch, command, "--help") == 0
     assert said in " ".join(capsys.readouterr().out.split())
+
+
+def test_no_value_is_dropped_without_a_word(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    twice = ("--config", "a.toml", "--config", "b.toml")
+    assert twin(monkeypatch, "alarms", "history", *twice) == 2
+    assert "--config is given twice, and only one can be used" in capsys.readouterr().err

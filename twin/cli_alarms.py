@@ -38,6 +38,12 @@ ConfigFile = Annotated[
     Path | None,
     typer.Option("--config", metavar="CONFIG", help="Its unit, rules and [alarms] url."),
 ]
+ConfigFiles = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--config", metavar="CONFIG", help="Its unit, rules and [alarms] url; one for each ejector."
+    ),
+]
 UnitId = Annotated[str, typer.Option("--id", metavar="ID", help="Unit, where there are several.")]
 Who = Annotated[str, typer.Option("--by", metavar="NAME", help="Instead of the user's name.")]
 JsonFile = Annotated[
@@ -47,18 +53,31 @@ JsonFile = Annotated[
 
 @alarms_app.command("list")
 def list_(
-    config: ConfigFile = None, unit: UnitId = "", alarms: Url = "", json_file: JsonFile = None
+    configs: ConfigFiles = None, unit: UnitId = "", alarms: Url = "", json_file: JsonFile = None
 ) -> None:
-    """What a person is to look at, the most urgent first; then what is kept quiet."""
-    with _open(alarms, config) as store:
-        whose = _chosen(store, config, unit)
-        shown, episodes = _standing(store, whose, config)
-    plain = [_plain_alarm(alarm, episodes.get(alarm.rule.name)) for alarm in shown]
+    """What a person is to look at, the most urgent first; then what is kept quiet.
+
+    Several configurations are as many ejectors, one after the other.
+    """
+    if unit and configs and len(configs) > 1:
+        raise ConfigError(
+            f"--id is for one ejector, and here are {len(configs)} configurations",
+            "leave it out, and give each configuration its own under [asset]",
+        )
+    plain: list[dict[str, Any]] = []
     now_ns = time.time_ns()
-    for one in plain:
-        print(_alarm_in_words(one, now_ns))
-    if not plain:
-        print(f"no alarm of {whose.id or whose.type}")
+    for config in configs or (None,):
+        with _open(alarms, config) as store:
+            whose = _chosen(store, config, unit)
+            shown, episodes = _standing(store, whose, config)
+        if configs and len(configs) > 1:
+            print(f"{whose.id or whose.type}:")
+        own = [_plain_alarm(alarm, episodes.get(alarm.rule.name), whose) for alarm in shown]
+        for one in own:
+            print(_alarm_in_words(one, now_ns))
+        if not own:
+            print(f"no alarm of {whose.id or whose.type}")
+        plain += own
     if json_file is not None:
         write_json(json_file, plain)
 
@@ -344,9 +363,10 @@ def _answered(store: "Store", number: int, name: str, deed: "Deed") -> str:
 # --- in words -----------------------------------------------------------------------------------
 
 
-def _plain_alarm(alarm: "Alarm", episode: "Episode | None") -> dict[str, Any]:
+def _plain_alarm(alarm: "Alarm", episode: "Episode | None", unit: "Unit") -> dict[str, Any]:
     rule = alarm.rule
     return {
+        "asset": {"type": unit.type, "id": unit.id},
         "alarm": rule.name,
         "state": alarm.state.value,
         "priority": rule.priority.value,

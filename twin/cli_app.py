@@ -36,15 +36,27 @@ _VERSION.expose_value = False  # it ends the program: no command takes it
 
 
 class _Common:
-    """Over one of Typer's classes: ``--version``, and a list of commands that cuts no sentence."""
+    """Over one of Typer's classes: ``--version``, no option twice, and no sentence that is cut."""
 
     help: str | None
 
     def get_params(self, ctx: Any) -> list[Any]:
         return [_VERSION, *super().get_params(ctx)]  # type: ignore[misc]
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """As Click does, which would take the last of two values without a word."""
+        _, _, given = self.make_parser(ctx).parse_args(args=list(args))  # type: ignore[attr-defined]
+        for option in given:
+            if given.count(option) > 1 and not _may_repeat(option):
+                ctx.fail(f"{option.opts[0]} is given twice, and only one can be used")
+        return super().parse_args(ctx, args)  # type: ignore[misc,no-any-return]
+
     def get_short_help_str(self, limit: int = 0) -> str:
         return " ".join((self.help or "").partition("\n\n")[0].split())
+
+
+def _may_repeat(option: Any) -> bool:
+    return bool(option.param_type_name == "argument" or option.multiple or option.is_flag)
 
 
 class _Command(_Common, TyperCommand):
