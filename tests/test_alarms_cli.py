@@ -138,7 +138,7 @@ def test_the_unit_is_found_or_named(run: Run, tmp_path: Path) -> None:
             store.before(Unit(UNIT.type, name))
     with pytest.raises(ConfigError, match="2 units") as caught:
         run("list")
-    assert caught.value.hint == "choose with --id; there are: gripper-01, rig-01"
+    assert caught.value.hint == "choose with --id; known: gripper-01, rig-01"
     assert run("list", "--id", "rig-01") == "no alarm of rig-01\n"
     where = ("--alarms", tmp_path / "alarms.sqlite", "--config", rigs.path_of("gripper"))
     assert run("list", *where) == "no alarm of gripper-01\n"

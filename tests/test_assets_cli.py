@@ -380,6 +380,33 @@ def test_a_named_database_that_is_not_there_is_not_passed_over(run: Run, tmp_pat
     assert not list(tmp_path.rglob("*.sqlite"))
 
 
+def test_what_is_refused_makes_no_database(run: Run, unit: Path, tmp_path: Path) -> None:
+    before = sorted(tmp_path.iterdir())
+    document = json.loads(run("export"))
+    document["records"] = [one for one in document["records"] if one["kind"] == "instance"]
+    bad = {
+        "damaged.json": '{"format": "ejector-twin-assets/1"}',
+        "no_type.json": json.dumps(document),
+        "wrong.toml": UNIT.replace("35.0\n\n[healthy", "-35.0\n\n[healthy"),
+        "other.toml": UNIT.replace(TYPE, "nobody-knows"),
+    }
+    for name, text in bad.items():
+        (tmp_path / name).write_text(text)
+        for database in ((), ("--assets", "new.sqlite")):
+            with pytest.raises(ConfigError):
+                run("add" if name.endswith(".toml") else "import", name, *database)
+        (tmp_path / name).unlink()
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_that_a_database_is_made_is_said_once(
+    run: Run, unit: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for said in (1, 0):
+        assets_app(["add", str(unit), "--assets", "n.sqlite"], standalone_mode=False)
+        assert capsys.readouterr().err.count("making a new asset database, n.sqlite") == said
+
+
 def test_an_unknown_key_of_the_configuration_is_refused(tmp_path: Path) -> None:
     document = Document.parse('[assets]\nurls = "x"\n', "cell.toml")
     with pytest.raises(ConfigError, match=r"cell\.toml:2: assets\.urls: unknown key"):

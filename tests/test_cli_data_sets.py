@@ -110,30 +110,47 @@ def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
     return capsys.readouterr().err.splitlines()
 
 
-def test_a_unit_that_is_named_and_not_known_is_said_once_and_its_type_is_used(
+@pytest.mark.parametrize("command", ["replay", "diagnose", "import"])
+def test_a_unit_that_is_named_and_not_known_is_refused_with_the_nearest(
+    command: str,
+    log: Path,
+    here: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    add_unit(monkeypatch, 30.0)
+    before = sorted(here.iterdir())
+    capsys.readouterr()
+    of = ("none.csv", "--config", GRIPPER, "-o", "out.mcap") if command == "import" else (log,)
+    options = ("--id", "gripper-7", "--assets", "assets.sqlite")
+    assert twin(monkeypatch, command, *of, *options) == 2
+    message = capsys.readouterr().err
+    assert "assets.sqlite: no unit is called 'gripper-7'" in message
+    assert "did you mean 'gripper-77'?" in message
+    assert "a new unit is named by [asset] id" in message
+    assert sorted(here.iterdir()) == before
+
+
+def test_what_nobody_mistyped_is_not_missed(
     log: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     add_unit(monkeypatch, 30.0)
     capsys.readouterr()
-    assert twin(monkeypatch, "replay", log, "--id", "gripper-78", "-o", "out.mcap") == 0
-    assert said(capsys) == [
-        "twin: no instance-specific data set of 'gripper-78' in assets.sqlite;"
-        " using the type's 'compact-ejector-35'"
-    ]
-    origin = about(here / "out.mcap", "origin")
-    assert origin.startswith("object-specific data of compact-ejector-35, record ")
-    assert open_log(here / "out.mcap").header.asset_id == "gripper-78"
-    for known in (("--id", UNIT), (), ("--config", GRIPPER)):  # what nobody named is not missed
+    for known in (("--id", UNIT), (), ("--config", GRIPPER)):
         assert twin(monkeypatch, "replay", log, *known) == 0
         assert said(capsys) == []
+    assert twin(monkeypatch, "replay", log, "--config", GRIPPER, "--id", "gripper-01") == 0
+    (line,) = said(capsys)  # the configuration names it, too
+    assert "no instance-specific data set of 'gripper-01' in " in line
+    assert "using the type's 'compact-ejector-35'" in line
 
 
-def test_without_a_database_the_shipped_type_is_used_and_said(
+def test_without_a_database_no_unit_is_known_but_those_shipped(
     log: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert twin(monkeypatch, "replay", log, "--id", UNIT) == 0
-    (line,) = said(capsys)
-    assert f"no instance-specific data set of '{UNIT}' in the shipped data sets; using the" in line
+    assert twin(monkeypatch, "replay", log, "--id", UNIT) == 2
+    message = capsys.readouterr().err
+    assert f"the shipped data sets: no unit is called '{UNIT}'" in message
     assert list(here.iterdir()) == []
 
 
@@ -141,13 +158,14 @@ def test_a_unit_of_a_type_nobody_knows_is_what_the_configuration_says_or_refused
     log: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config, _ = edited(here, 'type = "compact-ejector-35"', 'type = "other"', "gripper")
+    config.write_text(config.read_text().replace('id = "gripper-01"', f'id = "{UNIT}"'))
     command = ("replay", log, "--config", config, "--id", UNIT)
     assert twin(monkeypatch, *command, "-o", "out.mcap") == 0
     (line,) = said(capsys)
     assert f"no data set of '{UNIT}' or its type 'other' in " in line
     assert "using [data] of the configuration" in line
     assert about(here / "out.mcap", "origin") == "[data] of the configuration"
-    config.write_text('[asset]\ntype = "other"\n')
+    config.write_text(f'[asset]\ntype = "other"\nid = "{UNIT}"\n')
     assert twin(monkeypatch, *command) == 2
     message = capsys.readouterr().err
     assert f"no data set of '{UNIT}' or its type 'other' at that time" in message
@@ -279,9 +297,11 @@ def test_a_unit_that_is_calibrated_is_the_one_that_is_replayed(
     config.write_text(GRIPPER.read_text())
     answer = here / "calibration.json"
     command = ("calibrate", log, "--config", config, "--id", UNIT, "--json", answer)
-    assert twin(monkeypatch, *command) == 0
+    named = ("--assets", "assets.sqlite")  # what is named and not there is made as well
+    assert twin(monkeypatch, *command, *named) == 0
     said = capsys.readouterr()
     assert f"stored as {UNIT}" in said.out
+    assert "twin: making a new asset database, assets.sqlite" in said.err
     assert json.loads(answer.read_text())
 
     assert twin(monkeypatch, "assets", "show", UNIT, "--config", config) == 0

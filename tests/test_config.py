@@ -188,7 +188,7 @@ def test_as_of_takes_what_was_known_then(database: Assets, url: str) -> None:
 
 
 def test_a_unit_that_is_not_known_is_its_type_and_that_is_said(database: Assets, url: str) -> None:
-    config = taken(url, unit="unit-2")
+    config = taken(url, CELL.replace(f'id = "{UNIT}"', 'id = "unit-2"'))
     assert config.asset.id == "unit-2"
     assert config.data == taken(url, calibrated=False).data
     assert config.instead == (
@@ -196,6 +196,13 @@ def test_a_unit_that_is_not_known_is_its_type_and_that_is_said(database: Assets,
     )
     assert taken(url, CELL.replace(f'id = "{UNIT}"', "")).instead == ""
     assert taken(url, unit="unit-2", calibrated=False).instead == ""
+
+
+def test_a_unit_that_is_named_in_place_of_another_must_be_known(database: Assets, url: str) -> None:
+    with pytest.raises(ConfigError, match="no unit is called 'unit-3'"):
+        taken(url, unit="unit-3")
+    assert taken(url, unit="unit-3", own="unit-3").asset.id == "unit-3"  # a log of it
+    assert taken(url, unit="unit-3", calibrated=False).asset.id == "unit-3"  # to be calibrated
 
 
 def test_a_type_that_nobody_knows_is_what_the_configuration_says(

@@ -64,6 +64,17 @@ def test_a_configuration_says_which_and_what(
     assert all(f"<code>{name}</code>" in page for name in known)
 
 
+def test_a_mistyped_unit_is_refused_and_its_type_is_one_that_can_be_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ("--config", rigs.path_of("test_rig"), "--sources-only")
+    assert exported(monkeypatch, tmp_path, *options, "--id", "paper-unlt") == 2
+    assert "did you mean 'paper-unit'?" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+    assert exported(monkeypatch, tmp_path, *options, "--id", "compact-ejector-35") == 0
+    assert "compact-ejector-35 in compact_ejector_35.fmu" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("options", "what"),
     [

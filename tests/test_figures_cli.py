@@ -192,7 +192,7 @@ def test_of_several_units_one_is_named(run: Run, tmp_path: Path) -> None:
     fill(1, 30, Unit("compact-ejector-35", "rig-01"))
     with pytest.raises(ConfigError, match="2 units") as caught:
         run("counters")
-    assert caught.value.hint == "choose with --id; there are: gripper-01, rig-01"
+    assert caught.value.hint == "choose with --id; known: gripper-01, rig-01"
     assert "30" in run("counters", "--id", "rig-01")
     where = ("--figures", tmp_path / "figures.sqlite", "--config", rigs.path_of("gripper"))
     assert "20" in run("counters", *where)

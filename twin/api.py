@@ -25,6 +25,7 @@ from twin.diagnosis.answer import diagnose as find_cause
 from twin.diagnosis.report import in_words, write_report
 from twin.errors import ConfigError
 from twin.errors import TwinError as TwinError  # noqa: PLC0414 (``import twin`` has it)
+from twin.extras import install_hint
 from twin.figures.cycle import compiled as key_figures
 from twin.figures.settings import FigureSettings
 from twin.hil import Plant
@@ -110,7 +111,7 @@ class Log:
         except ImportError as error:
             raise ConfigError(
                 f"a DataFrame needs pandas, which is not installed: {error}",
-                "pip install 'ejector-twin[notebook]', or take columns()",
+                f"{install_hint('notebook')}, or take columns()",
             ) from error
         return DataFrame(self.columns())
 
@@ -283,11 +284,11 @@ def diagnose(log: Log, progress: Progress = _quiet) -> Answer:
 # --- what these share ---------------------------------------------------------------------------
 
 
-def _configured(config: Place | Config, assets: str = "", unit: str = "") -> Config:
+def _configured(config: Place | Config, assets: str = "", unit: str = "", own: str = "") -> Config:
     """The configuration with what is known of its unit; one that is at hand as it is."""
     if not isinstance(config, Config):
-        return Config.of(Document.read(Path(config)), assets, unit)
-    return Config.of(config.document, assets, unit) if assets or unit else config
+        return Config.of(Document.read(Path(config)), assets, unit, own=own)
+    return Config.of(config.document, assets, unit, own=own) if assets or unit else config
 
 
 def _of_log(recorded: Recorded, config: Place | Config | None, assets: str, unit: str) -> Config:
@@ -295,7 +296,7 @@ def _of_log(recorded: Recorded, config: Place | Config | None, assets: str, unit
     name = str(recorded.path)
     if config is None:
         return Config.of_recorded(recorded.header, name, assets=assets, unit=unit)
-    settings = _configured(config, assets, unit)
+    settings = _configured(config, assets, unit, recorded.header.asset_id)
     if not unit:
         settings.refuse_another(recorded.header, name)
     return settings

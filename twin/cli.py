@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli_alarms import alarms_app, alarms_of, asker_of
-from twin.cli_app import App
+from twin.cli_app import App, say_if_new
 from twin.cli_assets import assets_app
 from twin.cli_cert import cert
 from twin.cli_compare import compare
@@ -332,6 +332,7 @@ def calibrate(
     recorded = open_log(log)
     with _status() as say:
         calibration = fit_unit(settings, (rows for rows, _ in recorded.blocks()), say)
+    say_if_new(assets, settings.document)
     record, where = store(calibration, settings, assets, log)
     print(in_words(calibration))
     print(f"stored as {settings.asset.id} in {where}, record {record.id[:8]}")
@@ -610,6 +611,7 @@ def _save(diagnosis: "Diagnosis", settings: "Config", unit: str, assets: str, lo
     if known is None:
         print(f"nothing is stored as {unit}: {nothing(diagnosis)}")
         return
+    say_if_new(assets, settings.document)
     record, where = store(known, diagnosis, settings, unit, assets, log)
     print(f"stored as {unit} in {where}, record {record.id[:8]}; use it: --id {unit}")
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from twin.cli_app import App
-from twin.errors import ConfigError
+from twin.errors import ConfigError, known_names
 from twin.files import write_json
 from twin.instants import instant
 
@@ -322,9 +322,9 @@ def _chosen(store: "Store", config: Path | None, unit: str) -> "Unit":
     asked = unit or (str(document.tables.get("asset", {}).get("id", "")) if document else "")
     found = [one for one in units if not asked or one.id == asked]
     if len(found) != 1:
-        known = ", ".join(one.id or one.type for one in units) or "none"
+        known = known_names(asked, (one.id or one.type for one in units))
         what = f"{len(found)} units {asked!r}" if asked else f"{len(found)} units"
-        raise ConfigError(f"{store.name}: {what}", f"choose with --id; there are: {known}")
+        raise ConfigError(f"{store.name}: {what}", f"choose with --id; {known}")
     return found[0]
 
 

@@ -1,13 +1,16 @@
-"""What all commands have in common: plain help, ``-h`` and ``--version``."""
+"""What commands have in common: plain help, ``-h`` and ``--version``, and what they say."""
 
 import sys
 from collections.abc import Callable
 from importlib.metadata import version
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
+
+if TYPE_CHECKING:
+    from twin.settings import Document
 
 
 def _show_version(wanted: bool) -> None:
@@ -84,3 +87,11 @@ class App(typer.Typer):
     def command(self, name: str | None = None, **options: Any) -> Callable[..., Any]:
         """As Typer's, with what all commands have in common."""
         return super().command(name, cls=_Command, **options)
+
+
+def say_if_new(url: str, document: "Document | None") -> None:
+    """Say of the chosen database that what follows makes it, if it is not there."""
+    from twin.assets.place import chosen, is_new
+
+    if is_new(url, document):
+        print(f"twin: making a new asset database, {chosen(url, document)}", file=sys.stderr)

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from twin.cli_app import App
-from twin.errors import ConfigError, SourceError
+from twin.cli_app import App, say_if_new
+from twin.errors import ConfigError, SourceError, known_names
+from twin.extras import install_hint
 from twin.files import write_whole
 
 if TYPE_CHECKING:
@@ -94,8 +95,9 @@ def add(
     provenance = {"file": file.name, "code": f"ejector-twin {version('ejector-twin')}"}
     given, dated = read_asset(document, provenance)
     record = checked(given)
+    with _to_store(assets, config) as database:
+        check_asset(document, record, database)  # before a new one is made
     with _open(assets, config, write=True) as database:
-        check_asset(document, record, database)
         before = database.records(record.kind, record.name)
         if before and not dated:
             record = replace(record, valid_from_ns=time.time_ns())
@@ -124,6 +126,8 @@ def import_(
     else:
         document, fmus = _read_json(file), {}
     model = _only_fmu(file, fmus) if fmu is not None else b""
+    with _to_store(assets, config, shipped=False) as database:
+        database.refuse(document)  # before a new one is made
     with _open(assets, config, write=True, shipped=False) as database:
         new = database.import_(document)
         print(f"{new} new of {len(document['records'])} records, in {database.name}")
@@ -176,11 +180,22 @@ def export(
 # --- what the commands share --------------------------------------------------------------------
 
 
+def _to_store(url: str, config: Path | None, *, shipped: bool = True) -> "Assets":
+    """The database in which something is to be stored, to look into first; it may be new."""
+    from twin.assets.place import open_chosen
+    from twin.settings import Document
+
+    document = Document.read(config) if config else None
+    return open_chosen(url, document, write=False, shipped=shipped, to_store=True)
+
+
 def _open(url: str, config: Path | None, *, write: bool, shipped: bool = True) -> "Assets":
     from twin.assets.place import open_chosen
     from twin.settings import Document
 
     document = Document.read(config) if config else None
+    if write:
+        say_if_new(url, document)
     database = open_chosen(url, document, write=write, shipped=shipped)
     print(f"asset database: {database.name}", file=sys.stderr)
     return database
@@ -200,10 +215,8 @@ def _holding_each(records: "Iterable[Record]", now: int) -> "list[Record]":
 
 def _require(records: "list[Record]", name: str, database: "Assets") -> None:
     if not records:
-        known = sorted({record.name for record in database.records()})
-        raise ConfigError(
-            f"{database.name}: no type or unit is called {name!r}", f"known: {', '.join(known)}"
-        )
+        known = known_names(name, (record.name for record in database.records()))
+        raise ConfigError(f"{database.name}: no type or unit is called {name!r}", known)
 
 
 def _table(records: "list[Record]", now: int) -> str:
@@ -307,4 +320,4 @@ def _read_fmu(path: Path) -> "Fmu":
 
 def _not_installed(error: ImportError) -> ConfigError:
     what = f"shells need the Eclipse BaSyx SDK, which is not installed: {error}"
-    return ConfigError(what, "pip install 'ejector-twin[aas]'")
+    return ConfigError(what, install_hint("aas"))

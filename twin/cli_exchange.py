@@ -1,13 +1,14 @@
 """``twin export-fmu``: the model of one ejector for other people's simulations."""
 
 import sys
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.errors import ConfigError
+from twin.errors import ConfigError, known_names
 from twin.files import write_whole
 
 if TYPE_CHECKING:
@@ -64,8 +65,8 @@ def export_fmu(
     from twin.exchange.ssp import make_ssp
     from twin.exchange.variables import Component
 
-    document = _document(config, unit, assets)
-    known = Config.of(document, assets, unit if config else "")
+    document, asked = _document(config, unit, assets)
+    known = Config.of(document, assets, asked)
     name = known.asset.id or known.asset.type
     program = f"ejector-twin {version('ejector-twin')}"
     component = Component.of(known.data, vessel.value)
@@ -77,32 +78,37 @@ def export_fmu(
         raise ConfigError(f"{target}: neither an FMU nor an SSP", "call it *.fmu or *.ssp")
     content = fmu.content
     if target.suffix == ".ssp":
-        kind = Config.of(document, assets, unit if config else "", calibrated=False)
+        kind = Config.of(document, assets, asked, calibrated=False)
         content = make_ssp(fmu, name, component, Component.of(kind.data, vessel.value))
     write_whole(target, content)
     _remark(known, binary=fmu.binary, wanted=not sources_only)
     print(f"{name} in {target}: FMI {fmi.value}.0, {known.origin}")
 
 
-def _document(config: Path | None, unit: str, assets: str) -> "Document":
-    """The configuration; without one what names a unit or type that the database knows."""
+def _document(config: Path | None, name: str, assets: str) -> "tuple[Document, str]":
+    """The configuration, and the unit in place of its own.
+
+    Without a configuration it is one that names a unit or type that the database knows.
+    """
     from twin.assets.place import open_chosen
     from twin.settings import Document
 
     if config is not None:
-        return Document.read(config)
-    if not unit:
+        document = Document.read(config)
+        asset = document.tables.get("asset", {})
+        if name and name == asset.get("type"):
+            return replace(document, tables={**document.tables, "asset": {"type": name}}), ""
+        return document, name
+    if not name:
         raise ConfigError("of which ejector?", "name it with --id, or give a --config")
     with open_chosen(assets, None, write=False) as database:
-        records = database.records(name=unit)
+        records = database.records(name=name)
         if not records:
-            known = sorted({record.name for record in database.records()})
-            raise ConfigError(
-                f"{database.name}: no type or unit is called {unit!r}", f"known: {', '.join(known)}"
-            )
+            known = known_names(name, (record.name for record in database.records()))
+            raise ConfigError(f"{database.name}: no type or unit is called {name!r}", known)
     newest = max(records, key=lambda record: record.recorded_ns)
-    asset = {"type": newest.type, "id": unit if newest.kind == "instance" else ""}
-    return Document("", "", {"asset": asset})
+    asset = {"type": newest.type, "id": name if newest.kind == "instance" else ""}
+    return Document("", "", {"asset": asset}), ""
 
 
 def _remark(known: "Config", *, binary: str, wanted: bool) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from twin.cli_app import App
+from twin.cli_app import App, say_if_new
 from twin.errors import ConfigError, SourceError
 from twin.files import require_writable, write_json
 
@@ -169,6 +169,7 @@ class _Fleet:
         from twin.settings import Document
 
         document = None if config is None else Document.read(config)
+        say_if_new(assets, document)
         with open_chosen(assets, document, write=True) as database:
             return cls(document, chosen(assets, document), database.name)
 
@@ -182,7 +183,8 @@ class _Fleet:
         unit = header.asset_id
         if work == "calibrate" and not unit:
             raise ConfigError(f"{log.path}: a log of no unit", "record it with [asset] id, or --id")
-        config = Config.of(document, str(self.assets), unit, calibrated=work != "calibrate")
+        calibrated = work != "calibrate"
+        config = Config.of(document, str(self.assets), unit, calibrated=calibrated, own=unit)
         config.refuse_another(header, str(log.path))
         return config
 

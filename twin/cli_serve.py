@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.errors import ConfigError
+from twin.extras import install_hint
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -144,9 +145,7 @@ def _require_extra() -> None:
         import uvicorn  # noqa: F401
         import websockets  # noqa: F401
     except ImportError as error:
-        raise ConfigError(
-            f"twin serve needs {error.name}", "install it: .venv/bin/pip install -e '.[serve]'"
-        ) from error
+        raise ConfigError(f"twin serve needs {error.name}", install_hint("serve")) from error
 
 
 def _require_users(place: "Place", users: "Users") -> None:

@@ -19,7 +19,7 @@ from pydantic import Field, ValidationError
 
 from twin.assets.diagram import FLOW, SUPPLY, VACUUM
 from twin.assets.record import Found, Record, UnknownAssetError
-from twin.errors import ConfigError, SourceError
+from twin.errors import ConfigError, SourceError, known_names
 from twin.log.header import LogHeader
 from twin.model.dataset import DataSet
 from twin.model.diagram import reduce
@@ -98,18 +98,23 @@ class Config:
         *,
         calibrated: bool = True,
         as_of_ns: int | None = None,
+        own: str = "",
     ) -> "Config":
         """Check all of the twin's tables; ConfigError names file, line and key, or the record.
 
         ``assets`` names the database in place of the configuration's, ``unit`` the ID in place of
-        its own. Not ``calibrated`` is the unit as its type has it, whatever is known of itself.
-        ``as_of_ns`` (UTC) takes what the database knew then.
+        its own: ConfigError if the database does not know it and it is not ``own``, that of a log.
+        Not ``calibrated`` is the unit as its type has it, whatever is known of itself: it may be
+        new. ``as_of_ns`` (UTC) takes what the database knew then.
         """
         from twin.assets.place import open_chosen
 
         document.refuse_unknown_tables(TABLES)
         asset = _asset(document, unit)
-        with open_chosen(assets, document, write=False) as database:
+        # What is not calibrated is read to be calibrated, and stored: in a new database, too.
+        with open_chosen(assets, document, write=False, to_store=not calibrated) as database:
+            if unit and calibrated and unit not in (own, document.section(Asset, "asset").id):
+                _require_unit(database, unit)
             found = _find(database, document, asset.type, asset.id if calibrated else "", as_of_ns)
             where = database.name
         known = _layered(document, found, where)
@@ -149,7 +154,7 @@ class Config:
         with _in_log(header.metadata, log):
             document = instead or Document.parse(header.config_text, header.config_name)
         if instead is not None or assets or unit or as_of_ns is not None:
-            return cls.of(document, assets, unit, as_of_ns=as_of_ns)
+            return cls.of(document, assets, unit, as_of_ns=as_of_ns, own=header.asset_id)
         config = cls.of_log(document, header.metadata, log)
         # --id may have named another unit than the configuration does.
         named = {"type": header.asset_type, "id": header.asset_id}
@@ -224,6 +229,17 @@ def _asset(document: Document, unit: str) -> Asset:
             'say which type of ejector it is: type = "..." under [asset]',
         )
     return asset
+
+
+def _require_unit(database: "Assets", unit: str) -> None:
+    """ConfigError if nothing was ever known of ``unit``: its name is taken for a mistyped one."""
+    if not database.records("instance", unit):
+        units = known_names(unit, (record.name for record in database.records("instance")))
+        raise ConfigError(
+            f"{database.name}: no unit is called {unit!r}",
+            f"{units}\n  a new unit is named by [asset] id in the configuration; twin calibrate"
+            " stores its data set",
+        )
 
 
 def _find(

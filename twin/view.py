@@ -27,6 +27,7 @@ import numpy.typing as npt
 
 from twin.errors import ConfigError, SourceError
 from twin.events import Event, Kind, Severity
+from twin.extras import install_hint
 from twin.model.effects import EFFECTS, UNKNOWN
 from twin.signals import (
     BREAK,
@@ -335,7 +336,7 @@ def import_rerun() -> Any:
     except ImportError as error:
         raise ConfigError(
             f"the view needs Rerun, which is not installed: {error}",
-            "pip install 'ejector-twin[view]'",
+            install_hint("view"),
         ) from error
 
 
@@ -344,7 +345,7 @@ def _executable() -> str:
     folder = Path(str(importlib.import_module("rerun_cli").__file__)).parent
     found = shutil.which("rerun", path=folder)
     if not found:
-        raise ConfigError(f"no Rerun viewer in {folder}", "pip install 'ejector-twin[view]'")
+        raise ConfigError(f"no Rerun viewer in {folder}", install_hint("view"))
     return found
 
 

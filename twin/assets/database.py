@@ -54,7 +54,9 @@ def open_assets(
     ConfigError for a URL of an unknown kind, a newer schema and another program's file; SourceError
     if it cannot be reached, read or written, or stays locked.
     """
-    absent = "" if create else "check --assets; twin assets add or import makes one"
+    absent = (
+        "" if create else "check --assets; twin calibrate, or twin assets add or import, makes one"
+    )
     assets = Assets(where, ASSETS, busy_s, clock, absent)
     with assets.closed_on_error():
         assets.prepare(shipped=shipped)
@@ -138,17 +140,16 @@ class Assets(Database):
         """
         given = parse_export(document)
         with self._writing() as connection:
-            here = {record.id: record for record in _read(connection, ())}
-            before = len(here)
-            types = _known(connection, "type") | {r.name for r in given if r.kind == "type"}
-            for record in given:
-                if _is_here(record, here):
-                    continue
-                if record.kind == "instance":
-                    _require_type(record, types)
+            new = _new(connection, given)
+            for record in new:
                 _insert(connection, record)
-                here[record.id] = record
-        return len(here) - before
+        return len(new)
+
+    def refuse(self, document: Mapping[str, Any]) -> None:
+        """ConfigError where ``import_`` would raise one; nothing is written."""
+        given = parse_export(document)
+        with self._reading() as connection:
+            _new(connection, given)
 
     def _append(self, connection: Connection, record: Record) -> Record:
         """Insert as the last one: recorded later than all before, whatever the clocks say."""
@@ -188,6 +189,21 @@ def _read(connection: Connection, conditions: Conditions) -> list[Record]:
     for row in connection.execute(select(ARRAY).join(RECORD).where(*conditions)):
         arrays[row.record][row.name] = _array(row)
     return [_record(row, arrays[row.id]) for row in found]
+
+
+def _new(connection: Connection, given: Sequence[Record]) -> list[Record]:
+    """Those of the records that are not here yet; ConfigError for one that cannot be added."""
+    here = {record.id: record for record in _read(connection, ())}
+    types = _known(connection, "type") | {r.name for r in given if r.kind == "type"}
+    new: list[Record] = []
+    for record in given:
+        if _is_here(record, here):
+            continue
+        if record.kind == "instance":
+            _require_type(record, types)
+        here[record.id] = record
+        new.append(record)
+    return new
 
 
 def _array(row: Row[Any]) -> Array:

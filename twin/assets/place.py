@@ -17,18 +17,31 @@ class AssetsSettings(Settings):
 
 
 def open_chosen(
-    named: str, document: Document | None, *, write: bool, shipped: bool = True
+    named: str,
+    document: Document | None,
+    *,
+    write: bool,
+    shipped: bool = True,
+    to_store: bool = False,
 ) -> Assets:
     """Open the database named on the command line, else in the configuration, else the default.
 
     The default is a file beside the configuration, without one in the current folder. Only who
-    writes makes a file: to read where the default is not there, the shipped ones are enough.
-    ``shipped`` as in ``open_assets``.
+    writes makes a file, named or default. To read where the default is not there, the shipped
+    data sets are enough; and where a named one is not there, if what is read for is ``to_store``
+    something in it. SourceError otherwise. ``shipped`` as in ``open_assets``.
     """
     where = chosen(named, document)
-    if named or (document and document.section(AssetsSettings, "assets").url):
-        return open_assets(where, create=write, shipped=shipped)
-    return open_assets(where if write or Path(where).exists() else MEMORY, shipped=shipped)
+    is_named = bool(named or (document and document.section(AssetsSettings, "assets").url))
+    if not write and (to_store or not is_named) and is_new(named, document):
+        return open_assets(MEMORY, shipped=shipped)
+    return open_assets(where, create=write, shipped=shipped)
+
+
+def is_new(named: str, document: Document | None) -> bool:
+    """Whether that database is a file that is not there yet."""
+    file = sqlite_file(parse_url(chosen(named, document), ASSETS))
+    return file is not None and not file.exists()
 
 
 def chosen(named: str, document: Document | None) -> str | Path:

@@ -15,12 +15,13 @@ from urllib.parse import urlsplit
 from pebble import ProcessExpired, ProcessPool
 
 from twin.errors import ConfigError, SourceError
+from twin.extras import install_hint
 from twin.fleet.works import Done, Job
 
 Submit = Callable[[Callable[[Job], Done], Job], Future[Done]]
 CONNECT_S = 10.0
 PORT = 8786  # Dask's
-_MISSING = "pip install 'ejector-twin[dask]', or take --engine local"
+_MISSING = f"{install_hint('dask')}, or take --engine local"
 
 
 def cores() -> int:
