@@ -26,6 +26,7 @@ EXCEPTIONS = {
     10: "gateway: no path to the unit",
     11: "gateway: the unit does not answer",
 }
+STATUS_BITS = {"suction": 0, "blow_off": 1}  # of a ring's record, as in Command
 OURS = (1, 2, 3)  # the request is wrong and stays wrong; the others may pass
 
 
@@ -86,7 +87,20 @@ class ModbusSettings(Settings):
             raise ValueError("the ring holds 32-bit pressures: tags.pressure.type must be so too")
         if self.mode == "block" and tags.supply is not None and tags.supply.size != 1:
             raise ValueError("the ring holds a 16-bit supply: tags.supply.type must be so too")
+        if self.mode == "block":
+            self._refuse_other_bits()
         return self
+
+    def _refuse_other_bits(self) -> None:
+        """ValueError for a command's bit that is not the one which the ring's status has it in."""
+        for name, bit in STATUS_BITS.items():
+            tag = getattr(self.tags, name)
+            if tag is not None and tag.bit is not None and tag.bit != bit:
+                raise ValueError(
+                    f"tags.{name}.bit = {tag.bit} has no effect in block mode: each record of the "
+                    f"ring has {name} in bit {bit} of its status. Have the PLC write it there, "
+                    'or read the tags with mode = "poll"'
+                )
 
     def at(self, host: str, port: int) -> "ModbusSettings":
         """Give the same for a PLC at another address."""

@@ -542,3 +542,11 @@ def test_whatever_happens_rows_are_true_and_breaks_are_flagged(acts: list[str]) 
     assert restarted.sum() <= acts.count("restart")
     even = np.diff(samples["time_ns"]) == steps * 1_000_000
     assert (even | restarted | ((after & Quality.CLOCK) != 0)).all()
+
+
+@pytest.mark.parametrize(("name", "bit"), [("suction", 1), ("blow_off", 0)])
+def test_a_bit_that_would_have_no_effect_is_refused(name: str, bit: int) -> None:
+    pressure = {"address": "30002", "type": "float32", "unit": "mbar", "reference": "absolute"}
+    tags = {"pressure": pressure, name: {"address": "30005", "bit": bit}}
+    with pytest.raises(ValueError, match=f"tags.{name}.bit = {bit} has no effect in block mode"):
+        ModbusSettings.model_validate({"host": "plc", "tags": tags})
