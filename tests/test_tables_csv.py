@@ -131,7 +131,10 @@ def test_columns_not_taken_are_named(tmp_path: Path) -> None:
         ("suction,blow_off,pressure_pa", "no column time_s or time_ms or time_us or time_ns"),
         ("time_s,blow_off,pressure_pa", "no column suction;"),
         ("time_s,suction,pressure_pa", "no column blow_off;"),
-        ("time_s,suction,blow_off", "no column pressure_mbar or pressure_pa or vacuum_mbar or"),
+        (
+            "time_s,suction,blow_off",
+            "no column pressure_mbar or pressure_pa or pressure_bar or vacuum_mbar or",
+        ),
         ("time_s,time_ms,suction,blow_off,pressure_pa", "only one of .*'time_s', 'time_ms'"),
         ("time_s,suction,blow_off,pressure_pa,vacuum_pa", "only one of .*'pressure_pa', 'vac"),
         ("time_s,suction,suction,blow_off,pressure_pa", "column 'suction' stands there 2 times"),
@@ -408,3 +411,18 @@ def test_a_file_is_never_in_memory_as_a_whole(
     assert 1000 < len(next(blocks)) < 10_000  # given long before the bad end is read
     with pytest.raises(SourceError, match=":50002: 1 cells"):
         list(blocks)
+
+
+@pytest.mark.parametrize("kind", ["vacuum", "pressure"])
+def test_a_column_in_bar_is_not_taken_as_mbar(tmp_path: Path, kind: str) -> None:
+    bars = {"vacuum": (0.0, 0.71), "pressure": (1.013, 0.29)}[kind]
+    rows = [f"{n / 1000},{int(n > 500)},0,{bars[n > 600]}" for n in range(2000)]
+    path = tmp_path / "bar.csv"
+    path.write_text("\n".join([f"time_s,suction,blow_off,{kind}_mbar", *rows]))
+    ambient = 101_300.0
+    with pytest.raises(SourceError, match="is probably in bar") as caught:
+        list(open_table(path, ImportSettings(), ambient).blocks())
+    assert f'{kind}_bar = "{kind}_mbar"' in caught.value.hint
+    said = ImportSettings.model_validate({"columns": {f"{kind}_bar": f"{kind}_mbar"}})
+    *_, block = open_table(path, said, ambient).blocks()
+    assert block["pressure"][-1] == pytest.approx(30_300.0 if kind == "vacuum" else 29_000.0)

@@ -4,13 +4,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from twin.errors import SourceError
-from twin.signals import MBAR, Command
+from twin.signals import BAR, MBAR, Command
 from twin.tables.settings import Column, ImportSettings
 
 DIGITS = {Column.TIME_S: 9, Column.TIME_MS: 6, Column.TIME_US: 3, Column.TIME_NS: 0}  # down to ns
 COMMANDS = {Column.SUCTION: Command.SUCTION, Column.BLOW_OFF: Command.BLOW_OFF}
-ABSOLUTE = {Column.PRESSURE_MBAR: MBAR, Column.PRESSURE_PA: 1.0}  # in Pa
-BELOW_AMBIENT = {Column.VACUUM_MBAR: MBAR, Column.VACUUM_PA: 1.0}  # in Pa
+ABSOLUTE = {  # in Pa
+    Column.PRESSURE_MBAR: MBAR,
+    Column.PRESSURE_PA: 1.0,
+    Column.PRESSURE_BAR: BAR,
+}
+BELOW_AMBIENT = {  # in Pa
+    Column.VACUUM_MBAR: MBAR,
+    Column.VACUUM_PA: 1.0,
+    Column.VACUUM_BAR: BAR,
+}
 
 _REQUIRED = (tuple(DIGITS), *((name,) for name in COMMANDS), (*ABSOLUTE, *BELOW_AMBIENT))
 
@@ -36,7 +44,12 @@ class Layout:
 def find_layout(header: Sequence[str], settings: ImportSettings, place: str) -> Layout:
     """Find the known columns among a file's; SourceError names ``place`` and what is amiss."""
     wanted = {name: settings.columns.get(name, name.value) for name in Column}
-    theirs = {name: there for name, there in wanted.items() if there in header}
+    claimed = set(settings.columns.values())  # not taken by its own name as well
+    theirs = {
+        name: there
+        for name, there in wanted.items()
+        if there in header and (name in settings.columns or there not in claimed)
+    }
     for name in settings.columns:
         if name not in theirs:
             what = f"no column {wanted[name]!r}, which [import.columns] gives for {name}"

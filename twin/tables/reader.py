@@ -13,6 +13,7 @@ from twin.tables.intake import Intake
 from twin.tables.layout import Layout, find_layout
 from twin.tables.parquet_file import ParquetFile
 from twin.tables.settings import Column, ImportSettings
+from twin.tables.unit_check import UnitCheck
 
 
 class _File(Protocol):
@@ -47,13 +48,16 @@ class Table:
         """Every row of the file in order, about 10 000 rows of SAMPLE at a time.
 
         SourceError names the line and column of the first bad input, once all blocks before its
-        own are given, and says where a file ends without a row.
+        own are given, and says where a file ends without a row, or with pressures in another unit.
         """
         intake = Intake(self.layout, self.settings, self.ambient)
+        check = UnitCheck(self.layout, self.ambient)
         block = None
         for batch in self._file.batches(self.layout.theirs):
             block = intake.take(batch)
+            check.see(block)
             yield block
+        check.refuse(self._file.place)
         if block is None:
             raise SourceError(f"{self._file.place}: no row follows", "export it with its data")
 

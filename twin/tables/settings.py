@@ -20,6 +20,8 @@ class Column(StrEnum):
     BLOW_OFF = "blow_off"
     VACUUM_MBAR = "vacuum_mbar"
     PRESSURE_MBAR = "pressure_mbar"
+    VACUUM_BAR = "vacuum_bar"
+    PRESSURE_BAR = "pressure_bar"
     VACUUM_PA = "vacuum_pa"
     PRESSURE_PA = "pressure_pa"
     SUPPLY_BAR = "supply_bar"
