@@ -292,9 +292,7 @@ def _free_flow(base, losses, here, gauge):
     sucked, _ = stage.py_func(ambient, t, ambient, t, push, flow, ring, area, losses[0])
     if base["stages"] == 2:
         kept = base["momentum_kept"] * push
-        more, _ = stage.py_func(
-            ambient, t, ambient, t, kept, flow + sucked, area, wide, losses[1]
-        )
+        more, _ = stage.py_func(ambient, t, ambient, t, kept, flow + sucked, area, wide, losses[1])
         sucked += more
     return max(sucked, 1e-9)
 

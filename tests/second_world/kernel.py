@@ -135,9 +135,7 @@ def seal(plant, rest, gas, event, blowing):
     last = gas.pressure.size - 1
     if event == CONTACT:
         rest.sealed = 1.0
-    elif event == STRIP or (
-        blowing and gas.pressure[last] > rest.ambient + plant.lift_pressure
-    ):
+    elif event == STRIP or (blowing and gas.pressure[last] > rest.ambient + plant.lift_pressure):
         rest.sealed = 0.0
 
 

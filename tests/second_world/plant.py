@@ -83,7 +83,12 @@ def supply(plant, rest, size, source, neighbour):
             -half + math.sqrt(half * half + quadratic * (available - rest.p_supply))
         ) / quadratic
     through = secant(
-        plant.valve_conductance * rest.valve_lagged, CRITICAL_VALVE, rest.p_supply, rest.p_feed, t, t
+        plant.valve_conductance * rest.valve_lagged,
+        CRITICAL_VALVE,
+        rest.p_supply,
+        rest.p_feed,
+        t,
+        t,
     )
     return inflow, through, size[_NEIGHBOUR] * neighbour
 
@@ -97,9 +102,7 @@ def blow(plant, rest, size, head, dt):
         flow = orifice(opening, CRITICAL_VALVE, rest.p_supply, head, t)
         return flow, flow
     flow = orifice(opening, CRITICAL_VALVE, rest.p_reservoir, head, t)
-    refill = orifice(
-        plant.refill_conductance, CRITICAL_VALVE, rest.p_supply, rest.p_reservoir, t
-    )
+    refill = orifice(plant.refill_conductance, CRITICAL_VALVE, rest.p_supply, rest.p_reservoir, t)
     rest.p_reservoir += dt * R_AIR * t / plant.reservoir_volume * (refill - flow)
     return flow, refill
 
@@ -199,7 +202,6 @@ def openings(plant, rest, gas, size):
     gas.source[last] = size[_OUTGASSING] * rest.moisture * max(vacuum, 0.0) / FULL_VACUUM
 
 
-
 @njit
 def move_flaps(plant, rest, gas, dt):
     """Flap and check valve follow the pressure across them with their inertia."""
@@ -261,8 +263,10 @@ def hose_faces(plant, rest, gas, size, dt):
             left = 0.5 * (flow[face - 1] + flow[face])
             right = 0.5 * (flow[face] + flow[face + 1])
             push = (
-                left * left * t[face] / p[face] - right * right * t[face + 1] / p[face + 1]
-            ) * R_AIR / (area * area)
+                (left * left * t[face] / p[face] - right * right * t[face + 1] / p[face + 1])
+                * R_AIR
+                / (area * area)
+            )
         if face == HOSE:
             resistance += filters * old / density
         inertia = length / (area * dt)

@@ -8,20 +8,19 @@ import numpy.typing as npt
 from second_world.constants import CV, R_AIR
 from second_world.rig import Rig
 
-SECOND, FIRST, HEAD, CELLS = 0, 1, 2, 3  # cells: stage 2, stage 1, head, hose from here, vessel last
+SECOND, FIRST, HEAD, CELLS = (
+    0,
+    1,
+    2,
+    3,
+)  # cells: stage 2, stage 1, head, hose from here, vessel last
 FLAP, CHECK, HOSE = 0, 1, 2  # faces: face i lies between the cells i and i + 1
 QUEUE = 16  # strokes of a valve that may be under way at once
 
 REST = np.dtype(
     [
         (name, "f8")
-        for name in (
-            "p_supply p_feed p_reservoir p_exhaust primary flap check "
-            "valve valve_lagged blow_valve volume cup_held cup_shut backlash_held backlash_shut "
-            "yielded creep line_wall vessel_wall sealed ice water filled moisture warmth "
-            "own_reading lag_1 lag_2 lag_3 saving saving_since ambient leak_scale "
-            "mass_in energy_in"
-        ).split()
+        for name in ["p_supply", "p_feed", "p_reservoir", "p_exhaust", "primary", "flap", "check", "valve", "valve_lagged", "blow_valve", "volume", "cup_held", "cup_shut", "backlash_held", "backlash_shut", "yielded", "creep", "line_wall", "vessel_wall", "sealed", "ice", "water", "filled", "moisture", "warmth", "own_reading", "lag_1", "lag_2", "lag_3", "saving", "saving_since", "ambient", "leak_scale", "mass_in", "energy_in"]
     ]
 )
 
@@ -112,5 +111,3 @@ def valves() -> Strokes:
         np.zeros(2),
         np.zeros(2),
     )
-
-
