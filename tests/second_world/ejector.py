@@ -33,7 +33,9 @@ def jet(p_nozzle, p_chamber, t_supply, flow, velocity_coefficient):
 
 
 @njit
-def stage(p_chamber, t_chamber, p_behind, t_mixed, momentum, primary, jet_area, area, losses):
+def stage(  # noqa: PLR0917
+    p_chamber, t_chamber, p_behind, t_mixed, momentum, primary, jet_area, area, losses
+):
     """Air sucked in kg/s (negative: it flows back) and its slope with chamber pressure."""
     drive = p_chamber - p_behind + momentum / area
     drive = max(drive, -CHOKED_BACK * p_behind)

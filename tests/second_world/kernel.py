@@ -183,7 +183,9 @@ def note(traces, rest, gas, row):
 
 
 @njit
-def run(plant, rest, gas, strokes, course, chance, starts, sizes, lags, steps, traces):
+def run(  # noqa: PLR0917
+    plant, rest, gas, strokes, course, chance, starts, sizes, lags, steps, traces
+):
     """Run the whole course; `steps` per millisecond, an even number."""
     dt = 1e-3 / steps
     active, blow_was, wanted_was, running, running_was = 0, False, False, False, False
@@ -235,7 +237,9 @@ def _sources() -> str:
 
 def _entry(stamp):
     @njit(cache=True)
-    def simulate(plant, rest, gas, strokes, course, chance, starts, sizes, lags, steps, traces):
+    def simulate(  # noqa: PLR0917
+        plant, rest, gas, strokes, course, chance, starts, sizes, lags, steps, traces
+    ):
         _ = stamp
         run(plant, rest, gas, strokes, course, chance, starts, sizes, lags, steps, traces)
 

@@ -20,7 +20,43 @@ QUEUE = 16  # strokes of a valve that may be under way at once
 REST = np.dtype(
     [
         (name, "f8")
-        for name in ["p_supply", "p_feed", "p_reservoir", "p_exhaust", "primary", "flap", "check", "valve", "valve_lagged", "blow_valve", "volume", "cup_held", "cup_shut", "backlash_held", "backlash_shut", "yielded", "creep", "line_wall", "vessel_wall", "sealed", "ice", "water", "filled", "moisture", "warmth", "own_reading", "lag_1", "lag_2", "lag_3", "saving", "saving_since", "ambient", "leak_scale", "mass_in", "energy_in"]
+        for name in [
+            "p_supply",
+            "p_feed",
+            "p_reservoir",
+            "p_exhaust",
+            "primary",
+            "flap",
+            "check",
+            "valve",
+            "valve_lagged",
+            "blow_valve",
+            "volume",
+            "cup_held",
+            "cup_shut",
+            "backlash_held",
+            "backlash_shut",
+            "yielded",
+            "creep",
+            "line_wall",
+            "vessel_wall",
+            "sealed",
+            "ice",
+            "water",
+            "filled",
+            "moisture",
+            "warmth",
+            "own_reading",
+            "lag_1",
+            "lag_2",
+            "lag_3",
+            "saving",
+            "saving_since",
+            "ambient",
+            "leak_scale",
+            "mass_in",
+            "energy_in",
+        ]
     ]
 )
 
