@@ -1,8 +1,9 @@
 """What an analyst needs in a notebook: a log as columns, simulation, calibration, diagnosis.
 
-``import twin`` has all of it. ``calibrate`` and ``diagnose`` are the commands of the same name without
-their files, and give the same answers. Columns are in SI units, which end their names; what the field has names for
-(key figures, sizes of causes, values of a data set) comes in the field's units, as everywhere.
+``import twin`` has all of it. ``calibrate`` and ``diagnose`` are the commands of the same name
+without their files, and give the same answers. Columns are in SI units, which end their names; what
+the field has names for (key figures, sizes of causes, values of a data set) comes in the field's
+units, as everywhere.
 """
 
 import warnings
