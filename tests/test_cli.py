@@ -138,7 +138,7 @@ def test_no_plc_is_exit_code_3(
     assert not log.exists()  # or the next try would find a log it may not overwrite
     said = capsys.readouterr().err
     assert f"{address}: no connection" in said
-    assert "is the PLC on" in said
+    assert "is the Modbus TCP server started there" in said
 
 
 @pytest.mark.parametrize("address", ["nowhere", ":502", "10.0.0.5:", "10.0.0.5:http"])

@@ -308,4 +308,4 @@ def test_limits_are_of_the_figures_that_have_one() -> None:
         "leakage",
         "free_flow",
     }
-    assert found["t1"] == 2000.0
+    assert found["t1"] == LIMITS.t1

@@ -41,7 +41,7 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *D
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 # Folders that the sources lie in: what begins with one of them is a file of ours.
 OURS = {"twin", "drivers", "tests", "tools", "configs", "docs", ".ci"}
-OF_OTHERS = {"--no-nanny"}
+OF_OTHERS = {"--no-nanny", "--without"}
 USAGE_ERROR = BadParameter.__mro__[1]  # which typer hands out under no name of its own
 TARGET = re.compile(r"^([a-z]+):", re.MULTILINE)
 FENCE = re.compile(r"^```([\w{}-]*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -330,7 +330,7 @@ def test_pages_name_every_key_of_a_table(page: str, table: type[Settings]) -> No
 
 
 def test_options_that_are_named_alone_are_those_of_a_command_or_a_tool() -> None:
-    known = set(options_of(get_command(app))) | {"--help"}
+    known = set(options_of(get_command(app))) | {"--help", "--version"}
     for tool in (ROOT / "tools").glob("*.py"):
         known |= set(re.findall(r"(?<=\")--[a-z-]+", tool.read_text(encoding="utf-8")))
     for name in NAMES:

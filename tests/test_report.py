@@ -794,7 +794,7 @@ def test_ends_of_an_interval_are_told_apart() -> None:
     assert "since 9.5 s into the log (95 %: 9.49 s to 9.51 s)" in said
     assert "less rms deviation (95 %: 94.96 to 95.04)" in said
     late = LEAK | {"onset_s": 754.2, "onset_low95_s": 754.1, "onset_high95_s": 754.3}
-    assert when(late, interval=True).endswith("(95 %: 12 min 34.1 s to 12 min 34.3 s)")
+    assert when(late, NO_CLOCK, interval=True).endswith("(95 %: 12 min 34.1 s to 12 min 34.3 s)")
 
 
 @pytest.mark.parametrize(
