@@ -112,16 +112,16 @@ def test_closed_system_keeps_its_mass_and_its_energy_comes_from_the_walls_alone(
     assert after.temperature[closed] == pytest.approx(ambient, abs=1.0)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="isothermal 3.4 % slow, adiabatic run too short: not understood yet"
-)
 @pytest.mark.parametrize("isothermal", [True, False])
 def test_evacuation_is_the_analytic_one_where_the_suction_is_choked(isothermal):
-    """A jet without thickness and with any momentum leaves the whole mixing tube to the air."""
+    """A jet without thickness and with any momentum leaves the whole mixing tube to the air.
+
+    The walls of hose and chambers warm the air on its way: the tank is large beside both.
+    """
     rig = tight(ordinary("closed_tank"))
-    area = 2.0e-6
-    volume = 1.0e-3
-    wide = 1.0e-6
+    area = 2.0e-5
+    volume = 1.0e-2
+    wide = 1.0e-5
     ejector = replace(
         rig.ejector,
         stages=1,
@@ -139,7 +139,7 @@ def test_evacuation_is_the_analytic_one_where_the_suction_is_choked(isothermal):
     rig = replace(
         rig,
         ejector=ejector,
-        line=replace(rig.line, line_length=0.1, line_diameter=0.02, line_fittings=0.0),
+        line=replace(rig.line, line_length=0.01, line_diameter=0.02, line_fittings=0.0),
         vessel=replace(
             rig.vessel,
             rigid_volume=volume,
@@ -150,9 +150,9 @@ def test_evacuation_is_the_analytic_one_where_the_suction_is_choked(isothermal):
         supply=replace(rig.supply, valve_conductance=1e-7, feed_volume=1e-8),
         air_saving=replace(rig.air_saving, air_saving=0),
     )
-    traces, _, _ = records.run_course(rig, quiet(rig, 2500, kernel.SUCTION), chance(), NO_FAULT, 20)
+    traces, _, _ = records.run_course(rig, quiet(rig, 3200, kernel.SUCTION), chance(), NO_FAULT, 20)
     ambient, t = rig.surroundings.ambient_pressure, rig.surroundings.ambient_temperature
-    hose = math.pi / 4.0 * 0.02**2 * 0.1
+    hose = math.pi / 4.0 * 0.02**2 * 0.01
     rate = area * CHOKED * R_AIR * math.sqrt(t) / (volume + hose + 2e-6)
     start, end = np.argmax(traces.vessel < 0.9 * ambient), np.argmax(traces.vessel < 0.3 * ambient)
     if isothermal:
@@ -160,8 +160,8 @@ def test_evacuation_is_the_analytic_one_where_the_suction_is_choked(isothermal):
     else:  # p = p₀ (1 + (γ − 1)/2 · rate · t)^(−2γ/(γ − 1)), Shapiro
         exponent = -(GAMMA - 1.0) / (2.0 * GAMMA)
         expected = (0.3**exponent - 0.9**exponent) / (0.5 * (GAMMA - 1.0) * rate)
-    assert 0.4e3 < end < 2500
-    assert (end - start) * 1e-3 == pytest.approx(expected, rel=0.02)
+    assert start < end
+    assert (end - start) * 1e-3 == pytest.approx(expected, rel=0.01)
 
 
 def test_choked_leak_fills_an_adiabatic_tank_at_the_textbook_rate():
