@@ -12,8 +12,7 @@ leaves open. A second stage takes the mixed stream of the first one as its jet.
 
 import math
 
-from numba import njit
-
+from second_world.compiled import compiled
 from second_world.constants import CHOKED, GAMMA, R_AIR
 
 SOFT_ROOT = 400.0  # Pa; the root of the momentum balance is linear within this of zero
@@ -21,7 +20,7 @@ CHOKED_BACK = 0.472  # share of the pressure behind above which backward flow is
 ROUNDING = 0.06  # width of the change from momentum-limited to choked, share of the choked flow
 
 
-@njit
+@compiled
 def jet(p_nozzle, p_chamber, t_supply, flow, velocity_coefficient):
     """Momentum (N) and area (m²) of the primary jet once it has expanded to the chamber."""
     if p_nozzle <= p_chamber or flow <= 0.0:
@@ -32,7 +31,7 @@ def jet(p_nozzle, p_chamber, t_supply, flow, velocity_coefficient):
     return flow * speed, flow * R_AIR * t_supply * cold / (p_chamber * speed)
 
 
-@njit
+@compiled
 def stage(  # noqa: PLR0917
     p_chamber, t_chamber, p_behind, t_mixed, momentum, primary, jet_area, area, losses
 ):

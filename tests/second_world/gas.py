@@ -2,8 +2,7 @@
 
 import math
 
-from numba import njit
-
+from second_world.compiled import compiled
 from second_world.constants import (
     CHOKED,
     GAMMA,
@@ -22,7 +21,7 @@ EARLY_TURBULENCE = 1500.0  # Reynolds number; hoses with fittings trip early
 _CRITICAL_AIR = 0.5283  # critical pressure ratio of an ideal nozzle, (2/(γ+1))^(γ/(γ−1))
 
 
-@njit
+@compiled
 def expansion(ratio, critical):
     """Flow through an orifice as a share of its choked flow (ISO 6358-1, eq. 2)."""
     if ratio <= critical:
@@ -34,7 +33,7 @@ def expansion(ratio, critical):
     return math.sqrt(1.0 - share * share)
 
 
-@njit
+@compiled
 def orifice(conductance, critical, p_from, p_to, t_from):
     """Mass flow in kg/s, never backwards. `conductance`: kg/(s·Pa) choked at 20 °C."""
     if p_to >= p_from:
@@ -43,7 +42,7 @@ def orifice(conductance, critical, p_from, p_to, t_from):
     return conductance * hot * p_from * expansion(p_to / p_from, critical)
 
 
-@njit
+@compiled
 def secant(conductance, critical, p_left, p_right, t_left, t_right):
     """Flow through an orifice per pressure difference, in kg/(s·Pa); always positive."""
     high, low, t_from = p_left, p_right, t_left
@@ -57,7 +56,7 @@ def secant(conductance, critical, p_left, p_right, t_left, t_right):
     return conductance * hot * high * expansion(ratio, critical) / (high - low)
 
 
-@njit
+@compiled
 def nozzle_flow(area, p_from, p_to, t_from):
     """Mass flow in kg/s of an ideal convergent nozzle of effective `area` (m²)."""
     if p_to >= p_from or area <= 0.0:
@@ -65,7 +64,7 @@ def nozzle_flow(area, p_from, p_to, t_from):
     return area * CHOKED * p_from / math.sqrt(t_from) * expansion(p_to / p_from, _CRITICAL_AIR)
 
 
-@njit
+@compiled
 def viscosity(t):
     """Dynamic viscosity in Pa·s (Sutherland)."""
     warm = t / SUTHERLAND_T0
@@ -78,13 +77,13 @@ def viscosity(t):
     )
 
 
-@njit
+@compiled
 def conductivity(mu):
     """Heat conductivity in W/(m·K) from the Prandtl number."""
     return mu * _CP / PRANDTL
 
 
-@njit
+@compiled
 def turbulent_factor(reynolds, relative_roughness):
     """Darcy's friction factor of a turbulent pipe (Haaland 1983)."""
     re = max(reynolds, EARLY_TURBULENCE)
@@ -92,13 +91,13 @@ def turbulent_factor(reynolds, relative_roughness):
     return 1.0 / (root * root)
 
 
-@njit
+@compiled
 def tube_nusselt(reynolds):
     """Nusselt number in a tube: laminar 3.66, turbulent Dittus-Boelter, whichever is more."""
     return max(3.66, 0.023 * reynolds**0.8 * PRANDTL**0.4)
 
 
-@njit
+@compiled
 def vessel_nusselt(length, p, t_gas, t_wall, inflow_reynolds):
     """Nusselt number in a vessel: conduction, free convection (McAdams 1954), a jet's stirring."""
     mu = viscosity(t_gas)
@@ -108,7 +107,7 @@ def vessel_nusselt(length, p, t_gas, t_wall, inflow_reynolds):
     return 4.0 + 0.13 * rayleigh ** (1.0 / 3.0) + 0.1 * inflow_reynolds**0.6
 
 
-@njit
+@compiled
 def jet_velocity(p_from, p_to, t_from):
     """Speed in m/s of an isentropic expansion from rest."""
     if p_to >= p_from:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from numba import njit
 
 from second_world import faults
+from second_world.compiled import compiled
 from second_world.plant import approach, coefficients, memories, step
 from second_world.state import CELLS, HEAD, QUEUE
 
@@ -73,7 +74,7 @@ class Lags(NamedTuple):
     second: float  # s
 
 
-@njit
+@compiled
 def command(strokes, which, target, at):
     """Queue a stroke of a valve; strokes never overtake each other."""
     ends = strokes.ends[which]
@@ -85,7 +86,7 @@ def command(strokes, which, target, at):
     ends[2] += 1
 
 
-@njit
+@compiled
 def opening(strokes, which, now, open_time, close_time):
     """Opening of a valve, 0 to 1, with the stroke that is under way."""
     ends = strokes.ends[which]
@@ -106,7 +107,7 @@ def opening(strokes, which, now, open_time, close_time):
         ends[0] += 1
 
 
-@njit
+@compiled
 def air_saving(plant, rest, size, wanted, now, noise):
     """Two-point control on the ejector's own sensor; returns whether the nozzle shall run."""
     if not wanted:
@@ -127,7 +128,7 @@ def air_saving(plant, rest, size, wanted, now, noise):
     return rest.saving < 0.5
 
 
-@njit
+@compiled
 def seal(plant, rest, gas, event, blowing):
     """Cups touch the part, lift off it when blown free, or are pulled off at last."""
     if plant.released < 0.5:
@@ -139,7 +140,7 @@ def seal(plant, rest, gas, event, blowing):
         rest.sealed = 0.0
 
 
-@njit
+@compiled
 def order_nozzle(plant, strokes, size, chance, running, now, traces):
     """Command the suction valve and note when its stroke begins."""
     stroke = strokes.ends[0, 2]
@@ -154,7 +155,7 @@ def order_nozzle(plant, strokes, size, chance, running, now, traces):
         traces.switches[0] += 1
 
 
-@njit
+@compiled
 def order_blow_off(plant, strokes, size, chance, blowing, now):
     """Command the blow-off valve."""
     stroke = strokes.ends[1, 2]
@@ -163,7 +164,7 @@ def order_blow_off(plant, strokes, size, chance, blowing, now):
     command(strokes, 1, 1.0 if blowing else 0.0, now + max(dead, 0.0002) + size[_BLOW_DELAY])
 
 
-@njit
+@compiled
 def sense(rest, gas, size, lags, own_lag, dt):
     """Move the sensors on by a step."""
     rest.own_reading = approach(rest.own_reading, gas.pressure[HEAD], dt, own_lag)
@@ -172,7 +173,7 @@ def sense(rest, gas, size, lags, own_lag, dt):
     rest.lag_3 = approach(rest.lag_3, rest.lag_2, dt, size[_LAG])
 
 
-@njit
+@compiled
 def note(traces, rest, gas, row):
     """Keep what holds at the end of a millisecond's start."""
     traces.seen[row] = rest.lag_3
@@ -182,7 +183,7 @@ def note(traces, rest, gas, row):
     traces.warmth[row] = rest.warmth
 
 
-@njit
+@compiled
 def run(  # noqa: PLR0917
     plant, rest, gas, strokes, course, chance, starts, sizes, lags, steps, traces
 ):
@@ -236,7 +237,7 @@ def _sources() -> str:
 
 
 def _entry(stamp):
-    @njit(cache=True)
+    @njit(cache=True, error_model="numpy")
     def simulate(  # noqa: PLR0917
         plant, rest, gas, strokes, course, chance, starts, sizes, lags, steps, traces
     ):

@@ -8,9 +8,8 @@ with the flows that came out: what leaves a cell enters its neighbour to the las
 
 import math
 
-from numba import njit
-
 from second_world import faults
+from second_world.compiled import compiled
 from second_world.constants import CHOKED, CP, GAMMA, R_AIR
 from second_world.ejector import jet, stage
 from second_world.gas import (
@@ -62,7 +61,7 @@ _FLAP_LEAK = faults.INDEX["leaking_flap", "sonic_flow"]
 _HOSE = faults.INDEX["collapsing_hose", "area_loss"]
 
 
-@njit
+@compiled
 def approach(value, goal, dt, time_constant):
     """First-order lag, exact for a constant goal; without a time constant the goal itself."""
     if time_constant <= 0.0:
@@ -70,7 +69,7 @@ def approach(value, goal, dt, time_constant):
     return goal + (value - goal) * math.exp(-dt / time_constant)
 
 
-@njit
+@compiled
 def supply(plant, rest, size, source, neighbour):
     """Flow in from the regulator, conductance of the valve, flow that a neighbour takes."""
     t = plant.ambient_temperature
@@ -93,7 +92,7 @@ def supply(plant, rest, size, source, neighbour):
     return inflow, through, size[_NEIGHBOUR] * neighbour
 
 
-@njit
+@compiled
 def blow(plant, rest, size, head, dt):
     """Blow-off flow in kg/s, and what it takes from the supply; a reservoir pays for itself."""
     t = plant.ambient_temperature
@@ -107,7 +106,7 @@ def blow(plant, rest, size, head, dt):
     return flow, refill
 
 
-@njit
+@compiled
 def feed(plant, rest, gas, size, source, neighbour, dt):
     """Move the supply side on by a step; sets the primary flow and the head's source."""
     t = plant.ambient_temperature
@@ -130,7 +129,7 @@ def feed(plant, rest, gas, size, source, neighbour, dt):
     rest.primary = per_pascal * p_feed
 
 
-@njit
+@compiled
 def eject(plant, rest, gas, size, dt):
     """Set what the ejector takes from its chambers, and the pressure behind it."""
     t = plant.ambient_temperature
@@ -178,7 +177,7 @@ def eject(plant, rest, gas, size, dt):
     rest.p_exhaust = approach(rest.p_exhaust, goal, dt, plant.silencer_time)
 
 
-@njit
+@compiled
 def openings(plant, rest, gas, size):
     """Set the conductance to ambient of every cell, and gas that the walls give off."""
     last = gas.pressure.size - 1
@@ -202,7 +201,7 @@ def openings(plant, rest, gas, size):
     gas.source[last] = size[_OUTGASSING] * rest.moisture * max(vacuum, 0.0) / FULL_VACUUM
 
 
-@njit
+@compiled
 def move_flaps(plant, rest, gas, dt):
     """Flap and check valve follow the pressure across them with their inertia."""
     p = gas.pressure
@@ -214,7 +213,7 @@ def move_flaps(plant, rest, gas, dt):
         rest.check = 1.0
 
 
-@njit
+@compiled
 def valve_faces(plant, rest, gas, size):
     """Linear flow through the flap and the check valve."""
     p, t = gas.pressure, gas.temperature
@@ -227,7 +226,7 @@ def valve_faces(plant, rest, gas, size):
     gas.conductance[CHECK] = secant(check, CRITICAL_VALVE, p[FIRST], p[HEAD], t[FIRST], t[HEAD])
 
 
-@njit
+@compiled
 def hose_area(plant, rest, gas, size):
     """Cross-section in m² that water and the collapse under vacuum leave."""
     vacuum = min(max(rest.ambient - gas.pressure[CELLS], 0.0) / FULL_VACUUM, 1.0)
@@ -235,7 +234,7 @@ def hose_area(plant, rest, gas, size):
     return math.pi / 4.0 * plant.line_diameter**2 * left
 
 
-@njit
+@compiled
 def hose_faces(plant, rest, gas, size, dt):
     """Momentum balance of the air in the hose, face by face."""
     count = gas.flow.size
@@ -275,13 +274,13 @@ def hose_faces(plant, rest, gas, size, dt):
     return area
 
 
-@njit
+@compiled
 def temperature_at(gas, face, flow):
     """Temperature that a face carries: of the cell the air comes from."""
     return gas.temperature[face] if flow > 0.0 else gas.temperature[face + 1]
 
 
-@njit
+@compiled
 def new_pressures(plant, rest, gas, dt):
     """Solve the energy balances of all cells for the new pressures (Thomas's algorithm)."""
     count = gas.pressure.size
@@ -316,7 +315,7 @@ def new_pressures(plant, rest, gas, dt):
         gas.right[i] -= gas.upper[i] * gas.right[i + 1]
 
 
-@njit
+@compiled
 def choked_flow(flow, p_left, p_right, t_left, t_right, area):
     """No more than the speed of sound allows in the hose."""
     if flow > 0.0:
@@ -324,7 +323,7 @@ def choked_flow(flow, p_left, p_right, t_left, t_right, area):
     return max(flow, -CHOKED * p_right / math.sqrt(t_right) * area)
 
 
-@njit
+@compiled
 def transport(plant, rest, gas, area, dt):
     """Move mass and energy with the new flows; the ledger holds what crossed the boundary."""
     count = gas.pressure.size
@@ -353,14 +352,14 @@ def transport(plant, rest, gas, area, dt):
         gas.energy[face + 1] += carried
 
 
-@njit
+@compiled
 def shut(pressure, softness):
     """Share of a cup's stroke that a vacuum (Pa) takes: S-shaped, like a bellows."""
     u = max(pressure, 0.0)
     return u * u / (u * u + softness * softness + 1.0)
 
 
-@njit
+@compiled
 def yield_cups(plant, rest, gas, size, dt):
     """Cups change the vessel's volume; the gas does the work."""
     last = gas.pressure.size - 1
@@ -385,7 +384,7 @@ def yield_cups(plant, rest, gas, size, dt):
     gas.volume[last] = volume
 
 
-@njit
+@compiled
 def warm(plant, rest, gas, dt):
     """Heat between gas, walls and ambient."""
     last = gas.pressure.size - 1
@@ -409,7 +408,7 @@ def warm(plant, rest, gas, dt):
     rest.vessel_wall -= (vessel + lost) / plant.vessel_wall_heat
 
 
-@njit
+@compiled
 def settle(gas):
     """Pressure and temperature from energy, mass and volume."""
     for i in range(gas.pressure.size):
@@ -417,7 +416,7 @@ def settle(gas):
         gas.temperature[i] = gas.pressure[i] * gas.volume[i] / (gas.mass[i] * R_AIR)
 
 
-@njit
+@compiled
 def step(plant, rest, gas, size, source, neighbour, dt):
     """One step of `dt` seconds. `source`: Pa above ambient that the regulator holds."""
     rest.valve_lagged = (
@@ -439,7 +438,7 @@ def step(plant, rest, gas, size, source, neighbour, dt):
     settle(gas)
 
 
-@njit
+@compiled
 def coefficients(plant, gas, size):
     """Film and friction coefficients, which change slowly beside the pressures."""
     last = gas.pressure.size - 1
@@ -467,7 +466,7 @@ def coefficients(plant, gas, size):
     gas.film[last] = max(film, 0.0) * plant.vessel_surface
 
 
-@njit
+@compiled
 def memories(plant, rest, gas, blowing, dt):
     """What the mechanisms outside the table remember: ice, water, moisture, a full silencer."""
     running = rest.valve_lagged > 0.5
