@@ -1,6 +1,7 @@
 """The second world is judged by physics alone: books that balance, limits with known answers."""
 
 import ast
+import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,7 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import second_world
-from second_world import KINDS, Fault, Record, draw_rig, gas, kernel, record, records, state
+from second_world import KINDS, Fault, Record, draw_rig, export, gas, kernel, record, records, state
 from second_world.constants import CHOKED, GAMMA, MBAR, R_AIR, SL_PER_MIN
 from second_world.faults import EVERYTHING, OUTSIDE, TABLE, Schedule, sucked_at
 from second_world.rig import Rig
@@ -477,6 +478,18 @@ def test_files_are_what_the_contract_says(tmp_path):
     table = pq.read_table(tmp_path / "trace.parquet")
     assert table.column_names == lines[0].split(",")
     assert table["vacuum_mbar"].to_numpy() == pytest.approx(rec.vacuum_mbar())
+
+
+def test_export_writes_the_record_and_its_truth(tmp_path):
+    fault = ["--fault", "leakage=2.5@0.5"]
+    export.main(["--seed", "7", "--kind", "micro", "--cycles", "1", *fault, "-o", str(tmp_path)])
+    lines = (tmp_path / "7-micro.csv").read_text().splitlines()
+    assert lines[0] == "time_s,suction,blow_off,vacuum_mbar"
+    truth = json.loads((tmp_path / "7-micro.json").read_text())
+    assert truth["rig"]["vessel"]["rigid_volume"] == draw_rig(7, "micro").vessel.rigid_volume
+    assert truth["faults"][0]["parameters"] == {"sonic_flow": 2.5}
+    assert truth["faults"][0]["onset_s"] == 0.5
+    assert len(truth["nozzle_s"]) == len(truth["nozzle_on"])
 
 
 def test_the_truth_knows_when_the_nozzle_ran():
