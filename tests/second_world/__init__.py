@@ -11,6 +11,9 @@ own sensor, which the PLC cannot see. Sources stand beside each law.
 
 Other than a lumped model: sound in the hose, end vacuum, kink and sag under supply all follow from
 the physics. Kinetic energy of the gas and humidity are left out.
+
+A record begins after a long rest. Its first evacuation takes up to an eighth longer than later
+ones, whose air is still warm from filling.
 """
 
 from second_world.draw import KINDS, draw_rig
