@@ -12,8 +12,9 @@ from drivers.lasting import LostError, unreachable
 from drivers.tags import Address, Place, Pressure, Tag, WordOrder, Words
 from drivers.telegram import HEAD, Request, Store, belongs, exception
 from drivers.tls import Tls, secured
+from drivers.trace import COMMAND_BITS, no_effect, refuse_unused
 from twin.errors import SourceError
-from twin.settings import Settings
+from twin.settings import KeyedError, Settings
 
 EXCEPTIONS = {
     1: "illegal function: it does not serve this kind of address",
@@ -26,7 +27,8 @@ EXCEPTIONS = {
     10: "gateway: no path to the unit",
     11: "gateway: the unit does not answer",
 }
-STATUS_BITS = {"suction": 0, "blow_off": 1}  # of a ring's record, as in Command
+STATUS = Address("input", 4)  # in the register map: the bits of a record's status
+COILS = Address("coil", 0)  # and the first of the commands as coils, in the same order
 OURS = (1, 2, 3)  # the request is wrong and stays wrong; the others may pass
 
 
@@ -88,19 +90,25 @@ class ModbusSettings(Settings):
         if self.mode == "block" and tags.supply is not None and tags.supply.size != 1:
             raise ValueError("the ring holds a 16-bit supply: tags.supply.type must be so too")
         if self.mode == "block":
-            self._refuse_other_bits()
+            self._refuse_without_effect()
         return self
 
-    def _refuse_other_bits(self) -> None:
-        """ValueError for a command's bit that is not the one which the ring's status has it in."""
-        for name, bit in STATUS_BITS.items():
+    def _refuse_without_effect(self) -> None:
+        """KeyedError for what is read from the tags alone, and not from the ring."""
+        for name, bit in COMMAND_BITS.items():
             tag = getattr(self.tags, name)
-            if tag is not None and tag.bit is not None and tag.bit != bit:
-                raise ValueError(
-                    f"tags.{name}.bit = {tag.bit} has no effect in block mode: each record of the "
-                    f"ring has {name} in bit {bit} of its status. Have the PLC write it there, "
-                    'or read the tags with mode = "poll"'
-                )
+            same = (COILS + bit, None), (STATUS, bit)
+            if tag is not None and (tag.address, tag.bit) not in same:
+                place = tag.address if tag.bit is None else f"{tag.address} bit {tag.bit}"
+                raise no_effect(name, place, "poll")
+        if self.tags.heartbeat is not None:
+            raise KeyedError(
+                "has no effect in block mode: the ring's sequence shows whether the PLC's program "
+                'runs. Leave out [driver.tags.heartbeat], or set mode = "poll" in [driver]',
+                "tags",
+                "heartbeat",
+            )
+        refuse_unused(self.model_fields_set, ("gap_ms",), "poll")
 
     def at(self, host: str, port: int) -> "ModbusSettings":
         """Give the same for a PLC at another address."""

@@ -9,8 +9,10 @@ from urllib.parse import urlsplit
 from pydantic import BeforeValidator, Field, model_validator
 
 from drivers.tags import Quantity
+from drivers.trace import COMMAND_BITS, no_effect, refuse_unused
 from twin.settings import Settings
 
+COMMAND_NODES = {"suction": "Cmd.Suction", "blow_off": "Cmd.BlowOff"}  # as `twin plc` names them
 PORT = 4840  # registered for OPC UA
 NODE = re.compile(r"(?:nsu=(?P<uri>[^;]+);)?(?P<identifier>[sigb]=.+)", re.DOTALL)
 
@@ -133,6 +135,8 @@ class OpcuaSettings(Settings):
             raise ValueError("subscribing needs the tags suction and blow_off")
         if self.security.policy == "None" and (self.user.name or self.user.certificate):
             raise ValueError("a user needs security.policy: a password is not sent in the clear")
+        if self.mode == "block":
+            self._refuse_without_effect()
         nameless = [node for node in self._nodes() if not node.uri]
         if nameless and not self.namespace:
             raise ValueError(
@@ -140,6 +144,17 @@ class OpcuaSettings(Settings):
                 f'"nsu=URI;{nameless[0]}"'
             )
         return self
+
+    def _refuse_without_effect(self) -> None:
+        """KeyedError for what is read from single nodes alone, and not from the trace."""
+        for name in COMMAND_BITS:
+            tag = getattr(self.tags, name)
+            if tag is None:
+                continue
+            if tag.bit is not None or not tag.node.identifier.endswith(COMMAND_NODES[name]):
+                place = tag.node if tag.bit is None else f"{tag.node} bit {tag.bit}"
+                raise no_effect(name, place, "subscribe")
+        refuse_unused(self.model_fields_set, ("gap_ms", "sampling_ms"), "subscribe")
 
     def _nodes(self) -> list[Node]:
         nodes = [tag.node for _, tag in self.tags if tag is not None]

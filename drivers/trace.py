@@ -5,7 +5,7 @@ its sequence; whatever is missing shows as a missing number and as a flag on the
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Generic, Protocol, TypeVar
 
@@ -14,9 +14,11 @@ import numpy.typing as npt
 
 from drivers.lasting import EMPTY, Clock, LostError
 from twin.errors import SourceError
+from twin.settings import KeyedError
 from twin.signals import Quality, Samples
 
 COMMANDS = 0b11  # in the status of a record, as in Command
+COMMAND_BITS = {"suction": 0, "blow_off": 1}  # the same by the tags' names
 OVERFLOW_BIT = 8  # in the status of a record
 RESERVE = 64  # records at the old end of the ring that the PLC may overwrite while they are read
 CLOCK_TOLERANCE_NS = 50_000_000  # PLC time against sequence
@@ -64,6 +66,31 @@ class Header:
             and scans < self.depth
             and not self.clock_jumped(earlier, scans)
         )
+
+
+def no_effect(tag: str, place: object, single: str) -> KeyedError:
+    """The error for a command's tag in block mode that is not where the trace has that command.
+
+    ``single`` is the mode that reads single values.
+    """
+    return KeyedError(
+        f"{place} has no effect in block mode: each record has {tag} in bit {COMMAND_BITS[tag]} of "
+        f"its status. Have the PLC write it there and leave out [driver.tags.{tag}], or read "
+        f'single values with mode = "{single}" in [driver]',
+        "tags",
+        tag,
+    )
+
+
+def refuse_unused(given: Collection[str], names: Collection[str], single: str) -> None:
+    """KeyedError if one of the settings that are ``given`` is for the mode ``single`` alone."""
+    for name in names:
+        if name in given:
+            raise KeyedError(
+                "has no effect in block mode: a missing record shows in the sequence. Leave it "
+                f'out, or set mode = "{single}" in [driver]',
+                name,
+            )
 
 
 def refusal(header: Header) -> type[SourceError]:

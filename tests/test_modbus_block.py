@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from drivers.lasting import Clock
 from drivers.modbus import ModbusSettings, blocks
 from tests.modbus_server import CUT, HALF, SILENT, ModbusServer, PlcTime, TracePlc
-from twin.errors import SourceError
+from twin.errors import ConfigError, SourceError
 from twin.events import Kind
 from twin.monitor.clock import ClockWatch
+from twin.settings import Document
 from twin.signals import SAMPLE, Quality, Samples
 
 TAGS = {
@@ -544,9 +545,59 @@ def test_whatever_happens_rows_are_true_and_breaks_are_flagged(acts: list[str]) 
     assert (even | restarted | ((after & Quality.CLOCK) != 0)).all()
 
 
-@pytest.mark.parametrize(("name", "bit"), [("suction", 1), ("blow_off", 0)])
-def test_a_bit_that_would_have_no_effect_is_refused(name: str, bit: int) -> None:
-    pressure = {"address": "30002", "type": "float32", "unit": "mbar", "reference": "absolute"}
-    tags = {"pressure": pressure, name: {"address": "30005", "bit": bit}}
-    with pytest.raises(ValueError, match=f"tags.{name}.bit = {bit} has no effect in block mode"):
-        ModbusSettings.model_validate({"host": "plc", "tags": tags})
+BLOCK = """[driver]
+host = "plc"
+
+[driver.tags.pressure]
+address = "30002"
+type = "float32"
+unit = "mbar"
+reference = "absolute"
+
+[driver.tags.{tag}]
+{lines}
+"""
+
+
+@pytest.mark.parametrize(
+    ("tag", "lines"),
+    [
+        ("suction", 'address = "30005"\nbit = 0'),
+        ("blow_off", 'address = "30005"\nbit = 1'),
+        ("suction", 'address = "00001"'),
+        ("blow_off", 'address = "coil:1"'),
+    ],
+)
+def test_a_command_where_the_register_map_has_it_is_taken(tag: str, lines: str) -> None:
+    text = BLOCK.format(tag=tag, lines=lines)
+    assert Document.parse(text, "cell.toml").section(ModbusSettings, "driver").mode == "block"
+
+
+@pytest.mark.parametrize(
+    ("tag", "lines"),
+    [
+        ("suction", 'address = "30005"\nbit = 1'),
+        ("blow_off", 'address = "30005"\nbit = 0'),
+        ("suction", 'address = "coil:1"'),
+        ("blow_off", 'address = "00001"'),
+        ("suction", 'address = "holding:20"\nbit = 0'),
+        ("suction", 'address = "discrete:0"'),
+        ("heartbeat", 'address = "30006"\ntype = "uint32"'),
+    ],
+)
+def test_a_tag_that_would_have_no_effect_is_refused(tag: str, lines: str) -> None:
+    text = BLOCK.format(tag=tag, lines=lines)
+    with pytest.raises(ConfigError, match="has no effect in block mode") as caught:
+        Document.parse(text, "cell.toml").section(ModbusSettings, "driver")
+    assert f"cell.toml:10: driver.tags.{tag}: " in str(caught.value)
+    assert f"eave out [driver.tags.{tag}]" in str(caught.value)
+
+
+def test_a_setting_of_polling_is_refused_in_block_mode() -> None:
+    text = BLOCK.format(tag="blow_off", lines='address = "coil:1"')
+    text = text.replace('"plc"', '"plc"\ngap_ms = 50')
+    with pytest.raises(ConfigError, match=r"cell\.toml:3: driver\.gap_ms: .*has no effect"):
+        Document.parse(text, "cell.toml").section(ModbusSettings, "driver")
+    polled = text.replace("gap_ms", 'mode = "poll"\ngap_ms')
+    polled += '[driver.tags.suction]\naddress = "holding:20"\nbit = 7\n'
+    assert Document.parse(polled, "cell.toml").section(ModbusSettings, "driver").gap_ms == 50

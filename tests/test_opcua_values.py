@@ -147,8 +147,8 @@ def test_nodes_are_named_by_uri(text: str, uri: str, identifier: str) -> None:
 
 TAGS: dict[str, Any] = {
     "pressure": {"node": "s=P", "unit": "mbar", "reference": "absolute"},
-    "suction": {"node": "s=S"},
-    "blow_off": {"node": "s=B"},
+    "suction": {"node": "s=Cmd.Suction"},
+    "blow_off": {"node": "s=Cell2.Cmd.BlowOff"},  # with the prefix of one of several ejectors
 }
 FINE: dict[str, Any] = {"url": "opc.tcp://plc:4840", "namespace": "urn:plc", "tags": TAGS}
 
@@ -174,6 +174,22 @@ def test_settings_that_cannot_work_are_refused(changes: dict[str, Any], message:
     assert OpcuaSettings.model_validate(FINE)
     with pytest.raises(ValidationError, match=message):
         OpcuaSettings.model_validate(FINE | changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"tags": {**TAGS, "suction": {"node": "s=Cmd.BlowOff"}}}, "in bit 0 of its status"),
+        ({"tags": {**TAGS, "blow_off": {"node": 's="DB"."Blow"'}}}, "in bit 1 of its status"),
+        ({"tags": {**TAGS, "suction": {"node": "s=Cmd.Suction", "bit": 3}}}, "bit 3 has no effect"),
+        ({"gap_ms": 20}, "has no effect in block mode"),
+        ({"sampling_ms": 1}, "has no effect in block mode"),
+    ],
+)
+def test_what_would_have_no_effect_is_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        OpcuaSettings.model_validate(FINE | changes)
+    assert OpcuaSettings.model_validate(FINE | changes | {"mode": "subscribe"})
 
 
 def test_a_node_that_was_there_and_is_not_is_waited_for() -> None:

@@ -24,6 +24,14 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
+class KeyedError(ValueError):
+    """What is wrong with one key of a table, where only the whole table shows it."""
+
+    def __init__(self, what: str, *keys: str) -> None:
+        super().__init__(what)
+        self.keys = keys  # from the table's own on
+
+
 S = TypeVar("S", bound=Settings)
 
 
@@ -75,7 +83,9 @@ class Document:
         problems = error.errors(include_url=False)
         # A mistyped key first: that the right one is missing follows from it.
         for problem in sorted(problems, key=lambda one: one["type"] != "extra_forbidden"):
-            keys = self._written((*path, *problem["loc"]))
+            cause = problem.get("ctx", {}).get("error")
+            below = cause.keys if isinstance(cause, KeyedError) else ()
+            keys = self._written((*path, *problem["loc"], *below))
             what = "unknown key" if problem["type"] == "extra_forbidden" else problem["msg"]
             is_said = problem["type"] in ("missing", "value_error")  # or is a whole table
             given = "" if is_said else f" (is {shorten(repr(problem['input']), 80)})"
