@@ -426,3 +426,29 @@ def test_a_column_in_bar_is_not_taken_as_mbar(tmp_path: Path, kind: str) -> None
     said = ImportSettings.model_validate({"columns": {f"{kind}_bar": f"{kind}_mbar"}})
     *_, block = open_table(path, said, ambient).blocks()
     assert block["pressure"][-1] == pytest.approx(30_300.0 if kind == "vacuum" else 29_000.0)
+
+
+def _dead(folder: Path, column: str = "vacuum_mbar") -> Path:
+    """A record of an ejector that draws nothing: 1 mbar of vacuum in 1.5 s of suction."""
+    rows = [f"{n / 1000},{int(n > 500)},0,{float(n > 600)}" for n in range(2000)]
+    path = folder / "dead.csv"
+    path.write_text("\n".join([f"time_s,suction,blow_off,{column}", *rows]))
+    return path
+
+
+def test_a_record_of_a_dead_ejector_is_taken_once_its_unit_is_said(tmp_path: Path) -> None:
+    path, ambient = _dead(tmp_path), 101_300.0
+    with pytest.raises(SourceError, match="is probably in bar") as caught:
+        list(open_table(path, ImportSettings(), ambient).blocks())
+    assert 'under [import]: pressure_unit = "mbar"' in caught.value.hint
+    said = ImportSettings.model_validate({"pressure_unit": "mbar"})
+    *_, block = open_table(path, said, ambient).blocks()
+    assert block["pressure"][-1] == pytest.approx(101_200.0)
+
+
+def test_a_unit_other_than_the_columns_is_refused(tmp_path: Path) -> None:
+    path = _dead(tmp_path, "vacuum_bar")
+    said = ImportSettings.model_validate({"pressure_unit": "mbar"})
+    with pytest.raises(ConfigError, match="is taken as vacuum_bar") as caught:
+        open_table(path, said, 101_300.0)
+    assert 'vacuum_mbar = "vacuum_bar"' in caught.value.hint

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from twin.errors import SourceError
+from twin.errors import ConfigError, SourceError
 from twin.signals import BAR, MBAR, Command
 from twin.tables.settings import Column, ImportSettings
 
@@ -56,6 +56,7 @@ def find_layout(header: Sequence[str], settings: ImportSettings, place: str) -> 
             raise _missing(what, name, header, place)
     for names in _REQUIRED:
         _require_one(names, theirs, header, place)
+    _require_unit(theirs, settings, place)
     for there in theirs.values():
         if header.count(there) > 1:
             raise _too_many(f"column {there!r} stands there {header.count(there)} times", place)
@@ -71,6 +72,20 @@ def _require_one(
         raise _missing(f"no column {' or '.join(names)}", names[0], header, place)
     if len(found) > 1:
         raise _too_many(f"only one of the columns {', '.join(map(repr, found))} can be used", place)
+
+
+def _require_unit(theirs: Mapping[Column, str], settings: ImportSettings, place: str) -> None:
+    """ConfigError if the column of pressure is in another unit than the settings say."""
+    column = next(name for name in (*ABSOLUTE, *BELOW_AMBIENT) if name in theirs)
+    kind, _, unit = column.rpartition("_")
+    said = settings.pressure_unit
+    if said is not None and said.lower() != unit:
+        raise ConfigError(
+            f'{place}: pressure_unit = "{said}" under [import], but column {theirs[column]!r} is'
+            f" taken as {column}",
+            f'say under [import.columns]: {kind}_{said.lower()} = "{theirs[column]}", or leave'
+            " pressure_unit out",
+        )
 
 
 def _missing(what: str, name: Column, header: Sequence[str], place: str) -> SourceError:

@@ -51,7 +51,7 @@ class Table:
         own are given, and says where a file ends without a row, or with pressures in another unit.
         """
         intake = Intake(self.layout, self.settings, self.ambient)
-        check = UnitCheck(self.layout, self.ambient)
+        check = UnitCheck(self.layout, self.settings, self.ambient)
         block = None
         for batch in self._file.batches(self.layout.theirs):
             block = intake.take(batch)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from enum import StrEnum
+from typing import Literal
 
 from pydantic import Field
 
@@ -46,4 +47,5 @@ class ImportSettings(Settings):
     values: Bad = Bad.REFUSE  # text in a number, NaN, an empty cell, too many or too few cells
     jumps: Bad = Bad.REFUSE  # time or sequence that does not go forward
     gaps: Bad = Bad.REFUSE  # samples that are missing
+    pressure_unit: Literal["mbar", "bar", "Pa"] | None = None  # says that the column's is right
     period_ms: float | None = Field(None, gt=0.0, le=60_000.0)  # else the median of the file's

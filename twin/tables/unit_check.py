@@ -7,10 +7,10 @@ import numpy as np
 from twin.errors import SourceError
 from twin.signals import MBAR, Command, Samples
 from twin.tables.layout import Layout
-from twin.tables.settings import Column
+from twin.tables.settings import Column, ImportSettings
 
 # Ambient is about 1 bar: read as mbar, no absolute pressure or vacuum in bar comes to 2 mbar.
-# No ejector leaves as little in a second of suction, or evacuates to as little.
+# No ejector evacuates to as little, and only a dead one leaves as little after a second of suction.
 LEAST = 2.0 * MBAR
 LONG_NS = 1_000_000_000
 _IN_BAR = {
@@ -24,6 +24,7 @@ class UnitCheck:
     """What is seen of one file's pressure, block after block; ``ambient`` in Pa."""
 
     layout: Layout
+    settings: ImportSettings
     ambient: float
     _highest: float = -np.inf  # Pa, as the column counts it
     _suction_ns: int = 0  # commanded so far
@@ -40,7 +41,9 @@ class UnitCheck:
         self._highest = max(self._highest, counted.max(initial=-np.inf))
 
     def refuse(self, place: str) -> None:
-        """SourceError after the last block if the column cannot be in mbar."""
+        """SourceError after the last block if the column is hardly in mbar, and not said to be."""
+        if self.settings.pressure_unit is not None:
+            return
         column = self.layout.pressure
         better = _IN_BAR.get(column)
         if better is None or self._suction_ns < LONG_NS or not self._highest < LEAST:
@@ -51,5 +54,6 @@ class UnitCheck:
             f"{place}: column {theirs!r} is never above {self._highest / MBAR:.3g} mbar{when}: it"
             " is probably in bar",
             f'say so under [import.columns]: {better} = "{theirs}"; if it is negative under'
-            " suction, turn its sign in the file",
+            " suction, turn its sign in the file. If it is in mbar, say so under [import]:"
+            ' pressure_unit = "mbar"',
         )
