@@ -53,7 +53,7 @@ def hidden(units: int, faults: int, seed: int) -> Mapping[int, str]:
 def record(unit: int, faults: Mapping[int, str], folder: Path, seed: int) -> None:
     """Both logs of a unit, beside the twin of its type; those that are there stay."""
     document = shipped(_system(unit))
-    config = Config.of(document, unit=_id(unit))
+    config = Config.of(document, unit=_id(unit), own=_id(unit))  # nothing is known of it yet
     plc = drawn(rig_of(document), 10_000 * (1 + seed) + unit)
     for day, fault in ((0, None), (TODAY, faults.get(unit))):
         path = folder / f"{_id(unit)}-{day:03d}.mcap"
