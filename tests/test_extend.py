@@ -86,6 +86,25 @@ def test_it_is_stored_as_a_unit_with_where_it_is_from(saved: Saved) -> None:
     assert received[0] < record.valid_from_ns < received[-1]  # the first cycle begins later
 
 
+def test_a_database_that_is_not_there_is_made_and_said(
+    saved: Saved,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    new = tmp_path / "new.sqlite"
+    log = saved.folder / "one.mcap"
+    assert twin(monkeypatch, "diagnose", log, "--assets", new) == 3  # nothing is to be stored
+    assert "no such asset database" in capsys.readouterr().err
+    assert not new.exists()
+    assert twin(monkeypatch, "diagnose", log, "--save-as", "leaky", "--assets", new) == 0
+    heard = capsys.readouterr()
+    assert f"making a new asset database, {new}" in heard.err
+    with open_assets(new) as database, open_assets(saved.assets) as default:
+        (record,), (same,) = (one.records("instance", "leaky") for one in (database, default))
+    assert record.data == same.data  # with the data set of the log: a new database has no other
+
+
 def test_its_alarms_are_gone_on_another_log_of_the_same_rig(
     saved: Saved, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -295,7 +295,8 @@ def diagnose(
 
     require_writable(json_file, report)
     recorded = open_log(log)
-    settings = _settings_of(recorded.header, log, config, assets, unit, as_of)
+    store = bool(save_as)
+    settings = _settings_of(recorded.header, log, config, assets, unit, as_of, to_store=store)
     if not unit:
         settings.refuse_another(recorded.header, str(log))
     with _status() as say:
@@ -580,16 +581,28 @@ def _configured(document: "Document", assets: str, unit: str) -> "Config":
 
 
 def _settings_of(
-    header: "LogHeader", log: Path, instead: Path | None, assets: str, unit: str, as_of: str
+    header: "LogHeader",
+    log: Path,
+    instead: Path | None,
+    assets: str,
+    unit: str,
+    as_of: str,
+    *,
+    to_store: bool = False,
 ) -> "Config":
-    """The configuration a log carries, with the data set it was made with; or another one."""
+    """The configuration a log carries, with the data set it was made with; or another one.
+
+    ``to_store`` something in the asset database: it may be new.
+    """
     from twin.assets.file import parse_time
     from twin.config import Config
     from twin.settings import Document
 
     document = Document.read(instead) if instead is not None else None
     known = parse_time(as_of) if as_of else None
-    settings = Config.of_recorded(header, str(log), document, assets, unit, known)
+    settings = Config.of_recorded(
+        header, str(log), document, assets, unit, known, to_store=to_store
+    )
     _say_instead(settings, unit)
     return settings
 

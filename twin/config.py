@@ -99,20 +99,22 @@ class Config:
         calibrated: bool = True,
         as_of_ns: int | None = None,
         own: str = "",
+        to_store: bool = False,
     ) -> "Config":
         """Check all of the twin's tables; ConfigError names file, line and key, or the record.
 
         ``assets`` names the database in place of the configuration's, ``unit`` the ID in place of
         its own: ConfigError if the database does not know it and it is not ``own``, that of a log.
         Not ``calibrated`` is the unit as its type has it, whatever is known of itself: it may be
-        new. ``as_of_ns`` (UTC) takes what the database knew then.
+        new. ``as_of_ns`` (UTC) takes what the database knew then. ``to_store`` allows a database
+        that is not there yet.
         """
         from twin.assets.place import open_chosen
 
         document.refuse_unknown_tables(TABLES)
         asset = _asset(document, unit)
-        # What is not calibrated is read to be calibrated, and stored: in a new database, too.
-        with open_chosen(assets, document, write=False, to_store=not calibrated) as database:
+        to_store = to_store or not calibrated  # what is not, is read to be calibrated and stored
+        with open_chosen(assets, document, write=False, to_store=to_store) as database:
             if unit and calibrated and unit not in (own, document.section(Asset, "asset").id):
                 _require_unit(database, unit)
             found = _find(database, document, asset.type, asset.id if calibrated else "", as_of_ns)
@@ -146,15 +148,22 @@ class Config:
         assets: str = "",
         unit: str = "",
         as_of_ns: int | None = None,
+        *,
+        to_store: bool = False,
     ) -> "Config":
         """The configuration a log carries, with the data set it was made with; or ``instead``.
 
         Where a database, a unit or a time is named the data set is looked up anew, as in ``of``.
+        A database that is to be made knows nothing to look up.
         """
+        from twin.assets.place import is_new
+
         with _in_log(header.metadata, log):
             document = instead or Document.parse(header.config_text, header.config_name)
-        if instead is not None or assets or unit or as_of_ns is not None:
-            return cls.of(document, assets, unit, as_of_ns=as_of_ns, own=header.asset_id)
+        known = bool(assets) and not (to_store and is_new(assets, document))
+        if instead is not None or known or unit or as_of_ns is not None:
+            own = header.asset_id
+            return cls.of(document, assets, unit, as_of_ns=as_of_ns, own=own, to_store=to_store)
         config = cls.of_log(document, header.metadata, log)
         # --id may have named another unit than the configuration does.
         named = {"type": header.asset_type, "id": header.asset_id}
