@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli_alarms import alarms_app, alarms_of, asker_of
-from twin.cli_app import App, say_if_new
+from twin.cli_app import App, not_negative, read_config, say_if_new
 from twin.cli_assets import assets_app
 from twin.cli_cert import cert
 from twin.cli_compare import compare
@@ -89,7 +89,8 @@ def run(
     configs: ConfigFiles,
     *,
     duration: Annotated[
-        float | None, typer.Option(metavar="S", help="Stop after S seconds with the PLC.")
+        float | None,
+        typer.Option(metavar="S", callback=not_negative, help="Stop after S seconds with the PLC."),
     ] = None,
     log: Annotated[Path | None, typer.Option(metavar="FILE", help="Write an MCAP log.")] = None,
     view: ViewFlag = False,
@@ -127,6 +128,7 @@ def run(
             f"--id is for one ejector, and here are {len(configs)}",
             "leave it out, and give each configuration its own under [asset]",
         )
+    require_writable(log, rrd)  # the PLC may answer much later
     ejectors = _named([_configured(Document.read(one), assets, unit) for one in configs])
     pairs = {name: pair_of(one) for name, one in ejectors.items()}  # compiled before time counts
     width = 0 if alone else max(map(len, ejectors))
@@ -172,9 +174,8 @@ def run(
 
     failed: list[str] = []
     units = {figure.name: figure.unit for figure in FIGURES.values()}
-    documents = [one.document for one in ejectors.values()]
     with (
-        open_results(documents, units) as show,
+        open_results([one.document for one in ejectors.values()], units) as show,
         _views_of(ejectors, view, rrd) as view_of,
         _stop_on_signal(duration) as stopped,
         _spared(),
@@ -244,9 +245,12 @@ def plc(
         typer.Option(metavar="NAME=VALUE[@START][/COURSE]", help="For example leakage=2.0@10."),
     ] = None,
     port: Annotated[int | None, typer.Option(help="Modbus TCP port; 0 takes any free.")] = None,
-    seed: Annotated[int, typer.Option(help="For all that is random: same seed, same run.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, help="For all that is random: same seed, same run.")
+    ] = 0,
     duration: Annotated[
-        float | None, typer.Option(metavar="S", help="Stop after S seconds.")
+        float | None,
+        typer.Option(metavar="S", callback=not_negative, help="Stop after S seconds."),
     ] = None,
 ) -> None:
     """Run the simulated PLC with an ejector behind it, for trials and tests.
@@ -257,9 +261,15 @@ def plc(
     from drivers.plc.faults import parse_fault
     from drivers.plc.live import run_plc
     from drivers.plc.settings import PlcSettings
-    from twin.settings import Document
 
-    settings = [Document.read(one).section(PlcSettings, "plc").on_port(port) for one in configs]
+    documents = [read_config(one) for one in configs]
+    for document in documents:
+        if "plc" not in document.tables:
+            raise ConfigError(
+                f"{document.name}: there is no [plc] table",
+                "say what is simulated, as configs/test_rig.toml does",
+            )
+    settings = [one.section(PlcSettings, "plc").on_port(port) for one in documents]
     run_plc(settings, [parse_fault(text) for text in fault or []], seed, duration)
 
 
@@ -267,9 +277,8 @@ def plc(
 def probe(config: ConfigFile, address: Address = "") -> None:
     """Say what a PLC at the configured address answers, word order included."""
     from drivers.sources import probe_source
-    from twin.settings import Document
 
-    for line in probe_source(Document.read(config), address):
+    for line in probe_source(read_config(config), address):
         print(line)
 
 
@@ -410,6 +419,7 @@ def paper(
     from twin.paper.tables import late_by, recomputed
     from twin.paper.words import in_words
 
+    require_writable(json_file, picture)
     rows = recomputed()
     separation = separate(late_by(rows))
     if picture is not None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from twin.cli_app import App
+from twin.cli_app import App, not_negative, read_config
 from twin.errors import ConfigError, known_names
 from twin.files import write_json
 from twin.instants import instant
@@ -87,7 +87,9 @@ def history(
     config: ConfigFile = None,
     unit: UnitId = "",
     alarms: Url = "",
-    days: Annotated[float | None, typer.Option(metavar="N", help="Only the last N days.")] = None,
+    days: Annotated[
+        float | None, typer.Option(metavar="N", callback=not_negative, help="Only the last N days.")
+    ] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Every time an alarm was active: since when, how long, who acknowledged it, what spoke for it.
@@ -109,7 +111,9 @@ def export(
     config: ConfigFile = None,
     unit: UnitId = "",
     alarms: Url = "",
-    days: Annotated[float | None, typer.Option(metavar="N", help="Only the last N days.")] = None,
+    days: Annotated[
+        float | None, typer.Option(metavar="N", callback=not_negative, help="Only the last N days.")
+    ] = None,
     standing: Annotated[
         bool, typer.Option("--standing", help="What stands now, instead of the history.")
     ] = False,
@@ -144,7 +148,9 @@ def acknowledge(
 @alarms_app.command()
 def shelve(
     names: Names,
-    hours: Annotated[float, typer.Option(metavar="H", help="For how long.")] = 1.0,
+    hours: Annotated[
+        float, typer.Option(metavar="H", callback=not_negative, help="For how long.")
+    ] = 1.0,
     config: ConfigFile = None,
     unit: UnitId = "",
     alarms: Url = "",
@@ -284,9 +290,7 @@ class _From:
 
 
 def _document(config: Path | None) -> "Document | None":
-    from twin.settings import Document
-
-    return Document.read(config) if config else None
+    return read_config(config) if config else None
 
 
 def _open(url: str, config: Path | None) -> "Store":

@@ -1,8 +1,10 @@
 """What commands have in common: plain help, ``-h`` and ``--version``, and what they say."""
 
+import math
 import sys
 from collections.abc import Callable
 from importlib.metadata import version
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -95,3 +97,24 @@ def say_if_new(url: str, document: "Document | None") -> None:
 
     if is_new(url, document):
         print(f"twin: making a new asset database, {chosen(url, document)}", file=sys.stderr)
+
+
+def read_config(path: Path) -> "Document":
+    """Read a configuration for a command that takes some of its tables.
+
+    Errors as ``Document.read``; ConfigError if it has a table that no command knows: then it is
+    another kind of file.
+    """
+    from twin.config import TABLES
+    from twin.settings import Document
+
+    document = Document.read(path)
+    document.refuse_unknown_tables(TABLES)
+    return document
+
+
+def not_negative(value: float | None) -> float | None:
+    """For an option with a number: usage error unless it is finite and not below zero."""
+    if value is not None and not (math.isfinite(value) and value >= 0.0):
+        raise typer.BadParameter(f"{value:g} is not a finite number from 0 on")
+    return value

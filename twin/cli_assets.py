@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from twin.cli_app import App, say_if_new
+from twin.cli_app import App, read_config, say_if_new
 from twin.errors import ConfigError, SourceError, known_names
 from twin.extras import install_hint
 from twin.files import write_whole
@@ -183,17 +183,15 @@ def export(
 def _to_store(url: str, config: Path | None, *, shipped: bool = True) -> "Assets":
     """The database in which something is to be stored, to look into first; it may be new."""
     from twin.assets.place import open_chosen
-    from twin.settings import Document
 
-    document = Document.read(config) if config else None
+    document = read_config(config) if config else None
     return open_chosen(url, document, write=False, shipped=shipped, to_store=True)
 
 
 def _open(url: str, config: Path | None, *, write: bool, shipped: bool = True) -> "Assets":
     from twin.assets.place import open_chosen
-    from twin.settings import Document
 
-    document = Document.read(config) if config else None
+    document = read_config(config) if config else None
     if write:
         say_if_new(url, document)
     database = open_chosen(url, document, write=write, shipped=shipped)
@@ -215,6 +213,10 @@ def _holding_each(records: "Iterable[Record]", now: int) -> "list[Record]":
 
 def _require(records: "list[Record]", name: str, database: "Assets") -> None:
     if not records:
+        if database.records(name=name):
+            raise ConfigError(
+                f"{database.name}: nothing was known of {name!r} at that time", "see --history"
+            )
         known = known_names(name, (record.name for record in database.records()))
         raise ConfigError(f"{database.name}: no type or unit is called {name!r}", known)
 
@@ -258,8 +260,12 @@ def _read_json(file: Path) -> dict[str, Any]:
     """The document in a file; whether it is an export is for the database to say."""
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise SourceError(f"{file}: cannot be read: {error}", "check the path") from error
+    except OSError as error:
+        message = f"{file}: cannot be read: {error.strerror}"
+        raise SourceError(message, "check the path") from error
+    except UnicodeDecodeError as error:
+        message = f"{file}: not a text file, so not an export"
+        raise SourceError(message, "twin assets export makes one") from error
     except (ValueError, RecursionError) as error:
         hint = "twin assets export makes it"
         raise ConfigError(f"{file}: not valid JSON: {error}", hint) from error

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from twin.files import said_plainly
+
 
 def cert(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="New or empty.")],
@@ -13,7 +15,8 @@ def cert(
     """Make a certificate and key of our own, beside folders for those we trust."""
     from drivers import certificates
 
-    own = certificates.make(folder, name)
+    with said_plainly(folder):
+        own = certificates.make(folder, name)
     print(f"made {own.path}")
     print(f"     {certificates.described(own.certificate)}")
     print(f"     valid until {own.certificate.not_valid_after_utc:%Y-%m-%d}; the key stays here")

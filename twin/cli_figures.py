@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.cli_app import App
+from twin.cli_app import App, not_negative, read_config
 from twin.errors import ConfigError, known_names
-from twin.files import write_json
+from twin.files import require_writable, write_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -36,7 +36,9 @@ ConfigFile = Annotated[
     typer.Option("--config", metavar="CONFIG", help="Its unit, limits and [figures] url."),
 ]
 UnitId = Annotated[str, typer.Option("--id", metavar="ID", help="Unit, where there are several.")]
-Days = Annotated[float | None, typer.Option(metavar="N", help="Only the last N days.")]
+Days = Annotated[
+    float | None, typer.Option(metavar="N", callback=not_negative, help="Only the last N days.")
+]
 JsonFile = Annotated[
     Path | None, typer.Option("--json", metavar="F", help="Write the same as JSON.")
 ]
@@ -62,6 +64,9 @@ def show(
     from twin.log.reader import open_log
     from twin.tables.sheet import export as export_table
 
+    if figures and not keep:
+        raise ConfigError("--figures is for --keep", "say --keep as well, or leave it out")
+    require_writable(json_file, output)
     recorded = open_log(log)
     settings = _of_log(recorded, log, config)
     plain = [kept for _, kept in of_log(recorded, key_figures_of(settings))]
@@ -142,7 +147,10 @@ def autoset(
     unit: UnitId = "",
     figures: Url = "",
     tolerance: Annotated[
-        float | None, typer.Option(metavar="S", help="Share of the worst good cycle, over it.")
+        float | None,
+        typer.Option(
+            metavar="S", callback=not_negative, help="Share of the worst good cycle, over it."
+        ),
     ] = None,
 ) -> None:
     """Permitted t1 and leakage from the last good cycles, to put into the configuration."""
@@ -213,9 +221,7 @@ _COUNTED = {"cycles": "suction cycles", "switchings": "valve switchings", "alarm
 
 
 def _document(config: Path | None) -> "Document | None":
-    from twin.settings import Document
-
-    return Document.read(config) if config else None
+    return read_config(config) if config else None
 
 
 def _open(url: str, config: Path | None, *, write: bool) -> "Store":

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from twin.cli_app import App, say_if_new
+from twin.cli_app import App, read_config, say_if_new
 from twin.errors import ConfigError, SourceError
 from twin.files import require_writable, write_json
 
@@ -75,8 +75,9 @@ def _command(work: str) -> Callable[..., None]:
         json_file: JsonFile = None,
     ) -> None:
         require_writable(json_file)
+        files, workers_of = _files(logs), _Engine(engine, scheduler, workers)  # before a database
         fleet = _Fleet.of(config, assets)
-        told = _done(work, logs, fleet, _Engine(engine, scheduler, workers))
+        told = _done(work, files, fleet, workers_of)
         if json_file is not None:
             write_json(json_file, {"work": work, "logs": _plain(told, fleet)})
         _leave(told)
@@ -107,8 +108,9 @@ def report(
     from twin.fleet.words import in_words, write_page
 
     require_writable(json_file, page)
-    fleet = _Fleet.of(config, assets)
-    told = _done("replay", logs, fleet, _Engine(engine, scheduler, workers)) if logs else []
+    files, workers_of = _files(logs or []), _Engine(engine, scheduler, workers)
+    fleet = _Fleet.of(config, assets, to_store=bool(files))
+    told = _done("replay", files, fleet, workers_of) if files else []
     with open_store(fleet.assets) as store, open_assets(fleet.assets) as database:
         results, records = store.newest(), database.records()
     if logs:
@@ -135,21 +137,26 @@ class _Engine:
     scheduler: str
     workers: int | None
 
-    @contextmanager
-    def open(self) -> "Iterator[Submit]":
-        """The one that was asked for; ConfigError where options do not go together."""
-        from twin.fleet.engines import cores, dask, local
-
+    def __post_init__(self) -> None:
+        """ConfigError where options do not go together."""
         if self.name is EngineName.LOCAL:
             if self.scheduler:
                 raise ConfigError("a scheduler is Dask's", "add --engine dask")
-            with local(self.workers or cores()) as submit:
-                yield submit
             return
         if self.workers is not None:
             raise ConfigError("a cluster has the workers it has", "leave --workers away")
         if not self.scheduler:
             raise ConfigError("no scheduler is named", "give --scheduler tcp://HOST:8786")
+
+    @contextmanager
+    def open(self) -> "Iterator[Submit]":
+        """The one that was asked for."""
+        from twin.fleet.engines import cores, dask, local
+
+        if self.name is EngineName.LOCAL:
+            with local(self.workers or cores()) as submit:
+                yield submit
+            return
         with dask(self.scheduler) as submit:
             yield submit
 
@@ -163,12 +170,16 @@ class _Fleet:
     name: str
 
     @classmethod
-    def of(cls, config: Path | None, assets: str) -> "_Fleet":
-        """The database is made where it is missing."""
-        from twin.assets.place import chosen, open_chosen
-        from twin.settings import Document
+    def of(cls, config: Path | None, assets: str, *, to_store: bool = True) -> "_Fleet":
+        """The database is made where it is missing, if answers are ``to_store`` in it."""
+        from twin.assets.place import chosen, is_new, open_chosen
 
-        document = None if config is None else Document.read(config)
+        document = None if config is None else read_config(config)
+        if not to_store and is_new(assets, document):
+            raise SourceError(
+                f"{chosen(assets, document)}: no such asset database",
+                "name logs, or folders of them",
+            )
         say_if_new(assets, document)
         with open_chosen(assets, document, write=True) as database:
             return cls(document, chosen(assets, document), database.name)
@@ -189,12 +200,11 @@ class _Fleet:
         return config
 
 
-def _done(work: str, logs: Sequence[Path], fleet: _Fleet, engine: _Engine) -> "list[Told]":
+def _done(work: str, files: Sequence[Path], fleet: _Fleet, engine: _Engine) -> "list[Told]":
     """Do what is missing; say what became of each log, and of all; gives them as they are named."""
     from twin.fleet.go import Told, ask, go
     from twin.fleet.store import open_store
 
-    files = _files(logs)
     asking = ask(work, files, lambda log: fleet.config_of(log, work))
     asked = list(_progress(asking, len(files), "reading logs"))
     wanted = [one for one in asked if not isinstance(one, Told)]
@@ -230,7 +240,7 @@ def _files(logs: Sequence[Path]) -> list[Path]:
     found: list[Path] = []
     for path in logs:
         found += first_parts(path) if path.is_dir() else [path]
-    if not found:
+    if logs and not found:
         raise SourceError(f"{logs[0]}: no log in it", "name logs, or folders with *.mcap")
     return list(dict.fromkeys(found))
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from twin.cli_app import read_config
 from twin.errors import ConfigError
 from twin.extras import install_hint
 
@@ -104,9 +105,8 @@ def _heard_of(broker: Path | None) -> "Iterator[Hall | None]":
     from twin.outlets.settings import chosen
     from twin.page.hall import Hall
     from twin.page.hall_line import listening
-    from twin.settings import Document
 
-    document, hall = Document.read(broker), Hall()
+    document, hall = read_config(broker), Hall()
     document.refuse_unknown_tables(TABLES)
     mqtt, _ = chosen(document)
     if not mqtt.host:

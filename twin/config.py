@@ -116,7 +116,7 @@ class Config:
         to_store = to_store or not calibrated  # what is not, is read to be calibrated and stored
         with open_chosen(assets, document, write=False, to_store=to_store) as database:
             if unit and calibrated and unit not in (own, document.section(Asset, "asset").id):
-                _require_unit(database, unit)
+                _require_unit(database, unit, {own, document.section(Asset, "asset").id} - {""})
             found = _find(database, document, asset.type, asset.id if calibrated else "", as_of_ns)
             where = database.name
         known = _layered(document, found, where)
@@ -240,10 +240,14 @@ def _asset(document: Document, unit: str) -> Asset:
     return asset
 
 
-def _require_unit(database: "Assets", unit: str) -> None:
-    """ConfigError if nothing was ever known of ``unit``: its name is taken for a mistyped one."""
+def _require_unit(database: "Assets", unit: str, others: set[str]) -> None:
+    """ConfigError if nothing was ever known of ``unit``: its name is taken for a mistyped one.
+
+    ``others`` may be meant too: the unit of the log and that of the configuration.
+    """
     if not database.records("instance", unit):
-        units = known_names(unit, (record.name for record in database.records("instance")))
+        stored = {record.name for record in database.records("instance")}
+        units = known_names(unit, stored | others)
         raise ConfigError(
             f"{database.name}: no unit is called {unit!r}",
             f"{units}\n  a new unit is named by [asset] id in the configuration; twin calibrate"
@@ -259,6 +263,11 @@ def _find(
         return database.get(type_name, unit, as_of_ns=as_of_ns)
     except UnknownAssetError:
         if "data" not in document.tables:
+            if type_name in ("", NO_TYPE):
+                raise ConfigError(
+                    f"{document.name}: neither [asset] type nor [data] says what ejector this is",
+                    "begin with one of the files in configs/",
+                ) from None
             raise
         return None
 

@@ -48,8 +48,12 @@ class Document:
         """Read a TOML file; SourceError if it cannot be read, ConfigError if it is not TOML."""
         try:
             return cls.parse(path.read_text(encoding="utf-8"), str(path))
-        except (OSError, UnicodeDecodeError) as error:
-            raise SourceError(f"{path}: cannot be read: {error}", "check the path") from error
+        except OSError as error:
+            message = f"{path}: cannot be read: {error.strerror}"
+            raise SourceError(message, "check the path") from error
+        except UnicodeDecodeError as error:
+            message = f"{path}: not a text file, so not TOML"
+            raise SourceError(message, "name a file like those in configs/") from error
 
     @classmethod
     def parse(cls, text: str, name: str) -> "Document":

@@ -12,6 +12,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 from uuid import UUID, uuid5
+from zipfile import is_zipfile
 
 from basyx.aas import model
 from basyx.aas.adapter.aasx import AASXReader, AASXWriter, DictSupplementaryFileContainer
@@ -199,6 +200,8 @@ def _opened(path: Path) -> tuple[Store, DictSupplementaryFileContainer]:
     except OSError as error:
         message = f"{path}: cannot be read: {error.strerror}"
         raise SourceError(message, "check the path") from error
+    if not is_zipfile(content):
+        raise ConfigError(f"{path}: not an AASX package: it is not a ZIP file", HINT)
     try:
         with AASXReader(content, failsafe=False) as reader:
             reader.read_into(store, files)

@@ -71,6 +71,8 @@ def open_table(path: Path, settings: ImportSettings, ambient: float) -> Table:
     ConfigError for another suffix, SourceError where the file cannot be read or lacks a column.
     """
     kind = _KINDS.get(path.suffix.lower())
+    if not path.exists():
+        raise SourceError(f"{path}: cannot be read: No such file or directory", "check the path")
     if kind is None:
         known = " and ".join(_KINDS)
         raise ConfigError(f"{path}: cannot tell what it is", f"{known} files can be read")
