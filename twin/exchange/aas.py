@@ -201,7 +201,7 @@ def _opened(path: Path) -> tuple[Store, DictSupplementaryFileContainer]:
         message = f"{path}: cannot be read: {error.strerror}"
         raise SourceError(message, "check the path") from error
     if not is_zipfile(content):
-        raise ConfigError(f"{path}: not an AASX package: it is not a ZIP file", HINT)
+        raise ConfigError(f"{path}: not a whole AASX package: it is not a ZIP file", HINT)
     try:
         with AASXReader(content, failsafe=False) as reader:
             reader.read_into(store, files)
