@@ -163,12 +163,3 @@ def test_a_signal_outlives_a_step_that_is_done_anew() -> None:
     model.now[kernel.SIGNALS] = Signal.PART_PRESENT
     _, signals = read(model, theta, tuple(one[399:] for one in driven))  # type: ignore[arg-type]
     assert signals.tolist() == [Signal.PART_PRESENT]
-
-
-@pytest.mark.parametrize("factor", [1e6, -1e6, 1e12])
-def test_absurd_pressures_are_stepped_over_to_the_end(factor: float) -> None:
-    """No step is shorter than the shortest, however fast the gas is to move."""
-    samples = rigs.recorded("test_rig", 4.0)[0].copy()
-    samples["pressure"] *= np.float32(factor)
-    given, ticks = rigs.expectation(rigs.twin("test_rig"), [samples])
-    assert len(given) == len(ticks) == len(samples)
