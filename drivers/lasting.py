@@ -26,6 +26,10 @@ class LostError(SourceError):
     """No connection, no answer, or a broken one: it may come back."""
 
 
+class AbsentError(SourceError):
+    """An answer without what is wanted: it was never there, or the PLC is still starting."""
+
+
 def unreachable(where: str, error: OSError | UnicodeError, server: str) -> LostError:
     """Say why nobody could be connected to at ``where``; ``server`` is what should listen there.
 
@@ -70,7 +74,7 @@ class Connection(Protocol):
         """Hang up."""
 
 
-Away = Callable[[LostError], None]  # told that a PLC does not answer yet, and why
+Away = Callable[[SourceError], None]  # told why a PLC does not answer yet
 
 C_contra = TypeVar("C_contra", bound=Connection, contravariant=True)
 
@@ -88,25 +92,27 @@ def lasting(
 ) -> Generator[Samples, None, None]:
     """Samples of ``source`` over one connection after the other; empty blocks in between.
 
-    A LostError before the first sample goes to ``away``, once, or comes out where there is none;
-    later ones mean another try. All other errors come out. Closing hangs up.
+    Where it is lost or lacks what is wanted, it is tried again. Before the first block ``away`` is
+    told why, once for each reason; without ``away`` the error comes out. All other errors come out.
+    Closing hangs up.
     """
     begun = False
+    reasons = set[str]()  # that were told
     try:
         while True:
             try:
                 link.open()
-                if begun:
+                if begun or reasons:
                     yield EMPTY  # connected is not yet answered
                 for block in source.samples(link):
                     begun = True
                     yield block
-            except LostError as error:
-                if not begun:
-                    if away is None:
-                        raise
+            except (LostError, AbsentError) as error:
+                if not begun and away is None:
+                    raise
+                if not begun and away is not None and str(error) not in reasons:
+                    reasons.add(str(error))
                     away(error)
-                begun = True
                 link.close()  # if it is not yet: what it knows of the PLC may no longer hold
                 yield from _pause(clock)
     finally:

@@ -18,9 +18,10 @@ def blocks(
     """Samples as they come: a block at least every 0.5 s, empty while there is nothing.
 
     Once there was a block, a lost connection is retried for ever and shows as empty blocks and
-    flags. LostError before that goes to ``away``, and is retried too, where there is one. Other
-    SourceErrors come out, and whenever the server cannot be trusted or serves something
-    else. It runs in a thread, since connecting may take seconds. Closing releases all.
+    flags. Before that it is retried too where there is ``away``, which is told why: nobody answers,
+    or the server lacks its nodes. Other SourceErrors come out, and whenever the server cannot
+    be trusted or serves something else. It runs in a thread, since connecting may take seconds.
+    Closing releases all.
     """
     link = OpcuaLink(settings, clock)
     if settings.mode == "block":

@@ -13,7 +13,7 @@ from asyncua.crypto import security_policies
 from cryptography import x509
 
 from drivers import certificates
-from drivers.lasting import Clock, LostError, unreachable
+from drivers.lasting import AbsentError, Clock, LostError, unreachable
 from drivers.opcua_settings import Node, OpcuaSettings
 from drivers.opcua_values import (
     CODE,
@@ -200,7 +200,7 @@ class OpcuaLink:
     def read(self, nodes: tuple[Node, ...]) -> list[ua.DataValue]:
         """Values of ``nodes``, by one request, whatever their quality.
 
-        LostError if no answer comes; SourceError if a node is not there or not to be read.
+        LostError if no answer comes; AbsentError if a node is not there or not to be read.
         """
         values = self._do("reading", self._read(nodes))
         if len(values) != len(nodes):
@@ -253,7 +253,7 @@ class OpcuaLink:
 
     def _unfit(self, text: str, hint: str) -> SourceError:
         """It lacks what we want: for good, or until it has started, if it once had it."""
-        return LostError(text, hint) if self._known else SourceError(text, hint)
+        return LostError(text, hint) if self._known else AbsentError(text, hint)
 
     # --- subscribing ------------------------------------------------------------------------------
 

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from asyncua import ua
 
-from drivers.lasting import LostError
+from drivers.lasting import AbsentError, LostError
 from drivers.opcua_settings import Node
 from twin.errors import SourceError
 from twin.signals import Quality
@@ -169,12 +169,13 @@ def passing(error: SourceError) -> LostError:
 
 
 def wrong_type(node: Node, variant: ua.Variant | None, wanted: str) -> SourceError:
-    """The error where a node holds something else."""
-    if variant is None or variant.VariantType == _T.Null:
-        held = "nothing"
-    else:
+    """The error where a node holds something else, or nothing yet."""
+    error: type[SourceError] = AbsentError
+    held = "nothing"
+    if variant is not None and variant.VariantType != _T.Null:
         held = f"{'an array of ' if variant.is_array else ''}{variant.VariantType.name}"
-    return SourceError(
+        error = SourceError
+    return error(
         f"{node} holds {held}; expected is {wanted}",
         "compare the nodes in [driver] with the server's; twin probe shows what they hold",
     )

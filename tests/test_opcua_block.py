@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from modbus_server import PlcTime
 
-from drivers.lasting import Clock, LostError, lasting
+from drivers.lasting import AbsentError, Away, Clock, LostError, lasting
 from drivers.opcua_settings import Node, OpcuaSettings
 from drivers.opcua_trace import NodeTrace
 from twin.errors import SourceError
@@ -57,7 +57,7 @@ class TornServer:
         self.clock: PlcTime | None = None
         self.sequences = np.zeros(depth, np.int64)
         self.pressures = np.zeros(depth)
-        self.open_count = self.close_count = self.broken = 0
+        self.open_count = self.close_count = self.broken = self.absent = 0
         self.sequence -= min(sequence, depth)
         self.record(self.sequence)
         self.scan(min(sequence, depth))
@@ -120,6 +120,9 @@ class TornServer:
         if self.broken:
             self.broken -= 1
             raise LostError("lost")
+        if self.absent:
+            self.absent -= 1
+            raise AbsentError("there is no node")
         assert self.clock is not None
         values: dict[Node, ua.DataValue] = {}
         asked = {node.identifier.removeprefix("s="): node for node in nodes}
@@ -132,12 +135,12 @@ class TornServer:
 
 
 class Rig:
-    def __init__(self, server: TornServer, **changes: Any) -> None:
+    def __init__(self, server: TornServer, away: Away | None = None, **changes: Any) -> None:
         self.server = server
         self.time = server.clock = PlcTime(server.scan)
         clock = Clock(self.time.wall_ns, self.time.now_ns, self.time.sleep)
         trace = NodeTrace(settings_for(**changes), clock)
-        self.stream: Iterator[Samples] = lasting(trace, server, clock)  # type: ignore[type-var]
+        self.stream: Iterator[Samples] = lasting(trace, server, clock, away)  # type: ignore[type-var]
 
     def take(self, count: int) -> Samples:
         return np.concatenate([np.empty(0, SAMPLE), *islice(self.stream, count)])
@@ -403,6 +406,25 @@ def test_a_lost_connection_comes_back_and_the_ring_fills_the_gap(rig: Rig) -> No
     assert rig.server.open_count == 2
     assert rig.server.close_count == 1
     assert (np.diff(samples["sequence"]) == 1).all()
+
+
+def test_what_is_not_there_at_the_start_is_waited_for_and_each_reason_is_told_once() -> None:
+    server, reasons = TornServer(), list[SourceError]()
+    server.broken, server.absent = 3, 4
+    samples = Rig(server, reasons.append).take(40)
+    assert [str(reason) for reason in reasons] == ["lost", "there is no node"]
+    assert server.open_count == 1 + 3 + 4
+    assert len(samples)
+    assert not samples["quality"][0] & (Quality.GAP | Quality.RESTART)
+
+
+@pytest.mark.parametrize("why", ["broken", "absent"])
+def test_what_is_not_there_at_the_start_comes_out_where_nobody_waits(why: str) -> None:
+    server = TornServer()
+    setattr(server, why, 1)
+    with pytest.raises(SourceError):
+        Rig(server).take(1)
+    assert server.close_count
 
 
 def test_a_program_that_stands_still_gives_empty_blocks(rig: Rig) -> None:

@@ -85,10 +85,13 @@ def assert_nothing_made_up(rig: Rig, samples: Samples) -> None:
     assert set(np.flatnonzero(jumps) + 1) <= set(flags(samples, BREAK))
 
 
+@pytest.mark.parametrize("read_before", [3, 0])
 @pytest.mark.parametrize("name", NODES)
-def test_values_that_a_starting_plc_does_not_have_yet_are_waited_for(name: str) -> None:
-    rig = Rig(TornServer())
-    rig.take(3)
+def test_values_that_a_starting_plc_does_not_have_yet_are_waited_for(
+    name: str, read_before: int
+) -> None:
+    rig = Rig(TornServer(), lambda _reason: None)
+    rig.take(read_before)
     rig.server.replaced[f"Trace.{name}"] = ua.Variant(None, T.Null)
     for code in (ua.StatusCodes.Good, ua.StatusCodes.BadWaitingForInitialData):
         rig.server.codes[f"Trace.{name}"] = code

@@ -375,6 +375,50 @@ def test_plcs_that_are_off_when_the_twin_starts_are_read_once_they_are_on(tmp_pa
         assert kinds(open_log(log)) <= {Kind.CYCLE, Kind.CLOCK, Kind.TWIN_LATE}
 
 
+def test_a_twin_alone_waits_for_an_opc_ua_server_and_for_its_nodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """First nobody is there, then a server that starts and has other nodes so far, then the PLC."""
+    port = free_port()
+
+    def with_nodes(prefix: str) -> Callable[[dict[str, Any]], None]:
+        def change(tables: dict[str, Any]) -> None:
+            tables["driver"]["url"] = f"opc.tcp://127.0.0.1:{port}"
+            tables["plc"]["opcua"] |= {"port": port, "prefix": prefix}
+
+        return change
+
+    whole = configured(tmp_path, "test_rig_opcua", "whole", with_nodes(""))
+    starting = configured(tmp_path, "test_rig_opcua", "starting", with_nodes("Starting."))
+    log = tmp_path / "run.mcap"
+    with running(whole, "--log", log) as process:
+        assert process.stderr is not None
+        told = said_until(process.stderr, "it is tried until it answers")
+        with start_plc(starting):
+            assert twin(monkeypatch, "run", whole, "--once") == 3
+            told += said_until(process.stderr, "there is no node")
+        with start_plc(whole):
+            until(process, lambda: rows(log) > 500)
+            process.send_signal(signal.SIGINT)
+            told += list(process.stderr)
+            assert process.wait(PATIENCE_S) == 130, told
+    assert "there is no node s=Trace.Sequence" in capsys.readouterr().err
+    once = ("no connection", "it is tried until", "there is no node", "the PLC answers")
+    assert [sum(what in line for line in told) for what in once] == [1, 1, 1, 1], told
+    assert open_log(log).complete
+    assert kinds(open_log(log)) <= {Kind.CYCLE, Kind.CLOCK, Kind.TWIN_LATE}
+
+
+def said_until(stream: IO[str], what: str) -> list[str]:
+    """Lines up to the first one with it."""
+    lines = list[str]()
+    while not lines or what not in lines[-1]:
+        line = stream.readline()
+        assert line, lines  # it has ended
+        lines.append(line)
+    return lines
+
+
 def said_of(stream: IO[str], what: str, times: int) -> list[str]:
     """The first lines with it."""
     return list(itertools.islice((line for line in stream if what in line), times))

@@ -52,6 +52,7 @@ if TYPE_CHECKING:
 
 GARBAGE = 20_000  # objects made and not let go of, after which Python looks for garbage
 INTERRUPTED = 130
+WAITS = "it is tried until it answers"  # a PLC that is off
 ALARMED = 1
 
 app = App("A live digital twin of pneumatic vacuum ejectors.")
@@ -749,7 +750,7 @@ class _Plc:
     ) -> None:
         self._opened, self._once = opened, once
         self._said = f"{name}: " if name else ""
-        self._failure: SourceError | None = None  # why it did not answer
+        self._waits = False  # it did not answer at first
 
     def blocks(self) -> "Iterator[Samples]":
         """Its samples from now on; errors as from ``drivers.sources.open_source``."""
@@ -764,14 +765,14 @@ class _Plc:
                     break
                 if stopped(begun=False):
                     return False
-        if self._failure is not None:
+        if self._waits:
             _complain(f"{self._said}the PLC answers")
         return True
 
     def _away(self, error: SourceError) -> None:
-        self._failure = error
-        hint = "it is tried until it answers; with --once the run ends instead"
-        _complain(f"{self._said}{error}\n  {error.hint}\n  {hint}")
+        waits = "" if self._waits else f"\n  {WAITS}; with --once the run ends instead"
+        self._waits = True
+        _complain(f"{self._said}{error}\n  {error.hint}{waits}")
 
 
 @contextmanager
