@@ -37,9 +37,9 @@ from twin.files import require_writable, write_json
 from twin.instants import stamp
 
 if TYPE_CHECKING:
+    from drivers.hil import Writer
     from drivers.lasting import Away
     from drivers.results_state import Results
-    from drivers.shared import Lines
     from twin.cli_outlets import Begin, Standing
     from twin.config import Config
     from twin.diagnosis.answer import Diagnosis
@@ -113,6 +113,7 @@ def run(
     asset's id before its suffix). One that fails does not stop the others. A PLC that does not
     answer yet is tried until it does.
     """
+    from drivers.hil import open_writer
     from drivers.results_settings import open_results
     from drivers.shared import Lines
     from drivers.sources import open_source
@@ -143,9 +144,11 @@ def run(
         shown = show(name, settings.asset.type, asker_of(settings)) if show else None
         at = settings.document, address, lines if hil or not alone else None
         plc = _Plc(partial(open_source, *at), label, once=once)
-        with _closed(shown):
+        with _closed(shown), ExitStack() as closing:
             if not plc.answers(stopped):  # said before a log is begun
                 return
+            # So is what is wrong with [hil].
+            writer = closing.enter_context(open_writer(*at)) if hil else None
             file = _file_of(log, label)
             # The log comes last: what people are told does not wait for the disk.
             sinks = _opened(
@@ -167,9 +170,7 @@ def run(
             advisers: list[Adviser] = [] if hil else [adviser, board := alarms()]
             sinks = [*([] if hil else _told(board.standing(), shown, outlets)), *sinks]
             # It begins with the newest row: what came while all this was opened is not judged.
-            source = plc.blocks()
-            if hil:
-                source = _answering(source, settings, address, lines)
+            source = _answering(plc.blocks(), settings, writer) if writer else plc.blocks()
             with _closed(source):
                 run_loop(_until(stopped, source), twin, monitor, sinks, Listening(), advisers)
 
@@ -570,16 +571,15 @@ def pair_of(settings: "Config") -> tuple["Twin", "Monitor"]:
 
 
 def _answering(
-    source: "Iterator[Samples]", settings: "Config", address: str, lines: "Lines"
+    source: "Iterator[Samples]", settings: "Config", writer: "Writer"
 ) -> "Iterator[Samples]":
     """The blocks with the model as the plant, which answers what the PLC commands."""
-    from drivers.hil import Outputs, open_writer
+    from drivers.hil import Outputs
     from twin.hil import Plant, in_place
     from twin.model.dataset import coefficients
 
     plant = Plant(coefficients(settings.data), settings.data.terms)
-    with open_writer(settings.document, address, lines) as writer:
-        yield from in_place(source, plant, lambda *values: writer.put(Outputs(*values)))
+    return in_place(source, plant, lambda *values: writer.put(Outputs(*values)))
 
 
 def _configured(document: "Document", assets: str, unit: str) -> "Config":
