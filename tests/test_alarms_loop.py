@@ -135,7 +135,7 @@ def test_the_diagnosis_renames_it_and_other_causes_have_their_own() -> None:
     stream.at(8, cycle(8))
     found = stream.at(9, diagnosis(9, 5, "suction_loss", "sensor_offset"))
     assert found == ["deviation_suction_loss renamed", "deviation_sensor_offset raised"]
-    assert "deviation_leakage is deviation_suction_loss (medium" in stream.said[-2].text
+    assert "deviation_leakage is now deviation_suction_loss (medium" in stream.said[-2].text
     assert stream.at(11, deviation(11)) == ["deviation_sensor_offset cleared"]
     renamed, other = stream.desk.news.episodes.values()
     assert renamed.alarm == "deviation_suction_loss"
@@ -150,7 +150,7 @@ def test_an_alarm_without_a_name_gets_it_and_goes_on() -> None:
     stream = Stream()
     assert stream.at(5, deviation(5, "unknown")) == ["deviation_unknown raised"]
     assert stream.at(8, deviation(8)) == [f"{LEAK} renamed"]
-    assert stream.said[-1].text.startswith("deviation_unknown is deviation_leakage (medium")
+    assert stream.said[-1].text.startswith("deviation_unknown is now deviation_leakage (medium")
     (episode,) = stream.desk.news.episodes.values()
     assert (episode.alarm, episode.raised_ns) == (LEAK, APART + 5 * S)
     assert (episode.evidence["first_cycle"], episode.evidence["guess"]) == (5, "leakage")

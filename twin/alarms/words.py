@@ -85,7 +85,7 @@ def _text(change: Change, alarm: Alarm, evidence: Evidence) -> str:
 def _deed(change: Change, alarm: Alarm) -> str:
     """What happened, in a few words."""
     if change.deed is Deed.RENAMED:
-        return f"{change.alarm} is {change.to}"
+        return f"{change.alarm} is now {change.to}"
     by = f" by {change.who}" if change.who else ""
     said = f"{change.alarm} {_SAID[change.deed]}{by}"
     if change.deed is Deed.SHELVED and alarm.shelved_until is not None:
