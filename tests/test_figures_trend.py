@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from twin.figures.settings import FigureSettings, limits
 from twin.figures.table import FIGURES
 from twin.figures.trend import DAY_NS, FARTHEST, Line, Trend, line_through, reach, trend_of
-from twin.figures.words import in_words, limit_of, trend_plain
+from twin.figures.words import _give_or_take, in_words, limit_of, trend_plain
 from twin.model.dataset import DataSet
 
 TRIALS = 150
@@ -309,3 +309,9 @@ def test_limits_are_of_the_figures_that_have_one() -> None:
         "free_flow",
     }
     assert found["t1"] == LIMITS.t1
+
+
+def test_values_without_scatter_have_no_interval_of_zero_width() -> None:
+    assert _give_or_take(9e-10, 0.0) == ""
+    assert _give_or_take(0.0, 75.0) == ""
+    assert _give_or_take(0.82, 75.69) == " ± 0.82"

@@ -136,7 +136,7 @@ def test_it_is_asked_once_enough_cycles_deviate_and_its_answer_is_an_event(
     assert event.time_ns == stream.now_ns - CYCLE_NS // 4  # of the last row
     assert event.data == {"alarm_ns": 6 * CYCLE_NS, "begin_ns": 0, "answer": ANSWER}
     assert event.text == (
-        "leakage (1.9 sl/min), since 14:13:27, 8 s ago, 7.5 s into the log;"
+        "leakage (1.9 sl/min), since 2026-09-21 14:13:27, 7.5 s into the log;"
         " how sure: no other listed cause fits as well;"
         " look at hoses, fittings and cups: a cut, or a loose connection"
     )
@@ -331,20 +331,20 @@ def test_a_block_is_kept_as_it_was() -> None:
     [
         (
             {"course": "constant"},
-            "leakage (1.9 sl/min), since 14:13:24, 2 min ago, 4.0 s into the log, or longer;",
+            "leakage (1.9 sl/min), since 2026-09-21 14:13:24, 4.0 s into the log, or longer;",
         ),
         (
             {"course": "ramp", "onset_s": 0.0},
-            "growing since 14:13:24, 2 min ago, 4.0 s into the log, or longer;",
+            "growing since 2026-09-21 14:13:24, 4.0 s into the log, or longer;",
         ),
-        ({"course": "ramp"}, "growing since 14:13:27, 2 min ago, 7.5 s into the log;"),
+        ({"course": "ramp"}, "growing since 2026-09-21 14:13:27, 7.5 s into the log;"),
         ({"course": "intermittent", "share_pct": 40.0}, "in 40 % of the cycles;"),
         ({"probability": 0.6, "not_separable_from": ["suction_loss"]}, "suction loss"),
         ({"not_separable_from": ["suction_loss"]}, "or the nozzles and the silencer"),
     ],
 )
 def test_a_cause_is_said_with_course_and_certainty(changed: dict[str, Any], said: str) -> None:
-    line = in_a_line(ANSWER | {"causes": [CAUSE | changed]}, BEGIN_NS + 127_500_000_000)
+    line = in_a_line(ANSWER | {"causes": [CAUSE | changed]})
     assert said in line
     assert "\n" not in line
 
@@ -388,11 +388,11 @@ def test_a_plc_that_began_anew_moves_no_begin(monkeypatch: pytest.MonkeyPatch) -
 def test_other_verdicts_are_said_as_what_they_are() -> None:
     left = {"where": "hold", "depends_on": [], "shape": "+9 mbar in the mean"}
     unlisted = ANSWER | {"verdict": "unlisted", "causes": [], "unlisted": left}
-    line = in_a_line(unlisted, 0)
+    line = in_a_line(unlisted)
     assert line == "no listed effect explains what is left in hold: +9 mbar in the mean"
-    assert in_a_line(unlisted | {"causes": [CAUSE]}, 0).endswith(f"; and {line}")
+    assert in_a_line(unlisted | {"causes": [CAUSE]}).endswith(f"; and {line}")
     consistent = ANSWER | {"verdict": "consistent", "causes": []}
-    assert in_a_line(consistent, 0) == "the last 8 cycles agree with the model after all"
+    assert in_a_line(consistent) == "the last 8 cycles agree with the model after all"
 
 
 # In the loop.

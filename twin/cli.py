@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli_alarms import alarms_app, alarms_of, asker_of
-from twin.cli_app import App, not_negative, read_config, say_if_new
+from twin.cli_app import App, not_negative, read_config, say_if_cut, say_if_new
 from twin.cli_assets import assets_app
 from twin.cli_cert import cert
 from twin.cli_compare import compare
@@ -220,6 +220,7 @@ def replay(
 
         require_writable(json_file)
         recorded = open_log(log)
+        say_if_cut(recorded, log, "replayed")
         settings = _settings_of(recorded.header, log, config, assets, unit, as_of)
         twin, monitor = pair_of(settings)
         alarms = alarms_of(settings)()
@@ -306,6 +307,7 @@ def diagnose(
 
     require_writable(json_file, report)
     recorded = open_log(log)
+    say_if_cut(recorded, log, "diagnosed")
     store = bool(save_as)
     settings = _settings_of(recorded.header, log, config, assets, unit, as_of, to_store=store)
     if not unit:
@@ -342,6 +344,7 @@ def calibrate(
     if not settings.asset.id:
         raise ConfigError("no unit is named", "give --id ID, or [asset] id in the configuration")
     recorded = open_log(log)
+    say_if_cut(recorded, log, "used")
     with _status() as say:
         calibration = fit_unit(settings, (rows for rows, _ in recorded.blocks()), say)
     say_if_new(assets, settings.document)
@@ -392,8 +395,7 @@ def export(
     from twin.tables.export import export as write_table
 
     recorded = open_log(log)
-    if not recorded.complete:
-        print(f"twin: {log} is not complete; what can be read is exported", file=sys.stderr)
+    say_if_cut(recorded, log, "exported")
     write_table(recorded.blocks(ROWS), recorded.header, output)
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from twin.cli_app import say_if_cut
 from twin.errors import ConfigError
 from twin.files import require_writable, write_json
 
@@ -56,8 +57,7 @@ def _read(path: Path) -> "Side":
     from twin.log.reader import open_log
 
     log = open_log(path)
-    if not log.complete:
-        print(f"twin: {path} is not complete; what can be read is compared", file=sys.stderr)
+    say_if_cut(log, path, "compared")
     settings = Config.of_recorded(log.header, str(path))
     figures = compiled(settings.data, settings.document.section(FigureSettings, "figures"))
     return side_of(log, settings, figures)

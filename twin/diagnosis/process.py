@@ -65,7 +65,7 @@ class LiveDiagnosis:
         self._config, self._log, self._reports = config, log, reports
         self._stopped, self._status, self._clock = stopped, status, clock
         self._recent = Recent()
-        self._now_ns = self._here_ns = 0  # of the last row: PLC time, and its receipt
+        self._now_ns = 0  # of the last row, PLC time
         self._first_ns: int | None = None  # when the first row of all was received
         self._begin_ns = 0  # PLC time at which the log began, as the PLC counts now
         self._alarm: Event | None = None  # that waits for its diagnosis
@@ -110,7 +110,7 @@ class LiveDiagnosis:
 
     def _count(self, samples: Samples) -> None:
         """Know when the log began in PLC time, also after that was set or began anew."""
-        self._now_ns, self._here_ns = (int(samples[name][-1]) for name in ("time_ns", "host_ns"))
+        self._now_ns = int(samples["time_ns"][-1])
         if self._first_ns is None:
             self._first_ns, self._begin_ns = (
                 int(samples[name][0]) for name in ("host_ns", "time_ns")
@@ -156,7 +156,7 @@ class LiveDiagnosis:
             self._settle(asked.alarm)
         data = {"alarm_ns": asked.alarm.time_ns, "begin_ns": self._begin_ns, "answer": answer}
         data |= {"report": asked.report.stem} if asked.report else {}
-        return [Event(self._now_ns, Kind.DIAGNOSIS, in_a_line(answer, self._here_ns), data)]
+        return [Event(self._now_ns, Kind.DIAGNOSIS, in_a_line(answer), data)]
 
     def _settle(self, alarm: Event) -> None:
         """The alarm waits no longer; another one may have been raised since."""
@@ -249,9 +249,9 @@ class Asked:
 # --- in words -------------------------------------------------------------------------------------
 
 
-def in_a_line(answer: Mapping[str, Any], now_ns: int) -> str:
-    """The answer in a line, as it is read at a time (UTC, ns)."""
-    times = Times.of(answer, now_ns)
+def in_a_line(answer: Mapping[str, Any]) -> str:
+    """The answer in a line that is kept: with dates and no ages, which would grow old."""
+    times = Times.of(answer, None)
     found = "; and ".join(_cause(cause, times) for cause in answer["causes"])
     match answer["verdict"]:
         case "explained":

@@ -303,7 +303,7 @@ def _footer(diagnosis: Diagnosis, times: Times) -> str:
         ("data set", f"{diagnosis.data_set}: {_data_set(diagnosis.evidence.theta)}"),
         ("program", f"ejector-twin {version('ejector-twin')}"),
     ]
-    if times.log_begin_ns is not None:
+    if times.log_begin_ns is not None and times.now_ns is not None:
         between = f"{dated(times.log_begin_ns)} to {dated(times.now_ns)}"
         rows.insert(2, ("recorded", f"{between}; ages count back from its end"))
     return page.pairs(rows)

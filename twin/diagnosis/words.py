@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from twin.instants import SECOND_NS, instant
+from twin.instants import SECOND_NS, dated, instant
 from twin.model.courses import Course
 from twin.model.effects import EFFECTS
 
@@ -30,17 +30,18 @@ FIGURES = (
 
 @dataclass(frozen=True)
 class Times:
-    """What the onsets of an answer are, as people read them at a time (UTC, ns).
+    """What the onsets of an answer are, as people read them at ``now_ns`` (UTC).
 
-    ``log_begin_ns`` is by the clock here; None where no clock gave the times of the log.
+    ``log_begin_ns`` is by the clock here; None where no clock gave the times of the log. Text that
+    is kept, to be read at any time, has the date in place of an age: its ``now_ns`` is None.
     """
 
     begin_s: float  # of the log, before what was looked at
     log_begin_ns: int | None
-    now_ns: int
+    now_ns: int | None
 
     @classmethod
-    def of(cls, answer: Answer, now_ns: int) -> "Times":
+    def of(cls, answer: Answer, now_ns: int | None) -> "Times":
         """Those of an answer."""
         cycles = answer["cycles"]
         return cls(cycles.get("begin_s", 0.0), cycles.get("log_begin_ns"), now_ns)
@@ -51,7 +52,8 @@ class Times:
         if self.log_begin_ns is None:
             return into
         ns = self.log_begin_ns + round(seconds * SECOND_NS)
-        return f"{instant(ns, self.now_ns)}, {into}"
+        at = dated(ns) if self.now_ns is None else instant(ns, self.now_ns)
+        return f"{at}, {into}"
 
 
 def lines(answer: Answer, now_ns: int) -> str:

@@ -11,6 +11,7 @@ from twin.figures.trend import FARTHEST, FEWEST_BINS, SURE, Line, Reach, Step, T
 from twin.instants import clock, instant, lasting
 
 SHOWN = ("t0", "t1", "leakage", "free_flow", "max_vacuum", "nozzle_share", "air", "supply")
+NO_SCATTER = 1e-6  # of the level: where all values are alike, nothing says how sure they are
 NO_DASH = {"-": "", "0 or 1": "", "0 to 3": ""}
 
 
@@ -67,7 +68,7 @@ def in_words(figure: Figure, trend: Trend, now_ns: int) -> str:
 
 def _stepped(step: Step, unit: str, now_ns: int) -> str:
     levels = (
-        f"{one:.4g} ± {half:.2g}"
+        f"{one:.4g}{_give_or_take(half, one)}"
         for one, half in ((step.before, step.before_half), (step.after, step.after_half))
     )
     between = f"{clock(step.earliest_ns, now_ns)} to {clock(step.latest_ns, now_ns)}"
@@ -80,9 +81,14 @@ def _runs(line: Line, unit: str, *, since: bool) -> str:
     slope, half = line.slope, line.slope_half()
     span, per = (1.0, " per day") if line.is_rate else (line.span, "")
     over = f"over {lasting(line.span * 86_400.0)}"
-    how = f"{slope * span:+.3g} ± {half * span:.2g}{unit}{per} {over}"
+    how = f"{slope * span:+.3g}{_give_or_take(half * span, line.level)}{unit}{per} {over}"
     now, then = ("", " since then") if since else (f"{line.level:.4g}{unit}, ", "")
     return f"{now}{how}{then}" if line.is_trend else f"{now}no trend{then} ({how})"
+
+
+def _give_or_take(half: float, level: float) -> str:
+    """Half of an interval; nothing where the record shows no scatter to take it from."""
+    return f" ± {half:.2g}" if half > NO_SCATTER * max(abs(level), 1.0) else ""
 
 
 def _limited(trend: Trend, limit: str) -> str:

@@ -44,13 +44,24 @@ class Report:
         """Several lines for people."""
         lines = [
             f"{self.path}: {self.samples} rows, {self.duration_s:.1f} s, {self.events} events",
-            f"gaps: {self.gaps}, {self.missing} rows missing{self._unseen()}",
-            f"size: {self.bytes_per_sample:.1f} bytes a row, parts: {self.parts}",
+            f"gaps: {self.gaps}, {self._missing()}{self._unseen()}",
+            f"{self._size()}parts: {self.parts}",
             f"state: {self._state()}",
         ]
         if self.time_back:
             lines.insert(2, f"PLC time does not go forward at {self.time_back} places")
         return "\n".join([*lines, *(f"unreadable: {damage}" for damage in self.damage)])
+
+    def _missing(self) -> str:
+        """How many rows are missing: over a restart the PLC counts anew, so nobody knows."""
+        if not self.restarts:
+            return f"{self.missing} rows missing"
+        if self.restarts == self.gaps:
+            return "how many rows are missing is not known"
+        return f"{self.missing} rows missing, and those over a restart, which nobody knows"
+
+    def _size(self) -> str:
+        return f"size: {self.bytes_per_sample:.1f} bytes a row, " if self.samples else ""
 
     def _unseen(self) -> str:
         """How long the gaps are, and how many of them are restarts."""

@@ -65,7 +65,9 @@ class _Waiting(event.Listener):
     def on_start(self, event: object) -> None:
         if not self.said:
             self.said = True
-            _log.warning("compiling the model for this processor: a minute, only the first time")
+            _log.warning(
+                "compiling what is not yet compiled for this processor: a minute at most, then kept"
+            )
 
     def on_end(self, event: object) -> None:
         pass
