@@ -44,7 +44,7 @@ NEEDS: Mapping[str, Need] = {
         ("mosquitto",),
         "alarms, data and uploads through an MQTT broker",
     ),
-    "openssl": Need(("openssl",), ("openssl",), "MQTT inside TLS"),
+    "openssl": Need(("openssl",), ("openssl",), "MQTT and webhooks inside TLS"),
     "node-opcua": Need(
         ("node",),
         ("nodejs", "npm"),

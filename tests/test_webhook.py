@@ -247,6 +247,7 @@ def test_what_comes_with_an_answer_is_not_read() -> None:
     assert sent.delivered == [message(1)]
 
 
+@pytest.mark.needs("openssl")
 def test_inside_tls(tmp_path: Path) -> None:
     own = certificate(tmp_path)
     server = Server(certificate=own)
