@@ -58,7 +58,8 @@ def suction_flow(theta: Theta, p: float, jet: float, supply: float) -> float:
     missing = theta[c.SUPPLY_NOMINAL] - supply
     end = theta[c.END_RATIO] * ambient * (1.0 + theta[c.END_SLOPE] * missing)
     end = min(max(end, 0.0), 0.98 * ambient)
-    x = min(max(jet - (ambient - p) / (ambient - end), 0.0), 1.2)
+    deep = 1.0 - theta[c.JET_DEPTH] * (1.0 - jet)
+    x = min(max(deep - (ambient - p) / (ambient - end), 0.0), 1.2)
     bend = np.polyval(theta[[c.BEND_3, c.BEND_2, c.SKEW, c.BULGE]], x)
     return float(jet * capacity * max(x * (1.0 + (1.0 - x) * bend), 0.0))
 
@@ -82,8 +83,8 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
         root = np.sqrt(linear**2 + 4.0 * quadratic * abs(difference))
         far = 2.0 * difference / (linear + root)
 
-    out = suction_flow(theta, port, jet, supply)
-    out += theta[c.RELIEF] * max(port - ambient, 0.0)
+    out = suction_flow(theta, port, jet, supply) + theta[c.RELIEF] * max(port - ambient, 0.0)
+    out += max(-through_hole(theta[c.EXHAUST], port, ambient), 0.0)
     blown = valve * theta[c.BLOW_OFF] * (supply + ambient)
     blown /= theta[c.SUPPLY_NOMINAL] + theta[c.AMBIENT_NOMINAL]
     if port < ambient:

@@ -17,8 +17,8 @@
 enum { /* twin.model.theta.COEFFICIENTS */
     AMBIENT, AMBIENT_NOMINAL, TEMPERATURE, SUPPLY, DROOP, SUPPLY_LAG, SUPPLY_NOMINAL,
     SUPPLY_OPTIMUM, SUPPLY_CURVATURE, END_SLOPE, SUCTION, END_RATIO, BULGE, SKEW, BEND_2, BEND_3,
-    RESPONSE, RESPONSE_OFF, RAMP_UP, SLOW_RAMP_UP, RAMP_DOWN, BLOW_OFF, BLOW_OFF_RESPONSE,
-    BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, RELIEF, PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT,
+    RESPONSE, RESPONSE_OFF, RAMP_UP, SLOW_RAMP_UP, JET_DEPTH, RAMP_DOWN, BLOW_OFF, BLOW_OFF_RESPONSE,
+    BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, RELIEF, EXHAUST, PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT,
     VOLUME, COMPLIANCE, FILM, AREA, NEAR_RESISTANCE, NEAR_LAMINAR, NEAR_INERTANCE, RESISTANCE,
     LAMINAR, INERTANCE, PLACE, LEAK, LAMINAR_LEAK, INFLOW, BACK_FLOW, OPENING, SENSOR_LAG, SLOW_SENSOR,
     SENSOR_OFFSET, SENSOR_GAIN, H1, H1_LOW, H2, H2_LOW, RELEASE, CONTROL_SENSOR, AIR_SAVING,
@@ -145,16 +145,18 @@ INLINED Port at_port(double p, const Driven *driven, const double *k)
 {
     double ambient = K(AMBIENT);
     double per_pa = 1.0 / (ambient - driven->end);
-    Tangent curve = characteristic(driven->jet - (ambient - p) * per_pa, k);
+    double depth = driven->jet + (1.0 - K(JET_DEPTH)) * (1.0 - driven->jet);
+    Tangent curve = characteristic(depth - (ambient - p) * per_pa, k);
     double out_slope = driven->jet * driven->suction * per_pa * curve.slope;
     double out = driven->jet * driven->suction * curve.level - out_slope * p;
     double relief = p > ambient ? K(RELIEF) : 0.0;
     Tangent flow = opening(p, ambient);
     double back = K(BACK_FLOW) * (1.0 - min(driven->jet, 1.0));
     back = p < ambient ? back : 0.0;
+    double vent = p > ambient ? K(EXHAUST) : 0.0;
     return (Port){
-        out - relief * ambient,
-        out_slope + relief,
+        out - relief * ambient - vent * (flow.level - flow.slope * p),
+        out_slope + relief - vent * flow.slope,
         driven->blow_off + back * (flow.level - flow.slope * p),
         back * flow.slope,
     };

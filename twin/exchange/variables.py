@@ -45,7 +45,7 @@ _PORTS = {
 _VESSEL: Mapping[Where, Mapping[str, str]] = {
     "inside": {
         "INFLOW": "v[V_VESSEL_INFLOW]",
-        "RELEASE": "v[V_CUPS_RELEASE] >= 0.0 ? v[V_CUPS_RELEASE] : NAN",
+        "RELEASE": "v[V_CUPS_RELEASE] > -9e5 ? v[V_CUPS_RELEASE] : NAN",
     },
     # A vessel so large that its pressure stays what the port says for a millisecond.
     "outside": {
@@ -177,11 +177,11 @@ def _ports(theta: Theta, where: Where) -> list[Variable]:
             _flow("vessel.inflow", "into the vessel from what else hangs on it", Role.INPUT),
             Variable(
                 "cups.release",
-                "vacuum at which blow-off lets the part go; negative: nothing is let go",
+                "vacuum at which blow-off lets the part go; -5e5: when it ends; -1e6: never",
                 Role.DATA,
                 "Pa",
-                -1.0 if math.isnan(k["RELEASE"]) else k["RELEASE"],
-                -1.0,
+                -1e6 if math.isnan(k["RELEASE"]) else k["RELEASE"],
+                -1e6,
                 1e5,
                 "mbar",
             ),

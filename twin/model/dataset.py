@@ -27,6 +27,7 @@ from twin.signals import BAR, MBAR, ML, MS, SL_MIN
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 
+AFTER_BLOW_OFF = -5e5  # Pa of vacuum that no blow-off reaches: the part goes when it ends
 SHORTEST_SWING = 5e-3  # s, of a line's gas that can be seen at a sample each millisecond
 RIPPLE = 1e-3  # of suction capacity, from one hundredth of the range to the next: still monotonic
 
@@ -89,11 +90,13 @@ class Ejector(Settings):
     response_off_ms: float = Field(12.0, ge=0.0, le=500.0)
     ramp_up_ms: float = Field(8.0, ge=0.5, le=500.0)
     ramp_down_ms: float = Field(4.0, ge=0.5, le=500.0)
+    jet_depth: float = Field(1.0, ge=0.0, le=1.0)  # how much less deep a weaker jet draws
     blow_off_sl_min: NotNegative = 100.0
     blow_off_response_ms: float = Field(15.0, ge=0.0, le=500.0)
     blow_off_response_off_ms: float = Field(12.0, ge=0.0, le=500.0)
     blow_off_ramp_ms: float = Field(5.0, ge=0.5, le=500.0)
     relief_sl_min: NotNegative = 200.0  # out through the exhaust at 100 mbar above ambient
+    exhaust_sl_min: NotNegative = 0.0  # the same, sonic, where the exhaust is an opening
     h1_mbar: float = Field(750.0, gt=0.0, le=998.0)
     h1_hysteresis_mbar: float = Field(150.0, gt=0.0)
     h2_mbar: float = Field(550.0, gt=0.0, le=998.0)
@@ -154,6 +157,7 @@ class System(Settings):
     line_share: float = Field(0.6, gt=0.0, lt=1.0)  # of the tubes' volume, half-way along
     sensor_shift: float = Field(0.0, ge=-1.0, le=1.0)  # of its place: 1 is the whole line outwards
     leak_sl_min: NotNegative = 0.3  # of seals and fittings, sonic
+    part_leaves: Literal["in_blow_off", "after_blow_off"] = "in_blow_off"
 
     @model_validator(mode="after")
     def _line_has_volume(self) -> "System":
@@ -242,12 +246,14 @@ def _set_ejector(theta: Theta, ejector: Ejector, end_ratio: float) -> None:
     theta[c.RESPONSE] = ejector.response_ms * MS
     theta[c.RESPONSE_OFF] = ejector.response_off_ms * MS
     theta[c.RAMP_UP] = ejector.ramp_up_ms * MS / 2.0
+    theta[c.JET_DEPTH] = ejector.jet_depth
     theta[c.RAMP_DOWN] = ejector.ramp_down_ms * MS / 2.0
     theta[c.BLOW_OFF] = ejector.blow_off_sl_min * SL_MIN
     theta[c.BLOW_OFF_RESPONSE] = ejector.blow_off_response_ms * MS
     theta[c.BLOW_OFF_RESPONSE_OFF] = ejector.blow_off_response_off_ms * MS
     theta[c.BLOW_OFF_RAMP] = ejector.blow_off_ramp_ms * MS
     theta[c.RELIEF] = ejector.relief_sl_min * SL_MIN / (100.0 * MBAR)
+    theta[c.EXHAUST] = ejector.exhaust_sl_min * SL_MIN
     theta[[c.H1, c.H2]] = ejector.h1_mbar * MBAR, ejector.h2_mbar * MBAR
     theta[c.H1_LOW] = (ejector.h1_mbar - ejector.h1_hysteresis_mbar) * MBAR
     theta[c.H2_LOW] = (ejector.h2_mbar - ejector.h2_hysteresis_mbar) * MBAR
@@ -281,7 +287,8 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     theta[c.LEAK] = total.leak + system.leak_sl_min * SL_MIN
     theta[c.LAMINAR_LEAK] = total.open
     theta[c.OPENING] = total.opening
-    theta[c.RELEASE] = total.release
+    late = system.part_leaves == "after_blow_off" and not math.isnan(total.release)
+    theta[c.RELEASE] = AFTER_BLOW_OFF if late else total.release
 
 
 def _swings(theta: Theta, inertance: float) -> bool:

@@ -360,7 +360,7 @@ def _enter(state, phases, k):  # type: ignore[no-untyped-def]
             state[NOZZLE_AGE, i] = NEVER  # seen in the pressure: the valve has already acted
         if phase == _SUCTION and before != _HOLD:
             state[OPEN, i] = 0.0  # the next part is there
-        if phase == _IDLE and before == _BLOW_OFF and k[c.RELEASE, i] >= 0.0:
+        if phase == _IDLE and before == _BLOW_OFF and not math.isnan(k[c.RELEASE, i]):
             state[OPEN, i] = 1.0  # blow-off has let the part go, early or late
 
 
@@ -384,7 +384,7 @@ def _rest(state, k):  # type: ignore[no-untyped-def]
     for i in range(state.shape[1]):
         _settle(state, k, i, k[c.AMBIENT, i])
         state[NOZZLE_AGE, i] = state[BLOW_AGE, i] = NEVER
-        state[OPEN, i] = 1.0 if k[c.RELEASE, i] >= 0.0 else 0.0
+        state[OPEN, i] = 1.0 if not math.isnan(k[c.RELEASE, i]) else 0.0
         state[VALID, i] = 1.0
 
 
@@ -407,7 +407,7 @@ def _synchronise(state, levels, k):  # type: ignore[no-untyped-def]
         if math.isnan(level):
             continue
         idle = state[PHASE, i] == _IDLE
-        if k[c.RELEASE, i] >= 0.0 and (idle or state[OPEN, i] > 0.0):
+        if not math.isnan(k[c.RELEASE, i]) and (idle or state[OPEN, i] > 0.0):
             _settle(state, k, i, k[c.AMBIENT, i])
             state[OPEN, i] = 1.0
         elif state[VALID, i] > 0.0:

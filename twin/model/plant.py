@@ -175,7 +175,8 @@ def at_port(p, driven, k, i):  # type: ignore[no-untyped-def]
     """
     ambient = k[c.AMBIENT, i]
     per_pa = 1.0 / (ambient - driven.end)
-    share, rise = characteristic(driven.jet - (ambient - p) * per_pa, k, i)
+    depth = driven.jet + (1.0 - k[c.JET_DEPTH, i]) * (1.0 - driven.jet)
+    share, rise = characteristic(depth - (ambient - p) * per_pa, k, i)
     out_slope = driven.jet * driven.suction * per_pa * rise
     out = driven.jet * driven.suction * share - out_slope * p
     relief = k[c.RELIEF, i]
@@ -183,9 +184,11 @@ def at_port(p, driven, k, i):  # type: ignore[no-untyped-def]
     share, rise = opening(p, ambient)
     back = k[c.BACK_FLOW, i] * (1.0 - min(driven.jet, 1.0))
     back = back if p < ambient else 0.0
+    vent = k[c.EXHAUST, i]
+    vent = vent if p > ambient else 0.0
     return (
-        out - relief * ambient,
-        out_slope + relief,
+        out - relief * ambient - vent * (share - rise * p),
+        out_slope + relief - vent * rise,
         driven.blow_off + back * (share - rise * p),
         back * rise,
     )
