@@ -14,7 +14,7 @@ from twin.calibration.calibrate import calibrate
 from twin.calibration.cycles import Cycles
 from twin.calibration.fit import fit
 from twin.calibration.left_out import with_left_out
-from twin.calibration.parameters import FREE, directions, values, with_values
+from twin.calibration.parameters import FREE, Space, directions, values, with_values
 from twin.calibration.report import as_json, in_words
 from twin.calibration.store import store
 from twin.config import Config
@@ -84,7 +84,7 @@ def test_intervals_hold_the_true_values_of_other_units() -> None:
     for seed in DRAWN:
         name = SYSTEMS[seed % len(SYSTEMS)]
         plc = drawn(rig(name), seed)
-        fitted = fit(recorded(plc, CYCLES, seed), typed(name).data, quiet)
+        fitted = fit(recorded(plc, CYCLES, seed), Space.of_type(typed(name).data), quiet)
         found += misses(fitted, plc).values()
     assert np.mean(np.abs(found) <= 1.96) >= 0.9
 

@@ -23,6 +23,7 @@ NEEDED = {
     "probe": ("C",),
     "diagnose": ("L",),
     "calibrate": ("L", "--config", "C"),
+    "commission": ("L", "--config", "C"),
     "import": ("rows.csv", "--config", "C", "-o", "new.mcap"),
     "export": ("L", "-o", "new.csv"),
     "effects": (),
@@ -99,7 +100,11 @@ WRONG = {
     "--address": (("nowhere", "127.0.0.1:0", "127.0.0.1:99999"), {USAGE}),
     "--port": (("70000", "-1", "x"), {USAGE}),
 }
-RIGHT = {"calibrate": "--id", "figures show": "--figures"}  # of these: a new unit; see below
+RIGHT = {
+    "calibrate": "--id",
+    "commission": "--id",
+    "figures show": "--figures",
+}  # of these: a new unit; see below
 READ = ("C", "L", "rows.csv", "unit.toml", "here.json")  # arguments that are files
 
 

@@ -19,6 +19,7 @@ from drivers.plc.faults import Fault
 from drivers.plc.settings import PlcSettings
 from drivers.plc.simulate import blocks
 from twin.calibration.fit import Fitted, fit
+from twin.calibration.parameters import Space
 from twin.config import Config
 from twin.settings import Document
 from twin.signals import MS, Samples
@@ -112,7 +113,9 @@ def main() -> None:
         name = SYSTEMS[seed % len(SYSTEMS)]
         plc = drawn(rig_of(documents[name]), seed)
         begin = time.perf_counter()
-        fitted = fit(recorded(plc, asked.cycles, seed), types[name], lambda _what: None)
+        fitted = fit(
+            recorded(plc, asked.cycles, seed), Space.of_type(types[name]), lambda _what: None
+        )
         found[name].append(misses(fitted, plc))
         numbers = " ".join(f"{sigmas:6.2f}" for sigmas in found[name][-1].values())
         print(f"{name:<10}{seed:>4}  {numbers}  {time.perf_counter() - begin:.0f} s", flush=True)

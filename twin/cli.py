@@ -355,6 +355,85 @@ def calibrate(
         write_json(json_file, as_json(calibration, record))
 
 
+@app.command()
+def commission(
+    source: Annotated[
+        Path, typer.Argument(metavar="LOG.mcap|CONFIG", help="A record, or the unit's PLC.")
+    ],
+    unit: UnitId = "",
+    config: ConfigOption = None,
+    cycles: Annotated[
+        int, typer.Option(metavar="N", help="How many cycles to record from a PLC.")
+    ] = 12,
+    assets: AssetsUrl = "",
+    json_file: JsonFile = None,
+    report: Annotated[
+        Path | None, typer.Option(metavar="F.html", help="One page for people.")
+    ] = None,
+) -> None:
+    """Fit a unit that nobody has seen before to a record of healthy cycles, and store it.
+
+    The configuration says what hangs on the ejector; a fifth off is near enough. The record
+    corrects it where they differ. The verdict is good, usable or refused (exit code 2).
+    """
+    from twin.calibration.commission import commission as fit_unit
+    from twin.calibration.page import write_page
+    from twin.calibration.report import commissioned_as_json, commissioned_in_words
+    from twin.calibration.store import store_first
+    from twin.config import Config
+    from twin.log.reader import open_log
+    from twin.settings import Document
+
+    require_writable(json_file, report)
+    recorded = None if source.suffix == ".toml" else open_log(source)
+    if recorded is None or config is not None:
+        document = Document.read(config or source)
+    else:
+        document = Document.parse(recorded.header.config_text, recorded.header.config_name)
+    settings = Config.of(document, assets, unit, calibrated=False)
+    if not settings.asset.id:
+        raise ConfigError("no unit is named", "give --id ID, or [asset] id in the configuration")
+    with _status() as say:
+        blocks = (
+            (rows for rows, _ in recorded.blocks())
+            if recorded is not None
+            else _recorded_cycles(document, cycles, say)
+        )
+        found = fit_unit(settings, blocks, say)
+    print(commissioned_in_words(found))
+    record = None
+    if found.verdict.word != "refused":
+        say_if_new(assets, settings.document)
+        record, where = store_first(found.calibration, settings, assets, source)
+        print(f"stored as {settings.asset.id} in {where}, record {record.id[:8]}")
+    if json_file is not None:
+        write_json(json_file, commissioned_as_json(found, settings.asset, record))
+    if report is not None:
+        write_page(found, settings.asset, report)
+    if record is None:
+        raise typer.Exit(2)
+
+
+def _recorded_cycles(
+    document: "Document", cycles: int, say: "Callable[[str], None]"
+) -> "Iterator[Samples]":
+    """Blocks from the PLC until so many cycles have ended after the first, which may be cut."""
+    from drivers.sources import open_source
+    from twin.signals import Command
+
+    begun, before = 0, True
+    source = open_source(document)
+    with _closed(source):
+        for block in source:
+            on = (block["commands"] & Command.SUCTION) != 0
+            for row in on.tolist():
+                begun, before = begun + (row and not before), row
+            say(f"recording: suction {min(begun, cycles + 2)} of {cycles + 2}")
+            yield block
+            if begun > cycles + 1:
+                return
+
+
 @app.command("import")
 def import_(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV or Parquet.")],

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from twin.calibration.alike import refuse_changing
 from twin.calibration.cycles import Cycles
 from twin.calibration.fit import Fitted, fit
-from twin.calibration.parameters import FREE
+from twin.calibration.parameters import FREE, Space
 from twin.config import Config
 from twin.diagnosis.evidence import collect
 from twin.diagnosis.healthy import learned
@@ -53,7 +53,7 @@ def calibrate(
     refuse_insufficient(samples, before)
     samples = samples[samples["time_ns"] <= before[-1].end_ns]
     used = samples["time_ns"] <= before[:MOST_FITTED][-1].end_ns
-    fitted = fit(samples[used], config.data, progress)
+    fitted = fit(samples[used], Space.of_type(config.data), progress)
     refuse_rounded(fitted.data, samples)
     progress("what healthy cycles scatter")
     cycles = complete(fitted.data, samples)
@@ -155,7 +155,7 @@ def uncertain(fitted: Fitted) -> dict[str, tuple[float, ...]]:
     factor = np.linalg.cholesky(fitted.left_open)
     return {
         free.name: tuple(float(f"{change:.4g}") for change in row[: number + 1])
-        for number, (free, row) in enumerate(zip(FREE, factor, strict=True))
+        for number, (free, row) in enumerate(zip(fitted.free, factor, strict=True))
     }
 
 

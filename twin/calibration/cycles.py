@@ -1,5 +1,6 @@
 """Healthy cycles as the fit sees them: rows in one stretch, averaged over bins."""
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -28,30 +29,58 @@ class Cycles:
     bins: Bins
 
     @classmethod
-    def found(cls, samples: Samples, data: DataSet) -> "Cycles":
-        """Find the phases as the twin of ``data`` does."""
+    def found(cls, samples: Samples, data: DataSet, *, through: bool = False) -> "Cycles":
+        """Find the phases as the twin of ``data`` does.
+
+        With ``through`` the model runs on through a switching of the nozzle; otherwise it is
+        synchronised on the level that was measured there.
+        """
         theta = coefficients(data)
         knees = expected_knees(theta, data.sensor.noise_mbar * MBAR)
         finder = PhaseFinder(as_wide_as_needed(knees, [samples]))
         early, late = finder.push(samples), finder.flush()
         rows, phase = (np.concatenate([early[i], late[i]]) for i in (0, 1))
         level = np.concatenate([early[2], late[2]]).astype(np.float32).astype(np.float64)
+        if through:
+            level[_switches(phase)] = np.nan
         dt = steps(rows, None)
         expected = _expected(theta.reshape(-1, 1), dt, phase, level)[:, 0]
         usable = ((rows["quality"] & UNUSABLE) == 0) & np.isfinite(rows["pressure"])
         bins = binned(phase, usable & np.isfinite(expected), _edges(phase), BINS)
         return cls(rows, dt, phase, level, bins)
 
-    def off(self, theta: Floats) -> Floats:
-        """Measured minus expected pressure (Pa) in each bin for hypotheses, (coefficients, n)."""
-        half = -(-theta.shape[1] // (2 * kernel.LANES)) * kernel.LANES
-        halves = [part for part in (theta[:, :half], theta[:, half:]) if part.shape[1]]
-        with ThreadPoolExecutor(len(halves)) as pool:
-            return np.concatenate(list(pool.map(self._off, halves)), axis=1)
+    def off(self, theta: Floats, early: Sequence[int] = ()) -> Floats:
+        """Measured minus expected pressure (Pa) in each bin for hypotheses, (coefficients, n).
 
-    def _off(self, theta: Floats) -> Floats:
-        expected = _expected(theta, self.dt, self.phase, self.level)
+        ``early`` says for each by how many rows the nozzle switches before it is seen to.
+        """
+        phase = self._phases(early) if any(early) else self.phase.reshape(-1, 1)
+        half = -(-theta.shape[1] // (2 * kernel.LANES)) * kernel.LANES
+        parts = [slice(None, half), slice(half, None)] if half < theta.shape[1] else [slice(None)]
+        each = [(theta[:, part], phase[:, part] if any(early) else phase) for part in parts]
+        with ThreadPoolExecutor(len(each)) as pool:
+            return np.concatenate(list(pool.map(lambda one: self._off(*one), each)), axis=1)
+
+    def _phases(self, early: Sequence[int]) -> npt.NDArray[np.uint8]:
+        """Phases with every switching moved, (rows, n)."""
+        moved = np.repeat(self.phase[:, None], len(early), axis=1)
+        for lane, rows in enumerate(early):
+            for row in _switches(self.phase):
+                begin, end = (row - rows, row) if rows > 0 else (row, row - rows)
+                moved[max(begin, 0) : end, lane] = self.phase[row if rows > 0 else row - 1]
+        return moved
+
+    def _off(self, theta: Floats, phase: npt.NDArray[np.uint8]) -> Floats:
+        expected = _expected(theta, self.dt, phase, self.level)
         return self.bins.mean(self.samples["pressure"][:, None] - expected)
+
+
+def _switches(phase: npt.NDArray[np.uint8]) -> Ints:
+    """Rows at which the nozzle was seen to switch while suction is commanded."""
+    inside = np.isin(phase, (Phase.SUCTION, Phase.HOLD))
+    changes = np.flatnonzero(np.diff(phase)) + 1
+    switches: Ints = changes[inside[changes] & inside[changes - 1]]
+    return switches
 
 
 def _edges(phase: npt.NDArray[np.uint8]) -> Ints:

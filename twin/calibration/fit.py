@@ -7,6 +7,7 @@ model's own error leave of it. All derivatives come from one run of the bank of 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +15,7 @@ from scipy.optimize import least_squares
 
 from twin.calibration.cycles import Cycles
 from twin.calibration.left_out import with_left_out
-from twin.calibration.parameters import FREE, directions, values, with_values
+from twin.calibration.parameters import Free, Space
 from twin.calibration.weights import Weights, weighted
 from twin.model.dataset import RIPPLE, DataSet, coefficients
 from twin.signals import MBAR, Samples
@@ -24,6 +25,10 @@ ROUNDS = (1e-2, 1e-2, 1e-3)
 MOST_STEPS = 8  # in a round
 FIRST_SHARE = 0.4  # of the log, for the first round: it has the longest way to go
 DETERMINED = 0.5  # of what the type leaves open: what is known better comes from the log
+# The same for a fit from afar: what the model may be off by (Pa), round by round.
+NARROWING = (3.0 * MBAR, 1.0 * MBAR, 0.4 * MBAR)
+SWITCHING = 6.0  # rows, one standard deviation of when the nozzle switched
+MOST_FAR_STEPS, FAR_TOLERANCE = 50, 1e-4
 STEP = 0.05  # of a parameter's sigma, for derivatives
 
 Floats = npt.NDArray[np.float64]
@@ -31,20 +36,14 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass
 class Problem:
-    """Residuals and their derivatives over ways to differ from the type's data set, in sigmas."""
+    """Residuals and their derivatives over coordinates of ``space``, all in sigmas."""
 
-    data: DataSet
+    space: Space
     cycles: Cycles
     weights: Weights
     _at: Floats | None = None
     _residual: Floats = field(default_factory=lambda: np.empty(0))
     _jacobian: Floats = field(default_factory=lambda: np.empty((0, 0)))
-
-    def data_at(self, x: Floats) -> DataSet:
-        """The data set at ``x``, kept within the bounds of each value."""
-        low, high = ([getattr(free, end) for free in FREE] for end in ("low", "high"))
-        moved = values(self.data) + directions(self.data) @ x
-        return with_values(self.data, np.clip(moved, low, high))
 
     def residual(self, x: Floats) -> Floats:
         """Residuals of all bins, and how far ``x`` is from what is expected."""
@@ -59,13 +58,32 @@ class Problem:
     def _evaluate(self, x: Floats) -> None:
         if self._at is not None and np.array_equal(self._at, x):
             return
-        moved = [self.data_at(one) for one in (x, *(x + np.eye(len(x)) * STEP))]
-        off = self.cycles.off(np.stack([coefficients(data) for data in moved], axis=1))
+        n = len(self.space.free)
+        moved = [self.space.at(one) for one in (x[:n], *(x[:n] + np.eye(n) * STEP))]
+        white, slopes = self._whitened(moved, float(x[n]) * SWITCHING if len(x) > n else None)
         rising = np.stack([_rising(data) for data in moved], axis=1)
-        white = np.concatenate([*self.weights.white(off), rising])
+        bent = (rising[:, 1:] - rising[:, :1]) / STEP
+        bent = np.column_stack([bent, np.zeros((len(bent), len(x) - n))])
         self._at = x.copy()
-        self._residual = np.concatenate([white[:, 0], x])
-        self._jacobian = np.concatenate([(white[:, 1:] - white[:, :1]) / STEP, np.eye(len(x))])
+        self._residual = np.concatenate([white, rising[:, 0], x])
+        self._jacobian = np.concatenate([slopes, bent, np.eye(len(x))])
+
+    def _whitened(self, moved: Sequence[DataSet], early: float | None) -> tuple[Floats, Floats]:
+        """Residuals in sigmas and their slopes; ``early`` (rows) is how much sooner the nozzle
+        switches than it was seen to, None where that is not free.
+        """
+        theta = np.stack([coefficients(data) for data in moved], axis=1)
+        if early is None:
+            white = np.concatenate(self.weights.white(self.cycles.off(theta)))
+            return white[:, 0], (white[:, 1:] - white[:, :1]) / STEP
+        whole = int(np.floor(early))
+        rows = [*[whole] * len(moved), whole + 1]
+        off = self.cycles.off(np.column_stack([theta, theta[:, 0]]), rows)
+        white = np.concatenate(self.weights.white(off))
+        by_row = white[:, -1] - white[:, 0]
+        slopes = (white[:, 1:-1] - white[:, :1]) / STEP
+        at = white[:, 0] + (early - whole) * by_row
+        return at, np.column_stack([slopes, by_row * SWITCHING])
 
 
 def _rising(data: DataSet) -> Floats:
@@ -79,6 +97,7 @@ class Fitted:
     """A data set from healthy cycles, and how sure it is."""
 
     data: DataSet
+    free: tuple[Free, ...]
     covariance: Floats  # of the free parameters, in their units
     left_open: Floats  # the same without what the model leaves out: what other logs may show
     prior: Floats  # one standard deviation of each before the log, in its unit
@@ -98,39 +117,77 @@ class Fitted:
 
     def interval(self, name: str) -> tuple[float, float]:
         """95 % interval of a parameter (``table.key``), in its unit."""
-        number = [free.name for free in FREE].index(name)
-        value, reach = FREE[number].of(self.data), 1.96 * float(self.spread[number])
+        number = [free.name for free in self.free].index(name)
+        value, reach = self.free[number].of(self.data), 1.96 * float(self.spread[number])
         return value - reach, value + reach
 
 
-def fit(samples: Samples, data: DataSet, progress: Callable[[str], None]) -> Fitted:
-    """Fit the free parameters, starting from and held by ``data``."""
-    x, best, noise = np.zeros(len(FREE)), data, data.sensor.noise_mbar * MBAR
+def fit(samples: Samples, space: Space, progress: Callable[[str], None]) -> Fitted:
+    """Fit the free parameters to healthy cycles of a unit of known type, starting from its data."""
+    x, best, noise = np.zeros(len(space.free)), space.data, space.data.sensor.noise_mbar * MBAR
     for turn, tolerance in enumerate(ROUNDS):
         progress(f"fitting, round {turn + 1} of {len(ROUNDS)}")
         rows = round(len(samples) * (FIRST_SHARE if turn == 0 else 1.0))
         cycles = Cycles.found(samples[:rows], best)
         weights = weighted(cycles, coefficients(best), noise, fitted=turn > 0)
-        problem = Problem(data, cycles, weights)
-        found = least_squares(
-            problem.residual,
-            x,
-            problem.jacobian,
-            max_nfev=MOST_STEPS,
-            xtol=1e-3,
-            ftol=tolerance,
-        )
-        x, best = found.x, problem.data_at(found.x)
-    ways = directions(data)
+        problem = Problem(space, cycles, weights)
+        x = _solved(problem, x, MOST_STEPS, tolerance)
+        best = space.at(x)
+    return _fitted(problem, x)
+
+
+def fit_from_afar(samples: Samples, space: Space, progress: Callable[[str], None]) -> Fitted:
+    """Fit a unit that nobody has seen before, however far from the guess that ``space`` is about.
+
+    What the model may be off by begins wide and is narrowed, so that the fit follows the large
+    features first; residuals beyond it pull less than their square (a robust loss).
+    """
+    # The last coordinate is how much sooner the nozzle switches than it was seen to.
+    x, best, noise = np.zeros(len(space.free) + 1), space.data, space.data.sensor.noise_mbar * MBAR
+    for turn, error in enumerate(NARROWING):
+        progress(f"fitting from afar, round {turn + 1} of {len(NARROWING)}")
+        rows = round(len(samples) * (FIRST_SHARE if turn == 0 else 1.0))
+        cycles = Cycles.found(samples[:rows], best, through=True)
+        weights = weighted(cycles, coefficients(best), noise, fitted=False, error=error)
+        x = _solved(Problem(space, cycles, weights), x, MOST_FAR_STEPS, FAR_TOLERANCE, "soft_l1")
+        best = space.at(x[:-1])
+        x[-1] = 0.0  # it is found anew, as the new data have it
+    weights = weighted(cycles, coefficients(best), noise, fitted=True)
+    return _fitted(Problem(space, cycles, weights), x[:-1])
+
+
+def _solved(
+    problem: Problem,
+    x: Floats,
+    steps: int,
+    tolerance: float,
+    loss: Literal["linear", "soft_l1"] = "linear",
+) -> Floats:
+    found = least_squares(
+        problem.residual,
+        x,
+        problem.jacobian,
+        max_nfev=steps,
+        xtol=1e-3,
+        ftol=tolerance,
+        loss=loss,
+    )
+    best: Floats = found.x
+    return best
+
+
+def _fitted(problem: Problem, x: Floats) -> Fitted:
+    """What the fit found at ``x``, and how sure it is."""
+    space, cycles = problem.space, problem.cycles
+    best = DataSet.model_validate(space.at(x).model_dump())
+    ways = space.slopes(x)
     off = cycles.off(np.stack(with_left_out(best), axis=1))
     jacobian = problem.jacobian(x)
     plain = np.asarray(np.linalg.inv(jacobian.T @ jacobian), np.float64)
-    covariance = ways @ _with_left_out(plain, jacobian, weights.white(off)) @ ways.T
+    covariance = ways @ _with_left_out(plain, jacobian, problem.weights.white(off)) @ ways.T
     prior = np.sqrt(np.diag(ways @ ways.T))
     left = float(np.sqrt(np.average(off[:, 0] ** 2, weights=cycles.bins.count)))
-    return Fitted(
-        DataSet.model_validate(best.model_dump()), covariance, ways @ plain @ ways.T, prior, left
-    )
+    return Fitted(best, space.free, covariance, ways @ plain @ ways.T, prior, left)
 
 
 def _with_left_out(covariance: Floats, jacobian: Floats, white: Sequence[Floats]) -> Floats:

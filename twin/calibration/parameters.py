@@ -1,5 +1,6 @@
 """What a calibration may move: one table, each with what the type leaves open."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,9 +84,50 @@ _SMOOTH = np.array(
 )
 
 
-def values(data: DataSet) -> Floats:
-    """Values of all free parameters, in their units."""
-    return np.array([free.of(data) for free in FREE])
+# Where nobody knows the type: one standard deviation of the logarithm, over what the market has; of
+# what is ADDED, in its unit. Wide enough that no healthy rig is refused for being unusual.
+FREE_IN_MARKET = (
+    *FREE,
+    Free(_E, "port_volume_ml", "ml", 0.2, 0.1, 1000.0, True),
+    Free(_E, "jet_depth", "", 0.2, 0.0, 1.0),
+    Free(_E, "exhaust_sl_min", "sl/min", 0.4, 0.0, 5000.0, True),
+)
+ADDED = {f"{_E}.{key}" for key in ("bulge", "skew", "bend_2", "bend_3")}
+ADDED |= {"ejector.jet_depth", "system.line_share", "system.sensor_shift"}
+MARKET = {
+    "ejector.suction_capacity_sl_min": 0.5,
+    "ejector.end_pressure_mbar": 0.5,
+    "ejector.bulge": 0.8,
+    "ejector.skew": 0.5,
+    "ejector.bend_2": 0.4,
+    "ejector.bend_3": 0.2,
+    "ejector.response_ms": 0.6,
+    "ejector.response_off_ms": 0.6,
+    "ejector.ramp_up_ms": 0.7,
+    "ejector.ramp_down_ms": 1.2,
+    "ejector.blow_off_sl_min": 1.0,
+    "ejector.blow_off_response_ms": 0.6,
+    "ejector.blow_off_response_off_ms": 0.6,
+    "ejector.blow_off_ramp_ms": 0.7,
+    "ejector.relief_sl_min": 1.5,
+    "ejector.exhaust_sl_min": 1.5,
+    "ejector.jet_depth": 0.3,
+    "ejector.port_volume_ml": 1.0,
+    "system.film_coefficient": 0.7,
+    "system.tube_film_coefficient": 1.0,
+    "system.line_factor": 1.2,
+    "system.line_share": 0.25,
+    "system.sensor_shift": 0.4,
+    "system.leak_sl_min": 1.5,
+    "sensor.lag_ms": 0.4,
+}
+SMALLEST = 0.02  # in its unit, a value of the type from which a scale can lead away
+FARTHEST = 5.0  # of the logarithm, from the guess
+
+
+def values(data: DataSet, free: Sequence[Free] = FREE) -> Floats:
+    """Values of free parameters, in their units."""
+    return np.array([one.of(data) for one in free])
 
 
 def directions(data: DataSet) -> Floats:
@@ -98,10 +140,58 @@ def directions(data: DataSet) -> Floats:
     return ways
 
 
-def with_values(data: DataSet, numbers: Floats) -> DataSet:
+def with_values(data: DataSet, numbers: Floats, free: Sequence[Free] = FREE) -> DataSet:
     """``data`` with other values, unchecked: a search passes through what is no ejector."""
     changed: dict[str, dict[str, float]] = {}
-    for free, number in zip(FREE, numbers, strict=True):
-        changed.setdefault(free.table, {})[free.key] = float(number)
+    for one, number in zip(free, numbers, strict=True):
+        changed.setdefault(one.table, {})[one.key] = float(number)
     tables = {name: getattr(data, name).model_copy(update=new) for name, new in changed.items()}
     return data.model_copy(update=tables)
+
+
+@dataclass(frozen=True)
+class Space:
+    """Where a fit may go: coordinates in standard deviations about a data set, 0 at the data set.
+
+    ``ways`` are (parameters, n). A parameter that is ``scaled`` is multiplied by the exponential of
+    its coordinate, any other is added to.
+    """
+
+    data: DataSet
+    free: tuple[Free, ...]
+    ways: Floats
+    scaled: npt.NDArray[np.bool_]
+
+    @classmethod
+    def of_type(cls, data: DataSet) -> "Space":
+        """Units of a known type, ``data``."""
+        return cls(data, FREE, directions(data), np.zeros(len(FREE), np.bool_))
+
+    @classmethod
+    def of_market(cls, data: DataSet) -> "Space":
+        """Any ejector on the market and what may hang on it; ``data`` is a guess."""
+        spread = np.array([MARKET[one.name] for one in FREE_IN_MARKET])
+        ways = np.diag(spread)
+        ways[np.ix_(_BENDS, _BENDS)] = _SMOOTH * spread[_BENDS]
+        scaled = np.array([one.name not in ADDED for one in FREE_IN_MARKET])
+        return cls(data, FREE_IN_MARKET, ways, scaled)
+
+    def values(self, x: Floats) -> Floats:
+        """Values of the free parameters at ``x``, kept within their bounds."""
+        low, high = ([getattr(one, end) for one in self.free] for end in ("low", "high"))
+        return np.clip(self._unbound(x), low, high)
+
+    def at(self, x: Floats) -> DataSet:
+        """The data set at ``x``."""
+        return with_values(self.data, self.values(x), self.free)
+
+    def slopes(self, x: Floats) -> Floats:
+        """(parameters, n): derivatives of the values."""
+        return np.where(self.scaled, self._unbound(x), 1.0)[:, None] * self.ways
+
+    def _unbound(self, x: Floats) -> Floats:
+        moved = self.ways @ x
+        centre = values(self.data, self.free)
+        least = np.array([max(one.low, SMALLEST) for one in self.free])
+        scale = np.exp(np.clip(moved, -FARTHEST, FARTHEST))
+        return np.where(self.scaled, np.maximum(centre, least) * scale, centre + moved)

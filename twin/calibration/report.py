@@ -4,7 +4,9 @@ from typing import Any
 
 from twin.assets.record import Record
 from twin.calibration.calibrate import Calibration
-from twin.calibration.parameters import FREE
+from twin.calibration.commission import Commissioned
+from twin.calibration.verdict import WEAKENS, Verdict
+from twin.config import Asset
 from twin.signals import MBAR, Phase
 
 
@@ -16,7 +18,7 @@ def in_words(calibration: Calibration) -> str:
         "",
         f"{'parameter':<34}{'value':>9}   {'95 % interval':<19}{'unit':<11}from",
     ]
-    for free, known in zip(FREE, fitted.determined, strict=True):
+    for free, known in zip(fitted.free, fitted.determined, strict=True):
         low, high = (f"{bound:.4g}" for bound in fitted.interval(free.name))
         source = "log" if known else "type"
         lines.append(
@@ -55,7 +57,7 @@ def parameters(calibration: Calibration) -> dict[str, dict[str, Any]]:
     """Each parameter's value with its unit, 95 % interval, and whether the log determines it."""
     fitted = calibration.fitted
     found = {}
-    for free, known in zip(FREE, fitted.determined, strict=True):
+    for free, known in zip(fitted.free, fitted.determined, strict=True):
         low, high = fitted.interval(free.name)
         found[free.name] = {
             "value": free.of(fitted.data),
@@ -65,3 +67,64 @@ def parameters(calibration: Calibration) -> dict[str, dict[str, Any]]:
             "determined": bool(known),
         }
     return found
+
+
+def commissioned_in_words(found: Commissioned) -> str:
+    """The verdict, what the record corrects, what was found and what was assumed."""
+    lines = [headline(found.verdict), ""]
+    lines += [
+        f"{phase.name.lower().replace('_', '-'):<10}{one.left / MBAR:>7.2f} mbar rms off;"
+        f" this record cannot be followed nearer than {one.floor / MBAR:.2f}"
+        for phase, one in found.verdict.residuals.items()
+    ]
+    for remark in found.remarks:
+        lines += ["", f"the record contradicts the configuration: {remark.text}"]
+        lines += [f"  the record's value is used; write: {remark.line}"]
+    lines += ["", in_words(found.calibration)]
+    if found.assumed:
+        lines += ["", f"not shown by this record, assumed: {', '.join(found.assumed)}"]
+    return "\n".join(lines)
+
+
+def headline(verdict: Verdict) -> str:
+    """The verdict in a sentence."""
+    weak = [
+        f"{verdict.residuals[phase].times:.1f} times in {phase.name.lower().replace('_', '-')}"
+        f" ({WEAKENS[phase]})"
+        for phase in verdict.weak
+    ]
+    if verdict.word == "good":
+        return "good: the twin follows this record as closely as its cycles follow each other"
+    beyond = f"the twin is off by more than its cycles differ: {', '.join(weak)}"
+    if verdict.word == "usable":
+        return f"usable: {beyond}. Causes that act there are named less surely"
+    return (
+        f"refused: {beyond}. Nothing is stored. Check tubes, volumes and the sensor's place in"
+        " [data.system.parts], and that the record is of one healthy unit"
+    )
+
+
+def commissioned_as_json(
+    found: Commissioned, asset: Asset, record: Record | None
+) -> dict[str, Any]:
+    """The same for programs; ``data`` is there even where it is refused."""
+    fitted = found.calibration.fitted
+    return {
+        "format": "ejector-twin-commissioning/1",
+        "asset": {"type": asset.type, "id": asset.id},
+        "record": record.id if record else None,
+        "verdict": found.verdict.word,
+        "residual": {
+            phase.name.lower(): {
+                "left_mbar": one.left / MBAR,
+                "floor_mbar": one.floor / MBAR,
+                "times": one.times,
+            }
+            for phase, one in found.verdict.residuals.items()
+        },
+        "contradicts": [{"what": one.text, "line": one.line} for one in found.remarks],
+        "assumed": found.assumed,
+        "cycles": found.calibration.cycles,
+        "parameters": parameters(found.calibration),
+        "data": fitted.data.model_dump(),
+    }

@@ -6,15 +6,31 @@ from twin.assets import provenance
 from twin.assets.place import open_chosen
 from twin.assets.record import Record
 from twin.calibration.calibrate import Calibration
-from twin.calibration.parameters import FREE
 from twin.config import Config
 from twin.signals import MBAR
+
+OF_TYPE = ("supply", "ejector")  # tables of a data set that say what a type is
 
 
 def store(calibration: Calibration, config: Config, assets: str, log: Path) -> tuple[Record, str]:
     """Add the unit's data set to the database; give the record and the database's name."""
     with open_chosen(assets, config.document, write=True) as database:
         return database.add(record_of(calibration, config, log)), database.name
+
+
+def store_first(
+    calibration: Calibration, config: Config, assets: str, log: Path
+) -> tuple[Record, str]:
+    """The same for a unit whose type may be unknown: its first unit then says what the type is."""
+    with open_chosen(assets, config.document, write=True) as database:
+        unit = record_of(calibration, config, log)
+        if not database.records("type", unit.type):
+            own = {table: unit.data[table] for table in OF_TYPE}
+            note = {"note": f"begun with the commissioning of {unit.name}"}
+            provenance_ = dict(unit.provenance) | note
+            kind = Record("type", unit.type, unit.type, own, provenance=provenance_)
+            database.add(kind)
+        return database.add(unit), database.name
 
 
 def record_of(calibration: Calibration, config: Config, log: Path) -> Record:
@@ -31,9 +47,11 @@ def record_of(calibration: Calibration, config: Config, log: Path) -> Record:
         | {
             "cycles": calibration.cycles,
             "from": config.origin,
-            "parameters": [free.name for free in FREE],
+            "parameters": [free.name for free in fitted.free],
             "determined": [
-                free.name for free, known in zip(FREE, fitted.determined, strict=True) if known
+                free.name
+                for free, known in zip(fitted.free, fitted.determined, strict=True)
+                if known
             ],
             "left_mbar": round(fitted.left / MBAR, 3),
         },

@@ -38,10 +38,12 @@ class Weights:
         return [solve_triangular(factor, off[here], lower=True) for here, factor in self.parts]
 
 
-def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> Weights:
+def weighted(
+    cycles: Cycles, theta: Theta, noise: float, *, fitted: bool, error: float = FIRST_ERROR
+) -> Weights:
     """Weights for residuals about ``theta``, by what it leaves if it is ``fitted``.
 
-    ``noise`` (Pa) is the sensor's.
+    ``noise`` (Pa) is the sensor's, ``error`` (Pa) the model's own where it is not fitted yet.
     """
     bins = cycles.bins
     bigger = ("added_volume", {"volume": VOLUME * theta[c.VOLUME] / ML})
@@ -49,10 +51,10 @@ def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> Wei
     moved = [apply(theta, name, sizes) for name, sizes in (bigger, *scattering)]
     off = cycles.off(np.stack([theta, *moved], axis=1))
     moves = off[:, 1:] - off[:, :1]
-    error, cycle_error = np.full(len(off), FIRST_ERROR), np.zeros(len(off))
+    errors, cycle_error = np.full(len(off), error), np.zeros(len(off))
     if fitted:
-        error, cycle_error = _errors(off[:, 0], bins, noise)
-    error = np.hypot(error, LATE * _slope(cycles))
+        errors, cycle_error = _errors(off[:, 0], bins, noise)
+    errors = np.hypot(errors, LATE * _slope(cycles))
     numbers = np.unique(bins.cycle[bins.cycle >= 0])
     parts = []
     for one in numbers:
@@ -61,7 +63,7 @@ def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> Wei
         common = apart * (bins.kind[here, None] == bins.kind[here])
         alone = apart * (bins.stretch[here, None] == bins.stretch[here])
         volume, scatter = moves[here, :1], moves[here, 1:]
-        covariance = np.outer(error[here], error[here]) * common + volume @ volume.T
+        covariance = np.outer(errors[here], errors[here]) * common + volume @ volume.T
         covariance *= len(numbers)
         covariance += np.outer(cycle_error[here], cycle_error[here]) * alone
         covariance += scatter @ scatter.T + np.diag(noise**2 / bins.count[here])

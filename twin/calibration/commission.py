@@ -1,0 +1,208 @@
+"""Commissioning: a unit that nobody has seen before, from a record and what a person can read off.
+
+The record says what the configuration need not: noise, thresholds, ambient pressure where the
+system is opened, rough flows and delays. From there the fit goes wherever the market may be.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydantic import ValidationError
+
+from twin.calibration.calibrate import (
+    MOST_FITTED,
+    Calibration,
+    complete,
+    like_these,
+    refuse_insufficient,
+    scatter,
+)
+from twin.calibration.cycles import Cycles
+from twin.calibration.fit import Fitted, fit_from_afar
+from twin.calibration.parameters import Space
+from twin.calibration.readings import Readings, read
+from twin.calibration.verdict import Verdict, judge
+from twin.config import Config
+from twin.errors import ConfigError
+from twin.model.dataset import DataSet
+from twin.model.system import Cups, volume
+from twin.signals import MBAR, ML, MS, SAMPLE, SL_MIN, Command, Samples
+
+SLOWEST = 2.0 * MS  # s between rows; what switches faster than a few rows is not seen
+MOST_MISSING = 0.2  # share of rows
+ROOM_TEMPERATURE = 293.15  # K, for a first guess
+CLEARLY = 15.0  # mbar by which a threshold must differ to be told; overshoot is part of a turn
+AMBIENT_CLEARLY = 3.0  # mbar, the same for ambient pressure
+
+
+@dataclass(frozen=True)
+class Remark:
+    """Something that the record says and the configuration does not, with the line to change."""
+
+    text: str
+    line: str
+
+
+@dataclass(frozen=True)
+class Commissioned:
+    """A unit's calibration, how well it follows the record, and what the record corrected."""
+
+    calibration: Calibration
+    readings: Readings
+    verdict: Verdict
+    remarks: tuple[Remark, ...]
+    samples: Samples  # that the twin was judged on
+
+    @property
+    def assumed(self) -> list[str]:
+        """Values that the record does not show; they stay what the guess said, and as wide."""
+        fitted = self.calibration.fitted
+        known = zip(fitted.free, fitted.determined, strict=True)
+        return [one.name for one, sure in known if not sure]
+
+
+def commission(
+    config: Config, blocks: Iterable[Samples], progress: Callable[[str], None]
+) -> Commissioned:
+    """Fit a unit from its record; ``config`` says what hangs on the ejector, roughly.
+
+    ConfigError with the reason where the record cannot answer. How well the twin follows a record
+    that can is the ``verdict``; who stores it must look at it.
+    """
+    progress("reading the record")
+    samples = np.concatenate([np.empty(0, SAMPLE), *blocks])
+    refuse_empty(samples)
+    readings = read(samples)
+    refuse_unreadable(readings)
+    guess, remarks = guessed(config.data, readings)
+    before = complete(guess, samples)
+    refuse_insufficient(samples, before)
+    samples = samples[samples["time_ns"] <= before[-1].end_ns]
+    used = samples[samples["time_ns"] <= before[:MOST_FITTED][-1].end_ns]
+    tried = [_fit(used, one, progress) for one in ways_to_release(guess)]
+    fitted = min(tried, key=lambda one: one.left)
+    progress("judging the fit")
+    verdict = judge(Cycles.found(samples, fitted.data), fitted.data, readings.noise)
+    cycles = complete(fitted.data, samples)
+    known = replace(config, data=fitted.data)
+    healthy = like_these(known, fitted, scatter(fitted.data, cycles), samples)
+    times = samples["host_ns"]
+    calibration = Calibration(fitted, healthy, len(cycles), int(times[0]), int(times[-1]))
+    return Commissioned(calibration, readings, verdict, tuple(remarks), samples)
+
+
+def refuse_empty(samples: Samples) -> None:
+    """ConfigError if there is no suction to look at."""
+    if not (samples["commands"] == Command.SUCTION).any():
+        raise ConfigError("the record has no suction", "check which tag or column is suction")
+
+
+def refuse_unreadable(readings: Readings) -> None:
+    """ConfigError where sampling or signal cannot show what an ejector does."""
+    if readings.period > SLOWEST:
+        raise ConfigError(
+            f"the record has a row each {readings.period / MS:.0f} ms: the nozzle's switching and"
+            " the valves' delays are not seen in it",
+            f"record again with a row each {SLOWEST / MS:.0f} ms or faster",
+        )
+    if readings.missing > MOST_MISSING:
+        raise ConfigError(
+            f"{readings.missing:.0%} of the record's rows are missing",
+            'record again in block mode (mode = "block"), which loses none',
+        )
+    if not readings.deepest < readings.highest - readings.least_vacuum:
+        raise ConfigError(
+            f"the pressure moves by {(readings.highest - readings.deepest) / MBAR:.1f} mbar only"
+            " in the whole record: no vacuum is made",
+            "check the unit, the sign and the range of [driver.tags.pressure], or of the column",
+        )
+    if readings.rises_in_suction:
+        raise ConfigError(
+            "the pressure rises while suction is commanded and falls while blow-off is",
+            'swap the two commands, or the sign of the pressure (reference = "vacuum")',
+        )
+
+
+def _fit(samples: Samples, guess: DataSet, progress: Callable[[str], None]) -> Fitted:
+    try:
+        return fit_from_afar(samples, Space.of_market(guess), progress)
+    except (ValidationError, np.linalg.LinAlgError) as error:
+        raise ConfigError(
+            "the fit ends at values that no ejector has: this is no record of the parts that"
+            " [data.system] lists, or of more than one unit",
+            "check volumes, tubes and the sensor's place; commission on a record of one unit",
+        ) from error
+
+
+def guessed(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:
+    """``data`` with what the record shows in its place, and remarks where that differs."""
+    tables = data.model_dump()
+    remarks: list[Remark] = []
+    ambient = tables["ambient"]["pressure_mbar"]
+    if readings.opened:
+        found = round(readings.idle / MBAR, 1)
+        if abs(found - ambient) > AMBIENT_CLEARLY:
+            line = f"[data.ambient] pressure_mbar = {found:g}"
+            text = f"the opened system stands at {found:g} mbar; the configuration says {ambient:g}"
+            remarks.append(Remark(text, line))
+        tables["ambient"]["pressure_mbar"] = ambient = found
+    tables["sensor"]["noise_mbar"] = max(readings.noise / MBAR, 0.05)
+    ejector = tables["ejector"]
+    if not readings.saves_air:
+        if ejector["air_saving"] != "off":
+            text = (
+                "in no suction the nozzle goes off by itself; the configuration has air saving on"
+            )
+            remarks.append(Remark(text, '[data.ejector] air_saving = "off"'))
+        ejector["air_saving"] = "off"
+    else:
+        ejector["air_saving"] = "on" if ejector["air_saving"] == "off" else ejector["air_saving"]
+        remarks += _thresholds(ejector, readings, ambient)
+    capacity = readings.capacity(_volume(data), ambient * MBAR, ROOM_TEMPERATURE) / SL_MIN
+    if np.isfinite(capacity):
+        ejector["suction_capacity_sl_min"] = float(np.clip(capacity, 1.0, 1000.0))
+    blow_off = readings.blow_off(_volume(data), ambient * MBAR, ROOM_TEMPERATURE) / SL_MIN
+    if np.isfinite(blow_off):
+        ejector["blow_off_sl_min"] = float(np.clip(blow_off, 1.0, 2000.0))
+        ejector["jet_depth"] = 0.5
+        ejector["exhaust_sl_min"] = ejector["blow_off_sl_min"]
+        ejector["relief_sl_min"] = 0.3 * ejector["blow_off_sl_min"]
+    return DataSet.model_validate(tables), remarks
+
+
+def ways_to_release(data: DataSet) -> list[DataSet]:
+    """``data``, and where it has cups also with a part that goes only when blow-off ends."""
+    if not any(isinstance(part, Cups) for part in data.system.parts):
+        return [data]
+    ways = ("in_blow_off", "after_blow_off")
+    systems = [data.system.model_copy(update={"part_leaves": way}) for way in ways]
+    return [data.model_copy(update={"system": system}) for system in systems]
+
+
+def _thresholds(ejector: dict[str, float], readings: Readings, ambient: float) -> list[Remark]:
+    """Set H1 and its hysteresis from the turns; H2 stays below them."""
+    h1, remarks = round(ambient - readings.off / MBAR), []
+    if abs(h1 - ejector["h1_mbar"]) > CLEARLY:
+        text = f"the nozzle goes off at {h1:g} mbar; the configuration says {ejector['h1_mbar']:g}"
+        remarks.append(Remark(text, f"[data.ejector] h1_mbar = {h1:g}"))
+    hysteresis = ejector["h1_hysteresis_mbar"]
+    if np.isfinite(readings.on):
+        hysteresis = max(round(h1 - (ambient - readings.on / MBAR)), 1.0)
+        if abs(hysteresis - ejector["h1_hysteresis_mbar"]) > CLEARLY:
+            text = (
+                f"the nozzle goes on again {hysteresis:g} mbar below that; the configuration says"
+                f" {ejector['h1_hysteresis_mbar']:g}"
+            )
+            line = f"[data.ejector] h1_hysteresis_mbar = {hysteresis:g}"
+            remarks.append(Remark(text, line))
+    h2 = min(ejector["h2_mbar"], h1 - hysteresis)
+    if h2 <= ejector["h2_hysteresis_mbar"]:
+        hysteresis, h2 = h1 / 5.0, h1 / 2.0
+    ejector.update(h1_mbar=h1, h1_hysteresis_mbar=hysteresis, h2_mbar=h2)
+    return remarks
+
+
+def _volume(data: DataSet) -> float:
+    """All that is evacuated (m³)."""
+    return sum(volume(part) for part in data.system.parts) + data.ejector.port_volume_ml * ML

@@ -1,0 +1,118 @@
+"""The page of a commissioning: verdict, what to change, measured against fitted, what was found."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from twin.calibration.commission import Commissioned
+from twin.calibration.report import headline, parameters
+from twin.config import Asset
+from twin.diagnosis import page
+from twin.diagnosis.drawing import AFTER, MEASURED, as_svg, empty, legend
+from twin.files import write_text
+from twin.live import Twin
+from twin.model.dataset import DataSet
+from twin.monitor.cycles import Cycle, whole
+from twin.signals import MBAR, NS, Phase, Samples
+
+MARKS = {"good": ("●", "#2e7d4f"), "usable": ("▲", "#b36b00"), "refused": ("■", "#b3261e")}
+HEIGHT = 5.0  # inches
+
+
+def write_page(found: Commissioned, asset: Asset, path: Path) -> None:
+    """Write the page, one HTML file that needs no network."""
+    mark, colour = MARKS[found.verdict.word]
+    parts = [
+        page.section("What to change", "\n".join(_remarks(found))),
+        _picture(found),
+        page.section("How close", _residuals(found)),
+        page.section("What was found", _parameters(found)),
+    ]
+    text = page.PAGE.substitute(
+        title=f"Commissioning of {asset.id}",
+        colour=colour,
+        mark=mark,
+        verdict=found.verdict.word,
+        headline=f"{asset.type} {asset.id}: {headline(found.verdict)}",
+        body="\n".join(parts),
+        footer=f"{found.calibration.cycles} cycles; pressures in mbar, intervals of 95 %",
+    )
+    write_text(path, text)
+
+
+def _remarks(found: Commissioned) -> Iterator[str]:
+    for remark in found.remarks:
+        yield page.box(remark.text, f"The record's value is used. Write: {remark.line}")
+    if not found.remarks:
+        yield page.paragraph("Nothing: the record does not contradict the configuration.")
+
+
+def _residuals(found: Commissioned) -> str:
+    head = ("phase", "rms left, mbar", "floor, mbar", "times the floor")
+    rows = (
+        (
+            phase.name.lower().replace("_", "-"),
+            *(f"{value:.2f}" for value in (one.left / MBAR, one.floor / MBAR, one.times)),
+        )
+        for phase, one in found.verdict.residuals.items()
+    )
+    caption = "The floor is what cycles of this record differ by, noise included"
+    return page.table(caption, head, rows, numbers=(1, 2, 3))
+
+
+def _parameters(found: Commissioned) -> str:
+    head = ("value", "found", "from", "to", "unit", "known from")
+    rows = (
+        (
+            name,
+            *(f"{one[key]:.4g}" for key in ("value", "low95", "high95")),
+            one["unit"],
+            "record" if one["determined"] else "assumed",
+        )
+        for name, one in parameters(found.calibration).items()
+    )
+    return page.table("Values of the data set, with intervals of 95 %", head, rows, (1, 2, 3))
+
+
+def _picture(found: Commissioned) -> str:
+    title = f"Measured against fitted: {_worst(found)}"
+    alt = "Vacuum of one cycle, measured and fitted, and the deviation below it"
+    with empty("commissioning", HEIGHT) as figure:
+        _draw(figure, _typical(found.calibration.fitted.data, found.samples))
+        svg = as_svg(figure, alt)
+    return page.picture(title, svg, "The cycle whose deviation is the median of all.")
+
+
+def _worst(found: Commissioned) -> str:
+    if not found.verdict.weak:
+        return "the twin follows every phase"
+    names = [phase.name.lower().replace("_", "-") for phase in found.verdict.weak]
+    return f"the twin is off in {' and '.join(names)}"
+
+
+def _typical(data: DataSet, samples: Samples) -> Cycle:
+    """The cycle with the median deviation."""
+    cycles = [one for one in whole(Twin.of(data).over([samples])) if one.settled]
+    cycles.sort(key=lambda one: float(np.nanmean(one.off**2)))
+    return cycles[len(cycles) // 2]
+
+
+def _draw(figure: Figure, cycle: Cycle) -> None:
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2.0, 1.0))
+    seconds = (cycle.samples["time_ns"] - cycle.samples["time_ns"][0]) * NS
+    measured = cycle.samples["pressure"].astype(float) / MBAR
+    fitted = cycle.ticks["expected"].astype(float) / MBAR
+    above.plot(seconds, measured, color=MEASURED, linewidth=1.6, label="measured")
+    above.plot(seconds, fitted, color=AFTER, linewidth=1.0, label="fitted")
+    above.set_ylabel("pressure, mbar absolute")
+    below.plot(seconds, cycle.off, color=AFTER, linewidth=0.8)
+    below.set_ylabel("measured less\nfitted, mbar")
+    below.set_xlabel("time since suction was commanded, s")
+    blown = cycle.ticks["phase"] == Phase.BLOW_OFF
+    for axes in (above, below):
+        axes.fill_between(
+            seconds, 0, 1, where=blown, transform=axes.get_xaxis_transform(), color="#eeeeee"
+        )
+    legend(figure, (above,))

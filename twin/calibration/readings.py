@@ -1,0 +1,254 @@
+"""What a record shows by itself, before any model: noise, steps, cadence, switching, delays.
+
+A commissioning starts from these readings. They are rough (some per cent, some milliseconds) and
+need nothing but commands and pressure; the fit refines them.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from twin.model.gas import GAMMA, R
+from twin.signals import MBAR, MS, NS, UNUSABLE, Command, Samples
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+# Noise is what is left beside a parabola over two periods of the mains, so that hum counts. Edges
+# are in few of such windows, so a low quantile of them is noise.
+WINDOW_MS, FEWEST_ROWS = 40.0, 16
+QUIET = 0.3
+SMOOTH_MS = 20.0  # a period of the mains; over it turning points are looked for
+CLEAR = 6.0  # sigmas of the smoothed pressure that make a turn
+LEAST_TURN = 1.5 * MBAR  # Pa
+EDGE_MS = 30.0  # after a command, in which a turn is still the valve's delay
+LEAST_VACUUM = 20.0 * MBAR  # Pa
+MOST_SUCTIONS = 0.5  # of all suctions must turn for an ejector that saves air
+OPENED_MS = 40.0  # at the end of an idle, over which an opened system stands at ambient
+STILL = 3.0  # sigmas by which the pressure of an opened system may still move in them
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Rows of one command, first to last exclusive."""
+
+    command: int
+    first: int
+    last: int
+
+
+@dataclass(frozen=True)
+class Readings:
+    """What a record shows without a model. Pressures in Pa, absolute; NaN where it shows none."""
+
+    period: float  # s, the usual time between rows
+    missing: float  # share of rows that are not there
+    noise: float  # Pa, one standard deviation, steps of the converter included
+    step: float  # Pa, the smallest difference between two readings
+    idle: float  # Pa, the reading at the end of an idle: ambient, where the system is opened
+    opened: bool  # idles end at one pressure that stands still
+    suctions: int
+    off: float  # Pa, at which the nozzle goes off (median of the turns)
+    on: float  # Pa, at which it goes on again
+    switches: int  # how many suctions show the nozzle go off
+    deepest: float  # Pa, the lowest pressure
+    highest: float  # Pa
+    rises_in_suction: bool  # and falls in blow-off: commands or sign are swapped
+    response: float  # s, from the suction command until the pressure falls
+    blow_off_response: float  # s
+    fill_rate: float  # 1/s, dp/dt over ambient as blow-off begins
+    draw_rate: float  # 1/s, −dp/dt over pressure as suction begins
+
+    @property
+    def least_vacuum(self) -> float:
+        """Vacuum (Pa) that an ejector makes if it makes any."""
+        return max(LEAST_VACUUM, 10.0 * self.noise)
+
+    @property
+    def saves_air(self) -> bool:
+        """Whether the ejector switches its nozzle off by itself."""
+        return self.switches > MOST_SUCTIONS * self.suctions
+
+    def capacity(self, volume: float, ambient: float, temperature: float) -> float:
+        """Suction (kg/s) at ambient that empties ``volume`` (m³) as fast as the record shows.
+
+        Between an isothermal and an adiabatic vessel; so within a fifth.
+        """
+        between = (1.0 + 1.0 / GAMMA) / 2.0
+        return self.draw_rate * volume * ambient / (R * temperature) * between
+
+    def blow_off(self, volume: float, ambient: float, temperature: float) -> float:
+        """Blow-off flow (kg/s) that fills ``volume`` (m³) as fast as the record shows."""
+        between = (1.0 + 1.0 / GAMMA) / 2.0
+        return self.fill_rate * volume * ambient / (R * temperature) * between
+
+
+def read(samples: Samples) -> Readings:
+    """Read ``samples``, at least one suction among them."""
+    usable = ((samples["quality"] & UNUSABLE) == 0) & np.isfinite(samples["pressure"])
+    rows = samples[usable]
+    pressure = rows["pressure"].astype(np.float64)
+    apart = np.diff(rows["time_ns"]) * NS
+    period = float(np.median(apart))
+    numbers = samples["sequence"]
+    span = max(int(numbers[-1] - numbers[0]) + 1, 1)
+    noise, step = noise_of(pressure, period), _step(pressure)
+    noise = max(noise, step / np.sqrt(12.0))
+    found = list(stretches(rows["commands"]))
+    width = max(round(SMOOTH_MS * MS / period), 3)
+    edge = max(round(EDGE_MS * MS / period), 1)
+    turn = max(CLEAR * noise / np.sqrt(width), LEAST_TURN)
+    suctions = [one for one in found if one.command == Command.SUCTION]
+    offs, ons, switches = [], [], 0
+    for one in suctions:
+        smooth = _smoothed(pressure[one.first : one.last], width)
+        lows, highs = turns(smooth[edge:], turn)
+        offs += list(smooth[edge:][lows])
+        ons += list(smooth[edge:][highs])
+        switches += len(lows) > 0
+    idle, opened = _idle(pressure, found, round(OPENED_MS * MS / period), noise)
+    return Readings(
+        period=period,
+        missing=1.0 - len(rows) / span,
+        noise=noise,
+        step=step,
+        idle=idle,
+        opened=opened,
+        suctions=len(suctions),
+        off=_median(offs),
+        on=_median(ons),
+        switches=switches,
+        deepest=float(pressure.min()),
+        highest=float(pressure.max()),
+        rises_in_suction=_rises(pressure, found, Command.SUCTION)
+        and not _rises(pressure, found, Command.BLOW_OFF),
+        response=_median(_delays(pressure, suctions, -1.0, noise)) * period,
+        blow_off_response=_median(
+            _delays(pressure, [o for o in found if o.command == Command.BLOW_OFF], 1.0, noise)
+        )
+        * period,
+        fill_rate=_fill_rate(pressure, found, period, idle),
+        draw_rate=_draw_rate(pressure, suctions, period),
+    )
+
+
+def stretches(commands: npt.NDArray[np.uint8]) -> Iterator[Stretch]:
+    """Stretches of one command, in order; blow-off wins over suction."""
+    told = np.where(commands & Command.BLOW_OFF, int(Command.BLOW_OFF), commands & Command.SUCTION)
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(told)) + 1, [len(told)]])
+    for first, last in pairwise(edges.tolist()):
+        yield Stretch(int(told[first]), first, last)
+
+
+def noise_of(pressure: Floats, period: float) -> float:
+    """Noise of readings (Pa), hum and steps of the converter included."""
+    rows = max(round(WINDOW_MS * MS / period), FEWEST_ROWS)
+    windows = pressure[: len(pressure) // rows * rows].reshape(-1, rows)
+    if not len(windows):
+        return float("nan")
+    smooth = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, rows), 3))[0]
+    left = windows - (windows @ smooth) @ smooth.T
+    variance = np.sum(left**2, axis=1) / (rows - 3)
+    return float(np.sqrt(np.quantile(variance, QUIET)))
+
+
+def turns(smooth: Floats, least: float) -> tuple[list[int], list[int]]:
+    """Rows of the lows and the highs between which ``smooth`` moves by at least ``least``.
+
+    It begins by falling. A last low or high that nothing follows is none.
+    """
+    found: tuple[list[int], list[int]] = ([], [])
+    falling, best = True, 0
+    for row, value in enumerate(smooth.tolist()):
+        if (value < smooth[best]) if falling else (value > smooth[best]):
+            best = row
+        elif abs(value - smooth[best]) >= least:
+            found[0 if falling else 1].append(best)
+            falling, best = not falling, row
+    return found
+
+
+def _smoothed(pressure: Floats, width: int) -> Floats:
+    """Mean over ``width`` rows about each; fewer at the ends."""
+    sums = np.convolve(pressure, np.ones(width), "same")
+    return sums / np.convolve(np.ones(len(pressure)), np.ones(width), "same")
+
+
+def _step(pressure: Floats) -> float:
+    """The smallest difference (Pa) between readings that many show: a step of the converter."""
+    levels = np.unique(np.round(pressure, 1))
+    return float(np.quantile(np.diff(levels), 0.1)) if len(levels) > 2 else 0.0
+
+
+def _idle(pressure: Floats, found: list[Stretch], rows: int, noise: float) -> tuple[float, bool]:
+    """What idles end at, and whether each stands still there, all at one pressure."""
+    ends = [
+        pressure[one.last - rows : one.last]
+        for one in found[1:]
+        if one.command == 0 and one.last - one.first >= 2 * rows
+    ]
+    if not ends:
+        return float("nan"), False
+    half = rows // 2
+    moves = [abs(end[half:].mean() - end[:half].mean()) for end in ends]
+    levels = np.array([end.mean() for end in ends])
+    still = STILL * noise * np.sqrt(2.0 / max(half, 1)) + 0.1 * MBAR
+    opened = bool(np.median(moves) < still and np.ptp(levels) < 2.0 * MBAR + 4.0 * noise)
+    return float(np.median(levels)), opened
+
+
+def _rises(pressure: Floats, found: list[Stretch], command: int) -> bool:
+    """Whether the pressure ends higher than it began in most stretches of a command."""
+    moves = [
+        pressure[one.last - 1] - pressure[one.first] for one in found if one.command == command
+    ]
+    return bool(moves) and float(np.median(moves)) > 0.0
+
+
+def _delays(pressure: Floats, found: list[Stretch], sign: float, noise: float) -> list[float]:
+    """Rows from a command until the pressure moves ``sign`` by five sigmas for three rows."""
+    rows = []
+    for one in found:
+        before = pressure[max(one.first - 10, 0) : one.first]
+        if len(before) < 3:
+            continue
+        moved = sign * (pressure[one.first : one.last] - before.mean()) > 5.0 * noise
+        held = np.flatnonzero(moved[:-2] & moved[1:-1] & moved[2:])
+        if len(held):
+            rows.append(float(held[0]))
+    return rows
+
+
+def _draw_rate(pressure: Floats, suctions: list[Stretch], period: float) -> float:
+    """−dp/dt over p (1/s) at its steepest between a tenth and a third of the way down."""
+    rates = []
+    for one in suctions:
+        part = pressure[one.first : one.last]
+        way = part[0] - part.min()
+        begun, ended = (np.flatnonzero(part < part[0] - share * way) for share in (0.1, 0.33))
+        if len(ended) and ended[0] > begun[0]:
+            first, last = begun[0], ended[0]
+            rates.append(np.log(part[first] / part[last]) / ((last - first) * period))
+    return _median(rates)
+
+
+def _fill_rate(pressure: Floats, found: list[Stretch], period: float, ambient: float) -> float:
+    """dp/dt over ambient (1/s) between a third and two thirds of the way up."""
+    rates = []
+    for one in found:
+        if one.command == Command.BLOW_OFF:
+            part = pressure[one.first : one.last]
+            top = min(part.max(), ambient) if np.isfinite(ambient) else part.max()
+            way = top - part[0]
+            begun, ended = (np.flatnonzero(part > part[0] + share * way) for share in (0.33, 0.67))
+            if len(ended) and ended[0] > begun[0]:
+                rise = part[ended[0]] - part[begun[0]]
+                rates.append(rise / ((ended[0] - begun[0]) * period) / top)
+    return _median(rates)
+
+
+def _median(values: list[float]) -> float:
+    return float(np.median(values)) if values else float("nan")

@@ -1,0 +1,89 @@
+"""How well a calibrated twin follows the record it was fitted to, phase by phase.
+
+What is left beside the model has two parts. What is the same in all cycles is the model's own
+error. What differs from cycle to cycle is noise, quantisation and scatter: no model of this unit
+can do better, so it is the floor of the record.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.calibration.cycles import Cycles
+from twin.model.dataset import DataSet, coefficients
+from twin.monitor.bins import Floats, Ints
+from twin.signals import MBAR, Phase
+
+GOOD, USABLE = 1.5, 2.0  # times the floor
+LEAST_FLOOR = 0.3 * MBAR  # Pa; nobody needs a twin nearer than that
+FEWEST = 3  # cycles that show one place, to tell what is common from what scatters
+WEAKENS = {
+    Phase.IDLE: "leaks and heat while nothing is commanded",
+    Phase.SUCTION: "suction, end vacuum, volume and valve response",
+    Phase.HOLD: "leaks and the check valve",
+    Phase.BLOW_OFF: "blow-off",
+}
+
+
+@dataclass(frozen=True)
+class Residual:
+    """What is left in one phase (Pa rms), and the floor of the record there."""
+
+    left: float
+    floor: float
+
+    @property
+    def times(self) -> float:
+        """What is left over the floor."""
+        return self.left / max(self.floor, LEAST_FLOOR)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """``good``, ``usable`` or ``refused``, with what is left in each phase."""
+
+    residuals: Mapping[Phase, Residual]
+
+    @property
+    def word(self) -> str:
+        """The verdict in a word: by the worst phase."""
+        worst = max(one.times for one in self.residuals.values())
+        return "good" if worst <= GOOD else "usable" if worst <= USABLE else "refused"
+
+    @property
+    def weak(self) -> list[Phase]:
+        """Phases that the twin follows less well than the record allows, the worst first."""
+        weak = [phase for phase, one in self.residuals.items() if one.times > GOOD]
+        return sorted(weak, key=lambda phase: -self.residuals[phase].times)
+
+
+def judge(cycles: Cycles, data: DataSet, noise: float) -> Verdict:
+    """Judge the twin of ``data`` on ``cycles``; ``noise`` (Pa) is that of single readings."""
+    off = cycles.off(coefficients(data).reshape(-1, 1))[:, 0]
+    bins = cycles.bins
+    used = (bins.cycle >= 1) & np.isfinite(off)  # the model swings in in the first
+    found = {}
+    for phase in Phase:
+        here = used & (_phase_of(bins.kind) == phase)
+        if here.any():
+            found[phase] = _residual(off[here], bins.place[here], bins.count[here], noise)
+    return Verdict(found)
+
+
+def _phase_of(kind: Ints) -> Ints:
+    """Phase of each kind of stretch; suction after a hold is suction."""
+    phase: Ints = np.where(kind > max(Phase), int(Phase.SUCTION), kind)
+    return phase
+
+
+def _residual(off: Floats, place: Ints, count: Ints, noise: float) -> Residual:
+    """Rms over rows, with the noise of single readings added to the means of bins."""
+    _, number, many = np.unique(place, return_inverse=True, return_counts=True)
+    mean = np.bincount(number, off) / many
+    apart = (off - mean[number]) ** 2 * (many / np.maximum(many - 1, 1))[number]
+    shown = (many >= FEWEST)[number]
+    single = noise**2 * (1.0 - 1.0 / count)  # what averaging over a bin took away
+    left = np.average(off**2 + single, weights=count)
+    floor = np.average((apart + single)[shown], weights=count[shown]) if shown.any() else noise**2
+    return Residual(float(np.sqrt(left)), float(np.sqrt(floor)))
