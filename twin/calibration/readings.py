@@ -1,7 +1,7 @@
-"""What a record shows by itself, before any model: noise, steps, cadence, switching, delays.
+"""What a record shows by itself, before any model: noise, steps, cadence, switching, flows.
 
-A commissioning starts from these readings. They are rough (some per cent, some milliseconds) and
-need nothing but commands and pressure; the fit refines them.
+A commissioning starts from these readings. They are rough, to some per cent, and need
+nothing but commands and pressure; the fit refines them.
 """
 
 from collections.abc import Iterator
@@ -15,7 +15,6 @@ from twin.model.gas import GAMMA, R
 from twin.signals import MBAR, MS, NS, UNUSABLE, Command, Samples
 
 Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 # Noise is what is left beside a parabola over two periods of the mains, so that hum counts. Edges
 # are in few of such windows, so a low quantile of them is noise.
@@ -57,8 +56,6 @@ class Readings:
     deepest: float  # Pa, the lowest pressure
     highest: float  # Pa
     rises_in_suction: bool  # and falls in blow-off: commands or sign are swapped
-    response: float  # s, from the suction command until the pressure falls
-    blow_off_response: float  # s
     fill_rate: float  # 1/s, dp/dt over ambient as blow-off begins
     draw_rate: float  # 1/s, −dp/dt over pressure as suction begins
 
@@ -73,17 +70,12 @@ class Readings:
         return self.switches > MOST_SUCTIONS * self.suctions
 
     def capacity(self, volume: float, ambient: float, temperature: float) -> float:
-        """Suction (kg/s) at ambient that empties ``volume`` (m³) as fast as the record shows.
-
-        Between an isothermal and an adiabatic vessel; so within a fifth.
-        """
-        between = (1.0 + 1.0 / GAMMA) / 2.0
-        return self.draw_rate * volume * ambient / (R * temperature) * between
+        """Suction (kg/s) at ambient that empties ``volume`` (m³) as fast as the record shows."""
+        return _flow(self.draw_rate, volume, ambient, temperature)
 
     def blow_off(self, volume: float, ambient: float, temperature: float) -> float:
         """Blow-off flow (kg/s) that fills ``volume`` (m³) as fast as the record shows."""
-        between = (1.0 + 1.0 / GAMMA) / 2.0
-        return self.fill_rate * volume * ambient / (R * temperature) * between
+        return _flow(self.fill_rate, volume, ambient, temperature)
 
 
 def read(samples: Samples) -> Readings:
@@ -125,11 +117,6 @@ def read(samples: Samples) -> Readings:
         highest=float(pressure.max()),
         rises_in_suction=_rises(pressure, found, Command.SUCTION)
         and not _rises(pressure, found, Command.BLOW_OFF),
-        response=_median(_delays(pressure, suctions, -1.0, noise)) * period,
-        blow_off_response=_median(
-            _delays(pressure, [o for o in found if o.command == Command.BLOW_OFF], 1.0, noise)
-        )
-        * period,
         fill_rate=_fill_rate(pressure, found, period, idle),
         draw_rate=_draw_rate(pressure, suctions, period),
     )
@@ -208,20 +195,6 @@ def _rises(pressure: Floats, found: list[Stretch], command: int) -> bool:
     return bool(moves) and float(np.median(moves)) > 0.0
 
 
-def _delays(pressure: Floats, found: list[Stretch], sign: float, noise: float) -> list[float]:
-    """Rows from a command until the pressure moves ``sign`` by five sigmas for three rows."""
-    rows = []
-    for one in found:
-        before = pressure[max(one.first - 10, 0) : one.first]
-        if len(before) < 3:
-            continue
-        moved = sign * (pressure[one.first : one.last] - before.mean()) > 5.0 * noise
-        held = np.flatnonzero(moved[:-2] & moved[1:-1] & moved[2:])
-        if len(held):
-            rows.append(float(held[0]))
-    return rows
-
-
 def _draw_rate(pressure: Floats, suctions: list[Stretch], period: float) -> float:
     """−dp/dt over p (1/s) at its steepest between a tenth and a third of the way down."""
     rates = []
@@ -248,6 +221,15 @@ def _fill_rate(pressure: Floats, found: list[Stretch], period: float, ambient: f
                 rise = part[ended[0]] - part[begun[0]]
                 rates.append(rise / ((ended[0] - begun[0]) * period) / top)
     return _median(rates)
+
+
+def _flow(rate: float, volume: float, ambient: float, temperature: float) -> float:
+    """Flow (kg/s) behind a relative change of pressure (1/s), within a fifth.
+
+    Half-way between a vessel that stays as warm as its wall and one without any heat from it.
+    """
+    between = (1.0 + 1.0 / GAMMA) / 2.0
+    return rate * volume * ambient / (R * temperature) * between
 
 
 def _median(values: list[float]) -> float:
