@@ -18,6 +18,8 @@ class Free:
     ``spread`` is one standard deviation from unit to unit and from what is configured: a share of
     the value where ``relative``, else in its unit. ``healthy`` is how many of them below and above
     the type's value a unit is still taken for healthy; None where the value only shapes the curve.
+    ``market`` is the spread where nobody knows the type: of the logarithm where the value is
+    ``scaled``, else in its unit. It is wide enough for any rig that is on the market.
     """
 
     table: str
@@ -28,6 +30,8 @@ class Free:
     high: float
     relative: bool = False
     healthy: tuple[float, float] | None = None
+    market: float = 0.0
+    scaled: bool = True
 
     @property
     def name(self) -> str:
@@ -47,28 +51,28 @@ _E = "ejector"
 _ANY = (4.0, 4.0)
 FREE = (
     # A worn nozzle moves less air; a unit that moves more than its type is only a good one.
-    Free(_E, "suction_capacity_sl_min", "sl/min", 0.1, 1.0, 1000.0, True, (1.2, 4.0)),
-    Free(_E, "end_pressure_mbar", "mbar", 40.0, 10.0, 700.0, healthy=(4.0, 2.0)),
-    Free(_E, "bulge", "", 0.5, -0.9, 3.0),
-    Free(_E, "skew", "", 0.2, -5.0, 5.0),
-    Free(_E, "bend_2", "", 0.15, -10.0, 10.0),
-    Free(_E, "bend_3", "", 0.05, -10.0, 10.0),
-    Free(_E, "response_ms", "ms", 5.0, 0.0, 400.0, healthy=_ANY),
-    Free(_E, "response_off_ms", "ms", 4.0, 0.0, 400.0),
-    Free(_E, "ramp_up_ms", "ms", 3.0, 0.5, 200.0),
-    Free(_E, "ramp_down_ms", "ms", 1.5, 0.5, 200.0),
-    Free(_E, "blow_off_sl_min", "sl/min", 0.3, 1.0, 2000.0, True, healthy=_ANY),
-    Free(_E, "blow_off_response_ms", "ms", 5.0, 0.0, 400.0, healthy=_ANY),
-    Free(_E, "blow_off_response_off_ms", "ms", 4.0, 0.0, 400.0),
-    Free(_E, "blow_off_ramp_ms", "ms", 3.0, 0.5, 200.0),
-    Free(_E, "relief_sl_min", "sl/min", 0.4, 0.0, 5000.0, True),
-    Free("system", "film_coefficient", "W/(m²·K)", 4.0, 0.0, 500.0, healthy=_ANY),
-    Free("system", "tube_film_coefficient", "W/(m²·K)", 30.0, 0.0, 500.0),
-    Free("system", "line_factor", "", 0.4, 0.05, 20.0, healthy=_ANY),
-    Free("system", "line_share", "", 0.2, 0.05, 0.95),
-    Free("system", "sensor_shift", "", 0.2, -1.0, 1.0),
-    Free("system", "leak_sl_min", "sl/min", 1.0, 0.0, 60.0, healthy=(1.0, 0.6)),
-    Free("sensor", "lag_ms", "ms", 1.0, 0.5, 200.0),
+    Free(_E, "suction_capacity_sl_min", "sl/min", 0.1, 1.0, 1000.0, True, (1.2, 4.0), market=0.5),
+    Free(_E, "end_pressure_mbar", "mbar", 40.0, 10.0, 700.0, healthy=(4.0, 2.0), market=0.5),
+    Free(_E, "bulge", "", 0.5, -0.9, 3.0, market=0.8, scaled=False),
+    Free(_E, "skew", "", 0.2, -5.0, 5.0, market=0.5, scaled=False),
+    Free(_E, "bend_2", "", 0.15, -10.0, 10.0, market=0.4, scaled=False),
+    Free(_E, "bend_3", "", 0.05, -10.0, 10.0, market=0.2, scaled=False),
+    Free(_E, "response_ms", "ms", 5.0, 0.0, 400.0, healthy=_ANY, market=0.6),
+    Free(_E, "response_off_ms", "ms", 4.0, 0.0, 400.0, market=0.6),
+    Free(_E, "ramp_up_ms", "ms", 3.0, 0.5, 200.0, market=0.7),
+    Free(_E, "ramp_down_ms", "ms", 1.5, 0.5, 200.0, market=1.2),
+    Free(_E, "blow_off_sl_min", "sl/min", 0.3, 1.0, 2000.0, True, healthy=_ANY, market=1.0),
+    Free(_E, "blow_off_response_ms", "ms", 5.0, 0.0, 400.0, healthy=_ANY, market=0.6),
+    Free(_E, "blow_off_response_off_ms", "ms", 4.0, 0.0, 400.0, market=0.6),
+    Free(_E, "blow_off_ramp_ms", "ms", 3.0, 0.5, 200.0, market=0.7),
+    Free(_E, "relief_sl_min", "sl/min", 0.4, 0.0, 5000.0, True, market=1.5),
+    Free("system", "film_coefficient", "W/(m²·K)", 4.0, 0.0, 500.0, healthy=_ANY, market=0.7),
+    Free("system", "tube_film_coefficient", "W/(m²·K)", 30.0, 0.0, 500.0, market=1.0),
+    Free("system", "line_factor", "", 0.4, 0.05, 20.0, healthy=_ANY, market=1.2),
+    Free("system", "line_share", "", 0.2, 0.05, 0.95, market=0.25, scaled=False),
+    Free("system", "sensor_shift", "", 0.2, -1.0, 1.0, market=0.4, scaled=False),
+    Free("system", "leak_sl_min", "sl/min", 1.0, 0.0, 60.0, healthy=(1.0, 0.6), market=1.5),
+    Free("sensor", "lag_ms", "ms", 1.0, 0.5, 200.0, market=0.4),
 )
 _NUMBER = {free.key: number for number, free in enumerate(FREE)}
 _BENDS = [_NUMBER[key] for key in ("bulge", "skew", "bend_2", "bend_3")]
@@ -84,43 +88,13 @@ _SMOOTH = np.array(
 )
 
 
-# Where nobody knows the type: one standard deviation of the logarithm, over what the market has; of
-# what is ADDED, in its unit. Wide enough that no healthy rig is refused for being unusual.
+# What is free beside these where nobody knows the type.
 FREE_IN_MARKET = (
     *FREE,
-    Free(_E, "port_volume_ml", "ml", 0.2, 0.1, 1000.0, True),
-    Free(_E, "jet_depth", "", 0.2, 0.0, 1.0),
-    Free(_E, "exhaust_sl_min", "sl/min", 0.4, 0.0, 5000.0, True),
+    Free(_E, "port_volume_ml", "ml", 0.2, 0.1, 1000.0, True, market=1.0),
+    Free(_E, "jet_depth", "", 0.2, 0.0, 1.0, market=0.3, scaled=False),
+    Free(_E, "exhaust_sl_min", "sl/min", 0.4, 0.0, 5000.0, True, market=1.5),
 )
-ADDED = {f"{_E}.{key}" for key in ("bulge", "skew", "bend_2", "bend_3")}
-ADDED |= {"ejector.jet_depth", "system.line_share", "system.sensor_shift"}
-MARKET = {
-    "ejector.suction_capacity_sl_min": 0.5,
-    "ejector.end_pressure_mbar": 0.5,
-    "ejector.bulge": 0.8,
-    "ejector.skew": 0.5,
-    "ejector.bend_2": 0.4,
-    "ejector.bend_3": 0.2,
-    "ejector.response_ms": 0.6,
-    "ejector.response_off_ms": 0.6,
-    "ejector.ramp_up_ms": 0.7,
-    "ejector.ramp_down_ms": 1.2,
-    "ejector.blow_off_sl_min": 1.0,
-    "ejector.blow_off_response_ms": 0.6,
-    "ejector.blow_off_response_off_ms": 0.6,
-    "ejector.blow_off_ramp_ms": 0.7,
-    "ejector.relief_sl_min": 1.5,
-    "ejector.exhaust_sl_min": 1.5,
-    "ejector.jet_depth": 0.3,
-    "ejector.port_volume_ml": 1.0,
-    "system.film_coefficient": 0.7,
-    "system.tube_film_coefficient": 1.0,
-    "system.line_factor": 1.2,
-    "system.line_share": 0.25,
-    "system.sensor_shift": 0.4,
-    "system.leak_sl_min": 1.5,
-    "sensor.lag_ms": 0.4,
-}
 SMALLEST = 0.02  # in its unit, a value of the type from which a scale can lead away
 FARTHEST = 5.0  # of the logarithm, from the guess
 
@@ -170,10 +144,10 @@ class Space:
     @classmethod
     def of_market(cls, data: DataSet) -> "Space":
         """Any ejector on the market and what may hang on it; ``data`` is a guess."""
-        spread = np.array([MARKET[one.name] for one in FREE_IN_MARKET])
+        spread = np.array([one.market for one in FREE_IN_MARKET])
         ways = np.diag(spread)
         ways[np.ix_(_BENDS, _BENDS)] = _SMOOTH * spread[_BENDS]
-        scaled = np.array([one.name not in ADDED for one in FREE_IN_MARKET])
+        scaled = np.array([one.scaled for one in FREE_IN_MARKET])
         return cls(data, FREE_IN_MARKET, ways, scaled)
 
     def values(self, x: Floats) -> Floats:
