@@ -85,12 +85,12 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
 
     out = suction_flow(theta, port, jet, supply) + theta[c.RELIEF] * max(port - ambient, 0.0)
     out += max(-through_hole(theta[c.EXHAUST], port, ambient), 0.0)
-    blown = valve * theta[c.BLOW_OFF] * (supply + ambient)
-    blown /= theta[c.SUPPLY_NOMINAL] + theta[c.AMBIENT_NOMINAL]
+    blown = valve * theta[c.BLOW_OFF] * (1.0 + theta[c.BLOW_OFF_SHAPE] * (1.0 - port / ambient))
+    blown *= (supply + ambient) / (theta[c.SUPPLY_NOMINAL] + theta[c.AMBIENT_NOMINAL])
     if port < ambient:
         blown += through_hole(theta[c.BACK_FLOW] * (1.0 - min(jet, 1.0)), port, ambient)
-    seep = theta[c.LAMINAR_LEAK] + (valves.open or 0.0) * theta[c.OPENING]
-    leak = through_hole(theta[c.LEAK], vessel, ambient) + seep * (ambient - vessel)
+    hole = theta[c.LEAK] + (valves.open or 0.0) * theta[c.OPENING]
+    leak = through_hole(hole, vessel, ambient) + theta[c.LAMINAR_LEAK] * (ambient - vessel)
 
     far_t = vessel_t if far >= 0.0 else line_t
     leak_t = outside if vessel <= ambient else vessel_t

@@ -17,8 +17,8 @@
 enum { /* twin.model.theta.COEFFICIENTS */
     AMBIENT, AMBIENT_NOMINAL, TEMPERATURE, SUPPLY, DROOP, SUPPLY_LAG, SUPPLY_NOMINAL,
     SUPPLY_OPTIMUM, SUPPLY_CURVATURE, END_SLOPE, SUCTION, END_RATIO, BULGE, SKEW, BEND_2, BEND_3,
-    RESPONSE, RESPONSE_OFF, RAMP_UP, SLOW_RAMP_UP, JET_DEPTH, RAMP_DOWN, BLOW_OFF, BLOW_OFF_RESPONSE,
-    BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, RELIEF, EXHAUST, PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT,
+    RESPONSE, RESPONSE_OFF, RAMP_UP, SLOW_RAMP_UP, JET_DEPTH, RAMP_DOWN, BLOW_OFF, BLOW_OFF_SHAPE,
+    BLOW_OFF_RESPONSE, BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, RELIEF, EXHAUST, PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT,
     VOLUME, COMPLIANCE, FILM, AREA, NEAR_RESISTANCE, NEAR_LAMINAR, NEAR_INERTANCE, RESISTANCE,
     LAMINAR, INERTANCE, PLACE, LEAK, LAMINAR_LEAK, INFLOW, BACK_FLOW, OPENING, SENSOR_LAG, SLOW_SENSOR,
     SENSOR_OFFSET, SENSOR_GAIN, H1, H1_LOW, H2, H2_LOW, RELEASE, CONTROL_SENSOR, AIR_SAVING,
@@ -154,21 +154,22 @@ INLINED Port at_port(double p, const Driven *driven, const double *k)
     double back = K(BACK_FLOW) * (1.0 - min(driven->jet, 1.0));
     back = p < ambient ? back : 0.0;
     double vent = p > ambient ? K(EXHAUST) : 0.0;
+    double fuller = driven->blow_off * K(BLOW_OFF_SHAPE);
     return (Port){
         out - relief * ambient - vent * (flow.level - flow.slope * p),
         out_slope + relief - vent * flow.slope,
-        driven->blow_off + back * (flow.level - flow.slope * p),
-        back * flow.slope,
+        driven->blow_off + fuller + back * (flow.level - flow.slope * p),
+        back * flow.slope - fuller / ambient,
     };
 }
 
 INLINED Tangent at_vessel(double p, const Driven *driven, const double *k)
 {
     double ambient = K(AMBIENT);
-    double laminar = K(LAMINAR_LEAK) + driven->open * K(OPENING);
+    double laminar = K(LAMINAR_LEAK), sonic = K(LEAK) + driven->open * K(OPENING);
     Tangent flow = opening(p, ambient);
-    double slope = K(LEAK) * flow.slope - laminar;
-    double level = K(LEAK) * (flow.level - flow.slope * p) + laminar * ambient;
+    double slope = sonic * flow.slope - laminar;
+    double level = sonic * (flow.level - flow.slope * p) + laminar * ambient;
     return (Tangent){level + K(INFLOW), slope};
 }
 

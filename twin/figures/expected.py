@@ -94,7 +94,7 @@ class Expectation:
         if not self._theta[c.OPENING] > 0.0:
             return float("nan")
         opened = self._theta.copy()
-        opened[c.LAMINAR_LEAK] += opened[c.OPENING]
+        opened[c.LEAK] += opened[c.OPENING]
         rows = round(FREE_S * 1e3)
         commands = np.full(rows, Command.SUCTION, np.uint8)
         _, expected = strides.simulate(opened, np.full(rows, MS), commands)

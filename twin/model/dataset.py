@@ -92,6 +92,7 @@ class Ejector(Settings):
     ramp_down_ms: float = Field(4.0, ge=0.5, le=500.0)
     jet_depth: float = Field(1.0, ge=0.0, le=1.0)  # how much less deep a weaker jet draws
     blow_off_sl_min: NotNegative = 100.0
+    blow_off_shape: float = Field(0.0, ge=-0.9, le=3.0)  # how much more flows into full vacuum
     blow_off_response_ms: float = Field(15.0, ge=0.0, le=500.0)
     blow_off_response_off_ms: float = Field(12.0, ge=0.0, le=500.0)
     blow_off_ramp_ms: float = Field(5.0, ge=0.5, le=500.0)
@@ -156,6 +157,7 @@ class System(Settings):
     line_factor: NotNegative = 1.0  # flow resistance over what the parts add up to
     line_share: float = Field(0.6, gt=0.0, lt=1.0)  # of the tubes' volume, half-way along
     sensor_shift: float = Field(0.0, ge=-1.0, le=1.0)  # of its place: 1 is the whole line outwards
+    opening_factor: NotNegative = 1.0  # what flows through open cups over what they say
     leak_sl_min: NotNegative = 0.3  # of seals and fittings, sonic
     part_leaves: Literal["in_blow_off", "after_blow_off"] = "in_blow_off"
 
@@ -249,6 +251,7 @@ def _set_ejector(theta: Theta, ejector: Ejector, end_ratio: float) -> None:
     theta[c.JET_DEPTH] = ejector.jet_depth
     theta[c.RAMP_DOWN] = ejector.ramp_down_ms * MS / 2.0
     theta[c.BLOW_OFF] = ejector.blow_off_sl_min * SL_MIN
+    theta[c.BLOW_OFF_SHAPE] = ejector.blow_off_shape
     theta[c.BLOW_OFF_RESPONSE] = ejector.blow_off_response_ms * MS
     theta[c.BLOW_OFF_RESPONSE_OFF] = ejector.blow_off_response_off_ms * MS
     theta[c.BLOW_OFF_RAMP] = ejector.blow_off_ramp_ms * MS
@@ -284,9 +287,9 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     theta[c.NEAR_LAMINAR] = near * total.laminar * system.line_factor
     place = min(max(total.place + system.sensor_shift, 0.0), 1.0)
     theta[c.PLACE] = place * total.resistance * system.line_factor
-    theta[c.LEAK] = total.leak + system.leak_sl_min * SL_MIN
-    theta[c.LAMINAR_LEAK] = total.open
-    theta[c.OPENING] = total.opening
+    theta[c.LEAK] = total.leak + system.leak_sl_min * SL_MIN + total.open * system.opening_factor
+    theta[c.LAMINAR_LEAK] = 0.0
+    theta[c.OPENING] = total.opening * system.opening_factor
     late = system.part_leaves == "after_blow_off" and not math.isnan(total.release)
     theta[c.RELEASE] = AFTER_BLOW_OFF if late else total.release
 

@@ -186,11 +186,12 @@ def at_port(p, driven, k, i):  # type: ignore[no-untyped-def]
     back = back if p < ambient else 0.0
     vent = k[c.EXHAUST, i]
     vent = vent if p > ambient else 0.0
+    fuller = driven.blow_off * k[c.BLOW_OFF_SHAPE, i]
     return (
         out - relief * ambient - vent * (share - rise * p),
         out_slope + relief - vent * rise,
-        driven.blow_off + back * (share - rise * p),
-        back * rise,
+        driven.blow_off + fuller + back * (share - rise * p),
+        back * rise - fuller / ambient,
     )
 
 
@@ -201,10 +202,11 @@ def at_vessel(p, driven, k, i):  # type: ignore[no-untyped-def]
     An opening, a porous part, the rim of a cup without a part, and what else flows in.
     """
     ambient = k[c.AMBIENT, i]
-    laminar = k[c.LAMINAR_LEAK, i] + driven.open * k[c.OPENING, i]
+    laminar = k[c.LAMINAR_LEAK, i]
+    sonic = k[c.LEAK, i] + driven.open * k[c.OPENING, i]
     share, rise = opening(p, ambient)
-    slope = k[c.LEAK, i] * rise - laminar
-    level = k[c.LEAK, i] * (share - rise * p) + laminar * ambient
+    slope = sonic * rise - laminar
+    level = sonic * (share - rise * p) + laminar * ambient
     return level + k[c.INFLOW, i], slope
 
 

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from twin.model.gas import VISCOSITY, R
+from twin.model.gas import VISCOSITY, R, opening
 from twin.settings import Settings
 from twin.signals import MBAR, ML, SL_MIN
 
@@ -105,8 +105,8 @@ class Lumped:
     place: float  # of the sensor, as a share of the drop: 0 at the port, 1 at the vessel
     shrinks: float  # m³ at full vacuum
     leak: float  # kg/s sonic
-    opening: float  # kg/(s Pa) through the rims of all cups, when they stand open
-    open: float  # kg/(s Pa) through those that have no part
+    opening: float  # kg/s sonic, through the rims of all cups, when they stand open
+    open: float  # kg/s sonic, through those that have no part
     release: float  # Pa of vacuum; NaN where nothing is let go
 
 
@@ -125,7 +125,7 @@ def lumped(parts: tuple[Part, ...], suction: float, ambient: float, temperature:
         volumes += np.array(where) * volume(part)
         areas += np.array(where) * area(part)
     cups = [part for part in parts if isinstance(part, Cups)]
-    rim = [suction / (cup.free_flow_mbar * MBAR) for cup in cups]
+    rim = [suction / _share(cup.free_flow_mbar * MBAR, ambient) for cup in cups]
     return Lumped(
         port_volume=float(volumes[0]),
         port_area=float(areas[0]),
@@ -143,6 +143,12 @@ def lumped(parts: tuple[Part, ...], suction: float, ambient: float, temperature:
         open=sum(cup.open * one for cup, one in zip(cups, rim, strict=True)),
         release=min((cup.release_mbar * MBAR for cup in cups), default=math.nan),
     )
+
+
+def _share(vacuum: float, ambient: float) -> float:
+    """Flow through an opening into a ``vacuum`` (Pa) below ``ambient``, over its sonic flow."""
+    share, _ = opening.py_func(ambient - vacuum, ambient)  # type: ignore[no-untyped-call]
+    return float(share)
 
 
 def drop(part: Part, suction: float, ambient: float, temperature: float) -> tuple[float, float]:
