@@ -4,8 +4,9 @@ The record says what the configuration need not: noise, thresholds, ambient pres
 system is opened, rough flows and delays. From there the fit goes wherever the market may be.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from pydantic import ValidationError
@@ -20,18 +21,20 @@ from twin.calibration.calibrate import (
 )
 from twin.calibration.cycles import Cycles
 from twin.calibration.fit import Fitted, fit_from_afar
-from twin.calibration.parameters import Space
 from twin.calibration.readings import Readings, read
 from twin.calibration.verdict import Verdict, judge
 from twin.config import Config
 from twin.errors import ConfigError
-from twin.model.dataset import DataSet
+from twin.model import theta as c
+from twin.model.dataset import DataSet, coefficients
 from twin.model.system import Cups, volume
 from twin.signals import MBAR, ML, MS, SAMPLE, SL_MIN, Command, Samples
 
 SLOWEST = 2.0 * MS  # s between rows; what switches faster than a few rows is not seen
 MOST_MISSING = 0.2  # share of rows
 ROOM_TEMPERATURE = 293.15  # K, for a first guess
+# Where a fit starts: of the line, between sensor and port, and of all gas, in the port.
+PLACES, PORT_SHARES = (0.05, 0.95), (0.01, 0.15)
 CLEARLY = 15.0  # mbar by which a threshold must differ to be told; overshoot is part of a turn
 AMBIENT_CLEARLY = 3.0  # mbar, the same for ambient pressure
 
@@ -80,8 +83,7 @@ def commission(
     refuse_insufficient(samples, before)
     samples = samples[samples["time_ns"] <= before[-1].end_ns]
     used = samples[samples["time_ns"] <= before[:MOST_FITTED][-1].end_ns]
-    tried = [_fit(used, one, progress) for one in ways_to_release(guess)]
-    fitted = min(tried, key=lambda one: one.left)
+    fitted = _fit(used, starts(guess), progress)
     progress("judging the fit")
     verdict = judge(Cycles.found(samples, fitted.data), fitted.data, readings.noise)
     cycles = complete(fitted.data, samples)
@@ -124,9 +126,9 @@ def refuse_unreadable(readings: Readings) -> None:
         )
 
 
-def _fit(samples: Samples, guess: DataSet, progress: Callable[[str], None]) -> Fitted:
+def _fit(samples: Samples, guesses: Sequence[DataSet], progress: Callable[[str], None]) -> Fitted:
     try:
-        return fit_from_afar(samples, Space.of_market(guess), progress)
+        return fit_from_afar(samples, guesses, progress)
     except (ValidationError, np.linalg.LinAlgError) as error:
         raise ConfigError(
             "the fit ends at values that no ejector has: this is no record of the parts that"
@@ -159,25 +161,35 @@ def guessed(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:
     else:
         ejector["air_saving"] = "on" if ejector["air_saving"] == "off" else ejector["air_saving"]
         remarks += _thresholds(ejector, readings, ambient)
+    ejector["jet_depth"] = 0.5
     capacity = readings.capacity(_volume(data), ambient * MBAR, ROOM_TEMPERATURE) / SL_MIN
     if np.isfinite(capacity):
         ejector["suction_capacity_sl_min"] = float(np.clip(capacity, 1.0, 1000.0))
     blow_off = readings.blow_off(_volume(data), ambient * MBAR, ROOM_TEMPERATURE) / SL_MIN
     if np.isfinite(blow_off):
         ejector["blow_off_sl_min"] = float(np.clip(blow_off, 1.0, 2000.0))
-        ejector["jet_depth"] = 0.5
         ejector["exhaust_sl_min"] = ejector["blow_off_sl_min"]
         ejector["relief_sl_min"] = 0.3 * ejector["blow_off_sl_min"]
     return DataSet.model_validate(tables), remarks
 
 
-def ways_to_release(data: DataSet) -> list[DataSet]:
-    """``data``, and where it has cups also with a part that goes only when blow-off ends."""
-    if not any(isinstance(part, Cups) for part in data.system.parts):
-        return [data]
-    ways = ("in_blow_off", "after_blow_off")
-    systems = [data.system.model_copy(update={"part_leaves": way}) for way in ways]
-    return [data.model_copy(update={"system": system}) for system in systems]
+def starts(data: DataSet) -> list[DataSet]:
+    """``data``, and what may differ from it so much that no fit leads there.
+
+    Where along the line the sensor sits, what gas is at the port, and how a part leaves.
+    """
+    cups = any(isinstance(part, Cups) for part in data.system.parts)
+    ways = ("in_blow_off", "after_blow_off") if cups else (data.system.part_leaves,)
+    tables = data.model_dump()
+    theta = coefficients(data)
+    place = float(theta[c.PLACE] / (theta[c.NEAR_RESISTANCE] + theta[c.RESISTANCE]))
+    everything = _volume(data) / ML
+    found = []
+    for way, at, share in product(ways, PLACES, PORT_SHARES):
+        tables["system"].update(part_leaves=way, sensor_shift=at - place)
+        tables["ejector"]["port_volume_ml"] = share * everything
+        found.append(DataSet.model_validate(tables))
+    return found
 
 
 def _thresholds(ejector: dict[str, float], readings: Readings, ambient: float) -> list[Remark]:

@@ -9,11 +9,11 @@ import numpy.typing as npt
 
 from twin.model import kernel
 from twin.model.dataset import DataSet, coefficients
-from twin.monitor.bins import Bins, Floats, Ints, binned
+from twin.monitor.bins import Bins, Floats, Ints, binned, sparse
 from twin.monitor.knees import as_wide_as_needed, expected_knees
 from twin.monitor.phases import PhaseFinder
 from twin.monitor.signatures import steps
-from twin.signals import MBAR, UNUSABLE, Phase, Samples
+from twin.signals import MBAR, MS, UNUSABLE, Phase, Samples
 
 BINS = 6  # in each unit of warped time
 
@@ -27,6 +27,8 @@ class Cycles:
     phase: npt.NDArray[np.uint8]
     level: Floats
     bins: Bins
+    measured: Floats  # mean pressure (Pa) of each bin
+    drawn: Ints  # rows that suffice to draw what is expected
 
     @classmethod
     def found(cls, samples: Samples, data: DataSet, *, through: bool = False) -> "Cycles":
@@ -47,19 +49,31 @@ class Cycles:
         expected = _expected(theta.reshape(-1, 1), dt, phase, level)[:, 0]
         usable = ((rows["quality"] & UNUSABLE) == 0) & np.isfinite(rows["pressure"])
         bins = binned(phase, usable & np.isfinite(expected), _edges(phase), BINS)
-        return cls(rows, dt, phase, level, bins)
+        measured = bins.mean(rows["pressure"].astype(np.float64))
+        return cls(rows, dt, phase, level, bins, measured, _drawn(dt, phase, level))
 
     def off(self, theta: Floats, early: Sequence[int] = ()) -> Floats:
         """Measured minus expected pressure (Pa) in each bin for hypotheses, (coefficients, n).
 
         ``early`` says for each by how many rows the nozzle switches before it is seen to.
         """
-        phase = self._phases(early) if any(early) else self.phase.reshape(-1, 1)
+        moved = any(early)
+        phase = self._phases(early) if moved else self.phase[:, None]
+        changes = np.flatnonzero(np.diff(phase, axis=0).any(axis=1)) + 1
+        drawn = np.unique(np.concatenate([self.drawn, changes - 1, changes]))
+        dt = np.diff(np.cumsum(self.dt)[drawn], prepend=0.0)
+        phase, level = phase[drawn], self.level[drawn]
+
+        def run(part: slice) -> Floats:
+            phases = phase[:, part] if moved else phase
+            expected = _expected(theta[:, part], dt, phases, level, kernel.ROUGHLY)
+            off: Floats = self.measured[:, None] - self.bins.through(drawn, expected)
+            return off
+
         half = -(-theta.shape[1] // (2 * kernel.LANES)) * kernel.LANES
         parts = [slice(None, half), slice(half, None)] if half < theta.shape[1] else [slice(None)]
-        each = [(theta[:, part], phase[:, part] if any(early) else phase) for part in parts]
-        with ThreadPoolExecutor(len(each)) as pool:
-            return np.concatenate(list(pool.map(lambda one: self._off(*one), each)), axis=1)
+        with ThreadPoolExecutor(len(parts)) as pool:
+            return np.concatenate(list(pool.map(run, parts)), axis=1)
 
     def _phases(self, early: Sequence[int]) -> npt.NDArray[np.uint8]:
         """Phases with every switching moved, (rows, n)."""
@@ -69,10 +83,6 @@ class Cycles:
                 begin, end = (row - rows, row) if rows > 0 else (row, row - rows)
                 moved[max(begin, 0) : end, lane] = self.phase[row if rows > 0 else row - 1]
         return moved
-
-    def _off(self, theta: Floats, phase: npt.NDArray[np.uint8]) -> Floats:
-        expected = _expected(theta, self.dt, phase, self.level)
-        return self.bins.mean(self.samples["pressure"][:, None] - expected)
 
 
 def _switches(phase: npt.NDArray[np.uint8]) -> Ints:
@@ -89,8 +99,23 @@ def _edges(phase: npt.NDArray[np.uint8]) -> Ints:
     return np.flatnonzero(begins) + 1
 
 
-def _expected(theta: Floats, dt: Floats, phase: npt.NDArray[np.uint8], level: Floats) -> Floats:
+def _drawn(dt: Floats, phase: npt.NDArray[np.uint8], level: Floats) -> Ints:
+    """Rows that suffice to draw a course: where phases change, time breaks or a level is set."""
+    begins = np.isfinite(level) | (dt < 0.5 * MS) | (dt > 1.5 * MS)
+    begins[0] = True
+    begins[1:] |= np.diff(phase) != 0
+    return sparse(begins)
+
+
+def _expected(
+    theta: Floats,
+    dt: Floats,
+    phase: npt.NDArray[np.uint8],
+    level: Floats,
+    tolerance: float = kernel.TOLERANCE,
+) -> Floats:
     """Run hypotheses, (coefficients, n), over rows: (rows, n) in Pa."""
     expected = np.empty((len(dt), theta.shape[1]))
-    kernel.advance(kernel.new_state(theta.shape[1]), theta, dt, phase, level, expected)
+    state = kernel.new_state(theta.shape[1])
+    kernel.advance(state, theta, dt, phase, level, expected, tolerance=tolerance)
     return expected

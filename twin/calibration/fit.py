@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from twin.calibration.cycles import Cycles
 from twin.calibration.left_out import with_left_out
 from twin.calibration.parameters import Free, Space
-from twin.calibration.weights import Weights, weighted
+from twin.calibration.weights import Weights, plain, weighted
 from twin.model.dataset import RIPPLE, DataSet, coefficients
 from twin.signals import MBAR, Samples
 
@@ -25,13 +25,29 @@ ROUNDS = (1e-2, 1e-2, 1e-3)
 MOST_STEPS = 8  # in a round
 FIRST_SHARE = 0.4  # of the log, for the first round: it has the longest way to go
 DETERMINED = 0.5  # of what the type leaves open: what is known better comes from the log
-# The same for a fit from afar: what the model may be off by (Pa), round by round.
-NARROWING = (3.0 * MBAR, 1.0 * MBAR, 0.4 * MBAR)
 SWITCHING = 6.0  # rows, one standard deviation of when the nozzle switched
-MOST_FAR_STEPS, FAR_TOLERANCE = 50, 1e-4
 STEP = 0.05  # of a parameter's sigma, for derivatives
 
 Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Round:
+    """A round of a fit from afar: how many of the starts go through, on which cycles, how long."""
+
+    starts: int
+    share: float  # of the record
+    error: float  # Pa, what the model may be off by
+    steps: int
+    tolerance: float  # of the cost, below which it is done
+
+
+# All starts are tried on a few cycles; what they are off by is narrowed with what is left of them.
+NARROWING = (
+    Round(100, 0.3, 5.0 * MBAR, 25, 1e-2),
+    Round(3, 0.3, 1.5 * MBAR, 25, 1e-3),
+    Round(1, 1.0, 0.6 * MBAR, 50, 1e-4),
+)
 
 
 @dataclass
@@ -136,24 +152,55 @@ def fit(samples: Samples, space: Space, progress: Callable[[str], None]) -> Fitt
     return _fitted(problem, x)
 
 
-def fit_from_afar(samples: Samples, space: Space, progress: Callable[[str], None]) -> Fitted:
-    """Fit a unit that nobody has seen before, however far from the guess that ``space`` is about.
+@dataclass(frozen=True)
+class _Start:
+    """Where a fit from afar has come to from one of its starts."""
 
-    What the model may be off by begins wide and is narrowed, so that the fit follows the large
-    features first; residuals beyond it pull less than their square (a robust loss).
+    space: Space
+    x: Floats
+    cost: float = 0.0
+
+    @property
+    def data(self) -> DataSet:
+        return self.space.at(self.x)
+
+
+def fit_from_afar(
+    samples: Samples, guesses: Sequence[DataSet], progress: Callable[[str], None]
+) -> Fitted:
+    """Fit a unit that nobody has seen before, however far from the ``guesses`` it may be.
+
+    Each guess is a start, as a curve has more than one explanation near which a fit can end. What
+    the model may be off by begins wide and is narrowed, so that the fit follows the large features
+    first; residuals beyond it pull less than their square (a robust loss). No bin's error is taken
+    to be another's: what a fit may call scatter from cycle to cycle hides what it gets wrong.
     """
+    noise = guesses[0].sensor.noise_mbar * MBAR
+    spaces = [Space.of_market(guess) for guess in guesses]
+    starts = [_Start(space, np.zeros(len(space.free))) for space in spaces]
+    for number, one in enumerate(NARROWING, 1):
+        starts = starts[: one.starts]
+        progress(f"fitting, round {number} of {len(NARROWING)}: {len(starts)} starts")
+        rows = samples[: round(len(samples) * one.share)]
+        starts = sorted((_followed(rows, start, one, noise) for start in starts), key=_cost)
+    best = starts[0]
+    cycles = Cycles.found(samples, best.data, through=True)
+    weights = weighted(cycles, coefficients(best.data), noise, fitted=True)
+    return _fitted(Problem(best.space, cycles, weights), best.x)
+
+
+def _cost(start: _Start) -> float:
+    return start.cost
+
+
+def _followed(samples: Samples, start: _Start, one: Round, noise: float) -> _Start:
+    """Where a round leads from a start."""
+    cycles = Cycles.found(samples, start.data, through=True)
+    problem = Problem(start.space, cycles, plain(cycles, noise, one.error))
     # The last coordinate is how much sooner the nozzle switches than it was seen to.
-    x, best, noise = np.zeros(len(space.free) + 1), space.data, space.data.sensor.noise_mbar * MBAR
-    for turn, error in enumerate(NARROWING):
-        progress(f"fitting from afar, round {turn + 1} of {len(NARROWING)}")
-        rows = round(len(samples) * (FIRST_SHARE if turn == 0 else 1.0))
-        cycles = Cycles.found(samples[:rows], best, through=True)
-        weights = weighted(cycles, coefficients(best), noise, fitted=False, error=error)
-        x = _solved(Problem(space, cycles, weights), x, MOST_FAR_STEPS, FAR_TOLERANCE, "soft_l1")
-        best = space.at(x[:-1])
-        x[-1] = 0.0  # it is found anew, as the new data have it
-    weights = weighted(cycles, coefficients(best), noise, fitted=True)
-    return _fitted(Problem(space, cycles, weights), x[:-1])
+    x = _solved(problem, np.append(start.x, 0.0), one.steps, one.tolerance, "soft_l1")
+    cost = float(np.sum(np.log1p(problem.residual(x) ** 2)))
+    return _Start(start.space, x[:-1], cost)
 
 
 def _solved(

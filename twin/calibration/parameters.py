@@ -68,7 +68,7 @@ FREE = (
     Free(_E, "relief_sl_min", "sl/min", 0.4, 0.0, 5000.0, True, market=1.5),
     Free("system", "film_coefficient", "W/(m²·K)", 4.0, 0.0, 500.0, healthy=_ANY, market=0.7),
     Free("system", "tube_film_coefficient", "W/(m²·K)", 30.0, 0.0, 500.0, market=1.0),
-    Free("system", "line_factor", "", 0.4, 0.05, 20.0, healthy=_ANY, market=1.2),
+    Free("system", "line_factor", "", 0.4, 0.02, 1000.0, healthy=_ANY, market=1.2),
     Free("system", "line_share", "", 0.2, 0.05, 0.95, market=0.25, scaled=False),
     Free("system", "sensor_shift", "", 0.2, -1.0, 1.0, market=0.4, scaled=False),
     Free("system", "leak_sl_min", "sl/min", 1.0, 0.0, 60.0, healthy=(1.0, 0.6), market=1.5),
@@ -94,6 +94,8 @@ FREE_IN_MARKET = (
     Free(_E, "port_volume_ml", "ml", 0.2, 0.1, 1000.0, True, market=1.0),
     Free(_E, "jet_depth", "", 0.2, 0.0, 1.0, market=0.3, scaled=False),
     Free(_E, "exhaust_sl_min", "sl/min", 0.4, 0.0, 5000.0, True, market=1.5),
+    Free(_E, "blow_off_shape", "", 0.1, -0.9, 3.0, market=0.4, scaled=False),
+    Free("system", "opening_factor", "", 0.4, 1e-3, 100.0, True, market=1.5),
 )
 SMALLEST = 0.02  # in its unit, a value of the type from which a scale can lead away
 FARTHEST = 5.0  # of the logarithm, from the guess

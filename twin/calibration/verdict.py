@@ -17,6 +17,7 @@ from twin.signals import MBAR, Phase
 
 GOOD, USABLE = 1.5, 2.0  # times the floor
 LEAST_FLOOR = 0.3 * MBAR  # Pa; nobody needs a twin nearer than that
+ODD = 2.0  # times the middle cycle's rms
 FEWEST = 3  # cycles that show one place, to tell what is common from what scatters
 WEAKENS = {
     Phase.IDLE: "leaks and heat while nothing is commanded",
@@ -67,7 +68,9 @@ def judge(cycles: Cycles, data: DataSet, noise: float) -> Verdict:
     for phase in Phase:
         here = used & (_phase_of(bins.kind) == phase)
         if here.any():
-            found[phase] = _residual(off[here], bins.place[here], bins.count[here], noise)
+            found[phase] = _residual(
+                off[here], bins.place[here], bins.cycle[here], bins.count[here], noise
+            )
     return Verdict(found)
 
 
@@ -77,13 +80,21 @@ def _phase_of(kind: Ints) -> Ints:
     return phase
 
 
-def _residual(off: Floats, place: Ints, count: Ints, noise: float) -> Residual:
-    """Rms over rows, with the noise of single readings added to the means of bins."""
+def _residual(off: Floats, place: Ints, cycle: Ints, count: Ints, noise: float) -> Residual:
+    """Rms over rows, with the noise of single readings added to the means of bins.
+
+    A cycle in which something went wrong raises the floor no more than ODD times the middle one.
+    """
     _, number, many = np.unique(place, return_inverse=True, return_counts=True)
     mean = np.bincount(number, off) / many
     apart = (off - mean[number]) ** 2 * (many / np.maximum(many - 1, 1))[number]
     shown = (many >= FEWEST)[number]
     single = noise**2 * (1.0 - 1.0 / count)  # what averaging over a bin took away
     left = np.average(off**2 + single, weights=count)
-    floor = np.average((apart + single)[shown], weights=count[shown]) if shown.any() else noise**2
+    each = [
+        np.average((apart + single)[here], weights=count[here])
+        for one in np.unique(cycle[shown])
+        if (here := shown & (cycle == one)).any()
+    ]
+    floor = np.mean(np.minimum(each, ODD**2 * np.median(each))) if each else noise**2
     return Residual(float(np.sqrt(left)), float(np.sqrt(floor)))

@@ -38,12 +38,20 @@ class Weights:
         return [solve_triangular(factor, off[here], lower=True) for here, factor in self.parts]
 
 
-def weighted(
-    cycles: Cycles, theta: Theta, noise: float, *, fitted: bool, error: float = FIRST_ERROR
-) -> Weights:
+def plain(cycles: Cycles, noise: float, error: float) -> Weights:
+    """Weights where nobody knows yet what scatters: each bin by noise and ``error`` (Pa) alone."""
+    bins = cycles.bins
+    parts = []
+    for one in np.unique(bins.cycle[bins.cycle >= 1]):  # the model swings in in the first
+        here = np.flatnonzero(bins.cycle == one)
+        parts.append((here, np.diag(np.sqrt(error**2 + noise**2 / bins.count[here]))))
+    return Weights(parts)
+
+
+def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> Weights:
     """Weights for residuals about ``theta``, by what it leaves if it is ``fitted``.
 
-    ``noise`` (Pa) is the sensor's, ``error`` (Pa) the model's own where it is not fitted yet.
+    ``noise`` (Pa) is the sensor's.
     """
     bins = cycles.bins
     bigger = ("added_volume", {"volume": VOLUME * theta[c.VOLUME] / ML})
@@ -51,7 +59,7 @@ def weighted(
     moved = [apply(theta, name, sizes) for name, sizes in (bigger, *scattering)]
     off = cycles.off(np.stack([theta, *moved], axis=1))
     moves = off[:, 1:] - off[:, :1]
-    errors, cycle_error = np.full(len(off), error), np.zeros(len(off))
+    errors, cycle_error = np.full(len(off), FIRST_ERROR), np.zeros(len(off))
     if fitted:
         errors, cycle_error = _errors(off[:, 0], bins, noise)
     errors = np.hypot(errors, LATE * _slope(cycles))
