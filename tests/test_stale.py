@@ -156,7 +156,7 @@ def test_a_twin_that_is_late_says_so_once_and_nothing_is_stale() -> None:
     (told,) = seen.of(Kind.TWIN_LATE, *STALENESS)
     assert told.kind is Kind.TWIN_LATE
     assert told.severity is Severity.WARNING
-    assert told.time_ns == samples["time_ns"][3000]
+    assert told.time_ns == samples["time_ns"][2999]  # since then it took none
     assert told.data["seconds"] == pytest.approx(2.1)
     again = rigs.watch("test_rig", seen.samples)  # as a log has them
     assert again.events == [event for event in seen.events if event is not told]
@@ -341,3 +341,68 @@ def test_no_diagnosis_is_asked_for_while_it_is_stale(monkeypatch: pytest.MonkeyP
     )
     assert len(asked) == 1
     assert kinds(seen.of(*STALENESS)) == [Kind.PLC_STALE, Kind.PLC_BACK]
+
+
+# The order in which things are told.
+
+
+def restarted(samples: Samples, row: int, seconds: float, back_s: float) -> Samples:
+    """The same with a restart: the PLC counts anew, and its time begins ``back_s`` earlier."""
+    rest = lost(samples, row, seconds)
+    rest["quality"][row] = Quality.GAP | Quality.RESTART | Quality.CLOCK
+    rest["sequence"][row:] -= rest["sequence"][row]
+    rest["time_ns"][row:] -= round(back_s * S)
+    return rest
+
+
+class Echo:
+    """An adviser that says something to each event, at its time."""
+
+    def follow(self, samples: Samples, events: Sequence[Event]) -> list[Event]:
+        times = samples["time_ns"]
+        assert (np.diff(times) > 0).all()  # one time at once: it may look rows up by it
+        return [Event(one.time_ns, Kind.ALARM, str(one.kind)) for one in events]
+
+    def finish(self) -> list[Event]:
+        return []
+
+    def close(self) -> None: ...
+
+
+def with_advice(samples: Samples, size: int) -> list[Event]:
+    """What a replay tells of the rig's rows, received 5 ms after they were taken."""
+    samples["host_ns"] = samples["host_ns"] + 5 * MS
+    seen, blocks = Collect(), rigs.cut(samples, size)
+    run(blocks, rigs.twin("test_rig"), rigs.monitor("test_rig"), [seen], advisers=[Echo()])
+    return seen.events
+
+
+@pytest.mark.parametrize("size", [100, 60_000])
+def test_a_cycle_that_silence_cuts_is_told_before_the_silence(size: int) -> None:
+    begin = edges(healthy(40.0))[6] - 100  # it has come to idle
+    told = with_advice(lost(healthy(40.0), begin, 2.0), size)
+    times = [event.time_ns for event in told]
+    assert times == sorted(times)
+    said = [event.kind for event in told if event.kind is not Kind.ALARM]
+    stale = said.index(Kind.PLC_STALE)
+    assert said[stale - 1 : stale + 3] == [Kind.CYCLE, Kind.PLC_STALE, Kind.PLC_BACK, Kind.GAP]
+
+
+@pytest.mark.parametrize("size", [100, 60_000])
+@pytest.mark.parametrize("back_s", [1.8, 20.0, -100.0])
+def test_what_a_restart_cuts_is_told_in_its_own_time(size: int, back_s: float) -> None:
+    """The PLC's time steps back once, and so do the events: what went before it, then the rest."""
+    begin = edges(healthy(40.0))[6] - 100
+    samples = restarted(healthy(40.0), begin, 2.0, back_s)
+    told = with_advice(samples, size)
+    kinds_told = kinds(told)
+    first_after = kinds_told.index(Kind.PLC_BACK)
+    for part in (told[:first_after], told[first_after:]):
+        times = [event.time_ns for event in part]
+        assert times == sorted(times)
+    before = [kind for kind in kinds_told[:first_after] if kind is not Kind.ALARM]
+    assert before[-3:] == [Kind.CYCLE, Kind.CLOCK, Kind.PLC_STALE]
+    assert told[first_after].time_ns == samples["time_ns"][begin]
+    answered = [event for event in told if event.kind is Kind.ALARM]
+    assert len(answered) == len(told) / 2
+    assert all(told.index(one) > kinds_told.index(Kind(one.text)) for one in answered)

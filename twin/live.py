@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from heapq import merge
 from typing import Protocol
 
 import numpy as np
@@ -15,7 +14,7 @@ from twin.model.dataset import DataSet, coefficients
 from twin.model.strides import Strides
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
-from twin.monitor.detect import Monitor
+from twin.monitor.detect import Monitor, in_order
 from twin.monitor.knees import expected_knees
 from twin.monitor.listening import Listening
 from twin.monitor.phases import Found, Knees, PhaseFinder
@@ -121,29 +120,32 @@ def run(
     with ExitStack() as closing:
         for close in [sink.close for sink in sinks] + [adviser.close for adviser in advisers]:
             closing.callback(close)
-        for block, happened in timed:
-            samples, ticks = twin.advance(block)
-            events = happened + monitor.update(samples, ticks)
+        for samples, ticks, events in _watched(timed, twin, monitor):
             hand_out(sinks, samples, ticks, _advised(advisers, samples, events))
-        samples, ticks = twin.flush()
-        events = monitor.update(samples, ticks) + monitor.close()
-        hand_out(sinks, samples, ticks, _advised(advisers, samples, events))
-        if last_words := _last_words(advisers, samples[:0]):
-            hand_out(sinks, samples[:0], ticks[:0], last_words)
+        none = np.empty(0, SAMPLE), np.empty(0, TICK)
+        if last_words := _last_words(advisers, none[0]):
+            hand_out(sinks, *none, last_words)
+
+
+def _watched(
+    timed: Iterable[tuple[Samples, Sequence[Event]]], twin: Twin, monitor: Monitor
+) -> Iterator[tuple[Samples, Ticks, list[Event]]]:
+    """All rows with what they make happen, in the order of time within each PLC time."""
+    for block, happened in timed:
+        yield from monitor.over(*twin.advance(block), happened)
+    *parts, (samples, ticks, events) = monitor.over(*twin.flush())
+    yield from parts
+    yield samples, ticks, in_order([*events, *monitor.close()])
 
 
 def _advised(advisers: Sequence[Adviser], samples: Samples, events: list[Event]) -> list[Event]:
     """What happened with what advisers say to it, in the order of time; each hears those before it.
 
-    Both keep their own order: where the PLC's time jumps, nothing comes before what it follows.
+    Rows and events are of one PLC time.
     """
     for adviser in advisers:
-        events = [*merge(events, adviser.follow(samples, events), key=_time_of)]
+        events = in_order([*events, *adviser.follow(samples, events)])
     return events
-
-
-def _time_of(event: Event) -> int:
-    return event.time_ns
 
 
 def _last_words(advisers: Sequence[Adviser], none: Samples) -> list[Event]:

@@ -86,6 +86,7 @@ class Quality(IntFlag):
 # Plain numbers: with an IntFlag NumPy makes 64 bits of every byte.
 UNUSABLE = int(Quality.OVERFLOW | Quality.STALE | Quality.BAD)  # no pressure to compare with
 BREAK = int(Quality.GAP | Quality.RESTART | Quality.CLOCK)  # time does not run on from before
+NEW_TIME = int(Quality.RESTART | Quality.CLOCK)  # another PLC time begins, earlier or later
 
 
 def unseen_ns(before: Samples | np.void, after: Samples | np.void) -> npt.NDArray[np.int64]:
@@ -93,7 +94,7 @@ def unseen_ns(before: Samples | np.void, after: Samples | np.void) -> npt.NDArra
 
     By PLC time where it runs on; after a restart or a jump of it, by the times of receipt.
     """
-    runs_on = (after["quality"] & (Quality.RESTART | Quality.CLOCK)) == 0
+    runs_on = (after["quality"] & NEW_TIME) == 0
     by_plc, by_receipt = (after[name] - before[name] for name in ("time_ns", "host_ns"))
     passed: npt.NDArray[np.int64] = np.maximum(np.where(runs_on, by_plc, by_receipt), 0)
     return passed

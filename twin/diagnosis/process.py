@@ -27,7 +27,7 @@ from twin.diagnosis.words import Times, certainty, left_over, listed, sized, whe
 from twin.events import Event, Kind
 from twin.instants import SECOND_NS
 from twin.model.effects import EFFECTS
-from twin.signals import SAMPLE, Quality, Samples
+from twin.signals import NEW_TIME, SAMPLE, Samples
 
 CYCLES = 13  # that are kept: all but the first are judged, in which the model swings in
 MOST_ROWS = 300_000  # that are kept, however long cycles are
@@ -115,7 +115,7 @@ class LiveDiagnosis:
             self._first_ns, self._begin_ns = (
                 int(samples[name][0]) for name in ("host_ns", "time_ns")
             )
-        for row in np.flatnonzero(samples["quality"] & (Quality.RESTART | Quality.CLOCK))[-1:]:
+        for row in np.flatnonzero(samples["quality"] & NEW_TIME)[-1:]:
             since_ns = int(samples["host_ns"][row]) - self._first_ns
             self._begin_ns = int(samples["time_ns"][row]) - since_ns
 

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from twin.events import Event, Kind
 from twin.model.compiled import compiled
-from twin.signals import SAMPLE, Quality, Samples
+from twin.signals import NEW_TIME, SAMPLE, Samples
 
 WINDOW_NS = 5_000_000_000  # of PLC time; the fastest receipt of each counts
 KEPT = 120  # windows: ten minutes, over which the drift of a quartz is steady
@@ -30,8 +30,6 @@ OLDEST = 0.1  # of the windows may have come since the line was drawn that says 
 FARTHEST = 1000  # scans between two receipts; beyond, the period is not known that well
 UNSTEADY = 2.0  # times what the middle receipt came after the fastest: the fastest may be late too
 SHORTER, LONGER = 2, 12  # windows after which a way that is shorter, or longer, is a clock's doing
-
-_NEW = int(Quality.RESTART | Quality.CLOCK)  # after these another time begins
 
 Integers = npt.NDArray[np.int64]
 Floats = npt.NDArray[np.float64]
@@ -167,7 +165,7 @@ class ClockWatch:
         if not len(samples):
             return []
         events = []
-        if samples["quality"][0] & _NEW:
+        if samples["quality"][0] & NEW_TIME:
             events += self.close()
             self._begin()
         receipts = _receipts(self._receipt, samples)

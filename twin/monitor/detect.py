@@ -6,7 +6,7 @@ differ where no single one does. It is cleared, with hysteresis, when all are ba
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -22,7 +22,18 @@ from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, Look, Teller,
 from twin.monitor.healthy import Healthy
 from twin.monitor.signatures import Likeness, drawn_rows, likenesses, look_alikes
 from twin.settings import Settings
-from twin.signals import BREAK, NS, SAMPLE, TICK, Quality, Samples, Ticks, joined, unseen_ns
+from twin.signals import (
+    BREAK,
+    NEW_TIME,
+    NS,
+    SAMPLE,
+    TICK,
+    Quality,
+    Samples,
+    Ticks,
+    joined,
+    unseen_ns,
+)
 
 if TYPE_CHECKING:  # its SciPy would be imported with every configuration
     from twin.monitor.isolation import Heard, Isolation, Verdict
@@ -108,22 +119,44 @@ class Monitor:
 
     def update(self, samples: Samples, ticks: Ticks) -> list[Event]:
         """Take rows with the twin's ticks; give what they make happen."""
-        events = []
-        breaks = np.flatnonzero(samples["quality"] & BREAK).tolist()
-        for begin, end in pairwise([0, *breaks, len(samples)]):
-            rows = slice(begin, end)
-            found = list(self._stream_events(samples[rows]))
-            silent = any(event.kind is Kind.PLC_BACK for event in found)
-            silent |= bool((samples["quality"][begin : begin + 1] & Quality.OURS).any())
-            cycles = list(self._cutter.push(samples[rows], ticks[rows]))
-            found += self._judge(cycles, silent)
-            found += self.clocks.push(samples[rows]) if self.clocks else []
-            events += sorted(found, key=_order)  # as if row by row
+        return [event for _, _, events in self.over(samples, ticks) for event in events]
+
+    def over(
+        self, samples: Samples, ticks: Ticks, happened: Sequence[Event] = ()
+    ) -> Iterator[tuple[Samples, Ticks, list[Event]]]:
+        """Take rows with the twin's ticks; give them with what they make happen, in order of time.
+
+        Each part is of one PLC time: what a row with another one ends comes with the rows before
+        it. ``happened`` is what is known already since the rows of the last call. The last part
+        may be empty.
+        """
+        events, part = [*happened], 0
+        new_time = np.flatnonzero(samples["quality"] & NEW_TIME)
+        breaks = np.flatnonzero(samples["quality"] & BREAK)
+        bounds = {0, *breaks.tolist(), *(new_time + 1).tolist(), len(samples)}
+        for begin, end in pairwise(sorted(bounds)):
+            found = self._watch(samples[begin:end], ticks[begin:end])
+            if samples["quality"][begin] & NEW_TIME:  # then it is this row alone
+                now_ns = int(samples["time_ns"][begin])
+                events += [event for event in found if event.time_ns != now_ns]
+                if events or part < begin:
+                    yield samples[part:begin], ticks[part:begin], in_order(events)
+                events, part = [event for event in found if event.time_ns == now_ns], begin
+            else:
+                events += found
+        yield samples[part:], ticks[part:], in_order(events)
         if self.teller:
             self.teller.ahead(*self._cutter.begun)
         if self.isolation:
             self.isolation.ahead(*self._cutter.begun)
-        return events
+
+    def _watch(self, samples: Samples, ticks: Ticks) -> list[Event]:
+        """What rows make happen; a break may stand before the first one only."""
+        found = list(self._stream_events(samples))
+        silent = any(event.kind is Kind.PLC_BACK for event in found)
+        silent |= bool(samples["quality"][0] & Quality.OURS)
+        found += self._judge(list(self._cutter.push(samples, ticks)), silent)
+        return found + (self.clocks.push(samples) if self.clocks else [])
 
     def silent(self, last: np.void, listened_ns: int) -> list[Event]:
         """PLC_STALE, once, if the twin has listened too long since the ``last`` fresh row (ns)."""
@@ -218,7 +251,7 @@ class Monitor:
             text = f"the PLC is back after {silence_ms / 1e3:.2f} s"
             data = {"silence_ms": silence_ms}
             time_ns = int(row["time_ns"])
-            if not row["quality"] & (Quality.RESTART | Quality.CLOCK):
+            if not row["quality"] & NEW_TIME:
                 time_ns = max(time_ns, since_ns + self.stale_ns)  # a ring may have filled the pause
             events.append(Event(time_ns, Kind.PLC_BACK, text, data))
         return events
@@ -437,9 +470,9 @@ def _is_proportional(verdict: "Verdict | None") -> bool:
     return bool(verdict and verdict.causes and verdict.causes[0].is_small)
 
 
-def _order(event: Event) -> int:
-    """Where an event belongs among others; silence before what ends it, though rows fill it."""
-    return int(event.data["since_ns"]) if event.kind is Kind.PLC_STALE else event.time_ns
+def in_order(events: Iterable[Event]) -> list[Event]:
+    """Events of one PLC time in the order of time; of the same moment, as they came."""
+    return sorted(events, key=lambda event: event.time_ns)
 
 
 def _gap(before: np.void, row: np.void) -> Event:

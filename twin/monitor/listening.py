@@ -31,7 +31,7 @@ class Listening:
     def over(
         self, source: Iterable[Samples], monitor: Monitor
     ) -> Iterator[tuple[Samples, list[Event]]]:
-        """The blocks, with what the time they took makes happen."""
+        """The blocks, with what the time they took makes happen, in the PLC's time before them."""
         blocks = iter(source)
         asked_ns = self.clock()
         while (block := next(blocks, None)) is not None:
@@ -52,7 +52,7 @@ class Listening:
             if (block["host_ns"][first] - last["host_ns"] > monitor.stale_ns).any():
                 block = block.copy()
                 block["quality"][first] |= Quality.OURS.value
-            events = self._late(int(block["time_ns"][0]), now_ns, monitor.stale_ns)
+            events = self._late(int(last["time_ns"][0]), now_ns, monitor.stale_ns)
         self._last, self._heard_ns, self._listened_ns = block[fresh[-1:]].copy(), now_ns, 0
         return block, events
 
