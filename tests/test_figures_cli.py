@@ -75,6 +75,15 @@ def counted(out: str) -> list[list[str]]:
     return [line.split()[-2:] for line in out.splitlines()[1:]]
 
 
+def test_a_log_that_was_cut_off_is_shown_and_said_to_be(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(log.read_bytes()[:-100])
+    figures_app(["show", str(cut)], standalone_mode=False)
+    assert f"twin: {cut} is not complete; what can be read is used" in capsys.readouterr().err
+
+
 def test_a_log_is_shown_with_what_was_expected(run: Run, log: Path) -> None:
     head, *rows = run("show", log).splitlines()
     assert head.split()[:3] == ["cycle", "t0", "(ms)"]

@@ -112,6 +112,36 @@ def test_a_broken_log_costs_only_itself(
     assert "Traceback" not in said.err
 
 
+def test_a_log_that_was_cut_off_is_said_to_be(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, found = tmp_path / "cut.mcap", tmp_path / "f.json"
+    whole = (logs / "A1-0.mcap").read_bytes()
+    log.write_bytes(whole[:-100])
+    database = ("--assets", tmp_path / "f.sqlite")
+    for state in ("done", "known"):
+        assert twin(monkeypatch, "fleet", "diagnose", log, *database, "--json", found) == 0
+        said = capsys.readouterr()
+        assert f"twin: {log} is not complete; what can be read is diagnosed" in said.err
+        assert "0 could not be, 1 cut off; in" in said.out
+        (one,) = json.loads(found.read_text())["logs"]
+        assert (one["state"], one["log_complete"]) == (state, False)
+    assert twin(monkeypatch, "fleet", "report", *database, "--json", found) == 0  # of the database
+    assert "1 log cut off: judged by what is there" in capsys.readouterr().out
+    (unit,) = json.loads(found.read_text())["units"]
+    assert (unit["verdict"], unit["log_complete"]) == ("consistent", False)
+
+
+def test_commissioning_says_that_its_record_was_cut_off(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "cut.mcap"
+    log.write_bytes((logs / "A1-0.mcap").read_bytes()[:-100])
+    absent = tmp_path / "absent.toml"
+    assert twin(monkeypatch, "commission", log, "--config", absent, "--id", "A1") == 3
+    assert f"twin: {log} is not complete; what can be read is used" in capsys.readouterr().err
+
+
 def test_units_are_calibrated_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

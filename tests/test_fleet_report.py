@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +112,7 @@ def test_without_watching_the_worst_diagnosis_is_first() -> None:
             "stands_out": 2,
             "does_not": 1,
             "not_judged": 0,
+            "log_cut": 0,
             "causes": {"unlisted": 1, "leakage": 1},
         }
     ]
@@ -201,6 +203,29 @@ def test_the_count_is_one_sentence(states: str, says: str, tmp_path: Path) -> No
     text = page.read_text(encoding="utf-8")
     assert f"<h1>{says}</h1>" in text
     assert ("✓" in text) == (set(states) == {"d"})  # green only where all are known to be well
+
+
+def test_a_log_that_was_cut_off_never_looks_well(tmp_path: Path) -> None:
+    """Its unit is judged by what is there, and everything that tells of it says so."""
+    well = [result("diagnose", f"U{n}", diagnosis("consistent")) for n in range(2)]
+    well[1] = replace(well[1], complete=False)
+    found, page = report(well, [], 0), tmp_path / "fleet.html"
+    said = in_words(found)
+    assert "2 units: none stands out; 1 log cut off: judged by what is there" in said
+    assert re.search(r"U1 +b1 +U1\.mcap +does not stand out", said)
+    write_page(found, page)
+    text = page.read_text(encoding="utf-8")
+    assert "✓" not in text
+    assert "Log cut off" in text
+    units = {one["id"]: one for one in found.plain()["units"]}
+    assert {name: one["log_complete"] for name, one in units.items()} == {"U0": True, "U1": False}
+    assert found.plain()["groups"][0]["log_cut"] == 1
+
+
+def test_an_older_log_that_was_cut_off_is_no_matter_of_the_newest() -> None:
+    cut = replace(result("diagnose", "U1", diagnosis("consistent"), day=1.0), complete=False)
+    whole = result("diagnose", "U1", diagnosis("consistent"), day=2.0)
+    assert "cut off" not in headline(report([cut, whole], [], 0))
 
 
 def test_one_that_drifts_is_told_with_its_rate() -> None:

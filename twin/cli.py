@@ -386,6 +386,8 @@ def commission(
 
     require_writable(json_file, report)
     recorded = None if source.suffix == ".toml" else open_log(source)
+    if recorded is not None:
+        say_if_cut(recorded, source, "used")
     if recorded is None or config is not None:
         document = Document.read(config or source)
     else:

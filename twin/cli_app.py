@@ -12,6 +12,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 if TYPE_CHECKING:
+    from twin.fleet.go import Wanted
     from twin.log.reader import Log
     from twin.settings import Document
 
@@ -92,7 +93,7 @@ class App(typer.Typer):
         return super().command(name, cls=_Command, **options)
 
 
-def say_if_cut(recorded: "Log", log: Path, what: str) -> None:
+def say_if_cut(recorded: "Log | Wanted", log: Path, what: str) -> None:
     """Say that a log does not end as its writer would have ended it; ``what`` is done with it."""
     if not recorded.complete:
         print(f"twin: {log} is not complete; what can be read is {what}", file=sys.stderr)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.cli_app import App, not_negative, read_config
+from twin.cli_app import App, not_negative, read_config, say_if_cut
 from twin.errors import ConfigError, known_names
 from twin.files import require_writable, write_json
 
@@ -68,6 +68,7 @@ def show(
         raise ConfigError("--figures is for --keep", "say --keep as well, or leave it out")
     require_writable(json_file, output)
     recorded = open_log(log)
+    say_if_cut(recorded, log, "used")
     settings = _of_log(recorded, log, config)
     plain = [kept for _, kept in of_log(recorded, key_figures_of(settings))]
     print(cycles_table(plain))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from twin.cli_app import App, read_config, say_if_new
+from twin.cli_app import App, read_config, say_if_cut, say_if_new
 from twin.errors import ConfigError, SourceError
 from twin.files import require_writable, write_json
 
@@ -55,6 +55,7 @@ Page = Annotated[
     Path | None, typer.Option("--html", metavar="F.html", help="Write a page with a picture.")
 ]
 
+_DONE = {"calibrate": "used", "diagnose": "diagnosed", "replay": "replayed"}  # with a log
 _WHAT = {
     "calibrate": "Fit every unit to its log of healthy cycles, and store its data set.",
     "diagnose": "Say of every log what the simulation gets wrong, and why.",
@@ -211,6 +212,8 @@ def _done(work: str, files: Sequence[Path], fleet: _Fleet, engine: _Engine) -> "
     told = [one for one in asked if isinstance(one, Told)]
     for one in told:
         print(f"twin: {one.error}", file=sys.stderr)
+    for job in wanted:
+        say_if_cut(job, job.job.log, _DONE[work])
     with open_store(fleet.assets) as store, engine.open() as submit:
         for one in _progress(go(wanted, submit, store, fleet.assets), len(wanted), work):
             told.append(one)
@@ -219,9 +222,10 @@ def _done(work: str, files: Sequence[Path], fleet: _Fleet, engine: _Engine) -> "
     count = {
         state: sum(one.state == state for one in told) for state in ("done", "known", "failed")
     }
+    cut = sum(not one.complete for one in told)
     print(
         f"{work}: {count['done']} of {len(told)} logs done, {count['known']} were known,"
-        f" {count['failed']} could not be; in {fleet.name}"
+        f" {count['failed']} could not be{f', {cut} cut off' if cut else ''}; in {fleet.name}"
     )
     place = {log: number for number, log in enumerate(files)}
     return sorted(told, key=lambda one: place[one.log])
@@ -266,6 +270,7 @@ def _plain(told: "Iterable[Told]", fleet: _Fleet) -> list[dict[str, object]]:
                 "log": str(one.log),
                 "state": one.state,
                 "error": one.error or None,
+                "log_complete": one.complete if one.key else None,
                 "answer": store.answer(one.key) if one.key else None,
             }
             for one in told

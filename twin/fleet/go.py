@@ -23,6 +23,7 @@ class Wanted:
     job: Job
     key: Key
     begin_ns: int
+    complete: bool  # the log
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class Told:
     state: str  # done, known, failed
     key: Key | None = None  # of the answer, where there is one
     error: str = ""
+    complete: bool = True  # the log, as far as it could be read
 
 
 def ask(work: str, logs: Iterable[Path], configure: Configure) -> Iterator[Wanted | Told]:
@@ -41,7 +43,8 @@ def ask(work: str, logs: Iterable[Path], configure: Configure) -> Iterator[Wante
         try:
             log = open_log(path)
             config = configure(log)
-            yield Wanted(Job(work, path, config, code()), key_of(work, log, config), _begin_ns(log))
+            job, key = Job(work, path, config, code()), key_of(work, log, config)
+            yield Wanted(job, key, _begin_ns(log), log.complete)
         except (TwinError, OSError) as error:
             yield _failed(path, str(error))
 
@@ -50,12 +53,13 @@ def go(
     wanted: Sequence[Wanted], submit: Submit, store: Store, assets: str | Path
 ) -> Iterator[Told]:
     """Have jobs done; tell of each as it is done, and kept."""
+    store.note({one.key.log_sha256: one.complete for one in wanted})
     known = store.known([one.key for one in wanted])
     futures: dict[Future[Done], Wanted] = {}
     asked = set(known)
     for one in wanted:
         if one.key in asked:
-            yield Told(one.job.log, "known", one.key)
+            yield Told(one.job.log, "known", one.key, complete=one.complete)
         else:
             asked.add(one.key)
             futures[submit(run, one.job)] = one
@@ -77,7 +81,7 @@ def _keep(future: Future[Done], one: Wanted, store: Store, assets: str | Path) -
         with open_assets(assets) as database:
             database.add(done.record)
     store.add(one.key, one.job.config, log, one.begin_ns, done.answer)
-    return Told(log, "done", one.key)
+    return Told(log, "done", one.key, complete=one.complete)
 
 
 def _failed(log: Path, why: str) -> Told:

@@ -36,6 +36,7 @@ class Row:
     id: str
     batch: str
     log: str  # the newest
+    log_complete: bool  # otherwise it was cut off, and the unit is judged by what is there
     logs: int
     state: State
     reason: str
@@ -81,8 +82,12 @@ class Report:
         """The units in a state."""
         return [row for row in self.rows if row.state is state]
 
+    def cut(self) -> list[Row]:
+        """The units whose newest log was cut off."""
+        return [row for row in self.rows if not row.log_complete]
+
     def groups(self) -> list[dict[str, Any]]:
-        """By type and batch: how many units there are, how many in each state, and the causes."""
+        """By type and batch: how many units there are, in each state and cut off, and causes."""
         members: dict[tuple[str, str], list[Row]] = defaultdict(list)
         for row in self.rows:
             members[row.type, row.batch].append(row)
@@ -92,6 +97,7 @@ class Report:
                 "batch": batch,
                 "units": len(rows),
                 **{state.value: sum(row.state is state for row in rows) for state in State},
+                "log_cut": sum(not row.log_complete for row in rows),
                 "causes": dict(
                     Counter(cause_of(row) for row in rows if row.stands_out).most_common()
                 ),
@@ -145,6 +151,7 @@ def _row(mine: Sequence[Result], standing: Standing | None) -> Row:
         last.id,
         last.batch,
         last.log,
+        last.complete,
         len({one.key.log_sha256 for one in mine}),
         state,
         reason,
@@ -202,6 +209,7 @@ def _plain(rank: int, row: Row) -> dict[str, Any]:
         "id": row.id,
         "batch": row.batch,
         "log": row.log,
+        "log_complete": row.log_complete,
         "logs": row.logs,
         "state": row.state.value,
         "reason": row.reason or None,

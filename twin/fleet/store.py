@@ -14,6 +14,7 @@ from typing import Any
 
 from sqlalchemy import (
     BigInteger,
+    Boolean,
     Column,
     ColumnElement,
     MetaData,
@@ -49,6 +50,14 @@ RESULT = Table(
     sqlite_with_rowid=False,
 )
 
+LOG = Table(
+    "fleet_log",
+    metadata,
+    Column("log_sha256", Text, primary_key=True),
+    Column("complete", Boolean, nullable=False),  # its writer came to the end
+    sqlite_with_rowid=False,
+)
+
 
 @dataclass(frozen=True)
 class Key:
@@ -72,6 +81,7 @@ class Result:
     begin_ns: int
     stored_ns: int
     answer: Mapping[str, Any]
+    complete: bool = True  # the log; otherwise it was cut off, and this is of what is there
 
 
 def key_of(work: str, log: Log, config: Config) -> Key:
@@ -132,19 +142,29 @@ class Store(Database):
             if connection.execute(select(RESULT.c.work).where(*_is(key))).first() is None:
                 connection.execute(RESULT.insert().values(values))
 
+    def note(self, complete: Mapping[str, bool]) -> None:
+        """Keep which logs, by their SHA-256, are complete."""
+        with self._writing() as connection:
+            there = set(connection.scalars(select(LOG.c.log_sha256)))
+            for sha, is_complete in complete.items():
+                if sha not in there:
+                    connection.execute(LOG.insert().values(log_sha256=sha, complete=is_complete))
+
     def newest(self) -> list[Result]:
         """Of every work and log the answer that was added last, in the order of recording."""
         with self._reading() as connection:
             rows = connection.execute(select(RESULT).order_by(RESULT.c.stored_ns)).all()
+            cut = set(connection.scalars(select(LOG.c.log_sha256).where(~LOG.c.complete)))
         last = {(row.work, row.log_sha256, row.asset_type, row.asset_id): row for row in rows}
-        return sorted((_result(row) for row in last.values()), key=lambda one: one.begin_ns)
+        results = (_result(row, row.log_sha256 not in cut) for row in last.values())
+        return sorted(results, key=lambda one: one.begin_ns)
 
 
 def _is(key: Key) -> list[ColumnElement[bool]]:
     return [column == getattr(key, column.name) for column in RESULT.primary_key.columns]
 
 
-def _result(row: Row[Any]) -> Result:
+def _result(row: Row[Any], complete: bool) -> Result:
     return Result(
         Key(row.work, row.log_sha256, row.code, row.basis),
         row.asset_type,
@@ -154,4 +174,5 @@ def _result(row: Row[Any]) -> Result:
         row.begin_ns,
         row.stored_ns,
         json.loads(row.answer),
+        complete,
     )

@@ -20,7 +20,13 @@ GOOD, BAD, UNKNOWN = "#2e7d4f", "#b3261e", "#555555"
 HEAD = ("unit", "batch", "stands out by", "most like", "drift", "diagnosis")
 NOT_JUDGED = ("unit", "batch", "why")
 REFUSED = ("log", "why")
-GROUPS = ("type", "batch", "units", "stand out", "do not", "not judged", "causes")
+CUT = ("unit", "batch", "log", "judged by what is there")
+GROUPS = ("type", "batch", "units", "stand out", "do not", "not judged", "log cut off", "causes")
+SAID = {
+    State.STANDS_OUT: "stands out",
+    State.DOES_NOT: "does not stand out",
+    State.NOT_JUDGED: "could not be judged",
+}
 
 
 def in_words(report: Report) -> str:
@@ -33,6 +39,7 @@ def in_words(report: Report) -> str:
     lines += _listed("could not be judged", NOT_JUDGED, _reasons(report))
     if advice := _advice(report):
         lines += ["", advice]
+    lines += _listed("log cut off", CUT, _cut(report))
     lines += _listed("could not be used", REFUSED, _refused(report))
     lines += ["", *_columns([GROUPS, *_groups(report)])]
     for kind, rows in _kinds(report):
@@ -46,9 +53,13 @@ def headline(report: Report) -> str:
     said = [f"{out or 'none'} {'stands' if out < 2 else 'stand'} out"]
     said += [f"{fine} {'does' if fine == 1 else 'do'} not"] if fine and (out or unknown) else []
     said += [f"{unknown} could not be judged"] if unknown else []
-    lost = len(report.refused)
-    logs = f"; {lost} {_some('log', lost)} could not be used" if lost else ""
-    return f"{len(report.rows)} {_some('unit', len(report.rows))}: {', '.join(said)}{logs}"
+    counted = (
+        (len(report.cut()), "cut off: judged by what is there"),
+        (len(report.refused), "could not be used"),
+    )
+    logs = [f"{count} {_some('log', count)} {what}" for count, what in counted if count]
+    units = f"{len(report.rows)} {_some('unit', len(report.rows))}"
+    return f"{units}: {'; '.join([', '.join(said), *logs])}"
 
 
 def write_page(report: Report, path: Path) -> None:
@@ -61,15 +72,17 @@ def write_page(report: Report, path: Path) -> None:
     if unknown := _reasons(report):
         advice = paragraph(_advice(report)) if _advice(report) else ""
         parts.append(section("Could not be judged", table("", NOT_JUDGED, unknown) + advice))
+    if cut := _cut(report):
+        parts.append(section("Log cut off", table("", CUT, cut)))
     if lost := _refused(report):
         cards = "\n".join(card(log, why, ()) for log, why in lost)
         parts.append(section("Logs that could not be used", cards))
     parts += _drawn(report)
-    parts.append(section("By type and batch", table("", GROUPS, _groups(report), range(2, 6))))
+    parts.append(section("By type and batch", table("", GROUPS, _groups(report), range(2, 7))))
     for kind, (top, *values) in _kinds(report):
         body = table("", top, values, range(1, 6))
         parts.append(section(f"{kind}, by its calibrated units", body + paragraph(_MEAN)))
-    colour, mark = (BAD, "▲") if out else (UNKNOWN, "?") if unknown or lost else (GOOD, "✓")
+    colour, mark = (BAD, "▲") if out else (UNKNOWN, "?") if unknown or cut or lost else (GOOD, "✓")
     page = PAGE.substitute(
         title="Fleet",
         colour=colour,
@@ -115,6 +128,12 @@ def _advice(report: Report) -> str:
     return _FEW if any(few) else ""
 
 
+def _cut(report: Report) -> list[tuple[str, ...]]:
+    """The units whose newest log was cut off, and how they are judged all the same."""
+    rows = report.cut()
+    return [(_name(row), row.batch, Path(row.log).name, SAID[row.state]) for row in rows]
+
+
 def _refused(report: Report) -> list[tuple[str, str]]:
     """The logs that nothing could be done with, each with why."""
     return [(one.log, one.why.removeprefix(f"{one.log}: ")) for one in report.refused]
@@ -156,6 +175,7 @@ def _groups(report: Report) -> list[tuple[str, ...]]:
             group["batch"],
             str(group["units"]),
             *(str(group[state]) for state in State),
+            str(group["log_cut"]),
             ", ".join(f"{spoken(cause)} ({count})" for cause, count in group["causes"].items()),
         )
         for group in report.groups()
