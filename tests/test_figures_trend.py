@@ -301,6 +301,57 @@ def test_what_grows_steadily_is_no_step(rise: float) -> None:
         assert trend_of(times(7, 2000), grown + rng.normal(size=2000)).step is None
 
 
+def ending(values: "np.ndarray[tuple[int], np.dtype[np.float64]]", lacking: int) -> Trend:
+    """And then cycles that cannot tell."""
+    return minutes(np.concatenate([values, np.full(lacking, np.nan)]))
+
+
+def test_a_figure_that_can_be_measured_no_more_has_no_trend_but_an_end() -> None:
+    """Leakage, once the vacuum does not come to H1 any more."""
+    noise = np.random.default_rng(21).normal(size=100)
+    trend = ending(75.0 + noise, 12)
+    now = BEGIN_NS + 600 * 10**9
+    assert re.fullmatch(
+        r"leakage: last measured at 14:18:17, 5 min ago, and not in the 12 cycles since; 7[45]\S*"
+        r" mbar/s",
+        in_words(LEAKAGE, trend, now),
+    )
+    plain = trend_plain(LEAKAGE, trend)
+    assert plain["ended"] == {"host_ns": BEGIN_NS + 99 * 3 * 10**9, "cycles": 12}
+    assert trend.ahead(0.25) == 0.0
+    torn = ending(np.where(np.arange(100) < 40, 75.0, 465.0) + noise, 12)
+    said = in_words(LEAKAGE, torn, now)
+    assert "no trend" not in said
+    assert "12 cycles since; stepped from 7" in said
+    assert said.endswith("over its limit of 250 mbar/s")
+    rising = in_words(LEAKAGE, ending(np.linspace(75.0, 105.0, 100) + noise, 12), now)
+    assert re.search(r"since; 105\S* mbar/s, \+\S+ ± \S+ mbar/s over 5 min$", rising)
+    few = in_words(LEAKAGE, ending(noise[:3], 12), now)
+    assert few.endswith("and not in the 12 cycles since")
+
+
+def test_no_limit_comes_once_a_figure_is_not_measured() -> None:
+    rising = 200.0 + np.linspace(0.0, 40.0, 1000)
+    ended = trend_of(times(10, 1012), np.concatenate([rising, np.full(12, np.nan)]), 250.0)
+    assert trend_of(times(10, 1000), rising, 250.0).comes is not None
+    assert ended.comes is None
+    assert "its limit" not in in_words(LEAKAGE, ended, 0)
+
+
+@pytest.mark.parametrize(
+    ("every", "lacking", "ends"), [(1, 2, False), (1, 3, True), (6, 5, False), (6, 6, True)]
+)
+def test_a_figure_that_is_seldom_measured_has_not_ended(
+    every: int, lacking: int, ends: bool
+) -> None:
+    values = np.full(300 * every, np.nan)
+    values[::every] = np.random.default_rng(22).normal(75.0, 1.0, 300)
+    values[10:40] = np.nan  # once it was not measured for long, and then it was again
+    trend = minutes(np.concatenate([values[: len(values) - every + 1], np.full(lacking, np.nan)]))
+    assert trend.lacking == (lacking if ends else 0)
+    assert ("no trend" in in_words(LEAKAGE, trend, BEGIN_NS)) == (not ends)
+
+
 def test_limits_are_of_the_figures_that_have_one() -> None:
     found = {name: limit_of(name, LIMITS) for name in FIGURES}
     assert {name for name, limit in found.items() if limit is not None} == {

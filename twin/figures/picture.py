@@ -75,6 +75,8 @@ def _draw_course(axes: Axes, trend: Trend, scale: float) -> None:
         axes.plot(at, line.medians, "o", color="tab:blue", markersize=4, label="medians")
     rises = line is not None and line.is_trend
     label = "trend" if rises else "step" if trend.step is not None else "no trend"
+    if trend.lacking:
+        label = f"not measured in the last {trend.lacking} cycles"
     axes.plot(days * scale, middle, color="tab:blue", label=label)
     band = middle - half, middle + half
     axes.fill_between(days * scale, *band, color="tab:blue", alpha=0.2, lw=0)

@@ -31,6 +31,7 @@ AT_ONCE = 0.5  # of a step, within LEAST_BINS before and after it: what grows sl
 PARTS = ((1.0, 0.0), (0.5, 10.0), (0.25, 10.0))
 LIKELY = 1.92  # of log-likelihood, that where a step is best may be better: 95 %
 DAY_NS = 86_400 * 10**9
+ENDED = 3  # cycles in a row without a value, at least, where a figure can be measured no more
 TRIMMED = 0.1  # of the bins on either side, before their mean is the line's level
 MOST_ALIKE = 0.95  # correlation of neighbours
 ROBUST = 1.4826  # standard deviations in the median of absolute deviations, for normal scatter
@@ -123,11 +124,12 @@ class Trend:
     """How a record runs: its newest step, and the line since then or through all of it.
 
     Without a step None; without a line where there are too few cycles. ``comes`` is when the line
-    comes up to the ``limit``.
+    comes up to the ``limit``. A figure that can be measured no more has no future.
     """
 
-    begin_ns: int  # of the record
+    begin_ns: int  # of the record: first and last cycle that has a value
     end_ns: int
+    lacking: int  # cycles after its end, without a value; 0 where that is as usual
     step: Step | None
     line: Line | None
     limit: float | None
@@ -135,7 +137,7 @@ class Trend:
 
     def ahead(self, share: float) -> float:
         """How many days after the record's end are of interest: a share of it, or to the limit."""
-        if self.line is None:
+        if self.line is None or self.lacking:
             return 0.0
         ahead = share * self.line.span
         if self.comes is not None:
@@ -166,16 +168,31 @@ class Trend:
 def trend_of(host_ns: npt.NDArray[np.int64], values: Floats, limit: float | None = None) -> Trend:
     """How a record of cycles in order (received UTC, ns) runs; values may be NaN."""
     known = np.isfinite(values)
+    lacking = _lacking(known)
     host_ns, values = host_ns[known], values[known]
     newest, first = None, 0
     while (step := _newest_step(host_ns[first:], values[first:])) is not None:
         newest, first = step, first + step.first
     line = line_through(host_ns[first:], values[first:])
     comes = None
-    if line is not None and limit is not None and line.is_rate:
+    if line is not None and limit is not None and line.is_rate and not lacking:
         comes = reach(line, limit)
     begin, end = (int(host_ns[0]), int(host_ns[-1])) if len(host_ns) else (0, 0)
-    return Trend(begin, end, newest, line, limit, comes)
+    return Trend(begin, end, lacking, newest, line, limit, comes)
+
+
+def _lacking(known: npt.NDArray[np.bool_]) -> int:
+    """How many of the last cycles have no value; 0 where stretches as long were seen before.
+
+    A stretch counts as usual if one in a hundred between two values was as long.
+    """
+    rows = np.flatnonzero(known)
+    if not len(rows):
+        return 0
+    lacking = len(known) - 1 - int(rows[-1])
+    between = np.diff(rows) - 1
+    usual = int(np.quantile(between, SURE, method="lower")) if len(between) else 0
+    return lacking if lacking >= ENDED and lacking > usual else 0
 
 
 def line_through(host_ns: npt.NDArray[np.int64], values: Floats) -> Line | None:

@@ -55,11 +55,15 @@ def in_words(figure: Figure, trend: Trend, now_ns: int) -> str:
     """How a figure runs, in a sentence; that it neither stepped nor drifts is said as well."""
     unit = NO_DASH.get(figure.unit, f" {figure.unit}")
     said = []
+    if trend.lacking:
+        last = f"last measured at {instant(trend.end_ns, now_ns)}"
+        said.append(f"{last}, and not in the {trend.lacking} cycles since")
     if (step := trend.step) is not None:
         said.append(_stepped(step, unit, now_ns))
     if (line := trend.line) is not None:
-        said.append(_runs(line, unit, since=step is not None))
-    elif step is None:
+        runs = _ran if trend.lacking else _runs
+        said.append(runs(line, unit, since=step is not None))
+    elif step is None and not trend.lacking:
         return f"{figure.name}: not enough to say: fewer than {FEWEST_BINS} stretches with cycles"
     if trend.limit is not None:
         said.append(_limited(trend, f"its limit of {trend.limit:.4g}{unit}"))
@@ -77,13 +81,27 @@ def _stepped(step: Step, unit: str, now_ns: int) -> str:
 
 
 def _runs(line: Line, unit: str, *, since: bool) -> str:
-    """What a line says; a record of less than a day has no rate per day, but what it changed by."""
-    slope, half = line.slope, line.slope_half()
-    span, per = (1.0, " per day") if line.is_rate else (line.span, "")
-    over = f"over {lasting(line.span * 86_400.0)}"
-    how = f"{slope * span:+.3g}{_give_or_take(half * span, line.level)}{unit}{per} {over}"
+    """What a line says since a step or through all of the record."""
+    how = _changes(line, unit)
     now, then = ("", " since then") if since else (f"{line.level:.4g}{unit}, ", "")
     return f"{now}{how}{then}" if line.is_trend else f"{now}no trend{then} ({how})"
+
+
+def _ran(line: Line, unit: str, *, since: bool) -> str:
+    """The same of a figure that can be measured no more: its level then, and a trend if it had one.
+
+    That it had none would sound as if all were well.
+    """
+    level = "" if since else f"{line.level:.4g}{unit}"
+    how = f"{_changes(line, unit)}{' after that' if since else ''}" if line.is_trend else ""
+    return ", ".join(filter(None, [level, how]))
+
+
+def _changes(line: Line, unit: str) -> str:
+    """By how much a line changes per day, or over a record that is shorter."""
+    span, per = (1.0, " per day") if line.is_rate else (line.span, "")
+    change = f"{line.slope * span:+.3g}{_give_or_take(line.slope_half() * span, line.level)}"
+    return f"{change}{unit}{per} over {lasting(line.span * 86_400.0)}"
 
 
 def _give_or_take(half: float, level: float) -> str:
@@ -98,7 +116,7 @@ def _limited(trend: Trend, limit: str) -> str:
     level = line.level if line is not None else step.after if step is not None else 0.0
     if level >= trend.limit and (step is not None or (line is not None and line.is_trend)):
         return f"over {limit}"
-    if line is None or not line.is_trend or not line.is_rate:
+    if line is None or not line.is_trend or not line.is_rate or trend.lacking:
         return ""
     return _comes(trend.comes, line, limit)
 
@@ -116,6 +134,7 @@ def trend_plain(figure: Figure, trend: Trend) -> dict[str, Any]:
     """The same as JSON has it; null where there is nothing to say."""
     plain: dict[str, Any] = {"figure": figure.name, "unit": figure.unit, "limit": trend.limit}
     plain |= {"step": None, "line": None, "days_to_limit": None}
+    plain["ended"] = {"host_ns": trend.end_ns, "cycles": trend.lacking} if trend.lacking else None
     if (step := trend.step) is not None:
         plain["step"] = {
             "from": step.before,
