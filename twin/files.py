@@ -1,5 +1,6 @@
 """Files that answers are written to: refused before the work, whole or not at all after it."""
 
+import errno
 import json
 import math
 import os
@@ -18,7 +19,10 @@ def require_writable(*paths: Path | None) -> None:
             continue
         if path.is_dir():
             raise _unwritable(path, "it is a folder")
-        if not os.access(path.parent, os.W_OK):
+        if path.exists():  # it is written over, whatever its folder allows: /dev/stdout
+            if not os.access(path, os.W_OK):
+                raise _unwritable(path, os.strerror(errno.EACCES))
+        elif not os.access(path.parent, os.W_OK):
             raise _unwritable(path, "no folder to write to")
 
 
