@@ -303,7 +303,11 @@ def test_revised_intervals_and_dropped_connections(
     awkward: OpcuaPlc, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     settings = as_user(awkward, tmp_path, "s3cret", **SUBSCRIBE)
-    with closing(blocks(settings)) as source, caplog.at_level(logging.WARNING):
+    lost: list[SourceError] = []  # it may hang up before there is a block, too
+    with (
+        closing(blocks(settings, away=lost.append)) as source,
+        caplog.at_level(logging.WARNING),
+    ):
         samples = taken(source, 120)  # 2.4 s: it hangs up at least once meanwhile
     assert caplog.messages == [
         f"{awkward.url}: the server samples every 20 ms, not 5, publishes every 100 ms, not 50"
