@@ -3,7 +3,7 @@
 import json
 import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -42,7 +42,7 @@ def list_(assets: Url = "", config: ConfigFile = None) -> None:
     """List all types and units, each with the data set that holds now."""
     with _open(assets, config, write=False) as database:
         records = database.records()
-    print(_table(records, time.time_ns()))
+    print(_table(records, time.time_ns(), _recorded_in(database)))
 
 
 @assets_app.command()
@@ -65,13 +65,14 @@ def show(
     with _open(assets, config, write=False) as database:
         records = database.records(name=name, as_of_ns=known)
         _require(records, name, database)
+    recorded = _recorded_in(database)
     if history:
-        print("\n".join(_line_of_history(record) for record in records))
+        print("\n".join(_line_of_history(record, recorded) for record in records))
         return
     shown = _holding_each(records, now)
     if not shown:
         raise ConfigError(f"no data set of {name!r} holds at that time", "see --history")
-    print("\n".join(_in_full(record) for record in shown), end="")
+    print("\n".join(_in_full(record, recorded) for record in shown), end="")
 
 
 @assets_app.command()
@@ -221,12 +222,21 @@ def _require(records: "list[Record]", name: str, database: "Assets") -> None:
         raise ConfigError(f"{database.name}: no type or unit is called {name!r}", known)
 
 
-def _table(records: "list[Record]", now: int) -> str:
+def _recorded_in(database: "Assets") -> "Callable[[Record], str]":
+    """When a record came to a database; what is shipped and in no database never did."""
+    from twin.assets.file import show_time
+
+    if database.in_memory:
+        return lambda _: "no, shipped"
+    return lambda record: show_time(record.recorded_ns)
+
+
+def _table(records: "list[Record]", now: int, recorded: "Callable[[Record], str]") -> str:
     from twin.assets.file import show_time
 
     rows = [("kind", "name", "type", "valid from", "recorded", "hash")]
     for record in _holding_each(records, now):
-        times = show_time(record.valid_from_ns), show_time(record.recorded_ns)
+        times = show_time(record.valid_from_ns), recorded(record)
         rows.append((record.kind, record.name, record.type, *times, record.hash))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join(
@@ -235,20 +245,20 @@ def _table(records: "list[Record]", now: int) -> str:
     )
 
 
-def _line_of_history(record: "Record") -> str:
+def _line_of_history(record: "Record", recorded: "Callable[[Record], str]") -> str:
     from twin.assets.file import show_time
 
     since = show_time(record.valid_from_ns)
     source = ", ".join(f"{key} {value}" for key, value in record.provenance.items())
-    recorded = show_time(record.recorded_ns)
-    return f"recorded {recorded}  valid from {since:<20}  {record.kind}  {record.hash}  {source}"
+    times = f"recorded {recorded(record)}  valid from {since:<20}"
+    return f"{times}  {record.kind}  {record.hash}  {source}"
 
 
-def _in_full(record: "Record") -> str:
-    from twin.assets.file import show_time, write_asset
+def _in_full(record: "Record", recorded: "Callable[[Record], str]") -> str:
+    from twin.assets.file import write_asset
 
     lines = [
-        f"hash {record.hash}, recorded {show_time(record.recorded_ns)}, id {record.id}",
+        f"hash {record.hash}, recorded {recorded(record)}, id {record.id}",
         *(f"{key}: {value}" for key, value in record.provenance.items()),
         *(f"array {name}: shape {array.shape}" for name, array in record.arrays.items()),
     ]

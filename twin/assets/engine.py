@@ -113,6 +113,11 @@ class Database:
         """The file or the URL, for messages; without a password."""
         return shown(self._url)
 
+    @property
+    def in_memory(self) -> bool:
+        """Whether it is made anew each time it is opened, and gone when it is closed."""
+        return is_in_memory(self._url)
+
     @contextmanager
     def closed_on_error(self) -> Iterator[None]:
         """Make its tables inside: where that fails, it is closed."""
@@ -144,6 +149,11 @@ class Database:
 
 def _unknown_kind(message: str) -> ConfigError:
     return ConfigError(message, "use sqlite:///FILE, or postgresql://USER@HOST/NAME")
+
+
+def is_in_memory(url: URL) -> bool:
+    """Whether it is an SQLite database without a file."""
+    return url.get_backend_name() == "sqlite" and sqlite_file(url) is None
 
 
 def sqlite_file(url: URL) -> Path | None:
