@@ -76,7 +76,10 @@ def test_effects_are_listed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert twin(monkeypatch, "effects") == 0
-    assert capsys.readouterr().out.strip() == f"{table()}\n\n{courses()}"
+    out = capsys.readouterr().out
+    assert out.strip() == f"{table('; ')}\n\n{courses()}"
+    assert "| `h1_shift` -200 to 200 mbar; `h2_shift` -200 to 200 mbar |" in out  # for a terminal
+    assert "<" not in out
 
 
 @pytest.mark.parametrize("command", ["run", "replay", "plc", "probe", "effects", "log"])

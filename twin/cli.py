@@ -486,7 +486,7 @@ def effects() -> None:
     from twin.model.courses import table as courses
     from twin.model.effects import table
 
-    print(table(), courses(), sep="\n\n")
+    print(table("; "), courses(), sep="\n\n")
 
 
 @app.command()

@@ -307,11 +307,14 @@ def apply(theta: Theta, name: str, values: Mapping[str, float]) -> Theta:
     return changed
 
 
-def table() -> str:
-    """The table of effects in Markdown, as the README has it and ``twin effects`` prints it."""
+def table(line_break: str = "<br>") -> str:
+    """The table of effects in Markdown, as the README has it.
+
+    ``line_break`` stands between an effect's parameters: Markdown has none of its own in a table.
+    """
     lines = ["| effect | what it means | parameters |", "| --- | --- | --- |"]
     for effect in EFFECTS.values():
-        numbers = "<br>".join(
+        numbers = line_break.join(
             f"`{p.name}` {p.low:g} to {p.high:g} {p.unit}" for p in effect.parameters
         )
         lines.append(f"| `{effect.name}` | {effect.sentence} | {numbers} |")
