@@ -327,6 +327,23 @@ def test_a_calibration_without_a_unit_is_exit_code_2(
 # Tables.
 
 
+@pytest.mark.parametrize(
+    "command",
+    [("import", "a.csv", "--config", GRIPPER), ("replay", "a.mcap"), ("log", "recover", "a.mcap")],
+)
+def test_a_new_log_is_not_named_like_a_table(
+    command: tuple[str | Path, ...],
+    here: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert twin(monkeypatch, *command, "-o", "x.csv") == 2
+    said = capsys.readouterr().err
+    assert "x.csv: a log is an MCAP file, and its name ends in .mcap" in said
+    assert "say -o x.mcap" in said
+    assert not (here / "x.csv").exists()
+
+
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 def test_a_log_goes_out_and_comes_back_the_same(
     suffix: str, log: Path, here: Path, monkeypatch: pytest.MonkeyPatch

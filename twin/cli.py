@@ -215,10 +215,13 @@ def replay(
     with _unwatched():
         from twin.live import REPLAYED
         from twin.live import run as run_loop
+        from twin.log.part import refuse_other_suffix
         from twin.log.reader import open_log
         from twin.log.recorder import Recorder
 
         require_writable(json_file)
+        if output is not None:
+            refuse_other_suffix(output)
         recorded = open_log(log)
         say_if_cut(recorded, log, "replayed")
         settings = _settings_of(recorded.header, log, config, assets, unit, as_of)
@@ -446,12 +449,14 @@ def import_(
 ) -> None:
     """Make a log of a PLC's trace export, with what the twin expects beside it."""
     from twin.live import run as run_loop
+    from twin.log.part import refuse_other_suffix
     from twin.log.recorder import Recorder
     from twin.settings import Document
     from twin.signals import MBAR
     from twin.tables.reader import open_table
     from twin.tables.settings import ImportSettings
 
+    refuse_other_suffix(output)
     settings = _configured(Document.read(config), assets, unit)
     wanted = settings.document.section(ImportSettings, "import")
     table = open_table(file, wanted, settings.data.ambient.pressure_mbar * MBAR)
@@ -533,7 +538,9 @@ def recover(
 ) -> None:
     """Write a complete log of everything that can be read in a damaged or unfinished one."""
     from twin.log.check import recover as recover_log
+    from twin.log.part import refuse_other_suffix
 
+    refuse_other_suffix(output)
     print(recover_log(log, output))
 
 

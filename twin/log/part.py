@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from twin.errors import ConfigError
 from twin.log.header import Identity, LogHeader, to_metadata
 from twin.log.output import Output
 from twin.log.schema import CHANNELS, LIBRARY
@@ -9,6 +10,7 @@ from twin.log.writer import Writer
 
 OWN_METADATA = "ejector-twin"
 FREE_METADATA = "run"
+SUFFIX = ".mcap"
 CLOCK_METADATA = "clock"  # at the end: the PLC's clock against the one here
 
 
@@ -17,9 +19,18 @@ def part_path(path: Path, number: int) -> Path:
     return path if number == 0 else path.with_name(f"{path.stem}.{number:04d}{path.suffix}")
 
 
+def refuse_other_suffix(path: Path) -> None:
+    """ConfigError for a new log with a name that says it is something else."""
+    if path.suffix != SUFFIX:
+        raise ConfigError(
+            f"{path}: a log is an MCAP file, and its name ends in {SUFFIX}",
+            f"say -o {path.with_suffix(SUFFIX)}",
+        )
+
+
 def first_parts(folder: Path) -> list[Path]:
     """The logs of a folder by their first files, in the order of their names."""
-    files = sorted(folder.glob("*.mcap"))
+    files = sorted(folder.glob(f"*{SUFFIX}"))
     return [path for path in files if not _follows(path, set(files))]
 
 
