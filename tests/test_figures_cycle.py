@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Iterable, Sequence
 from functools import cache
 
@@ -25,7 +26,19 @@ from twin.model.term import Term
 from twin.monitor.cycles import LONGEST_PIECE, CycleCutter
 from twin.monitor.cycles import figures as old_figures
 from twin.monitor.detect import Monitor
-from twin.signals import BREAK, MBAR, ML, SAMPLE, SL_MIN, TICK, Phase, Quality, Samples, Ticks
+from twin.signals import (
+    BREAK,
+    MBAR,
+    ML,
+    SAMPLE,
+    SL_MIN,
+    TICK,
+    Command,
+    Phase,
+    Quality,
+    Samples,
+    Ticks,
+)
 
 GAS, KELVIN = 287.05, 293.15
 ROOM = {"test_rig": 755 * ML, "gripper": 150 * ML}
@@ -188,6 +201,33 @@ def test_an_open_cup_gives_the_free_flow_vacuum_beside_that_of_the_model() -> No
     assert cycle.measured["free_flow"] == pytest.approx(1.3 * still, rel=1e-4)
     assert cycle.expected["free_flow"] == still
     assert cycle.expected["performance"] == pytest.approx(100 * (1 - still / 750))
+
+
+def test_a_cycle_that_is_cut_off_says_that_it_is_incomplete() -> None:
+    samples, ticks = seen("gripper")
+    idle, suction = samples["commands"] == 0, samples["commands"] == Command.SUCTION
+    end = np.flatnonzero(idle[:-1] & suction[1:])[3] + 100
+    *_, last = told(samples[:end], ticks[:end], rigs.config("gripper").data)
+    assert last.words == f"cycle {last.cycle}: incomplete, not evaluated"
+
+
+def test_a_cycle_that_does_not_come_to_h2_says_so() -> None:
+    """The vacuum still rises when suction ends: no open cup."""
+    data = rigs.config("gripper").data
+    samples, ticks = seen("gripper")
+    pieces = [one for one in CycleCutter().push(samples, ticks) if one.complete]
+    piece = pieces[2]
+    rows = np.flatnonzero(np.isin(piece.ticks["phase"], (Phase.SUCTION, Phase.HOLD)))
+    vacuum = np.linspace(0.0, 300.0, len(rows))  # mbar
+    piece.samples["pressure"][rows] = (data.ambient.pressure_mbar - vacuum) * MBAR
+    piece.ticks["phase"][rows] = Phase.SUCTION
+    key = KeyFigures(data)
+    cycle = [key.take(one) for one in pieces[:3]][2]
+    assert cycle is not None
+    assert re.fullmatch(
+        r"cycle \d+: H2 not reached \(expected in \d+ ms\); H1 not reached \(highest 300 mbar\)",
+        cycle.words,
+    )
 
 
 def test_a_vessel_opens_nowhere() -> None:

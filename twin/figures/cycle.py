@@ -59,8 +59,18 @@ class CycleFigures:
             for name, label in _TOLD.items()
             if math.isfinite(self.measured[name])
         ]
-        told = f"cycle {self.cycle}: {', '.join(parts) or 'nothing to tell'}"
+        told = f"cycle {self.cycle}: {', '.join(parts) or self._why_none}"
         return "; ".join([told, *self._warned.values()])
+
+    @property
+    def _why_none(self) -> str:
+        """Why a cycle has none of them."""
+        if not math.isfinite(self.measured["max_vacuum"]):
+            return "incomplete, not evaluated"
+        expected = self.expected["t0"]
+        return "H2 not reached" + (
+            f" (expected in {expected:.0f} {FIGURES['t0'].unit})" if math.isfinite(expected) else ""
+        )
 
     @property
     def _warned(self) -> dict[str, str]:
