@@ -8,7 +8,7 @@ from typing import Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from drivers.lasting import LostError, unreachable
+from drivers.lasting import AbsentError, LostError, unreachable
 from drivers.tags import Address, Place, Pressure, Tag, WordOrder, Words
 from drivers.telegram import HEAD, Request, Store, belongs, exception
 from drivers.tls import Tls, secured
@@ -29,7 +29,8 @@ EXCEPTIONS = {
 }
 STATUS = Address("input", 4)  # in the register map: the bits of a record's status
 COILS = Address("coil", 0)  # and the first of the commands as coils, in the same order
-OURS = (1, 2, 3)  # the request is wrong and stays wrong; the others may pass
+OURS = (1, 3)  # the request is wrong and stays wrong; the others may pass
+ABSENT = 2  # it may come: a PLC that starts or takes a new program does not serve it yet
 
 
 class Tags(Settings):
@@ -157,7 +158,8 @@ class Link:
     def read(self, address: Address, count: int) -> Words:
         """Read ``count`` words (bits as 0 or 1) from ``address`` on, in one request.
 
-        LostError if no complete answer comes; SourceError if the PLC refuses the address.
+        LostError if no complete answer comes; AbsentError if the PLC does not serve the address;
+        SourceError if it refuses the request otherwise.
         """
         request = Request(address, count)
         data = np.frombuffer(self.ask(request), np.uint8)
@@ -200,10 +202,11 @@ class Link:
     def _refused(self, request: Request | Store, code: int) -> SourceError:
         what = EXCEPTIONS.get(code, "an exception unknown to the protocol")
         text = f"{self._about(request)}: {what} (Modbus exception {code})"
-        if code not in OURS:
+        if code not in (*OURS, ABSENT):
             self.close()
             return LostError(text, "is the unit id right, and does the PLC run?")
-        return SourceError(
+        kind = AbsentError if code == ABSENT else SourceError
+        return kind(
             text,
             "check the addresses in [driver]: holding:0 counts from 0, the manual's 40001 from 1; "
             "everything read at once must exist",

@@ -21,8 +21,9 @@ def blocks(
     """Samples as they come: a block at least every 0.5 s, empty while there is nothing.
 
     Once there was a sample, a lost connection is retried for ever and shows as empty blocks and
-    flags. LostError before that goes to ``away``, and is retried too, where there is one. Other
-    SourceErrors come out, and whenever the PLC refuses an address. Closing releases all.
+    flags, and so is an address that the PLC does not serve any more. Before that both are retried
+    too where there is ``away``, which is told why. Other SourceErrors come out, and whenever the
+    PLC refuses a request otherwise. Closing releases all.
     Blocks come over a connection that they share with others, where there are ``lines``; polling
     has no millisecond to wait for others.
     """

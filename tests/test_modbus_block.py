@@ -424,7 +424,7 @@ def test_a_plc_that_starts_with_an_empty_header_is_waited_for(rig: Rig) -> None:
     assert rig.take(2)["quality"][0] == Quality.RESTART | Quality.GAP
 
 
-@pytest.mark.parametrize("why", [CUT, "blank header"])
+@pytest.mark.parametrize("why", [CUT, "blank header", "illegal address"])
 def test_a_plc_that_is_not_there_yet_is_tried_until_it_is_and_said_once(why: str) -> None:
     told: list[str] = []
     with ModbusServer() as server:
@@ -435,17 +435,29 @@ def test_a_plc_that_is_not_there_yet_is_tried_until_it_is_and_said_once(why: str
         with closing(stream):
             if why == CUT:
                 server.hook = lambda *_: CUT
+            if why == "illegal address":
+                server.refused = [range(65536)]
             assert not any(len(next(stream)) for _ in range(20))
             server.hook = lambda *_: None
+            server.refused = []
             time.scan = TracePlc(server).scan
             assert any(len(next(stream)) for _ in range(8))
     assert len(told) == 1
 
 
-def test_an_address_refused_later_is_an_error_and_not_retried(rig: Rig) -> None:
+def test_an_address_that_is_not_served_any_more_is_tried_until_it_is(rig: Rig) -> None:
+    """As while the PLC takes a new program."""
     rig.at_work()
     rig.server.refused = [range(100, 112)]
-    with pytest.raises(SourceError, match=r"holding:100–111 \[40101–40112\]: illegal data addr"):
+    assert not any(len(next(rig.stream)) for _ in range(8))
+    rig.server.refused = []
+    assert any(len(next(rig.stream)) for _ in range(8))
+
+
+def test_a_request_that_is_refused_otherwise_is_an_error_and_not_retried(rig: Rig) -> None:
+    rig.at_work()
+    rig.server.hook = lambda *_: 1
+    with pytest.raises(SourceError, match=r"holding:100–111 \[40101–40112\]: illegal function"):
         rig.take(2)
 
 
