@@ -14,6 +14,7 @@ from drivers.ring import RECORDS_AT_ONCE, Trace
 from drivers.tags import Address, Pressure, Tag, WordOrder, Words, numbers
 from drivers.trace import Header
 from twin.errors import SourceError
+from twin.signals import BAR, MBAR
 
 TEST_REGISTERS = Address("holding", 0)
 ORDERS: tuple[WordOrder, ...] = ("big", "little")
@@ -22,6 +23,9 @@ WATCHED_S = 0.5  # to measure the scan rate
 # Of the time watched: a clock in a PLC is off by less than a thousandth, a task that misses its
 # period or a sequence with its words swapped by much more.
 RATE_TOLERANCE = 0.1
+# Absolute pressures that can be: no ejector evacuates to 2 mbar, and no network of compressed air
+# has more than PN 16. Beyond are numbers of another type, or with their words swapped.
+POSSIBLE = 2.0 * MBAR, 17.0 * BAR
 
 
 @dataclass(frozen=True)
@@ -103,16 +107,32 @@ def _show(link: Link, tag: Tag, settings: ModbusSettings) -> str:
     if len(orders) > 1:
         values = [f"{order} {value}" for order, value in zip(orders, values, strict=True)]
         values.append(f"configured {settings.word_order}")
-    return f"{tag.address}: {hexadecimal} = {', '.join(values)}"
+    text = f"{tag.address}: {hexadecimal} = {', '.join(values)}"
+    if isinstance(tag, Pressure) and not _is_possible(tag, words, settings.word_order, settings):
+        fits = [order for order in orders if _is_possible(tag, words, order, settings)]
+        look = "check its address, type, scale, unit and range under [driver.tags]"
+        raise SourceError(
+            f"{text}: this pressure cannot be",
+            f'word_order = "{fits[0]}" in [driver] gives one that can be; or {look}'
+            if fits
+            else look,
+        )
+    return text
+
+
+def _is_possible(tag: Pressure, words: Words, order: WordOrder, settings: ModbusSettings) -> bool:
+    """Whether there is an ejector at such a pressure, and it is in the range that the tag has."""
+    pascal, quality = tag.decode(words, order, settings.ambient_mbar * MBAR)
+    return not quality[0] and POSSIBLE[0] <= float(pascal[0]) <= POSSIBLE[1]
 
 
 def _value(tag: Tag, words: Words, order: WordOrder, settings: ModbusSettings) -> str:
     raw = tag.raw(words, order)[0]
     if not isinstance(tag, Pressure):
         return f"{raw}"
-    pascal, quality = tag.decode(words, order, settings.ambient_mbar * 100.0)
+    pascal, quality = tag.decode(words, order, settings.ambient_mbar * MBAR)
     flags = " flagged" if quality[0] else ""
-    return f"{raw:.6g} → {pascal[0] / 100.0:.5g} mbar absolute{flags}"
+    return f"{raw:.6g} → {pascal[0] / MBAR:.5g} mbar absolute{flags}"
 
 
 def word_order_of(words: Words) -> WordOrder | None:

@@ -81,6 +81,29 @@ def test_without_test_registers_both_orders_are_shown(plc: TracePlc) -> None:
     assert "little" in found["pressure"].text
 
 
+@pytest.mark.parametrize(
+    ("reads", "swapped", "measures", "hint"),
+    [
+        (612.5, True, None, 'word_order = "little" in [driver] gives one that can be; or check'),
+        (-5.0, False, None, "check its address, type, scale"),  # less than nothing
+        (0.0, False, None, "check its address, type, scale"),  # no ejector comes so far
+        (612.5, False, [0.0, 500.0], "check its address, type, scale"),
+    ],
+)
+def test_a_pressure_that_cannot_be_is_not_good(
+    plc: TracePlc, reads: float, swapped: bool, measures: list[float] | None, hint: str
+) -> None:
+    plc.put(3, 0, [0] * 6)  # without test registers there is nothing else to tell by
+    words = plc.words(">f", reads)
+    plc.put(4, 1, words[::-1] if swapped else words)
+    tag = TAGS["pressure"] | ({"range": measures} if measures else {})
+    found = lines(plc, tags=TAGS | {"pressure": tag})
+    assert found["word order"].good
+    assert not found["pressure"].good
+    assert found["pressure"].text.endswith(": this pressure cannot be")
+    assert found["pressure"].hint.startswith(hint)
+
+
 def test_what_the_plc_refuses_is_said_and_the_rest_goes_on(plc: TracePlc) -> None:
     plc.server.refused = [range(5), range(1000, 65536)]
     found = lines(plc)
