@@ -6,6 +6,7 @@ from pathlib import Path
 from drivers.plc.registers import table as register_table
 from twin.alarms.words import rules_table as alarm_rules_table
 from twin.alarms.words import table as alarm_states_table
+from twin.figures.curve import table as curve_table
 from twin.figures.table import table as figures_table
 from twin.figures.warnings import table as warnings_table
 from twin.model.courses import table as courses_table
@@ -21,6 +22,7 @@ TABLES = {
     "effects": effects_table,
     "courses": courses_table,
     "key figures": figures_table,
+    "curve figures": curve_table,
     "warnings": warnings_table,
     "alarm states": alarm_states_table,
     "alarm rules": alarm_rules_table,

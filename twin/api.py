@@ -203,13 +203,19 @@ class Answer:
 
 
 def open(  # noqa: A001  (as a module's open is called)
-    path: Place, config: Place | Config | None = None, *, unit: str = "", assets: str = ""
+    path: Place,
+    config: Place | Config | None = None,
+    *,
+    unit: str = "",
+    assets: str = "",
+    derive_commands: bool = False,
 ) -> Log:
     """Open a log (MCAP), or a table (CSV, Parquet) of a PLC's trace.
 
     A log carries its configuration and the data set it was recorded beside; ``config``, a file or
     that of another log or calibration, takes its place. A table needs one. ``unit`` and ``assets``
-    are the unit and the asset database in place of the configured ones.
+    are the unit and the asset database in place of the configured ones. ``derive_commands`` finds
+    the commands that a table lacks from its pressure, and warns of what cannot be told then.
 
     SourceError where a file cannot be read, ConfigError where a configuration cannot be used or is
     that of another ejector.
@@ -225,9 +231,10 @@ def open(  # noqa: A001  (as a module's open is called)
         raise ConfigError(f"{path}: a table does not say which ejector it is of", hint)
     else:
         settings = _configured(config, assets, unit)
-        source = _table(path, settings)
+        source = _table(path, settings, derive_commands)
         remark = f"columns not taken: {', '.join(source.ignored)}" if source.ignored else ""
-    for what in filter(None, (remark, settings.instead if unit else "")):
+    derived = source.commands if isinstance(source, Table) else source.header.derived
+    for what in filter(None, (remark, derived, settings.instead if unit else "")):
         warnings.warn(what, stacklevel=2)
     return Log(path, settings, assets, _source=source)
 
@@ -303,10 +310,12 @@ def _of_log(recorded: Recorded, config: Place | Config | None, assets: str, unit
     return settings
 
 
-def _table(path: Path, settings: Config) -> Table:
-    """A table whose columns are as the configuration says."""
+def _table(path: Path, settings: Config, derive: bool) -> Table:
+    """A table whose columns are as the configuration says, maybe with derived commands."""
     wanted = settings.document.section(ImportSettings, "import")
-    return open_table(path, wanted, settings.data.ambient.pressure_mbar * MBAR)
+    ambient = settings.data.ambient.pressure_mbar * MBAR
+    table = open_table(path, wanted, ambient, derive=derive)
+    return table.with_commands() if derive else table
 
 
 def _bits(flags: npt.NDArray[np.uint8], bits: Mapping[str, int]) -> Columns:

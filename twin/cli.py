@@ -230,7 +230,9 @@ def replay(
     with _views_of({"": settings}, view, rrd) as view_of, _stop_on_signal(None) as stopped:
         console, kept = Console(), _Kept() if json_file else None
         sinks = _opened(
-            (lambda: Recorder(output, settings.log_header())) if output else None,
+            (lambda: Recorder(output, settings.log_header(recorded.header.unmeasured)))
+            if output
+            else None,
             view_of(""),
             lambda: console,
             (lambda: kept) if kept else None,
@@ -446,9 +448,14 @@ def import_(
     output: Annotated[Path, typer.Option("-o", metavar="LOG.mcap", help="Write the new log.")],
     unit: UnitId = "",
     assets: AssetsUrl = "",
+    derive_commands: Annotated[
+        bool,
+        typer.Option("--derive-commands", help="Find commands that FILE lacks from the pressure."),
+    ] = False,
 ) -> None:
     """Make a log of a PLC's trace export, with what the twin expects beside it."""
     from twin.live import run as run_loop
+    from twin.log.header import DERIVED
     from twin.log.part import refuse_other_suffix
     from twin.log.recorder import Recorder
     from twin.settings import Document
@@ -459,12 +466,18 @@ def import_(
     refuse_other_suffix(output)
     settings = _configured(Document.read(config), assets, unit)
     wanted = settings.document.section(ImportSettings, "import")
-    table = open_table(file, wanted, settings.data.ambient.pressure_mbar * MBAR)
+    ambient = settings.data.ambient.pressure_mbar * MBAR
+    table = open_table(file, wanted, ambient, derive=derive_commands)
     if table.ignored:
         print(f"twin: columns not taken: {', '.join(table.ignored)}", file=sys.stderr)
+    unmeasured = {}
+    if derive_commands:
+        table = table.with_commands()
+        unmeasured[DERIVED] = table.commands
+        print(f"twin: {table.commands}", file=sys.stderr)
     twin, monitor = pair_of(settings)
     with _whole(output) as part, _stop_on_signal(None) as stopped:
-        sinks = _opened(lambda: Recorder(part, settings.log_header()), Console)
+        sinks = _opened(lambda: Recorder(part, settings.log_header(unmeasured)), Console)
         blocks = _until(stopped, _progress(table.blocks(), "importing"))
         run_loop(blocks, twin, monitor, sinks)
     _leave(interrupted=stopped() == "interrupted")
@@ -634,10 +647,12 @@ def _file_of(path: Path | None, name: str) -> Path | None:
 
 def _recorder(file: Path, settings: "Config", *, hil: bool) -> "Sink":
     """The log of a live run."""
+    from twin.log.header import HIL
     from twin.log.recorder import Recorder
 
     rotate = round(settings.log.rotate_mb * 1e6)
-    return Recorder(file, settings.log_header(hil=hil), rotate_bytes=rotate)
+    own = {HIL: "the pressure is the model's own, as it was written to the PLC"} if hil else None
+    return Recorder(file, settings.log_header(own), rotate_bytes=rotate)
 
 
 def pair_of(settings: "Config") -> tuple["Twin", "Monitor"]:

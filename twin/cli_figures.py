@@ -55,12 +55,13 @@ def show(
     keep: Annotated[bool, typer.Option("--keep", help="Add them to the database.")] = False,
     figures: Url = "",
 ) -> None:
-    """Key figures of every cycle of a log: measured, and what the twin expected."""
+    """Key figures of every cycle of a log: measured, expected, and read off the curve."""
     from twin.assets.unit import Unit
+    from twin.figures.curve import stretches, volume_of
     from twin.figures.export import to_table
     from twin.figures.read import of_log
     from twin.figures.store import open_store
-    from twin.figures.words import cycles_table
+    from twin.figures.words import curve_plain, curve_table, cycles_table
     from twin.log.reader import open_log
     from twin.tables.sheet import export as export_table
 
@@ -71,10 +72,16 @@ def show(
     say_if_cut(recorded, log, "used")
     settings = _of_log(recorded, log, config)
     plain = [kept for _, kept in of_log(recorded, key_figures_of(settings))]
-    print(cycles_table(plain))
+    suctions = list(stretches((rows for rows, _ in recorded.blocks()), volume_of(settings)))
+    if recorded.header.derived:
+        print(f"twin: {recorded.header.derived}", file=sys.stderr)
+    print(cycles_table(plain), curve_table(suctions), sep="\n\n")
     unit, data_set = Unit(recorded.header.asset_type, recorded.header.asset_id), settings.data.hash
     if json_file is not None:
-        write_json(json_file, {"log": str(log), "cycles": plain})
+        content = {"log": str(log), "cycles": plain, "curve": curve_plain(suctions)}
+        if recorded.header.derived:
+            content["commands"] = recorded.header.derived
+        write_json(json_file, content)
     if output is not None:
         with open_store("sqlite://") as store:
             store.add(unit, data_set, log.name, plain)

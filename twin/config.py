@@ -169,10 +169,10 @@ class Config:
         named = {"type": header.asset_type, "id": header.asset_id}
         return replace(config, asset=config.asset.model_copy(update=named))
 
-    def log_header(self, *, hil: bool = False) -> LogHeader:
+    def log_header(self, unmeasured: Mapping[str, str] | None = None) -> LogHeader:
         """What a log of this unit must carry to be replayed alone.
 
-        ``hil``: its pressure is the model's own.
+        ``unmeasured`` says what of its rows was not measured (``LogHeader.unmeasured``).
         """
         metadata = {
             "program": version("ejector-twin"),
@@ -180,9 +180,8 @@ class Config:
             "origin": self.origin,
             "data": self.data.model_dump_json(),
             "healthy": self.monitor.healthy.model_dump_json(),
+            **(unmeasured or {}),
         }
-        if hil:
-            metadata["hil"] = "the pressure is the model's own, as it was written to the PLC"
         return LogHeader(
             asset_type=self.asset.type,
             asset_id=self.asset.id,

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from twin.model.gas import GAMMA, R
+from twin.figures.curve import flow_behind
 from twin.signals import MBAR, MS, NS, UNUSABLE, Command, Samples
 
 Floats = npt.NDArray[np.float64]
@@ -71,11 +71,11 @@ class Readings:
 
     def capacity(self, volume: float, ambient: float, temperature: float) -> float:
         """Suction (kg/s) at ambient that empties ``volume`` (m³) as fast as the record shows."""
-        return _flow(self.draw_rate, volume, ambient, temperature)
+        return flow_behind(self.draw_rate, volume, ambient, temperature)
 
     def blow_off(self, volume: float, ambient: float, temperature: float) -> float:
         """Blow-off flow (kg/s) that fills ``volume`` (m³) as fast as the record shows."""
-        return _flow(self.fill_rate, volume, ambient, temperature)
+        return flow_behind(self.fill_rate, volume, ambient, temperature)
 
 
 def read(samples: Samples) -> Readings:
@@ -221,15 +221,6 @@ def _fill_rate(pressure: Floats, found: list[Stretch], period: float, ambient: f
                 rise = part[ended[0]] - part[begun[0]]
                 rates.append(rise / ((ended[0] - begun[0]) * period) / top)
     return _median(rates)
-
-
-def _flow(rate: float, volume: float, ambient: float, temperature: float) -> float:
-    """Flow (kg/s) behind a relative change of pressure (1/s), within a fifth.
-
-    Half-way between a vessel that stays as warm as its wall and one without any heat from it.
-    """
-    between = (1.0 + 1.0 / GAMMA) / 2.0
-    return rate * volume * ambient / (R * temperature) * between
 
 
 def _median(values: list[float]) -> float:

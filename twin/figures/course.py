@@ -20,6 +20,7 @@ LEAST_WINDOW_S = 0.05  # noise of 0.3 mbar then gives 3 mbar/s
 LAST_S = 0.5  # at the end of the suction, in which it may stand still
 ENDS = (0.01, 0.99)  # quantiles that stand for the lowest and the highest reading
 LONGEST_HOLE = 0.01  # s without a reading, beyond which a switching may have been missed
+MOST_STEPS = 5.0  # of the cadence, without a reading: beyond, a level may have been missed
 
 Floats = npt.NDArray[np.float64]
 Bytes = npt.NDArray[np.uint8]
@@ -61,6 +62,7 @@ class Vacuum(NamedTuple):
     """What the vacuum did until suction was not commanded any more, single readings smoothed."""
 
     seamless: bool  # readings are so close that no switching can have been missed
+    even: bool  # none is missing that tells a level, however far apart they are
     h2_s: float  # when it came to H2
     h1_s: float  # and to H1
     highest: float  # mbar
@@ -92,6 +94,11 @@ class Course(NamedTuple):
     def is_whole(self) -> bool:
         """Whether nothing of the suction was missed, to its end."""
         return self.ended and self.vacuum.seamless
+
+    @property
+    def is_even(self) -> bool:
+        """Whether the vacuum was seen as often as ever, to the end of the suction."""
+        return self.ended and self.vacuum.even
 
 
 def course(rows: Rows, h2: float, h1: float) -> Course:
@@ -241,13 +248,17 @@ def _vacuum(time, vacuum, phase, end, levels):  # type: ignore[no-untyped-def]
     """What it did in rows of suction, which ended at ``end`` (s)."""
     times, smooth, hole = _readings(time, vacuum, end)
     seamless = len(times) > 0 and hole <= LONGEST_HOLE
+    longest = LONGEST_HOLE
+    if len(times) > 1:
+        longest = max(longest, MOST_STEPS * (times[-1] - times[0]) / (len(times) - 1))
     last, last_slope, _ = _line(times, smooth, end - LAST_S, end)
     begin, behind = _stretch(phase, _HOLD, 0)
     leakage = _leakage(time[begin:behind], vacuum[begin:behind]) if seamless else math.nan
     return Vacuum(
         seamless,
-        _reached(times, smooth, levels[0]),
-        _reached(times, smooth, levels[1]),
+        len(times) > 0 and hole <= longest,
+        _reached(times, smooth, levels[0], longest),
+        _reached(times, smooth, levels[1], longest),
         smooth.max() if len(smooth) > 0 else math.nan,
         last,
         last_slope,
@@ -286,12 +297,15 @@ def _smoothed(padded):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _reached(time, vacuum, level):  # type: ignore[no-untyped-def]
-    """Time (s) at which the vacuum comes to ``level`` (mbar); NaN if it does not, or unseen."""
+def _reached(time, vacuum, level, longest):  # type: ignore[no-untyped-def]
+    """Time (s) at which the vacuum comes to ``level`` (mbar); NaN if it does not.
+
+    So it is where there was no reading for ``longest`` (s) before.
+    """
     for row in range(len(time)):
         if vacuum[row] >= level:
             before = time[row - 1] if row > 0 else 0.0
-            if time[row] - before > LONGEST_HOLE:
+            if time[row] - before > longest:
                 return math.nan
             if row == 0:
                 return time[row]

@@ -84,7 +84,7 @@ def quality(course: Course, unit: Unit) -> float:
 
 def free_flow(course: Course, unit: Unit) -> float:
     """Vacuum (mbar) at which suction stands still short of H1, as with the cup open."""
-    if not course.is_whole or course.nozzle.went_off:
+    if not course.is_even or (course.is_whole and course.nozzle.went_off):
         return UNKNOWN
     if course.suction_s < FREE_SUCTION_S or abs(course.vacuum.last_slope) > STEADY:
         return UNKNOWN
@@ -99,7 +99,7 @@ def performance(course: Course, unit: Unit) -> float:
 
 def max_vacuum(course: Course, _unit: Unit) -> float:
     """Highest vacuum (mbar)."""
-    return course.vacuum.highest if course.is_whole else UNKNOWN
+    return course.vacuum.highest if course.is_even else UNKNOWN
 
 
 def h1_not_reached(course: Course, unit: Unit) -> float:

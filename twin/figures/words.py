@@ -1,9 +1,11 @@
 """Key figures for people: a table of cycles, and trends in a sentence."""
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from twin.figures.curve import CURVE, Reading, Stretch, readings
 from twin.figures.settings import Limits
 from twin.figures.store import History
 from twin.figures.table import FIGURES, Figure
@@ -24,6 +26,64 @@ def cycles_table(cycles: Sequence[Mapping[str, Any]]) -> str:
         "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
         for row in rows
     )
+
+
+def curve_table(suctions: Sequence[Stretch]) -> str:
+    """One line for each suction: what is read off the curve, and why some of it is not."""
+    if not suctions:
+        return "no suction in this record: nothing is read off its curve"
+    found = [readings(one) for one in suctions]
+    head = ["suction", *(f"{name} ({figure.unit})" for name, figure in CURVE.items())]
+    rows = [[str(number), *map(_reading, one.values())] for number, one in enumerate(found)]
+    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+    lines = [
+        "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in (head, *rows)
+    ]
+    step = max(one.step for one in suctions) * 1e3
+    title = (
+        "read off the curve, without a model; vacuum counts from the record's own idle;"
+        f" ± is half of a 95 % interval; a reading each {step:.3g} ms"
+    )
+    return "\n".join([title, *lines, *_missing(found)])
+
+
+def _reading(reading: Reading) -> str:
+    if reading.why:
+        return "-"
+    if not reading.half > 0.0:
+        return f"{reading.value:.3g}"
+    decimals = max(1 - math.floor(math.log10(reading.half)), 0)
+    return f"{reading.value:.{decimals}f} ± {reading.half:.{decimals}f}"
+
+
+def _missing(found: Sequence[Mapping[str, Reading]]) -> list[str]:
+    """Why figures are not told, the most frequent reason of each."""
+    lines = []
+    for name in CURVE:
+        whys = Counter(one[name].why for one in found if one[name].why)
+        if whys:
+            (why, _), many = whys.most_common(1)[0], sum(whys.values())
+            lines.append(f"{name}: not told of {many} of {len(found)}: {why}")
+    return lines
+
+
+def curve_plain(suctions: Sequence[Stretch]) -> list[dict[str, Any]]:
+    """The same as JSON has it: value, half of the 95 % interval, unit; or ``why`` there is none."""
+    return [
+        {
+            "begin_ns": one.begin_ns,
+            **{name: _reading_plain(name, reading) for name, reading in readings(one).items()},
+        }
+        for one in suctions
+    ]
+
+
+def _reading_plain(name: str, reading: Reading) -> dict[str, Any]:
+    if reading.why:
+        return {"value": None, "why": reading.why}
+    value, half = round(reading.value, 4), round(reading.half, 4)
+    return {"value": value, "half95": half, "unit": CURVE[name].unit}
 
 
 def _cells(cycle: Mapping[str, Any]) -> list[str]:

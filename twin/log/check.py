@@ -34,6 +34,7 @@ class Report:
     restarts: int  # gaps after which the sequence begins anew
     time_back: int  # places where PLC time does not go forward
     bytes_per_sample: float  # of the files
+    derived: str = ""  # how its commands were, where nobody recorded them
 
     @property
     def sound(self) -> bool:
@@ -50,6 +51,8 @@ class Report:
         ]
         if self.time_back:
             lines.insert(2, f"PLC time does not go forward at {self.time_back} places")
+        if self.derived:
+            lines.append(f"commands: {self.derived}")
         return "\n".join([*lines, *(f"unreadable: {damage}" for damage in self.damage)])
 
     def _missing(self) -> str:
@@ -139,6 +142,7 @@ def _go_through(log: Log, take: Callable[[Samples, Ticks, Sequence[Event]], None
         restarts=tally.restarts,
         time_back=tally.time_back,
         bytes_per_sample=size / max(tally.samples, 1),
+        derived=log.header.derived,
     )
 
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 FORMAT = "ejector-twin-log/1"
+HIL, DERIVED = "hil", "derived_commands"  # what of the rows was not measured, in free metadata
 
 
 @dataclass(frozen=True)
@@ -15,6 +16,16 @@ class LogHeader:
     config_text: str  # TOML, kept as an attachment
     metadata: dict[str, str] = field(default_factory=dict)  # hash of the data set, version, ...
     ambient: float = 101_325.0  # Pa, from which the vacuum in /scalars is counted
+
+    @property
+    def derived(self) -> str:
+        """How commands were derived from the pressure, in words; empty where they were recorded."""
+        return self.metadata.get(DERIVED, "")
+
+    @property
+    def unmeasured(self) -> dict[str, str]:
+        """What of the rows was not measured, and goes with them into another log."""
+        return {name: self.metadata[name] for name in (HIL, DERIVED) if name in self.metadata}
 
 
 @dataclass(frozen=True)

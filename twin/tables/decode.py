@@ -41,7 +41,8 @@ def decode(batch: Batch, layout: Layout, ambient: float) -> tuple[Samples, Spoil
         if name in batch.columns:
             _whole(batch, name, rows[name.value], bad)
     for name in COMMANDS:
-        _command(batch, name, rows, bad)
+        if name in batch.columns:
+            _command(batch, name, rows, bad)
     with np.errstate(over="ignore"):  # too large is infinite, and infinite is bad
         _pressure(batch, layout.pressure, ambient, rows, bad)
         _supply(batch, rows, bad)

@@ -88,6 +88,8 @@ class Intake:
         else:
             self._count(run, lead)
         for name, bit in COMMANDS.items():
+            if name not in good:
+                continue
             read = run["commands"] & bit.value
             state = read.copy()
             _carry_on(state, good[name], 0)

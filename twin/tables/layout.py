@@ -20,7 +20,7 @@ BELOW_AMBIENT = {  # in Pa
     Column.VACUUM_BAR: BAR,
 }
 
-_REQUIRED = (tuple(DIGITS), *((name,) for name in COMMANDS), (*ABSOLUTE, *BELOW_AMBIENT))
+_REQUIRED = (tuple(DIGITS), (*ABSOLUTE, *BELOW_AMBIENT))
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,11 @@ class Layout:
 
     theirs: Mapping[Column, str]  # name in the file
     ignored: tuple[str, ...]
+
+    @property
+    def lacking(self) -> tuple[Column, ...]:
+        """The commands that the file does not have."""
+        return tuple(name for name in COMMANDS if name not in self.theirs)
 
     @property
     def time(self) -> Column:
@@ -41,8 +46,13 @@ class Layout:
         return next(name for name in (*ABSOLUTE, *BELOW_AMBIENT) if name in self.theirs)
 
 
-def find_layout(header: Sequence[str], settings: ImportSettings, place: str) -> Layout:
-    """Find the known columns among a file's; SourceError names ``place`` and what is amiss."""
+def find_layout(
+    header: Sequence[str], settings: ImportSettings, place: str, *, derive: bool = False
+) -> Layout:
+    """Find the known columns among a file's; SourceError names ``place`` and what is amiss.
+
+    With ``derive`` commands may be lacking, and one must.
+    """
     wanted = {name: settings.columns.get(name, name.value) for name in Column}
     claimed = set(settings.columns.values())  # not taken by its own name as well
     theirs = {
@@ -54,8 +64,14 @@ def find_layout(header: Sequence[str], settings: ImportSettings, place: str) -> 
         if name not in theirs:
             what = f"no column {wanted[name]!r}, which [import.columns] gives for {name}"
             raise _missing(what, name, header, place)
-    for names in _REQUIRED:
+    commands = [] if derive else [(name,) for name in COMMANDS]
+    for names in (*_REQUIRED, *commands):
         _require_one(names, theirs, header, place)
+    if derive and all(name in theirs for name in COMMANDS):
+        raise ConfigError(
+            f"{place}: the file has both commands, {' and '.join(COMMANDS)}: none is to be derived",
+            "leave --derive-commands out",
+        )
     _require_unit(theirs, settings, place)
     for there in theirs.values():
         if header.count(there) > 1:
@@ -91,10 +107,10 @@ def _require_unit(theirs: Mapping[Column, str], settings: ImportSettings, place:
 def _missing(what: str, name: Column, header: Sequence[str], place: str) -> SourceError:
     there = ", ".join(map(repr, header))
     shown = there if len(there) <= 300 else f"{there[:300]} ..."
-    return SourceError(
-        f"{place}: {what}; the columns are {shown}",
-        f'say under [import.columns] which one it is: {name} = "NAME IN THE FILE"',
-    )
+    hint = f'say under [import.columns] which one it is: {name} = "NAME IN THE FILE"'
+    if name in COMMANDS:
+        hint += "; if nobody recorded it, twin import --derive-commands finds it from the pressure"
+    return SourceError(f"{place}: {what}; the columns are {shown}", hint)
 
 
 def _too_many(what: str, place: str) -> SourceError:
