@@ -85,7 +85,9 @@ def test_a_log_that_was_cut_off_is_shown_and_said_to_be(
 
 
 def test_a_log_is_shown_with_what_was_expected(run: Run, log: Path) -> None:
-    head, *rows = run("show", log).splitlines()
+    cycles, curve = run("show", log).split("\n\n")
+    head, *rows = cycles.splitlines()
+    assert curve.startswith("read off the curve, without a model; vacuum counts from the record's")
     assert head.split()[:3] == ["cycle", "t0", "(ms)"]
     assert len(rows) == 10  # the last one cut off
     assert rows[3].split()[0] == "3"

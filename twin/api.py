@@ -31,6 +31,7 @@ from twin.figures.cycle import compiled as key_figures
 from twin.figures.settings import FigureSettings
 from twin.hil import Plant
 from twin.live import Twin
+from twin.log.header import DERIVED, LogHeader
 from twin.log.reader import Log as Recorded
 from twin.log.reader import open_log
 from twin.model.dataset import coefficients
@@ -125,6 +126,14 @@ class Log:
         teller = key_figures(self.config.data, figures)
         told = (teller.take(cycle) for cycle in cut(self._rows()))
         return [one.plain() for one in told if one is not None]
+
+    @property
+    def _header(self) -> LogHeader:
+        """What the log says of itself, or would say as one."""
+        if not isinstance(self._source, Table):
+            return self._source.header
+        derived = self._source.commands
+        return self.config.log_header({DERIVED: derived} if derived else None)
 
     def _samples(self) -> Iterator[Samples]:
         """What was measured, in blocks."""
@@ -233,10 +242,10 @@ def open(  # noqa: A001  (as a module's open is called)
         settings = _configured(config, assets, unit)
         source = _table(path, settings, derive_commands)
         remark = f"columns not taken: {', '.join(source.ignored)}" if source.ignored else ""
-    derived = source.commands if isinstance(source, Table) else source.header.derived
-    for what in filter(None, (remark, derived, settings.instead if unit else "")):
+    log = Log(path, settings, assets, _source=source)
+    for what in filter(None, (remark, log._header.derived, settings.instead if unit else "")):
         warnings.warn(what, stacklevel=2)
-    return Log(path, settings, assets, _source=source)
+    return log
 
 
 def simulate(
@@ -273,6 +282,7 @@ def calibrate(log: Log, progress: Progress = _quiet) -> Calibrated:
     ``progress`` is told what is being done: ``print``, for example. ConfigError where the log does
     not suffice, or is not that of a healthy unit.
     """
+    log._header.require_commands(str(log.path))
     document, unit = log.config.document, log.config.asset.id
     settings = Config.of(document, log.assets, unit, calibrated=False)
     found = fit_unit(settings, log._samples(), progress)
@@ -286,7 +296,8 @@ def diagnose(log: Log, progress: Progress = _quiet) -> Answer:
 
     ``progress`` as in ``calibrate``. ConfigError where the twin is not calibrated.
     """
-    return Answer(find_cause(log.config, log._samples(), str(log.path), progress))
+    samples, derived = log._samples(), log._header.derived
+    return Answer(find_cause(log.config, samples, str(log.path), progress, derived=derived))
 
 
 # --- what these share ---------------------------------------------------------------------------

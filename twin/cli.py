@@ -225,7 +225,7 @@ def replay(
         recorded = open_log(log)
         say_if_cut(recorded, log, "replayed")
         settings = _settings_of(recorded.header, log, config, assets, unit, as_of)
-        twin, monitor = pair_of(settings)
+        twin, monitor = pair_of(settings, judges=not recorded.header.derived)
         alarms = alarms_of(settings)()
     with _views_of({"": settings}, view, rrd) as view_of, _stop_on_signal(None) as stopped:
         console, kept = Console(), _Kept() if json_file else None
@@ -318,7 +318,8 @@ def diagnose(
     if not unit:
         settings.refuse_another(recorded.header, str(log))
     with _status() as say:
-        diagnosis = find_cause(settings, (rows for rows, _ in recorded.blocks()), str(log), say)
+        blocks = (rows for rows, _ in recorded.blocks())
+        diagnosis = find_cause(settings, blocks, str(log), say, derived=recorded.header.derived)
     print(in_words(diagnosis))
     if json_file is not None:
         write_json(json_file, diagnosis.json)
@@ -349,6 +350,7 @@ def calibrate(
     if not settings.asset.id:
         raise ConfigError("no unit is named", "give --id ID, or [asset] id in the configuration")
     recorded = open_log(log)
+    recorded.header.require_commands(str(log))
     say_if_cut(recorded, log, "used")
     with _status() as say:
         calibration = fit_unit(settings, (rows for rows, _ in recorded.blocks()), say)
@@ -392,6 +394,7 @@ def commission(
     require_writable(json_file, report)
     recorded = None if source.suffix == ".toml" else open_log(source)
     if recorded is not None:
+        recorded.header.require_commands(str(source))
         say_if_cut(recorded, source, "used")
     if recorded is None or config is not None:
         document = Document.read(config or source)
@@ -475,7 +478,7 @@ def import_(
         table = table.with_commands()
         unmeasured[DERIVED] = table.commands
         print(f"twin: {table.commands}", file=sys.stderr)
-    twin, monitor = pair_of(settings)
+    twin, monitor = pair_of(settings, judges=not table.commands)
     with _whole(output) as part, _stop_on_signal(None) as stopped:
         sinks = _opened(lambda: Recorder(part, settings.log_header(unmeasured)), Console)
         blocks = _until(stopped, _progress(table.blocks(), "importing"))
@@ -655,8 +658,8 @@ def _recorder(file: Path, settings: "Config", *, hil: bool) -> "Sink":
     return Recorder(file, settings.log_header(own), rotate_bytes=rotate)
 
 
-def pair_of(settings: "Config") -> tuple["Twin", "Monitor"]:
-    """The twin of a configuration and its monitor."""
+def pair_of(settings: "Config", *, judges: bool = True) -> tuple["Twin", "Monitor"]:
+    """The twin of a configuration and its monitor, which may be one that ``judges`` no cycle."""
     from twin.live import compiled
     from twin.monitor.detect import Monitor
     from twin.monitor.isolation import Isolation
@@ -665,11 +668,11 @@ def pair_of(settings: "Config") -> tuple["Twin", "Monitor"]:
     watch = settings.monitor
     isolation = (
         Isolation.of(settings.data, watch.healthy, watch.false_alarm_days)
-        if watch.isolate
+        if watch.isolate and judges
         else None
     )
-    teller = key_figures_of(settings)
-    monitor = Monitor(watch, twin.theta, teller=teller, isolation=isolation)
+    teller = key_figures_of(settings) if judges else None
+    monitor = Monitor(watch, twin.theta, teller=teller, isolation=isolation, judges=judges)
     if settings.document.tables.get("driver", {}).get("mode") == "poll":
         monitor.clocks = None  # then time is that of the poll here
     return twin, monitor

@@ -106,7 +106,8 @@ def refuse_unreadable(readings: Readings) -> None:
         raise ConfigError(
             f"the record has a row each {readings.period / MS:.0f} ms: the nozzle's switching and"
             " the valves' delays are not seen in it",
-            f"record again with a row each {SLOWEST / MS:.0f} ms or faster",
+            f"record again with a row each {SLOWEST / MS:.0f} ms or faster; what needs no twin:"
+            " twin figures show LOG, twin compare A B",
         )
     if readings.missing > MOST_MISSING:
         raise ConfigError(

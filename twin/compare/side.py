@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from twin.config import Config
 from twin.errors import SourceError
+from twin.figures.curve import Stretch, readings, stretches, volume_of
 from twin.figures.cycle import MOST_PIECES, CycleFigures, KeyFigures
 from twin.log.header import LogHeader
 from twin.log.reader import Log
@@ -67,7 +68,7 @@ class Curve:
 
 @dataclass
 class Side:
-    """The complete cycles of one log."""
+    """The complete cycles of one log; the suctions of one whose commands were derived."""
 
     name: str
     header: LogHeader
@@ -76,6 +77,7 @@ class Side:
     measured: list[dict[str, float]] = field(default_factory=list)  # a row for each cycle
     expected: list[dict[str, float]] = field(default_factory=list)
     deviation: list[dict[str, float]] = field(default_factory=list)
+    curve: list[dict[str, float]] = field(default_factory=list)  # read off it, without a model
     measured_vacuum: Curve = field(default_factory=Curve)
     expected_vacuum: Curve = field(default_factory=Curve)
     off: Curve = field(default_factory=Curve)  # measured less expected pressure
@@ -84,6 +86,11 @@ class Side:
     def asset(self) -> str:
         """Type and id, for people."""
         return " ".join(filter(None, (self.header.asset_type, self.header.asset_id)))
+
+    @property
+    def derived(self) -> bool:
+        """Whether nobody recorded its commands."""
+        return bool(self.header.derived)
 
     def add(self, cycle: Cycle, told: CycleFigures, theta: Theta) -> None:
         """Take a whole cycle; ``theta`` are the coefficients of the twin beside it."""
@@ -108,6 +115,12 @@ def side_of(log: Log, settings: Config, key_figures: KeyFigures) -> Side:
     """
     theta = coefficients(settings.data)
     side = Side(log.path.name, log.header, settings.data.hash)
+    blocks = (rows for rows, _ in log.blocks())
+    suctions = _settled(one for one in stretches(blocks, volume_of(settings)) if one.ended)
+    side.curve = [_told(one) for one in suctions]
+    if side.derived:
+        _add_suctions(side, suctions)
+        return side
     for cycle in whole(log.blocks()):
         told = key_figures.take(cycle)
         if told is not None and told.complete and cycle.complete and cycle.settled:
@@ -118,6 +131,28 @@ def side_of(log: Log, settings: Config, key_figures: KeyFigures) -> Side:
             "record at least two cycles in a row without a gap",
         )
     return side
+
+
+def _settled(suctions: Iterable[Stretch]) -> list[Stretch]:
+    """All but the first of several, whose gas is not yet as warm as in the others."""
+    every = list(suctions)
+    return every[1:] if len(every) > 1 and every[0].begun else every
+
+
+def _told(suction: Stretch) -> dict[str, float]:
+    return {name: one.value for name, one in readings(suction).items() if not one.why}
+
+
+def _add_suctions(side: Side, suctions: list[Stretch]) -> None:
+    """Take those of derived commands; SourceError if none ends in the record."""
+    if not suctions:
+        raise SourceError(
+            f"{side.name}: no suction to compare: none ends in the record",
+            "record at least one suction with its release",
+        )
+    side.cycles = list(range(len(suctions)))
+    for one in suctions:
+        side.measured_vacuum.add(one.time - one.origin, one.vacuum)
 
 
 def whole(blocks: Iterable[tuple[Samples, Ticks]]) -> Iterator[Cycle]:

@@ -72,6 +72,14 @@ def remarks(comparison: Comparison) -> list[str]:
         said.append(
             f"different units, {a.header.asset_id or 'none'} and {b.header.asset_id or 'none'}"
         )
+    for label, side in (("A", a), ("B", b)):
+        if side.derived:
+            said.append(f"{label}: {side.header.derived}")
+    if a.derived != b.derived:
+        said.append(
+            "the commands of one log were recorded and of the other derived: compare no times with"
+            " them, for a recorded command comes before the pressure moves"
+        )
     if a.data_set != b.data_set:
         said.append(
             "the logs were made beside different data sets: what is expected, and deviations,"

@@ -60,9 +60,11 @@ def diagnose(
     log: str,
     progress: Callable[[str], None],
     before_s: float = 0.0,
+    derived: str = "",
 ) -> Diagnosis:
     """Diagnose a log, or the part of it that begins ``before_s`` into it.
 
+    ``derived`` says how its commands were, where nobody recorded them: then it cannot answer.
     Onsets in the answer count from the log's begin. ConfigError where the twin is not calibrated.
     """
     progress("running the twin over the log")
@@ -74,7 +76,7 @@ def diagnose(
         "asset": {"type": config.asset.type, "id": config.asset.id},
     }
     part = _part(blocks, before_s)
-    if reason := insufficient(evidence):
+    if reason := f"{derived}: record the commands as well" if derived else insufficient(evidence):
         answer = head | _insufficient(evidence, part, reason)
         return Diagnosis(evidence, config.data.hash, None, HEALTHY, (), None, None, [], answer)
     whole, evidence = evidence, thinned(evidence, evidence.judged, MOST_JUDGED)

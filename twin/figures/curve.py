@@ -82,12 +82,10 @@ class Stretch:
 
     @cached_property
     def idle(self) -> float:
-        """Pressure (mbar) at which nothing is commanded: at the end of what follows, or before."""
-        after = self.pressure[self.end :]
-        if self.ended and len(after) >= 3:
-            return float(np.median(after[-self.rows(LEVEL_S) :]))
-        before = self.pressure[: self.before]
-        return float(np.median(before[-self.rows(LEVEL_S) :])) if len(before) else math.nan
+        """Pressure (mbar) at which nothing is commanded: before suction, or at the end after it."""
+        before, after = self.pressure[: self.before], self.pressure[self.end :]
+        rest = before if self.begun and len(before) >= 3 else after
+        return float(np.median(rest[-self.rows(LEVEL_S) :])) if len(rest) else math.nan
 
     @cached_property
     def vacuum(self) -> Floats:
@@ -125,6 +123,15 @@ class Stretch:
     def rows(self, seconds: float) -> int:
         """Rows in so many seconds, three at least."""
         return max(round(seconds / self.step), 3)
+
+    @property
+    def origin(self) -> float:
+        """When (s) suction begins; where the record begins in it, when the evacuation does."""
+        if self.begun or self.half == self.before:
+            return 0.0
+        rows = slice(self.before, self.half + 1)
+        begins = self.crossing(self.level(0.1), rows, up=True)
+        return begins if math.isfinite(begins) else float(self.time[self.half])
 
     def level(self, share: float) -> float:
         """Vacuum (mbar) at a share of the evacuation's way."""

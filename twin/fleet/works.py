@@ -90,8 +90,10 @@ WORKS: Mapping[str, Callable[[Job], tuple[dict[str, Any], Record | None]]] = {
 
 
 def _samples(job: Job) -> Iterator[Samples]:
-    """What was measured, in blocks."""
-    return (samples for samples, _ in open_log(job.log).blocks())
+    """What was measured, in blocks; ConfigError where nobody recorded the commands."""
+    log = open_log(job.log)
+    log.header.require_commands(str(job.log))
+    return (samples for samples, _ in log.blocks())
 
 
 def _unsaid(_what: str) -> None:

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, field
 
+from twin.errors import ConfigError
+
 FORMAT = "ejector-twin-log/1"
 HIL, DERIVED = "hil", "derived_commands"  # what of the rows was not measured, in free metadata
 
@@ -21,6 +23,15 @@ class LogHeader:
     def derived(self) -> str:
         """How commands were derived from the pressure, in words; empty where they were recorded."""
         return self.metadata.get(DERIVED, "")
+
+    def require_commands(self, log: str) -> None:
+        """ConfigError where nobody recorded the commands: no twin can be fitted to such a log."""
+        if self.derived:
+            raise ConfigError(
+                f"{log}: {self.derived}. A twin needs to know when valves were told",
+                "record suction and blow-off beside the pressure, a row each 2 ms or faster;"
+                " what needs no twin: twin figures show LOG, twin compare A B",
+            )
 
     @property
     def unmeasured(self) -> dict[str, str]:

@@ -31,6 +31,7 @@ STALE = int(Quality.STALE)  # plain: NumPy makes masks of bytes with these, and 
 SUCTION, BLOW_OFF, IDLE = int(Phase.SUCTION), int(Phase.BLOW_OFF), int(Phase.IDLE)
 HOLD = int(Phase.HOLD)
 _NAMES = tuple((int(phase), phase.name.lower()) for phase in Phase)
+MEASURED = ("max_vacuum", "t0_measured")  # of ``figures``, what needs no model
 PAPER_VACUUM = 600.0 * MBAR  # Pa below ambient: what the founding paper times evacuation to
 
 

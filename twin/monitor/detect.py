@@ -18,7 +18,16 @@ from twin.events import Event, Kind
 from twin.model.effects import EFFECTS, UNKNOWN
 from twin.model.theta import Theta
 from twin.monitor.clock import ClockWatch
-from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, Look, Teller, Told, figures
+from twin.monitor.cycles import (
+    LONGEST_PIECE,
+    MEASURED,
+    Cycle,
+    CycleCutter,
+    Look,
+    Teller,
+    Told,
+    figures,
+)
 from twin.monitor.healthy import Healthy
 from twin.monitor.signatures import Likeness, drawn_rows, likenesses, look_alikes
 from twin.settings import Settings
@@ -100,6 +109,7 @@ class Monitor:
     active: str = ""  # the standing alarm's effect, or UNKNOWN; empty while there is none
     isolation: "Isolation | None" = None
     clocks: ClockWatch | None = field(default_factory=ClockWatch)  # None: the PLC has none
+    judges: bool = True  # cycles; not where nobody recorded the commands
     _cutter: CycleCutter = field(default_factory=CycleCutter)
     _before: Cycle | None = None
     _sought: Mapping[str, float] = field(default_factory=dict)  # figures, as the cause was sought
@@ -280,8 +290,13 @@ class Monitor:
         before, self._before = self._before, cycle
         whole = cycle.complete or len(cycle.samples) >= LONGEST_PIECE
         stale = silent or cycle.stale or (before is not None and before.stale)
-        fit = whole and cycle.settled and cycle.coverage >= FEWEST_SHARE and not stale
-        return Look(cycle, before, figures(cycle, self.theta), fit)
+        fit = (
+            self.judges and whole and cycle.settled and cycle.coverage >= FEWEST_SHARE and not stale
+        )
+        found = figures(cycle, self.theta)
+        if not self.judges:  # what hangs on the model
+            found = {name: value for name, value in found.items() if name in MEASURED}
+        return Look(cycle, before, found, fit)
 
     def _conclude(self, look: Look, told: Told | None, heard: "Heard | None") -> list[Event]:
         """What there is to say of a cycle, and an alarm if it is one."""
@@ -500,9 +515,8 @@ def _summary(
         data = {name: value for name, value in data.items() if not name.startswith("t0_")}
         return Event(told.end_ns, Kind.CYCLE, told.words, data | told.plain())
     text = f"cycle {cycle.index}"
-    if "t0_measured" in found and "t0_expected" in found:
-        text += (
-            f": evacuated to H2 in {found['t0_measured']:.0f} ms"
-            f" (expected {found['t0_expected']:.0f} ms)"
-        )
+    if "t0_measured" in found:
+        text += f": evacuated to H2 in {found['t0_measured']:.0f} ms"
+        if "t0_expected" in found:
+            text += f" (expected {found['t0_expected']:.0f} ms)"
     return Event(cycle.end_ns, Kind.CYCLE, text, data)

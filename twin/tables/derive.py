@@ -33,6 +33,7 @@ BRIEF, SHALLOW = 50.0 * MS, 0.2  # s, and share of the deepest vacuum: a line th
 ABRUPT = 0.1  # of the record, in which half of some move is over; drift takes longer
 ONSET = 0.05  # of a move, at which its beginning is looked for; noise and wander may ask for more
 FLAT = 0.25  # of the slope of a return: what is less steep comes before it
+LOOKS = 4  # at a fall, each from the level that the one before found
 SETTLED = 20.0 * MS  # s before a fall, that tell the level it begins at
 PEAK = 0.8  # of an overshoot; blow-off has ended where the pressure is below it
 MOST_AMBIENT = 1100.0 * MBAR  # Pa; the highest air pressure measured at sea level is 1085 mbar
@@ -146,7 +147,7 @@ def _least_move(traces: Sequence[_Trace]) -> float:
     pressure = np.concatenate([trace.pressure for trace in traces])
     noise = max(trace.noise for trace in traces)
     lowest, highest = float(pressure.min()), float(pressure.max())
-    if 0.0 < highest < 0.002 * MOST_AMBIENT:
+    if lowest >= 0.0 and highest < 0.002 * MOST_AMBIENT:
         raise SourceError(
             f"the pressure is never above {highest / MBAR:.3g} mbar: it is probably in bar",
             'say so under [import.columns]: pressure_bar = "NAME IN THE FILE", or vacuum_bar',
@@ -205,6 +206,8 @@ def _suctions(trace: _Trace, move: float) -> list[_Suction]:
     all_tops = _tops(trace, move, lows)
     usual = [_usual(number, all_tops) for number in range(len(all_tops))]
     tops = [_as_idle(top, other) for top, other in zip(all_tops, usual, strict=True)]
+    if tops[0] is not None:  # no blow-off is seen before it
+        tops[0] = all_tops[0]
     bounds = [0, *(number for number in range(1, len(lows)) if tops[number]), len(lows)]
     found = []
     for first, last in pairwise(bounds):
@@ -279,13 +282,14 @@ def _vacua(trace: _Trace, move: float) -> list[int]:
 def _rings(trace: _Trace, low: int, highs: list[int]) -> bool:
     """Whether a low is but a line that rings: brief, and shallow beside the deepest vacuum."""
     place = bisect(highs, low)
-    if place in {0, len(highs)}:
-        return False
-    rows = slice(highs[place - 1], highs[place] + 1)
+    first = highs[place - 1] if place else 0
+    rows = slice(first, (highs[place] if place < len(highs) else len(trace.time) - 1) + 1)
     part, deepest = trace.pressure[rows], float(np.ptp(trace.pressure))
     if max(part[0], part[-1]) - trace.pressure[low] > SHALLOW * deepest:
         return False
     side = min(part[0], part[-1])
+    if place in {0, len(highs)}:  # it may be idle after blow-off: nobody sees how it goes on
+        return True
     half = np.flatnonzero(part <= 0.5 * (side + trace.pressure[low]))
     return float(trace.time[rows][half[-1]] - trace.time[rows][half[0]]) < BRIEF
 
@@ -321,10 +325,25 @@ def _tops(trace: _Trace, move: float, lows: list[int]) -> list[_Top | None]:
         way = float(part.max()) - deep
         up = np.flatnonzero(part >= deep + RETURNED * way)
         rows = slice(first + int(up[0]), first + int(up[-1]) + 1)
-        level, width = _longest(pressure[rows])
+        level, width = _longest(_flat(trace, rows))
         wander = max(move, 2.0 * width)
         tops.append(_Top(rows, level, wander) if way >= move else None)
     return tops
+
+
+def _flat(trace: _Trace, rows: slice) -> Floats:
+    """Pressures (Pa) of some rows that are less steep than the fall after them, or all of these."""
+    time, pressure = trace.time[rows], trace.pressure[rows]
+    high = pressure.min() + 0.75 * np.ptp(pressure)
+    began = int(np.flatnonzero(pressure >= high)[-1])
+    fall, took = pressure[began] - pressure[-1], time[-1] - time[began]
+    if fall <= 0.0:
+        return pressure
+    window = max(0.1 * took, 2.0 * float(np.median(np.diff(time))))
+    ahead = np.searchsorted(time, time + window).clip(0, len(time) - 1)
+    moved, passed = np.abs(pressure[ahead] - pressure), time[ahead] - time
+    flat = pressure[(moved < FLAT * fall / took * passed + trace.noise) & (passed > 0.0)]
+    return flat if len(flat) > 1 else pressure
 
 
 def _longest(pressure: Floats) -> tuple[float, float]:
@@ -343,7 +362,8 @@ def _fall(trace: _Trace, top: _Top, low: int) -> float:
     """When (s) the pressure leaves idle: where a line through its first fall begins."""
     level, begin = top.level, float(trace.time[top.rows.start])
     rows = slice(top.rows.start, low + 1)
-    for _ in range(2):
+    settled = max(SETTLED, 2.5 * float(np.median(np.diff(trace.time[rows]))))
+    for _ in range(LOOKS):
         depth = level - trace.pressure[low]
         step = max(min(ONSET * depth, top.wander), CLEAR / 2.0 * trace.noise)
         first, second = (trace.last(rows, True, level - n * step) for n in (1, 2))
@@ -352,7 +372,7 @@ def _fall(trace: _Trace, top: _Top, low: int) -> float:
         at, later = (trace.crossing(row, level - n * step) for row, n in ((first, 1), (second, 2)))
         still = trace.last(rows, True, level - 0.25 * step)
         begin = max(2.0 * at - later, float(trace.time[max(still, rows.start)]))
-        before = (trace.time >= begin - SETTLED) & (trace.time <= begin)
+        before = (trace.time >= begin - settled) & (trace.time <= begin)
         before[: rows.start] = False
         if before.any():
             level = float(np.median(trace.pressure[before]))
