@@ -29,17 +29,19 @@ from twin.signals import (
     Samples,
     joined,
 )
+from twin.tables.derive import shortest_half
 
 Floats = npt.NDArray[np.float64]
 
 SURE = 1.96  # standard errors
 LEVEL_S = 0.5  # at most, over which a level is read
-LEAST_LEVEL_S = 0.2  # that an open cup stands, and a decay takes
+LEAST_LEVEL_S = 0.1  # that an open cup stands, and twice of it that a decay takes
 DECAY_S = 1.0  # at most, over which a decay is read
 FEWEST = 5  # rows of a level or a line
 CLEAR = 5.0  # sigmas of a reading
 LEAST_VACUUM = 5.0  # mbar
 SWING = 3.0  # mbar beside a line, beyond which the vacuum does not follow one
+CURVED = 0.15  # of what it moves by: gas that warms up loses vacuum along a curve
 LONGEST_HOLE = 5.0  # usual steps without a reading
 KELVIN, ROUGH = 293.15, 0.2  # of the gas, to turn a rate into a flow; and the share it may be off
 
@@ -152,6 +154,7 @@ class Stretch:
         )
 
 
+NO_IDLE = "the record has no idle, from which vacuum counts"
 NO_VACUUM = "there is no vacuum"
 NO_END = "the record ends before"
 HOLE = "readings are missing there"
@@ -167,15 +170,15 @@ def open_cup(one: Stretch) -> Reading:
     """Vacuum (mbar) at which an open cup stands before the evacuation."""
     if one.half == one.before:
         return Reading(math.nan, why=IN_VACUUM)
-    ahead = one.vacuum[one.before : max(one.half - 2, one.before)][-one.rows(LEVEL_S) :]
-    if len(ahead) < max(FEWEST, one.rows(LEAST_LEVEL_S)):
+    ahead = one.vacuum[one.before : one.half]
+    if len(ahead) < 2 * max(FEWEST, one.rows(LEAST_LEVEL_S)):
         return Reading(math.nan, why="the evacuation begins at once")
-    level, spread = float(np.median(ahead)), float(ahead.std())
-    if spread > max(CLEAR * one.noise, SWING):
-        return Reading(math.nan, why="the vacuum does not stand still before the evacuation")
+    level, apart = shortest_half(ahead)
+    if apart > max(CLEAR * one.noise, SWING):
+        return Reading(math.nan, why="no vacuum stands still before the evacuation")
     if level < max(LEAST_VACUUM, CLEAR * one.noise):
-        return Reading(math.nan, why="no vacuum stands before the evacuation")
-    return Reading(level, SURE * max(spread, one.noise))
+        return Reading(math.nan, why="the vacuum before the evacuation is not told from none")
+    return Reading(level, max(apart, SURE * one.noise))
 
 
 def evacuation(one: Stretch) -> Reading:
@@ -222,10 +225,11 @@ def decay(one: Stretch) -> Reading:
     since = one.time - one.time[one.deepest]
     rows = np.flatnonzero((since >= LEAK_SETTLE_S) & (since <= LEAK_SETTLE_S + DECAY_S))
     rows = rows[rows < one.end - 1]
-    if len(rows) < FEWEST or one.time[rows[-1]] - one.time[rows[0]] < LEAST_LEVEL_S:
+    if len(rows) < FEWEST or one.time[rows[-1]] - one.time[rows[0]] < 2.0 * LEAST_LEVEL_S:
         return Reading(math.nan, why="suction ends at the highest vacuum")
     slope, error, left = _line(one.time[rows], one.vacuum[rows])
-    if left > max(CLEAR * one.noise, SWING):
+    moved = abs(slope) * float(one.time[rows[-1]] - one.time[rows[0]])
+    if left > max(CLEAR * one.noise, SWING, CURVED * moved):
         return Reading(math.nan, why="the vacuum swings, as an air saving lets it")
     return Reading(-slope, SURE * error)
 
@@ -308,6 +312,8 @@ CURVE = {
 
 def readings(one: Stretch) -> dict[str, Reading]:
     """All figures of one suction."""
+    if math.isnan(one.idle):
+        return {name: Reading(math.nan, why=NO_IDLE) for name in CURVE}
     return {name: figure.of(one) for name, figure in CURVE.items()}
 
 

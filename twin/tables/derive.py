@@ -325,7 +325,7 @@ def _tops(trace: _Trace, move: float, lows: list[int]) -> list[_Top | None]:
         way = float(part.max()) - deep
         up = np.flatnonzero(part >= deep + RETURNED * way)
         rows = slice(first + int(up[0]), first + int(up[-1]) + 1)
-        level, width = _longest(_flat(trace, rows))
+        level, width = shortest_half(_flat(trace, rows))
         wander = max(move, 2.0 * width)
         tops.append(_Top(rows, level, wander) if way >= move else None)
     return tops
@@ -346,9 +346,9 @@ def _flat(trace: _Trace, rows: slice) -> Floats:
     return flat if len(flat) > 1 else pressure
 
 
-def _longest(pressure: Floats) -> tuple[float, float]:
-    """The level (Pa) that half of some rows are closest about, and how far these are apart."""
-    ordered = np.sort(pressure)
+def shortest_half(values: Floats) -> tuple[float, float]:
+    """The level that half of some values are closest about, and how far these are apart."""
+    ordered = np.sort(values)
     half = (len(ordered) + 1) // 2
     spans = ordered[half - 1 :] - ordered[: len(ordered) - half + 1]
     first = int(spans.argmin())
