@@ -189,6 +189,18 @@ def test_where_no_release_goes_above_idle_it_is_not_called_blow_off() -> None:
     assert "valve delays and the timing of commands cannot be told" in blown.words(["x"])
 
 
+def test_a_long_blow_off_is_told_from_idle_where_ambient_is_known() -> None:
+    blown = [PICK, (1040.0, 0.02, 1.0), (1013.0, 0.02, 0.6)]
+    samples = cycle([IDLE, *blown * 3], 0.5, 0.001)
+    starts = 0.5 + 2.6 * np.arange(3)
+    samples["commands"] = derive(samples, 101_300.0).commands
+    assert edges(samples, Command.SUCTION) == pytest.approx(starts, abs=0.01)
+    assert edges(samples, Command.BLOW_OFF, ends=True) == pytest.approx(starts + 2.0, abs=0.02)
+    # Without it nobody knows: what stands longer is taken for idle, and the rest for an open cup.
+    found = edges(with_derived(samples), Command.SUCTION)
+    assert found == pytest.approx(starts[1:] - 0.6, abs=0.01)
+
+
 TIME = np.arange(0.0, 20.0, 0.01)
 
 
@@ -270,3 +282,27 @@ def test_the_reason_names_the_file(tmp_path: Path) -> None:
     table = open_table(path, ImportSettings(), AMBIENT, derive=True)
     with pytest.raises(SourceError, match=r"a\.csv:1: the pressure moves by"):
         table.with_commands()
+
+
+def test_whatever_comes_ends_in_commands_or_in_a_reason() -> None:
+    rng = np.random.default_rng(SEED)
+    for _ in range(300):
+        count = int(rng.integers(1, 400))
+        steps = rng.exponential(rng.choice([0.001, 0.03, 1.0]), count)
+        if rng.random() < 0.3:
+            steps = np.abs(rng.choice([0.0, 0.001, 0.001, 5.0], count))
+        kind = rng.integers(4)
+        walk = np.cumsum(rng.normal(0.0, rng.choice([1.0, 30.0, 200.0]), count))
+        blocks = np.repeat(rng.choice([300.0, 500.0, 985.0, 1013.0, 1090.0, 1300.0], count), 7)
+        shapes = (700.0 + walk, blocks[:count], 1013.0 - np.abs(walk), rng.uniform(0, 1200, count))
+        samples = rows_of(np.cumsum(steps), shapes[kind] * MBAR)
+        bad = rng.random(count) < 0.05
+        samples["pressure"][bad] = np.nan
+        samples["quality"][rng.random(count) < 0.02] = Quality.CLOCK.value
+        try:
+            found = derive(samples, None if rng.random() < 0.5 else AMBIENT)
+        except SourceError:
+            continue
+        assert len(found.commands) == count
+        assert set(np.unique(found.commands).tolist()) <= {0, 1, 2}
+        assert found.suctions > 0

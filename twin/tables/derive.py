@@ -28,12 +28,13 @@ LEAST_VACUUM = 20.0 * MBAR  # Pa, that a record must show
 LEAST_MOVE = 10.0 * MBAR  # Pa; a fall and a return of less are none
 CLEAR = 10.0  # sigmas that they must have
 RETURNED = 0.6  # of the way up, from which on a vacuum has ended; an air saving swings by less
+LEAST_SHARE = 0.1  # of what stands still between a release and a fall, that idle has
 NEAR = 3  # tops on each side, that tell how high idle is
 BRIEF, SHALLOW = 50.0 * MS, 0.2  # s, and share of the deepest vacuum: a line that rings
 ABRUPT = 0.1  # of the record, in which half of some move is over; drift takes longer
 ONSET = 0.05  # of a move, at which its beginning is looked for; noise and wander may ask for more
 FLAT = 0.25  # of the slope of a return: what is less steep comes before it
-LOOKS = 4  # at a fall, each from the level that the one before found
+LOOKS = 20  # at a fall at most, each from the level that the one before found: idle cools
 SETTLED = 20.0 * MS  # s before a fall, that tell the level it begins at
 PEAK = 0.8  # of an overshoot; blow-off has ended where the pressure is below it
 MOST_AMBIENT = 1100.0 * MBAR  # Pa; the highest air pressure measured at sea level is 1085 mbar
@@ -62,13 +63,17 @@ class Derived:
         return f"{' and '.join(lacking)} derived from the pressure: {many}; {how}; {UNTOLD}"
 
 
-def derive(samples: Samples) -> Derived:
-    """Find the commands of a whole record; SourceError with the reason where it shows none."""
+def derive(samples: Samples, ambient: float | None = None) -> Derived:
+    """Find the commands of a whole record; SourceError with the reason where it shows none.
+
+    ``ambient`` (Pa) is what the sensor reads there, where that is known: idle is then told from a
+    long blow-off.
+    """
     traces = list(_traces(samples))
     if not traces:
         raise SourceError("too few usable readings follow on each other", "record at least a cycle")
     move = _least_move(traces)
-    found = [(trace, _suctions(trace, move)) for trace in traces]
+    found = [(trace, _suctions(trace, move, ambient)) for trace in traces]
     suctions = [one for _, edges in found for one in edges]
     if not suctions:
         raise SourceError(
@@ -83,11 +88,12 @@ def derive(samples: Samples) -> Derived:
     for trace, edges in found:
         part = slice(trace.rows[0], trace.rows[-1] + 1)
         for one in edges:
-            inside = (times[part] >= one.begin) & (times[part] < one.end)
-            commands[part][inside] = int(Command.SUCTION)
+            stretches = [(one.begin, one.end, Command.SUCTION)]
             if blown and one.blown is not None:
-                after = (times[part] >= one.end) & (times[part] < one.blown)
-                commands[part][after] = int(Command.BLOW_OFF)
+                stretches.append((one.end, one.blown, Command.BLOW_OFF))
+            for begin, end, command in stretches:
+                first, last = np.searchsorted(times[part], (begin, end))
+                commands[part][first:last] = int(command)
     return Derived(commands, len(suctions), blown)
 
 
@@ -115,7 +121,9 @@ class _Trace:
         return int(rows.start + found[-1]) if len(found) else -1
 
     def crossing(self, row: int, level: float) -> float:
-        """When (s) the line from ``row`` to the next row comes to a level."""
+        """When (s) the line from ``row`` to the next row, if there is one, comes to a level."""
+        if row + 1 >= len(self.time):
+            return float(self.time[row])
         (t, u), (p, q) = self.time[row : row + 2], self.pressure[row : row + 2]
         return float(t if p == q else t + (u - t) * min(max((level - p) / (q - p), 0.0), 1.0))
 
@@ -187,6 +195,7 @@ class _Top:
 
     rows: slice
     level: float  # Pa, at which it stays the longest: idle
+    high: float  # Pa, the highest
     wander: float  # Pa, that idle may differ by: its gas cools
 
 
@@ -199,11 +208,11 @@ class _Suction:
     blown: float | None
 
 
-def _suctions(trace: _Trace, move: float) -> list[_Suction]:
+def _suctions(trace: _Trace, move: float, ambient: float | None) -> list[_Suction]:
     lows = _vacua(trace, move)
     if not lows or not _is_abrupt(trace):
         return []
-    all_tops = _tops(trace, move, lows)
+    all_tops = _tops(trace, move, lows, ambient)
     usual = [_usual(number, all_tops) for number in range(len(all_tops))]
     tops = [_as_idle(top, other) for top, other in zip(all_tops, usual, strict=True)]
     if tops[0] is not None:  # no blow-off is seen before it
@@ -227,7 +236,8 @@ def _usual(number: int, tops: list[_Top | None]) -> _Top | None:
     if not others:
         return None
     wander = max(top.wander for top in (tops[number], *others) if top is not None)
-    return _Top(slice(0, 0), float(np.median([top.level for top in others])), wander)
+    levels, highs = zip(*((top.level, top.high) for top in others), strict=True)
+    return _Top(slice(0, 0), float(np.median(levels)), float(np.median(highs)), wander)
 
 
 def _as_idle(top: _Top | None, usual: _Top | None) -> _Top | None:
@@ -236,9 +246,11 @@ def _as_idle(top: _Top | None, usual: _Top | None) -> _Top | None:
     An open cup under suction does, and one that has lost its part. One that stays above it does so
     in a long blow-off.
     """
-    if top is None or usual is None or abs(top.level - usual.level) <= usual.wander:
+    if top is None or usual is None:
         return top
-    return None if top.level < usual.level else replace(top, level=usual.level)
+    if top.high < usual.level - usual.wander:
+        return None
+    return top if top.level <= usual.level + usual.wander else replace(top, level=usual.level)
 
 
 def _suction(trace: _Trace, low: int, before: _Top | None, after: _Top | None) -> _Suction:
@@ -264,7 +276,8 @@ def _vacua(trace: _Trace, move: float) -> list[int]:
     pressure = np.minimum(trace.pressure, MOST_AMBIENT)
     lows, highs = _turns(pressure.tolist(), move)
     middle = 0.5 * (pressure.max() + pressure.min())
-    lows = [row for row in lows if not _rings(trace, row, highs)]
+    shallow = SHALLOW * float(np.ptp(trace.pressure))
+    lows = [row for row in lows if not _rings(trace, row, highs, shallow)]
     if not lows:
         return []
     top = float(np.median([pressure[row] for row in highs if pressure[row] >= middle]))
@@ -279,13 +292,13 @@ def _vacua(trace: _Trace, move: float) -> list[int]:
     return kept
 
 
-def _rings(trace: _Trace, low: int, highs: list[int]) -> bool:
-    """Whether a low is but a line that rings: brief, and shallow beside the deepest vacuum."""
+def _rings(trace: _Trace, low: int, highs: list[int], shallow: float) -> bool:
+    """Whether a low is but a line that rings: brief, and less deep than ``shallow`` (Pa)."""
     place = bisect(highs, low)
     first = highs[place - 1] if place else 0
     rows = slice(first, (highs[place] if place < len(highs) else len(trace.time) - 1) + 1)
-    part, deepest = trace.pressure[rows], float(np.ptp(trace.pressure))
-    if max(part[0], part[-1]) - trace.pressure[low] > SHALLOW * deepest:
+    part = trace.pressure[rows]
+    if max(part[0], part[-1]) - trace.pressure[low] > shallow:
         return False
     side = min(part[0], part[-1])
     if place in {0, len(highs)}:  # it may be idle after blow-off: nobody sees how it goes on
@@ -315,7 +328,7 @@ def _turns(pressure: list[float], least: float) -> tuple[list[int], list[int]]:
     return found
 
 
-def _tops(trace: _Trace, move: float, lows: list[int]) -> list[_Top | None]:
+def _tops(trace: _Trace, move: float, lows: list[int], ambient: float | None) -> list[_Top | None]:
     """What is before the first vacuum, between two, and after the last; None if nothing is."""
     pressure, tops = np.minimum(trace.pressure, MOST_AMBIENT), list[_Top | None]()
     for before, after in pairwise([None, *lows, None]):
@@ -325,9 +338,10 @@ def _tops(trace: _Trace, move: float, lows: list[int]) -> list[_Top | None]:
         way = float(part.max()) - deep
         up = np.flatnonzero(part >= deep + RETURNED * way)
         rows = slice(first + int(up[0]), first + int(up[-1]) + 1)
-        level, width = shortest_half(_flat(trace, rows))
-        wander = max(move, 2.0 * width)
-        tops.append(_Top(rows, level, wander) if way >= move else None)
+        flat = _flat(trace, rows)
+        (level, _), (_, width) = shortest_half(_still(flat, ambient)), shortest_half(flat)
+        wander, high = max(move, 2.0 * width), float(trace.pressure[rows].max())
+        tops.append(_Top(rows, level, high, wander) if way >= move else None)
     return tops
 
 
@@ -344,6 +358,14 @@ def _flat(trace: _Trace, rows: slice) -> Floats:
     moved, passed = np.abs(pressure[ahead] - pressure), time[ahead] - time
     flat = pressure[(moved < FLAT * fall / took * passed + trace.noise) & (passed > 0.0)]
     return flat if len(flat) > 1 else pressure
+
+
+def _still(flat: Floats, ambient: float | None) -> Floats:
+    """Those of some pressures (Pa) that are ambient, where it is known and enough of them are."""
+    if ambient is None:
+        return flat
+    near = flat[np.abs(flat - ambient) <= LEAST_MOVE]
+    return near if len(near) >= max(NEAR, LEAST_SHARE * len(flat)) else flat
 
 
 def shortest_half(values: Floats) -> tuple[float, float]:
@@ -372,49 +394,53 @@ def _fall(trace: _Trace, top: _Top, low: int) -> float:
         at, later = (trace.crossing(row, level - n * step) for row, n in ((first, 1), (second, 2)))
         still = trace.last(rows, True, level - 0.25 * step)
         begin = max(2.0 * at - later, float(trace.time[max(still, rows.start)]))
-        before = (trace.time >= begin - settled) & (trace.time <= begin)
-        before[: rows.start] = False
-        if before.any():
-            level = float(np.median(trace.pressure[before]))
+        since, until = np.searchsorted(trace.time, (begin - settled, begin))
+        before = trace.pressure[max(int(since), rows.start) : int(until) + 1]
+        was, level = level, float(np.median(before)) if len(before) else level
+        if abs(level - was) < 0.1 * step:
+            break
     return begin
 
 
 def _return(trace: _Trace, low: int, top: _Top) -> float:
-    """When (s) a vacuum ends: where the steep way up to the top begins."""
-    pressure, time = trace.pressure, trace.time
-    rows, way = slice(low, top.rows.start + 1), top.level - pressure[low]
-    early, late = (trace.last(rows, False, pressure[low] + share * way) for share in (0.4, 0.6))
-    steep = (
-        0.2
-        * way
-        / max(
-            trace.crossing(late, pressure[low] + 0.6 * way)
-            - trace.crossing(early, pressure[low] + 0.4 * way),
-            1e-9,
-        )
-    )
-    changes = np.count_nonzero(np.diff(pressure[early : late + 2]))  # a reading may be held
-    held = (time[late + 1] - time[early]) / max(changes, 1)
-    window = max(CLEAR * trace.noise / steep, 2.0 * held)
-    back = np.searchsorted(time, time[low : early + 1] - window, side="right") - 1
-    here = np.arange(low, early + 1)
-    back = np.clip(np.minimum(back, here - 1), low, None)
-    climbed = pressure[here] - pressure[back]
-    flat = np.flatnonzero(climbed <= FLAT * steep * (time[here] - time[back]))
-    last = low + int(flat[-1])
-    level = float(np.median(pressure[back[last - low] : last + 1]))
-    step = max(ONSET * (top.level - level), CLEAR / 2.0 * trace.noise)
+    """When (s) a vacuum ends: where a line through the foot of the steep way up begins."""
+    rows = slice(low, top.rows.start + 1)
+    high = max(top.level, float(trace.pressure[top.rows.start]))
+    since, foot = _foot(trace, rows, high)
+    level = float(np.median(trace.pressure[since : foot + 1]))
+    step = max(ONSET * (high - level), CLEAR / 2.0 * trace.noise)
     first, second = (trace.last(rows, False, level + n * step) for n in (1, 2))
+    if first < 0:
+        return float(trace.time[foot])
     at, later = (trace.crossing(row, level + n * step) for row, n in ((first, 1), (second, 2)))
-    return max(2.0 * at - later, float(time[back[last - low]]))
+    return max(2.0 * at - later, float(trace.time[since]))
+
+
+def _foot(trace: _Trace, rows: slice, high: float) -> tuple[int, int]:
+    """The last rows, first and last, over which the way up to ``high`` (Pa) is not yet steep."""
+    low, pressure, time = rows.start, trace.pressure, trace.time
+    way = high - float(pressure[low])
+    early, late = (trace.last(rows, False, pressure[low] + share * way) for share in (0.4, 0.6))
+    begins, ends = (
+        trace.crossing(row, pressure[low] + share * way)
+        for row, share in ((early, 0.4), (late, 0.6))
+    )
+    steep = 0.2 * way / max(ends - begins, NS)
+    changes = np.count_nonzero(np.diff(pressure[early : late + 2]))  # a reading may be held
+    held = (time[min(late + 1, len(time) - 1)] - time[early]) / max(changes, 1)
+    window = max(CLEAR * trace.noise / steep, 2.0 * held)
+    here = np.arange(low, early + 1)
+    back = np.searchsorted(time, time[here] - window, side="right") - 1
+    back = np.clip(np.minimum(back, here - 1), low, None)
+    climbed, passed = pressure[here] - pressure[back], time[here] - time[back]
+    last = int(np.flatnonzero(climbed <= FLAT * steep * passed)[-1])
+    return int(back[last]), low + last
 
 
 def _overshoot(trace: _Trace, top: _Top) -> float | None:
     """When (s) the pressure leaves what it was blown up to, above idle; None if it was not."""
-    part = trace.pressure[top.rows]
-    over = float(part.max()) - top.level
+    over = float(trace.pressure[top.rows].max()) - top.level
     if over < top.wander:
         return None
-    row = trace.last(top.rows, True, top.level + PEAK * over)
-    last = min(row, top.rows.stop - 2)
-    return trace.crossing(last, top.level + PEAK * over)
+    level = top.level + PEAK * over
+    return trace.crossing(trace.last(top.rows, True, level), level)

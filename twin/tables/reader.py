@@ -14,7 +14,7 @@ from twin.tables.csv_file import CsvFile
 from twin.tables.decode import Batch
 from twin.tables.derive import Derived, derive
 from twin.tables.intake import Intake
-from twin.tables.layout import COMMANDS, Layout, find_layout
+from twin.tables.layout import BELOW_AMBIENT, COMMANDS, Layout, find_layout
 from twin.tables.parquet_file import ParquetFile
 from twin.tables.settings import Column, ImportSettings
 from twin.tables.unit_check import UnitCheck
@@ -62,7 +62,9 @@ class Table:
         SourceError where there is no cycle in it, and otherwise as from ``blocks``.
         """
         try:
-            return replace(self, derived=derive(joined(*self.blocks())))
+            # A vacuum counts from ambient; of an absolute pressure nobody knows where that is.
+            zero = self.ambient if self.layout.pressure in BELOW_AMBIENT else None
+            return replace(self, derived=derive(joined(*self.blocks()), zero))
         except SourceError as error:
             if self.path.name in str(error):
                 raise
