@@ -7,10 +7,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import rigs
-from test_derive import coarse, cycle, with_derived
+from test_derive import coarse, cycle, known, with_derived
 
 from twin.compare.compare import chance
 from twin.figures.curve import CURVE, Reading, Stretch, flow_behind, readings, stretches
+from twin.figures.cycle import KeyFigures
+from twin.monitor.cycles import cut
 from twin.signals import MBAR, ML, SL_MIN, Command, Quality, Samples
 
 # Levels (mbar) with time constant and length (s): idle, an open cup, a part, a slow leak, a vent.
@@ -134,3 +136,18 @@ def test_neighbouring_grades_of_a_leak_are_told_apart() -> None:
         assert np.nanmin(chances) < 0.05 / len(CURVE), (less, more, chances)
     means = [figure(leak, "evacuation").mean() for leak in GRADES]
     assert means == sorted(means)
+
+
+def test_a_slow_cadence_keeps_the_key_figures_that_no_switching_changes() -> None:
+    told = []
+    teller = KeyFigures(rigs.config("gripper").data)
+    for piece in cut(rigs.twin("gripper").over([coarse(known("gripper"))])):
+        if (one := teller.take(piece)) is not None and one.complete:
+            told.append(one.measured)
+    assert len(told) >= 8
+    for measured in told[1:]:
+        assert measured["max_vacuum"] == pytest.approx(740.0, abs=15.0)
+        assert measured["t0"] == pytest.approx(189.0, abs=33.0)  # a row, which may come late
+        assert measured["h1_not_reached"] in {0.0, 1.0}
+        for name in ("t1", "leakage", "nozzle_share", "air", "switchings"):
+            assert math.isnan(measured[name]), name
