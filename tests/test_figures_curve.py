@@ -74,6 +74,14 @@ def test_a_rate_gives_the_flow_where_the_volume_is_known() -> None:
     assert "volume is not known" in read(commanded(0.001))["flow"].why
 
 
+def test_a_peak_that_a_slow_logger_misses_lies_in_its_interval() -> None:
+    true = [CURVE["highest"].of(one) for one in stretches([known("gripper")]) if one.ended]
+    slow = [CURVE["highest"].of(one) for one in stretches([coarse(known("gripper"))]) if one.ended]
+    for one, other in zip(true, slow, strict=True):
+        assert abs(one.value - other.value) < max(1.5 * other.half, 3.0)
+        assert other.half < 60.0
+
+
 def test_what_is_not_told_has_its_reason() -> None:
     samples = commanded(0.0256)
     whole = read(samples)
@@ -146,7 +154,7 @@ def test_a_slow_cadence_keeps_the_key_figures_that_no_switching_changes() -> Non
             told.append(one.measured)
     assert len(told) >= 8
     for measured in told[1:]:
-        assert measured["max_vacuum"] == pytest.approx(740.0, abs=15.0)
+        assert measured["max_vacuum"] == pytest.approx(740.0, abs=30.0)  # a peak between two
         assert measured["t0"] == pytest.approx(189.0, abs=33.0)  # a row, which may come late
         assert measured["h1_not_reached"] in {0.0, 1.0}
         for name in ("t1", "leakage", "nozzle_share", "air", "switchings"):

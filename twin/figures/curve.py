@@ -162,8 +162,11 @@ IN_VACUUM = "the record begins in the vacuum"
 
 
 def highest(one: Stretch) -> Reading:
-    """Highest vacuum (mbar)."""
-    return Reading(one.top, SURE * one.noise) if one.ended else Reading(math.nan, why=NO_END)
+    """Highest vacuum (mbar); a peak between two readings may be higher by what they differ by."""
+    if not one.ended:
+        return Reading(math.nan, why=NO_END)
+    near = one.vacuum[max(one.deepest - 1, one.before) : min(one.deepest + 2, one.end)]
+    return Reading(one.top, max(SURE * one.noise, one.top - float(near.min())))
 
 
 def open_cup(one: Stretch) -> Reading:
