@@ -128,10 +128,10 @@ def test_without_a_calibration_there_is_no_diagnosis(
     before, after = GRIPPER.read_text().split("[monitor.healthy.figures]", 1)
     config = here / "bare.toml"
     config.write_text(before + after[after.index("[plc.rig]") :])
-    assert twin(monkeypatch, "diagnose", log, "--config", config) == 2
-    said = capsys.readouterr().err
-    assert "bare.toml: the twin is not calibrated" in said
-    assert "twin calibrate LOG --config CONFIG" in said
+    assert twin(monkeypatch, "diagnose", log, "--config", config) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.startswith("insufficient: The log cannot answer: not commissioned: causes are not")
+    assert "twin commission HEALTHY.mcap --id gripper-01" in said
 
 
 def test_the_answer_names_the_unit_that_the_log_is_of(

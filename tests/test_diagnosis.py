@@ -27,7 +27,6 @@ from twin.diagnosis.judge import gain, judge
 from twin.diagnosis.search import _confirmed, held_out_gain, tried_in_or_out
 from twin.diagnosis.unlisted import Unlisted, look
 from twin.diagnosis.weights import covariance, levels
-from twin.errors import ConfigError
 from twin.model import theta as c
 from twin.model.courses import Cause, Course
 from twin.monitor.cycles import PAPER_VACUUM
@@ -512,10 +511,3 @@ def test_a_gap_costs_its_cycle_and_nothing_else() -> None:
 
     (cause,) = of(gappy()).json["causes"]
     assert cause["effect"] == "leakage"
-
-
-def test_without_calibration_there_is_no_diagnosis() -> None:
-    text = DOCUMENT.text.split("# What healthy cycles are like")[0] + "[plc]\n"
-    bare = Config.of(Document.parse(text, "bare.toml"))
-    with pytest.raises(ConfigError, match=r"bare\.toml: the twin is not calibrated"):
-        of(record(8.0), bare)

@@ -294,7 +294,7 @@ def calibrate(log: Log, progress: Progress = _quiet) -> Calibrated:
 def diagnose(log: Log, progress: Progress = _quiet) -> Answer:
     """Say what the simulation gets wrong on a log, why, and what knowing it gains.
 
-    ``progress`` as in ``calibrate``. ConfigError where the twin is not calibrated.
+    ``progress`` as in ``calibrate``.
     """
     samples, derived = log._samples(), log._header.derived
     return Answer(find_cause(log.config, samples, str(log.path), progress, derived=derived))

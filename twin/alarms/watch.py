@@ -20,7 +20,7 @@ _SWITCHED = {  # events that begin and end something
 }
 STREAM = frozenset(name for name, _ in _SWITCHED.values())  # nothing is wrong until it is said
 NAMES = STREAM | {DEVIATION} | set(CAUTIONS)
-_MEASURE = ("figure", "phase", "excess_mbar", "sigma", "size", "unit", "also")
+_MEASURE = ("figure", "phase", "excess_mbar", "sigma", "size", "unit", "also", "commissioned")
 
 
 def values(event: Event) -> dict[str, float]:

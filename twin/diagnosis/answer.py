@@ -20,6 +20,7 @@ from twin.instants import CALENDAR_NS, SECOND_NS
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS
 from twin.model.term import Term
+from twin.monitor.healthy import NOT_COMMISSIONED
 from twin.signals import Quality, Samples
 
 FORMAT = "ejector-twin-diagnosis/1"
@@ -65,7 +66,8 @@ def diagnose(
     """Diagnose a log, or the part of it that begins ``before_s`` into it.
 
     ``derived`` says how its commands were, where nobody recorded them: then it cannot answer.
-    Onsets in the answer count from the log's begin. ConfigError where the twin is not calibrated.
+    Onsets in the answer count from the log's begin. Without a calibrated twin the answer is
+    ``insufficient``: its causes would be those of the data set, not of the ejector.
     """
     progress("running the twin over the log")
     blocks = [block for block in blocks if len(block)]
@@ -76,7 +78,8 @@ def diagnose(
         "asset": {"type": config.asset.type, "id": config.asset.id},
     }
     part = _part(blocks, before_s)
-    if reason := f"{derived}: record the commands as well" if derived else insufficient(evidence):
+    unrecorded = f"{derived}: record the commands as well" if derived else None
+    if reason := unrecorded or _not_commissioned(config) or insufficient(evidence):
         answer = head | _insufficient(evidence, part, reason)
         return Diagnosis(evidence, config.data.hash, None, HEALTHY, (), None, None, [], answer)
     whole, evidence = evidence, thinned(evidence, evidence.judged, MOST_JUDGED)
@@ -145,6 +148,14 @@ def _sure(found: Hypothesis, before: Judged, after: Judged) -> bool:
     left = after.leftover
     share = (left**2 - 1.0) / max(before.leftover**2 - 1.0, 1e-9)
     return share < MOST_LEFT and (len(found) == 1 or left < SEVERAL or share < NEARLY_ALL)
+
+
+def _not_commissioned(config: Config) -> str:
+    """What to do first where nobody knows what this unit's healthy cycles are like."""
+    if config.monitor.healthy.is_known:
+        return ""
+    run = f"twin commission HEALTHY.mcap --id {config.asset.id or 'ID'}"
+    return f"{NOT_COMMISSIONED}; fit the twin first to a log of healthy cycles: {run}"
 
 
 def insufficient(evidence: Evidence) -> str:

@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.config import Config
-from twin.errors import ConfigError
 from twin.live import Twin
 from twin.model import kernel
 from twin.model import theta as c
@@ -331,13 +330,7 @@ def _together(courses: Sequence[Schedule], rows: int) -> Iterator[tuple[int, int
 
 
 def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
-    """Run the calibrated twin over a log and collect its complete cycles.
-
-    ConfigError if nobody says what healthy cycles are like.
-    """
-    if "suction_rms" not in config.monitor.healthy.figures:
-        hint = "calibrate the twin first: twin calibrate LOG --config CONFIG, on healthy cycles"
-        raise ConfigError(f"{config.document.name}: the twin is not calibrated", hint)
+    """Run the calibrated twin over a log and collect its complete cycles."""
     theta = coefficients(config.data)
     knees = expected_knees(theta, config.data.sensor.noise_mbar * MBAR)
     nothing = Evidence(

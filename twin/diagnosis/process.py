@@ -49,6 +49,7 @@ Status = Callable[[], AbstractContextManager[Callable[[str], None]]]
 class LiveDiagnosis:
     """Follows the live loop, and has each alarm diagnosed (``twin.live.Adviser``).
 
+    Alarms of a unit that is not commissioned are not: their causes are not named.
     ``status`` gives a function that says what is waited for at the end, until ``stopped`` says that
     nobody wants to wait. ``reports`` is a folder that keeps the page of each answer.
     """
@@ -122,7 +123,7 @@ class LiveDiagnosis:
     def _note(self, event: Event) -> None:
         if _is_whole_cycle(event):
             self._since += 1
-        elif event.kind is Kind.DEVIATION:
+        elif event.kind is Kind.DEVIATION and self._config.monitor.healthy.is_known:
             if self._alarm is None:
                 self._since, self._wanted = 1, DEVIATING
             self._alarm = event

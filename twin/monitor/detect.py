@@ -28,7 +28,7 @@ from twin.monitor.cycles import (
     Told,
     figures,
 )
-from twin.monitor.healthy import Healthy
+from twin.monitor.healthy import NOT_COMMISSIONED, Healthy
 from twin.monitor.signatures import Likeness, drawn_rows, likenesses, look_alikes
 from twin.settings import Settings
 from twin.signals import (
@@ -352,6 +352,11 @@ class Monitor:
         return self.active == UNKNOWN and _names(verdict)
 
     @property
+    def _is_commissioned(self) -> bool:
+        """Whether the twin is near enough to the unit that what it gets wrong names a cause."""
+        return self.settings.healthy.is_known
+
+    @property
     def _differs(self) -> bool:
         """Whether cycles differ together, if no single one does."""
         return self.isolation is not None and self.isolation.stands
@@ -361,7 +366,8 @@ class Monitor:
         if self.isolation is None or heard is None:
             return None
         far = far if far >= self.settings.raise_sigma else 0.0
-        return self.isolation.judge(heard, far, begins=begins)
+        verdict = self.isolation.judge(heard, far, begins=begins)
+        return verdict if self._is_commissioned or verdict is None else verdict.unnamed()
 
     def _worst(self, found: Mapping[str, float]) -> Outlier | None:
         outliers = []
@@ -432,6 +438,8 @@ class Monitor:
         self, worst: Outlier, before: Cycle | None, cycle: Cycle, verdict: "Verdict | None"
     ) -> list[Event]:
         """Name the alarm, or name it anew when another cause than the standing one fits."""
+        if not self._is_commissioned:
+            return []
         ranking = self._name(worst, before, cycle, verdict)
         best = ranking[0]
         self._mixed = None
@@ -453,8 +461,11 @@ class Monitor:
         also: Sequence[str],
     ) -> Event:
         """The alarm: ``what`` is off, and what fits it."""
-        text = "; ".join([what, best.words]) + "".join(f", or {', '.join(also)}" for _ in also[:1])
+        why = best.words if self._is_commissioned else NOT_COMMISSIONED
+        text = "; ".join([what, why]) + "".join(f", or {', '.join(also)}" for _ in also[:1])
         data = {"cycle": cycle.index, **measured, **best.plain(), "also": ",".join(also)}
+        if not self._is_commissioned:
+            data["commissioned"] = False
         return Event(cycle.end_ns, Kind.DEVIATION, text, data)
 
     def _name(

@@ -7,6 +7,8 @@ from pydantic import Field, model_validator
 
 from twin.settings import Settings
 
+NOT_COMMISSIONED = "not commissioned: causes are not named"
+
 
 class Scatter(Settings):
     """What one figure is in healthy cycles: mean and one standard deviation, its unit in mbar."""
@@ -45,3 +47,8 @@ class Healthy(Settings):
     scatter: Mapping[str, float] = Field(default_factory=dict)
     leftover: float = Field(1.0, gt=0.0)  # sigmas, by all this, that healthy cycles have
     uncertain: Mapping[str, tuple[float, ...]] = Field(default_factory=dict)
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the unit is commissioned: its healthy cycles were looked at."""
+        return "suction_rms" in self.figures

@@ -66,6 +66,11 @@ class Verdict:
     since: int = 0  # cycles that differ
     sigmas: float = 0.0  # by which a cycle differs, in what is foremost
 
+    def unnamed(self) -> "Verdict":
+        """The same without names: what differs is one unknown cause."""
+        share = sum(one.share for one in self.causes)
+        return replace(self, causes=[Likeness(UNKNOWN, None, "", share)] if self.causes else ())
+
     def plain(self) -> dict[str, float]:
         """The probabilities, of what has at least one in a hundred."""
         shown = {one.effect: round(one.share, 3) for one in self.causes}

@@ -16,6 +16,7 @@ from twin.alarms.words import STATES
 from twin.diagnosis.words import certainty, ends, number, spoken
 from twin.instants import instant, lasting
 from twin.model.effects import EFFECTS, UNKNOWN
+from twin.monitor.healthy import NOT_COMMISSIONED
 
 S_NS = 1_000_000_000
 _CAUSE_OF = {value_of(cause): cause for cause in CAUSES}
@@ -155,7 +156,9 @@ def _size(parameter: Mapping[str, Any]) -> str:
 
 def _sureness(evidence: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
     """How sure the cause is: by the diagnosis, or else by the first guess."""
-    if "probability" in evidence:
+    if evidence.get("commissioned") is False:
+        yield "how sure", NOT_COMMISSIONED
+    elif "probability" in evidence:
         yield "how sure", f"diagnosed: {certainty(evidence)}"
     elif "guess" in evidence:
         also = ", ".join(spoken(one) for one in str(evidence.get("also", "")).split(",") if one)
