@@ -205,7 +205,7 @@ def test_a_second_import_brings_nothing(
     monkeypatch.chdir(tmp_path)
     written(tmp_path / "a.aasx", database.records())
     assert twin(monkeypatch, "assets", "import", "a.aasx") == 0
-    assert "0 new of 5 records" in capsys.readouterr().out
+    assert "0 new of 7 records" in capsys.readouterr().out
 
 
 # What others see.

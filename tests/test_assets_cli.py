@@ -15,6 +15,7 @@ from twin.errors import ConfigError, SourceError, TwinError
 from twin.settings import Document
 
 TYPE, PAPER_UNIT = "compact-ejector-35", "paper-unit"  # shipped
+SHIPPED = [["type", TYPE], *(["instance", unit] for unit in ("gripper-01", PAPER_UNIT, "rig-01"))]
 
 UNIT = """\
 kind = "instance"
@@ -69,7 +70,7 @@ def rows(table: str) -> list[list[str]]:
 
 
 def test_reading_makes_no_file(run: Run, tmp_path: Path) -> None:
-    assert [row[:2] for row in rows(run("list"))] == [["type", TYPE], ["instance", PAPER_UNIT]]
+    assert [row[:2] for row in rows(run("list"))] == SHIPPED
     assert "suction_capacity_sl_min = 35.0" in run("show", PAPER_UNIT)
     shown = run("show", TYPE)
     assert "suction_capacity_sl_min = 33.4" in shown
@@ -90,8 +91,7 @@ def test_what_is_added_is_listed_and_shown(run: Run, unit: Path) -> None:
     table = rows(run("list"))
     added = next(row for row in table if row[1] == "unit-1")
     assert [row[:4] for row in table] == [
-        ["type", TYPE, TYPE, "always"],
-        ["instance", PAPER_UNIT, TYPE, "always"],
+        *([*one, TYPE, "always"] for one in SHIPPED),
         ["instance", "unit-1", TYPE, "2026-05-01T12:00:00Z"],
     ]
     shown = run("show", "unit-1")
@@ -148,7 +148,9 @@ def test_a_first_data_set_always_holds_and_a_later_one_from_now_on(
 
 def test_show_looks_back_in_both_times(run: Run, tmp_path: Path) -> None:
     day = 86_400 * 10**9
-    clock = iter([day, day, 10 * day, 20 * day])  # recorded: what is shipped, then two data sets
+    clock = iter(
+        [*[day] * len(SHIPPED), 10 * day, 20 * day]
+    )  # recorded: what is shipped, then two data sets
     with open_assets(tmp_path / "assets.sqlite", clock=lambda: next(clock)) as assets:
         assets.add(Record("instance", "u", TYPE, {"a": 1}, valid_from_ns=5 * day))
         assets.add(Record("instance", "u", TYPE, {"a": 2}, valid_from_ns=5 * day))
@@ -174,9 +176,9 @@ def test_a_name_that_is_not_there_lists_those_that_are(run: Run) -> None:
 
 def test_export_and_import_carry_everything_over(run: Run, unit: Path, tmp_path: Path) -> None:
     run("add", unit)
-    assert run("export", "-o", "all.json") == "3 records in all.json\n"
-    assert run("import", "all.json", "--assets", "sqlite:///new.sqlite").startswith("3 new of 3 ")
-    assert run("import", "all.json", "--assets", "sqlite:///new.sqlite").startswith("0 new of 3 ")
+    assert run("export", "-o", "all.json") == "5 records in all.json\n"
+    assert run("import", "all.json", "--assets", "sqlite:///new.sqlite").startswith("5 new of 5 ")
+    assert run("import", "all.json", "--assets", "sqlite:///new.sqlite").startswith("0 new of 5 ")
     assert run("export", "--assets", "new.sqlite") == (tmp_path / "all.json").read_text()
 
 

@@ -29,7 +29,7 @@ from twin.errors import ConfigError, SourceError
 from twin.model.dataset import DataSet
 
 TYPE, PAPER_UNIT = "compact-ejector-35", "paper-unit"  # shipped
-SHIPPED = [TYPE, PAPER_UNIT]
+SHIPPED = [TYPE, "gripper-01", PAPER_UNIT, "rig-01"]
 WRITER = Path(__file__).with_name("assets_writer.py")
 WRITES = 100
 NUMBERS = itertools.count()  # names that no other example uses
@@ -73,7 +73,7 @@ def sabotage(url: str, on_sqlite: str, on_postgresql: str) -> None:
 
 def units(assets: Assets, **when: int) -> list[Record]:
     """Those that did not come with the program."""
-    return [r for r in assets.records("instance", **when) if r.name != PAPER_UNIT]
+    return [r for r in assets.records("instance", **when) if r.name not in SHIPPED]
 
 
 def same(left: Record, right: Record) -> bool:
@@ -287,13 +287,14 @@ def test_get_is_right_in_both_times(
 
 
 def test_the_clock_says_now_and_recorded_times_rise_even_if_it_does_not(url: str) -> None:
-    times = iter([900, 1000, 2000, 1500, 2000, 1999, 2500])  # the first two are of the shipped
+    shipped = [700, 800, 900, 1000]
+    times = iter([*shipped, 2000, 1500, 2000, 1999, 2500])
     with open_assets(url, clock=lambda: next(times)) as assets:
         first, second, third = (assets.add(replace(UNIT, valid_from_ns=2000)) for _ in range(3))
         assert [r.recorded_ns for r in (first, second, third)] == [2000, 2001, 2002]
         assert assets.get(TYPE, "unit-1").used == "type"  # at 1999
         assert assets.get(TYPE, "unit-1").record.id == third.id  # at 2500
-        assert [r.recorded_ns for r in assets.records()] == [900, 1000, 2000, 2001, 2002]
+        assert [r.recorded_ns for r in assets.records()] == [*shipped, 2000, 2001, 2002]
         assert [r.id for r in units(assets, as_of_ns=2001)] == [first.id, second.id]
         assert assets.records("instance", "nobody") == []
 

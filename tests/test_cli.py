@@ -100,10 +100,9 @@ def test_wrong_usage_is_exit_code_2(
 @pytest.mark.parametrize(
     ("old", "new", "key"),
     [
-        ("response_ms = ", "responce_ms = ", "data.ejector.responce_ms: unknown key"),
-        ("response_ms = ", "response_ms = -", "data.ejector.response_ms: "),
+        ("optimum_bar = ", "optinum_bar = ", "data.supply.optinum_bar: unknown key"),
+        ("optimum_bar = ", "optimum_bar = -", "data.supply.optimum_bar: "),
         ("interval_ms = 30", "interval_ms = 3000", "driver.interval_ms: "),
-        ("raise_sigma = ", "raise_sigma = -", "monitor.raise_sigma: "),
         ("[asset]", "[aset]", "unknown table [aset]"),
     ],
 )
@@ -234,6 +233,7 @@ def test_a_replay_with_another_configuration_expects_something_else(
     faulty_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, _ = edited(tmp_path, "volume_ml = 750.0", "volume_ml = 700.0")
+    path.write_text(path.read_text().replace('id = "rig-01"', 'id = "rig-02"'))
     assert twin(monkeypatch, "replay", faulty_log, "--config", path, "-o", tmp_path / "b.mcap") == 0
     old, new = (
         np.concatenate([ticks["expected"] for _, ticks in open_log(log).blocks()])

@@ -139,9 +139,10 @@ def test_what_nobody_mistyped_is_not_missed(
     for known in (("--id", UNIT), (), ("--config", GRIPPER)):
         assert twin(monkeypatch, "replay", log, *known) == 0
         assert said(capsys) == []
-    assert twin(monkeypatch, "replay", log, "--config", GRIPPER, "--id", "gripper-01") == 0
+    config, _ = edited(here, 'id = "gripper-01"', 'id = "gripper-02"', "gripper")
+    assert twin(monkeypatch, "replay", log, "--config", config, "--id", "gripper-02") == 0
     (line,) = said(capsys)  # the configuration names it, too
-    assert "no instance-specific data set of 'gripper-01' in " in line
+    assert "no instance-specific data set of 'gripper-02' in " in line
     assert "using the type's 'compact-ejector-35'" in line
 
 

@@ -125,13 +125,11 @@ def test_a_log_that_names_no_unit_is_taken(here: Path, monkeypatch: pytest.Monke
 def test_without_a_calibration_there_is_no_diagnosis(
     log: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before, after = GRIPPER.read_text().split("[monitor.healthy.figures]", 1)
-    config = here / "bare.toml"
-    config.write_text(before + after[after.index("[plc.rig]") :])
-    assert twin(monkeypatch, "diagnose", log, "--config", config) == 0
+    config = other(here, 'id = "gripper-01"', 'id = "gripper-02"')
+    assert twin(monkeypatch, "diagnose", log, "--config", config, "--id", "gripper-02") == 0
     said = " ".join(capsys.readouterr().out.split())
     assert said.startswith("insufficient: The log cannot answer: not commissioned: causes are not")
-    assert "twin commission HEALTHY.mcap --id gripper-01" in said
+    assert "twin commission HEALTHY.mcap --id gripper-02" in said
 
 
 def test_the_answer_names_the_unit_that_the_log_is_of(

@@ -44,8 +44,8 @@ diameter_mm = 4.0
 kind = "vessel"
 volume_ml = 90.0
 
-[monitor.healthy.figures]
-hold_rms = {{ mean = 1.0, sigma = 0.1 }}
+[monitor]
+raise_sigma = 5.0
 """
 HEALTHY = {"figures": {"hold_rms": {"mean": 2.0, "sigma": 0.5}}}
 
@@ -121,7 +121,7 @@ def test_the_papers_unit_evacuates_both_shipped_systems(tmp_path: Path) -> None:
         document = replace(document, name=str(tmp_path / "cell.toml"))
         config = Config.of(document, unit="paper-unit")
         assert config.data.ejector.suction_capacity_sl_min == 35.0
-        assert config.data.system == rigs.config(name).data.system
+        assert config.data.system.parts == rigs.config(name).data.system.parts
         assert "paper-unit" in config.origin
 
 
@@ -151,11 +151,22 @@ def test_not_calibrated_is_the_unit_as_its_type_has_it(database: Assets, url: st
 
 
 def test_the_healthy_scatter_is_the_units_if_it_has_one(database: Assets, url: str) -> None:
-    assert taken(url).monitor.healthy.figures["hold_rms"].mean == 1.0
+    assert taken(url).monitor.healthy == Healthy()
     add(database, {})
-    assert taken(url).monitor.healthy.figures["hold_rms"].mean == 1.0
+    assert taken(url).monitor.healthy == Healthy()
     add(database, {}, healthy=HEALTHY)
     assert taken(url).monitor.healthy == Healthy.model_validate(HEALTHY)
+    assert taken(url).monitor.raise_sigma == 5.0  # the configuration's
+
+
+def test_what_a_calibration_found_is_no_configuration(database: Assets, url: str) -> None:
+    found = "\n[monitor.healthy.figures]\nhold_rms = { mean = 1.0, sigma = 0.1 }\n"
+    with pytest.raises(ConfigError, match=r"cell\.toml: \[monitor\.healthy\]: ") as caught:
+        taken(url, CELL + found)
+    assert "twin calibrate" in caught.value.hint
+    header = LogHeader(TYPE, UNIT, "cell.toml", CELL + found, {"data": whole_json()})
+    old = Config.of_recorded(header, "day.mcap", unit=UNIT, assets=url)
+    assert old.monitor.healthy == Healthy()  # a log of that time may be replayed
 
 
 def test_a_unit_moved_to_another_system_is_refused(database: Assets, url: str) -> None:
@@ -383,7 +394,7 @@ def test_nothing_is_made_up_that_a_log_does_not_say(text: str, problem: str) -> 
     [
         ("[asset\n", "cell.toml: not valid TOML: "),
         (CELL + "[colours]\n", "cell.toml:20: unknown table [colours]"),
-        (CELL.replace("monitor.healthy", "monitor.heathy"), "monitor.heathy: unknown key"),
+        (CELL.replace("raise_", "rise_"), "cell.toml:19: monitor.rise_sigma: unknown key"),
         (CELL.replace("id =", "ib ="), "cell.toml:3: asset.ib: unknown key (is 'unit-1')"),
     ],
 )

@@ -142,8 +142,9 @@ def test_a_limit_too_far_to_be_dated_is_drawn_all_the_same(run: Run, tmp_path: P
     fill(10, 500)
     config = tmp_path / "cell.toml"
     text = rigs.path_of("gripper").read_text()
-    config.write_text(text.replace("h2_mbar = 550.0", "permitted_leakage_mbar_s = 900.0", 1))
-    out = run("trend", "leakage", "--config", config, "--picture", "t.svg")
+    text = text.replace('id = "gripper-01"', 'id = "cell-1"')
+    config.write_text(text + "\n[data.ejector]\npermitted_leakage_mbar_s = 900.0\n")
+    out = run("trend", "leakage", "--config", config, "--id", "gripper-01", "--picture", "t.svg")
     assert out.rstrip().endswith("its limit of 900 mbar/s is more than 29.8 days away")
     assert b"</svg>" in Path("t.svg").read_bytes()
 

@@ -51,6 +51,7 @@ def test_each_log_is_worked_on_once(
 ) -> None:
     database, first, second = (tmp_path / name for name in ("f.sqlite", "1.json", "2.json"))
     asked = ("fleet", "diagnose", logs, "--assets", database, "--workers", "2", "--json")
+    fleets.commission(database, *UNITS)
     assert twin(monkeypatch, *asked, first) == 0
     assert "3 of 3 logs done, 0 were known" in capsys.readouterr().out
     assert twin(monkeypatch, *asked, second) == 0
@@ -66,7 +67,8 @@ def test_each_log_is_worked_on_once(
     }
     # The same as one log alone.
     alone = tmp_path / "alone.json"
-    assert twin(monkeypatch, "diagnose", logs / "A3-2.mcap", "--json", alone) == 0
+    one = ("diagnose", logs / "A3-2.mcap", "--assets", database, "--id", "A3")
+    assert twin(monkeypatch, *one, "--json", alone) == 0
     found = json.loads(alone.read_text())
     assert found["causes"][0]["effect"] == before["A3-2.mcap"]["answer"]["causes"][0]["effect"]
     assert found["extended"] == before["A3-2.mcap"]["answer"]["extended"]

@@ -700,8 +700,7 @@ def test_two_ejectors_of_one_plc_are_each_in_the_loop_with_a_model_of_their_own(
         paths = []
         for unit, system in enumerate(("test_rig", "gripper"), 1):
 
-            def change(tables: dict[str, Any], unit: int = unit, system: str = system) -> None:
-                tables["asset"]["id"] = system
+            def change(tables: dict[str, Any], unit: int = unit) -> None:
                 tables["driver"] |= {"port": port, "unit": unit}
                 tables["plc"]["server"]["unit"] = unit
 
@@ -719,7 +718,7 @@ def test_two_ejectors_of_one_plc_are_each_in_the_loop_with_a_model_of_their_own(
             _, complaints = process.communicate(timeout=PATIENCE_S)
             assert process.returncode == 130, complaints
     for system in ("test_rig", "gripper"):
-        log = open_log(tmp_path / f"a.{system}.mcap")
+        log = open_log(tmp_path / f"a.{rigs.config(system).asset.id}.mcap")
         rows = np.concatenate([samples for samples, _ in log.blocks()])
         anew, _ = Plant(rigs.theta(system)).run(rows)
         assert anew.astype(np.float32).tobytes() == rows["pressure"].tobytes()

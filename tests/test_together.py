@@ -24,6 +24,7 @@ from plc_process import PlcProcess, start_plc
 
 from drivers.lasting import LostError
 from drivers.link import ModbusSettings
+from drivers.opcua_settings import TraceNodes
 from drivers.shared import Line, Lines, SharedLink
 from drivers.tags import Address
 from twin.errors import SourceError
@@ -287,8 +288,9 @@ def over_opcua(url: str, prefix: str, unit: int) -> Callable[[dict[str, Any]], N
         tables["plc"]["opcua"] |= {"port": 0, "prefix": prefix}
         for tag in tables["driver"]["tags"].values():
             tag["node"] = tag["node"].replace("s=", f"s={prefix}")
-        trace = tables["driver"]["trace"]
-        tables["driver"]["trace"] = {k: v.replace("s=", f"s={prefix}") for k, v in trace.items()}
+        tables["driver"]["trace"] = {
+            name: str(node).replace("s=", f"s={prefix}") for name, node in TraceNodes()
+        }
 
     return change
 

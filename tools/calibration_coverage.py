@@ -9,9 +9,7 @@ alternate between the shipped configurations. Compared is what means the same in
 import argparse
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -26,11 +24,6 @@ from twin.signals import MS, Samples
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 SYSTEMS = ("test_rig", "gripper")
-KEPT = {  # of [data]: what is configured, not calibrated; the rest is the type's
-    "ejector": {"h1_mbar", "h1_hysteresis_mbar", "h2_mbar", "h2_hysteresis_mbar"},
-    "sensor": {"noise_mbar"},
-    "system": {"parts"},
-}
 TRUE: Mapping[str, Callable[[PlcSettings], float]] = {
     "ejector.suction_capacity_sl_min": lambda plc: plc.ejector.suction_capacity_sl_min,
     "ejector.end_pressure_mbar": lambda plc: plc.ejector.end_pressure_mbar,
@@ -49,11 +42,7 @@ def shipped(name: str) -> Document:
 
 def as_type(document: Document) -> Config:
     """A configuration with the system as built, and of the ejector only its type's data."""
-    data: dict[str, Any] = {
-        key: {k: v for k, v in table.items() if k in KEPT.get(key, set(table))}
-        for key, table in document.tables["data"].items()
-    }
-    return Config.of(replace(document, tables={**document.tables, "data": data}), calibrated=False)
+    return Config.of(document, calibrated=False)
 
 
 def rig_of(document: Document) -> PlcSettings:

@@ -7,6 +7,7 @@ Half of the logs of 12 cycles hide a fault. Each worker is warmed up with two lo
 
 import argparse
 import json
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -19,12 +20,14 @@ from tools.dask_cluster import cluster
 from tools.fleet_trial import TODAY, TWIN, hidden, record
 
 ASKED = 1.8
+COMMISSIONED = "commissioned.sqlite"  # the data sets of all units
 
 
 def answers(logs: Sequence[Path], scheduler: str, folder: Path, name: str) -> tuple[Any, float]:
     """What was found in all logs, and in how many seconds."""
     found = folder / f"{name}.json"
-    database = ["--assets", str(folder / f"{name}.sqlite"), "--json", str(found)]
+    answered = shutil.copy(folder / COMMISSIONED, folder / f"{name}.sqlite")
+    database = ["--assets", str(answered), "--json", str(found)]
     on = ["--engine", "dask", "--scheduler", scheduler]
     begun = time.perf_counter()
     subprocess.run([*TWIN, "fleet", "diagnose", *map(str, logs), *database, *on], check=True)
@@ -33,7 +36,7 @@ def answers(logs: Sequence[Path], scheduler: str, folder: Path, name: str) -> tu
 
 
 def main() -> None:
-    """Record, diagnose on one and on two, compare."""
+    """Record, commission, diagnose on one and on two, compare."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--logs", type=int, default=40)
     parser.add_argument("--first", type=int, default=0, help="seed")
@@ -44,6 +47,9 @@ def main() -> None:
         faults = hidden(units, units // 2, asked.first)
         for unit in range(units):
             record(unit, faults, folder, asked.first)
+        healthy = sorted(folder.glob("*-000.mcap"))
+        into = ["--assets", str(folder / COMMISSIONED)]
+        subprocess.run([*TWIN, "fleet", "calibrate", *map(str, healthy), *into], check=True)
         every = sorted(folder.glob(f"*-{TODAY:03d}.mcap"))
         found, took = [], []
         for workers in (1, 2):

@@ -387,7 +387,7 @@ def commission(
     from twin.calibration.page import write_page
     from twin.calibration.report import commissioned_as_json, commissioned_in_words
     from twin.calibration.store import store_first
-    from twin.config import Config
+    from twin.config import Config, document_in
     from twin.log.reader import open_log
     from twin.settings import Document
 
@@ -399,7 +399,7 @@ def commission(
     if recorded is None or config is not None:
         document = Document.read(config or source)
     else:
-        document = Document.parse(recorded.header.config_text, recorded.header.config_name)
+        document = document_in(recorded.header)
     settings = Config.of(document, assets, unit, calibrated=False)
     if not settings.asset.id:
         raise ConfigError("no unit is named", "give --id ID, or [asset] id in the configuration")

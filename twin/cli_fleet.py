@@ -187,11 +187,10 @@ class _Fleet:
 
     def config_of(self, log: "Log", work: str) -> "Config":
         """What is known now of the unit of a log, or of its type."""
-        from twin.config import Config
-        from twin.settings import Document
+        from twin.config import Config, document_in
 
         header = log.header
-        document = self.document or Document.parse(header.config_text, header.config_name)
+        document = self.document or document_in(header)
         unit = header.asset_id
         if work == "calibrate" and not unit:
             raise ConfigError(f"{log.path}: a log of no unit", "record it with [asset] id, or --id")

@@ -112,6 +112,7 @@ class Config:
         from twin.assets.place import open_chosen
 
         document.refuse_unknown_tables(TABLES)
+        _refuse_calibrated(document)
         asset = _asset(document, unit)
         to_store = to_store or not calibrated  # what is not, is read to be calibrated and stored
         with open_chosen(assets, document, write=False, to_store=to_store) as database:
@@ -159,7 +160,7 @@ class Config:
         from twin.assets.place import is_new
 
         with _in_log(header.metadata, log):
-            document = instead or Document.parse(header.config_text, header.config_name)
+            document = instead or document_in(header)
         known = bool(assets) and not (to_store and is_new(assets, document))
         if instead is not None or known or unit or as_of_ns is not None:
             own = header.asset_id
@@ -206,10 +207,22 @@ class Config:
     @classmethod
     def _checked(cls, document: Document, asset: Asset, known: Known, origin: str) -> "Config":
         monitor = document.section(MonitorSettings, "monitor")
-        if known.healthy != Healthy():
-            monitor = monitor.model_copy(update={"healthy": known.healthy})
+        monitor = monitor.model_copy(update={"healthy": known.healthy})
         log = document.section(LogSettings, "log")
         return cls(document, asset, known.data, monitor, log, origin)
+
+
+def document_in(header: LogHeader) -> Document:
+    """The configuration that a log carries; ConfigError if it is not TOML.
+
+    Older ones have what a calibration found, which stands in the log itself as well.
+    """
+    document = Document.parse(header.config_text, header.config_name)
+    monitor = document.tables.get("monitor", {})
+    if not isinstance(monitor, Mapping):
+        return document
+    without = {key: value for key, value in monitor.items() if key != "healthy"}
+    return replace(document, tables={**document.tables, "monitor": without})
 
 
 def check_asset(document: Document, record: Record, database: "Assets") -> None:
@@ -223,6 +236,17 @@ def check_asset(document: Document, record: Record, database: "Assets") -> None:
         below = _laid(kind, {}, partial(_in_record, kind, database.name))
     _laid(record, below, partial(_in_file, document))
     replace(document, tables={"healthy": record.healthy}).section(Known)
+
+
+def _refuse_calibrated(document: Document) -> None:
+    """ConfigError if a person's file has what only a calibration can know."""
+    monitor = document.tables.get("monitor", {})
+    if isinstance(monitor, Mapping) and "healthy" in monitor:
+        raise ConfigError(
+            f"{document.name}: [monitor.healthy]: what a calibration found stands in the asset"
+            " database, not in a configuration",
+            "remove the table; twin commission and twin calibrate store it",
+        )
 
 
 # --- which records ------------------------------------------------------------------------------

@@ -114,6 +114,7 @@ class Document:
         """Line of the deepest of ``keys`` that can be found; TOML parsers do not keep it."""
         table: tuple[str, ...] = ()
         seen: Counter[str] = Counter()  # how often a table of a list has begun
+        items: tuple[str, ...] = ()  # the list whose inline tables stand in lines of their own
         best, depth = 1, 0
         for number, line in enumerate(self.text.splitlines(), 1):
             if header := re.match(r"\s*\[+\s*([^\]]+?)\s*\]", line):
@@ -122,8 +123,12 @@ class Document:
                     table = (*table, str(seen[header[1]]))
                     seen[header[1]] += 1
                 here = table
-            elif key := re.match(r"""\s*(["'\w.-]+)\s*=""", line):
+            elif key := re.match(r"""\s*(["'\w.-]+)\s*=\s*(\[\s*(#.*)?$)?""", line):
                 here = (*table, *_path(key[1]))
+                items = here if key[2] else ()
+            elif items and line.lstrip().startswith("{"):
+                here = (*items, str(seen[".".join(items)]))
+                seen[".".join(items)] += 1
             else:
                 continue
             if depth < len(here) and here == keys[: len(here)]:
