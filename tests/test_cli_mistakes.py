@@ -32,6 +32,7 @@ NEEDED = {
     "export-fmu": ("--config", "C"),
     "serve": ("--config", "C"),
     "cert": ("pki",),
+    "init": (),
     "assets list": (),
     "assets show": ("paper-unit",),
     "assets add": ("unit.toml",),
@@ -60,7 +61,7 @@ NEEDED = {
     "log recover": ("L", "-o", "new.mcap"),
 }
 # Commands that do something useful without an argument.
-ALONE = {"effects", "paper", "assets list", "assets export", "alarms rules"}
+ALONE = {"effects", "paper", "init", "assets list", "assets export", "alarms rules"}
 FILES = ("text.txt", "bytes.bin", "empty", "folder")  # of no command's kind
 
 
@@ -103,8 +104,19 @@ WRONG = {
 RIGHT = {
     "calibrate": "--id",
     "commission": "--id",
+    "init": "--id",
     "figures show": "--figures",
 }  # of these: a new unit; see below
+INIT = {  # values that say nothing of a machine
+    "--range": ("1500,0", "0", "nan,1", "a,b"),
+    "--hose-mm": ("0", "-1", "nan", "long"),
+    "--volume-ml": ("0", "inf"),
+    "--unit": ("bars",),
+    "--reference": ("sealevel",),
+    "--end": ("nothing",),
+    "--pressure": ("somewhere",),
+    "--suction": ("30005/77",),
+}
 READ = ("C", "L", "rows.csv", "unit.toml", "here.json")  # arguments that are files
 
 
@@ -129,6 +141,10 @@ def _cases() -> Iterator[tuple[str, tuple[str, ...], set[int]]]:
         for address in ("127.0.0.1:1", "no.such.host.invalid:502"):
             yield command, (*NEEDED[command], "--address", address), {SOURCE}
     yield "cert", ("text.txt",), {SOURCE}
+    yield "init", ("text.txt",), {SOURCE}
+    yield "init", ("nofolder/cell.toml",), {SOURCE}
+    for option, wrong in INIT.items():
+        yield from (("init", (option, value), {USAGE}) for value in wrong)
     yield "figures show", ("L", "--figures", "f.sqlite"), {USAGE}
     yield "assets show", ("paper-unit", "--as-of", "1999-01-01"), {USAGE}
     yield "fleet report", (), {SOURCE}

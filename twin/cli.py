@@ -29,6 +29,7 @@ from twin.cli_compare import compare
 from twin.cli_exchange import export_fmu
 from twin.cli_figures import figures_app, keeper_of, key_figures_of
 from twin.cli_fleet import fleet_app
+from twin.cli_init import init
 from twin.cli_outlets import outlets_of
 from twin.cli_serve import live_rows_of, reports_of, serve
 from twin.errors import ConfigError, SourceError, TwinError
@@ -564,6 +565,7 @@ app.command()(compare)
 app.command()(export_fmu)
 app.command()(serve)
 app.command()(cert)
+app.command()(init)
 
 
 def main() -> None:

@@ -289,7 +289,7 @@ def _find(
             if type_name in ("", NO_TYPE):
                 raise ConfigError(
                     f"{document.name}: neither [asset] type nor [data] says what ejector this is",
-                    "begin with one of the files in configs/",
+                    "write a file to begin with: twin init",
                 ) from None
             raise
         return None

@@ -1,0 +1,139 @@
+"""``twin init``: whatever is answered or not known, the file that it writes is taken as it is."""
+
+import io
+import itertools
+import sys
+from pathlib import Path
+
+import pytest
+from command_line import twin
+
+from drivers.sources import settings_of
+from twin.config import Config
+from twin.settings import Document
+
+MODBUS, OPC_UA = ("--address", "10.0.0.5:502"), ("--address", "opc.tcp://plc:4840")
+SAID = (
+    *("--id", "gripper-7", "--type", "ecm-20", "--unit", "bar", "--reference", "vacuum"),
+    *("--range", "-0.05,1.013", "--hose-mm", "1500", "--diameter-mm", "4", "--end", "cups"),
+    *("--volume-ml", "60", "--sensor", "end", "--released", "yes", "--supply-bar", "5.5"),
+)
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder, with nobody at the keyboard."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    return tmp_path
+
+
+def taken(path: str = "cell.toml") -> Config:
+    return Config.of(Document.read(Path(path)), calibrated=False)
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        (*address, ring, "--end", end, "--released", released)
+        for address, ring, end, released in itertools.product(
+            (MODBUS, OPC_UA),
+            ("--ring", "--no-ring"),
+            ("cups", "vessel"),
+            ("yes", "no", "unknown"),
+        )
+    ],
+    ids=" ".join,
+)
+def test_what_is_written_is_taken_as_it_is(
+    flags: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert twin(monkeypatch, "init", *flags) == 0
+    text = Path("cell.toml").read_text()
+    assert len(text.splitlines()) <= 60
+    config, driver = taken(), settings_of(Document.read(Path("cell.toml")))
+    assert (driver.kind == "opcua") == ("opc.tcp://plc:4840" in flags)
+    assert (driver.mode == "block") == ("--ring" in flags)
+    *_, last = config.data.system.parts
+    is_released = "yes" in flags or ("unknown" in flags and "cups" in flags)
+    assert last.kind == ("cups" if is_released else "vessel")
+
+
+def test_what_is_said_is_in_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tags = ("--no-ring", "--pressure", "40101", "--pressure-type", "uint16", "--scale", "0.1")
+    assert twin(monkeypatch, "init", *SAID, *MODBUS, *tags, "--suction", "40102/3") == 0
+    config = taken()
+    assert (config.asset.type, config.asset.id) == ("ecm-20", "gripper-7")
+    hose, sensor, cups = config.data.system.parts
+    assert (hose.length_mm, hose.diameter_mm, cups.volume_ml) == (1500.0, 4.0, 60.0)
+    assert sensor.kind == "sensor"
+    assert config.data.supply.pressure_bar == 5.5
+    driver = settings_of(config.document)
+    assert (driver.host, driver.port) == ("10.0.0.5", 502)
+    assert driver.tags.pressure.address.manual == "40101"
+    assert (driver.tags.pressure.scale, driver.tags.pressure.range) == (0.1, (-0.05, 1.013))
+    assert (driver.tags.pressure.unit, driver.tags.pressure.reference) == ("bar", "vacuum")
+    assert driver.tags.suction.bit == 3
+    assert "guessed" not in config.document.text
+    *_, first, second = capsys.readouterr().out.splitlines()
+    assert first.strip() == "twin probe cell.toml"
+    assert second.strip() == "twin commission cell.toml --cycles 12"
+
+
+def test_what_nobody_knows_is_guessed_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert twin(monkeypatch, "init", "left.toml") == 0
+    config = taken("left.toml")
+    assert config.asset.id == "left"
+    assert config.asset.type == "type-of-left"  # not to be taken for that of another unit
+    for what in ("type", "length_mm", "diameter_mm", "volume_ml", '{ kind = "sensor" }', "host"):
+        lines = [line for line in config.document.text.splitlines() if what in line]
+        assert any("not known" in line or "not said" in line for line in lines), what
+
+
+def test_a_unit_of_which_there_are_only_files_has_no_driver(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twin(monkeypatch, "init", "--address", "none") == 0
+    assert "driver" not in taken().document.tables
+    *_, first, second = capsys.readouterr().out.splitlines()
+    assert first.strip() == "twin import TRACE.csv --config cell.toml -o healthy.mcap"
+    assert second.strip() == "twin commission healthy.mcap --config cell.toml"
+
+
+def test_on_a_terminal_it_asks_what_no_flag_says(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ("--type", "ecm-20", *MODBUS, "--ring", "--unit", "mbar", "--range", "unknown")
+    answers = ("press-3", "absolute", "cups", "900", "wide", "4", "unknown", "end", "yes", "")
+    monkeypatch.setattr(sys, "stdin", Terminal("\n".join(answers) + "\n"))
+    assert twin(monkeypatch, "init", *given) == 0
+    hose, _, cups = taken().data.system.parts
+    assert (taken().asset.id, hose.length_mm, hose.diameter_mm) == ("press-3", 900.0, 4.0)
+    assert cups.kind == "cups"
+    said = "".join(capsys.readouterr())
+    assert "'wide' is no number above zero" in said  # and it is asked again
+    assert "nameplate" not in said
+
+
+def test_a_file_that_is_there_is_not_overwritten(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("cell.toml").write_text("mine")
+    assert twin(monkeypatch, "init") == 3
+    assert "already a file" in capsys.readouterr().err
+    assert Path("cell.toml").read_text() == "mine"
+
+
+def test_what_is_wrong_is_said_and_nothing_is_written(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twin(monkeypatch, "init", *MODBUS, "--ring", "--suction", "coil:7") == 2
+    assert "driver.tags.suction" in capsys.readouterr().err
+    assert list(here.iterdir()) == []

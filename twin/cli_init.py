@@ -1,0 +1,471 @@
+"""``twin init``: a commented configuration to begin with, from flags and a few questions."""
+
+import json
+import re
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import typer
+
+from twin.errors import ConfigError, SourceError
+from twin.files import said_plainly
+
+UNKNOWN = "unknown"
+NO_PLC = "none"
+FILE_ONLY, PLACEHOLDER = "none: there are only files", "192.168.0.10:502"
+OPC_UA = "opc.tcp://"
+LAYOUTS = {  # where the simulated PLC and docs/connect-your-plc.md have pressure and commands
+    ("modbus", True): ("30002", "30005/0", "30005/1"),
+    ("modbus", False): ("40001", "00001", "00002"),
+    ("opcua", True): ("s=Meas.Pressure", "s=Cmd.Suction", "s=Cmd.BlowOff"),
+    ("opcua", False): ("s=Meas.Pressure", "s=Cmd.Suction", "s=Cmd.BlowOff"),
+}
+_TAGS = {  # what to look up, by OPC UA and by ring
+    (False, True): "in block mode the ring's values are read instead",
+    (False, False): 'addresses as in manuals, or counted from 0: "holding:0"',
+    (True, True): "in block mode the values of [driver.trace] are read instead",
+    (True, False): "nodes of the namespace",
+}
+GUESSED = {"hose_mm": 1000.0, "diameter_mm": 6.0, "cups": 50.0, "vessel": 750.0}  # mid-market
+
+
+class Unit(StrEnum):
+    """Of the pressure, as it arrives."""
+
+    MBAR = "mbar"
+    BAR = "bar"
+    KPA = "kPa"
+    PA = "Pa"
+    PSI = "psi"
+
+
+class Reference(StrEnum):
+    """What a pressure is counted from."""
+
+    ABSOLUTE = "absolute"
+    GAUGE = "gauge"
+    VACUUM = "vacuum"
+
+
+class Number(StrEnum):
+    """How a pressure is coded in registers."""
+
+    INT16 = "int16"
+    UINT16 = "uint16"
+    INT32 = "int32"
+    UINT32 = "uint32"
+    FLOAT32 = "float32"
+
+
+class End(StrEnum):
+    """What the ejector evacuates."""
+
+    CUPS = "cups"
+    VESSEL = "vessel"
+
+
+class Place(StrEnum):
+    """Where the sensor is that the PLC reads."""
+
+    EJECTOR = "ejector"
+    END = "end"
+    UNKNOWN = UNKNOWN
+
+
+class Answer(StrEnum):
+    """To a question that a person may not be able to answer."""
+
+    YES = "yes"
+    NO = "no"
+    UNKNOWN = UNKNOWN
+
+
+def _positive(text: str) -> float | None:
+    """For an option with a size: usage error unless it is above zero; None for ``unknown``."""
+    if text == UNKNOWN:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < 1e9:
+        raise typer.BadParameter(f"{text!r} is no number above zero; write unknown, if it is")
+    return value
+
+
+def _address(text: str) -> str:
+    """For the PLC's address: usage error unless it is one of the three forms."""
+    host, _, port = text.removeprefix(OPC_UA).rpartition(":")
+    if text != NO_PLC and not (host and port.isdecimal() and 0 < int(port) <= 0xFFFF):
+        raise typer.BadParameter(
+            f"{text!r} is no address: write HOST:PORT (Modbus TCP), {OPC_UA}HOST:PORT, or none"
+        )
+    return text
+
+
+def _range(text: str) -> tuple[float, float] | None:
+    """For the sensor's range: usage error unless LOW,HIGH; None for ``unknown``."""
+    if text == UNKNOWN:
+        return None
+    try:
+        low, high = map(float, text.split(","))
+    except ValueError:
+        low, high = 0.0, 0.0
+    if not -1e9 < low < high < 1e9:
+        raise typer.BadParameter(f"{text!r} is no range: write LOW,HIGH, for example 0,1500")
+    return low, high
+
+
+@dataclass(frozen=True)
+class Connection:
+    """Where pressure and commands come from."""
+
+    address: str
+    is_ring: bool
+    namespace: str
+    pressure: str
+    coded: Number
+    scale: float
+    suction: str
+    blow_off: str
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What the pressure means."""
+
+    unit: Unit
+    reference: Reference
+    range: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class System:
+    """What hangs on the ejector; None is not known."""
+
+    hose_mm: float | None
+    diameter_mm: float | None
+    end: End
+    volume_ml: float | None
+    sensor: Place
+    released: Answer
+    supply_bar: float | None
+
+
+T = TypeVar("T")
+
+
+def _asked(given: T | None, words: str, default: str, parse: Callable[[str], T]) -> T:
+    """A flag's value; without one, what a person answers; where nobody can be asked, a default."""
+    if given is not None:
+        return given
+    if not sys.stdin.isatty():
+        return parse(default)
+
+    def checked(text: str) -> T:
+        try:
+            return parse(text.strip())
+        except ValueError as error:  # of a choice
+            raise typer.BadParameter(f"{text!r} is none of these") from error
+
+    answer: T = typer.prompt(words, default=str(default), value_proc=checked, err=True)
+    return answer
+
+
+def _size(flag: str, what: str) -> Any:
+    return typer.Option(flag, metavar="X|unknown", help=what)
+
+
+def init(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The new configuration.")] = Path(
+        "cell.toml"
+    ),
+    *,
+    unit: Annotated[
+        str | None, typer.Option("--id", metavar="ID", help="Name of the unit.")
+    ] = None,
+    kind: Annotated[
+        str | None, typer.Option("--type", help="Type on the nameplate, or unknown.")
+    ] = None,
+    address: Annotated[
+        str | None,
+        typer.Option(metavar="HOST:PORT|opc.tcp://HOST:PORT|none", help="Where the PLC is."),
+    ] = None,
+    ring: Annotated[
+        bool | None,
+        typer.Option("--ring/--no-ring", help="The PLC keeps a ring of scans, or is polled."),
+    ] = None,
+    namespace: Annotated[
+        str, typer.Option(metavar="URI", help="Of the OPC UA nodes.")
+    ] = "urn:ejector-twin:plc",
+    pressure: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Of the pressure: register or node.")
+    ] = None,
+    coded: Annotated[
+        Number | None, typer.Option("--pressure-type", help="Of the pressure's register.")
+    ] = None,
+    scale: Annotated[float, typer.Option(help="Pressure in its unit for a raw value of 1.")] = 1.0,
+    suction: Annotated[
+        str | None, typer.Option(metavar="ADDRESS[/BIT]", help="Of the suction command.")
+    ] = None,
+    blow_off: Annotated[
+        str | None, typer.Option(metavar="ADDRESS[/BIT]", help="Of the blow-off command.")
+    ] = None,
+    pressure_unit: Annotated[Unit | None, typer.Option("--unit", help="Of the pressure.")] = None,
+    reference: Annotated[
+        Reference | None, typer.Option(help="What the pressure is counted from.")
+    ] = None,
+    sensor_range: Annotated[
+        str | None, typer.Option("--range", metavar="LOW,HIGH|unknown", help="Of the sensor.")
+    ] = None,
+    hose: Annotated[str | None, _size("--hose-mm", "Length of the hose.")] = None,
+    diameter: Annotated[str | None, _size("--diameter-mm", "Inner diameter of the hose.")] = None,
+    end: Annotated[End | None, typer.Option(help="What is evacuated.")] = None,
+    volume: Annotated[str | None, _size("--volume-ml", "Of all cups, or of the vessel.")] = None,
+    sensor: Annotated[Place | None, typer.Option(help="Where the sensor is.")] = None,
+    released: Annotated[
+        Answer | None, typer.Option(help="Whether blow-off lets the part go.")
+    ] = None,
+    supply: Annotated[str | None, _size("--supply-bar", "At the regulator, gauge.")] = None,
+) -> None:
+    """Write a commented configuration to begin with, from flags or a few questions.
+
+    On a terminal what no flag says is asked; unknown is an answer to most. Elsewhere it is
+    guessed, and the file says so. A file that is there is not overwritten.
+    """
+    if file.exists():
+        message = f"{file}: there is already a file of that name"
+        raise SourceError(message, "choose another name, or remove it")
+    named = _asked(unit, "Name of this unit", file.stem, str)
+    typed = _asked(kind, "Type on the nameplate", UNKNOWN, str)
+    where = _address(_asked(address, f"Where the PLC is ({FILE_ONLY})", PLACEHOLDER, _address))
+    connection = None
+    if where != NO_PLC:
+        connection = _connection(where, ring, namespace, pressure, coded, scale, suction, blow_off)
+    meant = Sensor(
+        _asked(pressure_unit, "Unit of the pressure (mbar, bar, kPa, Pa, psi)", "mbar", Unit),
+        _asked(reference, "Counted from (absolute, gauge, vacuum)", "absolute", Reference),
+        _parsed(sensor_range, "Range of the sensor, LOW,HIGH", _range),
+    )
+    what = _asked(end, "What is evacuated (cups, vessel)", End.CUPS, End)
+    system = System(
+        _parsed(hose, "Length of the hose, mm", _positive),
+        _parsed(diameter, "Its inner diameter, mm", _positive),
+        what,
+        _parsed(volume, "Volume of all cups, or of the vessel, ml", _positive),
+        _asked(sensor, "Where the sensor is (ejector, end, unknown)", UNKNOWN, Place),
+        _asked(released, "Does blow-off let the part go (yes, no, unknown)", UNKNOWN, Answer),
+        _parsed(supply, "Supply at the regulator, bar gauge", _positive),
+    )
+    text = configuration(file, named, typed, connection, meant, system)
+    _check(text, file)
+    with said_plainly(file), file.open("x", encoding="utf-8") as new:
+        new.write(text)
+    print(f"written: {file}; look through it, then:")
+    for line in next_commands(file, connection):
+        print(f"  {line}")
+
+
+def _parsed(given: str | None, words: str, parse: Callable[[str], T]) -> T:
+    """The same for what may be unknown, which is None then."""
+    return parse(given) if given is not None else _asked(None, words, UNKNOWN, parse)
+
+
+def _connection(
+    where: str,
+    ring: bool | None,
+    namespace: str,
+    pressure: str | None,
+    coded: Number | None,
+    scale: float,
+    suction: str | None,
+    blow_off: str | None,
+) -> Connection:
+    kind = "opcua" if where.startswith(OPC_UA) else "modbus"
+    words = "Does the PLC keep a ring of scans, as docs/connect-your-plc.md has it (yes, no)"
+    told = None if ring is None else Answer.YES if ring else Answer.NO
+    is_ring = _asked(told, words, Answer.YES, Answer) is Answer.YES
+    usual = LAYOUTS[kind, is_ring]
+    if is_ring:  # which has its own layout
+        given = pressure or usual[0], suction or usual[1], blow_off or usual[2]
+        return Connection(
+            where, True, namespace, given[0], coded or Number.FLOAT32, scale, *given[1:]
+        )
+    number = Number.FLOAT32
+    at = _asked(pressure, "Address of the pressure", usual[0], str)
+    if kind == "modbus":
+        number = _asked(coded, f"Its type ({', '.join(Number)})", Number.INT16, Number)
+    on = _asked(suction, "Address of the suction command, with /BIT in a word", usual[1], str)
+    off = _asked(blow_off, "Address of the blow-off command", usual[2], str)
+    return Connection(where, False, namespace, at, number, scale, on, off)
+
+
+def _check(text: str, file: Path) -> None:
+    """ConfigError if what was answered makes no configuration: then nothing is written."""
+    from drivers.sources import settings_of
+    from twin.config import Config
+    from twin.settings import Document
+
+    document = Document.parse(text, str(file))
+    if "driver" in document.tables:
+        settings_of(document)
+    config = Config.of(document, calibrated=False)
+    if config.asset.id.strip() != config.asset.id or not config.asset.id.isprintable():
+        raise ConfigError(f"{config.asset.id!r} cannot be the name of a unit", "use plain letters")
+
+
+def next_commands(file: Path, connection: Connection | None) -> tuple[str, str]:
+    """The two that follow."""
+    if connection is None:
+        return (
+            f"twin import TRACE.csv --config {file} -o healthy.mcap",
+            f"twin commission healthy.mcap --config {file}",
+        )
+    return f"twin probe {file}", f"twin commission {file} --cycles 12"
+
+
+# --- the file -----------------------------------------------------------------------------------
+
+
+def configuration(
+    file: Path,
+    unit: str,
+    kind: str,
+    connection: Connection | None,
+    sensor: Sensor,
+    system: System,
+) -> str:
+    """The text; what is guessed says so."""
+    is_known = kind not in ("", UNKNOWN)
+    name = kind if is_known else f"type-of-{unit}"
+    note = "as on the nameplate" if is_known else "not known: a type of its own"
+    first, second = next_commands(file, connection)
+    lines = [
+        "# What a person knows of this ejector; a guess says so. What a calibration finds does not",
+        "# stand here but in the asset database. Every key of [data]: docs/data-set.md",
+        f"# Next: {first}; then {second}",
+        "",
+        "[asset]",
+        _line(f"type = {_quoted(name)}", note),
+        f"id = {_quoted(unit)}",
+        "",
+        *(_no_driver(sensor) if connection is None else _driver(connection, sensor)),
+        "",
+        "# --- what hangs on the ejector, outwards from its port; a fifth off is near enough -----",
+        "",
+        *_system(system),
+        "",
+        *_supply(system.supply_bar),
+        "",
+        "# twin commission finds the rest. Known for sure may be:",
+        "# [data.ejector]",
+        "# h1_mbar = 750.0               # vacuum at which air saving ends suction",
+        '# control_sensor = "plc"        # it switches by the sensor that the PLC reads (IO-Link)',
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _driver(connection: Connection, sensor: Sensor) -> list[str]:
+    is_opcua = connection.address.startswith(OPC_UA)
+    lines = [
+        "# --- where the samples come from: docs/connect-your-plc.md, docs/opcua.md ---------",
+        "",
+    ]
+    lines += ["[driver]"]
+    if is_opcua:
+        polled, key = "subscribe", "node"
+        lines += ['kind = "opcua"', f"url = {_quoted(connection.address)}"]
+        lines += [_line(f"namespace = {_quoted(connection.namespace)}", "of the nodes")]
+    else:
+        polled, key = "poll", "address"
+        host, _, port = connection.address.rpartition(":")
+        asked = "not said: put the PLC's address here" if connection.address == PLACEHOLDER else ""
+        lines += ['kind = "modbus"', _line(f"host = {_quoted(host)}", asked), f"port = {port}"]
+        lines += ["unit = 1", _line('word_order = "big"', "twin probe tells which")]
+    mode = "block" if connection.is_ring else polled
+    why = f'a ring of scans; without one "{polled}"' if connection.is_ring else "no ring of scans"
+    lines += [
+        _line(f'mode = "{mode}"', why),
+        "",
+        _line("[driver.tags]", _TAGS[is_opcua, connection.is_ring]),
+    ]
+    number = "" if is_opcua else f'type = "{connection.coded}", '
+    scale = "" if connection.scale == 1.0 else f"scale = {connection.scale:g}, "
+    pressure = f"{key} = {_quoted(connection.pressure)}, {number}{scale}{_meaning(sensor)}"
+    lines += [f"pressure = {{ {pressure} }}"]
+    for name, place in (("suction", connection.suction), ("blow_off", connection.blow_off)):
+        bit = re.fullmatch(r"(.+)/(\d+)", place)
+        at = f"{key} = {_quoted(bit[1])}, bit = {bit[2]}" if bit else f"{key} = {_quoted(place)}"
+        lines += [f"{name} = {{ {at} }}"]
+    return lines
+
+
+def _no_driver(sensor: Sensor) -> list[str]:
+    """A unit of which there are only files."""
+    kind = "vacuum" if sensor.reference is Reference.VACUUM else "pressure"
+    return [
+        "# --- files of another program: docs/csv.md --------------------------------------",
+        "",
+        "[import.columns]",
+        '# time_s = "Time"               # the file\'s names, where they are others',
+        f'# {kind}_mbar = "Pressure"',
+    ]
+
+
+def _meaning(sensor: Sensor) -> str:
+    words = f'unit = "{sensor.unit}", reference = "{sensor.reference}"'
+    if sensor.range is None:
+        return words
+    low, high = sensor.range
+    return f"{words}, range = [{low:g}, {high:g}]"
+
+
+def _system(system: System) -> list[str]:
+    is_released = system.released is Answer.YES or (
+        system.released is Answer.UNKNOWN and system.end is End.CUPS
+    )
+    kind = "cups" if is_released else "vessel"
+    behind = {
+        Answer.YES: "open to ambient once the part is gone",
+        Answer.NO: "closed: nothing is released",
+        Answer.UNKNOWN: "not known whether the part is released: guessed",
+    }[system.released]
+    sizes = {
+        "length_mm": (system.hose_mm, GUESSED["hose_mm"]),
+        "diameter_mm": (system.diameter_mm, GUESSED["diameter_mm"]),
+    }
+    guessed = [name for name, (known, _) in sizes.items() if known is None]
+    values = ", ".join(
+        f"{name} = {known if known is not None else guess}"
+        for name, (known, guess) in sizes.items()
+    )
+    hose = _line(
+        f'    {{ kind = "tube", {values} }},',
+        f"{' and '.join(guessed)} not known: guessed" if guessed else "",
+    )
+    volume = system.volume_ml if system.volume_ml is not None else GUESSED[system.end]
+    size = "" if system.volume_ml is not None else "; volume_ml not known: guessed"
+    place = "not known: guessed" if system.sensor is Place.UNKNOWN else f"at the {system.sensor}"
+    sensor = _line('    { kind = "sensor" },', place)
+    parts = [hose, sensor] if system.sensor is Place.END else [sensor, hose]
+    last = _line(f'    {{ kind = "{kind}", volume_ml = {volume} }},', behind + size)
+    return ["[data.system]", "parts = [", *parts, last, "]"]
+
+
+def _supply(known: float | None) -> list[str]:
+    value = "# pressure_bar = 5.0" if known is None else f"pressure_bar = {known}"
+    what = "gauge, at the regulator" + ("; not known" if known is None else "")
+    return ["[data.supply]", _line(value, what)]
+
+
+def _line(text: str, comment: str) -> str:
+    return f"{text:<31} # {comment}" if comment else text
+
+
+def _quoted(text: str) -> str:
+    """A TOML string."""
+    return json.dumps(text, ensure_ascii=False)
