@@ -29,6 +29,7 @@ from twin.diagnosis.unlisted import Unlisted, look
 from twin.diagnosis.weights import covariance, levels
 from twin.model import theta as c
 from twin.model.courses import Cause, Course
+from twin.model.effects import EFFECTS
 from twin.monitor.cycles import PAPER_VACUUM
 from twin.monitor.phases import Knees
 from twin.settings import Document
@@ -364,6 +365,18 @@ def test_the_time_to_h2_is_to_that_of_the_unit() -> None:
     figures = judge(evidence, weights, HEALTHY).figures
     assert figures["h2_time_error_pct"] == figures["evacuation_time_error_pct"]
     assert figures["h2_time_error_pct"] != diagnosis.json["baseline"]["h2_time_error_pct"]
+
+
+@pytest.mark.parametrize(("effect", "typical"), [("leakage", 59.0), ("sensor_lag", 390.0)])
+def test_no_size_is_told_beyond_the_bounds_of_its_effect(effect: str, typical: float) -> None:
+    """An interval may be wide; what a ramp has come to has the bounds of the effect, too."""
+    evidence, (first, *_) = collect(CONFIG, record(8.0)), EFFECTS[effect].parameters
+    x, spread = np.array([typical / first.typical]), np.array([0.5 * first.high / first.typical])
+    for course in (Course.CONSTANT, Course.RAMP):
+        cause = Cause(effect, {first.name: typical}, course, onset_s=1.0)
+        (told,) = answer_module._parameters(evidence, cause, x, spread).values()
+        name = "at_end_" if course == Course.RAMP else ""
+        assert first.low <= told[f"{name}low95"] < told[f"{name}high95"] <= first.high
 
 
 def test_few_rows_draw_the_same_curve_as_all() -> None:

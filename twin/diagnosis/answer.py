@@ -278,13 +278,13 @@ def _parameters(
     for p, size, sigma in zip(EFFECTS[cause.effect].parameters, x, spread, strict=True):
         if not np.isfinite(sigma) or sigma > abs(p.high - p.low) / p.typical:
             continue  # nothing in this log depends on it
-        neutral = 0.0 if ramp else p.neutral(evidence.theta)
+        at_neutral = p.neutral(evidence.theta)
+        neutral = 0.0 if ramp else at_neutral
         value = neutral + float(size) * p.typical
         scale = OF_HEAT if cause.effect == "heat_exchange" else RELATIVE
         reach = 1.96 * math.hypot(float(sigma) * p.typical, scale * value)
-        low, high = value - reach, value + reach
-        if not ramp:
-            low, high = max(low, p.low), min(high, p.high)
+        shift = at_neutral - neutral  # of a ramp these are changes, and the bounds are not
+        low, high = max(value - reach, p.low - shift), min(value + reach, p.high - shift)
         per_hour = 1.0 / hours(evidence, cause) if ramp else 1.0
         found[p.name] = {
             "value": rounded(value * per_hour),
@@ -294,7 +294,7 @@ def _parameters(
         }
         if ramp:
             for name, change in (("at_end", value), ("at_end_low95", low), ("at_end_high95", high)):
-                found[p.name][name] = rounded(p.neutral(evidence.theta) + change)
+                found[p.name][name] = rounded(at_neutral + change)
     return found
 
 
