@@ -9,6 +9,7 @@ from rigs import Collect
 
 from twin.alarms.loop import Alarms
 from twin.alarms.settings import board_rules
+from twin.alarms.words import COMMISSION
 from twin.cli import pair_of
 from twin.config import Config
 from twin.diagnosis.answer import diagnose
@@ -66,6 +67,8 @@ def test_alarm_log_and_page_say_that_it_is_not_commissioned() -> None:
     evidence = alarm.data["evidence"]
     assert NOT_COMMISSIONED in evidence["words"]  # which the alarm list prints
     assert ("how sure", NOT_COMMISSIONED) in list(facts(evidence))
+    assert alarm.data["action"] == COMMISSION  # a diagnosis would say nothing more
+    assert alarm.text.endswith(COMMISSION)
 
 
 def test_no_cause_is_named_anywhere() -> None:

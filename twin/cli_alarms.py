@@ -368,6 +368,8 @@ def _answered(store: "Store", number: int, name: str, deed: "Deed") -> str:
 
 
 def _plain_alarm(alarm: "Alarm", episode: "Episode | None", unit: "Unit") -> dict[str, Any]:
+    from twin.alarms.words import action_of
+
     rule = alarm.rule
     return {
         "asset": {"type": unit.type, "id": unit.id},
@@ -375,7 +377,7 @@ def _plain_alarm(alarm: "Alarm", episode: "Episode | None", unit: "Unit") -> dic
         "state": alarm.state.value,
         "priority": rule.priority.value,
         "consequence": rule.consequence,
-        "action": rule.action,
+        "action": action_of(rule, episode.evidence if episode else {}),
         "shelved_until_ns": alarm.shelved_until,
         "episode": _plain_episode(episode) if episode else None,
     }

@@ -8,6 +8,7 @@ import pyarrow as pa
 from twin.alarms.board import Episode
 from twin.alarms.rules import Rule
 from twin.alarms.state import Alarm
+from twin.alarms.words import action_of
 from twin.assets.unit import Unit
 
 _TIME = pa.timestamp("ns", "UTC")
@@ -30,7 +31,7 @@ _STATE = (("state", _TEXT, ""), ("shelved_until", _TIME, ""))
 def history_table(episodes: Sequence[Episode], rules: Mapping[str, Rule], unit: Unit) -> pa.Table:
     """Every time that an alarm was active; what has not happened yet is null."""
     rows = [
-        {**_whose(unit, one.alarm), **_of_episode(one), **_of_rule(rules.get(one.alarm))}
+        {**_whose(unit, one.alarm), **_of_episode(one), **_of_rule(rules.get(one.alarm), one)}
         for one in episodes
     ]
     return _table(rows, (*_WHOSE, *_EPISODE, *_RULE))
@@ -45,7 +46,7 @@ def standing_table(
         name, episode = alarm.rule.name, episodes.get(alarm.rule.name)
         state = {"state": alarm.state.value, "shelved_until": alarm.shelved_until}
         since = _of_episode(episode) if episode else {}
-        rows.append({**_whose(unit, name), **state, **since, **_of_rule(alarm.rule)})
+        rows.append({**_whose(unit, name), **state, **since, **_of_rule(alarm.rule, episode)})
     return _table(rows, (*_WHOSE, *_STATE, *_EPISODE, *_RULE))
 
 
@@ -67,14 +68,14 @@ def _of_episode(episode: Episode) -> dict[str, Any]:
     }
 
 
-def _of_rule(rule: Rule | None) -> dict[str, Any]:
+def _of_rule(rule: Rule | None, episode: Episode | None) -> dict[str, Any]:
     """What the rules in use say of an alarm; nothing of one that they do not know any more."""
     if rule is None:
         return {}
     return {
         "priority": rule.priority.value,
         "consequence": rule.consequence,
-        "action": rule.action,
+        "action": action_of(rule, episode.evidence if episode else {}),
     }
 
 

@@ -9,6 +9,7 @@ from twin.alarms.state import SECOND_NS, Alarm, Change, Deed, State
 from twin.alarms.watch import Evidence, quantity
 from twin.events import Event, Kind
 
+COMMISSION = "Commission the unit (twin commission): then causes are named."
 STATES = {
     State.NORMAL: "nothing to do",
     State.UNACKNOWLEDGED: "active, and nobody has acknowledged it",
@@ -43,6 +44,11 @@ def worth_saying(change: Change, alarm: Alarm) -> bool:
     return change.announced or alarm.concerns or change.deed not in SUPPRESSIONS
 
 
+def action_of(rule: Rule, evidence: Evidence) -> str:
+    """What to do; no diagnosis helps where the twin was never fitted to the unit."""
+    return COMMISSION if evidence.get("commissioned") is False else rule.action
+
+
 def plain(alarm: Alarm, evidence: Evidence, episode: Episode | None) -> dict[str, Any]:
     """An alarm as it is with its newest episode, in what JSON can hold."""
     rule = alarm.rule
@@ -57,7 +63,7 @@ def plain(alarm: Alarm, evidence: Evidence, episode: Episode | None) -> dict[str
         "quantity": quantity(rule.value),
         "priority": rule.priority.value,
         "consequence": rule.consequence,
-        "action": rule.action,
+        "action": action_of(rule, evidence),
         "evidence": dict(evidence),
     }
 
@@ -78,7 +84,7 @@ def _text(change: Change, alarm: Alarm, evidence: Evidence) -> str:
     rule = alarm.rule
     why = f": {evidence['words']}" if "words" in evidence else ""
     consequence = "" if change.deed is Deed.RENAMED else rule.consequence  # the same as before
-    advice = " ".join(filter(None, (consequence, rule.action)))
+    advice = " ".join(filter(None, (consequence, action_of(rule, evidence))))
     return f"{said} ({rule.priority} priority){why}. {advice}".rstrip()
 
 

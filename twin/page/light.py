@@ -12,7 +12,7 @@ from twin.alarms.causes import CAUSES, UNLISTED, value_of
 from twin.alarms.requests import Request
 from twin.alarms.rules import Priority
 from twin.alarms.state import Alarm, State
-from twin.alarms.words import STATES
+from twin.alarms.words import STATES, action_of
 from twin.diagnosis.words import certainty, ends, number, spoken
 from twin.instants import instant, lasting
 from twin.model.effects import EFFECTS, UNKNOWN
@@ -84,7 +84,7 @@ def _alarm(
         "shelved_until": until and until / S_NS,
         "quiet_until": said(until, now_ns),
         "consequence": rule.consequence,
-        "action": rule.action,
+        "action": action_of(rule, episode.evidence if episode else {}),
         "asked": [_asked(one) for one in waiting if one.alarm == rule.name],
         **(told(episode, rule.value, now_ns) if episode else named(rule.name, rule.value)),
     }
