@@ -165,9 +165,9 @@ def test_without_anything_known_of_healthy_cycles_sums_alarm_still() -> None:
     told = [
         event for block in rigs.cut(samples, 1000) for event in watched.update(*twin.advance(block))
     ]
-    alarm = named(told)[0]
+    (alarm,) = raised(told)
     assert alarm.data["figure"] == "cycles"
-    assert alarm.data["effect"] in ("leakage", "porous_leakage")
+    assert alarm.data["effect"] == UNKNOWN  # nobody knows how far off its twin is
 
 
 def test_sizes_are_possible_ones() -> None:
