@@ -68,7 +68,8 @@ def test_what_is_said_is_in_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tags = ("--no-ring", "--pressure", "40101", "--pressure-type", "uint16", "--scale", "0.1")
-    assert twin(monkeypatch, "init", *SAID, *MODBUS, *tags, "--suction", "40102/3") == 0
+    commands = ("--suction", "40102/3", "--blow-off", "40102/4")
+    assert twin(monkeypatch, "init", *SAID, *MODBUS, *tags, *commands) == 0
     config = taken()
     assert (config.asset.type, config.asset.id) == ("ecm-20", "gripper-7")
     hose, sensor, cups = config.data.system.parts
@@ -95,6 +96,9 @@ def test_what_nobody_knows_is_guessed_and_says_so(monkeypatch: pytest.MonkeyPatc
     for what in ("type", "length_mm", "diameter_mm", "volume_ml", '{ kind = "sensor" }', "host"):
         lines = [line for line in config.document.text.splitlines() if what in line]
         assert any("not known" in line or "not said" in line for line in lines), what
+    head = " ".join(config.document.text.split("[asset]")[0].replace("#", "").split())
+    flags = "--id, --type, --address, --ring, --unit, --reference, --range, --end, --hose-mm, "
+    assert f"Not said, so guessed: {flags}" in head
 
 
 def test_a_unit_of_which_there_are_only_files_has_no_driver(

@@ -3,10 +3,12 @@
 import json
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
+from textwrap import wrap
 from typing import Annotated, Any, TypeVar
 
 import typer
@@ -159,21 +161,33 @@ class System:
 T = TypeVar("T")
 
 
-def _asked(given: T | None, words: str, default: str, parse: Callable[[str], T]) -> T:
-    """A flag's value; without one, what a person answers; where nobody can be asked, a default."""
-    if given is not None:
-        return given
-    if not sys.stdin.isatty():
-        return parse(default)
+class Questions:
+    """Flags, and what people answer where there is none; ``guessed`` is what nobody said."""
 
-    def checked(text: str) -> T:
-        try:
-            return parse(text.strip())
-        except ValueError as error:  # of a choice
-            raise typer.BadParameter(f"{text!r} is none of these") from error
+    def __init__(self) -> None:
+        self.guessed: list[str] = []
 
-    answer: T = typer.prompt(words, default=str(default), value_proc=checked, err=True)
-    return answer
+    def ask(self, flag: str, given: Any, words: str, default: str, parse: Callable[[str], T]) -> T:
+        """A flag's value, else a person's answer, else the default."""
+        text = default
+        if given is not None:
+            text = str(given)
+        elif sys.stdin.isatty():
+            text = typer.prompt(words, default=default, value_proc=partial(_kept, parse), err=True)
+        elif default != UNKNOWN:
+            self.guessed.append(flag)
+        if text == UNKNOWN:
+            self.guessed.append(flag)
+        return parse(text)
+
+
+def _kept(parse: Callable[[str], Any], text: str) -> str:
+    """What a person typed, if it is an answer; usage error else, and it is asked again."""
+    try:
+        parse(text.strip())
+    except ValueError as error:  # of a choice
+        raise typer.BadParameter(f"{text!r} is none of these") from error
+    return text.strip()
 
 
 def _size(flag: str, what: str) -> Any:
@@ -240,28 +254,33 @@ def init(
     if file.exists():
         message = f"{file}: there is already a file of that name"
         raise SourceError(message, "choose another name, or remove it")
-    named = _asked(unit, "Name of this unit", file.stem, str)
-    typed = _asked(kind, "Type on the nameplate", UNKNOWN, str)
-    where = _address(_asked(address, f"Where the PLC is ({FILE_ONLY})", PLACEHOLDER, _address))
+    asked = Questions()
+    ask = asked.ask
+    named = ask("--id", unit, "Name of this unit", file.stem, str)
+    typed = ask("--type", kind, "Type on the nameplate", UNKNOWN, str)
+    where = ask("--address", address, f"Where the PLC is ({FILE_ONLY})", PLACEHOLDER, _address)
     connection = None
     if where != NO_PLC:
-        connection = _connection(where, ring, namespace, pressure, coded, scale, suction, blow_off)
+        tags = pressure, suction, blow_off
+        connection = _connection(asked, where, ring, namespace, tags, coded, scale)
     meant = Sensor(
-        _asked(pressure_unit, "Unit of the pressure (mbar, bar, kPa, Pa, psi)", "mbar", Unit),
-        _asked(reference, "Counted from (absolute, gauge, vacuum)", "absolute", Reference),
-        _parsed(sensor_range, "Range of the sensor, LOW,HIGH", _range),
+        ask("--unit", pressure_unit, f"Unit of the pressure ({_of(Unit)})", Unit.MBAR, Unit),
+        ask("--reference", reference, f"Counted from ({_of(Reference)})", "absolute", Reference),
+        ask("--range", sensor_range, "Range of the sensor, LOW,HIGH", UNKNOWN, _range),
     )
-    what = _asked(end, "What is evacuated (cups, vessel)", End.CUPS, End)
+    what = ask("--end", end, f"What is evacuated ({_of(End)})", End.CUPS, End)
+    volume_of = "Volume of all cups, or of the vessel, ml"
+    lets_go = f"Does blow-off let the part go ({_of(Answer)})"
     system = System(
-        _parsed(hose, "Length of the hose, mm", _positive),
-        _parsed(diameter, "Its inner diameter, mm", _positive),
+        ask("--hose-mm", hose, "Length of the hose, mm", UNKNOWN, _positive),
+        ask("--diameter-mm", diameter, "Its inner diameter, mm", UNKNOWN, _positive),
         what,
-        _parsed(volume, "Volume of all cups, or of the vessel, ml", _positive),
-        _asked(sensor, "Where the sensor is (ejector, end, unknown)", UNKNOWN, Place),
-        _asked(released, "Does blow-off let the part go (yes, no, unknown)", UNKNOWN, Answer),
-        _parsed(supply, "Supply at the regulator, bar gauge", _positive),
+        ask("--volume-ml", volume, volume_of, UNKNOWN, _positive),
+        ask("--sensor", sensor, f"Where the sensor is ({_of(Place)})", UNKNOWN, Place),
+        ask("--released", released, lets_go, UNKNOWN, Answer),
+        ask("--supply-bar", supply, "Supply at the regulator, bar gauge", UNKNOWN, _positive),
     )
-    text = configuration(file, named, typed, connection, meant, system)
+    text = configuration(file, (named, typed), connection, meant, system, asked.guessed)
     _check(text, file)
     with said_plainly(file), file.open("x", encoding="utf-8") as new:
         new.write(text)
@@ -270,38 +289,35 @@ def init(
         print(f"  {line}")
 
 
-def _parsed(given: str | None, words: str, parse: Callable[[str], T]) -> T:
-    """The same for what may be unknown, which is None then."""
-    return parse(given) if given is not None else _asked(None, words, UNKNOWN, parse)
+def _of(choices: type[StrEnum]) -> str:
+    return ", ".join(choices)
 
 
 def _connection(
+    asked: Questions,
     where: str,
     ring: bool | None,
     namespace: str,
-    pressure: str | None,
+    tags: tuple[str | None, ...],
     coded: Number | None,
     scale: float,
-    suction: str | None,
-    blow_off: str | None,
 ) -> Connection:
     kind = "opcua" if where.startswith(OPC_UA) else "modbus"
     words = "Does the PLC keep a ring of scans, as docs/connect-your-plc.md has it (yes, no)"
     told = None if ring is None else Answer.YES if ring else Answer.NO
-    is_ring = _asked(told, words, Answer.YES, Answer) is Answer.YES
-    usual = LAYOUTS[kind, is_ring]
+    is_ring = asked.ask("--ring", told, words, Answer.YES, Answer) is Answer.YES
+    usual, number = LAYOUTS[kind, is_ring], coded or Number.FLOAT32
     if is_ring:  # which has its own layout
-        given = pressure or usual[0], suction or usual[1], blow_off or usual[2]
-        return Connection(
-            where, True, namespace, given[0], coded or Number.FLOAT32, scale, *given[1:]
-        )
-    number = Number.FLOAT32
-    at = _asked(pressure, "Address of the pressure", usual[0], str)
+        at, on, off = (given or own for given, own in zip(tags, usual, strict=True))
+        return Connection(where, is_ring, namespace, at, number, scale, on, off)
+    at = asked.ask("--pressure", tags[0], "Address of the pressure", usual[0], str)
     if kind == "modbus":
-        number = _asked(coded, f"Its type ({', '.join(Number)})", Number.INT16, Number)
-    on = _asked(suction, "Address of the suction command, with /BIT in a word", usual[1], str)
-    off = _asked(blow_off, "Address of the blow-off command", usual[2], str)
-    return Connection(where, False, namespace, at, number, scale, on, off)
+        words = f"Its type ({_of(Number)})"
+        number = asked.ask("--pressure-type", coded, words, Number.INT16, Number)
+    words = "Address of the suction command, with /BIT in a word"
+    on = asked.ask("--suction", tags[1], words, usual[1], str)
+    off = asked.ask("--blow-off", tags[2], "Address of the blow-off command", usual[2], str)
+    return Connection(where, is_ring, namespace, at, number, scale, on, off)
 
 
 def _check(text: str, file: Path) -> None:
@@ -333,21 +349,27 @@ def next_commands(file: Path, connection: Connection | None) -> tuple[str, str]:
 
 def configuration(
     file: Path,
-    unit: str,
-    kind: str,
+    asset: tuple[str, str],
     connection: Connection | None,
     sensor: Sensor,
     system: System,
+    guessed: Sequence[str],
 ) -> str:
-    """The text; what is guessed says so."""
+    """The text for an asset (its ID and type); what is ``guessed`` says so."""
+    unit, kind = asset
     is_known = kind not in ("", UNKNOWN)
     name = kind if is_known else f"type-of-{unit}"
     note = "as on the nameplate" if is_known else "not known: a type of its own"
     first, second = next_commands(file, connection)
     lines = [
-        "# What a person knows of this ejector; a guess says so. What a calibration finds does not",
+        "# What a person knows of this ejector. What a calibration finds does not",
         "# stand here but in the asset database. Every key of [data]: docs/data-set.md",
         f"# Next: {first}; then {second}",
+        *(
+            f"# {line}"
+            for line in wrap(f"Not said, so guessed: {', '.join(guessed)}", 96)
+            if guessed
+        ),
         "",
         "[asset]",
         _line(f"type = {_quoted(name)}", note),
