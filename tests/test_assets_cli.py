@@ -81,7 +81,7 @@ def test_reading_makes_no_file(run: Run, tmp_path: Path) -> None:
 
 def test_what_is_in_no_database_was_not_recorded(run: Run) -> None:
     """Without a database there are the shipped data sets; they were not recorded just now."""
-    assert [row[4:6] for row in rows(run("list"))] == [["no,", "shipped"]] * 2
+    assert [row[4:6] for row in rows(run("list"))] == [["no,", "shipped"]] * len(SHIPPED)
     assert "recorded no, shipped, id " in run("show", TYPE)
     assert run("show", TYPE, "--history").startswith("recorded no, shipped  valid from always")
 

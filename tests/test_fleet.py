@@ -121,6 +121,7 @@ def test_a_log_that_was_cut_off_is_said_to_be(
     whole = (logs / "A1-0.mcap").read_bytes()
     log.write_bytes(whole[:-100])
     database = ("--assets", tmp_path / "f.sqlite")
+    fleets.commission(tmp_path / "f.sqlite", "A1")
     for state in ("done", "known"):
         assert twin(monkeypatch, "fleet", "diagnose", log, *database, "--json", found) == 0
         said = capsys.readouterr()
