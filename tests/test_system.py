@@ -12,7 +12,7 @@ from stepping import states, theta_of
 from twin.model import kernel
 from twin.model import theta as c
 from twin.model.dataset import DataSet
-from twin.model.gas import VISCOSITY, R, opening
+from twin.model.gas import VISCOSITY, R, orifice
 from twin.model.system import (
     FRICTION,
     TUBE_LOSS,
@@ -193,7 +193,7 @@ def test_cups_count() -> None:
 
 def test_a_cup_that_draws_all_the_suction_has_its_free_flow_vacuum() -> None:
     of = total(tube(), cups(count=3, open=1, free_flow_mbar=8.0, release_mbar=30.0))
-    through, _ = opening.py_func(AMBIENT - 8 * MBAR, AMBIENT)  # type: ignore[no-untyped-call]
+    through, _ = orifice.py_func(1.0 - 8 * MBAR / AMBIENT)  # type: ignore[no-untyped-call]
     assert of.open * through == pytest.approx(SUCTION)
     assert of.opening == pytest.approx(3 * of.open)
     assert of.release == 30 * MBAR
@@ -213,7 +213,7 @@ def test_an_open_cup_stays_near_ambient() -> None:
     assert np.ptp(rows[-50:, kernel.VESSEL]) < 1.0
     vacuum = theta[c.AMBIENT] - rows[-1, kernel.VESSEL]
     assert 5.0 * MBAR < vacuum <= 6.0 * MBAR
-    through, _ = opening.py_func(rows[-1, kernel.VESSEL], theta[c.AMBIENT])  # type: ignore[no-untyped-call]
+    through, _ = orifice.py_func(rows[-1, kernel.VESSEL] / theta[c.AMBIENT])  # type: ignore[no-untyped-call]
     assert rows[-1, kernel.NEAR] == pytest.approx(through * theta[c.LEAK], rel=1e-3)
 
 

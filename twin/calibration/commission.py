@@ -30,7 +30,7 @@ from twin.model.dataset import DataSet, coefficients
 from twin.model.system import Cups, volume
 from twin.signals import MBAR, ML, MS, SAMPLE, SL_MIN, Command, Samples
 
-SLOWEST = 2.0 * MS  # s between rows; what switches faster than a few rows is not seen
+SLOWEST = 10.5 * MS  # s between rows; what switches faster than a few rows is not seen
 MOST_MISSING = 0.2  # share of rows
 ROOM_TEMPERATURE = 293.15  # K, for a first guess
 # Where a fit starts: of the line, between sensor and port, and of all gas, in the port.

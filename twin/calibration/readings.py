@@ -24,6 +24,7 @@ SMOOTH_MS = 20.0  # a period of the mains; over it turning points are looked for
 CLEAR = 6.0  # sigmas of the smoothed pressure that make a turn
 LEAST_TURN = 1.5 * MBAR  # Pa
 EDGE_MS = 30.0  # after a command, in which a turn is still the valve's delay
+DEEP = 0.3  # of the way down, from the lowest, in which the nozzle may go off
 LEAST_VACUUM = 20.0 * MBAR  # Pa
 MOST_SUCTIONS = 0.5  # of all suctions must turn for an ejector that saves air
 OPENED_MS = 40.0  # at the end of an idle, over which an opened system stands at ambient
@@ -96,10 +97,10 @@ def read(samples: Samples) -> Readings:
     suctions = [one for one in found if one.command == Command.SUCTION]
     offs, ons, switches = [], [], 0
     for one in suctions:
-        smooth = _smoothed(pressure[one.first : one.last], width)
-        lows, highs = turns(smooth[edge:], turn)
-        offs += list(smooth[edge:][lows])
-        ons += list(smooth[edge:][highs])
+        smooth = _smoothed(pressure[one.first : one.last], width)[edge:]
+        lows, highs = deep(smooth, *turns(smooth, turn))
+        offs += list(smooth[lows])
+        ons += list(smooth[highs])
         switches += len(lows) > 0
     idle, opened = _idle(pressure, found, round(OPENED_MS * MS / period), noise)
     return Readings(
@@ -156,6 +157,15 @@ def turns(smooth: Floats, least: float) -> tuple[list[int], list[int]]:
             found[0 if falling else 1].append(best)
             falling, best = not falling, row
     return found
+
+
+def deep(smooth: Floats, lows: list[int], highs: list[int]) -> tuple[list[int], list[int]]:
+    """Those of the turns that are down where air is saved; a line that is set off rings above."""
+    if not lows:
+        return [], []
+    lowest = smooth.min()
+    lows = [row for row in lows if smooth[row] - lowest < DEEP * (smooth[0] - lowest)]
+    return lows, [row for row in highs if lows and row > lows[0]]
 
 
 def _smoothed(pressure: Floats, width: int) -> Floats:
