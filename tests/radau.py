@@ -89,8 +89,8 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
     blown *= (supply + ambient) / (theta[c.SUPPLY_NOMINAL] + theta[c.AMBIENT_NOMINAL])
     if port < ambient:
         blown += through_hole(theta[c.BACK_FLOW] * (1.0 - min(jet, 1.0)), port, ambient)
-    hole = theta[c.LEAK] + (valves.open or 0.0) * theta[c.OPENING]
-    leak = through_hole(hole, vessel, ambient) + theta[c.LAMINAR_LEAK] * (ambient - vessel)
+    hole, pore = theta[[c.LEAK, c.LAMINAR_LEAK]] + (valves.open or 0.0) * theta[[c.HOLE, c.OPENING]]
+    leak = through_hole(hole, vessel, ambient) + pore * (ambient - vessel)
 
     far_t = vessel_t if far >= 0.0 else line_t
     leak_t = outside if vessel <= ambient else vessel_t

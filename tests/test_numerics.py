@@ -216,8 +216,8 @@ def _net_flow(theta: Theta, row: Rows) -> float:
     blown = row[kernel.BLOWING] * theta[c.BLOW_OFF] * (row[kernel.SUPPLIED] + ambient)
     blown /= theta[c.SUPPLY_NOMINAL] + theta[c.AMBIENT_NOMINAL]
     blown *= 1.0 + theta[c.BLOW_OFF_SHAPE] * (1.0 - port / ambient)
-    hole = theta[c.LEAK] + row[kernel.OPEN] * theta[c.OPENING]
-    return float(blown - out + radau.through_hole(hole, vessel, ambient))
+    leak = radau.through_hole(theta[c.LEAK], vessel, ambient)
+    return float(blown - out + leak + row[kernel.OPEN] * theta[c.OPENING] * (ambient - vessel))
 
 
 # What must hold for every data set.

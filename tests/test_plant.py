@@ -173,7 +173,9 @@ def test_a_vessel_is_leaked_into_by_hole_pore_and_rim() -> None:
     theta = theta_of(system={"parts": [*VESSEL, {"kind": "cups", "volume_ml": 20.0}]})
     ambient, p = theta[c.AMBIENT], 0.4 * theta[c.AMBIENT]
     theta[[c.LEAK, c.LAMINAR_LEAK]] = 2.0 * SL_MIN, 1e-9
-    for is_open, more in ((0.0, 0.0), (1.0, theta[c.OPENING])):
+    theta[c.HOLE] = 1.5 * SL_MIN
+    opened = theta[c.OPENING] * 0.6 * ambient + theta[c.HOLE]
+    for is_open, more in ((0.0, 0.0), (1.0, opened)):
         level, slope = at_vessel(p, driven(is_open=is_open), one(theta), 0)
         assert level + slope * p == pytest.approx(2 * SL_MIN + 1e-9 * 0.6 * ambient + more)
 

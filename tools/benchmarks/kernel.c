@@ -20,7 +20,7 @@ enum { /* twin.model.theta.COEFFICIENTS */
     RESPONSE, RESPONSE_OFF, RAMP_UP, SLOW_RAMP_UP, JET_DEPTH, RAMP_DOWN, BLOW_OFF, BLOW_OFF_SHAPE,
     BLOW_OFF_RESPONSE, BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, RELIEF, EXHAUST, PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT,
     VOLUME, COMPLIANCE, FILM, AREA, NEAR_RESISTANCE, NEAR_LAMINAR, NEAR_INERTANCE, RESISTANCE,
-    LAMINAR, INERTANCE, PLACE, LEAK, LAMINAR_LEAK, INFLOW, BACK_FLOW, OPENING, SENSOR_LAG, SLOW_SENSOR,
+    LAMINAR, INERTANCE, PLACE, LEAK, LAMINAR_LEAK, INFLOW, BACK_FLOW, OPENING, HOLE, SENSOR_LAG, SLOW_SENSOR,
     SENSOR_OFFSET, SENSOR_GAIN, H1, H1_LOW, H2, H2_LOW, RELEASE, CONTROL_SENSOR, AIR_SAVING,
     PERMITTED_LEAKAGE, BLOW_OFF_MODE, BLOW_OFF_TIME, COEFFICIENTS
 };
@@ -166,7 +166,8 @@ INLINED Port at_port(double p, const Driven *driven, const double *k)
 INLINED Tangent at_vessel(double p, const Driven *driven, const double *k)
 {
     double ambient = K(AMBIENT);
-    double laminar = K(LAMINAR_LEAK), sonic = K(LEAK) + driven->open * K(OPENING);
+    double laminar = K(LAMINAR_LEAK) + driven->open * K(OPENING);
+    double sonic = K(LEAK) + driven->open * K(HOLE);
     Tangent flow = opening(p, ambient);
     double slope = sonic * flow.slope - laminar;
     double level = sonic * (flow.level - flow.slope * p) + laminar * ambient;

@@ -30,11 +30,11 @@ from twin.model.dataset import DataSet, coefficients
 from twin.model.system import Cups, volume
 from twin.signals import MBAR, ML, MS, SAMPLE, SL_MIN, Command, Samples
 
-SLOWEST = 10.5 * MS  # s between rows; what switches faster than a few rows is not seen
+SLOWEST = 2.05 * MS  # s between rows; what switches faster than a few rows is not seen
 MOST_MISSING = 0.2  # share of rows
 ROOM_TEMPERATURE = 293.15  # K, for a first guess
 # Where a fit starts: of the line, between sensor and port, and of all gas, in the port.
-PLACES, PORT_SHARES = (0.05, 0.95), (0.01, 0.15)
+PLACES, PORT_SHARES = (0.05, 0.95), (0.01, 0.1)
 CLEARLY = 15.0  # mbar by which a threshold must differ to be told; overshoot is part of a turn
 AMBIENT_CLEARLY = 3.0  # mbar, the same for ambient pressure
 
@@ -187,7 +187,7 @@ def starts(data: DataSet) -> list[DataSet]:
     everything = _volume(data) / ML
     found = []
     for way, at, share in product(ways, PLACES, PORT_SHARES):
-        tables["system"].update(part_leaves=way, sensor_shift=at - place)
+        tables["system"].update(part_leaves=way, rim="turbulent", sensor_shift=at - place)
         tables["ejector"]["port_volume_ml"] = share * everything
         found.append(DataSet.model_validate(tables))
     return found

@@ -29,6 +29,7 @@ class Cycles:
     bins: Bins
     measured: Floats  # mean pressure (Pa) of each bin
     drawn: Ints  # rows that suffice to draw what is expected
+    tolerance: float  # Pa, of a step of the model
 
     @classmethod
     def found(cls, samples: Samples, data: DataSet, *, through: bool = False) -> "Cycles":
@@ -50,7 +51,10 @@ class Cycles:
         usable = ((rows["quality"] & UNUSABLE) == 0) & np.isfinite(rows["pressure"])
         bins = binned(phase, usable & np.isfinite(expected), _edges(phase), BINS)
         measured = bins.mean(rows["pressure"].astype(np.float64))
-        return cls(rows, dt, phase, level, bins, measured, _drawn(dt, phase, level))
+        # A fit from afar takes what is quick: it has a long way to go, and is off by more.
+        drawn = _drawn(dt, phase, level) if through else np.arange(len(dt))
+        tolerance = kernel.ROUGHLY if through else kernel.TOLERANCE
+        return cls(rows, dt, phase, level, bins, measured, drawn, tolerance)
 
     def off(self, theta: Floats, early: Sequence[int] = ()) -> Floats:
         """Measured minus expected pressure (Pa) in each bin for hypotheses, (coefficients, n).
@@ -66,7 +70,7 @@ class Cycles:
 
         def run(part: slice) -> Floats:
             phases = phase[:, part] if moved else phase
-            expected = _expected(theta[:, part], dt, phases, level, kernel.ROUGHLY)
+            expected = _expected(theta[:, part], dt, phases, level, self.tolerance)
             off: Floats = self.measured[:, None] - self.bins.through(drawn, expected)
             return off
 

@@ -45,8 +45,11 @@ class Round:
 # All starts are tried on a few cycles; what they are off by is narrowed with what is left of them.
 NARROWING = (
     Round(100, 0.3, 5.0 * MBAR, 25, 1e-2),
-    Round(3, 0.3, 1.5 * MBAR, 25, 1e-3),
-    Round(1, 1.0, 0.6 * MBAR, 50, 1e-4),
+    Round(4, 0.3, 1.5 * MBAR, 20, 1e-3),
+    Round(2, 1.0, 0.6 * MBAR, 40, 1e-4),
+)
+ROBUST = (
+    8.0  # sigmas, beyond which a residual pulls less than its square; below, what is wrong does
 )
 
 
@@ -218,6 +221,7 @@ def _solved(
         xtol=1e-3,
         ftol=tolerance,
         loss=loss,
+        f_scale=ROBUST,
     )
     best: Floats = found.x
     return best

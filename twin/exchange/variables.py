@@ -54,6 +54,7 @@ _VESSEL: Mapping[Where, Mapping[str, str]] = {
         "FILM": "0.0",
         "AREA": "0.0",
         "OPENING": "0.0",
+        "HOLE": "0.0",
         "RELEASE": "NAN",
         "INFLOW": "0.0",
     },

@@ -91,10 +91,11 @@ class Expectation:
     @cached_property
     def free_flow(self) -> float:
         """Vacuum (mbar) that suction reaches with all cups open; NaN where nothing can open."""
-        if not self._theta[c.OPENING] > 0.0:
+        if not self._theta[[c.OPENING, c.HOLE]].any():
             return float("nan")
         opened = self._theta.copy()
-        opened[c.LEAK] += opened[c.OPENING]
+        opened[c.LAMINAR_LEAK] += opened[c.OPENING]
+        opened[c.LEAK] += opened[c.HOLE]
         rows = round(FREE_S * 1e3)
         commands = np.full(rows, Command.SUCTION, np.uint8)
         _, expected = strides.simulate(opened, np.full(rows, MS), commands)

@@ -157,6 +157,7 @@ class System(Settings):
     line_factor: NotNegative = 1.0  # flow resistance over what the parts add up to
     line_share: float = Field(0.6, gt=0.0, lt=1.0)  # of the tubes' volume, half-way along
     sensor_shift: float = Field(0.0, ge=-1.0, le=1.0)  # of its place: 1 is the whole line outwards
+    rim: Literal["laminar", "turbulent"] = "laminar"  # of a cup that stands open
     opening_factor: NotNegative = 1.0  # what flows through open cups over what they say
     leak_sl_min: NotNegative = 0.3  # of seals and fittings, sonic
     part_leaves: Literal["in_blow_off", "after_blow_off"] = "in_blow_off"
@@ -287,9 +288,10 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     theta[c.NEAR_LAMINAR] = near * total.laminar * system.line_factor
     place = min(max(total.place + system.sensor_shift, 0.0), 1.0)
     theta[c.PLACE] = place * total.resistance * system.line_factor
-    theta[c.LEAK] = total.leak + system.leak_sl_min * SL_MIN + total.open * system.opening_factor
-    theta[c.LAMINAR_LEAK] = 0.0
-    theta[c.OPENING] = total.opening * system.opening_factor
+    theta[c.LEAK] = total.leak + system.leak_sl_min * SL_MIN
+    theta[c.LAMINAR_LEAK] = total.open
+    wide = c.OPENING if system.rim == "laminar" else c.HOLE
+    theta[wide] = (total.opening if wide == c.OPENING else total.hole) * system.opening_factor
     late = system.part_leaves == "after_blow_off" and not math.isnan(total.release)
     theta[c.RELEASE] = AFTER_BLOW_OFF if late else total.release
 

@@ -202,8 +202,8 @@ def at_vessel(p, driven, k, i):  # type: ignore[no-untyped-def]
     An opening, a porous part, the rim of a cup without a part, and what else flows in.
     """
     ambient = k[c.AMBIENT, i]
-    laminar = k[c.LAMINAR_LEAK, i]
-    sonic = k[c.LEAK, i] + driven.open * k[c.OPENING, i]
+    laminar = k[c.LAMINAR_LEAK, i] + driven.open * k[c.OPENING, i]
+    sonic = k[c.LEAK, i] + driven.open * k[c.HOLE, i]
     share, rise = opening(p, ambient)
     slope = sonic * rise - laminar
     level = sonic * (share - rise * p) + laminar * ambient

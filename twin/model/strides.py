@@ -173,7 +173,7 @@ def _stride(begin, end, clock, k, longest, tolerance):  # type: ignore[no-untype
             mine[_GUESS + row, 0] = begin[row, 0] + G * h * mine[_RATE + row, 0]
         kernel._substep(mine, k, h, _GUESS)
         off = mine[ROUGH, 0] * h * h * h
-        if off <= TOO_FAR * tolerance or h <= SHORTEST_STEP:
+        if not off > TOO_FAR * tolerance or h <= SHORTEST_STEP:  # what is no number ends as well
             break
         h = max(h * (tolerance / off) ** (1.0 / 3.0), SHORTEST_STEP)
     put(end, 0, mine, 0)

@@ -105,8 +105,9 @@ class Lumped:
     place: float  # of the sensor, as a share of the drop: 0 at the port, 1 at the vessel
     shrinks: float  # m³ at full vacuum
     leak: float  # kg/s sonic
-    opening: float  # kg/s sonic, through the rims of all cups, when they stand open
-    open: float  # kg/s sonic, through those that have no part
+    opening: float  # kg/(s Pa) through the rims of all cups, when they stand open
+    open: float  # kg/(s Pa) through those that have no part
+    hole: float  # kg/s sonic, the flow of ``opening`` where rims are openings
     release: float  # Pa of vacuum; NaN where nothing is let go
 
 
@@ -125,7 +126,8 @@ def lumped(parts: tuple[Part, ...], suction: float, ambient: float, temperature:
         volumes += np.array(where) * volume(part)
         areas += np.array(where) * area(part)
     cups = [part for part in parts if isinstance(part, Cups)]
-    rim = [suction / _share(cup.free_flow_mbar * MBAR, ambient) for cup in cups]
+    rim = [suction / (cup.free_flow_mbar * MBAR) for cup in cups]
+    hole = [suction / _share(cup.free_flow_mbar * MBAR, ambient) for cup in cups]
     return Lumped(
         port_volume=float(volumes[0]),
         port_area=float(areas[0]),
@@ -141,6 +143,7 @@ def lumped(parts: tuple[Part, ...], suction: float, ambient: float, temperature:
         leak=sum(cup.count * cup.lip_leak_sl_min for cup in cups) * SL_MIN,
         opening=sum(cup.count * one for cup, one in zip(cups, rim, strict=True)),
         open=sum(cup.open * one for cup, one in zip(cups, rim, strict=True)),
+        hole=sum(cup.count * one for cup, one in zip(cups, hole, strict=True)),
         release=min((cup.release_mbar * MBAR for cup in cups), default=math.nan),
     )
 
