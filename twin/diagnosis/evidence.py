@@ -5,6 +5,7 @@ measured minus expected pressure, averaged over short bins, and the vacuum at wh
 switched against the vacuum at which the hypothesis would.
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
@@ -15,6 +16,7 @@ from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from pydantic.fields import FieldInfo
 
 from twin.config import Config
 from twin.live import Twin
@@ -42,6 +44,8 @@ SUPPLY_UNKNOWN = {"end_pressure_slope": 0.5, "curvature": 0.5, "optimum_bar": 0.
 
 Hypothesis = tuple[Cause, ...]
 HEALTHY: Hypothesis = ()
+OF_THE_WAY = 0.9
+_BOUNDS = ("ge", "gt", "le", "lt")
 One = TypeVar("One")
 Other = TypeVar("Other")
 
@@ -399,13 +403,22 @@ def _aside(data: DataSet, changes: Mapping[str, float]) -> tuple[Theta, Theta]:
 
 
 def _changed(data: DataSet, changes: Mapping[str, float], sign: float) -> DataSet:
-    """A data set, unchecked: it need be no ejector."""
+    """A data set, unchecked as a whole: it need be no ejector. Each value keeps to its bounds."""
     for name, change in changes.items():
         table, key = name.split(".")
         part = getattr(data, table)
-        moved = part.model_copy(update={key: getattr(part, key) + sign * change})
-        data = data.model_copy(update={table: moved})
+        value = _kept(type(part).model_fields[key], getattr(part, key), sign * change)
+        data = data.model_copy(update={table: part.model_copy(update={key: value})})
     return data
+
+
+def _kept(field_info: FieldInfo, value: float, change: float) -> float:
+    """A value changed, but at most by OF_THE_WAY to a bound: no flow or volume is negative."""
+    bounds = (getattr(one, name, None) for one in field_info.metadata for name in _BOUNDS)
+    for bound in (one for one in bounds if one is not None):
+        if (bound - value) * change > 0.0:
+            change = math.copysign(min(abs(change), OF_THE_WAY * abs(bound - value)), change)
+    return value + change
 
 
 def thinned(evidence: Evidence, cycles: Sequence[int], most: int) -> Evidence:
