@@ -227,7 +227,7 @@ def test_what_was_stored_is_what_the_configuration_gives(tmp_path: Path) -> None
 
 
 def test_bins_cross_no_phase_change_and_hold_every_row_once() -> None:
-    cycles = Cycles.found(log_of("gripper"), calibrated("gripper").fitted.data)
+    cycles = Cycles.as_live(log_of("gripper"), calibrated("gripper").fitted.data)
     used = cycles.bins.number >= 0
     assert (np.bincount(cycles.bins.number[used]) == cycles.bins.count).all()
     changes = np.flatnonzero(np.diff(cycles.phase)) + 1
@@ -239,7 +239,7 @@ def test_bins_cross_no_phase_change_and_hold_every_row_once() -> None:
 
 def test_hypotheses_in_a_bank_are_as_each_alone() -> None:
     data = calibrated("gripper").fitted.data
-    cycles = Cycles.found(log_of("gripper")[:4000], data)
+    cycles = Cycles.as_live(log_of("gripper")[:4000], data)
     ways = directions(data)
     bank = [with_values(data, values(data) + 0.3 * ways[:, one]) for one in range(9)]
     theta = np.stack([coefficients(one) for one in bank], axis=1)

@@ -128,7 +128,7 @@ def refuse_unalike(data: DataSet, samples: Samples, cycles: Sequence[Cycle]) -> 
     """ConfigError if something came or went while the log was recorded."""
     theta = coefficients(data)
     found = [figures(cycle, theta) for cycle in cycles]
-    refuse_changing(Cycles.found(samples, data), theta, data.sensor.noise_mbar * MBAR, found)
+    refuse_changing(Cycles.as_live(samples, data), theta, data.sensor.noise_mbar * MBAR, found)
 
 
 def scatter(data: DataSet, cycles: Sequence[Cycle]) -> dict[str, Scatter]:

@@ -8,14 +8,17 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.model import kernel
+from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.monitor.bins import Bins, Floats, Ints, binned, sparse
 from twin.monitor.knees import as_wide_as_needed, expected_knees
-from twin.monitor.phases import PhaseFinder
+from twin.monitor.nozzle import Switching, noise_of, switchings
+from twin.monitor.phases import PhaseFinder, commanded
 from twin.monitor.signatures import steps
 from twin.signals import MBAR, MS, UNUSABLE, Phase, Samples
 
 BINS = 6  # in each unit of warped time
+Bytes = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,7 @@ class Cycles:
 
     samples: Samples
     dt: Floats
-    phase: npt.NDArray[np.uint8]
+    phase: Bytes
     level: Floats
     bins: Bins
     measured: Floats  # mean pressure (Pa) of each bin
@@ -32,28 +35,42 @@ class Cycles:
     tolerance: float  # Pa, of a step of the model
 
     @classmethod
-    def found(cls, samples: Samples, data: DataSet, *, through: bool = False) -> "Cycles":
-        """Find the phases as the twin of ``data`` does.
-
-        With ``through`` the model runs on through a switching of the nozzle; otherwise it is
-        synchronised on the level that was measured there.
-        """
+    def as_live(cls, samples: Samples, data: DataSet) -> "Cycles":
+        """Find the phases as the live twin of ``data`` does, which is synchronised at each knee."""
         theta = coefficients(data)
         knees = expected_knees(theta, data.sensor.noise_mbar * MBAR)
         finder = PhaseFinder(as_wide_as_needed(knees, [samples]))
         early, late = finder.push(samples), finder.flush()
         rows, phase = (np.concatenate([early[i], late[i]]) for i in (0, 1))
         level = np.concatenate([early[2], late[2]]).astype(np.float32).astype(np.float64)
-        if through:
-            level[_switches(phase)] = np.nan
+        return cls._of(rows, phase, level, theta, quickly=False)
+
+    @classmethod
+    def found(cls, samples: Samples, data: DataSet) -> "Cycles":
+        """Find the phases, and where the nozzle switched whatever hangs on it.
+
+        It switches where the pressure shows it, and the model runs on through that.
+        """
+        theta = coefficients(data)
+        blow_off = float(theta[c.BLOW_OFF_MODE]), float(theta[c.BLOW_OFF_TIME])
+        rows, told, level = commanded(samples, blow_off)
+        level = level.astype(np.float32).astype(np.float64)
+        phase = _switched(told, switchings(rows, told, noise_of(rows, told)))
+        return cls._of(rows, phase, level, theta, quickly=True)
+
+    @classmethod
+    def _of(
+        cls, rows: Samples, phase: Bytes, level: Floats, theta: Floats, *, quickly: bool
+    ) -> "Cycles":
+        """Those of ``phase`` and ``level``, as far as the model of ``theta`` has a say in them."""
         dt = steps(rows, None)
         expected = _expected(theta.reshape(-1, 1), dt, phase, level)[:, 0]
         usable = ((rows["quality"] & UNUSABLE) == 0) & np.isfinite(rows["pressure"])
         bins = binned(phase, usable & np.isfinite(expected), _edges(phase), BINS)
         measured = bins.mean(rows["pressure"].astype(np.float64))
         # A fit from afar takes what is quick: it has a long way to go, and is off by more.
-        drawn = _drawn(dt, phase, level) if through else np.arange(len(dt))
-        tolerance = kernel.ROUGHLY if through else kernel.TOLERANCE
+        drawn = _drawn(dt, phase, level) if quickly else np.arange(len(dt))
+        tolerance = kernel.ROUGHLY if quickly else kernel.TOLERANCE
         return cls(rows, dt, phase, level, bins, measured, drawn, tolerance)
 
     def off(self, theta: Floats, early: Sequence[int] = ()) -> Floats:
@@ -79,7 +96,7 @@ class Cycles:
         with ThreadPoolExecutor(len(parts)) as pool:
             return np.concatenate(list(pool.map(run, parts)), axis=1)
 
-    def _phases(self, early: Sequence[int]) -> npt.NDArray[np.uint8]:
+    def _phases(self, early: Sequence[int]) -> Bytes:
         """Phases with every switching moved, (rows, n)."""
         moved = np.repeat(self.phase[:, None], len(early), axis=1)
         for lane, rows in enumerate(early):
@@ -89,7 +106,18 @@ class Cycles:
         return moved
 
 
-def _switches(phase: npt.NDArray[np.uint8]) -> Ints:
+def _switched(told: Bytes, found: Sequence[Switching]) -> Bytes:
+    """Phases as commanded, with the nozzle going on and off as was found."""
+    phase = told.copy()
+    ends = [*(np.flatnonzero(np.diff(told)) + 1).tolist(), len(told)]
+    for one in found:
+        end = ends[int(np.searchsorted(ends, one.row, "right"))]
+        if told[one.row] == Phase.SUCTION:
+            phase[one.row : end] = Phase.SUCTION if one.on else Phase.HOLD
+    return phase
+
+
+def _switches(phase: Bytes) -> Ints:
     """Rows at which the nozzle was seen to switch while suction is commanded."""
     inside = np.isin(phase, (Phase.SUCTION, Phase.HOLD))
     changes = np.flatnonzero(np.diff(phase)) + 1
@@ -97,13 +125,13 @@ def _switches(phase: npt.NDArray[np.uint8]) -> Ints:
     return switches
 
 
-def _edges(phase: npt.NDArray[np.uint8]) -> Ints:
+def _edges(phase: Bytes) -> Ints:
     """Rows at which a cycle begins: suction that does not go on from a hold."""
     begins = (phase[1:] == Phase.SUCTION) & np.isin(phase[:-1], (Phase.IDLE, Phase.BLOW_OFF))
     return np.flatnonzero(begins) + 1
 
 
-def _drawn(dt: Floats, phase: npt.NDArray[np.uint8], level: Floats) -> Ints:
+def _drawn(dt: Floats, phase: Bytes, level: Floats) -> Ints:
     """Rows that suffice to draw a course: where phases change, time breaks or a level is set."""
     begins = np.isfinite(level) | (dt < 0.5 * MS) | (dt > 1.5 * MS)
     begins[0] = True
@@ -114,7 +142,7 @@ def _drawn(dt: Floats, phase: npt.NDArray[np.uint8], level: Floats) -> Ints:
 def _expected(
     theta: Floats,
     dt: Floats,
-    phase: npt.NDArray[np.uint8],
+    phase: Bytes,
     level: Floats,
     tolerance: float = kernel.TOLERANCE,
 ) -> Floats:

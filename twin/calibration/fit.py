@@ -147,7 +147,7 @@ def fit(samples: Samples, space: Space, progress: Callable[[str], None]) -> Fitt
     for turn, tolerance in enumerate(ROUNDS):
         progress(f"fitting, round {turn + 1} of {len(ROUNDS)}")
         rows = round(len(samples) * (FIRST_SHARE if turn == 0 else 1.0))
-        cycles = Cycles.found(samples[:rows], best)
+        cycles = Cycles.as_live(samples[:rows], best)
         weights = weighted(cycles, coefficients(best), noise, fitted=turn > 0)
         problem = Problem(space, cycles, weights)
         x = _solved(problem, x, MOST_STEPS, tolerance)
@@ -187,7 +187,7 @@ def fit_from_afar(
         rows = samples[: round(len(samples) * one.share)]
         starts = sorted((_followed(rows, start, one, noise) for start in starts), key=_cost)
     best = starts[0]
-    cycles = Cycles.found(samples, best.data, through=True)
+    cycles = Cycles.found(samples, best.data)
     weights = weighted(cycles, coefficients(best.data), noise, fitted=True)
     return _fitted(Problem(best.space, cycles, weights), best.x)
 
@@ -198,7 +198,7 @@ def _cost(start: _Start) -> float:
 
 def _followed(samples: Samples, start: _Start, one: Round, noise: float) -> _Start:
     """Where a round leads from a start."""
-    cycles = Cycles.found(samples, start.data, through=True)
+    cycles = Cycles.found(samples, start.data)
     problem = Problem(start.space, cycles, plain(cycles, noise, one.error))
     # The last coordinate is how much sooner the nozzle switches than it was seen to.
     x = _solved(problem, np.append(start.x, 0.0), one.steps, one.tolerance, "soft_l1")

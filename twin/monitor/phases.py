@@ -270,6 +270,20 @@ def _look(state, pressure, row, look, may_bend, phase, level):  # type: ignore[n
 Found = tuple[Samples, npt.NDArray[np.uint8], npt.NDArray[np.float64]]
 
 
+def commanded(samples: Samples, blow_off: tuple[float, float]) -> Found:
+    """What commands alone make of a whole record: its phases, and levels before its cycles.
+
+    ``blow_off`` is the ejector's own, as in ``Knees``.
+    """
+    finder = PhaseFinder(Knees(0, 0.0, 0, 0, 0, 0, 0, blow_off=blow_off))
+    early, late = finder.push(samples), finder.flush()
+    return (
+        joined(early[0], late[0]),
+        np.concatenate([early[1], late[1]]),
+        np.concatenate([early[2], late[2]]),
+    )
+
+
 @dataclass
 class PhaseFinder:
     """Takes blocks in, gives them out a little later with phase and synchronisation level."""
