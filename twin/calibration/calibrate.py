@@ -151,17 +151,12 @@ def scatter(data: DataSet, cycles: Sequence[Cycle]) -> dict[str, Scatter]:
 
 
 def uncertain(fitted: Fitted) -> dict[str, tuple[float, ...]]:
-    """Ways in which the log leaves the data set open, as ``Healthy`` has them.
-
-    A sigma either way leads to no value beyond its bounds: the model is run there.
-    """
-    factor, ways = np.linalg.cholesky(fitted.left_open), {}
-    for number, (free, row) in enumerate(zip(fitted.free, factor, strict=True)):
-        value = free.of(fitted.data)
-        room = max(min(value - free.low, free.high - value), 0.0)
-        changes = np.clip(row[: number + 1], -room, room)
-        ways[free.name] = tuple(float(f"{change:.4g}") for change in changes)
-    return ways
+    """Ways in which the log leaves the data set open, as ``Healthy`` has them."""
+    factor = np.linalg.cholesky(fitted.left_open)
+    return {
+        free.name: tuple(float(f"{change:.4g}") for change in row[: number + 1])
+        for number, (free, row) in enumerate(zip(fitted.free, factor, strict=True))
+    }
 
 
 def like_these(
