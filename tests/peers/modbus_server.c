@@ -62,10 +62,11 @@ static void scan(uint32_t number, int64_t time_ns)
     put(map->tab_registers + HEADER + 2, (uint64_t)time_ns, 4);
 }
 
+static int64_t first, began; /* of scan 0: monotonic, and as the header tells it */
+
 static void *task(void *unused)
 {
-    int64_t first = now_ns(CLOCK_MONOTONIC), began = now_ns(CLOCK_REALTIME);
-    for (uint32_t number = 0;; number++) {
+    for (uint32_t number = 1;; number++) {
         int64_t due = first + number * 1000000LL;
         struct timespec at = {due / 1000000000LL, due % 1000000000LL};
         while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &at, NULL) == EINTR)
@@ -138,6 +139,8 @@ int main(int count, char **arguments)
         return 1;
     }
     constants();
+    first = now_ns(CLOCK_MONOTONIC), began = now_ns(CLOCK_REALTIME);
+    scan(0, began); /* whoever asks at once finds a ring that runs */
     if (pthread_create(&thread, NULL, task, NULL) != 0)
         return 1;
     printf("listening on 127.0.0.1:%d\n", ntohs(address.sin_port));
