@@ -163,3 +163,13 @@ def test_a_signal_outlives_a_step_that_is_done_anew() -> None:
     model.now[kernel.SIGNALS] = Signal.PART_PRESENT
     _, signals = read(model, theta, tuple(one[399:] for one in driven))  # type: ignore[arg-type]
     assert signals.tolist() == [Signal.PART_PRESENT]
+
+
+def test_numbers_that_no_ejector_has_end_all_the_same() -> None:
+    """A fit may try them: what comes is no pressure, but it comes."""
+    theta = rigs.theta("test_rig")
+    theta[c.RESISTANCE] = np.nan
+    phase = phase_rows([(SUCTION, 300), (BLOW_OFF, 100)])
+    driven = np.full(len(phase), MS), phase, np.full(len(phase), np.nan)
+    expected, _ = read(Strides.at_rest(theta), theta, driven)
+    assert not np.isfinite(expected).all()

@@ -48,9 +48,8 @@ NARROWING = (
     Round(4, 0.3, 1.5 * MBAR, 20, 1e-3),
     Round(2, 1.0, 0.6 * MBAR, 40, 1e-4),
 )
-ROBUST = (
-    8.0  # sigmas, beyond which a residual pulls less than its square; below, what is wrong does
-)
+# Sigmas, beyond which a residual pulls less than its square; below, it is what a fit gets wrong.
+ROBUST = 8.0
 
 
 @dataclass
