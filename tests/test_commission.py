@@ -1,6 +1,7 @@
 """Commissioning a unit that nobody has seen before, on rigs of a world that is not the model's."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -14,16 +15,18 @@ from second_world.records import Record as Logged
 from second_world.records import record
 
 from twin.assets.place import open_chosen
+from twin.calibration.calibrate import complete
 from twin.calibration.commission import Commissioned, commission, guessed
+from twin.calibration.cycles import Cycles
 from twin.calibration.page import write_page
 from twin.calibration.readings import Readings, read, turns
 from twin.calibration.report import commissioned_as_json, commissioned_in_words
 from twin.calibration.store import store_first
-from twin.calibration.verdict import Residual, Verdict
+from twin.calibration.verdict import Residual, Verdict, judge
 from twin.config import Asset, Config
 from twin.errors import ConfigError
 from twin.model.dataset import DataSet
-from twin.signals import MBAR, SAMPLE, Command, Phase, Samples
+from twin.signals import BREAK, MBAR, SAMPLE, Command, Phase, Quality, Samples, bridged
 
 CYCLES = 9
 UNKNOWN_TYPE = "nobody-knows-40"
@@ -186,27 +189,104 @@ def refused(samples: Samples) -> str:
     return str(error.value)
 
 
-def test_swapped_commands_are_recognised_from_the_curves() -> None:
-    samples = log_of("gripper").copy()
+def swapped(samples: Samples) -> None:
     suction, blow_off = (samples["commands"] & bit for bit in (1, 2))
     samples["commands"] = suction * 2 + blow_off // 2
-    assert "rises while suction" in refused(samples)
 
 
-def test_a_column_in_bar_and_one_of_another_place_are_refused() -> None:
-    samples = log_of("gripper").copy()
-    samples["pressure"] = 101300.0 + (samples["pressure"] - 101300.0) / 1000.0
-    assert "no vacuum is made" in refused(samples)
+def counted(scale: float, offset: float) -> Callable[[Samples], None]:
+    """The pressure as another unit or reference has it; ``offset`` in ambient pressures."""
+
+    def change(samples: Samples) -> None:
+        samples["pressure"] = scale * samples["pressure"] + offset * np.float32(101300.0)
+
+    return change
+
+
+@pytest.mark.parametrize("name", ["gripper", "test_rig", "second world"])
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (swapped, "the two commands are swapped"),
+        (counted(-1.0, 2.0), "its sign is wrong"),
+        (counted(1.0, -1.0), "gauge pressure, taken for absolute"),
+        (counted(1.0, 1.0), "absolute pressure, taken for gauge"),
+        (counted(-1.0, 1.0), "vacuum, taken for absolute pressure"),
+        (counted(0.1, 0.0), "mbar absolute: too little"),
+        (counted(0.001, 0.999), "no vacuum is made"),
+    ],
+)
+def test_what_is_connected_wrongly_is_recognised_from_the_curves(
+    wrong: Callable[[Samples], None], said: str, name: str
+) -> None:
+    here = samples_of(logged(SEED, KIND)) if name == "second world" else log_of(name).copy()
+    wrong(here)
+    assert said in refused(here)
+
+
+def test_blow_off_that_no_row_commands_is_told_where_the_curve_shows_it() -> None:
+    here = samples_of(logged(SEED, KIND))
+    here["commands"] &= np.uint8(Command.SUCTION)
+    assert "no row has blow-off commanded" in refused(here)
+    _, remarks = guessed(typed("gripper").data, read(here))
+    assert any("no row of the record has blow-off" in one.text for one in remarks)
+
+
+def test_kilopascals_taken_for_millibar_are_asked_about() -> None:
+    here = samples_of(logged(SEED, KIND))
+    here["pressure"] = 101300.0 - (101300.0 - here["pressure"]) / 10.0
+    _, remarks = guessed(typed("gripper").data, read(here))
+    assert any("where ejectors make 300 and more" in one.text for one in remarks)
+
+
+def test_a_record_of_two_units_is_refused_with_the_cycle() -> None:
+    one, other = (samples_of(logged(seed, KIND, 12)) for seed in (SEED, SEED + 1))
+    half = len(one) // 2
+    late = other[len(other) // 2 :].copy()
+    for key, since in (("time_ns", 1_000_000), ("host_ns", 1_000_000), ("sequence", 1)):
+        late[key] += one[key][half - 1] - late[key][0] + since
+    assert "it is of two units" in refused(np.concatenate([one[:half], late]))
 
 
 def test_rows_too_far_apart_are_refused_and_it_is_said_what_they_hide() -> None:
-    assert "a row each 10 ms" in refused(log_of("gripper")[::10])
+    assert "a row each 20 ms" in refused(log_of("gripper")[::20])
 
 
 def test_no_suction_is_refused() -> None:
     samples = log_of("gripper").copy()
     samples["commands"] = 0
     assert "no suction" in refused(samples)
+
+
+def test_missing_rows_leave_a_record_that_can_be_fitted() -> None:
+    whole = samples_of(logged(SEED, KIND))
+    kept = np.random.default_rng(1).random(len(whole)) > 0.05
+    holes = whole[kept]
+    missing = np.diff(holes["sequence"], prepend=holes["sequence"][0] - 1) > 1
+    holes["quality"][missing] |= np.uint8(Quality.GAP)
+    blocks = np.split(holes, [len(holes) // 3, len(holes) // 3 + 1])
+    bridged_rows = np.concatenate(list(bridged(blocks)))
+    assert not (bridged_rows["quality"] & BREAK).any()
+    assert (holes["quality"] & BREAK).any(), "what was logged stays as it was"
+    assert len(complete(typed("gripper").data, bridged_rows)) >= CYCLES - 2
+
+
+def test_a_longer_gap_is_not_stepped_over() -> None:
+    whole = samples_of(logged(SEED, KIND))
+    late = whole[6:].copy()
+    late["quality"][0] |= np.uint8(Quality.GAP)
+    rows = np.concatenate(list(bridged([whole[:1], late])))
+    assert rows["quality"][1] & BREAK
+
+
+def test_the_nozzle_may_be_seen_late_the_same_in_all_cycles() -> None:
+    """The verdict is about the twin, which is set on the pressure where it sees the nozzle."""
+    found = commissioned()
+    data = found.calibration.fitted.data
+    cycles = Cycles.found(found.samples, data)
+    moved = replace(cycles, phase=cycles._phases([-6])[:, 0].copy())
+    one, other = (judge(each, data, 0.0).residuals[Phase.HOLD].left for each in (cycles, moved))
+    assert other == pytest.approx(one, rel=0.1)
 
 
 def verdict(**times: float) -> Verdict:

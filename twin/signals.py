@@ -4,6 +4,7 @@ Everything flows in blocks: structured arrays of ``SAMPLE`` (what was measured) 
 ``TICK`` (what the twin says to it). A live block has 10 to 100 rows, a replayed one thousands.
 """
 
+from collections.abc import Iterable, Iterator
 from enum import IntEnum, IntFlag
 
 import numpy as np
@@ -86,6 +87,9 @@ class Quality(IntFlag):
 # Plain numbers: with an IntFlag NumPy makes 64 bits of every byte.
 UNUSABLE = int(Quality.OVERFLOW | Quality.STALE | Quality.BAD)  # no pressure to compare with
 BREAK = int(Quality.GAP | Quality.RESTART | Quality.CLOCK)  # time does not run on from before
+BRIDGED = (
+    4.5  # times the usual time between rows: a gap so short hides nothing, if no command changes
+)
 NEW_TIME = int(Quality.RESTART | Quality.CLOCK)  # another PLC time begins, earlier or later
 
 
@@ -98,6 +102,31 @@ def unseen_ns(before: Samples | np.void, after: Samples | np.void) -> npt.NDArra
     by_plc, by_receipt = (after[name] - before[name] for name in ("time_ns", "host_ns"))
     passed: npt.NDArray[np.int64] = np.maximum(np.where(runs_on, by_plc, by_receipt), 0)
     return passed
+
+
+def bridged(blocks: Iterable[Samples]) -> Iterator[Samples]:
+    """The blocks of one stream, without the mark of gaps of a few rows: the model steps over them.
+
+    A command that changes in one is taken to change at its end. Longer gaps stay, as what happened
+    in them is not known.
+    """
+    before = np.empty(0, SAMPLE)
+    for block in blocks:
+        rows = np.concatenate([before, block])
+        if (block["quality"] & np.uint8(Quality.GAP)).any():
+            _bridge(rows)
+        yield rows[len(before) :]
+        before = rows[-1:]
+
+
+def _bridge(rows: Samples) -> None:
+    """Take the mark from gaps between two of ``rows`` that hide nothing."""
+    after, prior = rows[1:], rows[:-1]
+    if not len(after):
+        return
+    short = unseen_ns(prior, after) <= BRIDGED * np.median(np.diff(rows["time_ns"]))
+    short &= after["quality"] & NEW_TIME == 0
+    after["quality"][short] &= np.uint8(~np.uint8(Quality.GAP))
 
 
 class Phase(IntEnum):

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -11,11 +12,19 @@ from twin.errors import ConfigError
 from twin.model.effects import EFFECTS, Parameter, apply
 from twin.model.theta import Theta
 from twin.monitor.bins import Floats
+from twin.signals import MBAR
 
 SMALLEST = 0.5  # of an effect's typical size: less is within what cycles scatter
 LEAST_SCATTER = 0.05  # of it, from cycle to cycle, whatever a few cycles show
 MEDIAN = 0.954  # of the difference of two, over the standard deviation of each
 SIGNIFICANT = 8.0  # standard errors between the cycles before and after
+# Where a record's cycles part into those before and those after, without any model.
+PARTED = (
+    0.8  # of what cycles differ by; a drift has 0.75, 50 healthy rigs of a drawn world 0.5 at most
+)
+EACH = 3  # cycles at least, before and after
+LEAST_PARTED = 2.0 * MBAR  # Pa rms
+COMMON = 0.8  # of the cycles must have a place for it to be compared
 LEVELS = {"h1_level": "h1_shift", "h1_low_level": "h2_shift"}  # figures and what moves them
 
 
@@ -52,6 +61,49 @@ def refuse_changing(
             f" like {best.effect}, by {size:.2g} {best.parameter.unit}",
             "record healthy cycles of one state; twin diagnose says more",
         )
+
+
+def refuse_parted(cycles: Cycles) -> None:
+    """ConfigError if the cycles before and after one of them are two kinds: of two units, say.
+
+    The one in which it changes may be of neither kind.
+    """
+    curves, weights = _curves(cycles)
+    for first, mixed in product(range(EACH, len(curves) - EACH + 1), (0, 1)):
+        early, late = curves[:first], curves[first + mixed :]
+        if len(late) < EACH:
+            continue
+        both = np.concatenate([early, late])
+        total = float(np.sum(weights * (both - both.mean(axis=0)) ** 2))
+        apart = float(np.sum(weights * (late.mean(axis=0) - early.mean(axis=0)) ** 2))
+        explained = apart * len(early) * len(late) / len(both)
+        if apart > LEAST_PARTED**2 and explained > PARTED * total:
+            usual = np.sqrt((total - explained) / len(both)) / MBAR
+            raise ConfigError(
+                f"with cycle {first + 2} of the record all changes, by {np.sqrt(apart) / MBAR:.1f}"
+                f" mbar rms, where cycles otherwise differ by {usual:.1f}: it is of two units, or"
+                " something was changed in the midst of it",
+                "commission on a record of one healthy unit in one state",
+            )
+
+
+def _curves(cycles: Cycles) -> tuple[Floats, Floats]:
+    """Mean pressure (Pa) of each cycle but the first at each place, (cycles, places), and what
+    each place weighs; the weights add up to 1. What a cycle lacks is as in the mean cycle.
+    """
+    bins = cycles.bins
+    used = np.flatnonzero(bins.cycle >= 1)
+    numbers, cycle = np.unique(bins.cycle[used], return_inverse=True)
+    _, place = np.unique(bins.place[used], return_inverse=True)
+    sums, rows = (np.zeros((len(numbers), place.max(initial=-1) + 1)) for _ in range(2))
+    np.add.at(sums, (cycle, place), cycles.measured[used] * bins.count[used])
+    np.add.at(rows, (cycle, place), bins.count[used])
+    common = (rows > 0).mean(axis=0) >= COMMON
+    sums, rows = sums[:, common], rows[:, common]
+    curves = np.divide(sums, rows, out=np.full(sums.shape, np.nan), where=rows > 0)
+    curves = np.where(np.isnan(curves), np.nanmean(curves, axis=0), curves)
+    weights = rows.mean(axis=0)
+    return curves, weights / weights.sum()
 
 
 def _in_pressure(cycles: Cycles, theta: Theta, noise: float) -> Iterator[Step]:

@@ -19,7 +19,7 @@ from twin.model.dataset import DataSet, coefficients
 from twin.monitor.cycles import Cycle, figures, whole
 from twin.monitor.healthy import Healthy, Scatter
 from twin.monitor.knees import as_wide_as_needed
-from twin.signals import BREAK, MBAR, SAMPLE, UNUSABLE, Command, Phase, Samples
+from twin.signals import BREAK, MBAR, SAMPLE, UNUSABLE, Command, Phase, Samples, bridged
 
 FEWEST = 5  # complete cycles
 MOST_FITTED = 12  # cycles that are fitted; what more there are tell the scatter
@@ -48,7 +48,7 @@ def calibrate(
     ConfigError where the log does not suffice or is not that of a healthy unit.
     """
     progress("reading the log")
-    samples = np.concatenate([np.empty(0, SAMPLE), *blocks])
+    samples = np.concatenate([np.empty(0, SAMPLE), *bridged(blocks)])
     before = complete(config.data, samples)
     refuse_insufficient(samples, before)
     samples = samples[samples["time_ns"] <= before[-1].end_ns]

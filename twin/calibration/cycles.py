@@ -10,12 +10,12 @@ import numpy.typing as npt
 from twin.model import kernel
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
-from twin.monitor.bins import Bins, Floats, Ints, binned, sparse
+from twin.monitor.bins import Bins, Floats, Ints, binned, drawn
 from twin.monitor.knees import as_wide_as_needed, expected_knees
 from twin.monitor.nozzle import Switching, noise_of, switchings
 from twin.monitor.phases import PhaseFinder, commanded
 from twin.monitor.signatures import steps
-from twin.signals import MBAR, MS, UNUSABLE, Phase, Samples
+from twin.signals import MBAR, UNUSABLE, Phase, Samples
 
 BINS = 6  # in each unit of warped time
 Bytes = npt.NDArray[np.uint8]
@@ -132,11 +132,11 @@ def _edges(phase: Bytes) -> Ints:
 
 
 def _drawn(dt: Floats, phase: Bytes, level: Floats) -> Ints:
-    """Rows that suffice to draw a course: where phases change, time breaks or a level is set."""
-    begins = np.isfinite(level) | (dt < 0.5 * MS) | (dt > 1.5 * MS)
+    """Rows that suffice to draw a course: where phases change, rows are missing, a level is set."""
+    begins = np.isfinite(level)
     begins[0] = True
     begins[1:] |= np.diff(phase) != 0
-    return sparse(begins)
+    return drawn(dt, begins)
 
 
 def _expected(

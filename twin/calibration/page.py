@@ -47,6 +47,8 @@ def _remarks(found: Commissioned) -> Iterator[str]:
         yield page.box(remark.text, f"The record's value is used. Write: {remark.line}")
     if not found.remarks:
         yield page.paragraph("Nothing: the record does not contradict the configuration.")
+    if found.unseen:
+        yield page.paragraph(found.unseen)
 
 
 def _residuals(found: Commissioned) -> str:

@@ -57,6 +57,7 @@ class Readings:
     deepest: float  # Pa, the lowest pressure
     highest: float  # Pa
     rises_in_suction: bool  # and falls in blow-off: commands or sign are swapped
+    tells_blow_off: bool  # in any row
     fill_rate: float  # 1/s, dp/dt over ambient as blow-off begins
     draw_rate: float  # 1/s, −dp/dt over pressure as suction begins
 
@@ -118,6 +119,7 @@ def read(samples: Samples) -> Readings:
         highest=float(pressure.max()),
         rises_in_suction=_rises(pressure, found, Command.SUCTION)
         and not _rises(pressure, found, Command.BLOW_OFF),
+        tells_blow_off=any(one.command == Command.BLOW_OFF for one in found),
         fill_rate=_fill_rate(pressure, found, period, idle),
         draw_rate=_draw_rate(pressure, suctions, period),
     )
@@ -212,7 +214,7 @@ def _draw_rate(pressure: Floats, suctions: list[Stretch], period: float) -> floa
         part = pressure[one.first : one.last]
         way = part[0] - part.min()
         begun, ended = (np.flatnonzero(part < part[0] - share * way) for share in (0.1, 0.33))
-        if len(ended) and ended[0] > begun[0]:
+        if len(ended) and ended[0] > begun[0] and part[ended[0]] > 0.0:
             first, last = begun[0], ended[0]
             rates.append(np.log(part[first] / part[last]) / ((last - first) * period))
     return _median(rates)

@@ -81,6 +81,8 @@ def commissioned_in_words(found: Commissioned) -> str:
         lines += ["", f"the record contradicts the configuration: {remark.text}"]
         lines += [f"  the record's value is used; write: {remark.line}"]
     lines += ["", in_words(found.calibration)]
+    if found.unseen:
+        lines += ["", found.unseen]
     if found.assumed:
         lines += ["", f"not shown by this record, assumed: {', '.join(found.assumed)}"]
     return "\n".join(lines)
@@ -124,6 +126,7 @@ def commissioned_as_json(
         },
         "contradicts": [{"what": one.text, "line": one.line} for one in found.remarks],
         "assumed": found.assumed,
+        "unseen": found.unseen,
         "cycles": found.calibration.cycles,
         "parameters": parameters(found.calibration),
         "data": fitted.data.model_dump(),

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.model.compiled import compiled, per_row
+from twin.model.kernel import LONGEST_BRIDGE
 from twin.model.term import AGAIN
 from twin.signals import MS, Phase
 
@@ -199,6 +200,20 @@ def _number(phase, usable, starts, begins, number):  # type: ignore[no-untyped-d
             found[bins - 1, 0] += 1
             number[row] = bins - 1
     return found[:bins].copy()
+
+
+def drawn(dt: Floats, begins: npt.NDArray[np.bool_]) -> Ints:
+    """Rows, ``dt`` seconds apart, that suffice to draw a course whose bends begin at some of them.
+
+    Those about a missing row are among them, as lines are drawn by rows. Where rows are so far
+    apart that the model would not step over those left out, all are.
+    """
+    apart = dt[dt > 0.0]
+    period = float(np.median(apart)) if len(apart) else MS
+    if 1.5 * period * FARTHEST > LONGEST_BRIDGE:
+        return np.arange(len(dt))
+    odd = np.flatnonzero((dt < 0.5 * period) | (dt > 1.5 * period))
+    return np.unique(np.concatenate([sparse(begins), odd, np.maximum(odd - 1, 0)]))
 
 
 def sparse(begins: npt.NDArray[np.bool_], since: int = -1) -> Ints:

@@ -14,8 +14,8 @@ from twin.model import kernel
 from twin.model.compiled import compiled
 from twin.model.effects import EFFECTS, UNKNOWN, Effect, apply
 from twin.model.theta import Theta
-from twin.monitor.bins import Floats, Ints, sparse
-from twin.signals import BREAK, MBAR, MS, NS, Samples, Ticks, deviation
+from twin.monitor.bins import Floats, Ints, drawn
+from twin.signals import BREAK, MBAR, NS, Samples, Ticks, deviation
 
 LOOK_ALIKE = 0.9  # of the best fit's gain
 UNNAMED = "its cause is sought in the first whole cycle"
@@ -75,9 +75,7 @@ def drawn_rows(samples: Samples, ticks: Ticks) -> Ints:
     begins |= np.isfinite(ticks["level"])
     known = np.isfinite(ticks["expected"])
     begins |= np.diff(known, prepend=False) != 0
-    dt = steps(samples, None)
-    begins |= (dt < 0.5 * MS) | (dt > 1.5 * MS)
-    return sparse(begins)
+    return drawn(steps(samples, None), begins)
 
 
 def likenesses(theta: Theta, samples: Samples, ticks: Ticks, begin: int) -> list[Likeness]:
