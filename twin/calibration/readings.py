@@ -27,8 +27,9 @@ EDGE_MS = 30.0  # after a command, in which a turn is still the valve's delay
 DEEP = 0.3  # of the way down, from the lowest, in which the nozzle may go off
 LEAST_VACUUM = 20.0 * MBAR  # Pa
 MOST_SUCTIONS = 0.5  # of all suctions must turn for an ejector that saves air
-OPENED_MS = 40.0  # at the end of an idle, over which an opened system stands at ambient
-STILL = 3.0  # sigmas by which the pressure of an opened system may still move in them
+OPENED_MS = 40.0  # at the end of an idle, in which an opened system stands at ambient
+OPENED_FROM = 2.0 / 3.0  # of an idle, from where on it does
+STILL = 3.0  # sigmas by which the pressure of an opened system may still move in that time
 
 
 @dataclass(frozen=True)
@@ -181,18 +182,22 @@ def _step(pressure: Floats) -> float:
 
 
 def _idle(pressure: Floats, found: list[Stretch], rows: int, noise: float) -> tuple[float, bool]:
-    """What idles end at, and whether each stands still there, all at one pressure."""
-    ends = [
-        pressure[one.last - rows : one.last]
-        for one in found[1:]
-        if one.command == 0 and one.last - one.first >= 2 * rows
-    ]
-    if not ends:
+    """What idles end at, and whether each stands still there, all at one pressure.
+
+    A closed system that settles slowly moves too little in its last milliseconds to be told from
+    one that is open, but more since some time ago.
+    """
+    idles = [one for one in found[1:] if one.command == 0 and one.last - one.first >= 2 * rows]
+    if not idles:
         return float("nan"), False
-    half = rows // 2
-    moves = [abs(end[half:].mean() - end[:half].mean()) for end in ends]
-    levels = np.array([end.mean() for end in ends])
-    still = STILL * noise * np.sqrt(2.0 / max(half, 1)) + 0.1 * MBAR
+    half = max(rows // 2, 1)
+    moves, levels = [], np.empty(len(idles))
+    for number, one in enumerate(idles):
+        since = one.first + int(OPENED_FROM * (one.last - one.first))
+        early = pressure[min(since, one.last - 2 * half) :][:half]
+        moves.append(abs(pressure[one.last - half : one.last].mean() - early.mean()))
+        levels[number] = pressure[one.last - rows : one.last].mean()
+    still = STILL * noise * np.sqrt(2.0 / half) + 0.1 * MBAR
     opened = bool(np.median(moves) < still and np.ptp(levels) < 2.0 * MBAR + 4.0 * noise)
     return float(np.median(levels)), opened
 
