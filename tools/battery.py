@@ -2,7 +2,7 @@
 
     python tools/battery.py [--world both|first|second] [--first SEED] [--cases FILE.jsonl]
         [--single 152] [--pair 20] [--healthy 30] [--unlisted 20] [--units 10]
-        [--rigs 60] [--cadences 1 2 5 10] [--write docs/battery.md]
+        [--rigs 60] [--cadences 1 2 5 10] [--records 6] [--write docs/battery.md]
 
 The first world is the rig behind the simulated PLC, calibrated from its type's data. The second
 one (tests/second_world) shares no equation with the model: each drawn rig is commissioned from a
@@ -19,6 +19,7 @@ import secrets
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 
 from tools import battery_first, battery_second
@@ -39,10 +40,12 @@ def first_world(
         yield case or file.add(battery_first.NAME, battery_first.answered(kind, seed, units))
 
 
-def second_world(file: CaseFile, first: int, rigs: int, cadences: Sequence[int]) -> Iterator[Case]:
-    """Each case of the second world: rig after rig, what follows if it was commissioned."""
+def second_world(
+    file: CaseFile, seeds: range, cadences: Sequence[int], records: int
+) -> Iterator[Case]:
+    """Each case of the second world: rig after rig, and ``records`` more if it was commissioned."""
     name = battery_second.NAME
-    for seed in range(first, first + rigs):
+    for seed in seeds:
         met = battery_second.drawn(seed, cadences)
         if met is None:
             continue
@@ -50,7 +53,7 @@ def second_world(file: CaseFile, first: int, rigs: int, cadences: Sequence[int])
         begun = kept or file.add(name, battery_second.commissioned(met))
         yield begun
         unit = battery_second.with_unit(met, begun)
-        for kind, number, hidden in battery_second.cases(met) if unit else ():
+        for kind, number, hidden in islice(battery_second.cases(met), records if unit else 0):
             case = file.get(name, (kind, seed, number))
             yield case or file.add(name, battery_second.diagnosed(unit, kind, number, hidden))
 
@@ -86,6 +89,9 @@ def main() -> int:
         default=battery_second.CADENCES,
         help="ms between rows there; rigs with another are left out",
     )
+    parser.add_argument(
+        "--records", type=int, default=battery_second.RECORDS, help="after a commissioning there"
+    )
     parser.add_argument("--write", type=Path, metavar="FILE", help="page whose tables to replace")
     asked = parser.parse_args()
     first = first_of(asked.cases) if asked.first is None else asked.first
@@ -95,7 +101,9 @@ def main() -> int:
     counts = {kind: getattr(asked, kind) for kind in battery_first.COUNTS}
     runs = {
         battery_first.NAME: first_world(file, first, counts, asked.units),
-        battery_second.NAME: second_world(file, first, asked.rigs, asked.cadences),
+        battery_second.NAME: second_world(
+            file, range(first, first + asked.rigs), asked.cadences, asked.records
+        ),
     }
     reached = True
     for world in WORLDS if asked.world == "both" else (asked.world,):

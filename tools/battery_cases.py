@@ -62,10 +62,14 @@ class Case:
         return "error" if self.answer is None else str(self.answer["verdict"])
 
     @property
+    def causes(self) -> Sequence[Mapping[str, Any]]:
+        """The causes of the answer; a commissioning has none."""
+        return (self.answer or {}).get("causes", ())
+
+    @property
     def sets(self) -> list[list[str]]:
         """Each cause of the answer with its look-alikes, the cause first."""
-        causes = self.answer["causes"] if self.answer else []
-        return [[cause["effect"], *cause["not_separable_from"]] for cause in causes]
+        return [[cause["effect"], *cause["not_separable_from"]] for cause in self.causes]
 
     @property
     def first(self) -> str | None:
@@ -80,18 +84,17 @@ class Case:
     @property
     def left(self) -> float:
         """Sigmas that the answer leaves; NaN without one."""
-        left = self.answer["extended"]["leftover_sigma"] if self.answer else None
+        left = (self.answer or {}).get("extended", {}).get("leftover_sigma")
         return float("nan") if left is None else float(left)
 
     @property
     def named(self) -> str:
         """The causes of the answer, with course, size and look-alikes."""
-        causes = self.answer["causes"] if self.answer else []
         return " + ".join(
             f"{one['effect']} {one['course']} "
             + ", ".join(f"{p.get('at_end', p['value'])}" for p in one["parameters"].values())
             + "".join(f" ~{other}" for other in one["not_separable_from"])
-            for one in causes
+            for one in self.causes
         )
 
     @property
@@ -170,8 +173,7 @@ _JUDGES = {
 
 def _cause(case: Case, truth: Hidden) -> Mapping[str, Any] | None:
     """The cause of the answer that is the effect which is hidden."""
-    assert case.answer is not None
-    return next((one for one in case.answer["causes"] if one["effect"] == truth.effect), None)
+    return next((one for one in case.causes if one["effect"] == truth.effect), None)
 
 
 def _covers(cause: Mapping[str, Any], truth: Hidden) -> bool | None:

@@ -46,6 +46,7 @@ RIGS = 60
 CYCLES = 12
 CADENCES = (1, 2, 5, 10)  # ms
 SINGLES, PAIRS, UNLISTED = 3, 1, 1  # records of each rig, beside a second healthy one
+RECORDS = 1 + SINGLES + PAIRS + UNLISTED
 LONG_WAY = 0.4  # of an effect's range, at which each of a pair begins
 COURSES = {"constant": 0.4, "step": 0.25, "ramp": 0.15, "intermittent": 0.2}
 CRASHED = "crashed: "
