@@ -9,7 +9,7 @@ from tools.battery_cases import Case, CaseFile, spread
 from tools.battery_page import ASKED, likely
 
 CHANCE = 0.01  # of so bad a count where what is asked for holds just so
-COUNTS = {"single": 2, "pair": 1, "healthy": 1, "unlisted": 1}
+COUNTS = {"single": 2, "healthy": 1}
 
 
 def no_worse_than_chance(cases: Sequence[Case]) -> None:

@@ -37,7 +37,8 @@ from twin.tables.settings import Bad, ImportSettings
 sys.path.append(str(Path(__file__).parent.parent / "tests"))  # where the second world is
 
 from second_world import Fault, draw_rig, faults, record
-from second_world.gas import nozzle_flow
+from second_world.gas import nozzle_flow, orifice
+from second_world.plant import CRITICAL_VALVE
 from second_world.records import Record
 from second_world.rig import Rig
 
@@ -285,13 +286,11 @@ def truths(met: Met, scale: float) -> dict[str, float]:
     Flows follow from the volume, of which a person tells a rough value: they are compared as they
     are beside that value; ``scale`` is told over true volume.
     """
-    rig, here = met.rig, met.rig.surroundings
+    rig = met.rig
     sagging = _sagging(rig)
     end = _end_pressure(sagging) + rig.ejector.check_opening
     found = {
-        "ejector.suction_capacity_sl_min": scale
-        * faults.sucked_at(sagging, here.ambient_pressure, 0.0)
-        / SL_MIN,
+        "ejector.suction_capacity_sl_min": scale * _capacity(sagging) / SL_MIN,
         "ejector.end_pressure_mbar": _as_read(met, end) / MBAR,
     }
     if not rig.vessel.porous:
@@ -301,13 +300,41 @@ def truths(met: Met, scale: float) -> dict[str, float]:
 
 def _sagging(rig: Rig) -> Rig:
     """The rig with the supply that its nozzle leaves."""
-    supply, here = rig.supply, rig.surroundings
-    pressure = here.ambient_pressure + supply.supply_gauge
+    supply, flow = rig.supply, _primary(rig)
+    sag = supply.supply_droop * flow + supply.supply_resistance * flow**2
+    return replace(rig, supply=replace(supply, supply_gauge=supply.supply_gauge - sag))
+
+
+def _capacity(rig: Rig) -> float:
+    """Flow (kg/s) into the port at ambient pressure: behind it lies the check valve."""
+    ambient, t = rig.surroundings.ambient_pressure, rig.surroundings.ambient_temperature
+    if not rig.ejector.has_check_valve:
+        return _sucked(rig, ambient)
+    low, high = 0.7 * ambient, ambient
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        through = orifice.py_func(rig.ejector.check_conductance, CRITICAL_VALVE, ambient, middle, t)
+        low, high = (middle, high) if through > _sucked(rig, middle) else (low, middle)
+    return _sucked(rig, low)
+
+
+def _sucked(rig: Rig, pressure: float) -> float:
+    """Flow (kg/s) that is sucked at a chamber pressure (Pa), its own back pressure included."""
+    flow, extra = 0.0, 0.0
+    for _ in range(10):
+        flow = faults.sucked_at(rig, pressure, extra)
+        extra = rig.ejector.silencer * ((_primary(rig) + flow) ** 2 - _primary(rig) ** 2)
+    return flow
+
+
+def _primary(rig: Rig) -> float:
+    """Flow (kg/s) through the nozzle."""
+    here = rig.surroundings
+    pressure = here.ambient_pressure + rig.supply.supply_gauge
     flow = nozzle_flow.py_func(
         rig.ejector.nozzle_area, pressure, here.ambient_pressure, here.ambient_temperature
     )
-    sag = supply.supply_droop * flow + supply.supply_resistance * flow**2
-    return replace(rig, supply=replace(supply, supply_gauge=supply.supply_gauge - sag))
+    return float(flow)
 
 
 def _end_pressure(rig: Rig) -> float:
