@@ -192,6 +192,21 @@ def test_a_system_that_still_settles_is_not_open(settles_s: float, opened: bool)
     assert read(rows).opened == opened
 
 
+def test_the_record_shows_what_flows_back_once_suction_has_ended() -> None:
+    """Pause of 50 ms in which the pressure rises by 2 mbar/ms, from the 20th one on."""
+    pause = 300.0 + 2.0 * np.maximum(np.arange(50) - 20.0, 0.0)
+    fill, idle = np.linspace(360.0, 1000.0, 100), np.full(400, 1000.0)
+    cycle = np.concatenate([np.linspace(1000.0, 300.0, 400), pause, fill, idle])
+    commands = np.repeat([Command.SUCTION, 0, Command.BLOW_OFF, 0], [400, 50, 100, 400])
+    rows = np.zeros(6 * len(cycle), SAMPLE)
+    rows["time_ns"] = np.arange(len(rows)) * 1_000_000
+    rows["sequence"], rows["commands"] = np.arange(len(rows)), np.tile(commands, 6)
+    rows["pressure"] = np.tile(cycle, 6) * MBAR
+    assert read(rows).back_rate == pytest.approx(2.0, rel=0.02)  # 1/s of 1000 mbar
+    rows["commands"][rows["commands"] == 0] = Command.BLOW_OFF
+    assert np.isnan(read(rows).back_rate)
+
+
 def test_a_turn_needs_what_noise_does_not_make() -> None:
     fall, rise = np.linspace(10.0, 2.0, 50), np.linspace(2.0, 4.0, 50)
     smooth = np.concatenate([fall, rise, rise[::-1]])

@@ -25,6 +25,7 @@ CLEAR = 6.0  # sigmas of the smoothed pressure that make a turn
 LEAST_TURN = 1.5 * MBAR  # Pa
 EDGE_MS = 30.0  # after a command, in which a turn is still the valve's delay
 DEEP = 0.3  # of the way down, from the lowest, in which the nozzle may go off
+STEEP_MS, BACK_MS = 10.0, 200.0  # what flows back without a check valve does so at once
 LEAST_VACUUM = 20.0 * MBAR  # Pa
 MOST_SUCTIONS = 0.5  # of all suctions must turn for an ejector that saves air
 OPENED_MS = 40.0  # at the end of an idle, in which an opened system stands at ambient
@@ -60,6 +61,7 @@ class Readings:
     rises_in_suction: bool  # and falls in blow-off: commands or sign are swapped
     fill_rate: float  # 1/s, dp/dt over ambient as blow-off begins
     draw_rate: float  # 1/s, −dp/dt over pressure as suction begins
+    back_rate: float  # 1/s, dp/dt over ambient at its steepest after suction, nothing commanded
 
     @property
     def least_vacuum(self) -> float:
@@ -78,6 +80,10 @@ class Readings:
     def blow_off(self, volume: float, ambient: float, temperature: float) -> float:
         """Blow-off flow (kg/s) that fills ``volume`` (m³) as fast as the record shows."""
         return flow_behind(self.fill_rate, volume, ambient, temperature)
+
+    def back_flow(self, volume: float, ambient: float, temperature: float) -> float:
+        """Flow (kg/s) that fills ``volume`` (m³) as fast as it fills once suction has ended."""
+        return flow_behind(self.back_rate, volume, ambient, temperature)
 
 
 def read(samples: Samples) -> Readings:
@@ -121,6 +127,7 @@ def read(samples: Samples) -> Readings:
         and not _rises(pressure, found, Command.BLOW_OFF),
         fill_rate=_fill_rate(pressure, found, period, idle),
         draw_rate=_draw_rate(pressure, suctions, period),
+        back_rate=_back_rate(pressure, found, period, idle),
     )
 
 
@@ -235,6 +242,18 @@ def _fill_rate(pressure: Floats, found: list[Stretch], period: float, ambient: f
             if len(ended) and ended[0] > begun[0]:
                 rise = part[ended[0]] - part[begun[0]]
                 rates.append(rise / ((ended[0] - begun[0]) * period) / top)
+    return _median(rates)
+
+
+def _back_rate(pressure: Floats, found: list[Stretch], period: float, ambient: float) -> float:
+    """dp/dt over ambient (1/s), over STEEP_MS at its steepest soon after suction."""
+    width, rows = max(round(STEEP_MS * MS / period), 2), round(BACK_MS * MS / period)
+    rates = []
+    for before, one in pairwise(found):
+        part = pressure[one.first : min(one.last, one.first + rows)]
+        if before.command == Command.SUCTION and one.command == 0 and len(part) > width:
+            rise = float(np.max(part[width:] - part[:-width]))
+            rates.append(rise / (width * period) / ambient)
     return _median(rates)
 
 
