@@ -35,7 +35,7 @@ bench: .venv/dev
 	$(BIN)/python tools/bench.py
 
 battery: .venv/dev  # one thread for matrices, as the command line has it: more wait for each other
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python tools/battery.py --write docs/battery.md
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python tools/battery.py --cases battery.jsonl --write docs/battery.md
 
 clean:
 	rm -rf .venv demo site

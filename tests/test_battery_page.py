@@ -1,29 +1,52 @@
-"""docs/battery.md holds the tables of one run, which the battery writes; older ones are lines."""
+"""docs/battery.md holds the tables of one run in each world; older ones are lines."""
 
-from collections.abc import Iterator
+import json
+import re
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from tools import battery
-from tools.battery_page import ASKED, FOUND, Case, Hidden, Tally, summary, tables, with_run
+from tools import battery_first
+from tools.battery_cases import FOUND, Case, CaseFile, Hidden, first_of
+from tools.battery_page import ASKED, all_kept, likely, summary, tables, with_run
 from twin.errors import TwinError
 
 PAGE = (Path(__file__).parent.parent / "docs" / "battery.md").read_text(encoding="utf-8")
-HEAD = "| what | reached | asked for | kept |"
+HEAD = "| what | reached | by chance | asked for | kept |"
 LEAK = Hidden("leakage", "constant", 1.0)
+WORLDS = ("first", "second")
 
 
-def test_the_page_has_the_table_of_one_run() -> None:
-    assert PAGE.count(HEAD) == 1
-    assert PAGE.count("<!-- newest run: python tools/battery.py --write docs/battery.md -->") == 1
+def answer(effect: str, verdict: str = "explained", left: float = 1.31) -> dict[str, Any]:
+    """An answer that names one effect of size 0.9."""
+    size = {"value": 0.9, "low95": 0.8, "high95": 1.1}
+    cause = {"effect": effect, "course": "constant", "not_separable_from": []}
+    return {
+        "verdict": verdict,
+        "causes": [cause | {"parameters": {"flow": size}}],
+        "extended": {"leftover_sigma": left},
+        "gain": {"share_of_achievable_pct": 97.0},
+    }
 
 
-def test_a_run_replaces_the_tables_and_leaves_a_line_of_the_one_before() -> None:
-    page = with_run(with_run(PAGE, "first line", f"{HEAD}\n1"), "second line", f"{HEAD}\n2")
-    assert page.count(HEAD) == 1
+def single(effect: str, **more: Any) -> Case:
+    return Case("single", 7, "gripper", [LEAK], answer(effect), more=more)
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_the_page_has_a_place_for_each_world(world: str) -> None:
+    place = f"<!-- newest run of the {world} world: python tools/battery.py --write docs/battery.md"
+    assert PAGE.count(place) == 1
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_run_replaces_the_tables_and_leaves_a_line_of_the_one_before(world: str) -> None:
+    page = with_run(PAGE, world, "first line", f"{HEAD}\n1")
+    page = with_run(page, world, "second line", f"{HEAD}\n2")
     assert f"**second line**\n\n{HEAD}\n2\n<!-- end -->" in page
+    assert f"{HEAD}\n1" not in page
     older = page.partition("<!-- older runs")[2].splitlines()
     assert older[1] == "- first line"
     assert older[2].startswith("- 20")  # the run that stood in the page
@@ -31,43 +54,118 @@ def test_a_run_replaces_the_tables_and_leaves_a_line_of_the_one_before() -> None
 
 
 def test_a_page_without_a_place_for_the_run_is_refused() -> None:
-    with pytest.raises(ValueError, match="newest run"):
-        with_run("# Another page", "line", "tables")
+    with pytest.raises(ValueError, match="newest run of the first world"):
+        with_run("# Another page", "first", "line", "tables")
 
 
 def test_tables_say_what_was_reached_and_what_was_not_found() -> None:
-    cause = {"effect": "porous_leakage", "course": "constant", "not_separable_from": []}
-    answer = {
-        "verdict": "explained",
-        "causes": [cause | {"parameters": {"flow": {"value": 0.9}}}],
-        "extended": {"leftover_sigma": 1.31},
-    }
-    tally = Tally()
-    battery.judge_single(answer, [LEAK], tally)
-    tally.cases.append(Case("single", 7, "gripper", [LEAK], answer, found=False))
-    text = tables(tally)
-    assert "| confidently wrong | 1 of 1 (100%) | at most 2% | **no** |" in text
+    cases = [single("porous_leakage")]
+    text = tables(cases)
+    assert "| explained and wrong | 1 of 1 (100%) | 3% to 100% | at most 1% | **no** |" in text
     assert "| `leakage` | 1 | 0 | 0 | porous_leakage 1 | 1 | 1.31 |" in text
     row = "| single | 7 | gripper | leakage constant 1 | explained | porous_leakage constant 0.9 |"
     assert row in text
-    line = summary(tally, "2026-01-02", "abc")
-    assert line == "2026-01-02, commit abc, seeds 7 to 7: found 0 of 1 single."
-    assert not tally.all_kept
+    line = summary("first", cases, "2026-01-02", "abc")
+    assert line == "2026-01-02, first world, commit abc, seeds 7 to 7: found 0 of 1 single."
+    assert not all_kept(cases)
+
+
+def test_a_size_counts_where_it_means_the_same_in_both_worlds() -> None:
+    assert single("leakage").outcomes["covered"] is True
+    assert "covered" not in single("leakage", comparable=False).outcomes
+    of_volume = single("leakage", of_volume=True).outcomes
+    assert "covered" not in of_volume
+    assert of_volume["flows"] is True
+
+
+@pytest.mark.parametrize("kind", ["healthy", "single", "pair"])
+def test_explained_and_wrong_is_what_names_a_cause_that_is_not_there(kind: str) -> None:
+    hidden = {"healthy": [], "single": [LEAK], "pair": [LEAK, replace(LEAK, effect="sensor_lag")]}
+    wrong = Case(kind, 1, "gripper", hidden[kind], answer("sensor_gain"))
+    assert wrong.outcomes["wrong"] is True
+    unsure = replace(wrong, answer=answer("sensor_gain", "unlisted"))
+    assert unsure.outcomes["wrong"] is False
 
 
 @pytest.mark.parametrize("kind", FOUND)
-def test_a_case_that_ends_in_an_error_is_not_found(
-    kind: str, monkeypatch: pytest.MonkeyPatch
+def test_a_case_that_ends_in_an_error_is_not_found(kind: str) -> None:
+    case = Case(kind, 3, "gripper", [LEAK], error="no suction phase")
+    assert case.outcomes == {FOUND[kind]: False}
+    assert set(case.outcomes) <= set(ASKED)
+    text = tables([case])
+    if kind == "commissioning":
+        assert "| no suction phase | 1 |" in text
+    else:
+        assert f"| {kind} | 3 | gripper | leakage constant 1 | error | – | – |" in text
+
+
+def test_a_refusal_of_the_diagnosis_is_an_error_of_the_case(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def refused(*_: object) -> Iterator[object]:
+    def refused(*_: object) -> object:
         raise TwinError("no suction phase", "record more")
 
-    one = SimpleNamespace(name="gripper", config=None)
-    monkeypatch.setattr(battery, "case", lambda *_: (one, [LEAK], None))
-    monkeypatch.setattr(battery, "diagnose", refused)
-    tally = Tally()
-    (line,) = battery.run(kind, range(3, 4), 1, tally)
-    assert line.startswith("FAILED")
-    assert tally.outcomes == {FOUND[kind]: [False]}
-    assert set(tally.outcomes) <= set(ASKED)
-    assert f"| {kind} | 3 | gripper | leakage constant 1 | error | – | – |" in tables(tally)
+    one = battery_first.Unit("gripper", None, None)  # type: ignore[arg-type]
+    monkeypatch.setattr(battery_first, "drawn_case", lambda *_: (one, [LEAK], None))
+    monkeypatch.setattr(battery_first, "diagnose", refused)
+    case = battery_first.answered("single", 3, 1)
+    assert (case.verdict, case.error) == ("error", "no suction phase")
+
+
+def commissioning(seed: int, verdict: str, times: float, true: bool | None = None) -> Case:
+    if true is not None:
+        return Case("commissioning", seed, "micro", error="a row each 10 ms", more={"true": true})
+    residual = {"suction": {"times": 1.0}, "blow_off": {"times": times}}
+    held = {"true": 10.0, "value": 11.0, "low95": 9.0, "high95": 13.0, "holds": True}
+    found = {"verdict": verdict, "residual": residual, "covered": {"ejector.x": held}}
+    return Case("commissioning", seed, "micro", answer=found, seconds=float(seed))
+
+
+def test_commissionings_are_told_by_verdict_phase_parameter_and_reason() -> None:
+    cases = [
+        commissioning(1, "good", 1.2),
+        commissioning(2, "refused", 3.0),
+        commissioning(3, "", 0.0, true=True),
+    ]
+    text = tables(cases)
+    assert "| rigs commissioned without editing a number | 1 of 3 (33%) | 1% to 91% |" in text
+    assert "| refused for a reason that is true of the record | 1 of 2 (50%) |" in text
+    assert "| micro | 3 | 1 | – | 1 | 1 |" in text
+    assert "| blow_off | 2 | 2.10 | 2.82 | 3.00 |" in text
+    assert "| the worst phase | 2 | 2.10 | 2.82 | 3.00 |" in text
+    assert "| `ejector.x` | 1 | 1 | 10% | ±18% |" in text  # of those that are stored
+    assert "| a row each … ms | 1 | yes | 3 |" in text
+    assert "most in blow_off | 1 | **no** | 2 |" in text
+    assert "| commissioning | 3 | 1.0 s | 1.9 s | 2.0 s |" in text
+
+
+def test_chance_says_how_likely_so_few_are() -> None:
+    cases = [Case("healthy", seed, "gripper", (), answer("x")) for seed in range(3)]
+    assert likely(cases, "consistent") == pytest.approx(0.03**3)
+    right = Case("healthy", 9, "gripper", (), answer("x", "consistent"))
+    assert likely([*cases, right], "consistent") > likely(cases, "consistent")
+
+
+# The file of cases.
+
+RUN = {"first": 12, "commit": "abc"}
+
+
+def test_a_run_that_was_cut_goes_on_where_it_ended(tmp_path: Path) -> None:
+    path, case = tmp_path / "cases.jsonl", single("leakage")
+    CaseFile(path, RUN).add("second", case)
+    with path.open("a") as file:
+        file.write('{"world": "second", "kind": "sin')  # cut
+    assert first_of(path) == 12
+    again = CaseFile(path, RUN)
+    assert again.get("second", ("single", 7, 0)) == case
+    assert again.get("first", ("single", 7, 0)) is None
+    again.add("first", replace(case, seed=8))
+    assert [json.loads(line).get("seed") for line in path.read_text().splitlines()] == [None, 7, 8]
+
+
+def test_cases_of_another_run_are_not_mixed(tmp_path: Path) -> None:
+    path = tmp_path / "cases.jsonl"
+    CaseFile(path, RUN)
+    with pytest.raises(ValueError, match=re.escape(str(path))):
+        CaseFile(path, RUN | {"commit": "abd"})

@@ -18,11 +18,13 @@ from twin.assets.place import open_chosen
 from twin.calibration.calibrate import complete
 from twin.calibration.commission import Commissioned, commission, guessed
 from twin.calibration.cycles import Cycles
+from twin.calibration.fit import RISING, falling, soft
 from twin.calibration.page import write_page
 from twin.calibration.readings import Readings, read, turns
 from twin.calibration.report import commissioned_as_json, commissioned_in_words
 from twin.calibration.store import store_first
 from twin.calibration.verdict import Residual, Verdict, judge
+from twin.calibration.weights import Weights
 from twin.config import Asset, Config
 from twin.errors import ConfigError
 from twin.model.dataset import DataSet
@@ -128,6 +130,29 @@ def test_it_says_the_verdict_what_to_change_and_what_was_assumed(tmp_path: Path)
     assert "Measured against fitted" in page
 
 
+# What a fit may not end at.
+
+
+def test_a_characteristic_that_rises_is_bent_back_until_it_falls() -> None:
+    data = typed("test_rig").data
+    assert falling(data) == data
+    bends = {"bulge": 1.0, "skew": 0.5, "bend_2": 3.0, "bend_3": -1.0}
+    rises = data.model_copy(update={"ejector": data.ejector.model_copy(update=bends)})
+    with pytest.raises(ValueError, match="not monotonic"):
+        DataSet.model_validate(rises.model_dump())
+    back = DataSet.model_validate(falling(rises).model_dump()).ejector
+    assert back.bulge / bends["bulge"] == pytest.approx(back.bend_2 / bends["bend_2"])
+    assert np.diff(back.share(np.linspace(0.0, 1.0, 101))).min() == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_loss_that_is_soft_for_residuals_keeps_the_characteristic_falling() -> None:
+    weights = Weights([(np.arange(3), np.eye(3))])
+    cost = soft(weights)(np.full(3 + RISING + 2, 400.0))
+    assert cost[0, :3] == pytest.approx(2.0 * (np.sqrt(401.0) - 1.0))
+    assert cost[0, 3:-2] == pytest.approx(400.0)
+    assert cost[1, 3:-2] == pytest.approx(1.0)
+
+
 # What a record shows without a model.
 
 
@@ -153,6 +178,36 @@ def test_hum_is_noise() -> None:
     hum = 2.0 * MBAR * np.sin(2.0 * np.pi * 50.0 * samples["time_ns"] * 1e-9)
     samples["pressure"] += hum.astype(np.float32)
     assert read(samples).noise / MBAR == pytest.approx(2.0 / np.sqrt(2.0), rel=0.15)
+
+
+@pytest.mark.parametrize(("settles_s", "opened"), [(0.25, False), (0.01, True)])
+def test_a_system_that_still_settles_is_not_open(settles_s: float, opened: bool) -> None:
+    """In its last 40 ms it moves by less than noise."""
+    seconds = np.arange(700) * 1e-3
+    idle = 960.0 + 70.0 * np.exp(-seconds / settles_s)
+    cycle = np.concatenate([np.linspace(960.0, 300.0, 400), np.linspace(300.0, 1200.0, 100), idle])
+    commands = np.repeat([Command.SUCTION, Command.BLOW_OFF, 0], [400, 100, 700])
+    rows = np.zeros(6 * len(cycle), SAMPLE)
+    rows["time_ns"] = np.arange(len(rows)) * 1_000_000
+    rows["sequence"], rows["commands"] = np.arange(len(rows)), np.tile(commands, 6)
+    noise = np.random.default_rng(1).normal(0.0, 0.9, len(rows))
+    rows["pressure"] = (np.tile(cycle, 6) + noise) * MBAR
+    assert read(rows).opened == opened
+
+
+def test_the_record_shows_what_flows_back_once_suction_has_ended() -> None:
+    """Pause of 50 ms in which the pressure rises by 2 mbar/ms, from the 20th one on."""
+    pause = 300.0 + 2.0 * np.maximum(np.arange(50) - 20.0, 0.0)
+    fill, idle = np.linspace(360.0, 1000.0, 100), np.full(400, 1000.0)
+    cycle = np.concatenate([np.linspace(1000.0, 300.0, 400), pause, fill, idle])
+    commands = np.repeat([Command.SUCTION, 0, Command.BLOW_OFF, 0], [400, 50, 100, 400])
+    rows = np.zeros(6 * len(cycle), SAMPLE)
+    rows["time_ns"] = np.arange(len(rows)) * 1_000_000
+    rows["sequence"], rows["commands"] = np.arange(len(rows)), np.tile(commands, 6)
+    rows["pressure"] = np.tile(cycle, 6) * MBAR
+    assert read(rows).back_rate == pytest.approx(2.0, rel=0.02)  # 1/s of 1000 mbar
+    rows["commands"][rows["commands"] == 0] = Command.BLOW_OFF
+    assert np.isnan(read(rows).back_rate)
 
 
 def test_a_turn_needs_what_noise_does_not_make() -> None:

@@ -14,7 +14,7 @@ import pytest
 from drivers.plc.faults import parse_fault
 from drivers.plc.settings import PlcSettings
 from drivers.plc.simulate import blocks
-from tools import battery
+from tools import battery_first
 from tools.calibration_coverage import as_type, drawn, recorded, rig_of, shipped
 from twin.calibration.calibrate import calibrate
 from twin.config import Config
@@ -72,7 +72,7 @@ def test_a_log_whose_clock_begins_at_zero_is_told_in_seconds_since_its_beginning
 
 
 # Hidden where the twin's own physics are not looked at: in the simulated rig. More of them, with
-# sizes and courses by seed, are in tools/battery.py.
+# sizes and courses by seed, are in tools/battery_first.py.
 
 
 @pytest.mark.parametrize(
@@ -87,13 +87,9 @@ def test_a_log_whose_clock_begins_at_zero_is_told_in_seconds_since_its_beginning
     ],
 )
 def test_what_is_hidden_is_found(kind: str, seed: int) -> None:
-    tally = battery.Tally()
-    (line,) = battery.run(kind, range(seed, seed + 1), 1, tally)
-    found = (
-        "named" if kind == "single" else {"pair": "pairs", "healthy": "consistent"}.get(kind, kind)
-    )
-    assert tally.outcomes[found] == [True], line
-    assert not any(tally.outcomes.get("wrong", [])), line
+    case = battery_first.answered(kind, seed, 1)
+    assert case.found, (case.verdict, case.named, case.error)
+    assert not case.outcomes.get("wrong"), case.named
 
 
 def hummed(samples: Samples, seed: int) -> Samples:
@@ -107,13 +103,13 @@ def hummed(samples: Samples, seed: int) -> Samples:
 
 
 @cache
-def hummed_unit(name: str) -> battery.Unit:
+def hummed_unit(name: str) -> battery_first.Unit:
     """A unit that was calibrated on such a record."""
     document = shipped(name)
     plc, config = drawn(rig_of(document), 1000), as_type(document)
     found = calibrate(config, [hummed(recorded(plc, 6, 5000), 5000)], quiet)
     monitor = config.monitor.model_copy(update={"healthy": found.healthy})
-    return battery.Unit(name, plc, replace(config, data=found.fitted.data, monitor=monitor))
+    return battery_first.Unit(name, plc, replace(config, data=found.fitted.data, monitor=monitor))
 
 
 @pytest.mark.parametrize("seed", [90001, 90002])
@@ -232,7 +228,7 @@ def test_where_the_nozzle_goes_off_several_times_each_knee_is_off_by_itself(seed
 @pytest.mark.parametrize("flow", [4.0, 5.4])
 def test_a_valve_whose_closing_no_healthy_cycle_shows_is_nothing_unlisted(flow: float) -> None:
     """Suctions of a leaking gripper end with the nozzle on; healthy ones all end in a hold."""
-    unit = battery.unit("gripper", 1)
+    unit = battery_first.unit("gripper", 1)
     assert unit.config.data.ejector.response_off_ms - unit.plc.valves.suction_off_ms > 2.0
     log = recorded(unit.plc, 11, 7, [parse_fault(f"porous_leakage={flow}")])
     answer = diagnose(unit.config, [log], "log.mcap", quiet).json

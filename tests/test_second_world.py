@@ -385,6 +385,22 @@ def test_cups_with_backlash_yield_in_evacuation_and_stay_flat_in_the_hold():
     assert rise(faulty) > 1.05 * rise(healthy(rig))
 
 
+@pytest.mark.parametrize("course", ["constant", "step", "intermittent"])
+def test_volume_that_is_added_brings_its_gas_along(course):
+    """A hose that is connected is no piston: when it comes and goes the pressure stays."""
+    rig = saving()
+    size = {"volume": volume_share(rig, 0.3)}
+    on = records.plan_cycles(rig, SEED, 2)[1].suction_on
+    faulty = record(rig, SEED, 2, [Fault("added_volume", size, course, on * 1e-3, cycles=[1])])
+    clean, begins = healthy(rig), 0 if course == "constant" else on
+    moved = np.abs(faulty.truth.vessel_pressure - clean.truth.vessel_pressure)
+    assert moved[begins : begins + 3].max() < 0.5 * MBAR
+    assert (
+        evacuations(faulty, faulty.truth.vessel_pressure)[1]
+        > 1.1 * (evacuations(clean, clean.truth.vessel_pressure)[1])
+    )
+
+
 def test_a_sticking_valve_delays_some_strokes_and_only_these_cycles():
     rig = saving()
     clean, faulty = (

@@ -1,15 +1,18 @@
-"""What the battery writes: tables of its newest run, and a line for each older one."""
+"""What the battery writes: tables of its newest run in each world, a line for each older one."""
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import binomtest
 
-MOST_LEFT = 1.2  # sigmas, where explained
+from tools.battery_cases import FOUND, MOST_LEFT, Case, of_kind, spread
+
 MORE = 3  # kinds of answer told of an effect that was not named first
+WHOLE = ("gain",)  # each a share already
+WORST = "the worst phase"
 
 
 class Asked(NamedTuple):
@@ -21,118 +24,63 @@ class Asked(NamedTuple):
 
 
 ASKED = {
+    "commissioned": Asked("rigs commissioned without editing a number", 0.95),
+    "true": Asked("refused for a reason that is true of the record", 1.0),
+    "parameters": Asked("95 % interval covers a parameter, where the world has it", 0.90),
     "named": Asked("single effects named first or in a set of at most three", 0.95),
     "alone": Asked("named alone, no look-alike needed", 0.85),
-    "wrong": Asked("confidently wrong", 0.02, most=True),
+    "wrong": Asked("explained and wrong", 0.01, most=True),
     "course": Asked("the course right, where named", 0.90),
     "covered": Asked("95 % interval covers the size", 0.90),
+    "flows": Asked("95 % interval covers a flow or volume, the vessel's told a fifth off", 0.90),
     "left": Asked(f"leftover at most {MOST_LEFT} sigmas, where explained", 0.95),
     "gain": Asked("share of the achievable gain, mean, where explained", 0.90),
     "pairs": Asked("pairs, both named", 0.85),
-    "consistent": Asked("healthy records called consistent", 29.0 / 30.0),
+    "consistent": Asked("healthy records called consistent", 0.97),
     "unlisted": Asked("effects outside the table called unlisted", 0.85),
 }
-FOUND = {"single": "named", "pair": "pairs", "healthy": "consistent", "unlisted": "unlisted"}
 
 
-@dataclass(frozen=True)
-class Hidden:
-    """What is hidden in a log."""
-
-    effect: str
-    course: str
-    size: float  # what a ramp comes to
-
-    def __str__(self) -> str:
-        return f"{self.effect} {self.course} {self.size:.3g}"
+def kept(cases: Sequence[Case], name: str) -> bool:
+    """Whether what is asked for is reached."""
+    share, asked = float(np.mean(spread(cases, name))), ASKED[name]
+    return share <= asked.share if asked.most else share >= asked.share
 
 
-@dataclass(frozen=True)
-class Case:
-    """One log: where it is from, what is hidden, and the answer; None where there was an error."""
-
-    kind: str
-    seed: int
-    system: str
-    hidden: Sequence[Hidden]
-    answer: Mapping[str, Any] | None
-    found: bool
-
-    @property
-    def verdict(self) -> str:
-        """Verdict of the answer."""
-        return "error" if self.answer is None else str(self.answer["verdict"])
-
-    @property
-    def first(self) -> str | None:
-        """The effect that is named first."""
-        causes = self.answer["causes"] if self.answer else []
-        return causes[0]["effect"] if causes else None
-
-    @property
-    def alone(self) -> bool:
-        """Whether exactly one effect is named, with no look-alike."""
-        causes = self.answer["causes"] if self.answer else []
-        return len(causes) == 1 and not causes[0]["not_separable_from"]
-
-    @property
-    def left(self) -> float:
-        """Sigmas that the answer leaves; NaN without one."""
-        left = self.answer["extended"]["leftover_sigma"] if self.answer else None
-        return float("nan") if left is None else float(left)
-
-    @property
-    def named(self) -> str:
-        """The causes of the answer, with course, size and look-alikes."""
-        causes = self.answer["causes"] if self.answer else []
-        return " + ".join(
-            f"{one['effect']} {one['course']} "
-            + ", ".join(f"{p.get('at_end', p['value'])}" for p in one["parameters"].values())
-            + "".join(f" ~{other}" for other in one["not_separable_from"])
-            for one in causes
-        )
+def all_kept(cases: Sequence[Case]) -> bool:
+    """Whether all that is asked for is reached."""
+    return all(kept(cases, name) for name in ASKED if spread(cases, name))
 
 
-@dataclass
-class Tally:
-    """Outcomes so far, by what is asked for, and the cases."""
-
-    outcomes: dict[str, list[float]] = field(default_factory=dict)
-    cases: list[Case] = field(default_factory=list)
-
-    def count(self, **outcomes: float | None) -> None:
-        """Count what applies to a case."""
-        for name, outcome in outcomes.items():
-            if outcome is not None:
-                self.outcomes.setdefault(name, []).append(outcome)
-
-    def kept(self, name: str) -> bool:
-        """Whether what is asked for is reached."""
-        share, asked = float(np.mean(self.outcomes[name])), ASKED[name]
-        return share <= asked.share if asked.most else share >= asked.share
-
-    @property
-    def all_kept(self) -> bool:
-        """Whether all that is asked for is reached."""
-        return all(map(self.kept, self.outcomes))
+def likely(cases: Sequence[Case], name: str) -> float:
+    """How likely so bad a count is by chance where what is asked for holds just so."""
+    outcomes, asked = spread(cases, name), ASKED[name]
+    side = "greater" if asked.most else "less"
+    return float(binomtest(round(sum(outcomes)), len(outcomes), asked.share, side).pvalue)
 
 
-def summary(tally: Tally, when: str, commit: str) -> str:
+def summary(world: str, cases: Sequence[Case], when: str, commit: str) -> str:
     """The run in one line: when, of which commit, on which seeds, and what was found."""
-    seeds = [one.seed for one in tally.cases]
-    kinds = [kind for kind, name in FOUND.items() if name in tally.outcomes]
-    found = (
-        f"{sum(tally.outcomes[FOUND[kind]]):.0f} of {len(tally.outcomes[FOUND[kind]])} {kind}"
-        for kind in kinds
+    seeds = [one.seed for one in cases]
+    found = []
+    for kind, name in FOUND.items():
+        if outcomes := spread(cases, name):
+            found.append(f"{sum(outcomes):.0f} of {len(outcomes)} {_PLURAL.get(kind, kind)}")
+    return (
+        f"{when}, {world} world, commit {commit}, seeds {min(seeds)} to {max(seeds)}:"
+        f" found {', '.join(found)}."
     )
-    return f"{when}, commit {commit}, seeds {min(seeds)} to {max(seeds)}: found {', '.join(found)}."
 
 
-def tables(tally: Tally) -> str:
+_PLURAL = {"commissioning": "commissioned"}
+
+
+def tables(cases: Sequence[Case]) -> str:
     """What was reached, what was named for what, and what was not found, in Markdown."""
     parts = [
-        _table(("what", "reached", "asked for", "kept"), _figures(tally)),
-        _table(
+        table(("what", "reached", "by chance", "asked for", "kept"), _figures(cases)),
+        *commissionings(list(of_kind(cases, "commissioning"))),
+        table(
             (
                 "hidden",
                 "cases",
@@ -142,21 +90,34 @@ def tables(tally: Tally) -> str:
                 "explained",
                 "most left",
             ),
-            _effects([one for one in tally.cases if one.kind == "single"]),
+            _effects(list(of_kind(cases, "single"))),
         ),
-        _table(
+        table(
             ("not found", "seed", "system", "hidden", "verdict", "named", "sigmas left"),
-            _missed([one for one in tally.cases if not one.found]),
+            _missed([one for one in cases if not one.found and one.kind != "commissioning"]),
         ),
+        table(("processor time of", "cases", "median", "95 %", "most"), _seconds(cases)),
     ]
     return "\n\n".join(filter(None, parts))
 
 
-def with_run(page: str, line: str, run: str) -> str:
-    """The page with a new run; the line of the one that it replaces goes to the older ones."""
-    newest, older = _marked("newest run", page), _marked("older runs", page)
+def commissionings(cases: Sequence[Case]) -> Iterator[str]:
+    """Verdicts by kind of rig, what is left by phase, parameters, and reasons of refusals."""
+    yield table(("rigs", "drawn", "good", "usable", "refused", "error"), _verdicts(cases))
+    yield table(("left over floor", "rigs", "median", "90 %", "most"), _phases(cases))
+    yield table(
+        ("parameter", "rigs", "95 % interval holds it", "off, median", "interval, median"),
+        _parameters(cases),
+    )
+    yield table(("not commissioned because", "rigs", "true", "seeds"), _reasons(cases))
+
+
+def with_run(page: str, world: str, line: str, run: str) -> str:
+    """The page with a world's new run; the line of the one that it replaces goes to the older."""
+    newest, older = _marked(f"newest run of the {world} world", page), _marked("older runs", page)
     before = newest[2].strip().split("\n", 1)[0].strip("*")
-    page = page.replace(older[0], f"{older[1]}- {before}\n{older[2]}{older[3]}")
+    if before:
+        page = page.replace(older[0], f"{older[1]}- {before}\n{older[2]}{older[3]}")
     return page.replace(newest[0], f"{newest[1]}**{line}**\n\n{run}\n{newest[3]}")
 
 
@@ -167,15 +128,85 @@ def _marked(name: str, page: str) -> re.Match[str]:
     return found
 
 
-def _figures(tally: Tally) -> Iterator[Sequence[str]]:
+def _figures(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
     for name, asked in ASKED.items():
-        if outcomes := tally.outcomes.get(name):
-            share = f"{np.mean(outcomes):.0%}"
-            whole = name == "gain"  # each a share already
-            reached = share if whole else f"{sum(outcomes):.0f} of {len(outcomes)} ({share})"
+        if outcomes := spread(cases, name):
+            count, share = len(outcomes), f"{np.mean(outcomes):.0%}"
+            reached, chance = share, "–"
+            if name not in WHOLE:
+                reached = f"{sum(outcomes):.0f} of {count} ({share})"
+                ends = binomtest(round(sum(outcomes)), count).proportion_ci(0.95)
+                chance = f"{ends.low:.0%} to {ends.high:.0%}"
             word = "at most" if asked.most else "at least"
-            kept = "yes" if tally.kept(name) else "**no**"
-            yield asked.words, reached, f"{word} {asked.share:.0%}", kept
+            yes = "yes" if kept(cases, name) else "**no**"
+            yield asked.words, reached, chance, f"{word} {asked.share:.0%}", yes
+
+
+def _verdicts(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
+    names = ("good", "usable", "refused", "error")
+    for system in [*dict.fromkeys(sorted(one.system for one in cases)), ""]:
+        mine = [one for one in cases if one.system == system or not system]
+        counts = Counter(one.verdict for one in mine)
+        if mine:
+            yield system or "all", str(len(mine)), *(str(counts[name] or "–") for name in names)
+
+
+def _phases(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
+    left: dict[str, list[float]] = {}
+    for one in cases:
+        residuals = one.answer["residual"] if one.answer else {}
+        times = {phase: each["times"] for phase, each in residuals.items()}
+        for phase, each in times.items():
+            left.setdefault(phase, []).append(each)
+        if times:
+            left.setdefault(WORST, []).append(max(times.values()))
+    for phase in [name for name in left if name != WORST] + [WORST] * (WORST in left):
+        yield phase, str(len(left[phase])), *_quantiles(left[phase], "{:.2f}")
+
+
+def _quantiles(values: Sequence[float], form: str) -> Iterator[str]:
+    return (form.format(one) for one in (*np.quantile(values, (0.5, 0.9)), max(values)))
+
+
+def _parameters(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
+    found: dict[str, list[Mapping[str, float]]] = {}
+    for one in cases:
+        if one.found and one.answer is not None:
+            for name, each in one.answer["covered"].items():
+                found.setdefault(name, []).append(each)
+    for name, rigs in found.items():
+        held = sum(one["holds"] for one in rigs)
+        off = np.median([abs(one["value"] / one["true"] - 1.0) for one in rigs])
+        half = np.median([(one["high95"] - one["low95"]) / 2.0 / abs(one["value"]) for one in rigs])
+        yield f"`{name}`", str(len(rigs)), str(held), f"{off:.0%}", f"±{half:.0%}"
+
+
+def _reasons(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
+    for reason, mine in _grouped(cases, _reason):
+        true = {one.outcomes.get("true") for one in mine}
+        word = "yes" if true == {True} else "**no**" if true == {False} else "some"
+        yield reason, str(len(mine)), word, ", ".join(str(one.seed) for one in mine)
+
+
+def _reason(case: Case) -> str | None:
+    """Why a rig has no twin, numbers left out."""
+    if case.found:
+        return None
+    if case.answer is not None:
+        phases = case.answer["residual"]
+        worst = max(phases, key=lambda phase: phases[phase]["times"])
+        return f"refused: the twin is off by more than its cycles differ, most in {worst}"
+    return re.sub(r"\d+(\.\d+)?", "…", case.error.strip().splitlines()[-1]).replace("|", "/")
+
+
+def _grouped(
+    cases: Sequence[Case], of: Callable[[Case], str | None]
+) -> list[tuple[str, list[Case]]]:
+    groups: dict[str, list[Case]] = {}
+    for one in cases:
+        if (name := of(one)) is not None:
+            groups.setdefault(name, []).append(one)
+    return sorted(groups.items(), key=lambda group: -len(group[1]))
 
 
 def _effects(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
@@ -197,7 +228,14 @@ def _missed(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
         yield one.kind, str(one.seed), one.system, hidden, one.verdict, one.named or "–", left
 
 
-def _table(heads: Sequence[str], rows: Iterator[Sequence[str]]) -> str:
+def _seconds(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
+    for kind in FOUND:
+        if spent := [one.seconds for one in of_kind(cases, kind)]:
+            middle, high = np.quantile(spent, (0.5, 0.95))
+            yield kind, str(len(spent)), f"{middle:.1f} s", f"{high:.1f} s", f"{max(spent):.1f} s"
+
+
+def table(heads: Sequence[str], rows: Iterator[Sequence[str]]) -> str:
     """A table, or nothing where it has no row."""
     lines = [" | ".join(row) for row in rows]
     head = [" | ".join(heads), " | ".join("---" for _ in heads)]

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from drivers.plc.faults import parse_fault
-from tools.battery import ON_GRIPPER, SIGNED, SIZES
+from tools.battery_first import ON_GRIPPER, SIGNED, SIZES
 from tools.calibration_coverage import SYSTEMS, drawn, recorded, rig_of, shipped
 from twin.config import Config
 from twin.live import Twin

@@ -360,8 +360,23 @@ def shut(pressure, softness):
 
 
 @compiled
+def add_volume(rest, gas, size):
+    """What is added or taken away holds gas as the rest of the vessel does: nothing expands."""
+    last = gas.pressure.size - 1
+    share = (size[_ADDED] - rest.added) / gas.volume[last]
+    if share == 0.0:
+        return
+    rest.mass_in += share * gas.mass[last]
+    rest.energy_in += share * gas.energy[last]
+    for held in (gas.mass, gas.energy, gas.volume):
+        held[last] *= 1.0 + share
+    rest.added = size[_ADDED]
+
+
+@compiled
 def yield_cups(plant, rest, gas, size, dt):
     """Cups change the vessel's volume; the gas does the work."""
+    add_volume(rest, gas, size)
     last = gas.pressure.size - 1
     vacuum = rest.ambient - gas.pressure[last]
     rest.cup_held = min(max(rest.cup_held, vacuum - plant.cup_play), vacuum + plant.cup_play)

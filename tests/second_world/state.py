@@ -32,6 +32,7 @@ REST = np.dtype(
             "valve_lagged",
             "blow_valve",
             "volume",
+            "added",
             "cup_held",
             "cup_shut",
             "backlash_held",

@@ -183,6 +183,9 @@ def guessed(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:
         ejector["blow_off_sl_min"] = float(np.clip(blow_off, 1.0, 2000.0))
         ejector["exhaust_sl_min"] = ejector["blow_off_sl_min"]
         ejector["relief_sl_min"] = 0.3 * ejector["blow_off_sl_min"]
+    back = readings.back_flow(_volume(data), ambient * MBAR, ROOM_TEMPERATURE) / SL_MIN
+    if np.isfinite(back):
+        ejector["back_flow_sl_min"] = float(np.clip(back, 0.0, 2000.0))
     return DataSet.model_validate(tables), remarks
 
 

@@ -7,7 +7,7 @@ model's own error leave of it. All derivatives come from one run of the bank of 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -27,8 +27,17 @@ FIRST_SHARE = 0.4  # of the log, for the first round: it has the longest way to 
 DETERMINED = 0.5  # of what the type leaves open: what is known better comes from the log
 SWITCHING = 6.0  # rows, one standard deviation of when the nozzle switched
 STEP = 0.05  # of a parameter's sigma, for derivatives
+RISING = 40  # steps over the characteristic, in which suction is looked at
+BENDS = ("bulge", "skew", "bend_2", "bend_3")
 
 Floats = npt.NDArray[np.float64]
+
+
+class Loss(Protocol):
+    """What a squared residual costs, with two derivatives: (3, residuals), as scipy has it."""
+
+    def __call__(self, squares: Floats, /, *, cost_only: bool | None = None) -> Floats:
+        """The cost of each; scipy asks for the cost alone by keyword, and takes all."""
 
 
 @dataclass(frozen=True)
@@ -106,8 +115,21 @@ class Problem:
 
 def _rising(data: DataSet) -> Floats:
     """Penalty (sigmas) where suction would rise with vacuum: no ejector's does."""
-    steps = np.diff(data.ejector.share(np.linspace(0.0, 1.0, 41)))
+    steps = np.diff(data.ejector.share(np.linspace(0.0, 1.0, RISING + 1)))
     return np.minimum(steps, 0.0) / (0.1 * RIPPLE)
+
+
+def falling(data: DataSet) -> DataSet:
+    """``data`` with its characteristic bent no further than suction falls with vacuum.
+
+    The penalty keeps a fit nearly there; a data set must be there.
+    """
+    x = np.linspace(0.0, 1.0, 101)
+    straight, steps = np.diff(x), np.diff(data.ejector.share(x))
+    back = steps < 0.0
+    share = float(np.min(straight[back] / (straight - steps)[back], initial=1.0))
+    bends = {name: share * getattr(data.ejector, name) for name in BENDS}
+    return data.model_copy(update={"ejector": data.ejector.model_copy(update=bends)})
 
 
 @dataclass(frozen=True)
@@ -200,7 +222,7 @@ def _followed(samples: Samples, start: _Start, one: Round, noise: float) -> _Sta
     cycles = Cycles.found(samples, start.data)
     problem = Problem(start.space, cycles, plain(cycles, noise, one.error))
     # The last coordinate is how much sooner the nozzle switches than it was seen to.
-    x = _solved(problem, np.append(start.x, 0.0), one.steps, one.tolerance, "soft_l1")
+    x = _solved(problem, np.append(start.x, 0.0), one.steps, one.tolerance, soft(problem.weights))
     cost = float(np.sum(np.log1p(problem.residual(x) ** 2)))
     return _Start(start.space, x[:-1], cost)
 
@@ -210,7 +232,7 @@ def _solved(
     x: Floats,
     steps: int,
     tolerance: float,
-    loss: Literal["linear", "soft_l1"] = "linear",
+    loss: Loss | Literal["linear"] = "linear",
 ) -> Floats:
     found = least_squares(
         problem.residual,
@@ -226,10 +248,27 @@ def _solved(
     return best
 
 
+def soft(weights: Weights) -> Loss:
+    """Loss that grows linearly beyond ROBUST, but for a characteristic that rises.
+
+    Soft, that bound would give way to any misfit.
+    """
+    bins = sum(len(here) for here, _ in weights.parts)
+    bound = slice(bins, bins + RISING)
+
+    def loss(squares: Floats, /, *, cost_only: bool | None = None) -> Floats:
+        soft = 1.0 + squares
+        rho = np.stack([2.0 * (np.sqrt(soft) - 1.0), soft**-0.5, -0.5 * soft**-1.5])
+        rho[:, bound] = squares[bound], np.ones(RISING), np.zeros(RISING)
+        return rho
+
+    return loss
+
+
 def _fitted(problem: Problem, x: Floats) -> Fitted:
     """What the fit found at ``x``, and how sure it is."""
     space, cycles = problem.space, problem.cycles
-    best = DataSet.model_validate(space.at(x).model_dump())
+    best = DataSet.model_validate(falling(space.at(x)).model_dump())
     ways = space.slopes(x)
     off = cycles.off(np.stack(with_left_out(best), axis=1))
     jacobian = problem.jacobian(x)

@@ -25,10 +25,12 @@ CLEAR = 6.0  # sigmas of the smoothed pressure that make a turn
 LEAST_TURN = 1.5 * MBAR  # Pa
 EDGE_MS = 30.0  # after a command, in which a turn is still the valve's delay
 DEEP = 0.3  # of the way down, from the lowest, in which the nozzle may go off
+STEEP_MS, BACK_MS = 10.0, 200.0  # what flows back without a check valve does so at once
 LEAST_VACUUM = 20.0 * MBAR  # Pa
 MOST_SUCTIONS = 0.5  # of all suctions must turn for an ejector that saves air
-OPENED_MS = 40.0  # at the end of an idle, over which an opened system stands at ambient
-STILL = 3.0  # sigmas by which the pressure of an opened system may still move in them
+OPENED_MS = 40.0  # at the end of an idle, in which an opened system stands at ambient
+OPENED_FROM = 2.0 / 3.0  # of an idle, from where on it does
+STILL = 3.0  # sigmas by which the pressure of an opened system may still move in that time
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,7 @@ class Readings:
     tells_blow_off: bool  # in any row
     fill_rate: float  # 1/s, dp/dt over ambient as blow-off begins
     draw_rate: float  # 1/s, −dp/dt over pressure as suction begins
+    back_rate: float  # 1/s, dp/dt over ambient at its steepest after suction, nothing commanded
 
     @property
     def least_vacuum(self) -> float:
@@ -78,6 +81,10 @@ class Readings:
     def blow_off(self, volume: float, ambient: float, temperature: float) -> float:
         """Blow-off flow (kg/s) that fills ``volume`` (m³) as fast as the record shows."""
         return flow_behind(self.fill_rate, volume, ambient, temperature)
+
+    def back_flow(self, volume: float, ambient: float, temperature: float) -> float:
+        """Flow (kg/s) that fills ``volume`` (m³) as fast as it fills once suction has ended."""
+        return flow_behind(self.back_rate, volume, ambient, temperature)
 
 
 def read(samples: Samples) -> Readings:
@@ -122,6 +129,7 @@ def read(samples: Samples) -> Readings:
         tells_blow_off=any(one.command == Command.BLOW_OFF for one in found),
         fill_rate=_fill_rate(pressure, found, period, idle),
         draw_rate=_draw_rate(pressure, suctions, period),
+        back_rate=_back_rate(pressure, found, period, idle),
     )
 
 
@@ -183,18 +191,22 @@ def _step(pressure: Floats) -> float:
 
 
 def _idle(pressure: Floats, found: list[Stretch], rows: int, noise: float) -> tuple[float, bool]:
-    """What idles end at, and whether each stands still there, all at one pressure."""
-    ends = [
-        pressure[one.last - rows : one.last]
-        for one in found[1:]
-        if one.command == 0 and one.last - one.first >= 2 * rows
-    ]
-    if not ends:
+    """What idles end at, and whether each stands still there, all at one pressure.
+
+    A closed system that settles slowly moves too little in its last milliseconds to be told from
+    one that is open, but more since some time ago.
+    """
+    idles = [one for one in found[1:] if one.command == 0 and one.last - one.first >= 2 * rows]
+    if not idles:
         return float("nan"), False
-    half = rows // 2
-    moves = [abs(end[half:].mean() - end[:half].mean()) for end in ends]
-    levels = np.array([end.mean() for end in ends])
-    still = STILL * noise * np.sqrt(2.0 / max(half, 1)) + 0.1 * MBAR
+    half = max(rows // 2, 1)
+    moves, levels = [], np.empty(len(idles))
+    for number, one in enumerate(idles):
+        since = one.first + int(OPENED_FROM * (one.last - one.first))
+        early = pressure[min(since, one.last - 2 * half) :][:half]
+        moves.append(abs(pressure[one.last - half : one.last].mean() - early.mean()))
+        levels[number] = pressure[one.last - rows : one.last].mean()
+    still = STILL * noise * np.sqrt(2.0 / half) + 0.1 * MBAR
     opened = bool(np.median(moves) < still and np.ptp(levels) < 2.0 * MBAR + 4.0 * noise)
     return float(np.median(levels)), opened
 
@@ -232,6 +244,18 @@ def _fill_rate(pressure: Floats, found: list[Stretch], period: float, ambient: f
             if len(ended) and ended[0] > begun[0]:
                 rise = part[ended[0]] - part[begun[0]]
                 rates.append(rise / ((ended[0] - begun[0]) * period) / top)
+    return _median(rates)
+
+
+def _back_rate(pressure: Floats, found: list[Stretch], period: float, ambient: float) -> float:
+    """dp/dt over ambient (1/s), over STEEP_MS at its steepest soon after suction."""
+    width, rows = max(round(STEEP_MS * MS / period), 2), round(BACK_MS * MS / period)
+    rates = []
+    for before, one in pairwise(found):
+        part = pressure[one.first : min(one.last, one.first + rows)]
+        if before.command == Command.SUCTION and one.command == 0 and len(part) > width:
+            rise = float(np.max(part[width:] - part[:-width]))
+            rates.append(rise / (width * period) / ambient)
     return _median(rates)
 
 

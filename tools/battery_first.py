@@ -1,0 +1,148 @@
+"""Cases of the first world: the rigs behind the simulated PLC, about the shipped configurations.
+
+Each case has a rig of its own (true values about those of a shipped configuration), calibrated on a
+healthy record of its own; then effect, course and size are drawn.
+"""
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+
+from drivers.plc.faults import Fault, parse_fault
+from drivers.plc.settings import PlcSettings
+from tools.battery_cases import Case, Hidden
+from tools.calibration_coverage import SYSTEMS, as_type, drawn, recorded, rig_of, shipped
+from twin.calibration.calibrate import calibrate
+from twin.config import Config
+from twin.diagnosis.answer import diagnose
+from twin.errors import TwinError
+from twin.signals import MS, Samples
+
+NAME = "first"
+CYCLES = 12
+# Sizes from just isolable to gross, in the unit of the effect's parameter; drawn evenly in their
+# logarithm. The gripper's volume is a sixth of the tank's, its wall takes up less heat.
+SIZES = {
+    "leakage": (0.4, 8.0),
+    "porous_leakage": (0.4, 6.0),
+    "check_valve_leak": (0.5, 5.0),
+    "suction_loss": (3.0, 30.0),
+    "end_vacuum_loss": (10.0, 60.0),
+    "supply_pressure_drop": (0.25, 1.5),
+    "filter_clogging": (15.0, 150.0),
+    "added_volume": (15.0, 200.0),
+    "cup_compliance": (10.0, 80.0),
+    "heat_exchange": (14.0, 25.0),
+    "response_delay": (4.0, 40.0),
+    "slow_ramp_up": (8.0, 50.0),
+    "threshold_drift": (5.0, 40.0),
+    "weak_blow_off": (6.0, 50.0),
+    "blow_off_delay": (4.0, 40.0),
+    "sensor_offset": (3.0, 30.0),
+    "sensor_gain": (0.8, 6.0),
+    "sensor_lag": (5.0, 40.0),
+    "ambient_pressure": (6.0, 40.0),
+}
+ON_GRIPPER = {
+    "added_volume": (8.0, 60.0),
+    "cup_compliance": (10.0, 50.0),
+    "heat_exchange": (25.0, 50.0),
+}
+SIGNED = {"threshold_drift", "sensor_offset", "sensor_gain"}
+NEGATIVE = {"ambient_pressure"}
+UNLISTED = {
+    "lip_lift": (1.5, 8.0),
+    "supply_swing": (0.4, 1.5),
+    "condensate": (3.0, 12.0),
+    "nozzle_icing": (10.0, 50.0),
+    "sensor_backlash": (10.0, 50.0),
+}
+COURSES = {"constant": 0.4, "step": 0.25, "ramp": 0.15, "intermittent": 0.2}
+COUNTS = {"single": 152, "pair": 20, "healthy": 30, "unlisted": 20}
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One rig, and its calibrated configuration."""
+
+    name: str
+    plc: PlcSettings
+    config: Config
+
+
+@cache
+def unit(name: str, seed: int) -> Unit:
+    """A rig with true values of its own, calibrated on its own healthy record."""
+    document = shipped(name)
+    plc, config = drawn(rig_of(document), 1000 + seed), as_type(document)
+    found = calibrate(config, [recorded(plc, 10, 5000 + seed)], _quiet)
+    monitor = config.monitor.model_copy(update={"healthy": found.healthy})
+    return Unit(name, plc, replace(config, data=found.fitted.data, monitor=monitor))
+
+
+def _quiet(_what: str) -> None:
+    """Take progress and say nothing."""
+
+
+def draw_size(rng: np.random.Generator, name: str, effect: str, least: float = 0.0) -> float:
+    """Size of an effect on a system; ``least`` is the share of its range to begin at."""
+    table = {**SIZES, **(ON_GRIPPER if name == "gripper" else {}), **UNLISTED}
+    low, high = (math.log(one) for one in table[effect])
+    size = math.exp(rng.uniform(low + least * (high - low), high))
+    down = effect in NEGATIVE or (effect in SIGNED and rng.random() < 0.5)
+    return -size if down else size
+
+
+def fault(rng: np.random.Generator, plc: PlcSettings, hidden: Hidden) -> Fault:
+    """The rig's fault for what is hidden; when and in which cycles is drawn."""
+    program = plc.program
+    cycle = (program.suction_ms + program.blow_off_ms + program.idle_ms) * MS
+    text = f"{hidden.effect}={hidden.size:.4f}"
+    if hidden.course == "step":
+        text += f"@{0.5 + cycle * rng.uniform(4.0, 8.0):.2f}"
+    elif hidden.course == "ramp":
+        text += f"/ramp:{0.5 + CYCLES * cycle:.1f}"
+    elif hidden.course == "intermittent":
+        text += f"/share:{rng.uniform(0.35, 0.65):.2f}"
+    return parse_fault(text)
+
+
+def drawn_case(kind: str, seed: int, units: int) -> tuple[Unit, list[Hidden], Samples]:
+    """A unit, what is hidden, and the log."""
+    rng = np.random.default_rng([2026, seed, sorted(COUNTS).index(kind)])
+    name = SYSTEMS[int(rng.integers(len(SYSTEMS)))]
+    one = unit(name, int(rng.integers(units)))
+    hidden: list[Hidden] = []
+    if kind == "single":
+        effect = list(SIZES)[seed % len(SIZES)]
+        course = str(rng.choice(list(COURSES), p=list(COURSES.values())))
+        hidden = [Hidden(effect, course, draw_size(rng, name, effect))]
+    elif kind == "pair":
+        two = rng.choice(list(SIZES), 2, replace=False)
+        hidden = [Hidden(str(e), "constant", draw_size(rng, name, str(e), 0.4)) for e in two]
+    elif kind == "unlisted":
+        effect = list(UNLISTED)[seed % len(UNLISTED)]
+        hidden = [Hidden(effect, "constant", draw_size(rng, name, effect))]
+    faults = [fault(rng, one.plc, what) for what in hidden]
+    return one, hidden, recorded(one.plc, CYCLES - 1, int(rng.integers(1 << 30)), faults)
+
+
+def answered(kind: str, seed: int, units: int) -> Case:
+    """Draw a case of a kind and diagnose it."""
+    one, hidden, samples = drawn_case(kind, seed, units)
+    begin, answer, error = time.process_time(), None, ""
+    try:
+        answer = diagnose(one.config, [samples], "battery", _quiet).json
+    except TwinError as refusal:
+        error = str(refusal)
+    spent = round(time.process_time() - begin, 2)
+    return Case(kind, seed, one.name, hidden, answer, error=error, seconds=spent)
+
+
+def keys(first: int, counts: dict[str, int]) -> Iterator[tuple[str, int]]:
+    """Kind and seed of each case of a run."""
+    return ((kind, seed) for kind, many in counts.items() for seed in range(first, first + many))
