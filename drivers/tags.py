@@ -13,7 +13,7 @@ import numpy.typing as npt
 from pydantic import BeforeValidator, Field, model_validator
 
 from twin.settings import Settings
-from twin.signals import BAR, MBAR, SL_MIN, UNUSABLE, Quality
+from twin.signals import BAR, MBAR, SL_MIN, UNUSABLE, ZERO_C, Quality
 
 Words = npt.NDArray[np.uint16]
 Floats = npt.NDArray[np.float64]
@@ -34,7 +34,6 @@ CODE: dict[Type, str] = {  # as NumPy reads it once the high word stands first
     "uint32": ">u4",
     "float32": ">f4",
 }
-ZERO_C = 273.15  # K
 # kg/s in one litre a minute of air: standard as ISO 8778 has it, normal as DIN 1343 (0 °C, 1013.25
 # mbar, 1.2928 kg/m³).
 MASS_FLOW = {"sl/min": SL_MIN, "Nl/min": 1.2928e-3 / 60.0}

@@ -21,7 +21,7 @@ from twin.monitor.phases import Found, Knees, PhaseFinder
 from twin.monitor.signatures import steps
 from twin.signals import MBAR, SAMPLE, TICK, Samples, Ticks
 
-REPLAYED = 40_000  # rows that a replay takes at once: what is done to many cycles stays in caches
+REPLAYED = 60_000  # rows that a replay takes at once: what is done to many cycles stays in caches
 
 
 class Sink(Protocol):

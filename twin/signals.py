@@ -14,6 +14,7 @@ MBAR = 100.0  # Pa
 BAR = 1e5  # Pa
 MS = 1e-3  # s
 NS = 1e-9  # s
+ZERO_C = 273.15  # K
 ML = 1e-6  # m³
 STANDARD_DENSITY = 1.185  # kg/m³ at 100 kPa, 20 °C, 65 % relative humidity (ISO 8778)
 SL_MIN = STANDARD_DENSITY * 1e-3 / 60.0  # kg/s in one standard litre per minute
