@@ -65,8 +65,8 @@ def test_what_is_reported_comes_back_to_the_bit(tmp_path: Path, suffix: str) -> 
     samples = np.concatenate(list(blocks(told, 4.0)))
     for column in ("ambient", "temperature", "pressure_2", "flow"):
         samples[column][100:200] = 0.0
-    samples["reported"][300:400] &= Reported.FLOW_KNOWN  # the rest is not known
-    samples["reported"][100:200] &= Reported.NOZZLE_KNOWN | Reported.NOZZLE
+    samples["reported"][300:400] &= np.uint8(Reported.FLOW_KNOWN)  # the rest is not known
+    samples["reported"][100:200] &= np.uint8(Reported.NOZZLE_KNOWN | Reported.NOZZLE)
     ticks = np.zeros(len(samples), TICK)
     with Recorder(tmp_path / "a.mcap", HEADER) as recorder:
         recorder.write(samples, ticks)

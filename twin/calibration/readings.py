@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.figures.curve import flow_behind
-from twin.signals import MBAR, MS, NS, UNUSABLE, Command, Samples
+from twin.monitor.nozzle import reports_nozzle, told_edges
+from twin.signals import MBAR, MS, NS, UNUSABLE, Command, Reported, Samples
 
 Floats = npt.NDArray[np.float64]
 
@@ -96,12 +97,17 @@ def read(samples: Samples) -> Readings:
     turn = max(CLEAR * noise / np.sqrt(width), LEAST_TURN)
     suctions = [one for one in found if one.command == Command.SUCTION]
     offs, ons, switches = [], [], 0
+    told = reports_nozzle(rows["reported"][rows["commands"] == Command.SUCTION])
+    nozzle = (rows["reported"] & np.uint8(Reported.NOZZLE)) != 0
     for one in suctions:
         smooth = _smoothed(pressure[one.first : one.last], width)[edge:]
         lows, highs = deep(smooth, *turns(smooth, turn))
         offs += list(smooth[lows])
         ons += list(smooth[highs])
-        switches += len(lows) > 0
+        edges = [one.first + row for row in told_edges(nozzle[one.first : one.last])]
+        switches += len(edges if told else lows) > 0
+        if told and not lows:  # it holds so well that the pressure does not turn
+            offs += list(pressure[edges[:1]])
     idle, opened = _idle(pressure, found, round(OPENED_MS * MS / period), noise)
     return Readings(
         period=period,
