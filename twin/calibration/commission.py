@@ -15,6 +15,7 @@ from twin.calibration.calibrate import (
     MOST_FITTED,
     Calibration,
     complete,
+    contradictions,
     like_these,
     refuse_insufficient,
     scatter,
@@ -28,7 +29,8 @@ from twin.errors import ConfigError
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.model.system import Cups, volume
-from twin.signals import MBAR, ML, MS, SAMPLE, SL_MIN, Command, Samples
+from twin.monitor.reports import Contradiction
+from twin.signals import MBAR, ML, MS, SAMPLE, SL_MIN, Command, Reported, Samples
 
 SLOWEST = 2.05 * MS  # s between rows; what switches faster than a few rows is not seen
 MOST_MISSING = 0.2  # share of rows
@@ -55,6 +57,7 @@ class Commissioned:
     readings: Readings
     verdict: Verdict
     remarks: tuple[Remark, ...]
+    contradictions: tuple[Contradiction, ...]  # of what is reported and the pressure
     samples: Samples  # that the twin was judged on
 
     @property
@@ -81,6 +84,13 @@ def commission(
     guess, remarks = guessed(config.data, readings)
     before = complete(guess, samples)
     refuse_insufficient(samples, before)
+    against = contradictions(before, guess)
+    if any(one.signal == "nozzle" for one in against):
+        progress("the nozzle is not as reported: reading the pressure alone")
+        samples = unreported(samples)
+        readings = read(samples)
+        guess, remarks = guessed(config.data, readings)
+        before = complete(guess, samples)
     samples = samples[samples["time_ns"] <= before[-1].end_ns]
     used = samples[samples["time_ns"] <= before[:MOST_FITTED][-1].end_ns]
     fitted = _fit(used, starts(guess), progress)
@@ -91,7 +101,14 @@ def commission(
     healthy = like_these(known, fitted, scatter(fitted.data, cycles), samples)
     times = samples["host_ns"]
     calibration = Calibration(fitted, healthy, len(cycles), int(times[0]), int(times[-1]))
-    return Commissioned(calibration, readings, verdict, tuple(remarks), samples)
+    return Commissioned(calibration, readings, verdict, tuple(remarks), tuple(against), samples)
+
+
+def unreported(samples: Samples) -> Samples:
+    """The same as if nobody had reported the nozzle."""
+    samples = samples.copy()
+    samples["reported"] &= ~np.uint8(Reported.NOZZLE_KNOWN | Reported.NOZZLE)
+    return samples
 
 
 def refuse_empty(samples: Samples) -> None:
@@ -159,6 +176,7 @@ def guessed(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:
             )
             remarks.append(Remark(text, '[data.ejector] air_saving = "off"'))
         ejector["air_saving"] = "off"
+        remarks += _part_present(ejector, readings, ambient)
     else:
         ejector["air_saving"] = "on" if ejector["air_saving"] == "off" else ejector["air_saving"]
         remarks += _thresholds(ejector, readings, ambient)
@@ -209,11 +227,24 @@ def _thresholds(ejector: dict[str, float], readings: Readings, ambient: float) -
             )
             line = f"[data.ejector] h1_hysteresis_mbar = {hysteresis:g}"
             remarks.append(Remark(text, line))
+    remarks += _part_present(ejector, readings, ambient)
     h2 = min(ejector["h2_mbar"], h1 - hysteresis)
     if h2 <= ejector["h2_hysteresis_mbar"]:
         hysteresis, h2 = h1 / 5.0, h1 / 2.0
     ejector.update(h1_mbar=h1, h1_hysteresis_mbar=hysteresis, h2_mbar=h2)
     return remarks
+
+
+def _part_present(ejector: dict[str, float], readings: Readings, ambient: float) -> list[Remark]:
+    """Set H2 to where the ejector itself says that the part is there, if it says so."""
+    if not np.isfinite(readings.part):
+        return []
+    h2, before = round(ambient - readings.part / MBAR), ejector["h2_mbar"]
+    if abs(h2 - before) <= CLEARLY + readings.part_unsure / MBAR:
+        return []
+    ejector["h2_mbar"] = h2
+    text = f"part present comes at {h2:g} mbar; the configuration says {before:g}"
+    return [Remark(text, f"[data.ejector] h2_mbar = {h2:g}")]
 
 
 def _volume(data: DataSet) -> float:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from twin.figures.curve import flow_behind
 from twin.monitor.nozzle import reports_nozzle, told_edges
+from twin.monitor.reports import part_at
 from twin.signals import MBAR, MS, NS, UNUSABLE, Command, Reported, Samples
 
 Floats = npt.NDArray[np.float64]
@@ -60,6 +61,8 @@ class Readings:
     rises_in_suction: bool  # and falls in blow-off: commands or sign are swapped
     fill_rate: float  # 1/s, dp/dt over ambient as blow-off begins
     draw_rate: float  # 1/s, −dp/dt over pressure as suction begins
+    part: float = np.nan  # Pa, at which the ejector itself reports a part
+    part_unsure: float = np.nan  # Pa, as that may be late
 
     @property
     def least_vacuum(self) -> float:
@@ -108,6 +111,11 @@ def read(samples: Samples) -> Readings:
         switches += len(edges if told else lows) > 0
         if told and not lows:  # it holds so well that the pressure does not turn
             offs += list(pressure[edges[:1]])
+    parts = [
+        at
+        for one in suctions
+        if (at := part_at(rows[one.first : one.last], pressure[one.first : one.last]))
+    ]
     idle, opened = _idle(pressure, found, round(OPENED_MS * MS / period), noise)
     return Readings(
         period=period,
@@ -126,6 +134,8 @@ def read(samples: Samples) -> Readings:
         and not _rises(pressure, found, Command.BLOW_OFF),
         fill_rate=_fill_rate(pressure, found, period, idle),
         draw_rate=_draw_rate(pressure, suctions, period),
+        part=_median([pascal for pascal, _ in parts]),
+        part_unsure=_median([unsure for _, unsure in parts]),
     )
 
 

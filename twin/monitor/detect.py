@@ -29,6 +29,7 @@ from twin.monitor.cycles import (
     figures,
 )
 from twin.monitor.healthy import NOT_COMMISSIONED, Healthy
+from twin.monitor.reports import ReportWatch
 from twin.monitor.signatures import Likeness, drawn_rows, likenesses, look_alikes
 from twin.settings import Settings
 from twin.signals import (
@@ -109,6 +110,7 @@ class Monitor:
     active: str = ""  # the standing alarm's effect, or UNKNOWN; empty while there is none
     isolation: "Isolation | None" = None
     clocks: ClockWatch | None = field(default_factory=ClockWatch)  # None: the PLC has none
+    reports: ReportWatch | None = None  # of signals beside pressure and commands
     judges: bool = True  # cycles; not where nobody recorded the commands
     _cutter: CycleCutter = field(default_factory=CycleCutter)
     _before: Cycle | None = None
@@ -283,7 +285,10 @@ class Monitor:
         told = [self.teller.take(one) if self.teller else None for one in cycles]
         heard = self.isolation.hear(looks) if self.isolation else [None] * len(cycles)
         found = map(self._conclude, looks, told, heard)
-        return [event for events in found for event in events]
+        checked = [[*self.reports.take(one)] if self.reports else [] for one in cycles]
+        return [
+            one for some in zip(found, checked, strict=True) for events in some for one in events
+        ]
 
     def _look(self, cycle: Cycle, silent: bool) -> Look:
         """Its figures, and whether it can be judged."""
