@@ -20,6 +20,7 @@ from twin.monitor.cycles import Cycle, figures, whole
 from twin.monitor.healthy import Healthy, Scatter
 from twin.monitor.knees import as_wide_as_needed
 from twin.monitor.reports import Contradiction, standing
+from twin.monitor.surroundings import taken_in
 from twin.signals import BREAK, MBAR, SAMPLE, UNUSABLE, Command, Phase, Samples
 
 FEWEST = 5  # complete cycles
@@ -50,6 +51,7 @@ def calibrate(
     """
     progress("reading the log")
     samples = np.concatenate([np.empty(0, SAMPLE), *blocks])
+    config = replace(config, data=taken_in(config.data, samples))
     before = complete(config.data, samples)
     refuse_insufficient(samples, before)
     refuse_contradicting(before, config.data)

@@ -29,7 +29,8 @@ from twin.errors import ConfigError
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.model.system import Cups, volume
-from twin.monitor.reports import Contradiction
+from twin.monitor.reports import APART, Contradiction
+from twin.monitor.surroundings import taken_in
 from twin.signals import MBAR, ML, MS, SAMPLE, SL_MIN, Command, Reported, Samples
 
 SLOWEST = 2.05 * MS  # s between rows; what switches faster than a few rows is not seen
@@ -39,6 +40,7 @@ ROOM_TEMPERATURE = 293.15  # K, for a first guess
 PLACES, PORT_SHARES = (0.05, 0.95), (0.01, 0.1)
 CLEARLY = 15.0  # mbar by which a threshold must differ to be told; overshoot is part of a turn
 AMBIENT_CLEARLY = 3.0  # mbar, the same for ambient pressure
+LEAST_OFFSET = 1.0  # mbar, of the sensor beside a barometer, to be taken for one
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,7 @@ def commission(
     refuse_empty(samples)
     readings = read(samples)
     refuse_unreadable(readings)
+    config = replace(config, data=taken_in(config.data, samples))
     guess, remarks = guessed(config.data, readings)
     before = complete(guess, samples)
     refuse_insufficient(samples, before)
@@ -160,7 +163,13 @@ def guessed(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:
     tables = data.model_dump()
     remarks: list[Remark] = []
     ambient = tables["ambient"]["pressure_mbar"]
-    if readings.opened:
+    offset = (readings.idle - readings.barometer) / MBAR
+    if readings.opened and abs(offset) <= APART / MBAR:  # so much the sensor may read off
+        tables["ambient"]["pressure_mbar"] = round(readings.barometer / MBAR, 1)
+        if abs(offset) > LEAST_OFFSET:
+            tables["effects"]["sensor_offset"] = {"offset": round(offset, 1)}
+        ambient = readings.idle / MBAR  # what vacuum is read from
+    elif readings.opened:
         found = round(readings.idle / MBAR, 1)
         if abs(found - ambient) > AMBIENT_CLEARLY:
             line = f"[data.ambient] pressure_mbar = {found:g}"

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from twin.figures.curve import flow_behind
 from twin.monitor.nozzle import reports_nozzle, told_edges
 from twin.monitor.reports import part_at
+from twin.monitor.surroundings import told
 from twin.signals import MBAR, MS, NS, UNUSABLE, Command, Reported, Samples
 
 Floats = npt.NDArray[np.float64]
@@ -61,6 +62,7 @@ class Readings:
     rises_in_suction: bool  # and falls in blow-off: commands or sign are swapped
     fill_rate: float  # 1/s, dp/dt over ambient as blow-off begins
     draw_rate: float  # 1/s, −dp/dt over pressure as suction begins
+    barometer: float = np.nan  # Pa, its median
     part: float = np.nan  # Pa, at which the ejector itself reports a part
     part_unsure: float = np.nan  # Pa, as that may be late
 
@@ -100,7 +102,7 @@ def read(samples: Samples) -> Readings:
     turn = max(CLEAR * noise / np.sqrt(width), LEAST_TURN)
     suctions = [one for one in found if one.command == Command.SUCTION]
     offs, ons, switches = [], [], 0
-    told = reports_nozzle(rows["reported"][rows["commands"] == Command.SUCTION])
+    reported = reports_nozzle(rows["reported"][rows["commands"] == Command.SUCTION])
     nozzle = (rows["reported"] & np.uint8(Reported.NOZZLE)) != 0
     for one in suctions:
         smooth = _smoothed(pressure[one.first : one.last], width)[edge:]
@@ -108,8 +110,8 @@ def read(samples: Samples) -> Readings:
         offs += list(smooth[lows])
         ons += list(smooth[highs])
         edges = [one.first + row for row in told_edges(nozzle[one.first : one.last])]
-        switches += len(edges if told else lows) > 0
-        if told and not lows:  # it holds so well that the pressure does not turn
+        switches += len(edges if reported else lows) > 0
+        if reported and not lows:  # it holds so well that the pressure does not turn
             offs += list(pressure[edges[:1]])
     parts = [
         at
@@ -134,6 +136,7 @@ def read(samples: Samples) -> Readings:
         and not _rises(pressure, found, Command.BLOW_OFF),
         fill_rate=_fill_rate(pressure, found, period, idle),
         draw_rate=_draw_rate(pressure, suctions, period),
+        barometer=told(samples).get("ambient", np.nan),
         part=_median([pascal for pascal, _ in parts]),
         part_unsure=_median([unsure for _, unsure in parts]),
     )

@@ -31,6 +31,7 @@ from twin.monitor.cycles import (
 from twin.monitor.healthy import NOT_COMMISSIONED, Healthy
 from twin.monitor.reports import ReportWatch
 from twin.monitor.signatures import Likeness, drawn_rows, likenesses, look_alikes
+from twin.monitor.surroundings import following
 from twin.settings import Settings
 from twin.signals import (
     BREAK,
@@ -298,7 +299,7 @@ class Monitor:
         fit = (
             self.judges and whole and cycle.settled and cycle.coverage >= FEWEST_SHARE and not stale
         )
-        found = figures(cycle, self.theta)
+        found = figures(cycle, following(self.theta, cycle.samples))
         if not self.judges:  # what hangs on the model
             found = {name: value for name, value in found.items() if name in MEASURED}
         return Look(cycle, before, found, fit)
@@ -487,7 +488,7 @@ class Monitor:
         samples = np.concatenate([part.samples for part in parts])
         ticks = np.concatenate([part.ticks for part in parts])
         begin = len(samples) - len(cycle.samples)
-        ranking = likenesses(self.theta, samples, ticks, begin)
+        ranking = likenesses(following(self.theta, samples), samples, ticks, begin)
         return ranking or [Likeness(UNKNOWN, None, "", 0.0)]  # not one sync in a long piece
 
 
