@@ -19,7 +19,7 @@ from twin.monitor.knees import expected_knees
 from twin.monitor.listening import Listening
 from twin.monitor.phases import Found, Knees, PhaseFinder
 from twin.monitor.signatures import steps
-from twin.monitor.surroundings import following, stretches
+from twin.monitor.surroundings import are_told, following, stretches
 from twin.signals import MBAR, SAMPLE, TICK, Phase, Samples, Ticks
 
 REPLAYED = 60_000  # rows that a replay takes at once: what is done to many cycles stays in caches
@@ -103,7 +103,7 @@ class Twin:
 
     def _surrounded(self, samples: Samples, ticks: Ticks) -> Iterable[tuple[slice, Samples]]:
         """Rows in one stretch of surroundings; nearly always nobody tells any."""
-        if samples["ambient"].any() or samples["temperature"].any():
+        if are_told(samples):
             return stretches(samples, ticks, self._phase)
         return [(slice(None), samples[:0])]
 

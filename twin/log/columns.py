@@ -34,6 +34,7 @@ def _places(rows: np.dtype[np.void]) -> _Places:
 
 
 _SAMPLE_PLACES, _TICK_PLACES = _places(SAMPLE), _places(TICK)
+_EXTRA_FROM = int(_SAMPLE_PLACES[-len(EXTRA), 0])  # they stand last in a row
 
 
 def encode(samples: Samples, ticks: Ticks) -> bytes:
@@ -44,9 +45,10 @@ def encode(samples: Samples, ticks: Ticks) -> bytes:
     for rows, places in ((samples, _SAMPLE_PLACES), (ticks, _TICK_PLACES)):
         raw = np.ascontiguousarray(rows).view(np.uint8)
         raw.flags.writeable = False  # as rows of a file are: one type to compile for
+        blank = rows is samples and _ends_in_zeros(raw, rows.itemsize, _EXTRA_FROM)
         for offset, width in places.tolist():
             name = next(columns)
-            if name in EXTRA and _is_zero(raw, rows.itemsize, offset, width):
+            if name in EXTRA and (blank or _is_zero(raw, rows.itemsize, offset, width)):
                 continue
             used = _pack(raw, rows.itemsize, offset, width, space)
             setattr(message, name, space[:used].tobytes())
@@ -85,6 +87,19 @@ def _read(raw, at, width):  # type: ignore[no-untyped-def]
     for j in range(width):
         bits |= np.uint64(raw[at + np.uint64(j)]) << np.uint64(8 * j)
     return bits
+
+
+@compiled
+def _ends_in_zeros(rows, size, offset):  # type: ignore[no-untyped-def]
+    """Whether all fields from ``offset`` on are zero in all rows, to the bit: quick to see."""
+    any_bits = np.uint64(0)
+    words = (size - offset) // 8
+    for begin in range(0, len(rows), size):
+        for word in range(words):
+            any_bits |= _read(rows, np.uint64(begin + offset + 8 * word), 8)
+        for at in range(begin + offset + 8 * words, begin + size):
+            any_bits |= np.uint64(rows[at])
+    return any_bits == 0
 
 
 @compiled

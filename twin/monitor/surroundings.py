@@ -10,11 +10,21 @@ from collections.abc import Iterator
 import numpy as np
 
 from twin.model import theta as c
+from twin.model.compiled import compiled
 from twin.model.dataset import DataSet
 from twin.model.theta import Theta
 from twin.signals import MBAR, ZERO_C, Phase, Samples, Ticks
 
 COLUMNS = (("ambient", c.AMBIENT), ("temperature", c.TEMPERATURE))
+
+
+@compiled
+def are_told(samples):  # type: ignore[no-untyped-def]
+    """Whether any row tells of the surroundings; nearly always none does."""
+    for row in range(len(samples)):
+        if samples[row].ambient > 0.0 or samples[row].temperature > 0.0:
+            return True
+    return False
 
 
 def told(samples: Samples) -> dict[str, float]:
@@ -29,9 +39,9 @@ def told(samples: Samples) -> dict[str, float]:
 
 def following(theta: Theta, samples: Samples) -> Theta:
     """Coefficients with the surroundings that rows tell of; the same ones where they tell none."""
-    found = told(samples)
-    if not found:
+    if not are_told(samples):
         return theta
+    found = told(samples)
     theta = theta.copy()
     for column, coefficient in COLUMNS:
         theta[coefficient] = found.get(column, theta[coefficient])
