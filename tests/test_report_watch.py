@@ -20,6 +20,8 @@ from twin.calibration.commission import commission, guessed
 from twin.calibration.readings import read
 from twin.calibration.report import commissioned_as_json, commissioned_in_words
 from twin.config import Asset
+from twin.diagnosis.answer import diagnose
+from twin.diagnosis.report import in_words
 from twin.errors import ConfigError
 from twin.events import Event, Kind
 from twin.live import run
@@ -230,3 +232,13 @@ def test_a_calibration_refuses_what_contradicts() -> None:
     with pytest.raises(ConfigError, match="goes off at 75") as error:
         calibrate(typed("test_rig"), [samples], quiet)
     assert "leave the tag out" in str(error.value.hint)
+
+
+def test_a_diagnosis_tells_it_beside_its_answer() -> None:
+    diagnosis = diagnose(
+        rigs.config("test_rig"), [changed(simulated("test_rig"), reversed_flow)], "log", quiet
+    )
+    (one,) = diagnosis.json["signals"]
+    assert one["signal"] == "flow"
+    assert f"flow           {one['what']}" in in_words(diagnosis)
+    assert diagnosis.json["verdict"] == "consistent"
