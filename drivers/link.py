@@ -9,7 +9,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from drivers.lasting import AbsentError, LostError, unreachable
-from drivers.tags import Address, Place, Pressure, Tag, WordOrder, Words
+from drivers.reports import BITS, refuse_unclear
+from drivers.tags import Address, Flow, Place, Pressure, Tag, Temperature, WordOrder, Words
 from drivers.telegram import HEAD, Request, Store, belongs, exception
 from drivers.tls import Tls, secured
 from drivers.trace import COMMAND_BITS, no_effect, refuse_unused
@@ -41,12 +42,21 @@ class Tags(Settings):
     blow_off: Tag | None = None
     supply: Pressure | None = None
     heartbeat: Tag | None = None  # changes at every scan: at rest, the PLC's program stands still
+    nozzle: Tag | None = None  # on; as the ejector itself reports it
+    air_saving: Tag | None = None  # or that it saves air: the nozzle is off under suction
+    part_present: Tag | None = None  # the same: H2 is reached
+    ambient: Pressure | None = None  # a barometer
+    temperature: Temperature | None = None  # of the gas or the surroundings
+    pressure_2: Pressure | None = None  # at the other end of the line
+    flow: Flow | None = None  # suction flow
 
     @model_validator(mode="after")
-    def _commands_are_bits(self) -> Self:
-        for tag in (self.suction, self.blow_off):
+    def _are_what_they_must(self) -> Self:
+        for name in ("suction", "blow_off", *BITS):
+            tag = getattr(self, name)
             if tag is not None and tag.type != "bit":
-                raise ValueError("suction and blow_off are bits")
+                raise ValueError(f"{name} is a bit")
+        refuse_unclear(self.nozzle, self.air_saving, self.ambient)
         return self
 
 
@@ -96,12 +106,12 @@ class ModbusSettings(Settings):
 
     def _refuse_without_effect(self) -> None:
         """KeyedError for what is read from the tags alone, and not from the ring."""
-        for name, bit in COMMAND_BITS.items():
+        for name, bit in (COMMAND_BITS | BITS).items():
             tag = getattr(self.tags, name)
-            same = (COILS + bit, None), (STATUS, bit)
+            same = [(STATUS, bit), *([(COILS + bit, None)] if name in COMMAND_BITS else [])]
             if tag is not None and (tag.address, tag.bit) not in same:
                 place = tag.address if tag.bit is None else f"{tag.address} bit {tag.bit}"
-                raise no_effect(name, place, "poll")
+                raise no_effect(name, bit, place, "poll")
         if self.tags.heartbeat is not None:
             raise KeyedError(
                 "has no effect in block mode: the ring's sequence shows whether the PLC's program "

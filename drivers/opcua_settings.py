@@ -8,11 +8,18 @@ from urllib.parse import urlsplit
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from drivers.tags import Quantity
+from drivers.reports import BITS, refuse_unclear
+from drivers.tags import Flowmeter, Quantity, Thermometer
 from drivers.trace import COMMAND_BITS, no_effect, refuse_unused
 from twin.settings import Settings
 
-COMMAND_NODES = {"suction": "Cmd.Suction", "blow_off": "Cmd.BlowOff"}  # as `twin plc` names them
+BIT_NODES = {  # of the trace's status, as `twin plc` names them singly
+    "suction": "Cmd.Suction",
+    "blow_off": "Cmd.BlowOff",
+    "nozzle": "Meas.Nozzle",
+    "air_saving": "Meas.AirSaving",
+    "part_present": "Meas.PartPresent",
+}
 PORT = 4840  # registered for OPC UA
 NODE = re.compile(r"(?:nsu=(?P<uri>[^;]+);)?(?P<identifier>[sigb]=.+)", re.DOTALL)
 
@@ -58,6 +65,18 @@ class NodePressure(Quantity):
     node: NodeName
 
 
+class NodeTemperature(Thermometer):
+    """A temperature in the server."""
+
+    node: NodeName
+
+
+class NodeFlow(Flowmeter):
+    """A suction flow in the server."""
+
+    node: NodeName
+
+
 class NodeTags(Settings):
     """The server's values that the twin reads one by one."""
 
@@ -65,6 +84,18 @@ class NodeTags(Settings):
     suction: NodeTag | None = None
     blow_off: NodeTag | None = None
     supply: NodePressure | None = None
+    nozzle: NodeTag | None = None  # on; as the ejector itself reports it
+    air_saving: NodeTag | None = None  # or that it saves air: the nozzle is off under suction
+    part_present: NodeTag | None = None  # the same: H2 is reached
+    ambient: NodePressure | None = None  # a barometer
+    temperature: NodeTemperature | None = None  # of the gas or the surroundings
+    pressure_2: NodePressure | None = None  # at the other end of the line
+    flow: NodeFlow | None = None  # suction flow
+
+    @model_validator(mode="after")
+    def _are_clear(self) -> Self:
+        refuse_unclear(self.nozzle, self.air_saving, self.ambient)
+        return self
 
 
 class TraceNodes(Settings):
@@ -147,13 +178,13 @@ class OpcuaSettings(Settings):
 
     def _refuse_without_effect(self) -> None:
         """KeyedError for what is read from single nodes alone, and not from the trace."""
-        for name in COMMAND_BITS:
+        for name, bit in (COMMAND_BITS | BITS).items():
             tag = getattr(self.tags, name)
             if tag is None:
                 continue
-            if tag.bit is not None or not tag.node.identifier.endswith(COMMAND_NODES[name]):
+            if tag.bit is not None or not tag.node.identifier.endswith(BIT_NODES[name]):
                 place = tag.node if tag.bit is None else f"{tag.node} bit {tag.bit}"
-                raise no_effect(name, place, "subscribe")
+                raise no_effect(name, bit, place, "subscribe")
         refuse_unused(self.model_fields_set, ("gap_ms", "sampling_ms"), "subscribe")
 
     def _nodes(self) -> list[Node]:

@@ -26,6 +26,7 @@ from drivers.opcua_values import (
     time_ns,
     truth,
 )
+from drivers.reports import BITS, VALUES, ambient_of, put_bits, put_values
 from twin.errors import SourceError
 from twin.signals import MBAR, SAMPLE, UNUSABLE, Command, Quality, Samples
 
@@ -74,13 +75,10 @@ class Subscription:
         assert tags.blow_off is not None
         self._settings = settings
         self._clock = clock
-        self._bits: tuple[NodeTag, ...] = (tags.suction, tags.blow_off)
-        supply = () if tags.supply is None else (tags.supply.node,)
-        self.nodes: tuple[Node, ...] = (
-            tags.pressure.node,
-            *(tag.node for tag in self._bits),
-            *supply,
-        )
+        self._tags = {name: tag for name, tag in tags if tag is not None}  # the pressure first
+        self._all = tuple(self._tags.values())
+        self._places = {name: place for place, name in enumerate(self._tags)}
+        self.nodes: tuple[Node, ...] = tuple(tag.node for tag in self._tags.values())
         self.queue = max(10, round(QUEUE_MS / settings.sampling_ms))  # values to be kept of each
         self._columns: list[Column] = []
         self._said = ""
@@ -100,8 +98,8 @@ class Subscription:
             raise passing(error) from error
 
     def _published_blocks(self, link: OpcuaLink) -> Iterator[Samples]:
-        for node, value in zip(self.nodes, link.read(self.nodes), strict=True):
-            self._number(self.nodes.index(node), value)  # says so if it has another type
+        for place, value in enumerate(link.read(self.nodes)):
+            self._number(place, value)  # says so if it has another type
         granted = link.subscribe(self.nodes, self.queue)
         self._say(granted)
         self._period_ns = round(max(granted.sampling_ms, self._settings.sampling_ms) * 1e6)
@@ -162,8 +160,9 @@ class Subscription:
         node = self.nodes[place]
         if not readable(value):
             return float("nan")
-        if 1 <= place <= len(self._bits):
-            return float(truth(value, node, self._bits[place - 1].bit))
+        tag = self._all[place]
+        if isinstance(tag, NodeTag):
+            return float(truth(value, node, tag.bit))
         return number(value, node)
 
     def _rows(self) -> Samples:
@@ -171,27 +170,37 @@ class Subscription:
         pressures = self._columns[PRESSURE]
         if not pressures.times:
             return EMPTY
-        tags, ambient = self._settings.tags, self._settings.ambient_mbar * MBAR
+        tags = self._settings.tags
         block = np.zeros(len(pressures.times), SAMPLE)
         times = block["time_ns"] = np.array(pressures.times)
         block["host_ns"] = self._clock.wall_ns()
-        raw = np.array(pressures.values)
-        block["pressure"], block["quality"] = tags.pressure.pressure(raw, ambient)
+        raw = {name: self._usable(name, times) for name in VALUES if name in self._places}
+        fixed = self._settings.ambient_mbar * MBAR
+        ambient = ambient_of(block, tags, raw, fixed)
+        put_values(block, tags, raw, ambient)
+        measured = np.array(pressures.values)
+        block["pressure"], block["quality"] = tags.pressure.pressure(measured, ambient)
         block["quality"] |= np.array([quality(code) for code in pressures.codes], np.uint8)
-        for place, command in enumerate((Command.SUCTION, Command.BLOW_OFF), 1):
-            on, flags = self._columns[place].at(times)
+        for name, command in (("suction", Command.SUCTION), ("blow_off", Command.BLOW_OFF)):
+            on, flags = self._columns[self._places[name]].at(times)
             block["commands"] |= np.where(on == 1, np.uint8(command), np.uint8(0))
             block["quality"] |= flags | np.where(np.isnan(on), Quality.BAD, 0).astype(np.uint8)
         block["supply"] = np.nan
         if tags.supply is not None:
-            supply, flags = self._columns[-1].at(times)
-            supply[(flags & UNUSABLE) != 0] = np.nan
-            block["supply"] = tags.supply.gauge(supply, ambient)
+            block["supply"] = tags.supply.gauge(self._usable("supply", times), fixed)
+        bits = {name: self._usable(name, times) for name in BITS if name in self._places}
+        put_bits(block, bits)
         self._count(block, np.array([lost_some(code) for code in pressures.codes]))
         self._columns[PRESSURE] = Column()
         for column in self._columns[1:]:
             column.keep_last()
         return block
+
+    def _usable(self, name: str, times: Integers) -> npt.NDArray[np.float64]:
+        """What a tag held at ``times``; NaN where nothing can be made of it."""
+        values, flags = self._columns[self._places[name]].at(times)
+        values[(flags & UNUSABLE) != 0] = np.nan
+        return values
 
     def _count(self, block: Samples, lost: npt.NDArray[np.bool_]) -> None:
         """Number the rows, and mark where some are missing or time does not run on."""

@@ -28,6 +28,7 @@ from drivers.opcua_values import (
     whole,
     wholes,
 )
+from drivers.reports import BITS, VALUES, ambient_of, once, put_bits, put_values
 from drivers.trace import (
     COMMANDS,
     OVERFLOW_BIT,
@@ -52,7 +53,7 @@ class Ring:
     sequences: Integers
     statuses: Integers
     pressures: Floats  # NaN where there is none
-    supply: float  # NaN where there is none
+    single: dict[str, float]  # supply and what else is read by itself; NaN where there is none
     quality: int  # Quality bits that the server gives to all of it
     apart: int  # scans that may have gone by while the header was read
     overwritten: int  # records up to this one, counted from the header's, may be
@@ -64,15 +65,20 @@ class NodeTrace(Follower[Header, OpcuaLink]):
     def __init__(self, settings: OpcuaSettings, clock: Clock) -> None:
         super().__init__(settings, clock)
         self._settings = settings
-        trace, supply = settings.trace, settings.tags.supply
+        trace, tags = settings.trace, settings.tags
         self._header_nodes = (trace.sequence, trace.time, trace.boot, trace.period)
         self._arrays = (trace.sequences, trace.statuses, trace.pressures)
-        self._supply = () if supply is None else (supply.node,)
+        self._single = {
+            name: getattr(tags, name).node
+            for name in ("supply", *VALUES)
+            if getattr(tags, name) is not None
+        }
+        self._told = {name: bit for name, bit in BITS.items() if getattr(tags, name) is not None}
 
     @property
     def requests(self) -> tuple[tuple[Node, ...], tuple[Node, ...]]:
         """What is read, one after the other: the header, and all else."""
-        return self._header_nodes, self._arrays + self._supply
+        return self._header_nodes, (*self._arrays, *self._single.values())
 
     def start(self, link: OpcuaLink) -> Header:
         """Begin at the newest record; SourceError if there is no ring as configured."""
@@ -126,7 +132,7 @@ class NodeTrace(Follower[Header, OpcuaLink]):
         return Ring(
             header,
             *arrays,
-            supply=self._supply_of(given),
+            single={name: _number_of(given, node) for name, node in self._single.items()},
             quality=self._quality(given),
             apart=-(-header_ns // period_ns),
             overwritten=-(-took_ns // period_ns) + 1 - header.depth,  # one is being written
@@ -173,12 +179,6 @@ class NodeTrace(Follower[Header, OpcuaLink]):
     def _quality(self, given: dict[Node, Any]) -> int:
         return quality(code_of(given[self._settings.trace.pressures]))
 
-    def _supply_of(self, given: dict[Node, Any]) -> float:
-        for node in self._supply:
-            if not quality(code_of(given[node])) & UNUSABLE:
-                return number(given[node], node)
-        return float("nan")
-
     def _read(self, link: OpcuaLink) -> Samples:
         """Whatever is new and was announced."""
         assert self._header is not None
@@ -200,14 +200,27 @@ class NodeTrace(Follower[Header, OpcuaLink]):
         return replace(ring, header=self._steadied(ring.header, ring.apart))
 
     def _decode(self, ring: Ring, slots: Integers) -> Samples:
-        tags, ambient = self._settings.tags, self._settings.ambient_mbar * MBAR
+        tags = self._settings.tags
         block = np.zeros(len(slots), SAMPLE)
         status = ring.statuses[slots]
         block["commands"] = status & COMMANDS
+        put_bits(
+            block, {name: (status >> bit & 1).astype(float) for name, bit in self._told.items()}
+        )
+        raw = {name: once(value, name, len(block)) for name, value in ring.single.items()}
+        fixed = self._settings.ambient_mbar * MBAR
+        ambient = ambient_of(block, tags, raw, fixed)
+        put_values(block, tags, raw, ambient)
         block["pressure"], flags = tags.pressure.pressure(ring.pressures[slots], ambient)
         overflow = (status >> OVERFLOW_BIT & 1).astype(np.uint8) * Quality.OVERFLOW.value
         block["quality"] = flags | overflow | np.uint8(ring.quality)
         block["supply"] = np.nan
         if tags.supply is not None:
-            block["supply"] = tags.supply.gauge(np.array([ring.supply]), ambient)
+            block["supply"] = tags.supply.gauge(np.array([ring.single["supply"]]), fixed)
         return block
+
+
+def _number_of(given: dict[Node, Any], node: Node) -> float:
+    """A single value; NaN where the server does not stand by it."""
+    bad = quality(code_of(given[node])) & UNUSABLE
+    return float("nan") if bad else number(given[node], node)

@@ -4,38 +4,21 @@ It cannot be lossless on a general-purpose machine: slots are numbered, and a mi
 missing number. Time is that of the middle of the request here.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
 
 from drivers.lasting import Clock, LostError
 from drivers.link import Link, ModbusSettings
-from drivers.tags import Flags, Tag, Words
-from drivers.telegram import MOST_WORDS, Request
+from drivers.plan import Answers, holds, plan
+from drivers.reports import BITS, VALUES, ambient_of, put_bits, put_values
+from drivers.tags import Flags
 from twin.signals import MBAR, SAMPLE, Command, Quality, Samples
 
 SLOT_NS = 1_000_000
 SPIN_NS = 60_000  # a sleeping thread wakes about this late; longer spinning won nothing
 HEARTBEAT_NS = 100_000_000  # unchanged for longer: the PLC's program stands still
-
-
-def plan(tags: Iterable[Tag], most: int = MOST_WORDS) -> list[Request]:
-    """Fewest requests that cover all tags, none longer than ``most``."""
-    requests: list[Request] = []
-    for tag in sorted(tags, key=lambda tag: (tag.address.area, tag.address.offset)):
-        end = tag.address.offset + tag.size
-        last = requests[-1] if requests else None
-        if (
-            last is not None
-            and last.address.area == tag.address.area
-            and end - last.address.offset <= most
-        ):
-            count = max(last.count, end - last.address.offset)
-            requests[-1] = Request(last.address, count)
-        else:
-            requests.append(Request(tag.address, tag.size))
-    return requests
 
 
 class Poller:
@@ -45,10 +28,9 @@ class Poller:
         tags = settings.tags
         self._settings = settings
         self._clock = clock
-        known = (tags.pressure, tags.suction, tags.blow_off, tags.supply, tags.heartbeat)
-        self._requests = plan(tag for tag in known if tag is not None)
+        self._requests = plan(tag for _, tag in tags if tag is not None)
         # The pressure last, so that a slow answer for the rest does not put its time off.
-        self._requests.sort(key=lambda request: self._column(tags.pressure, request) is not None)
+        self._requests.sort(key=lambda request: holds(request, tags.pressure))
         self._start_ns = clock.now_ns()
         self._wall_ns = clock.wall_ns() - self._start_ns  # anchored once: time never runs back
         self._slot = 0  # to be read next
@@ -76,7 +58,7 @@ class Poller:
         except LostError:
             if not rows:
                 raise  # else the closed connection says so again at the next block
-        return self._decode(self._answers(rows), np.array(slots, dtype=np.int64))
+        return self._decode(Answers.of(self._requests, rows), np.array(slots, dtype=np.int64))
 
     def _now_slot(self) -> int:
         return (self._clock.now_ns() - self._start_ns) // SLOT_NS
@@ -99,45 +81,31 @@ class Poller:
             row += link.ask(request)
         return row, asked_ns, self._clock.now_ns()
 
-    def _answers(self, rows: list[bytes]) -> list[Words]:
-        """Words (rows, count) for each request."""
-        data = np.frombuffer(b"".join(rows), np.uint8).reshape(len(rows), -1)
-        starts = np.cumsum([request.size for request in self._requests])
-        parts = np.split(data, starts[:-1], axis=1)
-        return [request.words(part) for request, part in zip(self._requests, parts, strict=True)]
-
-    def _column(self, tag: Tag, request: Request) -> slice | None:
-        """Where in the answer to ``request`` the tag lies, if it does."""
-        at = tag.address.offset - request.address.offset
-        inside = tag.address.area == request.address.area and 0 <= at < request.count
-        return slice(at, at + tag.size) if inside else None
-
-    def _words(self, tag: Tag, answers: list[Words]) -> Words:
-        """Words of one tag (rows, size) from all answers."""
-        for request, words in zip(self._requests, answers, strict=True):
-            if (columns := self._column(tag, request)) is not None:
-                return words[:, columns]
-        raise AssertionError(f"{tag.address} is in no request")
-
-    def _decode(self, answers: list[Words], slots: npt.NDArray[np.int64]) -> Samples:
+    def _decode(self, answers: Answers, slots: npt.NDArray[np.int64]) -> Samples:
         tags, order = self._settings.tags, self._settings.word_order
-        ambient = self._settings.ambient_mbar * MBAR
         block = np.zeros(len(slots), SAMPLE)
         block["sequence"] = slots[:, 0]
         block["time_ns"] = slots[:, 1] + self._wall_ns
         block["host_ns"] = slots[:, 2] + self._wall_ns
         for tag, command in ((tags.suction, Command.SUCTION), (tags.blow_off, Command.BLOW_OFF)):
             assert tag is not None  # the settings see to it
-            bits = tag.raw(self._words(tag, answers), order).astype(np.uint8)
+            bits = answers.raw(tag, order).astype(np.uint8)
             block["commands"] |= bits * np.uint8(command)
-        words = self._words(tags.pressure, answers)
+        told = {name: getattr(tags, name) for name in BITS if getattr(tags, name) is not None}
+        put_bits(block, {name: answers.floats(tag, order) for name, tag in told.items()})
+        read = {name: getattr(tags, name) for name in VALUES if getattr(tags, name) is not None}
+        raw = {name: answers.floats(tag, order) for name, tag in read.items()}
+        fixed = self._settings.ambient_mbar * MBAR
+        ambient = ambient_of(block, tags, raw, fixed)
+        put_values(block, tags, raw, ambient)
+        words = answers.words(tags.pressure)
         block["pressure"], block["quality"] = tags.pressure.decode(words, order, ambient)
         block["supply"] = np.nan
         if tags.supply is not None:
-            block["supply"] = tags.supply.supply(self._words(tags.supply, answers), order, ambient)
+            block["supply"] = tags.supply.supply(answers.words(tags.supply), order, fixed)
         block["quality"] |= self._gaps(slots[:, 0])
         if tags.heartbeat is not None:
-            beats = tags.heartbeat.raw(self._words(tags.heartbeat, answers), order)
+            beats = answers.raw(tags.heartbeat, order)
             block["quality"] |= self._stale(beats, slots[:, 2])
         return block
 

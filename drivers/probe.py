@@ -9,7 +9,7 @@ import numpy as np
 
 from drivers.lasting import REAL, Clock, LostError
 from drivers.link import Link, ModbusSettings
-from drivers.poll import plan
+from drivers.plan import plan
 from drivers.ring import RECORDS_AT_ONCE, Trace
 from drivers.tags import Address, Pressure, Tag, WordOrder, Words, numbers
 from drivers.trace import Header

@@ -10,6 +10,8 @@ import numpy.typing as npt
 
 from drivers.lasting import EMPTY, Clock
 from drivers.link import Link, ModbusSettings, span
+from drivers.plan import Answers, plan
+from drivers.reports import BITS, VALUES, ambient_of, once, put_bits, put_values
 from drivers.tags import WordOrder, Words, numbers
 from drivers.trace import COMMANDS, OVERFLOW_BIT, RESERVE, WRAP, Follower, refusal
 from drivers.trace import Header as AnyHeader
@@ -54,6 +56,12 @@ class Trace(Follower[Header, Link]):
     def __init__(self, settings: ModbusSettings, clock: Clock) -> None:
         super().__init__(settings, clock)
         self._settings = settings
+        tags = settings.tags
+        self._told = {name: bit for name, bit in BITS.items() if getattr(tags, name) is not None}
+        self._values = {
+            name: getattr(tags, name) for name in VALUES if getattr(tags, name) is not None
+        }
+        self._requests = plan(self._values.values())
 
     def start(self, link: Link) -> Header:
         """Begin at the newest record; SourceError if there is no ring as configured."""
@@ -100,6 +108,7 @@ class Trace(Follower[Header, Link]):
     def _read(self, link: Link) -> Samples:
         """Whatever is new, as far as the time for one block goes."""
         started = self._clock.now_ns()
+        beside = self._read_values(link)
         header = self._next_header(link)
         if not header.ready:
             return EMPTY
@@ -112,7 +121,17 @@ class Trace(Follower[Header, Link]):
             overwritten = self._overwritten(link, header)
             valid &= np.arange(first, end) > overwritten
         sequence = self._pass(first, valid)
-        return self._stamp(self._decode(header, records[valid]), header, sequence)
+        return self._stamp(self._decode(header, records[valid], beside), header, sequence)
+
+    def _read_values(self, link: Link) -> dict[str, float]:
+        """What is not in the ring, as it stands in the PLC: read once a block."""
+        if not self._values:
+            return {}
+        answers = Answers.of(
+            self._requests, [b"".join(link.ask(request) for request in self._requests)]
+        )
+        order = self._settings.word_order
+        return {name: float(answers.floats(tag, order)[0]) for name, tag in self._values.items()}
 
     def _next_header(self, link: Link) -> Header:
         """Read the header; twice where it surprises, since it may have been torn.
@@ -151,16 +170,22 @@ class Trace(Follower[Header, Link]):
             return self._newest
         return self._newest + scans - header.depth + 1  # one is being written
 
-    def _decode(self, header: Header, records: Words) -> Samples:
+    def _decode(self, header: Header, records: Words, beside: dict[str, float]) -> Samples:
         tags, order = self._settings.tags, self._settings.word_order
-        ambient = self._settings.ambient_mbar * MBAR
         block = np.zeros(len(records), SAMPLE)
         status = records[:, 1]
         block["commands"] = status & COMMANDS
+        put_bits(
+            block, {name: (status >> bit & 1).astype(float) for name, bit in self._told.items()}
+        )
+        raw = {name: once(value, name, len(block)) for name, value in beside.items()}
+        fixed = self._settings.ambient_mbar * MBAR
+        ambient = ambient_of(block, tags, raw, fixed)
+        put_values(block, tags, raw, ambient)
         block["pressure"], quality = tags.pressure.decode(records[:, 2:4], order, ambient)
         overflow = ((status >> OVERFLOW_BIT) & 1).astype(np.uint8) * Quality.OVERFLOW.value
         block["quality"] = quality | overflow
         block["supply"] = np.nan
         if tags.supply is not None:
-            block["supply"] = tags.supply.supply(header.supply, order, ambient)
+            block["supply"] = tags.supply.supply(header.supply, order, fixed)
         return block

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from pydantic import BeforeValidator, Field, model_validator
 
 from twin.settings import Settings
-from twin.signals import BAR, MBAR, UNUSABLE, Quality
+from twin.signals import BAR, MBAR, SL_MIN, UNUSABLE, ZERO_C, Quality
 
 Words = npt.NDArray[np.uint16]
 Floats = npt.NDArray[np.float64]
@@ -21,6 +21,7 @@ Flags = npt.NDArray[np.uint8]
 
 Area = Literal["coil", "discrete", "input", "holding"]
 Type = Literal["bit", "int16", "uint16", "int32", "uint32", "float32"]
+NumberType = Literal["int16", "uint16", "int32", "uint32", "float32"]
 WordOrder = Literal["big", "little"]
 Reference = Literal["absolute", "gauge", "vacuum"]
 
@@ -33,6 +34,9 @@ CODE: dict[Type, str] = {  # as NumPy reads it once the high word stands first
     "uint32": ">u4",
     "float32": ">f4",
 }
+# kg/s in one litre a minute of air: standard as ISO 8778 has it, normal as DIN 1343 (0 °C, 1013.25
+# mbar, 1.2928 kg/m³).
+MASS_FLOW = {"sl/min": SL_MIN, "Nl/min": 1.2928e-3 / 60.0}
 PASCAL = {"Pa": 1.0, "mbar": MBAR, "kPa": 1000.0, "bar": BAR, "psi": 6894.757293168}
 
 
@@ -125,12 +129,53 @@ class Tag(Settings):
         values = numbers(words, CODE[self.type], order)
         return values if self.bit is None else (values.astype(np.uint16) >> self.bit) & 1
 
+    def floats(self, words: Words, order: WordOrder) -> Floats:
+        """The same as numbers of one kind, whatever they are."""
+        with np.errstate(invalid="ignore"):  # signalling NaNs too
+            return self.raw(words, order).astype(np.float64)
 
-class Quantity(Settings):
-    """What a number means: pressure = raw · scale + offset in ``unit``, from ``reference``."""
+
+class Scaled(Settings):
+    """What a number means: value = raw · scale + offset in its unit."""
 
     scale: float = 1.0
     offset: float = 0.0
+
+    @model_validator(mode="after")
+    def _has_a_scale(self) -> Self:
+        if self.scale == 0:
+            raise ValueError("scale must not be 0")
+        return self
+
+    def value(self, raw: Floats) -> Floats:
+        """In the unit of the tag."""
+        with np.errstate(invalid="ignore", over="ignore"):  # whatever comes, it is judged
+            return raw * self.scale + self.offset
+
+
+class Thermometer(Scaled):
+    """A temperature, of the gas or of what surrounds the ejector."""
+
+    unit: Literal["C", "K"]
+
+    def kelvin(self, raw: Floats) -> Floats:
+        """Temperatures in K."""
+        return self.value(raw) + (ZERO_C if self.unit == "C" else 0.0)
+
+
+class Flowmeter(Scaled):
+    """A suction flow, positive into the ejector: standard or normal litres a minute."""
+
+    unit: Literal["sl/min", "Nl/min"]
+
+    def mass_flow(self, raw: Floats) -> Floats:
+        """Flows in kg/s."""
+        return self.value(raw) * MASS_FLOW[self.unit]
+
+
+class Quantity(Scaled):
+    """What a number means: pressure = raw · scale + offset in ``unit``, from ``reference``."""
+
     unit: Literal["mbar", "bar", "kPa", "Pa", "psi"]
     reference: Reference  # vacuum: positive below ambient
     range: tuple[float, float] | None = None  # in unit; beyond it a value is flagged, and kept
@@ -138,21 +183,19 @@ class Quantity(Settings):
 
     @model_validator(mode="after")
     def _can_be_used(self) -> Self:
-        if self.scale == 0:
-            raise ValueError("scale must not be 0")
         if self.range is not None and not self.range[0] < self.range[1]:
             raise ValueError("range must be [low, high] with low < high")
         return self
 
     def pressure(
-        self, raw: Floats, ambient: float, onto: Reference = "absolute"
+        self, raw: Floats, ambient: float | Floats, onto: Reference = "absolute"
     ) -> tuple[npt.NDArray[np.float32], Flags]:
         """Pressures in Pa, counted from ``onto``, and quality bits.
 
-        ``ambient`` is in Pa. NaN and infinite values become NaN and BAD.
+        ``ambient`` is in Pa, one or row by row. NaN and infinite values become NaN and BAD.
         """
         with np.errstate(invalid="ignore", over="ignore"):  # whatever comes, it is judged
-            value = raw * self.scale + self.offset
+            value = self.value(raw)
             pascal = _counted(value * PASCAL[self.unit], self.reference, onto, ambient)
             column = pascal.astype(np.float32)
             quality = self._judge(raw, value)
@@ -182,7 +225,7 @@ class Quantity(Settings):
             quality[(raw > above) | (raw < -above - 1)] |= Quality.OVERFLOW.value
         return quality
 
-    def gauge(self, raw: Floats, ambient: float) -> npt.NDArray[np.float32]:
+    def gauge(self, raw: Floats, ambient: float | Floats) -> npt.NDArray[np.float32]:
         """Pressures in Pa gauge; NaN where they are none."""
         pascal, quality = self.pressure(raw, ambient, onto="gauge")
         pascal[(quality & UNUSABLE) != 0] = np.nan
@@ -201,18 +244,28 @@ class Pressure(Quantity, Tag):
         return self
 
     def decode(
-        self, words: Words, order: WordOrder, ambient: float, onto: Reference = "absolute"
+        self, words: Words, order: WordOrder, ambient: float | Floats, onto: Reference = "absolute"
     ) -> tuple[npt.NDArray[np.float32], Flags]:
         """Pressures in Pa, counted from ``onto``, and quality bits, from words (rows, size)."""
-        return self.pressure(self._numbers(words, order), ambient, onto)
+        return self.pressure(self.floats(words, order), ambient, onto)
 
-    def supply(self, words: Words, order: WordOrder, ambient: float) -> npt.NDArray[np.float32]:
+    def supply(
+        self, words: Words, order: WordOrder, ambient: float | Floats
+    ) -> npt.NDArray[np.float32]:
         """Supply pressures in Pa gauge from words (rows, size); NaN where they are none."""
-        return self.gauge(self._numbers(words, order), ambient)
+        return self.gauge(self.floats(words, order), ambient)
 
-    def _numbers(self, words: Words, order: WordOrder) -> Floats:
-        with np.errstate(invalid="ignore"):  # signalling NaNs too
-            return self.raw(words, order).astype(np.float64)
+
+class Temperature(Thermometer, Tag):
+    """A temperature in the PLC's registers."""
+
+    type: NumberType
+
+
+class Flow(Flowmeter, Tag):
+    """A suction flow in the PLC's registers."""
+
+    type: NumberType
 
 
 def words_of(number: float, code: str, order: WordOrder) -> tuple[int, ...]:
@@ -221,8 +274,11 @@ def words_of(number: float, code: str, order: WordOrder) -> tuple[int, ...]:
     return tuple(words if order == "big" else words[::-1])
 
 
-def _counted(pascal: Floats, reference: Reference, onto: Reference, ambient: float) -> Floats:
+def _counted(
+    pascal: Floats, reference: Reference, onto: Reference, ambient: float | Floats
+) -> Floats:
     """Pressures counted from ``reference`` as counted from ``onto``; ambient cancels exactly."""
+    zero: dict[Reference, float | Floats]
     zero = {"absolute": 0.0, "gauge": ambient, "vacuum": ambient}
     sign = {"absolute": 1.0, "gauge": 1.0, "vacuum": -1.0}
     return sign[onto] * (sign[reference] * pascal + (zero[reference] - zero[onto]))

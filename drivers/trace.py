@@ -68,13 +68,13 @@ class Header:
         )
 
 
-def no_effect(tag: str, place: object, single: str) -> KeyedError:
-    """The error for a command's tag in block mode that is not where the trace has that command.
+def no_effect(tag: str, bit: int, place: object, single: str) -> KeyedError:
+    """The error for a bit's tag in block mode that is not where the trace has that bit.
 
     ``single`` is the mode that reads single values.
     """
     return KeyedError(
-        f"{place} has no effect in block mode: each record has {tag} in bit {COMMAND_BITS[tag]} of "
+        f"{place} has no effect in block mode: each record has {tag} in bit {bit} of "
         f"its status. Have the PLC write it there and leave out [driver.tags.{tag}], or read "
         f'single values with mode = "{single}" in [driver]',
         "tags",

@@ -1,6 +1,7 @@
 """How well the nozzle's switching is found, against the truth of rigs of the second world.
 
     python tests/nozzle_found.py [--first 9000] [--rigs 6] [--cycles 12] [--old] [--each]
+        [--reported MS]
 
 Rigs are drawn by seed, so many of each kind, and each that saves air once more with a larger leak
 and another hysteresis, so that its nozzle goes on again. A switching counts where the record goes
@@ -28,7 +29,7 @@ from twin.model.dataset import coefficients
 from twin.monitor.knees import as_wide_as_needed, expected_knees
 from twin.monitor.nozzle import noise_of, switchings
 from twin.monitor.phases import PhaseFinder
-from twin.signals import MS, NS, SAMPLE, Command, Phase, Samples
+from twin.signals import MS, NS, SAMPLE, Command, Phase, Reported, Samples
 
 STAMP = 1.0 * MS  # by which a record's stamps are late
 SHOWS_WITHIN = 100.0 * MS  # and three rows
@@ -147,9 +148,20 @@ def true(logged: Record) -> list[tuple[float, bool, float]]:
     return found
 
 
-def scored(name: str, logged: Record, finder=found_by_new) -> Score:  # type: ignore[no-untyped-def]
-    """Score a finder on a record."""
+def reporting(samples: Samples, logged: Record, late: float) -> Samples:
+    """The same with the nozzle reported, so long (s) after its valve has begun to move."""
+    seconds = samples["time_ns"] * NS
+    at = np.searchsorted(logged.truth.nozzle_s + STAMP + late, seconds, "right")
+    on = np.concatenate([[False], logged.truth.nozzle_on])[at]
+    samples["reported"] = Reported.NOZZLE_KNOWN + on * np.uint8(Reported.NOZZLE)
+    return samples
+
+
+def scored(name, logged, finder=found_by_new, late=None) -> Score:  # type: ignore[no-untyped-def]
+    """Score a finder on a record; ``late`` (s) is how late reports of the nozzle are, if any."""
     samples = samples_of(logged)
+    if late is not None:
+        samples = reporting(samples, logged, late)
     began = time.perf_counter()
     left = finder(samples, logged)
     took = time.perf_counter() - began
@@ -198,12 +210,14 @@ def main() -> None:
     for name, default in (("--first", 9000), ("--rigs", 6), ("--cycles", 12)):
         parser.add_argument(name, type=int, default=default)
     parser.add_argument("--old", action="store_true", help="the live twin's finder")
+    parser.add_argument("--reported", type=float, help="the ejector reports, so many ms late")
     parser.add_argument("--each", action="store_true", help="each rig with something wrong, too")
     asked = parser.parse_args()
     finder = found_by_old if asked.old else found_by_new
+    late = None if asked.reported is None else asked.reported * MS
     scores = []
     for name, logged in drawn(asked.first, asked.rigs, asked.cycles):
-        scores.append(one := scored(name, logged, finder))
+        scores.append(one := scored(name, logged, finder, late))
         if asked.each and (one.missed or one.false or one.beyond):
             sensor = logged.truth.rig.sensor
             sys.stdout.write(

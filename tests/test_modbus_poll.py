@@ -12,7 +12,8 @@ import pytest
 from drivers.lasting import Clock, LostError
 from drivers.link import Link, ModbusSettings
 from drivers.modbus import blocks
-from drivers.poll import Poller, plan
+from drivers.plan import plan
+from drivers.poll import Poller
 from drivers.tags import Tag
 from tests.modbus_server import CUT, ModbusServer, PlcTime
 from twin.errors import SourceError

@@ -18,16 +18,17 @@ from asyncua import ua
 
 from drivers.lasting import Clock
 from drivers.link import ModbusSettings
-from drivers.opcua_settings import Node, OpcuaSettings
+from drivers.opcua_settings import BIT_NODES, Node, OpcuaSettings
 from drivers.opcua_trace import NodeTrace
 from drivers.plc.opcua import MEASURED, TRACE
 from drivers.plc.registers import HEADER, HEADER_SIZE, MAP, RECORD, RING, Registers
 from drivers.plc.scan import OVERFLOW, PERIOD_NS
+from drivers.reports import BITS
 from drivers.ring import Header, Trace
 from drivers.tags import Address
 from tests.structured_text import Block, iec, parsed
 from twin.settings import Document
-from twin.signals import MBAR, SAMPLE, Command, Quality, Samples
+from twin.signals import MBAR, SAMPLE, Command, Quality, Reported, Samples
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE = (DOCS / "connect-your-plc.md").read_text(encoding="utf-8")
@@ -38,11 +39,12 @@ TABLES = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
 FAMILIES = {"s7": ("scl", 0), "twincat": ("st", 12288), "codesys": ("st", 0)}  # as on the page
 DEPTH, NODES = 2048, 1024  # records in the ring of registers, and in that of the nodes
 NAMES = {  # of a scan's values in either language
-    "st": ("rPressure", "iSupply", "xSuction", "xBlowOff", "xOverflow", "ulTimeNs"),
-    "scl": ("pressure", "supply", "suction", "blowOff", "overflow", "timeNs"),
+    "st": ("rPressure", "iSupply", "xSuction", "xBlowOff", "xOverflow", "wReported", "ulTimeNs"),
+    "scl": ("pressure", "supply", "suction", "blowOff", "overflow", "reported", "timeNs"),
 }
 MEMORY = {"st": ("awRegisters", "stNodes"), "scl": ("registers", "nodes")}
 COUNTER = {"st": "udiSequence", "scl": "sequence"}
+REPORTS = ("air_saving", "part_present")
 UA = {
     "INT": ua.VariantType.Int16,
     "UINT": ua.VariantType.UInt16,
@@ -63,11 +65,19 @@ def sources() -> Sources:
 
 
 def modbus(table: str) -> ModbusSettings:
+    table += "[driver.tags]\n" + "\n".join(
+        f'{name} = {{ address = "30005", bit = {BITS[name]} }}' for name in REPORTS
+    )
     return Document.parse(table, "connect-your-plc.md").section(ModbusSettings, "driver")
 
 
 def opcua() -> OpcuaSettings:
-    return Document.parse(TABLES[4], "connect-your-plc.md").section(OpcuaSettings, "driver")
+    table = (
+        TABLES[4]
+        + "[driver.tags]\n"
+        + "\n".join(f'{name} = {{ node = "s={BIT_NODES[name]}" }}' for name in REPORTS)
+    )
+    return Document.parse(table, "connect-your-plc.md").section(OpcuaSettings, "driver")
 
 
 class Plc:
@@ -97,7 +107,9 @@ class Plc:
     def values(self, scan: int) -> tuple[Any, ...]:
         pressure = float(np.float32(13.25 - scan * 0.37 % 900))
         suction, blow_off, overflow = scan % 7 < 4, scan % 11 > 8, scan % 501 == 0
-        return pressure, scan % 5000, suction, blow_off, overflow, START_NS + scan * PERIOD_NS
+        reported = 0xFFE3 | (scan % 5 < 2) << 3 | (scan % 3 < 1) << 4  # more than it may be
+        time_ns = START_NS + scan * PERIOD_NS
+        return pressure, scan % 5000, suction, blow_off, overflow, reported, time_ns
 
     def now_ns(self) -> int:
         return self.scan * PERIOD_NS + self._inside * PERIOD_NS // 64
@@ -170,7 +182,14 @@ def assert_whole(samples: Samples, plc: Plc, late: int) -> None:
     """Nothing missing, and what the PLC had; time may be that of a scan ``late`` later."""
     assert (np.diff(samples["sequence"]) == 1).all()
     expected = [plc.values(int(scan)) for scan in samples["sequence"]]
-    pressure, _, suction, blow_off, overflow, time_ns = map(np.array, zip(*expected, strict=True))
+    pressure, _, suction, blow_off, overflow, reported, time_ns = map(
+        np.array, zip(*expected, strict=True)
+    )
+    saving, part = reported >> 3 & 1, reported >> 4 & 1
+    asked = (suction != 0) & (blow_off == 0)
+    known = Reported.NOZZLE_KNOWN | Reported.PART_KNOWN
+    said = known + Reported.NOZZLE * (asked & (saving == 0)) + Reported.PART * part
+    np.testing.assert_array_equal(samples["reported"], said)
     pascal = ((pressure + AMBIENT) * MBAR).astype(np.float32)
     np.testing.assert_allclose(samples["pressure"], pascal, rtol=1e-7)
     commands = suction * Command.SUCTION + blow_off * Command.BLOW_OFF
@@ -276,8 +295,13 @@ def test_the_registers_are_those_of_the_simulated_plc(sources: Sources, language
         DEPTH, [("sequence", "<i8"), ("pressure", "<f4"), ("supply", "<i2"), ("status", "<u2")]
     )
     for scan in range(700):
-        pressure, supply, suction, blow_off, overflow, _ = plc.values(scan)
-        ours[scan] = scan, pressure, supply, suction + 2 * blow_off + OVERFLOW * overflow
+        pressure, supply, suction, blow_off, overflow, reported, _ = plc.values(scan)
+        ours[scan] = (
+            scan,
+            pressure,
+            supply,
+            (suction + 2 * blow_off + OVERFLOW * overflow + (reported & 0x1C)),
+        )
     settings = SimpleNamespace(server=SimpleNamespace(word_order="big"))
     task: Any = SimpleNamespace(ring=ours, newest=699, settings=settings)
     simulated = Registers(task, START_NS, boot=int(plc.words[HEADER + 6]))
@@ -307,8 +331,8 @@ def test_the_nodes_hold_the_same_scans(sources: Sources, language: str) -> None:
     assert (plc.node("Period"), plc.node("Sequence")) == (PERIOD_NS // 1000, 799)
     assert plc.node("TimeNs") == START_NS + (first + 1499) * PERIOD_NS
     for scan in range(plc.scan - NODES, plc.scan):
-        pressure, _, suction, blow_off, overflow, _ = plc.values(scan)
-        status = suction + 2 * blow_off + OVERFLOW * overflow
+        pressure, _, suction, blow_off, overflow, reported, _ = plc.values(scan)
+        status = suction + 2 * blow_off + OVERFLOW * overflow + (reported & 0x1C)
         record = [plc.node(name)[scan % NODES] for name in ("Sequences", "Statuses", "Pressures")]
         assert record == [scan % WRAP, status, pressure]
 

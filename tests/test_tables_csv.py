@@ -9,7 +9,7 @@ from table_rows import AMBIENT, MARK, REFUSE, SMALL, taken, written
 
 from twin.errors import ConfigError, SourceError, TwinError
 from twin.settings import Document
-from twin.signals import Command, Quality
+from twin.signals import Command, Quality, Reported
 from twin.tables import csv_file
 from twin.tables.reader import open_table
 from twin.tables.settings import ImportSettings
@@ -452,3 +452,37 @@ def test_a_unit_other_than_the_columns_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="is taken as vacuum_bar") as caught:
         open_table(path, said, 101_300.0)
     assert 'vacuum_mbar = "vacuum_bar"' in caught.value.hint
+
+
+def test_what_an_ejector_reports_is_taken(tmp_path: Path) -> None:
+    path = written(
+        tmp_path,
+        """time_ms,suction,blow_off,pressure_mbar,reported_air_saving,reported_part_present
+        0,1,0,900,0,0
+        1,1,0,400,1,1
+        2,1,0,400,,
+        3,0,0,400,0,1
+        """.replace("        ", ""),
+    )
+    known = Reported.NOZZLE_KNOWN | Reported.PART_KNOWN
+    on, part = Reported.NOZZLE, Reported.PART
+    assert taken(path)["reported"].tolist() == [known | on, known | part, 0, known | part]
+
+
+@pytest.mark.parametrize(
+    ("header", "cell", "message"),
+    [
+        ("reported_nozzle", "2", "'2' is not 0 or 1"),
+        ("flow_sl_min", "much", "'much' is not a finite number"),
+    ],
+)
+def test_what_is_reported_is_checked(tmp_path: Path, header: str, cell: str, message: str) -> None:
+    text = f"time_ms,suction,blow_off,pressure_mbar,{header}\n0,1,0,900,{cell}\n"
+    with pytest.raises(SourceError, match=message):
+        taken(written(tmp_path, text))
+
+
+def test_two_columns_that_say_the_same_are_refused(tmp_path: Path) -> None:
+    text = "time_ms,suction,blow_off,pressure_mbar,reported_nozzle,reported_air_saving\n"
+    with pytest.raises(SourceError, match="say the same"):
+        taken(written(tmp_path, text + "0,1,0,900,1,0\n"))

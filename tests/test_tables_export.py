@@ -12,11 +12,13 @@ from log_rows import HEADER, course
 from pyarrow import parquet
 from table_rows import AMBIENT, REFUSE, SMALL, taken, written
 
+from drivers.plc.settings import PlcSettings
+from drivers.plc.simulate import blocks
 from twin.errors import ConfigError, SourceError
 from twin.log.header import LogHeader
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
-from twin.signals import Quality, Samples, Signal, Ticks
+from twin.signals import TICK, Quality, Reported, Samples, Signal, Ticks
 from twin.tables import parquet_file
 from twin.tables.export import export
 from twin.tables.reader import open_table
@@ -55,6 +57,23 @@ def test_a_log_comes_back_to_the_bit(tmp_path: Path, suffix: str) -> None:
     assert taken(path).tobytes() == samples.tobytes()
     assert open_table(path, REFUSE, 1.0).ignored == SAID
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted(["a.mcap", path.name])
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_what_is_reported_comes_back_to_the_bit(tmp_path: Path, suffix: str) -> None:
+    told = PlcSettings.model_validate({"reports": {"bits": True, "values": True}})
+    samples = np.concatenate(list(blocks(told, 4.0)))
+    for column in ("ambient", "temperature", "pressure_2", "flow"):
+        samples[column][100:200] = 0.0
+    samples["reported"][300:400] &= np.uint8(Reported.FLOW_KNOWN)  # the rest is not known
+    samples["reported"][100:200] &= np.uint8(Reported.NOZZLE_KNOWN | Reported.NOZZLE)
+    ticks = np.zeros(len(samples), TICK)
+    with Recorder(tmp_path / "a.mcap", HEADER) as recorder:
+        recorder.write(samples, ticks)
+    log = open_log(tmp_path / "a.mcap")
+    path = tmp_path / f"a.{suffix}"
+    export(log.blocks(7000), log.header, path)
+    assert taken(path).tobytes() == samples.tobytes()
 
 
 def test_other_programs_read_the_ticks_too(tmp_path: Path) -> None:

@@ -665,6 +665,7 @@ def pair_of(settings: "Config", *, judges: bool = True) -> tuple["Twin", "Monito
     from twin.live import compiled
     from twin.monitor.detect import Monitor
     from twin.monitor.isolation import Isolation
+    from twin.monitor.reports import ReportWatch
 
     twin = compiled(settings.data)
     watch = settings.monitor
@@ -675,6 +676,7 @@ def pair_of(settings: "Config", *, judges: bool = True) -> tuple["Twin", "Monito
     )
     teller = key_figures_of(settings) if judges else None
     monitor = Monitor(watch, twin.theta, teller=teller, isolation=isolation, judges=judges)
+    monitor.reports = ReportWatch(twin.theta, twin.knees) if judges else None
     if settings.document.tables.get("driver", {}).get("mode") == "poll":
         monitor.clocks = None  # then time is that of the poll here
     return twin, monitor

@@ -26,6 +26,8 @@ class Kind(StrEnum):
     TWIN_LATE = "twin_late"
     SIGNAL_BAD = "signal_bad"
     SIGNAL_GOOD = "signal_good"
+    SIGNAL_CONTRADICTS = "signal_contradicts"
+    SIGNAL_AGREES = "signal_agrees"
     CYCLE = "cycle"
     DEVIATION = "deviation"
     DEVIATION_CLEARED = "deviation_cleared"
@@ -44,6 +46,8 @@ SEVERITY: dict[Kind, Severity] = {
     Kind.TWIN_LATE: Severity.WARNING,
     Kind.SIGNAL_BAD: Severity.WARNING,
     Kind.SIGNAL_GOOD: Severity.INFO,
+    Kind.SIGNAL_CONTRADICTS: Severity.WARNING,  # what is reported, and the pressure
+    Kind.SIGNAL_AGREES: Severity.INFO,
     Kind.CYCLE: Severity.INFO,
     Kind.DEVIATION: Severity.ALARM,
     Kind.DEVIATION_CLEARED: Severity.INFO,

@@ -19,7 +19,8 @@ from twin.monitor.knees import expected_knees
 from twin.monitor.listening import Listening
 from twin.monitor.phases import Found, Knees, PhaseFinder
 from twin.monitor.signatures import steps
-from twin.signals import MBAR, SAMPLE, TICK, Samples, Ticks
+from twin.monitor.surroundings import are_told, following, stretches
+from twin.signals import MBAR, SAMPLE, TICK, Phase, Samples, Ticks
 
 REPLAYED = 60_000  # rows that a replay takes at once: what is done to many cycles stays in caches
 
@@ -56,9 +57,11 @@ class Twin:
     terms: Sequence[Term] = ()
     _strides: Strides = field(default_factory=Strides)
     _last_ns: int | None = None
+    _phase: int = Phase.IDLE  # of the newest row
 
     def __post_init__(self) -> None:
         self._finder = PhaseFinder(self.knees)
+        self._around = self.theta  # with the surroundings as they are told
         self._terms = Terms(self.terms, float(self.theta[c.AMBIENT]))
 
     @classmethod
@@ -88,12 +91,21 @@ class Twin:
         expected = np.empty(len(samples))
         dt = steps(samples, self._last_ns)
         level, signals = ticks["level"].astype("f8"), np.empty(len(samples), "u1")
-        strides.advance(self._strides, self.theta, dt, phase, level, expected, signals)
+        for rows, telling in self._surrounded(samples, ticks):
+            self._around = following(self._around, telling)
+            driven, out = (dt[rows], phase[rows], level[rows]), (expected[rows], signals[rows])
+            strides.advance(self._strides, self._around, *driven, *out)
         self._terms.add(phase, expected)
         ticks["expected"], ticks["signals"] = expected, signals
         if len(samples):
-            self._last_ns = int(samples["time_ns"][-1])
+            self._last_ns, self._phase = int(samples["time_ns"][-1]), int(phase[-1])
         return samples, ticks
+
+    def _surrounded(self, samples: Samples, ticks: Ticks) -> Iterable[tuple[slice, Samples]]:
+        """Rows in one stretch of surroundings; nearly always nobody tells any."""
+        if are_told(samples):
+            return stretches(samples, ticks, self._phase)
+        return [(slice(None), samples[:0])]
 
 
 def compiled(data: DataSet) -> Twin:

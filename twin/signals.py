@@ -15,6 +15,7 @@ MBAR = 100.0  # Pa
 BAR = 1e5  # Pa
 MS = 1e-3  # s
 NS = 1e-9  # s
+ZERO_C = 273.15  # K
 ML = 1e-6  # m³
 STANDARD_DENSITY = 1.185  # kg/m³ at 100 kPa, 20 °C, 65 % relative humidity (ISO 8778)
 SL_MIN = STANDARD_DENSITY * 1e-3 / 60.0  # kg/s in one standard litre per minute
@@ -28,8 +29,16 @@ SAMPLE = np.dtype(
         ("supply", "<f4"),  # Pa, gauge, as read; NaN where it is not measured
         ("commands", "u1"),  # Command bits
         ("quality", "u1"),  # Quality bits
+        # What an ejector or its surroundings may tell besides; all zero where nothing does. No
+        # pressure and no temperature is 0 in these; a flow is measured where Reported says so.
+        ("reported", "u1"),  # Reported bits
+        ("ambient", "<f4"),  # Pa, absolute, of a barometer
+        ("temperature", "<f4"),  # K, of the gas or the surroundings
+        ("pressure_2", "<f4"),  # Pa, absolute, of a second sensor
+        ("flow", "<f4"),  # kg/s, suction flow
     ]
 )
+EXTRA = ("reported", "ambient", "temperature", "pressure_2", "flow")  # of these, what few have
 
 TICK = np.dtype(
     [
@@ -69,6 +78,16 @@ class Signal(IntFlag):
 
     PART_PRESENT = 1  # H2
     AIR_SAVING = 2  # H1
+
+
+class Reported(IntFlag):
+    """What an ejector says of itself, and what of it is known in a row."""
+
+    NOZZLE_KNOWN = 1
+    NOZZLE = 2  # it is on
+    PART_KNOWN = 4
+    PART = 8  # part present: H2 is reached
+    FLOW_KNOWN = 16
 
 
 class Quality(IntFlag):

@@ -16,7 +16,7 @@ from drivers.opcua_security import secure
 from drivers.plc.opcua_server import Behaviour
 from drivers.plc.partner import Written
 from drivers.plc.registers import Registers
-from drivers.plc.scan import DEPTH, OVERFLOW, PERIOD_NS, Scans
+from drivers.plc.scan import DEPTH, OVERFLOW, PERIOD_NS, REPORTED, Scans
 from drivers.plc.settings import OpcuaServer, PlcSettings
 from twin.errors import ConfigError, SourceError
 from twin.signals import Command
@@ -62,7 +62,7 @@ class Memory:
 
     def value(self, name: str, sequence: int) -> ua.DataValue:
         """One value of one scan, stamped with its time."""
-        variant = MEASURED[name](self._task.ring[sequence % DEPTH])
+        variant = OF_SCANS[name](self._task.ring[sequence % DEPTH])
         return ua.DataValue(Value=variant, SourceTimestamp=self.time(sequence))
 
     def trace(self, name: str) -> ua.DataValue:
@@ -121,6 +121,18 @@ MEASURED: dict[str, Callable[[np.void], ua.Variant]] = {
     "Meas.Supply": lambda scan: ua.Variant(int(scan["supply"]), Type.Int16),
     "Meas.Overflow": _bit(OVERFLOW),
 }
+REPORTS: dict[str, Callable[[np.void], ua.Variant]] = {  # with reports.bits
+    "Meas.Nozzle": _bit(1 << REPORTED),
+    "Meas.AirSaving": _bit(2 << REPORTED),
+    "Meas.PartPresent": _bit(4 << REPORTED),
+}
+VALUES: dict[str, Callable[[np.void], ua.Variant]] = {  # with reports.values
+    "Meas.Ambient": lambda scan: ua.Variant(float(scan["ambient"]) / 10, Type.Float),
+    "Meas.Temperature": lambda scan: ua.Variant(float(scan["temperature"]) / 10, Type.Float),
+    "Meas.Pressure2": lambda scan: ua.Variant(float(scan["vessel"]), Type.Float),
+    "Meas.Flow": lambda scan: ua.Variant(float(scan["flow"]), Type.Float),
+}
+OF_SCANS = MEASURED | REPORTS | VALUES
 TRACE: dict[str, Callable[[Memory], ua.Variant]] = {
     "Trace.Sequence": _header("Trace.Sequence"),
     "Trace.Time": _header("Trace.Time"),
@@ -146,7 +158,18 @@ KINDS: dict[ua.VariantType, Callable[[Any], Any]] = {
 RANGES: dict[str, tuple[Unit, float, float]] = {
     "Meas.Pressure": (MBAR, 0.0, 2000.0),  # absolute
     "Meas.Supply": (MBAR, 0.0, 10_000.0),  # gauge
+    "Meas.Ambient": (MBAR, 500.0, 1200.0),  # absolute
+    "Meas.Temperature": (Unit("CEL", "°C"), -40.0, 100.0),
+    "Meas.Pressure2": (MBAR, 0.0, 2000.0),  # absolute
+    "Meas.Flow": (Unit("L2", "l/min"), -2000.0, 2000.0),  # standard litres
 }
+
+
+def served_of(settings: PlcSettings) -> tuple[str, ...]:
+    """Names of what is served of each scan."""
+    reports = settings.reports
+    bits = tuple(REPORTS) if reports.bits else ()
+    return (*MEASURED, *bits, *(VALUES if reports.values else ()))
 
 
 @asynccontextmanager
@@ -155,8 +178,13 @@ async def serving(
 ) -> AsyncIterator["Serving"]:
     """Serve OPC UA while the context lasts. SourceError where the address cannot be had."""
     served = [Memory(one, catch_up, settings.trace_depth) for one in memories]
-    named = {f"{memory.prefix}{name}": (memory, name) for memory in served for name in MEASURED}
-    if len(named) < len(served) * len(MEASURED):
+    pairs = [
+        (memory, name)
+        for memory, one in zip(served, memories, strict=True)
+        for name in served_of(one.task.settings)
+    ]
+    named = {f"{memory.prefix}{name}": (memory, name) for memory, name in pairs}
+    if len(named) < len(pairs):
         raise ConfigError("two ejectors have the same nodes", "set prefix under [plc.opcua]")
 
     def value(node: str, sequence: int) -> ua.DataValue:
@@ -229,7 +257,7 @@ class _Space:
             for name in ("Identification", "Cmd", "Meas", "Param", "Trace")
         }
         await self._identify(groups["Identification"])
-        for name in (*MEASURED, *TRACE):
+        for name in (*served_of(settings), *TRACE):
             await self._live(groups[name.partition(".")[0]], name)
         await self._parameters(groups["Param"], settings)
         if self._memory.partner is not None:

@@ -44,6 +44,7 @@ class PartnerTask(Task):
         """Scans with what is written by now; there is no truth behind them."""
         scans = np.zeros(n, SCAN)
         scans["sequence"] = self.newest + 1 + np.arange(n)
+        scans["ambient"] = np.rint(self.settings.rig.ambient_mbar * 10)
         scans["pressure"], scans["supply"] = self.written.pressure, self._supply
         scans["status"] = [next(self._steps) for _ in range(n)]
         self.newest += n

@@ -33,6 +33,11 @@ READING = np.dtype(
         ("pressure", "f8"),  # Pa, absolute
         ("supply", "f8"),  # Pa, gauge
         ("overflow", "u1"),
+        ("reported", "u1"),  # 1 nozzle on, 2 air saving, 4 part present: as its control has them
+        ("ambient", "f8"),  # Pa, absolute
+        ("temperature", "f8"),  # K, of the surroundings
+        ("vessel", "f8"),  # Pa, absolute
+        ("flow", "f8"),  # kg/s, out of the line into the port
     ]
 )
 

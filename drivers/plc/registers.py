@@ -16,7 +16,7 @@ from twin.signals import Command
 
 RECORD = 4  # registers of one scan in the ring
 HEADER, HIL, RING = 100, 200, 1000
-HEADER_SIZE, TEST_SIZE, INPUT_SIZE, HIL_SIZE, COILS = 12, 6, 7, 5, 2
+HEADER_SIZE, TEST_SIZE, INPUT_SIZE, VALUES_SIZE, HIL_SIZE, COILS = 12, 6, 7, 6, 5, 2
 RING_SIZE = RECORD * DEPTH
 
 Words = list[int]
@@ -38,8 +38,19 @@ MAP = (
     Place("input", 0, 1, "int16", "pressure, 0.1 mbar absolute"),
     Place("input", 1, 2, "float32", "pressure, mbar absolute"),
     Place("input", 3, 1, "int16", "supply, mbar gauge"),
-    Place("input", 4, 1, "bits", "status: bit 0 suction, bit 1 blow-off, bit 8 input overflow"),
+    Place(
+        "input",
+        4,
+        1,
+        "bits",
+        "status: bit 0 suction, bit 1 blow-off, bit 8 input overflow; where the ejector reports "
+        "them, bit 2 nozzle on, bit 3 air saving, bit 4 part present",
+    ),
     Place("input", 5, 2, "uint32", "sequence number of the newest scan"),
+    Place("input", 7, 1, "int16", "barometer, 0.1 mbar absolute; from here on with `values`"),
+    Place("input", 8, 1, "int16", "temperature of the surroundings, 0.1 °C"),
+    Place("input", 9, 2, "float32", "second pressure, in the vessel, mbar absolute"),
+    Place("input", 11, 2, "float32", "suction flow, sl/min"),
     Place("holding", 0, 1, "uint16", "test of the word order: 0x1234"),
     Place("holding", 1, 1, "int16", "test: -12345"),
     Place("holding", 2, 2, "uint32", "test: 0x12345678"),
@@ -102,7 +113,7 @@ class Registers:
         return True
 
     def inputs(self) -> Words:
-        """Input registers 0 to 6: plain values of the newest scan."""
+        """Input registers 0 to 6: plain values of the newest scan; to 12 with what is besides."""
         scan = self.task.ring[self.task.newest % DEPTH]
         tenths = int(np.clip(np.rint(float(scan["pressure"]) * 10), -32768, 32767))
         return [
@@ -111,6 +122,10 @@ class Registers:
             int(scan["supply"]) & 0xFFFF,
             int(scan["status"]),
             *self._split(np.uint32(self.task.newest & 0xFFFFFFFF)),
+            int(scan["ambient"]) & 0xFFFF,
+            int(scan["temperature"]) & 0xFFFF,
+            *self._split(scan["vessel"]),
+            *self._split(scan["flow"]),
         ]
 
     def holding(self, address: int, count: int) -> Words:

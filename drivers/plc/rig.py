@@ -263,6 +263,10 @@ def read(p: Any, s: Any, row: Any, noise: Any, reading: Any) -> None:
     reading.pressure = round(clipped / MBAR / p.sensor_step) * p.sensor_step * MBAR
     supply = round((s.supply + p.supply_noise * noise[2]) / MBAR)
     reading.supply = min(max(supply, -32768), 32767) * MBAR
+    nozzle, saving, part = s.suction_wanted > 0.0, s.saving > 0.0, s.part_present > 0.0
+    reading.reported = (1 if nozzle else 0) + (2 if saving else 0) + (4 if part else 0)
+    reading.ambient, reading.temperature = p.ambient + row.ambient_pressure_shift, p.wall
+    reading.vessel, reading.flow = s.vessel_pressure, -s.near_flow
 
 
 @njit(cache=True)

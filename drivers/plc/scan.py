@@ -14,18 +14,23 @@ from drivers.plc.faults import Fault, Rows
 from drivers.plc.plant import READING, TRUTH, Record, at_rest, plant, refuse_stiff
 from drivers.plc.rig import DT, NOISES, run
 from drivers.plc.settings import PlcSettings, Program
-from twin.signals import BAR, MBAR, SL_MIN, Command
+from twin.signals import BAR, MBAR, SL_MIN, ZERO_C, Command
 
 PERIOD_NS = 1_000_000
 DEPTH = 4096  # scans that the trace ring holds
 OVERFLOW = 0x100  # bit of the status word
+REPORTED = 2  # place of the first of three bits: nozzle, air saving, part present
 
 SCAN = np.dtype(
     [
         ("sequence", "<i8"),
         ("pressure", "<f4"),  # mbar, absolute, as in the registers
         ("supply", "<i2"),  # mbar, gauge, as in the registers
-        ("status", "<u2"),  # command bits and OVERFLOW
+        ("status", "<u2"),  # command bits, REPORTED and OVERFLOW
+        ("ambient", "<i2"),  # 0.1 mbar absolute, as in the registers
+        ("temperature", "<i2"),  # 0.1 °C
+        ("vessel", "<f4"),  # mbar, absolute
+        ("flow", "<f4"),  # sl/min
     ]
 )
 Scans = npt.NDArray[np.void]  # of SCAN
@@ -84,6 +89,7 @@ class Task:
         self._noise = np.random.default_rng([seed, 0])
         self._scatter = np.random.default_rng([seed, 2])
         self._cycle_scatter = self._scatter.standard_normal((1, 2))  # before the first cycle
+        self._reported = np.zeros(round(settings.reports.bits_delay_ms), np.uint8)  # not yet told
 
     def advance_to(self, n_scans: int) -> None:
         """Compute scans until ``n_scans`` have been since the start; a stall is caught up here."""
@@ -107,7 +113,19 @@ class Task:
         scans["pressure"] = readings["pressure"] / MBAR
         scans["supply"] = np.rint(readings["supply"] / MBAR)
         scans["status"] = commands + OVERFLOW * readings["overflow"].astype(np.uint16)
+        if self.settings.reports.bits:
+            scans["status"] |= self._late(readings["reported"]).astype(np.uint16) << REPORTED
+        scans["ambient"] = np.rint(readings["ambient"] / MBAR * 10)
+        scans["temperature"] = np.rint((readings["temperature"] - ZERO_C) * 10)
+        scans["vessel"], scans["flow"] = readings["vessel"] / MBAR, readings["flow"] / SL_MIN
         return scans, truths
+
+    def _late(self, reported: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+        """What has been reported by now."""
+        known = np.concatenate([self._reported, reported])
+        late = round(self.settings.reports.bits_delay_ms)
+        self._reported = known[len(known) - late :]
+        return known[: len(reported)]
 
     def _commands(self, n: int) -> npt.NDArray[np.uint8]:
         if self.settings.program.commands == "coils":

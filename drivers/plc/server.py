@@ -112,7 +112,8 @@ def _device(unit: int, answers: Answers) -> SimDevice:
     ]
     if answers.memory.partner:
         holding.insert(2, _words(registers.HIL, registers.HIL_SIZE))
-    inputs = [_words(0, registers.INPUT_SIZE)]
+    more = registers.VALUES_SIZE if answers.memory.task.settings.reports.values else 0
+    inputs = [_words(0, registers.INPUT_SIZE + more)]
     return SimDevice(unit, simdata=(_bits(), _bits(), holding, inputs), action=answers.answer)
 
 

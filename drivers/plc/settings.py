@@ -78,6 +78,14 @@ class Control(Settings):
     noise_mbar: float = Field(default=0.5, ge=0, le=20)
 
 
+class Reports(Settings):
+    """What the ejector and its surroundings tell besides, where the PLC serves it."""
+
+    bits: bool = False  # nozzle, air saving and part present in the status, as IO-Link brings them
+    bits_delay_ms: float = Field(default=0.0, ge=0, le=100)  # IO-Link's cycle, and the PLC's
+    values: bool = False  # barometer, thermometer, the vessel's pressure and the suction flow
+
+
 class Program(Settings):
     """What the PLC commands: a pick-and-place cycle, or coils that a client writes.
 
@@ -145,6 +153,7 @@ class PlcSettings(Settings):
     valves: Valves = Valves()
     sensor: Sensor = Sensor()
     control: Control = Control()
+    reports: Reports = Reports()
     program: Program = Program()
     scatter: Scatter = Scatter()
     server: Server = Server()

@@ -6,10 +6,11 @@ import numpy as np
 
 from drivers.plc.faults import Fault
 from drivers.plc.plant import Record
-from drivers.plc.scan import OVERFLOW, PERIOD_NS, Scans, Task
-from drivers.plc.settings import PlcSettings
-from twin.signals import MBAR, SAMPLE, Quality, Samples
+from drivers.plc.scan import OVERFLOW, PERIOD_NS, REPORTED, Scans, Task
+from drivers.plc.settings import PlcSettings, Reports
+from twin.signals import MBAR, SAMPLE, SL_MIN, ZERO_C, Quality, Reported, Samples
 
+NOTHING = Reports()
 EPOCH_NS = 1_767_225_600_000_000_000  # 2026-01-01, PLC time of sequence 0
 
 
@@ -37,11 +38,14 @@ def with_truth(
     total = round(duration_s * 1000)
     for first in range(0, total, block):
         scans, truth = task.compute(min(block, total - first))
-        yield to_samples(scans), truth
+        yield to_samples(scans, settings.reports), truth
 
 
-def to_samples(scans: Scans) -> Samples:
-    """Turn scans into samples exactly as a client that reads the float32 registers does."""
+def to_samples(scans: Scans, reports: Reports = NOTHING) -> Samples:
+    """Turn scans into samples exactly as a client that reads the float32 registers does.
+
+    What is reported besides is there in each row, where it is served: as polled.
+    """
     samples = np.zeros(len(scans), SAMPLE)
     samples["sequence"] = scans["sequence"]
     samples["time_ns"] = EPOCH_NS + scans["sequence"] * PERIOD_NS
@@ -50,4 +54,14 @@ def to_samples(scans: Scans) -> Samples:
     samples["supply"] = scans["supply"].astype(np.float64) * MBAR
     samples["commands"] = scans["status"] & 3
     samples["quality"] = np.where(scans["status"] & OVERFLOW, Quality.OVERFLOW, 0)
+    if reports.bits:
+        nozzle, part = scans["status"] >> REPORTED & 1, scans["status"] >> REPORTED + 2 & 1
+        samples["reported"] = Reported.NOZZLE_KNOWN | Reported.PART_KNOWN
+        samples["reported"] |= (nozzle * Reported.NOZZLE + part * Reported.PART).astype(np.uint8)
+    if reports.values:
+        samples["ambient"] = scans["ambient"] * (MBAR / 10)
+        samples["temperature"] = scans["temperature"] / 10 + ZERO_C
+        samples["pressure_2"] = scans["vessel"].astype(np.float64) * MBAR
+        samples["flow"] = scans["flow"] * SL_MIN
+        samples["reported"] |= np.uint8(Reported.FLOW_KNOWN)
     return samples

@@ -19,6 +19,8 @@ from twin.model.dataset import DataSet, coefficients
 from twin.monitor.cycles import Cycle, figures, whole
 from twin.monitor.healthy import Healthy, Scatter
 from twin.monitor.knees import as_wide_as_needed
+from twin.monitor.reports import Contradiction, standing
+from twin.monitor.surroundings import taken_in
 from twin.signals import BREAK, MBAR, SAMPLE, UNUSABLE, Command, Phase, Samples, bridged
 
 FEWEST = 5  # complete cycles
@@ -49,8 +51,10 @@ def calibrate(
     """
     progress("reading the log")
     samples = np.concatenate([np.empty(0, SAMPLE), *bridged(blocks)])
+    config = replace(config, data=taken_in(config.data, samples))
     before = complete(config.data, samples)
     refuse_insufficient(samples, before)
+    refuse_contradicting(before, config.data)
     samples = samples[samples["time_ns"] <= before[-1].end_ns]
     used = samples["time_ns"] <= before[:MOST_FITTED][-1].end_ns
     fitted = fit(samples[used], Space.of_type(config.data), progress)
@@ -90,6 +94,19 @@ def refuse_insufficient(samples: Samples, cycles: Sequence[Cycle]) -> None:
             f"the log has {len(cycles)} complete cycles that count; a calibration needs {FEWEST}",
             "record suction, blow-off and idle again and again without a gap",
         )
+
+
+def refuse_contradicting(cycles: Sequence[Cycle], data: DataSet) -> None:
+    """ConfigError if the ejector says something else of its nozzle than the pressure does."""
+    for one in contradictions(cycles, data):
+        if one.signal == "nozzle":
+            raise ConfigError(one.what, f"{one.action}; or leave the tag out")
+
+
+def contradictions(cycles: Sequence[Cycle], data: DataSet) -> list[Contradiction]:
+    """The signals in a record that its pressure contradicts."""
+    twin = Twin.of(data)
+    return standing(cycles, twin.theta, twin.knees)
 
 
 def refuse_rounded(data: DataSet, samples: Samples) -> None:

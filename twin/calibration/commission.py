@@ -16,6 +16,7 @@ from twin.calibration.calibrate import (
     MOST_FITTED,
     Calibration,
     complete,
+    contradictions,
     like_these,
     refuse_insufficient,
     scatter,
@@ -30,7 +31,9 @@ from twin.errors import ConfigError
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.model.system import Cups, volume
-from twin.signals import MBAR, ML, MS, SAMPLE, SL_MIN, Command, Samples, bridged
+from twin.monitor.reports import APART, Contradiction
+from twin.monitor.surroundings import taken_in
+from twin.signals import MBAR, ML, MS, SAMPLE, SL_MIN, Command, Reported, Samples, bridged
 
 SLOWEST = 10.5 * MS  # s between rows; what switches faster than a few rows is not seen
 COARSE = 2.05 * MS  # s between rows, above which it is said what they do not show
@@ -41,6 +44,7 @@ PLACES, PORT_SHARES = (0.05, 0.95), (0.01, 0.1)
 CLEARLY = 15.0  # mbar by which a threshold must differ to be told; overshoot is part of a turn
 LITTLE_VACUUM = 200.0  # mbar; flow ejectors on leaking parts make more
 AMBIENT_CLEARLY = 3.0  # mbar, the same for ambient pressure
+LEAST_OFFSET = 1.0  # mbar, of the sensor beside a barometer, to be taken for one
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,7 @@ class Commissioned:
     readings: Readings
     verdict: Verdict
     remarks: tuple[Remark, ...]
+    contradictions: tuple[Contradiction, ...]  # of what is reported and the pressure
     samples: Samples  # that the twin was judged on
 
     @property
@@ -93,10 +98,18 @@ def commission(
     refuse_empty(samples)
     readings = read(samples)
     refuse_unreadable(readings)
+    config = replace(config, data=taken_in(config.data, samples))
     refuse_miswired(samples, readings, config.data.ambient.pressure_mbar * MBAR)
     guess, remarks = guessed(config.data, readings)
     before = complete(guess, samples)
     refuse_insufficient(samples, before)
+    against = contradictions(before, guess)
+    if any(one.signal == "nozzle" for one in against):
+        progress("the nozzle is not as reported: reading the pressure alone")
+        samples = unreported(samples)
+        readings = read(samples)
+        guess, remarks = guessed(config.data, readings)
+        before = complete(guess, samples)
     samples = samples[samples["time_ns"] <= before[-1].end_ns]
     used = samples[samples["time_ns"] <= before[:MOST_FITTED][-1].end_ns]
     refuse_parted(Cycles.found(samples, guess))
@@ -108,7 +121,14 @@ def commission(
     healthy = like_these(known, fitted, scatter(fitted.data, cycles), samples)
     times = samples["host_ns"]
     calibration = Calibration(fitted, healthy, len(cycles), int(times[0]), int(times[-1]))
-    return Commissioned(calibration, readings, verdict, tuple(remarks), samples)
+    return Commissioned(calibration, readings, verdict, tuple(remarks), tuple(against), samples)
+
+
+def unreported(samples: Samples) -> Samples:
+    """The same as if nobody had reported the nozzle."""
+    samples = samples.copy()
+    samples["reported"] &= ~np.uint8(Reported.NOZZLE_KNOWN | Reported.NOZZLE)
+    return samples
 
 
 def refuse_empty(samples: Samples) -> None:
@@ -149,7 +169,13 @@ def guessed(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:
     tables = data.model_dump()
     remarks: list[Remark] = []
     ambient = tables["ambient"]["pressure_mbar"]
-    if readings.opened:
+    offset = (readings.idle - readings.barometer) / MBAR
+    if readings.opened and abs(offset) <= APART / MBAR:  # so much the sensor may read off
+        tables["ambient"]["pressure_mbar"] = round(readings.barometer / MBAR, 1)
+        if abs(offset) > LEAST_OFFSET:
+            tables["effects"]["sensor_offset"] = {"offset": round(offset, 1)}
+        ambient = readings.idle / MBAR  # what vacuum is read from
+    elif readings.opened:
         found = round(readings.idle / MBAR, 1)
         if abs(found - ambient) > AMBIENT_CLEARLY:
             line = f"[data.ambient] pressure_mbar = {found:g}"
@@ -165,6 +191,7 @@ def guessed(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:
             )
             remarks.append(Remark(text, '[data.ejector] air_saving = "off"'))
         ejector["air_saving"] = "off"
+        remarks += _part_present(ejector, readings, ambient)
     else:
         ejector["air_saving"] = "on" if ejector["air_saving"] == "off" else ejector["air_saving"]
         remarks += _thresholds(ejector, readings, ambient)
@@ -224,11 +251,24 @@ def _thresholds(ejector: dict[str, float], readings: Readings, ambient: float) -
             )
             line = f"[data.ejector] h1_hysteresis_mbar = {hysteresis:g}"
             remarks.append(Remark(text, line))
+    remarks += _part_present(ejector, readings, ambient)
     h2 = min(ejector["h2_mbar"], h1 - hysteresis)
     if h2 <= ejector["h2_hysteresis_mbar"]:
         hysteresis, h2 = h1 / 5.0, h1 / 2.0
     ejector.update(h1_mbar=h1, h1_hysteresis_mbar=hysteresis, h2_mbar=h2)
     return remarks
+
+
+def _part_present(ejector: dict[str, float], readings: Readings, ambient: float) -> list[Remark]:
+    """Set H2 to where the ejector itself says that the part is there, if it says so."""
+    if not np.isfinite(readings.part):
+        return []
+    h2, before = round(ambient - readings.part / MBAR), ejector["h2_mbar"]
+    if abs(h2 - before) <= CLEARLY + readings.part_unsure / MBAR:
+        return []
+    ejector["h2_mbar"] = h2
+    text = f"part present comes at {h2:g} mbar; the configuration says {before:g}"
+    return [Remark(text, f"[data.ejector] h2_mbar = {h2:g}")]
 
 
 def _volume(data: DataSet) -> float:

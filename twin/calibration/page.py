@@ -45,7 +45,9 @@ def write_page(found: Commissioned, asset: Asset, path: Path) -> None:
 def _remarks(found: Commissioned) -> Iterator[str]:
     for remark in found.remarks:
         yield page.box(remark.text, f"The record's value is used. Write: {remark.line}")
-    if not found.remarks:
+    for one in found.contradictions:
+        yield page.box(one.what, f"{one.action[0].upper()}{one.action[1:]}.")
+    if not found.remarks and not found.contradictions:
         yield page.paragraph("Nothing: the record does not contradict the configuration.")
     if found.unseen:
         yield page.paragraph(found.unseen)

@@ -12,7 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.figures.curve import flow_behind
-from twin.signals import MBAR, MS, NS, UNUSABLE, Command, Samples
+from twin.monitor.nozzle import reports_nozzle, told_edges
+from twin.monitor.reports import part_at
+from twin.monitor.surroundings import told
+from twin.signals import MBAR, MS, NS, UNUSABLE, Command, Reported, Samples
 
 Floats = npt.NDArray[np.float64]
 
@@ -63,6 +66,9 @@ class Readings:
     fill_rate: float  # 1/s, dp/dt over ambient as blow-off begins
     draw_rate: float  # 1/s, −dp/dt over pressure as suction begins
     back_rate: float  # 1/s, dp/dt over ambient at its steepest after suction, nothing commanded
+    barometer: float = np.nan  # Pa, its median
+    part: float = np.nan  # Pa, at which the ejector itself reports a part
+    part_unsure: float = np.nan  # Pa, as that may be late
 
     @property
     def least_vacuum(self) -> float:
@@ -104,12 +110,22 @@ def read(samples: Samples) -> Readings:
     turn = max(CLEAR * noise / np.sqrt(width), LEAST_TURN)
     suctions = [one for one in found if one.command == Command.SUCTION]
     offs, ons, switches = [], [], 0
+    reported = reports_nozzle(rows["reported"][rows["commands"] == Command.SUCTION])
+    nozzle = (rows["reported"] & np.uint8(Reported.NOZZLE)) != 0
     for one in suctions:
         smooth = _smoothed(pressure[one.first : one.last], width)[edge:]
         lows, highs = deep(smooth, *turns(smooth, turn))
         offs += list(smooth[lows])
         ons += list(smooth[highs])
-        switches += len(lows) > 0
+        edges = [one.first + row for row in told_edges(nozzle[one.first : one.last])]
+        switches += len(edges if reported else lows) > 0
+        if reported and not lows:  # it holds so well that the pressure does not turn
+            offs += list(pressure[edges[:1]])
+    parts = [
+        at
+        for one in suctions
+        if (at := part_at(rows[one.first : one.last], pressure[one.first : one.last]))
+    ]
     idle, opened = _idle(pressure, found, round(OPENED_MS * MS / period), noise)
     return Readings(
         period=period,
@@ -130,6 +146,9 @@ def read(samples: Samples) -> Readings:
         fill_rate=_fill_rate(pressure, found, period, idle),
         draw_rate=_draw_rate(pressure, suctions, period),
         back_rate=_back_rate(pressure, found, period, idle),
+        barometer=told(samples).get("ambient", np.nan),
+        part=_median([pascal for pascal, _ in parts]),
+        part_unsure=_median([unsure for _, unsure in parts]),
     )
 
 

@@ -80,6 +80,9 @@ def commissioned_in_words(found: Commissioned) -> str:
     for remark in found.remarks:
         lines += ["", f"the record contradicts the configuration: {remark.text}"]
         lines += [f"  the record's value is used; write: {remark.line}"]
+    for one in found.contradictions:
+        lines += ["", f"a signal contradicts the pressure ({one.signal}): {one.what}"]
+        lines += [f"  {one.action}"]
     lines += ["", in_words(found.calibration)]
     if found.unseen:
         lines += ["", found.unseen]
@@ -125,6 +128,10 @@ def commissioned_as_json(
             for phase, one in found.verdict.residuals.items()
         },
         "contradicts": [{"what": one.text, "line": one.line} for one in found.remarks],
+        "signals": [
+            {"signal": one.signal, "what": one.what, "do": one.action}
+            for one in found.contradictions
+        ],
         "assumed": found.assumed,
         "unseen": found.unseen,
         "cycles": found.calibration.cycles,

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,9 @@ from twin.instants import CALENDAR_NS, SECOND_NS
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS
 from twin.model.term import Term
+from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import NOT_COMMISSIONED
+from twin.monitor.reports import standing
 from twin.signals import Quality, Samples
 
 FORMAT = "ejector-twin-diagnosis/1"
@@ -72,11 +75,13 @@ def diagnose(
     progress("running the twin over the log")
     blocks = [block for block in blocks if len(block)]
     evidence = replace(collect(config, blocks), before_s=before_s)
-    head = {
+    head: dict[str, Any] = {
         "format": FORMAT,
         "log": log,
         "asset": {"type": config.asset.type, "id": config.asset.id},
     }
+    if against := _signals(evidence):
+        head["signals"] = against
     part = _part(blocks, before_s)
     unrecorded = f"{derived}: record the commands as well" if derived else None
     if reason := unrecorded or _not_commissioned(config) or insufficient(evidence):
@@ -127,6 +132,17 @@ def diagnose(
     return Diagnosis(
         evidence, config.data.hash, searched, found, terms, before, after, held_out, answer
     )
+
+
+def _signals(evidence: Evidence) -> list[dict[str, str]]:
+    """What the ejector reports, or somebody measures, that the pressure contradicts."""
+    bounds = pairwise(evidence.starts.tolist())
+    cycles = (
+        Cycle(number, evidence.samples[first:last], evidence.ticks[first:last], complete=True)
+        for number, (first, last) in enumerate(bounds)
+    )
+    against = standing(cycles, evidence.theta, evidence.knees)
+    return [{"signal": one.signal, "what": one.what, "do": one.action} for one in against]
 
 
 def _verdict(found: Hypothesis, before: Judged, after: Judged, strange: Unlisted) -> str:

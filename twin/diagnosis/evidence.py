@@ -33,8 +33,21 @@ from twin.monitor.healthy import Healthy
 from twin.monitor.knees import as_wide_as_needed, expected_knees
 from twin.monitor.phases import Knees
 from twin.monitor.signatures import drawn_rows, steps
+from twin.monitor.surroundings import following
 from twin.monitor.switching import Seen, seen
-from twin.signals import MBAR, NS, SAMPLE, TICK, UNUSABLE, Command, Phase, Samples, Ticks, bridged
+from twin.signals import (
+    MBAR,
+    NS,
+    SAMPLE,
+    TICK,
+    UNUSABLE,
+    Command,
+    Phase,
+    Samples,
+    Ticks,
+    bridged,
+    joined,
+)
 
 CORES: ContextVar[int] = ContextVar("CORES", default=2)  # on which a diagnosis runs
 LATER, LONGEST_SUCTION = 1.3, 10_000  # cycles' suction, rows: until when H1 may be reached
@@ -361,6 +374,9 @@ def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
 def of_log(beside: Evidence, blocks: Iterable[Samples]) -> Evidence:
     """What another log says beside the same twin."""
     blocks = list(bridged(blocks))
+    rows = joined(np.empty(0, SAMPLE), *blocks)
+    uncertain = tuple((following(up, rows), following(down, rows)) for up, down in beside.uncertain)
+    beside = replace(beside, theta=following(beside.theta, rows), uncertain=uncertain)
     knees = as_wide_as_needed(beside.knees, blocks)
     cycles = whole(Twin(beside.theta, knees, beside.terms).over(blocks))
     samples = np.concatenate([np.empty(0, SAMPLE), *(cycle.samples for cycle in cycles)])

@@ -40,6 +40,7 @@ from twin.diagnosis.words import (
     lines,
     listed,
     number,
+    signals,
     sized,
     some,
     spoken,
@@ -110,6 +111,8 @@ def _steps(answer: Answer, times: Times) -> Iterator[str]:
     if answer["verdict"] == "unlisted":
         title = "Something that no listed cause explains"
         yield page.card(title, f"Left in {left_over(answer)}.", steps.items())
+    for one in signals(answer):
+        yield page.box(f"The signal {one['signal']}", f"{one['what']}: {one['do']}.")
     for title, text in record.items():
         yield page.box(title.capitalize(), f"{text[:1].upper()}{text[1:]}.")
     if answer["verdict"] == "consistent":

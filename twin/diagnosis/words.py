@@ -60,7 +60,14 @@ def lines(answer: Answer, now_ns: int) -> str:
     """The answer in a few lines of plain text."""
     said = [f"{answer['verdict']}: {headline(answer, now_ns)}"]
     said += [f"  {label:<14} {text}" for label, text in _facts(answer, now_ns)]
+    said += [f"  {one['signal']:<14} {one['what']}: {one['do']}" for one in signals(answer)]
     return "\n".join(said)
+
+
+def signals(answer: Answer) -> Sequence[Answer]:
+    """What is reported and contradicts the pressure; nearly always nothing."""
+    found: Sequence[Answer] = answer.get("signals", ())
+    return found
 
 
 def headline(answer: Answer, now_ns: int) -> str:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from twin.log.schema import ADDED, COLUMNS, SAMPLES
 from twin.model.compiled import compiled, per_row
-from twin.signals import SAMPLE, TICK, Samples, Ticks
+from twin.signals import EXTRA, SAMPLE, TICK, Samples, Ticks
 
 _Places = npt.NDArray[np.int64]
 
@@ -34,6 +34,7 @@ def _places(rows: np.dtype[np.void]) -> _Places:
 
 
 _SAMPLE_PLACES, _TICK_PLACES = _places(SAMPLE), _places(TICK)
+_EXTRA_FROM = int(_SAMPLE_PLACES[-len(EXTRA), 0])  # they stand last in a row
 
 
 def encode(samples: Samples, ticks: Ticks) -> bytes:
@@ -44,9 +45,13 @@ def encode(samples: Samples, ticks: Ticks) -> bytes:
     for rows, places in ((samples, _SAMPLE_PLACES), (ticks, _TICK_PLACES)):
         raw = np.ascontiguousarray(rows).view(np.uint8)
         raw.flags.writeable = False  # as rows of a file are: one type to compile for
+        blank = rows is samples and _ends_in_zeros(raw, rows.itemsize, _EXTRA_FROM)
         for offset, width in places.tolist():
+            name = next(columns)
+            if name in EXTRA and (blank or _is_zero(raw, rows.itemsize, offset, width)):
+                continue
             used = _pack(raw, rows.itemsize, offset, width, space)
-            setattr(message, next(columns), space[:used].tobytes())
+            setattr(message, name, space[:used].tobytes())
     packed: bytes = message.SerializeToString()
     return packed
 
@@ -64,7 +69,7 @@ def decode(packed: bytes | memoryview) -> tuple[Samples, Ticks]:
     spans = spans[_NUMBERS]
     if (wrong := _misfit(spans, count, _ADDED)) >= 0:
         raise ValueError(f"{COLUMNS[wrong]} is not packed for {count} rows")
-    samples, ticks = np.empty(count, SAMPLE), np.empty(count, TICK)
+    samples, ticks = np.zeros(count, SAMPLE), np.zeros(count, TICK)
     of_samples, of_ticks = spans[: len(_SAMPLE_PLACES)], spans[len(_SAMPLE_PLACES) :]
     _unpack(raw, of_samples, _SAMPLE_PLACES, count, samples.view(np.uint8))
     _unpack(raw, of_ticks, _TICK_PLACES, count, ticks.view(np.uint8))
@@ -82,6 +87,28 @@ def _read(raw, at, width):  # type: ignore[no-untyped-def]
     for j in range(width):
         bits |= np.uint64(raw[at + np.uint64(j)]) << np.uint64(8 * j)
     return bits
+
+
+@compiled
+def _ends_in_zeros(rows, size, offset):  # type: ignore[no-untyped-def]
+    """Whether all fields from ``offset`` on are zero in all rows, to the bit: quick to see."""
+    any_bits = np.uint64(0)
+    words = (size - offset) // 8
+    for begin in range(0, len(rows), size):
+        for word in range(words):
+            any_bits |= _read(rows, np.uint64(begin + offset + 8 * word), 8)
+        for at in range(begin + offset + 8 * words, begin + size):
+            any_bits |= np.uint64(rows[at])
+    return any_bits == 0
+
+
+@compiled
+def _is_zero(rows, size, offset, width):  # type: ignore[no-untyped-def]
+    """Whether a field is zero in all rows, to the bit."""
+    any_bits = np.uint64(0)
+    for at in range(offset, len(rows), size):
+        any_bits |= _read(rows, np.uint64(at), width)
+    return any_bits == 0
 
 
 @compiled
@@ -225,7 +252,7 @@ def _sum(bits, steps, rows, size, at, width):  # type: ignore[no-untyped-def]
 
 @compiled
 def _unpack(packed, spans, places, n, rows):  # type: ignore[no-untyped-def]
-    """Fill ``n`` rows, each field from its packed column; one that is not there is zero."""
+    """Fill ``n`` rows, each field from its packed column; one that is not there stays zero."""
     size = len(rows) // n
     bits = np.zeros(len(places), np.uint64)
     for column in range(len(places)):
@@ -236,6 +263,8 @@ def _unpack(packed, spans, places, n, rows):  # type: ignore[no-untyped-def]
         m = min(_TILE, n - row)
         for column in range(len(places)):
             start, end = spans[column]
+            if end == start:
+                continue
             offset, width = places[column]
             kept = max(end - start - _FIRST, 0) // n
             first, at = start + _FIRST + row, row * size + offset

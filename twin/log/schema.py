@@ -4,7 +4,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 
-from twin.signals import SAMPLE, TICK
+from twin.signals import EXTRA, SAMPLE, TICK
 
 _Field = descriptor_pb2.FieldDescriptorProto
 _TIME = ".google.protobuf.Timestamp"
@@ -12,19 +12,23 @@ _Type: TypeAlias = _Field.Type.ValueType | str  # a string names a message or an
 _Fields = dict[int, tuple[str, _Type]]  # by number: name and type
 
 COLUMNS = (*(SAMPLE.names or ()), *(TICK.names or ()))  # in the order of twin.log.columns
-ADDED = {"signals"}  # columns that logs of earlier programs do not have; there they are all zero
+ADDED = {"signals", *EXTRA}  # columns that a log need not have; there they are all zero
 
 _SAMPLES = """Rows of the measurement and the model at full rate, column by column, lossless.
 Each column: 8 bytes with the first row's bits, then k byte planes of `count` bytes each.
 Bits: the field's bits as a signed little-endian integer, sign-extended to 64 bits
-(int64: sequence, time_ns, host_ns; float32: pressure, supply, expected, level; others 8 bits).
+(int64: sequence, time_ns, host_ns; 8 bits: commands, quality, reported, phase, signals; others
+float32).
 Planes: d[0] = 0, d[i] = bits[i] - bits[i-1] modulo 2**64, z = (d << 1) ^ (d >> 63);
 plane j holds byte j of every z; k = (length - 8) / count; planes that would be all zero are left
 out. Units: time_ns PLC time and host_ns time of receipt in ns, pressure and expected Pa absolute,
 supply Pa gauge, level Pa absolute on which the model was set anew, commands 1 suction
 + 2 blow-off, quality 1 gap + 2 restart + 4 clock + 8 out of range + 16 overflow + 32 stale
 + 64 bad + 128 received late by the twin itself, phase 0 idle, 1 suction, 2 hold, 3 blow-off,
-signals that the model hands out 1 part present (H2) + 2 air saving (H1)."""
+signals that the model hands out 1 part present (H2) + 2 air saving (H1).
+Where they are measured, else zero, and left out where all are: reported by the ejector 1 nozzle
+known + 2 nozzle on + 4 part present known + 8 part present + 16 flow known, ambient Pa absolute of
+a barometer, temperature K, pressure_2 Pa absolute of a second sensor, flow kg/s of suction."""
 
 _SCALARS = """About 50 rows a second, and each row where a command or the phase changes, to look at.
 deviation_mbar is measured minus expected absolute pressure: above 0 is less vacuum than expected.

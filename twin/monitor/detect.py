@@ -29,7 +29,9 @@ from twin.monitor.cycles import (
     figures,
 )
 from twin.monitor.healthy import NOT_COMMISSIONED, Healthy
+from twin.monitor.reports import ReportWatch
 from twin.monitor.signatures import Likeness, drawn_rows, likenesses, look_alikes
+from twin.monitor.surroundings import following
 from twin.settings import Settings
 from twin.signals import (
     BREAK,
@@ -109,6 +111,7 @@ class Monitor:
     active: str = ""  # the standing alarm's effect, or UNKNOWN; empty while there is none
     isolation: "Isolation | None" = None
     clocks: ClockWatch | None = field(default_factory=ClockWatch)  # None: the PLC has none
+    reports: ReportWatch | None = None  # of signals beside pressure and commands
     judges: bool = True  # cycles; not where nobody recorded the commands
     _cutter: CycleCutter = field(default_factory=CycleCutter)
     _before: Cycle | None = None
@@ -283,7 +286,10 @@ class Monitor:
         told = [self.teller.take(one) if self.teller else None for one in cycles]
         heard = self.isolation.hear(looks) if self.isolation else [None] * len(cycles)
         found = map(self._conclude, looks, told, heard)
-        return [event for events in found for event in events]
+        checked = [[*self.reports.take(one)] if self.reports else [] for one in cycles]
+        return [
+            one for some in zip(found, checked, strict=True) for events in some for one in events
+        ]
 
     def _look(self, cycle: Cycle, silent: bool) -> Look:
         """Its figures, and whether it can be judged."""
@@ -293,7 +299,7 @@ class Monitor:
         fit = (
             self.judges and whole and cycle.settled and cycle.coverage >= FEWEST_SHARE and not stale
         )
-        found = figures(cycle, self.theta)
+        found = figures(cycle, following(self.theta, cycle.samples))
         if not self.judges:  # what hangs on the model
             found = {name: value for name, value in found.items() if name in MEASURED}
         return Look(cycle, before, found, fit)
@@ -482,7 +488,7 @@ class Monitor:
         samples = np.concatenate([part.samples for part in parts])
         ticks = np.concatenate([part.ticks for part in parts])
         begin = len(samples) - len(cycle.samples)
-        ranking = likenesses(self.theta, samples, ticks, begin)
+        ranking = likenesses(following(self.theta, samples), samples, ticks, begin)
         return ranking or [Likeness(UNKNOWN, None, "", 0.0)]  # not one sync in a long piece
 
 

@@ -22,6 +22,7 @@ AGAIN = 30e-3  # s after a knee, in which lines ring, before the next can be one
 AT_ONCE = 2  # rows: so few would follow the lag that calibration finds, and that lag them
 HELD = 2.0  # s for which the nozzle is off in the free run
 LONGEST_RUN = 60_000  # rows of it
+TOLD_LATE = 20e-3  # s, that what an ejector reports may be late: a slow IO-Link cycle and a PLC's
 RINGS = 1.5  # times as high as in the free run a line may ring
 MOST_APART = 2.0 / 3.0  # of H1's hysteresis: thresholds drift
 
@@ -51,6 +52,8 @@ def expected_knees(theta: Theta, noise: float) -> Knees:
         settled=round((theta[c.RESPONSE] + SETTLED) / MS),
         again=round(AGAIN / MS),
         blow_off=(float(theta[c.BLOW_OFF_MODE]), float(theta[c.BLOW_OFF_TIME])),
+        about=round((max(theta[c.RESPONSE], theta[c.RESPONSE_OFF]) + TOLD_LATE + SETTLED) / MS),
+        acts=(round(theta[c.RESPONSE_OFF] / MS), round(theta[c.RESPONSE] / MS)),
     )
     return _as_seen(at_once, theta, GAMMA * theta[c.H1] / bend)
 

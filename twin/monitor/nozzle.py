@@ -4,6 +4,8 @@ A suction begins with the nozzle on: the pressure falls. Where the fall ends for
 pressure turns again, the nozzle went off; where a fall as slow as the first begins, it went on.
 Nothing is known of the system, not even whether it saves air. The levels at which it switches are
 alike in all suctions: learned in a first pass, they decide where one alone is in doubt.
+
+Where the ejector reports its nozzle, that says how often it switched; the pressure says when.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -27,7 +29,7 @@ from twin.monitor.breaks import (
     smoothed,
     stepped,
 )
-from twin.signals import MBAR, MS, NS, UNUSABLE, Phase, Samples
+from twin.signals import MBAR, MS, NS, UNUSABLE, Phase, Reported, Samples
 
 LONGEST_GAP, GAP_ROWS = 20.0 * MS, 5.0  # without a reading; beyond it a suction is in two parts
 LEAST_VACUUM, LEAST_NOISE, LEAST_ROWS = 20.0 * MBAR, 10.0, 12  # less shows nothing
@@ -54,6 +56,9 @@ CLEAR, CLEAR_AT_LEVEL, CLEAR_ALONE = 8.0, 5.0, 16.0
 OTHERS = 1.0 / 3.0  # of the suctions must show it go off for its levels to be known
 SIGMAS_OF_LEVEL, SHARE_OF_LEVEL = 5.0, 0.02  # as near to it
 TO_SIGMA = 1.4826  # from a median deviation
+# A reported switching shows within so long of its report (a valve, and a slow IO-Link cycle); share
+# of the readings in suction that must have a report.
+TOLD_WITHIN, MOST_TOLD = 50.0 * MS, 0.98
 ON_WITHIN, ON_WINDOW = 20.0 * MS, 40  # about the turn; rows on either side that show the slopes
 
 
@@ -105,10 +110,46 @@ def switchings(samples: Samples, phase: npt.NDArray[np.uint8], noise: Noise) -> 
     if np.count_nonzero(sucks) < LEAST_ROWS:
         return []
     course = Course(time, pressure, noise)
-    return [
-        Switching(int(rows[np.searchsorted(time, knee.time)]), knee.on, knee.time)
-        for knee in _found(course, list(_suctions(time, sucks, noise.period)))
-    ]
+    suctions = list(_suctions(time, sucks, noise.period))
+    said = samples["reported"][rows]
+    knees = _found(course, suctions)
+    found = [(knee.time, knee.on) for knee in knees]
+    if reports_nozzle(said[sucks]):
+        found = sorted(_told(time, suctions, knees, (said & np.uint8(Reported.NOZZLE)) != 0))
+    return [Switching(int(rows[np.searchsorted(time, when)]), on, when) for when, on in found]
+
+
+def reports_nozzle(said: npt.NDArray[np.uint8]) -> bool:
+    """Whether the ejector reports its nozzle in rows whose ``reported`` these are."""
+    return bool(np.mean((said & np.uint8(Reported.NOZZLE_KNOWN)) != 0) > MOST_TOLD)
+
+
+def told_edges(on: npt.NDArray[np.bool_]) -> list[int]:
+    """Rows of a suction at which the nozzle is reported to switch; it begins on.
+
+    What is reported may be late, so a nozzle that is off as suction begins goes on with it.
+    """
+    edges = (np.flatnonzero(np.diff(on)) + 1).tolist()
+    return edges if not len(on) or on[0] else edges[1:]
+
+
+def _told(
+    time: Floats, suctions: Sequence[Rows], shown: Sequence[Knee], on: npt.NDArray[np.bool_]
+) -> Iterator[tuple[float, bool]]:
+    """When (s) the nozzle switched for each report of it, and whether it went on.
+
+    That is when the pressure shows it; where it does not, as long after the report as elsewhere.
+    """
+    rows = np.array([a + row for a, b in suctions for row in told_edges(on[a:b])], np.int64)
+    for opens in (False, True):
+        reported = time[rows[on[rows] == opens]]
+        late = np.array([[knee.time for knee in shown if knee.on == opens]]) - reported[:, None]
+        late = np.column_stack([late, np.full(len(reported), np.inf)])  # there may be none
+        late = late[np.arange(len(reported)), np.abs(late).argmin(axis=1)]
+        shows = np.abs(late) < TOLD_WITHIN
+        usual = float(np.median(late[shows])) if shows.any() else 0.0
+        for when in (reported + np.where(shows, late, usual)).tolist():
+            yield min(when, float(time[-1])), opens
 
 
 def _readings(
@@ -141,7 +182,7 @@ def _falls(pressure: Floats, suctions: Iterable[Rows]) -> Floats:
 
 
 def _found(course: Course, suctions: Sequence[Rows]) -> list[Knee]:
-    """All knees of a record, in order of time."""
+    """All knees that the pressure of a record shows, in order of time."""
     levels: Levels | None = None
     knees = list[Knee]()
     for _ in range(2):

@@ -5,6 +5,9 @@ see it. It shows as a knee in the pressure: the slope breaks. The finder looks f
 straight line on each side, so where there may be one it is a lag behind the measurement; behind it
 everything is known when the model steps, and the model is synchronised on the measured level at
 each knee. Rows that cannot be at a knee are given out at once.
+
+Where the ejector reports its nozzle, knees are looked for about what it reports and nowhere else.
+One that it reports and the pressure does not show is where the valve must have acted.
 """
 
 import math
@@ -17,7 +20,7 @@ import numpy.typing as npt
 from twin.model import theta as c
 from twin.model.compiled import compiled, per_row
 from twin.model.control import new_timer, timed
-from twin.signals import BREAK, NS, SAMPLE, UNUSABLE, Phase, Samples, joined
+from twin.signals import BREAK, NS, SAMPLE, UNUSABLE, Phase, Reported, Samples, joined
 
 IDLE_ROWS = 20  # rows of idle that give the level before a cycle
 FEWEST_IDLE_ROWS = 5
@@ -32,7 +35,11 @@ MOST_MISSING = 0.5  # of a line's rows
 # The level of the last knee is NaN before a suction's first.
 _NOZZLE, _AGE, _BEST, _BEST_AGE, _BEST_LEVEL, _KNEE_LEVEL = range(6)
 _IDLE_AGE, _IDLE_SUM, _ANCHORED = range(6, 9)
-_BEGINNING = (0.0, -1.0, 0.0, 0.0, 0.0, math.nan, 0.0, 0.0, 0.0)
+# Of this suction: knees, rows since it began; switchings that were reported long ago, and how the
+# nozzle was said to be then (1 on, 0 off, -1 not yet).
+_SWITCHED, _SINCE, _REPORTS, _SAID = range(9, 13)
+_BEGINNING = (0.0, -1.0, 0.0, 0.0, 0.0, math.nan, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)
+_KNOWN, _ON = int(Reported.NOZZLE_KNOWN), int(Reported.NOZZLE_KNOWN | Reported.NOZZLE)
 _IDLE, _SUCTION, _HOLD, _BLOW_OFF = (int(phase) for phase in Phase)
 
 
@@ -43,7 +50,8 @@ class Knees:
     The nozzle's closing shows ``off_shift`` rows later, its opening ``on_shift``. No knee is looked
     for in the rows until suction has ``settled``, nor in those until one can follow ``again``, nor
     until the pressure is ``apart`` (Pa) from where the last was. A window of more than ``longest``
-    rows could take the way to the end pressure for a knee.
+    rows could take the way to the end pressure for a knee. Where the ejector reports its nozzle, a
+    knee is within ``about`` rows of that, and the valve, closing and opening, ``acts`` rows after.
     """
 
     window: int
@@ -55,6 +63,8 @@ class Knees:
     longest: int
     apart: float = 0.0
     blow_off: tuple[float, float] = (float(c.EXTERNAL), 0.0)  # the ejector's own: mode, pulse (s)
+    about: int = 50
+    acts: tuple[int, int] = (10, 10)
 
     @property
     def settles(self) -> int:
@@ -158,12 +168,12 @@ def _break_at(pressure, row, window, noise, nozzle_on):  # type: ignore[no-untyp
 
 
 @compiled
-def _find(state, pressure, commands, first, look, phase, level):  # type: ignore[no-untyped-def]
+def _find(state, pressure, reported, commands, first, look, phase, level):  # type: ignore[no-untyped-def]
     """Fill ``phase`` and ``level`` from ``first`` on; gives the row that needs later ones.
 
-    ``look`` = window, noise, off shift, on shift, settled, again, apart; window 0 looks for no
-    knees (at the end of a stretch, where the rows after are missing). A knee reaches back by its
-    shift.
+    ``look`` = window, noise, off shift, on shift, settled, again, apart, about, acts (2); window 0
+    looks for no knees (at the end of a stretch, where the rows after are missing). A knee reaches
+    back by its shift.
     """
     window, settled = int(look[0]), look[4]
     end = first  # of the rows with the same command
@@ -174,17 +184,15 @@ def _find(state, pressure, commands, first, look, phase, level):  # type: ignore
         starts = suction and state[_AGE] < 0.0
         may_bend = suction and window > 0 and state[_AGE] >= settled + window
         same = end - row - 1
-        if may_bend and same < window and end == len(commands):
+        later = max(window, int(look[7])) if reported[row] & _KNOWN else window  # rows to be known
+        if may_bend and same < later and end == len(commands):
             return row
         if suction:
             state[_AGE] = 0.0 if starts else state[_AGE] + 1.0
         else:
             state[_AGE] = -1.0
         if starts:
-            state[_NOZZLE], state[_BEST], state[_KNEE_LEVEL] = 1.0, 0.0, math.nan
-            if state[_IDLE_AGE] >= FEWEST_IDLE_ROWS:
-                level[row] = _idle_level(state, pressure, row)
-                state[_ANCHORED] = 1.0
+            _start(state, pressure, row, level)
         if commands[row] == 0:
             _idle(state, pressure, row, level)
             phase[row] = _IDLE
@@ -194,8 +202,22 @@ def _find(state, pressure, commands, first, look, phase, level):  # type: ignore
             if suction and state[_NOZZLE] > 0.0:
                 phase[row] = _SUCTION
         if suction and window > 0:
-            _look(state, pressure, row, look, may_bend and same >= window, phase, level)
+            looks = may_bend and same >= window
+            _look(state, pressure, reported[:end], row, look, looks, phase, level)
+            if reported[row] & _KNOWN:
+                _follow(state, pressure, reported, row, look, phase, level)
     return len(pressure)
+
+
+@per_row
+def _start(state, pressure, row, level):  # type: ignore[no-untyped-def]
+    """Begin a suction, with the nozzle on."""
+    state[_NOZZLE], state[_BEST], state[_KNEE_LEVEL] = 1.0, 0.0, math.nan
+    state[_SWITCHED] = state[_REPORTS] = 0.0
+    state[_SINCE] = state[_SAID] = -1.0
+    if state[_IDLE_AGE] >= FEWEST_IDLE_ROWS:
+        level[row] = _idle_level(state, pressure, row)
+        state[_ANCHORED] = 1.0
 
 
 @compiled
@@ -213,7 +235,8 @@ def _unsettled(state, look):  # type: ignore[no-untyped-def]
     if state[_AGE] < 0.0 or look[0] == 0.0:
         return 0
     reach = int(look[2] if state[_NOZZLE] > 0.0 else look[3])
-    return reach + (int(state[_BEST_AGE]) + 1 if state[_BEST] > 0.0 else 0)
+    reach += int(state[_BEST_AGE]) + 1 if state[_BEST] > 0.0 else 0
+    return max(reach, _overdue(look)) if state[_SINCE] >= 0.0 else reach
 
 
 @per_row
@@ -243,7 +266,7 @@ def _idle_level(state, pressure, row):  # type: ignore[no-untyped-def]
 
 
 @per_row
-def _look(state, pressure, row, look, may_bend, phase, level):  # type: ignore[no-untyped-def]
+def _look(state, pressure, reported, row, look, may_bend, phase, level):  # type: ignore[no-untyped-def]
     """Follow the break's significance over the rows and settle on its peak."""
     window, noise, nozzle_on = int(look[0]), look[1], state[_NOZZLE] > 0.0
     significance, here = 0.0, 0.0
@@ -251,6 +274,8 @@ def _look(state, pressure, row, look, may_bend, phase, level):  # type: ignore[n
         significance, here = _break_at(pressure, row, window, noise, nozzle_on)
         since = here - state[_KNEE_LEVEL]  # up while the nozzle is off, down while it is on
         if (-since if nozzle_on else since) < look[6]:  # a line that rings
+            significance = 0.0
+        if significance > SIGNIFICANT and _denied(state, reported, row, look):
             significance = 0.0
     if significance > max(state[_BEST], SIGNIFICANT):
         state[_BEST], state[_BEST_AGE], state[_BEST_LEVEL] = significance, 0.0, here
@@ -264,7 +289,68 @@ def _look(state, pressure, row, look, may_bend, phase, level):  # type: ignore[n
         level[knee] = state[_KNEE_LEVEL] = state[_BEST_LEVEL]
         phase[knee - shift : row + 1] = _HOLD if nozzle_on else _SUCTION
         state[_NOZZLE], state[_BEST] = 0.0 if nozzle_on else 1.0, 0.0
+        state[_SWITCHED] += 1.0
         state[_AGE] = state[_BEST_AGE] + window + look[4] - look[5]  # the valve has acted already
+
+
+@per_row
+def _told(reported, first, last, begin, about, on):  # type: ignore[no-untyped-def]
+    """How often the ejector says in some rows that its nozzle switched, and how it is then.
+
+    ``on`` is how it was before: 1 on, 0 off; -1 as suction begins at ``begin``, until it is on, as
+    what is reported may be late.
+    """
+    count = 0
+    for row in range(max(first, 0), last):
+        said = reported[row] & _ON
+        if said & _KNOWN == 0:
+            continue
+        if on < 0.0:
+            on = 1.0 if said == _ON or row - begin >= about else on
+        if on >= 0.0 and (said == _ON) != (on > 0.0):
+            count += 1
+            on = 1.0 - on
+    return count, on
+
+
+@compiled
+def _denied(state, reported, row, look):  # type: ignore[no-untyped-def]
+    """Whether the ejector reports no switching about a row that is not taken for another's."""
+    if reported[row] & _KNOWN == 0:
+        return False
+    about, begin = int(look[7]), row - int(state[_SINCE])
+    first = max(row - _overdue(look), begin)
+    more, _ = _told(
+        reported, first, min(row + about + 1, len(reported)), begin, about, state[_SAID]
+    )
+    return state[_REPORTS] + more <= state[_SWITCHED]
+
+
+@per_row
+def _overdue(look):  # type: ignore[no-untyped-def]
+    """Rows after which a reported switching that does not show never will."""
+    return int(look[7]) + int(look[0]) // 2
+
+
+@per_row
+def _follow(state, pressure, reported, row, look, phase, level):  # type: ignore[no-untyped-def]
+    """Take what was reported some time ago; where no knee has shown it, go by that alone."""
+    state[_SINCE] += 1.0
+    said_at, begin = row - _overdue(look), row - int(state[_SINCE])
+    if said_at < begin or said_at < 0:
+        return
+    more, state[_SAID] = _told(reported, said_at, said_at + 1, begin, look[7], state[_SAID])
+    state[_REPORTS] += more
+    if more == 0 or state[_REPORTS] <= state[_SWITCHED]:
+        return
+    nozzle_on, window = state[_NOZZLE] > 0.0, int(look[0])
+    knee = said_at + int(min(look[8] if nozzle_on else look[9], look[7]))
+    slope, middle = _line(pressure, max(knee - SHORTEST_WINDOW + 1, 0), SHORTEST_WINDOW)
+    level[knee] = state[_KNEE_LEVEL] = middle + 0.5 * (SHORTEST_WINDOW - 1) * slope
+    phase[knee : row + 1] = _HOLD if nozzle_on else _SUCTION
+    state[_NOZZLE], state[_BEST] = 0.0 if nozzle_on else 1.0, 0.0
+    state[_SWITCHED] += 1.0
+    state[_AGE] = (row - knee) + window + look[4] - look[5]  # as after a knee that shows
 
 
 Found = tuple[Samples, npt.NDArray[np.uint8], npt.NDArray[np.float64]]
@@ -329,7 +415,8 @@ class PhaseFinder:
         ready = slice(self._given, max(settled, self._given))
         given = self._rows[ready], self._phase[ready], self._level[ready]
         self._given = ready.stop
-        context = max(self.knees.window + self.knees.lag, IDLE_ROWS)  # how far later rows look back
+        looked_at = self.knees.window + self.knees.lag + self.knees.about
+        context = max(looked_at, IDLE_ROWS)  # how far later rows look back
         drop = min(max(self._seen - context, 0), self._given)
         self._rows, self._phase = self._rows[drop:], self._phase[drop:]
         self._level, self._told = self._level[drop:], self._told[drop:]
@@ -354,8 +441,14 @@ class PhaseFinder:
         knees = self.knees
         shifts = knees.off_shift, knees.on_shift
         again = max(knees.again, window)
-        look = np.array([window, knees.noise, *shifts, knees.settled, again, knees.apart])
-        self._seen = _find(
-            self._state, pressure, self._told, self._seen, look, self._phase, self._level
+        look = np.array(
+            [
+                *(window, knees.noise, *shifts, knees.settled, again),
+                *(knees.apart, knees.about, *knees.acts),
+            ],
+            np.float64,
         )
+        reported = np.ascontiguousarray(self._rows["reported"])
+        rows = pressure, reported, self._told
+        self._seen = _find(self._state, *rows, self._seen, look, self._phase, self._level)
         return self._seen - int(_unsettled(self._state, look))

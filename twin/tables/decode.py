@@ -7,8 +7,16 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from twin.signals import BAR, SAMPLE, UNUSABLE, Quality, Samples
-from twin.tables.layout import ABSOLUTE, BELOW_AMBIENT, COMMANDS, DIGITS, Layout
+from twin.signals import SAMPLE, UNUSABLE, Command, Quality, Reported, Samples
+from twin.tables.layout import (
+    ABSOLUTE,
+    BELOW_AMBIENT,
+    BESIDE,
+    COMMANDS,
+    DIGITS,
+    REPORTED,
+    Layout,
+)
 from twin.tables.numbers import Mask, floats, integers
 from twin.tables.settings import Column
 
@@ -45,7 +53,13 @@ def decode(batch: Batch, layout: Layout, ambient: float) -> tuple[Samples, Spoil
             _command(batch, name, rows, bad)
     with np.errstate(over="ignore"):  # too large is infinite, and infinite is bad
         _pressure(batch, layout.pressure, ambient, rows, bad)
-        _supply(batch, rows, bad)
+        rows["supply"] = np.nan
+        for name in BESIDE:
+            if name in batch.columns:
+                _beside(batch, name, rows, bad)
+    for name in REPORTED:
+        if name in batch.columns:
+            _reported(batch, name, rows, bad)
     return rows, bad
 
 
@@ -75,13 +89,32 @@ def _pressure(batch: Batch, name: Column, ambient: float, rows: Samples, bad: Sp
     bad[name] = unreadable | (np.isnan(rows["pressure"]) & ~told)
 
 
-def _supply(batch: Batch, rows: Samples, bad: Spoilt) -> None:
+def _beside(batch: Batch, name: Column, rows: Samples, bad: Spoilt) -> None:
     """An empty cell means that it is not measured."""
-    rows["supply"] = np.nan
-    if Column.SUPPLY_BAR in batch.columns:
-        value, empty, unreadable = floats(batch.columns[Column.SUPPLY_BAR])
-        rows["supply"] = _single(value * BAR)
-        bad[Column.SUPPLY_BAR] = unreadable | (np.isnan(rows["supply"]) & ~empty)
+    column, unit, zero = BESIDE[name]
+    value, empty, unreadable = floats(batch.columns[name])
+    single = _single(value * unit + zero if zero else value * unit)  # -0 + 0 is another zero
+    measured = np.isfinite(single)
+    bad[name] = unreadable | (~measured & ~empty)
+    rows[column] = single if column == "supply" else np.where(measured, single, 0.0)
+    if column == "flow":
+        rows["reported"] |= np.where(measured, np.uint8(Reported.FLOW_KNOWN), np.uint8(0))
+
+
+def _reported(batch: Batch, name: Column, rows: Samples, bad: Spoilt) -> None:
+    """An empty cell means that nothing was reported; an ejector that saves air has its nozzle off.
+
+    That is so while it is to suck, and the nozzle is on while it does not save.
+    """
+    state, empty, unreadable = floats(batch.columns[name])
+    known = (state == 0) | (state == 1)
+    bad[name] = unreadable | (~known & ~empty)
+    on = state == 1
+    if name is Column.REPORTED_AIR_SAVING:
+        on = (state == 0) & (rows["commands"] == Command.SUCTION)
+    bit, whether = REPORTED[name]
+    rows["reported"] |= np.where(known, np.uint8(whether), np.uint8(0))
+    rows["reported"] |= np.where(known & on, np.uint8(bit), np.uint8(0))
 
 
 def _single(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:

@@ -13,7 +13,19 @@ from pyarrow import csv, parquet
 
 from twin.errors import ConfigError, SourceError
 from twin.log.header import LogHeader
-from twin.signals import BAR, MBAR, Command, Phase, Quality, Samples, Signal, Ticks
+from twin.signals import (
+    BAR,
+    MBAR,
+    SL_MIN,
+    ZERO_C,
+    Command,
+    Phase,
+    Quality,
+    Reported,
+    Samples,
+    Signal,
+    Ticks,
+)
 
 ROWS = 100_000  # a good size of block to export: what a reader of Parquet takes at once
 
@@ -37,6 +49,31 @@ def _given(bit: Signal) -> _Column:
     return lambda _, ticks: (ticks["signals"] & bit.value) != 0
 
 
+def _reported(bit: Reported, known: Reported) -> _Column:
+    """0 or 1, NaN where nothing was reported."""
+
+    def of(samples: Samples, _: Ticks) -> npt.NDArray[np.float64]:
+        said = (samples["reported"] & bit.value) != 0
+        return np.where(samples["reported"] & known.value, said, np.nan)
+
+    return of
+
+
+def _measured(column: str, unit: float, zero: float = 0.0) -> _Column:
+    """Not there, and so NaN, where it is 0."""
+
+    def of(samples: Samples, _: Ticks) -> npt.NDArray[np.float64]:
+        values = samples[column].astype(np.float64)
+        return np.where(values != 0.0, (values - zero) / unit, np.nan)
+
+    return of
+
+
+def _flow(samples: Samples, _: Ticks) -> npt.NDArray[np.float64]:
+    known = (samples["reported"] & Reported.FLOW_KNOWN.value) != 0
+    return np.where(known, _wide(samples["flow"], SL_MIN), np.nan)
+
+
 def _wide(column: npt.NDArray[np.float32], unit: float) -> npt.NDArray[np.float64]:
     """In ``unit``, with digits enough to come back to the bit."""
     return column.astype(np.float64) / unit
@@ -52,6 +89,16 @@ _FIELDS = {
     "blow_off": _Field("0 or 1", pa.uint8(), _commanded(Command.BLOW_OFF)),
     "pressure_mbar": _Field("mbar absolute", pa.float64(), lambda s, _: _wide(s["pressure"], MBAR)),
     "supply_bar": _Field("bar gauge", pa.float64(), lambda s, _: _wide(s["supply"], BAR)),
+    "reported_nozzle": _Field(
+        "0 or 1, on", pa.uint8(), _reported(Reported.NOZZLE, Reported.NOZZLE_KNOWN)
+    ),
+    "reported_part_present": _Field(
+        "0 or 1", pa.uint8(), _reported(Reported.PART, Reported.PART_KNOWN)
+    ),
+    "ambient_mbar": _Field("mbar absolute", pa.float64(), _measured("ambient", MBAR)),
+    "temperature_c": _Field("°C", pa.float64(), _measured("temperature", 1.0, ZERO_C)),
+    "pressure_2_mbar": _Field("mbar absolute", pa.float64(), _measured("pressure_2", MBAR)),
+    "flow_sl_min": _Field("sl/min", pa.float64(), _flow),
     "quality": _Field(f"sum of {_FLAGS}", pa.uint8(), lambda s, _: s["quality"]),
     "expected_mbar": _Field("mbar absolute", pa.float64(), lambda _, t: _wide(t["expected"], MBAR)),
     "phase": _Field(_PHASES, pa.uint8(), lambda _, t: t["phase"]),
@@ -103,7 +150,7 @@ _KINDS = {".csv": _write_csv, ".parquet": _write_parquet}
 
 def _batch(samples: Samples, ticks: Ticks, header: LogHeader) -> pa.RecordBatch:
     columns = [
-        pa.array(field.of(samples, ticks).astype(field.kind.to_pandas_dtype()), from_pandas=True)
+        pa.array(field.of(samples, ticks), from_pandas=True).cast(field.kind)
         for field in _FIELDS.values()  # from_pandas: NaN becomes null
     ]
     return pa.record_batch(columns, _schema(header))

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from twin.errors import SourceError
 from twin.signals import BREAK, SAMPLE, Quality, Samples
 from twin.tables.decode import Batch, Spoilt, decode
-from twin.tables.layout import COMMANDS, DIGITS, Layout
+from twin.tables.layout import COMMANDS, DIGITS, REPORTED, Layout
 from twin.tables.numbers import Mask
 from twin.tables.settings import Bad, Column, ImportSettings
 
@@ -18,7 +18,7 @@ _LONGEST = 2**62  # ns, of a period: longer ones cannot be counted with
 
 _SHOULD_BE = {
     **dict.fromkeys(DIGITS, "a time"),
-    **dict.fromkeys(COMMANDS, "0 or 1"),
+    **dict.fromkeys((*COMMANDS, *REPORTED), "0 or 1"),
     Column.TIME_NS: "a whole number",
     Column.HOST_NS: "a whole number",
     Column.SEQUENCE: "a whole number",

@@ -4,10 +4,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from twin.errors import ConfigError, SourceError
-from twin.signals import BAR, MBAR, Command
+from twin.signals import BAR, MBAR, SL_MIN, ZERO_C, Command, Reported
 from twin.tables.settings import Column, ImportSettings
 
 DIGITS = {Column.TIME_S: 9, Column.TIME_MS: 6, Column.TIME_US: 3, Column.TIME_NS: 0}  # down to ns
+REPORTED = {  # which bit says it, and which that it is known; an empty cell says nothing
+    Column.REPORTED_NOZZLE: (Reported.NOZZLE, Reported.NOZZLE_KNOWN),
+    Column.REPORTED_AIR_SAVING: (Reported.NOZZLE, Reported.NOZZLE_KNOWN),
+    Column.REPORTED_PART_PRESENT: (Reported.PART, Reported.PART_KNOWN),
+}
+BESIDE = {  # column of SAMPLE, what one unit is in SI, and where it counts from
+    Column.SUPPLY_BAR: ("supply", BAR, 0.0),
+    Column.AMBIENT_MBAR: ("ambient", MBAR, 0.0),
+    Column.TEMPERATURE_C: ("temperature", 1.0, ZERO_C),
+    Column.PRESSURE_2_MBAR: ("pressure_2", MBAR, 0.0),
+    Column.FLOW_SL_MIN: ("flow", SL_MIN, 0.0),
+}
 COMMANDS = {Column.SUCTION: Command.SUCTION, Column.BLOW_OFF: Command.BLOW_OFF}
 ABSOLUTE = {  # in Pa
     Column.PRESSURE_MBAR: MBAR,
@@ -19,6 +31,8 @@ BELOW_AMBIENT = {  # in Pa
     Column.VACUUM_PA: 1.0,
     Column.VACUUM_BAR: BAR,
 }
+
+ONE_OF_THEM = (Column.REPORTED_NOZZLE, Column.REPORTED_AIR_SAVING)
 
 _REQUIRED = (tuple(DIGITS), (*ABSOLUTE, *BELOW_AMBIENT))
 
@@ -73,6 +87,9 @@ def find_layout(
             "leave --derive-commands out",
         )
     _require_unit(theirs, settings, place)
+    both = [theirs[name] for name in ONE_OF_THEM if name in theirs]
+    if len(both) > 1:
+        raise _too_many(f"columns {' and '.join(map(repr, both))} say the same", place)
     for there in theirs.values():
         if header.count(there) > 1:
             raise _too_many(f"column {there!r} stands there {header.count(there)} times", place)

@@ -26,6 +26,13 @@ class Column(StrEnum):
     VACUUM_PA = "vacuum_pa"
     PRESSURE_PA = "pressure_pa"
     SUPPLY_BAR = "supply_bar"
+    REPORTED_NOZZLE = "reported_nozzle"
+    REPORTED_AIR_SAVING = "reported_air_saving"
+    REPORTED_PART_PRESENT = "reported_part_present"
+    AMBIENT_MBAR = "ambient_mbar"
+    TEMPERATURE_C = "temperature_c"
+    PRESSURE_2_MBAR = "pressure_2_mbar"
+    FLOW_SL_MIN = "flow_sl_min"
     QUALITY = "quality"
     HOST_NS = "host_ns"
 

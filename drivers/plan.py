@@ -1,0 +1,72 @@
+"""Tags of a Modbus PLC read in as few requests as can be."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.tags import Tag, WordOrder, Words
+from drivers.telegram import MOST_WORDS, Request
+
+
+def plan(tags: Iterable[Tag], most: int = MOST_WORDS) -> list[Request]:
+    """Fewest requests that cover all tags, none longer than ``most``."""
+    requests: list[Request] = []
+    for tag in sorted(tags, key=lambda tag: (tag.address.area, tag.address.offset)):
+        end = tag.address.offset + tag.size
+        last = requests[-1] if requests else None
+        if (
+            last is not None
+            and last.address.area == tag.address.area
+            and end - last.address.offset <= most
+        ):
+            count = max(last.count, end - last.address.offset)
+            requests[-1] = Request(last.address, count)
+        else:
+            requests.append(Request(tag.address, tag.size))
+    return requests
+
+
+def holds(request: Request, tag: Tag) -> bool:
+    """Whether the answer to ``request`` brings the tag."""
+    return _column(request, tag) is not None
+
+
+def _column(request: Request, tag: Tag) -> slice | None:
+    """Where in the answer the tag lies, if it does."""
+    at = tag.address.offset - request.address.offset
+    inside = tag.address.area == request.address.area and 0 <= at < request.count
+    return slice(at, at + tag.size) if inside else None
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What came to some requests, asked again and again: words (rows, count) for each."""
+
+    requests: Sequence[Request]
+    found: Sequence[Words]
+
+    @classmethod
+    def of(cls, requests: Sequence[Request], rows: Sequence[bytes]) -> "Answers":
+        """From the data of all answers, one behind the other, row by row."""
+        data = np.frombuffer(b"".join(rows), np.uint8).reshape(len(rows), -1)
+        starts = np.cumsum([request.size for request in requests])
+        parts = np.split(data, starts[:-1], axis=1)
+        words = [request.words(part) for request, part in zip(requests, parts, strict=True)]
+        return cls(requests, words)
+
+    def words(self, tag: Tag) -> Words:
+        """Words of one tag (rows, size)."""
+        for request, words in zip(self.requests, self.found, strict=True):
+            if (columns := _column(request, tag)) is not None:
+                return words[:, columns]
+        raise AssertionError(f"{tag.address} is in no request")
+
+    def raw(self, tag: Tag, order: WordOrder) -> npt.NDArray[np.generic]:
+        """Its numbers as they stand in the PLC, row by row."""
+        return tag.raw(self.words(tag), order)
+
+    def floats(self, tag: Tag, order: WordOrder) -> npt.NDArray[np.float64]:
+        """The same as numbers of one kind, whatever they are."""
+        return tag.floats(self.words(tag), order)
