@@ -4,9 +4,10 @@ The record says what the configuration need not: noise, thresholds, ambient pres
 system is opened, rough flows and delays. From there the fit goes wherever the market may be.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -167,53 +168,70 @@ def _fit(samples: Samples, guesses: Sequence[DataSet], progress: Callable[[str],
 def guessed(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:
     """``data`` with what the record shows in its place, and remarks where that differs."""
     tables = data.model_dump()
-    remarks: list[Remark] = []
-    ambient = tables["ambient"]["pressure_mbar"]
+    ambient, remarks = _ambient(tables, readings)
+    tables["sensor"]["noise_mbar"] = max(readings.noise / MBAR, 0.05)
+    remarks += [*_air_saving(tables["ejector"], readings, ambient), *_questions(readings)]
+    _flows(tables["ejector"], readings, _volume(data), ambient * MBAR)
+    return DataSet.model_validate(tables), remarks
+
+
+def _ambient(tables: dict[str, dict[str, Any]], readings: Readings) -> tuple[float, list[Remark]]:
+    """Set ambient pressure where it shows, and the sensor's offset; what vacuum is read from."""
+    told = float(tables["ambient"]["pressure_mbar"])
+    if not readings.opened:
+        return told, []
     offset = (readings.idle - readings.barometer) / MBAR
-    if readings.opened and abs(offset) <= APART / MBAR:  # so much the sensor may read off
+    if abs(offset) <= APART / MBAR:  # so much the sensor may read off
         tables["ambient"]["pressure_mbar"] = round(readings.barometer / MBAR, 1)
         if abs(offset) > LEAST_OFFSET:
             tables["effects"]["sensor_offset"] = {"offset": round(offset, 1)}
-        ambient = readings.idle / MBAR  # what vacuum is read from
-    elif readings.opened:
-        found = round(readings.idle / MBAR, 1)
-        if abs(found - ambient) > AMBIENT_CLEARLY:
-            line = f"[data.ambient] pressure_mbar = {found:g}"
-            text = f"the opened system stands at {found:g} mbar; the configuration says {ambient:g}"
-            remarks.append(Remark(text, line))
-        tables["ambient"]["pressure_mbar"] = ambient = found
-    tables["sensor"]["noise_mbar"] = max(readings.noise / MBAR, 0.05)
-    ejector = tables["ejector"]
-    if not readings.saves_air:
-        if ejector["air_saving"] != "off":
-            text = (
-                "in no suction the nozzle goes off by itself; the configuration has air saving on"
-            )
-            remarks.append(Remark(text, '[data.ejector] air_saving = "off"'))
-        ejector["air_saving"] = "off"
-        remarks += _part_present(ejector, readings, ambient)
-    else:
-        ejector["air_saving"] = "on" if ejector["air_saving"] == "off" else ejector["air_saving"]
-        remarks += _thresholds(ejector, readings, ambient)
-    ejector["jet_depth"] = 0.5
+        return readings.idle / MBAR, []
+    found = round(readings.idle / MBAR, 1)
+    tables["ambient"]["pressure_mbar"] = found
+    if abs(found - told) <= AMBIENT_CLEARLY:
+        return found, []
+    text = f"the opened system stands at {found:g} mbar; the configuration says {told:g}"
+    return found, [Remark(text, f"[data.ambient] pressure_mbar = {found:g}")]
+
+
+def _air_saving(ejector: dict[str, Any], readings: Readings, ambient: float) -> list[Remark]:
+    """Set whether air is saved, and at which pressures; ``ambient`` in mbar."""
+    told = ejector["air_saving"]
+    if readings.saves_air:
+        ejector["air_saving"] = "on" if told == "off" else told
+        return _thresholds(ejector, readings, ambient)
+    ejector["air_saving"] = "off"
+    remarks = []
+    if told != "off":
+        text = "in no suction the nozzle goes off by itself; the configuration has air saving on"
+        remarks.append(Remark(text, '[data.ejector] air_saving = "off"'))
+    return [*remarks, *_part_present(ejector, readings, ambient)]
+
+
+def _questions(readings: Readings) -> Iterator[Remark]:
+    """What is strange in the record, but may be so."""
     if not readings.tells_blow_off:
         text = "no row of the record has blow-off; where the unit has one, its command is missing"
-        remarks.append(Remark(text, "[driver.tags.blow_off], or the column blow_off"))
+        yield Remark(text, "[driver.tags.blow_off], or the column blow_off")
     if (highest := (readings.highest - readings.deepest) / MBAR) < LITTLE_VACUUM:
         text = f"the vacuum is {highest:.0f} mbar at most, where ejectors make 300 and more"
-        remarks.append(Remark(text, "[driver.tags.pressure] unit, if it is in kPa, mmHg or psi"))
-    capacity = readings.capacity(_volume(data), ambient * MBAR, ROOM_TEMPERATURE) / SL_MIN
+        yield Remark(text, "[driver.tags.pressure] unit, if it is in kPa, mmHg or psi")
+
+
+def _flows(ejector: dict[str, Any], readings: Readings, evacuated: float, ambient: float) -> None:
+    """Set first guesses of flows, by how fast ``evacuated`` (m³) empties and fills."""
+    ejector["jet_depth"] = 0.5
+    capacity = readings.capacity(evacuated, ambient, ROOM_TEMPERATURE) / SL_MIN
     if np.isfinite(capacity):
         ejector["suction_capacity_sl_min"] = float(np.clip(capacity, 1.0, 1000.0))
-    blow_off = readings.blow_off(_volume(data), ambient * MBAR, ROOM_TEMPERATURE) / SL_MIN
+    blow_off = readings.blow_off(evacuated, ambient, ROOM_TEMPERATURE) / SL_MIN
     if np.isfinite(blow_off):
         ejector["blow_off_sl_min"] = float(np.clip(blow_off, 1.0, 2000.0))
         ejector["exhaust_sl_min"] = ejector["blow_off_sl_min"]
         ejector["relief_sl_min"] = 0.3 * ejector["blow_off_sl_min"]
-    back = readings.back_flow(_volume(data), ambient * MBAR, ROOM_TEMPERATURE) / SL_MIN
+    back = readings.back_flow(evacuated, ambient, ROOM_TEMPERATURE) / SL_MIN
     if np.isfinite(back):
         ejector["back_flow_sl_min"] = float(np.clip(back, 0.0, 2000.0))
-    return DataSet.model_validate(tables), remarks
 
 
 def starts(data: DataSet) -> list[DataSet]:
@@ -235,7 +253,7 @@ def starts(data: DataSet) -> list[DataSet]:
     return found
 
 
-def _thresholds(ejector: dict[str, float], readings: Readings, ambient: float) -> list[Remark]:
+def _thresholds(ejector: dict[str, Any], readings: Readings, ambient: float) -> list[Remark]:
     """Set H1 and its hysteresis from the turns; H2 stays below them."""
     h1, remarks = round(ambient - readings.off / MBAR), []
     if abs(h1 - ejector["h1_mbar"]) > CLEARLY:
