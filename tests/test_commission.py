@@ -182,9 +182,11 @@ def test_hum_is_noise() -> None:
 
 @pytest.mark.parametrize(("settles_s", "opened"), [(0.25, False), (0.01, True)])
 def test_a_system_that_still_settles_is_not_open(settles_s: float, opened: bool) -> None:
-    """In its last 40 ms it moves by less than noise."""
+    """In its last 40 ms it moves by less than noise; one that is open touches its part in them."""
     seconds = np.arange(700) * 1e-3
     idle = 960.0 + 70.0 * np.exp(-seconds / settles_s)
+    if opened:
+        idle[-30:] -= 3.0
     cycle = np.concatenate([np.linspace(960.0, 300.0, 400), np.linspace(300.0, 1200.0, 100), idle])
     commands = np.repeat([Command.SUCTION, Command.BLOW_OFF, 0], [400, 100, 700])
     rows = np.zeros(6 * len(cycle), SAMPLE)
@@ -193,6 +195,7 @@ def test_a_system_that_still_settles_is_not_open(settles_s: float, opened: bool)
     noise = np.random.default_rng(1).normal(0.0, 0.9, len(rows))
     rows["pressure"] = (np.tile(cycle, 6) + noise) * MBAR
     assert read(rows).opened == opened
+    assert not opened or read(rows).idle / MBAR == pytest.approx(960.0, abs=0.2)
 
 
 def test_the_record_shows_what_flows_back_once_suction_has_ended() -> None:

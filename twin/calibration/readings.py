@@ -31,8 +31,8 @@ DEEP = 0.3  # of the way down, from the lowest, in which the nozzle may go off
 STEEP_MS, BACK_MS = 10.0, 200.0  # what flows back without a check valve does so at once
 LEAST_VACUUM = 20.0 * MBAR  # Pa
 MOST_SUCTIONS = 0.5  # of all suctions must turn for an ejector that saves air
-OPENED_MS = 40.0  # at the end of an idle, in which an opened system stands at ambient
-OPENED_FROM = 2.0 / 3.0  # of an idle, from where on it does
+OPENED_MS = 40.0  # of an idle, over which its pressure is averaged
+OPENED_FROM, OPENED_TO = 0.6, 0.85  # of an idle, in which an opened system stands at ambient
 STILL = 3.0  # sigmas by which the pressure of an opened system may still move in that time
 
 
@@ -53,8 +53,8 @@ class Readings:
     missing: float  # share of rows that are not there
     noise: float  # Pa, one standard deviation, steps of the converter included
     step: float  # Pa, the smallest difference between two readings
-    idle: float  # Pa, the reading at the end of an idle: ambient, where the system is opened
-    opened: bool  # idles end at one pressure that stands still
+    idle: float  # Pa, the reading late in an idle: ambient, where the system is opened
+    opened: bool  # idles stand still at one pressure
     suctions: int
     off: float  # Pa, at which the nozzle goes off (median of the turns)
     on: float  # Pa, at which it goes on again
@@ -210,21 +210,22 @@ def _step(pressure: Floats) -> float:
 
 
 def _idle(pressure: Floats, found: list[Stretch], rows: int, noise: float) -> tuple[float, bool]:
-    """What idles end at, and whether each stands still there, all at one pressure.
+    """What idles stand at, and whether each stands still, all at one pressure.
 
-    A closed system that settles slowly moves too little in its last milliseconds to be told from
-    one that is open, but more since some time ago.
+    A closed system that settles slowly moves too little in some milliseconds to be told from one
+    that is open. Before the next suction begins a cup may touch its part already.
     """
+    half = max(rows // 2, 1)
     idles = [one for one in found[1:] if one.command == 0 and one.last - one.first >= 2 * rows]
     if not idles:
         return float("nan"), False
-    half = max(rows // 2, 1)
     moves, levels = [], np.empty(len(idles))
     for number, one in enumerate(idles):
-        since = one.first + int(OPENED_FROM * (one.last - one.first))
-        early = pressure[min(since, one.last - 2 * half) :][:half]
-        moves.append(abs(pressure[one.last - half : one.last].mean() - early.mean()))
-        levels[number] = pressure[one.last - rows : one.last].mean()
+        first, last = (
+            one.first + round(share * (one.last - one.first)) for share in (OPENED_FROM, OPENED_TO)
+        )
+        moves.append(abs(pressure[last - half : last].mean() - pressure[first:][:half].mean()))
+        levels[number] = pressure[last - rows : last].mean()
     still = STILL * noise * np.sqrt(2.0 / half) + 0.1 * MBAR
     opened = bool(np.median(moves) < still and np.ptp(levels) < 2.0 * MBAR + 4.0 * noise)
     return float(np.median(levels)), opened
