@@ -18,10 +18,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from second_rigs import config_of, samples_of
 from second_world import KINDS, draw_rig, record
 from second_world.records import Record
 from second_world.rig import Rig
-from test_commission import config_of
 
 from twin.calibration.commission import guessed
 from twin.calibration.readings import read
@@ -29,7 +29,7 @@ from twin.model.dataset import coefficients
 from twin.monitor.knees import as_wide_as_needed, expected_knees
 from twin.monitor.nozzle import noise_of, switchings
 from twin.monitor.phases import PhaseFinder
-from twin.signals import MS, NS, SAMPLE, Command, Phase, Reported, Samples
+from twin.signals import MS, NS, Phase, Reported, Samples
 
 STAMP = 1.0 * MS  # by which a record's stamps are late
 SHOWS_WITHIN = 100.0 * MS  # and three rows
@@ -64,18 +64,6 @@ class Score:
     def beyond(self) -> int:
         """How many are further off than the limit."""
         return int(np.count_nonzero(self.errors > max(LIMIT, self.period)))
-
-
-def samples_of(logged: Record) -> Samples:
-    """A record as it would be imported, its missing rows unflagged."""
-    rows = np.zeros(len(logged.time_ns), SAMPLE)
-    rows["time_ns"] = rows["host_ns"] = logged.time_ns
-    period = np.median(np.diff(logged.time_ns))
-    rows["sequence"] = np.round((logged.time_ns - logged.time_ns[0]) / period)
-    rows["commands"] = logged.suction * np.uint8(Command.SUCTION)
-    rows["commands"] |= logged.blow_off * np.uint8(Command.BLOW_OFF)
-    rows["pressure"], rows["supply"] = logged.pressure_pa, np.nan
-    return rows
 
 
 def told(samples: Samples) -> npt.NDArray[np.uint8]:

@@ -5,11 +5,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from calibrations import log_of, quiet, typed
+from second_rigs import UNKNOWN_TYPE, config_of, samples_of
 from second_world.draw import draw_rig
 from second_world.records import Record as Logged
 from second_world.records import record
@@ -25,57 +25,17 @@ from twin.calibration.report import commissioned_as_json, commissioned_in_words
 from twin.calibration.store import store_first
 from twin.calibration.verdict import Residual, Verdict, judge
 from twin.calibration.weights import Weights
-from twin.config import Asset, Config
+from twin.config import Asset
 from twin.errors import ConfigError
 from twin.model.dataset import DataSet
 from twin.signals import BREAK, MBAR, SAMPLE, Command, Phase, Quality, Samples, bridged
 
 CYCLES = 9
-UNKNOWN_TYPE = "nobody-knows-40"
-
-
-def samples_of(logged: Logged) -> Samples:
-    rows = np.zeros(len(logged.time_ns), SAMPLE)
-    rows["time_ns"] = rows["host_ns"] = logged.time_ns
-    period = np.median(np.diff(logged.time_ns))
-    rows["sequence"] = np.round((logged.time_ns - logged.time_ns[0]) / period)
-    rows["commands"] = logged.suction * np.uint8(Command.SUCTION)
-    rows["commands"] |= logged.blow_off * np.uint8(Command.BLOW_OFF)
-    rows["pressure"], rows["supply"] = logged.pressure_pa, np.nan
-    return rows
 
 
 @cache
 def logged(seed: int, kind: str | None = None, cycles: int = CYCLES) -> Logged:
     return record(draw_rig(seed, kind), seed, cycles)
-
-
-def known(value: Any, otherwise: float) -> float:
-    return otherwise if value == "unknown" else float(value)
-
-
-def config_of(truth: dict[str, Any]) -> Config:
-    """What a person read off the machine, a fifth off or unknown, of a type that nobody knows."""
-    ambient = known(truth["ambient_mbar"], 1013.0)
-    hose = {
-        "kind": "tube",
-        "length_mm": 1e3 * known(truth["hose_length_m"], 1.0),
-        "diameter_mm": known(truth["hose_diameter_mm"], 6.0),
-    }
-    kind = "cups" if truth["part_released"] else "vessel"
-    end = {"kind": kind, "volume_ml": known(truth["vessel_ml"], 300.0)}
-    parts = [{"kind": "sensor"}, hose, end]
-    if truth["sensor_place"] != "ejector":
-        parts = [hose, {"kind": "sensor"}, end]
-    supply = known(truth["supply_bar"], 5.0)
-    data = {
-        "ambient": {"pressure_mbar": ambient},
-        "supply": {"pressure_bar": supply, "optimum_bar": supply},
-        "ejector": {"air_saving": "on" if truth["air_saving"] else "off"},
-        "system": {"parts": parts},
-    }
-    asset = Asset(type=UNKNOWN_TYPE, id="unit-1")
-    return replace(typed("test_rig"), asset=asset, data=DataSet.model_validate(data))
 
 
 # A seed of the second world whose draw is a plain gripper at 1 ms: what is tested holds for any.
@@ -335,6 +295,16 @@ def test_a_longer_gap_is_not_stepped_over() -> None:
     late["quality"][0] |= np.uint8(Quality.GAP)
     rows = np.concatenate(list(bridged([whole[:1], late])))
     assert rows["quality"][1] & BREAK
+
+
+def test_gaps_are_bridged_alike_however_the_rows_are_cut() -> None:
+    rows = samples_of(logged(SEED, KIND))[:40].copy()
+    late = np.delete(rows, [*range(10, 13), *range(20, 24)])  # three are missing, then four
+    late["quality"][[10, 17]] |= np.uint8(Quality.GAP)
+    for size in (1, 2, 5, len(late)):
+        cut = [late[first : first + size] for first in range(0, len(late), size)]
+        flagged = np.concatenate(list(bridged(cut)))["quality"] & np.uint8(Quality.GAP)
+        assert np.flatnonzero(flagged).tolist() == [17]
 
 
 def test_the_nozzle_may_be_seen_late_the_same_in_all_cycles() -> None:

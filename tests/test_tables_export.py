@@ -46,14 +46,20 @@ def recorded(count: int = 25_000) -> tuple[Samples, Ticks]:
     return samples, ticks
 
 
+def exported(folder: Path, suffix: str, samples: Samples, ticks: Ticks) -> Path:
+    """Rows by way of a log."""
+    with Recorder(folder / "a.mcap", HEADER) as recorder:
+        recorder.write(samples, ticks)
+    log = open_log(folder / "a.mcap")
+    path = folder / f"a.{suffix}"
+    export(log.blocks(7000), log.header, path)
+    return path
+
+
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_log_comes_back_to_the_bit(tmp_path: Path, suffix: str) -> None:
     samples, ticks = recorded()
-    with Recorder(tmp_path / "a.mcap", HEADER) as recorder:
-        recorder.write(samples, ticks)
-    log = open_log(tmp_path / "a.mcap")
-    path = tmp_path / f"a.{suffix}"
-    export(log.blocks(7000), log.header, path)
+    path = exported(tmp_path, suffix, samples, ticks)
     assert taken(path).tobytes() == samples.tobytes()
     assert open_table(path, REFUSE, 1.0).ignored == SAID
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted(["a.mcap", path.name])
@@ -68,11 +74,7 @@ def test_what_is_reported_comes_back_to_the_bit(tmp_path: Path, suffix: str) -> 
     samples["reported"][300:400] &= np.uint8(Reported.FLOW_KNOWN)  # the rest is not known
     samples["reported"][100:200] &= np.uint8(Reported.NOZZLE_KNOWN | Reported.NOZZLE)
     ticks = np.zeros(len(samples), TICK)
-    with Recorder(tmp_path / "a.mcap", HEADER) as recorder:
-        recorder.write(samples, ticks)
-    log = open_log(tmp_path / "a.mcap")
-    path = tmp_path / f"a.{suffix}"
-    export(log.blocks(7000), log.header, path)
+    path = exported(tmp_path, suffix, samples, ticks)
     assert taken(path).tobytes() == samples.tobytes()
 
 

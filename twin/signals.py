@@ -106,9 +106,7 @@ class Quality(IntFlag):
 # Plain numbers: with an IntFlag NumPy makes 64 bits of every byte.
 UNUSABLE = int(Quality.OVERFLOW | Quality.STALE | Quality.BAD)  # no pressure to compare with
 BREAK = int(Quality.GAP | Quality.RESTART | Quality.CLOCK)  # time does not run on from before
-BRIDGED = (
-    4.5  # times the usual time between rows: a gap so short hides nothing, if no command changes
-)
+MOST_BRIDGED = 3  # rows missing one after the other, over which the model steps
 NEW_TIME = int(Quality.RESTART | Quality.CLOCK)  # another PLC time begins, earlier or later
 
 
@@ -131,21 +129,20 @@ def bridged(blocks: Iterable[Samples]) -> Iterator[Samples]:
     """
     before = np.empty(0, SAMPLE)
     for block in blocks:
-        rows = np.concatenate([before, block])
         if (block["quality"] & np.uint8(Quality.GAP)).any():
+            rows = np.concatenate([before, block])
             _bridge(rows)
-        yield rows[len(before) :]
-        before = rows[-1:]
+            yield rows[len(before) :]
+        else:
+            yield block
+        before = block[-1:] if len(block) else before
 
 
 def _bridge(rows: Samples) -> None:
-    """Take the mark from gaps between two of ``rows`` that hide nothing."""
-    after, prior = rows[1:], rows[:-1]
-    if not len(after):
-        return
-    short = unseen_ns(prior, after) <= BRIDGED * np.median(np.diff(rows["time_ns"]))
-    short &= after["quality"] & NEW_TIME == 0
-    after["quality"][short] &= np.uint8(~np.uint8(Quality.GAP))
+    """Take the mark from gaps of MOST_BRIDGED rows at most between two of ``rows``."""
+    missing = np.diff(rows["sequence"]) - 1
+    short = (missing <= MOST_BRIDGED) & (rows["quality"][1:] & NEW_TIME == 0)
+    rows["quality"][1:][short] &= np.uint8(~np.uint8(Quality.GAP))
 
 
 class Phase(IntEnum):

@@ -18,10 +18,9 @@ SMALLEST = 0.5  # of an effect's typical size: less is within what cycles scatte
 LEAST_SCATTER = 0.05  # of it, from cycle to cycle, whatever a few cycles show
 MEDIAN = 0.954  # of the difference of two, over the standard deviation of each
 SIGNIFICANT = 8.0  # standard errors between the cycles before and after
-# Where a record's cycles part into those before and those after, without any model.
-PARTED = (
-    0.8  # of what cycles differ by; a drift has 0.75, 50 healthy rigs of a drawn world 0.5 at most
-)
+# A record parts into the cycles before and after one where that explains so much of what they
+# differ by. A drift comes to 0.75; 50 healthy rigs of the tests' second world to 0.5 at most.
+PARTED = 0.8
 EACH = 3  # cycles at least, before and after
 LEAST_PARTED = 2.0 * MBAR  # Pa rms
 COMMON = 0.8  # of the cycles must have a place for it to be compared

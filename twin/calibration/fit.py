@@ -7,6 +7,7 @@ model's own error leave of it. All derivatives come from one run of the bank of 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Literal, Protocol
 
 import numpy as np
@@ -206,15 +207,13 @@ def fit_from_afar(
         starts = starts[: one.starts]
         progress(f"fitting, round {number} of {len(NARROWING)}: {len(starts)} starts")
         rows = samples[: round(len(samples) * one.share)]
-        starts = sorted((_followed(rows, start, one, noise) for start in starts), key=_cost)
+        starts = sorted(
+            (_followed(rows, start, one, noise) for start in starts), key=attrgetter("cost")
+        )
     best = starts[0]
     cycles = Cycles.found(samples, best.data)
     weights = weighted(cycles, coefficients(best.data), noise, fitted=True)
     return _fitted(Problem(best.space, cycles, weights), best.x)
-
-
-def _cost(start: _Start) -> float:
-    return start.cost
 
 
 def _followed(samples: Samples, start: _Start, one: Round, noise: float) -> _Start:

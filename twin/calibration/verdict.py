@@ -19,7 +19,7 @@ from twin.signals import MBAR, Phase
 GOOD, USABLE = 1.5, 2.0  # times the floor
 LEAST_FLOOR = 0.3 * MBAR  # Pa; nobody needs a twin nearer than that
 ODD = 2.0  # times the middle cycle's rms
-MOST_EARLY = 15  # rows before or behind the row at which the nozzle is seen to switch
+MOST_EARLY = 15e-3  # s (a row at least), by which the nozzle may be seen early or late
 FEWEST = 3  # cycles that show one place, to tell what is common from what scatters
 WEAKENS = {
     Phase.IDLE: "leaks and heat while nothing is commanded",
@@ -79,10 +79,11 @@ def judge(cycles: Cycles, data: DataSet, noise: float) -> Verdict:
 def _off(cycles: Cycles, theta: Theta) -> Floats:
     """What is left (Pa) in each bin, with the nozzle switching as early or late as fits best.
 
-    Nobody reports it, and it is seen some rows off, the same in all cycles. The live twin is set on
-    the pressure where it sees it.
+    It is seen in the pressure a little off, the same in all cycles. The live twin is set on the
+    pressure where it sees it.
     """
-    early = range(-MOST_EARLY, MOST_EARLY + 1)
+    most = max(round(MOST_EARLY / float(np.median(cycles.dt))), 1)
+    early = range(-most, most + 1)
     off = cycles.off(np.repeat(theta[:, None], len(early), axis=1), early)
     usable = np.isfinite(off).all(axis=1)
     left = np.average(off[usable] ** 2, axis=0, weights=cycles.bins.count[usable])

@@ -7,7 +7,7 @@ import numpy as np
 
 from twin.calibration.readings import Floats, Readings, stretches
 from twin.errors import ConfigError
-from twin.signals import MBAR, UNUSABLE, Command, Samples
+from twin.signals import MBAR, UNUSABLE, Samples
 
 NEVER_OPENED = 0.2  # of ambient pressure: what never comes above it was never at ambient
 TWICE = 1.5  # of ambient pressure: what idles above it counts ambient pressure twice
@@ -23,11 +23,10 @@ def refuse_miswired(samples: Samples, readings: Readings, ambient: float) -> Non
     """ConfigError where the curves show another wiring; ``ambient`` (Pa) as configured."""
     if readings.rises_in_suction:
         _refuse_rising(readings, ambient)
-    lowest = f"{readings.deepest / MBAR:.0f} mbar absolute"
     if readings.deepest < BELOW_NOTHING:
         raise ConfigError(
-            f"the pressure falls to {lowest}, and none is below zero: it is gauge pressure, taken"
-            " for absolute",
+            f"the pressure falls to {readings.deepest / MBAR:.0f} mbar absolute, and none is below"
+            " zero: it is gauge pressure, taken for absolute",
             f'set reference = "gauge" of {TAG}',
         )
     if readings.highest < NEVER_OPENED * ambient:
@@ -48,7 +47,8 @@ def refuse_miswired(samples: Samples, readings: Readings, ambient: float) -> Non
             " in the whole record: no vacuum is made",
             f"check the unit and the range of {TAG}",
         )
-    _refuse_untold_blow_off(samples)
+    if not readings.tells_blow_off:
+        _refuse_untold_blow_off(samples)
 
 
 def _refuse_rising(readings: Readings, ambient: float) -> NoReturn:
@@ -73,13 +73,10 @@ def _refuse_rising(readings: Readings, ambient: float) -> NoReturn:
 
 
 def _refuse_untold_blow_off(samples: Samples) -> None:
-    """ConfigError where no row has blow-off, and the pressure rises as only it makes it rise."""
-    if (samples["commands"] & Command.BLOW_OFF).any():
-        return
-    held = [one for one in _idles(samples) if len(one) > 1]
-    rises = [one[-1] - one[0] for one in held]
-    shares = [_held(one) for one in held]
-    if shares and np.median(shares) > HELD:
+    """ConfigError where the pressure rises as only blow-off makes it rise."""
+    idles = list(_idles(samples))
+    rises = [one[-1] - one[0] for one in idles]
+    if idles and np.median([_held(one) for one in idles]) > HELD:
         raise ConfigError(
             f"after suction the pressure holds, then rises by {np.median(rises) / MBAR:.0f} mbar at"
             " once, and no row has blow-off commanded: something lets air in that is not told",

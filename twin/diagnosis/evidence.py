@@ -33,7 +33,7 @@ from twin.monitor.healthy import Healthy
 from twin.monitor.knees import as_wide_as_needed, expected_knees
 from twin.monitor.phases import Knees
 from twin.monitor.signatures import drawn_rows, steps
-from twin.monitor.surroundings import following
+from twin.monitor.surroundings import are_told, following
 from twin.monitor.switching import Seen, seen
 from twin.signals import (
     MBAR,
@@ -57,7 +57,7 @@ SUPPLY_UNKNOWN = {"end_pressure_slope": 0.5, "curvature": 0.5, "optimum_bar": 0.
 
 Hypothesis = tuple[Cause, ...]
 HEALTHY: Hypothesis = ()
-OF_THE_WAY = 0.9
+OF_THE_WAY = 0.9  # to its bound, at most, an uncertain value is moved
 _BOUNDS = ("ge", "gt", "le", "lt")
 One = TypeVar("One")
 Other = TypeVar("Other")
@@ -374,7 +374,7 @@ def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
 def of_log(beside: Evidence, blocks: Iterable[Samples]) -> Evidence:
     """What another log says beside the same twin."""
     blocks = list(bridged(blocks))
-    rows = joined(np.empty(0, SAMPLE), *blocks)
+    rows = joined(np.empty(0, SAMPLE), *(block for block in blocks if are_told(block)))
     uncertain = tuple((following(up, rows), following(down, rows)) for up, down in beside.uncertain)
     beside = replace(beside, theta=following(beside.theta, rows), uncertain=uncertain)
     knees = as_wide_as_needed(beside.knees, blocks)
