@@ -114,7 +114,7 @@ def commission(
     samples = samples[samples["time_ns"] <= before[-1].end_ns]
     used = samples[samples["time_ns"] <= before[:MOST_FITTED][-1].end_ns]
     refuse_parted(Cycles.found(samples, guess))
-    fitted = _fit(used, starts(guess), progress)
+    fitted = _fit(used, starts(guess, readings.meets), progress)
     progress("judging the fit")
     verdict = judge(Cycles.found(samples, fitted.data), fitted.data, readings.noise)
     cycles = complete(fitted.data, samples)
@@ -234,20 +234,23 @@ def _flows(ejector: dict[str, Any], readings: Readings, evacuated: float, ambien
         ejector["back_flow_sl_min"] = float(np.clip(back, 0.0, 2000.0))
 
 
-def starts(data: DataSet) -> list[DataSet]:
+def starts(data: DataSet, meets: float) -> list[DataSet]:
     """``data``, and what may differ from it so much that no fit leads there.
 
-    Where along the line the sensor sits, what gas is at the port, and how a part leaves.
+    Where along the line the sensor sits, what gas is at the port, how a part leaves, and whether
+    cups meet the next one ``meets`` seconds after suction is commanded, or (NaN) are on it by then.
     """
     cups = any(isinstance(part, Cups) for part in data.system.parts)
-    ways = ("in_blow_off", "after_blow_off") if cups else (data.system.part_leaves,)
+    leaves = ("in_blow_off", "after_blow_off") if cups else (data.system.part_leaves,)
+    waits = (0.0, meets / MS) if cups and np.isfinite(meets) else (0.0,)
     tables = data.model_dump()
     theta = coefficients(data)
     place = float(theta[c.PLACE] / (theta[c.NEAR_RESISTANCE] + theta[c.RESISTANCE]))
     everything = _volume(data) / ML
     found = []
-    for way, at, share in product(ways, PLACES, PORT_SHARES):
+    for wait, way, at, share in product(waits, leaves, PLACES, PORT_SHARES):
         tables["system"].update(part_leaves=way, rim="turbulent", sensor_shift=at - place)
+        tables["system"].update(part_meets_ms=wait)
         tables["ejector"]["port_volume_ml"] = share * everything
         found.append(DataSet.model_validate(tables))
     return found

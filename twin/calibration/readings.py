@@ -31,6 +31,9 @@ DEEP = 0.3  # of the way down, from the lowest, in which the nozzle may go off
 STEEP_MS, BACK_MS = 10.0, 200.0  # what flows back without a check valve does so at once
 LEAST_VACUUM = 20.0 * MBAR  # Pa
 MOST_SUCTIONS = 0.5  # of all suctions must turn for an ejector that saves air
+# Open cups draw some mbar before they meet a part: shares of the way down.
+FIRST_FALL, DRAWN = 0.005, (0.15, 0.35)
+LEAST_WAIT_MS = 15.0  # between them; ramp and sensor take less
 OPENED_MS = 40.0  # of an idle, over which its pressure is averaged
 OPENED_FROM, OPENED_TO = 0.6, 0.85  # of an idle, in which an opened system stands at ambient
 STILL = 3.0  # sigmas by which the pressure of an opened system may still move in that time
@@ -65,6 +68,7 @@ class Readings:
     tells_blow_off: bool  # in any row
     fill_rate: float  # 1/s, dp/dt over ambient as blow-off begins
     draw_rate: float  # 1/s, −dp/dt over pressure as suction begins
+    meets: float  # s after suction is commanded, when open cups meet a part; NaN if they have one
     back_rate: float  # 1/s, dp/dt over ambient at its steepest after suction, nothing commanded
     barometer: float = np.nan  # Pa, its median
     part: float = np.nan  # Pa, at which the ejector itself reports a part
@@ -145,6 +149,7 @@ def read(samples: Samples) -> Readings:
         tells_blow_off=any(one.command == Command.BLOW_OFF for one in found),
         fill_rate=_fill_rate(pressure, found, period, idle),
         draw_rate=_draw_rate(pressure, suctions, period),
+        meets=_meets(pressure, suctions, period, noise),
         back_rate=_back_rate(pressure, found, period, idle),
         barometer=told(samples).get("ambient", np.nan),
         part=_median([pascal for pascal, _ in parts]),
@@ -250,6 +255,26 @@ def _draw_rate(pressure: Floats, suctions: list[Stretch], period: float) -> floa
             first, last = begun[0], ended[0]
             rates.append(np.log(part[first] / part[last]) / ((last - first) * period))
     return _median(rates)
+
+
+def _meets(pressure: Floats, suctions: list[Stretch], period: float, noise: float) -> float:
+    """When the fall proper begins (s), where in most suctions a small one comes well before it.
+
+    The fall proper is drawn back from between two shares of the way.
+    """
+    times = []
+    for one in suctions:
+        part = pressure[one.first : one.last]
+        part = part[: int(part.argmin()) + 1]
+        way = part[0] - part[-1]
+        levels = (max(FIRST_FALL * way, CLEAR * noise), DRAWN[0] * way, DRAWN[1] * way)
+        if levels[0] < levels[1]:
+            first, early, late = (int(np.argmax(part <= part[0] - one)) for one in levels)
+            begins = early - DRAWN[0] / (DRAWN[1] - DRAWN[0]) * (late - early)
+            known = (begins - first) * period > LEAST_WAIT_MS * MS
+            times.append(begins * period if known else np.nan)
+    met = np.isfinite(times)
+    return _median(np.array(times)[met].tolist()) if met.sum() > 0.5 * len(suctions) else np.nan
 
 
 def _fill_rate(pressure: Floats, found: list[Stretch], period: float, ambient: float) -> float:

@@ -100,18 +100,21 @@ def _phase_of(kind: Ints) -> Ints:
 def _residual(off: Floats, place: Ints, cycle: Ints, count: Ints, noise: float) -> Residual:
     """Rms over rows, with the noise of single readings added to the means of bins.
 
-    A cycle in which something went wrong raises the floor no more than ODD times the middle one.
+    A cycle in which something went wrong says little of the model and of the floor: it counts no
+    more in either than one that is ODD times as far from the mean as the middle one.
     """
     _, number, many = np.unique(place, return_inverse=True, return_counts=True)
     mean = np.bincount(number, off) / many
     apart = (off - mean[number]) ** 2 * (many / np.maximum(many - 1, 1))[number]
     shown = (many >= FEWEST)[number]
     single = noise**2 * (1.0 - 1.0 / count)  # what averaging over a bin took away
-    left = np.average(off**2 + single, weights=count)
-    each = [
-        np.average((apart + single)[here], weights=count[here])
-        for one in np.unique(cycle[shown])
-        if (here := shown & (cycle == one)).any()
-    ]
-    floor = np.mean(np.minimum(each, ODD**2 * np.median(each))) if each else noise**2
+    if not shown.any():
+        return Residual(float(np.sqrt(np.average(off**2 + single, weights=count))), noise)
+    _, turn = np.unique(cycle, return_inverse=True)
+    rows, rows_shown = np.bincount(turn, count), np.bincount(turn, count * shown)
+    each = np.bincount(turn, count * shown * (apart + single)) / np.maximum(rows_shown, 1)
+    middle = np.median(each[rows_shown > 0])
+    trust = np.minimum(1.0, ODD**2 * middle / np.maximum(each, middle))
+    left = np.sum(trust * np.bincount(turn, count * (off**2 + single))) / np.sum(rows)
+    floor = np.mean((trust * each)[rows_shown > 0])
     return Residual(float(np.sqrt(left)), float(np.sqrt(floor)))

@@ -56,6 +56,7 @@ _VESSEL: Mapping[Where, Mapping[str, str]] = {
         "OPENING": "0.0",
         "HOLE": "0.0",
         "RELEASE": "NAN",
+        "CONTACT": "0.0",
         "INFLOW": "0.0",
     },
 }

@@ -162,6 +162,7 @@ class System(Settings):
     opening_factor: NotNegative = 1.0  # what flows through open cups over what they say
     leak_sl_min: NotNegative = 0.3  # of seals and fittings, sonic
     part_leaves: Literal["in_blow_off", "after_blow_off"] = "in_blow_off"
+    part_meets_ms: NotNegative = 0.0  # after suction is commanded: cups that move to the part
 
     @model_validator(mode="after")
     def _line_has_volume(self) -> "System":
@@ -296,6 +297,7 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     theta[wide] = (total.opening if wide == c.OPENING else total.hole) * system.opening_factor
     late = system.part_leaves == "after_blow_off" and not math.isnan(total.release)
     theta[c.RELEASE] = AFTER_BLOW_OFF if late else total.release
+    theta[c.CONTACT] = system.part_meets_ms * MS
 
 
 def _swings(theta: Theta, inertance: float) -> bool:

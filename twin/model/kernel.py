@@ -233,6 +233,12 @@ def _release(state, k, h, i):  # type: ignore[no-untyped-def]
 
 
 @inlined
+def _until_met(state, k, i):  # type: ignore[no-untyped-def]
+    """Seconds until the cups meet the next part, below zero since; NEVER without suction."""
+    return k[c.CONTACT, i] - state[NOZZLE_AGE, i] if state[NOZZLE_COMMAND, i] > 0.5 else NEVER
+
+
+@inlined
 def _opened(before, gas, commanded, k, i):  # type: ignore[no-untyped-def]
     """Cup after a step in which the vessel's pressure rose from ``before``: 0 if still closed.
 
@@ -245,12 +251,14 @@ def _opened(before, gas, commanded, k, i):  # type: ignore[no-untyped-def]
 
 @inlined
 def _jumps(state, k, h, i):  # type: ignore[no-untyped-def]
-    """Whether a valve moves or a cup opens within the next ``h``, or has just done so."""
+    """Whether a valve moves, a cup opens or meets a part within ``h``, or has just done so."""
     for position, response in ((NOZZLE, c.RESPONSE), (BLOW, c.BLOW_OFF_RESPONSE)):
         command = state[position + 1, i]
         late = k[response if command > 0.5 else response + 1, i] - state[position + 2, i]
         if late < h and (state[position, i] != command or late > -h):
             return True
+    if k[c.CONTACT, i] > 0.0 and abs(_until_met(state, k, i)) < h:
+        return True
     return _release(state, k, h, i)
 
 
@@ -284,6 +292,7 @@ def _substep(state, k, h, guess):  # type: ignore[no-untyped-def]
     far off. Were it in another array, LLVM would run the loop on one at a time.
     """
     for i in range(state.shape[1]):
+        left = _until_met(state, k, i)
         nozzle = _valve(state, NOZZLE, h, k, c.RESPONSE, i)
         blow = _valve(state, BLOW, h, k, c.BLOW_OFF_RESPONSE, i)
         gas = Gas(
@@ -314,7 +323,8 @@ def _substep(state, k, h, guess):  # type: ignore[no-untyped-def]
             state[guess + NEAR, i],
             state[guess + FAR, i],
         )
-        before, open_cup = gas.vessel, state[OPEN, i]
+        before = gas.vessel
+        open_cup = state[OPEN, i] * max(left, 0.0) / h if left < h else state[OPEN, i]
         valves, passes = (nozzle, blow, open_cup), 1 if guess else 3
         gas, lags, off = advance_gas(gas, lags, ahead, passes, h, valves, k, i)
         state[PORT, i], state[PORT_MASS, i] = gas.port, gas.port_mass
@@ -324,7 +334,8 @@ def _substep(state, k, h, guess):  # type: ignore[no-untyped-def]
         state[DRIVE, i], state[JET, i], state[BLOWING, i] = lags.drive, lags.jet, lags.valve
         state[SUPPLIED, i], state[FELT, i], state[SENSED, i] = lags.supply, lags.felt, lags.sensed
         opened = _opened(before, gas, state[BLOW_COMMAND, i], k, i)
-        state[OPEN, i] = min(open_cup, 1.0) if open_cup > 0.0 else opened
+        opened = min(open_cup, 1.0) if open_cup > 0.0 else opened
+        state[OPEN, i] = 0.0 if left < h else opened
         state[ROUGH, i] = off / (h * h * h)
 
 
@@ -358,8 +369,9 @@ def _enter(state, phases, k):  # type: ignore[no-untyped-def]
         _command(state, BLOW, 1.0 if phase == _BLOW_OFF else 0.0, i)
         if (before == _HOLD and phase == _SUCTION) or (before == _SUCTION and phase == _HOLD):
             state[NOZZLE_AGE, i] = NEVER  # seen in the pressure: the valve has already acted
-        if phase == _SUCTION and before != _HOLD:
-            state[OPEN, i] = 0.0  # the next part is there
+        if phase == _SUCTION and before != _HOLD:  # the next part is there, or comes
+            comes = k[c.CONTACT, i] > 0.0 and not math.isnan(k[c.RELEASE, i])
+            state[OPEN, i] = 1.0 if comes else 0.0
         if phase == _IDLE and before == _BLOW_OFF and not math.isnan(k[c.RELEASE, i]):
             state[OPEN, i] = 1.0  # blow-off has let the part go, early or late
 
@@ -407,7 +419,8 @@ def _synchronise(state, levels, k):  # type: ignore[no-untyped-def]
         if math.isnan(level):
             continue
         idle = state[PHASE, i] == _IDLE
-        if not math.isnan(k[c.RELEASE, i]) and (idle or state[OPEN, i] > 0.0):
+        open_cup = state[OPEN, i] > 0.0 and state[PHASE, i] != _SUCTION
+        if not math.isnan(k[c.RELEASE, i]) and (idle or open_cup):
             _settle(state, k, i, k[c.AMBIENT, i])
             state[OPEN, i] = 1.0
         elif state[VALID, i] > 0.0:

@@ -24,6 +24,7 @@ from twin.model.kernel import (
     LONGEST_BRIDGE,
     NEVER,
     NOZZLE,
+    OPEN,
     PHASE,
     PORT,
     ROUGH,
@@ -124,8 +125,8 @@ def _carried(strides: Strides) -> tuple[State, State, State, Floats]:
 
 @per_row
 def _until_jump(state, k):  # type: ignore[no-untyped-def]
-    """Seconds until the next valve acts."""
-    first = NEVER
+    """Seconds until the next valve acts, or the cups meet a part."""
+    first = max(kernel._until_met(state, k, 0), 0.0) if state[OPEN, 0] > 0.0 else NEVER
     for position, response in ((NOZZLE, c.RESPONSE), (BLOW, c.BLOW_OFF_RESPONSE)):
         command = state[position + 1, 0]
         late = k[response if command > 0.5 else response + 1, 0] - state[position + 2, 0]
