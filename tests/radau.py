@@ -64,13 +64,19 @@ def suction_flow(theta: Theta, p: float, jet: float, supply: float) -> float:
     return float(jet * capacity * max(x * (1.0 + (1.0 - x) * bend), 0.0))
 
 
+def room(theta: Theta, vessel: float) -> tuple[float, float]:
+    """Volume of a vessel that shrinks with vacuum (m³), and its slope (m³/Pa)."""
+    vacuum, early = 1.0 - vessel / theta[c.AMBIENT], theta[c.SOFTNESS]
+    full, left = theta[c.COMPLIANCE] * (1.0 + early), 1.0 + early * abs(vacuum)
+    return theta[c.VOLUME] - full * vacuum / left, full / left**2 / theta[c.AMBIENT]
+
+
 def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
     """d/dt of three pressures, three masses, two flows, drive, jet, valve, supply, sensor."""
     port, line, vessel, port_mass, line_mass, vessel_mass, near, far = y[:8]
     drive, jet, valve, supply, felt, sensed = y[8:]
     ambient, outside = theta[c.AMBIENT], theta[c.TEMPERATURE]
-    shrunk = theta[c.COMPLIANCE] * (1.0 - vessel / ambient)
-    volume = theta[c.VOLUME] - shrunk
+    volume, stretch = room(theta, vessel)
     port_t = port * theta[c.PORT_VOLUME] / (R * port_mass)
     line_t = line * theta[c.LINE_VOLUME] / (R * line_mass)
     vessel_t = vessel * volume / (R * vessel_mass)
@@ -103,7 +109,6 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
     line_gain -= CP * near * near_t
     into_vessel = CP * (leak * leak_t - far * far_t)
     into_vessel += theta[c.FILM] * theta[c.AREA] * (outside - vessel_t)
-    stretch = theta[c.COMPLIANCE] / ambient
 
     rising = valves.nozzle > drive
     rise, fall = theta[c.RAMP_UP], theta[c.RAMP_DOWN]

@@ -90,7 +90,8 @@ def switched_on(state: kernel.State) -> kernel.State:
 def volume(theta: Theta, pressure: npt.ArrayLike) -> Rows:
     """Volume of the vessel (m³), less what cups shrink."""
     vacuum = 1.0 - np.asarray(pressure) / theta[c.AMBIENT]
-    return np.asarray(theta[c.VOLUME] - theta[c.COMPLIANCE] * vacuum)
+    shape = (1.0 + theta[c.SOFTNESS]) * vacuum / (1.0 + theta[c.SOFTNESS] * np.abs(vacuum))
+    return np.asarray(theta[c.VOLUME] - theta[c.COMPLIANCE] * shape)
 
 
 def temperature(theta: Theta, rows: Rows) -> Rows:

@@ -254,7 +254,12 @@ def test_every_coefficient_is_filled_in() -> None:
         "SLOW_SENSOR",
     }
     modes = {"CONTROL_SENSOR", "BLOW_OFF_MODE"}  # the first of each
-    assert zero == {"COMPLIANCE", "EXHAUST", "BLOW_OFF_SHAPE", "HOLE"} | effects | modes
+    assert (
+        zero
+        == {"COMPLIANCE", "SOFTNESS", "CONTACT", "EXHAUST", "BLOW_OFF_SHAPE", "HOLE"}
+        | effects
+        | modes
+    )
 
 
 def test_the_hash_tells_data_sets_apart() -> None:

@@ -11,7 +11,7 @@ import rigs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from stepping import phase_rows
-from test_numerics import cycle_of, moves_of
+from test_numerics import between_samples, cycle_of, moves_of
 
 from twin.model import kernel, strides
 from twin.model import theta as c
@@ -51,10 +51,12 @@ def read(
     return expected, signals
 
 
+@pytest.mark.parametrize("soft_and_late", [False, True])
 @pytest.mark.parametrize("name", rigs.NAMES)
-def test_a_whole_cycle_is_within_half_a_pascal_of_the_exact_solution(name: str) -> None:
-    theta = rigs.theta(name)
-    theta[[c.RESPONSE, c.BLOW_OFF_RESPONSE]] += [0.37 * MS, 0.61 * MS]  # between two samples
+def test_a_whole_cycle_is_within_half_a_pascal_of_the_exact_solution(
+    name: str, soft_and_late: bool
+) -> None:
+    theta = between_samples(name, soft_and_late)
     phases = cycle_of(name)
     phase = phase_rows(phases)
     driven = np.full(len(phase), MS), phase, np.full(len(phase), np.nan)

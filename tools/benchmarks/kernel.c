@@ -19,14 +19,14 @@ enum { /* twin.model.theta.COEFFICIENTS */
     SUPPLY_OPTIMUM, SUPPLY_CURVATURE, END_SLOPE, SUCTION, END_RATIO, BULGE, SKEW, BEND_2, BEND_3,
     RESPONSE, RESPONSE_OFF, RAMP_UP, SLOW_RAMP_UP, JET_DEPTH, RAMP_DOWN, BLOW_OFF, BLOW_OFF_SHAPE,
     BLOW_OFF_RESPONSE, BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, RELIEF, EXHAUST, PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT,
-    VOLUME, COMPLIANCE, FILM, AREA, NEAR_RESISTANCE, NEAR_LAMINAR, NEAR_INERTANCE, RESISTANCE,
+    VOLUME, COMPLIANCE, SOFTNESS, FILM, AREA, NEAR_RESISTANCE, NEAR_LAMINAR, NEAR_INERTANCE, RESISTANCE,
     LAMINAR, INERTANCE, PLACE, LEAK, LAMINAR_LEAK, INFLOW, BACK_FLOW, OPENING, HOLE, SENSOR_LAG, SLOW_SENSOR,
-    SENSOR_OFFSET, SENSOR_GAIN, H1, H1_LOW, H2, H2_LOW, RELEASE, CONTROL_SENSOR, AIR_SAVING,
-    PERMITTED_LEAKAGE, BLOW_OFF_MODE, BLOW_OFF_TIME, COEFFICIENTS
+    SENSOR_OFFSET, SENSOR_GAIN, H1, H1_LOW, H2, H2_LOW, RELEASE, CONTACT, CONTROL_SENSOR,
+    AIR_SAVING, PERMITTED_LEAKAGE, BLOW_OFF_MODE, BLOW_OFF_TIME, COEFFICIENTS
 };
 enum { /* what a call computes only once, behind them */
     K_SUCTION = COEFFICIENTS, K_END, K_BLOW_OFF, K_FLATTER, K_HEAT, K_PORT_HEAT, K_LINE_HEAT,
-    K_PLACE, PREPARED
+    K_PLACE, K_STRETCH, K_SOFT, PREPARED
 };
 enum { /* the state of twin.model.kernel */
     S_PORT, S_PORT_MASS, S_LINE, S_LINE_MASS, S_VESSEL, S_VESSEL_MASS, S_NEAR, S_FAR,
@@ -115,6 +115,8 @@ static void prepare(const double *theta, double *k)
     K(K_HEAT) = T(FILM) * T(AREA) / CP;
     K(K_PORT_HEAT) = T(PORT_HEAT) / CP;
     K(K_LINE_HEAT) = T(LINE_HEAT) / CP;
+    K(K_STRETCH) = T(COMPLIANCE) * (1.0 + T(SOFTNESS)) / ambient;
+    K(K_SOFT) = T(SOFTNESS) / ambient;
     double friction = T(NEAR_RESISTANCE) + T(RESISTANCE);
     K(K_PLACE) = friction > 0.0 ? min(T(PLACE) / friction, 1.0) : 0.0;
 }
@@ -195,6 +197,15 @@ INLINED double per_joule(double mass)
     return 1.0 / (R * mass);
 }
 
+typedef struct { double volume, stretch; } Room;
+
+INLINED Room room(double vessel, const double *k)
+{
+    double vacuum = K(AMBIENT) - vessel;
+    double left = 1.0 / (1.0 + K(K_SOFT) * fabs(vacuum));
+    return (Room){K(VOLUME) - K(K_STRETCH) * vacuum * left, K(K_STRETCH) * left * left};
+}
+
 INLINED Gas solve(Gas y, const Gas *known, double step, const Driven *driven, const double *k)
 {
     double ambient = K(AMBIENT), outside = K(TEMPERATURE);
@@ -203,8 +214,8 @@ INLINED Gas solve(Gas y, const Gas *known, double step, const Driven *driven, co
     double out = at.out, out_slope = at.out_slope, blown = at.in, blown_slope = at.in_slope;
     Tangent leaking = at_vessel(y.vessel, driven, k);
     double leak = leaking.level, leak_slope = leaking.slope;
-    double stretch = K(COMPLIANCE) / ambient;
-    double volume = K(VOLUME) - stretch * (ambient - y.vessel);
+    Room shrunk = room(y.vessel, k);
+    double volume = shrunk.volume, stretch = shrunk.stretch;
     double port_stored = K(PORT_VOLUME) * per_pa, line_stored = K(LINE_VOLUME) * per_pa;
     double vessel_stored = (volume + GAMMA * y.vessel * stretch) * per_pa;
     double warmth = K(K_HEAT), port_warmth = K(K_PORT_HEAT), line_warmth = K(K_LINE_HEAT);
@@ -410,6 +421,11 @@ static int release(const double *state, const double *k, double h)
     return S(OPEN) == 0.0 ? soon : S(OPEN) > 1.0;
 }
 
+INLINED double until_met(const double *state, const double *k)
+{
+    return S(NOZZLE_COMMAND) > 0.5 ? K(CONTACT) - S(NOZZLE_AGE) : NEVER;
+}
+
 INLINED double opened(double before, const Gas *gas, double commanded, const double *k)
 {
     double beyond = gas->vessel - (K(AMBIENT) - K(RELEASE));
@@ -427,7 +443,7 @@ static int moves(const double *state, int position, double h, const double *k, i
 static int jumps(const double *state, const double *k, double h)
 {
     return moves(state, NOZZLE, h, k, RESPONSE) || moves(state, BLOW, h, k, BLOW_OFF_RESPONSE) ||
-           release(state, k, h);
+           (K(CONTACT) > 0.0 && fabs(until_met(state, k)) < h) || release(state, k, h);
 }
 
 static int passes(const double *state, const double *k, double h)
@@ -446,6 +462,7 @@ static int finer(const double *state, const double *k, double h)
 
 INLINED void substep(double *state, const double *k, double h)
 {
+    double until = until_met(state, k);
     double nozzle = valve_over(state, NOZZLE, h, k, RESPONSE);
     double blow = valve_over(state, BLOW, h, k, BLOW_OFF_RESPONSE);
     Gas gas = {
@@ -456,7 +473,8 @@ INLINED void substep(double *state, const double *k, double h)
         S(S_DRIVE), S(S_JET), S(S_BLOWING),
         S(S_SUPPLIED), S(S_FELT), S(S_SENSED),
     };
-    double before = gas.vessel, open_cup = S(OPEN);
+    double before = gas.vessel;
+    double open_cup = until < h ? S(OPEN) * max(until, 0.0) / h : S(OPEN);
     Advanced next = advance_gas(&gas, &lags, h, &(Valves){nozzle, blow, open_cup}, k);
     S(S_PORT) = next.gas.port, S(S_PORT_MASS) = next.gas.port_mass;
     S(S_VESSEL) = next.gas.vessel, S(S_VESSEL_MASS) = next.gas.vessel_mass;
@@ -466,7 +484,7 @@ INLINED void substep(double *state, const double *k, double h)
     S(S_BLOWING) = next.lags.valve, S(S_SUPPLIED) = next.lags.supply;
     S(S_FELT) = next.lags.felt, S(S_SENSED) = next.lags.sensed;
     double now = opened(before, &next.gas, S(BLOW_COMMAND), k);
-    S(OPEN) = open_cup > 0.0 ? min(open_cup, 1.0) : now;
+    S(OPEN) = until < h ? 0.0 : open_cup > 0.0 ? min(open_cup, 1.0) : now;
     S(ROUGH) = next.off / (h * h * h);
 }
 
@@ -506,7 +524,7 @@ static void enter(double *state, int phase, const double *k)
         (before == SUCTION_PHASE && phase == HOLD_PHASE))
         S(NOZZLE_AGE) = NEVER;
     if (phase == SUCTION_PHASE && before != HOLD_PHASE)
-        S(OPEN) = 0.0;
+        S(OPEN) = K(CONTACT) > 0.0 && K(RELEASE) >= 0.0 ? S(OPEN) : 0.0;
     if (phase == IDLE_PHASE && before == BLOW_OFF_PHASE && K(RELEASE) >= 0.0)
         S(OPEN) = 1.0;
 }
@@ -514,7 +532,7 @@ static void enter(double *state, int phase, const double *k)
 static void settle(double *state, const double *k, double pressure)
 {
     double temperature = K(TEMPERATURE);
-    double volume = K(VOLUME) - K(COMPLIANCE) * (1.0 - pressure / K(AMBIENT));
+    double volume = room(pressure, k).volume;
     S(S_PORT) = S(S_LINE) = S(S_VESSEL) = pressure;
     S(S_FELT) = S(S_SENSED) = pressure;
     S(S_PORT_MASS) = pressure * K(PORT_VOLUME) / (R * temperature);
@@ -538,7 +556,7 @@ static void shift_by(double *state, double shift)
 static void synchronise(double *state, double level, const double *k)
 {
     int idle = S(PHASE) == IDLE_PHASE;
-    if (K(RELEASE) >= 0.0 && (idle || S(OPEN) > 0.0)) {
+    if (K(RELEASE) >= 0.0 && (idle || (S(OPEN) > 0.0 && S(PHASE) != SUCTION_PHASE))) {
         settle(state, k, K(AMBIENT));
         S(OPEN) = 1.0;
     } else if (S(VALID) > 0.0) {

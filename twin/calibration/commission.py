@@ -42,6 +42,7 @@ MOST_MISSING = 0.2  # share of rows
 ROOM_TEMPERATURE = 293.15  # K, for a first guess
 # Where a fit starts: of the line, between sensor and port, and of all gas, in the port.
 PLACES, PORT_SHARES = (0.05, 0.95), (0.01, 0.1)
+SHRINKS, SOFTNESS = 0.03, 5.0  # share of the cups' volume, and how early (System.softness)
 CLEARLY = 15.0  # mbar by which a threshold must differ to be told; overshoot is part of a turn
 LITTLE_VACUUM = 200.0  # mbar; flow ejectors on leaking parts make more
 AMBIENT_CLEARLY = 3.0  # mbar, the same for ambient pressure
@@ -240,7 +241,7 @@ def starts(data: DataSet, meets: float) -> list[DataSet]:
     Where along the line the sensor sits, what gas is at the port, how a part leaves, and whether
     cups meet the next one ``meets`` seconds after suction is commanded, or (NaN) are on it by then.
     """
-    cups = any(isinstance(part, Cups) for part in data.system.parts)
+    cups = sum(volume(part) for part in data.system.parts if isinstance(part, Cups)) / ML
     leaves = ("in_blow_off", "after_blow_off") if cups else (data.system.part_leaves,)
     waits = (0.0, meets / MS) if cups and np.isfinite(meets) else (0.0,)
     tables = data.model_dump()
@@ -250,7 +251,7 @@ def starts(data: DataSet, meets: float) -> list[DataSet]:
     found = []
     for wait, way, at, share in product(waits, leaves, PLACES, PORT_SHARES):
         tables["system"].update(part_leaves=way, rim="turbulent", sensor_shift=at - place)
-        tables["system"].update(part_meets_ms=wait)
+        tables["system"].update(part_meets_ms=wait, shrinks_ml=SHRINKS * cups, softness=SOFTNESS)
         tables["ejector"]["port_volume_ml"] = share * everything
         found.append(DataSet.model_validate(tables))
     return found

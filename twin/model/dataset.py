@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 
 from twin.errors import ConfigError
 from twin.model import theta as c
-from twin.model.effects import apply
+from twin.model.effects import FLATTEST, apply
 from twin.model.gas import GAMMA, R
 from twin.model.system import Part, Tube, Vessel, lumped
 from twin.model.term import Term
@@ -160,6 +160,8 @@ class System(Settings):
     sensor_shift: float = Field(0.0, ge=-1.0, le=1.0)  # of its place: 1 is the whole line outwards
     rim: Literal["laminar", "turbulent"] = "laminar"  # of a cup that stands open
     opening_factor: NotNegative = 1.0  # what flows through open cups over what they say
+    shrinks_ml: NotNegative = 0.0  # at full vacuum, beside what the cups say
+    softness: NotNegative = 0.0  # 0: shrinks in proportion to vacuum, n: half by 1/(n + 2) of it
     leak_sl_min: NotNegative = 0.3  # of seals and fittings, sonic
     part_leaves: Literal["in_blow_off", "after_blow_off"] = "in_blow_off"
     part_meets_ms: NotNegative = 0.0  # after suction is commanded: cups that move to the part
@@ -280,7 +282,8 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     port_area = total.port_area + ends * total.line_area
     theta[c.PORT_HEAT] = port_area * system.tube_film_coefficient
     theta[c.LINE_HEAT] = half_way * total.line_area * system.tube_film_coefficient
-    theta[c.COMPLIANCE] = total.shrinks
+    theta[c.COMPLIANCE] = min(total.shrinks + system.shrinks_ml * ML, FLATTEST * theta[c.VOLUME])
+    theta[c.SOFTNESS] = system.softness
     theta[c.FILM] = system.film_coefficient
     theta[c.AREA] = total.vessel_area + ends * total.line_area
     near = 0.5 if _swings(theta, total.inertance) else 0.0

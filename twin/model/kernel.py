@@ -25,6 +25,7 @@ from twin.model.plant import (
     prepare,
     put,
     reading,
+    room,
     sensed_at,
 )
 from twin.model.plant import advance as advance_gas
@@ -165,7 +166,7 @@ def run_on(
 def at_rest(theta: c.Theta) -> State:
     """Return a model that stands at ambient pressure and temperature, nothing commanded."""
     state = new_state(*theta.shape[1:])
-    _rest(state.reshape(STATE, -1), theta.reshape(len(c.COEFFICIENTS), -1))
+    _rest(state.reshape(STATE, -1), prepare(theta.reshape(len(c.COEFFICIENTS), -1)))
     return state
 
 
@@ -176,10 +177,11 @@ def take_over(state: State, before: c.Theta, after: c.Theta) -> None:
     """
     for mass, volume in ((PORT_MASS, c.PORT_VOLUME), (LINE_MASS, c.LINE_VOLUME)):
         state[mass] *= after[volume] / before[volume]
-    room = _room(state[VESSEL], before)
+    room, _ = _room(state[VESSEL], before)
     joined = room + (after[c.VOLUME] - before[c.VOLUME])
     state[VESSEL_MASS] *= joined / room
     walls = after[c.COMPLIANCE] != before[c.COMPLIANCE]
+    walls |= after[c.SOFTNESS] != before[c.SOFTNESS]
     walls |= after[c.AMBIENT] != before[c.AMBIENT]
     moved = walls & (state[VALID] > 0.0)
     if moved.any():
@@ -187,10 +189,12 @@ def take_over(state: State, before: c.Theta, after: c.Theta) -> None:
         state[VESSEL] = np.where(moved, _squeezed(vessel, joined, after), state[VESSEL])
 
 
-def _room(vessel: State, theta: c.Theta) -> State:
-    """Volume of the vessel at a pressure (m³), shrunk by its vacuum."""
-    room: State = theta[c.VOLUME] - theta[c.COMPLIANCE] * (1.0 - vessel / theta[c.AMBIENT])
-    return room
+def _room(vessel: State, theta: c.Theta) -> tuple[State, State]:
+    """Volume of the vessel at a pressure (m³), shrunk by its vacuum, and its rise (m³/Pa)."""
+    share, softness = 1.0 - vessel / theta[c.AMBIENT], theta[c.SOFTNESS]
+    left = 1.0 / (1.0 + softness * abs(share))
+    stretch = theta[c.COMPLIANCE] * (1.0 + softness) * left
+    return theta[c.VOLUME] - stretch * share, stretch * left / theta[c.AMBIENT]
 
 
 def _squeezed(vessel: State, joined: State, theta: c.Theta) -> State:
@@ -200,9 +204,9 @@ def _squeezed(vessel: State, joined: State, theta: c.Theta) -> State:
     """
     pressure = vessel.copy()
     for _ in range(SQUEEZES):
-        room = _room(pressure, theta)
+        room, rise = _room(pressure, theta)
         off = np.log(pressure / vessel) + GAMMA * np.log(room / joined)
-        slope = 1.0 / pressure + GAMMA * theta[c.COMPLIANCE] / theta[c.AMBIENT] / room
+        slope = 1.0 / pressure + GAMMA * rise / room
         pressure *= np.exp(-off / slope / pressure)
     return pressure
 
@@ -371,7 +375,7 @@ def _enter(state, phases, k):  # type: ignore[no-untyped-def]
             state[NOZZLE_AGE, i] = NEVER  # seen in the pressure: the valve has already acted
         if phase == _SUCTION and before != _HOLD:  # the next part is there, or comes
             comes = k[c.CONTACT, i] > 0.0 and not math.isnan(k[c.RELEASE, i])
-            state[OPEN, i] = 1.0 if comes else 0.0
+            state[OPEN, i] = state[OPEN, i] if comes else 0.0  # one that is held stays
         if phase == _IDLE and before == _BLOW_OFF and not math.isnan(k[c.RELEASE, i]):
             state[OPEN, i] = 1.0  # blow-off has let the part go, early or late
 
@@ -380,7 +384,7 @@ def _enter(state, phases, k):  # type: ignore[no-untyped-def]
 def _settle(state, k, i, pressure):  # type: ignore[no-untyped-def]
     """Let gas, sensor and supply stand at ``pressure``, as warm as the wall."""
     temperature = k[c.TEMPERATURE, i]
-    volume = k[c.VOLUME, i] - k[c.COMPLIANCE, i] * (1.0 - pressure / k[c.AMBIENT, i])
+    volume, _ = room(pressure, k, i)
     state[PORT, i] = state[LINE, i] = state[VESSEL, i] = pressure
     state[FELT, i] = state[SENSED, i] = pressure
     state[PORT_MASS, i] = pressure * k[c.PORT_VOLUME, i] / (R * temperature)

@@ -20,10 +20,10 @@ from twin.model.gas import CP, GAMMA, R, opening
 from twin.model.theta import Theta
 
 # What a step needs and a call computes only once, in rows behind the coefficients.
-(_SUCTION, _END, _BLOW_OFF, _FLATTER, _HEAT, _PORT_HEAT, _LINE_HEAT, _PLACE) = range(
-    len(c.COEFFICIENTS), len(c.COEFFICIENTS) + 8
+(_SUCTION, _END, _BLOW_OFF, _FLATTER, _HEAT, _PORT_HEAT, _LINE_HEAT, _PLACE, _STRETCH, _SOFT) = (
+    range(len(c.COEFFICIENTS), len(c.COEFFICIENTS) + 10)
 )
-PREPARED = len(c.COEFFICIENTS) + 8
+PREPARED = len(c.COEFFICIENTS) + 10
 
 # A runaway hypothesis stays a number; a node that is flushed many times in a step keeps its gas.
 LIGHTEST = 1e-15  # kg
@@ -97,6 +97,8 @@ def prepare_one(k, i):  # type: ignore[no-untyped-def]
     k[_HEAT, i] = k[c.FILM, i] * k[c.AREA, i] / CP
     k[_PORT_HEAT, i] = k[c.PORT_HEAT, i] / CP
     k[_LINE_HEAT, i] = k[c.LINE_HEAT, i] / CP
+    k[_STRETCH, i] = k[c.COMPLIANCE, i] * (1.0 + k[c.SOFTNESS, i]) / ambient
+    k[_SOFT, i] = k[c.SOFTNESS, i] / ambient
     friction = k[c.NEAR_RESISTANCE, i] + k[c.RESISTANCE, i]
     k[_PLACE, i] = min(k[c.PLACE, i] / friction, 1.0) if friction > 0.0 else 0.0
 
@@ -239,15 +241,22 @@ def per_joule(mass):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def temperatures(y, known, step, entering, drawn, k, i):  # type: ignore[no-untyped-def]
-    """Gas temperatures (K) of port, line and vessel, at which it leaves them.
+def room(vessel, k, i):  # type: ignore[no-untyped-def]
+    """Volume (m³) of a vessel that shrinks with vacuum, and how much it grows per Pa."""
+    vacuum = k[c.AMBIENT, i] - vessel
+    left = 1.0 / (1.0 + k[_SOFT, i] * abs(vacuum))
+    return k[c.VOLUME, i] - k[_STRETCH, i] * vacuum * left, k[_STRETCH, i] * left * left
+
+
+@inlined
+def temperatures(y, volume, known, step, entering, drawn, k, i):  # type: ignore[no-untyped-def]
+    """Gas temperatures (K) of port, line and vessel of a ``volume`` (m³), at which it leaves them.
 
     Port's and line's follow from their balances, the port's with what is ``entering`` and ``drawn``
     (kg/s): a small node is flushed many times in a step, and p V / (m R) would swing from pass to
     pass.
     """
     outside, per_pa = k[c.TEMPERATURE, i], 1.0 / (GAMMA * R * step)
-    volume = k[c.VOLUME, i] - k[c.COMPLIANCE, i] / k[c.AMBIENT, i] * (k[c.AMBIENT, i] - y.vessel)
     vessel_t = y.vessel * volume * per_joule(y.vessel_mass)
     line_t = y.line * k[c.LINE_VOLUME, i] * per_joule(y.line_mass)
     held = k[c.PORT_VOLUME, i] * per_pa * known.port + (entering + k[_PORT_HEAT, i]) * outside
@@ -264,21 +273,20 @@ def solve(y, known, step, driven, k, i):  # type: ignore[no-untyped-def]
     """One pass over the balances of all nodes: ``y`` is the guess, ``known`` what came before.
 
     Mass and energy of an ideal gas: V dp/dt = γ R Σ w T + (γ − 1) Q, and with a volume that shrinks
-    in proportion to vacuum (V + γ p dV/dp) in place of V. So each pressure is linear in the flows;
+    with vacuum (V + γ p dV/dp) in place of V. So each pressure is linear in the flows;
     the near flow is made a tangent over the line's pressure, the far one is solved for.
     """
     ambient, outside = k[c.AMBIENT, i], k[c.TEMPERATURE, i]
     per_s, per_pa, per_k = 1.0 / step, 1.0 / (GAMMA * R * step), 1.0 / outside
     out, out_slope, blown, blown_slope = at_port(y.port, driven, k, i)
     leak, leak_slope = at_vessel(y.vessel, driven, k, i)
-    stretch = k[c.COMPLIANCE, i] / ambient
-    volume = k[c.VOLUME, i] - stretch * (ambient - y.vessel)
+    volume, stretch = room(y.vessel, k, i)
     port_stored, line_stored = k[c.PORT_VOLUME, i] * per_pa, k[c.LINE_VOLUME, i] * per_pa
     vessel_stored = (volume + GAMMA * y.vessel * stretch) * per_pa
     warmth, port_warmth, line_warmth = k[_HEAT, i], k[_PORT_HEAT, i], k[_LINE_HEAT, i]
 
     entering, drawn = blown + blown_slope * y.port, max(out + out_slope * y.port, 0.0)
-    port_t, line_t, vessel_t = temperatures(y, known, step, entering, drawn, k, i)
+    port_t, line_t, vessel_t = temperatures(y, volume, known, step, entering, drawn, k, i)
     near_t = line_t if y.near >= 0.0 else port_t
     far_t = vessel_t if y.far >= 0.0 else line_t
     leak_t = outside if y.vessel <= ambient else vessel_t

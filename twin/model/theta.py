@@ -49,6 +49,10 @@ COEFFICIENTS: Mapping[str, tuple[str, str]] = {
     "LINE_HEAT": ("W/K", "between its gas and the wall"),
     "VOLUME": ("m³", "of the node at the far end, the vessel"),
     "COMPLIANCE": ("m³", "less at full vacuum"),
+    "SOFTNESS": (
+        "1",
+        "how much of that is gone early: 0 in proportion to vacuum, n half at 1/(n+2)",
+    ),
     "FILM": ("W/(m² K)", "between the vessel's gas and the wall"),
     "AREA": ("m²", "of that wall"),
     "NEAR_RESISTANCE": ("Pa²/(kg/s)²", "port to line: what grows with the square of the flow"),
@@ -119,6 +123,7 @@ COEFFICIENTS: Mapping[str, tuple[str, str]] = {
     LINE_HEAT,
     VOLUME,
     COMPLIANCE,
+    SOFTNESS,
     FILM,
     AREA,
     NEAR_RESISTANCE,
