@@ -197,3 +197,13 @@ def test_the_model_runs_on_where_the_nozzle_was_found_to_switch(name: str) -> No
     rows = np.flatnonzero(changes) + 1
     assert rows.tolist() == [one.row for one in found]
     assert not np.isfinite(cycles.level[rows]).any()
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_where_no_air_is_saved_the_nozzle_never_goes_off_by_itself(name: str) -> None:
+    samples, _ = rigs.recorded(name, 12.0)
+    data = rigs.config(name).data
+    ejector = data.ejector.model_copy(update={"air_saving": "off"})
+    without = data.model_copy(update={"ejector": ejector})
+    assert (Cycles.found(samples, data).phase == Phase.HOLD).any()
+    assert not (Cycles.found(samples, without).phase == Phase.HOLD).any()

@@ -49,13 +49,16 @@ class Cycles:
     def found(cls, samples: Samples, data: DataSet) -> "Cycles":
         """Find the phases, and where the nozzle switched whatever hangs on it.
 
-        It switches where the pressure shows it, and the model runs on through that.
+        It switches where the pressure shows it, and the model runs on through that. An ejector that
+        saves no air never switches it by itself.
         """
         theta = coefficients(data)
         blow_off = float(theta[c.BLOW_OFF_MODE]), float(theta[c.BLOW_OFF_TIME])
         rows, told, level = commanded(samples, blow_off)
         level = level.astype(np.float32).astype(np.float64)
-        phase = _switched(told, switchings(rows, told, noise_of(rows, told)))
+        saves_air = theta[c.AIR_SAVING] != c.OFF
+        found = switchings(rows, told, noise_of(rows, told)) if saves_air else []
+        phase = _switched(told, found)
         return cls._of(rows, phase, level, theta, quickly=True)
 
     @classmethod
