@@ -18,7 +18,7 @@ from twin.assets.place import open_chosen
 from twin.calibration.calibrate import complete
 from twin.calibration.commission import Commissioned, commission, guessed
 from twin.calibration.cycles import Cycles
-from twin.calibration.fit import RISING, falling, soft
+from twin.calibration.fit import BEST_END, END_PRESSURE, RISING, falling, soft
 from twin.calibration.page import write_page
 from twin.calibration.readings import Readings, read, turns
 from twin.calibration.report import commissioned_as_json, commissioned_in_words
@@ -327,3 +327,27 @@ def test_the_worst_phase_gives_the_verdict() -> None:
     assert weak.word == "usable"
     assert weak.weak == [Phase.BLOW_OFF, Phase.HOLD]
     assert verdict(suction=5.0).word == "refused"
+
+
+def test_an_end_pressure_that_the_record_does_not_come_near_is_below_its_deepest() -> None:
+    fitted = commissioned().calibration.fitted
+    number = [one.name for one in fitted.free].index(END_PRESSURE)
+    end = fitted.data.ejector.end_pressure_mbar * MBAR
+    near, far = (replace(fitted, deepest=end + above) for above in (0.1 * MBAR, 100.0 * MBAR))
+    assert near.reaches_end
+    assert near.interval(END_PRESSURE)[1] < 2.0 * end / MBAR
+    assert not far.reaches_end
+    assert not far.determined[number]
+    assert far.interval(END_PRESSURE) == (BEST_END / MBAR, end / MBAR + 100.0)
+
+
+def test_the_interval_of_what_is_scaled_is_one_of_its_logarithm() -> None:
+    """A leak of 0.01 ± 0.01 sl/min is not below zero."""
+    fitted = commissioned().calibration.fitted
+    number = [one.name for one in fitted.free].index("system.leak_sl_min")
+    leak = fitted.free[number].of(fitted.data)
+    covariance = fitted.covariance.copy()
+    covariance[number, number] = leak**2
+    low, high = replace(fitted, covariance=covariance).interval("system.leak_sl_min")
+    assert low == pytest.approx(leak / np.exp(1.96))
+    assert high == pytest.approx(leak * np.exp(1.96))

@@ -6,7 +6,7 @@ model's own error leave of it. All derivatives come from one run of the bank of 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import Literal, Protocol
 
@@ -19,7 +19,7 @@ from twin.calibration.left_out import with_left_out
 from twin.calibration.parameters import Free, Space
 from twin.calibration.weights import Weights, plain, weighted
 from twin.model.dataset import RIPPLE, DataSet, coefficients
-from twin.signals import MBAR, Samples
+from twin.signals import MBAR, UNUSABLE, Samples
 
 # Tolerances of the rounds. Knees are found and residuals weighed with what the round before found.
 ROUNDS = (1e-2, 1e-2, 1e-3)
@@ -29,6 +29,11 @@ DETERMINED = 0.5  # of what the type leaves open: what is known better comes fro
 SWITCHING = 6.0  # rows, one standard deviation of when the nozzle switched
 STEP = 0.05  # of a parameter's sigma, for derivatives
 RISING = 40  # steps over the characteristic, in which suction is looked at
+END_PRESSURE = "ejector.end_pressure_mbar"
+NEARLY_NOTHING = 0.02  # of the suction capacity, at the deepest pressure of a record
+BEST_END = 50.0 * MBAR  # Pa, absolute; single-stage ejectors end at 70 and more
+DEEPEST = 0.001  # quantile of a record's rows: no single reading
+MOST_FACTOR = 10.0  # of the logarithm
 BENDS = ("bulge", "skew", "bend_2", "bend_3")
 
 Floats = npt.NDArray[np.float64]
@@ -143,6 +148,16 @@ class Fitted:
     left_open: Floats  # the same without what the model leaves out: what other logs may show
     prior: Floats  # one standard deviation of each before the log, in its unit
     left: float  # Pa rms that the model is off in the fitted cycles
+    scaled: npt.NDArray[np.bool_]  # of which parameters the logarithm is normally distributed
+    deepest: float = np.nan  # Pa, to which the record goes; NaN where the type knows what is below
+
+    @property
+    def reaches_end(self) -> bool:
+        """Whether the record goes down to where the ejector moves nearly nothing any more."""
+        ejector, ambient = self.data.ejector, self.data.ambient.pressure_mbar
+        end = ejector.end_pressure_mbar
+        beyond = max(self.deepest / MBAR - end, 0.0) / (ambient - end)
+        return not float(ejector.share(np.array([beyond]))[0]) > NEARLY_NOTHING
 
     @property
     def spread(self) -> Floats:
@@ -154,13 +169,27 @@ class Fitted:
     def determined(self) -> npt.NDArray[np.bool_]:
         """Which parameters the log determines; the others come from the type."""
         known: npt.NDArray[np.bool_] = self.spread < DETERMINED * self.prior
+        known[self._number(END_PRESSURE)] &= self.reaches_end
         return known
 
     def interval(self, name: str) -> tuple[float, float]:
-        """95 % interval of a parameter (``table.key``), in its unit."""
-        number = [free.name for free in self.free].index(name)
-        value, reach = self.free[number].of(self.data), 1.96 * float(self.spread[number])
-        return value - reach, value + reach
+        """95 % interval of a parameter (``table.key``), in its unit.
+
+        An end pressure that the record does not come near is known to be below its deepest: how the
+        characteristic goes on from there is nobody's knowledge.
+        """
+        if name == END_PRESSURE and not self.reaches_end:
+            return BEST_END / MBAR, self.deepest / MBAR
+        number = self._number(name)
+        free, reach = self.free[number], 1.96 * float(self.spread[number])
+        value = free.of(self.data)
+        if self.scaled[number] and value > 0.0:
+            factor = float(np.exp(min(reach / value, MOST_FACTOR)))
+            return max(value / factor, free.low), min(value * factor, free.high)
+        return max(value - reach, free.low), min(value + reach, free.high)
+
+    def _number(self, name: str) -> int:
+        return [free.name for free in self.free].index(name)
 
 
 def fit(samples: Samples, space: Space, progress: Callable[[str], None]) -> Fitted:
@@ -213,7 +242,9 @@ def fit_from_afar(
     best = starts[0]
     cycles = Cycles.found(samples, best.data)
     weights = weighted(cycles, coefficients(best.data), noise, fitted=True)
-    return _fitted(Problem(best.space, cycles, weights), best.x)
+    pressure = samples["pressure"][(samples["quality"] & UNUSABLE) == 0]
+    deepest = float(np.nanquantile(pressure, DEEPEST))
+    return replace(_fitted(Problem(best.space, cycles, weights), best.x), deepest=deepest)
 
 
 def _followed(samples: Samples, start: _Start, one: Round, noise: float) -> _Start:
@@ -275,7 +306,8 @@ def _fitted(problem: Problem, x: Floats) -> Fitted:
     covariance = ways @ _with_left_out(plain, jacobian, problem.weights.white(off)) @ ways.T
     prior = np.sqrt(np.diag(ways @ ways.T))
     left = float(np.sqrt(np.average(off[:, 0] ** 2, weights=cycles.bins.count)))
-    return Fitted(best, space.free, covariance, ways @ plain @ ways.T, prior, left)
+    left_open = ways @ plain @ ways.T
+    return Fitted(best, space.free, covariance, left_open, prior, left, space.scaled)
 
 
 def _with_left_out(covariance: Floats, jacobian: Floats, white: Sequence[Floats]) -> Floats:
