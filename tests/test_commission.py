@@ -16,7 +16,7 @@ from second_world.records import record
 
 from twin.assets.place import open_chosen
 from twin.calibration.calibrate import complete
-from twin.calibration.commission import Commissioned, commission, guessed
+from twin.calibration.commission import Commissioned, commission, guessed, starts
 from twin.calibration.cycles import Cycles
 from twin.calibration.fit import BEST_END, END_PRESSURE, RISING, falling, soft
 from twin.calibration.page import write_page
@@ -27,8 +27,9 @@ from twin.calibration.verdict import Residual, Verdict, judge
 from twin.calibration.weights import Weights
 from twin.config import Asset
 from twin.errors import ConfigError
-from twin.model.dataset import DataSet
-from twin.signals import BREAK, MBAR, SAMPLE, Command, Phase, Quality, Samples, bridged
+from twin.model import theta as c
+from twin.model.dataset import DataSet, coefficients
+from twin.signals import BREAK, MBAR, MS, SAMPLE, Command, Phase, Quality, Samples, bridged
 
 CYCLES = 9
 
@@ -171,6 +172,47 @@ def test_the_record_shows_what_flows_back_once_suction_has_ended() -> None:
     assert read(rows).back_rate == pytest.approx(2.0, rel=0.02)  # 1/s of 1000 mbar
     rows["commands"][rows["commands"] == 0] = Command.BLOW_OFF
     assert np.isnan(read(rows).back_rate)
+
+
+@pytest.mark.parametrize(("waits", "draws"), [(60, 8.0), (60, 0.0), (0, 8.0)])
+def test_cups_that_meet_a_part_late_draw_a_little_before(waits: int, draws: float) -> None:
+    """Without the little fall, suction is only late."""
+    open_cups = np.full(waits, 1000.0 - draws)
+    fall = np.linspace(1000.0 - draws, 300.0, 340)
+    fill, idle = np.linspace(300.0, 1000.0, 100), np.full(400, 1000.0)
+    cycle = np.concatenate([np.full(20, 1000.0), open_cups, fall, fill, idle])
+    commands = np.repeat([Command.SUCTION, Command.BLOW_OFF, 0], [360 + waits, 100, 400])
+    rows = np.zeros(6 * len(cycle), SAMPLE)
+    rows["time_ns"] = np.arange(len(rows)) * 1_000_000
+    rows["sequence"], rows["commands"] = np.arange(len(rows)), np.tile(commands, 6)
+    rows["pressure"] = np.tile(cycle, 6) * MBAR
+    meets = read(rows).meets / MS
+    assert meets == pytest.approx(80.0, abs=6.0) if waits and draws else np.isnan(meets)
+
+
+def test_a_fit_starts_with_cups_that_meet_a_part_late_and_without_where_the_record_shows_it() -> (
+    None
+):
+    data = config_of(logged(SEED, KIND).truth.readable).data
+    plain, late = starts(data, np.nan), starts(data, 80.0 * MS)
+    assert {one.system.part_meets_ms for one in plain} == {0.0}
+    assert {one.system.part_meets_ms for one in late} == {0.0, 80.0}
+    assert len(late) == 2 * len(plain)
+    assert all(coefficients(one)[c.COMPLIANCE] > 0.0 for one in late)
+
+
+def test_a_cycle_in_which_something_went_wrong_counts_little_in_what_is_left_and_in_the_floor() -> (
+    None
+):
+    found = commissioned()
+    data = found.calibration.fitted.data
+    cycles = Cycles.found(found.samples, data)
+    last = cycles.bins.cycle == cycles.bins.cycle.max()
+    odd = replace(cycles, measured=cycles.measured + np.where(last, 30.0 * MBAR, 0.0))
+    plain, moved = (judge(each, data, 0.0).residuals[Phase.SUCTION] for each in (cycles, odd))
+    uncapped = 30.0 * MBAR / np.sqrt(CYCLES - 1)
+    assert moved.left < 0.5 * np.hypot(plain.left, uncapped)
+    assert moved.floor < 0.6 * np.hypot(plain.floor, uncapped)
 
 
 def test_a_turn_needs_what_noise_does_not_make() -> None:
