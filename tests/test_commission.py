@@ -21,7 +21,7 @@ from twin.calibration.cycles import Cycles
 from twin.calibration.fit import BEST_END, END_PRESSURE, RISING, falling, soft
 from twin.calibration.page import write_page
 from twin.calibration.readings import Readings, read, turns
-from twin.calibration.report import commissioned_as_json, commissioned_in_words
+from twin.calibration.report import commissioned_as_json, commissioned_in_words, headline
 from twin.calibration.store import store_first
 from twin.calibration.verdict import Residual, Verdict, judge
 from twin.calibration.weights import Weights
@@ -393,3 +393,19 @@ def test_the_interval_of_what_is_scaled_is_one_of_its_logarithm() -> None:
     low, high = replace(fitted, covariance=covariance).interval("system.leak_sl_min")
     assert low == pytest.approx(leak / np.exp(1.96))
     assert high == pytest.approx(leak * np.exp(1.96))
+
+
+def test_a_verdict_says_where_most_is_left() -> None:
+    found = commissioned()
+    data = found.calibration.fitted.data
+    cycles = Cycles.found(found.samples, data)
+    here = (cycles.bins.kind == int(Phase.HOLD)) & (cycles.bins.since == 5)
+    assert here.any()
+    moved = replace(cycles, measured=cycles.measured - np.where(here, 40.0 * MBAR, 0.0))
+    hold = judge(moved, data, 0.0).residuals[Phase.HOLD]
+    assert hold.most == pytest.approx(-40.0 * MBAR, abs=5.0 * MBAR)
+    assert hold.at == pytest.approx(5.0 * np.median(cycles.dt))
+    after = f"{hold.at / MS:.0f} ms after it begins"
+    assert f"mbar measured below expected, {after}" in headline(
+        Verdict({Phase.HOLD: replace(hold, left=9.0 * hold.floor)})
+    )

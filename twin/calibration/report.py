@@ -5,9 +5,9 @@ from typing import Any
 from twin.assets.record import Record
 from twin.calibration.calibrate import Calibration
 from twin.calibration.commission import Commissioned
-from twin.calibration.verdict import WEAKENS, Verdict
+from twin.calibration.verdict import WEAKENS, Residual, Verdict
 from twin.config import Asset
-from twin.signals import MBAR, Phase
+from twin.signals import MBAR, MS, Phase
 
 
 def in_words(calibration: Calibration) -> str:
@@ -92,20 +92,28 @@ def commissioned_in_words(found: Commissioned) -> str:
 
 
 def headline(verdict: Verdict) -> str:
-    """The verdict in a sentence."""
-    weak = [
-        f"{verdict.residuals[phase].times:.1f} times in {phase.name.lower().replace('_', '-')}"
-        f" ({WEAKENS[phase]})"
-        for phase in verdict.weak
-    ]
+    """The verdict in a sentence or two."""
     if verdict.word == "good":
         return "good: the twin follows this record as closely as its cycles follow each other"
-    beyond = f"the twin is off by more than its cycles differ: {', '.join(weak)}"
+    weak = "; ".join(_weak(phase, verdict.residuals[phase]) for phase in verdict.weak)
+    beyond = f"the twin is off by more than its cycles differ: {weak}"
     if verdict.word == "usable":
         return f"usable: {beyond}. Causes that act there are named less surely"
     return (
-        f"refused: {beyond}. Nothing is stored. Check tubes, volumes and the sensor's place in"
-        " [data.system.parts], and that the record is of one healthy unit"
+        f"refused: {beyond}. Nothing is stored: causes would be named wrongly. Commands, unit and"
+        " sign look right, and the fit makes up for rough volumes and tubes. So something hangs on"
+        " the ejector that [data.system.parts] does not list, or the unit has a fault already, or"
+        " it does what the model has not. What needs no twin: twin figures, twin compare"
+    )
+
+
+def _weak(phase: Phase, one: Residual) -> str:
+    """What is left in a phase, where most, and which causes that concerns."""
+    side = "above" if one.most > 0.0 else "below"
+    return (
+        f"{one.times:.1f} times in {phase.name.lower().replace('_', '-')}, at most"
+        f" {abs(one.most) / MBAR:.1f} mbar measured {side} expected, {one.at / MS:.0f} ms after it"
+        f" begins ({WEAKENS[phase]})"
     )
 
 
@@ -124,6 +132,8 @@ def commissioned_as_json(
                 "left_mbar": one.left / MBAR,
                 "floor_mbar": one.floor / MBAR,
                 "times": one.times,
+                "most_mbar": one.most / MBAR,
+                "at_ms": one.at / MS,
             }
             for phase, one in found.verdict.residuals.items()
         },

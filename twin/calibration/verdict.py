@@ -31,10 +31,12 @@ WEAKENS = {
 
 @dataclass(frozen=True)
 class Residual:
-    """What is left in one phase (Pa rms), and the floor of the record there."""
+    """What is left in one phase (Pa rms), the floor of the record there, and where most is left."""
 
     left: float
     floor: float
+    most: float = 0.0  # Pa, measured minus expected in the mean cycle, where it is largest
+    at: float = 0.0  # s after the phase began
 
     @property
     def times(self) -> float:
@@ -70,10 +72,19 @@ def judge(cycles: Cycles, data: DataSet, noise: float) -> Verdict:
     for phase in Phase:
         here = used & (_phase_of(bins.kind) == phase)
         if here.any():
-            found[phase] = _residual(
-                off[here], bins.place[here], bins.cycle[here], bins.count[here], noise
-            )
+            of, place = off[here], bins.place[here]
+            left, floor = _left(of, place, bins.cycle[here], bins.count[here], noise)
+            since = bins.since[here] * float(np.median(cycles.dt))
+            found[phase] = Residual(left, floor, *_most(of, place, since))
     return Verdict(found)
+
+
+def _most(off: Floats, place: Ints, since: Floats) -> tuple[float, float]:
+    """The largest mean (Pa) of places that enough cycles show, and when (s) that is."""
+    _, number, many = np.unique(place, return_inverse=True, return_counts=True)
+    mean = np.bincount(number, off) / many
+    worst = int(np.argmax(np.abs(mean) * (many >= min(FEWEST, many.max()))))
+    return float(mean[worst]), float(np.median(since[number == worst]))
 
 
 def _off(cycles: Cycles, theta: Theta) -> Floats:
@@ -97,8 +108,10 @@ def _phase_of(kind: Ints) -> Ints:
     return phase
 
 
-def _residual(off: Floats, place: Ints, cycle: Ints, count: Ints, noise: float) -> Residual:
-    """Rms over rows, with the noise of single readings added to the means of bins.
+def _left(off: Floats, place: Ints, cycle: Ints, count: Ints, noise: float) -> tuple[float, float]:
+    """Rms over rows (Pa) of what is left, and of the floor.
+
+    The noise of single readings is added to the means of bins.
 
     A cycle in which something went wrong says little of the model and of the floor: it counts no
     more in either than one that is ODD times as far from the mean as the middle one.
@@ -109,7 +122,7 @@ def _residual(off: Floats, place: Ints, cycle: Ints, count: Ints, noise: float) 
     shown = (many >= FEWEST)[number]
     single = noise**2 * (1.0 - 1.0 / count)  # what averaging over a bin took away
     if not shown.any():
-        return Residual(float(np.sqrt(np.average(off**2 + single, weights=count))), noise)
+        return float(np.sqrt(np.average(off**2 + single, weights=count))), noise
     _, turn = np.unique(cycle, return_inverse=True)
     rows, rows_shown = np.bincount(turn, count), np.bincount(turn, count * shown)
     each = np.bincount(turn, count * shown * (apart + single)) / np.maximum(rows_shown, 1)
@@ -117,4 +130,4 @@ def _residual(off: Floats, place: Ints, cycle: Ints, count: Ints, noise: float) 
     trust = np.minimum(1.0, ODD**2 * middle / np.maximum(each, middle))
     left = np.sum(trust * np.bincount(turn, count * (off**2 + single))) / np.sum(rows)
     floor = np.mean((trust * each)[rows_shown > 0])
-    return Residual(float(np.sqrt(left)), float(np.sqrt(floor)))
+    return float(np.sqrt(left)), float(np.sqrt(floor))
