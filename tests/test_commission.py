@@ -16,7 +16,15 @@ from second_world.records import record
 
 from twin.assets.place import open_chosen
 from twin.calibration.calibrate import complete
-from twin.calibration.commission import Commissioned, commission, guessed, starts
+from twin.calibration.commission import (
+    ELSEWHERE,
+    Commissioned,
+    commission,
+    guessed,
+    misplaced,
+    place_of,
+    starts,
+)
 from twin.calibration.cycles import Cycles
 from twin.calibration.fit import BEST_END, END_PRESSURE, RISING, falling, soft
 from twin.calibration.page import write_page
@@ -393,6 +401,24 @@ def test_the_interval_of_what_is_scaled_is_one_of_its_logarithm() -> None:
     low, high = replace(fitted, covariance=covariance).interval("system.leak_sl_min")
     assert low == pytest.approx(leak / np.exp(1.96))
     assert high == pytest.approx(leak * np.exp(1.96))
+
+
+def test_a_sensor_at_another_place_than_told_is_said_where_the_fit_is_sure() -> None:
+    fitted = commissioned().calibration.fitted
+    number = [one.key for one in fitted.free].index("sensor_shift")
+    here = fitted.data.system.sensor_shift
+    system = fitted.data.system.model_copy(update={"sensor_shift": here + (-0.9, 0.9)[here < 0.0]})
+    told = fitted.data.model_copy(update={"system": system})
+    apart = abs(place_of(told) - place_of(fitted.data))
+    assert apart > ELSEWHERE
+    for unsure, said in ((0.1 * apart, True), (0.5 * apart, False)):
+        covariance = fitted.covariance.copy()
+        covariance[number, number] = unsure**2
+        remarks = list(misplaced(told, replace(fitted, covariance=covariance)))
+        assert [one.text.startswith("the pressure is read nearer to") for one in remarks] == (
+            [True] if said else []
+        )
+    assert not list(misplaced(fitted.data, fitted))
 
 
 def test_a_verdict_says_where_most_is_left() -> None:

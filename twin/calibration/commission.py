@@ -44,6 +44,8 @@ ROOM_TEMPERATURE = 293.15  # K, for a first guess
 PLACES, PORT_SHARES = (0.05, 0.95), (0.01, 0.1)
 SHRINKS, SOFTNESS = 0.03, 5.0  # share of the cups' volume, and how early (System.softness)
 CLEARLY = 15.0  # mbar by which a threshold must differ to be told; overshoot is part of a turn
+# Of the line, by which a sensor is at another place than told, and sigmas.
+ELSEWHERE, SURELY = 0.6, 4.0
 LITTLE_VACUUM = 200.0  # mbar; flow ejectors on leaking parts make more
 AMBIENT_CLEARLY = 3.0  # mbar, the same for ambient pressure
 LEAST_OFFSET = 1.0  # mbar, of the sensor beside a barometer, to be taken for one
@@ -118,6 +120,7 @@ def commission(
     fitted = _fit(used, starts(guess, readings.meets), progress)
     progress("judging the fit")
     verdict = judge(Cycles.found(samples, fitted.data), fitted.data, readings.noise)
+    remarks += misplaced(config.data, fitted)
     cycles = complete(fitted.data, samples)
     known = replace(config, data=fitted.data)
     healthy = like_these(known, fitted, scatter(fitted.data, cycles), samples)
@@ -245,8 +248,7 @@ def starts(data: DataSet, meets: float) -> list[DataSet]:
     leaves = ("in_blow_off", "after_blow_off") if cups else (data.system.part_leaves,)
     waits = (0.0, meets / MS) if cups and np.isfinite(meets) else (0.0,)
     tables = data.model_dump()
-    theta = coefficients(data)
-    place = float(theta[c.PLACE] / (theta[c.NEAR_RESISTANCE] + theta[c.RESISTANCE]))
+    place = place_of(data)
     everything = _volume(data) / ML
     found = []
     for wait, way, at, share in product(waits, leaves, PLACES, PORT_SHARES):
@@ -255,6 +257,25 @@ def starts(data: DataSet, meets: float) -> list[DataSet]:
         tables["ejector"]["port_volume_ml"] = share * everything
         found.append(DataSet.model_validate(tables))
     return found
+
+
+def misplaced(told: DataSet, fitted: Fitted) -> Iterator[Remark]:
+    """A remark where the pressure is clearly read at another place than ``told``."""
+    was, found = place_of(told), place_of(fitted.data)
+    unsure = float(fitted.spread[[one.key for one in fitted.free].index("sensor_shift")])
+    if abs(found - was) > ELSEWHERE and abs(found - was) > SURELY * unsure:
+        here, there = ("the vessel", "the port") if found > was else ("the port", "the vessel")
+        text = f"the pressure is read nearer to {here}; the configuration has the sensor nearer to"
+        line = (
+            '[[data.system.parts]] kind = "sensor" stands in the order of parts, from the port on'
+        )
+        yield Remark(f"{text} {there}", line)
+
+
+def place_of(data: DataSet) -> float:
+    """Where along the line the sensor is: 0 at the port, 1 at the vessel."""
+    theta = coefficients(data)
+    return float(theta[c.PLACE] / (theta[c.NEAR_RESISTANCE] + theta[c.RESISTANCE]))
 
 
 def _thresholds(ejector: dict[str, Any], readings: Readings, ambient: float) -> list[Remark]:
