@@ -97,6 +97,8 @@ FREE_IN_MARKET = (
     Free(_E, "back_flow_sl_min", "sl/min", 0.4, 0.0, 5000.0, True, market=1.5),
     Free(_E, "blow_off_shape", "", 0.1, -0.9, 3.0, market=0.4, scaled=False),
     Free("system", "opening_factor", "", 0.4, 1e-3, 100.0, True, market=1.5),
+    Free("system", "line_volume_factor", "", 0.2, 0.02, 50.0, True, market=0.5),
+    Free("system", "line_inertia_factor", "", 0.2, 0.02, 50.0, True, market=0.5),
     Free("system", "shrinks_ml", "ml", 0.3, 0.0, 5000.0, True, market=1.5),
     Free("system", "softness", "", 0.5, 0.0, 500.0, True, market=1.0),
     Free("system", "part_meets_ms", "ms", 5.0, 0.0, 5000.0, market=0.3),

@@ -156,6 +156,8 @@ class System(Settings):
     film_coefficient: NotNegative = 10.0  # W/(m² K), of vessel and cups
     tube_film_coefficient: NotNegative = 60.0  # W/(m² K)
     line_factor: NotNegative = 1.0  # flow resistance over what the parts add up to
+    line_volume_factor: Positive = 1.0  # the tubes' volume over what the parts add up to
+    line_inertia_factor: NotNegative = 1.0  # inertia of their gas over the same
     line_share: float = Field(0.6, gt=0.0, lt=1.0)  # of the tubes' volume, half-way along
     sensor_shift: float = Field(0.0, ge=-1.0, le=1.0)  # of its place: 1 is the whole line outwards
     rim: Literal["laminar", "turbulent"] = "laminar"  # of a cup that stands open
@@ -276,9 +278,11 @@ def _set_ejector(theta: Theta, ejector: Ejector, end_ratio: float) -> None:
 def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     total = lumped(system.parts, theta[c.SUCTION], theta[c.AMBIENT], theta[c.TEMPERATURE])
     half_way, ends = system.line_share, (1.0 - system.line_share) / 2.0
-    theta[c.PORT_VOLUME] = ejector_volume + total.port_volume + ends * total.line_volume
-    theta[c.LINE_VOLUME] = half_way * total.line_volume
-    theta[c.VOLUME] = total.vessel_volume + ends * total.line_volume
+    line_volume = system.line_volume_factor * total.line_volume
+    inertance = system.line_inertia_factor * total.inertance
+    theta[c.PORT_VOLUME] = ejector_volume + total.port_volume + ends * line_volume
+    theta[c.LINE_VOLUME] = half_way * line_volume
+    theta[c.VOLUME] = total.vessel_volume + ends * line_volume
     port_area = total.port_area + ends * total.line_area
     theta[c.PORT_HEAT] = port_area * system.tube_film_coefficient
     theta[c.LINE_HEAT] = half_way * total.line_area * system.tube_film_coefficient
@@ -286,8 +290,8 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     theta[c.SOFTNESS] = system.softness
     theta[c.FILM] = system.film_coefficient
     theta[c.AREA] = total.vessel_area + ends * total.line_area
-    near = 0.5 if _swings(theta, total.inertance) else 0.0
-    theta[[c.NEAR_INERTANCE, c.INERTANCE]] = near * total.inertance
+    near = 0.5 if _swings(theta, inertance) else 0.0
+    theta[[c.NEAR_INERTANCE, c.INERTANCE]] = near * inertance
     for line, value in ((c.RESISTANCE, total.resistance), (c.LAMINAR, total.laminar)):
         theta[line] = (1.0 - near) * value * system.line_factor
     theta[c.NEAR_RESISTANCE] = near * total.resistance * system.line_factor
