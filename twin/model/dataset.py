@@ -80,10 +80,10 @@ class Ejector(Settings):
 
     suction_capacity_sl_min: Positive = 33.4
     end_pressure_mbar: Positive = 150.0
-    bulge: float = Field(0.0, ge=-0.9, le=3.0)
-    skew: float = Field(0.0, ge=-5.0, le=5.0)
-    bend_2: float = Field(0.0, ge=-10.0, le=10.0)
-    bend_3: float = Field(0.0, ge=-10.0, le=10.0)
+    bulge: float = Field(0.0, ge=-0.95, le=3.0)
+    skew: float = Field(0.0, ge=-20.0, le=20.0)
+    bend_2: float = Field(0.0, ge=-40.0, le=40.0)
+    bend_3: float = Field(0.0, ge=-40.0, le=40.0)
     port_volume_ml: Positive = 1.0
     air_consumption_sl_min: NotNegative = 80.0  # of the nozzle, at operating pressure
     response_ms: float = Field(15.0, ge=0.0, le=500.0)
