@@ -98,6 +98,7 @@ class Ejector(Settings):
     blow_off_ramp_ms: float = Field(5.0, ge=0.5, le=500.0)
     relief_sl_min: NotNegative = 200.0  # out through the exhaust at 100 mbar above ambient
     exhaust_sl_min: NotNegative = 0.0  # the same, sonic, where the exhaust is an opening
+    cracking_pressure_mbar: NotNegative = 0.0  # above ambient, where the check valve lets out
     back_flow_sl_min: NotNegative = 0.0  # in through it while off, sonic; no check valve
     h1_mbar: float = Field(750.0, gt=0.0, le=998.0)
     h1_hysteresis_mbar: float = Field(150.0, gt=0.0)
@@ -260,6 +261,7 @@ def _set_ejector(theta: Theta, ejector: Ejector, end_ratio: float) -> None:
     theta[c.RELIEF] = ejector.relief_sl_min * SL_MIN / (100.0 * MBAR)
     theta[c.BACK_FLOW] = ejector.back_flow_sl_min * SL_MIN
     theta[c.EXHAUST] = ejector.exhaust_sl_min * SL_MIN
+    theta[c.CRACKING] = ejector.cracking_pressure_mbar * MBAR
     theta[[c.H1, c.H2]] = ejector.h1_mbar * MBAR, ejector.h2_mbar * MBAR
     theta[c.H1_LOW] = (ejector.h1_mbar - ejector.h1_hysteresis_mbar) * MBAR
     theta[c.H2_LOW] = (ejector.h2_mbar - ejector.h2_hysteresis_mbar) * MBAR

@@ -169,7 +169,8 @@ def _suction_at(k, p):  # type: ignore[no-untyped-def]
 def at_port(p, driven, k, i):  # type: ignore[no-untyped-def]
     """Flows out of and into the port (kg/s) at ``p``, as tangents: two each, level and slope.
 
-    Out: the ejector's suction, and above ambient the exhaust. A jet that is still building up draws
+    Out: the ejector's suction, and the exhaust where the port is far enough above ambient for the
+    check valve to open; that pressure is lost to the flow. A jet that is still building up draws
     neither as much nor as deep. In: blow-off, and back-flow through a leaking check valve while the
     nozzle is off.
     """
@@ -179,16 +180,17 @@ def at_port(p, driven, k, i):  # type: ignore[no-untyped-def]
     share, rise = characteristic(depth - (ambient - p) * per_pa, k, i)
     out_slope = driven.jet * driven.suction * per_pa * rise
     out = driven.jet * driven.suction * share - out_slope * p
+    opens = ambient + k[c.CRACKING, i]
     relief = k[c.RELIEF, i]
-    relief = relief if p > ambient else 0.0
-    share, rise = opening(p, ambient)
+    relief = relief if p > opens else 0.0
+    share, rise = opening(p if p < ambient else p - k[c.CRACKING, i], ambient)
     back = k[c.BACK_FLOW, i] * (1.0 - min(driven.jet, 1.0))
     back = back if p < ambient else 0.0
     vent = k[c.EXHAUST, i]
-    vent = vent if p > ambient else 0.0
+    vent = vent if p > opens else 0.0
     fuller = driven.blow_off * k[c.BLOW_OFF_SHAPE, i]
     return (
-        out - relief * ambient - vent * (share - rise * p),
+        out - relief * opens - vent * (share - rise * p),
         out_slope + relief - vent * rise,
         driven.blow_off + fuller + back * (share - rise * p),
         back * rise - fuller / ambient,
