@@ -155,6 +155,7 @@ class System(Settings):
         Vessel(kind="vessel", volume_ml=750.0),
     )
     film_coefficient: NotNegative = 10.0  # W/(m² K), of vessel and cups
+    free_convection: float = Field(0.0, ge=0.0, le=1.0)  # share of that, at CONVECTS_AT
     tube_film_coefficient: NotNegative = 60.0  # W/(m² K)
     line_factor: NotNegative = 1.0  # flow resistance over what the parts add up to
     line_share: float = Field(0.6, gt=0.0, lt=1.0)  # of the tubes' volume, half-way along
@@ -283,6 +284,7 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     theta[c.LINE_HEAT] = half_way * total.line_area * system.tube_film_coefficient
     theta[c.COMPLIANCE] = total.shrinks
     theta[c.FILM] = system.film_coefficient
+    theta[c.CONVECTION] = system.free_convection
     theta[c.AREA] = total.vessel_area + ends * total.line_area
     near = 0.5 if _swings(theta, total.inertance) else 0.0
     theta[[c.NEAR_INERTANCE, c.INERTANCE]] = near * total.inertance

@@ -33,6 +33,8 @@ _PER_COLDEST, _PER_HOTTEST = 1.0 / (R * COLDEST), 1.0 / (R * HOTTEST)  # kg/J
 MOST = 100.0  # kg/s
 FAINTEST = 1e-12  # of a jet that fades; less is none, and slow to calculate with
 
+CONVECTS_AT = 10.0  # K between gas and wall, at which the film coefficient holds
+
 # Alexander's SDIRK of third order: L-stable, each stage implicit in itself by the same G, the last
 # stage is the step's result (R. Alexander, SIAM J. Numer. Anal. 14, 1977). In multiples of G.
 # The stages stand at G, half-way from there to 1, and 1; _FURTHER leads from the first to the next.
@@ -262,6 +264,16 @@ def temperatures(y, known, step, entering, drawn, k, i):  # type: ignore[no-unty
 
 
 @inlined
+def convection(density, warmer, k, i):  # type: ignore[no-untyped-def]
+    """Film coefficient over the data set's, at a pressure over ambient and a gas ``warmer`` (K).
+
+    Free convection along a wall, laminar: Nu in proportion to Ra^¼, so to (p² ΔT)^¼.
+    """
+    free = math.sqrt(density * math.sqrt(abs(warmer) * (1.0 / CONVECTS_AT)))
+    return 1.0 + k[c.CONVECTION, i] * (free - 1.0)
+
+
+@inlined
 def solve(y, known, step, driven, k, i):  # type: ignore[no-untyped-def]
     """One pass over the balances of all nodes: ``y`` is the guess, ``known`` what came before.
 
@@ -277,10 +289,11 @@ def solve(y, known, step, driven, k, i):  # type: ignore[no-untyped-def]
     volume = k[c.VOLUME, i] - stretch * (ambient - y.vessel)
     port_stored, line_stored = k[c.PORT_VOLUME, i] * per_pa, k[c.LINE_VOLUME, i] * per_pa
     vessel_stored = (volume + GAMMA * y.vessel * stretch) * per_pa
-    warmth, port_warmth, line_warmth = k[_HEAT, i], k[_PORT_HEAT, i], k[_LINE_HEAT, i]
+    port_warmth, line_warmth = k[_PORT_HEAT, i], k[_LINE_HEAT, i]
 
     entering, drawn = blown + blown_slope * y.port, max(out + out_slope * y.port, 0.0)
     port_t, line_t, vessel_t = temperatures(y, known, step, entering, drawn, k, i)
+    warmth = k[_HEAT, i] * convection(y.vessel / ambient, vessel_t - outside, k, i)
     near_t = line_t if y.near >= 0.0 else port_t
     far_t = vessel_t if y.far >= 0.0 else line_t
     leak_t = outside if y.vessel <= ambient else vessel_t
