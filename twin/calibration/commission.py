@@ -247,7 +247,7 @@ def starts(data: DataSet) -> list[DataSet]:
     everything = _volume(data) / ML
     found = []
     for way, at, share in product(ways, PLACES, PORT_SHARES):
-        tables["system"].update(part_leaves=way, rim="turbulent", sensor_shift=at - place, free_convection=0.5)
+        tables["system"].update(part_leaves=way, rim="turbulent", sensor_shift=at - place, free_convection=0.5, stirring=1.0)
         tables["ejector"]["port_volume_ml"] = share * everything
         found.append(DataSet.model_validate(tables))
     return found

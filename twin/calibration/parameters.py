@@ -98,6 +98,7 @@ FREE_IN_MARKET = (
     Free(_E, "back_flow_sl_min", "sl/min", 0.4, 0.0, 5000.0, True, market=1.5),
     Free(_E, "blow_off_shape", "", 0.1, -0.9, 3.0, market=0.4, scaled=False),
     Free("system", "free_convection", "", 0.2, 0.0, 1.0, market=0.3, scaled=False),
+    Free("system", "stirring", "", 0.2, 0.0, 20.0, market=1.0),
     Free("system", "opening_factor", "", 0.4, 1e-3, 100.0, True, market=1.5),
 )
 SMALLEST = 0.02  # in its unit, a value of the type from which a scale can lead away

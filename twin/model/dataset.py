@@ -156,6 +156,7 @@ class System(Settings):
     )
     film_coefficient: NotNegative = 10.0  # W/(m² K), of vessel and cups
     free_convection: float = Field(0.0, ge=0.0, le=1.0)  # share of that, at CONVECTS_AT
+    stirring: NotNegative = 0.0  # more of it while blow-off enters
     tube_film_coefficient: NotNegative = 60.0  # W/(m² K)
     line_factor: NotNegative = 1.0  # flow resistance over what the parts add up to
     line_share: float = Field(0.6, gt=0.0, lt=1.0)  # of the tubes' volume, half-way along
@@ -285,6 +286,7 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     theta[c.COMPLIANCE] = total.shrinks
     theta[c.FILM] = system.film_coefficient
     theta[c.CONVECTION] = system.free_convection
+    theta[c.STIRRING] = system.stirring
     theta[c.AREA] = total.vessel_area + ends * total.line_area
     near = 0.5 if _swings(theta, total.inertance) else 0.0
     theta[[c.NEAR_INERTANCE, c.INERTANCE]] = near * total.inertance

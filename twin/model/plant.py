@@ -264,13 +264,15 @@ def temperatures(y, known, step, entering, drawn, k, i):  # type: ignore[no-unty
 
 
 @inlined
-def convection(density, warmer, k, i):  # type: ignore[no-untyped-def]
+def convection(y, warmer, k, i):  # type: ignore[no-untyped-def]
     """Film coefficient over the data set's, at a pressure over ambient and a gas ``warmer`` (K).
 
     Free convection along a wall, laminar: Nu in proportion to Ra^¼, so to (p² ΔT)^¼.
     """
+    density, entering = y.vessel / k[c.AMBIENT, i], max(-y.far, 0.0)
+    jet = k[c.STIRRING, i] * math.sqrt(entering / max(k[c.BLOW_OFF, i], LIGHTEST))
     free = math.sqrt(density * math.sqrt(abs(warmer) * (1.0 / CONVECTS_AT)))
-    return 1.0 + k[c.CONVECTION, i] * (free - 1.0)
+    return 1.0 + k[c.CONVECTION, i] * (free - 1.0) + jet
 
 
 @inlined
@@ -293,7 +295,7 @@ def solve(y, known, step, driven, k, i):  # type: ignore[no-untyped-def]
 
     entering, drawn = blown + blown_slope * y.port, max(out + out_slope * y.port, 0.0)
     port_t, line_t, vessel_t = temperatures(y, known, step, entering, drawn, k, i)
-    warmth = k[_HEAT, i] * convection(y.vessel / ambient, vessel_t - outside, k, i)
+    warmth = k[_HEAT, i] * convection(y, vessel_t - outside, k, i)
     near_t = line_t if y.near >= 0.0 else port_t
     far_t = vessel_t if y.far >= 0.0 else line_t
     leak_t = outside if y.vessel <= ambient else vessel_t
