@@ -171,6 +171,7 @@ def guessed(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:
     ambient, remarks = _ambient(tables, readings)
     tables["sensor"]["noise_mbar"] = max(readings.noise / MBAR, 0.05)
     remarks += [*_air_saving(tables["ejector"], readings, ambient), *_questions(readings)]
+    tables["system"].update(free_convection=0.5, forced_convection=1.0)
     _flows(tables["ejector"], readings, _volume(data), ambient * MBAR)
     return DataSet.model_validate(tables), remarks
 
@@ -221,6 +222,7 @@ def _questions(readings: Readings) -> Iterator[Remark]:
 def _flows(ejector: dict[str, Any], readings: Readings, evacuated: float, ambient: float) -> None:
     """Set first guesses of flows, by how fast ``evacuated`` (m³) empties and fills."""
     ejector["jet_depth"] = 0.5
+    ejector["cracking_pressure_mbar"] = 5.0
     capacity = readings.capacity(evacuated, ambient, ROOM_TEMPERATURE) / SL_MIN
     if np.isfinite(capacity):
         ejector["suction_capacity_sl_min"] = float(np.clip(capacity, 1.0, 1000.0))
@@ -247,7 +249,7 @@ def starts(data: DataSet) -> list[DataSet]:
     everything = _volume(data) / ML
     found = []
     for way, at, share in product(ways, PLACES, PORT_SHARES):
-        tables["system"].update(part_leaves=way, rim="turbulent", sensor_shift=at - place, free_convection=0.5, stirring=1.0)
+        tables["system"].update(part_leaves=way, rim="turbulent", sensor_shift=at - place)
         tables["ejector"]["port_volume_ml"] = share * everything
         found.append(DataSet.model_validate(tables))
     return found

@@ -29,6 +29,7 @@ NotNegative = Annotated[float, Field(ge=0.0)]
 
 AFTER_BLOW_OFF = -5e5  # Pa of vacuum that no blow-off reaches: the part goes when it ends
 SHORTEST_SWING = 5e-3  # s, of a line's gas that can be seen at a sample each millisecond
+UNSEEN_SWING = 3.5e-3  # s, of one that cannot at all
 RIPPLE = 1e-3  # of suction capacity, from one hundredth of the range to the next: still monotonic
 
 # The modes of the configuration as the coefficients hold them.
@@ -80,7 +81,7 @@ class Ejector(Settings):
 
     suction_capacity_sl_min: Positive = 33.4
     end_pressure_mbar: Positive = 150.0
-    bulge: float = Field(0.0, ge=-0.9, le=3.0)
+    bulge: float = Field(0.0, ge=-1.0, le=3.0)
     skew: float = Field(0.0, ge=-5.0, le=5.0)
     bend_2: float = Field(0.0, ge=-10.0, le=10.0)
     bend_3: float = Field(0.0, ge=-10.0, le=10.0)
@@ -155,8 +156,8 @@ class System(Settings):
         Vessel(kind="vessel", volume_ml=750.0),
     )
     film_coefficient: NotNegative = 10.0  # W/(m² K), of vessel and cups
-    free_convection: float = Field(0.0, ge=0.0, le=1.0)  # share of that, at CONVECTS_AT
-    stirring: NotNegative = 0.0  # more of it while blow-off enters
+    free_convection: float = Field(0.0, ge=0.0, le=1.0)  # share of that, at FREE_AT
+    forced_convection: NotNegative = 0.0  # how many times more while all blow-off enters
     tube_film_coefficient: NotNegative = 60.0  # W/(m² K)
     line_factor: NotNegative = 1.0  # flow resistance over what the parts add up to
     line_share: float = Field(0.6, gt=0.0, lt=1.0)  # of the tubes' volume, half-way along
@@ -263,7 +264,7 @@ def _set_ejector(theta: Theta, ejector: Ejector, end_ratio: float) -> None:
     theta[c.RELIEF] = ejector.relief_sl_min * SL_MIN / (100.0 * MBAR)
     theta[c.BACK_FLOW] = ejector.back_flow_sl_min * SL_MIN
     theta[c.EXHAUST] = ejector.exhaust_sl_min * SL_MIN
-    theta[c.CRACKING] = ejector.cracking_pressure_mbar * MBAR
+    theta[c.CRACKING_PRESSURE] = ejector.cracking_pressure_mbar * MBAR
     theta[[c.H1, c.H2]] = ejector.h1_mbar * MBAR, ejector.h2_mbar * MBAR
     theta[c.H1_LOW] = (ejector.h1_mbar - ejector.h1_hysteresis_mbar) * MBAR
     theta[c.H2_LOW] = (ejector.h2_mbar - ejector.h2_hysteresis_mbar) * MBAR
@@ -285,10 +286,11 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     theta[c.LINE_HEAT] = half_way * total.line_area * system.tube_film_coefficient
     theta[c.COMPLIANCE] = total.shrinks
     theta[c.FILM] = system.film_coefficient
-    theta[c.CONVECTION] = system.free_convection
-    theta[c.STIRRING] = system.stirring
+    theta[c.FREE_CONVECTION] = system.free_convection
+    if theta[c.BLOW_OFF] > 0.0:
+        theta[c.FORCED_CONVECTION] = system.forced_convection**2 / theta[c.BLOW_OFF]
     theta[c.AREA] = total.vessel_area + ends * total.line_area
-    near = 0.5 if _swings(theta, total.inertance) else 0.0
+    near = 0.5 * _swings(theta, total.inertance)
     theta[[c.NEAR_INERTANCE, c.INERTANCE]] = near * total.inertance
     for line, value in ((c.RESISTANCE, total.resistance), (c.LAMINAR, total.laminar)):
         theta[line] = (1.0 - near) * value * system.line_factor
@@ -304,7 +306,12 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     theta[c.RELEASE] = AFTER_BLOW_OFF if late else total.release
 
 
-def _swings(theta: Theta, inertance: float) -> bool:
-    """Whether the line's gas swings slowly enough to be seen; a shorter line is only friction."""
+def _swings(theta: Theta, inertance: float) -> float:
+    """Whether the line's gas swings slowly enough to be seen; a shorter line is only friction.
+
+    From 0 to 1 without a step: a fit that meets one goes no further.
+    """
     stored = (theta[c.PORT_VOLUME] + theta[c.LINE_VOLUME]) / (GAMMA * R * theta[c.TEMPERATURE])
-    return 2.0 * math.pi * math.sqrt(inertance * stored) > SHORTEST_SWING
+    period = 2.0 * math.pi * math.sqrt(inertance * stored)
+    share = (period - UNSEEN_SWING) / (SHORTEST_SWING - UNSEEN_SWING)
+    return min(max(share, 0.0), 1.0)

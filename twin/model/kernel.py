@@ -261,7 +261,7 @@ def _passes(state, k, h, i):  # type: ignore[no-untyped-def]
     The sensor's first stage follows it, so the distance between them tells how quickly it moves.
     """
     moves = abs(state[PORT, i] - state[FELT, i]) / k[c.SENSOR_LAG, i] * h
-    opens = k[c.AMBIENT, i] + k[c.CRACKING, i]
+    opens = k[c.AMBIENT, i] + k[c.CRACKING_PRESSURE, i]
     return state[BLOWING, i] > 0.01 and abs(state[PORT, i] - opens) < moves
 
 

@@ -33,7 +33,7 @@ _PER_COLDEST, _PER_HOTTEST = 1.0 / (R * COLDEST), 1.0 / (R * HOTTEST)  # kg/J
 MOST = 100.0  # kg/s
 FAINTEST = 1e-12  # of a jet that fades; less is none, and slow to calculate with
 
-CONVECTS_AT = 10.0  # K between gas and wall, at which the film coefficient holds
+FREE_AT = 10.0  # K between gas and wall at ambient pressure, where the film coefficient holds
 
 # Alexander's SDIRK of third order: L-stable, each stage implicit in itself by the same G, the last
 # stage is the step's result (R. Alexander, SIAM J. Numer. Anal. 14, 1977). In multiples of G.
@@ -182,10 +182,10 @@ def at_port(p, driven, k, i):  # type: ignore[no-untyped-def]
     share, rise = characteristic(depth - (ambient - p) * per_pa, k, i)
     out_slope = driven.jet * driven.suction * per_pa * rise
     out = driven.jet * driven.suction * share - out_slope * p
-    opens = ambient + k[c.CRACKING, i]
+    opens = ambient + k[c.CRACKING_PRESSURE, i]
     relief = k[c.RELIEF, i]
     relief = relief if p > opens else 0.0
-    share, rise = opening(p if p < ambient else p - k[c.CRACKING, i], ambient)
+    share, rise = opening(p if p < ambient else p - k[c.CRACKING_PRESSURE, i], ambient)
     back = k[c.BACK_FLOW, i] * (1.0 - min(driven.jet, 1.0))
     back = back if p < ambient else 0.0
     vent = k[c.EXHAUST, i]
@@ -265,14 +265,14 @@ def temperatures(y, known, step, entering, drawn, k, i):  # type: ignore[no-unty
 
 @inlined
 def convection(y, warmer, k, i):  # type: ignore[no-untyped-def]
-    """Film coefficient over the data set's, at a pressure over ambient and a gas ``warmer`` (K).
+    """Film coefficient in the vessel, over that of the data set; its gas is ``warmer`` (K).
 
-    Free convection along a wall, laminar: Nu in proportion to Ra^¼, so to (p² ΔT)^¼.
+    Free convection along a wall is laminar in vessels of some litres: Nu in proportion to Ra^¼, so
+    to (p² ΔT)^¼. A jet that enters stirs: Nu in proportion to about the root of its flow.
     """
-    density, entering = y.vessel / k[c.AMBIENT, i], max(-y.far, 0.0)
-    jet = k[c.STIRRING, i] * math.sqrt(entering / max(k[c.BLOW_OFF, i], LIGHTEST))
-    free = math.sqrt(density * math.sqrt(abs(warmer) * (1.0 / CONVECTS_AT)))
-    return 1.0 + k[c.CONVECTION, i] * (free - 1.0) + jet
+    free = math.sqrt(y.vessel / k[c.AMBIENT, i] * math.sqrt(abs(warmer) * (1.0 / FREE_AT)))
+    forced = math.sqrt(k[c.FORCED_CONVECTION, i] * max(-y.far, 0.0))
+    return 1.0 + k[c.FREE_CONVECTION, i] * (free - 1.0) + forced
 
 
 @inlined

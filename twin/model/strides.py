@@ -146,7 +146,7 @@ def _planned(begin, k, moving, before, tolerance):  # type: ignore[no-untyped-de
     h = min(h, (tolerance / rough) ** (1.0 / 3.0)) if rough > 0.0 else h
     while h > SHORTEST_STEP and kernel._release(begin, k, h, 0):
         h *= 0.5
-    opens = (k[c.AMBIENT, 0] + k[c.CRACKING, 0] - begin[PORT, 0]) / moving
+    opens = (k[c.AMBIENT, 0] + k[c.CRACKING_PRESSURE, 0] - begin[PORT, 0]) / moving
     if begin[BLOWING, 0] > 0.01 and 0.0 < opens < h:
         h = opens
     h = max(h, SHORTEST_STEP)
