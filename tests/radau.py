@@ -71,6 +71,13 @@ def room(theta: Theta, vessel: float) -> tuple[float, float]:
     return theta[c.VOLUME] - full * vacuum / left, full / left**2 / theta[c.AMBIENT]
 
 
+def film(theta: Theta, vessel: float, vessel_t: float, far: float) -> float:
+    rayleigh = (vessel / theta[c.AMBIENT]) ** 2 * abs(vessel_t - theta[c.TEMPERATURE]) / 10.0
+    free, entering = theta[c.FREE_CONVECTION], max(-far, 0.0)
+    times = 1.0 - free + free * rayleigh**0.25 + np.sqrt(theta[c.FORCED_CONVECTION] * entering)
+    return float(theta[c.FILM] * times)
+
+
 def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
     """d/dt of three pressures, three masses, two flows, drive, jet, valve, supply, sensor."""
     port, line, vessel, port_mass, line_mass, vessel_mass, near, far = y[:8]
@@ -89,8 +96,9 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
         root = np.sqrt(linear**2 + 4.0 * quadratic * abs(difference))
         far = 2.0 * difference / (linear + root)
 
-    out = suction_flow(theta, port, jet, supply) + theta[c.RELIEF] * max(port - ambient, 0.0)
-    out += max(-through_hole(theta[c.EXHAUST], port, ambient), 0.0)
+    forward = port - theta[c.CRACKING_PRESSURE]  # behind a check valve that is open
+    out = suction_flow(theta, port, jet, supply) + theta[c.RELIEF] * max(forward - ambient, 0.0)
+    out += max(-through_hole(theta[c.EXHAUST], forward, ambient), 0.0)
     blown = valve * theta[c.BLOW_OFF] * (1.0 + theta[c.BLOW_OFF_SHAPE] * (1.0 - port / ambient))
     blown *= (supply + ambient) / (theta[c.SUPPLY_NOMINAL] + theta[c.AMBIENT_NOMINAL])
     if port < ambient:
@@ -108,7 +116,7 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
     port_gain += CP * near * near_t
     line_gain -= CP * near * near_t
     into_vessel = CP * (leak * leak_t - far * far_t)
-    into_vessel += theta[c.FILM] * theta[c.AREA] * (outside - vessel_t)
+    into_vessel += film(theta, vessel, vessel_t, far) * theta[c.AREA] * (outside - vessel_t)
 
     rising = valves.nozzle > drive
     rise, fall = theta[c.RAMP_UP], theta[c.RAMP_DOWN]

@@ -14,10 +14,12 @@ from twin.model import theta as c
 from twin.model.gas import GAMMA, R
 from twin.model.plant import (
     Driven,
+    Gas,
     at_port,
     at_supply,
     at_vessel,
     characteristic,
+    convection,
     prepare,
     reading,
     sensed_at,
@@ -32,10 +34,16 @@ compiling = settings(deadline=None)  # the first example has to compile
 
 # As nearly one vessel as a system can be: a short wide tube, a small port.
 VESSEL = ({"kind": "tube", "length_mm": 20.0, "diameter_mm": 12.0},)
+CLOSED_TANK = {"kind": "vessel", "volume_ml": 1000.0}
 
 
 def one(theta: Theta) -> Prepared:
     return np.asarray(prepare(theta.reshape(-1, 1)))
+
+
+def still(vessel: float) -> Gas:
+    """Gas that does not flow, of which only the pressure in the vessel matters."""
+    return Gas(vessel, 1.0, vessel, 1.0, vessel, 1.0, 0.0, 0.0)
 
 
 def supplied(theta: Theta, missing: float = 0.0) -> tuple[float, float, float]:
@@ -157,6 +165,18 @@ def test_above_ambient_the_exhaust_lets_out() -> None:
     theta = theta_of(ejector={"relief_sl_min": 200.0})
     assert flow_out(theta, theta[c.AMBIENT] + 100 * MBAR, 0.0) == pytest.approx(200 * SL_MIN)
     assert flow_out(theta, theta[c.AMBIENT], 0.0) == 0.0
+
+
+def test_a_check_valve_lets_out_from_its_cracking_pressure_on() -> None:
+    theta = theta_of(ejector={"relief_sl_min": 200.0, "cracking_pressure_mbar": 6.0})
+    assert flow_out(theta, theta[c.AMBIENT] + 5.9 * MBAR, 0.0) == 0.0
+    assert flow_out(theta, theta[c.AMBIENT] + 106 * MBAR, 0.0) == pytest.approx(200 * SL_MIN)
+    theta[c.RELIEF], theta[c.EXHAUST] = 0.0, 200 * SL_MIN
+    assert flow_out(theta, theta[c.AMBIENT] + 5.9 * MBAR, 0.0) == 0.0
+    behind = theta.copy()
+    behind[c.CRACKING_PRESSURE] = 0.0
+    lets_out = flow_out(behind, theta[c.AMBIENT] + 100 * MBAR, 0.0)
+    assert flow_out(theta, theta[c.AMBIENT] + 106 * MBAR, 0.0) == pytest.approx(lets_out)
 
 
 def test_a_check_valve_leaks_only_while_the_nozzle_is_off() -> None:
@@ -321,6 +341,48 @@ def test_blow_off_settles_where_exhaust_and_flow_are_equal() -> None:
     rows = states(theta, [(Phase.BLOW_OFF, 4000)], standing(theta, 0.3e5))
     above = rows[-1, kernel.PORT] - theta[c.AMBIENT]
     assert above == pytest.approx(theta[c.BLOW_OFF] / theta[c.RELIEF], rel=1e-4)
+
+
+def test_after_blow_off_a_closed_vessel_stays_at_the_cracking_pressure() -> None:
+    theta = closed(film_coefficient=3000.0, tube_film_coefficient=3000.0)
+    theta[c.CRACKING_PRESSURE] = 8 * MBAR
+    rows = states(theta, [(Phase.BLOW_OFF, 4000), (Phase.IDLE, 3000)], standing(theta, 0.3e5))
+    above = rows[-1, [kernel.PORT, kernel.VESSEL]] - theta[c.AMBIENT]
+    assert above == pytest.approx(8 * MBAR, abs=0.05 * MBAR)
+
+
+@pytest.mark.parametrize(("warmer", "pressure"), [(10.0, 1.0), (-40.0, 0.25), (2.5, 0.5)])
+def test_free_convection_grows_with_the_difference_and_the_density(
+    warmer: float, pressure: float
+) -> None:
+    """Nu in proportion to Ra^¼, laminar; what the film coefficient says is at 10 K and ambient."""
+    theta = closed(film_coefficient=10.0)
+    gas = still(pressure * theta[c.AMBIENT])
+    assert convection(gas, warmer, one(theta), 0) == 1.0
+    theta[c.FREE_CONVECTION] = 0.6
+    free = (pressure**2 * abs(warmer) / 10.0) ** 0.25
+    assert convection(gas, warmer, one(theta), 0) == pytest.approx(0.4 + 0.6 * free)
+
+
+def test_a_jet_that_enters_the_vessel_stirs_its_gas_and_one_that_leaves_does_not() -> None:
+    theta = closed(film_coefficient=10.0, forced_convection=2.0)
+    gas, flow = still(theta[c.AMBIENT]), theta[c.BLOW_OFF]
+    assert convection(gas._replace(far=-flow), 10.0, one(theta), 0) == pytest.approx(3.0)
+    assert convection(gas._replace(far=-flow / 4), 10.0, one(theta), 0) == pytest.approx(2.0)
+    assert convection(gas._replace(far=flow), 10.0, one(theta), 0) == 1.0
+
+
+def test_a_line_comes_to_swing_without_a_step() -> None:
+    """A fit that meets a step in the coefficients goes no further."""
+
+    def inertance(port_ml: float) -> float:
+        parts = [{"kind": "tube", "length_mm": 186.0, "diameter_mm": 7.5}, CLOSED_TANK]
+        ejector = {"port_volume_ml": port_ml}
+        return float(theta_of(ejector=ejector, system={"parts": parts})[c.NEAR_INERTANCE])
+
+    at = np.array([inertance(port) for port in np.linspace(1.0, 40.0, 400)])
+    assert at[0] == 0.0 < at[-1]
+    assert np.abs(np.diff(at)).max() < 0.02 * at[-1]
 
 
 def test_the_jet_builds_up_in_two_stages_and_collapses_in_its_own_time() -> None:

@@ -18,8 +18,9 @@ enum { /* twin.model.theta.COEFFICIENTS */
     AMBIENT, AMBIENT_NOMINAL, TEMPERATURE, SUPPLY, DROOP, SUPPLY_LAG, SUPPLY_NOMINAL,
     SUPPLY_OPTIMUM, SUPPLY_CURVATURE, END_SLOPE, SUCTION, END_RATIO, BULGE, SKEW, BEND_2, BEND_3,
     RESPONSE, RESPONSE_OFF, RAMP_UP, SLOW_RAMP_UP, JET_DEPTH, RAMP_DOWN, BLOW_OFF, BLOW_OFF_SHAPE,
-    BLOW_OFF_RESPONSE, BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, RELIEF, EXHAUST, PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT,
-    VOLUME, COMPLIANCE, SOFTNESS, FILM, AREA, NEAR_RESISTANCE, NEAR_LAMINAR, NEAR_INERTANCE, RESISTANCE,
+    BLOW_OFF_RESPONSE, BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, RELIEF, EXHAUST, CRACKING_PRESSURE,
+    PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT, VOLUME, COMPLIANCE, SOFTNESS, FILM, FREE_CONVECTION,
+    FORCED_CONVECTION, AREA, NEAR_RESISTANCE, NEAR_LAMINAR, NEAR_INERTANCE, RESISTANCE,
     LAMINAR, INERTANCE, PLACE, LEAK, LAMINAR_LEAK, INFLOW, BACK_FLOW, OPENING, HOLE, SENSOR_LAG, SLOW_SENSOR,
     SENSOR_OFFSET, SENSOR_GAIN, H1, H1_LOW, H2, H2_LOW, RELEASE, CONTACT, CONTROL_SENSOR,
     AIR_SAVING, PERMITTED_LEAKAGE, BLOW_OFF_MODE, BLOW_OFF_TIME, COEFFICIENTS
@@ -83,6 +84,7 @@ INLINED Tangent opening(double p, double ambient)
 #define PER_HOTTEST (1.0 / (R * HOTTEST))
 #define MOST 100.0
 #define FAINTEST 1e-12
+#define FREE_AT 10.0
 #define G 0.435866521508459
 #define A21 ((1.0 - G) / 2.0 / G)
 #define FURTHER ((1.0 + G) / 2.0 / G)
@@ -151,14 +153,15 @@ INLINED Port at_port(double p, const Driven *driven, const double *k)
     Tangent curve = characteristic(depth - (ambient - p) * per_pa, k);
     double out_slope = driven->jet * driven->suction * per_pa * curve.slope;
     double out = driven->jet * driven->suction * curve.level - out_slope * p;
-    double relief = p > ambient ? K(RELIEF) : 0.0;
-    Tangent flow = opening(p, ambient);
+    double opens = ambient + K(CRACKING_PRESSURE);
+    double relief = p > opens ? K(RELIEF) : 0.0;
+    Tangent flow = opening(p < ambient ? p : p - K(CRACKING_PRESSURE), ambient);
     double back = K(BACK_FLOW) * (1.0 - min(driven->jet, 1.0));
     back = p < ambient ? back : 0.0;
-    double vent = p > ambient ? K(EXHAUST) : 0.0;
+    double vent = p > opens ? K(EXHAUST) : 0.0;
     double fuller = driven->blow_off * K(BLOW_OFF_SHAPE);
     return (Port){
-        out - relief * ambient - vent * (flow.level - flow.slope * p),
+        out - relief * opens - vent * (flow.level - flow.slope * p),
         out_slope + relief - vent * flow.slope,
         driven->blow_off + fuller + back * (flow.level - flow.slope * p),
         back * flow.slope - fuller / ambient,
@@ -206,6 +209,13 @@ INLINED Room room(double vessel, const double *k)
     return (Room){K(VOLUME) - K(K_STRETCH) * vacuum * left, K(K_STRETCH) * left * left};
 }
 
+INLINED double convection(const Gas *y, double warmer, const double *k)
+{
+    double free = sqrt(y->vessel / K(AMBIENT) * sqrt(fabs(warmer) * (1.0 / FREE_AT)));
+    double forced = sqrt(K(FORCED_CONVECTION) * max(-y->far, 0.0));
+    return 1.0 + K(FREE_CONVECTION) * (free - 1.0) + forced;
+}
+
 INLINED Gas solve(Gas y, const Gas *known, double step, const Driven *driven, const double *k)
 {
     double ambient = K(AMBIENT), outside = K(TEMPERATURE);
@@ -218,7 +228,7 @@ INLINED Gas solve(Gas y, const Gas *known, double step, const Driven *driven, co
     double volume = shrunk.volume, stretch = shrunk.stretch;
     double port_stored = K(PORT_VOLUME) * per_pa, line_stored = K(LINE_VOLUME) * per_pa;
     double vessel_stored = (volume + GAMMA * y.vessel * stretch) * per_pa;
-    double warmth = K(K_HEAT), port_warmth = K(K_PORT_HEAT), line_warmth = K(K_LINE_HEAT);
+    double port_warmth = K(K_PORT_HEAT), line_warmth = K(K_LINE_HEAT);
 
     /* Gas leaves a node at the node's temperature. */
     double vessel_t = y.vessel * volume * per_joule(y.vessel_mass);
@@ -232,6 +242,7 @@ INLINED Gas solve(Gas y, const Gas *known, double step, const Driven *driven, co
     held += max(y.far, 0.0) * vessel_t + max(-y.near, 0.0) * port_t;
     leaving = y.line_mass * R * per_pa + line_warmth;
     line_t = held / (leaving + max(y.near, 0.0) + max(-y.far, 0.0));
+    double warmth = K(K_HEAT) * convection(&y, vessel_t - outside, k);
     double near_t = y.near >= 0.0 ? line_t : port_t;
     double far_t = y.far >= 0.0 ? vessel_t : line_t;
     double leak_t = y.vessel <= ambient ? outside : vessel_t;
@@ -449,7 +460,7 @@ static int jumps(const double *state, const double *k, double h)
 static int passes(const double *state, const double *k, double h)
 {
     double moved = fabs(S(S_PORT) - S(S_FELT)) / K(SENSOR_LAG) * h;
-    return S(S_BLOWING) > 0.01 && fabs(S(S_PORT) - K(AMBIENT)) < moved;
+    return S(S_BLOWING) > 0.01 && fabs(S(S_PORT) - (K(AMBIENT) + K(CRACKING_PRESSURE))) < moved;
 }
 
 static int finer(const double *state, const double *k, double h)

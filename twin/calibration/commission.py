@@ -175,6 +175,7 @@ def guessed(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:
     ambient, remarks = _ambient(tables, readings)
     tables["sensor"]["noise_mbar"] = max(readings.noise / MBAR, 0.05)
     remarks += [*_air_saving(tables["ejector"], readings, ambient), *_questions(readings)]
+    tables["system"].update(free_convection=0.5, forced_convection=1.0)
     _flows(tables["ejector"], readings, _volume(data), ambient * MBAR)
     return DataSet.model_validate(tables), remarks
 
@@ -225,6 +226,7 @@ def _questions(readings: Readings) -> Iterator[Remark]:
 def _flows(ejector: dict[str, Any], readings: Readings, evacuated: float, ambient: float) -> None:
     """Set first guesses of flows, by how fast ``evacuated`` (m³) empties and fills."""
     ejector["jet_depth"] = 0.5
+    ejector["cracking_pressure_mbar"] = 5.0
     capacity = readings.capacity(evacuated, ambient, ROOM_TEMPERATURE) / SL_MIN
     if np.isfinite(capacity):
         ejector["suction_capacity_sl_min"] = float(np.clip(capacity, 1.0, 1000.0))

@@ -27,6 +27,7 @@ MOST_STEPS = 8  # in a round
 FIRST_SHARE = 0.4  # of the log, for the first round: it has the longest way to go
 DETERMINED = 0.5  # of what the type leaves open: what is known better comes from the log
 SWITCHING = 6.0  # rows, one standard deviation of when the nozzle switched
+INSIDE = 0.1  # sigmas from a bound, where a search begins at most: on it, it would not move
 STEP = 0.05  # of a parameter's sigma, for derivatives
 RISING = 40  # steps over the characteristic, in which suction is looked at
 END_PRESSURE = "ejector.end_pressure_mbar"
@@ -62,6 +63,7 @@ NARROWING = (
     Round(100, 0.3, 5.0 * MBAR, 8, 1e-2),
     Round(6, 0.3, 5.0 * MBAR, 17, 1e-2),
     Round(3, 0.3, 1.5 * MBAR, 20, 1e-3),
+    Round(3, 0.3, 0.6 * MBAR, 20, 1e-3),
     Round(2, 1.0, 0.6 * MBAR, 40, 1e-4),
 )
 # Sigmas, beyond which a residual pulls less than its square; below, it is what a fit gets wrong.
@@ -93,37 +95,47 @@ class Problem:
         if self._at is not None and np.array_equal(self._at, x):
             return
         n = len(self.space.free)
-        moved = [self.space.at(one) for one in (x[:n], *(x[:n] + np.eye(n) * STEP))]
-        white, slopes = self._whitened(moved, float(x[n]) * SWITCHING if len(x) > n else None)
+        # A step that left the bounds would show no slope.
+        steps = np.where(x[:n] + STEP > self.space.high, -STEP, STEP)
+        moved = [self.space.at(one) for one in (x[:n], *(x[:n] + np.diag(steps)))]
+        early = float(x[n]) * SWITCHING if len(x) > n else None
+        white, slopes = self._whitened(moved, steps, early)
         rising = np.stack([_rising(data) for data in moved], axis=1)
-        bent = (rising[:, 1:] - rising[:, :1]) / STEP
+        bent = (rising[:, 1:] - rising[:, :1]) / steps
         bent = np.column_stack([bent, np.zeros((len(bent), len(x) - n))])
         self._at = x.copy()
         self._residual = np.concatenate([white, rising[:, 0], x])
         self._jacobian = np.concatenate([slopes, bent, np.eye(len(x))])
 
-    def _whitened(self, moved: Sequence[DataSet], early: float | None) -> tuple[Floats, Floats]:
-        """Residuals in sigmas and their slopes; ``early`` (rows) is how much sooner the nozzle
-        switches than it was seen to, None where that is not free.
+    def _whitened(
+        self, moved: Sequence[DataSet], steps: Floats, early: float | None
+    ) -> tuple[Floats, Floats]:
+        """Residuals in sigmas and their slopes over ``steps``.
+
+        ``early`` (rows) is how much sooner the nozzle switches than it was seen to, None where that
+        is not free.
         """
         theta = np.stack([coefficients(data) for data in moved], axis=1)
         if early is None:
             white = np.concatenate(self.weights.white(self.cycles.off(theta)))
-            return white[:, 0], (white[:, 1:] - white[:, :1]) / STEP
+            return white[:, 0], (white[:, 1:] - white[:, :1]) / steps
         whole = int(np.floor(early))
         rows = [*[whole] * len(moved), whole + 1]
         off = self.cycles.off(np.column_stack([theta, theta[:, 0]]), rows)
         white = np.concatenate(self.weights.white(off))
         by_row = white[:, -1] - white[:, 0]
-        slopes = (white[:, 1:-1] - white[:, :1]) / STEP
+        slopes = (white[:, 1:-1] - white[:, :1]) / steps
         at = white[:, 0] + (early - whole) * by_row
         return at, np.column_stack([slopes, by_row * SWITCHING])
 
 
 def _rising(data: DataSet) -> Floats:
-    """Penalty (sigmas) where suction would rise with vacuum: no ejector's does."""
+    """Penalty (sigmas) where suction would rise with vacuum: no ejector's does.
+
+    It is felt a little before: at a wall that comes without warning, a fit stops.
+    """
     steps = np.diff(data.ejector.share(np.linspace(0.0, 1.0, RISING + 1)))
-    return np.minimum(steps, 0.0) / (0.1 * RIPPLE)
+    return (np.hypot(steps, RIPPLE) - steps) / (0.6 * RIPPLE)
 
 
 def falling(data: DataSet) -> DataSet:
@@ -265,10 +277,13 @@ def _solved(
     tolerance: float,
     loss: Loss | Literal["linear"] = "linear",
 ) -> Floats:
+    rest = np.full(len(x) - len(problem.space.free), np.inf)
+    low, high = np.append(problem.space.low, -rest), np.append(problem.space.high, rest)
     found = least_squares(
         problem.residual,
-        x,
+        np.clip(x, low + INSIDE, high - INSIDE),
         problem.jacobian,
+        bounds=(low, high),
         max_nfev=steps,
         xtol=1e-3,
         ftol=tolerance,

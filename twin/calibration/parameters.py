@@ -53,7 +53,7 @@ FREE = (
     # A worn nozzle moves less air; a unit that moves more than its type is only a good one.
     Free(_E, "suction_capacity_sl_min", "sl/min", 0.1, 1.0, 1000.0, True, (1.2, 4.0), market=0.5),
     Free(_E, "end_pressure_mbar", "mbar", 40.0, 10.0, 700.0, healthy=(4.0, 2.0), market=0.5),
-    Free(_E, "bulge", "", 0.5, -0.95, 3.0, market=0.8, scaled=False),
+    Free(_E, "bulge", "", 0.5, -1.0, 3.0, market=0.8, scaled=False),
     Free(_E, "skew", "", 0.2, -20.0, 20.0, market=0.5, scaled=False),
     Free(_E, "bend_2", "", 0.15, -40.0, 40.0, market=0.4, scaled=False),
     Free(_E, "bend_3", "", 0.05, -40.0, 40.0, market=0.2, scaled=False),
@@ -94,8 +94,11 @@ FREE_IN_MARKET = (
     Free(_E, "port_volume_ml", "ml", 0.2, 0.1, 1000.0, True, market=1.0),
     Free(_E, "jet_depth", "", 0.2, 0.0, 1.0, market=0.3, scaled=False),
     Free(_E, "exhaust_sl_min", "sl/min", 0.4, 0.0, 5000.0, True, market=1.5),
+    Free(_E, "cracking_pressure_mbar", "mbar", 2.0, 0.0, 100.0, market=5.0, scaled=False),
     Free(_E, "back_flow_sl_min", "sl/min", 0.4, 0.0, 5000.0, True, market=1.5),
     Free(_E, "blow_off_shape", "", 0.1, -0.9, 3.0, market=0.4, scaled=False),
+    Free("system", "free_convection", "", 0.2, 0.0, 1.0, market=0.3, scaled=False),
+    Free("system", "forced_convection", "", 0.2, 0.0, 20.0, market=1.0),
     Free("system", "opening_factor", "", 0.4, 1e-3, 100.0, True, market=1.5),
     Free("system", "line_volume_factor", "", 0.2, 0.02, 50.0, True, market=0.5),
     Free("system", "line_inertia_factor", "", 0.2, 0.02, 50.0, True, market=0.5),
@@ -131,23 +134,37 @@ def with_values(data: DataSet, numbers: Floats, free: Sequence[Free] = FREE) -> 
     return data.model_copy(update=tables)
 
 
+def _reach(one: Free, data: DataSet) -> tuple[float, float]:
+    """Coordinates in a market about ``data`` at which a value is at its bounds."""
+    value = one.of(data)
+    if not one.scaled:
+        return (one.low - value) / one.market, (one.high - value) / one.market
+    centre, farthest = max(value, one.low, SMALLEST), np.exp(FARTHEST)
+    low, high = max(one.low, centre / farthest), min(one.high, centre * farthest)
+    return float(np.log(low / centre)) / one.market, float(np.log(high / centre)) / one.market
+
+
 @dataclass(frozen=True)
 class Space:
     """Where a fit may go: coordinates in standard deviations about a data set, 0 at the data set.
 
     ``ways`` are (parameters, n). A parameter that is ``scaled`` is multiplied by the exponential of
-    its coordinate, any other is added to.
+    its coordinate, any other is added to. A search stays between ``low`` and ``high``: outside,
+    where nothing moves, it would find no way back.
     """
 
     data: DataSet
     free: tuple[Free, ...]
     ways: Floats
     scaled: npt.NDArray[np.bool_]
+    low: Floats
+    high: Floats
 
     @classmethod
     def of_type(cls, data: DataSet) -> "Space":
         """Units of a known type, ``data``."""
-        return cls(data, FREE, directions(data), np.zeros(len(FREE), np.bool_))
+        anywhere = np.full(len(FREE), np.inf)
+        return cls(data, FREE, directions(data), anywhere < 0.0, -anywhere, anywhere)
 
     @classmethod
     def of_market(cls, data: DataSet) -> "Space":
@@ -156,7 +173,9 @@ class Space:
         ways = np.diag(spread)
         ways[np.ix_(_BENDS, _BENDS)] = _SMOOTH * spread[_BENDS]
         scaled = np.array([one.scaled for one in FREE_IN_MARKET])
-        return cls(data, FREE_IN_MARKET, ways, scaled)
+        low, high = np.array([_reach(one, data) for one in FREE_IN_MARKET]).T
+        low[_BENDS], high[_BENDS] = -np.inf, np.inf  # each coordinate moves several of them
+        return cls(data, FREE_IN_MARKET, ways, scaled, low, high)
 
     def values(self, x: Floats) -> Floats:
         """Values of the free parameters at ``x``, kept within their bounds."""

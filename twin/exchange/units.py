@@ -36,6 +36,7 @@ UNITS: Mapping[str, Unit] = {
     "ms": Unit(_TIME, MS),
     "kg/s": Unit(_FLOW, shown={"sl/min": 1.0 / SL_MIN}),
     "sl/min": Unit(_FLOW, SL_MIN),
+    "s/kg": Unit({"kg": -1, "s": 1}),
     "kg/(s.Pa)": Unit({"m": 1, "s": 1}),
     "m3": Unit(_VOLUME),
     "ml": Unit(_VOLUME, ML),

@@ -29,6 +29,7 @@ NotNegative = Annotated[float, Field(ge=0.0)]
 
 AFTER_BLOW_OFF = -5e5  # Pa of vacuum that no blow-off reaches: the part goes when it ends
 SHORTEST_SWING = 5e-3  # s, of a line's gas that can be seen at a sample each millisecond
+UNSEEN_SWING = 3.5e-3  # s, of one that cannot at all
 RIPPLE = 1e-3  # of suction capacity, from one hundredth of the range to the next: still monotonic
 
 # The modes of the configuration as the coefficients hold them.
@@ -80,7 +81,7 @@ class Ejector(Settings):
 
     suction_capacity_sl_min: Positive = 33.4
     end_pressure_mbar: Positive = 150.0
-    bulge: float = Field(0.0, ge=-0.95, le=3.0)
+    bulge: float = Field(0.0, ge=-1.0, le=3.0)
     skew: float = Field(0.0, ge=-20.0, le=20.0)
     bend_2: float = Field(0.0, ge=-40.0, le=40.0)
     bend_3: float = Field(0.0, ge=-40.0, le=40.0)
@@ -98,6 +99,7 @@ class Ejector(Settings):
     blow_off_ramp_ms: float = Field(5.0, ge=0.5, le=500.0)
     relief_sl_min: NotNegative = 200.0  # out through the exhaust at 100 mbar above ambient
     exhaust_sl_min: NotNegative = 0.0  # the same, sonic, where the exhaust is an opening
+    cracking_pressure_mbar: NotNegative = 0.0  # above ambient, where the check valve lets out
     back_flow_sl_min: NotNegative = 0.0  # in through it while off, sonic; no check valve
     h1_mbar: float = Field(750.0, gt=0.0, le=998.0)
     h1_hysteresis_mbar: float = Field(150.0, gt=0.0)
@@ -154,6 +156,8 @@ class System(Settings):
         Vessel(kind="vessel", volume_ml=750.0),
     )
     film_coefficient: NotNegative = 10.0  # W/(m² K), of vessel and cups
+    free_convection: float = Field(0.0, ge=0.0, le=1.0)  # share of that, at FREE_AT
+    forced_convection: NotNegative = 0.0  # how many times more while all blow-off enters
     tube_film_coefficient: NotNegative = 60.0  # W/(m² K)
     line_factor: NotNegative = 1.0  # flow resistance over what the parts add up to
     line_volume_factor: Positive = 1.0  # the tubes' volume over what the parts add up to
@@ -265,6 +269,7 @@ def _set_ejector(theta: Theta, ejector: Ejector, end_ratio: float) -> None:
     theta[c.RELIEF] = ejector.relief_sl_min * SL_MIN / (100.0 * MBAR)
     theta[c.BACK_FLOW] = ejector.back_flow_sl_min * SL_MIN
     theta[c.EXHAUST] = ejector.exhaust_sl_min * SL_MIN
+    theta[c.CRACKING_PRESSURE] = ejector.cracking_pressure_mbar * MBAR
     theta[[c.H1, c.H2]] = ejector.h1_mbar * MBAR, ejector.h2_mbar * MBAR
     theta[c.H1_LOW] = (ejector.h1_mbar - ejector.h1_hysteresis_mbar) * MBAR
     theta[c.H2_LOW] = (ejector.h2_mbar - ejector.h2_hysteresis_mbar) * MBAR
@@ -289,8 +294,11 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     theta[c.COMPLIANCE] = min(total.shrinks + system.shrinks_ml * ML, FLATTEST * theta[c.VOLUME])
     theta[c.SOFTNESS] = system.softness
     theta[c.FILM] = system.film_coefficient
+    theta[c.FREE_CONVECTION] = system.free_convection
+    if theta[c.BLOW_OFF] > 0.0:
+        theta[c.FORCED_CONVECTION] = system.forced_convection**2 / theta[c.BLOW_OFF]
     theta[c.AREA] = total.vessel_area + ends * total.line_area
-    near = 0.5 if _swings(theta, inertance) else 0.0
+    near = 0.5 * _swings(theta, inertance)
     theta[[c.NEAR_INERTANCE, c.INERTANCE]] = near * inertance
     for line, value in ((c.RESISTANCE, total.resistance), (c.LAMINAR, total.laminar)):
         theta[line] = (1.0 - near) * value * system.line_factor
@@ -307,7 +315,12 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     theta[c.CONTACT] = system.part_meets_ms * MS
 
 
-def _swings(theta: Theta, inertance: float) -> bool:
-    """Whether the line's gas swings slowly enough to be seen; a shorter line is only friction."""
+def _swings(theta: Theta, inertance: float) -> float:
+    """Whether the line's gas swings slowly enough to be seen; a shorter line is only friction.
+
+    From 0 to 1 without a step: a fit that meets one goes no further.
+    """
     stored = (theta[c.PORT_VOLUME] + theta[c.LINE_VOLUME]) / (GAMMA * R * theta[c.TEMPERATURE])
-    return 2.0 * math.pi * math.sqrt(inertance * stored) > SHORTEST_SWING
+    period = 2.0 * math.pi * math.sqrt(inertance * stored)
+    share = (period - UNSEEN_SWING) / (SHORTEST_SWING - UNSEEN_SWING)
+    return min(max(share, 0.0), 1.0)

@@ -268,12 +268,13 @@ def _jumps(state, k, h, i):  # type: ignore[no-untyped-def]
 
 @inlined
 def _passes(state, k, h, i):  # type: ignore[no-untyped-def]
-    """Whether blow-off brings the port as near to ambient pressure as it moves within ``h``.
+    """Whether blow-off brings the port as near to where the exhaust opens as it moves in ``h``.
 
     The sensor's first stage follows it, so the distance between them tells how quickly it moves.
     """
     moves = abs(state[PORT, i] - state[FELT, i]) / k[c.SENSOR_LAG, i] * h
-    return state[BLOWING, i] > 0.01 and abs(state[PORT, i] - k[c.AMBIENT, i]) < moves
+    opens = k[c.AMBIENT, i] + k[c.CRACKING_PRESSURE, i]
+    return state[BLOWING, i] > 0.01 and abs(state[PORT, i] - opens) < moves
 
 
 @compiled

@@ -33,6 +33,8 @@ _PER_COLDEST, _PER_HOTTEST = 1.0 / (R * COLDEST), 1.0 / (R * HOTTEST)  # kg/J
 MOST = 100.0  # kg/s
 FAINTEST = 1e-12  # of a jet that fades; less is none, and slow to calculate with
 
+FREE_AT = 10.0  # K between gas and wall at ambient pressure, where the film coefficient holds
+
 # Alexander's SDIRK of third order: L-stable, each stage implicit in itself by the same G, the last
 # stage is the step's result (R. Alexander, SIAM J. Numer. Anal. 14, 1977). In multiples of G.
 # The stages stand at G, half-way from there to 1, and 1; _FURTHER leads from the first to the next.
@@ -171,7 +173,8 @@ def _suction_at(k, p):  # type: ignore[no-untyped-def]
 def at_port(p, driven, k, i):  # type: ignore[no-untyped-def]
     """Flows out of and into the port (kg/s) at ``p``, as tangents: two each, level and slope.
 
-    Out: the ejector's suction, and above ambient the exhaust. A jet that is still building up draws
+    Out: the ejector's suction, and the exhaust where the port is far enough above ambient for the
+    check valve to open; that pressure is lost to the flow. A jet that is still building up draws
     neither as much nor as deep. In: blow-off, and back-flow through a leaking check valve while the
     nozzle is off.
     """
@@ -181,16 +184,17 @@ def at_port(p, driven, k, i):  # type: ignore[no-untyped-def]
     share, rise = characteristic(depth - (ambient - p) * per_pa, k, i)
     out_slope = driven.jet * driven.suction * per_pa * rise
     out = driven.jet * driven.suction * share - out_slope * p
+    opens = ambient + k[c.CRACKING_PRESSURE, i]
     relief = k[c.RELIEF, i]
-    relief = relief if p > ambient else 0.0
-    share, rise = opening(p, ambient)
+    relief = relief if p > opens else 0.0
+    share, rise = opening(p if p < ambient else p - k[c.CRACKING_PRESSURE, i], ambient)
     back = k[c.BACK_FLOW, i] * (1.0 - min(driven.jet, 1.0))
     back = back if p < ambient else 0.0
     vent = k[c.EXHAUST, i]
-    vent = vent if p > ambient else 0.0
+    vent = vent if p > opens else 0.0
     fuller = driven.blow_off * k[c.BLOW_OFF_SHAPE, i]
     return (
-        out - relief * ambient - vent * (share - rise * p),
+        out - relief * opens - vent * (share - rise * p),
         out_slope + relief - vent * rise,
         driven.blow_off + fuller + back * (share - rise * p),
         back * rise - fuller / ambient,
@@ -269,6 +273,18 @@ def temperatures(y, volume, known, step, entering, drawn, k, i):  # type: ignore
 
 
 @inlined
+def convection(y, warmer, k, i):  # type: ignore[no-untyped-def]
+    """Film coefficient in the vessel, over that of the data set; its gas is ``warmer`` (K).
+
+    Free convection along a wall is laminar in vessels of some litres: Nu in proportion to Ra^¼, so
+    to (p² ΔT)^¼. A jet that enters stirs: Nu in proportion to about the root of its flow.
+    """
+    free = math.sqrt(y.vessel / k[c.AMBIENT, i] * math.sqrt(abs(warmer) * (1.0 / FREE_AT)))
+    forced = math.sqrt(k[c.FORCED_CONVECTION, i] * max(-y.far, 0.0))
+    return 1.0 + k[c.FREE_CONVECTION, i] * (free - 1.0) + forced
+
+
+@inlined
 def solve(y, known, step, driven, k, i):  # type: ignore[no-untyped-def]
     """One pass over the balances of all nodes: ``y`` is the guess, ``known`` what came before.
 
@@ -283,10 +299,11 @@ def solve(y, known, step, driven, k, i):  # type: ignore[no-untyped-def]
     volume, stretch = room(y.vessel, k, i)
     port_stored, line_stored = k[c.PORT_VOLUME, i] * per_pa, k[c.LINE_VOLUME, i] * per_pa
     vessel_stored = (volume + GAMMA * y.vessel * stretch) * per_pa
-    warmth, port_warmth, line_warmth = k[_HEAT, i], k[_PORT_HEAT, i], k[_LINE_HEAT, i]
+    port_warmth, line_warmth = k[_PORT_HEAT, i], k[_LINE_HEAT, i]
 
     entering, drawn = blown + blown_slope * y.port, max(out + out_slope * y.port, 0.0)
     port_t, line_t, vessel_t = temperatures(y, volume, known, step, entering, drawn, k, i)
+    warmth = k[_HEAT, i] * convection(y, vessel_t - outside, k, i)
     near_t = line_t if y.near >= 0.0 else port_t
     far_t = vessel_t if y.far >= 0.0 else line_t
     leak_t = outside if y.vessel <= ambient else vessel_t
