@@ -27,6 +27,7 @@ from twin.calibration.commission import (
 )
 from twin.calibration.cycles import Cycles
 from twin.calibration.fit import BEST_END, END_PRESSURE, RISING, falling, soft
+from twin.calibration.left_out import with_left_out
 from twin.calibration.page import write_page
 from twin.calibration.readings import Readings, read, turns
 from twin.calibration.report import commissioned_as_json, commissioned_in_words, headline
@@ -435,3 +436,11 @@ def test_a_verdict_says_where_most_is_left() -> None:
     assert f"mbar measured below expected, {after}" in headline(
         Verdict({Phase.HOLD: replace(hold, left=9.0 * hold.floor)})
     )
+
+
+@pytest.mark.parametrize("factor", [0.3, 3.0])
+def test_what_is_left_out_of_a_line_never_takes_inertia_away(factor: float) -> None:
+    data = config_of(logged(SEED, KIND).truth.readable).data
+    system = data.system.model_copy(update={"line_inertia_factor": factor})
+    theta, *others = with_left_out(data.model_copy(update={"system": system}))
+    assert all(one[c.INERTANCE] >= theta[c.INERTANCE] for one in others)

@@ -20,6 +20,7 @@ def with_left_out(data: DataSet) -> list[Theta]:
     theta = coefficients(data)
     total = lumped(data.system.parts, theta[c.SUCTION], theta[c.AMBIENT], theta[c.TEMPERATURE])
     pushed, bare = theta.copy(), theta.copy()
-    pushed[c.INERTANCE] = total.inertance - theta[c.NEAR_INERTANCE]
+    inertance = data.system.line_inertia_factor * total.inertance
+    pushed[c.INERTANCE] = inertance - theta[c.NEAR_INERTANCE]
     bare[c.AREA] = total.vessel_area
     return [theta, pushed, bare]
