@@ -7,7 +7,7 @@ asset database. Where they came from is kept.
 
 import json
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
@@ -50,6 +50,7 @@ TABLES = {
     "webhook",
 }
 NO_TYPE = "unknown"
+FROM_AMBIENT = ("gauge", "vacuum")  # references of a tag
 HAND_WRITTEN = "[data] of the configuration"
 _WORDS = {"type": "object-specific data", "instance": "instance-specific data"}
 
@@ -169,6 +170,16 @@ class Config:
         # --id may have named another unit than the configuration does.
         named = {"type": header.asset_type, "id": header.asset_id}
         return replace(config, asset=config.asset.model_copy(update=named))
+
+    @property
+    def gauge(self) -> bool:
+        """Whether the pressure sensor counts from ambient, as far as the configuration says so."""
+        tables = self.document.tables
+        with suppress(KeyError, TypeError):
+            return bool(tables["driver"]["tags"]["pressure"]["reference"] in FROM_AMBIENT)
+        with suppress(KeyError, TypeError):
+            return any(str(name).startswith("vacuum_") for name in tables["import"]["columns"])
+        return False
 
     def log_header(self, unmeasured: Mapping[str, str] | None = None) -> LogHeader:
         """What a log of this unit must carry to be replayed alone.

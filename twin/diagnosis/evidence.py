@@ -33,7 +33,7 @@ from twin.monitor.healthy import Healthy
 from twin.monitor.knees import as_wide_as_needed, expected_knees
 from twin.monitor.phases import Knees
 from twin.monitor.signatures import drawn_rows, steps
-from twin.monitor.surroundings import are_told, following
+from twin.monitor.surroundings import are_told, following, told
 from twin.monitor.switching import Seen, seen
 from twin.signals import (
     MBAR,
@@ -75,7 +75,7 @@ def at_once(run: Callable[[One], Other], over: Sequence[One]) -> list[Other]:
 class Evidence:
     """The complete cycles of a log in one stretch of rows, with all that judges a hypothesis."""
 
-    theta: Theta  # of the calibrated twin as it stands
+    theta: Theta  # of the calibrated twin as it stands, in the surroundings of the log
     begin_ns: int  # PLC time of the first row here
     before_s: float  # of the log, before that row
     samples: Samples
@@ -91,6 +91,10 @@ class Evidence:
     knees: Knees  # how they were looked for
     uncertain: tuple[tuple[Theta, Theta], ...]  # a sigma either way where no log decided
     rows: Ints  # that suffice to draw what is expected
+    calibrated: Theta  # the same in those of its calibration
+    gauge: bool  # the pressure sensor counts from ambient
+    told: frozenset[str] = frozenset()  # surroundings that somebody measures
+    another_day: bool = True  # than that of the calibration
     _seen: dict[bytes, Seen] = field(default_factory=dict)  # by coefficients
 
     @property
@@ -122,7 +126,17 @@ class Evidence:
     def course(self, hypothesis: Hypothesis, base: Theta | None = None) -> Schedule:
         """The coefficients under a hypothesis, from which row on which."""
         base = self.theta if base is None else base
-        return schedule(base, hypothesis, self.seconds, self.cycle_of_row)
+        course = schedule(base, hypothesis, self.seconds, self.cycle_of_row)
+        return [(row, self._as_read(theta, base)) for row, theta in course]
+
+    def _as_read(self, theta: Theta, base: Theta) -> Theta:
+        """Readings of a gauge sensor were counted from the ambient pressure that was assumed."""
+        shift = float(theta[c.AMBIENT] - base[c.AMBIENT])
+        if not self.gauge or shift == 0.0:
+            return theta
+        theta = theta.copy()
+        theta[c.SENSOR_OFFSET] -= shift
+        return theta
 
     def expected(self, hypothesis: Hypothesis) -> Floats:
         """Pressure (Pa) that the sensor should read at each row."""
@@ -367,6 +381,8 @@ def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
         terms=config.data.terms,
         knees=knees,
         uncertain=tuple(_uncertain(config)),
+        calibrated=theta,
+        gauge=config.gauge,
     )
     return of_log(nothing, blocks)
 
@@ -376,7 +392,8 @@ def of_log(beside: Evidence, blocks: Iterable[Samples]) -> Evidence:
     blocks = list(bridged(blocks))
     rows = joined(np.empty(0, SAMPLE), *(block for block in blocks if are_told(block)))
     uncertain = tuple((following(up, rows), following(down, rows)) for up, down in beside.uncertain)
-    beside = replace(beside, theta=following(beside.theta, rows), uncertain=uncertain)
+    theta = following(beside.theta, rows)
+    beside = replace(beside, theta=theta, uncertain=uncertain, told=frozenset(told(rows)))
     knees = as_wide_as_needed(beside.knees, blocks)
     cycles = whole(Twin(beside.theta, knees, beside.terms).over(blocks))
     samples = np.concatenate([np.empty(0, SAMPLE), *(cycle.samples for cycle in cycles)])

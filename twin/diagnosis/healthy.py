@@ -22,6 +22,7 @@ LEAST_SCATTER, MOST_SCATTER = 0.2, 5.0  # of what is usual
 
 def learned(evidence: Evidence) -> Healthy:
     """Learn the model's error and the scatter from healthy cycles; the rest stays as it is."""
+    evidence = replace(evidence, another_day=False)
     judged = evidence.judged
     halves = [(judged[::2], judged[1::2]), (judged[1::2], judged[::2])]
     if len(judged) < FEWEST:

@@ -8,9 +8,10 @@ import numpy as np
 
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.model.courses import HOUR, Cause, Course
-from twin.model.effects import EFFECTS, Parameter
+from twin.model.effects import EFFECTS, Effect, Parameter
 from twin.monitor.bins import Floats
 
+WEATHER = "ambient_pressure"  # its typical size is one sigma of what the weather does
 LOCAL_ONSETS = 20  # as many onsets in a cycle can be told apart
 
 
@@ -73,9 +74,20 @@ def price(evidence: Evidence, hypothesis: Hypothesis) -> float:
     return sum(_price(evidence, cause) for cause in hypothesis)
 
 
+def often(evidence: Evidence, effect: Effect) -> float:
+    """How often an effect comes; weather that somebody measures is followed, and no cause."""
+    followed = effect.name == WEATHER and "ambient" in evidence.told
+    return min(effect.often, 1.0) if followed else effect.often
+
+
+def rarity(evidence: Evidence, hypothesis: Hypothesis) -> float:
+    """What of a price is how seldom its effects come, beside what wears; the log says the rest."""
+    return sum(-2.0 * math.log(often(evidence, EFFECTS[cause.effect])) for cause in hypothesis)
+
+
 def _price(evidence: Evidence, cause: Cause) -> float:
     effect, cycles = EFFECTS[cause.effect], len(evidence.judged)
-    ways = float(len(EFFECTS))
+    ways = len(EFFECTS) / often(evidence, effect)
     if cause.course == Course.STEP:
         ways *= LOCAL_ONSETS * cycles
     elif cause.course == Course.RAMP:
@@ -83,4 +95,5 @@ def _price(evidence: Evidence, cause: Cause) -> float:
     elif cause.course == Course.INTERMITTENT:
         acts = sum(int(evidence.numbers[one]) in cause.cycles for one in evidence.judged)
         ways *= 2.0 * math.comb(cycles, acts)
-    return 2.0 * len(effect.parameters) + 2.0 * math.log(ways)
+    cost = 2.0 * len(effect.parameters) + 2.0 * math.log(ways)
+    return cost + float(sizes(evidence, (cause,))[0]) ** 2 if effect.name == WEATHER else cost

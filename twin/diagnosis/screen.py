@@ -14,7 +14,7 @@ from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.hypotheses import price, sized
 from twin.diagnosis.weights import Weights, levels
 from twin.model.courses import Cause, Course
-from twin.model.effects import EFFECTS, Parameter
+from twin.model.effects import EFFECTS, Parameter, acting_on
 from twin.monitor.bins import Floats, Ints
 
 # Of its typical size, at which an effect's signature is taken. A delay moves what is sharp: a small
@@ -73,10 +73,10 @@ class _Gain:
 
 
 def columns(evidence: Evidence, weights: Weights, about: Hypothesis = HEALTHY) -> Columns:
-    """Signatures of all parameters about a hypothesis."""
+    """Signatures of the parameters of all effects that can act, about a hypothesis."""
     taken = [
         (effect.name, p, share)
-        for effect in EFFECTS.values()
+        for effect in acting_on(evidence.theta)
         for p in effect.parameters
         for share in (SHARES_OF_TIMES if p.unit == "ms" else SHARES)
     ]

@@ -14,7 +14,7 @@ import numpy as np
 
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, at_once, thinned
 from twin.diagnosis.fit import Fitted, fit, white
-from twin.diagnosis.hypotheses import bounds, parameters, sized, sizes
+from twin.diagnosis.hypotheses import WEATHER, bounds, parameters, rarity, sized, sizes
 from twin.diagnosis.screen import columns, pairs, promises
 from twin.diagnosis.weights import Covariance, Weights, covariance
 from twin.model.courses import Cause, Course
@@ -78,7 +78,7 @@ def search(
     if not any(_worth(healthy, healthy, 0.0, one) for one in singles):
         return Search(weights, healthy, None, singles, [], [])
     found = singles[0]
-    if found.leftover > QUIET:
+    if found.leftover > QUIET or _weather(evidence, singles):
         progress("comparing the best, each with its own weights")
         found = _likeliest(evidence, fitted, tried)
     judged, weights = _weights(evidence, fitted, found.hypothesis)
@@ -170,9 +170,11 @@ def _likeliest(evidence: Evidence, fitted: Sequence[int], tried: Sequence[Fitted
 
     What scatters moves with the causes: about the healthy twin, a valve's half millisecond is not
     where a delay of ten has put its edge. All cycles choose the course, the fitted ones the effect.
+    Weather that the log cannot reject beside the best comes first: it changes every week.
     """
-    least = min(one.score for one in tried)
-    near = [one for one in sorted(tried, key=lambda one: one.score) if one.score < NEAR * least]
+    ranked = sorted(tried, key=lambda one: one.score)
+    near = [one for one in ranked if one.score < NEAR * ranked[0].score][:TRIED_ALONE]
+    near += [one for one in _weather(evidence, ranked) if not any(one is other for other in near)]
 
     def alone(first: Fitted) -> tuple[float, float, Fitted]:
         judged, weights = _weights(evidence, fitted, first.hypothesis)
@@ -182,11 +184,26 @@ def _likeliest(evidence: Evidence, fitted: Sequence[int], tried: Sequence[Fitted
         return chi2 + judged.volume + price, one.score + weights.volume, one
 
     best: dict[tuple[str, ...], tuple[float, float, Fitted]] = {}
-    for each in at_once(alone, near[:TRIED_ALONE]):
+    for each in at_once(alone, near):
         everywhere, _, one = each
         if one.effects not in best or everywhere < best[one.effects][0]:
             best[one.effects] = each
-    return min(best.values(), key=lambda each: each[1])[2]
+    _, least, found = min(best.values(), key=lambda each: each[1])
+    for weather in _weather(evidence, [one for *_, one in best.values()]):
+        if best[weather.effects][1] < least + SAME * max(found.leftover**2, 1.0):
+            return weather
+    return found
+
+
+def _weather(evidence: Evidence, ranked: Sequence[Fitted]) -> list[Fitted]:
+    """Of fits, those by another ambient pressure, where nobody measures it.
+
+    What ejectors do in it is not known well. So they are compared with weights about themselves,
+    though they look poor by those of the calibration's day.
+    """
+    if "ambient" in evidence.told:
+        return []
+    return [one for one in ranked if one.effects == (WEATHER,)]
 
 
 def _started(
@@ -334,8 +351,15 @@ def held_out_gain(
 def _rivals(
     evidence: Evidence, judged: Weights, weights: Weights, found: Fitted, singles: list[Fitted]
 ) -> list[list[Fitted]]:
-    """For each cause: what fits as well in its place, re-fitted with the others."""
-    margin = SAME * max(found.leftover**2, 1.0)
+    """For each cause: what fits as well in its place, re-fitted with the others.
+
+    A log rejects a rival by what it shows, not by how seldom that comes.
+    """
+
+    def shown(one: Fitted) -> float:
+        return one.score - rarity(evidence, one.hypothesis)
+
+    worst = shown(found) + SAME * max(found.leftover**2, 1.0)
 
     def instead_of(left: int) -> list[Fitted]:
         others = tuple(c for i, c in enumerate(found.hypothesis) if i != left)
@@ -351,7 +375,7 @@ def _rivals(
             fitted = _ranked(evidence, judged, fit(evidence, weights, timed))
         else:
             fitted = [one for one in singles if one.effects != found.effects]
-        return [one for one in fitted if one.score - found.score < margin]
+        return [one for one in fitted if shown(one) < worst]
 
     return at_once(instead_of, range(len(found.hypothesis)))
 

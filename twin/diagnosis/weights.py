@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag, solve_triangular
 
+from twin.diagnosis.another_day import unsure
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.model import theta as c
 from twin.model.courses import Cause, Course, Schedule
@@ -105,9 +106,21 @@ def _usual(variance: Floats, count: Ints, noise: float) -> float:
 def covariance(evidence: Evidence, about: Hypothesis = HEALTHY) -> Covariance:
     """What scatters and is uncertain about a hypothesis."""
     sizes = scatter(evidence)
-    off, moves, left_open = moved(evidence, about, sizes, evidence.uncertain)
+    uncertain = (*evidence.uncertain, *_another_day(evidence, about))
+    off, moves, left_open = moved(evidence, about, sizes, uncertain)
     (healthy,) = evidence.off([HEALTHY]).T
     return Covariance(evidence, MISMATCH * np.abs(healthy - off), moves, left_open)
+
+
+def _another_day(evidence: Evidence, about: Hypothesis) -> list[tuple[Theta, Theta]]:
+    """What the log's day leaves open, where it is farthest from the calibration's."""
+    if not evidence.another_day:
+        return []
+    calibrated = float(evidence.calibrated[c.AMBIENT])
+    ambient = [float(theta[c.AMBIENT]) for _, theta in evidence.course(about)]
+    farthest = max(ambient, key=lambda one: abs(one - calibrated))
+    told, gauge = evidence.told, evidence.gauge
+    return list(unsure(evidence.calibrated, evidence.theta, farthest, told, gauge))
 
 
 def moved(

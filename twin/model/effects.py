@@ -13,6 +13,8 @@ from twin.model.theta import Theta
 from twin.signals import BAR, MBAR, ML, MS, SL_MIN
 
 FLATTEST = 0.9  # of the volume: cups that give way do not vanish
+# How often an effect comes, beside what wears: that is taken for once in two years.
+WEEKLY, SELDOM = 100.0, 0.1
 UNKNOWN = "unknown"  # stands for an effect where a deviation has no name yet
 
 
@@ -53,7 +55,8 @@ class Parameter:
 class Effect:
     """What differs, in words a maintenance person understands, and where it acts.
 
-    ``sentence`` says what it is, ``look_at`` what to look at first.
+    ``sentence`` says what it is, ``look_at`` what to look at first, ``often`` how often it comes
+    beside what wears: weather is weekly, a sensor of steel and silicon hardly ever drifts.
     """
 
     name: str
@@ -61,6 +64,8 @@ class Effect:
     look_at: str
     parameters: tuple[Parameter, ...]
     act: Callable[..., None]  # (theta, one value per parameter) -> changes theta in place
+    often: float = 1.0
+    acts: Callable[[Theta], bool] = lambda _: True  # whether a unit has what it acts on
 
 
 def _leakage(theta: Theta, flow: float) -> None:
@@ -115,6 +120,10 @@ def _slow_ramp_up(theta: Theta, time_constant: float) -> None:
 def _threshold_drift(theta: Theta, h1_shift: float, h2_shift: float) -> None:
     theta[c.H1] += h1_shift * MBAR
     theta[c.H1_LOW] += h2_shift * MBAR
+
+
+def _saves_air(theta: Theta) -> bool:
+    return bool(theta[c.AIR_SAVING] != c.OFF)
 
 
 def _weak_blow_off(theta: Theta, percent: float) -> None:
@@ -236,6 +245,7 @@ _TABLE = (
             _P("h2_shift", "mbar", -200.0, 200.0, 20.0),
         ),
         _threshold_drift,
+        acts=_saves_air,
     ),
     Effect(
         "weak_blow_off",
@@ -257,6 +267,7 @@ _TABLE = (
         "the sensor's zero: what it reads while open to ambient",
         (_P("offset", "mbar", -200.0, 200.0, 8.0),),
         _sensor_offset,
+        SELDOM,
     ),
     Effect(
         "sensor_gain",
@@ -264,6 +275,7 @@ _TABLE = (
         "the sensor's span: compare it with a gauge at high vacuum",
         (_P("error", "%", -30.0, 30.0, 2.0),),
         _sensor_gain,
+        SELDOM,
     ),
     Effect(
         "sensor_lag",
@@ -278,10 +290,16 @@ _TABLE = (
         "today's air pressure against that of the data set",
         (_P("shift", "mbar", -300.0, 100.0, 15.0),),
         _ambient_pressure,
+        WEEKLY,
     ),
 )
 
 EFFECTS: Mapping[str, Effect] = {effect.name: effect for effect in _TABLE}
+
+
+def acting_on(theta: Theta) -> list[Effect]:
+    """The effects that can act on a unit: what cannot is no hypothesis about it."""
+    return [effect for effect in _TABLE if effect.acts(theta)]
 
 
 def apply(theta: Theta, name: str, values: Mapping[str, float]) -> Theta:

@@ -17,6 +17,7 @@ from twin.signals import MS, Phase, Samples
 SHARP, ROUNDED = 2.5, 2.0  # times SIGNIFICANT, which is to show of a knee; lags round it
 ROUNDS = 8  # until the window's rows are known
 LONGEST_WINDOW = 240  # rows
+NEVER = 2**31  # rows into a suction: no knee is looked for
 SETTLED = 20e-3  # s after the valve's response before a knee can be one
 AGAIN = 30e-3  # s after a knee, in which lines ring, before the next can be one
 AT_ONCE = 2  # rows: so few would follow the lag that calibration finds, and that lag them
@@ -32,7 +33,8 @@ def expected_knees(theta: Theta, noise: float) -> Knees:
 
     The slope of a straight line over n rows of noise s has the deviation s √(12/n³); the window is
     chosen so that the break is SIGNIFICANT against the difference of two such slopes. A lag of the
-    sensor leaves 1 / (1 + lag / n) of that difference.
+    sensor leaves 1 / (1 + lag / n) of that difference. Where no air is saved there are no knees
+    but those that the ejector reports.
     """
     h1 = theta[c.AMBIENT] - theta[c.H1]
     suction = suction_at(theta, h1) * R * theta[c.TEMPERATURE]
@@ -49,7 +51,9 @@ def expected_knees(theta: Theta, noise: float) -> Knees:
         noise=noise,
         off_shift=0,
         on_shift=round((2.0 * theta[c.RAMP_UP] + 2.0 * theta[c.SENSOR_LAG]) / MS),
-        settled=round((theta[c.RESPONSE] + SETTLED) / MS),
+        settled=NEVER
+        if theta[c.AIR_SAVING] == c.OFF
+        else round((theta[c.RESPONSE] + SETTLED) / MS),
         again=round(AGAIN / MS),
         blow_off=(float(theta[c.BLOW_OFF_MODE]), float(theta[c.BLOW_OFF_TIME])),
         about=round((max(theta[c.RESPONSE], theta[c.RESPONSE_OFF]) + TOLD_LATE + SETTLED) / MS),
@@ -87,6 +91,8 @@ def as_wide_as_needed(knees: Knees, blocks: Sequence[Samples]) -> Knees:
     The narrowest of these: a wider one finds out more where a sensor, slower than anybody knew, has
     rounded the knees, but is further behind and needs longer stretches.
     """
+    if knees.settled == NEVER:
+        return knees
     best, (most, suctions) = knees, _nozzle_off(knees, blocks)
     window = knees.window
     while most < suctions and window < knees.longest:

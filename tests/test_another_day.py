@@ -1,0 +1,169 @@
+"""What another day does to a healthy rig is weather, and what cannot act is no cause."""
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import rigs
+
+from twin.config import Config
+from twin.diagnosis.another_day import unsure
+from twin.diagnosis.answer import diagnose
+from twin.diagnosis.evidence import HEALTHY, Evidence, collect
+from twin.diagnosis.hypotheses import often, price
+from twin.diagnosis.screen import columns, promises
+from twin.diagnosis.weights import covariance
+from twin.model import theta as c
+from twin.model.courses import Cause
+from twin.model.effects import EFFECTS
+from twin.model.theta import Theta
+from twin.monitor.knees import as_wide_as_needed, expected_knees
+from twin.monitor.phases import PhaseFinder
+from twin.settings import Document
+from twin.signals import MBAR, Phase, Samples
+
+NOBODY: frozenset[str] = frozenset()
+BOTH = frozenset({"ambient", "temperature"})
+
+
+def moved(calibrated: Theta, here: Theta, ambient: float, told: frozenset[str]) -> list[list[str]]:
+    """Names of the coefficients that each way moves."""
+    names = list(c.COEFFICIENTS)
+    ways = unsure(calibrated, here, ambient, told, gauge=False)
+    return [[names[i] for i in np.flatnonzero(up != here)] for up, _ in ways]
+
+
+def test_on_the_day_of_the_calibration_only_what_nobody_measures_is_unsure() -> None:
+    theta = rigs.theta("gripper")
+    ambient = float(theta[c.AMBIENT])
+    assert moved(theta, theta, ambient, NOBODY) == [["TEMPERATURE"]]
+    assert moved(theta, theta, ambient, BOTH) == [["AMBIENT"], ["SENSOR_OFFSET"]]
+
+
+def test_what_is_unsure_grows_in_proportion_to_how_other_the_day_is() -> None:
+    theta = rigs.theta("gripper")
+
+    def sizes(mbar: float, kelvin: float) -> list[float]:
+        here = theta.copy()
+        here[c.TEMPERATURE] += kelvin
+        ambient = float(theta[c.AMBIENT]) + mbar * MBAR
+        ways = list(unsure(theta, here, ambient, BOTH, gauge=False))[2:]
+        changed = [(up[up != here], here[up != here]) for up, _ in ways]
+        return [float(np.abs(after / before - 1.0).max()) for after, before in changed]
+
+    assert np.divide(sizes(-20.0, 0.0), sizes(-10.0, 0.0)) == pytest.approx(2.0, rel=0.05)
+    assert np.divide(sizes(0.0, 20.0), sizes(0.0, 10.0)) == pytest.approx(2.0, rel=0.05)
+    end = sizes(-10.0, 0.0)[0] * float(theta[c.END_RATIO] * theta[c.AMBIENT])
+    assert end == pytest.approx((1.0 - float(theta[c.END_RATIO])) * 10.0 * MBAR, rel=0.1)
+
+
+# --- weather or sensor ----------------------------------------------------------------------------
+
+
+@cache
+def reads_lower() -> Samples:
+    """An opened gripper that reads 10 mbar less all through, idle and hold."""
+    return rigs.recorded("gripper", 40.0, ("sensor_offset=-10",), seed=7)[0]
+
+
+def causes(samples: Samples) -> list[dict[str, Any]]:
+    found = diagnose(rigs.config("gripper"), [samples], "log", lambda _: None)
+    return list(found.json["causes"])
+
+
+def test_all_readings_lower_is_weather_or_the_sensor_and_weather_is_likelier() -> None:
+    (cause,) = causes(reads_lower())
+    assert cause["effect"] == "ambient_pressure"
+    assert cause["parameters"]["shift"]["value"] == pytest.approx(-10.0, abs=2.0)
+    assert cause["not_separable_from"] == ["sensor_offset"]
+
+
+def test_beside_a_barometer_it_is_the_sensor() -> None:
+    samples = reads_lower().copy()
+    samples["ambient"] = rigs.theta("gripper")[c.AMBIENT]
+    (cause,) = causes(samples)
+    assert cause["effect"] == "sensor_offset"
+    assert "ambient_pressure" not in cause["not_separable_from"]
+
+
+def test_weather_that_somebody_measures_is_no_cheap_cause() -> None:
+    evidence = collected()
+    followed = replace(evidence, told=BOTH)
+    weather = (Cause("ambient_pressure", {"shift": -10.0}),)
+    leak = (Cause("leakage", {"sonic_flow": 1.0}),)
+    assert price(evidence, weather) < price(evidence, leak) == price(followed, leak)
+    unlikely = (10.0 / EFFECTS["ambient_pressure"].parameters[0].typical) ** 2
+    assert price(followed, weather) == pytest.approx(price(followed, leak) + unlikely)
+    assert often(evidence, EFFECTS["sensor_offset"]) < 1.0
+
+
+# --- gauge sensors --------------------------------------------------------------------------------
+
+
+@cache
+def collected() -> Evidence:
+    return collect(rigs.config("gripper"), [rigs.recorded("gripper", 12.0)[0]])
+
+
+def test_a_gauge_sensor_reads_ambient_as_it_was_assumed() -> None:
+    lower = (Cause("ambient_pressure", {"shift": -20.0}),)
+    evidence = collected()
+    idle = evidence.ticks["phase"] == Phase.IDLE
+
+    def change(evidence: Evidence, rows: np.typing.NDArray[np.bool_]) -> float:
+        apart = evidence.expected(lower) - evidence.expected(HEALTHY)
+        return float(np.median(apart[rows])) / MBAR
+
+    assert change(evidence, idle) == pytest.approx(-20.0, abs=1.0)
+    gauge = replace(evidence, gauge=True, _seen={})
+    assert change(gauge, idle) == pytest.approx(0.0, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "gauge"),
+    [
+        ('[driver.tags.pressure]\nreference = "gauge"', True),
+        ('[driver.tags.pressure]\nreference = "vacuum"', True),
+        ('[driver.tags.pressure]\nreference = "absolute"', False),
+        ('[import.columns]\nvacuum_mbar = "p"', True),
+        ('[import.columns]\npressure_mbar = "p"', False),
+        ("", False),
+    ],
+)
+def test_the_configuration_says_what_the_sensor_counts_from(text: str, gauge: bool) -> None:
+    config: Config = replace(rigs.config("gripper"), document=Document.parse(text, "x.toml"))
+    assert config.gauge == gauge
+
+
+# --- what cannot act ------------------------------------------------------------------------------
+
+
+def test_an_effect_that_does_nothing_on_a_unit_is_no_hypothesis() -> None:
+    evidence = collected()
+    assert "threshold_drift" in offered(evidence)
+    theta = evidence.theta.copy()
+    theta[c.AIR_SAVING] = c.OFF
+    unit = replace(evidence, theta=theta, calibrated=theta, _seen={})
+    assert offered(unit) == offered(evidence) - {"threshold_drift"}
+
+
+def offered(evidence: Evidence) -> set[str]:
+    weights = covariance(evidence).of(evidence.judged)
+    found = promises(evidence, weights, columns(evidence, weights), each=1)
+    return {one.hypothesis[0].effect for one in found}
+
+
+def test_where_no_air_is_saved_no_switching_is_looked_for() -> None:
+    theta, samples = rigs.theta("gripper").copy(), rigs.recorded("gripper", 12.0)[0]
+
+    def hold(theta: Theta) -> int:
+        knees = as_wide_as_needed(expected_knees(theta, 0.3 * MBAR), [samples])
+        finder = PhaseFinder(knees)
+        phase = np.concatenate([finder.push(samples)[1], finder.flush()[1]])
+        return int(np.count_nonzero(phase == Phase.HOLD))
+
+    assert hold(theta) > 0
+    theta[c.AIR_SAVING] = c.OFF
+    assert hold(theta) == 0
