@@ -81,9 +81,8 @@ def often(evidence: Evidence, effect: Effect) -> float:
 
 
 def rarity(evidence: Evidence, hypothesis: Hypothesis) -> float:
-    """What of ``price`` is that its effects come seldom: no log says so."""
-    often_each = (often(evidence, EFFECTS[cause.effect]) for cause in hypothesis)
-    return sum(-2.0 * math.log(one) for one in often_each)
+    """What of a price is how seldom its effects come, beside what wears; the log says the rest."""
+    return sum(-2.0 * math.log(often(evidence, EFFECTS[cause.effect])) for cause in hypothesis)
 
 
 def _price(evidence: Evidence, cause: Cause) -> float:

@@ -353,12 +353,13 @@ def _rivals(
 ) -> list[list[Fitted]]:
     """For each cause: what fits as well in its place, re-fitted with the others.
 
-    However seldom it comes: that is for its probability to say, not for what the log can tell.
+    A log rejects a rival by what it shows, not by how seldom that comes.
     """
-    margin = SAME * max(found.leftover**2, 1.0)
 
-    def by_log(one: Fitted) -> float:
+    def shown(one: Fitted) -> float:
         return one.score - rarity(evidence, one.hypothesis)
+
+    worst = shown(found) + SAME * max(found.leftover**2, 1.0)
 
     def instead_of(left: int) -> list[Fitted]:
         others = tuple(c for i, c in enumerate(found.hypothesis) if i != left)
@@ -374,7 +375,7 @@ def _rivals(
             fitted = _ranked(evidence, judged, fit(evidence, weights, timed))
         else:
             fitted = [one for one in singles if one.effects != found.effects]
-        return [one for one in fitted if by_log(one) - by_log(found) < margin]
+        return [one for one in fitted if shown(one) < worst]
 
     return at_once(instead_of, range(len(found.hypothesis)))
 
