@@ -407,9 +407,13 @@ def test_the_interval_of_what_is_scaled_is_one_of_its_logarithm() -> None:
 def test_a_sensor_at_another_place_than_told_is_said_where_the_fit_is_sure() -> None:
     fitted = commissioned().calibration.fitted
     number = [one.key for one in fitted.free].index("sensor_shift")
-    here = fitted.data.system.sensor_shift
-    system = fitted.data.system.model_copy(update={"sensor_shift": here + (-0.9, 0.9)[here < 0.0]})
-    told = fitted.data.model_copy(update={"system": system})
+    near, told = (
+        fitted.data.model_copy(
+            update={"system": fitted.data.system.model_copy(update={"sensor_shift": shift})}
+        )
+        for shift in (-1.0, 1.0)
+    )
+    fitted = replace(fitted, data=near)
     apart = abs(place_of(told) - place_of(fitted.data))
     assert apart > ELSEWHERE
     for unsure, said in ((0.1 * apart, True), (0.5 * apart, False)):

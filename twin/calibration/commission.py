@@ -107,7 +107,8 @@ def commission(
     guess, remarks = guessed(config.data, readings)
     before = complete(guess, samples)
     refuse_insufficient(samples, before)
-    against = contradictions(before, guess)
+    looked = switching(guess, samples)
+    against = contradictions(complete(looked, samples), looked)
     if any(one.signal == "nozzle" for one in against):
         progress("the nozzle is not as reported: reading the pressure alone")
         samples = unreported(samples)
@@ -127,6 +128,17 @@ def commission(
     times = samples["host_ns"]
     calibration = Calibration(fitted, healthy, len(cycles), int(times[0]), int(times[-1]))
     return Commissioned(calibration, readings, verdict, tuple(remarks), tuple(against), samples)
+
+
+def switching(data: DataSet, samples: Samples) -> DataSet:
+    """``data`` so that switchings are looked for where the nozzle is reported, whatever that says.
+
+    A report that it never goes off is what the pressure may contradict.
+    """
+    if not (samples["reported"] & np.uint8(Reported.NOZZLE_KNOWN)).any():
+        return data
+    ejector = data.ejector.model_copy(update={"air_saving": "on"})
+    return data.model_copy(update={"ejector": ejector})
 
 
 def unreported(samples: Samples) -> Samples:
