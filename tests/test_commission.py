@@ -29,6 +29,7 @@ from twin.calibration.cycles import Cycles
 from twin.calibration.fit import BEST_END, END_PRESSURE, RISING, falling, soft
 from twin.calibration.left_out import with_left_out
 from twin.calibration.page import write_page
+from twin.calibration.parameters import Space
 from twin.calibration.readings import Readings, read, turns
 from twin.calibration.report import commissioned_as_json, commissioned_in_words, headline
 from twin.calibration.store import store_first
@@ -113,6 +114,26 @@ def test_a_characteristic_that_rises_is_bent_back_until_it_falls() -> None:
     back = DataSet.model_validate(falling(rises).model_dump()).ejector
     assert back.bulge / bends["bulge"] == pytest.approx(back.bend_2 / bends["bend_2"])
     assert np.diff(back.share(np.linspace(0.0, 1.0, 101))).min() == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_search_stays_where_values_move() -> None:
+    """At a bound and beyond it a value stays: a slope that leads there is no slope."""
+    space = Space.of_market(typed("test_rig").data)
+    alone = np.isfinite(space.low)
+    bends = {"bulge", "skew", "bend_2", "bend_3"}  # a coordinate moves several of them
+    assert {one.key for one, bound in zip(space.free, alone, strict=True) if not bound} == bends
+    inside = np.flatnonzero(alone & (space.low < -0.1) & (space.high > 0.1))
+    for end, step in ((space.low, 0.1), (space.high, -0.1)):
+        for number in inside:
+            x = np.zeros(len(space.free))
+            x[number] = end[number] + step
+            within = space.values(x)[number]
+            x[number] = end[number]
+            assert space.values(x)[number] != within
+            x[number] -= step
+            beyond = space.values(x)[number]
+            x[number] -= step
+            assert space.values(x)[number] == pytest.approx(beyond)
 
 
 def test_a_loss_that_is_soft_for_residuals_keeps_the_characteristic_falling() -> None:
