@@ -441,9 +441,7 @@ def test_a_sensor_at_another_place_than_told_is_said_where_the_fit_is_sure() -> 
         covariance = fitted.covariance.copy()
         covariance[number, number] = unsure**2
         remarks = list(misplaced(told, replace(fitted, covariance=covariance)))
-        assert [one.text.startswith("the pressure is read nearer to") for one in remarks] == (
-            [True] if said else []
-        )
+        assert [one.line.endswith("before the tubes") for one in remarks] == [True] * said
     assert not list(misplaced(fitted.data, fitted))
 
 

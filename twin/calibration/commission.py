@@ -108,7 +108,7 @@ def commission(
     before = complete(guess, samples)
     refuse_insufficient(samples, before)
     looked = switching(guess, samples)
-    against = contradictions(complete(looked, samples), looked)
+    against = contradictions(before if looked is guess else complete(looked, samples), looked)
     if any(one.signal == "nozzle" for one in against):
         progress("the nozzle is not as reported: reading the pressure alone")
         samples = unreported(samples)
@@ -121,7 +121,8 @@ def commission(
     fitted = _fit(used, starts(guess, readings.meets), progress)
     progress("judging the fit")
     verdict = judge(Cycles.found(samples, fitted.data), fitted.data, readings.noise)
-    remarks += misplaced(config.data, fitted)
+    if verdict.word != "refused":  # a fit that does not follow says nothing of places
+        remarks += misplaced(config.data, fitted)
     cycles = complete(fitted.data, samples)
     known = replace(config, data=fitted.data)
     healthy = like_these(known, fitted, scatter(fitted.data, cycles), samples)
@@ -280,9 +281,8 @@ def misplaced(told: DataSet, fitted: Fitted) -> Iterator[Remark]:
     if abs(found - was) > ELSEWHERE and abs(found - was) > SURELY * unsure:
         here, there = ("the vessel", "the port") if found > was else ("the port", "the vessel")
         text = f"the pressure is read nearer to {here}; the configuration has the sensor nearer to"
-        line = (
-            '[[data.system.parts]] kind = "sensor" stands in the order of parts, from the port on'
-        )
+        order = "after" if found > was else "before"
+        line = f'[[data.system.parts]] kind = "sensor", {order} the tubes'
         yield Remark(f"{text} {there}", line)
 
 

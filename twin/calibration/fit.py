@@ -192,7 +192,7 @@ class Fitted:
         characteristic goes on from there is nobody's knowledge.
         """
         if name == END_PRESSURE and not self.reaches_end:
-            return BEST_END / MBAR, self.deepest / MBAR
+            return min(BEST_END, self.deepest) / MBAR, self.deepest / MBAR
         number = self._number(name)
         free, reach = self.free[number], 1.96 * float(self.spread[number])
         value = free.of(self.data)

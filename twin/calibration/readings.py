@@ -269,7 +269,7 @@ def _meets(pressure: Floats, suctions: list[Stretch], period: float, noise: floa
         way = part[0] - part[-1]
         levels = (max(FIRST_FALL * way, CLEAR * noise), DRAWN[0] * way, DRAWN[1] * way)
         if levels[0] < levels[1]:
-            first, early, late = (int(np.argmax(part <= part[0] - one)) for one in levels)
+            first, early, late = (int(np.argmax(part <= part[0] - level)) for level in levels)
             begins = early - DRAWN[0] / (DRAWN[1] - DRAWN[0]) * (late - early)
             known = (begins - first) * period > LEAST_WAIT_MS * MS
             times.append(begins * period if known else np.nan)
