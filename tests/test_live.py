@@ -174,6 +174,44 @@ def test_a_replay_expects_the_same_to_the_bit_and_tells_the_same(tmp_path: Path,
         assert again.events == live.events
 
 
+def without_some(samples: Samples, share: float) -> Samples:
+    """The same with so many rows missing, here and there, and marked."""
+    kept = np.random.default_rng(1).random(len(samples)) >= share
+    holes = samples[kept].copy()
+    holes["quality"][1:][np.diff(holes["sequence"]) > 1] |= np.uint8(Quality.GAP)
+    return holes
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_cycles_with_a_twentieth_of_their_rows_missing_are_judged(
+    tmp_path: Path, name: str
+) -> None:
+    whole = rigs.recorded(name, 25.0)[0]
+    holes = without_some(whole, 0.05)
+    live = recorded_run(tmp_path / "a.mcap", name, rigs.cut(holes, 30))
+    assert rows_of(live)[0] == holes.tobytes(), "what is missing stays marked"
+    told = live.of(Kind.CYCLE)
+    assert len(told) == len(rigs.watch(name, rigs.cut(whole, 30)).of(Kind.CYCLE))
+    assert sum("suction_rms" in event.data for event in told) >= len(told) - 1
+    assert not live.of(Kind.DEVIATION)
+    gaps = live.of(Kind.GAP)
+    assert 20 <= len(gaps) <= 26, "one a second"
+    assert sum(event.data.get("gaps", 1) for event in gaps) > 0.9 * 0.04 * len(whole)
+    assert "the model steps over them" in gaps[-1].text
+    again = replay(open_log(tmp_path / "a.mcap"), name, 777)
+    assert again.events == live.events
+    assert rows_of(again) == rows_of(live)
+
+
+def test_a_gap_of_more_rows_breaks_the_cycle() -> None:
+    whole = rigs.recorded("gripper", 25.0)[0]
+    broken = np.delete(whole, np.arange(9000, 9004))
+    broken["quality"][9000] |= np.uint8(Quality.GAP)
+    seen = rigs.watch("gripper", rigs.cut(broken, 30))
+    assert len(seen.of(Kind.CYCLE)) < len(rigs.watch("gripper", [whole]).of(Kind.CYCLE))
+    assert [event.data for event in seen.of(Kind.GAP)] == [{"missing": 4, "seconds": 0.005}]
+
+
 def test_a_replay_of_a_replay_is_the_same(tmp_path: Path) -> None:
     samples, _ = rigs.recorded("gripper", 6.0)
     recorded_run(tmp_path / "a.mcap", "gripper", rigs.cut(samples, 30))

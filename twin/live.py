@@ -15,12 +15,13 @@ from twin.model.strides import Strides
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
 from twin.monitor.detect import Monitor, in_order
+from twin.monitor.gaps import ShortGaps
 from twin.monitor.knees import expected_knees
 from twin.monitor.listening import Listening
 from twin.monitor.phases import Found, Knees, PhaseFinder
 from twin.monitor.signatures import steps
 from twin.monitor.surroundings import are_told, following, stretches
-from twin.signals import MBAR, SAMPLE, TICK, Phase, Samples, Ticks
+from twin.signals import MBAR, SAMPLE, TICK, Phase, Samples, Ticks, bridged
 
 REPLAYED = 60_000  # rows that a replay takes at once: what is done to many cycles stays in caches
 
@@ -79,8 +80,8 @@ class Twin:
         return self._expect(self._finder.flush())
 
     def over(self, blocks: Iterable[Samples]) -> Iterator[tuple[Samples, Ticks]]:
-        """Advance over all of a stream to its end."""
-        for block in blocks:
+        """Advance over all of a stream to its end, and over gaps of a few rows."""
+        for block in bridged(blocks):
             yield self.advance(block)
         yield self.flush()
 
@@ -143,11 +144,15 @@ def _watched(
     timed: Iterable[tuple[Samples, Sequence[Event]]], twin: Twin, monitor: Monitor
 ) -> Iterator[tuple[Samples, Ticks, list[Event]]]:
     """All rows with what they make happen, in the order of time within each PLC time."""
+    gaps = ShortGaps()
     for block, happened in timed:
-        yield from monitor.over(*twin.advance(block), happened)
-    *parts, (samples, ticks, events) = monitor.over(*twin.flush())
-    yield from parts
-    yield samples, ticks, in_order([*events, *monitor.close()])
+        for samples, ticks, events in monitor.over(*twin.advance(gaps.off(block)), happened):
+            yield gaps.on(samples), ticks, in_order([*events, *gaps.told()])
+    *parts, (rest, ticks, events) = monitor.over(*twin.flush())
+    for part, beside, found in parts:
+        yield gaps.on(part), beside, in_order([*found, *gaps.told()])
+    rest = gaps.on(rest)
+    yield rest, ticks, in_order([*events, *gaps.told(), *monitor.close()])
 
 
 def _advised(advisers: Sequence[Adviser], samples: Samples, events: list[Event]) -> list[Event]:

@@ -5,6 +5,7 @@ Everything flows in blocks: structured arrays of ``SAMPLE`` (what was measured) 
 """
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
 
 import numpy as np
@@ -121,28 +122,32 @@ def unseen_ns(before: Samples | np.void, after: Samples | np.void) -> npt.NDArra
     return passed
 
 
-def bridged(blocks: Iterable[Samples]) -> Iterator[Samples]:
-    """The blocks of one stream, without the mark of gaps of a few rows: the model steps over them.
+@dataclass
+class Bridge:
+    """Takes blocks in, gives them out without the mark of gaps of a few rows: the model steps over.
 
     A command that changes in one is taken to change at its end. Longer gaps stay, as what happened
-    in them is not known.
+    in them is not known; so do those of which the numbers do not say how long they are.
     """
-    before = np.empty(0, SAMPLE)
-    for block in blocks:
-        if (block["quality"] & np.uint8(Quality.GAP)).any():
-            rows = np.concatenate([before, block])
-            _bridge(rows)
-            yield rows[len(before) :]
-        else:
-            yield block
-        before = block[-1:] if len(block) else before
+
+    _before: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # the row before
+
+    def over(self, block: Samples) -> Samples:
+        """The block as it came, or a copy without these marks."""
+        before, self._before = self._before, block[-1:].copy() if len(block) else self._before
+        if not (block["quality"] & np.uint8(Quality.GAP)).any():
+            return block
+        rows = np.concatenate([before, block])
+        missing = np.diff(rows["sequence"]) - 1
+        short = (missing > 0) & (missing <= MOST_BRIDGED) & (rows["quality"][1:] & NEW_TIME == 0)
+        rows["quality"][1:][short] &= np.uint8(~np.uint8(Quality.GAP))
+        return rows[len(before) :]
 
 
-def _bridge(rows: Samples) -> None:
-    """Take the mark from gaps of MOST_BRIDGED rows at most between two of ``rows``."""
-    missing = np.diff(rows["sequence"]) - 1
-    short = (missing <= MOST_BRIDGED) & (rows["quality"][1:] & NEW_TIME == 0)
-    rows["quality"][1:][short] &= np.uint8(~np.uint8(Quality.GAP))
+def bridged(blocks: Iterable[Samples]) -> Iterator[Samples]:
+    """All blocks of a stream as ``Bridge`` gives them."""
+    bridge = Bridge()
+    return (bridge.over(block) for block in blocks)
 
 
 class Phase(IntEnum):

@@ -121,7 +121,7 @@ def side_of(log: Log, settings: Config, key_figures: KeyFigures) -> Side:
     if side.derived:
         _add_suctions(side, suctions)
         return side
-    for cycle in whole(log.blocks()):
+    for cycle in whole(log.unbroken()):
         told = key_figures.take(cycle)
         if told is not None and told.complete and cycle.complete and cycle.settled:
             side.add(cycle, told, theta)

@@ -13,6 +13,6 @@ def of_log(log: Log, key_figures: KeyFigures) -> Iterator[tuple[CycleFigures, Ma
     """Every cycle of a log with its key figures, and as a database keeps them, alarms included."""
     alarms = Alarms()
     alarms.see(log.events())
-    for piece in cut(log.blocks()):
+    for piece in cut(log.unbroken()):
         if (told := key_figures.take(piece)) is not None:
             yield told, {**told.plain(), "alarms": alarms.until(told.end_ns)}

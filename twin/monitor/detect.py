@@ -28,6 +28,7 @@ from twin.monitor.cycles import (
     Told,
     figures,
 )
+from twin.monitor.gaps import gap_event
 from twin.monitor.healthy import NOT_COMMISSIONED, Healthy
 from twin.monitor.reports import ReportWatch
 from twin.monitor.signatures import Likeness, drawn_rows, likenesses, look_alikes
@@ -43,14 +44,15 @@ from twin.signals import (
     Samples,
     Ticks,
     joined,
-    unseen_ns,
 )
 
 if TYPE_CHECKING:  # its SciPy would be imported with every configuration
     from twin.monitor.isolation import Heard, Isolation, Verdict
 
 _UNFIT = int(Quality.OUT_OF_RANGE | Quality.OVERFLOW | Quality.STALE | Quality.BAD)
-FEWEST_SHARE = 0.95  # of a cycle's samples, to judge it: commands seen late look like a deviation
+# Of a cycle's samples, to judge it: commands seen late look like a deviation. Usual records lack up
+# to a twentieth of their rows.
+FEWEST_SHARE = 0.9
 RIVAL = 0.05  # probability from which on another cause is named as well
 STANDING = 0.8  # of the best fit's gain: then the name of a standing alarm still holds
 ALIKE = 0.2  # of how far out a cycle is: by so much its figures may move before the cause is sought
@@ -244,7 +246,7 @@ class Monitor:
             text = f"PLC time jumped by {jump:+.3f} s"
             events.append(Event(time_ns, Kind.CLOCK_JUMPED, text, {"jump_s": jump}))
         if quality & Quality.GAP and before is not None:
-            events.append(_gap(before, row))
+            events.append(gap_event(before, row))
         if (quality ^ self._unfit) & _UNFIT:
             self._unfit = quality & _UNFIT
             what = str(Quality(self._unfit).name).lower().replace("_", " ").replace("|", ", ")
@@ -505,17 +507,6 @@ def _is_proportional(verdict: "Verdict | None") -> bool:
 def in_order(events: Iterable[Event]) -> list[Event]:
     """Events of one PLC time in the order of time; of the same moment, as they came."""
     return sorted(events, key=lambda event: event.time_ns)
-
-
-def _gap(before: np.void, row: np.void) -> Event:
-    missing = int(row["sequence"]) - int(before["sequence"]) - 1
-    seconds = float(unseen_ns(before, row)) * NS
-    text = f"{missing} samples are missing ({seconds:.3f} s)"
-    if missing < 0 or row["quality"] & Quality.RESTART:
-        missing = 0
-        text = f"samples are missing over {seconds:.3f} s; how many is not known"
-    data: dict[str, float | int | str] = {"missing": missing, "seconds": seconds}
-    return Event(int(row["time_ns"]), Kind.GAP, text, data)
 
 
 def _summary(
