@@ -247,6 +247,15 @@ def test_a_jump_is_no_knee() -> None:
     assert not np.isfinite(level[1:]).any()
 
 
+@pytest.mark.parametrize(("name", "rows"), [("gripper", 2), ("test_rig", 2), ("test_rig", 3)])
+def test_a_sensor_that_is_slower_than_the_rows_hides_no_switch(name: str, rows: int) -> None:
+    """It holds each reading for some rows: then the pressure goes in steps, and none is a jump."""
+    samples, truth = rigs.recorded(name, SECONDS, ("leakage=2",) if name == "gripper" else (), 1)
+    samples = samples.copy()
+    samples["pressure"] = np.repeat(samples["pressure"][::rows], rows)[: len(samples)]
+    assert len(found_where_true(samples, truth, rigs.knees(name))) > 3
+
+
 def test_a_line_that_rings_does_not_hide_the_knee() -> None:
     """Pressure may rise as fast as if it jumped, but it takes some rows for it."""
     rise = [2.4, 9.1, 16.6, 25.1, 29.2, 29.4, 28.0, 25.2, 22.7, 22.9, 23.9, 26.0, 28.8, 29.8]

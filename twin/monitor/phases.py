@@ -115,14 +115,16 @@ def _line(pressure, start, rows):  # type: ignore[no-untyped-def]
 def _greatest_jump(pressure, first, last):  # type: ignore[no-untyped-def]
     """Row after which pressure jumps most (Pa): far more than before and after, and that."""
     row, greatest = first, 0.0
-    for i in range(first, last):
-        change = pressure[i + 1] - pressure[i]
-        before = pressure[i] - pressure[i - 1] if i > first else 0.0
-        after = pressure[i + 2] - pressure[i + 1] if i + 1 < last else 0.0
+    before, change, at = 0.0, 0.0, first
+    for i in range(first, last + 1):
+        after = pressure[i + 1] - pressure[i] if i < last else 0.0
+        if after == 0.0 and i < last:  # a sensor that is slower than the rows holds its reading
+            continue
         jump = abs(change - 0.5 * (before + after))
         alone = abs(change) > ALONE * max(abs(before), abs(after))
         if alone and jump > greatest:
-            row, greatest = i, jump
+            row, greatest = at, jump
+        before, change, at = change, after, i
     return row, greatest
 
 
