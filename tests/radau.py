@@ -66,9 +66,16 @@ def suction_flow(theta: Theta, p: float, jet: float, supply: float) -> float:
 
 def room(theta: Theta, vessel: float) -> tuple[float, float]:
     """Volume of a vessel that shrinks with vacuum (m³), and its slope (m³/Pa)."""
-    vacuum, early = 1.0 - vessel / theta[c.AMBIENT], theta[c.SOFTNESS]
-    full, left = theta[c.COMPLIANCE] * (1.0 + early), 1.0 + early * abs(vacuum)
-    return theta[c.VOLUME] - full * vacuum / left, full / left**2 / theta[c.AMBIENT]
+    early, ambient, stiff = theta[c.SOFTNESS], theta[c.AMBIENT], theta[c.STIFF_UNTIL]
+
+    def shrunk(vacuum: float) -> float:
+        pull = vacuum * abs(vacuum) / (abs(vacuum) + stiff) if vacuum else 0.0
+        most = ambient**2 / (ambient + stiff)
+        return float(theta[c.COMPLIANCE] * (1.0 + early) * pull / (most + early * abs(pull)))
+
+    vacuum, by = ambient - vessel, 1e-3 * ambient
+    slope = (shrunk(vacuum + by) - shrunk(vacuum - by)) / (2.0 * by)
+    return theta[c.VOLUME] - shrunk(vacuum), slope
 
 
 def film(theta: Theta, vessel: float, vessel_t: float, far: float) -> float:

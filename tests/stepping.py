@@ -89,8 +89,10 @@ def switched_on(state: kernel.State) -> kernel.State:
 
 def volume(theta: Theta, pressure: npt.ArrayLike) -> Rows:
     """Volume of the vessel (m³), less what cups shrink."""
-    vacuum = 1.0 - np.asarray(pressure) / theta[c.AMBIENT]
-    shape = (1.0 + theta[c.SOFTNESS]) * vacuum / (1.0 + theta[c.SOFTNESS] * np.abs(vacuum))
+    vacuum, stiff = 1.0 - np.asarray(pressure) / theta[c.AMBIENT], theta[c.STIFF_UNTIL]
+    stiff /= theta[c.AMBIENT]
+    pull = vacuum * np.abs(vacuum) * (1.0 + stiff) / np.maximum(np.abs(vacuum) + stiff, 1e-12)
+    shape = (1.0 + theta[c.SOFTNESS]) * pull / (1.0 + theta[c.SOFTNESS] * np.abs(pull))
     return np.asarray(theta[c.VOLUME] - theta[c.COMPLIANCE] * shape)
 
 

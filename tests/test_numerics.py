@@ -68,7 +68,7 @@ def between_samples(name: str, soft_and_late: bool) -> Theta:
     theta = rigs.theta(name)
     theta[[c.RESPONSE, c.BLOW_OFF_RESPONSE]] += [0.37 * MS, 0.61 * MS]
     if soft_and_late:
-        theta[[c.COMPLIANCE, c.SOFTNESS]] = 0.2 * theta[c.VOLUME], 5.0
+        theta[[c.COMPLIANCE, c.SOFTNESS, c.STIFF_UNTIL]] = 0.2 * theta[c.VOLUME], 5.0, 3e4
         theta[c.CONTACT] = 60.43 * MS
     return theta
 
@@ -211,12 +211,16 @@ def test_gas_takes_the_temperature_of_its_wall_at_the_rate_of_the_film(warmer: f
     assert gained == pytest.approx(heat, rel=1e-3, abs=1e-3)
 
 
-@pytest.mark.parametrize(("compliance_ml", "softness"), [(20.0, 0.0), (100.0, 0.0), (50.0, 5.0)])
+@pytest.mark.parametrize(
+    ("compliance_ml", "softness", "stiff_mbar"),
+    [(20.0, 0.0, 0.0), (100.0, 0.0, 0.0), (50.0, 5.0, 0.0), (50.0, 8.0, 300.0)],
+)
 def test_cups_that_shrink_are_worked_on_as_the_first_law_says(
-    compliance_ml: float, softness: float
+    compliance_ml: float, softness: float, stiff_mbar: float
 ) -> None:
     theta = closed(leak_sl_min=4.0)
     theta[[c.COMPLIANCE, c.SOFTNESS]] = compliance_ml * ML, softness
+    theta[c.STIFF_UNTIL] = stiff_mbar * MBAR
     rows = states(theta, [(IDLE, 400)], standing(theta, 0.2e5))
     p = rows[:, kernel.VESSEL]
     bigger = np.diff(volume(theta, p))
@@ -302,6 +306,7 @@ DATA_SETS = st.fixed_dictionaries(
                 "leak_sl_min": floats(0, 20),
                 "shrinks_ml": floats(0, 200),
                 "softness": floats(0, 20),
+                "stiff_mbar": floats(0, 500),
             }
         ),
     }

@@ -256,7 +256,7 @@ def test_every_coefficient_is_filled_in() -> None:
     convection = {"FREE_CONVECTION", "FORCED_CONVECTION"}
     modes = {"CONTROL_SENSOR", "BLOW_OFF_MODE"}  # the first of each
     opening = {"EXHAUST", "HOLE", "CRACKING_PRESSURE"}
-    cups = {"COMPLIANCE", "SOFTNESS", "CONTACT"}
+    cups = {"COMPLIANCE", "SOFTNESS", "STIFF_UNTIL", "CONTACT"}
     assert zero == {"BLOW_OFF_SHAPE"} | cups | opening | convection | effects | modes
 
 

@@ -42,7 +42,8 @@ MOST_MISSING = 0.2  # share of rows
 ROOM_TEMPERATURE = 293.15  # K, for a first guess
 # Where a fit starts: of the line, between sensor and port, and of all gas, in the port.
 PLACES, PORT_SHARES = (0.05, 0.95), (0.01, 0.1)
-SHRINKS, SOFTNESS = 0.03, 5.0  # share of the cups' volume, and how early (System.softness)
+# How cups give way: the share of their volume that goes, softness, and stiff_mbar (System).
+LIPS, BELLOWS = (0.03, 5.0, 30.0), (0.4, 10.0, 300.0)
 CLEARLY = 15.0  # mbar by which a threshold must differ to be told; overshoot is part of a turn
 # Of the line, by which a sensor is at another place than told, and sigmas.
 ELSEWHERE, SURELY = 0.6, 4.0
@@ -256,8 +257,9 @@ def _flows(ejector: dict[str, Any], readings: Readings, evacuated: float, ambien
 def starts(data: DataSet, meets: float) -> list[DataSet]:
     """``data``, and what may differ from it so much that no fit leads there.
 
-    Where along the line the sensor sits, what gas is at the port, how a part leaves, and whether
-    cups meet the next one ``meets`` seconds after suction is commanded, or (NaN) are on it by then.
+    Where along the line the sensor sits, what gas is at the port, how a part leaves, whether cups
+    spread or fold, and whether they meet the next part ``meets`` seconds after suction is
+    commanded, or (NaN) are on it by then.
     """
     cups = sum(volume(part) for part in data.system.parts if isinstance(part, Cups)) / ML
     leaves = ("in_blow_off", "after_blow_off") if cups else (data.system.part_leaves,)
@@ -265,10 +267,12 @@ def starts(data: DataSet, meets: float) -> list[DataSet]:
     tables = data.model_dump()
     place = place_of(data)
     everything = _volume(data) / ML
+    walls = [*product(PORT_SHARES, [LIPS]), *([(PORT_SHARES[0], BELLOWS)] if cups else [])]
     found = []
-    for wait, way, at, share in product(waits, leaves, PLACES, PORT_SHARES):
+    for wait, way, at, (share, (shrinks, softness, stiff)) in product(waits, leaves, PLACES, walls):
         tables["system"].update(part_leaves=way, rim="turbulent", sensor_shift=at - place)
-        tables["system"].update(part_meets_ms=wait, shrinks_ml=SHRINKS * cups, softness=SOFTNESS)
+        tables["system"].update(part_meets_ms=wait, shrinks_ml=shrinks * cups)
+        tables["system"].update(softness=softness, stiff_mbar=stiff)
         tables["ejector"]["port_volume_ml"] = share * everything
         found.append(DataSet.model_validate(tables))
     return found

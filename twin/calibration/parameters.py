@@ -104,6 +104,7 @@ FREE_IN_MARKET = (
     Free("system", "line_inertia_factor", "", 0.2, 0.02, 50.0, True, market=0.5),
     Free("system", "shrinks_ml", "ml", 0.3, 0.0, 5000.0, True, market=1.5),
     Free("system", "softness", "", 0.5, 0.0, 500.0, True, market=1.0),
+    Free("system", "stiff_mbar", "mbar", 20.0, 0.0, 2000.0, market=1.0),
     Free("system", "part_meets_ms", "ms", 5.0, 0.0, 5000.0, market=0.3),
 )
 SMALLEST = 0.02  # in its unit, a value of the type from which a scale can lead away

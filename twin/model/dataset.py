@@ -168,6 +168,7 @@ class System(Settings):
     opening_factor: NotNegative = 1.0  # what flows through open cups over what they say
     shrinks_ml: NotNegative = 0.0  # at full vacuum, beside what the cups say
     softness: NotNegative = 0.0  # 0: shrinks in proportion to vacuum, n: half by 1/(n + 2) of it
+    stiff_mbar: NotNegative = 0.0  # vacuum up to which cups hardly give way
     leak_sl_min: NotNegative = 0.3  # of seals and fittings, sonic
     part_leaves: Literal["in_blow_off", "after_blow_off"] = "in_blow_off"
     part_meets_ms: NotNegative = 0.0  # after suction is commanded: cups that move to the part
@@ -293,6 +294,7 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     theta[c.LINE_HEAT] = half_way * total.line_area * system.tube_film_coefficient
     theta[c.COMPLIANCE] = min(total.shrinks + system.shrinks_ml * ML, FLATTEST * theta[c.VOLUME])
     theta[c.SOFTNESS] = system.softness
+    theta[c.STIFF_UNTIL] = system.stiff_mbar * MBAR
     theta[c.FILM] = system.film_coefficient
     theta[c.FREE_CONVECTION] = system.free_convection
     if theta[c.BLOW_OFF] > 0.0:

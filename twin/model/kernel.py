@@ -20,6 +20,7 @@ from twin.model.plant import (
     LOWEST,
     ORDER,
     PREPARED,
+    TINY,
     Gas,
     Lags,
     prepare,
@@ -182,6 +183,7 @@ def take_over(state: State, before: c.Theta, after: c.Theta) -> None:
     state[VESSEL_MASS] *= joined / room
     walls = after[c.COMPLIANCE] != before[c.COMPLIANCE]
     walls |= after[c.SOFTNESS] != before[c.SOFTNESS]
+    walls |= after[c.STIFF_UNTIL] != before[c.STIFF_UNTIL]
     walls |= after[c.AMBIENT] != before[c.AMBIENT]
     moved = walls & (state[VALID] > 0.0)
     if moved.any():
@@ -191,10 +193,13 @@ def take_over(state: State, before: c.Theta, after: c.Theta) -> None:
 
 def _room(vessel: State, theta: c.Theta) -> tuple[State, State]:
     """Volume of the vessel at a pressure (m³), shrunk by its vacuum, and its rise (m³/Pa)."""
-    share, softness = 1.0 - vessel / theta[c.AMBIENT], theta[c.SOFTNESS]
-    left = 1.0 / (1.0 + softness * abs(share))
+    ambient, stiff = theta[c.AMBIENT], theta[c.STIFF_UNTIL]
+    vacuum, most = ambient - vessel, ambient / (1.0 + stiff / ambient)
+    held = stiff / (abs(vacuum) + stiff + TINY)
+    pull, softness = vacuum * (1.0 - held) / most, theta[c.SOFTNESS]
+    left = 1.0 / (1.0 + softness * abs(pull))
     stretch = theta[c.COMPLIANCE] * (1.0 + softness) * left
-    return theta[c.VOLUME] - stretch * share, stretch * left / theta[c.AMBIENT]
+    return theta[c.VOLUME] - stretch * pull, stretch * left * (1.0 - held * held) / most
 
 
 def _squeezed(vessel: State, joined: State, theta: c.Theta) -> State:

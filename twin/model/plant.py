@@ -33,6 +33,8 @@ _PER_COLDEST, _PER_HOTTEST = 1.0 / (R * COLDEST), 1.0 / (R * HOTTEST)  # kg/J
 MOST = 100.0  # kg/s
 FAINTEST = 1e-12  # of a jet that fades; less is none, and slow to calculate with
 
+TINY = 1e-9  # Pa, beside what may be nothing
+
 FREE_AT = 10.0  # K between gas and wall at ambient pressure, where the film coefficient holds
 
 # Alexander's SDIRK of third order: L-stable, each stage implicit in itself by the same G, the last
@@ -99,8 +101,9 @@ def prepare_one(k, i):  # type: ignore[no-untyped-def]
     k[_HEAT, i] = k[c.FILM, i] * k[c.AREA, i] / CP
     k[_PORT_HEAT, i] = k[c.PORT_HEAT, i] / CP
     k[_LINE_HEAT, i] = k[c.LINE_HEAT, i] / CP
-    k[_STRETCH, i] = k[c.COMPLIANCE, i] * (1.0 + k[c.SOFTNESS, i]) / ambient
-    k[_SOFT, i] = k[c.SOFTNESS, i] / ambient
+    most = ambient / (1.0 + k[c.STIFF_UNTIL, i] / ambient)  # that pulls at the cups
+    k[_STRETCH, i] = k[c.COMPLIANCE, i] * (1.0 + k[c.SOFTNESS, i]) / most
+    k[_SOFT, i] = k[c.SOFTNESS, i] / most
     friction = k[c.NEAR_RESISTANCE, i] + k[c.RESISTANCE, i]
     k[_PLACE, i] = min(k[c.PLACE, i] / friction, 1.0) if friction > 0.0 else 0.0
 
@@ -248,8 +251,11 @@ def per_joule(mass):  # type: ignore[no-untyped-def]
 def room(vessel, k, i):  # type: ignore[no-untyped-def]
     """Volume (m³) of a vessel that shrinks with vacuum, and how much it grows per Pa."""
     vacuum = k[c.AMBIENT, i] - vessel
-    left = 1.0 / (1.0 + k[_SOFT, i] * abs(vacuum))
-    return k[c.VOLUME, i] - k[_STRETCH, i] * vacuum * left, k[_STRETCH, i] * left * left
+    held = k[c.STIFF_UNTIL, i] / (abs(vacuum) + k[c.STIFF_UNTIL, i] + TINY)
+    pull = vacuum * (1.0 - held)
+    left = 1.0 / (1.0 + k[_SOFT, i] * abs(pull))
+    stretch = k[_STRETCH, i] * left
+    return k[c.VOLUME, i] - stretch * pull, stretch * left * (1.0 - held * held)
 
 
 @inlined
