@@ -5,7 +5,7 @@ warms up at the wall, some leaks in, and the meter may be slow: that is one ener
 gas, in which all of these are unknown and none needs a temperature.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable
 
 import numpy as np
 import numpy.typing as npt
@@ -23,12 +23,13 @@ COLDEST, WARMEST = 0.6, 1.1  # of the wall's temperature
 # Of the way down, rms, that a balance may leave: at once, or with a meter that is slow. Soft cups
 # leave more than that; their volume is not one number.
 LEFT, LEFT_IF_SLOW = 0.003, 0.01
+SLOWEST = 0.4  # of the time until the pressure is lowest; a slower meter tells too much
 
 Floats = npt.NDArray[np.float64]
 Suction = tuple[Floats, Floats, Floats]  # seconds, pressure (Pa), flow (kg/s), row by row
 
 
-def stored(suctions: Iterator[Suction]) -> float:
+def stored(suctions: Iterable[Suction]) -> float:
     """Gas (kg) for each Pa that it loses at constant temperature; NaN where that is not shown."""
     found = np.array([one for rows in suctions if np.isfinite(one := _stored(*rows))])
     if len(found) < FEWEST:
@@ -68,7 +69,7 @@ def _balance(
     out = cumulative_trapezoid(flow, since, initial=0)
     warm = np.full(len(pressure), (pressure[0] / before) ** (1.0 - 1.0 / GAMMA))
     still = pressure[0] / warm[0]
-    per_kg, left = 0.0, np.inf
+    per_kg, left, behind = 0.0, np.inf, list[float]()
     for _ in range(PASSES):
         columns = [
             -GAMMA * cumulative_trapezoid(warm, out, initial=0),
@@ -84,5 +85,7 @@ def _balance(
         gone = per_kg * out + sum(behind) * (flow - flow[0])
         kept = np.maximum(still - gone + leak * since, pressure / WARMEST)
         warm = np.clip(pressure / kept, COLDEST, WARMEST)
-    left /= np.sqrt(len(pressure))
-    return (1.0 / per_kg, left) if per_kg > 0.0 else (float("nan"), np.inf)
+    falls = float(since[pressure.argmin()])
+    if per_kg <= 0.0 or sum(behind) > SLOWEST * falls * per_kg:
+        return float("nan"), np.inf
+    return 1.0 / per_kg, left / np.sqrt(len(pressure))
