@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 from calibrations import typed
+from scipy.signal import lfilter
 from second_world.records import Record
 
 from twin.config import Asset, Config
 from twin.model.dataset import DataSet
-from twin.signals import SAMPLE, Command, Samples
+from twin.signals import MBAR, SAMPLE, Command, Reported, Samples
 
 UNKNOWN_TYPE = "nobody-knows-40"
 
@@ -51,4 +52,29 @@ def samples_of(logged: Record) -> Samples:
     rows["commands"] = logged.suction * np.uint8(Command.SUCTION)
     rows["commands"] |= logged.blow_off * np.uint8(Command.BLOW_OFF)
     rows["pressure"], rows["supply"] = logged.pressure_pa, np.nan
+    return rows
+
+
+def with_signals(logged: Record, slow_ms: float = 5.0) -> Samples:
+    """The same with a flow meter, and a second pressure at the other end of the line.
+
+    Both follow ``slow_ms`` later. The meter has noise, 1 %; the sensor reads 2 mbar and 0.3 % off.
+    """
+    rows, truth, rng = (
+        samples_of(logged),
+        logged.truth,
+        np.random.default_rng(logged.truth.rig.seed),
+    )
+    at_vessel = truth.rig.sensor.place == "ejector"
+    second = truth.vessel_pressure if at_vessel else truth.head_pressure
+    keep = float(np.exp(-1.0 / slow_ms)) if slow_ms else 0.0
+    when = np.round(logged.time_ns * 1e-6 - 1.0).astype(int).clip(0, len(second) - 1)
+    flow, vacuum = (
+        lfilter([1.0 - keep], [1.0, -keep], values)[when]
+        for values in (truth.flow, truth.noted_ambient - second)
+    )
+    noise = rng.normal(0.0, 1.0, (2, len(rows)))
+    rows["flow"] = flow + 0.01 * truth.flow.max() * noise[0]
+    rows["reported"] |= np.uint8(Reported.FLOW_KNOWN)
+    rows["pressure_2"] = truth.noted_ambient - 1.003 * vacuum + (2.0 + 0.4 * noise[1]) * MBAR
     return rows

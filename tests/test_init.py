@@ -11,6 +11,8 @@ from command_line import twin
 from drivers.sources import settings_of
 from twin.config import Config
 from twin.settings import Document
+from twin.tables.layout import BESIDE, REPORTED
+from twin.tables.settings import Column, ImportSettings
 
 MODBUS, OPC_UA = ("--address", "10.0.0.5:502"), ("--address", "opc.tcp://plc:4840")
 SAID = (
@@ -62,6 +64,42 @@ def test_what_is_written_is_taken_as_it_is(
     *_, last = config.data.system.parts
     is_released = "yes" in flags or ("unknown" in flags and "cups" in flags)
     assert last.kind == ("cups" if is_released else "vessel")
+
+
+LAYOUTS = [(*to, ring) for to in (MODBUS, OPC_UA) for ring in ("--ring", "--no-ring")]
+RARE = ("nozzle", "air_saving", "part_present", "ambient", "temperature", "pressure_2", "flow")
+
+
+@pytest.mark.parametrize("flags", LAYOUTS, ids=" ".join)
+@pytest.mark.parametrize("leaving", ["nozzle", "air_saving"])  # they say the same
+def test_the_tags_that_few_have_stand_there_ready_to_be_taken_in(
+    flags: tuple[str, ...], leaving: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert twin(monkeypatch, "init", *flags) == 0
+    text = written = Path("cell.toml").read_text()
+    for name in RARE:
+        assert written.count(f"# {name} = ") == 1
+        alone = written.replace(f"# {name} = ", f"{name} = ")
+        assert getattr(settings_of(Document.parse(alone, "x")).tags, name) is not None
+        if name != leaving:
+            text = text.replace(f"# {name} = ", f"{name} = ")
+    tags = settings_of(Document.parse(text, "x")).tags
+    assert [name for name in RARE if getattr(tags, name) is None] == [leaving]
+    if flags[-1] == "--no-ring" and flags[1] == MODBUS[1]:  # each at a place of its own
+        places = [getattr(tags, name).address for name in RARE if name != leaving]
+        places += [tags.pressure.address, tags.suction.address, tags.blow_off.address]
+        assert len(set(map(str, places))) == len(places)
+
+
+def test_so_do_the_columns_of_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert twin(monkeypatch, "init", "--address", "none") == 0
+    text = Path("cell.toml").read_text()
+    offered = [one for one in Column if f'# {one} = "' in text]
+    beside = {*BESIDE, *REPORTED} - {Column.SUPPLY_BAR}
+    assert beside < set(offered)
+    for one in offered:
+        text = text.replace(f"# {one} = ", f"{one} = ")
+    assert set(Document.parse(text, "x").section(ImportSettings, "import").columns) == set(offered)
 
 
 def test_what_is_said_is_in_it(

@@ -35,6 +35,49 @@ _TAGS = {  # what to look up, by OPC UA and by ring
 GUESSED = {"hose_mm": 1000.0, "diameter_mm": 6.0, "cups": 50.0, "vessel": 750.0}  # mid-market
 
 
+# What few have, as the same PLC has it: comments in the file, each ready to be taken in.
+OFFERED = """\
+# Each of these that is there narrows what is open: docs/reported-signals.md. Of nozzle
+# (1: it is on) and air saving (1: it is off) take one. A second pressure is at the other end.
+"""
+BESIDE_RING = """\
+# nozzle = { address = "30005", bit = 2 }
+# air_saving = { address = "30005", bit = 3 }
+# part_present = { address = "30005", bit = 4 }
+# ambient = { address = "30008", type = "int16", scale = 0.1, unit = "mbar", reference = "absolute" }
+# temperature = { address = "30009", type = "int16", scale = 0.1, unit = "C" }
+# pressure_2 = { address = "30010", type = "float32", unit = "mbar", reference = "absolute" }
+# flow = { address = "30012", type = "float32", unit = "sl/min" }
+"""  # noqa: E501
+BESIDE_POLLED = """\
+# nozzle = { address = "00003" }
+# air_saving = { address = "00004" }
+# part_present = { address = "00005" }
+# ambient = { address = "40003", type = "int16", scale = 0.1, unit = "mbar", reference = "absolute" }
+# temperature = { address = "40004", type = "int16", scale = 0.1, unit = "C" }
+# pressure_2 = { address = "40005", type = "float32", unit = "mbar", reference = "absolute" }
+# flow = { address = "40007", type = "float32", unit = "sl/min" }
+"""  # noqa: E501
+BESIDE_NODES = """\
+# nozzle = { node = "s=Meas.Nozzle" }
+# air_saving = { node = "s=Meas.AirSaving" }
+# part_present = { node = "s=Meas.PartPresent" }
+# ambient = { node = "s=Meas.Ambient", unit = "mbar", reference = "absolute" }
+# temperature = { node = "s=Meas.Temperature", unit = "C" }
+# pressure_2 = { node = "s=Meas.Pressure2", unit = "mbar", reference = "absolute" }
+# flow = { node = "s=Meas.Flow", unit = "sl/min" }
+"""
+BESIDE_COLUMNS = """\
+# reported_nozzle = "Nozzle"
+# reported_air_saving = "AirSaving"
+# reported_part_present = "PartPresent"
+# ambient_mbar = "Ambient"
+# temperature_c = "Temperature"
+# pressure_2_mbar = "Pressure2"
+# flow_sl_min = "Flow"
+"""
+
+
 class Unit(StrEnum):
     """Of the pressure, as it arrives."""
 
@@ -423,7 +466,8 @@ def _driver(connection: Connection, sensor: Sensor) -> list[str]:
         bit = re.fullmatch(r"(.+)/(\d+)", place)
         at = f"{key} = {_quoted(bit[1])}, bit = {bit[2]}" if bit else f"{key} = {_quoted(place)}"
         lines += [f"{name} = {{ {at} }}"]
-    return lines
+    registers = BESIDE_RING if connection.is_ring else BESIDE_POLLED
+    return [*lines, *(OFFERED + (BESIDE_NODES if is_opcua else registers)).splitlines()]
 
 
 def _no_driver(sensor: Sensor) -> list[str]:
@@ -435,6 +479,7 @@ def _no_driver(sensor: Sensor) -> list[str]:
         "[import.columns]",
         '# time_s = "Time"               # the file\'s names, where they are others',
         f'# {kind}_mbar = "Pressure"',
+        *(OFFERED + BESIDE_COLUMNS).splitlines(),
     ]
 
 

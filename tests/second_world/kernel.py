@@ -16,7 +16,7 @@ from numba import njit
 from second_world import faults
 from second_world.compiled import compiled
 from second_world.plant import approach, coefficients, memories, step
-from second_world.state import CELLS, HEAD, QUEUE
+from second_world.state import CELLS, HEAD, HOSE, QUEUE
 
 SUCTION, BLOW_OFF = 1, 2  # bits of the commands
 CONTACT, STRIP = 1, 2  # events at the seal
@@ -61,6 +61,7 @@ class Traces(NamedTuple):
     vessel: npt.NDArray[np.float64]  # Pa
     supply: npt.NDArray[np.float64]  # Pa
     warmth: npt.NDArray[np.float64]  # 0 to 1, of the sensor
+    flow: npt.NDArray[np.float64]  # kg/s, out of the hose into the ejector
     switch_time: npt.NDArray[np.float64]  # s
     switch_on: npt.NDArray[np.float64]
     switches: npt.NDArray[np.int64]  # how many of them
@@ -181,6 +182,7 @@ def note(traces, rest, gas, row):
     traces.vessel[row] = gas.pressure[gas.pressure.size - 1]
     traces.supply[row] = rest.p_supply
     traces.warmth[row] = rest.warmth
+    traces.flow[row] = -gas.flow[HOSE]
 
 
 @compiled

@@ -52,6 +52,7 @@ class Truth:
     head_pressure: npt.NDArray[np.float64]  # Pa, each ms
     vessel_pressure: npt.NDArray[np.float64]  # Pa, each ms
     supply_pressure: npt.NDArray[np.float64]  # Pa absolute, each ms
+    flow: npt.NDArray[np.float64]  # kg/s, out of the hose into the ejector, each ms
     readable: dict[str, Any]
 
 
@@ -108,6 +109,7 @@ def record(
         traces.head,
         traces.vessel,
         traces.supply,
+        traces.flow,
         readable(rig, seed, hidden["noted"]),
     )
     return _read(rig, seed, course, traces, sizes, truth)
@@ -122,7 +124,7 @@ def run_course(rig, course, chance, sizes, steps, gas=None):
     gas = state.still_air(rig) if gas is None else gas
     rest, strokes = state.at_rest(rig), state.valves()
     switches = (np.zeros(kernel.SWITCHES), np.zeros(kernel.SWITCHES), np.zeros(1, np.int64))
-    traces = kernel.Traces(*(np.zeros(rows) for _ in range(5)), *switches)
+    traces = kernel.Traces(*(np.zeros(rows) for _ in range(6)), *switches)
     kernel.simulate(
         plant_record(rig),
         rest,

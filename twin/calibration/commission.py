@@ -31,10 +31,21 @@ from twin.config import Config
 from twin.errors import ConfigError
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
-from twin.model.system import Cups, volume
+from twin.model.system import Cups, Part, Sensor, Tube, volume
 from twin.monitor.reports import APART, Contradiction
 from twin.monitor.surroundings import taken_in
-from twin.signals import MBAR, ML, MS, SAMPLE, SL_MIN, Command, Reported, Samples, bridged
+from twin.signals import (
+    MBAR,
+    ML,
+    MS,
+    SAMPLE,
+    SL_MIN,
+    ZERO_C,
+    Command,
+    Reported,
+    Samples,
+    bridged,
+)
 
 SLOWEST = 10.5 * MS  # s between rows; what switches faster than a few rows is not seen
 COARSE = 2.05 * MS  # s between rows, above which it is said what they do not show
@@ -49,6 +60,10 @@ CLEARLY = 15.0  # mbar by which a threshold must differ to be told; overshoot is
 ELSEWHERE, SURELY = 0.6, 4.0
 LITTLE_VACUUM = 200.0  # mbar; flow ejectors on leaking parts make more
 AMBIENT_CLEARLY = 3.0  # mbar, the same for ambient pressure
+# Share by which the evacuated volume must differ from what is told: nearly twice what a flow meter
+# is off by on rigs whose truth is known.
+VOLUME_CLEARLY = 0.15
+LEAST_LEFT = 0.1  # of what is not a tube, that a flow meter must leave of it
 LEAST_OFFSET = 1.0  # mbar, of the sensor beside a barometer, to be taken for one
 
 
@@ -110,11 +125,20 @@ def commission(
     refuse_insufficient(samples, before)
     looked = switching(guess, samples)
     against = contradictions(before if looked is guess else complete(looked, samples), looked)
-    if any(one.signal == "nozzle" for one in against):
+    wrong = {one.signal for one in against}
+    if "nozzle" in wrong:
         progress("the nozzle is not as reported: reading the pressure alone")
         samples = unreported(samples)
         readings = read(samples)
-        guess, remarks = guessed(config.data, readings)
+    if "pressure_2" in wrong:
+        samples = samples.copy()
+        samples["pressure_2"] = 0.0  # the fit follows one
+    metered, by_flow = config.data, list[Remark]()
+    if "flow" not in wrong:
+        metered, by_flow = as_metered(config.data, readings)
+    if "nozzle" in wrong or by_flow:
+        guess, remarks = guessed(metered, readings)
+        remarks = by_flow + remarks
         before = complete(guess, samples)
     samples = samples[samples["time_ns"] <= before[-1].end_ns]
     used = samples[samples["time_ns"] <= before[:MOST_FITTED][-1].end_ns]
@@ -181,6 +205,47 @@ def _fit(samples: Samples, guesses: Sequence[DataSet], progress: Callable[[str],
             " [data.system] lists, or of more than one unit",
             "check volumes, tubes and the sensor's place; commission on a record of one unit",
         ) from error
+
+
+def as_metered(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:
+    """``data`` with the volume that a flow meter tells, where it is clearly another than told.
+
+    Tubes stay as long and wide as told. Volumes of all else behind the port are multiplied alike,
+    so that the sum is what the meter tells. Where hardly anything is left for them, the tubes are
+    what is wrong, and nobody knows how: all stays as it is.
+    """
+    found = readings.evacuated(data.ambient.temperature_c + ZERO_C)
+    parts = data.system.parts
+    told = sum(volume(part) for part in parts)
+    tubes = sum(volume(part) for part in parts if isinstance(part, Tube | Sensor))
+    times = (found - tubes) / (told - tubes)
+    if not abs(found / told - 1.0) > VOLUME_CLEARLY or times < LEAST_LEFT:
+        return data, []
+    scaled = tuple(_scaled(part, times) for part in parts)
+    said = (
+        f'kind = "{part.kind}", volume_ml = {_rough(part.volume_ml)}'
+        for part in scaled
+        if not isinstance(part, Tube | Sensor) and part.volume_ml > 0.0
+    )
+    text = (
+        f"by the flow meter {_rough(found / ML)} ml are evacuated; the configuration says"
+        f" {_rough(told / ML)}"
+    )
+    line = f"[[data.system.parts]] {' and '.join(said)}"
+    system = data.system.model_copy(update={"parts": scaled})
+    return data.model_copy(update={"system": system}), [Remark(text, line)]
+
+
+def _scaled(part: Part, times: float) -> Part:
+    """A part with so many times its volume; tubes have theirs from length and diameter."""
+    if isinstance(part, Tube | Sensor):
+        return part
+    return part.model_copy(update={"volume_ml": times * part.volume_ml})
+
+
+def _rough(volume_ml: float) -> str:
+    """A volume as precise as a flow meter tells it."""
+    return f"{round(volume_ml, 0 if volume_ml >= 100.0 else 1):g}"
 
 
 def guessed(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:

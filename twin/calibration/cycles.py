@@ -2,7 +2,8 @@
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -10,14 +11,19 @@ import numpy.typing as npt
 from twin.model import kernel
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
+from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, binned, drawn
 from twin.monitor.knees import as_wide_as_needed, expected_knees
 from twin.monitor.nozzle import Switching, noise_of, switchings
 from twin.monitor.phases import PhaseFinder, commanded
 from twin.monitor.signatures import steps
-from twin.signals import MBAR, UNUSABLE, Phase, Samples
+from twin.signals import MBAR, MS, UNUSABLE, Phase, Samples
 
 BINS = 6  # in each unit of warped time
+# What a second sensor may be off the first by: 1 % of a vacuum sensor's bar, of its span as well,
+# and what is left of its lag, which is looked for among some.
+ZERO, SPAN, LAG = 10.0 * MBAR, 0.01, 1.0 * MS  # Pa, 1, s
+LAGS = np.array([0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0]) * MS
 Bytes = npt.NDArray[np.uint8]
 
 
@@ -33,6 +39,10 @@ class Cycles:
     measured: Floats  # mean pressure (Pa) of each bin
     drawn: Ints  # rows that suffice to draw what is expected
     tolerance: float  # Pa, of a step of the model
+    end: Literal["", "port", "vessel"] = ""  # of the line, where another sensor than the PLC's sits
+    lag: float = np.nan  # s, of that one
+    # (bins, n): how the same in all cycles it may be off (Pa), one standard deviation each.
+    unsure: Floats = field(default_factory=lambda: np.empty((0, 0)))
 
     @classmethod
     def as_live(cls, samples: Samples, data: DataSet) -> "Cycles":
@@ -74,13 +84,34 @@ class Cycles:
         # A fit from afar takes what is quick: it has a long way to go, and is off by more.
         drawn = _drawn(dt, phase, level) if quickly else np.arange(len(dt))
         tolerance = kernel.ROUGHLY if quickly else kernel.TOLERANCE
-        return cls(rows, dt, phase, level, bins, measured, drawn, tolerance)
+        unsure = np.empty((len(measured), 0))
+        return cls(rows, dt, phase, level, bins, measured, drawn, tolerance, unsure=unsure)
+
+    def of_second(self, end: Literal["port", "vessel"]) -> "Cycles":
+        """The same of the second pressure, which is measured at an ``end`` of the line."""
+        pressure = self.samples["pressure_2"].astype(np.float64)
+        usable = (self.bins.number >= 0) & (pressure > 0.0)
+        rows = np.arange(len(pressure))
+        pressure = np.interp(rows, rows[usable], pressure[usable])
+        bins = binned(self.phase, usable, _edges(self.phase), BINS)
+        measured = bins.mean(pressure)
+        slope = bins.mean(np.gradient(pressure) / float(np.median(self.dt)))
+        ways = np.full(len(measured), ZERO), SPAN * (measured.max() - measured), LAG * slope
+        return replace(self, bins=bins, measured=measured, end=end, unsure=np.stack(ways, axis=1))
+
+    def as_slow(self, theta: Theta) -> "Cycles":
+        """The same with the lag of LAGS with which the model of ``theta`` is nearest."""
+        slow = [replace(self, lag=float(lag))._sensed(theta) for lag in LAGS]
+        off = self.off(np.stack(slow, axis=1))
+        left = np.abs(off - self.unsure @ np.linalg.lstsq(self.unsure, off)[0])
+        return replace(self, lag=float(LAGS[np.average(left, axis=0).argmin()]))
 
     def off(self, theta: Floats, early: Sequence[int] = ()) -> Floats:
         """Measured minus expected pressure (Pa) in each bin for hypotheses, (coefficients, n).
 
         ``early`` says for each by how many rows the nozzle switches before it is seen to.
         """
+        theta = self._sensed(theta)
         moved = any(early)
         phase = self._phases(early) if moved else self.phase[:, None]
         changes = np.flatnonzero(np.diff(phase, axis=0).any(axis=1)) + 1
@@ -99,6 +130,17 @@ class Cycles:
         with ThreadPoolExecutor(len(parts)) as pool:
             return np.concatenate(list(pool.map(run, parts)), axis=1)
 
+    def _sensed(self, theta: Floats) -> Floats:
+        """Coefficients with the sensor that is looked at in place of the PLC's."""
+        if not self.end:
+            return theta
+        theta = theta.copy()
+        line = theta[c.NEAR_RESISTANCE] + theta[c.RESISTANCE]
+        theta[c.PLACE] = line if self.end == "vessel" else 0.0 * line
+        if np.isfinite(self.lag):
+            theta[c.SENSOR_LAG] = self.lag
+        return theta
+
     def _phases(self, early: Sequence[int]) -> Bytes:
         """Phases with every switching moved, (rows, n)."""
         moved = np.repeat(self.phase[:, None], len(early), axis=1)
@@ -107,6 +149,23 @@ class Cycles:
                 begin, end = (row - rows, row) if rows > 0 else (row, row - rows)
                 moved[max(begin, 0) : end, lane] = self.phase[row if rows > 0 else row - 1]
         return moved
+
+
+@dataclass(frozen=True)
+class Both:
+    """Two pressures of the same cycles: what is said of the second follows what is of the first."""
+
+    first: Cycles
+    second: Cycles
+
+    @property
+    def bins(self) -> Bins:
+        """Those of the first."""
+        return self.first.bins
+
+    def off(self, theta: Floats, early: Sequence[int] = ()) -> Floats:
+        """As of ``Cycles``."""
+        return np.concatenate([self.first.off(theta, early), self.second.off(theta, early)])
 
 
 def _switched(told: Bytes, found: Sequence[Switching]) -> Bytes:

@@ -14,12 +14,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
-from twin.calibration.cycles import Cycles
+from twin.calibration.cycles import Both, Cycles
 from twin.calibration.left_out import with_left_out
 from twin.calibration.parameters import Free, Space
+from twin.calibration.readings import noise_of
 from twin.calibration.weights import Weights, plain, weighted
+from twin.model import theta as c
 from twin.model.dataset import RIPPLE, DataSet, coefficients
-from twin.signals import MBAR, UNUSABLE, Samples
+from twin.signals import MBAR, NS, UNUSABLE, Samples
 
 # Tolerances of the rounds. Knees are found and residuals weighed with what the round before found.
 ROUNDS = (1e-2, 1e-2, 1e-3)
@@ -34,6 +36,8 @@ END_PRESSURE = "ejector.end_pressure_mbar"
 NEARLY_NOTHING = 0.02  # of the suction capacity, at the deepest pressure of a record
 BEST_END = 50.0 * MBAR  # Pa, absolute; single-stage ejectors end at 70 and more
 DEEPEST = 0.001  # quantile of a record's rows: no single reading
+MOST_WORSE = 1.1  # times the cost of the first pressure alone, with a second one
+MOST_ROWS = 0.5  # of the usable ones, above which a second pressure is followed
 MOST_FACTOR = 10.0  # of the logarithm
 BENDS = ("bulge", "skew", "bend_2", "bend_3")
 
@@ -75,7 +79,7 @@ class Problem:
     """Residuals and their derivatives over coordinates of ``space``, all in sigmas."""
 
     space: Space
-    cycles: Cycles
+    cycles: Cycles | Both
     weights: Weights
     _at: Floats | None = None
     _residual: Floats = field(default_factory=lambda: np.empty(0))
@@ -241,8 +245,11 @@ def fit_from_afar(
     the model may be off by begins wide and is narrowed, so that the fit follows the large features
     first; residuals beyond it pull less than their square (a robust loss). No bin's error is taken
     to be another's: what a fit may call scatter from cycle to cycle hides what it gets wrong.
+
+    A second pressure, where most rows have one, is followed from there on: from a guess, two lead
+    astray more often than one. It is not where the first is followed less well for it.
     """
-    noise = guesses[0].sensor.noise_mbar * MBAR
+    noises = [guesses[0].sensor.noise_mbar * MBAR]
     spaces = [Space.of_market(guess) for guess in guesses]
     starts = [_Start(space, np.zeros(len(space.free))) for space in spaces]
     for number, one in enumerate(NARROWING, 1):
@@ -250,24 +257,78 @@ def fit_from_afar(
         progress(f"fitting, round {number} of {len(NARROWING)}: {len(starts)} starts")
         rows = samples[: round(len(samples) * one.share)]
         starts = sorted(
-            (_followed(rows, start, one, noise) for start in starts), key=attrgetter("cost")
+            (_followed(rows, start, one, noises) for start in starts), key=attrgetter("cost")
         )
-    best = starts[0]
-    cycles = Cycles.found(samples, best.data)
-    weights = weighted(cycles, coefficients(best.data), noise, fitted=True)
+    best, two = starts[0], noises + second_noise(samples)
+    if len(two) > 1:
+        progress("following the second pressure as well")
+        both = _followed(samples, best, NARROWING[-1], two)
+        if _alone(samples, both, noises) < MOST_WORSE * _alone(samples, best, noises):
+            best, noises = both, two
+        else:
+            progress("the second pressure is left out: the first would be followed less well")
+    theta = coefficients(best.data)
+    problem = _problem(
+        samples, best, noises, lambda cycles, noise: weighted(cycles, theta, noise, fitted=True)
+    )
     pressure = samples["pressure"][(samples["quality"] & UNUSABLE) == 0]
     deepest = float(np.nanquantile(pressure, DEEPEST))
-    return replace(_fitted(Problem(best.space, cycles, weights), best.x), deepest=deepest)
+    return replace(_fitted(problem, best.x), deepest=deepest)
 
 
-def _followed(samples: Samples, start: _Start, one: Round, noise: float) -> _Start:
-    """Where a round leads from a start."""
+def second_noise(samples: Samples) -> list[float]:
+    """Noise (Pa) of a second pressure; empty where too few rows have one to follow it."""
+    usable = (samples["quality"] & UNUSABLE) == 0
+    there = usable & (samples["pressure_2"] > 0.0)
+    if np.count_nonzero(there) <= MOST_ROWS * np.count_nonzero(usable):
+        return []
+    period = float(np.median(np.diff(samples["time_ns"]))) * NS
+    return [noise_of(samples["pressure_2"][there].astype(np.float64), period)]
+
+
+def _alone(samples: Samples, start: _Start, noises: Sequence[float]) -> float:
+    """What is left of the first pressure alone, as a cost."""
+    error = NARROWING[-1].error
+    problem = _problem(samples, start, noises, lambda cycles, noise: plain(cycles, noise, error))
+    return _cost(problem.residual(start.x))
+
+
+def _cost(residual: Floats) -> float:
+    """Of residuals in sigmas; what is far off costs little more than what is off."""
+    return float(np.sum(np.log1p(residual**2)))
+
+
+def _other_end(data: DataSet) -> Literal["port", "vessel"]:
+    """The end of the line that the sensor of ``data`` is farther from."""
+    theta = coefficients(data)
+    line = theta[c.NEAR_RESISTANCE] + theta[c.RESISTANCE]
+    return "port" if theta[c.PLACE] > 0.5 * line else "vessel"
+
+
+def _problem(
+    samples: Samples,
+    start: _Start,
+    noises: Sequence[float],
+    weigh: Callable[[Cycles, float], Weights],
+) -> Problem:
+    """To follow the pressure from a start, and a second one where there are two ``noises`` (Pa)."""
     cycles = Cycles.found(samples, start.data)
-    problem = Problem(start.space, cycles, plain(cycles, noise, one.error))
+    weights = weigh(cycles, noises[0])
+    if len(noises) == 1:
+        return Problem(start.space, cycles, weights)
+    second = cycles.of_second(_other_end(start.data)).as_slow(coefficients(start.data))
+    weights = weights.followed_by(weigh(second, noises[1]), len(cycles.measured))
+    return Problem(start.space, Both(cycles, second), weights)
+
+
+def _followed(samples: Samples, start: _Start, one: Round, noises: Sequence[float]) -> _Start:
+    """Where a round leads from a start."""
+    problem = _problem(
+        samples, start, noises, lambda cycles, noise: plain(cycles, noise, one.error)
+    )
     # The last coordinate is how much sooner the nozzle switches than it was seen to.
     x = _solved(problem, np.append(start.x, 0.0), one.steps, one.tolerance, soft(problem.weights))
-    cost = float(np.sum(np.log1p(problem.residual(x) ** 2)))
-    return _Start(start.space, x[:-1], cost)
+    return _Start(start.space, x[:-1], _cost(problem.residual(x)))
 
 
 def _solved(
@@ -321,7 +382,8 @@ def _fitted(problem: Problem, x: Floats) -> Fitted:
     plain = np.asarray(np.linalg.inv(jacobian.T @ jacobian), np.float64)
     covariance = ways @ _with_left_out(plain, jacobian, problem.weights.white(off)) @ ways.T
     prior = np.sqrt(np.diag(ways @ ways.T))
-    left = float(np.sqrt(np.average(off[:, 0] ** 2, weights=cycles.bins.count)))
+    first = off[: len(cycles.bins.count), 0]
+    left = float(np.sqrt(np.average(first**2, weights=cycles.bins.count)))
     left_open = ways @ plain @ ways.T
     return Fitted(best, space.free, covariance, left_open, prior, left, space.scaled)
 

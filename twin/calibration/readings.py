@@ -11,7 +11,9 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
+from twin.calibration.meter import Suction, stored
 from twin.figures.curve import flow_behind
+from twin.model.gas import R
 from twin.monitor.nozzle import reports_nozzle, told_edges
 from twin.monitor.reports import part_at
 from twin.monitor.surroundings import told
@@ -73,6 +75,7 @@ class Readings:
     barometer: float = np.nan  # Pa, its median
     part: float = np.nan  # Pa, at which the ejector itself reports a part
     part_unsure: float = np.nan  # Pa, as that may be late
+    stored: float = np.nan  # kg/Pa, gas that is evacuated, by a flow meter
 
     @property
     def least_vacuum(self) -> float:
@@ -83,6 +86,10 @@ class Readings:
     def saves_air(self) -> bool:
         """Whether the ejector switches its nozzle off by itself."""
         return self.switches > MOST_SUCTIONS * self.suctions
+
+    def evacuated(self, temperature: float) -> float:
+        """Volume (m³) that is evacuated, by a flow meter; NaN where none tells it."""
+        return self.stored * R * temperature
 
     def capacity(self, volume: float, ambient: float, temperature: float) -> float:
         """Suction (kg/s) at ambient that empties ``volume`` (m³) as fast as the record shows."""
@@ -154,7 +161,18 @@ def read(samples: Samples) -> Readings:
         barometer=told(samples).get("ambient", np.nan),
         part=_median([pascal for pascal, _ in parts]),
         part_unsure=_median([unsure for _, unsure in parts]),
+        stored=stored(_metered(rows, suctions)),
     )
+
+
+def _metered(rows: Samples, suctions: list[Stretch]) -> Iterator[Suction]:
+    """Rows of each suction in which the flow is measured."""
+    for one in suctions:
+        here = rows[one.first : one.last]
+        here = here[(here["reported"] & np.uint8(Reported.FLOW_KNOWN)) != 0]
+        columns = here["time_ns"] * NS, here["pressure"], here["flow"]
+        seconds, pressure, flow = (column.astype(np.float64) for column in columns)
+        yield seconds, pressure, flow
 
 
 def stretches(commands: npt.NDArray[np.uint8]) -> Iterator[Stretch]:

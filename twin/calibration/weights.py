@@ -37,14 +37,23 @@ class Weights:
         """Residuals (bins, n) in sigmas for each cycle; what belongs to none is left out."""
         return [solve_triangular(factor, off[here], lower=True) for here, factor in self.parts]
 
+    def followed_by(self, other: "Weights", bins: int) -> "Weights":
+        """Those of one pressure with ``bins``, then those of another."""
+        return Weights([*self.parts, *((here + bins, factor) for here, factor in other.parts)])
+
 
 def plain(cycles: Cycles, noise: float, error: float) -> Weights:
     """Weights where nobody knows yet what scatters: each bin by noise and ``error`` (Pa) alone."""
     bins = cycles.bins
     parts = []
-    for one in np.unique(bins.cycle[bins.cycle >= 1]):  # the model swings in in the first
+    numbers = np.unique(bins.cycle[bins.cycle >= 1])  # the model swings in in the first
+    for one in numbers:
         here = np.flatnonzero(bins.cycle == one)
-        parts.append((here, np.diag(np.sqrt(error**2 + noise**2 / bins.count[here]))))
+        unsure = cycles.unsure[here]
+        covariance = unsure @ unsure.T
+        covariance *= len(numbers)
+        covariance[np.diag_indices(len(here))] += error**2 + noise**2 / bins.count[here]
+        parts.append((here, np.asarray(np.linalg.cholesky(covariance), np.float64)))
     return Weights(parts)
 
 
@@ -61,7 +70,7 @@ def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> Wei
     moves = off[:, 1:] - off[:, :1]
     errors, cycle_error = np.full(len(off), FIRST_ERROR), np.zeros(len(off))
     if fitted:
-        errors, cycle_error = _errors(off[:, 0], bins, noise)
+        errors, cycle_error = _errors(_beside(off[:, 0], cycles.unsure), bins, noise)
     errors = np.hypot(errors, LATE * _slope(cycles))
     numbers = np.unique(bins.cycle[bins.cycle >= 0])
     parts = []
@@ -71,12 +80,20 @@ def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> Wei
         common = apart * (bins.kind[here, None] == bins.kind[here])
         alone = apart * (bins.stretch[here, None] == bins.stretch[here])
         volume, scatter = moves[here, :1], moves[here, 1:]
+        unsure = cycles.unsure[here]
         covariance = np.outer(errors[here], errors[here]) * common + volume @ volume.T
+        covariance += unsure @ unsure.T
         covariance *= len(numbers)
         covariance += np.outer(cycle_error[here], cycle_error[here]) * alone
         covariance += scatter @ scatter.T + np.diag(noise**2 / bins.count[here])
         parts.append((here, np.linalg.cholesky(covariance)))
     return Weights(parts)
+
+
+def _beside(off: Floats, unsure: Floats) -> Floats:
+    """What is left (Pa) once the ways that a sensor may be off in are taken from it."""
+    taken: Floats = off - unsure @ np.linalg.lstsq(unsure, off)[0]
+    return taken
 
 
 def _slope(cycles: Cycles) -> Floats:

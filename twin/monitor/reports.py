@@ -254,7 +254,8 @@ def _flow(view: _View) -> dict[str, Contradiction | None]:
         f"by the flow {carried / litres:.2g} standard litres are drawn off until"
         f" {_mbar(float(view.vacuum[lowest]))} of vacuum; the pressure shows {shown / litres:.2g}"
     )
-    return _says("flow", what, "check unit, scale and direction of the tag flow")
+    action = "check unit, scale and direction of the tag flow, then volumes in [data.system.parts]"
+    return _says("flow", what, action)
 
 
 def _says(signal: str, what: str, action: str) -> dict[str, Contradiction | None]:
