@@ -54,6 +54,7 @@ ROOM_TEMPERATURE = 293.15  # K, for a first guess
 # Where a fit starts: of the line, between sensor and port, and of all gas, in the port.
 PLACES, PORT_SHARES = (0.05, 0.95), (0.01, 0.1)
 # How cups give way: the share of their volume that goes, softness, and stiff_mbar (System).
+NEARLY = 0.95  # of the deepest pressure of a suction that nothing ends but its command
 LIPS, BELLOWS = (0.03, 5.0, 30.0), (0.4, 10.0, 300.0)
 CLEARLY = 15.0  # mbar by which a threshold must differ to be told; overshoot is part of a turn
 # Of the line, by which a sensor is at another place than told, and sigmas.
@@ -305,6 +306,8 @@ def _questions(readings: Readings) -> Iterator[Remark]:
 def _flows(ejector: dict[str, Any], readings: Readings, evacuated: float, ambient: float) -> None:
     """Set first guesses of flows, by how fast ``evacuated`` (m³) empties and fills."""
     ejector["jet_depth"] = 0.5
+    if not readings.saves_air:  # so suction goes on to where hardly anything flows
+        ejector["end_pressure_mbar"] = float(np.clip(NEARLY * readings.deepest / MBAR, 10.0, 690.0))
     ejector["cracking_pressure_mbar"] = 5.0
     capacity = readings.capacity(evacuated, ambient, ROOM_TEMPERATURE) / SL_MIN
     if np.isfinite(capacity):
