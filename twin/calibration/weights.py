@@ -42,9 +42,13 @@ class Weights:
         return Weights([*self.parts, *((here + bins, factor) for here, factor in other.parts)])
 
 
-def plain(cycles: Cycles, noise: float, error: float) -> Weights:
-    """Weights where nobody knows yet what scatters: each bin by noise and ``error`` (Pa) alone."""
+def plain(cycles: Cycles, noise: float, error: float, late: float) -> Weights:
+    """Weights where nobody knows yet what scatters: each bin by noise and the model's own error.
+
+    That is ``error`` (Pa), and what the pressure moves by in ``late`` (s).
+    """
     bins = cycles.bins
+    errors = np.hypot(error, late * _slope(cycles))
     parts = []
     numbers = np.unique(bins.cycle[bins.cycle >= 1])  # the model swings in in the first
     for one in numbers:
@@ -52,7 +56,7 @@ def plain(cycles: Cycles, noise: float, error: float) -> Weights:
         unsure = cycles.unsure[here]
         covariance = unsure @ unsure.T
         covariance *= len(numbers)
-        covariance[np.diag_indices(len(here))] += error**2 + noise**2 / bins.count[here]
+        covariance[np.diag_indices(len(here))] += errors[here] ** 2 + noise**2 / bins.count[here]
         parts.append((here, np.asarray(np.linalg.cholesky(covariance), np.float64)))
     return Weights(parts)
 
@@ -99,7 +103,7 @@ def _beside(off: Floats, unsure: Floats) -> Floats:
 def _slope(cycles: Cycles) -> Floats:
     """Slope of the measured pressure in each bin (Pa/s)."""
     pressure = np.nan_to_num(cycles.samples["pressure"].astype(np.float64))
-    return cycles.bins.mean(np.gradient(pressure) / MS)
+    return cycles.bins.mean(np.gradient(pressure) / float(np.median(cycles.dt)))
 
 
 def _errors(off: Floats, bins: Bins, noise: float) -> tuple[Floats, Floats]:
