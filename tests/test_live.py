@@ -13,6 +13,7 @@ import rigs
 from plc_process import PlcProcess
 from rigs import Collect
 
+import twin
 from drivers.sources import open_source
 from twin.events import Event, Kind
 from twin.live import run
@@ -201,6 +202,17 @@ def test_cycles_with_a_twentieth_of_their_rows_missing_are_judged(
     again = replay(open_log(tmp_path / "a.mcap"), name, 777)
     assert again.events == live.events
     assert rows_of(again) == rows_of(live)
+
+
+def test_rows_of_a_log_with_holes_stay_marked_and_its_cycles_have_figures(tmp_path: Path) -> None:
+    holes = without_some(rigs.recorded("gripper", 25.0)[0], 0.05)
+    live = recorded_run(tmp_path / "a.mcap", "gripper", rigs.cut(holes, 30))
+    blocks = [block for block, _ in open_log(tmp_path / "a.mcap").blocks()]
+    rows = [samples for samples, _ in rigs.twin("gripper").over(blocks)]
+    assert b"".join(part.tobytes() for part in rows) == holes.tobytes()
+    told = twin.open(tmp_path / "a.mcap").cycles()
+    assert len(told) >= len(live.of(Kind.CYCLE)) - 1
+    assert sum("t0_measured" in one for one in told) >= len(told) - 1
 
 
 def test_a_gap_of_more_rows_breaks_the_cycle() -> None:

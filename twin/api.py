@@ -49,6 +49,7 @@ from twin.signals import (
     Ticks,
     deviation,
     joined,
+    unbroken,
 )
 from twin.tables.reader import Table, open_table
 from twin.tables.settings import ImportSettings
@@ -124,7 +125,7 @@ class Log:
         """
         figures = self.config.document.section(FigureSettings, "figures")
         teller = key_figures(self.config.data, figures)
-        told = (teller.take(cycle) for cycle in cut(self._rows()))
+        told = (teller.take(cycle) for cycle in cut(unbroken(self._rows())))
         return [one.plain() for one in told if one is not None]
 
     @property

@@ -21,7 +21,7 @@ from twin.monitor.listening import Listening
 from twin.monitor.phases import Found, Knees, PhaseFinder
 from twin.monitor.signatures import steps
 from twin.monitor.surroundings import are_told, following, stretches
-from twin.signals import MBAR, SAMPLE, TICK, Phase, Samples, Ticks, bridged
+from twin.signals import MBAR, SAMPLE, TICK, Phase, Samples, Ticks
 
 REPLAYED = 60_000  # rows that a replay takes at once: what is done to many cycles stays in caches
 
@@ -80,10 +80,13 @@ class Twin:
         return self._expect(self._finder.flush())
 
     def over(self, blocks: Iterable[Samples]) -> Iterator[tuple[Samples, Ticks]]:
-        """Advance over all of a stream to its end, and over gaps of a few rows."""
-        for block in bridged(blocks):
-            yield self.advance(block)
-        yield self.flush()
+        """Advance over a stream to its end, and over gaps of a few rows, which stay marked."""
+        gaps = ShortGaps()
+        for block in blocks:
+            samples, ticks = self.advance(gaps.off(block))
+            yield gaps.on(samples), ticks
+        samples, ticks = self.flush()
+        yield gaps.on(samples), ticks
 
     def _expect(self, found: Found) -> tuple[Samples, Ticks]:
         samples, phase, level = found

@@ -150,6 +150,12 @@ def bridged(blocks: Iterable[Samples]) -> Iterator[Samples]:
     return (bridge.over(block) for block in blocks)
 
 
+def unbroken(blocks: Iterable[tuple[Samples, Ticks]]) -> Iterator[tuple[Samples, Ticks]]:
+    """The same of blocks with what the twin says to them."""
+    bridge = Bridge()
+    return ((bridge.over(samples), ticks) for samples, ticks in blocks)
+
+
 class Phase(IntEnum):
     """Where in its cycle the ejector is, whatever commanded it."""
 

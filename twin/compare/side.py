@@ -17,7 +17,7 @@ from twin.model.dataset import coefficients
 from twin.model.theta import Theta
 from twin.monitor.cycles import Cycle, cut
 from twin.monitor.cycles import figures as judged
-from twin.signals import BREAK, MBAR, MS, NS, UNUSABLE, Phase, Samples, Ticks, deviation
+from twin.signals import BREAK, MBAR, MS, NS, UNUSABLE, Phase, Samples, Ticks, deviation, unbroken
 
 Floats = npt.NDArray[np.float64]
 
@@ -121,7 +121,7 @@ def side_of(log: Log, settings: Config, key_figures: KeyFigures) -> Side:
     if side.derived:
         _add_suctions(side, suctions)
         return side
-    for cycle in whole(log.unbroken()):
+    for cycle in whole(unbroken(log.blocks())):
         told = key_figures.take(cycle)
         if told is not None and told.complete and cycle.complete and cycle.settled:
             side.add(cycle, told, theta)

@@ -13,7 +13,7 @@ from twin.live import Twin
 from twin.monitor.bank import SUSPECTS, Bank, Suspect
 from twin.monitor.cycles import CycleCutter, figures
 from twin.monitor.statistics import Listener, Said
-from twin.signals import Samples
+from twin.signals import Samples, bridged
 
 FORMAT = "ejector-twin-watched/1"
 
@@ -25,7 +25,7 @@ def watched(config: Config, blocks: Iterable[Samples]) -> dict[str, Any]:
     teller = compiled(config.data, config.document.section(FigureSettings, "figures"))
     told: list[CycleFigures] = []
     heard: list[Said] = []
-    for rows, ticks in Twin.of(config.data).over(blocks):
+    for rows, ticks in Twin.of(config.data).over(bridged(blocks)):
         for cycle in cutter.push(rows, ticks):
             drawn = bank.take(cycle)
             if (one := teller.take(cycle)) is not None:

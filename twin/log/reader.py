@@ -17,7 +17,7 @@ from twin.log.messages import decode_event
 from twin.log.part import FREE_METADATA, OWN_METADATA, part_path
 from twin.log.records import Damage, is_complete, messages, records
 from twin.log.schema import EVENTS, SAMPLES
-from twin.signals import Bridge, Samples, Ticks
+from twin.signals import Samples, Ticks
 
 _UNDECODABLE = (ValueError, struct.error, DecodeError)
 
@@ -44,11 +44,6 @@ class Log:
         samples, ticks = tray.take()
         if len(samples):
             yield samples, ticks
-
-    def unbroken(self) -> Iterator[tuple[Samples, Ticks]]:
-        """The same for what steps over gaps of a few rows, as the live twin does."""
-        bridge = Bridge()
-        return ((bridge.over(samples), ticks) for samples, ticks in self.blocks())
 
     def events(self) -> Iterator[Event]:
         """What happened, in written order."""
