@@ -19,7 +19,7 @@ enum { /* twin.model.theta.COEFFICIENTS */
     SUPPLY_OPTIMUM, SUPPLY_CURVATURE, END_SLOPE, SUCTION, END_RATIO, BULGE, SKEW, BEND_2, BEND_3,
     RESPONSE, RESPONSE_OFF, RAMP_UP, SLOW_RAMP_UP, JET_DEPTH, RAMP_DOWN, BLOW_OFF, BLOW_OFF_SHAPE,
     BLOW_OFF_RESPONSE, BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, RELIEF, EXHAUST, CRACKING_PRESSURE,
-    PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT, VOLUME, COMPLIANCE, SOFTNESS, FILM, FREE_CONVECTION,
+    PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT, VOLUME, COMPLIANCE, SOFTNESS, STIFF_UNTIL, FILM, FREE_CONVECTION,
     FORCED_CONVECTION, AREA, NEAR_RESISTANCE, NEAR_LAMINAR, NEAR_INERTANCE, RESISTANCE,
     LAMINAR, INERTANCE, PLACE, LEAK, LAMINAR_LEAK, INFLOW, BACK_FLOW, OPENING, HOLE, SENSOR_LAG, SLOW_SENSOR,
     SENSOR_OFFSET, SENSOR_GAIN, H1, H1_LOW, H2, H2_LOW, RELEASE, CONTACT, CONTROL_SENSOR,
@@ -82,6 +82,7 @@ INLINED Tangent opening(double p, double ambient)
 #define HOTTEST 2000.0
 #define PER_COLDEST (1.0 / (R * COLDEST))
 #define PER_HOTTEST (1.0 / (R * HOTTEST))
+#define TINY 1e-9
 #define MOST 100.0
 #define FAINTEST 1e-12
 #define FREE_AT 10.0
@@ -117,8 +118,9 @@ static void prepare(const double *theta, double *k)
     K(K_HEAT) = T(FILM) * T(AREA) / CP;
     K(K_PORT_HEAT) = T(PORT_HEAT) / CP;
     K(K_LINE_HEAT) = T(LINE_HEAT) / CP;
-    K(K_STRETCH) = T(COMPLIANCE) * (1.0 + T(SOFTNESS)) / ambient;
-    K(K_SOFT) = T(SOFTNESS) / ambient;
+    double most = ambient / (1.0 + T(STIFF_UNTIL) / ambient);
+    K(K_STRETCH) = T(COMPLIANCE) * (1.0 + T(SOFTNESS)) / most;
+    K(K_SOFT) = T(SOFTNESS) / most;
     double friction = T(NEAR_RESISTANCE) + T(RESISTANCE);
     K(K_PLACE) = friction > 0.0 ? min(T(PLACE) / friction, 1.0) : 0.0;
 }
@@ -205,8 +207,10 @@ typedef struct { double volume, stretch; } Room;
 INLINED Room room(double vessel, const double *k)
 {
     double vacuum = K(AMBIENT) - vessel;
-    double left = 1.0 / (1.0 + K(K_SOFT) * fabs(vacuum));
-    return (Room){K(VOLUME) - K(K_STRETCH) * vacuum * left, K(K_STRETCH) * left * left};
+    double held = K(STIFF_UNTIL) / (fabs(vacuum) + K(STIFF_UNTIL) + TINY);
+    double pull = vacuum * (1.0 - held);
+    double left = 1.0 / (1.0 + K(K_SOFT) * fabs(pull)), stretch = K(K_STRETCH) * left;
+    return (Room){K(VOLUME) - stretch * pull, stretch * left * (1.0 - held * held)};
 }
 
 INLINED double convection(const Gas *y, double warmer, const double *k)
