@@ -250,7 +250,7 @@ def test_what_a_second_sensor_may_be_off_by_costs_little() -> None:
     drop = np.where(second.bins.kind == 1, 10.0 * MBAR, 0.0)  # in suction alone
     theta = coefficients(data)
     for weigh in (
-        lambda cycles: plain(cycles, 0.4 * MBAR, 3.0 * MBAR),
+        lambda cycles: plain(cycles, 0.4 * MBAR, 3.0 * MBAR, 0.0),
         lambda cycles: weighted(cycles, theta, 0.4 * MBAR, fitted=False),
     ):
 
