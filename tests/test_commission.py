@@ -231,6 +231,16 @@ def test_a_fit_starts_with_cups_that_meet_a_part_late_and_without_where_the_reco
     assert all(coefficients(one)[c.COMPLIANCE] > 0.0 for one in late)
 
 
+def test_a_fit_starts_with_lips_that_spread_and_bellows_that_fold_where_there_are_cups() -> None:
+    cups = config_of(logged(SEED, KIND).truth.readable).data
+    tank = typed("test_rig").data
+    shrinks = [one.system.shrinks_ml for one in starts(cups, np.nan)]
+    assert max(shrinks) > 10.0 * min(shrinks) > 0.0
+    assert {one.system.stiff_mbar for one in starts(cups, np.nan)} == {30.0, 300.0}
+    assert {one.system.shrinks_ml for one in starts(tank, np.nan)} == {0.0}
+    assert len({one.system.stiff_mbar for one in starts(tank, np.nan)}) == 1
+
+
 def test_a_cycle_in_which_something_went_wrong_counts_little_in_what_is_left_and_in_the_floor() -> (
     None
 ):
