@@ -149,13 +149,18 @@ def _watched(
     """All rows with what they make happen, in the order of time within each PLC time."""
     gaps = ShortGaps()
     for block, happened in timed:
-        for samples, ticks, events in monitor.over(*twin.advance(gaps.off(block)), happened):
-            yield gaps.on(samples), ticks, in_order([*events, *gaps.told()])
-    *parts, (rest, ticks, events) = monitor.over(*twin.flush())
-    for part, beside, found in parts:
-        yield gaps.on(part), beside, in_order([*found, *gaps.told()])
-    rest = gaps.on(rest)
-    yield rest, ticks, in_order([*events, *gaps.told(), *monitor.close()])
+        yield from _marked(gaps, monitor.over(*twin.advance(gaps.off(block)), happened))
+    *parts, (samples, ticks, events) = _marked(gaps, monitor.over(*twin.flush()))
+    yield from parts
+    yield samples, ticks, in_order([*events, *monitor.close()])
+
+
+def _marked(
+    gaps: ShortGaps, parts: Iterable[tuple[Samples, Ticks, list[Event]]]
+) -> Iterator[tuple[Samples, Ticks, list[Event]]]:
+    """Rows with the marks of short gaps again, and with what there is to say of these."""
+    for samples, ticks, events in parts:
+        yield gaps.on(samples), ticks, in_order([*events, *gaps.told()])
 
 
 def _advised(advisers: Sequence[Adviser], samples: Samples, events: list[Event]) -> list[Event]:

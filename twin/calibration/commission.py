@@ -53,8 +53,8 @@ MOST_MISSING = 0.2  # share of rows
 ROOM_TEMPERATURE = 293.15  # K, for a first guess
 # Where a fit starts: of the line, between sensor and port, and of all gas, in the port.
 PLACES, PORT_SHARES = (0.05, 0.95), (0.01, 0.1)
-# How cups give way: the share of their volume that goes, softness, and stiff_mbar (System).
 NEARLY = 0.95  # of the deepest pressure of a suction that nothing ends but its command
+# How cups give way: the share of their volume that goes, softness, and stiff_mbar (System).
 LIPS, BELLOWS = (0.03, 5.0, 30.0), (0.4, 10.0, 300.0)
 CLEARLY = 15.0  # mbar by which a threshold must differ to be told; overshoot is part of a turn
 # Of the line, by which a sensor is at another place than told, and sigmas.

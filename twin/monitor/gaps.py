@@ -26,8 +26,8 @@ def gap_event(before: np.void, row: np.void) -> Event:
 class ShortGaps:
     """Keeps the marks of short gaps aside while rows go through what steps over them.
 
-    Rows come back in the order in which they went in, however they are cut. The first short gap is
-    told of at once, what follows within a second together.
+    Rows come back in the order in which they went in, however they are cut. A short gap is told of
+    at once; those within a second after it are told with the next.
     """
 
     _bridge: Bridge = field(default_factory=Bridge)
