@@ -39,7 +39,7 @@ CAUSE: dict[str, Any] = {
     "parameters": {
         "sonic_flow": {"value": 1.9, "unit": "sl/min", "low95": 1.8, "high95": 2.0},
     },
-    "probability": 0.998,
+    "probability": 0.98,
     "not_separable_from": [],
     "why": "",
 }
@@ -138,7 +138,7 @@ def test_it_is_asked_once_enough_cycles_deviate_and_its_answer_is_an_event(
     assert event.data == {"alarm_ns": 6 * CYCLE_NS, "begin_ns": 0, "answer": ANSWER}
     assert event.text == (
         "leakage (1.9 sl/min), since 2026-09-21 14:13:27, 7.5 s into the log;"
-        " how sure: no other listed cause fits as well;"
+        " how sure: 98 %; no other listed cause fits as well;"
         " look at hoses, fittings and cups: a cut, or a loose connection"
     )
     stream.cycles(10)

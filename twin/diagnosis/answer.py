@@ -12,10 +12,11 @@ from twin.config import Config
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, collect, thinned
 from twin.diagnosis.experiments import next_experiment
 from twin.diagnosis.fit import Fitted
-from twin.diagnosis.hypotheses import hours, parameters
+from twin.diagnosis.hypotheses import hours, parameters, rarity
 from twin.diagnosis.judge import Judged, gain, judge, rounded
 from twin.diagnosis.search import Search, search, sharpened
 from twin.diagnosis.unlisted import STRANGE, Unlisted, extended, look
+from twin.diagnosis.unmodelled import Odds, Unmodelled
 from twin.diagnosis.weights import covariance
 from twin.instants import CALENDAR_NS, SECOND_NS
 from twin.model.courses import Cause, Course
@@ -37,7 +38,7 @@ MOST_LEFT = 0.5  # of chi-square beyond noise, that a cause may leave and still 
 MOST_SATURATED = 0.05  # share of samples
 MOST_JUDGED = 24  # cycles of a long log that are looked at, evenly spread
 MOST_NAMED = 4  # runners-up
-SUREST = 0.999  # rivals are rejected at one in a thousand, so no answer is surer
+LIKELY = 0.5  # that something acts which nobody listed: more, and it is said
 # Of a size, that the data set's own scale is not known better: volume and suction; and how the
 # wall's heat is shared between vessel and line.
 RELATIVE, OF_HEAT = 0.03, 0.1
@@ -100,9 +101,12 @@ def diagnose(
     before = judge(evidence, healthy.of(held_out), HEALTHY)
     after = judge(evidence, known.of(held_out), found)
     progress("looking for what nobody listed")
-    strange = look(known, found, fitted, held_out)
-    terms: tuple[Term, ...] = ()
-    if (verdict := _verdict(found, before, after, strange)) == "unlisted":
+    beside = Unmodelled(evidence, known.of(evidence.judged), found)
+    odds = [beside.odds(number) for number in range(len(found))]
+    likely = any(one.of_unlisted(len(found)) > LIKELY for one in odds)
+    strange = look(known, found, fitted, held_out, least=0.0 if likely else STRANGE)
+    verdict, terms = _verdict(found, before, after, strange, likely), tuple[Term, ...]()
+    if verdict == "unlisted":
         if not _sure(found, before, after):
             searched, found = replace(searched, found=None), HEALTHY
             strange = look(healthy, found, fitted, held_out)
@@ -115,7 +119,7 @@ def diagnose(
             strange = replace(strange, terms=())
     answer = head | {
         "verdict": verdict,
-        "causes": _causes(evidence, searched, before) if found else [],
+        "causes": _causes(evidence, searched, odds, before) if found else [],
         "runners_up": _runners_up(searched),
         "unlisted": _unlisted(strange) if verdict == "unlisted" else None,
         "cycles": {
@@ -145,12 +149,17 @@ def _signals(evidence: Evidence) -> list[dict[str, str]]:
     return [{"signal": one.signal, "what": one.what, "do": one.action} for one in against]
 
 
-def _verdict(found: Hypothesis, before: Judged, after: Judged, strange: Unlisted) -> str:
-    """Consistent, explained, or something real is left: in sigmas, in mbar, or of a kind."""
+def _verdict(
+    found: Hypothesis, before: Judged, after: Judged, strange: Unlisted, likely: bool
+) -> str:
+    """Consistent, explained, or something real is left: in sigmas, in mbar, or of a kind.
+
+    Or it is ``likely``, from what is left, that something acts which nobody listed.
+    """
     left = after.leftover > EXPLAINED
     usual = math.hypot(before.usual, ROUGH * before.rms, after.unmeasured)
     beyond = after.rms > BEYOND * usual
-    if left or beyond or strange.gain >= STRANGE:
+    if left or beyond or likely or strange.gain >= STRANGE:
         return "unlisted"
     return "explained" if found else "consistent"
 
@@ -221,7 +230,9 @@ def _runners_up(searched: Search) -> list[dict[str, Any]]:
 # --- causes ---------------------------------------------------------------------------------------
 
 
-def _causes(evidence: Evidence, searched: Search, before: Judged) -> list[dict[str, Any]]:
+def _causes(
+    evidence: Evidence, searched: Search, odds: Sequence[Odds], before: Judged
+) -> list[dict[str, Any]]:
     assert searched.found is not None
     found, first, result = searched.found, 0, []
     spread = np.sqrt(np.diag(found.covariance)) * max(found.leftover, 1.0)
@@ -235,7 +246,7 @@ def _causes(evidence: Evidence, searched: Search, before: Judged) -> list[dict[s
             "course": str(cause.course),
             "onset_s": _rounded_onset(evidence, cause),
             "parameters": values,
-            "probability": _probability(found, rivals),
+            "probability": _probability(evidence, found, rivals, odds[number]),
             "not_separable_from": [_stranger(one, found) for one in rivals],
             "why": _why(evidence, cause, values, before),
         }
@@ -257,10 +268,18 @@ def _stranger(rival: Fitted, found: Fitted) -> str:
     return next(one for one in rival.effects if one not in found.effects)
 
 
-def _probability(found: Fitted, rivals: list[Fitted]) -> float:
+def _probability(evidence: Evidence, found: Fitted, rivals: Sequence[Fitted], odds: Odds) -> float:
+    """How probable a cause is beside its rivals and beside something that nobody listed.
+
+    Listed effects count as equally frequent here: what the log shows decides.
+    """
+
+    def shown(one: Fitted) -> float:
+        return one.score - rarity(evidence, one.hypothesis)
+
     temper = 2.0 * max(found.leftover, 1.0) ** 2
-    weights = [math.exp(-max(one.score - found.score, 0.0) / temper) for one in rivals]
-    return round(min(1.0 / (1.0 + sum(weights)), SUREST), 3)
+    weights = sum(math.exp(min((shown(found) - shown(one)) / temper, 50.0)) for one in rivals)
+    return round(odds.of_cause(len(found.hypothesis), weights), 3)
 
 
 def _rounded_onset(evidence: Evidence, cause: Cause) -> float | None:

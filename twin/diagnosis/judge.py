@@ -14,7 +14,7 @@ from twin.monitor.bins import Floats, Ints
 from twin.monitor.cycles import PAPER_VACUUM, time_to_vacuum
 from twin.signals import MBAR, MS
 
-FEWEST = 3  # held-out cycles, to tell from how they differ how sure a gain is
+FEWEST = 5  # held-out cycles, to tell from how they differ how sure a gain is
 SURE = 0.975  # quantile on either side
 LITTLE = 1.25  # times the usual deviation: cycles differ by as much
 

@@ -20,7 +20,7 @@ from twin.monitor.bins import Bins, Floats, unwarped
 from twin.signals import MBAR, MS
 
 Over = Literal["time", "vacuum"]
-_OVER: Mapping[Over, str] = {"time": "time in the cycle", "vacuum": "vacuum"}
+OVER: Mapping[Over, str] = {"time": "time in the cycle", "vacuum": "vacuum"}
 _ALL = range(len(KINDS))
 STRANGE = 0.4  # chi-square per residual that terms must take away on cycles they have not seen
 DROP_BAR = 0.1
@@ -63,11 +63,16 @@ class _Left:
 
 
 def look(
-    known: Covariance, hypothesis: Hypothesis, fitted: Sequence[int], held_out: Sequence[int]
+    known: Covariance,
+    hypothesis: Hypothesis,
+    fitted: Sequence[int],
+    held_out: Sequence[int],
+    least: float = STRANGE,
 ) -> Unlisted:
     """Fit terms to what a hypothesis leaves on the fitted cycles; judge on the others.
 
-    ``known`` is about the same hypothesis.
+    ``known`` is about the same hypothesis. Terms must take away the ``least`` there (chi-square
+    per residual).
     """
     evidence = known.evidence
     off = evidence.off([hypothesis])
@@ -76,18 +81,19 @@ def look(
         for cycles in (fitted, held_out)
         for weights in (known.of(cycles),)
     )
-    best = max((_tried(evidence, here, there, over) for over in _OVER), key=lambda one: one.gain)
-    if best.gain >= STRANGE:
+    best = max((_tried(evidence, here, there, over) for over in OVER), key=lambda one: one.gain)
+    if best.gain >= least:
         return best
     return Unlisted(_worst(evidence, there), _driver(evidence, off[:, 0]), (), best.gain)
 
 
 def _tried(evidence: Evidence, here: _Left, there: _Left, over: Over) -> Unlisted:
     """Terms over time or vacuum."""
-    bins, values = evidence.bins, _over(evidence, here.off, over)
-    knots = {name: _knots(bins, values, kind, over) for kind, name in enumerate(KINDS)}
-    knots = {name: at for name, at in knots.items() if len(at)}
-    hats = [_hats(bins, values, name, at) for name, at in knots.items()]
+    shapes = smooth(evidence, here.off, over)
+    knots, hats = (
+        {name: at for name, (at, _) in shapes.items()},
+        [one for _, one in shapes.values()],
+    )
     columns = here.weights.white(np.concatenate(hats, axis=1))
     prior = np.eye(columns.shape[1]) / TERM_MBAR**2
     size = np.linalg.solve(columns.T @ columns + prior, columns.T @ here.white)
@@ -101,7 +107,17 @@ def _tried(evidence: Evidence, here: _Left, there: _Left, over: Over) -> Unliste
     )
     gain = float(there.white @ there.white - after @ after) / len(after)
     where = _phase(names[int(np.argmax(alone))])
-    return Unlisted(where, _OVER[over], terms, gain)
+    return Unlisted(where, OVER[over], terms, gain)
+
+
+def smooth(evidence: Evidence, off: Floats, over: Over) -> dict[str, tuple[Floats, Floats]]:
+    """Knots of each kind of stretch, and the share of each in each bin, (bins, knots).
+
+    ``off`` is what a hypothesis leaves (mbar), which tells the vacuum that it expects.
+    """
+    bins, values = evidence.bins, _over(evidence, off, over)
+    knots = {name: _knots(bins, values, kind, over) for kind, name in enumerate(KINDS)}
+    return {name: (at, _hats(bins, values, name, at)) for name, at in knots.items() if len(at)}
 
 
 def _term(name: str, over: Over, at: Floats, sizes: Floats) -> Term:

@@ -197,14 +197,11 @@ def _all_of_it(times: Times, whole: str) -> str:
 
 
 def certainty(cause: Answer) -> str:
-    """How sure it is among the listed causes, with what the log cannot tell from it.
-
-    Nothing is said of causes that are not listed: no chance was given to them.
-    """
+    """How sure it is, beside other listed causes and what nobody listed."""
     alike = listed([spoken(name) for name in cause["not_separable_from"]], "or")
+    percent = f"{100.0 * cause['probability']:.0f} %"
     if not alike:
-        return "no other listed cause fits as well"
-    percent = f"{100.0 * cause['probability']:.0f} % among the listed causes"
+        return f"{percent}; no other listed cause fits as well"
     return f"{percent}; this log cannot tell it from {alike}"
 
 

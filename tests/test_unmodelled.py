@@ -1,0 +1,88 @@
+"""What nobody listed is an alternative to every cause, and weighs what its mathematics says."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import multivariate_normal
+
+from tools import battery_first
+from twin.diagnosis import unmodelled
+from twin.diagnosis.answer import diagnose
+from twin.diagnosis.unmodelled import SHARES, Odds
+from twin.monitor.bins import Floats
+
+RESIDUALS, WAYS = 60, 5
+
+
+def drawn(seed: int) -> tuple[Floats, Floats, Floats]:
+    """Smooth courses (whitened), what is left, and what was explained."""
+    rng = np.random.default_rng(seed)
+    courses = rng.normal(size=(RESIDUALS, WAYS)) * np.array([1.0, 0.5, 2.0, 3.0, 0.1])
+    return courses, rng.normal(size=RESIDUALS), 4.0 * rng.normal(size=RESIDUALS)
+
+
+def odds(left: Floats, courses: Floats, explained: Floats) -> Odds:
+    return Odds.of(unmodelled._log_likelihoods(courses, left, explained, 1.0)[None])
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_ratio_is_that_of_two_normal_densities(seed: int) -> None:
+    courses, left, explained = drawn(seed)
+    scale = 1.7
+    found = unmodelled._log_likelihoods(courses, left, explained, scale)
+    alone = scale * np.eye(RESIDUALS)
+    for share, ratio in zip(SHARES, found, strict=True):
+        size = share**2 * (explained @ explained) / np.sum(courses**2)
+        both = multivariate_normal(cov=alone + size * courses @ courses.T)
+        expected = both.logpdf(left) - multivariate_normal(cov=alone).logpdf(left)
+        assert ratio == pytest.approx(expected, abs=1e-8)
+
+
+def test_both_ways_to_leave_something_are_distributions() -> None:
+    assert unmodelled._ANY.sum() == pytest.approx(1.0)
+    assert unmodelled._LITTLE.sum() == pytest.approx(1.0)
+
+
+@given(st.floats(0.0, unmodelled.MOST), st.integers(1, 3), st.floats(0.0, 1e3))
+def test_a_probability_is_one(ratio: float, causes: int, rivals: float) -> None:
+    one = Odds(ratio)
+    assert 0.0 <= one.of_cause(causes, rivals) <= 1.0
+    assert 0.0 <= one.of_unlisted(causes) <= 1.0
+    assert one.of_cause(causes, rivals + 1.0) <= one.of_cause(causes, rivals)
+    assert Odds(2.0 * ratio + 1.0).of_cause(causes, 0.0) <= one.of_cause(causes, 0.0) + 1e-12
+
+
+def test_what_explains_much_and_leaves_noise_is_surer_than_what_explains_little() -> None:
+    courses, left, explained = drawn(4)
+    sure, unsure = (odds(left, courses, size * explained) for size in (10.0, 0.1))
+    assert 0.98 < sure.of_cause(1, 0.0) < 0.995
+    assert unsure.of_cause(1, 0.0) < sure.of_cause(1, 0.0) - 0.03
+    assert sure.of_cause(3, 0.0) < sure.of_cause(2, 0.0) < sure.of_cause(1, 0.0)
+
+
+def test_what_is_left_and_smooth_speaks_for_something_unlisted() -> None:
+    courses, left, explained = drawn(5)
+    strange = odds(left + courses @ np.array([4.0, -3.0, 2.0, 1.0, 5.0]), courses, explained)
+    assert strange.of_unlisted(1) > 0.99
+    assert strange.of_cause(1, 0.0) < 0.7
+
+
+def test_an_effect_that_is_off_by_a_little_of_much_is_still_itself() -> None:
+    """A waveform that is off by a twentieth is the model's, not another effect's."""
+    courses, left, explained = drawn(6)
+    size = 40.0 * explained
+    way = courses[:, 3] / np.linalg.norm(courses[:, 3])
+    one = odds(left + 0.01 * np.linalg.norm(size) * way, courses, size)
+    assert one.of_cause(1, 0.0) > 0.95
+    assert one.of_unlisted(1) < 0.5
+
+
+@pytest.mark.parametrize("seed", [800057, 800010])
+def test_a_mechanism_that_a_listed_cause_mimics_is_not_called_that_cause(seed: int) -> None:
+    """Condensate, and a lip that lifts: a porous leak takes nearly all of either away."""
+    unit, hidden, samples = battery_first.drawn_case("unlisted", seed, 4)
+    assert hidden[0].effect in battery_first.UNLISTED
+    found = diagnose(unit.config, [samples], "log", lambda _: None).json
+    assert found["verdict"] == "unlisted"
+    assert all(cause["probability"] < 0.7 for cause in found["causes"])
