@@ -19,10 +19,13 @@ LEAK = Hidden("leakage", "constant", 1.0)
 WORLDS = ("first", "second")
 
 
-def answer(effect: str, verdict: str = "explained", left: float = 1.31) -> dict[str, Any]:
+def answer(
+    effect: str, verdict: str = "explained", left: float = 1.31, probability: float = 0.97
+) -> dict[str, Any]:
     """An answer that names one effect of size 0.9."""
     size = {"value": 0.9, "low95": 0.8, "high95": 1.1}
     cause = {"effect": effect, "course": "constant", "not_separable_from": []}
+    cause["probability"] = probability
     return {
         "verdict": verdict,
         "causes": [cause | {"parameters": {"flow": size}}],
@@ -33,6 +36,17 @@ def answer(effect: str, verdict: str = "explained", left: float = 1.31) -> dict[
 
 def single(effect: str, **more: Any) -> Case:
     return Case("single", 7, "gripper", [LEAK], answer(effect), more=more)
+
+
+def test_what_is_stated_is_compared_with_how_often_it_is_right() -> None:
+    named = [*["leakage"] * 3, "porous_leakage"]
+    sure = [Case("single", n, "gripper", [LEAK], answer(one)) for n, one in enumerate(named)]
+    doubted = Case("unlisted", 9, "gripper", [], answer("leakage", probability=0.6))
+    page = tables([*sure, doubted])
+    assert "| 95% to 98% | 4 | 97.0% | 75.0% | 19% to 99% |" in page
+    assert "| 50% to 80% | 1 | 60.0% | 0.0% | 0% to 98% |" in page
+    assert "Expected calibration error: 0.296, over 5 causes." in page  # (4 * 0.22 + 0.6) / 5
+    assert "| causes stated with 95% or more that act | 3 of 4 (75%) |" in page
 
 
 @pytest.mark.parametrize("world", WORLDS)

@@ -20,6 +20,7 @@ FOUND = {
 }
 STORED = ("good", "usable")  # verdicts of a commissioning after which a unit has its twin
 MOST_LEFT = 1.2  # sigmas, where explained
+SURE = 0.95  # probability from which on a cause is stated surely
 
 
 @dataclass(frozen=True)
@@ -98,12 +99,20 @@ class Case:
         )
 
     @property
+    def stated(self) -> list[tuple[float, bool]]:
+        """Probability of each cause of the answer, and whether it acts."""
+        effects = {truth.effect for truth in self.hidden}
+        return [(float(one["probability"]), one["effect"] in effects) for one in self.causes]
+
+    @property
     def outcomes(self) -> Outcomes:
         """What the case counts for, by what is asked for."""
         if self.answer is None:
             true = {"true": self.more["true"]} if "true" in self.more else {}
             return {FOUND[self.kind]: False} | true
         found = {name: one for name, one in _JUDGES[self.kind](self).items() if one is not None}
+        if sure := [acts for probability, acts in self.stated if probability >= SURE]:
+            found["sure"] = sure
         if self.kind != "commissioning" and self.verdict == "explained":
             share = self.answer["gain"]["share_of_achievable_pct"] / 100.0
             found |= {"left": self.left <= MOST_LEFT, "gain": share}

@@ -3,16 +3,18 @@
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import binomtest
 
-from tools.battery_cases import FOUND, MOST_LEFT, Case, of_kind, spread
+from tools.battery_cases import FOUND, MOST_LEFT, SURE, Case, of_kind, spread
 
 MORE = 3  # kinds of answer told of an effect that was not named first
 WHOLE = ("gain",)  # each a share already
 WORST = "the worst phase"
+STATED = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 1.01)  # probabilities that are counted together
 
 
 class Asked(NamedTuple):
@@ -30,6 +32,7 @@ ASKED = {
     "named": Asked("single effects named first or in a set of at most three", 0.95),
     "alone": Asked("named alone, no look-alike needed", 0.85),
     "wrong": Asked("explained and wrong", 0.01, most=True),
+    "sure": Asked(f"causes stated with {SURE:.0%} or more that act", 0.95),
     "course": Asked("the course right, where named", 0.90),
     "covered": Asked("95 % interval covers the size", 0.90),
     "flows": Asked("95 % interval covers a flow or volume, the vessel's told a fifth off", 0.90),
@@ -96,9 +99,29 @@ def tables(cases: Sequence[Case]) -> str:
             ("not found", "seed", "system", "hidden", "verdict", "named", "sigmas left"),
             _missed([one for one in cases if not one.found and one.kind != "commissioning"]),
         ),
+        *reliability(cases),
         table(("processor time of", "cases", "median", "95 %", "most"), _seconds(cases)),
     ]
     return "\n\n".join(filter(None, parts))
+
+
+def reliability(cases: Sequence[Case]) -> Iterator[str]:
+    """How often causes act that were stated with some probability; how far that is off in all."""
+    stated = np.array([each for one in cases for each in one.stated])
+    if not len(stated):
+        return
+    rows, off = list[Sequence[str]](), 0.0
+    for low, high in pairwise(STATED):
+        here = stated[(stated[:, 0] >= low) & (stated[:, 0] < high)]
+        if len(here):
+            said, acts = here.mean(axis=0)
+            off += abs(said - acts) * len(here) / len(stated)
+            ends = binomtest(int(here[:, 1].sum()), len(here)).proportion_ci(0.95)
+            chance = f"{ends.low:.0%} to {ends.high:.0%}"
+            said_of = f"{low:.0%} to {min(high, 1.0):.0%}"
+            rows.append((said_of, str(len(here)), f"{said:.1%}", f"{acts:.1%}", chance))
+    yield table(("probability stated", "causes", "mean", "act", "by chance"), iter(rows))
+    yield f"Expected calibration error: {off:.3f}, over {len(stated)} causes."
 
 
 def commissionings(cases: Sequence[Case]) -> Iterator[str]:
