@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tools.readme import filled
 from twin.figures.course import LAST_S, LEAK_WINDOW_S, LEAST_WINDOW_S, LONGEST_HOLE, Floats, Rows
 from twin.figures.course import course as found_in
-from twin.figures.expected import t1_from_rest
+from twin.figures.expected import leakage_from_rest, t1_from_rest
 from twin.figures.settings import FigureSettings, Limits, limits
 from twin.figures.table import FIGURES, Unit, figures, table
 from twin.figures.warnings import CAUTIONS, in_words, warnings
@@ -494,9 +494,50 @@ def beyond(**measured: float) -> tuple[str, ...]:
 
 def test_limits_are_the_units_where_nothing_is_set() -> None:
     t1 = 1.25 * t1_from_rest(DATA)
-    assert Limits(t1, 250.0, 540.0, (3.0, 6.0)) == limits(FigureSettings(), DATA)
-    own = FigureSettings(permitted_leakage_mbar_s=90.0, permitted_free_flow_mbar=40.0)
-    assert (limits(own, DATA).leakage, limits(own, DATA).free_flow) == (90.0, 40.0)
+    assert Limits(t1, 250.0, 540.0, (0.75 * 4.8, 1.25 * 4.8)) == limits(FigureSettings(), DATA)
+    own = FigureSettings(
+        permitted_leakage_mbar_s=90.0, permitted_free_flow_mbar=40.0, supply_low_bar=3.0
+    )
+    found = limits(own, DATA)
+    assert (found.leakage, found.free_flow, found.supply) == (90.0, 40.0, (3.0, 6.0))
+    assert found.configured == {"leakage", "free_flow", "lowest_supply"}
+
+
+def test_a_porous_part_has_a_limit_of_its_own() -> None:
+    """It loses more in hold than any ejector permits, and is healthy."""
+    parts = (DATA.system.parts[0], Vessel(kind="vessel", volume_ml=50.0))
+    effects = {"porous_leakage": {"flow_at_600mbar": 1.0}}
+    porous = DATA.model_copy(update={"system": System(parts=parts), "effects": effects})
+    usual = leakage_from_rest(porous)
+    assert usual > 250.0
+    assert limits(FigureSettings(), porous).leakage == pytest.approx(1.25 * usual)
+
+
+def test_nothing_is_lost_where_no_hold_comes() -> None:
+    busy = DATA.ejector.model_copy(update={"air_saving": "off"})
+    assert leakage_from_rest(DATA.model_copy(update={"ejector": busy})) == 0.0
+    weak = DATA.model_copy(update={"effects": {"end_vacuum_loss": {"end_pressure_rise": 300.0}}})
+    assert leakage_from_rest(weak) == 0.0
+
+
+def test_a_unit_on_a_high_supply_has_a_range_of_its_own() -> None:
+    high = DATA.model_copy(update={"supply": Supply(pressure_bar=6.8)})
+    assert limits(FigureSettings(), high).supply == pytest.approx((5.1, 8.5))
+
+
+def test_words_say_where_a_limit_comes_from() -> None:
+    over = {"t1": 9000.0, "leakage": 400.0}
+    set_here = limits(FigureSettings(permitted_t1_ms=2000.0), DATA)
+    t1, leakage = in_words(["t1_over_limit", "leakage_over_limit"], over, set_here)
+    assert t1 == "t1 over limit (9000 of 2000 ms, set in [figures])"
+    assert leakage == "leakage over limit (400 of 250 mbar/s, from the unit's data set)"
+
+
+def test_what_the_data_set_expects_is_warned_of_only_beyond_a_limit_that_is_set() -> None:
+    often = dict.fromkeys(FIGURES, math.nan) | {"quick_switchings": 7.0, "t1": 2100.0}
+    assert warnings(often, often, LIMITS) == ("t1_over_limit",)
+    seldom = often | {"quick_switchings": 2.0}
+    assert warnings(often, seldom, LIMITS) == ("valve_protection", "t1_over_limit")
 
 
 @pytest.mark.parametrize(
@@ -509,12 +550,12 @@ def test_limits_are_the_units_where_nothing_is_set() -> None:
         ("free_flow_too_high", {"free_flow": 540.0}, {"free_flow": 541.0}),
         (
             "supply_out_of_range",
-            {"lowest_supply": 3.0},
-            {"lowest_supply": 2.9, "highest_supply": 5},
+            {"lowest_supply": 3.61},
+            {"lowest_supply": 3.59, "highest_supply": 5},
         ),
         (
             "supply_out_of_range",
-            {"highest_supply": 6.0},
+            {"highest_supply": 5.99},
             {"lowest_supply": 5, "highest_supply": 6.1},
         ),
     ],
@@ -547,7 +588,9 @@ def test_the_page_has_the_tables_and_every_key() -> None:
     keys = tomllib.loads(example)["figures"]
     given = FigureSettings.model_validate(keys)
     assert set(keys) == set(FigureSettings.model_fields)
-    assert limits(given, DATA) == LIMITS  # the defaults, as the page says
+    found = limits(given, DATA)
+    assert (found.t1, found.leakage, found.free_flow) == (2000.0, LIMITS.leakage, LIMITS.free_flow)
+    assert found.supply == pytest.approx(LIMITS.supply)  # the defaults, as the page says
 
 
 def test_the_supply_range_is_one() -> None:

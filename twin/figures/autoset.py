@@ -5,11 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.errors import ConfigError
-from twin.figures.settings import LEAST_T1_MS, permitted
+from twin.figures.settings import LEAST_LEAKAGE, LEAST_T1_MS, permitted
 from twin.figures.store import History
 
 GOOD_CYCLES = 5  # the last ones; more tell no more of today
-LEAST_LEAKAGE = 10.0  # mbar/s over what was measured: below is scatter
 
 
 @dataclass(frozen=True)

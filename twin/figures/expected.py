@@ -11,12 +11,13 @@ from functools import cached_property
 
 import numpy as np
 
-from twin.figures.course import Bytes, Floats
+from twin.figures.course import Bytes, Floats, Rows, course
 from twin.model import kernel, strides
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.model.strides import Strides
 from twin.model.term import Terms
+from twin.model.theta import Theta
 from twin.monitor.cycles import STALE
 from twin.monitor.signatures import steps
 from twin.signals import BREAK, MBAR, MS, Command, Phase, Samples, Ticks
@@ -129,16 +130,33 @@ def t1_from_rest(data: DataSet) -> float:
     theta[c.AIR_SAVING] = c.OFF
     seconds = 1.0
     while seconds <= LONGEST_SUCTION_S:
-        rows = round(seconds * 1e3)
-        _, pressure = strides.simulate(
-            theta, np.full(rows, MS), np.full(rows, Command.SUCTION, np.uint8)
-        )
-        vacuum = (theta[c.AMBIENT] - pressure) / MBAR
+        vacuum, _ = _suction(theta, seconds)
         reached = np.flatnonzero(vacuum >= data.ejector.h1_mbar)
         if len(reached):
             return float(reached[0] - np.argmax(vacuum >= data.ejector.h2_mbar))
         seconds *= 4.0
     return math.inf
+
+
+def leakage_from_rest(data: DataSet) -> float:
+    """Leakage (mbar/s) that the data set expects of the first hold; 0 where there is none."""
+    reached_ms = t1_from_rest(data)
+    if not math.isfinite(reached_ms) or data.ejector.air_saving == "off":
+        return 0.0
+    vacuum, phase = _suction(coefficients(data), LONGEST_SUCTION_S)
+    time = np.arange(len(vacuum), dtype=np.float64) * MS
+    rows = Rows(time, vacuum, np.full(len(time), np.nan), phase, ended=True, blown=False)
+    found = course(rows, data.ejector.h2_mbar, data.ejector.h1_mbar).vacuum.leakage
+    return found if math.isfinite(found) else 0.0
+
+
+def _suction(theta: Theta, seconds: float) -> tuple[Floats, Bytes]:
+    """Vacuum (mbar) and phase, each millisecond, of a suction from rest."""
+    rows = round(seconds * 1e3)
+    commands = np.full(rows, Command.SUCTION, np.uint8)
+    phase, pressure = strides.simulate(theta, np.full(rows, MS), commands)
+    vacuum: Floats = (theta[c.AMBIENT] - pressure) / MBAR
+    return vacuum, phase
 
 
 def _first_level(ticks: Ticks, at_edge: bool) -> int | None:

@@ -5,22 +5,24 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from twin.figures.expected import t1_from_rest
+from twin.figures.expected import leakage_from_rest, t1_from_rest
 from twin.model.dataset import DataSet
 from twin.settings import Settings
 
 Positive = Annotated[float, Field(gt=0.0)]
 LEAST_T1_MS = 50.0  # over what is usual: below is scatter
+LEAST_LEAKAGE = 10.0  # mbar/s, the same
+LEAST_SUPPLY_BAR = 0.5  # the same
 
 
 class FigureSettings(Settings):
     """What is permitted in a cycle, the field's defaults; and whether figures are kept."""
 
     permitted_t1_ms: Positive | None = None  # as the data set expects it, and the tolerance
-    permitted_leakage_mbar_s: Positive | None = None  # as the data set's, for leak monitoring
+    permitted_leakage_mbar_s: Positive | None = None  # the same; at least what the ejector permits
     permitted_free_flow_mbar: Positive | None = None  # where the ejector would report a part
-    supply_low_bar: Annotated[float, Field(ge=0.0)] = 3.0  # gauge, at the nozzle
-    supply_high_bar: Positive = 6.0
+    supply_low_bar: Annotated[float, Field(ge=0.0)] | None = None  # gauge, at the nozzle
+    supply_high_bar: Positive | None = None  # both as the data set has it, and the tolerance
     energy_kwh_m3: Positive = 0.12  # to compress a standard cubic metre, whole compressor station
     autoset_tolerance: Annotated[float, Field(ge=0.0, le=10.0)] = 0.25  # over the last good cycles
     keep: bool = False  # twin run adds its cycles to the database
@@ -28,19 +30,28 @@ class FigureSettings(Settings):
 
     @model_validator(mode="after")
     def _range_is_one(self) -> Self:
-        if self.supply_low_bar >= self.supply_high_bar:
+        low, high = self.supply_low_bar, self.supply_high_bar
+        if low is not None and high is not None and low >= high:
             raise ValueError("supply_low_bar must be below supply_high_bar")
         return self
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What is permitted of one unit, every value known; in the figures' units."""
+    """What is permitted of one unit, every value known; in the figures' units.
+
+    ``configured`` are the figures whose limit the configuration sets.
+    """
 
     t1: float  # ms; infinite where no suction of the data set reaches H1
     leakage: float  # mbar/s
     free_flow: float  # mbar
     supply: tuple[float, float]  # bar gauge
+    configured: frozenset[str] = frozenset()
+
+    def source(self, figure: str) -> str:
+        """Where the limit of a figure comes from, for people."""
+        return "set in [figures]" if figure in self.configured else "from the unit's data set"
 
 
 def permitted(usual: float, tolerance: float, least: float) -> float:
@@ -50,13 +61,25 @@ def permitted(usual: float, tolerance: float, least: float) -> float:
 
 def limits(settings: FigureSettings, data: DataSet) -> Limits:
     """The limits of a unit: what is not set follows from its data set."""
-    ejector, t1 = data.ejector, settings.permitted_t1_ms
-    if t1 is None:
-        t1 = permitted(t1_from_rest(data), settings.autoset_tolerance, LEAST_T1_MS)
-    leakage, free_flow = settings.permitted_leakage_mbar_s, settings.permitted_free_flow_mbar
-    return Limits(
-        t1=t1,
-        leakage=ejector.permitted_leakage_mbar_s if leakage is None else leakage,
-        free_flow=ejector.h2_mbar - ejector.h2_hysteresis_mbar if free_flow is None else free_flow,
-        supply=(settings.supply_low_bar, settings.supply_high_bar),
+    t1, leakage = settings.permitted_t1_ms, settings.permitted_leakage_mbar_s
+    free_flow = settings.permitted_free_flow_mbar
+    low, high = settings.supply_low_bar, settings.supply_high_bar
+    chosen = {"t1": t1, "leakage": leakage, "free_flow": free_flow, "lowest_supply": low or high}
+    ejector, tolerance, nozzle_bar = (
+        data.ejector,
+        settings.autoset_tolerance,
+        data.supply.nozzle_bar,
     )
+    if t1 is None:
+        t1 = permitted(t1_from_rest(data), tolerance, LEAST_T1_MS)
+    if leakage is None:
+        usual = permitted(leakage_from_rest(data), tolerance, LEAST_LEAKAGE)
+        leakage = max(usual, ejector.permitted_leakage_mbar_s)
+    if free_flow is None:
+        free_flow = ejector.h2_mbar - ejector.h2_hysteresis_mbar
+    if low is None:
+        low = nozzle_bar - max(tolerance * nozzle_bar, LEAST_SUPPLY_BAR)
+    if high is None:
+        high = permitted(nozzle_bar, tolerance, LEAST_SUPPLY_BAR)
+    configured = frozenset(name for name, value in chosen.items() if value is not None)
+    return Limits(t1, leakage, free_flow, (low, high), configured)
