@@ -248,3 +248,17 @@ def test_a_slow_drift_is_found_while_it_is_small(name: str, effect: str, size: f
     assert BEGINS - 3 <= first.data["cycle"] <= BEGINS + 20
     last = probabilities(told)[max(probabilities(told))]
     assert last[effect] > 0.9
+
+
+@pytest.mark.parametrize(
+    ("name", "fault", "seed"),
+    [
+        ("test_rig", "threshold_drift=-150@59.4392", 24),
+        ("gripper", "check_valve_leak=14.286@41.5007", 43),
+    ],
+)
+def test_the_name_of_a_gross_fault_stays(name: str, fault: str, seed: int) -> None:
+    """It begins within a cycle. What small signatures say of it later is another cause."""
+    told = events(name, [fault], 31, seed)
+    assert raised(told)[0].data["effect"] == UNKNOWN
+    assert [event.data["effect"] for event in named(told)] == [fault.split("=", maxsplit=1)[0]]

@@ -345,21 +345,21 @@ def test_a_fault_that_stays_is_one_alarm(name: str, fault: str) -> None:
     assert kinds(events) == [Kind.DEVIATION] * 2  # the second names it
 
 
-@pytest.mark.parametrize(("more", "times"), [((), 1), (("sensor_lag=20@c7",), 2)])
+@pytest.mark.parametrize(("more", "times"), [((), 1), (("sensor_lag=20@c7",), 4)])
 def test_the_cause_is_sought_again_only_where_cycles_differ_otherwise(
     more: tuple[str, ...], times: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """To seek it takes longer than all else that is done for a cycle."""
+    """To seek it takes longer than all else that is done for a cycle. Three have to agree on it."""
     sought = []
     monkeypatch.setattr(detect, "likenesses", lambda *given: sought.append(0) or likenesses(*given))
-    samples = rigs.recorded("test_rig", 35.0, ("leakage=2@c3", *more), 6)[0]
+    samples = rigs.recorded("test_rig", 48.0, ("leakage=2@c3", *more), 6)[0]
     rigs.watch("test_rig", rigs.cut(samples, 1000))
     assert len(sought) == times
 
 
 def test_a_cause_that_changes_is_named_anew() -> None:
     faults = ("blow_off_delay=20@c3", "leakage=3@c8")
-    seen = rigs.watch("test_rig", [rigs.recorded("test_rig", 34.0, faults, 2)[0]])
+    seen = rigs.watch("test_rig", [rigs.recorded("test_rig", 45.0, faults, 2)[0]])
     _, first, *others = seen.of(Kind.DEVIATION)
     assert first.data["effect"] == "blow_off_delay"
     assert others

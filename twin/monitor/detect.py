@@ -57,6 +57,7 @@ RIVAL = 0.05  # probability from which on another cause is named as well
 STANDING = 0.8  # of the best fit's gain: then the name of a standing alarm still holds
 ALIKE = 0.2  # of how far out a cycle is: by so much its figures may move before the cause is sought
 NAMED = 0.5  # of the squares a name explains at least: more than it leaves
+RENAMED = 3  # cycles in a row that must agree on another name before a standing alarm gets it
 GREW = 2.0  # times as far out as any cycle before: something else has begun
 PHASES = {"h1": "suction", "h1_low": "hold"}  # which a level of the air saving ends
 
@@ -119,6 +120,7 @@ class Monitor:
     _before: Cycle | None = None
     _sought: Mapping[str, float] = field(default_factory=dict)  # figures, as the cause was sought
     _mixed: int | None = None  # the cycle in which something may have begun, not yet named
+    _rival: tuple[str, int] = ("", 0)  # another name for the standing alarm, cycles that gave it
     _farthest: float = 0.0  # sigmas by which a cycle was out since the alarm was raised
     _quiet_cycles: int = 0
     _last: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # row of the stream
@@ -329,7 +331,7 @@ class Monitor:
             self._quiet_cycles = quiet + 1
             if self._quiet_cycles >= self.settings.clear_cycles:
                 events.append(self._cleared(cycle))
-                self.active = ""
+                self.active, self._rival = "", ("", 0)
         if far < self.settings.raise_sigma:
             self._mixed = None
         self._farthest = max(self._farthest, far) if self.active else 0.0
@@ -429,7 +431,7 @@ class Monitor:
         """
         if cycle.cut_short or cycle.index == self._mixed:
             return True
-        if _is_proportional(verdict):
+        if self._small(verdict) or self._rival[1]:
             return False
         if found.keys() == self._sought.keys():
             names = [name for name in self.settings.healthy.figures if name in found]
@@ -451,14 +453,41 @@ class Monitor:
         ranking = self._name(worst, before, cycle, verdict)
         best = ranking[0]
         self._mixed = None
-        if best.effect in (self.active, UNKNOWN) or best.share < NAMED:
+        if best.effect == UNKNOWN or best.share < NAMED:
+            self._rival = ("", 0)
             return []
-        standing = max((one.share for one in ranking if one.effect == self.active), default=0.0)
-        if standing >= STANDING * best.share:
+        if not self._is_renamed(ranking):
             return []
         self.active = best.effect
         what = f"{worst.place}: {worst.excess:+.1f} mbar from healthy ({worst.sigmas:+.0f} sigma)"
         return [self._raised(cycle, what, worst.plain(), best, look_alikes(ranking))]
+
+    def _small(self, verdict: "Verdict | None") -> Sequence[Likeness]:
+        """Causes by the isolation, if the foremost is as small as its signatures are.
+
+        None against another name that stands: of something large they say nothing.
+        """
+        if not verdict or not verdict.causes or not verdict.causes[0].is_small:
+            return ()
+        return verdict.causes if self.active in (UNKNOWN, verdict.causes[0].effect) else ()
+
+    def _is_renamed(self, ranking: Sequence[Likeness]) -> bool:
+        """Whether the best of a ranking becomes the alarm's name.
+
+        The first name does at once. Another one does after ``RENAMED`` cycles in a row in which
+        the standing name fits badly, so that a single odd cycle changes nothing.
+        """
+        best = ranking[0]
+        standing = max((one.share for one in ranking if one.effect == self.active), default=0.0)
+        if standing >= STANDING * best.share:
+            self._rival = ("", 0)
+            return False
+        name, cycles = self._rival
+        self._rival = (best.effect, cycles + 1 if name == best.effect else 1)
+        if self.active != UNKNOWN and self._rival[1] < RENAMED:
+            return False
+        self._rival = ("", 0)
+        return True
 
     def _raised(
         self,
@@ -480,8 +509,8 @@ class Monitor:
         self, worst: Outlier, before: Cycle | None, cycle: Cycle, verdict: "Verdict | None"
     ) -> Sequence[Likeness]:
         """Rank the causes of a cycle's deviation; the cycle before lets the model swing in."""
-        if verdict is not None and _is_proportional(verdict):
-            return verdict.causes
+        if small := self._small(verdict):
+            return small
         if worst.figure.endswith("_level"):  # and nothing else: only the thresholds moved
             shift = EFFECTS["threshold_drift"].parameters[0]
             size = shift.reported(worst.excess, self.theta)
@@ -497,11 +526,6 @@ class Monitor:
 def _names(verdict: "Verdict | None") -> bool:
     """Whether the isolation has a name for what differs."""
     return bool(verdict and verdict.causes and verdict.causes[0].effect != UNKNOWN)
-
-
-def _is_proportional(verdict: "Verdict | None") -> bool:
-    """Whether the isolation names something as small as its signatures are."""
-    return bool(verdict and verdict.causes and verdict.causes[0].is_small)
 
 
 def in_order(events: Iterable[Event]) -> list[Event]:
