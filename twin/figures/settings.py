@@ -64,7 +64,12 @@ def limits(settings: FigureSettings, data: DataSet) -> Limits:
     t1, leakage = settings.permitted_t1_ms, settings.permitted_leakage_mbar_s
     free_flow = settings.permitted_free_flow_mbar
     low, high = settings.supply_low_bar, settings.supply_high_bar
-    chosen = {"t1": t1, "leakage": leakage, "free_flow": free_flow, "lowest_supply": low or high}
+    chosen = {
+        "t1": t1,
+        "leakage": leakage,
+        "free_flow": free_flow,
+        "lowest_supply": low if high is None else high,
+    }
     ejector, tolerance, nozzle_bar = (
         data.ejector,
         settings.autoset_tolerance,
