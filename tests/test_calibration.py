@@ -7,9 +7,11 @@ from pathlib import Path
 import calibrations
 import numpy as np
 import pytest
+import rigs
 from calibrations import CYCLES, beside, calibrated, log_of, quiet, rig, typed
 
 from tools.calibration_coverage import SYSTEMS, TRUE, drawn, misses, recorded
+from twin.calibration.alike import refuse_changing
 from twin.calibration.calibrate import calibrate
 from twin.calibration.cycles import Cycles
 from twin.calibration.fit import fit
@@ -190,6 +192,15 @@ def test_a_leak_that_begins_half_way_is_refused() -> None:
     said = refused("gripper", log_of("gripper", faults=("leakage=2.0@c5",)))
     assert "not alike" in said or "not that of a healthy unit" in said
     assert "leak" in said
+
+
+def test_cycles_of_a_unit_at_an_effects_bound_are_compared_as_well() -> None:
+    """No film coefficient is greater: what a smaller one does is looked for."""
+    data = rigs.config("gripper").data
+    system = data.system.model_copy(update={"film_coefficient": 500.0})
+    data = data.model_copy(update={"system": system})
+    cycles = Cycles.as_live(rigs.recorded("gripper", 12.0)[0], data)
+    refuse_changing(cycles, coefficients(data), data.sensor.noise_mbar * MBAR, [{}, {}])
 
 
 def test_the_log_of_another_system_is_refused() -> None:

@@ -9,7 +9,8 @@ import numpy as np
 from twin.calibration.cycles import Cycles
 from twin.calibration.weights import weighted
 from twin.errors import ConfigError
-from twin.model.effects import EFFECTS, Parameter, apply
+from twin.inference.sensitivities import coefficients_at, inside, sensitivities
+from twin.model.effects import EFFECTS, Parameter
 from twin.model.theta import Theta
 from twin.monitor.bins import Floats
 from twin.signals import MBAR
@@ -107,20 +108,19 @@ def _curves(cycles: Cycles) -> tuple[Floats, Floats]:
 
 def _in_pressure(cycles: Cycles, theta: Theta, noise: float) -> Iterator[Step]:
     """A step for each parameter of each effect, the model made linear."""
-    moves = [
-        (effect.name, parameter, {parameter.name: parameter.neutral(theta) + parameter.typical})
-        for effect in EFFECTS.values()
-        for parameter in effect.parameters
-    ]
-    moved = [apply(theta, name, sizes) for name, _, sizes in moves]
-    off = cycles.off(np.stack([theta, *moved], axis=1))
+    taken = [(one.name, p) for one in EFFECTS.values() for p in one.parameters]
+    typical = [(name, {p.name: p.typical}) for name, p in taken]
+    neutral = np.zeros(len(taken))
+    steps = inside(neutral, np.array([p.range(theta)[1] / p.typical for _, p in taken]), 1.0)
+    off = np.column_stack(
+        sensitivities(lambda at: cycles.off(coefficients_at(theta, typical, at)), neutral, steps)
+    )
     white = weighted(cycles, theta, noise, fitted=False).white(off)[1:]  # it swings in in the first
-    for number, (name, parameter, _) in enumerate(moves, 1):
-        slopes = [one[:, 0] - one[:, number] for one in white]
-        power = np.array([slope @ slope for slope in slopes])
+    for number, (name, parameter) in enumerate(taken, 1):
+        power = np.array([one[:, number] @ one[:, number] for one in white])
         if power.min() < 1.0:  # a typical size would be no more than noise
             continue
-        pull = np.array([slope @ one[:, 0] for slope, one in zip(slopes, white, strict=True)])
+        pull = np.array([-one[:, number] @ one[:, 0] for one in white])
         yield _clearest(name, parameter, pull / power, float(power.mean()), before=1)
 
 

@@ -19,6 +19,7 @@ from twin.calibration.left_out import with_left_out
 from twin.calibration.parameters import Free, Space
 from twin.calibration.readings import noise_of
 from twin.calibration.weights import Weights, plain, weighted
+from twin.inference.sensitivities import derivatives, inside, sensitivities
 from twin.model import theta as c
 from twin.model.dataset import RIPPLE, DataSet, coefficients
 from twin.model.system import Tube
@@ -31,7 +32,6 @@ FIRST_SHARE = 0.4  # of the log, for the first round: it has the longest way to 
 DETERMINED = 0.5  # of what the type leaves open: what is known better comes from the log
 SWITCHING = 6.0  # rows, one standard deviation of when the nozzle switched
 INSIDE = 0.1  # sigmas from a bound, where a search begins at most: on it, it would not move
-STEP = 0.05  # of a parameter's sigma, for derivatives
 RISING = 40  # steps over the characteristic, in which suction is looked at
 END_PRESSURE = "ejector.end_pressure_mbar"
 NEARLY_NOTHING = 0.02  # of the suction capacity, at the deepest pressure of a record
@@ -103,39 +103,21 @@ class Problem:
     def _evaluate(self, x: Floats) -> None:
         if self._at is not None and np.array_equal(self._at, x):
             return
+        # The nozzle switches at a row: between two, what is expected is between theirs.
+        n, whole = len(self.space.free), x.copy()
+        whole[n:] = np.floor(x[n:] * SWITCHING) / SWITCHING
+        steps = np.append(inside(x[:n], self.space.high), np.full(len(x) - n, 1.0 / SWITCHING))
+        at, slopes = sensitivities(self._predict, whole, steps)
+        self._at, self._residual, self._jacobian = x.copy(), at + slopes @ (x - whole), slopes
+
+    def _predict(self, points: Floats) -> Floats:
+        """Residuals at points, (coordinates, n) to (residuals, n)."""
         n = len(self.space.free)
-        # A step that left the bounds would show no slope.
-        steps = np.where(x[:n] + STEP > self.space.high, -STEP, STEP)
-        moved = [self.space.at(one) for one in (x[:n], *(x[:n] + np.diag(steps)))]
-        early = float(x[n]) * SWITCHING if len(x) > n else None
-        white, slopes = self._whitened(moved, steps, early)
+        moved = [self.space.at(one) for one in points[:n].T]
+        early = np.rint(points[n:] * SWITCHING).astype(int).ravel().tolist()
+        off = self.cycles.off(np.stack([coefficients(data) for data in moved], axis=1), early)
         rising = np.stack([_rising(data) for data in moved], axis=1)
-        bent = (rising[:, 1:] - rising[:, :1]) / steps
-        bent = np.column_stack([bent, np.zeros((len(bent), len(x) - n))])
-        self._at = x.copy()
-        self._residual = np.concatenate([white, rising[:, 0], x])
-        self._jacobian = np.concatenate([slopes, bent, np.eye(len(x))])
-
-    def _whitened(
-        self, moved: Sequence[DataSet], steps: Floats, early: float | None
-    ) -> tuple[Floats, Floats]:
-        """Residuals in sigmas and their slopes over ``steps``.
-
-        ``early`` (rows) is how much sooner the nozzle switches than it was seen to, None where that
-        is not free.
-        """
-        theta = np.stack([coefficients(data) for data in moved], axis=1)
-        if early is None:
-            white = np.concatenate(self.weights.white(self.cycles.off(theta)))
-            return white[:, 0], (white[:, 1:] - white[:, :1]) / steps
-        whole = int(np.floor(early))
-        rows = [*[whole] * len(moved), whole + 1]
-        off = self.cycles.off(np.column_stack([theta, theta[:, 0]]), rows)
-        white = np.concatenate(self.weights.white(off))
-        by_row = white[:, -1] - white[:, 0]
-        slopes = (white[:, 1:-1] - white[:, :1]) / steps
-        at = white[:, 0] + (early - whole) * by_row
-        return at, np.column_stack([slopes, by_row * SWITCHING])
+        return np.concatenate([*self.weights.white(off), rising, points])
 
 
 def _rising(data: DataSet) -> Floats:
@@ -415,7 +397,7 @@ def _with_left_out(covariance: Floats, jacobian: Floats, white: Sequence[Floats]
     ``white`` are residuals (bins, n) in sigmas: of the fit, then with what the model leaves out.
     """
     all_white = np.concatenate(white)
-    changes = all_white[:, 1:] - all_white[:, :1]
+    _, changes = derivatives(all_white)
     moves = covariance @ jacobian[: len(changes)].T @ changes
     total: Floats = covariance + moves @ moves.T
     return total

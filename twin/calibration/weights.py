@@ -12,8 +12,8 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from twin.calibration.cycles import Cycles
+from twin.inference.sensitivities import coefficients_at, sensitivities
 from twin.model import theta as c
-from twin.model.effects import apply
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints
 from twin.monitor.weights import SCATTER
@@ -69,12 +69,15 @@ def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> Wei
     bins = cycles.bins
     bigger = ("added_volume", {"volume": VOLUME * theta[c.VOLUME] / ML})
     scattering = [(name, {key: size}) for name, (key, size) in SCATTER.items()]
-    moved = [apply(theta, name, sizes) for name, sizes in (bigger, *scattering)]
-    off = cycles.off(np.stack([theta, *moved], axis=1))
-    moves = off[:, 1:] - off[:, :1]
+    sigmas = [bigger, *scattering]
+    off, moves = sensitivities(
+        lambda at: cycles.off(coefficients_at(theta, sigmas, at)),
+        np.zeros(len(sigmas)),
+        np.ones(len(sigmas)),
+    )
     errors, cycle_error = np.full(len(off), FIRST_ERROR), np.zeros(len(off))
     if fitted:
-        errors, cycle_error = _errors(_beside(off[:, 0], cycles.unsure), bins, noise)
+        errors, cycle_error = _errors(_beside(off, cycles.unsure), bins, noise)
     errors = np.hypot(errors, LATE * _slope(cycles))
     numbers = np.unique(bins.cycle[bins.cycle >= 0])
     parts = []

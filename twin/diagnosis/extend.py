@@ -16,6 +16,7 @@ from twin.diagnosis.answer import Diagnosis
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.words import spoken
 from twin.errors import ConfigError
+from twin.inference.sensitivities import derivatives
 from twin.live import Twin
 from twin.model.courses import Cause, Course
 from twin.model.dataset import DataSet, coefficients
@@ -232,8 +233,7 @@ def _wider(evidence: Evidence, found: Hypothesis, doubts: Sequence[Hypothesis]) 
 
 def _squares(evidence: Evidence, about: Hypothesis, moved: Sequence[Hypothesis]) -> Floats:
     """By how much hypotheses differ from one, mean square in mbar², (phases, hypotheses)."""
-    off = evidence.off([about, *moved])
-    squares = (off[:, 1:] - off[:, :1]) ** 2
+    squares = derivatives(evidence.off([about, *moved]))[1] ** 2
     bins = evidence.bins
     phase = np.where(bins.kind == AGAIN, Phase.SUCTION, bins.kind)
     found = np.zeros((len(Phase), len(moved)))

@@ -9,11 +9,11 @@ from scipy.optimize import lsq_linear
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.hypotheses import bounds, price, sized, sizes
 from twin.diagnosis.weights import Weights, levels
+from twin.inference.sensitivities import derivatives, inside, points
 from twin.model.courses import Course
 from twin.monitor.bins import Floats
 
 MOST_ROUNDS = 10
-STEP = 0.1  # typical sizes, for derivatives
 LONGEST = 6.0  # typical sizes that one round may move
 CONVERGED = 0.05  # chi-square that one more round would gain, in times what a residual has
 HOPELESS = 3.0  # times the chi-square of the best, after some rounds: not worth going on
@@ -77,19 +77,19 @@ class _Trial:
 
     def moves(self) -> Floats:
         """Steps for derivatives at the next point, one per size, away from the nearer bound."""
-        return np.where(self.next + STEP <= self.high, STEP, -STEP)
+        return inside(self.next, self.high)
 
     def take(self, white: Floats) -> None:
         """Take the residuals at the next point and beside it; choose the point after it."""
-        residual, chi2 = white[:, 0], float(white[:, 0] @ white[:, 0])
+        residual, jacobian = derivatives(white, self.moves())
+        chi2 = float(residual @ residual)
         if not chi2 < self.chi2:
             back = self.x + BACK * (self.next - self.x)
             self.done = bool(np.abs(self.next - self.x).max(initial=0.0) < 0.01)
             self.next = back
             return
         self.gained = self.chi2 - chi2
-        self.x, self.chi2, self.residual = self.next, chi2, residual
-        self.jacobian = (white[:, 1:] - white[:, :1]) / self.moves()
+        self.x, self.chi2, self.residual, self.jacobian = self.next, chi2, residual, jacobian
         q, r = np.linalg.qr(self.jacobian)
         pull = q.T @ residual
         low = np.maximum(self.low - self.x, -LONGEST) - 1e-9
@@ -127,17 +127,16 @@ def fit(
         going = [trial for trial in trials if not trial.done]
         if not going:
             break
-        points = [[trial.next, *(trial.next + np.diag(trial.moves()))] for trial in going]
+        around = [points(trial.next, trial.moves()).T for trial in going]
         asked = [
             sized(evidence, trial.hypothesis, point)
-            for trial, around in zip(going, points, strict=True)
-            for point in around
+            for trial, some in zip(going, around, strict=True)
+            for point in some
         ]
-        found = white(evidence, weights, asked)
-        first = 0
-        for trial, around in zip(going, points, strict=True):
-            trial.take(found[:, first : first + len(around)])
-            first += len(around)
+        ends = np.cumsum([len(some) for some in around])[:-1]
+        found = np.split(white(evidence, weights, asked), ends, axis=1)
+        for trial, some in zip(going, found, strict=True):
+            trial.take(some)
     return [_fitted(evidence, trial) for trial in trials]
 
 

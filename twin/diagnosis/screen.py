@@ -13,6 +13,7 @@ import numpy as np
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.hypotheses import price, sized
 from twin.diagnosis.weights import Weights, levels
+from twin.inference.sensitivities import derivatives
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS, Parameter, acting_on
 from twin.monitor.bins import Floats, Ints
@@ -83,9 +84,9 @@ def columns(evidence: Evidence, weights: Weights, about: Hypothesis = HEALTHY) -
     names, shares = [(name, p) for name, p, _ in taken], np.array([share for *_, share in taken])
     moved = [(*about, _with_size(evidence, Cause(name, {}), p, x)) for name, p, x in taken]
     hypotheses = [about, *moved]
-    off, level = evidence.off(hypotheses), levels(evidence, weights.cycles, hypotheses)
-    base = weights.white(off[:, :1], level[:, :1])[:, 0]
-    off, level = (off[:, 1:] - off[:, :1]) / shares, (level[:, 1:] - level[:, :1]) / shares
+    healthy, off = derivatives(evidence.off(hypotheses), shares)
+    usual, level = derivatives(levels(evidence, weights.cycles, hypotheses), shares)
+    base = weights.white(healthy[:, None], usual[:, None])[:, 0]
     parts = []
     for cycle in weights.cycles:
         inside = (evidence.bins.cycle == cycle)[:, None]

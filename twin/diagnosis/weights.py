@@ -4,7 +4,6 @@ Scatter differs from cycle to cycle and averages out. The model's own error is t
 them and does not; where a hypothesis explains much, a share of that is its error as well.
 """
 
-import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from scipy.linalg import block_diag, solve_triangular
 
 from twin.diagnosis.another_day import unsure
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
+from twin.inference.sensitivities import central, derivatives
 from twin.model import theta as c
 from twin.model.courses import Cause, Course, Schedule
 from twin.model.theta import Theta
@@ -151,14 +151,10 @@ def moved(
         [*[0] * as_it_is, *(rows for _, rows in both)],
     )
     ends = np.cumsum([len(steady), *[len(times) + 1] * 2, len(uncertain)])
-    linear, *apart = np.split(off[:, 1:] - off[:, :1], ends, axis=1)
-    moves, left_open = (_either_way(*two) for two in (apart[:2], apart[2:]))
-    return off[:, 0], np.hstack([linear, *moves]), np.hstack(left_open)
-
-
-def _either_way(plus: Floats, minus: Floats) -> tuple[Floats, Floats]:
-    """What one sigma of a normal variable moves, and what its square does."""
-    return (plus - minus) / 2.0, (plus + minus) / math.sqrt(2.0)
+    as_found, changes = derivatives(off)
+    linear, *apart = np.split(changes, ends, axis=1)
+    moves, left_open = (central(*two) for two in (apart[:2], apart[2:]))
+    return as_found, np.hstack([linear, *moves]), np.hstack(left_open)
 
 
 def _acting(theta: Theta, place: int, size: float, sign: int) -> Theta:

@@ -6,13 +6,13 @@ cycle and without a price for look-alikes; the diagnosis does it properly.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import repeat
 
 import numpy as np
 
+from twin.inference.sensitivities import coefficients_at, sensitivities
 from twin.model import kernel
 from twin.model.compiled import compiled
-from twin.model.effects import EFFECTS, UNKNOWN, Effect, apply
+from twin.model.effects import EFFECTS, UNKNOWN
 from twin.model.theta import Theta
 from twin.monitor.bins import Floats, Ints, drawn
 from twin.signals import BREAK, MBAR, NS, Samples, Ticks, deviation
@@ -88,24 +88,28 @@ def likenesses(theta: Theta, samples: Samples, ticks: Ticks, begin: int) -> list
     off = deviation(samples, ticks) / MBAR
     rows = np.isfinite(off)
     rows[:begin] = False
-    sizes = np.array([effect.parameters[0].typical for effect in EFFECTS.values()])
-    shares = np.zeros(len(sizes))
+    firsts = [effect.parameters[0] for effect in EFFECTS.values()]
+    typical = [(one.name, {p.name: p.typical for p in one.parameters}) for one in EFFECTS.values()]
+    bounds = [np.array(first.range(theta)) / first.typical for first in firsts]
+    sizes, shares = np.ones(len(typical)), np.zeros(len(typical))
+
+    def expect(at: Floats) -> Floats:
+        return _expect(coefficients_at(theta, typical, at), samples, ticks, drawn) / MBAR
+
     for _ in range(ROUNDS):
-        thetas = map(_changed, repeat(theta), EFFECTS.values(), sizes.tolist())
-        changed = np.stack([theta, *thetas], axis=1)
-        expected = _expect(changed, samples, ticks, drawn) / MBAR
-        rows &= np.isfinite(np.interp(number, drawn, expected[:, 0]))
+        steps = np.where(sizes == 0.0, 1.0, sizes)
+        expected, slopes = sensitivities(expect, np.zeros(len(sizes)), steps)
+        rows &= np.isfinite(np.interp(number, drawn, expected))
         if not rows.any():
             return []
-        for i, (effect, course) in enumerate(zip(EFFECTS.values(), expected.T[1:], strict=True)):
-            signature = np.interp(number[rows], drawn, course - expected[:, 0])
-            sizes[i], shares[i] = _fit(theta, effect, sizes[i], off[rows], signature)
+        for i, slope in enumerate(slopes.T):
+            signature = np.interp(number[rows], drawn, slope)
+            sizes[i], shares[i] = _fit(bounds[i], sizes[i], off[rows], signature)
     found = [
-        Likeness(effect.name, first.reported(size, theta), first.unit, share)
-        for effect, size, share in zip(
-            EFFECTS.values(), sizes.tolist(), shares.tolist(), strict=True
+        Likeness(name, first.reported(size * first.typical, theta), first.unit, share)
+        for (name, _), first, size, share in zip(
+            typical, firsts, sizes.tolist(), shares.tolist(), strict=True
         )
-        for first in effect.parameters[:1]
     ]
     return sorted(found, key=lambda likeness: -likeness.share)
 
@@ -126,21 +130,10 @@ def _expect(theta: Theta, samples: Samples, ticks: Ticks, rows: Ints) -> Floats:
     return expected
 
 
-def _changed(theta: Theta, effect: Effect, size: float) -> Theta:
-    """Coefficients with an effect: its first parameter is ``size`` from neutral."""
-    times = size / effect.parameters[0].typical
-    sizes = {p.name: p.neutral(theta) + times * p.typical for p in effect.parameters}
-    return apply(theta, effect.name, sizes)
-
-
-def _fit(
-    theta: Theta, effect: Effect, size: float, off: Floats, signature: Floats
-) -> tuple[float, float]:
-    """Size within bounds, and share of squares, by a ``signature`` that is of a given size."""
-    low, high = effect.parameters[0].range(theta)
+def _fit(bounds: Floats, size: float, off: Floats, signature: Floats) -> tuple[float, float]:
+    """Size within bounds, and share of squares, by a ``signature`` that was taken at a ``size``."""
     power, common = float(signature @ signature), float(off @ signature)
-    if size == 0.0 or not power > NOTHING**2 * len(signature):  # NaN: the model has no answer
+    if not size**2 * power > NOTHING**2 * len(signature):  # NaN: the model has no answer
         return 0.0, 0.0
-    found = min(max(common / power * size, low), high)
-    times = found / size
-    return found, times * (2.0 * common - times * power) / max(float(off @ off), 1e-12)
+    found = float(np.clip(common / power, *bounds))
+    return found, found * (2.0 * common - found * power) / max(float(off @ off), 1e-12)

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from twin.inference.sensitivities import derivatives
 from twin.model.dataset import DataSet, coefficients
 from twin.model.theta import Theta
 from twin.monitor.bank import DELAYS, LARGER, SUSPECTS, UNSURE_OF, hypotheses
@@ -111,7 +112,7 @@ class Listener:
     def __post_init__(self) -> None:
         found = seen(hypotheses(self.theta), SUCTION_ROWS, self.knees)
         vacuum = np.array([one.levels for one in found]).T
-        self._levels = np.nan_to_num(vacuum[:, 1:] - vacuum[:, :1])
+        self._levels = np.nan_to_num(derivatives(vacuum)[1])
         known = [self.healthy.figures.get(name) for name in LEVELS]
         means = [one.mean if one else at for one, at in zip(known, vacuum[:, 0], strict=True)]
         self._means = np.nan_to_num(np.array(means))
@@ -131,7 +132,7 @@ class Listener:
         level = np.array([figures[LEVELS[number]] for number in shown]) - self._means[shown]
         at = self._places(bins, shown)
         through = through[at.first]
-        moved = np.concatenate([(through[:, 1:] - through[:, :1]) / MBAR, self._levels[shown]])
+        moved = np.concatenate([derivatives(through / MBAR)[1], self._levels[shown]])
         suspects, larger, ways = np.split(moved, _COLUMNS, axis=1)
         moves = self._moves(suspects[: len(at.first)])
         covariance = from_cycle_to_cycle(bins, at.first, at.goes_on, moves, self.noise)

@@ -1,0 +1,1 @@
+"""What all inference is made of: sensitivities, covariances and how sure is sure enough."""
