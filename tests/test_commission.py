@@ -37,6 +37,7 @@ from twin.calibration.verdict import Residual, Verdict, judge
 from twin.calibration.weights import Weights
 from twin.config import Asset
 from twin.errors import ConfigError
+from twin.inference.covariance import Covariance
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.signals import BREAK, MBAR, MS, SAMPLE, Command, Phase, Quality, Samples, bridged
@@ -137,7 +138,7 @@ def test_a_search_stays_where_values_move() -> None:
 
 
 def test_a_loss_that_is_soft_for_residuals_keeps_the_characteristic_falling() -> None:
-    weights = Weights([(np.arange(3), np.eye(3))])
+    weights = Weights([(np.arange(3), Covariance(np.eye(3)))])
     cost = soft(weights)(np.full(3 + RISING + 2, 400.0))
     assert cost[0, :3] == pytest.approx(2.0 * (np.sqrt(401.0) - 1.0))
     assert cost[0, 3:-2] == pytest.approx(400.0)

@@ -10,7 +10,6 @@ import rigs
 from twin.monitor.bank import SUSPECTS, Bank
 from twin.monitor.cycles import Cycle, cut, figures
 from twin.monitor.statistics import PLACES, WEAK, Listener, Said
-from twin.monitor.weights import whitened
 
 Floats = npt.NDArray[np.float64]
 Heard = tuple[Cycle, npt.NDArray[np.int64], Floats, dict[str, float]]
@@ -49,19 +48,6 @@ def test_scores_and_sizes_are_those_of_the_inverse_covariance(heard: list[Heard]
     np.testing.assert_allclose(said.scores()[shown], (along / np.sqrt(power))[shown], rtol=1e-9)
     np.testing.assert_allclose(said.sizes()[shown], (along / power)[shown], rtol=1e-9)
     np.testing.assert_allclose(np.diag(said.alike())[shown], 1.0)
-
-
-def test_whitened_columns_have_the_products_of_the_inverse_covariance() -> None:
-    random = np.random.default_rng(3)
-    columns, half = random.normal(size=(9, 3)), random.normal(size=(9, 9))
-    covariance = half @ half.T + np.eye(9)
-    before = covariance.copy(), columns.copy()
-    white, log_det = whitened(covariance, columns)
-    products = columns.T @ np.linalg.inv(covariance) @ columns
-    np.testing.assert_allclose(white.T @ white, products, rtol=1e-9)
-    assert log_det == pytest.approx(np.linalg.slogdet(covariance)[1], rel=1e-9)
-    np.testing.assert_array_equal(covariance, before[0])
-    np.testing.assert_array_equal(columns, before[1])
 
 
 def assert_same(one: Said | None, other: Said | None) -> None:

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from twin.calibration.cycles import Cycles
+from twin.inference.covariance import Covariance, add_independent, fading, low_rank
 from twin.inference.sensitivities import coefficients_at, sensitivities
 from twin.model import theta as c
 from twin.model.theta import Theta
@@ -31,15 +31,15 @@ NEAR = 4  # places before and behind, over which the error's size is taken
 class Weights:
     """Whitens residuals cycle by cycle."""
 
-    parts: Sequence[tuple[Ints, Floats]]  # bins of a cycle, Cholesky factor of their covariance
+    parts: Sequence[tuple[Ints, Covariance]]  # bins of a cycle, and what they have in common
 
     def white(self, off: Floats) -> list[Floats]:
         """Residuals (bins, n) in sigmas for each cycle; what belongs to none is left out."""
-        return [solve_triangular(factor, off[here], lower=True) for here, factor in self.parts]
+        return [covariance.white(off[here]) for here, covariance in self.parts]
 
     def followed_by(self, other: "Weights", bins: int) -> "Weights":
         """Those of one pressure with ``bins``, then those of another."""
-        return Weights([*self.parts, *((here + bins, factor) for here, factor in other.parts)])
+        return Weights([*self.parts, *((here + bins, one) for here, one in other.parts)])
 
 
 def plain(cycles: Cycles, noise: float, error: float, late: float) -> Weights:
@@ -53,11 +53,9 @@ def plain(cycles: Cycles, noise: float, error: float, late: float) -> Weights:
     numbers = np.unique(bins.cycle[bins.cycle >= 1])  # the model swings in in the first
     for one in numbers:
         here = np.flatnonzero(bins.cycle == one)
-        unsure = cycles.unsure[here]
-        covariance = unsure @ unsure.T
-        covariance *= len(numbers)
-        covariance[np.diag_indices(len(here))] += errors[here] ** 2 + noise**2 / bins.count[here]
-        parts.append((here, np.asarray(np.linalg.cholesky(covariance), np.float64)))
+        covariance = low_rank(cycles.unsure[here]) * len(numbers)
+        add_independent(covariance, errors[here] ** 2 + noise**2 / bins.count[here])
+        parts.append((here, Covariance.of(covariance)))
     return Weights(parts)
 
 
@@ -80,20 +78,16 @@ def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> Wei
         errors, cycle_error = _errors(_beside(off, cycles.unsure), bins, noise)
     errors = np.hypot(errors, LATE * _slope(cycles))
     numbers = np.unique(bins.cycle[bins.cycle >= 0])
+    always, scatter = np.column_stack([moves[:, :1], cycles.unsure]), moves[:, 1:]
     parts = []
     for one in numbers:
         here = np.flatnonzero(bins.cycle == one)
-        apart = np.exp(-np.abs(bins.time[here, None] - bins.time[here]))
-        common = apart * (bins.kind[here, None] == bins.kind[here])
-        alone = apart * (bins.stretch[here, None] == bins.stretch[here])
-        volume, scatter = moves[here, :1], moves[here, 1:]
-        unsure = cycles.unsure[here]
-        covariance = np.outer(errors[here], errors[here]) * common + volume @ volume.T
-        covariance += unsure @ unsure.T
+        time = bins.time[here]
+        covariance = fading(errors[here], time, bins.kind[here]) + low_rank(always[here])
         covariance *= len(numbers)
-        covariance += np.outer(cycle_error[here], cycle_error[here]) * alone
-        covariance += scatter @ scatter.T + np.diag(noise**2 / bins.count[here])
-        parts.append((here, np.linalg.cholesky(covariance)))
+        covariance += fading(cycle_error[here], time, bins.stretch[here]) + low_rank(scatter[here])
+        add_independent(covariance, noise**2 / bins.count[here])
+        parts.append((here, Covariance.of(covariance)))
     return Weights(parts)
 
 

@@ -89,7 +89,7 @@ def healthy_sigma(evidence: Evidence, laid: Laid) -> Floats:
     share = np.zeros((len(laid.kind), len(laid.bins)))
     share[laid.place, np.arange(len(laid.bins))] = 1.0 / np.bincount(laid.place)[laid.place]
     size = len(laid.bins)
-    sigma: Floats = np.sqrt(np.sum((share @ weights.factor[:size, :size]) ** 2, axis=1))
+    sigma: Floats = np.sqrt(np.sum((share @ weights.covariance.factor[:size, :size]) ** 2, axis=1))
     return sigma
 
 

@@ -16,9 +16,10 @@ import numpy as np
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.fit import white
 from twin.diagnosis.unlisted import OVER, smooth
-from twin.diagnosis.weights import MISMATCH, Weights
+from twin.diagnosis.weights import Weights
 from twin.model.courses import Cause, Course
 from twin.monitor.bins import Floats
+from twin.monitor.weights import MISMATCH
 
 # How probable things are beforehand, beside a single listed effect. Chosen: something that is not
 # in the table is a tenth as probable, beside a listed effect a fifth; of two listed ones at once

@@ -9,16 +9,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import block_diag, solve_triangular
+from scipy.linalg import block_diag
 
 from twin.diagnosis.another_day import unsure
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
+from twin.inference import covariance as parts
 from twin.inference.sensitivities import central, derivatives
 from twin.model import theta as c
 from twin.model.courses import Cause, Course, Schedule
 from twin.model.theta import Theta
 from twin.monitor.bins import Floats, Ints
-from twin.monitor.weights import SCATTER, from_cycle_to_cycle, lasting, model_error
+from twin.monitor.statistics import LEVELS, UNKNOWN_LEVEL_MBAR
+from twin.monitor.weights import MISMATCH, SCATTER, from_cycle_to_cycle, lasting, model_error
 from twin.signals import MS, Phase
 
 # When a valve acts: an edge that moves is not linear in that.
@@ -29,11 +31,8 @@ KNEE_WINDOWS = 10  # a knee is found to a tenth of its window
 # What that moves, of the columns of ``moved``: each knee by itself, where a cycle has several.
 KNEES = [len(SCATTER) + len(_CLOSES), -1]
 UNSEEN = 3.0  # sigmas in a bin: what the data set leaves open by more, calibration cannot have seen
-MISMATCH = 0.08  # of what a hypothesis explains, is off in its waveform
-LEVELS = ("h1_level", "h1_low_level")
 _INTO = (Phase.HOLD, Phase.SUCTION)  # what begins at each
 LEVEL_MBAR = 0.5  # a switching level is not known better, in all cycles alike
-UNKNOWN_LEVEL_MBAR = 3.0  # of a level that healthy cycles do not show
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class Weights:
 
     cycles: tuple[int, ...]  # positions
     bins: Ints  # of these cycles
-    factor: Floats  # lower Cholesky factor of the covariance of bins, then levels
+    covariance: parts.Covariance  # of bins, then levels
     usual: float  # rms (mbar) over rows of a model that is as right as it was in healthy cycles
     unmeasured: float  # and of what no healthy cycle can have shown
     sigma: Floats  # of each level
@@ -51,14 +50,12 @@ class Weights:
     @property
     def volume(self) -> float:
         """Logarithm of the covariance's determinant: what wide weights cost a likelihood."""
-        return 2.0 * float(np.sum(np.log(np.diag(self.factor))))
+        return self.covariance.log_pdet
 
     def white(self, off: Floats, levels: Floats | None = None) -> Floats:
         """Residuals of hypotheses (mbar), (bins, n) and (levels, n), in sigmas."""
         rest = np.zeros((len(self.sigma), off.shape[1])) if levels is None else levels
-        both = np.concatenate([off[self.bins], rest])
-        result: Floats = solve_triangular(self.factor, both, lower=True, check_finite=False)
-        return result
+        return self.covariance.white(np.concatenate([off[self.bins], rest]))
 
 
 @dataclass(frozen=True)
@@ -78,23 +75,20 @@ class Covariance:
         common, alone = model_error(evidence.healthy.error, kind, time)
         common = np.hypot(common, self.mismatch[here])
         moves, left_open = self.moves[here] * float(scattered), self.left_open[here]
-        of_knees = moves[:, KNEES]
-        apart = np.exp(-np.abs(time[:, None] - time))
-        goes_on = lasting(bins, here, alone)
-        goes_on += of_knees @ of_knees.T * (bins.stretch[here][:, None] == bins.stretch[here])
+        goes_on = lasting(bins, here, alone) + parts.low_rank(moves[:, KNEES], bins.stretch[here])
         moves = np.delete(moves, KNEES, axis=1)
         covariance = from_cycle_to_cycle(bins, here, goes_on, moves, evidence.noise)
-        covariance += np.outer(common, common) * (apart * (kind[:, None] == kind))
+        covariance += parts.fading(common, time, kind)
         usual = _usual(np.diag(covariance), bins.count[here], evidence.noise)
         unseen = left_open**2 * (left_open**2 > UNSEEN**2 * np.diag(covariance)[:, None])
         unmeasured = _usual(np.sum(unseen, axis=1), bins.count[here], 0.0)
-        covariance += left_open @ left_open.T
+        covariance += parts.low_rank(left_open)
         sigma = _level_sigmas(evidence, cycles)
         levels = np.diag(sigma**2) + _together(evidence, cycles)
         whole = block_diag(covariance * evidence.healthy.leftover**2, levels)
-        factor = np.linalg.cholesky(whole.astype(np.float64))
         shown = np.array([one for one, _ in _shown(evidence, cycles)], np.int64)
-        return Weights(tuple(cycles), here, factor, usual, unmeasured, sigma, shown)
+        known = parts.Covariance.of(whole)
+        return Weights(tuple(cycles), here, known, usual, unmeasured, sigma, shown)
 
 
 def _usual(variance: Floats, count: Ints, noise: float) -> float:

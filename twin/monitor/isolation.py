@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from twin.inference.covariance import Covariance, fading, low_rank
 from twin.model.dataset import DataSet
 from twin.model.effects import UNKNOWN
 from twin.model.term import KINDS
@@ -34,7 +35,7 @@ from twin.monitor.cycles import Cycle, Look
 from twin.monitor.healthy import Healthy
 from twin.monitor.signatures import Likeness
 from twin.monitor.statistics import Listener, Said
-from twin.monitor.weights import whitened
+from twin.monitor.weights import MISMATCH
 from twin.signals import SAMPLE, TICK, Samples, Ticks
 
 DAY_S = 86_400.0
@@ -42,7 +43,6 @@ KEPT = 400  # cycles that are remembered: a change is not sought further back
 RECENT = 60  # of them, the last ones from which a cause is named
 LEARNED = 10  # cycles before which nothing is said
 SHOWN = 3.0  # sigmas: less by the cycles after the first, and it is not asked what differs
-MISMATCH = 0.08  # of what a suspect explains, is off in its signature
 DOUBTED = 0.05  # probability that anything differs, from which on it is asked what
 RETURNED = float(np.log(1000.0))  # of the odds that it is as before, for it to be over
 FEWEST_BACK = 3  # cycles to be sure of that, however far it was
@@ -258,20 +258,21 @@ class Isolation:
             return [Likeness(UNKNOWN, None, "", changed)]
         mean, covariance = self._mean(min(whole, RECENT))
         columns = np.column_stack([mean.off, mean.signatures, mean.larger])
-        white, spread = whitened(covariance, columns)
+        known = Covariance.of(covariance)
+        white = known.white(columns)
         off, signatures, larger = np.split(white, [1, 1 + len(SUSPECTS)], axis=1)
         sizes, left = _fitted(off, signatures, self._bounds)
         for number, some in zip(DELAYS, np.split(larger, len(DELAYS), axis=1), strict=True):
             grows = np.column_stack([np.zeros(len(off)), signatures[:, number], some])
             most = float(self._bounds[number, 1])
             sizes[number], left[number] = _fitted_along(off, grows, most)
-        left += spread
+        left += known.log_pdet
         # What a low supply does is not known well: in proportion to how low it is.
         ways, low = sizes[UNSURE_OF] * mean.unsure, slice(UNSURE_OF, UNSURE_OF + 1)
-        wider = covariance + ways @ ways.T
-        white, spread = whitened(wider, np.column_stack([mean.off, mean.signatures[:, low]]))
+        wider = Covariance.of(covariance + low_rank(ways))
+        white = wider.white(np.column_stack([mean.off, mean.signatures[:, low]]))
         sizes[low], left[low] = _fitted(white[:, :1], white[:, 1:], self._bounds[low])
-        left[low] += spread
+        left[low] += wider.log_pdet
         share = np.exp(0.5 * (left.min() - left))
         return self._by_effect(share * (changed / share.sum()), sizes)
 
@@ -292,12 +293,9 @@ class Isolation:
         off = columns[:, 0] - usual
         signatures, larger = np.split(columns[:, 1:], [len(SUSPECTS)], axis=1)
         own = np.hypot(last.common / np.sqrt(1.0 + seen), MISMATCH * off)
-        together = np.exp(-np.abs(last.time[:, None] - last.time)) * (
-            last.kind[:, None] == last.kind
-        )
         usually = 1.0 / np.sqrt(1.0 + seen)
         scatter = last.alone / len(some) + last.alone * np.outer(usually, usually)
-        covariance = scatter + np.outer(own, own) * together
+        covariance = scatter + fading(own, last.time, last.kind)
         return replace(last, off=off, signatures=signatures, larger=larger), covariance
 
     def _by_effect(self, share: Floats, sizes: Floats) -> list[Likeness]:

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from twin.inference.covariance import Covariance
 from twin.inference.sensitivities import derivatives
 from twin.model.dataset import DataSet, coefficients
 from twin.model.theta import Theta
@@ -21,13 +22,7 @@ from twin.monitor.healthy import Healthy
 from twin.monitor.knees import expected_knees
 from twin.monitor.phases import Knees
 from twin.monitor.switching import seen
-from twin.monitor.weights import (
-    SCATTER,
-    from_cycle_to_cycle,
-    lasting,
-    model_error,
-    whitened,
-)
+from twin.monitor.weights import SCATTER, from_cycle_to_cycle, lasting, model_error
 from twin.signals import MBAR
 
 PER_UNIT = 2  # bins in each unit of warped time
@@ -83,7 +78,7 @@ class Said:
 
     def _whitened(self) -> tuple[Floats, Floats, Floats]:
         """What is off and the signatures, and the sigmas² of each of these; 0 where none are."""
-        white, _ = whitened(self.alone, np.column_stack([self.off, self.signatures]))
+        white = Covariance.of(self.alone).white(np.column_stack([self.off, self.signatures]))
         off, signatures = white[:, 0], white[:, 1:]
         power = np.einsum("ij,ij->j", signatures, signatures)
         power[power < WEAK] = 0.0

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
-from scipy.linalg.lapack import dtrtrs
 
+from twin.inference.covariance import add_independent, fading, low_rank
 from twin.model.term import AGAIN, KINDS
 from twin.monitor.bins import Bins, Floats, Ints, warped
 from twin.monitor.healthy import ModelError
@@ -19,6 +19,7 @@ SCATTER: Mapping[str, tuple[str, float]] = {
     "response_delay": ("delay", 0.5),
     "blow_off_delay": ("delay", 0.5),
 }
+MISMATCH = 0.08  # of what a hypothesis explains, is off in its signature
 KNEE_MBAR = 0.7  # the level at a knee is not found better, and the model is set onto it
 FIRST_ERROR = ModelError(after_ms=(0.0,), common_mbar=(2.0,), alone_mbar=(0.5,))  # nothing known
 _HOLD = KINDS.index("hold")  # it begins with a knee, as AGAIN does
@@ -61,11 +62,9 @@ def lasting(bins: Bins, here: Ints, alone: Floats) -> Floats:
 
     The model's error from cycle to cycle, ``alone`` (mbar) in each, and the level found at a knee.
     """
-    stretch, kind, time = (of[here] for of in (bins.stretch, bins.kind, bins.time))
-    same = stretch[:, None] == stretch
-    covariance: Floats = np.outer(alone, alone) * (np.exp(-np.abs(time[:, None] - time)) * same)
-    covariance += KNEE_MBAR**2 * (same * ((kind == _HOLD) | (kind == AGAIN)))
-    return covariance
+    stretch, kind, time = bins.stretch[here], bins.kind[here], bins.time[here]
+    knee = KNEE_MBAR * ((kind == _HOLD) | (kind == AGAIN))
+    return fading(alone, time, stretch) + low_rank(knee[:, None], stretch)
 
 
 def from_cycle_to_cycle(
@@ -76,15 +75,6 @@ def from_cycle_to_cycle(
     Noise (mbar, of a row), what ``goes_on`` for a while (see ``lasting``), and what scatters: by
     how much (mbar) each bin ``moves`` with one sigma of it, (bins, scatters).
     """
-    cycle = bins.cycle[here]
-    covariance: Floats = moves @ moves.T * (cycle[:, None] == cycle) + goes_on
-    np.einsum("ii->i", covariance)[:] += noise**2 / bins.count[here]  # a view of the diagonal
+    covariance = low_rank(moves, bins.cycle[here]) + goes_on
+    add_independent(covariance, noise**2 / bins.count[here])
     return covariance
-
-
-def whitened(covariance: Floats, columns: Floats) -> tuple[Floats, float]:
-    """Columns beside each other, whitened; and the logarithm of the covariance's determinant."""
-    factor = np.linalg.cholesky(covariance)
-    # Its wrapper, solve_triangular, takes as long again: some 80 µs for each cycle.
-    white, _ = dtrtrs(factor, columns, lower=1)
-    return white, 2.0 * float(np.log(np.diag(factor)).sum())
