@@ -94,6 +94,24 @@ def test_probabilities_are_of_one_cause_or_none() -> None:
         assert set(one) <= {"none", UNKNOWN, *(suspect.effect for suspect in SUSPECTS)}
 
 
+@pytest.mark.parametrize(
+    ("name", "listed", "unlisted"),
+    [
+        ("gripper", "leakage=2", "lip_lift=4"),
+        ("test_rig", "leakage=0.25", "condensate=6"),
+    ],
+)
+def test_what_nobody_listed_is_an_alternative_to_the_name(
+    name: str, listed: str, unlisted: str
+) -> None:
+    said = []
+    for fault in (listed, unlisted):
+        told = probabilities(events(name, [f"{fault}@c{BEGINS}"]))
+        said.append(told[max(told)].get(UNKNOWN, 0.0))
+    assert said[0] < 0.05
+    assert said[1] > 0.25
+
+
 def test_what_is_told_does_not_depend_on_blocks() -> None:
     assert events("gripper", [f"leakage=0.5@c{BEGINS}"], size=47) == events(
         "gripper", [f"leakage=0.5@c{BEGINS}"], size=60_000

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from tools import battery_first
-from twin.diagnosis import unmodelled
 from twin.diagnosis.answer import diagnose
-from twin.diagnosis.unmodelled import SHARES, Odds
+from twin.inference import unmodelled
+from twin.inference.unmodelled import SHARES, Odds
 from twin.monitor.bins import Floats
 
 RESIDUALS, WAYS = 60, 5
@@ -23,14 +23,14 @@ def drawn(seed: int) -> tuple[Floats, Floats, Floats]:
 
 
 def odds(left: Floats, courses: Floats, explained: Floats) -> Odds:
-    return Odds.of(unmodelled._log_likelihoods(courses, left, explained, 1.0)[None])
+    return Odds.of(unmodelled.log_likelihoods(courses, left, explained, 1.0)[None])
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_ratio_is_that_of_two_normal_densities(seed: int) -> None:
     courses, left, explained = drawn(seed)
     scale = 1.7
-    found = unmodelled._log_likelihoods(courses, left, explained, scale)
+    found = unmodelled.log_likelihoods(courses, left, explained, scale)
     alone = scale * np.eye(RESIDUALS)
     for share, ratio in zip(SHARES, found, strict=True):
         size = share**2 * (explained @ explained) / np.sum(courses**2)

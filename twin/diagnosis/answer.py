@@ -16,8 +16,9 @@ from twin.diagnosis.hypotheses import hours, parameters, rarity
 from twin.diagnosis.judge import Judged, gain, judge, rounded
 from twin.diagnosis.search import Search, search, sharpened
 from twin.diagnosis.unlisted import STRANGE, Unlisted, extended, look
-from twin.diagnosis.unmodelled import Odds, Unmodelled
+from twin.diagnosis.unmodelled import Unmodelled
 from twin.diagnosis.weights import covariance
+from twin.inference.unmodelled import Odds
 from twin.instants import CALENDAR_NS, SECOND_NS
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS

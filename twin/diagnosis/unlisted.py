@@ -13,6 +13,7 @@ import numpy as np
 
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.weights import Covariance, Weights, levels
+from twin.inference.unmodelled import hats, knots_over
 from twin.model import theta as c
 from twin.model.courses import Cause
 from twin.model.term import KINDS, Term
@@ -168,7 +169,7 @@ def _knots(bins: Bins, values: Floats, kind: int, over: Over) -> Floats:
     if len(np.unique(bins.cycle[bins.kind == kind])) < FEWEST:
         return np.empty(0)
     if over == "time":
-        return np.arange(0.5, max(here.max(), 1.0))
+        return knots_over(here)
     count = max(int(np.ptp(here) / KNOT_MBAR), 1) + 1
     spread: Floats = np.quantile(here, np.linspace(0.0, 1.0, count))
     return spread[np.diff(spread, prepend=-np.inf) > KNOT_MBAR / 4.0]
@@ -176,8 +177,7 @@ def _knots(bins: Bins, values: Floats, kind: int, over: Over) -> Floats:
 
 def _hats(bins: Bins, values: Floats, name: str, knots: Floats) -> Floats:
     """Share of each knot in each bin, (bins, knots): straight lines between them."""
-    hats = np.stack([np.interp(values, knots, row) for row in np.eye(len(knots))], axis=1)
-    shares: Floats = hats * (bins.kind == KINDS.index(name))[:, None]
+    shares: Floats = hats(values, knots) * (bins.kind == KINDS.index(name))[:, None]
     return shares
 
 

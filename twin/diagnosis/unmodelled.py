@@ -1,12 +1,4 @@
-"""The alternative to each cause: something that nobody listed, smooth and of unknown size.
-
-Some effect outside the table pushes the pressure about. Listed effects mimic a part of that, and
-leave a share of it: a smooth course of its own over the time since a switching, or over the vacuum.
-Its size is not known, so it is integrated over; what it could have explained and did not need to
-counts against it by itself (MacKay, "Information Theory, Inference, and Learning Algorithms", 28).
-A listed effect that really acts leaves a share as well, as the model's waveform is a little off:
-that is small.
-"""
+"""What a cause leaves, and how well that suits something that nobody listed."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,50 +9,9 @@ from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.fit import white
 from twin.diagnosis.unlisted import OVER, smooth
 from twin.diagnosis.weights import Weights
+from twin.inference.unmodelled import Odds, log_likelihoods
 from twin.model.courses import Cause, Course
 from twin.monitor.bins import Floats
-from twin.monitor.weights import MISMATCH
-
-# How probable things are beforehand, beside a single listed effect. Chosen: something that is not
-# in the table is a tenth as probable, beside a listed effect a fifth; of two listed ones at once
-# each is a third as probable. UNLISTED halved or doubled moves 0.96 to 0.98 or 0.93.
-UNLISTED, BESIDE, FURTHER = 0.1, 0.2, 0.3
-SHARES = np.geomspace(0.003, 1.0, 9)  # of what was explained, that may be left of it
-_EDGES = np.concatenate([[0.0], np.sqrt(SHARES[1:] * SHARES[:-1]), [1.0]])
-_ANY = np.diff(_EDGES)  # of an effect that nobody listed all shares are as probable
-_LITTLE = _ANY * np.exp(-0.5 * (SHARES / MISMATCH) ** 2)  # of one that is: as its waveform is off
-_LITTLE /= _LITTLE.sum()
-MOST = 1e9  # beyond it nothing changes any more
-
-
-@dataclass(frozen=True)
-class Odds:
-    """How well what is left of the data suits an effect that nobody listed.
-
-    ``ratio`` is its marginal likelihood beside that of a listed effect, from 0 to MOST.
-    """
-
-    ratio: float
-
-    @classmethod
-    def of(cls, log_likelihoods: Floats) -> "Odds":
-        """From the log likelihoods with each of SHARES left, (·, shares): courses are averaged."""
-        likelihoods = np.exp(log_likelihoods - log_likelihoods.max()).mean(axis=0)
-        listed, unlisted = float(likelihoods @ _LITTLE), float(likelihoods @ _ANY)
-        return cls(unlisted / max(listed, unlisted / MOST))
-
-    def of_cause(self, causes: int, rivals: float) -> float:
-        """Probability that a cause acts, one of so many; ``rivals`` weigh so much beside it."""
-        beside = BESIDE * self.ratio
-        return (1.0 + beside) / (1.0 + rivals + beside + self._instead(causes))
-
-    def of_unlisted(self, causes: int) -> float:
-        """Probability that something acts that nobody listed, beside or instead of a cause."""
-        strange = BESIDE * self.ratio + self._instead(causes)
-        return strange / (1.0 + strange)
-
-    def _instead(self, causes: int) -> float:
-        return UNLISTED * self.ratio / FURTHER ** (causes - 1)
 
 
 @dataclass(frozen=True)
@@ -93,25 +44,11 @@ class Unmodelled:
         acts = _acts(self.evidence, self.found[number])[self.evidence.bins.cycle]
         logs = np.array(
             [
-                _log_likelihoods(self.weights.white(course * acts[:, None]), left, explained, scale)
+                log_likelihoods(self.weights.white(course * acts[:, None]), left, explained, scale)
                 for course in self._courses
             ]
         )
         return Odds.of(logs)
-
-
-def _log_likelihoods(courses: Floats, left: Floats, explained: Floats, scale: float) -> Floats:
-    """With each of SHARES left in smooth ``courses``, less that with none; all are whitened.
-
-    A share is of the root mean square; sizes of courses are normal. ``scale`` is the variance.
-    """
-    ways, sizes, _ = np.linalg.svd(courses, full_matrices=False)
-    power = (ways.T @ left) ** 2 / scale
-    total = float(explained @ explained) / scale
-    variance = SHARES[:, None] ** 2 * total * sizes**2 / max(float(sizes @ sizes), 1e-12)
-    gains = power * variance / (1.0 + variance) - np.log1p(variance)
-    logs: Floats = 0.5 * gains.sum(axis=1)
-    return logs
 
 
 def _acts(evidence: Evidence, cause: Cause) -> Floats:

@@ -15,12 +15,13 @@ from twin.diagnosis.another_day import unsure
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.inference import covariance as parts
 from twin.inference.sensitivities import central, derivatives
+from twin.inference.unmodelled import MISMATCH
 from twin.model import theta as c
 from twin.model.courses import Cause, Course, Schedule
 from twin.model.theta import Theta
 from twin.monitor.bins import Floats, Ints
 from twin.monitor.statistics import LEVELS, UNKNOWN_LEVEL_MBAR
-from twin.monitor.weights import MISMATCH, SCATTER, from_cycle_to_cycle, lasting, model_error
+from twin.monitor.weights import SCATTER, from_cycle_to_cycle, lasting, model_error
 from twin.signals import MS, Phase
 
 # When a valve acts: an edge that moves is not linear in that.

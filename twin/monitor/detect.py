@@ -401,7 +401,8 @@ class Monitor:
         """Raise the alarm for what no single cycle shows, or name the one that stands."""
         best = verdict.causes[0]
         self.active, self._sought = best.effect, {}
-        also = [one.effect for one in verdict.causes[1:] if one.share >= RIVAL]
+        others = [one for one in verdict.causes[1:] if one.effect != UNKNOWN]
+        also = [one.effect for one in others if one.share >= RIVAL]
         what = f"{verdict.since} cycles: {abs(verdict.sigmas):.1f} sigma off in each"
         measured: dict[str, float | int | str] = {"figure": "cycles", "cycles": verdict.since}
         measured["sigma"] = verdict.sigmas

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from twin.inference.covariance import Covariance, fading, low_rank
+from twin.inference.unmodelled import MISMATCH, Odds, hats, knots_over, log_likelihoods
 from twin.model.dataset import DataSet
 from twin.model.effects import UNKNOWN
 from twin.model.term import KINDS
@@ -35,7 +36,6 @@ from twin.monitor.cycles import Cycle, Look
 from twin.monitor.healthy import Healthy
 from twin.monitor.signatures import Likeness
 from twin.monitor.statistics import Listener, Said
-from twin.monitor.weights import MISMATCH
 from twin.signals import SAMPLE, TICK, Samples, Ticks
 
 DAY_S = 86_400.0
@@ -252,7 +252,10 @@ class Isolation:
         return whole if abs(shown.sum()) >= SHOWN * math.sqrt(max(len(shown), 1)) else 0
 
     def _causes(self, changes: Changes, since: int, changed: float) -> list[Likeness]:
-        """How probable each effect is; together as probable as that something ``changed``."""
+        """How probable each effect is, and one that nobody listed, which comes last.
+
+        Together they are as probable as that something ``changed``.
+        """
         whole = self._whole(changes, since)
         if not whole:
             return [Likeness(UNKNOWN, None, "", changed)]
@@ -274,7 +277,13 @@ class Isolation:
         sizes[low], left[low] = _fitted(white[:, :1], white[:, 1:], self._bounds[low])
         left[low] += wider.log_pdet
         share = np.exp(0.5 * (left.min() - left))
-        return self._by_effect(share * (changed / share.sum()), sizes)
+        best = int(np.argmin(left))
+        explained = _effect(best, float(sizes[best]), signatures, larger)
+        beside = off[:, 0] - explained
+        likely = log_likelihoods(known.white(_smooth(mean)), beside, explained, 1.0)
+        listed = changed * Odds.of(likely[None]).of_cause(1, 0.0)
+        found = self._by_effect(share * (listed / share.sum()), sizes)
+        return [*found, Likeness(UNKNOWN, None, "", changed - listed)]
 
     def _mean(self, since: int) -> tuple[Said, Floats]:
         """The mean of the last cycles, less what was usual; and its covariance."""
@@ -322,6 +331,28 @@ def _fitted(off: Floats, signatures: Floats, bounds: Floats) -> tuple[Floats, Fl
     power = np.maximum(np.sum(signatures**2, axis=0), 1e-12)
     sizes = np.clip(np.sum(signatures * off, axis=0) / power, *bounds.T)
     return sizes, np.sum((off - sizes * signatures) ** 2, axis=0)
+
+
+def _effect(number: int, size: float, signatures: Floats, larger: Floats) -> Floats:
+    """What a suspect does at a size, in its steps (all whitened)."""
+    if number not in DELAYS:
+        return signatures[:, number] * size
+    some = np.split(larger, len(DELAYS), axis=1)[DELAYS.index(number)]
+    grows = np.column_stack([np.zeros(len(some)), signatures[:, number], some])
+    at = np.array([0.0, *DELAY_STEPS]) / DELAY_STEPS[0]
+    here = int(np.clip(np.searchsorted(at, size) - 1, 0, len(at) - 2))
+    share = (size - at[here]) / (at[here + 1] - at[here])
+    effect: Floats = grows[:, here] * (1.0 - share) + grows[:, here + 1] * share
+    return effect
+
+
+def _smooth(said: Said) -> Floats:
+    """Smooth courses over the time of each kind of stretch, (places, courses)."""
+    courses = [np.zeros((len(said.kind), 0))]
+    for kind in np.unique(said.kind[said.kind >= 0]):
+        here = said.kind == kind
+        courses.append(hats(said.time, knots_over(said.time[here])) * here[:, None])
+    return np.hstack(courses)
 
 
 def _fitted_along(off: Floats, grows: Floats, most: float) -> tuple[float, float]:

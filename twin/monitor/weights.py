@@ -19,7 +19,6 @@ SCATTER: Mapping[str, tuple[str, float]] = {
     "response_delay": ("delay", 0.5),
     "blow_off_delay": ("delay", 0.5),
 }
-MISMATCH = 0.08  # of what a hypothesis explains, is off in its signature
 KNEE_MBAR = 0.7  # the level at a knee is not found better, and the model is set onto it
 FIRST_ERROR = ModelError(after_ms=(0.0,), common_mbar=(2.0,), alone_mbar=(0.5,))  # nothing known
 _HOLD = KINDS.index("hold")  # it begins with a knee, as AGAIN does
