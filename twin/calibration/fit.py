@@ -19,6 +19,7 @@ from twin.calibration.left_out import with_left_out
 from twin.calibration.parameters import Free, Space
 from twin.calibration.readings import noise_of
 from twin.calibration.weights import Weights, plain, weighted
+from twin.inference.levels import SIGMAS_95
 from twin.inference.sensitivities import derivatives, inside, sensitivities
 from twin.model import theta as c
 from twin.model.dataset import RIPPLE, DataSet, coefficients
@@ -185,7 +186,7 @@ class Fitted:
         if name == END_PRESSURE and not self.reaches_end:
             return min(BEST_END, self.deepest) / MBAR, self.deepest / MBAR
         number = self._number(name)
-        free, reach = self.free[number], 1.96 * float(self.spread[number])
+        free, reach = self.free[number], SIGMAS_95 * float(self.spread[number])
         value = free.of(self.data)
         if self.scaled[number] and value > 0.0:
             factor = float(np.exp(min(reach / value, MOST_FACTOR)))

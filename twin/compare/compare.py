@@ -17,6 +17,7 @@ from scipy import stats
 from twin.compare.side import Side
 from twin.figures.curve import CURVE
 from twin.figures.table import FIGURES
+from twin.inference.levels import UPPER_95
 from twin.signals import Phase
 
 Floats = npt.NDArray[np.float64]
@@ -149,7 +150,7 @@ def interval(a: Floats, b: Floats, rng: np.random.Generator) -> tuple[float, flo
     few = min(len(a), len(b))
     if few < FEWEST:
         return UNKNOWN, UNKNOWN
-    wide = math.sqrt(few / (few - 1)) * stats.t.ppf(0.975, few - 1)
+    wide = math.sqrt(few / (few - 1)) * stats.t.ppf(UPPER_95, few - 1)
     tail = float(stats.norm.sf(wide))
     differences = _means(b, rng) - _means(a, rng)
     low, high = np.quantile(differences, [tail, 1.0 - tail])

@@ -13,10 +13,10 @@ from twin.compare.side import BIN_S, LONGEST_S, Curve, Floats, Side
 from twin.compare.words import conclusion
 from twin.diagnosis.drawing import ANONYMOUS, STYLE
 from twin.files import said_plainly
+from twin.inference.levels import SIGMAS_95
 
 FORMATS = {".svg": ANONYMOUS, ".png": {"Software": None}}
 COLOURS = {"A": "#0a62a8", "B": "#c8500a"}
-SURE = 1.96  # standard errors
 TITLE = 130  # characters in a line
 
 
@@ -70,7 +70,7 @@ def difference(a: Curve, b: Curve) -> tuple[Floats, Floats, Floats]:
     """Time (s), difference of the means B − A (mbar) and half its 95 % band, where both are."""
     both = np.isfinite(a.mean) & np.isfinite(b.mean)
     error = np.hypot(a.error, b.error)
-    return bins()[both], (b.mean - a.mean)[both], SURE * error[both]
+    return bins()[both], (b.mean - a.mean)[both], SIGMAS_95 * error[both]
 
 
 def _band(axes: Axes, curve: Curve, colour: str, label: str) -> None:

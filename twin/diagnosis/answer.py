@@ -12,12 +12,13 @@ from twin.config import Config
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, collect, thinned
 from twin.diagnosis.experiments import next_experiment
 from twin.diagnosis.fit import Fitted
-from twin.diagnosis.hypotheses import hours, parameters, rarity
+from twin.diagnosis.hypotheses import hours, parameters, probable
 from twin.diagnosis.judge import Judged, gain, judge, rounded
 from twin.diagnosis.search import Search, search, sharpened
 from twin.diagnosis.unlisted import STRANGE, Unlisted, extended, look
 from twin.diagnosis.unmodelled import Unmodelled
 from twin.diagnosis.weights import covariance
+from twin.inference.levels import SIGMAS_95
 from twin.inference.unmodelled import Odds
 from twin.instants import CALENDAR_NS, SECOND_NS
 from twin.model.courses import Cause, Course
@@ -272,14 +273,11 @@ def _stranger(rival: Fitted, found: Fitted) -> str:
 def _probability(evidence: Evidence, found: Fitted, rivals: Sequence[Fitted], odds: Odds) -> float:
     """How probable a cause is beside its rivals and beside something that nobody listed.
 
-    Listed effects count as equally frequent here: what the log shows decides.
+    Of how often listed effects come only what is known counts.
     """
-
-    def shown(one: Fitted) -> float:
-        return one.score - rarity(evidence, one.hypothesis)
-
+    scores = [probable(evidence, one.score, one.hypothesis) for one in (found, *rivals)]
     temper = 2.0 * max(found.leftover, 1.0) ** 2
-    weights = sum(math.exp(min((shown(found) - shown(one)) / temper, 50.0)) for one in rivals)
+    weights = sum(math.exp(min((scores[0] - one) / temper, 50.0)) for one in scores[1:])
     return round(odds.of_cause(len(found.hypothesis), weights), 3)
 
 
@@ -318,7 +316,7 @@ def _parameters(
         neutral = 0.0 if ramp else at_neutral
         value = neutral + float(size) * p.typical
         scale = OF_HEAT if cause.effect == "heat_exchange" else RELATIVE
-        reach = 1.96 * math.hypot(float(sigma) * p.typical, scale * value)
+        reach = SIGMAS_95 * math.hypot(float(sigma) * p.typical, scale * value)
         shift = at_neutral - neutral  # of a ramp these are changes, and the bounds are not
         low, high = max(value - reach, p.low - shift), min(value + reach, p.high - shift)
         per_hour = 1.0 / hours(evidence, cause) if ramp else 1.0

@@ -16,6 +16,7 @@ from twin.diagnosis.answer import Diagnosis
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.words import spoken
 from twin.errors import ConfigError
+from twin.inference.levels import SIGMAS_95
 from twin.inference.sensitivities import derivatives
 from twin.live import Twin
 from twin.model.courses import Cause, Course
@@ -210,7 +211,7 @@ def _doubts(diagnosis: Diagnosis) -> Iterator[Hypothesis]:
             if value := cause.values.get(p.name, 0.0):
                 known = answers[cause.effect][p.name]  # of a ramp they are rates
                 sigma = abs(
-                    value * (known["high95"] - known["low95"]) / (2 * 1.96 * known["value"])
+                    value * (known["high95"] - known["low95"]) / (2 * SIGMAS_95 * known["value"])
                 )
                 moved = value + sigma if value + sigma <= p.high else value - sigma
                 other = replace(cause, values={**cause.values, p.name: moved})

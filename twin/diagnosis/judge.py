@@ -9,13 +9,13 @@ from scipy.stats import t as student
 
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.weights import Weights, levels
+from twin.inference.levels import UPPER_95
 from twin.model import theta as c
 from twin.monitor.bins import Floats, Ints
 from twin.monitor.cycles import PAPER_VACUUM, time_to_vacuum
 from twin.signals import MBAR, MS
 
 FEWEST = 5  # held-out cycles, to tell from how they differ how sure a gain is
-SURE = 0.975  # quantile on either side
 LITTLE = 1.25  # times the usual deviation: cycles differ by as much
 
 
@@ -96,7 +96,7 @@ def _interval(before: Floats, after: Floats) -> tuple[float | None, float | None
     sigma = float(np.std(each, ddof=1)) / math.sqrt(cycles)
     if sigma == 0.0:
         return None, None
-    reach = float(student.ppf(SURE, cycles - 1)) * sigma / 2.0  # of the rms, not its square
+    reach = float(student.ppf(UPPER_95, cycles - 1)) * sigma / 2.0  # of the rms, not its square
     ratio = math.sqrt(after.mean() / before.mean())
     low, high = (100.0 * (1.0 - ratio * math.exp(r)) for r in (reach, -reach))
     return math.floor(100.0 * low) / 100.0, math.ceil(100.0 * high) / 100.0

@@ -14,9 +14,10 @@ import numpy as np
 
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, at_once, thinned
 from twin.diagnosis.fit import Fitted, fit, white
-from twin.diagnosis.hypotheses import WEATHER, bounds, parameters, rarity, sized, sizes
+from twin.diagnosis.hypotheses import WEATHER, bounds, parameters, probable, shown, sized, sizes
 from twin.diagnosis.screen import columns, pairs, promises
 from twin.diagnosis.weights import Covariance, Weights, covariance
+from twin.inference.levels import CHI2_95, CHI2_999, SIGMAS_95
 from twin.model.courses import Cause, Course
 from twin.monitor.bins import Floats
 from twin.signals import MS
@@ -30,7 +31,6 @@ SHARE = (
 # Of an effect's typical size: less is within what calibration leaves, or beside another cause mends
 # what the model gets wrong about that.
 SMALLEST, SMALLEST_MORE = 0.2, 0.4
-SAME = 10.8  # chi-square up to which a log cannot reject a rival (one in a thousand)
 TRIED_ALONE = 5  # hypotheses that are compared with weights about themselves
 NEAR = 2.5  # times the least score, up to which they are
 QUIET = 1.2  # sigmas left, below which there is nothing to compare
@@ -44,8 +44,6 @@ WORTH_FLIPPING = 5.0  # chi-square that another set of cycles must gain
 ONSETS, MANY_ONSETS = 16, 64  # in a round of looking for when a step began
 ONSET_S = 0.01  # to which it is found at first
 FARTHEST_S = 4.0  # from an onset, that its interval may reach
-SURE = 3.84  # chi-square that bounds a 95 % interval
-SIGMAS = 1.96  # that do
 
 Progress = Callable[[str], None]
 
@@ -115,6 +113,10 @@ def search(
         (found,) = fit(evidence, weights, [_finely_timed(evidence, judged, found.hypothesis)])
     progress("looking for what the log cannot tell apart")
     rivals = _rivals(evidence, judged, weights, found, singles)
+    if found.effects == (WEATHER,):  # it may have come first by its prior alone
+        found, *rivals[0] = sorted(
+            [found, *rivals[0]], key=lambda one: probable(evidence, one.score, one.hypothesis)
+        )
     onsets = [
         _onset_interval(evidence, judged, found.hypothesis, number, found.leftover)
         for number in range(len(found.hypothesis))
@@ -190,7 +192,7 @@ def _likeliest(evidence: Evidence, fitted: Sequence[int], tried: Sequence[Fitted
             best[one.effects] = each
     _, least, found = min(best.values(), key=lambda each: each[1])
     for weather in _weather(evidence, [one for *_, one in best.values()]):
-        if best[weather.effects][1] < least + SAME * max(found.leftover**2, 1.0):
+        if best[weather.effects][1] < least + CHI2_999 * max(found.leftover**2, 1.0):
             return weather
     return found
 
@@ -344,7 +346,7 @@ def held_out_gain(
     before, after = white(evidence, unseen, [without, hypothesis]).T
     left = max(float(np.sqrt(np.mean(after**2))), 1.0)
     gain = float(before @ before - after @ after)
-    reach = SIGMAS * 2.0 * float(np.linalg.norm(before - after)) * left
+    reach = SIGMAS_95 * 2.0 * float(np.linalg.norm(before - after)) * left
     return gain - reach, gain + reach
 
 
@@ -355,11 +357,8 @@ def _rivals(
 
     A log rejects a rival by what it shows, not by how seldom that comes.
     """
-
-    def shown(one: Fitted) -> float:
-        return one.score - rarity(evidence, one.hypothesis)
-
-    worst = shown(found) + SAME * max(found.leftover**2, 1.0)
+    worst = shown(evidence, found.score, found.hypothesis)
+    worst += CHI2_999 * max(found.leftover**2, 1.0)
 
     def instead_of(left: int) -> list[Fitted]:
         others = tuple(c for i, c in enumerate(found.hypothesis) if i != left)
@@ -375,7 +374,7 @@ def _rivals(
             fitted = _ranked(evidence, judged, fit(evidence, weights, timed))
         else:
             fitted = [one for one in singles if one.effects != found.effects]
-        return [one for one in fitted if shown(one) < worst]
+        return [one for one in fitted if shown(evidence, one.score, one.hypothesis) < worst]
 
     return at_once(instead_of, range(len(found.hypothesis)))
 
@@ -531,7 +530,7 @@ def _onset_interval(
     reach = np.geomspace(max(ONSET_S, sampled), FARTHEST_S, 10)
     onsets = cause.onset_s + np.concatenate([-reach[::-1], [0.0], reach])
     misfit = _misfits(evidence, judged, others, cause, onsets)
-    inside = np.flatnonzero(misfit < misfit.min() + SURE * max(leftover**2, 1.0))
+    inside = np.flatnonzero(misfit < misfit.min() + CHI2_95 * max(leftover**2, 1.0))
     inside = np.union1d(inside, len(reach))  # the onset itself
     last = len(onsets) - 1  # the first that is rejected bounds it
     return float(onsets[max(inside[0] - 1, 0)]), float(onsets[min(inside[-1] + 1, last)])

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.config import Config
+from twin.inference.levels import OF_MEDIAN, SIGMAS_95
 from twin.model.control import LEAK_SETTLE_S
 from twin.model.gas import GAMMA, R
 from twin.model.system import volume
@@ -33,7 +34,6 @@ from twin.tables.derive import shortest_half
 
 Floats = npt.NDArray[np.float64]
 
-SURE = 1.96  # standard errors
 LEVEL_S = 0.5  # at most, over which a level is read
 LEAST_LEVEL_S = 0.1  # that an open cup stands, and twice of it that a decay takes
 DECAY_S = 1.0  # at most, over which a decay is read
@@ -80,7 +80,7 @@ class Stretch:
     def noise(self) -> float:
         """One standard deviation of a reading (mbar), from second differences."""
         second = np.diff(self.pressure, 2)
-        return float(np.median(np.abs(second))) / (0.6745 * math.sqrt(6.0))
+        return float(np.median(np.abs(second))) * OF_MEDIAN / math.sqrt(6.0)
 
     @cached_property
     def idle(self) -> float:
@@ -166,7 +166,7 @@ def highest(one: Stretch) -> Reading:
     if not one.ended:
         return Reading(math.nan, why=NO_END)
     near = one.vacuum[max(one.deepest - 1, one.before) : min(one.deepest + 2, one.end)]
-    return Reading(one.top, max(SURE * one.noise, one.top - float(near.min())))
+    return Reading(one.top, max(SIGMAS_95 * one.noise, one.top - float(near.min())))
 
 
 def open_cup(one: Stretch) -> Reading:
@@ -181,7 +181,7 @@ def open_cup(one: Stretch) -> Reading:
         return Reading(math.nan, why="no vacuum stands still before the evacuation")
     if level < max(LEAST_VACUUM, CLEAR * one.noise):
         return Reading(math.nan, why="the vacuum before the evacuation is not told from none")
-    return Reading(level, max(apart, SURE * one.noise))
+    return Reading(level, max(apart, SIGMAS_95 * one.noise))
 
 
 def evacuation(one: Stretch) -> Reading:
@@ -208,7 +208,7 @@ def rate(one: Stretch) -> Reading:
     if len(rows) < FEWEST:
         return Reading(math.nan, why=f"too few readings in the evacuation ({len(rows)} for it)")
     slope, error, _ = _line(one.time[rows], np.log(one.pressure[rows]))
-    return Reading(-slope, SURE * error)
+    return Reading(-slope, SIGMAS_95 * error)
 
 
 def flow(one: Stretch) -> Reading:
@@ -234,7 +234,7 @@ def decay(one: Stretch) -> Reading:
     moved = abs(slope) * float(one.time[rows[-1]] - one.time[rows[0]])
     if left > max(CLEAR * one.noise, SWING, CURVED * moved):
         return Reading(math.nan, why="the vacuum swings, as an air saving lets it")
-    return Reading(-slope, SURE * error)
+    return Reading(-slope, SIGMAS_95 * error)
 
 
 def last(one: Stretch) -> Reading:
@@ -242,7 +242,7 @@ def last(one: Stretch) -> Reading:
     if not one.ended:
         return Reading(math.nan, why=NO_END)
     part = one.vacuum[max(one.end - 1 - FEWEST, one.before) : max(one.end - 1, one.before + 1)]
-    return Reading(float(np.median(part)), SURE * one.noise)
+    return Reading(float(np.median(part)), SIGMAS_95 * one.noise)
 
 
 def release(one: Stretch) -> Reading:

@@ -18,6 +18,8 @@ import numpy.typing as npt
 from scipy.stats import t as student
 from scipy.stats import theilslopes, trim_mean
 
+from twin.inference.levels import OF_MEDIAN
+
 CONFIDENCE = 0.95  # of bands and intervals
 SURE = 0.99  # that the slope has a sign, before a trend is said to be one
 BINS = 60  # of a record
@@ -34,7 +36,6 @@ DAY_NS = 86_400 * 10**9
 ENDED = 3  # cycles in a row without a value, at least, where a figure can be measured no more
 TRIMMED = 0.1  # of the bins on either side, before their mean is the line's level
 MOST_ALIKE = 0.95  # correlation of neighbours
-ROBUST = 1.4826  # standard deviations in the median of absolute deviations, for normal scatter
 
 Floats = npt.NDArray[np.float64]
 
@@ -211,7 +212,7 @@ def line_through(host_ns: npt.NDArray[np.int64], values: Floats) -> Line | None:
     slope = float(theilslopes(medians, times).slope)
     level = float(trim_mean(medians - slope * times, TRIMMED))
     off = medians - level - slope * times
-    sigma = max(ROBUST * float(np.median(np.abs(off - np.median(off)))), float(off.std()) / 2.0)
+    sigma = max(OF_MEDIAN * float(np.median(np.abs(off - np.median(off)))), float(off.std()) / 2.0)
     return Line(times, medians, level, slope, sigma, _alike(off))
 
 
@@ -263,7 +264,7 @@ def _step(host_ns: npt.NDArray[np.int64], values: Floats, clear: float) -> Step 
     better = count * math.log(left_by_line / left) - 0.5 * math.log(count)
     if better < math.log(SURE / (1.0 - SURE)):
         return None
-    sigma = max(ROBUST * float(np.median(np.abs(off))), float(off.std()) / 2.0, least)
+    sigma = max(OF_MEDIAN * float(np.median(np.abs(off))), float(off.std()) / 2.0, least)
     error = sigma * _alike(off) / np.sqrt([k, count - k])
     before, after = (float(trim_mean(one, TRIMMED)) for one in (medians[:k], medians[k:]))
     chance = (1.0 - SURE) / len(places)  # as each place may look like a step by chance

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.events import Event, Kind
+from twin.inference.levels import OF_MEDIAN, SIGMAS_95
 from twin.model.compiled import compiled
 from twin.signals import NEW_TIME, SAMPLE, Samples
 
@@ -81,7 +82,7 @@ def line(x: Floats, y: Floats) -> tuple[float, float]:
 def slope_pm(x: Floats, y: Floats) -> float:
     """Half of the 95 % interval of the line's slope (Sen's, without ties)."""
     n, slopes = len(x), _slopes(x, y)
-    reach = 1.96 * np.sqrt(n * (n - 1) * (2 * n + 5) / 18)
+    reach = SIGMAS_95 * np.sqrt(n * (n - 1) * (2 * n + 5) / 18)
     low = max(round((len(slopes) - reach) / 2) - 1, 0)
     high = min(round((len(slopes) + reach) / 2), len(slopes) - 1)
     slopes.partition([low, high])
@@ -311,7 +312,7 @@ class ClockWatch:
             return 0.0
         self._draw()
         off = self._off_line(*point)
-        scatter = 1.4826 * median(np.abs(self._off_line(x, y)).tolist())
+        scatter = OF_MEDIAN * median(np.abs(self._off_line(x, y)).tolist())
         unsteady = UNSTEADY * median(late.tolist())
         return off if abs(off) > max(float(SET_NS), 8.0 * scatter, unsteady) else 0.0
 
@@ -338,8 +339,8 @@ class ClockWatch:
         self._draw()
         slope, at_end, _ = self._line
         drift_pm = slope_pm(x, y)
-        scatter = 1.4826 * median(np.abs(self._off_line(x, y)).tolist())
-        offset_pm = 1.96 * scatter + drift_pm * float(x[-1] - x[0]) / 2
+        scatter = OF_MEDIAN * median(np.abs(self._off_line(x, y)).tolist())
+        offset_pm = SIGMAS_95 * scatter + drift_pm * float(x[-1] - x[0]) / 2
         here = at_end + slope * (now - x[-1])
         return Estimate(-(zero + here) * 1e-6, offset_pm * 1e-6, -slope * 1e6, drift_pm * 1e6)
 

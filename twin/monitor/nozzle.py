@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from twin.inference.levels import OF_MEDIAN
 from twin.monitor.aligned import Knee, align
 from twin.monitor.breaks import (
     Course,
@@ -55,7 +56,6 @@ BREAKS, BREAKS_CLEARLY, BREAKS_AS_KNOWN, CLEARLY, RISES = 0.32, 0.2, 0.1, 100.0,
 CLEAR, CLEAR_AT_LEVEL, CLEAR_ALONE = 8.0, 5.0, 16.0
 OTHERS = 1.0 / 3.0  # of the suctions must show it go off for its levels to be known
 SIGMAS_OF_LEVEL, SHARE_OF_LEVEL = 5.0, 0.02  # as near to it
-TO_SIGMA = 1.4826  # from a median deviation
 # A reported switching shows within so long of its report (a valve, and a slow IO-Link cycle); share
 # of the readings in suction that must have a report.
 TOLD_WITHIN, MOST_TOLD = 50.0 * MS, 0.98
@@ -90,7 +90,7 @@ class Levels:
         held = [knee.held for knee in knees if np.isfinite(knee.held)]
         return cls(
             off,
-            TO_SIGMA * float(np.median(np.abs(offs - off))),
+            OF_MEDIAN * float(np.median(np.abs(offs - off))),
             float(np.quantile(rises, MOST)) if len(rises) > OTHERS * suctions else 0.0,
             float(np.quantile(held, MOST)) if held else -np.inf,
         )
