@@ -256,8 +256,8 @@ def test_a_term_that_takes_nothing_away_in_mbar_is_no_extension(
 ) -> None:
     """Sigmas can fall while millibars rise, where the log is far from all that is known."""
 
-    def worse(*known: Any) -> Unlisted:
-        found = look(*known)
+    def worse(*known: Any, **least: Any) -> Unlisted:
+        found = look(*known, **least)
         upside_down = ({"mbar": tuple(-mbar for mbar in one.mbar)} for one in found.terms)
         terms = zip(found.terms, upside_down, strict=True)
         return replace(found, terms=tuple(one.model_copy(update=mbar) for one, mbar in terms))
