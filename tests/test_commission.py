@@ -38,6 +38,7 @@ from twin.calibration.weights import Weights
 from twin.config import Asset
 from twin.errors import ConfigError
 from twin.inference.covariance import Covariance
+from twin.inference.levels import SIGMAS_95
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.signals import BREAK, MBAR, MS, SAMPLE, Command, Phase, Quality, Samples, bridged
@@ -432,8 +433,8 @@ def test_the_interval_of_what_is_scaled_is_one_of_its_logarithm() -> None:
     covariance = fitted.covariance.copy()
     covariance[number, number] = leak**2
     low, high = replace(fitted, covariance=covariance).interval("system.leak_sl_min")
-    assert low == pytest.approx(leak / np.exp(1.96))
-    assert high == pytest.approx(leak * np.exp(1.96))
+    assert low == pytest.approx(leak / np.exp(SIGMAS_95))
+    assert high == pytest.approx(leak * np.exp(SIGMAS_95))
 
 
 def test_a_sensor_at_another_place_than_told_is_said_where_the_fit_is_sure() -> None:
