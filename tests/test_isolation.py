@@ -94,6 +94,12 @@ def test_probabilities_are_of_one_cause_or_none() -> None:
         assert set(one) <= {"none", UNKNOWN, *(suspect.effect for suspect in SUSPECTS)}
 
 
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_what_is_not_known_of_a_low_supply_is_nothing_unlisted(name: str) -> None:
+    told = probabilities(events(name, [f"supply_pressure_drop=0.4@c{BEGINS}"]))
+    assert told[max(told)].get(UNKNOWN, 0.0) < 0.1
+
+
 @pytest.mark.parametrize(
     ("name", "listed", "unlisted"),
     [

@@ -78,7 +78,7 @@ def test_an_effect_that_is_off_by_a_little_of_much_is_still_itself() -> None:
     assert one.of_unlisted(1) < 0.5
 
 
-@pytest.mark.parametrize("seed", [800057, 800010])
+@pytest.mark.parametrize("seed", [830022, 830010])
 def test_a_mechanism_that_a_listed_cause_mimics_is_not_called_that_cause(seed: int) -> None:
     """Condensate, and a lip that lifts: a porous leak takes nearly all of either away."""
     unit, hidden, samples = battery_first.drawn_case("unlisted", seed, 4)

@@ -12,7 +12,7 @@ from twin.config import Config
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, collect, thinned
 from twin.diagnosis.experiments import next_experiment
 from twin.diagnosis.fit import Fitted
-from twin.diagnosis.hypotheses import hours, parameters, probable
+from twin.diagnosis.hypotheses import hours, parameters, score_with_tempered_prior
 from twin.diagnosis.judge import Judged, gain, judge, rounded
 from twin.diagnosis.search import Search, search, sharpened
 from twin.diagnosis.unlisted import STRANGE, Unlisted, extended, look
@@ -275,7 +275,9 @@ def _probability(evidence: Evidence, found: Fitted, rivals: Sequence[Fitted], od
 
     Of how often listed effects come only what is known counts.
     """
-    scores = [probable(evidence, one.score, one.hypothesis) for one in (found, *rivals)]
+    scores = [
+        score_with_tempered_prior(evidence, one.score, one.hypothesis) for one in (found, *rivals)
+    ]
     temper = 2.0 * max(found.leftover, 1.0) ** 2
     weights = sum(math.exp(min((scores[0] - one) / temper, 50.0)) for one in scores[1:])
     return round(odds.of_cause(len(found.hypothesis), weights), 3)

@@ -14,7 +14,7 @@ from twin.monitor.bins import Floats
 WEATHER = "ambient_pressure"  # its typical size is one sigma of what the weather does
 # Of the logarithm of how often effects come: a thousandfold prior is known to be tenfold, as sites
 # differ. Chosen.
-KNOWN = 1.0 / 3.0
+PRIOR_TEMPER = 1.0 / 3.0
 LOCAL_ONSETS = 20  # as many onsets in a cycle can be told apart
 
 
@@ -88,14 +88,14 @@ def rarity(evidence: Evidence, hypothesis: Hypothesis) -> float:
     return sum(-2.0 * math.log(often(evidence, EFFECTS[cause.effect])) for cause in hypothesis)
 
 
-def shown(evidence: Evidence, score: float, hypothesis: Hypothesis) -> float:
+def score_without_prior(evidence: Evidence, score: float, hypothesis: Hypothesis) -> float:
     """A score by what the log shows: how seldom the effects come is left out."""
     return score - rarity(evidence, hypothesis)
 
 
-def probable(evidence: Evidence, score: float, hypothesis: Hypothesis) -> float:
+def score_with_tempered_prior(evidence: Evidence, score: float, hypothesis: Hypothesis) -> float:
     """A score for a probability: how seldom effects come is known roughly, and counts as much."""
-    return score - (1.0 - KNOWN) * rarity(evidence, hypothesis)
+    return score - (1.0 - PRIOR_TEMPER) * rarity(evidence, hypothesis)
 
 
 def _price(evidence: Evidence, cause: Cause) -> float:

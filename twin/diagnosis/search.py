@@ -14,7 +14,15 @@ import numpy as np
 
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, at_once, thinned
 from twin.diagnosis.fit import Fitted, fit, white
-from twin.diagnosis.hypotheses import WEATHER, bounds, parameters, probable, shown, sized, sizes
+from twin.diagnosis.hypotheses import (
+    WEATHER,
+    bounds,
+    parameters,
+    score_with_tempered_prior,
+    score_without_prior,
+    sized,
+    sizes,
+)
 from twin.diagnosis.screen import columns, pairs, promises
 from twin.diagnosis.weights import Covariance, Weights, covariance
 from twin.inference.levels import CHI2_95, CHI2_999, SIGMAS_95
@@ -115,7 +123,8 @@ def search(
     rivals = _rivals(evidence, judged, weights, found, singles)
     if found.effects == (WEATHER,):  # it may have come first by its prior alone
         found, *rivals[0] = sorted(
-            [found, *rivals[0]], key=lambda one: probable(evidence, one.score, one.hypothesis)
+            [found, *rivals[0]],
+            key=lambda one: score_with_tempered_prior(evidence, one.score, one.hypothesis),
         )
     onsets = [
         _onset_interval(evidence, judged, found.hypothesis, number, found.leftover)
@@ -357,7 +366,7 @@ def _rivals(
 
     A log rejects a rival by what it shows, not by how seldom that comes.
     """
-    worst = shown(evidence, found.score, found.hypothesis)
+    worst = score_without_prior(evidence, found.score, found.hypothesis)
     worst += CHI2_999 * max(found.leftover**2, 1.0)
 
     def instead_of(left: int) -> list[Fitted]:
@@ -374,7 +383,11 @@ def _rivals(
             fitted = _ranked(evidence, judged, fit(evidence, weights, timed))
         else:
             fitted = [one for one in singles if one.effects != found.effects]
-        return [one for one in fitted if shown(evidence, one.score, one.hypothesis) < worst]
+        return [
+            one
+            for one in fitted
+            if score_without_prior(evidence, one.score, one.hypothesis) < worst
+        ]
 
     return at_once(instead_of, range(len(found.hypothesis)))
 

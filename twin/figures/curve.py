@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.config import Config
-from twin.inference.levels import OF_MEDIAN, SIGMAS_95
+from twin.inference.levels import MAD_TO_SIGMA, SIGMAS_95
 from twin.model.control import LEAK_SETTLE_S
 from twin.model.gas import GAMMA, R
 from twin.model.system import volume
@@ -80,7 +80,7 @@ class Stretch:
     def noise(self) -> float:
         """One standard deviation of a reading (mbar), from second differences."""
         second = np.diff(self.pressure, 2)
-        return float(np.median(np.abs(second))) * OF_MEDIAN / math.sqrt(6.0)
+        return float(np.median(np.abs(second))) * MAD_TO_SIGMA / math.sqrt(6.0)
 
     @cached_property
     def idle(self) -> float:

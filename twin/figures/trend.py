@@ -18,7 +18,7 @@ import numpy.typing as npt
 from scipy.stats import t as student
 from scipy.stats import theilslopes, trim_mean
 
-from twin.inference.levels import OF_MEDIAN
+from twin.inference.levels import MAD_TO_SIGMA
 
 CONFIDENCE = 0.95  # of bands and intervals
 SURE = 0.99  # that the slope has a sign, before a trend is said to be one
@@ -212,7 +212,9 @@ def line_through(host_ns: npt.NDArray[np.int64], values: Floats) -> Line | None:
     slope = float(theilslopes(medians, times).slope)
     level = float(trim_mean(medians - slope * times, TRIMMED))
     off = medians - level - slope * times
-    sigma = max(OF_MEDIAN * float(np.median(np.abs(off - np.median(off)))), float(off.std()) / 2.0)
+    sigma = max(
+        MAD_TO_SIGMA * float(np.median(np.abs(off - np.median(off)))), float(off.std()) / 2.0
+    )
     return Line(times, medians, level, slope, sigma, _alike(off))
 
 
@@ -264,7 +266,7 @@ def _step(host_ns: npt.NDArray[np.int64], values: Floats, clear: float) -> Step 
     better = count * math.log(left_by_line / left) - 0.5 * math.log(count)
     if better < math.log(SURE / (1.0 - SURE)):
         return None
-    sigma = max(OF_MEDIAN * float(np.median(np.abs(off))), float(off.std()) / 2.0, least)
+    sigma = max(MAD_TO_SIGMA * float(np.median(np.abs(off))), float(off.std()) / 2.0, least)
     error = sigma * _alike(off) / np.sqrt([k, count - k])
     before, after = (float(trim_mean(one, TRIMMED)) for one in (medians[:k], medians[k:]))
     chance = (1.0 - SURE) / len(places)  # as each place may look like a step by chance

@@ -10,5 +10,5 @@ SIGMAS_95 = _NORMAL.inv_cdf(UPPER_95)
 CHI2_95 = SIGMAS_95**2
 # Chi-square of one parameter that chance exceeds once in a thousand.
 CHI2_999 = _NORMAL.inv_cdf(1.0 - 0.001 / 2.0) ** 2
-# Standard deviations of normal scatter in the median of its absolute deviations.
-OF_MEDIAN = 1.0 / _NORMAL.inv_cdf(0.75)
+# Standard deviations of normal scatter in its median absolute deviation (MAD).
+MAD_TO_SIGMA = 1.0 / _NORMAL.inv_cdf(0.75)

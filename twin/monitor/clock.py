@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.events import Event, Kind
-from twin.inference.levels import OF_MEDIAN, SIGMAS_95
+from twin.inference.levels import MAD_TO_SIGMA, SIGMAS_95
 from twin.model.compiled import compiled
 from twin.signals import NEW_TIME, SAMPLE, Samples
 
@@ -312,7 +312,7 @@ class ClockWatch:
             return 0.0
         self._draw()
         off = self._off_line(*point)
-        scatter = OF_MEDIAN * median(np.abs(self._off_line(x, y)).tolist())
+        scatter = MAD_TO_SIGMA * median(np.abs(self._off_line(x, y)).tolist())
         unsteady = UNSTEADY * median(late.tolist())
         return off if abs(off) > max(float(SET_NS), 8.0 * scatter, unsteady) else 0.0
 
@@ -339,7 +339,7 @@ class ClockWatch:
         self._draw()
         slope, at_end, _ = self._line
         drift_pm = slope_pm(x, y)
-        scatter = OF_MEDIAN * median(np.abs(self._off_line(x, y)).tolist())
+        scatter = MAD_TO_SIGMA * median(np.abs(self._off_line(x, y)).tolist())
         offset_pm = SIGMAS_95 * scatter + drift_pm * float(x[-1] - x[0]) / 2
         here = at_end + slope * (now - x[-1])
         return Estimate(-(zero + here) * 1e-6, offset_pm * 1e-6, -slope * 1e6, drift_pm * 1e6)

@@ -45,6 +45,7 @@ LEARNED = 10  # cycles before which nothing is said
 SHOWN = 3.0  # sigmas: less by the cycles after the first, and it is not asked what differs
 DOUBTED = 0.05  # probability that anything differs, from which on it is asked what
 RETURNED = float(np.log(1000.0))  # of the odds that it is as before, for it to be over
+DELAYS_AT = np.array([0.0, *DELAY_STEPS]) / DELAY_STEPS[0]  # sizes of delays that are looked at
 FEWEST_BACK = 3  # cycles to be sure of that, however far it was
 
 
@@ -265,9 +266,8 @@ class Isolation:
         white = known.white(columns)
         off, signatures, larger = np.split(white, [1, 1 + len(SUSPECTS)], axis=1)
         sizes, left = _fitted(off, signatures, self._bounds)
-        for number, some in zip(DELAYS, np.split(larger, len(DELAYS), axis=1), strict=True):
-            grows = np.column_stack([np.zeros(len(off)), signatures[:, number], some])
-            most = float(self._bounds[number, 1])
+        for number in DELAYS:
+            grows, most = _grows(number, signatures, larger), float(self._bounds[number, 1])
             sizes[number], left[number] = _fitted_along(off, grows, most)
         left += known.log_pdet
         # What a low supply does is not known well: in proportion to how low it is.
@@ -278,9 +278,10 @@ class Isolation:
         left[low] += wider.log_pdet
         share = np.exp(0.5 * (left.min() - left))
         best = int(np.argmin(left))
-        explained = _effect(best, float(sizes[best]), signatures, larger)
-        beside = off[:, 0] - explained
-        likely = log_likelihoods(known.white(_smooth(mean)), beside, explained, 1.0)
+        suits = wider if best == UNSURE_OF else known
+        effect = _effect(best, float(sizes[best]), mean.signatures, mean.larger)
+        white = suits.white(np.column_stack([mean.off - effect, effect, _smooth(mean)]))
+        likely = log_likelihoods(white[:, 2:], white[:, 0], white[:, 1], 1.0)
         listed = changed * Odds.of(likely[None]).of_cause(1, 0.0)
         found = self._by_effect(share * (listed / share.sum()), sizes)
         return [*found, Likeness(UNKNOWN, None, "", changed - listed)]
@@ -334,16 +335,20 @@ def _fitted(off: Floats, signatures: Floats, bounds: Floats) -> tuple[Floats, Fl
 
 
 def _effect(number: int, size: float, signatures: Floats, larger: Floats) -> Floats:
-    """What a suspect does at a size, in its steps (all whitened)."""
+    """What a suspect does at a size, in its steps."""
     if number not in DELAYS:
         return signatures[:, number] * size
-    some = np.split(larger, len(DELAYS), axis=1)[DELAYS.index(number)]
-    grows = np.column_stack([np.zeros(len(some)), signatures[:, number], some])
-    at = np.array([0.0, *DELAY_STEPS]) / DELAY_STEPS[0]
-    here = int(np.clip(np.searchsorted(at, size) - 1, 0, len(at) - 2))
-    share = (size - at[here]) / (at[here + 1] - at[here])
+    grows = _grows(number, signatures, larger)
+    here = int(np.clip(np.searchsorted(DELAYS_AT, size) - 1, 0, len(DELAYS_AT) - 2))
+    share = (size - DELAYS_AT[here]) / (DELAYS_AT[here + 1] - DELAYS_AT[here])
     effect: Floats = grows[:, here] * (1.0 - share) + grows[:, here + 1] * share
     return effect
+
+
+def _grows(number: int, signatures: Floats, larger: Floats) -> Floats:
+    """What a delay does at each of DELAYS_AT, (places, sizes)."""
+    some = np.split(larger, len(DELAYS), axis=1)[DELAYS.index(number)]
+    return np.column_stack([np.zeros(len(some)), signatures[:, number], some])
 
 
 def _smooth(said: Said) -> Floats:
@@ -357,7 +362,7 @@ def _smooth(said: Said) -> Floats:
 
 def _fitted_along(off: Floats, grows: Floats, most: float) -> tuple[float, float]:
     """The same for what delays: from nothing on through its sizes, straight between them."""
-    at = np.array([0.0, *DELAY_STEPS]) / DELAY_STEPS[0]
+    at = DELAYS_AT
     wide, reach = np.diff(at), np.ones(len(DELAY_STEPS))
     reach[-1] = (most - at[-2]) / wide[-1]
     bounds = np.column_stack([np.zeros(len(reach)), reach])

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from twin.inference.levels import OF_MEDIAN
+from twin.inference.levels import MAD_TO_SIGMA
 from twin.monitor.aligned import Knee, align
 from twin.monitor.breaks import (
     Course,
@@ -90,7 +90,7 @@ class Levels:
         held = [knee.held for knee in knees if np.isfinite(knee.held)]
         return cls(
             off,
-            OF_MEDIAN * float(np.median(np.abs(offs - off))),
+            MAD_TO_SIGMA * float(np.median(np.abs(offs - off))),
             float(np.quantile(rises, MOST)) if len(rises) > OTHERS * suctions else 0.0,
             float(np.quantile(held, MOST)) if held else -np.inf,
         )

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.errors import SourceError
-from twin.inference.levels import OF_MEDIAN
+from twin.inference.levels import MAD_TO_SIGMA
 from twin.signals import MBAR, MS, NS, UNUSABLE, Command, Quality, Samples
 
 Floats = npt.NDArray[np.float64]
@@ -148,7 +148,7 @@ def _traces(samples: Samples) -> Iterator[_Trace]:
 
 def _noise(pressure: Floats) -> float:
     """Noise (Pa) of single readings, from second differences: few rows of a record are curved."""
-    return float(np.median(np.abs(np.diff(pressure, 2)))) * OF_MEDIAN / math.sqrt(6.0)
+    return float(np.median(np.abs(np.diff(pressure, 2)))) * MAD_TO_SIGMA / math.sqrt(6.0)
 
 
 def _least_move(traces: Sequence[_Trace]) -> float:
