@@ -101,6 +101,14 @@ def test_explained_and_wrong_is_what_names_a_cause_that_is_not_there(kind: str) 
     assert unsure.outcomes["wrong"] is False
 
 
+def test_a_spurious_cause_is_one_beside_those_that_act() -> None:
+    found, other = answer("leakage"), answer("sensor_gain")["causes"]
+    assert single("leakage").outcomes["spurious"] is False
+    assert single("sensor_gain").outcomes["spurious"] is False  # that is wrong, and no extra
+    case = Case("single", 7, "gripper", [LEAK], found | {"causes": found["causes"] + other})
+    assert case.outcomes["spurious"] is True
+
+
 @pytest.mark.parametrize("kind", FOUND)
 def test_a_case_that_ends_in_an_error_is_not_found(kind: str) -> None:
     case = Case(kind, 3, "gripper", [LEAK], error="no suction phase")

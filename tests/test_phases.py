@@ -15,9 +15,19 @@ from drivers.plc.simulate import blocks, with_truth
 from tools.calibration_coverage import drawn
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
-from twin.monitor.knees import LONGEST_WINDOW, as_wide_as_needed, expected_knees
+from twin.monitor.knees import LONGEST_WINDOW, as_wide_as_needed, expected_knees, knees_of
 from twin.monitor.phases import IDLE_ROWS, SHORTEST_WINDOW, Knees, PhaseFinder
-from twin.signals import BREAK, MBAR, SAMPLE, Command, Phase, Quality, Samples
+from twin.signals import (
+    BREAK,
+    MBAR,
+    MS,
+    SAMPLE,
+    Command,
+    Phase,
+    Quality,
+    Samples,
+    sampling_ms,
+)
 
 NEAR = 20  # rows between a switch and where it is found, lag of sensor and jet included
 SECONDS = 24.0
@@ -351,6 +361,20 @@ def found_late(name: str, factor: float) -> tuple[float, float]:
 @pytest.mark.parametrize("name", rigs.NAMES)
 def test_a_slow_sensor_does_not_change_when_the_nozzle_is_said_to_switch(name: str) -> None:
     assert found_late(name, 6.0) == pytest.approx(found_late(name, 1.0), abs=3.0)
+
+
+@pytest.mark.parametrize("every", [2, 5, 10])
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_in_rows_further_apart_each_switch_is_found_at_its_time(name: str, every: int) -> None:
+    samples, truth = rigs.recorded(name, SECONDS, ("leakage=2",))
+    samples, truth = samples[::every].copy(), truth[::every]
+    samples["sequence"] = np.arange(len(samples))
+    knees = knees_of(rigs.config(name).data, sampling_ms(samples))
+    assert knees.period == pytest.approx(every * MS)
+    late = found_where_true(samples, truth, knees)
+    assert len(late) >= 6
+    assert max(map(abs, late)) <= 5  # rows; the port's step pulls a knee forward
+    assert max(late) - min(late) <= 5
 
 
 # The window.

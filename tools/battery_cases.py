@@ -137,6 +137,7 @@ def _single(case: Case) -> Mapping[str, float | None]:
         "named": bool(sets) and truth.effect in sets[0] and len(sets[0]) <= 3,
         "alone": sets == [[truth.effect]],
         "wrong": case.verdict == "explained" and not any(truth.effect in one for one in sets),
+        "spurious": _spurious(case),
         "course": None if mine is None else mine["course"] == truth.course,
         covered: _covers(mine, truth) if comparable else None,
     }
@@ -149,6 +150,7 @@ def _pair(case: Case) -> Mapping[str, float | None]:
     return {
         "pairs": all(any(effect in one for one in case.sets) for effect in effects),
         "wrong": case.verdict == "explained" and strange,
+        "spurious": _spurious(case),
     }
 
 
@@ -178,6 +180,13 @@ _JUDGES = {
     "pair": _pair,
     "unlisted": _unlisted,
 }
+
+
+def _spurious(case: Case) -> bool:
+    """Whether beside a cause that acts another one is named that does not, nor a look-alike."""
+    effects = {truth.effect for truth in case.hidden}
+    acts = [bool(effects & set(one)) for one in case.sets]
+    return any(acts) and not all(acts)
 
 
 def _cause(case: Case, truth: Hidden) -> Mapping[str, Any] | None:

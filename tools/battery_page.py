@@ -32,6 +32,9 @@ ASKED = {
     "named": Asked("single effects named first or in a set of at most three", 0.95),
     "alone": Asked("named alone, no look-alike needed", 0.85),
     "wrong": Asked("explained and wrong", 0.01, most=True),
+    "spurious": Asked(
+        "answers with a cause beside the true ones that does not act", 0.03, most=True
+    ),
     "sure": Asked(f"causes stated with {SURE:.0%} or more that act", 0.95),
     "course": Asked("the course right, where named", 0.90),
     "covered": Asked("95 % interval covers the size", 0.90),

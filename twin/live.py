@@ -16,12 +16,12 @@ from twin.model.term import Term, Terms
 from twin.model.theta import Theta
 from twin.monitor.detect import Monitor, in_order
 from twin.monitor.gaps import ShortGaps
-from twin.monitor.knees import expected_knees
+from twin.monitor.knees import knees_of
 from twin.monitor.listening import Listening
 from twin.monitor.phases import Found, Knees, PhaseFinder
 from twin.monitor.signatures import steps
 from twin.monitor.surroundings import are_told, following, stretches
-from twin.signals import MBAR, SAMPLE, TICK, Phase, Samples, Ticks
+from twin.signals import SAMPLE, TICK, Phase, Samples, Ticks
 
 REPLAYED = 60_000  # rows that a replay takes at once: what is done to many cycles stays in caches
 
@@ -68,8 +68,7 @@ class Twin:
     @classmethod
     def of(cls, data: DataSet) -> "Twin":
         """The twin of a data set."""
-        theta = coefficients(data)
-        return cls(theta, expected_knees(theta, data.sensor.noise_mbar * MBAR), data.terms)
+        return cls(coefficients(data), knees_of(data), data.terms)
 
     def advance(self, block: Samples) -> tuple[Samples, Ticks]:
         """Take a block; give the rows that are settled with what the twin says to them."""

@@ -144,6 +144,13 @@ class Bridge:
         return rows[len(before) :]
 
 
+def sampling_ms(samples: Samples) -> float:
+    """The usual time between rows in whole milliseconds; at least one, as models run so."""
+    if len(samples) < 2:
+        return 1.0
+    return max(round(float(np.median(np.diff(samples["time_ns"]))) * NS / MS), 1.0)
+
+
 def bridged(blocks: Iterable[Samples]) -> Iterator[Samples]:
     """All blocks of a stream as ``Bridge`` gives them."""
     bridge = Bridge()

@@ -13,7 +13,7 @@ from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, binned, drawn
-from twin.monitor.knees import as_wide_as_needed, expected_knees
+from twin.monitor.knees import as_wide_as_needed, knees_of
 from twin.monitor.nozzle import Switching, noise_of, switchings
 from twin.monitor.phases import PhaseFinder, commanded
 from twin.monitor.signatures import steps
@@ -48,8 +48,7 @@ class Cycles:
     def as_live(cls, samples: Samples, data: DataSet) -> "Cycles":
         """Find the phases as the live twin of ``data`` does, which is synchronised at each knee."""
         theta = coefficients(data)
-        knees = expected_knees(theta, data.sensor.noise_mbar * MBAR)
-        finder = PhaseFinder(as_wide_as_needed(knees, [samples]))
+        finder = PhaseFinder(as_wide_as_needed(knees_of(data), [samples]))
         early, late = finder.push(samples), finder.flush()
         rows, phase = (np.concatenate([early[i], late[i]]) for i in (0, 1))
         level = np.concatenate([early[2], late[2]]).astype(np.float32).astype(np.float64)

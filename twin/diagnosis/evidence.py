@@ -30,7 +30,7 @@ from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, binned
 from twin.monitor.cycles import figures, whole
 from twin.monitor.healthy import Healthy
-from twin.monitor.knees import as_wide_as_needed, expected_knees
+from twin.monitor.knees import as_wide_as_needed, knees_of
 from twin.monitor.phases import Knees
 from twin.monitor.signatures import drawn_rows, steps
 from twin.monitor.surroundings import are_told, following, told
@@ -47,6 +47,7 @@ from twin.signals import (
     Ticks,
     bridged,
     joined,
+    sampling_ms,
 )
 
 CORES: ContextVar[int] = ContextVar("CORES", default=2)  # on which a diagnosis runs
@@ -362,8 +363,9 @@ def _together(courses: Sequence[Schedule], rows: int) -> Iterator[tuple[int, int
 
 def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
     """Run the calibrated twin over a log and collect its complete cycles."""
+    blocks = list(blocks)
     theta = coefficients(config.data)
-    knees = expected_knees(theta, config.data.sensor.noise_mbar * MBAR)
+    knees = knees_of(config.data, sampling_ms(max(blocks, key=len, default=np.empty(0, SAMPLE))))
     nothing = Evidence(
         theta=theta,
         begin_ns=0,

@@ -146,6 +146,7 @@ class Wiring(Settings):
 
     lag_ms: float = Field(3.0, ge=0.5, le=500.0)
     noise_mbar: float = Field(0.4, gt=0.0, le=50.0)  # one standard deviation, steps included
+    sampling_ms: float = Field(1.0, ge=0.5, le=100.0)  # from row to row
 
 
 class System(Settings):

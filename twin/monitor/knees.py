@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from twin.model import theta as c
+from twin.model.dataset import DataSet, coefficients
 from twin.model.gas import GAMMA, R
 from twin.model.plant import suction_at
 from twin.model.theta import Theta
 from twin.monitor.phases import SHORTEST_WINDOW, SIGNIFICANT, Knees, PhaseFinder
 from twin.monitor.switching import seen
-from twin.signals import MS, Phase, Samples
+from twin.signals import MBAR, MS, Phase, Samples
 
 SHARP, ROUNDED = 2.5, 2.0  # times SIGNIFICANT, which is to show of a knee; lags round it
 ROUNDS = 8  # until the window's rows are known
@@ -28,9 +29,16 @@ RINGS = 1.5  # times as high as in the free run a line may ring
 MOST_APART = 2.0 / 3.0  # of H1's hysteresis: thresholds drift
 
 
-def expected_knees(theta: Theta, noise: float) -> Knees:
+def knees_of(data: DataSet, sampling_ms: float | None = None) -> Knees:
+    """How knees will look in rows of a data set's unit, or in those of a record."""
+    period = (sampling_ms or data.sensor.sampling_ms) * MS
+    return expected_knees(coefficients(data), data.sensor.noise_mbar * MBAR, period)
+
+
+def expected_knees(theta: Theta, noise: float, period: float = MS) -> Knees:
     """Derive the knees' window from how sharply the slope breaks at H1 in this system.
 
+    ``noise`` in Pa; rows come each ``period`` (s).
     The slope of a straight line over n rows of noise s has the deviation s √(12/n³); the window is
     chosen so that the break is SIGNIFICANT against the difference of two such slopes. A lag of the
     sensor leaves 1 / (1 + lag / n) of that difference. Where no air is saved there are no knees
@@ -38,9 +46,11 @@ def expected_knees(theta: Theta, noise: float) -> Knees:
     """
     h1 = theta[c.AMBIENT] - theta[c.H1]
     suction = suction_at(theta, h1) * R * theta[c.TEMPERATURE]
-    bend = max(GAMMA * suction / (theta[c.VOLUME] + theta[c.PORT_VOLUME]) * MS, 1e-3)  # Pa per row
+    bend = max(
+        GAMMA * suction / (theta[c.VOLUME] + theta[c.PORT_VOLUME]) * period, 1e-3
+    )  # Pa per row
     sharp = rows = (24.0 * (SHARP * SIGNIFICANT * noise / bend) ** 2) ** (1.0 / 3.0)
-    lag = math.hypot(theta[c.SENSOR_LAG], theta[c.SENSOR_LAG] + theta[c.SLOW_SENSOR]) / MS
+    lag = math.hypot(theta[c.SENSOR_LAG], theta[c.SENSOR_LAG] + theta[c.SLOW_SENSOR]) / period
     for _ in range(ROUNDS):
         rows = max(sharp, sharp * (ROUNDED / SHARP * (1.0 + lag / rows)) ** (2.0 / 3.0))
     window = int(min(max(math.ceil(rows), SHORTEST_WINDOW), LONGEST_WINDOW))
@@ -50,14 +60,15 @@ def expected_knees(theta: Theta, noise: float) -> Knees:
         longest=int(min(max(to_the_end, window), LONGEST_WINDOW)),
         noise=noise,
         off_shift=0,
-        on_shift=round((2.0 * theta[c.RAMP_UP] + 2.0 * theta[c.SENSOR_LAG]) / MS),
+        on_shift=round((2.0 * theta[c.RAMP_UP] + 2.0 * theta[c.SENSOR_LAG]) / period),
         settled=NEVER
         if theta[c.AIR_SAVING] == c.OFF
-        else round((theta[c.RESPONSE] + SETTLED) / MS),
-        again=round(AGAIN / MS),
+        else round((theta[c.RESPONSE] + SETTLED) / period),
+        again=round(AGAIN / period),
         blow_off=(float(theta[c.BLOW_OFF_MODE]), float(theta[c.BLOW_OFF_TIME])),
-        about=round((max(theta[c.RESPONSE], theta[c.RESPONSE_OFF]) + TOLD_LATE + SETTLED) / MS),
-        acts=(round(theta[c.RESPONSE_OFF] / MS), round(theta[c.RESPONSE] / MS)),
+        about=round((max(theta[c.RESPONSE], theta[c.RESPONSE_OFF]) + TOLD_LATE + SETTLED) / period),
+        acts=(round(theta[c.RESPONSE_OFF] / period), round(theta[c.RESPONSE] / period)),
+        period=period,
     )
     return _as_seen(at_once, theta, GAMMA * theta[c.H1] / bend)
 
@@ -73,7 +84,7 @@ def _as_seen(knees: Knees, theta: Theta, most: float) -> Knees:
     leaky = theta.copy()
     leaky[c.BACK_FLOW] += gas * (theta[c.H1] - theta[c.H1_LOW]) / HELD
     leaky[c.AIR_SAVING] = c.WITHOUT_CONTINUOUS
-    rows = min(int(most + HELD / MS) + 2 * LONGEST_WINDOW, LONGEST_RUN)
+    rows = min(int(most + HELD / knees.period) + 2 * LONGEST_WINDOW, LONGEST_RUN)
     tight, leaking = seen([theta, leaky], rows, replace(knees, on_shift=0))
     most_rows = knees.on_shift + knees.window  # more: it is another knee
     if AT_ONCE < tight.off_rows <= most_rows:

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from twin.model import theta as c
 from twin.model.compiled import compiled, per_row
 from twin.model.control import new_timer, timed
-from twin.signals import BREAK, NS, SAMPLE, UNUSABLE, Phase, Reported, Samples, joined
+from twin.signals import BREAK, MS, NS, SAMPLE, UNUSABLE, Phase, Reported, Samples, joined
 
 IDLE_ROWS = 20  # rows of idle that give the level before a cycle
 FEWEST_IDLE_ROWS = 5
@@ -47,11 +47,12 @@ _IDLE, _SUCTION, _HOLD, _BLOW_OFF = (int(phase) for phase in Phase)
 class Knees:
     """How knees look in this system: rows of the window, noise (Pa), rows from valve to knee.
 
-    The nozzle's closing shows ``off_shift`` rows later, its opening ``on_shift``. No knee is looked
-    for in the rows until suction has ``settled``, nor in those until one can follow ``again``, nor
-    until the pressure is ``apart`` (Pa) from where the last was. A window of more than ``longest``
-    rows could take the way to the end pressure for a knee. Where the ejector reports its nozzle, a
-    knee is within ``about`` rows of that, and the valve, closing and opening, ``acts`` rows after.
+    Rows come each ``period`` (s). The nozzle's closing shows ``off_shift`` rows later, its opening
+    ``on_shift``. No knee is looked for in the rows until suction has ``settled``, nor in those
+    until one can follow ``again``, nor until the pressure is ``apart`` (Pa) from where the last
+    was. A window of more than ``longest`` rows could take the way to the end pressure for a knee.
+    Where the ejector reports its nozzle, a knee is within ``about`` rows of that, and the valve,
+    closing and opening, ``acts`` rows after.
     """
 
     window: int
@@ -65,6 +66,7 @@ class Knees:
     blow_off: tuple[float, float] = (float(c.EXTERNAL), 0.0)  # the ejector's own: mode, pulse (s)
     about: int = 50
     acts: tuple[int, int] = (10, 10)
+    period: float = MS
 
     @property
     def settles(self) -> int:

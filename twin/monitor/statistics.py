@@ -19,7 +19,7 @@ from twin.monitor.bank import DELAYS, LARGER, SUSPECTS, UNSURE_OF, hypotheses
 from twin.monitor.bins import Bins, Floats, Ints, averaged
 from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import Healthy
-from twin.monitor.knees import expected_knees
+from twin.monitor.knees import knees_of
 from twin.monitor.phases import Knees
 from twin.monitor.switching import seen
 from twin.monitor.weights import SCATTER, from_cycle_to_cycle, lasting, model_error
@@ -29,7 +29,7 @@ PER_UNIT = 2  # bins in each unit of warped time
 LEVELS = ("h1_level", "h1_low_level")
 UNKNOWN_LEVEL_MBAR = 3.0  # one sigma of a level that healthy cycles do not show
 PLACES = 8  # that are remembered: of a program or two, with what jitters
-SUCTION_ROWS = 4000  # commanded, to see where each suspect switches
+SUCTION = 4.0  # s, commanded to see where each suspect switches
 # Sigmas² of a step: nothing in the cycle depends on it. Hypotheses that are stepped apart from each
 # other are a pascal apart, which looks like some 0.002; the least that depends has 3.
 WEAK = 0.01
@@ -102,10 +102,10 @@ class Listener:
     def of(cls, data: DataSet, healthy: Healthy) -> "Listener":
         """The one for cycles beside the twin of a data set."""
         theta, noise = coefficients(data), data.sensor.noise_mbar
-        return cls(theta, healthy, noise, expected_knees(theta, noise * MBAR))
+        return cls(theta, healthy, noise, knees_of(data))
 
     def __post_init__(self) -> None:
-        found = seen(hypotheses(self.theta), SUCTION_ROWS, self.knees)
+        found = seen(hypotheses(self.theta), round(SUCTION / self.knees.period), self.knees)
         vacuum = np.array([one.levels for one in found]).T
         self._levels = np.nan_to_num(derivatives(vacuum)[1])
         known = [self.healthy.figures.get(name) for name in LEVELS]

@@ -13,7 +13,7 @@ from twin.model import theta as c
 from twin.model.compiled import compiled
 from twin.model.dataset import DataSet
 from twin.model.theta import Theta
-from twin.signals import MBAR, ZERO_C, Phase, Samples, Ticks
+from twin.signals import MBAR, ZERO_C, Phase, Samples, Ticks, sampling_ms
 
 COLUMNS = (("ambient", c.AMBIENT), ("temperature", c.TEMPERATURE))
 
@@ -49,14 +49,16 @@ def following(theta: Theta, samples: Samples) -> Theta:
 
 
 def taken_in(data: DataSet, samples: Samples) -> DataSet:
-    """A data set of the surroundings in which a record was taken, as far as it tells them."""
+    """A data set as a record was taken: how often, and in which surroundings if it tells them."""
     found, ambient = told(samples), data.ambient
     if "ambient" in found:
         ambient = ambient.model_copy(update={"pressure_mbar": round(found["ambient"] / MBAR, 1)})
     if "temperature" in found:
         celsius = round(found["temperature"] - ZERO_C, 1)
         ambient = ambient.model_copy(update={"temperature_c": celsius})
-    return DataSet.model_validate(data.model_copy(update={"ambient": ambient}).model_dump())
+    sensor = data.sensor.model_copy(update={"sampling_ms": sampling_ms(samples)})
+    taken = data.model_copy(update={"ambient": ambient, "sensor": sensor})
+    return DataSet.model_validate(taken.model_dump())
 
 
 def stretches(samples: Samples, ticks: Ticks, before: int) -> Iterator[tuple[slice, Samples]]:

@@ -6,6 +6,7 @@ and at another level than it happened; all that is the same here as in the log.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -52,57 +53,78 @@ class Seen:
 
 
 def seen(thetas: Sequence[Theta], rows: int, knees: Knees) -> list[Seen]:
-    """Command suction for ``rows`` from rest, let the model run free and look for its knees."""
-    commands = np.full(IDLE_ROWS + rows, Command.SUCTION, np.uint8)
-    commands[:IDLE_ROWS] = 0
+    """Command suction for ``rows`` from rest, let the model run free and look for its knees.
+
+    The model runs each millisecond, as the control of an ejector does; rows are as far apart as
+    those of ``knees``.
+    """
+    every = max(round(knees.period / MS), 1)
+    commands = np.full((IDLE_ROWS + rows) * every, Command.SUCTION, np.uint8)
+    commands[: IDLE_ROWS * every] = 0
     dt = np.full(len(commands), MS)
-    samples = np.zeros(len(commands), SAMPLE)
-    samples["sequence"] = np.arange(len(commands))
-    samples["time_ns"] = np.arange(len(commands)) * 1_000_000
-    samples["commands"] = commands
-    runs = ((theta, *strides.simulate(theta, dt, commands)) for theta in thetas)
-    return [_seen(samples, *each, knees) for each in runs]
+    samples = np.zeros(IDLE_ROWS + rows, SAMPLE)
+    samples["sequence"] = np.arange(len(samples))
+    samples["time_ns"] = np.arange(len(samples)) * every * 1_000_000
+    samples["commands"] = commands[::every]
+    found = []
+    for theta in thetas:
+        phase, expected = strides.simulate(theta, dt, commands)
+        run = _Run(theta, phase[::every], expected[::every], knees.period)
+        found.append(_seen(samples, run, knees))
+    return found
 
 
-def _seen(samples: Samples, theta: Theta, phase: Bytes, expected: Floats, knees: Knees) -> Seen:
-    samples["pressure"] = expected
+class _Run(NamedTuple):
+    """A free run of the model, as rows would show it."""
+
+    theta: Theta
+    phase: Bytes
+    expected: Floats  # Pa, what is read
+    period: float  # s, from row to row
+
+    def rows(self, coefficient: int) -> int:
+        """A time among the coefficients in rows."""
+        return round(float(self.theta[coefficient]) / self.period)
+
+
+def _seen(samples: Samples, run: _Run, knees: Knees) -> Seen:
+    samples["pressure"] = run.expected
     finder = PhaseFinder(knees)
     (_, early, low), (_, late, high) = finder.push(samples), finder.flush()
     found, level = np.concatenate([early, late]), np.concatenate([low, high])
-    off = _one(theta, phase, expected, found, level, Phase.HOLD)
-    on = _one(theta, phase, expected, found, level, Phase.SUCTION)
-    rings = _rings(theta, phase, expected, FALLS * knees.noise)
-    thresholds = _read_at(theta, c.H1), _read_at(theta, c.H1_LOW)
+    off = _one(run, found, level, Phase.HOLD)
+    on = _one(run, found, level, Phase.SUCTION)
+    rings = _rings(run, FALLS * knees.noise)
+    thresholds = _read_at(run.theta, c.H1), _read_at(run.theta, c.H1_LOW)
     return Seen(off[0], on[0], off[1], on[1], off[2], on[2], rings, thresholds)
 
 
-def _one(
-    theta: Theta, phase: Bytes, expected: Floats, found: Bytes, level: Floats, name: Phase
-) -> tuple[float, int, float]:
+def _one(run: _Run, found: Bytes, level: Floats, name: Phase) -> tuple[float, int, float]:
     """Vacuum, rows and level above the reading, for the first switching into ``name``."""
+    phase, expected = run.phase, run.expected
     before = Phase.SUCTION if name == Phase.HOLD else Phase.HOLD
     switched = np.flatnonzero((phase[1:] == name) & (phase[:-1] == before)) + 1
     knees = np.flatnonzero(np.isfinite(level) & (found == name))
     knees = knees[np.isin(found[knees - 1], (before, name)) & (knees > IDLE_ROWS + 1)]
     if not len(switched) or not len(knees):
         return np.nan, 0, 0.0
-    response = theta[c.RESPONSE_OFF if name == Phase.HOLD else c.RESPONSE]
-    rows = int(knees[0] - switched[0] - round(float(response) / MS))
-    vacuum = (theta[c.AMBIENT_NOMINAL] - level[knees[0]]) / MBAR
+    response = run.rows(c.RESPONSE_OFF if name == Phase.HOLD else c.RESPONSE)
+    rows = int(knees[0] - switched[0] - response)
+    vacuum = (run.theta[c.AMBIENT_NOMINAL] - level[knees[0]]) / MBAR
     return float(vacuum), rows, float(level[knees[0]] - expected[knees[0]])
 
 
-def _rings(theta: Theta, phase: Bytes, expected: Floats, falls: float) -> float:
+def _rings(run: _Run, falls: float) -> float:
     """How high (Pa) the line still rings above the reading as the valve first closed.
 
     It rings as long as the reading comes back by more than ``falls`` (Pa).
     """
-    off = phase == Phase.HOLD
+    off = run.phase == Phase.HOLD
     if not off.any():
         return 0.0
     first = int(off.argmax())
     rows = int((~off[first:]).argmax()) or len(off) - first
-    held = expected[first + round(float(theta[c.RESPONSE_OFF]) / MS) : first + rows]
+    held = run.expected[first + run.rows(c.RESPONSE_OFF) : first + rows]
     highest = np.maximum.accumulate(held)
     fallen = np.flatnonzero(highest - held > falls)
     return float(highest[fallen[-1]] - held[0]) if len(fallen) else 0.0
