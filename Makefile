@@ -2,6 +2,7 @@
 # Without a network: PIP_NO_INDEX=1 PIP_FIND_LINKS=/folder/of/wheels make ...
 PYTHON ?= python3
 BIN := .venv/bin
+PARALLEL := -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 
 .PHONY: demo test peers check format docs bench battery clean
@@ -10,7 +11,7 @@ demo: .venv/run
 	$(BIN)/python tools/demo.py
 
 test: .venv/dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(PARALLEL)
 
 # What the tests speak to, if it is there: a broker, a browser, PLCs of other make.
 peers:
@@ -21,7 +22,7 @@ check: .venv/dev
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(PARALLEL)
 
 format: .venv/dev
 	$(BIN)/ruff format .

@@ -29,6 +29,7 @@ GRIPPER = rigs.path_of("gripper")
 LOWEST = 19  # priority that there is
 PATIENCE_S = 60.0
 CYCLE_NS = 2_000_000_000
+_SHARED: list[psutil.Process] = []  # children that ran before the test
 
 CAUSE: dict[str, Any] = {
     "effect": "leakage",
@@ -110,7 +111,15 @@ class Stream:
 
 
 def children() -> list[psutil.Process]:
-    return psutil.Process().children()
+    """Those that a test has started: what tests share may have some of its own."""
+    return [one for one in psutil.Process().children() if one not in _SHARED]
+
+
+@pytest.fixture(autouse=True)
+def shared() -> Iterator[None]:
+    _SHARED[:] = psutil.Process().children()
+    yield
+    _SHARED.clear()
 
 
 @pytest.fixture

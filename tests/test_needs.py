@@ -38,6 +38,14 @@ def test_without_any_program_nothing_fails_and_a_table_says_what_is_left_out() -
         assert re.search(rf"^ *[1-9]\d*  {re.escape(name)} +{packages} +\S", table, re.M), name
 
 
+def test_several_processes_say_together_what_is_left_out() -> None:
+    done = run_without("cc", "-n", "2", "tests/test_bench_kernel.py", "tests/test_translate.py")
+    assert done.returncode == 0, done.stdout
+    count = re.search(r"^ *(\d+)  cc ", done.stdout, re.M)
+    assert count is not None
+    assert f"{count[1]} skipped" in done.stdout
+
+
 def test_in_ci_a_missing_program_is_a_failure() -> None:
     done = run_without("cc", "tests/test_bench_kernel.py", ci="true")
     assert done.returncode == 1, done.stdout
