@@ -323,6 +323,7 @@ def test_the_answer_has_the_form_that_others_rely_on() -> None:
         "verdict",
         "causes",
         "runners_up",
+        "unmodelled_probability",
         "unlisted",
         "cycles",
         "baseline",

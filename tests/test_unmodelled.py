@@ -49,6 +49,8 @@ def test_a_probability_is_one(ratio: float, causes: int, rivals: float) -> None:
     one = Odds(ratio)
     assert 0.0 <= one.of_cause(causes, rivals) <= 1.0
     assert 0.0 <= one.of_unlisted(causes) <= 1.0
+    assert one.instead(causes, rivals) <= 1.0 - one.of_cause(causes, rivals) + 1e-12
+    assert one.of_cause(causes, 0.0) + one.instead(causes, 0.0) == pytest.approx(1.0)
     assert one.of_cause(causes, rivals + 1.0) <= one.of_cause(causes, rivals)
     assert Odds(2.0 * ratio + 1.0).of_cause(causes, 0.0) <= one.of_cause(causes, 0.0) + 1e-12
 
@@ -66,6 +68,19 @@ def test_what_is_left_and_smooth_speaks_for_something_unlisted() -> None:
     strange = odds(left + courses @ np.array([4.0, -3.0, 2.0, 1.0, 5.0]), courses, explained)
     assert strange.of_unlisted(1) > 0.99
     assert strange.of_cause(1, 0.0) < 0.7
+
+
+def test_of_noise_alone_something_unlisted_is_improbable_and_of_a_course_in_it_sure() -> None:
+    courses, left, _ = drawn(7)
+    noise = np.ones(RESIDUALS)
+
+    def probability(white: Floats) -> float:
+        return unmodelled.of_nothing_listed(
+            unmodelled.log_likelihoods(courses, white, noise, 1.0)[None]
+        )
+
+    assert probability(left) < 0.1
+    assert probability(left + courses @ np.ones(WAYS)) == unmodelled.MOST_SURE
 
 
 def test_an_effect_that_is_off_by_a_little_of_much_is_still_itself() -> None:

@@ -17,7 +17,7 @@ from twin.diagnosis.judge import Judged, gain, judge, rounded
 from twin.diagnosis.search import Search, search, sharpened
 from twin.diagnosis.unlisted import STRANGE, Unlisted, extended, look
 from twin.diagnosis.unmodelled import Unmodelled
-from twin.diagnosis.weights import covariance
+from twin.diagnosis.weights import Weights, covariance
 from twin.inference.levels import SIGMAS_95
 from twin.inference.unmodelled import Odds
 from twin.instants import CALENDAR_NS, SECOND_NS
@@ -123,6 +123,9 @@ def diagnose(
         "verdict": verdict,
         "causes": _causes(evidence, searched, odds, before) if found else [],
         "runners_up": _runners_up(searched),
+        "unmodelled_probability": _unmodelled(
+            evidence, searched, odds, healthy.of(evidence.judged)
+        ),
         "unlisted": _unlisted(strange) if verdict == "unlisted" else None,
         "cycles": {
             "total": whole.cycles,
@@ -248,7 +251,10 @@ def _causes(
             "course": str(cause.course),
             "onset_s": _rounded_onset(evidence, cause),
             "parameters": values,
-            "probability": _probability(evidence, found, rivals, odds[number]),
+            "probability": round(
+                odds[number].of_cause(len(found.hypothesis), _weight(evidence, found, rivals)),
+                3,
+            ),
             "not_separable_from": [_stranger(one, found) for one in rivals],
             "why": _why(evidence, cause, values, before),
         }
@@ -270,8 +276,22 @@ def _stranger(rival: Fitted, found: Fitted) -> str:
     return next(one for one in rival.effects if one not in found.effects)
 
 
-def _probability(evidence: Evidence, found: Fitted, rivals: Sequence[Fitted], odds: Odds) -> float:
-    """How probable a cause is beside its rivals and beside something that nobody listed.
+def _unmodelled(
+    evidence: Evidence, searched: Search, odds: Sequence[Odds], weights: Weights
+) -> float:
+    """Probability of something unlisted in place of the first cause, or of any where none stands.
+
+    With the probability of that cause and those of its rivals it sums to one.
+    """
+    if searched.found is None:
+        return round(Unmodelled(evidence, weights, HEALTHY).alone(), 3)
+    found = searched.found
+    rivals = _weight(evidence, found, searched.rivals[0])
+    return round(odds[0].instead(len(found.hypothesis), rivals), 3)
+
+
+def _weight(evidence: Evidence, found: Fitted, rivals: Sequence[Fitted]) -> float:
+    """What rivals weigh beside a cause.
 
     Of how often listed effects come only what is known counts.
     """
@@ -279,8 +299,7 @@ def _probability(evidence: Evidence, found: Fitted, rivals: Sequence[Fitted], od
         score_with_tempered_prior(evidence, one.score, one.hypothesis) for one in (found, *rivals)
     ]
     temper = 2.0 * max(found.leftover, 1.0) ** 2
-    weights = sum(math.exp(min((scores[0] - one) / temper, 50.0)) for one in scores[1:])
-    return round(odds.of_cause(len(found.hypothesis), weights), 3)
+    return sum(math.exp(min((scores[0] - one) / temper, 50.0)) for one in scores[1:])
 
 
 def _rounded_onset(evidence: Evidence, cause: Cause) -> float | None:
@@ -381,6 +400,7 @@ def _insufficient(evidence: Evidence, part: dict[str, Any], reason: str) -> dict
         "verdict": "insufficient",
         "causes": [],
         "runners_up": [],
+        "unmodelled_probability": None,
         "unlisted": None,
         "cycles": {"total": evidence.cycles, "fitted": [], "held_out": [], **part},
         "baseline": nothing,

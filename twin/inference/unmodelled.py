@@ -24,6 +24,7 @@ _EDGES = np.concatenate([[0.0], np.sqrt(SHARES[1:] * SHARES[:-1]), [1.0]])
 _ANY = np.diff(_EDGES)  # of an effect that nobody listed all shares are as probable
 _LITTLE = _ANY * np.exp(-0.5 * (SHARES / MISMATCH) ** 2)  # of one that is: as its waveform is off
 _LITTLE /= _LITTLE.sum()
+MOST_SURE = 0.99  # nobody knows the whole table, nor all that may not be in it
 MOST = 1e9  # beyond it nothing changes any more
 
 
@@ -48,6 +49,11 @@ class Odds:
         beside = BESIDE * self.ratio
         return (1.0 + beside) / (1.0 + rivals + beside + self._instead(causes))
 
+    def instead(self, causes: int, rivals: float) -> float:
+        """Probability that something unlisted acts in place of a cause, one of so many."""
+        strange = self._instead(causes)
+        return strange / (1.0 + rivals + BESIDE * self.ratio + strange)
+
     def of_unlisted(self, causes: int) -> float:
         """Probability that something acts that nobody listed, beside or instead of a cause."""
         strange = BESIDE * self.ratio + self._instead(causes)
@@ -55,6 +61,16 @@ class Odds:
 
     def _instead(self, causes: int) -> float:
         return UNLISTED * self.ratio / FURTHER ** (causes - 1)
+
+
+def of_nothing_listed(log_likelihoods: Floats) -> float:
+    """Probability that something unlisted acts where no listed effect does.
+
+    ``log_likelihoods`` are those with each of SHARES of the noise left, (·, shares).
+    """
+    ratio = np.exp(np.minimum(log_likelihoods, np.log(MOST))).mean(axis=0) @ _ANY
+    strange = UNLISTED * float(ratio)
+    return min(strange / (1.0 + strange), MOST_SURE)
 
 
 def log_likelihoods(courses: Floats, left: Floats, explained: Floats, scale: float) -> Floats:
