@@ -101,6 +101,19 @@ def test_explained_and_wrong_is_what_names_a_cause_that_is_not_there(kind: str) 
     assert unsure.outcomes["wrong"] is False
 
 
+def test_ranks_of_true_sizes_are_uniform_where_intervals_are_right() -> None:
+    said = answer("leakage")
+    assert Case("single", 1, "gripper", [replace(LEAK, size=0.9)], said).rank == 0.5
+    assert Case("single", 1, "gripper", [replace(LEAK, size=0.8)], said).rank == pytest.approx(
+        0.025
+    )
+    assert Case("single", 1, "gripper", [replace(LEAK, size=1.1)], said).rank == pytest.approx(
+        0.975
+    )
+    assert Case("single", 1, "gripper", [replace(LEAK, course="step")], said).rank is None
+    assert "Ranks of 1 true sizes" in tables([single("leakage")])
+
+
 def test_a_spurious_cause_is_one_beside_those_that_act() -> None:
     found, other = answer("leakage"), answer("sensor_gain")["causes"]
     assert single("leakage").outcomes["spurious"] is False

@@ -372,10 +372,10 @@ def test_the_time_to_h2_is_to_that_of_the_unit() -> None:
 def test_no_size_is_told_beyond_the_bounds_of_its_effect(effect: str, typical: float) -> None:
     """An interval may be wide; what a ramp has come to has the bounds of the effect, too."""
     evidence, (first, *_) = collect(CONFIG, record(8.0)), EFFECTS[effect].parameters
-    x, spread = np.array([typical / first.typical]), np.array([0.5 * first.high / first.typical])
+    x, reach = np.array([typical / first.typical]), 0.4 * first.high / first.typical
     for course in (Course.CONSTANT, Course.RAMP):
         cause = Cause(effect, {first.name: typical}, course, onset_s=1.0)
-        (told,) = answer_module._parameters(evidence, cause, x, spread).values()
+        (told,) = answer_module._parameters(evidence, cause, x, x - reach, x + reach).values()
         name = "at_end_" if course == Course.RAMP else ""
         assert first.low <= told[f"{name}low95"] < told[f"{name}high95"] <= first.high
 

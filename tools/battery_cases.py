@@ -4,9 +4,12 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
+
+from twin.inference.levels import SIGMAS_95
 
 # By what is asked for: 1 reached, 0 not, or a share; several where a case counts more than once.
 Outcomes = dict[str, Any]
@@ -105,6 +108,24 @@ class Case:
         return [(float(one["probability"]), one["effect"] in effects) for one in self.causes]
 
     @property
+    def rank(self) -> float | None:
+        """Where the true size lies in what the answer says of it, from 0 to 1; None where unsaid.
+
+        Ranks of many true sizes are uniform where the intervals are right (simulation-based
+        calibration).
+        """
+        if self.kind != "single" or self.answer is None or not self.more.get("comparable", True):
+            return None
+        (truth,) = self.hidden
+        mine = _cause(self, truth)
+        said = None if mine is None else _said(mine, truth)
+        if said is None:
+            return None
+        low, value, high = said
+        sigma = ((high - value) if truth.size > value else (value - low)) / SIGMAS_95
+        return NormalDist().cdf((truth.size - value) / sigma) if sigma > 0.0 else None
+
+    @property
     def outcomes(self) -> Outcomes:
         """What the case counts for, by what is asked for."""
         if self.answer is None:
@@ -196,11 +217,18 @@ def _cause(case: Case, truth: Hidden) -> Mapping[str, Any] | None:
 
 def _covers(cause: Mapping[str, Any], truth: Hidden) -> bool | None:
     """Whether the interval of the first parameter holds the true size; None if of another kind."""
+    said = _said(cause, truth)
+    return None if said is None else bool(said[0] <= truth.size <= said[2])
+
+
+def _said(cause: Mapping[str, Any], truth: Hidden) -> tuple[float, float, float] | None:
+    """Low end, value and high end of the first parameter; None where the course is another."""
     if not cause["parameters"] or cause["course"] != truth.course:
         return None
     found = next(iter(cause["parameters"].values()))
-    of = "at_end_" if truth.course == "ramp" else ""
-    return bool(found[f"{of}low95"] <= truth.size <= found[f"{of}high95"])
+    if truth.course == "ramp":
+        return found["at_end_low95"], found["at_end"], found["at_end_high95"]
+    return found["low95"], found["value"], found["high95"]
 
 
 # --- the file -------------------------------------------------------------------------------------

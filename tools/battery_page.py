@@ -7,7 +7,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import binomtest
+from scipy.stats import binomtest, kstest
 
 from tools.battery_cases import FOUND, MOST_LEFT, SURE, Case, of_kind, spread
 
@@ -125,6 +125,14 @@ def reliability(cases: Sequence[Case]) -> Iterator[str]:
             rows.append((said_of, str(len(here)), f"{said:.1%}", f"{acts:.1%}", chance))
     yield table(("probability stated", "causes", "mean", "act", "by chance"), iter(rows))
     yield f"Expected calibration error: {off:.3f}, over {len(stated)} causes."
+    ranks = [one.rank for one in cases if one.rank is not None]
+    if ranks:
+        test = kstest(ranks, "uniform")
+        yield (
+            f"Ranks of {len(ranks)} true sizes within what was said of them: uniform but for"
+            f" {test.statistic:.2f} (Kolmogorov and Smirnov), by chance once in"
+            f" {1.0 / max(float(test.pvalue), 1e-6):.3g}."
+        )
 
 
 def commissionings(cases: Sequence[Case]) -> Iterator[str]:

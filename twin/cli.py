@@ -294,6 +294,7 @@ def probe(config: ConfigFile, address: Address = "") -> None:
 @app.command()
 def diagnose(
     log: LogFile,
+    *,
     config: ConfigOption = None,
     unit: UnitId = "",
     assets: AssetsUrl = "",
@@ -305,15 +306,26 @@ def diagnose(
     save_as: Annotated[
         str, typer.Option(metavar="NEWID", help="Keep the extended model as that of a unit.")
     ] = "",
+    judge_on: Annotated[
+        Path | None,
+        typer.Option(metavar="OTHER.mcap", help="Measure the gain on another log as well."),
+    ] = None,
 ) -> None:
     """Say what the simulation gets wrong on a log, why, and what knowing it gains."""
+    from twin.diagnosis.another_log import judged_on
     from twin.diagnosis.answer import diagnose as find_cause
+    from twin.diagnosis.extend import nothing
     from twin.diagnosis.report import in_words, write_report
+    from twin.diagnosis.words import on_another_log
     from twin.log.reader import open_log
 
     require_writable(json_file, report)
     recorded = open_log(log)
     say_if_cut(recorded, log, "diagnosed")
+    other = open_log(judge_on) if judge_on else None
+    if other is not None and judge_on is not None:
+        other.header.require_commands(str(judge_on))
+        say_if_cut(other, judge_on, "judged on")
     store = bool(save_as)
     settings = _settings_of(recorded.header, log, config, assets, unit, as_of, to_store=store)
     if not unit:
@@ -321,7 +333,13 @@ def diagnose(
     with _status() as say:
         blocks = (rows for rows, _ in recorded.blocks())
         diagnosis = find_cause(settings, blocks, str(log), say, derived=recorded.header.derived)
+        if other is not None:
+            say(f"judging on {judge_on}")
+            blocks = (rows for rows, _ in other.blocks())
+            diagnosis.json["judged_on"] = judged_on(diagnosis, settings, str(judge_on), blocks)
     print(in_words(diagnosis))
+    if other is not None:
+        print(on_another_log(diagnosis.json, nothing(diagnosis)))
     if json_file is not None:
         write_json(json_file, diagnosis.json)
     if report is not None:

@@ -24,6 +24,7 @@ from twin.instants import CALENDAR_NS, SECOND_NS
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS
 from twin.model.term import Term
+from twin.monitor.bins import Floats
 from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import NOT_COMMISSIONED
 from twin.monitor.reports import standing
@@ -40,6 +41,7 @@ MOST_LEFT = 0.5  # of chi-square beyond noise, that a cause may leave and still 
 MOST_SATURATED = 0.05  # share of samples
 MOST_JUDGED = 24  # cycles of a long log that are looked at, evenly spread
 MOST_NAMED = 4  # runners-up
+WIDEST = 0.9  # of a parameter's range: an interval as wide says nothing
 LIKELY = 0.5  # that something acts which nobody listed: more, and it is said
 # Of a size, that the data set's own scale is not known better: volume and suction; and how the
 # wall's heat is shared between vessel and line.
@@ -240,12 +242,12 @@ def _causes(
 ) -> list[dict[str, Any]]:
     assert searched.found is not None
     found, first, result = searched.found, 0, []
-    spread = np.sqrt(np.diag(found.covariance)) * max(found.leftover, 1.0)
     for number, cause in enumerate(found.hypothesis):
         count = len(parameters((cause,)))
         part = slice(first, first + count)
         rivals = searched.rivals[number]
-        values = _parameters(evidence, cause, found.x[part], spread[part])
+        low, high = (of[part] for of in searched.ends)
+        values = _parameters(evidence, cause, found.x[part], low, high)
         entry: dict[str, Any] = {
             "effect": cause.effect,
             "course": str(cause.course),
@@ -324,22 +326,25 @@ def _part(blocks: Sequence[Samples], before_s: float) -> dict[str, Any]:
 def _parameters(
     evidence: Evidence,
     cause: Cause,
-    x: np.typing.NDArray[np.float64],
-    spread: np.typing.NDArray[np.float64],
+    x: Floats,
+    lowest: Floats,
+    highest: Floats,
 ) -> dict[str, dict[str, Any]]:
     """Values with intervals; a ramp's are rates, and what they have come to at the log's end."""
     found = {}
     ramp = cause.course == Course.RAMP
-    for p, size, sigma in zip(EFFECTS[cause.effect].parameters, x, spread, strict=True):
-        if not np.isfinite(sigma) or sigma > abs(p.high - p.low) / p.typical:
+    sized = zip(EFFECTS[cause.effect].parameters, x, lowest, highest, strict=True)
+    for p, size, below, above in sized:
+        if not above - below < WIDEST * abs(p.high - p.low) / p.typical:
             continue  # nothing in this log depends on it
         at_neutral = p.neutral(evidence.theta)
         neutral = 0.0 if ramp else at_neutral
         value = neutral + float(size) * p.typical
         scale = OF_HEAT if cause.effect == "heat_exchange" else RELATIVE
-        reach = SIGMAS_95 * math.hypot(float(sigma) * p.typical, scale * value)
+        unsure = SIGMAS_95 * scale * value
+        down, up = (math.hypot(float(end - size) * p.typical, unsure) for end in (below, above))
         shift = at_neutral - neutral  # of a ramp these are changes, and the bounds are not
-        low, high = max(value - reach, p.low - shift), min(value + reach, p.high - shift)
+        low, high = max(value - down, p.low - shift), min(value + up, p.high - shift)
         per_hour = 1.0 / hours(evidence, cause) if ramp else 1.0
         found[p.name] = {
             "value": rounded(value * per_hour),

@@ -9,6 +9,8 @@ from scipy.optimize import lsq_linear
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.hypotheses import bounds, price, sized, sizes
 from twin.diagnosis.weights import Weights, levels
+from twin.inference.levels import CHI2_95
+from twin.inference.profile import profile_interval
 from twin.inference.sensitivities import derivatives, inside, points
 from twin.model.courses import Course
 from twin.monitor.bins import Floats
@@ -140,6 +142,41 @@ def fit(
     return [_fitted(evidence, trial) for trial in trials]
 
 
+def profiled(evidence: Evidence, weights: Weights, hypotheses: Sequence[Hypothesis]) -> Floats:
+    """Chi-square of hypotheses, each with the sizes near its own that suit it best: one step."""
+    asked, moves = list[Hypothesis](), list[Floats]()
+    for hypothesis in hypotheses:
+        x, (_, high) = sizes(evidence, hypothesis), bounds(evidence, hypothesis)
+        moves.append(inside(x, high))
+        asked += [sized(evidence, hypothesis, point) for point in points(x, moves[-1]).T]
+    ends = np.cumsum([1 + len(steps) for steps in moves])[:-1]
+    misfits = []
+    for found, steps in zip(
+        np.split(white(evidence, weights, asked), ends, axis=1), moves, strict=True
+    ):
+        residual, jacobian = derivatives(found, steps)
+        pull = jacobian.T @ residual
+        explained = pull @ np.linalg.solve(_information(jacobian), pull)
+        misfits.append(float(residual @ residual - explained))
+    return np.array(misfits)
+
+
+def interval(evidence: Evidence, weights: Weights, fitted: Fitted) -> tuple[Floats, Floats]:
+    """95 % interval of each size, low and high, from how the misfit grows about them.
+
+    What is left beside noise widens it.
+    """
+
+    def misfit(points: Floats) -> Floats:
+        asked = [sized(evidence, fitted.hypothesis, point) for point in points]
+        chi2: Floats = np.sum(white(evidence, weights, asked) ** 2, axis=0)
+        return chi2
+
+    rise = CHI2_95 * max(fitted.leftover**2, 1.0)
+    limits = bounds(evidence, fitted.hypothesis)
+    return profile_interval(misfit, fitted.x, fitted.covariance, limits, rise)
+
+
 def _give_up(trials: Sequence[_Trial]) -> None:
     best = min(trial.chi2 for trial in trials)
     for trial in trials:
@@ -155,6 +192,12 @@ def _give_up_behind(trials: Sequence[_Trial]) -> None:
         ahead.add(trial.kind)
 
 
+def _information(jacobian: Floats) -> Floats:
+    """Fisher's information of the sizes; a little where nothing depends on one."""
+    information: Floats = jacobian.T @ jacobian + 1e-6 * np.eye(jacobian.shape[1])
+    return information
+
+
 def _trial(evidence: Evidence, hypothesis: Hypothesis) -> _Trial:
     low, high = bounds(evidence, hypothesis)
     x = np.clip(sizes(evidence, hypothesis), low, high)
@@ -163,9 +206,7 @@ def _trial(evidence: Evidence, hypothesis: Hypothesis) -> _Trial:
 
 def _fitted(evidence: Evidence, trial: _Trial) -> Fitted:
     hypothesis = sized(evidence, trial.hypothesis, trial.x)
-    information = trial.jacobian.T @ trial.jacobian
-    information += 1e-6 * np.eye(len(information))
-    covariance = np.asarray(np.linalg.inv(information), np.float64)
+    covariance = np.asarray(np.linalg.inv(_information(trial.jacobian)), np.float64)
     cost = price(evidence, hypothesis)
     return Fitted(
         hypothesis, trial.x, covariance, trial.chi2, trial.chi2 + cost, len(trial.residual)

@@ -40,6 +40,7 @@ from twin.diagnosis.words import (
     lines,
     listed,
     number,
+    seen,
     signals,
     sized,
     some,
@@ -285,7 +286,8 @@ def _gain_table(answer: Answer) -> str:
 def _gained(answer: Answer) -> Iterator[tuple[str, ...]]:
     gain = answer["gain"]
     yield "less rms deviation", "", number(gain["rms_reduction_pct"]), "%"
-    yield "how sure", "", gain_interval(answer), "%" if gain["low95"] is not None else ""
+    interval = gain_interval(gain, len(answer["cycles"]["held_out"]), "held-out cycle")
+    yield "how sure", "", interval, "%" if gain["low95"] is not None else ""
     yield "share of what can be gained", "", number(gain["share_of_achievable_pct"]), "%"
 
 
@@ -294,7 +296,7 @@ def _cycles(answer: Answer) -> list[tuple[str, str]]:
     rows = [("cycles complete in the log", str(cycles["total"]))]
     if cycles["fitted"]:
         rows.append(("fitted on", some(cycles["fitted"])))
-        rows.append(("held out, to judge by", some(cycles["held_out"])))
+        rows.append(("held out, to judge by", some(cycles["held_out"]) + seen(answer)))
     return rows
 
 

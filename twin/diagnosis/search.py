@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, at_once, thinned
-from twin.diagnosis.fit import Fitted, fit, white
+from twin.diagnosis.fit import Fitted, fit, interval, profiled, white
 from twin.diagnosis.hypotheses import (
     WEATHER,
     bounds,
@@ -54,6 +54,7 @@ ONSET_S = 0.01  # to which it is found at first
 FARTHEST_S = 4.0  # from an onset, that its interval may reach
 
 Progress = Callable[[str], None]
+_NO_SIZES = np.empty(0), np.empty(0)
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,7 @@ class Search:
     found: Fitted | None
     ranking: list[Fitted]  # of all single causes, and of what was found
     rivals: list[list[Fitted]]  # of each cause: what could stand in its place
+    ends: tuple[Floats, Floats]  # of the 95 % interval of each size found
     onsets: list[tuple[float, float]]  # 95 % interval of each cause's onset
 
 
@@ -82,7 +84,7 @@ def search(
     singles = _ranked(evidence, judged, tried)
     healthy = _healthy(evidence, weights)
     if not any(_worth(healthy, healthy, 0.0, one) for one in singles):
-        return Search(weights, healthy, None, singles, [], [])
+        return Search(weights, healthy, None, singles, [], _NO_SIZES, [])
     found = singles[0]
     if found.leftover > QUIET or _weather(evidence, singles):
         progress("comparing the best, each with its own weights")
@@ -111,7 +113,7 @@ def search(
     confirmed = _confirmed(evidence, fitted, weights, found)
     if confirmed is None:
         weights = known.of(fitted)
-        return Search(weights, _healthy(evidence, weights), None, singles, [], [])
+        return Search(weights, _healthy(evidence, weights), None, singles, [], _NO_SIZES, [])
     if confirmed is not found:
         found = confirmed
         judged, weights = _weights(evidence, fitted, found.hypothesis)
@@ -130,7 +132,8 @@ def search(
         _onset_interval(evidence, judged, found.hypothesis, number, found.leftover)
         for number in range(len(found.hypothesis))
     ]
-    return Search(weights, healthy, found, singles, rivals, onsets)
+    ends = interval(evidence, weights, found)
+    return Search(weights, healthy, found, singles, rivals, ends, onsets)
 
 
 def _weights(
@@ -534,15 +537,21 @@ def _misfits(
 def _onset_interval(
     evidence: Evidence, judged: Weights, hypothesis: Hypothesis, number: int, leftover: float
 ) -> tuple[float, float]:
-    """95 % interval (s) of a step's onset, from how the misfit grows about it."""
+    """95 % interval (s) of a step's onset, from how the misfit grows about it.
+
+    Each onset has the sizes that suit it best.
+    """
     cause = hypothesis[number]
     if cause.course != Course.STEP:
         return cause.onset_s, cause.onset_s
-    others = (*hypothesis[:number], *hypothesis[number + 1 :])
     sampled = float(np.median(np.diff(evidence.seconds)))
     reach = np.geomspace(max(ONSET_S, sampled), FARTHEST_S, 10)
     onsets = cause.onset_s + np.concatenate([-reach[::-1], [0.0], reach])
-    misfit = _misfits(evidence, judged, others, cause, onsets)
+    begun = [
+        (*hypothesis[:number], replace(cause, onset_s=float(onset)), *hypothesis[number + 1 :])
+        for onset in onsets
+    ]
+    misfit = profiled(evidence, judged, begun)
     inside = np.flatnonzero(misfit < misfit.min() + CHI2_95 * max(leftover**2, 1.0))
     inside = np.union1d(inside, len(reach))  # the onset itself
     last = len(onsets) - 1  # the first that is rejected bounds it

@@ -73,16 +73,21 @@ def look(
     """Fit terms to what a hypothesis leaves on the fitted cycles; judge on the others.
 
     ``known`` is about the same hypothesis. Terms must take away the ``least`` there (chi-square
-    per residual).
+    per residual). Over what they run the fitted cycles say among themselves: the held-out ones
+    choose nothing.
     """
     evidence = known.evidence
     off = evidence.off([hypothesis])
-    here, there = (
-        _Left(weights, off[:, 0], weights.white(off, levels(evidence, cycles, [hypothesis]))[:, 0])
-        for cycles in (fitted, held_out)
-        for weights in (known.of(cycles),)
-    )
-    best = max((_tried(evidence, here, there, over) for over in OVER), key=lambda one: one.gain)
+
+    def left(cycles: Sequence[int]) -> _Left:
+        weights = known.of(cycles)
+        level = levels(evidence, cycles, [hypothesis])
+        return _Left(weights, off[:, 0], weights.white(off, level)[:, 0])
+
+    here, there = left(fitted), left(held_out)
+    some, others = (left(fitted[i::2]) for i in (0, 1)) if len(fitted) > 1 else (here, here)
+    over = max(OVER, key=lambda one: _tried(evidence, some, others, one).gain)
+    best = _tried(evidence, here, there, over)
     if best.gain >= least:
         return best
     return Unlisted(_worst(evidence, there), _driver(evidence, off[:, 0]), (), best.gain)

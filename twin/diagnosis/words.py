@@ -26,6 +26,8 @@ FIGURES = (
     ("level_rms_mbar", "rms error of the switching levels", "switching levels off by", "mbar"),
     ("leftover_sigma", "leftover (healthy: about 1)", "leftover", "sigma"),
 )
+# What of a course no cycle shows but the one that has it.
+_READ_FROM_ALL = {Course.STEP: "when it began", Course.INTERMITTENT: "in which it acts"}
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,31 @@ def _facts(answer: Answer, now_ns: int) -> Iterator[tuple[str, str]]:
         yield "gain", gain(answer)
     cycles = answer["cycles"]
     fitted, held_out = some(cycles["fitted"]), some(cycles["held_out"])
-    yield "cycles", f"{cycles['total']}; fitted: {fitted}; held out: {held_out}"
+    yield "cycles", f"{cycles['total']}; fitted: {fitted}; held out: {held_out}{seen(answer)}"
+
+
+def on_another_log(answer: Answer, nothing: str) -> str:
+    """How much is gained on the log of ``judged_on``; else why there is ``nothing`` to judge."""
+    judged = answer["judged_on"]
+    if judged is None:
+        return f"  {'another log':<14} nothing is judged on it: {nothing}"
+    before, after, cycles = judged["baseline"], judged["extended"], judged["cycles"]
+    figures = ", ".join(
+        f"{short} {number(before[key])} → {number(after[key])} {unit}"
+        for key, _, short, unit in FIGURES
+    )
+    less = f"{number(judged['gain']['rms_reduction_pct'])} % less rms deviation"
+    return (
+        f"  {'another log':<14} {judged['log']}, {cycles} cycles on which nothing was chosen:"
+        f" {figures}\n  {'gain there':<14} {less} ({gain_interval(judged['gain'], cycles)})"
+    )
+
+
+def seen(answer: Answer) -> str:
+    """What of the causes was read from the held-out cycles as well: no other shows it."""
+    courses = {cause["course"] for cause in answer["causes"]}
+    read = [what for course, what in _READ_FROM_ALL.items() if str(course) in courses]
+    return f", but for {listed(read)}, read from all" if read else ""
 
 
 def about(cause: Answer, times: Times, *, sure: bool) -> Iterator[tuple[str, str]]:
@@ -222,19 +248,20 @@ def extended(answer: Answer) -> bool:
 def gain(answer: Answer) -> str:
     """How much less deviation there is, and what share of what can be gained at all."""
     known = answer["gain"]
-    less = f"{number(known['rms_reduction_pct'])} % less rms deviation ({gain_interval(answer)})"
+    held_out = len(answer["cycles"]["held_out"])
+    interval = gain_interval(known, held_out, "held-out cycle")
+    less = f"{number(known['rms_reduction_pct'])} % less rms deviation ({interval})"
     return f"{less}, {number(known['share_of_achievable_pct'])} % of what can be gained"
 
 
-def gain_interval(answer: Answer) -> str:
-    """The interval of the gain, or why there is none."""
-    known, cycles = answer["gain"], len(answer["cycles"]["held_out"])
+def gain_interval(known: Answer, cycles: int, cycle: str = "cycle") -> str:
+    """The interval of a gain on so many cycles, or why there is none."""
     if known["low95"] is not None:
         low, high = ends(known["low95"], known["high95"])
         return f"95 %: {low} to {high}"
     if known["rms_reduction_pct"] == 0.0:
         return "no cause changes the pressure between switchings"
-    return f"{cycles} held-out cycle{'s' * (cycles != 1)} cannot tell how sure that is"
+    return f"{cycles} {cycle}{'s' * (cycles != 1)} cannot tell how sure that is"
 
 
 def number(value: float | None, digits: int = 3) -> str:
