@@ -126,14 +126,21 @@ class Case:
         return NormalDist().cdf((truth.size - value) / sigma) if sigma > 0.0 else None
 
     @property
-    def outcomes(self) -> Outcomes:
-        """What the case counts for, by what is asked for."""
+    def told(self) -> Outcomes:
+        """What verdict, names, courses and sizes of the answer count for, by what is asked for."""
         if self.answer is None:
-            true = {"true": self.more["true"]} if "true" in self.more else {}
-            return {FOUND[self.kind]: False} | true
+            return {FOUND[self.kind]: False}
         found = {name: one for name, one in _JUDGES[self.kind](self).items() if one is not None}
         if sure := [acts for probability, acts in self.stated if probability >= SURE]:
             found["sure"] = sure
+        return found
+
+    @property
+    def outcomes(self) -> Outcomes:
+        """The same, and what a diagnosis leaves and gains."""
+        if self.answer is None:
+            return self.told | ({"true": self.more["true"]} if "true" in self.more else {})
+        found = self.told
         if self.kind != "commissioning" and self.verdict == "explained":
             share = self.answer["gain"]["share_of_achievable_pct"] / 100.0
             found |= {"left": self.left <= MOST_LEFT, "gain": share}
@@ -249,14 +256,10 @@ class CaseFile:
             return
         whole = path.read_text(encoding="utf-8").rpartition("\n")[0]  # a cut line is none
         path.write_text(whole + "\n", encoding="utf-8")
-        begun, *found = map(json.loads, whole.splitlines())
+        begun, found = read_cases(path)
         if begun != run:
             raise ValueError(f"{path} has cases of another run, {begun}: finish or remove it")
-        for one in found:
-            world = one.pop("world")
-            hidden = [Hidden(**each) for each in one.pop("hidden")]
-            case = Case(hidden=hidden, **one)
-            self._cases[world, *case.key] = case
+        self._cases = {(world, *case.key): case for world, case in found}
 
     def get(self, world: str, key: tuple[str, int, int]) -> Case | None:
         """The case of a world, if it is answered."""
@@ -273,6 +276,17 @@ class CaseFile:
         assert self._path is not None
         with self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(line, default=float) + "\n")
+
+
+def read_cases(path: Path) -> tuple[Mapping[str, Any], list[tuple[str, Case]]]:
+    """Which run it is whose cases are in the file, and each case with its world."""
+    run, *lines = map(json.loads, path.read_text(encoding="utf-8").splitlines())
+    found = []
+    for line in lines:
+        world = line.pop("world")
+        hidden = [Hidden(**each) for each in line.pop("hidden")]
+        found.append((world, Case(hidden=hidden, **line)))
+    return run, found
 
 
 def first_of(path: Path | None) -> int | None:

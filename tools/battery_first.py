@@ -111,11 +111,13 @@ def fault(rng: np.random.Generator, plc: PlcSettings, hidden: Hidden) -> Fault:
     return parse_fault(text)
 
 
-def drawn_case(kind: str, seed: int, units: int) -> tuple[Unit, list[Hidden], Samples]:
-    """A unit, what is hidden, and the log."""
+def drawn_case(
+    kind: str, seed: int, units: int, first_unit: int = 0
+) -> tuple[Unit, list[Hidden], Samples]:
+    """One of the units from the first one on, what is hidden, and the log."""
     rng = np.random.default_rng([2026, seed, sorted(COUNTS).index(kind)])
     name = SYSTEMS[int(rng.integers(len(SYSTEMS)))]
-    one = unit(name, int(rng.integers(units)))
+    one = unit(name, first_unit + int(rng.integers(units)))
     hidden: list[Hidden] = []
     if kind == "single":
         effect = list(SIZES)[seed % len(SIZES)]

@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from scipy.stats import binomtest, kstest
 
 from tools.battery_cases import FOUND, MOST_LEFT, SURE, Case, of_kind, spread
@@ -110,21 +111,17 @@ def tables(cases: Sequence[Case]) -> str:
 
 def reliability(cases: Sequence[Case]) -> Iterator[str]:
     """How often causes act that were stated with some probability; how far that is off in all."""
-    stated = np.array([each for one in cases for each in one.stated])
-    if not len(stated):
-        return
-    rows, off = list[Sequence[str]](), 0.0
-    for low, high in pairwise(STATED):
-        here = stated[(stated[:, 0] >= low) & (stated[:, 0] < high)]
-        if len(here):
-            said, acts = here.mean(axis=0)
-            off += abs(said - acts) * len(here) / len(stated)
-            ends = binomtest(int(here[:, 1].sum()), len(here)).proportion_ci(0.95)
-            chance = f"{ends.low:.0%} to {ends.high:.0%}"
-            said_of = f"{low:.0%} to {min(high, 1.0):.0%}"
-            rows.append((said_of, str(len(here)), f"{said:.1%}", f"{acts:.1%}", chance))
-    yield table(("probability stated", "causes", "mean", "act", "by chance"), iter(rows))
-    yield f"Expected calibration error: {off:.3f}, over {len(stated)} causes."
+    rows = list[Sequence[str]]()
+    for low, high, here in _by_probability(cases):
+        said, acts = here.mean(axis=0)
+        ends = binomtest(int(here[:, 1].sum()), len(here)).proportion_ci(0.95)
+        chance = f"{ends.low:.0%} to {ends.high:.0%}"
+        said_of = f"{low:.0%} to {min(high, 1.0):.0%}"
+        rows.append((said_of, str(len(here)), f"{said:.1%}", f"{acts:.1%}", chance))
+    if rows:
+        yield table(("probability stated", "causes", "mean", "act", "by chance"), iter(rows))
+        off, causes = calibration_error(cases), sum(len(one.stated) for one in cases)
+        yield f"Expected calibration error: {off:.3f}, over {causes} causes."
     ranks = [one.rank for one in cases if one.rank is not None]
     if ranks:
         test = kstest(ranks, "uniform")
@@ -133,6 +130,26 @@ def reliability(cases: Sequence[Case]) -> Iterator[str]:
             f" {test.statistic:.2f} (Kolmogorov and Smirnov), by chance once in"
             f" {1.0 / max(float(test.pvalue), 1e-6):.3g}."
         )
+
+
+def calibration_error(cases: Sequence[Case]) -> float:
+    """By how much causes act more or less often than stated, mean over all; NaN without any."""
+    groups = [here for _, _, here in _by_probability(cases)]
+    if not groups:
+        return float("nan")
+    off = [abs(float(np.diff(here.mean(axis=0))[0])) for here in groups]
+    return float(np.average(off, weights=[len(here) for here in groups]))
+
+
+def _by_probability(
+    cases: Sequence[Case],
+) -> Iterator[tuple[float, float, npt.NDArray[np.float64]]]:
+    """Causes stated with a probability from a bound to the next: probability, and 1 if it acts."""
+    stated = np.array([each for one in cases for each in one.stated], np.float64).reshape(-1, 2)
+    for low, high in pairwise(STATED):
+        here = stated[(stated[:, 0] >= low) & (stated[:, 0] < high)]
+        if len(here):
+            yield low, high, here
 
 
 def commissionings(cases: Sequence[Case]) -> Iterator[str]:
@@ -148,14 +165,15 @@ def commissionings(cases: Sequence[Case]) -> Iterator[str]:
 
 def with_run(page: str, world: str, line: str, run: str) -> str:
     """The page with a world's new run; the line of the one that it replaces goes to the older."""
-    newest, older = _marked(f"newest run of the {world} world", page), _marked("older runs", page)
+    newest, older = marked(f"newest run of the {world} world", page), marked("older runs", page)
     before = newest[2].strip().split("\n", 1)[0].strip("*")
     if before:
         page = page.replace(older[0], f"{older[1]}- {before}\n{older[2]}{older[3]}")
     return page.replace(newest[0], f"{newest[1]}**{line}**\n\n{run}\n{newest[3]}")
 
 
-def _marked(name: str, page: str) -> re.Match[str]:
+def marked(name: str, page: str) -> re.Match[str]:
+    """The part of a page of some name: the mark it begins with, what it holds, its end."""
     found = re.search(rf"(<!-- {name}: [^\n]*-->\n)(.*?)(<!-- end -->)", page, re.DOTALL)
     if found is None:
         raise ValueError(f'the page has no part between "<!-- {name}: … -->" and "<!-- end -->"')
