@@ -31,6 +31,7 @@ from tools.learned_features import Floats, Record
 NONE, UNLISTED = "none", "unlisted"  # beside the effects
 TOGETHER = 0.95  # of what effects have in all: a cause and its look-alikes have as much
 COVERS = 0.95
+ENDS = ("low95", "high95")  # of an interval
 LEAST = 1e-6  # probability, where cross-entropies are compared
 FOLDS = 5  # of cross-validation, each with rigs of its own
 Names = npt.NDArray[np.str_]
@@ -118,7 +119,7 @@ class Learned:
         (course,) = self.courses.predict(features[None])
         size = self.sizes[first].of(features)
         if course == "ramp":
-            size |= {f"at_end_{name}": one for name, one in size.items()}
+            size |= {"at_end": size["value"]} | {f"at_end_{end}": size[end] for end in ENDS}
         cause = {
             "effect": first,
             "course": str(course),
