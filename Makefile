@@ -2,7 +2,8 @@
 # Without a network: PIP_NO_INDEX=1 PIP_FIND_LINKS=/folder/of/wheels make ...
 PYTHON ?= python3
 BIN := .venv/bin
-PARALLEL := -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+# Files among processes, each with one thread for matrices: more wait for each other.
+PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 
 .PHONY: demo test peers check format docs bench battery clean
@@ -11,7 +12,7 @@ demo: .venv/run
 	$(BIN)/python tools/demo.py
 
 test: .venv/dev
-	$(BIN)/python -m pytest $(PARALLEL)
+	$(PYTEST)
 
 # What the tests speak to, if it is there: a broker, a browser, PLCs of other make.
 peers:
@@ -22,7 +23,7 @@ check: .venv/dev
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest $(PARALLEL)
+	$(PYTEST)
 
 format: .venv/dev
 	$(BIN)/ruff format .

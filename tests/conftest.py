@@ -52,13 +52,16 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    config.stash[_LEFT_OUT] = Counter()
+    if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
+        return  # those that test look for themselves, on the path that they are started with
     without = config.getoption("--without")
     folder = tempfile.TemporaryDirectory(prefix="needs")
     config.add_cleanup(folder.cleanup)
     Path(folder.name).chmod(0o755)  # PostgreSQL runs as another user
     programs = Programs(Path(folder.name), [*NEEDS] if "all" in without else without)
     config.add_cleanup(programs.close)
-    config.stash[_PROGRAMS], config.stash[_LEFT_OUT] = programs, Counter()
+    config.stash[_PROGRAMS] = programs
 
 
 @pytest.hookimpl(tryfirst=True)

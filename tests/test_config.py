@@ -366,7 +366,10 @@ def test_a_logs_data_set_of_another_shape_is_named_with_its_key(
             "data.ambient, data.supply, data.ejector, data.sensor, data.system, data.effects,"
             " data.terms: missing",
         ),
-        (whole_json(sensor={"noise_mbar": 0.4}), "data.sensor.lag_ms: missing"),
+        (
+            whole_json(sensor={"noise_mbar": 0.4, "sampling_ms": 1.0}),
+            "data.sensor.lag_ms: missing",
+        ),
         (
             whole_json(
                 system=DataSet().system.model_dump(mode="json")
