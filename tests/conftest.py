@@ -54,7 +54,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[_LEFT_OUT] = Counter()
     if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
-        return  # those that test look for themselves, on the path that they are started with
+        return  # the processes that run tests look for programs themselves, on this path
     without = config.getoption("--without")
     folder = tempfile.TemporaryDirectory(prefix="needs")
     config.add_cleanup(folder.cleanup)

@@ -42,7 +42,7 @@ def test_each_commit_has_seeds_of_its_own() -> None:
     assert seed_of("unknown") == 0
 
 
-@pytest.mark.timeout(600)  # two commissionings, on a computer that does other things beside
+@pytest.mark.timeout(1200)  # two commissionings, on a computer that does other things beside
 def test_second_world() -> None:
     """Of the first five seeds those with rows 1 ms apart: a healthy record more, and one effect."""
     cases = list(second_world(CaseFile(None, {}), range(5), [1], 2))

@@ -183,7 +183,7 @@ def test_a_leak_in_clean_features_is_recognised(learned: Learned) -> None:
 def test_a_ramp_says_what_it_comes_to(learned: Learned) -> None:
     record = made("suction_loss", 5.0, 9002, "ramp")
     answer = learned.answer(record.features)
-    told = Case("single", 1, "gripper", record.hidden, answer).told
+    told = Case("single", 1, "gripper", record.hidden, answer).answer_outcomes
     assert told["named"]
     assert told["course"]
     assert told["covered"]

@@ -118,7 +118,7 @@ class Case:
             return None
         (truth,) = self.hidden
         mine = _cause(self, truth)
-        said = None if mine is None else _said(mine, truth)
+        said = None if mine is None else stated_interval(mine, truth)
         if said is None:
             return None
         low, value, high = said
@@ -126,7 +126,7 @@ class Case:
         return NormalDist().cdf((truth.size - value) / sigma) if sigma > 0.0 else None
 
     @property
-    def told(self) -> Outcomes:
+    def answer_outcomes(self) -> Outcomes:
         """What verdict, names, courses and sizes of the answer count for, by what is asked for."""
         if self.answer is None:
             return {FOUND[self.kind]: False}
@@ -139,8 +139,9 @@ class Case:
     def outcomes(self) -> Outcomes:
         """The same, and what a diagnosis leaves and gains."""
         if self.answer is None:
-            return self.told | ({"true": self.more["true"]} if "true" in self.more else {})
-        found = self.told
+            true = {"true": self.more["true"]} if "true" in self.more else {}
+            return self.answer_outcomes | true
+        found = self.answer_outcomes
         if self.kind != "commissioning" and self.verdict == "explained":
             share = self.answer["gain"]["share_of_achievable_pct"] / 100.0
             found |= {"left": self.left <= MOST_LEFT, "gain": share}
@@ -224,11 +225,11 @@ def _cause(case: Case, truth: Hidden) -> Mapping[str, Any] | None:
 
 def _covers(cause: Mapping[str, Any], truth: Hidden) -> bool | None:
     """Whether the interval of the first parameter holds the true size; None if of another kind."""
-    said = _said(cause, truth)
+    said = stated_interval(cause, truth)
     return None if said is None else bool(said[0] <= truth.size <= said[2])
 
 
-def _said(cause: Mapping[str, Any], truth: Hidden) -> tuple[float, float, float] | None:
+def stated_interval(cause: Mapping[str, Any], truth: Hidden) -> tuple[float, float, float] | None:
     """Low end, value and high end of the first parameter; None where the course is another."""
     if not cause["parameters"] or cause["course"] != truth.course:
         return None

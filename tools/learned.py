@@ -21,7 +21,7 @@ from scipy.stats import binomtest
 
 from tools import battery_first
 from tools.battery import first_world
-from tools.battery_cases import Case, CaseFile, Outcomes, read_cases
+from tools.battery_cases import Case, CaseFile, Outcomes, read_cases, stated_interval
 from tools.battery_page import ASKED, calibration_error, marked, table
 from tools.learned_features import RecordFile, training_keys
 from tools.learned_models import Learned, unlisted_unseen
@@ -61,30 +61,29 @@ def answered(learned: Learned, records: RecordFile, case: Case, units: int) -> C
     return replace(case, answer=answer, error="", seconds=spent)
 
 
-def told(case: Case) -> Outcomes:
+def counted(case: Case) -> Outcomes:
     """What an answer counts for."""
     if case.kind != "single":
-        return case.told
-    return case.told | {"first": case.first == case.hidden[0].effect}
+        return case.answer_outcomes
+    return case.answer_outcomes | {"first": case.first == case.hidden[0].effect}
 
 
 def half_widths(cases: Sequence[Case]) -> list[float]:
     """Of each interval that is compared with the truth: half of it over the size."""
     found = []
     for case in cases:
-        if "covered" in case.told:
+        if "covered" in case.answer_outcomes:
             (truth,) = case.hidden
             cause = next(one for one in case.causes if one["effect"] == truth.effect)
-            size = next(iter(cause["parameters"].values()))
-            of = "at_end_" if truth.course == "ramp" else ""
-            ends = size[f"{of}high95"] - size[f"{of}low95"]
-            found.append(ends / 2.0 / abs(truth.size))
+            if interval := stated_interval(cause, truth):
+                low, _, high = interval
+                found.append((high - low) / 2.0 / abs(truth.size))
     return found
 
 
 def figures(cases: Sequence[Case]) -> dict[str, str]:
     """What the answers reach, by the words of the row."""
-    found, counts = dict[str, str](), [told(one) for one in cases]
+    found, counts = dict[str, str](), [counted(one) for one in cases]
     for name, words in COUNTED.items():
         here = [np.atleast_1d(one[name]) for one in counts if name in one]
         if here:
@@ -118,7 +117,7 @@ def only_one_right(
     """
     if name not in OF_EACH_CASE:
         return None
-    both = [(told(one), told(other)) for one, other in zip(twin, learned, strict=True)]
+    both = [(counted(one), counted(other)) for one, other in zip(twin, learned, strict=True)]
     pairs = [(one[name], other[name]) for one, other in both if name in one and name in other]
     counts = sum(one > other for one, other in pairs), sum(one < other for one, other in pairs)
     return counts[::-1] if name == "wrong" else counts

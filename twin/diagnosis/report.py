@@ -36,11 +36,11 @@ from twin.diagnosis.words import (
     extended,
     gain_interval,
     headline,
+    held_out_cycles,
     left_over,
     lines,
     listed,
     number,
-    seen,
     signals,
     sized,
     some,
@@ -296,7 +296,7 @@ def _cycles(answer: Answer) -> list[tuple[str, str]]:
     rows = [("cycles complete in the log", str(cycles["total"]))]
     if cycles["fitted"]:
         rows.append(("fitted on", some(cycles["fitted"])))
-        rows.append(("held out, to judge by", some(cycles["held_out"]) + seen(answer)))
+        rows.append(("held out, to judge by", held_out_cycles(answer)))
     return rows
 
 

@@ -120,8 +120,8 @@ def _facts(answer: Answer, now_ns: int) -> Iterator[tuple[str, str]]:
     if extended(answer):
         yield "gain", gain(answer)
     cycles = answer["cycles"]
-    fitted, held_out = some(cycles["fitted"]), some(cycles["held_out"])
-    yield "cycles", f"{cycles['total']}; fitted: {fitted}; held out: {held_out}{seen(answer)}"
+    fitted = some(cycles["fitted"])
+    yield "cycles", f"{cycles['total']}; fitted: {fitted}; held out: {held_out_cycles(answer)}"
 
 
 def on_another_log(answer: Answer, nothing: str) -> str:
@@ -141,11 +141,12 @@ def on_another_log(answer: Answer, nothing: str) -> str:
     )
 
 
-def seen(answer: Answer) -> str:
-    """What of the causes was read from the held-out cycles as well: no other shows it."""
+def held_out_cycles(answer: Answer) -> str:
+    """The held-out cycles, and what of the causes was read from them as well."""
     courses = {cause["course"] for cause in answer["causes"]}
     read = [what for course, what in _READ_FROM_ALL.items() if str(course) in courses]
-    return f", but for {listed(read)}, read from all" if read else ""
+    exception = f", but for {listed(read)}, read from all" if read else ""
+    return some(answer["cycles"]["held_out"]) + exception
 
 
 def about(cause: Answer, times: Times, *, sure: bool) -> Iterator[tuple[str, str]]:

@@ -33,11 +33,10 @@ def profile_interval(
     ways = np.concatenate([-covariance / sigmas, covariance / sigmas], axis=1).T  # (2 sizes, sizes)
     own = np.tile(np.arange(count), 2)
     reach = np.full(2 * count, math.sqrt(rise))
-    at_bound = np.zeros(2 * count, np.bool_)
+    room = _room(x, ways, own, bounds)
     least = float(misfit(x[None])[0])
     going = np.ones(2 * count, np.bool_)
     for _ in range(ROUNDS):
-        room = _room(x, ways, own, bounds)
         at_bound = reach >= room
         reach = np.minimum(reach, room)
         points = np.clip(x + reach[going, None] * ways[going], *bounds)
@@ -49,7 +48,7 @@ def profile_interval(
         going[here[done]] = False
         if not going.any():
             break
-    reach = np.minimum(reach, _room(x, ways, own, bounds))
+    reach = np.minimum(reach, room)
     ends = x[own] + reach * ways[np.arange(2 * count), own]
     return ends[:count], ends[count:]
 
