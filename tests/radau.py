@@ -128,6 +128,7 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
     rising = valves.nozzle > drive
     rise, fall = theta[c.RAMP_UP], theta[c.RAMP_DOWN]
     first, second = (rise + theta[c.SLOW_RAMP_UP], rise) if rising else (fall, fall)
+    strength = strength_of_jet(theta, drive) if rising else drive
     regulated = theta[c.SUPPLY] - theta[c.DROOP] * max(valves.nozzle, valves.blow)
     friction = theta[c.NEAR_RESISTANCE] + theta[c.RESISTANCE]
     place = min(theta[c.PLACE] / friction, 1.0) if friction > 0.0 else 0.0
@@ -149,13 +150,22 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
             leak - far,
             *pushes,
             (valves.nozzle - drive) / first,
-            (drive - jet) / second,
+            (strength - jet) / second,
             (valves.blow - valve) / theta[c.BLOW_OFF_RAMP],
             (regulated - supply) / theta[c.SUPPLY_LAG],
             (there - felt) / theta[c.SENSOR_LAG],
             (felt - sensed) / (theta[c.SENSOR_LAG] + theta[c.SLOW_SENSOR]),
         ]
     )
+
+
+def strength_of_jet(theta: Theta, opening: float) -> float:
+    """Of a slow valve: nothing until a quarter of where it is full, then straight to S-shaped."""
+    whole = theta[c.SLOW_RAMP_UP] + theta[c.RAMP_UP]
+    full = 1.0 - (1.0 - theta[c.JET_FULL_AT]) * theta[c.SLOW_RAMP_UP] / whole
+    begins = 0.25 * full * (1.0 - full)
+    share = np.clip((opening - begins) / (full - begins), 0.0, 1.0)
+    return float(full * share + (1.0 - full) * (3.0 * share**2 - 2.0 * share**3))
 
 
 def _that_keeps_them_equal(

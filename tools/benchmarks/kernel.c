@@ -17,7 +17,7 @@
 enum { /* twin.model.theta.COEFFICIENTS */
     AMBIENT, AMBIENT_NOMINAL, TEMPERATURE, SUPPLY, DROOP, SUPPLY_LAG, SUPPLY_NOMINAL,
     SUPPLY_OPTIMUM, SUPPLY_CURVATURE, END_SLOPE, SUCTION, END_RATIO, BULGE, SKEW, BEND_2, BEND_3,
-    RESPONSE, RESPONSE_OFF, RAMP_UP, SLOW_RAMP_UP, JET_DEPTH, RAMP_DOWN, BLOW_OFF, BLOW_OFF_SHAPE,
+    RESPONSE, RESPONSE_OFF, RAMP_UP, SLOW_RAMP_UP, JET_FULL_AT, JET_DEPTH, RAMP_DOWN, BLOW_OFF, BLOW_OFF_SHAPE,
     BLOW_OFF_RESPONSE, BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, RELIEF, EXHAUST, CRACKING_PRESSURE,
     PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT, VOLUME, COMPLIANCE, SOFTNESS, STIFF_UNTIL, FILM, FREE_CONVECTION,
     FORCED_CONVECTION, AREA, NEAR_RESISTANCE, NEAR_LAMINAR, NEAR_INERTANCE, RESISTANCE,
@@ -86,6 +86,7 @@ INLINED Tangent opening(double p, double ambient)
 #define MOST 100.0
 #define FAINTEST 1e-12
 #define FREE_AT 10.0
+#define NOTHING_UNTIL 0.25
 #define G 0.435866521508459
 #define A21 ((1.0 - G) / 2.0 / G)
 #define FURTHER ((1.0 + G) / 2.0 / G)
@@ -307,6 +308,15 @@ INLINED double lag(double known, double target, double step, double slow)
     return known + step / (slow + step) * (target - known);
 }
 
+INLINED double drawing(double opening, const double *k)
+{
+    double slow = K(SLOW_RAMP_UP) / (K(SLOW_RAMP_UP) + K(RAMP_UP));
+    double full = 1.0 - slow * (1.0 - K(JET_FULL_AT));
+    double from_there = NOTHING_UNTIL * full * (1.0 - full);
+    double share = min(max((opening - from_there) / (full - from_there), 0.0), 1.0);
+    return share * (full + (1.0 - full) * share * (3.0 - 2.0 * share));
+}
+
 INLINED Stage stage(const Gas *guess, const Gas *known, const Lags *lags, double step,
                    const Valves *valves, int far_off, const double *k)
 {
@@ -314,7 +324,7 @@ INLINED Stage stage(const Gas *guess, const Gas *known, const Lags *lags, double
     double first = rise + K(SLOW_RAMP_UP);
     int rising = valves->nozzle > lags->drive;
     double drive = lag(lags->drive, valves->nozzle, step, rising ? first : fall);
-    double jet = lag(lags->jet, drive, step, rising ? rise : fall);
+    double jet = lag(lags->jet, rising ? drawing(drive, k) : drive, step, rising ? rise : fall);
     double valve = lag(lags->valve, valves->blow, step, K(BLOW_OFF_RAMP));
     double regulated = max(K(SUPPLY) - K(DROOP) * max(valves->nozzle, valves->blow), 0.0);
     double supply = lag(lags->supply, regulated, step, K(SUPPLY_LAG));

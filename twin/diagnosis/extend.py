@@ -43,6 +43,10 @@ def extended(diagnosis: Diagnosis, config: Config) -> Known | None:
     if not found and not terms:
         return None
     for effect, sizes in found.items():
+        law = EFFECTS[effect].law
+        if law and law.name in sizes:
+            ejector = data.ejector.model_copy(update={law.name: sizes[law.name]})
+            data = data.model_copy(update={"ejector": ejector})
         effects = {**data.effects, effect: _joined(data, effect, sizes)}
         data = data.model_copy(update={"effects": effects})
     tables = data.model_dump() | {"terms": [*data.terms, *terms]}
@@ -108,14 +112,14 @@ def _is_always(cause: Cause) -> bool:
 
 
 def _always(diagnosis: Diagnosis) -> Iterator[tuple[str, Sizes]]:
-    """What was found that goes on, with the sizes at the end; without what nothing depends on."""
+    """What was found that goes on: laws and sizes at the end, but of what nothing depends on."""
     evidence = diagnosis.evidence
     at_end = float(evidence.seconds[-1]), int(evidence.numbers[-1])
     for cause, answer in zip(diagnosis.hypothesis, diagnosis.json["causes"], strict=True):
         sizes = cause.at(evidence.theta, *at_end)
         known = {name: sizes[name] for name in answer["parameters"] if _is_always(cause)}
         if known:
-            yield cause.effect, known
+            yield cause.effect, {**cause.way(), **known}
 
 
 def _joined(data: DataSet, effect: str, found: Sizes) -> dict[str, float]:

@@ -30,7 +30,7 @@ ALIKE = 1e-6  # of their lengths' product: two columns are the same
 class Columns:
     """Whitened signatures of every parameter in every cycle, as products; sizes in typical ones."""
 
-    names: list[tuple[str, Parameter]]  # effect and parameter; again for each of its shares
+    names: list[tuple[Cause, Parameter]]  # effect, its law, parameter; again for each share
     signs: list[float]  # -1 or 1 where only smaller or greater than neutral is possible, else 0
     gram: Floats  # (parameters, cycles, parameters, cycles)
     pull: Floats  # (parameters, cycles), towards what is measured
@@ -76,13 +76,14 @@ class _Gain:
 def columns(evidence: Evidence, weights: Weights, about: Hypothesis = HEALTHY) -> Columns:
     """Signatures of the parameters of all effects that can act, about a hypothesis."""
     taken = [
-        (effect.name, p, share)
+        (Cause(effect.name, way), p, share)
         for effect in acting_on(evidence.theta)
+        for way in effect.ways()
         for p in effect.parameters
         for share in (SHARES_OF_TIMES if p.unit == "ms" else SHARES)
     ]
-    names, shares = [(name, p) for name, p, _ in taken], np.array([share for *_, share in taken])
-    moved = [(*about, _with_size(evidence, Cause(name, {}), p, x)) for name, p, x in taken]
+    names, shares = [(cause, p) for cause, p, _ in taken], np.array([share for *_, share in taken])
+    moved = [(*about, _with_size(evidence, cause, p, x)) for cause, p, x in taken]
     hypotheses = [about, *moved]
     healthy, off = derivatives(evidence.off(hypotheses), shares)
     usual, level = derivatives(levels(evidence, weights.cycles, hypotheses), shares)
@@ -108,8 +109,8 @@ def promises(evidence: Evidence, weights: Weights, found: Columns, each: int) ->
     """The best courses (``each`` of them) of every parameter, the most promising first."""
     best: dict[tuple[str, str], dict[Course, _Gain]] = {}
     shares = list(_shares(evidence, weights))
-    for number, (name, p) in enumerate(found.names):
-        mine = best.setdefault((name, p.name), {})
+    for number, (cause, p) in enumerate(found.names):
+        mine = best.setdefault((cause.effect, p.name), {})
         for option in _options(evidence, weights, found, number, shares):
             gain = _gain(evidence, found, option)
             before = mine.get(option.cause.course)
@@ -188,13 +189,13 @@ def _options(
     shares: Iterable[tuple[Course, float, Floats]],
 ) -> Iterator[_Option]:
     """All courses of a parameter that the cycles can tell apart."""
-    name = found.names[number][0]
+    kind = found.names[number][0]
     for course, onset, share in shares:
-        yield _Option(number, Cause(name, {}, course, onset), share)
+        yield _Option(number, replace(kind, course=course, onset_s=onset), share)
     cycles = np.array(weights.cycles)
     for chosen in _striking(found, number):
         struck = frozenset(int(n) for n in evidence.numbers[cycles[chosen]])
-        cause = Cause(name, {}, Course.INTERMITTENT, cycles=struck)
+        cause = replace(kind, course=Course.INTERMITTENT, cycles=struck)
         yield _Option(number, cause, share_of_cycles(evidence, weights, cause))
 
 
@@ -241,4 +242,4 @@ def _with_size(evidence: Evidence, cause: Cause, parameter: Parameter, size: flo
     effect = EFFECTS[cause.effect]
     x = np.array([size if p is parameter else 0.0 for p in effect.parameters])
     (whole,) = sized(evidence, (cause,), x)
-    return replace(whole, values={parameter.name: whole.values[parameter.name]})
+    return replace(whole, values={**whole.way(), parameter.name: whole.values[parameter.name]})

@@ -17,6 +17,7 @@ from twin.diagnosis.fit import Fitted, fit, interval, profiled, white
 from twin.diagnosis.hypotheses import (
     WEATHER,
     bounds,
+    in_other_ways,
     parameters,
     score_with_tempered_prior,
     score_without_prior,
@@ -132,8 +133,25 @@ def search(
         _onset_interval(evidence, judged, found.hypothesis, number, found.leftover)
         for number in range(len(found.hypothesis))
     ]
-    ends = interval(evidence, weights, found)
+    ends = _ends(evidence, weights, found)
     return Search(weights, healthy, found, singles, rivals, ends, onsets)
+
+
+def _ends(evidence: Evidence, weights: Weights, found: Fitted) -> tuple[Floats, Floats]:
+    """95 % interval of each size, by whichever law of a cause the log cannot reject."""
+    low, high = interval(evidence, weights, found)
+    others = [
+        way
+        for place in range(len(found.hypothesis))
+        for way in in_other_ways(found.hypothesis, place)
+        if way != found.hypothesis
+    ]
+    worst = found.chi2 + CHI2_95 * max(found.leftover**2, 1.0)
+    for other in fit(evidence, weights, others) if others else []:
+        if other.chi2 < worst:
+            also = interval(evidence, weights, other)
+            low, high = np.minimum(low, also[0]), np.maximum(high, also[1])
+    return low, high
 
 
 def _weights(
@@ -223,7 +241,7 @@ def _weather(evidence: Evidence, ranked: Sequence[Fitted]) -> list[Fitted]:
 def _started(
     evidence: Evidence, judged: Weights, hypotheses: Sequence[Hypothesis]
 ) -> list[Hypothesis]:
-    """The same with the last cause at the best of some sizes.
+    """The same with the last cause at the best of some sizes, by the law that suits it best.
 
     A delay moves what is sharp: from far away a step towards its true size does not seem to help.
     """
@@ -236,7 +254,8 @@ def _started(
         for size in (*-START, *START):
             if low[last] < size < high[last]:
                 around.append(np.concatenate([x[:last], [size], x[last + 1 :]]))
-        tried.append([sized(evidence, hypothesis, one) for one in around])
+        ways = in_other_ways(hypothesis, len(hypothesis) - 1)
+        tried.append([sized(evidence, way, one) for way in ways for one in around])
     every = [one for some in tried for one in some]
     chi2 = np.sum(white(evidence, judged, every) ** 2, axis=0)
     best, first = [], 0

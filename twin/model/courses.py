@@ -49,6 +49,11 @@ class Cause:
     onset_s: float = 0.0  # of step and ramp, since the first row
     cycles: frozenset[int] = frozenset()  # of an intermittent one
 
+    def way(self) -> dict[str, float]:
+        """The law that it acts by, where that is told beside the sizes."""
+        law = EFFECTS[self.effect].law
+        return {law.name: self.values[law.name]} if law and law.name in self.values else {}
+
     def at(self, theta: Theta, second: float, cycle: int) -> Mapping[str, float]:
         """Values of the parameters at a time in a cycle; empty where it does not act."""
         if self.course == Course.INTERMITTENT:
@@ -59,7 +64,7 @@ class Cause:
             return {}
         if self.course == Course.STEP:
             return self.values
-        grown = {}
+        grown = self.way()
         for parameter in EFFECTS[self.effect].parameters:
             rate = self.values.get(parameter.name, 0.0)
             value = parameter.neutral(theta) + rate * (second - self.onset_s) / HOUR

@@ -90,6 +90,7 @@ class Ejector(Settings):
     response_ms: float = Field(15.0, ge=0.0, le=500.0)
     response_off_ms: float = Field(12.0, ge=0.0, le=500.0)
     ramp_up_ms: float = Field(8.0, ge=0.5, le=500.0)
+    jet_full_at: float = Field(1.0, ge=0.02, le=1.0)  # of a slow valve's opening; see plant.drawing
     ramp_down_ms: float = Field(4.0, ge=0.5, le=500.0)
     jet_depth: float = Field(1.0, ge=0.0, le=1.0)  # how much less deep a weaker jet draws
     blow_off_sl_min: NotNegative = 100.0
@@ -261,6 +262,7 @@ def _set_ejector(theta: Theta, ejector: Ejector, end_ratio: float) -> None:
     theta[c.RESPONSE] = ejector.response_ms * MS
     theta[c.RESPONSE_OFF] = ejector.response_off_ms * MS
     theta[c.RAMP_UP] = ejector.ramp_up_ms * MS / 2.0
+    theta[c.JET_FULL_AT] = ejector.jet_full_at
     theta[c.JET_DEPTH] = ejector.jet_depth
     theta[c.RAMP_DOWN] = ejector.ramp_down_ms * MS / 2.0
     theta[c.BLOW_OFF] = ejector.blow_off_sl_min * SL_MIN

@@ -52,6 +52,19 @@ class Parameter:
 
 
 @dataclass(frozen=True)
+class Law:
+    """How an effect acts where its size alone does not say it, and no healthy cycle shows it.
+
+    A data set's value for it, ``ejector.name``, is that of a type which is well known. A diagnosis
+    tries each of ``tried``: what only one of them tells from another cause is not told apart.
+    """
+
+    name: str
+    coefficient: int
+    tried: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class Effect:
     """What differs, in words a maintenance person understands, and where it acts.
 
@@ -66,6 +79,11 @@ class Effect:
     act: Callable[..., None]  # (theta, one value per parameter) -> changes theta in place
     often: float = 1.0
     acts: Callable[[Theta], bool] = lambda _: True  # whether a unit has what it acts on
+    law: Law | None = None
+
+    def ways(self) -> list[dict[str, float]]:
+        """The ways that it may act in, as values beside those of its parameters."""
+        return [{self.law.name: value} for value in self.law.tried] if self.law else [{}]
 
 
 def _leakage(theta: Theta, flow: float) -> None:
@@ -235,6 +253,7 @@ _TABLE = (
         "the suction valve and the supply hose: something opens slowly",
         (_P("time_constant", "ms", 0.0, 400.0, 20.0),),
         _slow_ramp_up,
+        law=Law("jet_full_at", c.JET_FULL_AT, (1.0, 0.5, 0.2, 0.08)),
     ),
     Effect(
         "threshold_drift",
@@ -305,12 +324,14 @@ def acting_on(theta: Theta) -> list[Effect]:
 def apply(theta: Theta, name: str, values: Mapping[str, float]) -> Theta:
     """Return ``theta`` with an effect at the given parameter values (missing ones neutral).
 
+    A law may stand beside them; where it is missing, the data set's holds.
     Raises ConfigError for an unknown effect or parameter and for a value out of bounds.
     """
     effect = EFFECTS.get(name)
     if effect is None:
         raise ConfigError(f"unknown effect {name!r}", "twin effects lists them")
     known = {parameter.name for parameter in effect.parameters}
+    known |= {effect.law.name} if effect.law else set()
     if unknown := set(values) - known:
         raise ConfigError(f"{name} has no parameter {', '.join(sorted(unknown))}", f"has {known}")
     for parameter in effect.parameters:
@@ -321,6 +342,8 @@ def apply(theta: Theta, name: str, values: Mapping[str, float]) -> Theta:
                 f"between {parameter.low} and {parameter.high}",
             )
     changed = theta.copy()
+    if effect.law and effect.law.name in values:
+        changed[effect.law.coefficient] = values[effect.law.name]
     effect.act(changed, *(values.get(p.name, p.neutral(theta)) for p in effect.parameters))
     return changed
 

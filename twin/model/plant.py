@@ -31,6 +31,7 @@ LOWEST, HIGHEST = 1.0, 1e7  # Pa
 COLDEST, HOTTEST = 60.0, 2000.0  # K
 _PER_COLDEST, _PER_HOTTEST = 1.0 / (R * COLDEST), 1.0 / (R * HOTTEST)  # kg/J
 MOST = 100.0  # kg/s
+NOTHING_UNTIL = 0.25  # of the opening at which a jet is full: as a nozzle draws over its pressure
 FAINTEST = 1e-12  # of a jet that fades; less is none, and slow to calculate with
 
 TINY = 1e-9  # Pa, beside what may be nothing
@@ -369,6 +370,21 @@ def lag(known, target, step, slow):  # type: ignore[no-untyped-def]
 
 
 @inlined
+def drawing(opening, k, i):  # type: ignore[no-untyped-def]
+    """Strength of the jet, 0 to 1, that a valve which opens slowly lets through at its opening.
+
+    Valves are wider than the nozzle behind them, and a nozzle at half its pressure draws nearly as
+    much as at all of it, but at a tenth nothing: so the jet is at full strength long before a slow
+    valve is open. A valve that opens as fast as it should leaves no time to see that.
+    """
+    slow = k[c.SLOW_RAMP_UP, i] / (k[c.SLOW_RAMP_UP, i] + k[c.RAMP_UP, i])
+    full = 1.0 - slow * (1.0 - k[c.JET_FULL_AT, i])
+    from_there = NOTHING_UNTIL * full * (1.0 - full)
+    share = min(max((opening - from_there) / (full - from_there), 0.0), 1.0)
+    return share * (full + (1.0 - full) * share * (3.0 - 2.0 * share))
+
+
+@inlined
 def at_sensor(port, vessel, k, i):  # type: ignore[no-untyped-def]
     """Pressure (Pa) where the sensor sits, between port and vessel."""
     return port + k[_PLACE, i] * (vessel - port)
@@ -389,7 +405,7 @@ def stage(guess, known, lags, step, valves, passes, k, i):  # type: ignore[no-un
     first = rise + k[c.SLOW_RAMP_UP, i]
     rising = nozzle > lags.drive
     drive = lag(lags.drive, nozzle, step, first if rising else fall)
-    jet = lag(lags.jet, drive, step, rise if rising else fall)
+    jet = lag(lags.jet, drawing(drive, k, i) if rising else drive, step, rise if rising else fall)
     valve = lag(lags.valve, blow, step, k[c.BLOW_OFF_RAMP, i])
     regulated = max(k[c.SUPPLY, i] - k[c.DROOP, i] * max(nozzle, blow), 0.0)
     supply = lag(lags.supply, regulated, step, k[c.SUPPLY_LAG, i])
