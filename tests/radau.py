@@ -61,7 +61,19 @@ def suction_flow(theta: Theta, p: float, jet: float, supply: float) -> float:
     deep = 1.0 - theta[c.JET_DEPTH] * (1.0 - jet)
     x = min(max(deep - (ambient - p) / (ambient - end), 0.0), 1.2)
     bend = np.polyval(theta[[c.BEND_3, c.BEND_2, c.SKEW, c.BULGE]], x)
-    return float(jet * capacity * max(x * (1.0 + (1.0 - x) * bend), 0.0))
+    first = x * (1.0 + (1.0 - x) * bend)
+    share = (1.0 - theta[c.KINK]) * first + theta[c.KINK] * second_stage(x, theta[c.KINK_AT])
+    return float(jet * capacity * max(share, 0.0))
+
+
+def second_stage(x: float, closes: float) -> float:
+    """Share of its suction at ambient: straight from where it closes, that corner rounded."""
+
+    def rounded(u: float) -> float:
+        return float(np.hypot(u, 0.03) + u) / 2.0
+
+    least = rounded(-closes)
+    return (rounded(x - closes) - least) / (rounded(1.0 - closes) - least)
 
 
 def room(theta: Theta, vessel: float) -> tuple[float, float]:

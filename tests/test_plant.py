@@ -11,6 +11,7 @@ from stepping import closed, standing, states, switched_on, temperature, theta_o
 
 from twin.model import kernel
 from twin.model import theta as c
+from twin.model.dataset import Ejector
 from twin.model.gas import GAMMA, R
 from twin.model.plant import (
     Driven,
@@ -115,18 +116,27 @@ def test_the_characteristic_is_straight_without_bends_and_closes_below_end_press
     st.floats(-0.3, 0.3),
     st.floats(-0.3, 0.3),
     st.floats(-0.3, 0.3),
+    st.floats(0.0, 0.8),
+    st.floats(0.1, 0.9),
 )
 def test_the_slope_is_that_of_the_characteristic(
-    x: float, bulge: float, skew: float, bend_2: float, bend_3: float
+    x: float, bulge: float, skew: float, bend_2: float, bend_3: float, kink: float, at: float
 ) -> None:
+    bends = {"bulge": bulge, "skew": skew, "bend_2": bend_2, "bend_3": bend_3}
+    stage = {"kink": kink, "kink_at": at}
     theta = theta_of()
+    theta[[c.KINK, c.KINK_AT]] = kink, at
     theta[[c.BULGE, c.SKEW, c.BEND_2, c.BEND_3]] = bulge, skew, bend_2, bend_3
     k, step = one(theta), 1e-6
     ahead, behind = (characteristic(x + d, k, 0)[0] for d in (step, -step))
     share, slope = characteristic(x, k, 0)
     assert slope == pytest.approx(max((ahead - behind) / (2 * step), 0.0), abs=1e-6)
     by_hand = x * (1 + (1 - x) * np.polyval([bend_3, bend_2, skew, bulge], x))
-    assert share == pytest.approx(by_hand)
+    second = max(x - at, 0.0) / (1.0 - at)
+    rounded = kink * 0.016 / (1.0 - at) + 1e-12
+    assert share == pytest.approx((1.0 - kink) * by_hand + kink * second, abs=rounded)
+    shape = Ejector.model_construct(**bends, **stage).share(np.array([x]))
+    assert share == pytest.approx(float(shape[0]))
 
 
 def test_suction_runs_from_capacity_at_ambient_to_none_at_end_pressure() -> None:

@@ -251,11 +251,12 @@ def test_every_coefficient_is_filled_in() -> None:
         "BACK_FLOW",
         "SENSOR_OFFSET",
         "SLOW_RAMP_UP",
+        "EXHAUST_FOLLOWS",
         "SLOW_SENSOR",
     }
     convection = {"FREE_CONVECTION", "FORCED_CONVECTION"}
     modes = {"CONTROL_SENSOR", "BLOW_OFF_MODE"}  # the first of each
-    opening = {"EXHAUST", "HOLE", "CRACKING_PRESSURE"}
+    opening = {"EXHAUST", "HOLE", "CRACKING_PRESSURE", "KINK"}
     cups = {"COMPLIANCE", "SOFTNESS", "STIFF_UNTIL", "CONTACT"}
     assert zero == {"BLOW_OFF_SHAPE"} | cups | opening | convection | effects | modes
 

@@ -16,7 +16,7 @@
 
 enum { /* twin.model.theta.COEFFICIENTS */
     AMBIENT, AMBIENT_NOMINAL, TEMPERATURE, SUPPLY, DROOP, SUPPLY_LAG, SUPPLY_NOMINAL,
-    SUPPLY_OPTIMUM, SUPPLY_CURVATURE, END_SLOPE, SUCTION, END_RATIO, BULGE, SKEW, BEND_2, BEND_3,
+    SUPPLY_OPTIMUM, SUPPLY_CURVATURE, END_SLOPE, SUCTION, END_RATIO, EXHAUST_FOLLOWS, BULGE, SKEW, BEND_2, BEND_3, KINK, KINK_AT,
     RESPONSE, RESPONSE_OFF, RAMP_UP, SLOW_RAMP_UP, JET_FULL_AT, JET_DEPTH, RAMP_DOWN, BLOW_OFF, BLOW_OFF_SHAPE,
     BLOW_OFF_RESPONSE, BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, RELIEF, EXHAUST, CRACKING_PRESSURE,
     PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT, VOLUME, COMPLIANCE, SOFTNESS, STIFF_UNTIL, FILM, FREE_CONVECTION,
@@ -27,7 +27,7 @@ enum { /* twin.model.theta.COEFFICIENTS */
 };
 enum { /* what a call computes only once, behind them */
     K_SUCTION = COEFFICIENTS, K_END, K_BLOW_OFF, K_FLATTER, K_HEAT, K_PORT_HEAT, K_LINE_HEAT,
-    K_PLACE, K_STRETCH, K_SOFT, PREPARED
+    K_PLACE, K_STRETCH, K_SOFT, K_CLOSED, K_OPENS, PREPARED
 };
 enum { /* the state of twin.model.kernel */
     S_PORT, S_PORT_MASS, S_LINE, S_LINE_MASS, S_VESSEL, S_VESSEL_MASS, S_NEAR, S_FAR,
@@ -86,6 +86,7 @@ INLINED Tangent opening(double p, double ambient)
 #define MOST 100.0
 #define FAINTEST 1e-12
 #define FREE_AT 10.0
+#define ROUND 0.03
 #define NOTHING_UNTIL 0.25
 #define G 0.435866521508459
 #define A21 ((1.0 - G) / 2.0 / G)
@@ -123,6 +124,9 @@ static void prepare(const double *theta, double *k)
     K(K_STRETCH) = T(COMPLIANCE) * (1.0 + T(SOFTNESS)) / most;
     K(K_SOFT) = T(SOFTNESS) / most;
     double friction = T(NEAR_RESISTANCE) + T(RESISTANCE);
+    double at = T(KINK_AT), away = 1.0 - at;
+    K(K_CLOSED) = sqrt(at * at + ROUND * ROUND) - at;
+    K(K_OPENS) = T(KINK) / (sqrt(away * away + ROUND * ROUND) + away - K(K_CLOSED));
     K(K_PLACE) = friction > 0.0 ? min(T(PLACE) / friction, 1.0) : 0.0;
 }
 
@@ -143,8 +147,12 @@ INLINED Tangent characteristic(double x, const double *k)
     x = min(max(x, 0.0), 1.2);
     double bend = b0 + x * (b1 + x * (b2 + x * b3));
     double slope = b1 + x * (2.0 * b2 + x * 3.0 * b3);
-    double share = max(x * (1.0 + (1.0 - x) * bend), 0.0);
-    double rise = 1.0 + (1.0 - 2.0 * x) * bend + x * (1.0 - x) * slope;
+    double beyond = x - K(KINK_AT), first = 1.0 - K(KINK);
+    double root = sqrt(beyond * beyond + ROUND * ROUND);
+    double share = first * x * (1.0 + (1.0 - x) * bend) + K(K_OPENS) * (root + beyond - K(K_CLOSED));
+    double rise = first * (1.0 + (1.0 - 2.0 * x) * bend + x * (1.0 - x) * slope);
+    rise += K(K_OPENS) * (beyond / root + 1.0);
+    share = max(share, 0.0);
     return (Tangent){share, x > 0.0 ? max(rise, 0.0) : 0.0};
 }
 

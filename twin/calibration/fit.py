@@ -136,7 +136,8 @@ def falling(data: DataSet) -> DataSet:
     The penalty keeps a fit nearly there; a data set must be there.
     """
     x = np.linspace(0.0, 1.0, 101)
-    straight, steps = np.diff(x), np.diff(data.ejector.share(x))
+    unbent = data.ejector.model_copy(update=dict.fromkeys(BENDS, 0.0))
+    straight, steps = np.diff(unbent.share(x)), np.diff(data.ejector.share(x))
     back = steps < 0.0
     share = float(np.min(straight[back] / (straight - steps)[back], initial=1.0))
     bends = {name: share * getattr(data.ejector, name) for name in BENDS}

@@ -92,6 +92,8 @@ _SMOOTH = np.array(
 FREE_IN_MARKET = (
     *FREE,
     Free(_E, "port_volume_ml", "ml", 0.2, 0.1, 1000.0, True, market=1.0),
+    Free(_E, "kink", "", 0.1, 0.0, 0.95, market=0.3, scaled=False),
+    Free(_E, "kink_at", "", 0.1, 0.02, 0.95, market=0.2, scaled=False),
     Free(_E, "jet_depth", "", 0.2, 0.0, 1.0, market=0.3, scaled=False),
     Free(_E, "exhaust_sl_min", "sl/min", 0.4, 0.0, 5000.0, True, market=1.5),
     Free(_E, "cracking_pressure_mbar", "mbar", 2.0, 0.0, 100.0, market=5.0, scaled=False),

@@ -75,7 +75,9 @@ class _Trial:
     @property
     def kind(self) -> frozenset[object]:
         """What it is a fit of, whatever the sizes."""
-        return frozenset((c.effect, c.course, c.onset_s, c.cycles) for c in self.hypothesis)
+        return frozenset(
+            (c.effect, *c.way().values(), c.course, c.onset_s, c.cycles) for c in self.hypothesis
+        )
 
     def moves(self) -> Floats:
         """Steps for derivatives at the next point, one per size, away from the nearer bound."""

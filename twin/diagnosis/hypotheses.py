@@ -26,7 +26,9 @@ def parameters(hypothesis: Hypothesis) -> list[Parameter]:
 def in_other_ways(hypothesis: Hypothesis, place: int) -> list[Hypothesis]:
     """A hypothesis with one of its causes acting by each law that it may act by."""
     cause = hypothesis[place]
-    causes = [replace(cause, values={**cause.values, **way}) for way in EFFECTS[cause.effect].ways()]
+    causes = [
+        replace(cause, values={**cause.values, **way}) for way in EFFECTS[cause.effect].ways()
+    ]
     return [(*hypothesis[:place], one, *hypothesis[place + 1 :]) for one in causes]
 
 

@@ -8,7 +8,7 @@ its price beside the others. Last, each must predict cycles that no size was fit
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import chain, combinations
 
 import numpy as np
 
@@ -40,6 +40,7 @@ SHARE = (
 # Of an effect's typical size: less is within what calibration leaves, or beside another cause mends
 # what the model gets wrong about that.
 SMALLEST, SMALLEST_MORE = 0.2, 0.4
+TRIED_FIRST = 3  # single causes to begin with, until one holds in cycles it was not fitted to
 TRIED_ALONE = 5  # hypotheses that are compared with weights about themselves
 NEAR = 2.5  # times the least score, up to which they are
 QUIET = 1.2  # sigmas left, below which there is nothing to compare
@@ -86,55 +87,106 @@ def search(
     healthy = _healthy(evidence, weights)
     if not any(_worth(healthy, healthy, 0.0, one) for one in singles):
         return Search(weights, healthy, None, singles, [], _NO_SIZES, [])
-    found = singles[0]
-    if found.leftover > QUIET or _weather(evidence, singles):
-        progress("comparing the best, each with its own weights")
-        found = _likeliest(evidence, fitted, tried)
-    judged, weights = _weights(evidence, fitted, found.hypothesis)
-    healthy = _healthy(evidence, weights)
-    others = [one.hypothesis for one in singles if one.effects != found.effects]
-    found, *rest = fit(evidence, weights, [found.hypothesis, *others])
-    singles = [found, *sorted(rest, key=lambda one: one.score)]
+    firsts = _likeliest(evidence, fitted, tried, singles, progress)[:TRIED_FIRST]
+    for first in firsts:
+        here = _about(evidence, fitted, first.hypothesis)
+        if first is not firsts[0] and not _worth(here.healthy, here.healthy, 0.0, here.found):
+            continue
+        others = [one.hypothesis for one in singles if one.effects != first.effects]
+        rest = fit(evidence, here.weights, others)
+        ranked = [here.found, *sorted(rest, key=lambda one: one.score)]
+        here = _added(evidence, fitted, here, ranked, progress)
+        progress("asking cycles that nothing was fitted to")
+        confirmed = _confirmed(evidence, fitted, here.weights, here.found)
+        if confirmed is not None:
+            break
+    else:
+        weights = known.of(fitted)
+        return Search(weights, healthy, None, singles, [], _NO_SIZES, [])
+    singles = ranked
+    if confirmed is not here.found:
+        here = _about(evidence, fitted, confirmed.hypothesis)
+    progress("looking for what the log cannot tell apart")
+    here, rivals = _beside_rivals(evidence, fitted, here, singles)
+    found = here.found
+    onsets = [
+        _onset_interval(evidence, here.judged, found.hypothesis, number, found.leftover)
+        for number in range(len(found.hypothesis))
+    ]
+    ends = _ends(evidence, here.weights, found)
+    return Search(here.weights, here.healthy, found, singles, rivals, ends, onsets)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Causes with the sizes that suit them best by weights about themselves."""
+
+    found: Fitted
+    judged: Weights  # of all judged cycles
+    weights: Weights  # of the fitted ones
+    healthy: float  # chi-square without any cause
+
+
+def _about(evidence: Evidence, fitted: Sequence[int], hypothesis: Hypothesis) -> _Found:
+    """A hypothesis fitted anew, weighed by what scatters and is uncertain about it."""
+    judged, weights = _weights(evidence, fitted, hypothesis)
+    (found,) = fit(evidence, weights, [hypothesis])
+    return _Found(found, judged, weights, _healthy(evidence, weights))
+
+
+def _added(
+    evidence: Evidence,
+    fitted: Sequence[int],
+    here: _Found,
+    singles: Sequence[Fitted],
+    progress: Progress,
+) -> _Found:
+    """With more causes, while one more is worth its price; less those that no longer are."""
     before: set[frozenset[tuple[str, Course]]] = set()
     for _ in range(MOST_ROUNDS):
+        found = here.found
         # With other weights what was pruned comes back: then the search goes round.
         if len(found.hypothesis) == MOST_CAUSES or found.kind in before:
             break
         before.add(found.kind)
         progress(f"looking for what else there is beside {', '.join(found.effects)}")
-        more = _best_addition(evidence, judged, weights, found, singles, healthy)
+        more = _best_addition(evidence, here, singles)
         if more is None:
             break
-        found = more
-        judged, weights = _weights(evidence, fitted, found.hypothesis)
-        (found,) = fit(evidence, weights, [found.hypothesis])
-        healthy = _healthy(evidence, weights)
-        found = _pruned(evidence, weights, found, healthy)
-    progress("asking cycles that nothing was fitted to")
-    confirmed = _confirmed(evidence, fitted, weights, found)
-    if confirmed is None:
-        weights = known.of(fitted)
-        return Search(weights, _healthy(evidence, weights), None, singles, [], _NO_SIZES, [])
-    if confirmed is not found:
-        found = confirmed
-        judged, weights = _weights(evidence, fitted, found.hypothesis)
-        (found,) = fit(evidence, weights, [found.hypothesis])
-        healthy = _healthy(evidence, weights)
-    if any(cause.course == Course.STEP for cause in found.hypothesis):
-        (found,) = fit(evidence, weights, [_finely_timed(evidence, judged, found.hypothesis)])
-    progress("looking for what the log cannot tell apart")
-    rivals = _rivals(evidence, judged, weights, found, singles)
-    if found.effects == (WEATHER,):  # it may have come first by its prior alone
+        here = _about(evidence, fitted, more.hypothesis)
+        pruned = _pruned(evidence, here.weights, here.found, here.healthy)
+        here = replace(here, found=pruned)
+    return here
+
+
+def _beside_rivals(
+    evidence: Evidence, fitted: Sequence[int], here: _Found, singles: list[Fitted]
+) -> tuple[_Found, list[list[Fitted]]]:
+    """What was found and, for each of its causes, what could stand in its place.
+
+    Where that is clearly better, the way there led past it: it takes the place of what was found.
+    """
+    looked = set[frozenset[tuple[str, Course]]]()
+    while True:
+        if any(cause.course == Course.STEP for cause in here.found.hypothesis):
+            timed = _finely_timed(evidence, here.judged, here.found.hypothesis)
+            (found,) = fit(evidence, here.weights, [timed])
+            here = replace(here, found=found)
+        looked.add(here.found.kind)
+        rivals = _rivals(evidence, here.judged, here.weights, here.found, singles)
+        better = _overtaking(here.found, rivals)
+        if better is None or better.kind in looked:
+            break
+        if _confirmed(evidence, fitted, here.weights, better) is not better:
+            break
+        here = _about(evidence, fitted, better.hypothesis)
+    if here.found.effects == (WEATHER,):  # it may have come first by its prior alone
         found, *rivals[0] = sorted(
-            [found, *rivals[0]],
+            [here.found, *rivals[0]],
             key=lambda one: score_with_tempered_prior(evidence, one.score, one.hypothesis),
         )
-    onsets = [
-        _onset_interval(evidence, judged, found.hypothesis, number, found.leftover)
-        for number in range(len(found.hypothesis))
-    ]
-    ends = _ends(evidence, weights, found)
-    return Search(weights, healthy, found, singles, rivals, ends, onsets)
+        here = replace(here, found=found)
+    return here, rivals
 
 
 def _ends(evidence: Evidence, weights: Weights, found: Fitted) -> tuple[Floats, Floats]:
@@ -197,13 +249,22 @@ def _fit_singles(
     return fit(evidence, weights, _timed(evidence, judged, started))
 
 
-def _likeliest(evidence: Evidence, fitted: Sequence[int], tried: Sequence[Fitted]) -> Fitted:
-    """The best of hypotheses, each with weights about itself; the price of wide ones counts.
+def _likeliest(
+    evidence: Evidence,
+    fitted: Sequence[int],
+    tried: Sequence[Fitted],
+    singles: Sequence[Fitted],
+    progress: Progress,
+) -> list[Fitted]:
+    """Single causes, the likeliest first, each with weights about itself; wide ones cost.
 
     What scatters moves with the causes: about the healthy twin, a valve's half millisecond is not
     where a delay of ten has put its edge. All cycles choose the course, the fitted ones the effect.
     Weather that the log cannot reject beside the best comes first: it changes every week.
     """
+    if not (singles[0].leftover > QUIET or _weather(evidence, singles)):
+        return list(singles)
+    progress("comparing the best, each with its own weights")
     ranked = sorted(tried, key=lambda one: one.score)
     near = [one for one in ranked if one.score < NEAR * ranked[0].score][:TRIED_ALONE]
     near += [one for one in _weather(evidence, ranked) if not any(one is other for other in near)]
@@ -221,10 +282,11 @@ def _likeliest(evidence: Evidence, fitted: Sequence[int], tried: Sequence[Fitted
         if one.effects not in best or everywhere < best[one.effects][0]:
             best[one.effects] = each
     _, least, found = min(best.values(), key=lambda each: each[1])
-    for weather in _weather(evidence, [one for *_, one in best.values()]):
+    order = [one for *_, one in sorted(best.values(), key=lambda each: each[1])]
+    for weather in _weather(evidence, order):
         if best[weather.effects][1] < least + CHI2_999 * max(found.leftover**2, 1.0):
-            return weather
-    return found
+            return [weather, *(one for one in order if one is not weather)]
+    return order
 
 
 def _weather(evidence: Evidence, ranked: Sequence[Fitted]) -> list[Fitted]:
@@ -241,12 +303,13 @@ def _weather(evidence: Evidence, ranked: Sequence[Fitted]) -> list[Fitted]:
 def _started(
     evidence: Evidence, judged: Weights, hypotheses: Sequence[Hypothesis]
 ) -> list[Hypothesis]:
-    """The same with the last cause at the best of some sizes, by the law that suits it best.
+    """The same with the last cause at the best of some sizes, by each law that it may act by.
 
     A delay moves what is sharp: from far away a step towards its true size does not seem to help.
     """
     tried: list[list[Hypothesis]] = []
-    for hypothesis in hypotheses:
+    ways = [way for one in hypotheses for way in in_other_ways(one, len(one) - 1)]
+    for hypothesis in ways:
         low, high = bounds(evidence, hypothesis)
         x = sizes(evidence, hypothesis)
         last = len(x) - len(parameters(hypothesis[-1:]))
@@ -254,8 +317,7 @@ def _started(
         for size in (*-START, *START):
             if low[last] < size < high[last]:
                 around.append(np.concatenate([x[:last], [size], x[last + 1 :]]))
-        ways = in_other_ways(hypothesis, len(hypothesis) - 1)
-        tried.append([sized(evidence, way, one) for way in ways for one in around])
+        tried.append([sized(evidence, hypothesis, one) for one in around])
     every = [one for some in tried for one in some]
     chi2 = np.sum(white(evidence, judged, every) ** 2, axis=0)
     best, first = [], 0
@@ -265,15 +327,9 @@ def _started(
     return best
 
 
-def _best_addition(
-    evidence: Evidence,
-    judged: Weights,
-    weights: Weights,
-    found: Fitted,
-    singles: Sequence[Fitted],
-    healthy: float,
-) -> Fitted | None:
+def _best_addition(evidence: Evidence, here: _Found, singles: Sequence[Fitted]) -> Fitted | None:
     """What is found with one more cause, or a pair in its place; None if not worth it."""
+    found, judged, weights = here.found, here.judged, here.weights
     about = found.hypothesis
     promised = promises(evidence, judged, columns(evidence, judged, about), each=2)
     new = [one for one in promised if one.hypothesis[0].effect not in found.effects]
@@ -285,7 +341,7 @@ def _best_addition(
     candidates = _timed(evidence, judged, candidates)
     tried = _ranked(evidence, judged, fit(evidence, weights, candidates, best_only=True))
     for one in tried:
-        if _worth(healthy, found.chi2, found.chi2 - found.score, one):
+        if _worth(here.healthy, found.chi2, found.chi2 - found.score, one):
             return one
     return None
 
@@ -379,6 +435,12 @@ def held_out_gain(
     gain = float(before @ before - after @ after)
     reach = SIGMAS_95 * 2.0 * float(np.linalg.norm(before - after)) * left
     return gain - reach, gain + reach
+
+
+def _overtaking(found: Fitted, rivals: Sequence[Sequence[Fitted]]) -> Fitted | None:
+    """What stands better in place of a cause found; the way there did not lead past it."""
+    best = min(chain.from_iterable(rivals), key=lambda one: one.score, default=found)
+    return best if best.score < found.score - CHI2_999 * max(best.leftover**2, 1.0) else None
 
 
 def _rivals(

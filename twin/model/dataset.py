@@ -76,6 +76,13 @@ class Supply(Settings):
         return self
 
 
+def closing_stage(x: npt.NDArray[np.float64], at: float) -> npt.NDArray[np.float64]:
+    """Suction of a stage over its own at ambient, where it closes ``at``; as in the kernel."""
+    open_by, end, most = (np.hypot(one, c.KINK_WIDTH) + one for one in (x - at, -at, 1.0 - at))
+    share: npt.NDArray[np.float64] = (open_by - end) / (most - end)
+    return share
+
+
 class Ejector(Settings):
     """Characteristic, timing, blow-off and control of the ejector."""
 
@@ -85,6 +92,8 @@ class Ejector(Settings):
     skew: float = Field(0.0, ge=-20.0, le=20.0)
     bend_2: float = Field(0.0, ge=-40.0, le=40.0)
     bend_3: float = Field(0.0, ge=-40.0, le=40.0)
+    kink: float = Field(0.0, ge=0.0, le=0.95)
+    kink_at: float = Field(0.4, ge=0.02, le=0.95)
     port_volume_ml: Positive = 1.0
     air_consumption_sl_min: NotNegative = 80.0  # of the nozzle, at operating pressure
     response_ms: float = Field(15.0, ge=0.0, le=500.0)
@@ -98,6 +107,7 @@ class Ejector(Settings):
     blow_off_response_ms: float = Field(15.0, ge=0.0, le=500.0)
     blow_off_response_off_ms: float = Field(12.0, ge=0.0, le=500.0)
     blow_off_ramp_ms: float = Field(5.0, ge=0.5, le=500.0)
+    exhaust_follows: float = Field(0.0, ge=0.0, le=1.0)  # a loss of suction narrows it as well
     relief_sl_min: NotNegative = 200.0  # out through the exhaust at 100 mbar above ambient
     exhaust_sl_min: NotNegative = 0.0  # the same, sonic, where the exhaust is an opening
     cracking_pressure_mbar: NotNegative = 0.0  # above ambient, where the check valve lets out
@@ -115,7 +125,8 @@ class Ejector(Settings):
     def share(self, x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Suction over suction capacity; ``x`` runs from 0 at end pressure to 1 at ambient."""
         bend = self.bulge + x * (self.skew + x * (self.bend_2 + x * self.bend_3))
-        return x * (1.0 + (1.0 - x) * bend)
+        closing = closing_stage(x, self.kink_at)
+        return (1.0 - self.kink) * x * (1.0 + (1.0 - x) * bend) + self.kink * closing
 
     @model_validator(mode="after")
     def _thresholds_fit(self) -> "Ejector":
@@ -259,6 +270,8 @@ def _set_ejector(theta: Theta, ejector: Ejector, end_ratio: float) -> None:
     theta[c.END_RATIO] = end_ratio
     theta[[c.BULGE, c.SKEW]] = ejector.bulge, ejector.skew
     theta[[c.BEND_2, c.BEND_3]] = ejector.bend_2, ejector.bend_3
+    theta[c.EXHAUST_FOLLOWS] = ejector.exhaust_follows
+    theta[[c.KINK, c.KINK_AT]] = ejector.kink, ejector.kink_at
     theta[c.RESPONSE] = ejector.response_ms * MS
     theta[c.RESPONSE_OFF] = ejector.response_off_ms * MS
     theta[c.RAMP_UP] = ejector.ramp_up_ms * MS / 2.0

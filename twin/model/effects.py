@@ -100,6 +100,9 @@ def _check_valve_leak(theta: Theta, flow: float) -> None:
 
 def _suction_loss(theta: Theta, percent: float) -> None:
     theta[c.SUCTION] *= 1.0 - percent / 100.0
+    narrower = 1.0 - theta[c.EXHAUST_FOLLOWS] * percent / 100.0
+    theta[c.RELIEF] *= narrower
+    theta[c.EXHAUST] *= narrower
 
 
 def _end_vacuum_loss(theta: Theta, rise: float) -> None:
@@ -197,6 +200,8 @@ _TABLE = (
         "the nozzles and the silencer: clean or replace them",
         (_P("loss", "%", 0.0, 90.0, 10.0),),
         _suction_loss,
+        # A worn nozzle, or dirt in the tube that blow-off leaves through as well.
+        law=Law("exhaust_follows", c.EXHAUST_FOLLOWS, (0.0, 1.0)),
     ),
     Effect(
         "end_vacuum_loss",
@@ -253,6 +258,7 @@ _TABLE = (
         "the suction valve and the supply hose: something opens slowly",
         (_P("time_constant", "ms", 0.0, 400.0, 20.0),),
         _slow_ramp_up,
+        # The jet grows with the valve's opening, or is there long before it is open.
         law=Law("jet_full_at", c.JET_FULL_AT, (1.0, 0.5, 0.2, 0.08)),
     ),
     Effect(

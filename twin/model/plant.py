@@ -20,10 +20,21 @@ from twin.model.gas import CP, GAMMA, R, opening
 from twin.model.theta import Theta
 
 # What a step needs and a call computes only once, in rows behind the coefficients.
-(_SUCTION, _END, _BLOW_OFF, _FLATTER, _HEAT, _PORT_HEAT, _LINE_HEAT, _PLACE, _STRETCH, _SOFT) = (
-    range(len(c.COEFFICIENTS), len(c.COEFFICIENTS) + 10)
-)
-PREPARED = len(c.COEFFICIENTS) + 10
+(
+    _SUCTION,
+    _END,
+    _BLOW_OFF,
+    _FLATTER,
+    _HEAT,
+    _PORT_HEAT,
+    _LINE_HEAT,
+    _PLACE,
+    _STRETCH,
+    _SOFT,
+    _CLOSED,
+    _OPENS,
+) = range(len(c.COEFFICIENTS), len(c.COEFFICIENTS) + 12)
+PREPARED = len(c.COEFFICIENTS) + 12
 
 # A runaway hypothesis stays a number; a node that is flushed many times in a step keeps its gas.
 LIGHTEST = 1e-15  # kg
@@ -105,6 +116,10 @@ def prepare_one(k, i):  # type: ignore[no-untyped-def]
     most = ambient / (1.0 + k[c.STIFF_UNTIL, i] / ambient)  # that pulls at the cups
     k[_STRETCH, i] = k[c.COMPLIANCE, i] * (1.0 + k[c.SOFTNESS, i]) / most
     k[_SOFT, i] = k[c.SOFTNESS, i] / most
+    at = k[c.KINK_AT, i]
+    k[_CLOSED, i] = math.sqrt(at * at + c.KINK_WIDTH * c.KINK_WIDTH) - at
+    open_by = math.sqrt((1.0 - at) * (1.0 - at) + c.KINK_WIDTH * c.KINK_WIDTH) + 1.0 - at
+    k[_OPENS, i] = k[c.KINK, i] / (open_by - k[_CLOSED, i])
     friction = k[c.NEAR_RESISTANCE, i] + k[c.RESISTANCE, i]
     k[_PLACE, i] = min(k[c.PLACE, i] / friction, 1.0) if friction > 0.0 else 0.0
 
@@ -150,15 +165,19 @@ def characteristic(x, k, i):  # type: ignore[no-untyped-def]
     """Suction flow as a share of its value at ambient, and its slope, over ``x``.
 
     ``x`` runs from 0 at end pressure to 1 at ambient. Straight (the founding paper's shape) where
-    all bends are zero. Below end pressure the check valve closes: no flow back.
+    all bends are zero. A second stage opens where the first is moved enough by itself, a KINK.
+    Below end pressure the check valve closes: no flow back.
     """
     b0, b1, b2, b3 = k[c.BULGE, i], k[c.SKEW, i], k[c.BEND_2, i], k[c.BEND_3, i]
     x = min(max(x, 0.0), 1.2)
     bend = b0 + x * (b1 + x * (b2 + x * b3))
     slope = b1 + x * (2.0 * b2 + x * 3.0 * b3)
-    share = max(x * (1.0 + (1.0 - x) * bend), 0.0)
-    rise = 1.0 + (1.0 - 2.0 * x) * bend + x * (1.0 - x) * slope
-    return share, (max(rise, 0.0) if x > 0.0 else 0.0)
+    beyond, first = x - k[c.KINK_AT, i], 1.0 - k[c.KINK, i]
+    root = math.sqrt(beyond * beyond + c.KINK_WIDTH * c.KINK_WIDTH)
+    share = first * x * (1.0 + (1.0 - x) * bend) + k[_OPENS, i] * (root + beyond - k[_CLOSED, i])
+    rise = first * (1.0 + (1.0 - 2.0 * x) * bend + x * (1.0 - x) * slope)
+    rise += k[_OPENS, i] * (beyond / root + 1.0)
+    return max(share, 0.0), (max(rise, 0.0) if x > 0.0 else 0.0)
 
 
 def suction_at(theta: Theta, p: float) -> float:

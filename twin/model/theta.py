@@ -26,10 +26,13 @@ COEFFICIENTS: Mapping[str, tuple[str, str]] = {
     "END_SLOPE": ("1/Pa", "relative rise of end pressure per drop of supply"),
     "SUCTION": ("kg/s", "suction capacity: flow at ambient pressure in the port"),
     "END_RATIO": ("1", "end pressure over ambient"),
+    "EXHAUST_FOLLOWS": ("1", "share of a loss of suction by which the exhaust is narrowed as well"),
     "BULGE": ("1", "how far the characteristic bulges above a straight line"),
     "SKEW": ("1", "towards which end it bulges"),
     "BEND_2": ("1", "how it bends, finer"),
     "BEND_3": ("1", "how it bends, finer still"),
+    "KINK": ("1", "share of suction at ambient by a stage that closes on the way to end pressure"),
+    "KINK_AT": ("1", "where it closes: 0 at end pressure, 1 at ambient"),
     "RESPONSE": ("s", "from the command to the suction valve's action"),
     "RESPONSE_OFF": ("s", "the same for its end"),
     "RAMP_UP": ("s", "time constant of each of the jet's two stages"),
@@ -105,10 +108,13 @@ COEFFICIENTS: Mapping[str, tuple[str, str]] = {
     END_SLOPE,
     SUCTION,
     END_RATIO,
+    EXHAUST_FOLLOWS,
     BULGE,
     SKEW,
     BEND_2,
     BEND_3,
+    KINK,
+    KINK_AT,
     RESPONSE,
     RESPONSE_OFF,
     RAMP_UP,
@@ -165,6 +171,8 @@ COEFFICIENTS: Mapping[str, tuple[str, str]] = {
     BLOW_OFF_MODE,
     BLOW_OFF_TIME,
 ) = range(len(COEFFICIENTS))
+
+KINK_WIDTH = 0.03  # of the way from end pressure to ambient, over which a stage closes
 
 Theta = npt.NDArray[np.float64]  # one value per coefficient
 
