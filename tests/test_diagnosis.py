@@ -19,9 +19,10 @@ from tools.calibration_coverage import as_type, drawn, recorded, rig_of, shipped
 from twin.calibration.calibrate import calibrate
 from twin.config import Config
 from twin.diagnosis import answer as answer_module
+from twin.diagnosis import search as search_module
 from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.diagnosis.evidence import HEALTHY, Hypothesis, _unsettled, collect, thinned
-from twin.diagnosis.fit import fit
+from twin.diagnosis.fit import Fitted, fit
 from twin.diagnosis.hypotheses import price
 from twin.diagnosis.judge import gain, judge
 from twin.diagnosis.search import _confirmed, held_out_gain, tried_in_or_out
@@ -427,6 +428,36 @@ def test_what_another_heat_exchange_leaves_for_the_next_cycle_is_counted() -> No
     (cause,) = answer["causes"]
     assert (cause["effect"], cause["course"]) == ("heat_exchange", "intermittent")
     assert {0, 3, 6} <= set(cause["cycles"])
+
+
+def test_where_the_likeliest_does_not_hold_the_search_begins_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    likeliest = search_module._likeliest
+
+    def misled(*given: Any) -> list[Fitted]:
+        order = likeliest(*given)
+        healthy = frozenset({1, 2, 3})
+        wrong = Cause("weak_blow_off", {"loss": 30.0}, Course.INTERMITTENT, cycles=healthy)
+        return [replace(order[0], hypothesis=(wrong,)), *order]
+
+    monkeypatch.setattr(search_module, "_likeliest", misled)
+    monkeypatch.setattr(search_module, "_added", lambda _evidence, _fitted, here, *_: here)
+    (cause,) = of(record(27.0, "leakage=1.7@14.4", seed=21)).json["causes"]
+    assert (cause["effect"], cause["course"]) == ("leakage", "step")
+
+
+@pytest.mark.parametrize(("better_by", "takes_its_place"), [(50.0, True), (5.0, False)])
+def test_what_stands_clearly_better_in_place_of_a_cause_takes_it(
+    better_by: float, takes_its_place: bool
+) -> None:
+    found = Fitted((Cause("leakage", {}),), np.ones(1), np.eye(1), 150.0, 160.0, 150)
+    rival = replace(found, hypothesis=(Cause("porous_leakage", {}),), score=160.0 - better_by)
+    worse = replace(rival, score=170.0)
+    assert search_module._overtaking(found, [[worse], [rival]]) is (
+        rival if takes_its_place else None
+    )
+    assert search_module._overtaking(found, [[], []]) is None
 
 
 def test_a_great_delay_does_not_look_like_a_small_one() -> None:

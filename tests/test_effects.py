@@ -6,14 +6,14 @@ import pytest
 import rigs
 from hypothesis import given
 from hypothesis import strategies as st
-from stepping import PRESSURES, temperature
+from stepping import PRESSURES, states, temperature
 
 from twin.errors import ConfigError
 from twin.model import kernel
 from twin.model import theta as c
-from twin.model.effects import EFFECTS, apply, table
+from twin.model.effects import EFFECTS, Law, apply, table
 from twin.model.theta import Theta
-from twin.signals import BAR, MBAR, MS, Command
+from twin.signals import BAR, MBAR, MS, Command, Phase
 
 # What people, scripts and other systems hold on to.
 CONTRACT = """
@@ -204,6 +204,52 @@ def test_clogging_costs_the_drop_it_says_at_nominal_suction() -> None:
     clogged = apply(theta, "filter_clogging", {"pressure_drop_at_nominal": 100.0})
     after = np.sqrt(theta[c.AMBIENT] ** 2 - clogged[c.RESISTANCE] * theta[c.SUCTION] ** 2)
     assert theta[c.AMBIENT] - after == pytest.approx(100 * MBAR)
+
+
+def strength(theta: Theta, milliseconds: int) -> npt.NDArray[np.float64]:
+    """Of the jet, each millisecond from its valve's action on."""
+    still = theta.copy()
+    still[c.RESPONSE] = 0.0
+    rows = states(still, [(Phase.SUCTION, milliseconds)])
+    found: npt.NDArray[np.float64] = rows[:, kernel.JET]
+    return found
+
+
+def test_by_the_law_of_a_wide_valve_a_slow_one_is_a_late_one() -> None:
+    theta = rigs.theta("test_rig")
+    slow = {"time_constant": 100.0}
+    wide = strength(apply(theta, "slow_ramp_up", {**slow, "jet_full_at": 0.08}), 400)
+    grows = strength(apply(theta, "slow_ramp_up", {**slow, "jet_full_at": 1.0}), 400)
+    healthy = strength(theta, 400)
+
+    def rises(jet: npt.NDArray[np.float64]) -> tuple[int, int]:
+        """From 10 to 50, and from there to 90 % of its strength, in ms."""
+        first, half, last = (int(np.argmax(jet > share)) for share in (0.1, 0.5, 0.9))
+        return half, last - first
+
+    assert rises(wide)[0] - rises(healthy)[0] in range(3, 12)
+    assert rises(wide)[1] < rises(healthy)[1] + 12
+    assert rises(grows)[0] > 60
+    assert rises(grows)[1] > 120
+
+
+@pytest.mark.parametrize("law", [one.law for one in EFFECTS.values() if one.law])
+def test_a_law_without_its_effect_changes_nothing(law: Law) -> None:
+    theta = rigs.theta("gripper")
+    expected = cycle(theta)[0]
+    for value in law.tried:
+        other = theta.copy()
+        other[law.coefficient] = value
+        assert np.array_equal(cycle(other)[0], expected)
+
+
+def test_dirt_on_the_way_of_both_narrows_the_exhaust_as_well() -> None:
+    theta = rigs.theta("test_rig")
+    worn = apply(theta, "suction_loss", {"loss": 20.0})
+    dirty = apply(theta, "suction_loss", {"loss": 20.0, "exhaust_follows": 1.0})
+    assert worn[c.RELIEF] == theta[c.RELIEF]
+    assert dirty[c.RELIEF] == pytest.approx(0.8 * theta[c.RELIEF])
+    assert dirty[c.SUCTION] == worn[c.SUCTION]
 
 
 # What cannot be meant.

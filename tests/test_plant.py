@@ -7,8 +7,10 @@ import rigs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
+from scipy.optimize import least_squares
 from stepping import closed, standing, states, switched_on, temperature, theta_of
 
+from drivers.plc.rig import bulging
 from twin.model import kernel
 from twin.model import theta as c
 from twin.model.dataset import Ejector
@@ -137,6 +139,25 @@ def test_the_slope_is_that_of_the_characteristic(
     assert share == pytest.approx((1.0 - kink) * by_hand + kink * second, abs=rounded)
     shape = Ejector.model_construct(**bends, **stage).share(np.array([x]))
     assert share == pytest.approx(float(shape[0]))
+
+
+@pytest.mark.parametrize(("second", "depth"), [(0.3, 0.5), (0.45, 0.35), (0.6, 0.7)])
+def test_the_kink_of_a_second_stage_is_that_of_the_simulated_rig(
+    second: float, depth: float
+) -> None:
+    way = np.linspace(0.01, 1.0, 100)
+    deeper = [bulging(x, 1.25) for x in way]
+    closes = [bulging((x - 1.0) / depth + 1.0, 1.25) for x in way]
+    law = (1.0 - second) * np.array(deeper) + second * np.array(closes)
+    keys = ("bulge", "skew", "bend_2", "bend_3", "kink", "kink_at")
+
+    def off(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        return Ejector.model_construct(**dict(zip(keys, x, strict=False))).share(way) - law
+
+    without = least_squares(off, [0.3, 0.0, 0.0, 0.0])
+    with_it = least_squares(off, [0.3, 0.0, 0.0, 0.0, 0.3, 0.4])
+    assert np.std(with_it.fun) < 0.4 * np.std(without.fun)
+    assert with_it.x[-1] == pytest.approx(1.0 - depth, abs=0.05)
 
 
 def test_suction_runs_from_capacity_at_ambient_to_none_at_end_pressure() -> None:
