@@ -16,6 +16,7 @@ from twin.signals import MS
 ROUNDS = 3
 FEWEST = 6  # cycles, to judge on others what was learned from some
 LEAST_COMMON, LEAST_ALONE = 0.15, 0.1  # mbar
+ODD = 3.0  # times the median of cycles' chi-square, beyond which one counts no more
 HIDDEN = 1.3  # the error over what is left of it once the data set was fitted to the same cycles
 LEAST_SCATTER, MOST_SCATTER = 0.2, 5.0  # of what is usual
 
@@ -31,13 +32,23 @@ def learned(evidence: Evidence) -> Healthy:
         _left(replace(evidence, healthy=_learned(of_cycles(evidence, here))), there)
         for here, there in halves
     ]
-    return _learned(evidence).model_copy(update={"leftover": float(np.sqrt(np.mean(left)))})
+    return _learned(evidence).model_copy(update={"leftover": _usual(np.concatenate(left))})
 
 
-def _left(evidence: Evidence, cycles: Sequence[int]) -> float:
-    """Chi-square per residual that cycles have by what was learned from others."""
-    white = covariance(evidence).of(cycles).white(evidence.off([HEALTHY]))
-    return float(np.mean(white**2))
+def _left(evidence: Evidence, cycles: Sequence[int]) -> Floats:
+    """Chi-square per residual that each cycle has by what was learned from others."""
+    weights = covariance(evidence).of(cycles)
+    white = weights.white(evidence.off([HEALTHY]))[: len(weights.bins), 0]
+    cycle = evidence.bins.cycle[weights.bins]
+    return np.array([np.mean(white[cycle == one] ** 2) for one in cycles if one in cycle])
+
+
+def _usual(left: Floats) -> float:
+    """Sigmas that cycles have by what was learned from others; one odd cycle is not all of them.
+
+    What is learned in the end has seen that one as well.
+    """
+    return float(np.sqrt(np.mean(np.minimum(left, ODD * np.median(left)))))
 
 
 def _learned(evidence: Evidence) -> Healthy:

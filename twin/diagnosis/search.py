@@ -90,15 +90,13 @@ def search(
     firsts = _likeliest(evidence, fitted, tried, singles, progress)[:TRIED_FIRST]
     for first in firsts:
         here = _about(evidence, fitted, first.hypothesis)
-        if first is not firsts[0] and not _worth(here.healthy, here.healthy, 0.0, here.found):
-            continue
         others = [one.hypothesis for one in singles if one.effects != first.effects]
         rest = fit(evidence, here.weights, others)
         ranked = [here.found, *sorted(rest, key=lambda one: one.score)]
         here = _added(evidence, fitted, here, ranked, progress)
         progress("asking cycles that nothing was fitted to")
         confirmed = _confirmed(evidence, fitted, here.weights, here.found)
-        if confirmed is not None:
+        if confirmed and _worth(here.healthy, here.healthy, 0.0, confirmed):
             break
     else:
         weights = known.of(fitted)
