@@ -17,20 +17,20 @@ CRITICAL, LAMINAR = 0.528, 0.999
 Floats = npt.NDArray[np.float64]
 
 
-def psi(ratio: float) -> float:
+def psi(ratio: float, critical: float) -> float:
     """ISO 6358 flow function, straight near 1."""
-    if ratio <= CRITICAL:
+    if ratio <= critical:
         return 1.0
-    bent = (min(ratio, LAMINAR) - CRITICAL) / (1.0 - CRITICAL)
+    bent = (min(ratio, LAMINAR) - critical) / (1.0 - critical)
     root = float(np.sqrt(1.0 - bent**2))
     return root if ratio <= LAMINAR else root * (1.0 - ratio) / (1.0 - LAMINAR)
 
 
-def through_hole(sonic: float, p: float, ambient: float) -> float:
+def through_hole(sonic: float, p: float, ambient: float, critical: float = CRITICAL) -> float:
     """Flow inwards (kg/s)."""
     if p <= ambient:
-        return sonic * psi(p / ambient)
-    return -sonic * p / ambient * psi(ambient / p)
+        return sonic * psi(p / ambient, critical)
+    return -sonic * p / ambient * psi(ambient / p, critical)
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
     if port < ambient:
         blown += through_hole(theta[c.BACK_FLOW] * (1.0 - min(jet, 1.0)), port, ambient)
     hole, pore = theta[[c.LEAK, c.LAMINAR_LEAK]] + (valves.open or 0.0) * theta[[c.HOLE, c.OPENING]]
-    leak = through_hole(hole, vessel, ambient) + pore * (ambient - vessel)
+    leak = through_hole(hole, vessel, ambient, theta[c.LEAK_CRITICAL]) + pore * (ambient - vessel)
 
     far_t = vessel_t if far >= 0.0 else line_t
     leak_t = outside if vessel <= ambient else vessel_t

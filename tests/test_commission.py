@@ -239,8 +239,9 @@ def test_a_fit_starts_with_lips_that_spread_and_bellows_that_fold_where_there_ar
     shrinks = [one.system.shrinks_ml for one in starts(cups, np.nan)]
     assert max(shrinks) > 10.0 * min(shrinks) > 0.0
     assert {one.system.stiff_mbar for one in starts(cups, np.nan)} == {30.0, 300.0}
-    assert {one.system.shrinks_ml for one in starts(tank, np.nan)} == {0.0}
-    assert len({one.system.stiff_mbar for one in starts(tank, np.nan)}) == 1
+    # A vessel is rigid, or has cups behind it that somebody took for a part of it.
+    rigid, soft = sorted({one.system.shrinks_ml for one in starts(tank, np.nan)})
+    assert (rigid, soft > 0.0) == (0.0, True)
 
 
 def test_a_cycle_in_which_something_went_wrong_counts_little_in_what_is_left_and_in_the_floor() -> (

@@ -18,7 +18,7 @@ def test_the_gas_is_dry_air() -> None:
 
 
 def share(ratio: float) -> float:
-    flow, _ = orifice(ratio)
+    flow, _ = orifice(ratio, CRITICAL_RATIO)
     return float(flow)
 
 
@@ -45,6 +45,14 @@ def test_the_ellipse_is_near_the_isentropic_nozzle(ratio: float) -> None:
     critical = (2 / (GAMMA + 1)) ** (GAMMA / (GAMMA - 1))
     assert critical == pytest.approx(CRITICAL_RATIO, abs=5e-4)
     assert share(ratio) == pytest.approx(flow(ratio) / flow(critical), rel=0.02)
+
+
+@pytest.mark.parametrize("critical", [0.2, 0.35, 0.528])
+def test_a_fitting_is_sonic_up_to_a_ratio_of_its_own(critical: float) -> None:
+    assert orifice(critical, critical)[0] == 1.0
+    below = (0.8 - critical) / (1 - critical)
+    assert orifice(0.8, critical)[0] == pytest.approx(math.sqrt(1 - below**2), rel=1e-14)
+    assert orifice(1.0, critical)[0] == 0.0
 
 
 @compiling
@@ -74,14 +82,14 @@ def test_the_slope_is_that_of_the_flow(ratio: float) -> None:
     step = 1e-7
     if min(abs(ratio - CRITICAL_RATIO), abs(ratio - LAMINAR_RATIO)) > step < ratio < 1 - step:
         steep = (share(ratio + step) - share(ratio - step)) / (2 * step)
-        assert orifice(ratio)[1] == pytest.approx(steep, rel=1e-4, abs=1e-6)
+        assert orifice(ratio, CRITICAL_RATIO)[1] == pytest.approx(steep, rel=1e-4, abs=1e-6)
 
 
 # An opening to ambient.
 
 
 def into(p: float, ambient: float) -> float:
-    flow, _ = opening(p, ambient)
+    flow, _ = opening(p, ambient, CRITICAL_RATIO)
     return float(flow)
 
 
@@ -107,4 +115,4 @@ def test_the_slope_of_an_opening_is_that_of_its_flow(p: float) -> None:
     kinks += [ambient / LAMINAR_RATIO, ambient / CRITICAL_RATIO]
     if min(abs(p - kink) for kink in kinks) > 2 * step:
         steep = (into(p + step, ambient) - into(p - step, ambient)) / (2 * step)
-        assert opening(p, ambient)[1] == pytest.approx(steep, rel=1e-3, abs=1e-10)
+        assert opening(p, ambient, CRITICAL_RATIO)[1] == pytest.approx(steep, rel=1e-3, abs=1e-10)

@@ -21,7 +21,7 @@ enum { /* twin.model.theta.COEFFICIENTS */
     BLOW_OFF_RESPONSE, BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, RELIEF, EXHAUST, CRACKING_PRESSURE,
     PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT, VOLUME, COMPLIANCE, SOFTNESS, STIFF_UNTIL, FILM, FREE_CONVECTION,
     FORCED_CONVECTION, AREA, NEAR_RESISTANCE, NEAR_LAMINAR, NEAR_INERTANCE, RESISTANCE,
-    LAMINAR, INERTANCE, PLACE, LEAK, LAMINAR_LEAK, INFLOW, BACK_FLOW, OPENING, HOLE, SENSOR_LAG, SLOW_SENSOR,
+    LAMINAR, INERTANCE, PLACE, LEAK, LEAK_CRITICAL, LAMINAR_LEAK, INFLOW, BACK_FLOW, OPENING, HOLE, SENSOR_LAG, SLOW_SENSOR,
     SENSOR_OFFSET, SENSOR_GAIN, H1, H1_LOW, H2, H2_LOW, RELEASE, CONTACT, CONTROL_SENSOR,
     AIR_SAVING, PERMITTED_LEAKAGE, BLOW_OFF_MODE, BLOW_OFF_TIME, COEFFICIENTS
 };
@@ -48,25 +48,24 @@ INLINED double min(double a, double b) { return a < b ? a : b; }
 #define CP (GAMMA * R / (GAMMA - 1.0))
 #define CRITICAL_RATIO 0.528
 #define LAMINAR_RATIO 0.999
-#define STEEP (1.0 / (1.0 - CRITICAL_RATIO))
-#define EDGE ((LAMINAR_RATIO - CRITICAL_RATIO) * STEEP)
-#define LAMINAR_SLOPE (-sqrt(1.0 - EDGE * EDGE) / (1.0 - LAMINAR_RATIO))
+#define PER_LAMINAR (1.0 / (1.0 - LAMINAR_RATIO))
 
 typedef struct { double level, slope; } Tangent;
 
-INLINED Tangent orifice(double ratio)
+INLINED Tangent orifice(double ratio, double critical)
 {
-    double below = min(max((ratio - CRITICAL_RATIO) * STEEP, 0.0), EDGE);
+    double steep = 1.0 / (1.0 - critical);
+    double below = max((min(ratio, LAMINAR_RATIO) - critical) * steep, 0.0);
     double share = sqrt(1.0 - below * below);
     int laminar = ratio > LAMINAR_RATIO;
-    double slope = laminar ? LAMINAR_SLOPE : -STEEP * below / share;
-    return (Tangent){laminar ? -LAMINAR_SLOPE * (1.0 - ratio) : share, slope};
+    double slope = laminar ? -share * PER_LAMINAR : -steep * below / share;
+    return (Tangent){laminar ? share * PER_LAMINAR * (1.0 - ratio) : share, slope};
 }
 
-INLINED Tangent opening(double p, double ambient)
+INLINED Tangent opening(double p, double ambient, double critical)
 {
     int inwards = p <= ambient;
-    Tangent flow = orifice(inwards ? p / ambient : ambient / p);
+    Tangent flow = orifice(inwards ? p / ambient : ambient / p, critical);
     double share = flow.level, slope = flow.slope;
     double out = share * p / ambient;
     double steeper = (share - slope * ambient / p) / ambient;
@@ -166,7 +165,7 @@ INLINED Port at_port(double p, const Driven *driven, const double *k)
     double out = driven->jet * driven->suction * curve.level - out_slope * p;
     double opens = ambient + K(CRACKING_PRESSURE);
     double relief = p > opens ? K(RELIEF) : 0.0;
-    Tangent flow = opening(p < ambient ? p : p - K(CRACKING_PRESSURE), ambient);
+    Tangent flow = opening(p < ambient ? p : p - K(CRACKING_PRESSURE), ambient, CRITICAL_RATIO);
     double back = K(BACK_FLOW) * (1.0 - min(driven->jet, 1.0));
     back = p < ambient ? back : 0.0;
     double vent = p > opens ? K(EXHAUST) : 0.0;
@@ -184,7 +183,7 @@ INLINED Tangent at_vessel(double p, const Driven *driven, const double *k)
     double ambient = K(AMBIENT);
     double laminar = K(LAMINAR_LEAK) + driven->open * K(OPENING);
     double sonic = K(LEAK) + driven->open * K(HOLE);
-    Tangent flow = opening(p, ambient);
+    Tangent flow = opening(p, ambient, K(LEAK_CRITICAL));
     double slope = sonic * flow.slope - laminar;
     double level = sonic * (flow.level - flow.slope * p) + laminar * ambient;
     return (Tangent){level + K(INFLOW), slope};

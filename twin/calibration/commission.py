@@ -24,13 +24,14 @@ from twin.calibration.calibrate import (
 )
 from twin.calibration.cycles import Cycles
 from twin.calibration.fit import Fitted, fit_from_afar
+from twin.calibration.parameters import AMBIENT, AMBIENT_TOLD, FREE_IN_MARKET, Free
 from twin.calibration.readings import Readings, read
 from twin.calibration.verdict import Verdict, judge
 from twin.calibration.wiring import refuse_miswired
 from twin.config import Config
 from twin.errors import ConfigError
 from twin.model import theta as c
-from twin.model.dataset import DataSet, coefficients
+from twin.model.dataset import Ambient, DataSet, coefficients
 from twin.model.system import Cups, Part, Sensor, Tube, volume
 from twin.monitor.reports import APART, Contradiction
 from twin.monitor.surroundings import taken_in
@@ -55,7 +56,8 @@ ROOM_TEMPERATURE = 293.15  # K, for a first guess
 PLACES, PORT_SHARES = (0.05, 0.95), (0.01, 0.1)
 NEARLY = 0.95  # of the deepest pressure of a suction that nothing ends but its command
 # How cups give way: the share of their volume that goes, softness, and stiff_mbar (System).
-LIPS, BELLOWS = (0.03, 5.0, 30.0), (0.4, 10.0, 300.0)
+RIGID, LIPS, BELLOWS = (0.0, 5.0, 30.0), (0.03, 5.0, 30.0), (0.4, 10.0, 300.0)
+SAGS = {"droop_bar": 0.1, "lag_ms": 50.0}  # a supply, before anything is known of it
 CLEARLY = 15.0  # mbar by which a threshold must differ to be told; overshoot is part of a turn
 # Of the line, by which a sensor is at another place than told, and sigmas.
 ELSEWHERE, SURELY = 0.6, 4.0
@@ -144,11 +146,14 @@ def commission(
     samples = samples[samples["time_ns"] <= before[-1].end_ns]
     used = samples[samples["time_ns"] <= before[:MOST_FITTED][-1].end_ns]
     refuse_parted(Cycles.found(samples, guess))
-    fitted = _fit(used, starts(guess, readings.meets), progress)
+    free = free_of(config, readings)
+    fitted = _fit(used, starts(guess, readings.meets), free, progress)
+    if fitted.data.ambient != guess.ambient:  # thresholds are below ambient pressure
+        remarks = by_flow + guessed(within(metered, fitted.data.ambient), readings)[1]
     progress("judging the fit")
     verdict = judge(Cycles.found(samples, fitted.data), fitted.data, readings.noise)
     if verdict.word != "refused":  # a fit that does not follow says nothing of places
-        remarks += misplaced(config.data, fitted)
+        remarks += [*misplaced(config.data, fitted), *elsewhere(config.data, fitted)]
     cycles = complete(fitted.data, samples)
     known = replace(config, data=fitted.data)
     healthy = like_these(known, fitted, scatter(fitted.data, cycles), samples)
@@ -197,9 +202,14 @@ def refuse_unreadable(readings: Readings) -> None:
         )
 
 
-def _fit(samples: Samples, guesses: Sequence[DataSet], progress: Callable[[str], None]) -> Fitted:
+def _fit(
+    samples: Samples,
+    guesses: Sequence[DataSet],
+    free: tuple[Free, ...],
+    progress: Callable[[str], None],
+) -> Fitted:
     try:
-        return fit_from_afar(samples, guesses, progress)
+        return fit_from_afar(samples, guesses, progress, free)
     except (ValidationError, np.linalg.LinAlgError) as error:
         raise ConfigError(
             "the fit ends at values that no ejector has: this is no record of the parts that"
@@ -255,7 +265,8 @@ def guessed(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:
     ambient, remarks = _ambient(tables, readings)
     tables["sensor"]["noise_mbar"] = max(readings.noise / MBAR, 0.05)
     remarks += [*_air_saving(tables["ejector"], readings, ambient), *_questions(readings)]
-    tables["system"].update(free_convection=0.5, forced_convection=1.0)
+    tables["system"].update(free_convection=0.5, forced_convection=1.0, leak_critical_ratio=0.4)
+    tables["supply"].update(SAGS)
     _flows(tables["ejector"], readings, _volume(data), ambient * MBAR)
     return DataSet.model_validate(tables), remarks
 
@@ -335,15 +346,43 @@ def starts(data: DataSet, meets: float) -> list[DataSet]:
     tables = data.model_dump()
     place = place_of(data)
     everything = _volume(data) / ML
-    walls = [*product(PORT_SHARES, [LIPS]), *([(PORT_SHARES[0], BELLOWS)] if cups else [])]
+    usual, softer = (LIPS, BELLOWS) if cups else (RIGID, LIPS)  # a vessel may have cups behind it
+    walls = [*product(PORT_SHARES, [usual]), (PORT_SHARES[0], softer)]
     found = []
     for wait, way, at, (share, (shrinks, softness, stiff)) in product(waits, leaves, PLACES, walls):
         tables["system"].update(part_leaves=way, rim="turbulent", sensor_shift=at - place)
-        tables["system"].update(part_meets_ms=wait, shrinks_ml=shrinks * cups)
+        tables["system"].update(part_meets_ms=wait, shrinks_ml=shrinks * (cups or everything))
         tables["system"].update(softness=softness, stiff_mbar=stiff)
         tables["ejector"]["port_volume_ml"] = share * everything
         found.append(DataSet.model_validate(tables))
     return found
+
+
+def within(data: DataSet, ambient: Ambient) -> DataSet:
+    """``data`` in other surroundings."""
+    return data.model_copy(update={"ambient": ambient})
+
+
+def free_of(config: Config, readings: Readings) -> tuple[Free, ...]:
+    """What a fit may move: ambient pressure too, where nothing but the fit can tell it."""
+    if readings.opened or config.gauge or np.isfinite(readings.barometer):
+        return FREE_IN_MARKET
+    told = config.data.ambient.pressure_mbar != DataSet().ambient.pressure_mbar
+    return (*FREE_IN_MARKET, AMBIENT_TOLD if told else AMBIENT)
+
+
+def elsewhere(told: DataSet, fitted: Fitted) -> Iterator[Remark]:
+    """A remark where ambient pressure was fitted and is clearly another than ``told``."""
+    keys = [one.name for one in fitted.free]
+    if AMBIENT.name not in keys:
+        return
+    was, found = told.ambient.pressure_mbar, fitted.data.ambient.pressure_mbar
+    unsure = float(fitted.spread[keys.index(AMBIENT.name)])
+    if abs(found - was) > max(AMBIENT_CLEARLY, SURELY * unsure):
+        text = (
+            f"the closed system follows an ambient pressure of {found:.0f} mbar; the configuration"
+        )
+        yield Remark(f"{text} says {was:g}", f"[data.ambient] pressure_mbar = {found:.0f}")
 
 
 def misplaced(told: DataSet, fitted: Fitted) -> Iterator[Remark]:

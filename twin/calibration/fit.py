@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 
 from twin.calibration.cycles import Both, Cycles
 from twin.calibration.left_out import with_left_out
-from twin.calibration.parameters import Free, Space
+from twin.calibration.parameters import FREE_IN_MARKET, Free, Space
 from twin.calibration.readings import noise_of
 from twin.calibration.weights import Weights, plain, weighted
 from twin.inference.levels import SIGMAS_95
@@ -226,7 +226,10 @@ class _Start:
 
 
 def fit_from_afar(
-    samples: Samples, guesses: Sequence[DataSet], progress: Callable[[str], None]
+    samples: Samples,
+    guesses: Sequence[DataSet],
+    progress: Callable[[str], None],
+    free: tuple[Free, ...] = FREE_IN_MARKET,
 ) -> Fitted:
     """Fit a unit that nobody has seen before, however far from the ``guesses`` it may be.
 
@@ -239,7 +242,7 @@ def fit_from_afar(
     astray more often than one. It is not where the first is followed less well for it.
     """
     noises = [guesses[0].sensor.noise_mbar * MBAR]
-    spaces = [Space.of_market(guess) for guess in guesses]
+    spaces = [Space.of_market(guess, free) for guess in guesses]
     starts = [_Start(space, np.zeros(len(space.free))) for space in spaces]
     for number, one in enumerate(NARROWING, 1):
         starts = starts[: one.starts]

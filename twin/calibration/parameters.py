@@ -1,7 +1,7 @@
 """What a calibration may move: one table, each with what the type leaves open."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -101,6 +101,9 @@ FREE_IN_MARKET = (
     Free(_E, "blow_off_shape", "", 0.1, -0.9, 3.0, market=0.4, scaled=False),
     Free("system", "free_convection", "", 0.2, 0.0, 1.0, market=0.3, scaled=False),
     Free("system", "forced_convection", "", 0.2, 0.0, 20.0, market=1.0),
+    Free("supply", "droop_bar", "bar", 0.1, 0.0, 1.0, market=1.0),
+    Free("supply", "lag_ms", "ms", 20.0, 1.0, 1000.0, market=1.0),
+    Free("system", "leak_critical_ratio", "", 0.05, 0.1, 0.6, market=0.12, scaled=False),
     Free("system", "opening_factor", "", 0.4, 1e-3, 100.0, True, market=1.5),
     Free("system", "line_volume_factor", "", 0.2, 0.02, 50.0, True, market=0.5),
     Free("system", "line_inertia_factor", "", 0.2, 0.02, 50.0, True, market=0.5),
@@ -109,6 +112,10 @@ FREE_IN_MARKET = (
     Free("system", "stiff_mbar", "mbar", 20.0, 0.0, 2000.0, market=1.0),
     Free("system", "part_meets_ms", "ms", 5.0, 0.0, 5000.0, market=0.3),
 )
+# What is free beside these where an absolute sensor reads a system that is never open to ambient:
+# nothing else tells ambient pressure. Told, it is known to some mbar; else places differ by height.
+AMBIENT = Free("ambient", "pressure_mbar", "mbar", 3.0, 500.0, 1100.0, market=40.0, scaled=False)
+AMBIENT_TOLD = replace(AMBIENT, market=3.0)
 SMALLEST = 0.02  # in its unit, a value of the type from which a scale can lead away
 FARTHEST = 5.0  # of the logarithm, from the guess
 
@@ -129,10 +136,17 @@ def directions(data: DataSet) -> Floats:
 
 
 def with_values(data: DataSet, numbers: Floats, free: Sequence[Free] = FREE) -> DataSet:
-    """``data`` with other values, unchecked: a search passes through what is no ejector."""
+    """``data`` with other values, unchecked: a search passes through what is no ejector.
+
+    The nozzle goes off and on at pressures: with another ambient pressure that is another vacuum.
+    """
     changed: dict[str, dict[str, float]] = {}
     for one, number in zip(free, numbers, strict=True):
         changed.setdefault(one.table, {})[one.key] = float(number)
+    if "ambient" in changed:
+        higher = changed["ambient"][AMBIENT.key] - data.ambient.pressure_mbar
+        for key in ("h1_mbar", "h2_mbar"):
+            changed["ejector"][key] = getattr(data.ejector, key) + higher
     tables = {name: getattr(data, name).model_copy(update=new) for name, new in changed.items()}
     return data.model_copy(update=tables)
 
@@ -170,15 +184,15 @@ class Space:
         return cls(data, FREE, directions(data), anywhere < 0.0, -anywhere, anywhere)
 
     @classmethod
-    def of_market(cls, data: DataSet) -> "Space":
+    def of_market(cls, data: DataSet, free: tuple[Free, ...] = FREE_IN_MARKET) -> "Space":
         """Any ejector on the market and what may hang on it; ``data`` is a guess."""
-        spread = np.array([one.market for one in FREE_IN_MARKET])
+        spread = np.array([one.market for one in free])
         ways = np.diag(spread)
         ways[np.ix_(_BENDS, _BENDS)] = _SMOOTH * spread[_BENDS]
-        scaled = np.array([one.scaled for one in FREE_IN_MARKET])
-        low, high = np.array([_reach(one, data) for one in FREE_IN_MARKET]).T
+        scaled = np.array([one.scaled for one in free])
+        low, high = np.array([_reach(one, data) for one in free]).T
         low[_BENDS], high[_BENDS] = -np.inf, np.inf  # each coordinate moves several of them
-        return cls(data, FREE_IN_MARKET, ways, scaled, low, high)
+        return cls(data, free, ways, scaled, low, high)
 
     def values(self, x: Floats) -> Floats:
         """Values of the free parameters at ``x``, kept within their bounds."""

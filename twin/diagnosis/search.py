@@ -96,10 +96,10 @@ def search(
         here = _added(evidence, fitted, here, ranked, progress)
         progress("asking cycles that nothing was fitted to")
         confirmed = _confirmed(evidence, fitted, here.weights, here.found)
-        if confirmed and _worth(here.healthy, here.healthy, 0.0, confirmed):
+        alone = healthy + weights.volume
+        if confirmed and _beats(alone, confirmed, here.weights.volume):
             break
     else:
-        weights = known.of(fitted)
         return Search(weights, healthy, None, singles, [], _NO_SIZES, [])
     singles = ranked
     if confirmed is not here.found:
@@ -369,6 +369,15 @@ def _worth(healthy: float, chi2: float, paid: float, fitted: Fitted) -> bool:
     enough = max(SIGNIFICANT, SHARE * (healthy - chi2) / scale)
     least = SMALLEST if len(fitted.hypothesis) == 1 else SMALLEST_MORE
     return gain > enough and _smallest(fitted) >= least
+
+
+def _beats(alone: float, found: Fitted, volume: float) -> bool:
+    """Whether causes are big enough and explain more than none, each by weights about itself.
+
+    ``alone`` is the chi-square without any, with the volume of its weights.
+    """
+    gain = (alone - found.chi2 - volume) / max(found.leftover**2, 1.0)
+    return gain - (found.score - found.chi2) > SIGNIFICANT and _smallest(found) >= SMALLEST
 
 
 def _smallest(fitted: Fitted) -> float:

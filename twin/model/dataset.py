@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 from twin.errors import ConfigError
 from twin.model import theta as c
 from twin.model.effects import FLATTEST, apply
-from twin.model.gas import GAMMA, R
+from twin.model.gas import CRITICAL_RATIO, GAMMA, R
 from twin.model.system import Part, Tube, Vessel, lumped
 from twin.model.term import Term
 from twin.model.theta import Theta
@@ -183,6 +183,7 @@ class System(Settings):
     softness: NotNegative = 0.0  # 0: shrinks in proportion to vacuum, n: half by 1/(n + 2) of it
     stiff_mbar: NotNegative = 0.0  # vacuum up to which cups hardly give way
     leak_sl_min: NotNegative = 0.3  # of seals and fittings, sonic
+    leak_critical_ratio: float = Field(CRITICAL_RATIO, ge=0.1, le=0.6)  # up to which it is
     part_leaves: Literal["in_blow_off", "after_blow_off"] = "in_blow_off"
     part_meets_ms: NotNegative = 0.0  # after suction is commanded: cups that move to the part
 
@@ -324,6 +325,7 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     theta[c.NEAR_LAMINAR] = near * total.laminar * system.line_factor
     place = min(max(total.place + system.sensor_shift, 0.0), 1.0)
     theta[c.PLACE] = place * total.resistance * system.line_factor
+    theta[c.LEAK_CRITICAL] = system.leak_critical_ratio
     theta[c.LEAK] = total.leak + system.leak_sl_min * SL_MIN
     theta[c.LAMINAR_LEAK] = total.open
     wide = c.OPENING if system.rim == "laminar" else c.HOLE

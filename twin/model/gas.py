@@ -14,34 +14,32 @@ CP = GAMMA * R / (GAMMA - 1.0)  # J/(kg K)
 VISCOSITY = 1.82e-5  # Pa s, of air at 20 °C
 CRITICAL_RATIO = 0.528  # ISO 6358 critical pressure ratio of a well rounded opening
 LAMINAR_RATIO = 0.999  # above it ISO 6358 flow runs linearly to zero: no infinite slope, no chatter
-
-_STEEP = 1.0 / (1.0 - CRITICAL_RATIO)
-_EDGE = (LAMINAR_RATIO - CRITICAL_RATIO) * _STEEP
-_LAMINAR_SLOPE = -math.sqrt(1.0 - _EDGE * _EDGE) / (1.0 - LAMINAR_RATIO)
+_PER_LAMINAR = 1.0 / (1.0 - LAMINAR_RATIO)
 
 
 @inlined
-def orifice(ratio):  # type: ignore[no-untyped-def]
+def orifice(ratio, critical):  # type: ignore[no-untyped-def]
     """Flow through an opening as a share of its sonic flow, and its slope over ``ratio``.
 
-    ISO 6358-1 with critical ratio 0.528; ``ratio`` is downstream over upstream absolute pressure,
+    ISO 6358-1 with a ``critical`` ratio; ``ratio`` is downstream over upstream absolute pressure,
     between 0 and 1.
     """
-    below = min(max((ratio - CRITICAL_RATIO) * _STEEP, 0.0), _EDGE)
+    steep = 1.0 / (1.0 - critical)
+    below = max((min(ratio, LAMINAR_RATIO) - critical) * steep, 0.0)
     share = math.sqrt(1.0 - below * below)
     laminar = ratio > LAMINAR_RATIO
-    slope = _LAMINAR_SLOPE if laminar else -_STEEP * below / share
-    return (-_LAMINAR_SLOPE * (1.0 - ratio) if laminar else share), slope
+    slope = -share * _PER_LAMINAR if laminar else -steep * below / share
+    return (share * _PER_LAMINAR * (1.0 - ratio) if laminar else share), slope
 
 
 @inlined
-def opening(p, ambient):  # type: ignore[no-untyped-def]
+def opening(p, ambient, critical):  # type: ignore[no-untyped-def]
     """Flow from ambient into ``p`` through an opening, as a share of its sonic flow inwards.
 
     Negative outwards while ``p`` is above ambient. Also its slope over ``p`` (1/Pa).
     """
     inwards = p <= ambient
-    share, slope = orifice(p / ambient if inwards else ambient / p)
+    share, slope = orifice(p / ambient if inwards else ambient / p, critical)
     out = share * p / ambient
     steeper = (share - slope * ambient / p) / ambient
     return (share if inwards else -out), (slope / ambient if inwards else -steeper)

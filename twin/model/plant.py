@@ -16,7 +16,7 @@ import numpy as np
 
 from twin.model import theta as c
 from twin.model.compiled import compiled, inlined
-from twin.model.gas import CP, GAMMA, R, opening
+from twin.model.gas import CP, CRITICAL_RATIO, GAMMA, R, opening
 from twin.model.theta import Theta
 
 # What a step needs and a call computes only once, in rows behind the coefficients.
@@ -210,7 +210,8 @@ def at_port(p, driven, k, i):  # type: ignore[no-untyped-def]
     opens = ambient + k[c.CRACKING_PRESSURE, i]
     relief = k[c.RELIEF, i]
     relief = relief if p > opens else 0.0
-    share, rise = opening(p if p < ambient else p - k[c.CRACKING_PRESSURE, i], ambient)
+    forward = p if p < ambient else p - k[c.CRACKING_PRESSURE, i]
+    share, rise = opening(forward, ambient, CRITICAL_RATIO)
     back = k[c.BACK_FLOW, i] * (1.0 - min(driven.jet, 1.0))
     back = back if p < ambient else 0.0
     vent = k[c.EXHAUST, i]
@@ -233,7 +234,7 @@ def at_vessel(p, driven, k, i):  # type: ignore[no-untyped-def]
     ambient = k[c.AMBIENT, i]
     laminar = k[c.LAMINAR_LEAK, i] + driven.open * k[c.OPENING, i]
     sonic = k[c.LEAK, i] + driven.open * k[c.HOLE, i]
-    share, rise = opening(p, ambient)
+    share, rise = opening(p, ambient, k[c.LEAK_CRITICAL, i])
     slope = sonic * rise - laminar
     level = sonic * (share - rise * p) + laminar * ambient
     return level + k[c.INFLOW, i], slope

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from twin.model.gas import VISCOSITY, R, orifice
+from twin.model.gas import CRITICAL_RATIO, VISCOSITY, R, orifice
 from twin.settings import Settings
 from twin.signals import MBAR, ML, SL_MIN
 
@@ -150,7 +150,7 @@ def lumped(parts: tuple[Part, ...], suction: float, ambient: float, temperature:
 
 def _share(vacuum: float, ambient: float) -> float:
     """Flow through an opening into a ``vacuum`` (Pa) below ``ambient``, over its sonic flow."""
-    share, _ = orifice.py_func(1.0 - vacuum / ambient)  # type: ignore[no-untyped-call]
+    share, _ = orifice.py_func(1.0 - vacuum / ambient, CRITICAL_RATIO)  # type: ignore[no-untyped-call]
     return float(share)
 
 
