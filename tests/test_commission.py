@@ -20,16 +20,27 @@ from twin.calibration.commission import (
     ELSEWHERE,
     Commissioned,
     commission,
+    elsewhere,
+    free_of,
     guessed,
     misplaced,
     place_of,
     starts,
+    within,
 )
 from twin.calibration.cycles import Cycles
 from twin.calibration.fit import BEST_END, END_PRESSURE, RISING, falling, soft
 from twin.calibration.left_out import with_left_out
 from twin.calibration.page import write_page
-from twin.calibration.parameters import Space
+from twin.calibration.parameters import (
+    AMBIENT,
+    AMBIENT_TOLD,
+    FREE_IN_MARKET,
+    Free,
+    Space,
+    values,
+    with_values,
+)
 from twin.calibration.readings import Readings, read, turns
 from twin.calibration.report import commissioned_as_json, commissioned_in_words, headline
 from twin.calibration.store import store_first
@@ -41,6 +52,7 @@ from twin.inference.covariance import Covariance
 from twin.inference.levels import SIGMAS_95
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
+from twin.settings import Document
 from twin.signals import BREAK, MBAR, MS, SAMPLE, Command, Phase, Quality, Samples, bridged
 
 CYCLES = 9
@@ -242,6 +254,64 @@ def test_a_fit_starts_with_lips_that_spread_and_bellows_that_fold_where_there_ar
     # A vessel is rigid, or has cups behind it that somebody took for a part of it.
     rigid, soft = sorted({one.system.shrinks_ml for one in starts(tank, np.nan)})
     assert (rigid, soft > 0.0) == (0.0, True)
+
+
+# Ambient pressure, where no idle of a record shows it.
+
+
+@pytest.mark.parametrize(
+    ("opened", "barometer", "told", "free"),
+    [
+        (True, np.nan, 1013.0, None),  # idles stand at it
+        (False, 98_000.0, 1013.0, None),  # somebody measures it
+        (False, np.nan, 1013.0, AMBIENT),  # nobody said anything
+        (False, np.nan, 950.0, AMBIENT_TOLD),
+    ],
+)
+def test_ambient_pressure_is_fitted_where_nothing_else_tells_it(
+    opened: bool, barometer: float, told: float, free: Free | None
+) -> None:
+    of = logged(SEED, KIND)
+    config = config_of(of.truth.readable)
+    ambient = config.data.ambient.model_copy(update={"pressure_mbar": told})
+    config = replace(config, data=within(config.data, ambient))
+    readings = replace(read(samples_of(of)), opened=opened, barometer=barometer)
+    assert free_of(config, readings) == (*FREE_IN_MARKET, *([free] if free else []))
+
+
+def test_a_gauge_sensor_counts_from_the_ambient_pressure_that_was_told() -> None:
+    of = logged(SEED, KIND)
+    config = config_of(of.truth.readable)
+    readings = replace(read(samples_of(of)), opened=False, barometer=np.nan)
+    text = '[driver.tags.pressure]\nreference = "gauge"\n'
+    gauge = replace(config, document=Document.parse(text, "gauge.toml"))
+    assert gauge.gauge
+    assert free_of(gauge, readings) == FREE_IN_MARKET
+
+
+def test_thresholds_are_at_pressures_whatever_ambient_is() -> None:
+    data = typed("gripper").data
+    free = (*FREE_IN_MARKET, AMBIENT)
+    numbers = values(data, free)
+    numbers[-1] -= 50.0
+    moved = with_values(data, numbers, free)
+    before, after = coefficients(data), coefficients(moved)
+    assert after[c.AMBIENT] == pytest.approx(before[c.AMBIENT] - 50.0 * MBAR)
+    for at in (c.H1, c.H1_LOW, c.H2):
+        assert after[c.AMBIENT] - after[at] == pytest.approx(before[c.AMBIENT] - before[at])
+
+
+def test_another_ambient_pressure_is_said_with_the_line_to_change() -> None:
+    fitted = commissioned().calibration.fitted
+    told = fitted.data
+    assert not list(elsewhere(told, fitted))  # opened: it was not fitted
+    free = (*fitted.free, AMBIENT)
+    lower = within(told, told.ambient.model_copy(update={"pressure_mbar": 961.8}))
+    sure = np.zeros((len(free), len(free)))
+    for unsure, said in ((4.0, True), (20.0, False)):
+        sure[-1, -1] = unsure**2
+        (*remark,) = elsewhere(told, replace(fitted, data=lower, free=free, covariance=sure))
+        assert [one.line for one in remark] == ["[data.ambient] pressure_mbar = 962"] * said
 
 
 def test_a_cycle_in_which_something_went_wrong_counts_little_in_what_is_left_and_in_the_floor() -> (
