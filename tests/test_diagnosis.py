@@ -460,6 +460,17 @@ def test_what_stands_clearly_better_in_place_of_a_cause_takes_it(
     assert search_module._overtaking(found, [[], []]) is None
 
 
+def test_a_cause_that_became_too_small_beside_another_is_dropped() -> None:
+    evidence = collect(CONFIG, record(27.0, "leakage=1.7", seed=21))
+    fitted = evidence.judged[::2]
+    both = (Cause("leakage", {"sonic_flow": 1.7}), Cause("response_delay", {"delay": 0.5}))
+    weights = covariance(evidence, both).of(fitted)
+    (found,) = fit(evidence, weights, [both])
+    kept = _confirmed(evidence, fitted, weights, found)
+    assert kept is not None
+    assert kept.effects == ("leakage",)
+
+
 def test_a_great_delay_does_not_look_like_a_small_one() -> None:
     log = recorded(GRIPPER_PLC, 7, 34, [parse_fault("blow_off_delay=31")])
     (cause,) = of(iter([log]), GRIPPER).json["causes"]

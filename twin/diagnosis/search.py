@@ -3,7 +3,8 @@
 Forward: what the linear model promises is fitted in the non-linear one, singles and pairs side by
 side, because the members of a true pair may each look poor alone. What explains most is kept if it
 is worth its price, then the search begins anew about it. Backward: each cause must still be worth
-its price beside the others. Last, each must predict cycles that no size was fitted to.
+its price beside the others. Last, each must predict cycles that no size was fitted to; where the
+first one does not, the search begins again with the next.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -382,12 +383,17 @@ def _beats(alone: float, found: Fitted, volume: float) -> bool:
 
 def _smallest(fitted: Fitted) -> float:
     """The size of the smallest cause, in typical ones."""
+    return min(_sizes_of_causes(fitted))
+
+
+def _sizes_of_causes(fitted: Fitted) -> list[float]:
+    """The size of each cause, in typical ones: of the parameter that is farthest from neutral."""
     first, sizes = 0, []
     for cause in fitted.hypothesis:
         count = len(parameters((cause,)))
         sizes.append(float(np.abs(fitted.x[first : first + count]).max()))
         first += count
-    return min(sizes)
+    return sizes
 
 
 def _pruned(evidence: Evidence, weights: Weights, found: Fitted, healthy: float) -> Fitted:
@@ -407,9 +413,10 @@ def _pruned(evidence: Evidence, weights: Weights, found: Fitted, healthy: float)
 def _confirmed(
     evidence: Evidence, fitted: Sequence[int], weights: Weights, found: Fitted
 ) -> Fitted | None:
-    """Without the causes that do not predict cycles they were not fitted to; None if none is left.
+    """Without causes that are too small or do not predict cycles they were not fitted to.
 
-    Each is left out in turn and the others are fitted anew. The least certain goes first.
+    None if none is left. Each is left out in turn and the others are fitted anew. The least certain
+    goes first.
     """
     held_out = [one for one in evidence.judged if one not in fitted]
     while True:
@@ -422,7 +429,10 @@ def _confirmed(
         without = [one.hypothesis for one in others] or [HEALTHY]
         gains = [held_out_gain(evidence, unseen, one, found.hypothesis) for one in without]
         least = min(range(len(gains)), key=lambda left: gains[left][0])
-        if gains[least][0] > 0.0:
+        sizes_found = _sizes_of_causes(found)
+        if others and min(sizes_found) < SMALLEST_MORE:  # beside the others it became too small
+            least = sizes_found.index(min(sizes_found))
+        elif gains[least][0] > 0.0:
             return found
         if not others:
             return None
