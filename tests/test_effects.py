@@ -1,5 +1,8 @@
 """The table of effects: as promised to the outside, and each one acts as an effect must."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -281,3 +284,16 @@ def test_the_printed_table_lists_all() -> None:
         assert line.startswith(f"| `{name}` | {effect.sentence} |")
         for p in effect.parameters:
             assert f"`{p.name}` {p.low:g} to {p.high:g} {p.unit}" in line
+
+
+def test_the_page_of_effects_has_their_laws() -> None:
+    page = (Path(__file__).parent.parent / "docs" / "effects.md").read_text(encoding="utf-8")
+    for effect in EFFECTS.values():
+        if effect.law:
+            (row,) = (
+                line
+                for line in page.splitlines()
+                if line.startswith(f"| `{effect.name}` | `{effect.law.name}`")
+            )
+            tried = re.sub(r"\(.*?\)", "", row.split("|")[3])
+            assert tuple(float(one) for one in tried.split(",")) == effect.law.tried
