@@ -140,7 +140,7 @@ class FitReachedError(Exception):
 def fitted_on(monkeypatch: pytest.MonkeyPatch, config: Config, samples: Samples) -> FitReachedError:
     """What a commissioning hands to its fit."""
 
-    def stop(used: Samples, guesses: list[DataSet], _: object) -> None:
+    def stop(used: Samples, guesses: list[DataSet], *_: object) -> None:
         raise FitReachedError(used, guesses[0])
 
     monkeypatch.setattr(module, "_fit", stop)
