@@ -11,6 +11,7 @@ import pytest
 from calibrations import log_of, quiet, typed
 from second_rigs import UNKNOWN_TYPE, config_of, samples_of
 from second_world.draw import draw_rig
+from second_world.faults import Fault
 from second_world.records import Record as Logged
 from second_world.records import record
 
@@ -19,8 +20,8 @@ from twin.calibration.calibrate import complete
 from twin.calibration.commission import (
     ELSEWHERE,
     Commissioned,
+    another_ambient,
     commission,
-    elsewhere,
     free_of,
     guessed,
     misplaced,
@@ -47,6 +48,7 @@ from twin.calibration.store import store_first
 from twin.calibration.verdict import Residual, Verdict, judge
 from twin.calibration.weights import Weights
 from twin.config import Asset
+from twin.diagnosis.answer import diagnose
 from twin.errors import ConfigError
 from twin.inference.covariance import Covariance
 from twin.inference.levels import SIGMAS_95
@@ -256,6 +258,21 @@ def test_a_fit_starts_with_lips_that_spread_and_bellows_that_fold_where_there_ar
     assert (rigid, soft > 0.0) == (0.0, True)
 
 
+# What is named on it.
+
+
+def test_a_jet_that_rises_slowly_is_named_or_stands_beside_what_is() -> None:
+    of, found = logged(SEED, KIND), commissioned().calibration
+    config = config_of(of.truth.readable)
+    monitor = config.monitor.model_copy(update={"healthy": found.healthy})
+    config = replace(config, data=found.fitted.data, monitor=monitor)
+    slow = Fault("slow_ramp_up", {"time_constant": 25.0})
+    log = record(draw_rig(SEED, KIND), SEED + 1, CYCLES, [slow])
+    answer = diagnose(config, [samples_of(log)], "log.mcap", quiet).json
+    (cause,) = answer["causes"]
+    assert "slow_ramp_up" in (cause["effect"], *cause["not_separable_from"])
+
+
 # Ambient pressure, where no idle of a record shows it.
 
 
@@ -304,13 +321,13 @@ def test_thresholds_are_at_pressures_whatever_ambient_is() -> None:
 def test_another_ambient_pressure_is_said_with_the_line_to_change() -> None:
     fitted = commissioned().calibration.fitted
     told = fitted.data
-    assert not list(elsewhere(told, fitted))  # opened: it was not fitted
+    assert not list(another_ambient(told, fitted))  # opened: it was not fitted
     free = (*fitted.free, AMBIENT)
     lower = within(told, told.ambient.model_copy(update={"pressure_mbar": 961.8}))
     sure = np.zeros((len(free), len(free)))
     for unsure, said in ((4.0, True), (20.0, False)):
         sure[-1, -1] = unsure**2
-        (*remark,) = elsewhere(told, replace(fitted, data=lower, free=free, covariance=sure))
+        (*remark,) = another_ambient(told, replace(fitted, data=lower, free=free, covariance=sure))
         assert [one.line for one in remark] == ["[data.ambient] pressure_mbar = 962"] * said
 
 
@@ -493,7 +510,7 @@ def test_an_end_pressure_that_the_record_does_not_come_near_is_below_its_deepest
     assert near.interval(END_PRESSURE)[1] < 2.0 * end / MBAR
     assert not far.reaches_end
     assert not far.determined[number]
-    assert far.interval(END_PRESSURE) == (BEST_END / MBAR, end / MBAR + 100.0)
+    assert far.interval(END_PRESSURE) == (BEST_END / MBAR, far.deepest / MBAR)
 
 
 def test_the_interval_of_what_is_scaled_is_one_of_its_logarithm() -> None:

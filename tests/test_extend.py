@@ -154,6 +154,7 @@ def _known(cause: Cause) -> dict[str, Any]:
             "high95": value + 1.96 * SURE * value,
         }
         for name, value in cause.values.items()
+        if name not in cause.law()  # which no answer has
     }
 
 
@@ -177,6 +178,15 @@ def test_the_model_expects_what_the_hypothesis_did(evidence: Evidence) -> None:
     last = slice(evidence.starts[-2], evidence.starts[-1])
     expected = evidence.expected(causes)[last]
     assert np.abs(ticks["expected"][last] - expected).max() < 0.02 * MBAR
+
+
+def test_it_acts_by_the_law_that_was_found(evidence: Evidence) -> None:
+    cause = Cause("slow_ramp_up", {"time_constant": 40.0, "jet_full_at": 0.2})
+    known = extended(found(evidence, cause), rigs.config("test_rig"))
+    assert known is not None
+    assert known.data.ejector.jet_full_at == 0.2
+    assert known.data.effects == {"slow_ramp_up": {"time_constant": 40.0}}
+    np.testing.assert_array_equal(coefficients(known.data), evidence.course((cause,))[0][1])
 
 
 def test_a_step_has_its_size_and_holds_since_its_onset(evidence: Evidence, tmp_path: Path) -> None:

@@ -153,7 +153,7 @@ def commission(
     progress("judging the fit")
     verdict = judge(Cycles.found(samples, fitted.data), fitted.data, readings.noise)
     if verdict.word != "refused":  # a fit that does not follow says nothing of places
-        remarks += [*misplaced(config.data, fitted), *elsewhere(config.data, fitted)]
+        remarks += [*misplaced(config.data, fitted), *another_ambient(config.data, fitted)]
     cycles = complete(fitted.data, samples)
     known = replace(config, data=fitted.data)
     healthy = like_these(known, fitted, scatter(fitted.data, cycles), samples)
@@ -367,11 +367,11 @@ def free_of(config: Config, readings: Readings) -> tuple[Free, ...]:
     """What a fit may move: ambient pressure too, where nothing but the fit can tell it."""
     if readings.opened or config.gauge or np.isfinite(readings.barometer):
         return FREE_IN_MARKET
-    told = config.data.ambient.pressure_mbar != DataSet().ambient.pressure_mbar
+    told = config.data.ambient.pressure_mbar != Ambient().pressure_mbar
     return (*FREE_IN_MARKET, AMBIENT_TOLD if told else AMBIENT)
 
 
-def elsewhere(told: DataSet, fitted: Fitted) -> Iterator[Remark]:
+def another_ambient(told: DataSet, fitted: Fitted) -> Iterator[Remark]:
     """A remark where ambient pressure was fitted and is clearly another than ``told``."""
     keys = [one.name for one in fitted.free]
     if AMBIENT.name not in keys:

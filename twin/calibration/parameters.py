@@ -146,7 +146,7 @@ def with_values(data: DataSet, numbers: Floats, free: Sequence[Free] = FREE) -> 
     if "ambient" in changed:
         higher = changed["ambient"][AMBIENT.key] - data.ambient.pressure_mbar
         for key in ("h1_mbar", "h2_mbar"):
-            changed["ejector"][key] = getattr(data.ejector, key) + higher
+            changed.setdefault("ejector", {})[key] = getattr(data.ejector, key) + higher
     tables = {name: getattr(data, name).model_copy(update=new) for name, new in changed.items()}
     return data.model_copy(update=tables)
 

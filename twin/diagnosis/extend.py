@@ -119,7 +119,7 @@ def _always(diagnosis: Diagnosis) -> Iterator[tuple[str, Sizes]]:
         sizes = cause.at(evidence.theta, *at_end)
         known = {name: sizes[name] for name in answer["parameters"] if _is_always(cause)}
         if known:
-            yield cause.effect, {**cause.way(), **known}
+            yield cause.effect, {**cause.law(), **known}
 
 
 def _joined(data: DataSet, effect: str, found: Sizes) -> dict[str, float]:

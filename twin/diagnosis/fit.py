@@ -76,7 +76,7 @@ class _Trial:
     def kind(self) -> frozenset[object]:
         """What it is a fit of, whatever the sizes."""
         return frozenset(
-            (c.effect, *c.way().values(), c.course, c.onset_s, c.cycles) for c in self.hypothesis
+            (c.effect, *c.law().values(), c.course, c.onset_s, c.cycles) for c in self.hypothesis
         )
 
     def moves(self) -> Floats:

@@ -23,11 +23,11 @@ def parameters(hypothesis: Hypothesis) -> list[Parameter]:
     return [one for cause in hypothesis for one in EFFECTS[cause.effect].parameters]
 
 
-def in_other_ways(hypothesis: Hypothesis, place: int) -> list[Hypothesis]:
+def by_each_law(hypothesis: Hypothesis, place: int) -> list[Hypothesis]:
     """A hypothesis with one of its causes acting by each law that it may act by."""
     cause = hypothesis[place]
     causes = [
-        replace(cause, values={**cause.values, **way}) for way in EFFECTS[cause.effect].ways()
+        replace(cause, values={**cause.values, **law}) for law in EFFECTS[cause.effect].laws()
     ]
     return [(*hypothesis[:place], one, *hypothesis[place + 1 :]) for one in causes]
 
@@ -51,7 +51,7 @@ def sized(evidence: Evidence, hypothesis: Hypothesis, x: Floats) -> Hypothesis:
 
 
 def _sized(evidence: Evidence, cause: Cause, sizes: Iterator[float]) -> Cause:
-    values = cause.way()
+    values = cause.law()
     for p in EFFECTS[cause.effect].parameters:
         change = float(next(sizes)) * p.typical
         if cause.course == Course.RAMP:
@@ -109,7 +109,7 @@ def score_with_tempered_prior(evidence: Evidence, score: float, hypothesis: Hypo
 
 def _price(evidence: Evidence, cause: Cause) -> float:
     effect, cycles = EFFECTS[cause.effect], len(evidence.judged)
-    ways = len(EFFECTS) * len(effect.ways()) / often(evidence, effect)
+    ways = len(EFFECTS) * len(effect.laws()) / often(evidence, effect)
     if cause.course == Course.STEP:
         ways *= LOCAL_ONSETS * cycles
     elif cause.course == Course.RAMP:

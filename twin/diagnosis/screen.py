@@ -76,9 +76,9 @@ class _Gain:
 def columns(evidence: Evidence, weights: Weights, about: Hypothesis = HEALTHY) -> Columns:
     """Signatures of the parameters of all effects that can act, about a hypothesis."""
     taken = [
-        (Cause(effect.name, way), p, share)
+        (Cause(effect.name, law), p, share)
         for effect in acting_on(evidence.theta)
-        for way in effect.ways()
+        for law in effect.laws()
         for p in effect.parameters
         for share in (SHARES_OF_TIMES if p.unit == "ms" else SHARES)
     ]
@@ -242,4 +242,4 @@ def _with_size(evidence: Evidence, cause: Cause, parameter: Parameter, size: flo
     effect = EFFECTS[cause.effect]
     x = np.array([size if p is parameter else 0.0 for p in effect.parameters])
     (whole,) = sized(evidence, (cause,), x)
-    return replace(whole, values={**whole.way(), parameter.name: whole.values[parameter.name]})
+    return replace(whole, values={**whole.law(), parameter.name: whole.values[parameter.name]})

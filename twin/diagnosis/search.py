@@ -18,7 +18,7 @@ from twin.diagnosis.fit import Fitted, fit, interval, profiled, white
 from twin.diagnosis.hypotheses import (
     WEATHER,
     bounds,
-    in_other_ways,
+    by_each_law,
     parameters,
     score_with_tempered_prior,
     score_without_prior,
@@ -192,10 +192,10 @@ def _ends(evidence: Evidence, weights: Weights, found: Fitted) -> tuple[Floats, 
     """95 % interval of each size, by whichever law of a cause the log cannot reject."""
     low, high = interval(evidence, weights, found)
     others = [
-        way
+        other
         for place in range(len(found.hypothesis))
-        for way in in_other_ways(found.hypothesis, place)
-        if way != found.hypothesis
+        for other in by_each_law(found.hypothesis, place)
+        if other != found.hypothesis
     ]
     worst = found.chi2 + CHI2_95 * max(found.leftover**2, 1.0)
     for other in fit(evidence, weights, others) if others else []:
@@ -307,8 +307,7 @@ def _started(
     A delay moves what is sharp: from far away a step towards its true size does not seem to help.
     """
     tried: list[list[Hypothesis]] = []
-    ways = [way for one in hypotheses for way in in_other_ways(one, len(one) - 1)]
-    for hypothesis in ways:
+    for hypothesis in chain.from_iterable(by_each_law(one, len(one) - 1) for one in hypotheses):
         low, high = bounds(evidence, hypothesis)
         x = sizes(evidence, hypothesis)
         last = len(x) - len(parameters(hypothesis[-1:]))

@@ -49,7 +49,7 @@ class Cause:
     onset_s: float = 0.0  # of step and ramp, since the first row
     cycles: frozenset[int] = frozenset()  # of an intermittent one
 
-    def way(self) -> dict[str, float]:
+    def law(self) -> dict[str, float]:
         """The law that it acts by, where that is told beside the sizes."""
         law = EFFECTS[self.effect].law
         return {law.name: self.values[law.name]} if law and law.name in self.values else {}
@@ -64,7 +64,7 @@ class Cause:
             return {}
         if self.course == Course.STEP:
             return self.values
-        grown = self.way()
+        grown = self.law()
         for parameter in EFFECTS[self.effect].parameters:
             rate = self.values.get(parameter.name, 0.0)
             value = parameter.neutral(theta) + rate * (second - self.onset_s) / HOUR

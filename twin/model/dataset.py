@@ -299,7 +299,8 @@ def _set_ejector(theta: Theta, ejector: Ejector, end_ratio: float) -> None:
 
 
 def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
-    total = lumped(system.parts, theta[c.SUCTION], theta[c.AMBIENT], theta[c.TEMPERATURE])
+    suction, ambient, temperature = theta[[c.SUCTION, c.AMBIENT, c.TEMPERATURE]]
+    total = lumped(system.parts, suction, ambient, temperature, system.leak_critical_ratio)
     half_way, ends = system.line_share, (1.0 - system.line_share) / 2.0
     line_volume = system.line_volume_factor * total.line_volume
     inertance = system.line_inertia_factor * total.inertance

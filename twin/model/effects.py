@@ -81,8 +81,8 @@ class Effect:
     acts: Callable[[Theta], bool] = lambda _: True  # whether a unit has what it acts on
     law: Law | None = None
 
-    def ways(self) -> list[dict[str, float]]:
-        """The ways that it may act in, as values beside those of its parameters."""
+    def laws(self) -> list[dict[str, float]]:
+        """The laws that it may act by, as values beside those of its parameters."""
         return [{self.law.name: value} for value in self.law.tried] if self.law else [{}]
 
 

@@ -111,8 +111,17 @@ class Lumped:
     release: float  # Pa of vacuum; NaN where nothing is let go
 
 
-def lumped(parts: tuple[Part, ...], suction: float, ambient: float, temperature: float) -> Lumped:
-    """Add up the parts for a nominal ``suction`` (kg/s) at ``ambient`` (Pa) and ``temperature``."""
+def lumped(
+    parts: tuple[Part, ...],
+    suction: float,
+    ambient: float,
+    temperature: float,
+    critical: float = CRITICAL_RATIO,
+) -> Lumped:
+    """Add up the parts for a nominal ``suction`` (kg/s) at ``ambient`` (Pa) and ``temperature``.
+
+    Rims that are openings are sonic up to the pressure ratio ``critical``.
+    """
     drops = [drop(part, suction, ambient, temperature) for part in parts]
     total = sum(quadratic + linear for quadratic, linear in drops)
     volumes, areas, place, before = np.zeros(3), np.zeros(3), 0.0, 0.0
@@ -127,7 +136,7 @@ def lumped(parts: tuple[Part, ...], suction: float, ambient: float, temperature:
         areas += np.array(where) * area(part)
     cups = [part for part in parts if isinstance(part, Cups)]
     rim = [suction / (cup.free_flow_mbar * MBAR) for cup in cups]
-    hole = [suction / _share(cup.free_flow_mbar * MBAR, ambient) for cup in cups]
+    hole = [suction / _share(cup.free_flow_mbar * MBAR, ambient, critical) for cup in cups]
     return Lumped(
         port_volume=float(volumes[0]),
         port_area=float(areas[0]),
@@ -148,9 +157,9 @@ def lumped(parts: tuple[Part, ...], suction: float, ambient: float, temperature:
     )
 
 
-def _share(vacuum: float, ambient: float) -> float:
+def _share(vacuum: float, ambient: float, critical: float) -> float:
     """Flow through an opening into a ``vacuum`` (Pa) below ``ambient``, over its sonic flow."""
-    share, _ = orifice.py_func(1.0 - vacuum / ambient, CRITICAL_RATIO)  # type: ignore[no-untyped-call]
+    share, _ = orifice.py_func(1.0 - vacuum / ambient, critical)  # type: ignore[no-untyped-call]
     return float(share)
 
 
