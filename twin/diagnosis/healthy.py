@@ -1,12 +1,12 @@
 """What healthy cycles are like: how far the model is off in them, and what scatters by how much."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from twin.diagnosis.evidence import HEALTHY, Evidence, of_cycles
-from twin.diagnosis.weights import covariance, moved
+from twin.diagnosis.evidence import HEALTHY, Evidence
+from twin.diagnosis.weights import Covariance, moved, scatter
 from twin.model.term import KINDS
 from twin.monitor.bins import Floats, Ints, unwarped
 from twin.monitor.healthy import Healthy, ModelError
@@ -21,25 +21,39 @@ HIDDEN = 1.3  # the error over what is left of it once the data set was fitted t
 LEAST_SCATTER, MOST_SCATTER = 0.2, 5.0  # of what is usual
 
 
+@dataclass(frozen=True)
+class _Healthy:
+    """How far the twin is off in healthy cycles (mbar), and what moves that, (bins, ·)."""
+
+    evidence: Evidence
+    off: Floats
+    moves: Floats  # by the usual size of each scatter
+    left_open: Floats  # by each way that the data set is uncertain
+
+    def by(self, healthy: Healthy) -> Covariance:
+        """What bins have in common by what was learned."""
+        evidence = replace(self.evidence, healthy=healthy)
+        _, moves, _ = moved(evidence, HEALTHY, scatter(evidence))
+        return Covariance(evidence, np.zeros_like(self.off), moves, self.left_open)
+
+
 def learned(evidence: Evidence) -> Healthy:
     """Learn the model's error and the scatter from healthy cycles; the rest stays as it is."""
     evidence = replace(evidence, another_day=False)
+    seen = _Healthy(evidence, *moved(evidence, HEALTHY, SCATTER, evidence.uncertain))
     judged = evidence.judged
     halves = [(judged[::2], judged[1::2]), (judged[1::2], judged[::2])]
     if len(judged) < FEWEST:
         halves = [(judged, judged)]
-    left = [
-        _left(replace(evidence, healthy=_learned(of_cycles(evidence, here))), there)
-        for here, there in halves
-    ]
-    return _learned(evidence).model_copy(update={"leftover": _usual(np.concatenate(left))})
+    left = [_left(seen, _learned(seen, here), there) for here, there in halves]
+    return _learned(seen, judged).model_copy(update={"leftover": _usual(np.concatenate(left))})
 
 
-def _left(evidence: Evidence, cycles: Sequence[int]) -> Floats:
+def _left(seen: _Healthy, healthy: Healthy, cycles: Sequence[int]) -> Floats:
     """Chi-square per residual that each cycle has by what was learned from others."""
-    weights = covariance(evidence).of(cycles)
-    white = weights.white(evidence.off([HEALTHY]))[: len(weights.bins), 0]
-    cycle = evidence.bins.cycle[weights.bins]
+    weights = seen.by(healthy).of(cycles)
+    white = weights.white(seen.off[:, None])[: len(weights.bins), 0]
+    cycle = seen.evidence.bins.cycle[weights.bins]
     return np.array([np.mean(white[cycle == one] ** 2) for one in cycles if one in cycle])
 
 
@@ -51,43 +65,41 @@ def _usual(left: Floats) -> float:
     return float(np.sqrt(np.mean(np.minimum(left, ODD * np.median(left)))))
 
 
-def _learned(evidence: Evidence) -> Healthy:
+def _learned(seen: _Healthy, cycles: Sequence[int]) -> Healthy:
+    """What some cycles say."""
+    evidence = seen.evidence
     found = evidence.healthy.model_copy(
         update={"error": dict.fromkeys(KINDS, FIRST_ERROR), "scatter": {}, "leftover": 1.0}
     )
-    off, moves, _ = moved(evidence, HEALTHY, SCATTER)  # in what is usual
     for _ in range(ROUNDS):
-        evidence = replace(evidence, healthy=found)
-        amplitudes, spread = _amplitudes(evidence, off, moves)
-        left = off - np.einsum("bs,bs->b", moves, amplitudes[evidence.bins.cycle])
-        judged = evidence.judged
-        scatter = np.sqrt(amplitudes[judged].var(axis=0, ddof=1) + spread[judged].mean(axis=0))
-        scatter = np.clip(scatter[: len(SCATTER)], LEAST_SCATTER, MOST_SCATTER)
+        amplitudes, spread = _amplitudes(seen, found, cycles)
+        left = seen.off - np.einsum("bs,bs->b", seen.moves, amplitudes[evidence.bins.cycle])
+        sizes = np.sqrt(amplitudes[cycles].var(axis=0, ddof=1) + spread[cycles].mean(axis=0))
+        sizes = np.clip(sizes[: len(SCATTER)], LEAST_SCATTER, MOST_SCATTER)
         found = found.model_copy(
             update={
-                "error": _errors(evidence, left),
+                "error": _errors(evidence, left, cycles),
                 "scatter": {
                     name: float(size * times)
-                    for (name, (_, size)), times in zip(SCATTER.items(), scatter, strict=True)
+                    for (name, (_, size)), times in zip(SCATTER.items(), sizes, strict=True)
                 },
             }
         )
     return found
 
 
-def _amplitudes(evidence: Evidence, off: Floats, moves: Floats) -> tuple[Floats, Floats]:
+def _amplitudes(seen: _Healthy, healthy: Healthy, cycles: Sequence[int]) -> tuple[Floats, Floats]:
     """What scattered in each cycle, in its usual sizes, and with what variance that is known."""
+    evidence, moves = replace(seen.evidence, healthy=healthy), seen.moves
     size = (evidence.cycles, moves.shape[1])
     found, spread = np.zeros(size), np.zeros(size)
-    known = covariance(evidence)
-    known_sizes = [
-        evidence.healthy.scatter.get(name, size) / size for name, (_, size) in SCATTER.items()
-    ]
+    known = Covariance(evidence, np.zeros_like(seen.off), moves, seen.left_open)
+    known_sizes = [healthy.scatter.get(name, size) / size for name, (_, size) in SCATTER.items()]
     prior = np.ones(moves.shape[1])
     prior[: len(known_sizes)] = known_sizes
-    for cycle in evidence.judged:
+    for cycle in cycles:
         alone = known.of([cycle], scattered=False)
-        both = alone.white(np.column_stack([off, moves]))
+        both = alone.white(np.column_stack([seen.off, moves]))
         information = both[:, 1:].T @ both[:, 1:] + np.diag(prior**-2.0)
         variance = np.linalg.inv(information)
         found[cycle] = variance @ both[:, 1:].T @ both[:, 0]
@@ -95,11 +107,11 @@ def _amplitudes(evidence: Evidence, off: Floats, moves: Floats) -> tuple[Floats,
     return found, spread
 
 
-def _errors(evidence: Evidence, left: Floats) -> dict[str, ModelError]:
-    """How far the model is off, by kind of stretch and time since it began."""
-    found = {}
+def _errors(evidence: Evidence, left: Floats, cycles: Sequence[int]) -> dict[str, ModelError]:
+    """How far the model is off in some cycles, by kind of stretch and time since it began."""
+    found, bins = {}, evidence.bins
     for kind, name in enumerate(KINDS):
-        here = np.flatnonzero(evidence.bins.kind == kind)
+        here = np.flatnonzero((bins.kind == kind) & np.isin(bins.cycle, cycles))
         if len(here):
             found[name] = _error(evidence, left, here)
     return found
