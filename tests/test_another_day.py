@@ -13,7 +13,7 @@ from twin.diagnosis.another_day import unsure
 from twin.diagnosis.answer import diagnose
 from twin.diagnosis.evidence import HEALTHY, Evidence, collect
 from twin.diagnosis.hypotheses import often, price
-from twin.diagnosis.screen import columns, promises
+from twin.diagnosis.screen import columns, promises, signatures
 from twin.diagnosis.weights import covariance
 from twin.model import theta as c
 from twin.model.courses import Cause
@@ -151,7 +151,8 @@ def test_an_effect_that_does_nothing_on_a_unit_is_no_hypothesis() -> None:
 
 def offered(evidence: Evidence) -> set[str]:
     weights = covariance(evidence).of(evidence.judged)
-    found = promises(evidence, weights, columns(evidence, weights), each=1)
+    moved = signatures(evidence, weights.cycles)
+    found = promises(evidence, weights, columns(evidence, weights, moved), each=1)
     return {one.hypothesis[0].effect for one in found}
 
 

@@ -22,10 +22,10 @@ from twin.diagnosis import answer as answer_module
 from twin.diagnosis import search as search_module
 from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.diagnosis.evidence import HEALTHY, Hypothesis, _unsettled, collect, thinned
-from twin.diagnosis.fit import Fitted, fit
+from twin.diagnosis.fit import Fitted
 from twin.diagnosis.hypotheses import price
 from twin.diagnosis.judge import gain, judge
-from twin.diagnosis.search import _confirmed, held_out_gain, tried_in_or_out
+from twin.diagnosis.search import _about, _confirmed, held_out_gain, tried_in_or_out
 from twin.diagnosis.unlisted import Unlisted, look
 from twin.diagnosis.weights import covariance, levels
 from twin.model import theta as c
@@ -130,9 +130,7 @@ def confirmed(diagnosis: Diagnosis, *causes: Cause) -> Hypothesis:
     """What is left of causes, once they were fitted and asked for a gain on unseen cycles."""
     evidence, held_out = diagnosis.evidence, diagnosis.held_out
     cycles = [one for one in evidence.judged if one not in held_out]
-    weights = covariance(evidence, causes).of(cycles)
-    (found,) = fit(evidence, weights, [causes])
-    left = _confirmed(evidence, cycles, weights, found)
+    left = _confirmed(evidence, cycles, _about(evidence, cycles, causes))
     return () if left is None else left.hypothesis
 
 
@@ -464,9 +462,7 @@ def test_a_cause_that_became_too_small_beside_another_is_dropped() -> None:
     evidence = collect(CONFIG, record(27.0, "leakage=1.7", seed=21))
     fitted = evidence.judged[::2]
     both = (Cause("leakage", {"sonic_flow": 1.7}), Cause("response_delay", {"delay": 0.5}))
-    weights = covariance(evidence, both).of(fitted)
-    (found,) = fit(evidence, weights, [both])
-    kept = _confirmed(evidence, fitted, weights, found)
+    kept = _confirmed(evidence, fitted, _about(evidence, fitted, both))
     assert kept is not None
     assert kept.effects == ("leakage",)
 

@@ -142,16 +142,16 @@ def fitted(*causes: Cause, left: float) -> Fitted:
 def searched(name: str) -> Search:
     """What a search could have found, with a look-alike of the first cause."""
     hypothesis = HYPOTHESES[name]
-    weights = covariance(evidence()).of(FITTED)
+    known = covariance(evidence(), hypothesis)
     alike = fitted(Cause("porous_leakage", {}), *hypothesis[1:], left=1.02)
     ends = np.full(len(hypothesis), 0.9), np.full(len(hypothesis), 1.1)
     singles = [("leakage", 1.0), ("porous_leakage", 1.02), ("sensor_gain", 1.8)]
     ranking = [fitted(Cause(name, {}), left=left) for name, left in singles]
     if not hypothesis:
-        return Search(weights, 100.0, None, ranking, [], ends, [])
+        return Search(known, 100.0, None, ranking, [], ends, [])
     found = fitted(*hypothesis, left=0.97)
     rivals = [[alike], *[[] for _ in hypothesis[1:]]]
-    return Search(weights, 900.0, found, ranking, rivals, ends, [(9.9, 10.1)] * len(hypothesis))
+    return Search(known, 900.0, found, ranking, rivals, ends, [(9.9, 10.1)] * len(hypothesis))
 
 
 def answer(**changed: Any) -> dict[str, Any]:

@@ -68,13 +68,15 @@ class Round:
     tolerance: float  # of the cost, below which it is done
 
 
-# All starts are tried on a few cycles; what they are off by is narrowed with what is left of them.
+# All starts are tried on a few cycles, and half of what is left falls behind in each round; what
+# they are off by is narrowed with those that remain.
 NARROWING = (
-    Round(100, 0.3, 5.0 * MBAR, 8, 1e-2),
-    Round(6, 0.3, 5.0 * MBAR, 17, 1e-2),
-    Round(3, 0.3, 1.5 * MBAR, 20, 1e-3),
-    Round(3, 0.3, 0.6 * MBAR, 20, 1e-3),
-    Round(2, 1.0, 0.6 * MBAR, 40, 1e-4),
+    Round(100, 0.3, 5.0 * MBAR, 4, 1e-2),
+    Round(6, 0.3, 5.0 * MBAR, 8, 1e-2),
+    Round(3, 0.3, 5.0 * MBAR, 15, 1e-2),
+    Round(2, 0.3, 1.5 * MBAR, 20, 1e-3),
+    Round(2, 0.3, 0.6 * MBAR, 20, 1e-3),
+    Round(1, 1.0, 0.6 * MBAR, 40, 1e-4),
 )
 # Sigmas, beyond which a residual pulls less than its square; below, it is what a fit gets wrong.
 ROBUST = 8.0

@@ -101,7 +101,7 @@ def diagnose(
         searched = sharpened(whole, evidence, searched)
     found = searched.found.hypothesis if searched.found else HEALTHY
     progress("judging on the cycles it has not seen")
-    known = covariance(evidence, found) if found else healthy
+    known = searched.known
     before = judge(evidence, healthy.of(held_out), HEALTHY)
     after = judge(evidence, known.of(held_out), found)
     progress("looking for what nobody listed")

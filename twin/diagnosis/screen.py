@@ -73,8 +73,21 @@ class _Gain:
     option: _Option
 
 
-def columns(evidence: Evidence, weights: Weights, about: Hypothesis = HEALTHY) -> Columns:
-    """Signatures of the parameters of all effects that can act, about a hypothesis."""
+@dataclass(frozen=True)
+class Signatures:
+    """How the parameters of all effects that can act move pressure and switching levels (mbar)."""
+
+    names: list[tuple[Cause, Parameter]]
+    healthy: Floats  # what the hypothesis is off by that they are about, (bins,)
+    off: Floats  # (bins, parameters)
+    usual: Floats  # the same of levels
+    level: Floats
+
+
+def signatures(
+    evidence: Evidence, cycles: Sequence[int], about: Hypothesis = HEALTHY
+) -> Signatures:
+    """Simulate each parameter a little away from a hypothesis, in all cycles alike."""
     taken = [
         (Cause(effect.name, law), p, share)
         for effect in acting_on(evidence.theta)
@@ -86,8 +99,14 @@ def columns(evidence: Evidence, weights: Weights, about: Hypothesis = HEALTHY) -
     moved = [(*about, _with_size(evidence, cause, p, x)) for cause, p, x in taken]
     hypotheses = [about, *moved]
     healthy, off = derivatives(evidence.off(hypotheses), shares)
-    usual, level = derivatives(levels(evidence, weights.cycles, hypotheses), shares)
-    base = weights.white(healthy[:, None], usual[:, None])[:, 0]
+    usual, level = derivatives(levels(evidence, cycles, hypotheses), shares)
+    return Signatures(names, healthy, off, usual, level)
+
+
+def columns(evidence: Evidence, weights: Weights, moved: Signatures) -> Columns:
+    """Signatures weighed, cycle by cycle."""
+    names, off, level = moved.names, moved.off, moved.level
+    base = weights.white(moved.healthy[:, None], moved.usual[:, None])[:, 0]
     parts = []
     for cycle in weights.cycles:
         inside = (evidence.bins.cycle == cycle)[:, None]

@@ -25,7 +25,7 @@ from twin.diagnosis.hypotheses import (
     sized,
     sizes,
 )
-from twin.diagnosis.screen import columns, pairs, promises
+from twin.diagnosis.screen import Columns, Signatures, columns, pairs, promises, signatures
 from twin.diagnosis.weights import Covariance, Weights, covariance
 from twin.inference.levels import CHI2_95, CHI2_999, SIGMAS_95
 from twin.model.courses import Cause, Course
@@ -49,7 +49,8 @@ HOPEFUL = 5.0  # chi-square that the linear model must promise of one more cause
 TRIED_PAIRS, TRIED_MORE, TRIED_TIMES = 12, 8, 6
 SECOND = 0.5  # of the best gain, above which an effect's second course is fitted as well
 NEARLY = 0.3  # of the best gain, above which an effect may turn out to be a rival
-START = np.array([0.4, 1.0, 1.7, 2.5, 3.5, 5.0])  # typical sizes to begin a fit from
+START = np.array([0.4, 1.4, 4.0])  # typical sizes to begin a fit from
+START_OF_TIMES = np.array([0.4, 1.0, 1.7, 2.5, 3.5, 5.0])  # what moves an edge is far from linear
 MOST_FLIPS = 3  # rounds of looking for the cycles that something comes in
 WORTH_FLIPPING = 5.0  # chi-square that another set of cycles must gain
 ONSETS, MANY_ONSETS = 16, 64  # in a round of looking for when a step began
@@ -64,8 +65,8 @@ _NO_SIZES = np.empty(0), np.empty(0)
 class Search:
     """What the search found: the causes with their rivals, judged alike."""
 
-    weights: Weights  # of the fitted cycles, about what was found
-    healthy: float  # chi-square without any cause
+    known: Covariance  # about what was found
+    healthy: float  # chi-square without any cause, of the fitted cycles
     found: Fitted | None
     ranking: list[Fitted]  # of all single causes, and of what was found
     rivals: list[list[Fitted]]  # of each cause: what could stand in its place
@@ -83,25 +84,26 @@ def search(
     """
     progress("screening all effects and courses")
     judged, weights = known.of(evidence.judged), known.of(fitted)
-    tried = _fit_singles(evidence, judged, weights, progress)
+    alone = signatures(evidence, evidence.judged)
+    tried = _fit_singles(evidence, judged, weights, alone, progress)
     singles = _ranked(evidence, judged, tried)
     healthy = _healthy(evidence, weights)
     if not any(_worth(healthy, healthy, 0.0, one) for one in singles):
-        return Search(weights, healthy, None, singles, [], _NO_SIZES, [])
+        return Search(known, healthy, None, singles, [], _NO_SIZES, [])
     firsts = _likeliest(evidence, fitted, tried, singles, progress)[:TRIED_FIRST]
     for first in firsts:
         here = _about(evidence, fitted, first.hypothesis)
         others = [one.hypothesis for one in singles if one.effects != first.effects]
-        rest = fit(evidence, here.weights, others)
+        rest = fit(evidence, here.weights, others, best_only=True)
         ranked = [here.found, *sorted(rest, key=lambda one: one.score)]
-        here = _added(evidence, fitted, here, ranked, progress)
+        here = _added(evidence, fitted, here, ranked, alone, progress)
         progress("asking cycles that nothing was fitted to")
-        confirmed = _confirmed(evidence, fitted, here.weights, here.found)
-        alone = healthy + weights.volume
-        if confirmed and _beats(alone, confirmed, here.weights.volume):
+        confirmed = _confirmed(evidence, fitted, here)
+        none = healthy + weights.volume
+        if confirmed and _beats(none, confirmed, here.weights.volume):
             break
     else:
-        return Search(weights, healthy, None, singles, [], _NO_SIZES, [])
+        return Search(known, healthy, None, singles, [], _NO_SIZES, [])
     singles = ranked
     if confirmed is not here.found:
         here = _about(evidence, fitted, confirmed.hypothesis)
@@ -113,7 +115,7 @@ def search(
         for number in range(len(found.hypothesis))
     ]
     ends = _ends(evidence, here.weights, found)
-    return Search(here.weights, here.healthy, found, singles, rivals, ends, onsets)
+    return Search(here.known, here.healthy, found, singles, rivals, ends, onsets)
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,7 @@ class _Found:
     """Causes with the sizes that suit them best by weights about themselves."""
 
     found: Fitted
+    known: Covariance
     judged: Weights  # of all judged cycles
     weights: Weights  # of the fitted ones
     healthy: float  # chi-square without any cause
@@ -128,9 +131,10 @@ class _Found:
 
 def _about(evidence: Evidence, fitted: Sequence[int], hypothesis: Hypothesis) -> _Found:
     """A hypothesis fitted anew, weighed by what scatters and is uncertain about it."""
-    judged, weights = _weights(evidence, fitted, hypothesis)
+    known = covariance(evidence, hypothesis)
+    weights = known.of(fitted)
     (found,) = fit(evidence, weights, [hypothesis])
-    return _Found(found, judged, weights, _healthy(evidence, weights))
+    return _Found(found, known, known.of(evidence.judged), weights, _healthy(evidence, weights))
 
 
 def _added(
@@ -138,6 +142,7 @@ def _added(
     fitted: Sequence[int],
     here: _Found,
     singles: Sequence[Fitted],
+    alone: Signatures,
     progress: Progress,
 ) -> _Found:
     """With more causes, while one more is worth its price; less those that no longer are."""
@@ -149,7 +154,7 @@ def _added(
             break
         before.add(found.kind)
         progress(f"looking for what else there is beside {', '.join(found.effects)}")
-        more = _best_addition(evidence, here, singles)
+        more = _best_addition(evidence, here, singles, alone)
         if more is None:
             break
         here = _about(evidence, fitted, more.hypothesis)
@@ -176,7 +181,8 @@ def _beside_rivals(
         better = _overtaking(here.found, rivals)
         if better is None or better.kind in looked:
             break
-        if _confirmed(evidence, fitted, here.weights, better) is not better:
+        known = covariance(evidence, better.hypothesis)
+        if _confirmed(evidence, fitted, replace(here, found=better, known=known)) is not better:
             break
         here = _about(evidence, fitted, better.hypothesis)
     if here.found.effects == (WEATHER,):  # it may have come first by its prior alone
@@ -184,7 +190,8 @@ def _beside_rivals(
             [here.found, *rivals[0]],
             key=lambda one: score_with_tempered_prior(evidence, one.score, one.hypothesis),
         )
-        here = replace(here, found=found)
+        if found is not here.found:
+            here = replace(here, found=found, known=covariance(evidence, found.hypothesis))
     return here, rivals
 
 
@@ -203,14 +210,6 @@ def _ends(evidence: Evidence, weights: Weights, found: Fitted) -> tuple[Floats, 
             also = interval(evidence, weights, other)
             low, high = np.minimum(low, also[0]), np.maximum(high, also[1])
     return low, high
-
-
-def _weights(
-    evidence: Evidence, fitted: Sequence[int], about: Hypothesis
-) -> tuple[Weights, Weights]:
-    """Weights about a hypothesis, of all judged cycles and of the fitted ones."""
-    known = covariance(evidence, about)
-    return known.of(evidence.judged), known.of(fitted)
 
 
 def _healthy(evidence: Evidence, weights: Weights) -> float:
@@ -233,10 +232,10 @@ def _ranked(evidence: Evidence, judged: Weights, found: Sequence[Fitted]) -> lis
 
 
 def _fit_singles(
-    evidence: Evidence, judged: Weights, weights: Weights, progress: Progress
+    evidence: Evidence, judged: Weights, weights: Weights, alone: Signatures, progress: Progress
 ) -> list[Fitted]:
     """Fit every effect with its most promising courses."""
-    promised = promises(evidence, judged, columns(evidence, judged), each=2)
+    promised = promises(evidence, judged, columns(evidence, judged, alone), each=2)
     first = {one.hypothesis[0].effect: one for one in reversed(promised)}
     hypotheses = [
         one.hypothesis
@@ -269,7 +268,8 @@ def _likeliest(
     near += [one for one in _weather(evidence, ranked) if not any(one is other for other in near)]
 
     def alone(first: Fitted) -> tuple[float, float, Fitted]:
-        judged, weights = _weights(evidence, fitted, first.hypothesis)
+        known = covariance(evidence, first.hypothesis, both_ways=False)
+        judged, weights = known.of(evidence.judged), known.of(fitted)
         (one,) = fit(evidence, weights, [first.hypothesis])
         chi2 = float(np.sum(white(evidence, judged, [one.hypothesis]) ** 2))
         price = one.score - one.chi2
@@ -312,7 +312,8 @@ def _started(
         x = sizes(evidence, hypothesis)
         last = len(x) - len(parameters(hypothesis[-1:]))
         around = [x]
-        for size in (*-START, *START):
+        tried_sizes = START_OF_TIMES if parameters(hypothesis[-1:])[0].unit == "ms" else START
+        for size in (*-tried_sizes, *tried_sizes):
             if low[last] < size < high[last]:
                 around.append(np.concatenate([x[:last], [size], x[last + 1 :]]))
         tried.append([sized(evidence, hypothesis, one) for one in around])
@@ -325,16 +326,19 @@ def _started(
     return best
 
 
-def _best_addition(evidence: Evidence, here: _Found, singles: Sequence[Fitted]) -> Fitted | None:
+def _best_addition(
+    evidence: Evidence, here: _Found, singles: Sequence[Fitted], alone: Signatures
+) -> Fitted | None:
     """What is found with one more cause, or a pair in its place; None if not worth it."""
     found, judged, weights = here.found, here.judged, here.weights
     about = found.hypothesis
-    promised = promises(evidence, judged, columns(evidence, judged, about), each=2)
+    beside = signatures(evidence, judged.cycles, about)
+    promised = promises(evidence, judged, columns(evidence, judged, beside), each=2)
     new = [one for one in promised if one.hypothesis[0].effect not in found.effects]
     new = [one for one in new[:TRIED_MORE] if one.gain > HOPEFUL]
     candidates = _started(evidence, judged, [(*about, *one.hypothesis) for one in new])
     if len(about) == 1:
-        candidates += _linear_pairs(evidence, judged)
+        candidates += _linear_pairs(evidence, judged, columns(evidence, judged, alone))
         candidates += _fitted_pairs(evidence, weights, singles[:TRIED_PAIRS], found)
     candidates = _timed(evidence, judged, candidates)
     tried = _ranked(evidence, judged, fit(evidence, weights, candidates, best_only=True))
@@ -344,9 +348,8 @@ def _best_addition(evidence: Evidence, here: _Found, singles: Sequence[Fitted]) 
     return None
 
 
-def _linear_pairs(evidence: Evidence, judged: Weights) -> list[Hypothesis]:
+def _linear_pairs(evidence: Evidence, judged: Weights, alone: Columns) -> list[Hypothesis]:
     """Pairs that explain more than any single cause in the linear model."""
-    alone = columns(evidence, judged)
     singles = promises(evidence, judged, alone, each=2)
     two = pairs(evidence, judged, alone, singles)[:TRIED_PAIRS]
     return [one.hypothesis for one in two if one.gain > singles[0].gain + HOPEFUL]
@@ -409,17 +412,16 @@ def _pruned(evidence: Evidence, weights: Weights, found: Fitted, healthy: float)
     return found
 
 
-def _confirmed(
-    evidence: Evidence, fitted: Sequence[int], weights: Weights, found: Fitted
-) -> Fitted | None:
+def _confirmed(evidence: Evidence, fitted: Sequence[int], here: _Found) -> Fitted | None:
     """Without causes that are too small or do not predict cycles they were not fitted to.
 
     None if none is left. Each is left out in turn and the others are fitted anew. The least certain
     goes first.
     """
     held_out = [one for one in evidence.judged if one not in fitted]
+    found, weights, known = here.found, here.weights, here.known
     while True:
-        unseen = covariance(evidence, found.hypothesis).of(held_out)
+        unseen = known.of(held_out)
         without = [
             tuple(c for i, c in enumerate(found.hypothesis) if i != left)
             for left in range(len(found.hypothesis))
@@ -436,6 +438,7 @@ def _confirmed(
         if not others:
             return None
         found = others[least]
+        known = covariance(evidence, found.hypothesis)
 
 
 def held_out_gain(
@@ -472,7 +475,8 @@ def _rivals(
     def instead_of(left: int) -> list[Fitted]:
         others = tuple(c for i, c in enumerate(found.hypothesis) if i != left)
         if others:
-            promised = promises(evidence, judged, columns(evidence, judged, others), each=1)
+            beside = columns(evidence, judged, signatures(evidence, judged.cycles, others))
+            promised = promises(evidence, judged, beside, each=1)
             tried = [
                 (*others, *one.hypothesis)
                 for one in promised
@@ -594,7 +598,8 @@ def sharpened(whole: Evidence, part: Evidence, searched: Search) -> Search:
         if cause.course == Course.STEP:
             hypothesis, onsets[number] = _sharp_onset(whole, part, found, number)
             found = replace(found, hypothesis=hypothesis)
-    return replace(searched, found=found, onsets=onsets)
+    known = covariance(part, found.hypothesis)
+    return replace(searched, known=known, found=found, onsets=onsets)
 
 
 def _sharp_onset(

@@ -98,11 +98,17 @@ def _usual(variance: Floats, count: Ints, noise: float) -> float:
     return float(np.sqrt(np.average(rows, weights=count))) if len(count) else 0.0
 
 
-def covariance(evidence: Evidence, about: Hypothesis = HEALTHY) -> Covariance:
-    """What scatters and is uncertain about a hypothesis."""
+def covariance(
+    evidence: Evidence, about: Hypothesis = HEALTHY, *, both_ways: bool = True
+) -> Covariance:
+    """What scatters and is uncertain about a hypothesis.
+
+    Where the data set is not varied ``both_ways``, how what it leaves open bends is not seen: that
+    takes half the time, and is near enough to compare hypotheses.
+    """
     sizes = scatter(evidence)
     uncertain = (*evidence.uncertain, *_another_day(evidence, about))
-    off, moves, left_open = moved(evidence, about, sizes, uncertain)
+    off, moves, left_open = moved(evidence, about, sizes, uncertain, both_ways=both_ways)
     (healthy,) = evidence.off([HEALTHY]).T
     return Covariance(evidence, MISMATCH * np.abs(healthy - off), moves, left_open)
 
@@ -123,12 +129,14 @@ def moved(
     about: Hypothesis,
     sizes: Mapping[str, tuple[str, float]],
     uncertain: Sequence[tuple[Theta, Theta]] = (),
+    *,
+    both_ways: bool = True,
 ) -> tuple[Floats, Floats, Floats]:
     """Deviation of a hypothesis (mbar), and by how much it moves, (bins, ·).
 
     By each scatter's size; then by one sigma of what else differs from cycle to cycle: when the
     valves close, and where a knee was found; then by what is not linear in such times. Last by the
-    ``uncertain`` data sets, in the same way.
+    ``uncertain`` data sets, in the same way; not ``both_ways``, only by the first of each.
     """
     steady = [(*about, Cause(name, {key: size})) for name, (key, size) in sizes.items()]
     acts = [(_ACTS[name], size) for name, (_, size) in sizes.items() if name in _ACTS]
@@ -138,7 +146,8 @@ def moved(
     both = [(_acting(evidence.theta, *one, sign), 0) for sign in (1, -1) for one in times]
     both[len(times) : len(times)] = [(evidence.theta, late)]
     both.append((evidence.theta, -late))
-    both += [(up, 0) for up, _ in uncertain] + [(down, 0) for _, down in uncertain]
+    both += [(up, 0) for up, _ in uncertain]
+    both += [(down, 0) for _, down in uncertain if both_ways]
     as_it_is = len(steady) + 1
     off = evidence.off(
         [about, *steady, *[about] * len(both)],
@@ -147,8 +156,8 @@ def moved(
     )
     ends = np.cumsum([len(steady), *[len(times) + 1] * 2, len(uncertain)])
     as_found, changes = derivatives(off)
-    linear, *apart = np.split(changes, ends, axis=1)
-    moves, left_open = (central(*two) for two in (apart[:2], apart[2:]))
+    linear, sooner, later, up, down = np.split(changes, ends, axis=1)
+    moves, left_open = central(sooner, later), central(up, down) if both_ways else (up,)
     return as_found, np.hstack([linear, *moves]), np.hstack(left_open)
 
 
