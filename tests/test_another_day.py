@@ -133,8 +133,8 @@ def test_a_gauge_sensor_reads_ambient_as_it_was_assumed() -> None:
     ],
 )
 def test_the_configuration_says_what_the_sensor_counts_from(text: str, gauge: bool) -> None:
-    config: Config = replace(rigs.config("gripper"), document=Document.parse(text, "x.toml"))
-    assert config.gauge == gauge
+    text = f"{text}\n[data.supply]\npressure_bar = 5.0"
+    assert Config.of(Document.parse(text, "x.toml"), calibrated=False).gauge == gauge
 
 
 # --- what cannot act ------------------------------------------------------------------------------

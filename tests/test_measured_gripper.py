@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 import rigs
 from command_line import twin as command
+from table_rows import SMALL
 from test_derive import DATA, known, written
 
 import twin
+from twin.config import Config
 from twin.errors import ConfigError
 from twin.log.reader import open_log
 from twin.signals import Command
@@ -166,3 +168,19 @@ def test_a_notebook_opens_it_with_a_warning() -> None:
     assert log.columns()["suction"][0]
     with pytest.raises(ConfigError, match=NEEDS_COMMANDS):
         twin.calibrate(log)
+
+
+@pytest.mark.parametrize(("column", "gauge"), [("vacuum_mbar", True), ("pressure_mbar", False)])
+def test_a_log_of_a_table_says_what_its_pressure_counts_from(
+    column: str, gauge: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Weather moves the readings of one sensor and not of the other, whoever looks at the log."""
+    text = SMALL if column == "pressure_mbar" else SMALL.replace("pressure_mbar", column)
+    file, config = tmp_path / "t.csv", rigs.path_of("gripper")
+    file.write_text(text)
+    log, again = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    assert command(monkeypatch, "import", file, "--config", config, "-o", log) == 0
+    assert command(monkeypatch, "replay", log, "--config", config, "-o", again) == 0
+    for one in (log, again):
+        assert Config.of_recorded(open_log(one).header, one.name).gauge == gauge
+    assert twin.open(file, config).config.gauge == gauge

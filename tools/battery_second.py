@@ -140,7 +140,6 @@ class Person:
     """What somebody reads off a rig: the configuration, and how records reach the twin."""
 
     config: Config
-    gauge: bool
 
     @classmethod
     def at(cls, told: Mapping[str, Any], name: str) -> "Person":
@@ -165,12 +164,13 @@ class Person:
         text = configuration(Path(f"{name}.toml"), (name, ""), None, sensor, system, ())
         if (ambient := known("ambient_mbar")) is not None:  # where a barometer hangs
             text += f"\n[data.ambient]\npressure_mbar = {ambient}\n"
-        return cls(Config.of(Document.parse(text, name), calibrated=False), gauge)
+        config = Config.of(Document.parse(text, name), calibrated=False)
+        return cls(replace(config, gauge=gauge))
 
     def samples(self, logged: Record) -> Samples:
         """A record as ``twin import`` takes it in, gaps marked."""
         columns = logged.columns()
-        if not self.gauge:
+        if not self.config.gauge:
             columns["pressure_mbar"] = logged.pressure_pa / MBAR
             del columns["vacuum_mbar"]
         ambient = self.config.data.ambient.pressure_mbar * MBAR

@@ -242,6 +242,7 @@ def open(  # noqa: A001  (as a module's open is called)
     else:
         settings = _configured(config, assets, unit)
         source = _table(path, settings, derive_commands)
+        settings = replace(settings, gauge=source.counts_from_ambient)
         remark = f"columns not taken: {', '.join(source.ignored)}" if source.ignored else ""
     log = Log(path, settings, assets, _source=source)
     for what in filter(None, (remark, log._header.derived, settings.instead if unit else "")):
@@ -285,7 +286,8 @@ def calibrate(log: Log, progress: Progress = _quiet) -> Calibrated:
     """
     log._header.require_commands(str(log.path))
     document, unit = log.config.document, log.config.asset.id
-    settings = Config.of(document, log.assets, unit, calibrated=False)
+    known = Config.of(document, log.assets, unit, calibrated=False)
+    settings = replace(known, gauge=log.config.gauge)
     found = fit_unit(settings, log._samples(), progress)
     monitor = settings.monitor.model_copy(update={"healthy": found.healthy})
     fitted = replace(settings, data=found.fitted.data, monitor=monitor, origin=f"{log.path}")
@@ -319,7 +321,7 @@ def _of_log(recorded: Recorded, config: Place | Config | None, assets: str, unit
     settings = _configured(config, assets, unit, recorded.header.asset_id)
     if not unit:
         settings.refuse_another(recorded.header, name)
-    return settings
+    return settings.of_rows(recorded.header)
 
 
 def _table(path: Path, settings: Config, derive: bool) -> Table:

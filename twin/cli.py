@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from threading import Lock
@@ -370,6 +371,7 @@ def calibrate(
         raise ConfigError("no unit is named", "give --id ID, or [asset] id in the configuration")
     recorded = open_log(log)
     recorded.header.require_commands(str(log))
+    settings = settings.of_rows(recorded.header)
     say_if_cut(recorded, log, "used")
     with _status() as say:
         calibration = fit_unit(settings, (rows for rows, _ in recorded.blocks()), say)
@@ -420,6 +422,8 @@ def commission(
     else:
         document = document_in(recorded.header)
     settings = Config.of(document, assets, unit, calibrated=False)
+    if recorded is not None:
+        settings = settings.of_rows(recorded.header)
     if not settings.asset.id:
         raise ConfigError("no unit is named", "give --id ID, or [asset] id in the configuration")
     with _status() as say:
@@ -490,6 +494,7 @@ def import_(
     wanted = settings.document.section(ImportSettings, "import")
     ambient = settings.data.ambient.pressure_mbar * MBAR
     table = open_table(file, wanted, ambient, derive=derive_commands)
+    settings = replace(settings, gauge=table.counts_from_ambient)
     if table.ignored:
         print(f"twin: columns not taken: {', '.join(table.ignored)}", file=sys.stderr)
     unmeasured = {}

@@ -197,7 +197,7 @@ class _Fleet:
         calibrated = work != "calibrate"
         config = Config.of(document, str(self.assets), unit, calibrated=calibrated, own=unit)
         config.refuse_another(header, str(log.path))
-        return config
+        return config.of_rows(header)
 
 
 def _done(work: str, files: Sequence[Path], fleet: _Fleet, engine: _Engine) -> "list[Told]":

@@ -51,6 +51,7 @@ TABLES = {
 }
 NO_TYPE = "unknown"
 FROM_AMBIENT = ("gauge", "vacuum")  # references of a tag
+COUNTED_FROM, AMBIENT = "counted_from", "ambient"  # in a log's metadata, of its pressure
 HAND_WRITTEN = "[data] of the configuration"
 _WORDS = {"type": "object-specific data", "instance": "instance-specific data"}
 
@@ -89,6 +90,7 @@ class Config:
     log: LogSettings
     origin: str = HAND_WRITTEN  # where the data set is from, in words
     instead: str = ""  # of the unit's own data set, which nobody has: what is used, in words
+    gauge: bool = False  # whether the pressure sensor counts from ambient, as far as is known
 
     @classmethod
     def of(
@@ -165,21 +167,17 @@ class Config:
         known = bool(assets) and not (to_store and is_new(assets, document))
         if instead is not None or known or unit or as_of_ns is not None:
             own = header.asset_id
-            return cls.of(document, assets, unit, as_of_ns=as_of_ns, own=own, to_store=to_store)
-        config = cls.of_log(document, header.metadata, log)
-        # --id may have named another unit than the configuration does.
-        named = {"type": header.asset_type, "id": header.asset_id}
-        return replace(config, asset=config.asset.model_copy(update=named))
+            config = cls.of(document, assets, unit, as_of_ns=as_of_ns, own=own, to_store=to_store)
+        else:
+            config = cls.of_log(document, header.metadata, log)
+            # --id may have named another unit than the configuration does.
+            named = {"type": header.asset_type, "id": header.asset_id}
+            config = replace(config, asset=config.asset.model_copy(update=named))
+        return config.of_rows(header)
 
-    @property
-    def gauge(self) -> bool:
-        """Whether the pressure sensor counts from ambient, as far as the configuration says so."""
-        tables = self.document.tables
-        with suppress(KeyError, TypeError):
-            return bool(tables["driver"]["tags"]["pressure"]["reference"] in FROM_AMBIENT)
-        with suppress(KeyError, TypeError):
-            return any(str(name).startswith("vacuum_") for name in tables["import"]["columns"])
-        return False
+    def of_rows(self, header: LogHeader) -> "Config":
+        """The same for the rows of a log: they say what their pressure counts from."""
+        return replace(self, gauge=self.gauge or header.metadata.get(COUNTED_FROM) == AMBIENT)
 
     def log_header(self, unmeasured: Mapping[str, str] | None = None) -> LogHeader:
         """What a log of this unit must carry to be replayed alone.
@@ -192,6 +190,7 @@ class Config:
             "origin": self.origin,
             "data": self.data.model_dump_json(),
             "healthy": self.monitor.healthy.model_dump_json(),
+            **({COUNTED_FROM: AMBIENT} if self.gauge else {}),
             **(unmeasured or {}),
         }
         return LogHeader(
@@ -220,7 +219,17 @@ class Config:
         monitor = document.section(MonitorSettings, "monitor")
         monitor = monitor.model_copy(update={"healthy": known.healthy})
         log = document.section(LogSettings, "log")
-        return cls(document, asset, known.data, monitor, log, origin)
+        gauge = _counts_from_ambient(document.tables)
+        return cls(document, asset, known.data, monitor, log, origin, gauge=gauge)
+
+
+def _counts_from_ambient(tables: Tables) -> bool:
+    """Whether the tag, or the column, of the pressure is said to count from ambient."""
+    with suppress(KeyError, TypeError):
+        return bool(tables["driver"]["tags"]["pressure"]["reference"] in FROM_AMBIENT)
+    with suppress(KeyError, TypeError):
+        return any(str(name).startswith("vacuum_") for name in tables["import"]["columns"])
+    return False
 
 
 def document_in(header: LogHeader) -> Document:

@@ -56,6 +56,11 @@ class Table:
         """How commands were derived, in words; empty where the file has them."""
         return "" if self.derived is None else self.derived.words(self.layout.lacking)
 
+    @property
+    def counts_from_ambient(self) -> bool:
+        """Whether the pressure's column is a vacuum."""
+        return self.layout.pressure in BELOW_AMBIENT
+
     def with_commands(self) -> "Table":
         """The same with the commands that the file lacks, found from the pressure of all its rows.
 
@@ -63,7 +68,7 @@ class Table:
         """
         try:
             # A vacuum counts from ambient; of an absolute pressure nobody knows where that is.
-            zero = self.ambient if self.layout.pressure in BELOW_AMBIENT else None
+            zero = self.ambient if self.counts_from_ambient else None
             return replace(self, derived=derive(joined(*self.blocks()), zero))
         except SourceError as error:
             if self.path.name in str(error):
