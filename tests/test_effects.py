@@ -255,6 +255,24 @@ def test_dirt_on_the_way_of_both_narrows_the_exhaust_as_well() -> None:
     assert dirty[c.SUCTION] == worn[c.SUCTION]
 
 
+def test_a_filter_before_the_sensor_takes_the_sensor_with_it() -> None:
+    theta = rigs.theta("gripper")
+    behind = apply(theta, "filter_clogging", {"pressure_drop_at_nominal": 50.0})
+    before = apply(
+        theta, "filter_clogging", {"pressure_drop_at_nominal": 50.0, "filter_before_sensor": 1.0}
+    )
+
+    def to_vessel(theta: Theta) -> float:
+        """Resistance between the sensor and the vessel."""
+        return float(theta[c.NEAR_RESISTANCE] + theta[c.RESISTANCE] - theta[c.PLACE])
+
+    assert to_vessel(before) == pytest.approx(to_vessel(theta))
+    assert to_vessel(behind) > to_vessel(theta)
+    assert before[c.NEAR_RESISTANCE] + before[c.RESISTANCE] == pytest.approx(
+        behind[c.NEAR_RESISTANCE] + behind[c.RESISTANCE]
+    )
+
+
 # What cannot be meant.
 
 

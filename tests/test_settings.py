@@ -252,6 +252,7 @@ def test_every_coefficient_is_filled_in() -> None:
         "SENSOR_OFFSET",
         "SLOW_RAMP_UP",
         "EXHAUST_FOLLOWS",
+        "FILTER_AT",
         "SLOW_SENSOR",
     }
     convection = {"FREE_CONVECTION", "FORCED_CONVECTION"}

@@ -340,7 +340,7 @@ class Sensing:
 
 _OTHER = {Phase.HOLD: Phase.SUCTION, Phase.SUCTION: Phase.HOLD}
 _SENSING = [c.SENSOR_LAG, c.SLOW_SENSOR, c.RAMP_UP, c.SLOW_RAMP_UP, c.JET_FULL_AT, c.RAMP_DOWN]
-_SENSING += [c.NEAR_RESISTANCE, c.RESISTANCE]  # a drop along the line vanishes at a knee
+_SENSING += [c.NEAR_RESISTANCE, c.RESISTANCE, c.PLACE]  # a drop along the line vanishes at a knee
 
 
 def _later(sensing: tuple[Sensing, ...], rows: int) -> tuple[Sensing, ...]:

@@ -114,8 +114,10 @@ def _supply_pressure_drop(theta: Theta, drop: float) -> None:
 
 
 def _filter_clogging(theta: Theta, drop: float) -> None:
-    at_ejector = theta[c.PLACE] < theta[c.NEAR_RESISTANCE]  # where the sensor is; behind that
-    theta[c.NEAR_RESISTANCE if at_ejector else c.RESISTANCE] += c.resistance(theta, drop * MBAR)
+    more = c.resistance(theta, drop * MBAR)
+    near = theta[c.FILTER_AT] > 0.0 or theta[c.PLACE] < theta[c.NEAR_RESISTANCE]
+    theta[c.NEAR_RESISTANCE if near else c.RESISTANCE] += more
+    theta[c.PLACE] += theta[c.FILTER_AT] * more
 
 
 def _added_volume(theta: Theta, volume: float) -> None:
@@ -223,6 +225,8 @@ _TABLE = (
         "the vacuum filter: clean or replace it",
         (_P("pressure_drop_at_nominal", "mbar", 0.0, 800.0, 40.0),),
         _filter_clogging,
+        # In the line behind the sensor, or in the ejector with the sensor behind it.
+        law=Law("filter_before_sensor", c.FILTER_AT, (0.0, 1.0)),
     ),
     Effect(
         "added_volume",
