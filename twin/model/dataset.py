@@ -109,6 +109,7 @@ class Ejector(Settings):
     blow_off_ramp_ms: float = Field(5.0, ge=0.5, le=500.0)
     exhaust_follows: float = Field(0.0, ge=0.0, le=1.0)  # a loss of suction narrows it as well
     filter_before_sensor: float = Field(0.0, ge=0.0, le=1.0)  # 1: the sensor is behind its filter
+    end_follows_supply: float = Field(1.0, ge=0.1, le=20.0)  # times as end_pressure_slope has it
     relief_sl_min: NotNegative = 200.0  # out through the exhaust at 100 mbar above ambient
     exhaust_sl_min: NotNegative = 0.0  # the same, sonic, where the exhaust is an opening
     cracking_pressure_mbar: NotNegative = 0.0  # above ambient, where the check valve lets out
@@ -274,6 +275,7 @@ def _set_ejector(theta: Theta, ejector: Ejector, end_ratio: float) -> None:
     theta[[c.BEND_2, c.BEND_3]] = ejector.bend_2, ejector.bend_3
     theta[c.EXHAUST_FOLLOWS] = ejector.exhaust_follows
     theta[c.FILTER_AT] = ejector.filter_before_sensor
+    theta[c.END_FOLLOWS] = ejector.end_follows_supply
     theta[[c.KINK, c.KINK_AT]] = ejector.kink, ejector.kink_at
     theta[c.RESPONSE] = ejector.response_ms * MS
     theta[c.RESPONSE_OFF] = ejector.response_off_ms * MS
