@@ -255,6 +255,15 @@ def test_dirt_on_the_way_of_both_narrows_the_exhaust_as_well() -> None:
     assert dirty[c.SUCTION] == worn[c.SUCTION]
 
 
+def test_end_pressure_follows_a_missing_supply_as_steeply_as_the_law_says() -> None:
+    theta = rigs.theta("test_rig")
+    flat = apply(theta, "supply_pressure_drop", {"drop": 0.8})
+    steep = apply(theta, "supply_pressure_drop", {"drop": 0.8, "end_follows_supply": 6.0})
+    assert steep[c.SUPPLY] == flat[c.SUPPLY]
+    assert steep[c.END_SLOPE] == pytest.approx(6.0 * flat[c.END_SLOPE])
+    assert cycle(steep)[0].min() > cycle(flat)[0].min() + 10.0 * MBAR  # less vacuum
+
+
 def test_a_filter_before_the_sensor_takes_the_sensor_with_it() -> None:
     theta = rigs.theta("gripper")
     behind = apply(theta, "filter_clogging", {"pressure_drop_at_nominal": 50.0})
