@@ -54,7 +54,6 @@ from twin.inference.covariance import Covariance
 from twin.inference.levels import SIGMAS_95
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
-from twin.settings import Document
 from twin.signals import BREAK, MBAR, MS, SAMPLE, Command, Phase, Quality, Samples, bridged
 
 CYCLES = 9
@@ -300,9 +299,7 @@ def test_a_gauge_sensor_counts_from_the_ambient_pressure_that_was_told() -> None
     of = logged(SEED, KIND)
     config = config_of(of.truth.readable)
     readings = replace(read(samples_of(of)), opened=False, barometer=np.nan)
-    text = '[driver.tags.pressure]\nreference = "gauge"\n'
-    gauge = replace(config, document=Document.parse(text, "gauge.toml"))
-    assert gauge.gauge
+    gauge = replace(config, gauge=True)
     assert free_of(gauge, readings) == FREE_IN_MARKET
 
 

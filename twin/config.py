@@ -177,7 +177,8 @@ class Config:
 
     def of_rows(self, header: LogHeader) -> "Config":
         """The same for the rows of a log: they say what their pressure counts from."""
-        return replace(self, gauge=self.gauge or header.metadata.get(COUNTED_FROM) == AMBIENT)
+        gauge = self.gauge or header.metadata.get(COUNTED_FROM) == AMBIENT
+        return self if gauge == self.gauge else replace(self, gauge=gauge)
 
     def log_header(self, unmeasured: Mapping[str, str] | None = None) -> LogHeader:
         """What a log of this unit must carry to be replayed alone.
