@@ -246,30 +246,39 @@ def test_a_law_without_its_effect_changes_nothing(law: Law) -> None:
         assert np.array_equal(cycle(other)[0], expected)
 
 
+def by_two_laws(theta: Theta, effect: str, size: float, value: float) -> tuple[Theta, Theta]:
+    """An effect's coefficients by the data set's law, and by another value of it."""
+    (parameter,), law = EFFECTS[effect].parameters, EFFECTS[effect].law
+    assert law is not None
+    sized = {parameter.name: size}
+    return apply(theta, effect, sized), apply(theta, effect, {**sized, law.name: value})
+
+
 def test_dirt_on_the_way_of_both_narrows_the_exhaust_as_well() -> None:
     theta = rigs.theta("test_rig")
-    worn = apply(theta, "suction_loss", {"loss": 20.0})
-    dirty = apply(theta, "suction_loss", {"loss": 20.0, "exhaust_follows": 1.0})
+    worn, dirty = by_two_laws(theta, "suction_loss", 20.0, 1.0)
     assert worn[c.RELIEF] == theta[c.RELIEF]
     assert dirty[c.RELIEF] == pytest.approx(0.8 * theta[c.RELIEF])
     assert dirty[c.SUCTION] == worn[c.SUCTION]
 
 
 def test_end_pressure_follows_a_missing_supply_as_steeply_as_the_law_says() -> None:
+    """What sags by itself was fitted, and stays."""
     theta = rigs.theta("test_rig")
-    flat = apply(theta, "supply_pressure_drop", {"drop": 0.8})
-    steep = apply(theta, "supply_pressure_drop", {"drop": 0.8, "end_follows_supply": 6.0})
-    assert steep[c.SUPPLY] == flat[c.SUPPLY]
-    assert steep[c.END_SLOPE] == pytest.approx(6.0 * flat[c.END_SLOPE])
+    flat, steep = by_two_laws(theta, "supply_pressure_drop", 0.8, 6.0)
+    rise = 0.8 * BAR * theta[c.END_SLOPE]
+    assert (steep[c.SUPPLY], steep[c.END_SLOPE]) == (flat[c.SUPPLY], theta[c.END_SLOPE])
+    assert steep[c.END_RATIO] * (1.0 + rise) == pytest.approx(
+        theta[c.END_RATIO] * (1.0 + 6.0 * rise)
+    )
     assert cycle(steep)[0].min() > cycle(flat)[0].min() + 10.0 * MBAR  # less vacuum
+    _, hardly = by_two_laws(theta, "supply_pressure_drop", 1e-9, 6.0)
+    assert hardly[c.END_RATIO] == pytest.approx(theta[c.END_RATIO])
 
 
 def test_a_filter_before_the_sensor_takes_the_sensor_with_it() -> None:
     theta = rigs.theta("gripper")
-    behind = apply(theta, "filter_clogging", {"pressure_drop_at_nominal": 50.0})
-    before = apply(
-        theta, "filter_clogging", {"pressure_drop_at_nominal": 50.0, "filter_before_sensor": 1.0}
-    )
+    behind, before = by_two_laws(theta, "filter_clogging", 50.0, 1.0)
 
     def to_vessel(theta: Theta) -> float:
         """Resistance between the sensor and the vessel."""

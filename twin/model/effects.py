@@ -111,7 +111,8 @@ def _end_vacuum_loss(theta: Theta, rise: float) -> None:
 
 def _supply_pressure_drop(theta: Theta, drop: float) -> None:
     theta[c.SUPPLY] -= drop * BAR
-    theta[c.END_SLOPE] *= theta[c.END_FOLLOWS]
+    rise = theta[c.END_SLOPE] * drop * BAR  # which the plant adds; what sags by itself was fitted
+    theta[c.END_RATIO] *= (1.0 + theta[c.END_FOLLOWS] * rise) / (1.0 + rise)
 
 
 def _filter_clogging(theta: Theta, drop: float) -> None:
