@@ -11,7 +11,8 @@ import numpy as np
 from twin.config import Config
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, collect, thinned
 from twin.diagnosis.experiments import next_experiment
-from twin.diagnosis.fit import Fitted
+from twin.diagnosis.fit import Fitted, white
+from twin.diagnosis.healthy import left_in_each, usual_leftover
 from twin.diagnosis.hypotheses import hours, parameters, score_with_tempered_prior
 from twin.diagnosis.judge import Judged, gain, judge, rounded
 from twin.diagnosis.search import Search, search, sharpened
@@ -109,7 +110,9 @@ def diagnose(
     odds = [beside.odds(number) for number in range(len(found))]
     likely = any(one.of_unlisted(len(found)) > LIKELY for one in odds)
     strange = look(known, found, fitted, held_out, least=0.0 if likely else STRANGE)
-    verdict, terms = _verdict(found, before, after, strange, likely), tuple[Term, ...]()
+    # Where nothing was fitted, all cycles are unseen.
+    left = after.leftover if found else _left_in_all(evidence, healthy.of(evidence.judged))
+    verdict, terms = _verdict(found, before, after, left, strange, likely), tuple[Term, ...]()
     if verdict == "unlisted":
         if not _sure(found, before, after):
             searched, found = replace(searched, found=None), HEALTHY
@@ -156,17 +159,22 @@ def _signals(evidence: Evidence) -> list[dict[str, str]]:
     return [{"signal": one.signal, "what": one.what, "do": one.action} for one in against]
 
 
+def _left_in_all(evidence: Evidence, weights: Weights) -> float:
+    """Sigmas left of the twin without a cause in all cycles; one odd one counts little."""
+    residuals = white(evidence, weights, [HEALTHY])[:, 0]
+    return usual_leftover(left_in_each(evidence, weights, residuals))
+
+
 def _verdict(
-    found: Hypothesis, before: Judged, after: Judged, strange: Unlisted, likely: bool
+    found: Hypothesis, before: Judged, after: Judged, left: float, strange: Unlisted, likely: bool
 ) -> str:
     """Consistent, explained, or something real is left: in sigmas, in mbar, or of a kind.
 
     Or it is ``likely``, from what is left, that something acts which nobody listed.
     """
-    left = after.leftover > EXPLAINED
     usual = math.hypot(before.usual, ROUGH * before.rms, after.unmeasured)
     beyond = after.rms > BEYOND * usual
-    if left or beyond or likely or strange.gain >= STRANGE:
+    if left > EXPLAINED or beyond or likely or strange.gain >= STRANGE:
         return "unlisted"
     return "explained" if found else "consistent"
 

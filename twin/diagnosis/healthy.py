@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from twin.diagnosis.evidence import HEALTHY, Evidence
-from twin.diagnosis.weights import Covariance, moved, scatter
+from twin.diagnosis.weights import Covariance, Weights, moved, scatter
 from twin.model.term import KINDS
 from twin.monitor.bins import Floats, Ints, unwarped
 from twin.monitor.healthy import Healthy, ModelError
@@ -46,18 +46,25 @@ def learned(evidence: Evidence) -> Healthy:
     if len(judged) < FEWEST:
         halves = [(judged, judged)]
     left = [_left(seen, _learned(seen, here), there) for here, there in halves]
-    return _learned(seen, judged).model_copy(update={"leftover": _usual(np.concatenate(left))})
+    return _learned(seen, judged).model_copy(
+        update={"leftover": usual_leftover(np.concatenate(left))}
+    )
 
 
 def _left(seen: _Healthy, healthy: Healthy, cycles: Sequence[int]) -> Floats:
     """Chi-square per residual that each cycle has by what was learned from others."""
     weights = seen.by(healthy).of(cycles)
-    white = weights.white(seen.off[:, None])[: len(weights.bins), 0]
-    cycle = seen.evidence.bins.cycle[weights.bins]
-    return np.array([np.mean(white[cycle == one] ** 2) for one in cycles if one in cycle])
+    return left_in_each(seen.evidence, weights, weights.white(seen.off[:, None])[:, 0])
 
 
-def _usual(left: Floats) -> float:
+def left_in_each(evidence: Evidence, weights: Weights, white: Floats) -> Floats:
+    """Chi-square per residual in each cycle of ``weights``, from ``white`` residuals of bins."""
+    cycle = evidence.bins.cycle[weights.bins]
+    squares = white[: len(cycle)] ** 2
+    return np.array([np.mean(squares[cycle == one]) for one in weights.cycles if one in cycle])
+
+
+def usual_leftover(left: Floats) -> float:
     """Sigmas that cycles have by what was learned from others; one odd cycle is not all of them.
 
     What is learned in the end has seen that one as well.

@@ -41,6 +41,9 @@ SHARE = (
 # Of an effect's typical size: less is within what calibration leaves, or beside another cause mends
 # what the model gets wrong about that.
 SMALLEST, SMALLEST_MORE = 0.2, 0.4
+LEAST_UNSEEN = (
+    1.0  # chi-square that it must surely gain on unseen cycles: what a size gains by chance
+)
 TRIED_FIRST = 3  # single causes to begin with, until one holds in cycles it was not fitted to
 TRIED_ALONE = 5  # hypotheses that are compared with weights about themselves
 NEAR = 2.5  # times the least score, up to which they are
@@ -433,7 +436,7 @@ def _confirmed(evidence: Evidence, fitted: Sequence[int], here: _Found) -> Fitte
         sizes_found = _sizes_of_causes(found)
         if others and min(sizes_found) < SMALLEST_MORE:  # beside the others it became too small
             least = sizes_found.index(min(sizes_found))
-        elif gains[least][0] > 0.0:
+        elif gains[least][0] > LEAST_UNSEEN:
             return found
         if not others:
             return None
