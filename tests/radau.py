@@ -53,6 +53,7 @@ def suction_flow(theta: Theta, p: float, jet: float, supply: float) -> float:
         return max(1.0 - theta[c.SUPPLY_CURVATURE] * off**2, 0.0)
 
     ambient = theta[c.AMBIENT]
+    supply *= theta[c.AMBIENT_NOMINAL] / ambient  # ratios of pressures drive a jet
     capacity = theta[c.SUCTION] * peak(supply) / peak(theta[c.SUPPLY_NOMINAL])
     capacity *= ambient / theta[c.AMBIENT_NOMINAL]
     missing = theta[c.SUPPLY_NOMINAL] - supply

@@ -81,11 +81,22 @@ def test_missing_supply_raises_the_end_pressure_and_weakens_blow_off() -> None:
     assert less_blow_off == pytest.approx(blow_off * (3.5e5 + 101300) / (4.5e5 + 101300))
 
 
-def test_suction_and_end_pressure_scale_with_ambient() -> None:
+def test_over_ambient_a_jet_depends_on_the_supply_over_ambient_alone() -> None:
     theta = theta_of()
-    suction, end, _ = supplied(theta)
+    everywhere = one(theta)
     theta[c.AMBIENT] *= 0.8
-    assert supplied(theta)[:2] == pytest.approx([0.8 * suction, 0.8 * end])
+    for supply in (3.0e5, 4.5e5, 6.0e5):
+        suction, end, _ = at_supply(supply, everywhere, 0)
+        higher_up = at_supply(0.8 * supply, one(theta), 0)
+        assert higher_up[:2] == pytest.approx([0.8 * suction, 0.8 * end])
+
+
+def test_in_thin_air_the_same_supply_makes_a_deeper_vacuum() -> None:
+    theta = theta_of()
+    _, end, _ = supplied(theta)
+    theta[c.AMBIENT] *= 0.96
+    relative = theta[c.SUPPLY_NOMINAL] * (1.0 / 0.96 - 1.0)
+    assert supplied(theta)[1] == pytest.approx(0.96 * end * (1.0 - theta[c.END_SLOPE] * relative))
 
 
 def test_the_supply_droops_while_a_valve_is_open_and_recovers_with_its_lag() -> None:

@@ -1,9 +1,11 @@
 """Calibration: healthy cycles in, instance-specific data set out, or a reason why not."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.stats import chi2
 
 from twin.calibration.alike import refuse_changing
@@ -29,6 +31,7 @@ MOST_SPOILT = 0.02  # share of samples that are saturated, stale or bad
 MOST_LEFT = 15.0  # mbar rms, above which no ejector of this kind is behind the log
 SURE = 0.9  # that the scatter is no larger than a few cycles show
 LEAST_SCATTER = 0.05  # mbar
+NOTHING: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -167,19 +170,27 @@ def scatter(data: DataSet, cycles: Sequence[Cycle]) -> dict[str, Scatter]:
     return result
 
 
-def uncertain(fitted: Fitted) -> dict[str, tuple[float, ...]]:
-    """Ways in which the log leaves the data set open, as ``Healthy`` has them."""
-    factor = np.linalg.cholesky(fitted.left_open)
+def uncertain(fitted: Fitted, untold: Mapping[str, float]) -> dict[str, tuple[float, ...]]:
+    """Ways in which the log leaves the data set open, as ``Healthy`` has them.
+
+    ``untold`` are values that no log shows and nobody told, with their sigmas.
+    """
+    factor = block_diag(np.linalg.cholesky(fitted.left_open), np.diag([*untold.values()]))
+    names = [*(free.name for free in fitted.free), *untold]
     return {
-        free.name: tuple(float(f"{change:.4g}") for change in row[: number + 1])
-        for number, (free, row) in enumerate(zip(fitted.free, factor, strict=True))
+        name: tuple(float(f"{change:.4g}") for change in row[: number + 1])
+        for number, (name, row) in enumerate(zip(names, factor, strict=True))
     }
 
 
 def like_these(
-    config: Config, fitted: Fitted, figures: dict[str, Scatter], samples: Samples
+    config: Config,
+    fitted: Fitted,
+    figures: dict[str, Scatter],
+    samples: Samples,
+    untold: Mapping[str, float] = NOTHING,
 ) -> Healthy:
-    """What healthy cycles are like beside the calibrated twin."""
-    known = Healthy(figures=figures, uncertain=uncertain(fitted))
+    """What healthy cycles are like beside the calibrated twin; ``untold`` as in ``uncertain``."""
+    known = Healthy(figures=figures, uncertain=uncertain(fitted, untold))
     monitor = config.monitor.model_copy(update={"healthy": known})
     return learned(collect(replace(config, data=fitted.data, monitor=monitor), [samples]))

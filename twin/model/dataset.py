@@ -60,7 +60,8 @@ class Supply(Settings):
     pressure_bar: float = Field(4.5, gt=0.0, le=10.0)  # gauge, at the regulator
     droop_bar: NotNegative = 0.0  # less at the nozzle while a valve is open
     lag_ms: float = Field(20.0, ge=1.0, le=1000.0)  # of the supply line
-    optimum_bar: float = Field(4.5, gt=0.0, le=10.0)
+    # At which suction is greatest: an ejector is made for the pressure that it is run at.
+    optimum_bar: float = Field(default_factory=lambda told: told["pressure_bar"], gt=0.0, le=10.0)
     curvature: NotNegative = 1.0
     end_pressure_slope: NotNegative = 0.2  # relative rise of end pressure per bar missing
 

@@ -33,8 +33,9 @@ from twin.model.theta import Theta
     _SOFT,
     _CLOSED,
     _OPENS,
-) = range(len(c.COEFFICIENTS), len(c.COEFFICIENTS) + 12)
-PREPARED = len(c.COEFFICIENTS) + 12
+    _DENSER,
+) = range(len(c.COEFFICIENTS), len(c.COEFFICIENTS) + 13)
+PREPARED = len(c.COEFFICIENTS) + 13
 
 # A runaway hypothesis stays a number; a node that is flushed many times in a step keeps its gas.
 LIGHTEST = 1e-15  # kg
@@ -108,6 +109,7 @@ def prepare_one(k, i):  # type: ignore[no-untyped-def]
     peak = max(1.0 - k[c.SUPPLY_CURVATURE, i] * off * off, 1e-3)
     k[_SUCTION, i] = k[c.SUCTION, i] * (ambient / nominal) / peak
     k[_END, i] = k[c.END_RATIO, i] * ambient
+    k[_DENSER, i] = nominal / ambient
     k[_BLOW_OFF, i] = k[c.BLOW_OFF, i] / (k[c.SUPPLY_NOMINAL, i] + nominal)
     k[_FLATTER, i] = 1.0 / k[c.SUPPLY_OPTIMUM, i]
     k[_HEAT, i] = k[c.FILM, i] * k[c.AREA, i] / CP
@@ -148,13 +150,16 @@ def prepare(theta):  # type: ignore[no-untyped-def]
 def at_supply(supply, k, i):  # type: ignore[no-untyped-def]
     """Suction at ambient (kg/s), end pressure (Pa) and blow-off (kg/s) at a supply (Pa gauge).
 
-    Suction capacity peaks at the optimum supply; end pressure rises as supply falls; blow-off is
-    sonic, hence proportional to absolute supply pressure.
+    Suction capacity peaks at the optimum supply; end pressure rises as supply falls. Over ambient
+    pressure both depend on the supply over ambient pressure alone: what drives a jet are ratios of
+    pressures (dimensional analysis, at high Reynolds numbers). Blow-off is sonic, hence
+    proportional to absolute supply pressure.
     """
     ambient = k[c.AMBIENT, i]
-    off = supply * k[_FLATTER, i] - 1.0
+    relative = supply * k[_DENSER, i]  # that drives the jet alike at nominal ambient pressure
+    off = relative * k[_FLATTER, i] - 1.0
     suction = k[_SUCTION, i] * max(1.0 - k[c.SUPPLY_CURVATURE, i] * off * off, 0.0)
-    missing = k[c.SUPPLY_NOMINAL, i] - supply
+    missing = k[c.SUPPLY_NOMINAL, i] - relative
     end = k[_END, i] * (1.0 + k[c.END_SLOPE, i] * missing)
     blow_off = k[_BLOW_OFF, i] * (supply + ambient)
     return suction, min(max(end, 0.0), 0.98 * ambient), blow_off
