@@ -48,13 +48,11 @@ SLOWEST_S = 20.0  # for a browser to take one message
 
 STATIC = {
     "icon.svg": "image/svg+xml",
+    "chart.js": "text/javascript",
     "common.js": "text/javascript",
     "all.js": "text/javascript",
     "page.js": "text/javascript",
     "page.css": "text/css",
-    "uPlot.iife.min.js": "text/javascript",
-    "uPlot.min.css": "text/css",
-    "uPlot.LICENSE": "text/plain",
 }
 CSP = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self';"
