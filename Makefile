@@ -6,7 +6,7 @@ BIN := .venv/bin
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 
-.PHONY: demo test peers check format docs bench battery clean
+.PHONY: demo test peers check format docs bench battery audit coverage clean
 
 demo: .venv/run
 	$(BIN)/python tools/demo.py
@@ -39,8 +39,15 @@ bench: .venv/dev
 battery: .venv/dev  # one thread for matrices, as the command line has it: more wait for each other
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python tools/battery.py --cases battery.jsonl --write docs/battery.md
 
+audit: .venv/dev .venv/audit/done  # without a network: ADVISORIES=all.zip, an export of osv.dev
+	$(BIN)/python tools/audit.py audit $(if $(ADVISORIES),--advisories '$(ADVISORIES)')
+
+coverage: .venv/dev  # of branches, also in processes that tests start
+	$(PYTEST) --cov --cov-report=json:coverage.json --cov-report=
+	$(BIN)/python tools/coverage_table.py coverage.json
+
 clean:
-	rm -rf .venv demo site
+	rm -rf .venv demo site audit coverage.json .coverage*
 
 .venv/bin/python:
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
@@ -56,4 +63,9 @@ clean:
 
 .venv/dev: .venv/run requirements-dev.lock
 	$(PIP) --require-hashes -r requirements-dev.lock
+	touch $@
+
+.venv/audit/done: .venv/bin/python requirements-audit.lock
+	$(PYTHON) -m venv .venv/audit
+	.venv/audit/bin/python -m pip --disable-pip-version-check install --quiet --require-hashes -r requirements-audit.lock
 	touch $@

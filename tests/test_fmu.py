@@ -5,9 +5,11 @@ import re
 import subprocess
 import sys
 import zipfile
+from ctypes import CDLL
 from io import BytesIO
 from pathlib import Path
 
+import fmpy
 import fmus
 import numpy as np
 import pytest
@@ -32,6 +34,18 @@ FAULT = {
     "response_delay": {"delay": 7.3},
     "filter_clogging": {"pressure_drop_at_nominal": 40.0},
     "weak_blow_off": {"loss": 30.0},
+}
+ONLY_MODEL_EXCHANGE = {
+    "fmi2EnterEventMode",
+    "fmi2NewDiscreteStates",
+    "fmi2EnterContinuousTimeMode",
+    "fmi2CompletedIntegratorStep",
+    "fmi2SetTime",
+    "fmi2SetContinuousStates",
+    "fmi2GetDerivatives",
+    "fmi2GetEventIndicators",
+    "fmi2GetContinuousStates",
+    "fmi2GetNominalsOfContinuousStates",
 }
 ALL = [(version, where) for version in (2, 3) for where in ("inside", "outside")]
 
@@ -253,6 +267,95 @@ def test_sources_compile_without_a_warning(version: int, where: Where, tmp_path:
     command = ["cc", "-std=c99", "-Wall", "-Wextra", "-Werror", "-O1", "-c", f"fmi{version}.c"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def own_and_official(version: int, folder: Path) -> tuple[str, str, str]:
+    """Our header, and what includes the standard's own, which FMPy carries; the sources beside."""
+    for name, content in parts(made("gripper", version)).items():
+        if name.startswith("sources/"):
+            (folder / Path(name).name).write_bytes(content)
+    official = Path(fmpy.__file__).parent / "c-code" / f"fmi{version}Functions.h"
+    export = (
+        f"#define API(type, name) FMI{version}_Export type name\n#define FULL_NAME(name) name\n"
+    )
+    header = f"fmi{version}.h"
+    return header, (folder / header).read_text(), f'#include "{official}"\n{export}'
+
+
+@pytest.mark.needs("cc")
+@pytest.mark.parametrize("version", [2, 3])
+def test_every_function_is_as_the_standard_declares_it(version: int, tmp_path: Path) -> None:
+    header, _, official = own_and_official(version, tmp_path)
+    (tmp_path / header).write_text(official)
+    command = ["cc", "-std=c99", "-Wall", "-Werror", "-shared", "-fPIC", "-o", "a.so"]
+    linked = [*command, f"fmi{version}.c", "-Wl,--no-undefined", "-lm"]
+    done = subprocess.run(linked, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    declared = set(re.findall(rf"\bfmi{version}FullName\((fmi{version}\w+)\)", _included(official)))
+    library = CDLL(str(tmp_path / "a.so"))
+    model_exchange = set() if version == 3 else ONLY_MODEL_EXCHANGE
+    assert {name for name in declared if not hasattr(library, name)} == model_exchange
+
+
+def _included(text: str) -> str:
+    found = re.search(r'"(.*)"', text)
+    assert found
+    return Path(found[1]).read_text()
+
+
+@pytest.mark.needs("cc")
+@pytest.mark.parametrize("version", [2, 3])
+def test_types_and_numbers_are_those_of_the_standard(version: int, tmp_path: Path) -> None:
+    header, own, official = own_and_official(version, tmp_path)
+    plain = re.sub(r"/\*.*?\*/", "", own, flags=re.DOTALL)
+    types = set(re.findall(rf"\b(fmi{version}\w+)\)?[;(]", plain)) - {"fmi2CallbackFunctions"}
+    types = {one for one in types if re.search(rf"typedef[^;]*\b{one}\b", plain)}
+    values = {
+        name
+        for body in re.findall(r"enum \{(.*?)\}", plain, re.DOTALL)
+        for name in re.findall(r"\w+", body)
+    }
+    assert len(types) > 10 < len(values)
+    lines = [f'printf("{one} %d\\n", (int)sizeof({one}));' for one in sorted(types)]
+    lines += [f'printf("{one} %d\\n", (int)({one}));' for one in sorted(values)]
+    lines += [f"printf(fmi{version}Version);"]
+    if version == 2:
+        field = "(int)offsetof(fmi2CallbackFunctions, componentEnvironment)"
+        lines += ["printf(fmi2TypesPlatform);", f'printf("%d\\n", {field});']
+    body = "\n".join(lines)
+    said = []
+    for text in (own, official):
+        (tmp_path / header).write_text(text)
+        main = f'#include <stddef.h>\n#include <stdio.h>\n#include "{header}"\nint main(void) {{\n'
+        (tmp_path / "main.c").write_text(f"{main}{body}\nreturn 0;\n}}\n")
+        command = ["cc", "-std=c99", "-Wno-format-security", "-o", "main", "main.c"]
+        subprocess.run(command, cwd=tmp_path, check=True)
+        said.append(
+            subprocess.run(["./main"], cwd=tmp_path, check=True, capture_output=True).stdout
+        )
+    assert said[0] == said[1]
+
+
+@pytest.mark.needs("cc")
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_prefix_lets_several_be_linked_together(version: int, tmp_path: Path) -> None:
+    own_and_official(version, tmp_path)
+    prefixed = f"-DFMI{version}_FUNCTION_PREFIX=cell_"
+    command = [
+        "cc",
+        "-std=c99",
+        prefixed,
+        "-shared",
+        "-fPIC",
+        "-o",
+        "a.so",
+        f"fmi{version}.c",
+        "-lm",
+    ]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    library = CDLL(str(tmp_path / "a.so"))
+    assert hasattr(library, f"cell_fmi{version}DoStep")
+    assert not hasattr(library, f"fmi{version}DoStep")
 
 
 @pytest.mark.needs("cc", "c++")

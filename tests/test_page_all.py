@@ -406,7 +406,7 @@ def test_it_is_fit_for_gloves_on_every_screen(
         edges[1].send([Message("1", LEAK, alarm(Unit(TYPE, "cell-01"), text="<img src=x>"))])
         edges[2].hang_up()
         url = closing.enter_context(site(tmp_path, running.port))
-        for width, height in ((1280, 800), (1024, 768), (768, 1024)):
+        for width, height in ((1280, 800), (1024, 768), (768, 1024), (390, 844)):
             context = browser.new_context(
                 viewport={"width": width, "height": height}, color_scheme=scheme, has_touch=True
             )
@@ -414,7 +414,7 @@ def test_it_is_fit_for_gloves_on_every_screen(
             page.goto(url)
             expect(page.locator("#all-rows tr")).to_have_count(6)
             _is_fit(page)
-            page.locator("tr[data-name=cell-01]").click()
+            page.locator("tr[data-name=cell-01] td").nth(1).click()
             expect(page.locator("#one-alarms article")).to_have_count(1)
             _is_fit(page)
             context.close()

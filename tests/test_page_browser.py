@@ -1,5 +1,6 @@
 """The page in a real Chromium: what a technician sees and does."""
 
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -26,7 +27,12 @@ from twin.page.users import Users
 
 WORD = "correct horse"
 PATIENCE_S = 30.0
-SIZES = {"desktop": (1280, 800), "landscape": (1024, 768), "portrait": (768, 1024)}
+SIZES = {
+    "desktop": (1280, 800),
+    "landscape": (1024, 768),
+    "portrait": (768, 1024),
+    "phone": (390, 844),
+}
 DAY = 86_400 * S
 
 
@@ -222,14 +228,164 @@ def test_vacuum_is_drawn_as_it_comes(site: Site) -> None:
     site.until(page, lambda: _highest(page, "--blue") > 0.9 > _highest(page, "--orange") > 0.8, 700)
 
 
+def test_a_person_looks_closer_back_and_again_at_what_comes(site: Site) -> None:
+    page = site.open()
+    head, back = page.locator("#plot-head"), page.get_by_role("button", name="Back to live")
+    site.run.suck(5.0, vacuum_mbar=300.0)
+    site.run.suck(5.0, vacuum_mbar=600.0)
+    expect(page.locator("#measured")).to_have_text("600")
+    expect(head).to_have_text("Vacuum, the last 10 s")
+    expect(back).to_be_disabled()
+    page.get_by_role("button", name="Zoom in").first.click()
+    page.get_by_role("button", name="Zoom in").first.click()
+    expect(head).to_have_text("Vacuum, the last 2.5 s")
+    assert _shown(page) == [600.0]
+    _drag(page, 2.5 * 2.9)  # to where 300 mbar were
+    expect(head).to_have_text(re.compile(r"Vacuum, 9\.\d to 7\.\d s ago"))
+    assert _shown(page) == [300.0]
+    from_, _ = page.evaluate("live.chart.range()")
+    site.run.suck(1.0, vacuum_mbar=700.0)
+    expect(page.locator("#measured")).to_have_text("700")
+    assert page.evaluate("live.chart.range()[0]") == from_  # what a person looks at stands still
+    back.click()
+    expect(head).to_have_text("Vacuum, the last 10 s")
+    assert _shown(page) == [300.0, 600.0, 700.0]
+    page.locator("#plot").press("+")
+    page.locator("#plot").press("ArrowLeft")
+    expect(head).to_have_text("Vacuum, 5.5 to 0.5 s ago")
+    page.locator("#plot").press("Home")
+    expect(back).to_be_disabled()
+
+
+def test_two_fingers_and_the_wheel_look_closer(site: Site) -> None:
+    page = site.open()
+    site.run.suck(10.0)
+    expect(page.locator("#measured")).to_have_text("600")
+    page.evaluate(
+        """() => {
+          const send = (type, pointerId, clientX) => live.chart.canvas.dispatchEvent(
+            new PointerEvent(type, { pointerId, clientX, clientY: 300, bubbles: true }));
+          const { left } = live.chart.canvas.getBoundingClientRect();
+          live.chart.canvas.setPointerCapture = () => {};
+          send("pointerdown", 1, left + 100);
+          send("pointerdown", 2, left + 200);
+          send("pointermove", 2, left + 300);
+          send("pointerup", 1, left + 100);
+          send("pointerup", 2, left + 300);
+        }"""
+    )
+    assert page.evaluate("live.chart.width") == pytest.approx(5.0)
+    page.locator("#plot").dblclick()
+    page.locator("#plot").hover()
+    page.mouse.wheel(0, -50)  # alone it scrolls
+    assert page.evaluate("live.chart.width") is None
+    page.keyboard.down("Control")
+    page.mouse.wheel(0, -50)
+    page.wait_for_function("live.chart.width !== null && live.chart.width < 7")
+
+
+def _drag(page: Page, seconds: float) -> None:
+    """To the right, as the mouse does it; three times, each no further than it is wide."""
+    for _ in range(3):
+        left, width = page.evaluate("[live.chart.area.left, live.chart.area.width]")
+        from_, to = page.evaluate("live.chart.range()")
+        box = page.locator("#plot canvas").bounding_box()
+        assert box
+        x, y = box["x"] + left + 2, box["y"] + 100
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.mouse.move(x + seconds / 3 * width / (to - from_), y, steps=3)
+        page.mouse.up()
+
+
+def _shown(page: Page) -> list[float]:
+    """The measured vacuums that are seen."""
+    found: list[float] = page.evaluate(
+        """() => {
+          const [from, to] = live.chart.range();
+          const { time, measured_low: low } = live.rows;
+          return [...new Set(low.filter((_, i) => time[i] >= from && time[i] <= to))];
+        }"""
+    )
+    return found
+
+
+def test_an_alarm_is_marked_where_it_was_raised(site: Site) -> None:
+    page = site.open()
+    site.run.suck(2.0)
+    expect(page.locator("#measured")).to_have_text("600")
+    assert _highest(page, "--alarm") == -1
+    site.run.leak()
+    site.until(page, lambda: _highest(page, "--alarm") > 0.99, 500)
+    ((at, what),) = page.evaluate("live.alarms().map(({ at, text }) => [at, text])")
+    assert what == "Leakage"
+    last = page.evaluate("live.rows.time[live.rows.measured_low.lastIndexOf(600)]")
+    assert at == pytest.approx(last, abs=0.2)
+
+
+def test_a_peak_of_one_row_is_seen_among_thousands(site: Site) -> None:
+    page = site.open()
+    page.set_viewport_size({"width": 390, "height": 844})
+    page.wait_for_function("Boolean(socket && live.chart === null || live.chart)")
+    site.run.suck(1.0)
+    expect(page.locator("#measured")).to_have_text("600")
+    page.evaluate(
+        """() => {
+          const rows = { time: [], host: [], phase: [], broken: [] };
+          const names = ["measured_low", "measured_high", "expected_low", "expected_high"];
+          for (const name of names) rows[name] = [];
+          for (let i = 1; i <= 8000; i += 1) {
+            const time = live.end() + i * 0.025;
+            const value = i === 4321 ? 900 : 500;
+            const row = { time, host: 1e9 + time, phase: 1, broken: 0 };
+            for (const name of names) row[name] = value;
+            for (const name of Object.keys(rows)) rows[name].push(row[name]);
+          }
+          live.take(rows);
+          live.chart.zoom(100);
+        }"""
+    )
+    page.wait_for_function("live.chart.waits === false")
+    assert _highest(page, "--blue") > 0.9
+    points = page.evaluate(
+        """() => {
+          const [from, to] = live.chart.range();
+          const one = live.chart.series[1];
+          const x = (time) => 300 * (time - from) / (to - from);
+          return decimate(one, part(one, from, to), x, 1).length;
+        }"""
+    )
+    assert points <= 302
+
+
+@pytest.mark.parametrize("ratio", [1, 2, 3])
+def test_the_chart_fits_its_box_pixel_by_pixel_light_and_dark(site: Site, ratio: int) -> None:
+    page = site.open(device_scale_factor=ratio, color_scheme="light")
+    site.run.suck(2.0)
+    expect(page.locator("#measured")).to_have_text("600")
+    for width in (1440, 820, 390):
+        page.set_viewport_size({"width": width, "height": 900})
+        page.wait_for_function(
+            "(ratio) => { const { canvas } = live.chart; return live.chart.waits === false"
+            " && canvas.width === Math.round($('plot').clientWidth * ratio)"
+            " && canvas.height === Math.round($('plot').clientHeight * ratio); }",
+            arg=ratio,
+        )
+        _is_fit(page)
+    assert _highest(page, "--blue") > 0.8
+    page.emulate_media(color_scheme="dark")
+    site.until(page, lambda: _highest(page, "--blue") > 0.8)  # the dark scheme's blue
+
+
 def _highest(page: Page, colour: str) -> float:
     """How high a line of one of the page's colours is drawn: 1 at the top of the plot; -1: none."""
     height = page.evaluate(
         """(name) => {
           const wanted = getComputedStyle(document.documentElement).getPropertyValue(name).trim();
           const [r, g, b] = [1, 3, 5].map((at) => parseInt(wanted.slice(at, at + 2), 16));
-          const { left, top, width, height } = live.plot.bbox;
-          const { data } = live.plot.ctx.getImageData(left, top, width, height);
+          const [left, top, width, height] = ["left", "top", "width", "height"]
+            .map((side) => Math.round(live.chart.area[side] * devicePixelRatio));
+          const { data } = live.chart.ctx.getImageData(left, top, width, height);
           for (let i = 0; i < data.length; i += 4)
             if (data[i] === r && data[i + 1] === g && data[i + 2] === b)
               return 1 - Math.floor(i / 4 / width) / height;

@@ -141,7 +141,9 @@ def test_what_the_page_is_made_of_is_here(site: Site) -> None:
         answer = site.client.get(f"/static/{name}")
         assert answer.status_code == 200
         assert answer.headers["content-type"].startswith(kind)
-    assert "MIT" in site.client.get("/static/uPlot.LICENSE").text
+    first_view = [site.client.get("/"), *map(site.client.get, ("/api/me", "/api/all"))]
+    files = [len(site.client.get(f"/static/{name}").content) for name in STATIC]
+    assert sum(files) + sum(len(one.content) for one in first_view) < 100_000
 
 
 @pytest.mark.parametrize(
@@ -394,6 +396,7 @@ def test_rows_come_as_they_are_written(site: Site) -> None:
         rows = _rows(socket)
         assert rows["measured_low"][0] == rows["measured_high"][0] == 600.0
         assert rows["expected_low"][0] == 650.0
+        assert rows["host"][0] == NOW / 1e9
         assert set(rows["phase"]) == {1}
         run.suck(1.0, vacuum_mbar=700.0)
         later = _rows(socket)

@@ -10,7 +10,7 @@ from twin.exchange.variables import Component, Variable
 from twin.signals import MS
 
 WORDS = "Pneumatic vacuum ejector with its line and vessel, as its digital twin simulates it"
-LICENSE = "Apache-2.0; the headers of FMI: BSD-2-Clause"
+LICENSE = "Apache-2.0"
 
 
 @dataclass(frozen=True)

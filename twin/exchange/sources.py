@@ -49,10 +49,8 @@ def sources(component: Component, version: int) -> tuple[Mapping[str, str], str]
     token = str(uuid5(NAMESPACE_URL, f"ejector-twin FMI {version}\n{model}"))
     ties = f'#define TOKEN "{token}"\n#define STAMP {int(token[:8], 16)}.0\n'
     texts = {"model.h": f"{HEAD}\n{ties}{model}"}
-    for name in ("component.h", main_source(version)):
+    for name in ("component.h", "export.h", f"fmi{version}.h", main_source(version)):
         texts[name] = (templates / name).read_text(encoding="utf-8")
-    for header in (templates / f"fmi{version}").iterdir():
-        texts[header.name] = header.read_text(encoding="utf-8")
     return texts, token
 
 

@@ -146,6 +146,7 @@ class Ejector:
         return {
             "next": live.next,
             "time": (rows["time_ns"] / S_NS).round(3).tolist(),
+            "host": (rows["host_ns"] / S_NS).round(3).tolist(),  # as the alarms have it
             "phase": rows["phase"].tolist(),
             "commands": rows["commands"].tolist(),
             "broken": broken.astype(int).tolist(),

@@ -2,7 +2,7 @@
 
 #include "component.h"
 
-#include "fmi2Functions.h"
+#include "fmi2.h"
 
 #define UNUSED(x) (void)(x)
 
@@ -34,12 +34,12 @@ static fmi2Status done(fmi2Component instance, const char *wrong) {
     return wrong == NULL ? fmi2OK : failed(instance, wrong);
 }
 
-const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
+API(const char *, fmi2GetTypesPlatform)(void) { return fmi2TypesPlatform; }
 
-const char *fmi2GetVersion(void) { return fmi2Version; }
+API(const char *, fmi2GetVersion)(void) { return fmi2Version; }
 
-fmi2Status fmi2SetDebugLogging(fmi2Component instance, fmi2Boolean loggingOn, size_t nCategories,
-                               const fmi2String categories[]) {
+API(fmi2Status, fmi2SetDebugLogging)(fmi2Component instance, fmi2Boolean loggingOn,
+                                     size_t nCategories, const fmi2String categories[]) {
     UNUSED(nCategories);
     UNUSED(categories);
     ((Instance *)instance)->talks = loggingOn;
@@ -48,17 +48,17 @@ fmi2Status fmi2SetDebugLogging(fmi2Component instance, fmi2Boolean loggingOn, si
 
 /* --- instances --------------------------------------------------------------------------------- */
 
-void fmi2FreeInstance(fmi2Component instance) {
+API(void, fmi2FreeInstance)(fmi2Component instance) {
     if (instance != NULL) {
         free(((Instance *)instance)->name);
         free(instance);
     }
 }
 
-fmi2Component fmi2Instantiate(fmi2String instanceName, fmi2Type fmuType, fmi2String fmuGUID,
-                              fmi2String fmuResourceLocation,
-                              const fmi2CallbackFunctions *functions, fmi2Boolean visible,
-                              fmi2Boolean loggingOn) {
+API(fmi2Component, fmi2Instantiate)(fmi2String instanceName, fmi2Type fmuType, fmi2String fmuGUID,
+                                    fmi2String fmuResourceLocation,
+                                    const fmi2CallbackFunctions *functions, fmi2Boolean visible,
+                                    fmi2Boolean loggingOn) {
     const char *said = NULL;
     size_t length = instanceName != NULL ? strlen(instanceName) + 1 : 1;
     Instance *i = calloc(1, sizeof *i);
@@ -82,7 +82,7 @@ fmi2Component fmi2Instantiate(fmi2String instanceName, fmi2Type fmuType, fmi2Str
     }
     if (said != NULL) {
         say(i, said);
-        fmi2FreeInstance(i);
+        FULL_NAME(fmi2FreeInstance)(i);
         return NULL;
     }
     component_reset(&i->component);
@@ -91,9 +91,9 @@ fmi2Component fmi2Instantiate(fmi2String instanceName, fmi2Type fmuType, fmi2Str
 
 /* --- modes ------------------------------------------------------------------------------------- */
 
-fmi2Status fmi2SetupExperiment(fmi2Component instance, fmi2Boolean toleranceDefined,
-                               fmi2Real tolerance, fmi2Real startTime,
-                               fmi2Boolean stopTimeDefined, fmi2Real stopTime) {
+API(fmi2Status, fmi2SetupExperiment)(fmi2Component instance, fmi2Boolean toleranceDefined,
+                                     fmi2Real tolerance, fmi2Real startTime,
+                                     fmi2Boolean stopTimeDefined, fmi2Real stopTime) {
     UNUSED(toleranceDefined);
     UNUSED(tolerance);
     UNUSED(stopTimeDefined);
@@ -102,24 +102,24 @@ fmi2Status fmi2SetupExperiment(fmi2Component instance, fmi2Boolean toleranceDefi
     return fmi2OK;
 }
 
-fmi2Status fmi2EnterInitializationMode(fmi2Component instance) {
+API(fmi2Status, fmi2EnterInitializationMode)(fmi2Component instance) {
     ((Instance *)instance)->component.mode = INITIALIZING;
     return fmi2OK;
 }
 
-fmi2Status fmi2ExitInitializationMode(fmi2Component instance) {
+API(fmi2Status, fmi2ExitInitializationMode)(fmi2Component instance) {
     struct Component *c = &((Instance *)instance)->component;
     component_rest(c);
     c->mode = STEPPING;
     return fmi2OK;
 }
 
-fmi2Status fmi2Terminate(fmi2Component instance) {
+API(fmi2Status, fmi2Terminate)(fmi2Component instance) {
     ((Instance *)instance)->component.mode = TERMINATED;
     return fmi2OK;
 }
 
-fmi2Status fmi2Reset(fmi2Component instance) {
+API(fmi2Status, fmi2Reset)(fmi2Component instance) {
     component_reset(&((Instance *)instance)->component);
     return fmi2OK;
 }
@@ -127,8 +127,9 @@ fmi2Status fmi2Reset(fmi2Component instance) {
 /* --- values ------------------------------------------------------------------------------------ */
 
 #define VALUES(NAME, TYPE, KIND)                                                                 \
-    fmi2Status fmi2Get##NAME(fmi2Component instance, const fmi2ValueReference references[],      \
-                             size_t n, TYPE values[]) {                                          \
+    API(fmi2Status, fmi2Get##NAME)(fmi2Component instance,                                       \
+                                   const fmi2ValueReference references[], size_t n,              \
+                                   TYPE values[]) {                                              \
         char said[200];                                                                          \
         size_t j;                                                                                \
         double value = 0.0;                                                                      \
@@ -141,8 +142,9 @@ fmi2Status fmi2Reset(fmi2Component instance) {
         }                                                                                        \
         return fmi2OK;                                                                           \
     }                                                                                            \
-    fmi2Status fmi2Set##NAME(fmi2Component instance, const fmi2ValueReference references[],      \
-                             size_t n, const TYPE values[]) {                                    \
+    API(fmi2Status, fmi2Set##NAME)(fmi2Component instance,                                       \
+                                   const fmi2ValueReference references[], size_t n,              \
+                                   const TYPE values[]) {                                        \
         char said[200];                                                                          \
         size_t j;                                                                                \
         for (j = 0; j < n; j++) {                                                                \
@@ -158,64 +160,65 @@ VALUES(Real, fmi2Real, REAL)
 VALUES(Boolean, fmi2Boolean, TRUTH)
 VALUES(Integer, fmi2Integer, CHOICE)
 
-fmi2Status fmi2GetString(fmi2Component instance, const fmi2ValueReference references[], size_t n,
-                         fmi2String values[]) {
+API(fmi2Status, fmi2GetString)(fmi2Component instance, const fmi2ValueReference references[],
+                               size_t n, fmi2String values[]) {
     UNUSED(references);
     UNUSED(values);
     return n == 0 ? fmi2OK : failed(instance, "this FMU has no variable of type String");
 }
 
-fmi2Status fmi2SetString(fmi2Component instance, const fmi2ValueReference references[], size_t n,
-                         const fmi2String values[]) {
+API(fmi2Status, fmi2SetString)(fmi2Component instance, const fmi2ValueReference references[],
+                               size_t n, const fmi2String values[]) {
     UNUSED(values);
-    return fmi2GetString(instance, references, n, NULL);
+    return FULL_NAME(fmi2GetString)(instance, references, n, NULL);
 }
 
 /* --- time -------------------------------------------------------------------------------------- */
 
-fmi2Status fmi2DoStep(fmi2Component instance, fmi2Real currentCommunicationPoint,
-                      fmi2Real communicationStepSize,
-                      fmi2Boolean noSetFMUStatePriorToCurrentPoint) {
+API(fmi2Status, fmi2DoStep)(fmi2Component instance, fmi2Real currentCommunicationPoint,
+                            fmi2Real communicationStepSize,
+                            fmi2Boolean noSetFMUStatePriorToCurrentPoint) {
     struct Component *c = &((Instance *)instance)->component;
     UNUSED(noSetFMUStatePriorToCurrentPoint);
     return done(instance, component_do_step(c, currentCommunicationPoint, communicationStepSize));
 }
 
-fmi2Status fmi2CancelStep(fmi2Component instance) {
+API(fmi2Status, fmi2CancelStep)(fmi2Component instance) {
     return failed(instance, "a step is done when it returns: there is none to cancel");
 }
 
 /* --- states ------------------------------------------------------------------------------------ */
 
-fmi2Status fmi2GetFMUstate(fmi2Component instance, fmi2FMUstate *state) {
+API(fmi2Status, fmi2GetFMUstate)(fmi2Component instance, fmi2FMUstate *state) {
     return done(instance, component_save(&((Instance *)instance)->component, state));
 }
 
-fmi2Status fmi2SetFMUstate(fmi2Component instance, fmi2FMUstate state) {
+API(fmi2Status, fmi2SetFMUstate)(fmi2Component instance, fmi2FMUstate state) {
     ((Instance *)instance)->component = *(struct Component *)state;
     return fmi2OK;
 }
 
-fmi2Status fmi2FreeFMUstate(fmi2Component instance, fmi2FMUstate *state) {
+API(fmi2Status, fmi2FreeFMUstate)(fmi2Component instance, fmi2FMUstate *state) {
     UNUSED(instance);
     component_forget(state);
     return fmi2OK;
 }
 
-fmi2Status fmi2SerializedFMUstateSize(fmi2Component instance, fmi2FMUstate state, size_t *size) {
+API(fmi2Status, fmi2SerializedFMUstateSize)(fmi2Component instance, fmi2FMUstate state,
+                                            size_t *size) {
     UNUSED(instance);
     UNUSED(state);
     *size = sizeof(struct Component);
     return fmi2OK;
 }
 
-fmi2Status fmi2SerializeFMUstate(fmi2Component instance, fmi2FMUstate state,
-                                 fmi2Byte serialized[], size_t size) {
+API(fmi2Status, fmi2SerializeFMUstate)(fmi2Component instance, fmi2FMUstate state,
+                                       fmi2Byte serialized[], size_t size) {
     return done(instance, component_serialize(state, serialized, size));
 }
 
-fmi2Status fmi2DeSerializeFMUstate(fmi2Component instance, const fmi2Byte serialized[],
-                                   size_t size, fmi2FMUstate *state) {
+API(fmi2Status, fmi2DeSerializeFMUstate)(fmi2Component instance, const fmi2Byte serialized[],
+                                         size_t size, fmi2FMUstate *state) {
     return done(instance, component_deserialize(serialized, size, state));
 }
 
@@ -223,10 +226,10 @@ fmi2Status fmi2DeSerializeFMUstate(fmi2Component instance, const fmi2Byte serial
 
 #define ABSENT "the description says that this FMU does not do this"
 
-fmi2Status fmi2GetDirectionalDerivative(fmi2Component instance,
-                                        const fmi2ValueReference unknowns[], size_t nUnknown,
-                                        const fmi2ValueReference knowns[], size_t nKnown,
-                                        const fmi2Real seed[], fmi2Real sensitivity[]) {
+API(fmi2Status,
+    fmi2GetDirectionalDerivative)(fmi2Component instance, const fmi2ValueReference unknowns[],
+                                  size_t nUnknown, const fmi2ValueReference knowns[],
+                                  size_t nKnown, const fmi2Real seed[], fmi2Real sensitivity[]) {
     UNUSED(unknowns);
     UNUSED(nUnknown);
     UNUSED(knowns);
@@ -236,9 +239,9 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component instance,
     return failed(instance, ABSENT);
 }
 
-fmi2Status fmi2SetRealInputDerivatives(fmi2Component instance,
-                                       const fmi2ValueReference references[], size_t n,
-                                       const fmi2Integer orders[], const fmi2Real values[]) {
+API(fmi2Status,
+    fmi2SetRealInputDerivatives)(fmi2Component instance, const fmi2ValueReference references[],
+                                 size_t n, const fmi2Integer orders[], const fmi2Real values[]) {
     UNUSED(references);
     UNUSED(n);
     UNUSED(orders);
@@ -246,16 +249,17 @@ fmi2Status fmi2SetRealInputDerivatives(fmi2Component instance,
     return failed(instance, ABSENT);
 }
 
-fmi2Status fmi2GetRealOutputDerivatives(fmi2Component instance,
-                                        const fmi2ValueReference references[], size_t n,
-                                        const fmi2Integer orders[], fmi2Real values[]) {
+API(fmi2Status, fmi2GetRealOutputDerivatives)(fmi2Component instance,
+                                              const fmi2ValueReference references[], size_t n,
+                                              const fmi2Integer orders[], fmi2Real values[]) {
     UNUSED(values);
-    return fmi2SetRealInputDerivatives(instance, references, n, orders, NULL);
+    return FULL_NAME(fmi2SetRealInputDerivatives)(instance, references, n, orders, NULL);
 }
 
 /* Steps are done when they return, so none is pending and none has a status of its own. */
 #define NO_STATUS(NAME, TYPE)                                                                    \
-    fmi2Status fmi2Get##NAME(fmi2Component instance, const fmi2StatusKind kind, TYPE *value) {   \
+    API(fmi2Status, fmi2Get##NAME)(fmi2Component instance, const fmi2StatusKind kind,            \
+                                   TYPE *value) {                                                \
         UNUSED(instance);                                                                        \
         UNUSED(kind);                                                                            \
         UNUSED(value);                                                                           \

@@ -2,7 +2,7 @@
 
 #include "component.h"
 
-#include "fmi3Functions.h"
+#include "fmi3.h"
 
 #define UNUSED(x) (void)(x)
 
@@ -26,10 +26,10 @@ static fmi3Status done(fmi3Instance instance, const char *wrong) {
     return wrong == NULL ? fmi3OK : failed(instance, wrong);
 }
 
-const char *fmi3GetVersion(void) { return fmi3Version; }
+API(const char *, fmi3GetVersion)(void) { return fmi3Version; }
 
-fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean loggingOn, size_t nCategories,
-                               const fmi3String categories[]) {
+API(fmi3Status, fmi3SetDebugLogging)(fmi3Instance instance, fmi3Boolean loggingOn,
+                                     size_t nCategories, const fmi3String categories[]) {
     UNUSED(nCategories);
     UNUSED(categories);
     ((Instance *)instance)->talks = loggingOn;
@@ -38,7 +38,7 @@ fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean loggingOn, siz
 
 /* --- instances --------------------------------------------------------------------------------- */
 
-fmi3Instance fmi3InstantiateCoSimulation(
+API(fmi3Instance, fmi3InstantiateCoSimulation)(
     fmi3String instanceName, fmi3String instantiationToken, fmi3String resourcePath,
     fmi3Boolean visible, fmi3Boolean loggingOn, fmi3Boolean eventModeUsed,
     fmi3Boolean earlyReturnAllowed, const fmi3ValueReference requiredIntermediateVariables[],
@@ -73,10 +73,12 @@ fmi3Instance fmi3InstantiateCoSimulation(
     return i;
 }
 
-fmi3Instance fmi3InstantiateModelExchange(
-    fmi3String instanceName, fmi3String instantiationToken, fmi3String resourcePath,
-    fmi3Boolean visible, fmi3Boolean loggingOn, fmi3InstanceEnvironment instanceEnvironment,
-    fmi3LogMessageCallback logMessage) {
+API(fmi3Instance, fmi3InstantiateModelExchange)(fmi3String instanceName,
+                                                fmi3String instantiationToken,
+                                                fmi3String resourcePath, fmi3Boolean visible,
+                                                fmi3Boolean loggingOn,
+                                                fmi3InstanceEnvironment instanceEnvironment,
+                                                fmi3LogMessageCallback logMessage) {
     UNUSED(instanceName);
     UNUSED(instantiationToken);
     UNUSED(resourcePath);
@@ -87,7 +89,7 @@ fmi3Instance fmi3InstantiateModelExchange(
     return NULL;
 }
 
-fmi3Instance fmi3InstantiateScheduledExecution(
+API(fmi3Instance, fmi3InstantiateScheduledExecution)(
     fmi3String instanceName, fmi3String instantiationToken, fmi3String resourcePath,
     fmi3Boolean visible, fmi3Boolean loggingOn, fmi3InstanceEnvironment instanceEnvironment,
     fmi3LogMessageCallback logMessage, fmi3ClockUpdateCallback clockUpdate,
@@ -95,17 +97,18 @@ fmi3Instance fmi3InstantiateScheduledExecution(
     UNUSED(clockUpdate);
     UNUSED(lockPreemption);
     UNUSED(unlockPreemption);
-    return fmi3InstantiateModelExchange(instanceName, instantiationToken, resourcePath, visible,
-                                        loggingOn, instanceEnvironment, logMessage);
+    return FULL_NAME(fmi3InstantiateModelExchange)(instanceName, instantiationToken, resourcePath,
+                                                   visible, loggingOn, instanceEnvironment,
+                                                   logMessage);
 }
 
-void fmi3FreeInstance(fmi3Instance instance) { free(instance); }
+API(void, fmi3FreeInstance)(fmi3Instance instance) { free(instance); }
 
 /* --- modes ------------------------------------------------------------------------------------- */
 
-fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean toleranceDefined,
-                                       fmi3Float64 tolerance, fmi3Float64 startTime,
-                                       fmi3Boolean stopTimeDefined, fmi3Float64 stopTime) {
+API(fmi3Status, fmi3EnterInitializationMode)(fmi3Instance instance, fmi3Boolean toleranceDefined,
+                                             fmi3Float64 tolerance, fmi3Float64 startTime,
+                                             fmi3Boolean stopTimeDefined, fmi3Float64 stopTime) {
     struct Component *c = &((Instance *)instance)->component;
     UNUSED(toleranceDefined);
     UNUSED(tolerance);
@@ -116,19 +119,19 @@ fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean tolera
     return fmi3OK;
 }
 
-fmi3Status fmi3ExitInitializationMode(fmi3Instance instance) {
+API(fmi3Status, fmi3ExitInitializationMode)(fmi3Instance instance) {
     struct Component *c = &((Instance *)instance)->component;
     component_rest(c);
     c->mode = STEPPING;
     return fmi3OK;
 }
 
-fmi3Status fmi3Terminate(fmi3Instance instance) {
+API(fmi3Status, fmi3Terminate)(fmi3Instance instance) {
     ((Instance *)instance)->component.mode = TERMINATED;
     return fmi3OK;
 }
 
-fmi3Status fmi3Reset(fmi3Instance instance) {
+API(fmi3Status, fmi3Reset)(fmi3Instance instance) {
     component_reset(&((Instance *)instance)->component);
     return fmi3OK;
 }
@@ -136,8 +139,8 @@ fmi3Status fmi3Reset(fmi3Instance instance) {
 /* --- values ------------------------------------------------------------------------------------ */
 
 #define VALUES(NAME, TYPE, KIND)                                                                 \
-    fmi3Status fmi3Get##NAME(fmi3Instance instance, const fmi3ValueReference references[],       \
-                             size_t n, TYPE values[], size_t nValues) {                          \
+    API(fmi3Status, fmi3Get##NAME)(fmi3Instance instance, const fmi3ValueReference references[], \
+                                   size_t n, TYPE values[], size_t nValues) {                    \
         char said[200] = "as many values as value references are needed";                        \
         size_t j;                                                                                \
         double value = 0.0;                                                                      \
@@ -150,8 +153,8 @@ fmi3Status fmi3Reset(fmi3Instance instance) {
         }                                                                                        \
         return n == nValues ? fmi3OK : failed(instance, said);                                   \
     }                                                                                            \
-    fmi3Status fmi3Set##NAME(fmi3Instance instance, const fmi3ValueReference references[],       \
-                             size_t n, const TYPE values[], size_t nValues) {                    \
+    API(fmi3Status, fmi3Set##NAME)(fmi3Instance instance, const fmi3ValueReference references[], \
+                                   size_t n, const TYPE values[], size_t nValues) {              \
         char said[200] = "as many values as value references are needed";                        \
         size_t j;                                                                                \
         for (j = 0; j < n && n == nValues; j++) {                                                \
@@ -168,15 +171,15 @@ VALUES(Boolean, fmi3Boolean, TRUTH)
 VALUES(Int64, fmi3Int64, CHOICE)
 
 #define NO_VALUES(NAME, TYPE)                                                                    \
-    fmi3Status fmi3Get##NAME(fmi3Instance instance, const fmi3ValueReference references[],       \
-                             size_t n, TYPE values[], size_t nValues) {                          \
+    API(fmi3Status, fmi3Get##NAME)(fmi3Instance instance, const fmi3ValueReference references[], \
+                                   size_t n, TYPE values[], size_t nValues) {                    \
         UNUSED(references);                                                                      \
         UNUSED(values);                                                                          \
         UNUSED(nValues);                                                                         \
         return n == 0 ? fmi3OK : failed(instance, "this FMU has no variable of type " #NAME);    \
     }                                                                                            \
-    fmi3Status fmi3Set##NAME(fmi3Instance instance, const fmi3ValueReference references[],       \
-                             size_t n, TYPE const values[], size_t nValues) {                    \
+    API(fmi3Status, fmi3Set##NAME)(fmi3Instance instance, const fmi3ValueReference references[], \
+                                   size_t n, TYPE const values[], size_t nValues) {              \
         UNUSED(references);                                                                      \
         UNUSED(values);                                                                          \
         UNUSED(nValues);                                                                         \
@@ -193,39 +196,40 @@ NO_VALUES(UInt32, fmi3UInt32)
 NO_VALUES(UInt64, fmi3UInt64)
 NO_VALUES(String, fmi3String)
 
-fmi3Status fmi3GetBinary(fmi3Instance instance, const fmi3ValueReference references[], size_t n,
-                         size_t sizes[], fmi3Binary values[], size_t nValues) {
+API(fmi3Status, fmi3GetBinary)(fmi3Instance instance, const fmi3ValueReference references[],
+                               size_t n, size_t sizes[], fmi3Binary values[], size_t nValues) {
     UNUSED(sizes);
     UNUSED(values);
-    return fmi3GetUInt8(instance, references, n, NULL, nValues);
+    return FULL_NAME(fmi3GetUInt8)(instance, references, n, NULL, nValues);
 }
 
-fmi3Status fmi3SetBinary(fmi3Instance instance, const fmi3ValueReference references[], size_t n,
-                         const size_t sizes[], const fmi3Binary values[], size_t nValues) {
+API(fmi3Status, fmi3SetBinary)(fmi3Instance instance, const fmi3ValueReference references[],
+                               size_t n, const size_t sizes[], const fmi3Binary values[],
+                               size_t nValues) {
     UNUSED(sizes);
     UNUSED(values);
-    return fmi3SetUInt8(instance, references, n, NULL, nValues);
+    return FULL_NAME(fmi3SetUInt8)(instance, references, n, NULL, nValues);
 }
 
-fmi3Status fmi3GetClock(fmi3Instance instance, const fmi3ValueReference references[], size_t n,
-                        fmi3Clock values[]) {
+API(fmi3Status, fmi3GetClock)(fmi3Instance instance, const fmi3ValueReference references[],
+                              size_t n, fmi3Clock values[]) {
     UNUSED(values);
-    return fmi3GetUInt8(instance, references, n, NULL, n);
+    return FULL_NAME(fmi3GetUInt8)(instance, references, n, NULL, n);
 }
 
-fmi3Status fmi3SetClock(fmi3Instance instance, const fmi3ValueReference references[], size_t n,
-                        const fmi3Clock values[]) {
+API(fmi3Status, fmi3SetClock)(fmi3Instance instance, const fmi3ValueReference references[],
+                              size_t n, const fmi3Clock values[]) {
     UNUSED(values);
-    return fmi3SetUInt8(instance, references, n, NULL, n);
+    return FULL_NAME(fmi3SetUInt8)(instance, references, n, NULL, n);
 }
 
 /* --- time -------------------------------------------------------------------------------------- */
 
-fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 currentCommunicationPoint,
-                      fmi3Float64 communicationStepSize,
-                      fmi3Boolean noSetFMUStatePriorToCurrentPoint,
-                      fmi3Boolean *eventHandlingNeeded, fmi3Boolean *terminateSimulation,
-                      fmi3Boolean *earlyReturn, fmi3Float64 *lastSuccessfulTime) {
+API(fmi3Status, fmi3DoStep)(fmi3Instance instance, fmi3Float64 currentCommunicationPoint,
+                            fmi3Float64 communicationStepSize,
+                            fmi3Boolean noSetFMUStatePriorToCurrentPoint,
+                            fmi3Boolean *eventHandlingNeeded, fmi3Boolean *terminateSimulation,
+                            fmi3Boolean *earlyReturn, fmi3Float64 *lastSuccessfulTime) {
     struct Component *c = &((Instance *)instance)->component;
     const char *wrong;
     UNUSED(noSetFMUStatePriorToCurrentPoint);
@@ -241,35 +245,36 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 currentCommunicationPoi
 
 /* --- states ------------------------------------------------------------------------------------ */
 
-fmi3Status fmi3GetFMUState(fmi3Instance instance, fmi3FMUState *state) {
+API(fmi3Status, fmi3GetFMUState)(fmi3Instance instance, fmi3FMUState *state) {
     return done(instance, component_save(&((Instance *)instance)->component, state));
 }
 
-fmi3Status fmi3SetFMUState(fmi3Instance instance, fmi3FMUState state) {
+API(fmi3Status, fmi3SetFMUState)(fmi3Instance instance, fmi3FMUState state) {
     ((Instance *)instance)->component = *(struct Component *)state;
     return fmi3OK;
 }
 
-fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *state) {
+API(fmi3Status, fmi3FreeFMUState)(fmi3Instance instance, fmi3FMUState *state) {
     UNUSED(instance);
     component_forget(state);
     return fmi3OK;
 }
 
-fmi3Status fmi3SerializedFMUStateSize(fmi3Instance instance, fmi3FMUState state, size_t *size) {
+API(fmi3Status, fmi3SerializedFMUStateSize)(fmi3Instance instance, fmi3FMUState state,
+                                            size_t *size) {
     UNUSED(instance);
     UNUSED(state);
     *size = sizeof(struct Component);
     return fmi3OK;
 }
 
-fmi3Status fmi3SerializeFMUState(fmi3Instance instance, fmi3FMUState state,
-                                 fmi3Byte serialized[], size_t size) {
+API(fmi3Status, fmi3SerializeFMUState)(fmi3Instance instance, fmi3FMUState state,
+                                       fmi3Byte serialized[], size_t size) {
     return done(instance, component_serialize(state, serialized, size));
 }
 
-fmi3Status fmi3DeserializeFMUState(fmi3Instance instance, const fmi3Byte serialized[],
-                                   size_t size, fmi3FMUState *state) {
+API(fmi3Status, fmi3DeserializeFMUState)(fmi3Instance instance, const fmi3Byte serialized[],
+                                         size_t size, fmi3FMUState *state) {
     return done(instance, component_deserialize(serialized, size, state));
 }
 
@@ -277,26 +282,35 @@ fmi3Status fmi3DeserializeFMUState(fmi3Instance instance, const fmi3Byte seriali
 
 #define ABSENT "the description says that this FMU does not do this"
 
-fmi3Status fmi3EnterEventMode(fmi3Instance instance) { return failed(instance, ABSENT); }
-fmi3Status fmi3EnterStepMode(fmi3Instance instance) { return failed(instance, ABSENT); }
-fmi3Status fmi3EnterConfigurationMode(fmi3Instance instance) { return failed(instance, ABSENT); }
-fmi3Status fmi3ExitConfigurationMode(fmi3Instance instance) { return failed(instance, ABSENT); }
-fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance instance) { return failed(instance, ABSENT); }
-fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance instance) { return failed(instance, ABSENT); }
+API(fmi3Status, fmi3EnterEventMode)(fmi3Instance instance) { return failed(instance, ABSENT); }
+API(fmi3Status, fmi3EnterStepMode)(fmi3Instance instance) { return failed(instance, ABSENT); }
+API(fmi3Status, fmi3EnterConfigurationMode)(fmi3Instance instance) {
+    return failed(instance, ABSENT);
+}
+API(fmi3Status, fmi3ExitConfigurationMode)(fmi3Instance instance) {
+    return failed(instance, ABSENT);
+}
+API(fmi3Status, fmi3EvaluateDiscreteStates)(fmi3Instance instance) {
+    return failed(instance, ABSENT);
+}
+API(fmi3Status, fmi3EnterContinuousTimeMode)(fmi3Instance instance) {
+    return failed(instance, ABSENT);
+}
 
-fmi3Status fmi3GetNumberOfVariableDependencies(fmi3Instance instance, fmi3ValueReference reference,
-                                               size_t *nDependencies) {
+API(fmi3Status, fmi3GetNumberOfVariableDependencies)(fmi3Instance instance,
+                                                     fmi3ValueReference reference,
+                                                     size_t *nDependencies) {
     UNUSED(reference);
     UNUSED(nDependencies);
     return failed(instance, ABSENT);
 }
 
-fmi3Status fmi3GetVariableDependencies(fmi3Instance instance, fmi3ValueReference dependent,
-                                       size_t elementIndicesOfDependent[],
-                                       fmi3ValueReference independents[],
-                                       size_t elementIndicesOfIndependents[],
-                                       fmi3DependencyKind dependencyKinds[],
-                                       size_t nDependencies) {
+API(fmi3Status, fmi3GetVariableDependencies)(fmi3Instance instance, fmi3ValueReference dependent,
+                                             size_t elementIndicesOfDependent[],
+                                             fmi3ValueReference independents[],
+                                             size_t elementIndicesOfIndependents[],
+                                             fmi3DependencyKind dependencyKinds[],
+                                             size_t nDependencies) {
     UNUSED(dependent);
     UNUSED(elementIndicesOfDependent);
     UNUSED(independents);
@@ -306,10 +320,11 @@ fmi3Status fmi3GetVariableDependencies(fmi3Instance instance, fmi3ValueReference
     return failed(instance, ABSENT);
 }
 
-fmi3Status fmi3GetDirectionalDerivative(fmi3Instance instance, const fmi3ValueReference unknowns[],
-                                        size_t nUnknowns, const fmi3ValueReference knowns[],
-                                        size_t nKnowns, const fmi3Float64 seed[], size_t nSeed,
-                                        fmi3Float64 sensitivity[], size_t nSensitivity) {
+API(fmi3Status,
+    fmi3GetDirectionalDerivative)(fmi3Instance instance, const fmi3ValueReference unknowns[],
+                                  size_t nUnknowns, const fmi3ValueReference knowns[],
+                                  size_t nKnowns, const fmi3Float64 seed[], size_t nSeed,
+                                  fmi3Float64 sensitivity[], size_t nSensitivity) {
     UNUSED(unknowns);
     UNUSED(nUnknowns);
     UNUSED(knowns);
@@ -321,17 +336,19 @@ fmi3Status fmi3GetDirectionalDerivative(fmi3Instance instance, const fmi3ValueRe
     return failed(instance, ABSENT);
 }
 
-fmi3Status fmi3GetAdjointDerivative(fmi3Instance instance, const fmi3ValueReference unknowns[],
-                                    size_t nUnknowns, const fmi3ValueReference knowns[],
-                                    size_t nKnowns, const fmi3Float64 seed[], size_t nSeed,
-                                    fmi3Float64 sensitivity[], size_t nSensitivity) {
-    return fmi3GetDirectionalDerivative(instance, unknowns, nUnknowns, knowns, nKnowns, seed,
-                                        nSeed, sensitivity, nSensitivity);
+API(fmi3Status, fmi3GetAdjointDerivative)(fmi3Instance instance,
+                                          const fmi3ValueReference unknowns[], size_t nUnknowns,
+                                          const fmi3ValueReference knowns[], size_t nKnowns,
+                                          const fmi3Float64 seed[], size_t nSeed,
+                                          fmi3Float64 sensitivity[], size_t nSensitivity) {
+    return FULL_NAME(fmi3GetDirectionalDerivative)(instance, unknowns, nUnknowns, knowns, nKnowns,
+                                                   seed, nSeed, sensitivity, nSensitivity);
 }
 
-fmi3Status fmi3GetOutputDerivatives(fmi3Instance instance, const fmi3ValueReference references[],
-                                    size_t n, const fmi3Int32 orders[], fmi3Float64 values[],
-                                    size_t nValues) {
+API(fmi3Status, fmi3GetOutputDerivatives)(fmi3Instance instance,
+                                          const fmi3ValueReference references[], size_t n,
+                                          const fmi3Int32 orders[], fmi3Float64 values[],
+                                          size_t nValues) {
     UNUSED(references);
     UNUSED(n);
     UNUSED(orders);
@@ -340,9 +357,10 @@ fmi3Status fmi3GetOutputDerivatives(fmi3Instance instance, const fmi3ValueRefere
     return failed(instance, ABSENT);
 }
 
-fmi3Status fmi3GetIntervalDecimal(fmi3Instance instance, const fmi3ValueReference references[],
-                                  size_t n, fmi3Float64 intervals[],
-                                  fmi3IntervalQualifier qualifiers[]) {
+API(fmi3Status, fmi3GetIntervalDecimal)(fmi3Instance instance,
+                                        const fmi3ValueReference references[], size_t n,
+                                        fmi3Float64 intervals[],
+                                        fmi3IntervalQualifier qualifiers[]) {
     UNUSED(references);
     UNUSED(n);
     UNUSED(intervals);
@@ -350,9 +368,10 @@ fmi3Status fmi3GetIntervalDecimal(fmi3Instance instance, const fmi3ValueReferenc
     return failed(instance, ABSENT);
 }
 
-fmi3Status fmi3GetIntervalFraction(fmi3Instance instance, const fmi3ValueReference references[],
-                                   size_t n, fmi3UInt64 counters[], fmi3UInt64 resolutions[],
-                                   fmi3IntervalQualifier qualifiers[]) {
+API(fmi3Status, fmi3GetIntervalFraction)(fmi3Instance instance,
+                                         const fmi3ValueReference references[], size_t n,
+                                         fmi3UInt64 counters[], fmi3UInt64 resolutions[],
+                                         fmi3IntervalQualifier qualifiers[]) {
     UNUSED(references);
     UNUSED(n);
     UNUSED(counters);
@@ -361,16 +380,17 @@ fmi3Status fmi3GetIntervalFraction(fmi3Instance instance, const fmi3ValueReferen
     return failed(instance, ABSENT);
 }
 
-fmi3Status fmi3GetShiftDecimal(fmi3Instance instance, const fmi3ValueReference references[],
-                               size_t n, fmi3Float64 shifts[]) {
+API(fmi3Status, fmi3GetShiftDecimal)(fmi3Instance instance, const fmi3ValueReference references[],
+                                     size_t n, fmi3Float64 shifts[]) {
     UNUSED(references);
     UNUSED(n);
     UNUSED(shifts);
     return failed(instance, ABSENT);
 }
 
-fmi3Status fmi3GetShiftFraction(fmi3Instance instance, const fmi3ValueReference references[],
-                                size_t n, fmi3UInt64 counters[], fmi3UInt64 resolutions[]) {
+API(fmi3Status, fmi3GetShiftFraction)(fmi3Instance instance,
+                                      const fmi3ValueReference references[], size_t n,
+                                      fmi3UInt64 counters[], fmi3UInt64 resolutions[]) {
     UNUSED(references);
     UNUSED(n);
     UNUSED(counters);
@@ -378,17 +398,19 @@ fmi3Status fmi3GetShiftFraction(fmi3Instance instance, const fmi3ValueReference 
     return failed(instance, ABSENT);
 }
 
-fmi3Status fmi3SetIntervalDecimal(fmi3Instance instance, const fmi3ValueReference references[],
-                                  size_t n, const fmi3Float64 intervals[]) {
+API(fmi3Status, fmi3SetIntervalDecimal)(fmi3Instance instance,
+                                        const fmi3ValueReference references[], size_t n,
+                                        const fmi3Float64 intervals[]) {
     UNUSED(references);
     UNUSED(n);
     UNUSED(intervals);
     return failed(instance, ABSENT);
 }
 
-fmi3Status fmi3SetIntervalFraction(fmi3Instance instance, const fmi3ValueReference references[],
-                                   size_t n, const fmi3UInt64 counters[],
-                                   const fmi3UInt64 resolutions[]) {
+API(fmi3Status, fmi3SetIntervalFraction)(fmi3Instance instance,
+                                         const fmi3ValueReference references[], size_t n,
+                                         const fmi3UInt64 counters[],
+                                         const fmi3UInt64 resolutions[]) {
     UNUSED(references);
     UNUSED(n);
     UNUSED(counters);
@@ -396,23 +418,23 @@ fmi3Status fmi3SetIntervalFraction(fmi3Instance instance, const fmi3ValueReferen
     return failed(instance, ABSENT);
 }
 
-fmi3Status fmi3SetShiftDecimal(fmi3Instance instance, const fmi3ValueReference references[],
-                               size_t n, const fmi3Float64 shifts[]) {
-    return fmi3SetIntervalDecimal(instance, references, n, shifts);
+API(fmi3Status, fmi3SetShiftDecimal)(fmi3Instance instance, const fmi3ValueReference references[],
+                                     size_t n, const fmi3Float64 shifts[]) {
+    return FULL_NAME(fmi3SetIntervalDecimal)(instance, references, n, shifts);
 }
 
-fmi3Status fmi3SetShiftFraction(fmi3Instance instance, const fmi3ValueReference references[],
-                                size_t n, const fmi3UInt64 counters[],
-                                const fmi3UInt64 resolutions[]) {
-    return fmi3SetIntervalFraction(instance, references, n, counters, resolutions);
+API(fmi3Status,
+    fmi3SetShiftFraction)(fmi3Instance instance, const fmi3ValueReference references[], size_t n,
+                          const fmi3UInt64 counters[], const fmi3UInt64 resolutions[]) {
+    return FULL_NAME(fmi3SetIntervalFraction)(instance, references, n, counters, resolutions);
 }
 
-fmi3Status fmi3UpdateDiscreteStates(fmi3Instance instance, fmi3Boolean *discreteStatesNeedUpdate,
-                                    fmi3Boolean *terminateSimulation,
-                                    fmi3Boolean *nominalsOfContinuousStatesChanged,
-                                    fmi3Boolean *valuesOfContinuousStatesChanged,
-                                    fmi3Boolean *nextEventTimeDefined,
-                                    fmi3Float64 *nextEventTime) {
+API(fmi3Status,
+    fmi3UpdateDiscreteStates)(fmi3Instance instance, fmi3Boolean *discreteStatesNeedUpdate,
+                              fmi3Boolean *terminateSimulation,
+                              fmi3Boolean *nominalsOfContinuousStatesChanged,
+                              fmi3Boolean *valuesOfContinuousStatesChanged,
+                              fmi3Boolean *nextEventTimeDefined, fmi3Float64 *nextEventTime) {
     UNUSED(discreteStatesNeedUpdate);
     UNUSED(terminateSimulation);
     UNUSED(nominalsOfContinuousStatesChanged);
@@ -422,29 +444,30 @@ fmi3Status fmi3UpdateDiscreteStates(fmi3Instance instance, fmi3Boolean *discrete
     return failed(instance, ABSENT);
 }
 
-fmi3Status fmi3CompletedIntegratorStep(fmi3Instance instance,
-                                       fmi3Boolean noSetFMUStatePriorToCurrentPoint,
-                                       fmi3Boolean *enterEventMode,
-                                       fmi3Boolean *terminateSimulation) {
+API(fmi3Status, fmi3CompletedIntegratorStep)(fmi3Instance instance,
+                                             fmi3Boolean noSetFMUStatePriorToCurrentPoint,
+                                             fmi3Boolean *enterEventMode,
+                                             fmi3Boolean *terminateSimulation) {
     UNUSED(noSetFMUStatePriorToCurrentPoint);
     UNUSED(enterEventMode);
     UNUSED(terminateSimulation);
     return failed(instance, ABSENT);
 }
 
-fmi3Status fmi3SetTime(fmi3Instance instance, fmi3Float64 time) {
+API(fmi3Status, fmi3SetTime)(fmi3Instance instance, fmi3Float64 time) {
     UNUSED(time);
     return failed(instance, ABSENT);
 }
 
-fmi3Status fmi3SetContinuousStates(fmi3Instance instance, const fmi3Float64 values[], size_t n) {
+API(fmi3Status, fmi3SetContinuousStates)(fmi3Instance instance, const fmi3Float64 values[],
+                                         size_t n) {
     UNUSED(values);
     UNUSED(n);
     return failed(instance, ABSENT);
 }
 
 #define NO_NUMBERS(NAME)                                                                         \
-    fmi3Status fmi3Get##NAME(fmi3Instance instance, fmi3Float64 values[], size_t n) {            \
+    API(fmi3Status, fmi3Get##NAME)(fmi3Instance instance, fmi3Float64 values[], size_t n) {      \
         UNUSED(values);                                                                          \
         UNUSED(n);                                                                               \
         return failed(instance, ABSENT);                                                         \
@@ -455,18 +478,19 @@ NO_NUMBERS(EventIndicators)
 NO_NUMBERS(ContinuousStates)
 NO_NUMBERS(NominalsOfContinuousStates)
 
-fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance instance, size_t *n) {
+API(fmi3Status, fmi3GetNumberOfEventIndicators)(fmi3Instance instance, size_t *n) {
     UNUSED(instance);
     *n = 0;
     return fmi3OK;
 }
 
-fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance instance, size_t *n) {
-    return fmi3GetNumberOfEventIndicators(instance, n);
+API(fmi3Status, fmi3GetNumberOfContinuousStates)(fmi3Instance instance, size_t *n) {
+    return FULL_NAME(fmi3GetNumberOfEventIndicators)(instance, n);
 }
 
-fmi3Status fmi3ActivateModelPartition(fmi3Instance instance, fmi3ValueReference clockReference,
-                                      fmi3Float64 activationTime) {
+API(fmi3Status, fmi3ActivateModelPartition)(fmi3Instance instance,
+                                            fmi3ValueReference clockReference,
+                                            fmi3Float64 activationTime) {
     UNUSED(clockReference);
     UNUSED(activationTime);
     return failed(instance, ABSENT);

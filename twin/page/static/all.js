@@ -8,7 +8,7 @@ let me = { user: "", csrf: "" };
 let told = null; // what the server said last
 let heardMs = 0;
 let one = null; // the ejector that is shown by itself
-const plots = { rows: null, figure: null };
+const plots = { one: null, figure: null };
 
 // --- the table -----------------------------------------------------------------------------------
 
@@ -127,10 +127,9 @@ function card(alarm) {
 
 function showPlots() {
   const { time, low, high, expected } = one.rows;
-  const side = (name, width, dash) => ({ stroke: colour(name), width, dash, points: { show: false } });
-  draw("rows", $("one-plot"), [time, expected, low, high],
-    [{}, side("--orange", 2, [8, 5]), side("--blue", 2), side("--blue", 2)],
-    { bands: [{ series: [3, 2], fill: colour("--blue") + "55" }] }, 0);
+  const model = { colour: "--orange", width: 2, dash: [8, 5] };
+  draw("one", "mbar", [{ time, low: expected, ...model },
+    { time, low, high, colour: "--blue", width: 2, fill: 0.33 }]);
   const select = $("figure");
   const names = one.trends.map((trend) => trend.name);
   if ([...select.options].map((option) => option.value).join() !== names.join()) {
@@ -140,38 +139,28 @@ function showPlots() {
   }
   const trend = one.trends.find((each) => each.name === select.value);
   $("figure-what").textContent = trend ? `${trend.what}, ${trend.unit}` : "No cycle has been told yet.";
-  const none = { time: [], measured: [], expected: [] };
-  const { time: at, measured, expected: model } = trend || none;
-  const dots = { stroke: colour("--grey"), paths: () => null,
-    points: { show: true, size: 5, fill: colour("--grey"), width: 0 } };
-  draw("figure", $("figure-plot"), [at, measured, model], [{}, dots, side("--orange", 2, [8, 5])], {});
+  const { time: at, measured, expected: beside, unit } = trend || { time: [], measured: [], expected: [], unit: "" };
+  draw("figure", unit, [{ time: at, low: measured, colour: "--grey", dots: true },
+    { time: at, low: beside, ...model }]);
 }
 
-function draw(name, box, data, series, more, lowest) {
-  if (plots[name]) {
-    plots[name].setData(data);
-    return;
+function draw(name, unit, series) {
+  const least = name === "one" ? () => 0 : (low, high) => roomy(low, high)[0];
+  if (!plots[name]) {
+    const span = () => moments(plots[name] ? plots[name].series[0].time : []);
+    plots[name] = new Chart($(`${name}-plot`), {
+      home: span, all: span, least: 10, tools: $(`${name}-tools`), ticks: () => dateTicks,
+      values: (low = 0, high = low + 100) => [least(low, high), roomy(low, high)[1]],
+    });
   }
-  const bottom = (low) => (lowest === undefined ? trendRange(low ?? 0, low ?? 1)[0] : lowest);
-  plots[name] = new uPlot({
-    width: box.clientWidth, height: box.clientHeight, legend: { show: false }, cursor: { show: false }, tzDate: there,
-    padding: [null, 30, null, null],
-    scales: { x: { range: (_plot, first, last) => moments(first, last) }, y: { range: (_plot, low, high) => [bottom(low), trendRange(low ?? 0, high ?? 100)[1]] } },
-    axes: [axis({ space: 90, values: (_plot, ticks) => dates(ticks) }), axis({ size: 70 })],
-    series, ...more,
-  }, data, box);
+  plots[name].options.unit = unit;
+  plots[name].set(series);
 }
 
-function moments(first, last) { // at least a minute, also around one point alone
+function moments(times) { // at least a minute, also around one point alone
+  const [first, last] = times.length ? [times[0], times[times.length - 1]] : [now() - 60, now()];
   const room = Math.max(0, 60 - (last - first)) / 2;
-  return first === null ? [now() - 60, now()] : [first - room, last + room];
-}
-
-function clearPlots() {
-  for (const name of Object.keys(plots)) {
-    if (plots[name]) plots[name].destroy();
-    plots[name] = null;
-  }
+  return [first - room, last + room];
 }
 
 // --- looking -------------------------------------------------------------------------------------
@@ -244,12 +233,14 @@ async function logout() {
 
 $("search").addEventListener("input", () => { if (told) showList(); });
 $("figure").addEventListener("change", () => {
-  if (plots.figure) plots.figure.destroy();
-  plots.figure = null;
+  plots.figure.goHome();
   showPlots();
 });
 $("logout").addEventListener("click", logout);
-addEventListener("hashchange", () => { clearPlots(); one = null; scrollTo(0, 0); look(); });
-addEventListener("resize", () => { clearPlots(); show(); });
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { clearPlots(); show(); });
+addEventListener("hashchange", () => {
+  for (const plot of Object.values(plots)) if (plot) plot.goHome();
+  one = null;
+  scrollTo(0, 0);
+  look();
+});
 begin().then(lookOn, (error) => { $("connection").textContent = error.message; });

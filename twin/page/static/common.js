@@ -62,28 +62,3 @@ function rows(pairs) {
   return element("dl", { class: "rows" }, ...filled.flatMap(
     ([name, text]) => [element("dt", {}, name), element("dd", {}, text)]));
 }
-
-// --- plots ---------------------------------------------------------------------------------------
-
-function axis(more = {}) {
-  return {
-    stroke: colour("--ink"), font: "15px system-ui, sans-serif",
-    grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line") }, ...more,
-  };
-}
-
-function dates(ticks) {
-  const days = ticks.length > 1 && ticks[1] - ticks[0] >= 43200;
-  const seconds = ticks.length > 1 && ticks[1] - ticks[0] < 60 ? { second: "2-digit" } : {};
-  return ticks.map((tick) => {
-    const then = there(tick);
-    const midnight = then.getHours() === 0 && then.getMinutes() === 0;
-    return days || midnight ? then.toLocaleDateString("en-GB", { day: "numeric", month: "short" })
-      : then.toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit", ...seconds });
-  });
-}
-
-function trendRange(low, high) {
-  const room = Math.max((high - low) * 0.08, Math.abs(high) * 0.02, 1e-6);
-  return [low - room, high + room];
-}

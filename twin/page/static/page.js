@@ -8,7 +8,8 @@ const DEEDS = {
   out_of_service: "Take out of service", in_service: "Back into service",
 };
 const TIMES = [[900, "15 minutes"], [3600, "1 hour"], [4 * 3600, "4 hours"], [8 * 3600, "8 hours"]];
-const WINDOW_S = 10;
+const WINDOW_S = 10; // of live rows, at first
+const KEPT_S = 300; // of them, to look back at
 const SHOWN = ["size", "how sure"]; // of what speaks for an alarm, at first sight
 const QUIET = ["shelved", "suppressed", "out_of_service"];
 
@@ -226,120 +227,123 @@ async function answered(path) {
 
 // --- live vacuum ---------------------------------------------------------------------------------
 
+const NO_ROWS = () => ({
+  time: [], host: [], phase: [], measured_low: [], measured_high: [], expected_low: [], expected_high: [],
+});
+
 const live = {
-  plot: null,
-  data: [[], [], [], [], []], // time, measured low and high, expected low and high
-  phases: [],
+  chart: null,
+  rows: NO_ROWS(),
 
   clear() {
-    this.data = [[], [], [], [], []];
-    this.phases = [];
+    this.rows = NO_ROWS();
     for (const id of ["measured", "expected", "difference", "phase"]) $(id).textContent = "–";
-    if (this.plot) this.plot.setData(this.data);
+    if (this.chart) this.chart.goHome();
+    this.show();
   },
 
-  take(rows) {
-    const [time] = this.data;
-    const names = ["time", "measured_low", "measured_high", "expected_low", "expected_high"];
-    rows.time.forEach((t, i) => {
-      if (time.length && t <= time[time.length - 1]) this.clear(); // the PLC began anew
-      if (rows.broken[i] && this.data[0].length) this.push([t - 1e-3, null, null, null, null], 0);
-      this.push(names.map((name) => rows[name][i]), rows.phase[i]);
+  take(told) {
+    told.time.forEach((time, i) => {
+      const before = this.end();
+      if (time <= before) this.clear(); // the PLC began anew
+      if (told.broken[i] && this.rows.time.length) this.push(told, i, time - 1e-3, true);
+      this.push(told, i, time, false);
     });
-    this.forget();
-    this.show(rows);
+    const old = firstAfter(this.rows.time, this.end() - KEPT_S);
+    if (old > 0) for (const column of Object.values(this.rows)) column.splice(0, old);
+    this.say(told);
+    this.show();
   },
 
-  push(values, phase) {
-    values.forEach((value, i) => this.data[i].push(value));
-    this.phases.push(phase);
-  },
-
-  forget() {
-    const [time] = this.data;
-    const first = time.findIndex((t) => t >= time[time.length - 1] - WINDOW_S - 0.5);
-    if (first > 0) for (const column of [...this.data, this.phases]) column.splice(0, first);
-  },
-
-  show(rows) {
-    const last = rows.time.length - 1;
-    if (last >= 0) {
-      const middle = (side) => {
-        const [low, high] = [rows[`${side}_low`][last], rows[`${side}_high`][last]];
-        return low === null ? null : (low + high) / 2;
-      };
-      const [measured, expected] = [middle("measured"), middle("expected")];
-      const both = measured !== null && expected !== null;
-      $("measured").textContent = number(measured, 0);
-      $("expected").textContent = number(expected, 0);
-      $("difference").textContent = number(both ? measured - expected : null, 1);
-      $("phase").textContent = PHASES[rows.phase[last]];
+  push(told, i, time, broken) {
+    for (const [name, column] of Object.entries(this.rows)) {
+      const isValue = name.endsWith("low") || name.endsWith("high");
+      column.push(name === "time" ? time : broken && isValue ? null : told[name][i]);
     }
-    if (!this.plot) this.draw();
-    else this.plot.setData(this.data);
   },
 
-  draw() {
-    if (this.plot) this.plot.destroy();
-    const box = $("plot");
-    const side = (name, width, dash) => ({
-      stroke: colour(name), width, dash, points: { show: false },
+  end() {
+    const { time } = this.rows;
+    return time.length ? time[time.length - 1] : -Infinity;
+  },
+
+  say(told) {
+    const last = told.time.length - 1;
+    if (last < 0) return;
+    const middle = (side) => {
+      const [low, high] = [told[`${side}_low`][last], told[`${side}_high`][last]];
+      return low === null ? null : (low + high) / 2;
+    };
+    const [measured, expected] = [middle("measured"), middle("expected")];
+    const both = measured !== null && expected !== null;
+    $("measured").textContent = number(measured, 0);
+    $("expected").textContent = number(expected, 0);
+    $("difference").textContent = number(both ? measured - expected : null, 1);
+    $("phase").textContent = PHASES[told.phase[last]];
+  },
+
+  show() {
+    const { time } = this.rows;
+    const side = (name) => ({ time, low: this.rows[`${name}_low`], high: this.rows[`${name}_high`] });
+    if (!this.chart) this.begin();
+    this.chart.set([
+      { ...side("expected"), colour: "--orange", width: 3, dash: [8, 5] },
+      { ...side("measured"), colour: "--blue", width: 2, fill: 0.33 },
+    ]);
+    this.head();
+  },
+
+  begin() {
+    const home = () => {
+      const end = this.rows.time.length ? this.end() : 0;
+      return [end - WINDOW_S, end];
+    };
+    this.chart = new Chart($("plot"), {
+      home, least: 0.5, unit: "mbar", tools: $("plot-tools"), back: "Back to live",
+      all: () => [Math.min(home()[0], this.rows.time[0] ?? 0), home()[1]],
+      values: (low = 0, high = 0) => [Math.min(low, -20), Math.max(high * 1.05, 100)],
+      ticks: () => secondTicks(home()[1]),
+      bands: (from, to) => this.phases(from, to),
+      marks: () => this.alarms(),
+      moved: () => this.head(),
     });
-    this.plot = new uPlot({
-      width: box.clientWidth, height: box.clientHeight,
-      legend: { show: false }, cursor: { show: false },
-      scales: {
-        x: { time: false, range: () => this.range() },
-        y: { range: (_plot, low, high) => [Math.min(low ?? 0, -20), Math.max((high ?? 0) * 1.05, 100)] },
-      },
-      axes: [
-        axis({ values: (_plot, ticks) => ticks.map((t) => `${Math.round(t - this.range()[1])} s`),
-          splits: () => [-10, -8, -6, -4, -2, 0].map((s) => this.range()[1] + s) }),
-        axis({ size: 60 }),
-      ],
-      series: [{}, side("--orange", 3, [8, 5]), side("--orange", 3, [8, 5]),
-        side("--blue", 2), side("--blue", 2)],
-      bands: [{ series: [4, 3], fill: colour("--blue") + "55" }],
-      hooks: { drawClear: [(plot) => this.drawPhases(plot)] },
-    }, this.ordered(), box);
-    const plain = this.plot.setData.bind(this.plot);
-    this.plot.setData = () => plain(this.ordered());
   },
 
-  ordered() { // expected below, measured above
-    const [time, low, high, expectedLow, expectedHigh] = this.data;
-    return [time, expectedLow, expectedHigh, low, high];
+  head() {
+    if (!this.chart) return;
+    const [from, to] = this.chart.range().map((time) => Math.max(0, this.end() - time));
+    const brief = (seconds) => number(seconds, seconds < 10 && seconds % 1 > 0.05 ? 1 : 0);
+    $("plot-head").textContent = this.chart.end === null || !this.rows.time.length
+      ? `Vacuum, the last ${brief(this.rows.time.length ? from : WINDOW_S)} s`
+      : `Vacuum, ${brief(from)} to ${brief(to)} s ago`;
   },
 
-  range() {
-    const [time] = this.data;
-    const end = time.length ? time[time.length - 1] : 0;
-    return [end - WINDOW_S, end];
-  },
-
-  drawPhases(plot) {
-    const [time] = this.data;
-    const { ctx, bbox } = plot;
-    ctx.save();
-    ctx.beginPath();
-    ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-    ctx.clip();
-    for (let from = 0; from < time.length;) {
-      let to = from;
-      while (to + 1 < time.length && this.phases[to + 1] === this.phases[from]) to += 1;
-      const left = plot.valToPos(time[from], "x", true);
-      const right = plot.valToPos(time[Math.min(to + 1, time.length - 1)], "x", true);
-      ctx.fillStyle = colour(PHASE_COLOURS[this.phases[from]]);
-      ctx.fillRect(left, bbox.top, right - left, bbox.height);
-      from = to + 1;
+  phases(from, to) {
+    const { time, phase } = this.rows;
+    const [first, end] = part(this.rows, from, to);
+    const bands = [];
+    for (let i = first; i < end; i += 1) {
+      const last = bands[bands.length - 1];
+      if (last) last.to = time[i];
+      if (!last || last.phase !== phase[i]) {
+        bands.push({ phase: phase[i], colour: PHASE_COLOURS[phase[i]], from: time[i], to: time[i] });
+      }
     }
-    ctx.restore();
+    return bands;
+  },
+
+  alarms() { // where they were raised, by the clock of the run
+    const { time, host } = this.rows;
+    const isSeen = ({ raised }) => raised && host[0] <= raised && raised <= host[host.length - 1];
+    return (states[chosen] ? states[chosen].alarms : []).filter(isSeen).map(({ raised, what }) => (
+      { at: time[firstAfter(host, raised)] ?? this.end(), text: what, colour: "--alarm" }));
   },
 };
 
 // --- trends --------------------------------------------------------------------------------------
 
-let trendPlot = null;
+let trendChart = null;
+let trendSpan = [0, 1]; // s
 let trendAsked = 0;
 
 async function showTrend() {
@@ -356,41 +360,33 @@ async function showTrend() {
   const known = me.figures.find((one) => one.name === figure);
   $("trend-what").textContent = known ? known.what : "";
   $("trend-words").textContent = trend.words;
-  if (trendPlot) trendPlot.destroy();
-  trendPlot = null;
-  $("trend-plot").hidden = $("trend-legend").hidden = !trend.time;
+  $("trend-plot").hidden = $("trend-tools").hidden = $("trend-legend").hidden = !trend.time;
   if (trend.time) drawTrend(trend);
 }
 
 function drawTrend(trend) {
+  const { time } = trend;
   const line = trend.line || { time: [], middle: [], low: [], high: [] };
-  const fill = (times, value) => [times, times.map(() => value)];
-  const span = [...trend.time, ...line.time];
-  const ends = [Math.min(...span), Math.max(...span)];
-  const tables = [[trend.time, trend.measured, trend.expected],
-    [line.time, line.high, line.low, line.middle]];
-  if (trend.limit !== null && trend.limit !== undefined) tables.push(fill(ends, trend.limit));
-  const data = uPlot.join(tables, tables.map((table) => table.slice(1).map(() => 2)));
-  const bare = { width: 0, points: { show: false } };
-  const series = [
-    {},
-    { stroke: colour("--grey"), paths: () => null,
-      points: { show: true, size: 5, fill: colour("--grey"), width: 0 } },
-    { stroke: colour("--orange"), width: 2, dash: [8, 5], points: { show: false }, spanGaps: true },
-    { ...bare, stroke: colour("--blue"), spanGaps: true },
-    { ...bare, stroke: colour("--blue"), spanGaps: true },
-    { stroke: colour("--blue"), width: 3, points: { show: false }, spanGaps: true },
-    { stroke: colour("--red"), width: 3, dash: [2, 5], points: { show: false }, spanGaps: true },
-  ];
-  const box = $("trend-plot");
-  trendPlot = new uPlot({
-    width: box.clientWidth - 18, height: box.clientHeight - 18,
-    legend: { show: false }, cursor: { show: false }, tzDate: there,
-    scales: { y: { range: (_plot, low, high) => trendRange(low, high) } },
-    axes: [axis({ space: 90, values: (_plot, ticks) => dates(ticks) }), axis({ size: 70, label: trend.unit, labelFont: "15px system-ui" })],
-    series: series.slice(0, data.length),
-    bands: [{ series: [3, 4], fill: colour("--blue") + "40" }],
-  }, data, box);
+  const span = [...time, ...line.time];
+  trendSpan = [Math.min(...span), Math.max(...span)];
+  if (trendSpan[0] === trendSpan[1]) trendSpan = [trendSpan[0] - 30, trendSpan[1] + 30];
+  const known = trend.expected.map((_, i) => i).filter((i) => trend.expected[i] !== null);
+  const limit = trend.limit ?? null;
+  if (!trendChart) {
+    trendChart = new Chart($("trend-plot"), {
+      home: () => trendSpan, all: () => trendSpan, least: 10, tools: $("trend-tools"),
+      values: (low = 0, high = 1) => roomy(low, high), ticks: () => dateTicks,
+    });
+  }
+  trendChart.options.unit = trend.unit;
+  trendChart.set([
+    { time: line.time, low: line.low, high: line.high, colour: "--blue", fill: 0.25 },
+    { time, low: trend.measured, colour: "--grey", dots: true },
+    { time: known.map((i) => time[i]), low: known.map((i) => trend.expected[i]), colour: "--orange", width: 2, dash: [8, 5] },
+    { time: line.time, low: line.middle, colour: "--blue", width: 3 },
+    { time: limit === null ? [] : trendSpan, low: [limit, limit], colour: "--red", width: 3, dash: [2, 5] },
+  ]);
+  trendChart.goHome();
 }
 
 // --- history -------------------------------------------------------------------------------------
@@ -478,18 +474,8 @@ function showTab(name) {
     $(one).hidden = one !== name;
     $(`tab-${one}`).setAttribute("aria-selected", String(one === name));
   }
-  if (name === "now") resize();
   if (name === "trends") showTrend();
   if (name === "history") loadHistory();
-}
-
-function resize() {
-  const box = $("plot");
-  if (live.plot && box.clientWidth) live.plot.setSize({ width: box.clientWidth, height: box.clientHeight });
-  const trend = $("trend-plot");
-  if (trendPlot && trend.clientWidth) {
-    trendPlot.setSize({ width: trend.clientWidth - 18, height: trend.clientHeight - 18 });
-  }
 }
 
 async function begin() {
@@ -518,11 +504,6 @@ function listen() {
   $("priority").addEventListener("change", showHistory);
   $("shelve-cancel").addEventListener("click", () => $("shelve").close());
   $("logout").addEventListener("click", async () => { await post("/api/logout", {}); location.reload(); });
-  addEventListener("resize", resize);
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
-    if (live.plot) live.draw();
-    if (!$("trends").hidden) showTrend();
-  });
   setInterval(showConnection, 1000);
 }
 

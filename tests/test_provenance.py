@@ -1,0 +1,224 @@
+"""What is in the tree is the project's own, and packages and licences are what they say."""
+
+import ast
+import os
+import re
+import sys
+import sysconfig
+import tarfile
+import tomllib
+import zipfile
+from collections.abc import Iterator, Mapping
+from email.parser import BytesParser
+from functools import cache
+from hashlib import sha256
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+import hatchling.build
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = ("configs", "docs", "drivers", "tests", "tools", "twin")
+OURS = ("twin", "drivers", "tests", "tools")
+MADE = {"__pycache__", "node_modules"}
+TINY = 64  # bytes: below, files are alike by chance
+LONGEST = 500  # characters in a line that a person has written
+INSTALLED = Path(sysconfig.get_path("purelib"))
+
+
+def files(folder: Path) -> Iterator[Path]:
+    for place, folders, names in os.walk(folder):
+        folders[:] = sorted(set(folders) - MADE)
+        yield from (Path(place, name) for name in names)
+
+
+def our_files() -> list[Path]:
+    """All of the tree but LICENSE, whose text is meant to be everybody's."""
+    roots = [one for one in ROOT.iterdir() if one.is_file() and one.name != "LICENSE"]
+    return [*roots, *(one for folder in FOLDERS for one in files(ROOT / folder))]
+
+
+def copies(ours: list[Path], installed: Path) -> dict[str, str]:
+    """Which files are byte by byte those of an installed package."""
+    sizes: dict[int, list[Path]] = {}
+    for one in ours:
+        if one.stat().st_size >= TINY:
+            sizes.setdefault(one.stat().st_size, []).append(one)
+    found = {}
+    for other in files(installed):
+        if other.relative_to(installed).parts[0].startswith("ejector_twin-"):
+            continue
+        for one in sizes.get(other.stat().st_size, []):
+            if digest(one) == digest(other):
+                found[str(one)] = str(other)
+    return found
+
+
+def digest(path: Path) -> bytes:
+    return sha256(path.read_bytes()).digest()
+
+
+def test_no_file_is_that_of_an_installed_package() -> None:
+    assert copies(our_files(), INSTALLED) == {}
+
+
+def test_a_copied_file_is_found(tmp_path: Path) -> None:
+    """The check above sees what it is to see: a header of FMI, as it once stood in the tree."""
+    (copied := tmp_path / "a.h").write_bytes(
+        (INSTALLED / "fmpy/c-code/fmi3Functions.h").read_bytes()
+    )
+    assert copies([copied], INSTALLED / "fmpy") == {
+        str(copied): str(INSTALLED / "fmpy/c-code/fmi3Functions.h")
+    }
+
+
+def test_nobody_else_wrote_what_is_shipped() -> None:
+    """Minified scripts have no line that a person writes, and copies bring their notices."""
+    for path in (*files(ROOT / "twin"), *files(ROOT / "drivers")):
+        text = path.read_text(encoding="utf-8")
+        assert max(map(len, text.splitlines()), default=0) < LONGEST, path
+        assert not re.search(r"copyright|\(c\) \d{4}|licen[cs]ed under", text, re.IGNORECASE), path
+
+
+# --- wheel and licences -------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[zipfile.ZipFile]:
+    folder = tmp_path_factory.mktemp("wheel")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(ROOT)
+        name = hatchling.build.build_wheel(str(folder))
+    with zipfile.ZipFile(folder / name) as archive:
+        yield archive
+
+
+def test_a_wheel_has_the_packages_whole_and_one_licence(wheel: zipfile.ZipFile) -> None:
+    inside = [*files(ROOT / "twin"), *files(ROOT / "drivers")]
+    expected = {one.relative_to(ROOT).as_posix() for one in inside}
+    shipped = set(wheel.namelist())
+    (metadata,) = (one for one in shipped if one.endswith(".dist-info/METADATA"))
+    assert {one for one in shipped if ".dist-info/" not in one} == expected
+    told = BytesParser().parsebytes(wheel.read(metadata))
+    assert told["License-Expression"] == "Apache-2.0"
+    assert told.get_all("License-File") == ["LICENSE"]
+    text = wheel.read(metadata.replace("METADATA", "licenses/LICENSE"))
+    assert text == (ROOT / "LICENSE").read_bytes()
+
+
+def test_measured_data_says_whose_it_is_and_is_not_distributed() -> None:
+    page = (ROOT / "tests" / "data" / "README.md").read_text(encoding="utf-8")
+    for folder in (one for one in (ROOT / "tests" / "data").iterdir() if one.is_dir()):
+        (row,) = (line for line in page.splitlines() if f"`{folder.name}/` |" in line)
+        assert row.rstrip(" |").endswith("MIT"), row
+
+
+def test_a_source_distribution_has_what_the_wheel_is_made_of(tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(ROOT)
+        name = hatchling.build.build_sdist(str(tmp_path))
+    with tarfile.open(tmp_path / name) as archive:
+        inside = {one.name.split("/", 1)[1] for one in archive if one.isfile()}
+    others = {one for one in inside if not one.startswith(("twin/", "drivers/"))}
+    assert others == {".gitignore", "LICENSE", "README.md", "pyproject.toml", "PKG-INFO"}
+
+
+# --- imports and declarations -------------------------------------------------------------------
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+EXTRAS = PROJECT["project"]["optional-dependencies"]
+# What imports a package, and what it is installed with beside the base. One that is not here has
+# the base alone.
+NEEDS_EXTRA = {
+    "twin/api.py": "notebook",
+    "twin/cli_serve.py": "serve",
+    "twin/exchange/aas.py": "aas",
+    "twin/exchange/elements.py": "aas",
+    "twin/exchange/fmu_file.py": "aas",
+    "twin/exchange/submodels.py": "aas",
+    "twin/fleet/engines.py": "dask",
+    "twin/page/": "serve",
+    "twin/view.py": "view",
+}
+
+NEIGHBOURS = {one.stem for folder in ("tests", "tools") for one in (ROOT / folder).iterdir()}
+
+
+def declared(requirements: list[str]) -> set[str]:
+    return {canonicalize_name(Requirement(one).name) for one in requirements}
+
+
+@cache
+def imported(path: Path) -> list[tuple[str, int]]:
+    """Packages of others that a module imports, anywhere in it, with the line."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        names: list[str] = []
+        if isinstance(node, ast.Import):
+            names = [one.name for one in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            names = [str(node.module)]
+        elif is_named_import(node):
+            names = [node.args[0].value]  # type: ignore[attr-defined]
+        for name in (one.partition(".")[0] for one in names):
+            if name not in sys.stdlib_module_names and name not in OURS:
+                found.append((name, node.lineno))  # type: ignore[attr-defined]
+    return found
+
+
+def is_named_import(node: ast.AST) -> bool:
+    """``importlib.import_module("name")``."""
+    return (
+        isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Attribute)
+        and node.func.attr == "import_module"
+        and isinstance(node.args[0], ast.Constant)
+    )
+
+
+def undeclared(path: Path, allowed: set[str], providers: Mapping[str, list[str]]) -> list[str]:
+    """Where a module imports what nothing declares; tests and tools also have their neighbours."""
+    return [
+        f"{path.relative_to(ROOT)}:{line}: {name}"
+        for name, line in imported(path)
+        if not (name in NEIGHBOURS and path.relative_to(ROOT).parts[0] in ("tests", "tools"))
+        if not allowed & {canonicalize_name(one) for one in providers.get(name, [])}
+    ]
+
+
+def allowed_for(path: Path) -> set[str]:
+    base = declared(PROJECT["project"]["dependencies"])
+    name = path.relative_to(ROOT).as_posix()
+    if not name.startswith(("twin/", "drivers/")):
+        groups = PROJECT["dependency-groups"]
+        return base.union(*map(declared, [*EXTRAS.values(), *groups.values()]))
+    extras = {extra for place, extra in NEEDS_EXTRA.items() if name.startswith(place)}
+    return base.union(*(declared(EXTRAS[extra]) for extra in extras))
+
+
+def test_what_is_imported_is_declared_where_it_is_needed() -> None:
+    providers = packages_distributions()
+    modules = [one for folder in OURS for one in files(ROOT / folder) if one.suffix == ".py"]
+    assert len(modules) > 300
+    assert [bad for one in modules for bad in undeclared(one, allowed_for(one), providers)] == []
+
+
+def test_what_is_declared_is_imported() -> None:
+    """A dependency that nothing imports would be installed for nothing."""
+    providers = packages_distributions()
+    shipped = [*files(ROOT / "twin"), *files(ROOT / "drivers")]
+    used = {
+        canonicalize_name(distribution)
+        for path in shipped
+        if path.suffix == ".py"
+        for name, _ in imported(path)
+        for distribution in providers.get(name, [])
+    }
+    loaded_by_name = {"psycopg"}  # SQLAlchemy's, for postgresql+psycopg
+    wanted = declared(
+        [*PROJECT["project"]["dependencies"], *(r for of in EXTRAS.values() for r in of)]
+    )
+    assert wanted - used == loaded_by_name
