@@ -13,17 +13,23 @@ import pytest
 import rigs
 from log_rows import HEADER
 from lying_modbus import LyingServer
+from lying_opcua import LyingNodes
 from modbus_server import PlcTime, TracePlc
 from test_modbus_block import clock_of, settings_for
+from test_opcua_block import TornServer
+from test_opcua_block import settings_for as opcua_settings
 
+from drivers.lasting import lasting
 from drivers.modbus import blocks
+from drivers.opcua_link import OpcuaLink
+from drivers.opcua_trace import NodeTrace
 from twin.errors import TwinError
 from twin.events import Kind
 from twin.live import run
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
 from twin.monitor.listening import Listening, Notices
-from twin.signals import BREAK, SAMPLE, Quality, Samples
+from twin.signals import BREAK, SAMPLE, UNUSABLE, Quality, Samples
 
 BLOCKS = 400  # with lies, and half as many after them
 SHARE = 0.05  # of the answers that are lies
@@ -61,6 +67,37 @@ def test_lies_over_modbus_end_nothing_and_make_nothing_up(seed: int, tmp_path: P
     lost = [event.text for event in logged.events() if event.kind is Kind.PLC_LOST]
     assert lost
     assert all(f"127.0.0.1:{server.port}, unit 1: " in text for text in lost)
+
+
+def test_lies_over_opcua_end_nothing_and_make_nothing_up() -> None:
+    plc, told = TornServer(), list[str]()
+    time = plc.clock = PlcTime(plc.scan)
+    clock = clock_of(time)
+    with LyingNodes(plc, seed=1) as server:
+        settings = opcua_settings(url=server.url, timeout_ms=1000)
+        stream: Iterator[Samples] = lasting(
+            NodeTrace(settings, clock),
+            OpcuaLink(settings, clock),
+            clock,
+            lambda error: told.append(str(error)),
+        )  # type: ignore[type-var]
+        with closing(stream):  # type: ignore[type-var]
+            parts = list(islice(stream, 5))
+            server.share = 0.03
+            parts += islice(stream, 150)
+            server.share = 0.0
+            parts += islice(stream, 30)
+    rows = np.concatenate([np.empty(0, SAMPLE), *parts])
+    good = rows[(rows["quality"] & UNUSABLE) == 0]
+    true = np.array([plc.pressure(int(one)) * 100.0 for one in good["sequence"] % (1 << 32)])
+    np.testing.assert_allclose(good["pressure"], true, rtol=1e-6)
+    marked = (rows["quality"][1:] & BREAK) != 0
+    assert (marked | (np.diff(rows["sequence"]) == 1)).all()
+    assert (np.diff(rows["sequence"][-200:]) == 1).all(), "it did not come back"
+    assert rows["sequence"][-1] % (1 << 32) == plc.sequence
+    assert len(server.lies) > 8
+    assert told
+    assert all(server.url in text or "s=" in text for text in told)
 
 
 def assert_true(rows: Samples, plc: TracePlc) -> None:
