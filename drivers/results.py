@@ -74,6 +74,10 @@ class Server:
     """One process that serves; ``port`` is where. DownError where it has ended or hangs."""
 
     def __init__(self, settings: ResultsSettings, figures: Mapping[str, str]) -> None:
+        if not hasattr(os, "posix_spawn"):
+            raise SourceError(
+                "results are served on Linux only", "leave out opcua = true under [results]"
+            )
         ours, theirs = socket.socketpair()
         seconds = struct.pack("@ll", round(SILENCE_S), 0)  # struct timeval: s, µs
         for option in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):

@@ -9,6 +9,7 @@ docs/opcua.md.
 import asyncio
 import itertools
 import logging
+import os
 import sys
 import threading
 from collections.abc import Iterable, Mapping, Sequence
@@ -92,7 +93,7 @@ class Asking:
     def __init__(self, pipe: Connection) -> None:
         self._pipe, self._sending = pipe, threading.Lock()
         self._waiting: dict[int, Future[str]] = {}
-        self._numbers = itertools.count()
+        self._numbers = itertools.count(os.getpid() << 32)  # no other process counts them
 
     def send(self, message: tuple[Any, ...]) -> None:
         """Send a message, whole."""
