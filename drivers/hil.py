@@ -55,12 +55,13 @@ class Writer:
         self._news = threading.Condition()
         self._failure: SourceError | None = None
         self._closed = False
+        self._taken = False  # outputs were: what is refused later may pass
         outlet.open()
         self._thread = threading.Thread(target=self._run, name="hil writer")
         self._thread.start()
 
     def put(self, outputs: Outputs) -> None:
-        """Have them written as soon as may be; SourceError if the PLC has refused them."""
+        """Have them written as soon as may be; SourceError if the PLC refuses the first ones."""
         with self._news:
             if self._failure is not None:
                 raise self._failure
@@ -107,7 +108,10 @@ class Writer:
     def _write(self, outputs: Outputs, watchdog: int) -> None:
         try:
             self._outlet.write(outputs, watchdog)
-        except LostError as error:
+            self._taken = True
+        except SourceError as error:
+            if not self._taken and not isinstance(error, LostError):
+                raise
             log.warning("%s: nothing is written until it is back: %s", self._where, error)
             self._outlet.close()
             self._reconnect()
@@ -115,7 +119,7 @@ class Writer:
     def _reconnect(self) -> None:
         while not self._closed:
             self._pause(RETRY_S)
-            with suppress(LostError):
+            with suppress(SourceError):
                 self._outlet.open()
                 return
 

@@ -12,10 +12,11 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from twin.errors import SourceError
+from twin.errors import SourceError, TwinError
 from twin.signals import SAMPLE, Samples
 
 RETRY_S = 0.4  # between two attempts to connect
+LONGEST_RETRY_S = 1.6  # to a PLC that connects and gives no rows; a ring of 4 s outlasts it
 WAITING = 256  # blocks that may wait to be taken from a thread
 LONGEST_SILENCE_S = 0.25
 
@@ -74,7 +75,7 @@ class Connection(Protocol):
         """Hang up."""
 
 
-Away = Callable[[SourceError], None]  # told why a PLC does not answer yet
+Away = Callable[[TwinError], None]  # told why a PLC gives no rows, once for each reason
 
 C_contra = TypeVar("C_contra", bound=Connection, contravariant=True)
 
@@ -88,41 +89,66 @@ class Source(Protocol[C_contra]):
 
 
 def lasting(
-    source: Source[C_contra], link: C_contra, clock: Clock, away: Away | None = None
+    source: Source[C_contra],
+    link: C_contra,
+    clock: Clock,
+    away: Away | None = None,
+    *,
+    known: bool = False,
 ) -> Generator[Samples, None, None]:
     """Samples of ``source`` over one connection after the other; empty blocks in between.
 
-    Where it is lost or lacks what is wanted, it is tried again. Before the first block ``away`` is
-    told why, once for each reason; without ``away`` the error comes out. All other errors come out.
+    A PLC that is ``known``, or gave rows, is retried for ever, whatever it sends: the connection
+    counts as lost. Before that it is retried where it is not there or lacks what is wanted, and
+    there is ``away``; other errors come out. ``away`` is told each reason once until rows come.
     Closing hangs up.
     """
-    begun = False
     reasons = set[str]()  # that were told
+    pauses = Pauses()
     try:
         while True:
+            connected = False
             try:
                 link.open()
-                if begun or reasons:
+                connected = True
+                if known or reasons:
                     yield EMPTY  # connected is not yet answered
                 for block in source.samples(link):
-                    begun = True
+                    if len(block):
+                        known, pauses = True, Pauses()
+                        reasons.clear()
                     yield block
-            except (LostError, AbsentError) as error:
-                if not begun and away is None:
+            except TwinError as error:
+                passes = isinstance(error, LostError | AbsentError) and away is not None
+                if not known and not passes:
                     raise
-                if not begun and away is not None and str(error) not in reasons:
+                if away is not None and str(error) not in reasons:
                     reasons.add(str(error))
                     away(error)
                 link.close()  # if it is not yet: what it knows of the PLC may no longer hold
-                yield from _pause(clock)
+                yield from _pause(clock, pauses.after(connected=connected))
     finally:
         link.close()
 
 
-def _pause(clock: Clock) -> Iterator[Samples]:
+@dataclass
+class Pauses:
+    """How long to wait before the next attempt: longer each time that a PLC gives no rows."""
+
+    _next_s: float = RETRY_S
+
+    def after(self, *, connected: bool) -> float:
+        """Seconds; always ``RETRY_S`` where nobody could be connected to, so as to miss nothing."""
+        if not connected:
+            return RETRY_S
+        seconds, self._next_s = self._next_s, min(2.0 * self._next_s, LONGEST_RETRY_S)
+        return seconds
+
+
+def _pause(clock: Clock, seconds: float) -> Iterator[Samples]:
     """Empty blocks until the next try, and around whatever may take its time."""
     yield EMPTY
-    for _ in range(2):
+    for _ in range(round(2 * seconds / RETRY_S)):
         clock.sleep(RETRY_S / 2)
         yield EMPTY
 

@@ -17,18 +17,20 @@ def blocks(
     clock: Clock = REAL,
     lines: Lines | None = None,
     away: Away | None = None,
+    *,
+    known: bool = False,
 ) -> Generator[Samples, None, None]:
     """Samples as they come: a block at least every 0.5 s, empty while there is nothing.
 
-    Once there was a sample, a lost connection is retried for ever and shows as empty blocks and
-    flags, and so is an address that the PLC does not serve any more. Before that both are retried
-    too where there is ``away``, which is told why. Other SourceErrors come out, and whenever the
-    PLC refuses a request otherwise. Closing releases all.
+    Once there were rows, or the PLC is ``known`` to have given some, whatever it sends is at worst
+    a lost connection: it is retried for ever and shows as empty blocks and flags. Before that a PLC
+    that is not there or does not serve an address is retried where there is ``away``; other
+    SourceErrors come out. ``away`` is told why there are no rows. Closing releases all.
     Blocks come over a connection that they share with others, where there are ``lines``; polling
     has no millisecond to wait for others.
     """
     if settings.mode == "poll":
-        return in_thread(lasting(Poller(settings, clock), Link(settings), clock, away))
+        return in_thread(lasting(Poller(settings, clock), Link(settings), clock, away, known=known))
     link = Link(settings) if lines is None else SharedLink(settings, lines.to(settings))
-    stream = lasting(Trace(settings, clock), link, clock, away)
+    stream = lasting(Trace(settings, clock), link, clock, away, known=known)
     return stream if settings.tls is None else in_thread(stream)  # shaking hands takes time

@@ -13,17 +13,21 @@ __all__ = ["OpcuaSettings", "blocks"]
 
 
 def blocks(
-    settings: OpcuaSettings, clock: Clock = REAL, away: Away | None = None
+    settings: OpcuaSettings,
+    clock: Clock = REAL,
+    away: Away | None = None,
+    *,
+    known: bool = False,
 ) -> Generator[Samples, None, None]:
     """Samples as they come: a block at least every 0.5 s, empty while there is nothing.
 
-    Once there was a block, a lost connection is retried for ever and shows as empty blocks and
-    flags. Before that it is retried too where there is ``away``, which is told why: nobody answers,
-    or the server lacks its nodes. Other SourceErrors come out, and whenever the server cannot
-    be trusted or serves something else. It runs in a thread, since connecting may take seconds.
-    Closing releases all.
+    Once there were rows, or the server is ``known`` to have given some, whatever it sends is at
+    worst a lost connection: it is retried for ever and shows as empty blocks and flags. Before that
+    a server that is not there or lacks its nodes is retried where there is ``away``; other errors
+    come out. ``away`` is told why there are no rows. It runs in a thread, since connecting may take
+    seconds. Closing releases all.
     """
     link = OpcuaLink(settings, clock)
     if settings.mode == "block":
-        return in_thread(lasting(NodeTrace(settings, clock), link, clock, away))
-    return in_thread(lasting(Subscription(settings, clock), link, clock, away))
+        return in_thread(lasting(NodeTrace(settings, clock), link, clock, away, known=known))
+    return in_thread(lasting(Subscription(settings, clock), link, clock, away, known=known))

@@ -20,7 +20,6 @@ from drivers.opcua_values import (
     code_of,
     lost_some,
     number,
-    passing,
     quality,
     readable,
     time_ns,
@@ -90,14 +89,6 @@ class Subscription:
 
     def samples(self, link: OpcuaLink) -> Iterator[Samples]:
         """Blocks as they are published; ends only by an exception."""
-        try:
-            yield from self._published_blocks(link)
-        except SourceError as error:
-            if self._sequence < 0:
-                raise
-            raise passing(error) from error
-
-    def _published_blocks(self, link: OpcuaLink) -> Iterator[Samples]:
         for place, value in enumerate(link.read(self.nodes)):
             self._number(place, value)  # says so if it has another type
         granted = link.subscribe(self.nodes, self.queue)
@@ -150,8 +141,8 @@ class Subscription:
         at_ns = time_ns(value)
         if at_ns is None:
             raise SourceError(
-                f"{self._settings.where}: {self.nodes[place]} comes without any time",
-                "the server must send source or server timestamps",
+                f"{self._settings.where}: {self.nodes[place]} comes without a time that can be",
+                "the server must send source or server timestamps, after 1970 and before 2116",
             )
         self._columns[place].add(at_ns, self._number(place, value), code_of(value))
 

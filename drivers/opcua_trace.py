@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from drivers.lasting import EMPTY, Clock, LostError
+from drivers.lasting import Clock, LostError
 from drivers.opcua_link import OpcuaLink
 from drivers.opcua_settings import Node, OpcuaSettings
 from drivers.opcua_values import (
@@ -21,7 +21,6 @@ from drivers.opcua_values import (
     moment,
     number,
     numbers,
-    passing,
     quality,
     readable,
     status_name,
@@ -41,6 +40,7 @@ from drivers.trace import (
 from twin.errors import SourceError
 from twin.signals import MBAR, SAMPLE, UNUSABLE, Quality, Samples
 
+TRIES = 3  # for a ring that is not torn
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
@@ -82,47 +82,49 @@ class NodeTrace(Follower[Header, OpcuaLink]):
 
     def start(self, link: OpcuaLink) -> Header:
         """Begin at the newest record; SourceError if there is no ring as configured."""
-        ring = self._steady(self.ask(link))
+        header = self._proven(link).header
+        self._begin(header)
+        return header
+
+    def _proven(self, link: OpcuaLink) -> Ring:
+        """A ring that follows the last one, or holds what it announces; else SourceError.
+
+        It may be torn: one that surprises is read again.
+        """
+        last = self._header
+        for attempt in range(TRIES):
+            ring = self._steady(self.ask(link))
+            if last is not None and ring.header.follows(last):
+                return ring
+            read_again = attempt > 0 or last is None
+            if read_again and ring.header.ready and _holds_what_it_announces(ring):
+                return ring
         self.refuse_other(ring.header)
-        newest = ring.header.sequence
-        announced = np.arange(max(0, newest - 2 * RESERVE), newest + 1)
-        if not (ring.sequences[announced % ring.header.depth] == announced).any():
-            raise SourceError(
-                f"{self._settings.where}: {self._settings.trace.sequences} does not hold the "
-                f"sequence numbers that {self._settings.trace.sequence} announces ({newest})",
-                "check [driver.trace]; scan s must stand at s modulo the arrays' length",
-            )
-        self._begin(ring.header)
-        return ring.header
+        raise SourceError(
+            f"{self._settings.where}: {self._settings.trace.sequences} does not hold the sequence "
+            f"numbers that {self._settings.trace.sequence} announces ({ring.header.sequence})",
+            "check [driver.trace]; scan s must stand at s modulo the arrays' length",
+        )
 
     def refuse_other(self, header: Header) -> None:
         """SourceError if ``header`` does not describe a ring that can be followed."""
         if not header.ready:
             raise refusal(header)(
                 f"{self._settings.where}: no trace at {self._settings.trace.sequence}: it says "
-                f"{header.depth} records, one every {header.period_ns // 1000} µs; more than "
-                f"{2 * RESERVE} are needed",
+                f"{header.depth} records, one every {header.period_ns // 1000} µs, the newest at "
+                f"{header.time_ns} ns; needed are more than {2 * RESERVE}, and a time before 2116",
                 "check [driver.trace] against the PLC's trace block; is its program running?",
             )
 
     def ask(self, link: OpcuaLink) -> Ring:
-        """Read everything; LostError where the server has no values, SourceError for other ones.
-
-        Those that come later are LostErrors too: a PLC that starts has none of what it will have.
-        """
+        """Read everything; LostError where the server has no values, SourceError for other ones."""
         header, rest = self.requests
         asked_ns = self._clock.now_ns()
         values = link.read(header)
         header_ns = self._clock.now_ns() - asked_ns
         values += link.read(rest)
         took_ns = self._clock.now_ns() - asked_ns
-        try:
-            given = dict(zip(header + rest, values, strict=True))
-            return self._ring(given, header_ns, took_ns)
-        except SourceError as error:
-            if self._header is None:
-                raise
-            raise passing(error) from error
+        return self._ring(dict(zip(header + rest, values, strict=True)), header_ns, took_ns)
 
     def _ring(self, given: dict[Node, Any], header_ns: int, took_ns: int) -> Ring:
         self._refuse_bad(given)
@@ -181,12 +183,7 @@ class NodeTrace(Follower[Header, OpcuaLink]):
 
     def _read(self, link: OpcuaLink) -> Samples:
         """Whatever is new and was announced."""
-        assert self._header is not None
-        ring = self._steady(self.ask(link))
-        if not ring.header.follows(self._header):  # it may have been torn
-            ring = self._steady(self.ask(link))
-        if not ring.header.ready:
-            return EMPTY
+        ring = self._proven(link)
         self._place(ring.header)
         first, newest = self._next, self._newest
         wanted = np.arange(first, max(first, newest + 1))
@@ -218,6 +215,13 @@ class NodeTrace(Follower[Header, OpcuaLink]):
         if tags.supply is not None:
             block["supply"] = tags.supply.gauge(np.array([ring.single["supply"]]), fixed)
         return block
+
+
+def _holds_what_it_announces(ring: Ring) -> bool:
+    """Whether at least one of the newest records carries its sequence: some may be torn."""
+    newest = ring.header.sequence
+    announced = np.arange(max(0, newest - 2 * RESERVE), newest + 1)
+    return bool((ring.sequences[announced % ring.header.depth] == announced).any())
 
 
 def _number_of(given: dict[Node, Any], node: Node) -> float:

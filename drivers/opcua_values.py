@@ -7,8 +7,9 @@ import numpy as np
 import numpy.typing as npt
 from asyncua import ua
 
-from drivers.lasting import AbsentError, LostError
+from drivers.lasting import AbsentError
 from drivers.opcua_settings import Node
+from drivers.trace import LATEST_NS
 from twin.errors import SourceError
 from twin.signals import Quality
 
@@ -16,8 +17,6 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
-
-LATEST_NS = 1 << 62  # the year 2116; beyond it is no time
 
 _T = ua.VariantType
 WHOLE = {_T.SByte, _T.Byte, _T.Int16, _T.UInt16, _T.Int32, _T.UInt32, _T.Int64, _T.UInt64}
@@ -71,9 +70,9 @@ def status_name(code: int) -> str:
 
 
 def time_ns(value: ua.DataValue) -> int | None:
-    """When the source gave the value, ns since 1970; None if the server does not say."""
+    """When the source gave the value, ns since 1970; None if it gives no time that can be."""
     for stamp in (value.SourceTimestamp, value.ServerTimestamp):
-        if stamp is not None and (ns := nanoseconds(stamp)) > 0:  # 1601 means none
+        if stamp is not None and 0 < (ns := nanoseconds(stamp)) < LATEST_NS:  # 1601 means none
             return ns
     return None
 
@@ -161,11 +160,6 @@ def typed(number: float, kind: ua.VariantType, node: Node) -> ua.Variant:
             "choose another unit, scale or range for it under [hil.tags]",
         )
     return ua.Variant(round(number), kind)
-
-
-def passing(error: SourceError) -> LostError:
-    """The same as one that may pass: what was once there is waited for, as while a PLC starts."""
-    return LostError(str(error), error.hint)
 
 
 def wrong_type(node: Node, variant: ua.Variant | None, wanted: str) -> SourceError:

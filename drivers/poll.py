@@ -9,11 +9,12 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
-from drivers.lasting import Clock, LostError
+from drivers.lasting import Clock
 from drivers.link import Link, ModbusSettings
 from drivers.plan import Answers, holds, plan
 from drivers.reports import BITS, VALUES, ambient_of, put_bits, put_values
 from drivers.tags import Flags
+from twin.errors import SourceError
 from twin.signals import MBAR, SAMPLE, Command, Quality, Samples
 
 SLOT_NS = 1_000_000
@@ -35,6 +36,7 @@ class Poller:
         self._wall_ns = clock.wall_ns() - self._start_ns  # anchored once: time never runs back
         self._slot = 0  # to be read next
         self._last = -1  # slot of the last sample given
+        self._failure: SourceError | None = None  # after the rows that were given
         self._beat: np.generic | None = None
         self._beat_ns = 0
 
@@ -45,6 +47,9 @@ class Poller:
 
     def _block(self, link: Link) -> Samples:
         """The slots of one interval; where the connection breaks, those before it."""
+        if self._failure is not None:
+            failure, self._failure = self._failure, None
+            raise failure
         end = max(self._slot, self._now_slot()) + round(self._settings.interval_ms)
         rows: list[bytes] = []
         slots: list[tuple[int, int, int]] = []  # slot, middle of the request, receipt
@@ -55,9 +60,10 @@ class Poller:
                 rows.append(row)
                 slots.append((self._slot, (asked_ns + answered_ns) // 2, answered_ns))
                 self._slot += 1
-        except LostError:
+        except SourceError as error:
             if not rows:
-                raise  # else the closed connection says so again at the next block
+                raise
+            self._failure = error  # raised once these rows are given
         return self._decode(Answers.of(self._requests, rows), np.array(slots, dtype=np.int64))
 
     def _now_slot(self) -> int:

@@ -1,84 +1,149 @@
-"""What the twin finds, served over OPC UA, so that a SCADA can read it; nobody can write.
+"""What the twin finds, served over OPC UA by a process of its own (``drivers.results_serve``).
 
-Alarms are conditions, which some users may acknowledge (``drivers.results_alarms``).
-The server runs in a thread of its own. The loops leave what is newest in their ``Results`` and go
-on; here it is taken at an even pace. How it is laid out stands in docs/opcua.md.
+The loops leave what is newest in their ``Results`` and go on. A thread here takes it at an even
+pace and sends what has changed; it waits for each answer, so that nothing piles up. A server that
+dies or does not answer is ended and started again, with all that it showed; the loops are told.
 """
 
-import asyncio
-import logging
+import os
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
 import threading
-from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import Future
+import time
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
-from pathlib import Path
+from multiprocessing.connection import Connection
+from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import Any, Self
 
-from asyncua import Node, Server, ua
-
-from drivers.opcua_nodes import Names, Unit, add_quantity, add_state
-from drivers.opcua_security import secure
-from drivers.results_alarms import Acknowledge, Conditions, KnowingServer, Source
 from drivers.results_settings import ResultsSettings
-from drivers.results_state import MEANS, SIDES, Reading, Results, Standing, Status
-from twin.errors import SourceError
-from twin.signals import Phase
+from drivers.results_state import Reading, Results
+from twin.errors import SourceError, TwinError
 
-# It logs clients that hang up as errors; what stops the server is raised as well.
-logging.getLogger("asyncua").setLevel(logging.CRITICAL + 1)
-
-NAMESPACE = "urn:ejector-twin:results"
-APPLICATION = "urn:ejector-twin:twin"
 PATIENCE_S = 60.0  # for the library to build its address space on a busy machine
-EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-SPANS: dict[str, tuple[str, float, float]] = {  # unit: UNECE code, and a range for displays
-    "mbar": ("MBR", 0.0, 2000.0),
-    "bar": ("BAR", 0.0, 10.0),
-    "ms": ("C26", 0.0, 60_000.0),
-    "%": ("P1", 0.0, 100.0),
-    "Wh": ("WHR", 0.0, 100.0),
-    "Nl": ("", 0.0, 1000.0),
-    "mbar/s": ("", 0.0, 1000.0),
-}
-_S = ua.StatusCodes
-CODES = {
-    Status.GOOD: _S.Good,
-    Status.NONE_YET: _S.BadWaitingForInitialData,
-    Status.LAST: _S.UncertainLastUsableValue,
-    Status.BAD: _S.BadSensorFailure,
-    Status.BEYOND: _S.BadOutOfRange,
-    Status.MISSING: _S.BadNoDataAvailable,
-    Status.ENDED: _S.BadOutOfService,
-}
-_T = ua.VariantType
-PLAIN: dict[str, dict[str, ua.VariantType]] = {  # groups of values without a unit
-    "Health": {"Since": _T.DateTime, "Text": _T.String, "Cause": _T.String, "Unit": _T.String}
-    | {"Size": _T.Double},
-    "Events": {"Times": _T.DateTime} | dict.fromkeys(("Kinds", "Severities", "Texts"), _T.String),
-}
+SILENCE_S = 10.0  # a server that takes longer with what is new has hung
+LOOK_S = 0.05  # between looks for what the server asks, and whether to stop
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # before a server is started again
+SOUND_S = 60.0  # a server that ran so long and dies is told of again
+NICE = 5  # beyond the loop's own
+
+Acknowledge = Callable[[str, str], None]  # asks it: which alarm, and who does
+Tell = Callable[[str], None]  # told that the server is down, and why
 
 
-@dataclass
-class Leaf:
-    """A node: what the state calls it, its type, and what it shows."""
-
-    name: str
-    kind: ua.VariantType
-    is_array: bool
-    node: ua.NodeId
-    shown: Reading | None = None
+class DownError(Exception):
+    """The process has ended, or does not answer; the text says how."""
 
 
 @dataclass
 class Branch:
-    """The nodes of one ejector."""
+    """What one ejector has to show, and what of it the server has."""
 
     results: Results
-    source: Source
-    leaves: list[Leaf] = field(default_factory=list)
+    kind: str
+    acknowledge: Acknowledge | None
+    tell: Tell | None
+    shown: dict[str, Reading] = field(default_factory=dict)
+    standing: dict[str, Mapping[str, Any]] = field(default_factory=dict)  # alarms of concern
+    laid_out: threading.Event = field(default_factory=threading.Event)
+
+    def news(self) -> tuple[str, dict[str, Reading], list[Mapping[str, Any]]]:
+        """What has changed since the last time."""
+        changes = self.changes()
+        readings = self.results.readings()
+        changed = {name: one for name, one in readings.items() if one != self.shown.get(name)}
+        self.shown = readings
+        return self.results.asset, changed, changes
+
+    def changes(self) -> list[Mapping[str, Any]]:
+        """How alarms have changed; those that still concern anybody are kept."""
+        changes = self.results.changes()
+        for change in changes:
+            self.standing.pop(change["alarm"], None)
+            if change["active"] or not change["acknowledged"]:
+                self.standing[change["alarm"]] = change
+        return changes
+
+
+class Server:
+    """One process that serves; ``port`` is where. DownError where it has ended or hangs."""
+
+    def __init__(self, settings: ResultsSettings, figures: Mapping[str, str]) -> None:
+        if not hasattr(os, "posix_spawn"):
+            raise SourceError(
+                "results are served on Linux only", "leave out opcua = true under [results]"
+            )
+        ours, theirs = socket.socketpair()
+        seconds = struct.pack("@ll", round(SILENCE_S), 0)  # struct timeval: s, µs
+        for option in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):
+            ours.setsockopt(socket.SOL_SOCKET, option, seconds)
+        self._complaint = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
+        with theirs:
+            command = [sys.executable, "-m", "drivers.results_serve", str(theirs.fileno())]
+            self._process = subprocess.Popen(  # noqa: S603  # our own program
+                command,
+                pass_fds=[theirs.fileno()],
+                stderr=self._complaint,
+                start_new_session=True,  # a Ctrl-C is the loop's to answer
+            )
+        self._pipe = Connection(ours.detach())
+        with suppress(OSError):  # where that is not allowed it runs as it is
+            own = os.getpriority(os.PRIO_PROCESS, 0)
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, own + NICE)
+        self.send((settings, dict(figures)))
+
+    @property
+    def pid(self) -> int:
+        """Of the process."""
+        return self._process.pid
+
+    @property
+    def runs(self) -> bool:
+        """Whether it was not closed."""
+        return not self._pipe.closed
+
+    def send(self, message: object) -> None:
+        """Send it; DownError if nobody takes it."""
+        try:
+            self._pipe.send(message)
+        except OSError as error:
+            raise DownError(self._why()) from error
+
+    def heard(self, seconds: float) -> Any:
+        """The next message, or None if none comes within so long; DownError if none will come."""
+        try:
+            return self._pipe.recv() if self._pipe.poll(seconds) else None
+        except (EOFError, OSError) as error:
+            raise DownError(self._why()) from error
+
+    def _why(self) -> str:
+        try:
+            code = self._process.wait(1.0)
+        except subprocess.TimeoutExpired:
+            return "it does not answer"
+        self._complaint.seek(0)
+        *_, last = [b"", *self._complaint.read().splitlines()]
+        said = last.decode(errors="replace")
+        return f"it was ended by signal {-code}" if code < 0 else said or f"exit code {code}"
+
+    def close(self) -> None:
+        """Have it end; one that does not is ended."""
+        self._pipe.close()
+        try:
+            self._process.wait(SILENCE_S)
+        except subprocess.TimeoutExpired:
+            self.kill()
+        self._complaint.close()
+
+    def kill(self) -> None:
+        """End it at once."""
+        self._process.kill()
+        self._process.wait()
 
 
 class ResultsServer:
@@ -89,21 +154,18 @@ class ResultsServer:
     """
 
     def __init__(self, settings: ResultsSettings, figures: Mapping[str, str]) -> None:
-        self._settings = settings
-        self._figures = figures
+        self._settings, self._figures = settings, figures
         self._branches: list[Branch] = []
-        self._ready: Future[str] = Future()
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._stop = asyncio.Event()
+        self._answers: SimpleQueue[tuple[str, int, str]] = SimpleQueue()  # for the server
+        self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="results")
 
     def __enter__(self) -> Self:
-        self._thread.start()
         try:
-            self._ready.result(PATIENCE_S)
-        except BaseException:
-            self._thread.join()
-            raise
+            self._begin()
+        except DownError as error:
+            raise SourceError(f"results cannot be served over OPC UA: {error}") from error
+        self._thread.start()
         return self
 
     def __exit__(
@@ -112,207 +174,149 @@ class ResultsServer:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        assert self._loop is not None
-        with suppress(RuntimeError):  # it has ended by itself, and said why
-            self._loop.call_soon_threadsafe(self._stop.set)
+        self._stop.set()
         self._thread.join()
 
     @property
     def url(self) -> str:
         """Where it is reached."""
-        return self._ready.result(PATIENCE_S)
+        return f"opc.tcp://{self._settings.host}:{self._settings.port}"
 
-    def sink(self, asset: str, kind: str, acknowledge: Acknowledge | None = None) -> Results:
+    @property
+    def pid(self) -> int:
+        """Of the process that serves."""
+        return self._server.pid
+
+    def sink(
+        self,
+        asset: str,
+        kind: str,
+        acknowledge: Acknowledge | None = None,
+        tell: Tell | None = None,
+    ) -> Results:
         """Give a sink whose rows are served as ``asset``, of the type ``kind`` of ejectors.
 
         ``acknowledge`` is asked to acknowledge an alarm, in a thread; it may raise TwinError.
+        ``tell`` is told, in a thread, that the server is down; it is started again by itself.
         """
-        assert self._loop is not None
-        results = Results(asset, tuple(self._figures))
-        adding = self._add(results, kind, acknowledge)
-        added = asyncio.run_coroutine_threadsafe(adding, self._loop)
-        added.result(PATIENCE_S)
-        return results
+        branch = Branch(Results(asset, tuple(self._figures)), kind, acknowledge, tell)
+        self._branches.append(branch)
+        branch.laid_out.wait(PATIENCE_S)
+        return branch.results
 
     # --- in its own thread ----------------------------------------------------------------------
 
     def _run(self) -> None:
-        try:
-            asyncio.run(self._serve())
-        except BaseException as error:
-            if self._ready.done():
-                raise
-            self._ready.set_exception(error)
-
-    async def _serve(self) -> None:
-        self._loop = asyncio.get_running_loop()
-        server = self._server = await _prepared(self._settings)
-        self._index = await server.register_namespace(NAMESPACE)
-        names = ua.NodeId("EjectorTwin", self._index), ua.QualifiedName("EjectorTwin", self._index)
-        self._root = await server.get_objects_node().add_object(*names)
-        self._conditions = Conditions(server, self._settings.acknowledge)
-        try:
-            await server.start()
-        except OSError as error:
-            raise SourceError(
-                f"results cannot be served on {self._settings.host}:{self._settings.port} (OPC UA):"
-                f" {error.strerror or error}",
-                "take another port under [results], or 0 for any free one",
-            ) from error
-        try:
-            assert server.bserver is not None
-            self._ready.set_result(f"opc.tcp://{self._settings.host}:{server.bserver.port}")
-            await self._show_until_stopped()
-        finally:
-            await server.stop()
-
-    async def _show_until_stopped(self) -> None:
+        pause_s, told = FIRST_PAUSE_S, False
         while not self._stop.is_set():
-            for branch in self._branches:
-                await self._show(branch)
+            begun = time.monotonic()
             try:
-                await asyncio.wait_for(self._stop.wait(), self._settings.interval_ms * 1e-3)
-            except TimeoutError:
-                continue
+                self._begin_again()
+                self._show_until_stopped()
+            except (DownError, TwinError) as error:
+                if time.monotonic() - begun > SOUND_S:
+                    pause_s, told = FIRST_PAUSE_S, False
+                self._server.close()
+                if not told:
+                    self._say(str(error), pause_s)
+                    told = True
+                self._wait(pause_s)
+                pause_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
+        self._server.close()
 
-    async def _show(self, branch: Branch) -> None:
-        """Write what has changed."""
-        for change in branch.results.changes():
-            await self._conditions.tell(branch.source, change)
-        readings = branch.results.readings()
-        for leaf in branch.leaves:
-            reading = readings[leaf.name]
-            if reading != leaf.shown:
-                await self._server.write_attribute_value(leaf.node, _value(leaf, reading))
-                leaf.shown = reading
+    def _say(self, why: str, pause_s: float) -> None:
+        text = f"the results server (OPC UA) is down: {why}; it is started again in {pause_s:.0f} s"
+        for branch in list(self._branches):
+            if branch.tell is not None:
+                branch.tell(text)
 
-    # --- the address space ----------------------------------------------------------------------
+    def _wait(self, seconds: float) -> None:
+        """Until the next try; what alarms do meanwhile is kept as far as it concerns."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end and not self._stop.wait(LOOK_S):
+            for branch in list(self._branches):
+                branch.changes()
 
-    async def _add(self, results: Results, kind: str, acknowledge: Acknowledge | None) -> None:
-        """Lay out ``GROUPS`` below one object."""
-        top = await self._root.add_object(*self._names(results.asset))
-        source = Source(top.nodeid, results.asset, self._inputs(results.asset), acknowledge)
-        branch = Branch(results, source)
-        made = {name: await top.add_object(*self._names(results.asset, name)) for name in GROUPS}
-        for name, text in (("Id", results.asset), ("Type", kind)):
-            names = self._names(results.asset, "Identification", name)
-            await made["Identification"].add_variable(*names, text, _T.String)
-        for group, name, unit in self._quantities():
-            branch.leaves.append(
-                await self._quantity(made[group], results.asset, group, name, unit)
-            )
-        for group, name, states in STATES:
-            names = self._names(results.asset, group, name)
-            node = await add_state(self._server, made[group], names, states)
-            branch.leaves.append(Leaf(name, _T.UInt32, False, node.nodeid))
-        for group, kinds in PLAIN.items():
-            for name, variant in kinds.items():
-                names = self._names(results.asset, group, name)
-                branch.leaves.append(await _plain(made[group], names, name, variant, group))
-        names = self._names(results.asset, "Cycle", "Number")
-        branch.leaves.append(await _plain(made["Cycle"], names, "cycle", _T.Int64, "Cycle"))
-        await self._show(branch)
-        self._branches.append(branch)
+    def _begin(self) -> None:
+        """Start a server, and know its port."""
+        self._server = Server(self._settings, self._figures)
+        try:
+            what, told = self._answer(PATIENCE_S)
+            if what == "failed":
+                raise told
+        except BaseException:
+            self._server.close()
+            raise
+        self._settings = self._settings.model_copy(update={"port": told})
 
-    def _inputs(self, asset: str) -> dict[str, tuple[ua.NodeId, ua.NodeId]]:
-        """Where what alarms compare is: measured and expected, by quantity."""
-        paths = {"pressure": (("Meas", "Pressure"), ("Model", "Expected"))}
-        paths |= {
-            name: (("Cycle", f"{name}_measured"), ("Cycle", f"{name}_expected"))
-            for name in self._figures
-        }
-        return {
-            quantity: (self._names(asset, *measured)[0], self._names(asset, *expected)[0])
-            for quantity, (measured, expected) in paths.items()
-        }
+    def _begin_again(self) -> None:
+        """Start one with all that was shown, unless the first one runs."""
+        if self._server.runs:
+            return
+        self._begin()
+        for branch in self._branches:
+            branch.laid_out.clear()
 
-    def _names(self, *path: str) -> Names:
-        """NodeId and browse name of what lies at ``path``."""
-        return ua.NodeId(".".join(path), self._index), ua.QualifiedName(path[-1], self._index)
+    def _show_until_stopped(self) -> None:
+        while not self._stop.is_set():
+            for branch in list(self._branches):
+                if not branch.laid_out.is_set():
+                    self._add(branch)
+            self._ask("show", [branch.news() for branch in self._branches])
+            self._listen(self._settings.interval_ms * 1e-3)
 
-    def _quantities(self) -> Iterable[tuple[str, str, str]]:
-        """Group, name and unit of every value that has one."""
-        for group, name in (("Meas", "Pressure"), ("Meas", "Supply")):
-            yield group, name, "mbar"
-        for name in ("Expected", "Deviation"):
-            yield "Model", name, "mbar"
-        for name in MEANS:
-            yield "Cycle", name, "mbar"
-        for name, unit in self._figures.items():
-            for side in SIDES:
-                yield "Cycle", f"{name}_{side}", unit
+    def _add(self, branch: Branch) -> None:
+        """Have its nodes laid out, and what stands shown."""
+        asset, branch.shown = branch.results.asset, {}
+        self._ask("add", asset, branch.kind, branch.acknowledge is not None)
+        changes = list(branch.standing.values())
+        _, readings, new = branch.news()
+        self._ask("show", [(asset, readings, [*changes, *new])])
+        branch.laid_out.set()
 
-    async def _quantity(self, parent: Node, asset: str, group: str, name: str, unit: str) -> Leaf:
-        code, low, high = SPANS.get(unit, ("", 0.0, 1e6))
-        if name == "Deviation" or name in MEANS:
-            low = -high
-        elif name == "Supply":
-            high = 10_000.0
-        node = await add_quantity(
-            self._server,
-            parent,
-            self._names(asset, group, name),
-            Unit(code, unit),
-            (low, high),
-            ua.NodeId(ua.ObjectIds.Double),
-        )
-        return Leaf(name, _T.Double, False, node.nodeid)
+    def _ask(self, *message: Any) -> None:
+        """Have something done, and wait until it is."""
+        self._server.send(message)
+        self._answer(SILENCE_S)
 
+    def _answer(self, patience_s: float) -> Any:
+        """The answer of the server; what it asks meanwhile is seen to."""
+        end = time.monotonic() + patience_s
+        while time.monotonic() < end:
+            message = self._heard(LOOK_S)
+            if message is not None:
+                return message
+        self._server.kill()
+        raise DownError("it did not answer, and was ended")
 
-GROUPS = ("Identification", "Meas", "Model", "Cycle", "Health", "Events", "Alarms")
-STATES: Sequence[tuple[str, str, list[str]]] = (
-    ("Model", "Phase", [phase.name.lower().replace("_", "-") for phase in Phase]),
-    ("Health", "State", [one.name.lower().replace("_", " ") for one in Standing]),
-)
+    def _listen(self, seconds: float) -> None:
+        """See to what the server asks for so long."""
+        end = time.monotonic() + seconds
+        while (rest := end - time.monotonic()) > 0 and not self._stop.is_set():
+            self._heard(min(rest, LOOK_S))
 
+    def _heard(self, seconds: float) -> Any:
+        """A message within so long, unless it asks for something; that is passed on."""
+        with suppress(Empty):
+            while True:
+                self._server.send(self._answers.get_nowait())
+        message = self._server.heard(seconds)
+        if message is None or message[0] != "acknowledge":
+            return message
+        threading.Thread(target=self._acknowledge, args=message[1:], daemon=True).start()
+        return None
 
-@dataclass(frozen=True)
-class _Guard:
-    policies: Sequence[str]
-    certificates: Path | None
-    users: Mapping[str, str]
-
-
-async def _prepared(settings: ResultsSettings) -> Server:
-    server = Server(KnowingServer())
-    await server.init()
-    server.set_endpoint(f"opc.tcp://{settings.host}:{settings.port}/")
-    server.set_server_name("ejector-twin")
-    await server.set_application_uri(APPLICATION)
-    await secure(server, _Guard(settings.policies, settings.certificates, settings.passwords()))
-    return server
-
-
-async def _plain(parent: Node, names: Names, name: str, kind: ua.VariantType, group: str) -> Leaf:
-    """A variable without a unit; events are arrays of them."""
-    leaf = Leaf(name, kind, group == "Events", names[0])
-    empty = _variant(leaf, [] if leaf.is_array else _EMPTY[kind])
-    await parent.add_variable(*names, empty, kind)
-    return leaf
-
-
-_EMPTY: dict[ua.VariantType, Any] = {_T.DateTime: 0, _T.String: "", _T.Double: 0.0, _T.Int64: -1}
-
-
-def _value(leaf: Leaf, reading: Reading) -> ua.DataValue:
-    return ua.DataValue(
-        _variant(leaf, reading.value),
-        ua.StatusCode(CODES[reading.status]),
-        SourceTimestamp=_moment(reading.time_ns) if reading.time_ns else None,
-        ServerTimestamp=datetime.now(UTC),
-    )
-
-
-def _variant(leaf: Leaf, value: Any) -> ua.Variant:
-    """As OPC UA has it; moments come as ns since 1970."""
-    if leaf.kind is _T.DateTime:
-        value = [_moment(one) for one in value] if leaf.is_array else _moment(value)
-    return ua.Variant(value, leaf.kind, is_array=leaf.is_array)
-
-
-def _moment(ns: int) -> datetime:
-    """A time to the microsecond that the library keeps."""
-    return EPOCH + timedelta(microseconds=ns // 1000)
+    def _acknowledge(self, number: int, asset: str, alarm: str, who: str) -> None:
+        """Acknowledge an alarm; it may wait for a database."""
+        refused = f"{asset}: no such ejector"
+        for branch in self._branches:
+            if branch.results.asset == asset and branch.acknowledge is not None:
+                try:
+                    branch.acknowledge(alarm, who)
+                    refused = ""
+                except TwinError as error:
+                    refused = str(error)
+        self._answers.put(("acknowledged", number, refused))
 
 
 __all__ = ["ResultsServer", "ResultsSettings"]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from drivers.lasting import EMPTY, Clock
+from drivers.lasting import Clock
 from drivers.link import Link, ModbusSettings, span
 from drivers.plan import Answers, plan
 from drivers.reports import BITS, VALUES, ambient_of, once, put_bits, put_values
@@ -21,6 +21,7 @@ from twin.signals import MBAR, SAMPLE, Quality, Samples
 HEADER_WORDS = 12
 RECORD_WORDS = 4
 RECORDS_AT_ONCE = 31  # 124 of the 125 words that a request may carry
+TRIES = 3  # for a header that is neither torn nor ahead of its records
 LONGEST_FETCH_NS = 100_000_000  # then yield what came; no interval is longer
 
 
@@ -65,14 +66,26 @@ class Trace(Follower[Header, Link]):
 
     def start(self, link: Link) -> Header:
         """Begin at the newest record; SourceError if there is no ring as configured."""
-        ring = self._settings.ring
-        header = self.header(link)
-        for _ in range(3):  # some PLCs announce a record a little before it can be read
-            self.refuse_other(header)
-            if self._announced(link, header):
-                self._begin(header)
-                return header
+        header = self._proven(link)
+        self._begin(header)
+        return header
+
+    def _proven(self, link: Link) -> Header:
+        """A header that follows the last one, or announces what the ring holds; else SourceError.
+
+        It may be torn: one that surprises is read again. Some PLCs announce a record a little
+        before it can be read.
+        """
+        last = self._header
+        for attempt in range(TRIES):
             header = self.header(link)
+            if last is not None and header.follows(last):
+                return header
+            read_again = attempt > 0 or last is None
+            if read_again and self._fits(header) and self._announced(link, header):
+                return header
+        self.refuse_other(header)
+        ring = self._settings.ring
         raise SourceError(
             f"{self._settings.where}: the records at {ring.records} do not carry the sequence "
             f"numbers that the header at {ring.header} announces ({header.sequence})",
@@ -80,17 +93,22 @@ class Trace(Follower[Header, Link]):
             "twin probe shows both orders",
         )
 
+    def _fits(self, header: Header) -> bool:
+        """Whether ``header`` describes a ring that lies within the registers."""
+        end = self._settings.ring.records.offset + header.depth * RECORD_WORDS
+        return header.ready and end <= 0x10000
+
     def refuse_other(self, header: Header) -> None:
         """SourceError if ``header`` does not describe a ring that can be followed."""
         ring = self._settings.ring
-        end = ring.records.offset + header.depth * RECORD_WORDS
-        if not header.ready or end > 0x10000:
+        if not self._fits(header):
             raise refusal(header)(
                 f"{self._settings.where}: no trace header at {span(ring.header, HEADER_WORDS)}: "
                 f"it says {header.depth} records of {header.record_words} words, one every "
-                f"{header.period_ns // 1000} µs; expected are words of {RECORD_WORDS} and more "
-                f"than {2 * RESERVE} records",
-                "check [driver.ring] header against the PLC's trace block; is its program running?",
+                f"{header.period_ns // 1000} µs, the newest at {header.time_ns} ns; expected are "
+                f"words of {RECORD_WORDS}, more than {2 * RESERVE} records, and a time before 2116",
+                "check [driver.ring] header against the PLC's trace block, and word_order; is its "
+                "program running?",
             )
 
     def header(self, link: Link) -> Header:
@@ -110,8 +128,6 @@ class Trace(Follower[Header, Link]):
         started = self._clock.now_ns()
         beside = self._read_values(link)
         header = self._next_header(link)
-        if not header.ready:
-            return EMPTY
         self._place(header)
         first = self._next
         records, valid = self._fetch(link, header, first, self._newest + 1)
@@ -134,15 +150,11 @@ class Trace(Follower[Header, Link]):
         return {name: float(answers.floats(tag, order)[0]) for name, tag in self._values.items()}
 
     def _next_header(self, link: Link) -> Header:
-        """Read the header; twice where it surprises, since it may have been torn.
+        """Read the header, as evenly in time as it can be.
 
         Torn between sequence and time it does not surprise: its time is another scan's.
         """
-        assert self._header is not None
-        header = self.header(link)
-        if not header.follows(self._header):
-            header = self.header(link)
-        return self._steadied(header, 1)
+        return self._steadied(self._proven(link), 1)
 
     def _fetch(
         self, link: Link, header: Header, first: int, end: int

@@ -24,19 +24,22 @@ def open_source(
     address: str = "",
     lines: Lines | None = None,
     away: Away | None = None,
+    *,
+    known: bool = False,
 ) -> Iterator[Samples]:
     """The blocks of the source that ``[driver]`` names; ``address`` (host:port) goes before it.
 
     Several that are opened with the same ``lines`` share a connection where that can be done.
     Raises ConfigError for an unknown kind or bad settings, SourceError if it does not answer; with
-    ``away``, which is told why, it is tried until it does.
+    ``away``, which is told why, it is tried until it does. One that is ``known`` has given rows
+    before: whatever it sends, it is tried again.
     """
     settings = settings_of(document, address)
     if isinstance(settings, ModbusSettings):
-        return modbus.blocks(settings, lines=lines, away=away)
+        return modbus.blocks(settings, lines=lines, away=away, known=known)
     from drivers import opcua  # noqa: PLC0415 - the library takes its time
 
-    return opcua.blocks(settings, away=away)
+    return opcua.blocks(settings, away=away, known=known)
 
 
 def probe_source(document: Document, address: str = "") -> Iterator[str]:

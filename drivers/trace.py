@@ -23,6 +23,7 @@ OVERFLOW_BIT = 8  # in the status of a record
 RESERVE = 64  # records at the old end of the ring that the PLC may overwrite while they are read
 CLOCK_TOLERANCE_NS = 50_000_000  # PLC time against sequence
 LONGEST_PERIOD_NS = 1_000_000_000  # of scans that can be called so
+LATEST_NS = 1 << 62  # the year 2116; beyond it is no time
 WRAP = 1 << 32  # the PLC counts with 32 bits
 
 
@@ -40,7 +41,8 @@ class Header:
     @property
     def ready(self) -> bool:
         """Whether it describes a ring; a PLC that just starts may show zeros."""
-        return self.depth > 2 * RESERVE and 0 < self.period_ns <= LONGEST_PERIOD_NS
+        runs = 0 < self.period_ns <= LONGEST_PERIOD_NS and abs(self.time_ns) < LATEST_NS
+        return runs and self.depth > 2 * RESERVE
 
     @property
     def blank(self) -> bool:
@@ -159,9 +161,9 @@ class Follower(ABC, Generic[H, L]):
     def _place(self, header: H) -> None:
         """Say where ``header`` is and what broke on the way there."""
         assert self._header is not None
+        self.refuse_other(header)
         scans = header.advance(self._header)
         if scans is None:
-            self.refuse_other(header)
             self._break |= Quality.RESTART | Quality.GAP  # what ran meanwhile was never seen
             self._newest, self._next, self._last = header.sequence, 0, -1
         else:

@@ -112,6 +112,28 @@ class Stream:
         return [f"{one.data['alarm']} {one.data['deed']}" for one in events]
 
 
+@pytest.mark.parametrize("step_s", [-3600, 3600])
+@pytest.mark.parametrize("silent", [False, True])
+def test_a_clock_that_is_set_shortens_no_delay(step_s: int, silent: bool) -> None:
+    (leak,) = (rule for rule in board_rules(None) if rule.name == LEAK)
+    rules = [leak.model_copy(update={"on_delay_s": 60.0, "suppressed_by": ()})]
+    wall, steady = 0, 0
+    alarms = Alarms(rules, lambda: APART + wall, steady=lambda: steady)
+
+    def said(seconds: int, *events: Event) -> list[Event]:
+        nonlocal wall, steady
+        steady = seconds * S
+        wall = (seconds + (step_s if seconds >= 10 else 0)) * S
+        now = NONE if silent and not events else rows(seconds)
+        now["host_ns"] = APART + wall
+        return alarms.follow(now, events)
+
+    assert not said(5, deviation(5))
+    for seconds in (10, 30, 64):
+        assert not said(seconds)
+    assert [one.data["deed"] for one in said(66)] == ["raised"]
+
+
 def test_a_deviation_is_the_alarm_of_its_cause_with_what_to_do() -> None:
     stream = Stream()
     assert stream.at(5, deviation(5)) == [f"{LEAK} raised"]

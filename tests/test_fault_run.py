@@ -18,9 +18,9 @@ def test_after_every_disturbance_the_log_is_true_and_the_twin_right(
 ) -> None:
     monkeypatch.setattr(fault_run, "SETTLED_S", 5.0)
     monkeypatch.setattr(fault_run, "GROWTH_MB", 60.0)  # this short it is still filling its buffers
-    verdict, done = fault_run.run("modbus", 34.0, 4, 5, tmp_path)
+    verdict, done = fault_run.run("modbus", 50.0, 6, 5, tmp_path)
     assert verdict.problems == []
-    assert len(done) == len(set(done)) == 4
+    assert len(done) == len(set(done)) == 6
     assert verdict.counts["rows"] > 15_000
 
 

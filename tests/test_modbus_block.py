@@ -1,6 +1,7 @@
 """The PLC's ring, followed over a real socket; the PLC's time and ours pass only when told."""
 
 import itertools
+import re
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from typing import Any
@@ -11,10 +12,10 @@ import rigs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.lasting import Clock
+from drivers.lasting import Away, Clock
 from drivers.modbus import ModbusSettings, blocks
 from tests.modbus_server import CUT, HALF, SILENT, ModbusServer, PlcTime, TracePlc
-from twin.errors import ConfigError, SourceError
+from twin.errors import ConfigError, SourceError, TwinError
 from twin.events import Kind
 from twin.monitor.clock import ClockWatch
 from twin.settings import Document
@@ -44,11 +45,14 @@ def clock_of(time: PlcTime) -> Clock:
 class Rig:
     """Server, PLC, time and the stream of one test."""
 
-    def __init__(self, server: ModbusServer, plc: TracePlc, **changes: Any) -> None:
+    def __init__(
+        self, server: ModbusServer, plc: TracePlc, away: Away | None = None, **changes: Any
+    ) -> None:
         self.server = server
         self.plc = plc
         self.time = PlcTime(lambda scans: self.plc.scan(scans))  # noqa: PLW0108 - tests replace scan
-        self.stream = blocks(settings_for(server, **changes), clock_of(self.time))
+        told = settings_for(server, **changes)
+        self.stream = blocks(told, clock_of(self.time), away=away)
 
     def take(self, count: int) -> Samples:
         return np.concatenate([np.empty(0, SAMPLE), *itertools.islice(self.stream, count)])
@@ -410,7 +414,7 @@ def test_while_the_plc_is_away_a_block_comes_every_quarter_second(rig: Rig) -> N
         assert rig.time.ns - before <= 250_000_000
     rig.server.hook = lambda function, address, count: None
     before = rig.time.ns
-    assert any(len(next(rig.stream)) for _ in range(8))
+    assert any(len(next(rig.stream)) for _ in range(12))
     assert rig.time.ns - before <= 2_000_000_000
 
 
@@ -421,7 +425,7 @@ def test_a_plc_that_starts_with_an_empty_header_is_waited_for(rig: Rig) -> None:
     assert not len(rig.take(5))
     rig.plc.scan = scan  # type: ignore[method-assign]
     rig.plc.restart()
-    assert rig.take(2)["quality"][0] == Quality.RESTART | Quality.GAP
+    assert rig.take(8)["quality"][0] == Quality.RESTART | Quality.GAP
 
 
 @pytest.mark.parametrize("why", [CUT, "blank header", "illegal address"])
@@ -454,11 +458,58 @@ def test_an_address_that_is_not_served_any_more_is_tried_until_it_is(rig: Rig) -
     assert any(len(next(rig.stream)) for _ in range(8))
 
 
-def test_a_request_that_is_refused_otherwise_is_an_error_and_not_retried(rig: Rig) -> None:
-    rig.at_work()
-    rig.server.hook = lambda *_: 1
-    with pytest.raises(SourceError, match=r"holding:100–111 \[40101–40112\]: illegal function"):
-        rig.take(2)
+@pytest.mark.parametrize("code", range(1, 12))
+def test_a_request_that_is_refused_once_rows_came_is_a_lost_connection(code: int) -> None:
+    told: list[TwinError] = []
+    with ModbusServer() as server:
+        rig = Rig(server, TracePlc(server), away=told.append)
+        with closing(rig.stream):
+            rig.at_work()
+            server.hook = lambda *_: code
+            assert not len(rig.take(8))
+            server.hook = lambda *_: None
+            assert (np.diff(rig.take(12)["sequence"]) == 1).all()
+    (reason,) = told
+    assert re.search(r"holding:100–111 \[40101–40112\]: .+ \(Modbus exception", str(reason))
+
+
+def header(plc: TracePlc, **changes: Any) -> list[int]:
+    """Words of the trace's header that say something else."""
+    said = {"sequence": plc.sequence, "time_ns": plc.time_ns, "boot": plc.boot}
+    said |= {"period": 1000, "depth": plc.depth, "words": 4} | changes
+    counts = [said[name] for name in ("boot", "period", "depth", "words")]
+    return [*plc.words(">I", said["sequence"]), *plc.words(">q", said["time_ns"]), *counts, 5000, 0]
+
+
+@pytest.mark.parametrize(
+    ("lie", "says"),
+    [
+        ({"depth": 0}, "it says 0 records of 4 words"),
+        ({"depth": 65535}, "it says 65535 records of 4 words"),
+        ({"words": 5}, "of 5 words"),
+        ({"period": 0}, "one every 0 µs"),
+        ({"boot": 8, "time_ns": 2**63 - 1}, "the newest at 9223372036854775807 ns"),
+        ({"boot": 8, "time_ns": -(2**63)}, "the newest at -9223372036854775808 ns"),
+        ({"sequence": 700_001}, "do not carry the sequence numbers that the header"),
+        ({"sequence": 2**31}, "do not carry the sequence numbers that the header"),
+    ],
+)
+def test_a_header_that_lies_once_rows_came_is_a_lost_connection(
+    lie: dict[str, int], says: str
+) -> None:
+    told: list[TwinError] = []
+    with ModbusServer() as server:
+        rig = Rig(server, TracePlc(server), away=told.append)
+        with closing(rig.stream):
+            before = rig.at_work().take(1)
+            scan, rig.plc.scan = rig.plc.scan, lambda _scans: None  # type: ignore[method-assign]
+            rig.plc.put(3, 100, header(rig.plc, **lie))
+            assert not len(rig.take(6))
+            rig.plc.scan = scan  # type: ignore[method-assign]
+            after = rig.take(16)
+    assert says in str(told[0])
+    assert len(after)
+    assert_whole(np.concatenate([before, after]))
 
 
 def refuse_to_start(server: ModbusServer, **changes: Any) -> SourceError:

@@ -411,7 +411,7 @@ def test_a_lost_connection_comes_back_and_the_ring_fills_the_gap(rig: Rig) -> No
 def test_what_is_not_there_at_the_start_is_waited_for_and_each_reason_is_told_once() -> None:
     server, reasons = TornServer(), list[SourceError]()
     server.broken, server.absent = 3, 4
-    samples = Rig(server, reasons.append).take(40)
+    samples = Rig(server, reasons.append).take(80)
     assert [str(reason) for reason in reasons] == ["lost", "there is no node"]
     assert server.open_count == 1 + 3 + 4
     assert len(samples)

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
@@ -278,3 +278,12 @@ def test_whatever_is_published_rows_are_numbered_upwards_and_nothing_is_invented
     marked = samples["quality"] & (Quality.BAD | Quality.STALE)
     bad = [code & 0xC000_0000 != 0 for *_, code in sent]
     assert (marked != 0)[bad].all()
+
+
+@pytest.mark.parametrize("year", [1601, 9999])
+def test_a_time_that_cannot_be_is_told_with_its_node(year: int) -> None:
+    odd = change(0, 0.0, 900.0)
+    odd.Value.SourceTimestamp = datetime(year, 12, 31, tzinfo=UTC)
+    stream = subscription().samples(FakeLink([publication([odd], 1)], granted()))  # type: ignore[arg-type]
+    with pytest.raises(SourceError, match=r"s=.* comes without a time that can be"):
+        next(stream)

@@ -186,6 +186,19 @@ def test_a_wall_clock_that_is_set_is_no_silence(step_s: int, empty: int) -> None
     assert rigs.watch("test_rig", seen.samples).of(*STALENESS) == []
 
 
+@pytest.mark.parametrize("step_s", [-3600, 3600])
+def test_a_wall_clock_that_is_set_in_a_silence_does_not_lengthen_it(step_s: int) -> None:
+    """The rows of the silence are missing; PLC time says how long it was."""
+    samples = np.delete(healthy(), np.s_[3000:5000])
+    samples["host_ns"][3000:] += step_s * S
+    samples["quality"][3000] |= Quality.GAP
+    blocks = rigs.cut(samples, 100)
+    seen = beside([*blocks[:30], *[EMPTY] * 20, *blocks[30:]])
+    stale, back = seen.of(*STALENESS)
+    assert kinds([stale, back]) == [Kind.PLC_STALE, Kind.PLC_BACK]
+    assert back.data["silence_ms"] == pytest.approx(2001)
+
+
 def test_a_silence_that_the_ring_fills_is_over_after_it_began() -> None:
     """The connection was away: alarms are stamped with the rows, and the rows were all there."""
     samples = received_late(healthy(), [3000], 2 * S)

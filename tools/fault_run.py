@@ -1,17 +1,20 @@
 """A fault run: ``twin run`` beside the simulated PLC while everything that can go wrong does.
 
 Disturbances are drawn by seed; between the twin and the PLC stands a proxy that cuts, garbles,
-truncates and delays. The PLC keeps what it sampled, and the log is held against that: every sample
-is in it exactly once, bit for bit, or inside a recorded gap with the right bounds. The twin must be
-right again within a cycle, and its process must not grow.
+truncates, delays and lies. Strangers flood the port where results are served, that server is
+killed, and the clock here is set. The PLC keeps what it sampled, and the log is held against that:
+every sample is in it exactly once, bit for bit, or inside a recorded gap with the right bounds. The
+twin must be right again within a cycle, and its process must not grow.
 
     python tools/fault_run.py --protocol opcua --seconds 1200 --disturbances 40
 """
 
 import argparse
+import asyncio
 import json
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import tempfile
@@ -21,6 +24,7 @@ import tomllib
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -29,6 +33,7 @@ import numpy as np
 import numpy.typing as npt
 import psutil
 import tomli_w
+from asyncua import Client, ua
 
 from drivers.plc.live import WITNESSED
 from twin.events import Kind
@@ -40,6 +45,23 @@ CONFIGS = {"modbus": "test_rig", "opcua": "test_rig_opcua"}
 RIGHT_MBAR = 3.0  # rms of a cycle; healthy ones have 0.6
 SETTLED_S = 8.0  # from the end of a disturbance to the next
 GROWTH_MB = 12.0
+HEADER_BYTES = 9 + 2 * 12  # of an answer with the trace's header
+LIES = 0.2  # of the answers of a PLC that lies
+MB = b"\0" * 1_000_000
+# The twin with a clock that signals set, as an operator or a time server would.
+CLOCK = """
+import signal, time
+wall_ns, wall, ahead_ns = time.time_ns, time.time, 0
+time.time_ns = lambda: wall_ns() + ahead_ns
+time.time = lambda: wall() + ahead_ns * 1e-9
+def set_by(seconds):
+    global ahead_ns
+    ahead_ns += seconds * 10**9
+signal.signal(signal.SIGUSR1, lambda *_: set_by(3600))
+signal.signal(signal.SIGUSR2, lambda *_: set_by(-3600))
+from twin.cli import main
+main()
+"""
 START_S = 300.0  # the kernels may have to be compiled, on a busy machine
 
 
@@ -51,7 +73,8 @@ class Proxy:
 
     def __init__(self, random: np.random.Generator) -> None:
         self.target = 0
-        self.how = "pass"  # cut, garbage, truncate, slow, swallow
+        self.how = "pass"  # cut, garbage, truncate, slow, swallow, lie
+        self.lie: Callable[[bytes], bytes] = bytes
         self._random = random
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._listener.getsockname()[1]
@@ -99,6 +122,8 @@ class Proxy:
                 time.sleep(0.12)
             case "swallow":
                 return b""
+            case "lie" if self._random.random() < LIES:
+                return self.lie(data)
         return data
 
     def hang_up(self) -> None:
@@ -117,6 +142,36 @@ class Proxy:
         self.hang_up()
 
 
+def lie_by_modbus(data: bytes, random: np.random.Generator) -> bytes:
+    """An answer that is wrong in a way that can be told; of a header often what it says."""
+    if len(data) == HEADER_BYTES and random.random() < 0.7:
+        lies = [
+            (0, random.bytes(4)),  # the sequence
+            (4, struct.pack(">q", 2**63 - 1)),  # the time
+            *((at, b"\0\5") for at in (14, 16, 18)),  # period, depth, words of a record
+        ]
+        at, said = lies[int(random.integers(len(lies)))]
+        return data[: 9 + at] + said + data[9 + at + len(said) :]
+    match int(random.integers(3)):
+        case 0:  # an exception
+            code = bytes([data[7] | 0x80, int(random.integers(1, 12))])
+            return data[:4] + b"\0\3" + data[6:7] + code
+        case 1:  # another transaction
+            return random.bytes(2) + data[2:]
+        case _:  # another length
+            return data[:8] + bytes([data[8] ^ 0x55]) + data[9:]
+
+
+def lie_by_opcua(data: bytes, random: np.random.Generator) -> bytes:
+    """A message with another head: type, size, channel, token, sequence or request."""
+    changed = bytearray(data)
+    changed[int(random.integers(min(24, len(data))))] ^= 1 << int(random.integers(8))
+    return bytes(changed)
+
+
+LIAR = {"modbus": lie_by_modbus, "opcua": lie_by_opcua}
+
+
 # --- the three processes --------------------------------------------------------------------------
 
 
@@ -132,11 +187,13 @@ class Cell:
 
     def __enter__(self) -> Self:
         self.proxy = Proxy(self.random)
+        self.proxy.lie = partial(LIAR[self.protocol], random=self.random)
+        self.results_port = free_port()
         self._plc_config = self._configured("plc.toml", 0)
         self.start_plc()
         self.log = self.folder / "run.mcap"
         config = self._configured("twin.toml", self.proxy.port)
-        command = [sys.executable, "-m", "twin.cli", "run", str(config), "--log", str(self.log)]
+        command = [sys.executable, "-c", CLOCK, "run", str(config), "--log", str(self.log)]
         self._said = (self.folder / "twin.txt").open("w")
         self.twin = psutil.Popen(command, cwd=ROOT, stdout=self._said, stderr=self._said)
         return self
@@ -163,6 +220,7 @@ class Cell:
         )
         tables["plc"]["program"]["start_ms"] = 500.0
         tables["plc"]["server"]["port"] = 0
+        tables["results"] = {"opcua": True, "port": self.results_port}
         if self.protocol == "opcua":
             tables["plc"]["opcua"]["port"] = 0
             tables["driver"]["url"] = f"opc.tcp://127.0.0.1:{port or 4840}"
@@ -183,6 +241,11 @@ class Cell:
         if self.protocol == "opcua":
             port = int(self.plc.stdout.readline().strip().rpartition(":")[2])
         self.proxy.target = port
+
+    def results_server(self) -> psutil.Process:
+        """The process that serves the results."""
+        (found,) = (one for one in self.twin.children() if "drivers.results_serve" in one.cmdline())
+        return found
 
     def rows(self) -> int:
         """Bytes of log by now, which grow while rows come."""
@@ -234,7 +297,37 @@ def _set_clock(cell: Cell, seconds: float) -> None:
     time.sleep(min(seconds, 1.0))
 
 
+def _set_wall_clock(cell: Cell, _seconds: float) -> None:
+    ahead = bool(cell.random.integers(2))
+    cell.twin.send_signal(signal.SIGUSR1 if ahead else signal.SIGUSR2)
+
+
+def _flood_results(cell: Cell, seconds: float) -> None:
+    """Chunks without an end, as fast as they are taken, and connections that say nothing."""
+    end = time.monotonic() + seconds
+    there = "127.0.0.1", cell.results_port
+    with ExitStack() as stack, suppress(OSError):
+        for _ in range(50):
+            stack.enter_context(socket.create_connection(there, 1.0))
+    while time.monotonic() < end:
+        with suppress(OSError), socket.create_connection(there, 1.0) as connection:
+            connection.sendall(b"HELF" + (0xFFFF_FFF0).to_bytes(4, "little"))
+            while time.monotonic() < end:
+                connection.sendall(MB)
+
+
+def _kill_results(cell: Cell, _seconds: float) -> None:
+    cell.results_server().kill()
+
+
+# Of the disk, a full one and a folder that is deleted: they belong here as well.
+ON_DISK: dict[str, Callable[[Cell, float], None]] = {}
+
 DISTURBANCES: dict[str, Callable[[Cell, float], None]] = {
+    "the PLC lies": _through_proxy("lie"),
+    "the wall clock is set": _set_wall_clock,
+    "the results port is flooded": _flood_results,
+    "the results server is killed": _kill_results,
     "the PLC is killed and restarted": _restart,
     "the connection is cut": _through_proxy("cut"),
     "the client is stopped": _stop_client,
@@ -243,7 +336,23 @@ DISTURBANCES: dict[str, Callable[[Cell, float], None]] = {
     "answers are truncated": _through_proxy("truncate"),
     "answers are slow": _through_proxy("slow"),
     "answers are swallowed": _through_proxy("swallow"),
+    **ON_DISK,
 }
+
+
+def free_port() -> int:
+    """A port that nobody listens on."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        return int(listener.getsockname()[1])
+
+
+async def served(port: int) -> bool:
+    """Whether the results are there to be read, and fresh."""
+    async with Client(f"opc.tcp://127.0.0.1:{port}") as client:
+        index = await client.get_namespace_index("urn:ejector-twin:results")
+        pressure = client.get_node(f"ns={index};s=rig-01.Meas.Pressure")
+        value = await pressure.read_data_value(raise_on_bad_status=False)
+        return bool(value.StatusCode.is_good())
 
 
 # --- the log against what was sampled -------------------------------------------------------------
@@ -287,6 +396,8 @@ def judge(log: Path, boots: list[Path], verdict: Verdict) -> None:
     verdict.check(told == missing, f"gaps say that {told} are missing, and {missing} are")
     verdict.counts |= {"rows": len(samples), "restarts": len(starts), "missing": missing}
     verdict.counts["gaps"] = sum(event.kind is Kind.GAP for event in events)
+    for kind in (Kind.PLC_LOST, Kind.RESULTS_DOWN, Kind.TWIN_LATE):
+        verdict.counts[str(kind)] = sum(event.kind is kind for event in events)
     verdict.counts["stale"] = sum(event.kind is Kind.PLC_STALE for event in events)
     back = sum(event.kind is Kind.PLC_BACK for event in events)
     verdict.check(verdict.counts["stale"] - back in (0, 1), "stale and back do not take turns")
@@ -394,6 +505,7 @@ def run(
             DISTURBANCES[name](cell, lasts)
             verdict.check(cell.twin.is_running(), f"the twin ended at: {name}")
         _quiet(cell, max(end - time.monotonic(), SETTLED_S))
+        verdict.check(_is_served(cell), "the results are not served any more")
         cell.twin.send_signal(signal.SIGINT)
         verdict.check(cell.twin.wait(60) == 130, "the twin did not end as it should")
     judge(cell.log, cell.boots, verdict)
@@ -408,6 +520,13 @@ def _until_logged(cell: Cell) -> None:
             said = (cell.folder / "twin.txt").read_text()
             raise SystemExit(said or f"the twin logged nothing within {START_S:.0f} s")
         time.sleep(0.1)
+
+
+def _is_served(cell: Cell) -> bool:
+    try:
+        return asyncio.run(served(cell.results_port))
+    except (OSError, TimeoutError, ua.UaError):
+        return False
 
 
 def _quiet(cell: Cell, seconds: float) -> None:

@@ -34,13 +34,12 @@ from twin.cli_init import init
 from twin.cli_outlets import outlets_of
 from twin.cli_serve import live_rows_of, reports_of, serve
 from twin.errors import ConfigError, SourceError, TwinError
-from twin.events import Event, Severity
+from twin.events import Event, Kind, Severity
 from twin.files import require_writable, write_json
 from twin.instants import stamp
 
 if TYPE_CHECKING:
     from drivers.hil import Writer
-    from drivers.lasting import Away
     from drivers.results_state import Results
     from twin.cli_outlets import Begin, Standing
     from twin.config import Config
@@ -122,7 +121,6 @@ def run(
     from twin.diagnosis.process import LiveDiagnosis
     from twin.figures.table import FIGURES
     from twin.live import run as run_loop
-    from twin.monitor.listening import Listening
     from twin.settings import Document
     from twin.together import run_together
 
@@ -143,9 +141,11 @@ def run(
         label = "" if alone else name
         twin, monitor = pairs[name]
         alarms, outlets = alarms_of(settings, _complain), outlets_of(settings, _complain)
-        shown = show(name, settings.asset.type, asker_of(settings)) if show else None
         at = settings.document, address, lines if hil or not alone else None
         plc = _Plc(partial(open_source, *at), label, once=once)
+        shown = (
+            show(name, settings.asset.type, asker_of(settings), plc.results_down) if show else None
+        )
         with _closed(shown), ExitStack() as closing:
             if not plc.answers(stopped):  # said before a log is begun
                 return
@@ -174,7 +174,7 @@ def run(
             # It begins with the newest row: what came while all this was opened is not judged.
             source = _answering(plc.blocks(), settings, writer) if writer else plc.blocks()
             with _closed(source):
-                run_loop(_until(stopped, source), twin, monitor, sinks, Listening(), advisers)
+                run_loop(_until(stopped, source), twin, monitor, sinks, plc.listening, advisers)
 
     failed: list[str] = []
     units = {figure.name: figure.unit for figure in FIGURES.values()}
@@ -881,15 +881,24 @@ class _Plc:
     """The PLC of one ejector: tried until it answers, unless it is to answer at ``once``."""
 
     def __init__(
-        self, opened: "Callable[[Away | None], Iterator[Samples]]", name: str, *, once: bool
+        self,
+        opened: "Callable[..., Iterator[Samples]]",
+        name: str,
+        *,
+        once: bool,
     ) -> None:
+        from twin.monitor.listening import Listening
+
+        self.listening = Listening()
         self._opened, self._once = opened, once
         self._said = f"{name}: " if name else ""
         self._waits = False  # it did not answer at first
+        self._known = False  # it has given a row: whatever it sends from now on may pass
 
     def blocks(self) -> "Iterator[Samples]":
         """Its samples from now on; errors as from ``drivers.sources.open_source``."""
-        return self._opened(None if self._once else self._away)
+        away = None if self._once and not self._known else self._away
+        return self._opened(away, known=self._known)
 
     def answers(self, stopped: Callable[..., str]) -> bool:
         """Wait for a row and hang up; False if the run is interrupted before there is one."""
@@ -897,6 +906,7 @@ class _Plc:
         with _closed(source):
             for block in source:
                 if len(block):
+                    self._known = True
                     break
                 if stopped(begun=False):
                     return False
@@ -904,7 +914,14 @@ class _Plc:
             _complain(f"{self._said}the PLC answers")
         return True
 
-    def _away(self, error: SourceError) -> None:
+    def results_down(self, why: str) -> None:
+        """Have it said with the events of this ejector."""
+        self.listening.notices.tell(Kind.RESULTS_DOWN, why)
+
+    def _away(self, error: TwinError) -> None:
+        if self._known:
+            self.listening.notices.tell(Kind.PLC_LOST, str(error))
+            return
         waits = "" if self._waits else f"\n  {WAITS}; with --once the run ends instead"
         self._waits = True
         _complain(f"{self._said}{error}\n  {error.hint}{waits}")

@@ -247,7 +247,7 @@ def alarms_of(
     if say is None:
         return lambda: Alarms(by_cause, None)
     if not wanted.keep:
-        return lambda: Alarms(by_cause, time.time_ns)
+        return lambda: Alarms(by_cause, time.time_ns, steady=time.monotonic_ns)
 
     from twin.alarms.keeper import Keeper  # its SQLAlchemy is only loaded for who keeps them
     from twin.alarms.place import open_chosen
@@ -258,7 +258,7 @@ def alarms_of(
     parse_url(wanted.url, ALARM_DATABASE)
     opened = partial(open_chosen, "", document, write=True)
     keeper = Keeper(opened, Unit(settings.asset.type, settings.asset.id), say)
-    return lambda: Alarms(by_cause, time.time_ns, keeper.begin(), keeper)
+    return lambda: Alarms(by_cause, time.time_ns, keeper.begin(), keeper, time.monotonic_ns)
 
 
 def asker_of(settings: "Config") -> "Callable[[str, str], None] | None":

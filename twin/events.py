@@ -21,9 +21,11 @@ class Kind(StrEnum):
     PLC_RESTARTED = "plc_restarted"
     CLOCK_JUMPED = "clock_jumped"
     CLOCK = "clock"
+    PLC_LOST = "plc_lost"
     PLC_STALE = "plc_stale"
     PLC_BACK = "plc_back"
     TWIN_LATE = "twin_late"
+    RESULTS_DOWN = "results_down"
     SIGNAL_BAD = "signal_bad"
     SIGNAL_GOOD = "signal_good"
     SIGNAL_CONTRADICTS = "signal_contradicts"
@@ -41,9 +43,11 @@ SEVERITY: dict[Kind, Severity] = {
     Kind.PLC_RESTARTED: Severity.WARNING,
     Kind.CLOCK_JUMPED: Severity.WARNING,
     Kind.CLOCK: Severity.INFO,
+    Kind.PLC_LOST: Severity.WARNING,  # why there are no rows; how long that may last, PLC_STALE
     Kind.PLC_STALE: Severity.ALARM,
     Kind.PLC_BACK: Severity.INFO,
     Kind.TWIN_LATE: Severity.WARNING,
+    Kind.RESULTS_DOWN: Severity.WARNING,
     Kind.SIGNAL_BAD: Severity.WARNING,
     Kind.SIGNAL_GOOD: Severity.INFO,
     Kind.SIGNAL_CONTRADICTS: Severity.WARNING,  # what is reported, and the pressure

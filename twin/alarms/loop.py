@@ -24,6 +24,7 @@ from twin.signals import Quality, Samples
 # Whole cycles without a deviation: then one that stood before a restart is over. The first ones
 # may not have been judged.
 AGREEING = 5
+SET_NS = 5_000_000_000  # a clock that was set by less cannot be told from a twin that was late
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,7 @@ class Alarms:
     """The alarms of one ejector.
 
     ``clock`` (ns) is asked only while nothing arrives; without one, as for a log, time stands then.
+    ``steady`` (ns) runs on evenly: by it a clock that is set shortens no delay.
     """
 
     def __init__(
@@ -77,13 +79,15 @@ class Alarms:
         clock: Callable[[], int] | None,
         before: Before | None = None,
         office: Office | None = None,
+        steady: Callable[[], int] | None = None,
     ) -> None:
         before = before or Before()
         self.board = Board(rules)
         self.board.resume(before.states)
         self._before = [name for name in before.states if name in self.board.alarms]
         self._diary = Diary(before.going_on)
-        self._clock, self._office = clock, office
+        self._clock, self._office, self._steady = clock, office, steady
+        self._apart: int | None = None  # the clock here less the steady one
         self._evidence: dict[str, dict[str, Any]] = {  # by value
             self.board[one.alarm].rule.value: dict(one.evidence)
             for one in before.going_on
@@ -100,6 +104,7 @@ class Alarms:
     def follow(self, samples: Samples, events: Sequence[Event]) -> list[Event]:
         """Take rows and what happened; give what that changes."""
         now = self._time(samples)
+        self._follow_clock(now)
         if any(event.kind is Kind.DEVIATION for event in events):
             self._to_agree = 0  # it comes after its cycle, which does not agree
         said = self._hear(samples, events, now)
@@ -128,6 +133,15 @@ class Alarms:
         """Let go of the database."""
         if self._office is not None:
             self._office.close()
+
+    def _follow_clock(self, now: int) -> None:
+        """Leave delays as long as they are where the clock here was set."""
+        if self._steady is None:
+            return
+        before, self._apart = self._apart, now - self._steady()
+        if before is not None and abs(self._apart - before) > SET_NS:
+            for alarm in self.board.alarms.values():
+                alarm.shift(self._apart - before)
 
     def _time(self, samples: Samples) -> int:
         """When that is, by the clock here."""

@@ -133,6 +133,11 @@ class Alarm:
         if now - self._since >= delay * SECOND_NS:
             yield from self._turn(now)
 
+    def shift(self, by_ns: int) -> None:
+        """The clock was set: what waits for its delay waits no longer and no less."""
+        if self._since is not None:
+            self._since += by_ns
+
     def acknowledge(self, now: int, who: str) -> Iterator[Change]:
         """Somebody has seen it; a latching one may go now."""
         if self.acknowledged:

@@ -58,6 +58,7 @@ STANDING = 0.8  # of the best fit's gain: then the name of a standing alarm stil
 ALIKE = 0.2  # of how far out a cycle is: by so much its figures may move before the cause is sought
 NAMED = 0.5  # of the squares a name explains at least: more than it leaves
 RENAMED = 3  # cycles in a row that must agree on another name before a standing alarm gets it
+LONGEST_RING_NS = 120_000_000_000  # of rows that a PLC keeps while nobody reads them
 GREW = 2.0  # times as far out as any cycle before: something else has begun
 PHASES = {"h1": "suction", "h1_low": "hold"}  # which a level of the air saving ends
 
@@ -263,7 +264,7 @@ class Monitor:
         events = [] if since_ns in self._silences else [self._stale(since_ns)]
         if not row["quality"] & Quality.STALE:
             self._silences.remove(since_ns)
-            silence_ns = max(int(row["host_ns"]) - int(heard["host_ns"]), self.stale_ns)
+            silence_ns = max(_apart_ns(heard, row), self.stale_ns)
             silence_ms = silence_ns * NS * 1e3
             text = f"the PLC is back after {silence_ms / 1e3:.2f} s"
             data = {"silence_ms": silence_ms}
@@ -532,6 +533,18 @@ def _names(verdict: "Verdict | None") -> bool:
 def in_order(events: Iterable[Event]) -> list[Event]:
     """Events of one PLC time in the order of time; of the same moment, as they came."""
     return sorted(events, key=lambda event: event.time_ns)
+
+
+def _apart_ns(heard: np.void, row: np.void) -> int:
+    """Time between the receipts of two rows.
+
+    A wall clock that was set between them shows as far more, or less, than PLC time ran on: then
+    PLC time it is, less what a ring kept.
+    """
+    by_receipt, by_plc = (int(row[name]) - int(heard[name]) for name in ("host_ns", "time_ns"))
+    was_set = not 0 <= by_receipt - by_plc <= LONGEST_RING_NS
+    runs_on = not row["quality"] & NEW_TIME
+    return by_plc if was_set and runs_on else by_receipt
 
 
 def _summary(

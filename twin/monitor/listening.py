@@ -5,6 +5,7 @@ else. Rows carry what it decides (``Quality.OURS``), so that a replay decides th
 """
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
@@ -18,11 +19,31 @@ LONGEST_WAIT_NS = 500_000_000  # a driver gives a block at least this often: lon
 ONCE_NS = 60_000_000_000  # a twin that is late again within this time has said so
 
 
+MOST_NOTICES = 100  # that may wait for the loop
+
+
+@dataclass
+class Notices:
+    """What threads beside the loop have to tell; the loop takes it, in the PLC's time."""
+
+    _told: deque[tuple[Kind, str]] = field(default_factory=lambda: deque(maxlen=MOST_NOTICES))
+
+    def tell(self, kind: Kind, text: str) -> None:
+        """Have it said; any thread may, and none waits."""
+        self._told.append((kind, text))
+
+    def taken(self, time_ns: int) -> list[Event]:
+        """What was told since the last time, as events at ``time_ns``."""
+        told = [self._told.popleft() for _ in range(len(self._told))]
+        return [Event(time_ns, kind, text) for kind, text in told]
+
+
 @dataclass
 class Listening:
     """Times the blocks of a live source; a replay needs none of it."""
 
     clock: Callable[[], int] = time.perf_counter_ns  # runs on evenly
+    notices: Notices = field(default_factory=Notices)
     _last: Samples | None = None  # the last fresh row, as an array of one
     _heard_ns: int = 0  # when that was, by ``clock``
     _listened_ns: int = 0  # since then
@@ -37,7 +58,10 @@ class Listening:
         while (block := next(blocks, None)) is not None:
             now_ns = self.clock()
             self._listened_ns += min(now_ns - asked_ns, LONGEST_WAIT_NS)
-            yield self._judge(block, monitor, now_ns)
+            last = self._last
+            notices = [] if last is None else self.notices.taken(int(last["time_ns"][0]))
+            rows, events = self._judge(block, monitor, now_ns)
+            yield rows, notices + events
             asked_ns = self.clock()
 
     def _judge(self, block: Samples, monitor: Monitor, now_ns: int) -> tuple[Samples, list[Event]]:

@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from fcntl import LOCK_EX, LOCK_NB, flock
 from pathlib import Path
 
 import numpy as np
@@ -158,10 +157,15 @@ class _Writer:
         head["ended_ns"], head["magic"] = 0, MAGIC
 
     def _open(self, path: Path) -> None:
+        try:
+            import fcntl  # noqa: PLC0415 - other systems have none, and read without it
+        except ImportError as error:
+            hint = "leave out keep in [page]; everything else runs without it"
+            raise SourceError(f"{path}: live rows are written on Linux only", hint) from error
         path.parent.mkdir(parents=True, exist_ok=True)
         self._handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
-            flock(self._handle, LOCK_EX | LOCK_NB)
+            fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if os.fstat(self._handle).st_size != FILE.itemsize:
                 os.posix_fallocate(self._handle, 0, FILE.itemsize)
                 os.ftruncate(self._handle, FILE.itemsize)
