@@ -178,9 +178,9 @@ class OpcuaLink:
 
     async def _introduce(self, client: Client) -> None:
         user = self._settings.user
-        if user.name and user.password_file:
+        if user.name and user.password:
             client.set_user(user.name)
-            client.set_password(_secret(user.password_file))
+            client.set_password(user.password.read("[driver.user] password", Path()))
         elif user.certificate and user.key:
             try:
                 await client.load_client_certificate(str(user.certificate))
@@ -448,14 +448,3 @@ async def _leave(client: Client, patience_s: float) -> None:
         await asyncio.wait_for(client.disconnect(), patience_s)
     except (OSError, TimeoutError, ua.UaError):
         client.disconnect_socket()
-
-
-def _secret(path: Path) -> str:
-    """A password from its file."""
-    try:
-        return path.read_text(encoding="utf-8").strip("\r\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(
-            f"[driver.user] password_file {path}: cannot be read: {error}",
-            "a text file with the password alone",
-        ) from error

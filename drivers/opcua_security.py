@@ -32,17 +32,12 @@ class Guard(Protocol):
     def certificates(self) -> Path | None:
         """A folder as ``certificates.make`` makes it; needed for policies but None."""
 
-    @property
-    def users(self) -> Mapping[str, str]:
-        """Names and passwords; if there are any, everybody has to be one of them."""
-
 
 class Users:
     """Whom the server lets in, as the library asks for it."""
 
-    def __init__(self, settings: Guard) -> None:
-        self._passwords = settings.users
-        folder = settings.certificates
+    def __init__(self, folder: Path | None, passwords: Mapping[str, str]) -> None:
+        self._passwords = {name: one.encode() for name, one in passwords.items()}
         paths = sorted((folder / certificates.USERS).glob("*.der")) if folder else []
         self._certificates = {path.read_bytes() for path in paths}
 
@@ -61,16 +56,19 @@ class Users:
         """A user, or None if that is nobody we know."""
         if username:
             known = self._passwords.get(username)
-            right = known is not None and hmac.compare_digest(known, password or "")
+            right = known is not None and hmac.compare_digest(known, (password or "").encode())
         else:
             right = self.anybody or certificate in self._certificates
         return User(role=UserRole.User, name=username) if right else None
 
 
-async def secure(server: Server, settings: Guard) -> None:
-    """Set policies, our own certificate, and whose certificates are trusted."""
+async def secure(server: Server, settings: Guard, passwords: Mapping[str, str]) -> None:
+    """Set policies, our own certificate, and whose certificates are trusted.
+
+    ``passwords`` by user; if there are any, everybody has to be one of them.
+    """
     server.set_security_policy([POLICIES[policy] for policy in settings.policies])
-    users = Users(settings)
+    users = Users(settings.certificates, passwords)
     server.iserver.user_manager = users
     known = [ua.UserNameIdentityToken, ua.X509IdentityToken]
     server.set_identity_tokens([ua.AnonymousIdentityToken] if users.anybody else known)

@@ -13,7 +13,6 @@ from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -266,20 +265,13 @@ STATES: Sequence[tuple[str, str, list[str]]] = (
 )
 
 
-@dataclass(frozen=True)
-class _Guard:
-    policies: Sequence[str]
-    certificates: Path | None
-    users: Mapping[str, str]
-
-
 async def _prepared(settings: ResultsSettings) -> Server:
     server = Server(KnowingServer())
     await server.init()
     server.set_endpoint(f"opc.tcp://{settings.host}:{settings.port}/")
     server.set_server_name("ejector-twin")
     await server.set_application_uri(APPLICATION)
-    await secure(server, _Guard(settings.policies, settings.certificates, settings.passwords()))
+    await secure(server, settings, settings.passwords())
     return server
 
 

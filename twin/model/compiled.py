@@ -94,7 +94,7 @@ event.register("numba:compile", _Waiting())  # type: ignore[no-untyped-call]
 class _InOwnFolder(CompileResultCacheImpl):
     """Looks nowhere else: numba has folders to fall back on that nobody checks."""
 
-    _locator_classes = (UserProvidedCacheLocator,)
+    _locator_classes = [UserProvidedCacheLocator]  # noqa: RUF012 - as numba has it
 
 
 class _Cache(FunctionCache):
