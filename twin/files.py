@@ -1,6 +1,6 @@
 """Files that answers are written to: refused before the work, whole or not at all after it.
 
-And folders that nobody else may write to.
+And folders that nobody else may write to, and how much a file may make us hold in memory.
 """
 
 import errno
@@ -12,8 +12,23 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 from twin.errors import SourceError
+
+MEMORY_BUDGET = 64 << 20  # bytes; no record, batch of rows or package of ours is ever near it
+
+
+def require_within_budget(size: int, what: str) -> None:
+    """ValueError if what a file declares is too much to be held; ask before it is allocated."""
+    if size > MEMORY_BUDGET:
+        mib = MEMORY_BUDGET >> 20
+        raise ValueError(f"{what} claims {size / 2**20:.0f} MiB; more than {mib} MiB are not read")
+
+
+def unzipped_within_budget(archive: ZipFile) -> None:
+    """ValueError if all of an archive is too much to be held unpacked."""
+    require_within_budget(sum(one.file_size for one in archive.infolist()), "unpacked it")
 
 
 def require_writable(*paths: Path | None) -> None:
