@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
+from urllib.parse import urlsplit
 
 from asyncua import Client, ua
 from asyncua.crypto import security_policies
 from cryptography import x509
 
 from drivers import certificates
+from drivers import opcua_trust as trust
 from drivers.lasting import AbsentError, Clock, LostError, unreachable
 from drivers.opcua_settings import Node, OpcuaSettings
 from drivers.opcua_values import (
@@ -159,17 +161,27 @@ class OpcuaLink:
         own = certificates.own(security.certificates, now)
         policy = POLICIES[security.policy]
         offered = await client.connect_and_get_server_endpoints()
-        der = self._certificate(offered, policy.URI)
-        theirs = x509.load_der_x509_certificate(der)
-        certificates.check(theirs, security.certificates, now, self._settings.where)
+        endpoint = self._endpoint(offered, policy.URI)
+        chain: bytes = endpoint.ServerCertificate
+        der = chain[: int.from_bytes(chain[2:4], "big") + 4]  # the first of it, DER
+        await trust.check(
+            x509.load_der_x509_certificate(der),
+            endpoint.Server,
+            security.certificates,
+            now,
+            self._settings.where,
+            trust.Peer.SERVER,
+            urlsplit(self._settings.url).hostname or "",
+        )
         client.application_uri = own.uri
         await client.set_security(policy, own.path, own.key, None, der, ENCRYPTED)
 
-    def _certificate(self, offered: Sequence[ua.EndpointDescription], uri: str) -> bytes:
+    def _endpoint(
+        self, offered: Sequence[ua.EndpointDescription], uri: str
+    ) -> ua.EndpointDescription:
         for endpoint in offered:
             if endpoint.SecurityPolicyUri == uri and endpoint.SecurityMode == ENCRYPTED:
-                chain: bytes = endpoint.ServerCertificate
-                return chain[: int.from_bytes(chain[2:4], "big") + 4]  # the first of it, DER
+                return endpoint
         raise SourceError(
             f"{self._settings.where}: it does not offer {self._settings.security.policy} with "
             "signing and encryption",
