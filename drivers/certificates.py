@@ -1,8 +1,8 @@
 """Certificates in a folder: our own with its key, those we trust, those we have refused.
 
 ``own/certificate.der`` and ``own/key.pem`` say who we are; whoever lies in ``trusted/``, or is
-signed by a certificate authority that does, is known. A certificate that was refused is kept in
-``rejected/``, so that a person can look at it and move it.
+signed by a certificate authority that does, is known, unless a list in ``revoked/`` has it. A
+certificate that was refused is kept in ``rejected/``, so that a person can look at it and move it.
 """
 
 import socket
@@ -11,7 +11,6 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from cryptography import x509
-from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import rsa
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
@@ -19,7 +18,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from twin.errors import ConfigError, SourceError
 
 OWN, KEY = Path("own") / "certificate.der", Path("own") / "key.pem"
-TRUSTED, REJECTED = "trusted", "rejected"
+TRUSTED, REVOKED, REJECTED = "trusted", "revoked", "rejected"
 USERS = "users"  # of a server: those of the persons that it lets in
 KEY_BITS = 2048
 DAYS = 5 * 365
@@ -46,7 +45,7 @@ def make(folder: Path, name: str = "ejector-twin", days: int = DAYS) -> Own:
     own = folder / OWN
     if own.exists():
         raise ConfigError(f"{own} is there already", "delete it first if it is to be replaced")
-    for part in (own.parent, folder / TRUSTED, folder / REJECTED):
+    for part in (own.parent, *(folder / name for name in (TRUSTED, REVOKED, REJECTED))):
         part.mkdir(parents=True, exist_ok=True)
     key = rsa.generate_private_key(public_exponent=65537, key_size=KEY_BITS)
     _write_key(folder / KEY, key)
@@ -136,37 +135,27 @@ def own(folder: Path, now: datetime) -> Own:
     return Own(certificate, path, key)
 
 
-def check(certificate: x509.Certificate, folder: Path, now: datetime, whose: str) -> None:
-    """SourceError if the certificate of ``whose`` is out of date or nobody we trust."""
-    who = f"{whose}: its certificate ({described(certificate)})"
+def check_time(certificate: x509.Certificate, now: datetime, who: str) -> None:
+    """SourceError if the certificate, ``who`` in words, is out of date."""
     if not _in_time(certificate, now):
         raise SourceError(
             f"{who} {_when(certificate, now)}",
-            "give that server a new certificate, or set its clock and ours",
-        )
-    if not trusted(certificate, folder, now):
-        kept = _keep(certificate, folder)
-        raise SourceError(
-            f"{who} is not trusted",
-            f"if the fingerprint is the one the server shows: mv {kept} {folder / TRUSTED}/",
+            "give it a new certificate, or set its clock and ours",
         )
 
 
-def trusted(certificate: x509.Certificate, folder: Path, now: datetime) -> bool:
-    """Whether it, or a certificate authority that signed it, lies in ``trusted/``."""
-    known = [_read(path) for path in sorted((folder / TRUSTED).glob("*.*"))]
-    return any(
-        one == certificate or _signed_by(certificate, one, now) for one in known if one is not None
+def untrusted(certificate: x509.Certificate, folder: Path, who: str) -> SourceError:
+    """What to say of a certificate of nobody we trust; it is kept, to be looked at."""
+    kept = _keep(certificate, folder)
+    return SourceError(
+        f"{who} is not trusted",
+        f"if the fingerprint is the one that it shows: mv {kept} {folder / TRUSTED}/",
     )
 
 
-def _signed_by(certificate: x509.Certificate, issuer: x509.Certificate, now: datetime) -> bool:
-    try:
-        constraints = issuer.extensions.get_extension_for_class(x509.BasicConstraints).value
-        certificate.verify_directly_issued_by(issuer)
-    except (x509.ExtensionNotFound, ValueError, TypeError, InvalidSignature):
-        return False
-    return constraints.ca and _in_time(issuer, now)
+def lies_in_trusted(certificate: x509.Certificate, folder: Path) -> bool:
+    """Whether it is trusted itself, not because of an authority."""
+    return certificate in [_read(path) for path in (folder / TRUSTED).glob("*.*")]
 
 
 def described(certificate: x509.Certificate) -> str:

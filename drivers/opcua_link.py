@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
+from urllib.parse import urlsplit
 
 from asyncua import Client, ua
 from asyncua.crypto import security_policies
 from cryptography import x509
 
 from drivers import certificates
+from drivers import opcua_trust as trust
 from drivers.lasting import AbsentError, Clock, LostError, unreachable
 from drivers.opcua_settings import Node, OpcuaSettings
 from drivers.opcua_values import (
@@ -159,17 +161,27 @@ class OpcuaLink:
         own = certificates.own(security.certificates, now)
         policy = POLICIES[security.policy]
         offered = await client.connect_and_get_server_endpoints()
-        der = self._certificate(offered, policy.URI)
-        theirs = x509.load_der_x509_certificate(der)
-        certificates.check(theirs, security.certificates, now, self._settings.where)
+        endpoint = self._endpoint(offered, policy.URI)
+        chain: bytes = endpoint.ServerCertificate
+        der = chain[: int.from_bytes(chain[2:4], "big") + 4]  # the first of it, DER
+        await trust.check(
+            x509.load_der_x509_certificate(der),
+            endpoint.Server,
+            security.certificates,
+            now,
+            self._settings.where,
+            trust.Peer.SERVER,
+            urlsplit(self._settings.url).hostname or "",
+        )
         client.application_uri = own.uri
         await client.set_security(policy, own.path, own.key, None, der, ENCRYPTED)
 
-    def _certificate(self, offered: Sequence[ua.EndpointDescription], uri: str) -> bytes:
+    def _endpoint(
+        self, offered: Sequence[ua.EndpointDescription], uri: str
+    ) -> ua.EndpointDescription:
         for endpoint in offered:
             if endpoint.SecurityPolicyUri == uri and endpoint.SecurityMode == ENCRYPTED:
-                chain: bytes = endpoint.ServerCertificate
-                return chain[: int.from_bytes(chain[2:4], "big") + 4]  # the first of it, DER
+                return endpoint
         raise SourceError(
             f"{self._settings.where}: it does not offer {self._settings.security.policy} with "
             "signing and encryption",
@@ -178,9 +190,9 @@ class OpcuaLink:
 
     async def _introduce(self, client: Client) -> None:
         user = self._settings.user
-        if user.name and user.password_file:
+        if user.name and user.password:
             client.set_user(user.name)
-            client.set_password(_secret(user.password_file))
+            client.set_password(user.password.read("[driver.user] password", Path()))
         elif user.certificate and user.key:
             try:
                 await client.load_client_certificate(str(user.certificate))
@@ -448,14 +460,3 @@ async def _leave(client: Client, patience_s: float) -> None:
         await asyncio.wait_for(client.disconnect(), patience_s)
     except (OSError, TimeoutError, ua.UaError):
         client.disconnect_socket()
-
-
-def _secret(path: Path) -> str:
-    """A password from its file."""
-    try:
-        return path.read_text(encoding="utf-8").strip("\r\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(
-            f"[driver.user] password_file {path}: cannot be read: {error}",
-            "a text file with the password alone",
-        ) from error

@@ -11,6 +11,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from drivers.reports import BITS, refuse_unclear
 from drivers.tags import Flowmeter, Quantity, Thermometer
 from drivers.trace import COMMAND_BITS, no_effect, refuse_unused
+from twin.secret import Secret
 from twin.settings import Settings
 
 BIT_NODES = {  # of the trace's status, as `twin plc` names them singly
@@ -127,14 +128,14 @@ class User(Settings):
     """Who we are to the server: nobody, a name and password, or a certificate."""
 
     name: str = ""
-    password_file: Path | None = None  # a file, since configurations are copied into logs
+    password: Secret | None = None
     certificate: Path | None = None
     key: Path | None = None
 
     @model_validator(mode="after")
     def _is_one(self) -> Self:
-        if bool(self.name) != (self.password_file is not None):
-            raise ValueError("name and password_file belong together")
+        if bool(self.name) != (self.password is not None):
+            raise ValueError("name and password belong together")
         if (self.certificate is None) != (self.key is None):
             raise ValueError("certificate and key belong together")
         if self.name and self.certificate:
@@ -199,7 +200,9 @@ class OpcuaSettings(Settings):
     def below(self, folder: Path) -> "OpcuaSettings":
         """Give the same with files looked for in ``folder``, unless their paths are absolute."""
         security = _below(self.security, folder, "certificates")
-        user = _below(self.user, folder, "password_file", "certificate", "key")
+        user = _below(self.user, folder, "certificate", "key")
+        if self.user.password is not None:
+            user = user.model_copy(update={"password": self.user.password.below(folder)})
         return self.model_copy(update={"security": security, "user": user})
 
     @property

@@ -20,7 +20,6 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any
 
 from asyncua import Node, Server, ua
@@ -253,13 +252,6 @@ STATES: Sequence[tuple[str, str, list[str]]] = (
 )
 
 
-@dataclass(frozen=True)
-class _Guard:
-    policies: Sequence[str]
-    certificates: Path | None
-    users: Mapping[str, str]
-
-
 # --- what a client may ask for -----------------------------------------------------------------
 
 MOST_CONNECTIONS = 32
@@ -308,7 +300,7 @@ async def _prepared(settings: ResultsSettings) -> Server:
     server.set_endpoint(f"opc.tcp://{settings.host}:{settings.port}/")
     server.set_server_name("ejector-twin")
     await server.set_application_uri(APPLICATION)
-    await secure(server, _Guard(settings.policies, settings.certificates, settings.passwords()))
+    await secure(server, settings, settings.passwords())
     return server
 
 

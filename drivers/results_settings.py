@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal, Self
 from pydantic import Field, model_validator
 
 from twin.errors import ConfigError
+from twin.secret import Secret
 from twin.settings import Document, Settings
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ class ResultsSettings(Settings):
     interval_ms: float = Field(default=100.0, ge=20, le=10_000)  # between two values
     policies: tuple[Policy, ...] = Field(default=("None",), min_length=1)
     certificates: Path | None = None  # a folder as twin cert makes it; the same as the driver's
-    users: dict[str, Path] = Field(default={})  # name = "file with the password"; if any, of all
+    users: dict[str, Secret] = Field(default={})  # with their passwords; if any, of all
     acknowledge: tuple[str, ...] = ()  # of the users those who may acknowledge alarms
     unprotected: bool = False  # beyond this machine without a policy all the same
 
@@ -50,12 +51,15 @@ class ResultsSettings(Settings):
     def below(self, folder: Path) -> "ResultsSettings":
         """Give the same with files looked for in ``folder``, unless their paths are absolute."""
         pki = None if self.certificates is None else folder / self.certificates
-        users = {name: folder / path for name, path in self.users.items()}
+        users = {name: secret.below(folder) for name, secret in self.users.items()}
         return self.model_copy(update={"certificates": pki, "users": users})
 
     def passwords(self) -> dict[str, str]:
-        """Of every user, from the files; ConfigError where one cannot be read or is empty."""
-        return {name: _secret(name, path) for name, path in self.users.items()}
+        """Of every user; ConfigError where one cannot be read or is empty."""
+        return {
+            name: secret.read(f"[results] users.{name}", Path())
+            for name, secret in self.users.items()
+        }
 
 
 @contextmanager
@@ -99,16 +103,3 @@ def _is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:  # a name
         return host == "localhost"
-
-
-def _secret(name: str, path: Path) -> str:
-    try:
-        secret = path.read_text(encoding="utf-8").strip("\r\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(
-            f"[results] users.{name} {path}: cannot be read: {error}",
-            "a text file with the password alone",
-        ) from error
-    if not secret:
-        raise ConfigError(f"[results] users.{name} {path}: is empty", "write the password into it")
-    return secret

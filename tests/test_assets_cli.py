@@ -272,7 +272,7 @@ def test_a_characteristic_may_be_flat_where_nothing_is_left(run: Run, unit: Path
     ("old", "new", "line", "message"),
     [
         (CAPACITY, "suction_capacity_sl_min = 0.0", 8, "data.ejector.suction_capacity_sl_min: "),
-        (CAPACITY, "suction = 35.0", 8, "data.ejector.suction: unknown key (is 35.0)"),
+        (CAPACITY, "suction = 35.0", 8, "data.ejector.suction: unknown key"),
         (CAPACITY, "h2_mbar = 700.0", 7, "data.ejector: Value error, h1_mbar must be at least"),
         (CAPACITY, "end_pressure_mbar = 1013.0", 1, "end_pressure_mbar must be below ambient"),
         (CAPACITY, "bulge = -0.9\nskew = 5.0", 7, "a characteristic that is not monotonic"),

@@ -22,6 +22,7 @@ from postgres import make_schema
 
 from twin.assets import database
 from twin.assets.database import Assets, open_assets
+from twin.assets.engine import ASSETS, parse_url
 from twin.assets.exchange import to_export, to_plain
 from twin.assets.record import Record, checked
 from twin.assets.shipped import shipped_records
@@ -449,8 +450,9 @@ def test_a_database_locked_from_the_start_is_said(url: str) -> None:
 
 
 def test_a_server_that_cannot_be_reached_is_said_without_the_password(tmp_path: Path) -> None:
+    url = parse_url(f"postgresql://me@/assets?host={tmp_path}", ASSETS).set(password="secret")
     with pytest.raises(SourceError, match=r"postgresql://me:\*\*\*@/assets") as caught:
-        open_assets(f"postgresql://me:secret@/assets?host={tmp_path}", busy_s=0.1)
+        open_assets(url, busy_s=0.1)
     assert "secret" not in str(caught.value)
     assert "server" in caught.value.hint
 

@@ -398,7 +398,7 @@ def test_nothing_is_made_up_that_a_log_does_not_say(text: str, problem: str) -> 
         ("[asset\n", "cell.toml: not valid TOML: "),
         (CELL + "[colours]\n", "cell.toml:20: unknown table [colours]"),
         (CELL.replace("raise_", "rise_"), "cell.toml:19: monitor.rise_sigma: unknown key"),
-        (CELL.replace("id =", "ib ="), "cell.toml:3: asset.ib: unknown key (is 'unit-1')"),
+        (CELL.replace("id =", "ib ="), "cell.toml:3: asset.ib: unknown key"),
     ],
 )
 def test_a_logs_configuration_of_another_shape_is_said_to_stand_in_it(

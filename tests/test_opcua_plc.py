@@ -243,11 +243,12 @@ def awkward(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OpcuaPlc]:
     acquainted(folder)
     certificates.make(folder / "person", "someone")
     trust(folder / "theirs", folder / "person", certificates.USERS)
+    (folder / "twin").write_text("gehäuse-s3cret", encoding="utf-8")
     with start_opcua(
         folder,
         policies=["Basic256Sha256"],
         certificates=str(folder / "theirs"),
-        users={"twin": "s3cret"},
+        users={"twin": {"file": str(folder / "twin")}},
         min_sampling_ms=20,
         min_publishing_ms=100,
         late_publishing_ms=30,
@@ -259,12 +260,13 @@ def awkward(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OpcuaPlc]:
 def as_user(plc: OpcuaPlc, tmp_path: Path, password: str, **changes: Any) -> OpcuaSettings:
     file = tmp_path / "password"
     file.write_text(f"{password}\n", encoding="utf-8")
-    user = {"name": "twin", "password_file": file}
+    user = {"name": "twin", "password": {"file": file}}
     return plc.settings(user=user, security=plc.secure("Basic256Sha256"), **changes)
 
 
-def test_a_wrong_password(awkward: OpcuaPlc, tmp_path: Path) -> None:
-    error = refused(as_user(awkward, tmp_path, "secret"))
+@pytest.mark.parametrize("wrong", ["secret", "gehaeuse-s3cret", "gehäuse-secret"])
+def test_a_wrong_password(awkward: OpcuaPlc, tmp_path: Path, wrong: str) -> None:
+    error = refused(as_user(awkward, tmp_path, wrong))
     assert str(error).startswith(f"{awkward.url}: it does not let this user in (BadUserAccess")
     assert "secret" not in str(error)
 
@@ -288,9 +290,9 @@ def test_a_person_by_certificate(awkward: OpcuaPlc, tmp_path: Path) -> None:
 
 
 def test_a_password_that_cannot_be_read(awkward: OpcuaPlc, tmp_path: Path) -> None:
-    user = {"name": "twin", "password_file": tmp_path / "none"}
+    user = {"name": "twin", "password": {"file": tmp_path / "none"}}
     error = refused(awkward.settings(user=user, security=awkward.secure("Basic256Sha256")))
-    assert "password_file" in str(error)
+    assert "[driver.user] password" in str(error)
 
 
 def test_a_policy_that_is_not_offered(awkward: OpcuaPlc) -> None:
@@ -302,7 +304,7 @@ def test_a_policy_that_is_not_offered(awkward: OpcuaPlc) -> None:
 def test_revised_intervals_and_dropped_connections(
     awkward: OpcuaPlc, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    settings = as_user(awkward, tmp_path, "s3cret", **SUBSCRIBE)
+    settings = as_user(awkward, tmp_path, "gehäuse-s3cret", **SUBSCRIBE)
     lost: list[SourceError] = []  # it may hang up before there is a block, too
     with (
         closing(blocks(settings, away=lost.append)) as source,

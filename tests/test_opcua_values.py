@@ -166,7 +166,7 @@ FINE: dict[str, Any] = {"url": "opc.tcp://plc:4840", "namespace": "urn:plc", "ta
         ({"security": {"policy": "Basic256Sha256"}}, "twin cert makes it"),
         ({"security": {"policy": "Basic128Rsa15"}}, "Input should be"),
         ({"user": {"name": "twin"}}, "belong together"),
-        ({"user": {"name": "twin", "password_file": "p"}}, "not sent in the clear"),
+        ({"user": {"name": "twin", "password": {"file": "p"}}}, "not sent in the clear"),
         ({"user": {"certificate": "c"}}, "belong together"),
     ],
 )

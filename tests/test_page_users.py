@@ -8,8 +8,9 @@ import pytest
 from twin.errors import ConfigError
 from twin.page import sessions as module
 from twin.page import users
-from twin.page.sessions import FREE_TRIES, SESSION_S, Sessions, Tries
+from twin.page.sessions import SESSION_S, Sessions
 from twin.page.users import Users
+from twin.throttle import FREE_TRIES, LoginThrottle
 
 WORD = "correct horse"
 
@@ -144,7 +145,7 @@ def test_sessions_and_their_tokens_differ_and_do_not_pile_up(
 
 def test_after_some_wrong_tries_each_takes_longer() -> None:
     clock = Clock()
-    tries = Tries(60.0, clock)
+    tries = LoginThrottle(60.0, clock)
     waits = []
     for _ in range(FREE_TRIES + 8):
         tries.wrong("a")
@@ -158,8 +159,8 @@ def test_after_some_wrong_tries_each_takes_longer() -> None:
 
 
 def test_who_has_tried_is_not_remembered_without_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "MOST", 10)
-    tries = Tries(60.0, Clock())
+    monkeypatch.setattr("twin.throttle.MOST", 10)
+    tries = LoginThrottle(60.0, Clock())
     for number in range(100):
         tries.wrong(str(number))
     assert len(tries._wrong) == 10

@@ -73,7 +73,7 @@ def secured(folder: Path, policy: str) -> dict[str, Any]:
     (folder / "password").write_text("s3cret\n", encoding="utf-8")
     return {
         "security": {"policy": policy, "certificates": folder / "ours"},
-        "user": {"name": "twin", "password_file": folder / "password"},
+        "user": {"name": "twin", "password": {"file": folder / "password"}},
     }
 
 
@@ -461,7 +461,7 @@ def test_node_opcua_is_not_known_to_us(node: int, tmp_path: Path) -> None:
 def test_node_opcua_does_not_let_everybody_in(folder: Path, node: int, user: str) -> None:
     settings = secured(folder, "Basic256Sha256")
     (folder / "wrong").write_text("secret", encoding="utf-8")
-    settings["user"] = {"name": user, "password_file": folder / "wrong"}
+    settings["user"] = {"name": user, "password": {"file": folder / "wrong"}}
     assert "it does not let this user in" in str(refused(by_opcua(node, **settings)))
     error = refused(by_opcua(node, security=settings["security"]))
     assert "it does not let this user in" in str(error)

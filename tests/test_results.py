@@ -32,6 +32,7 @@ from drivers.sources import open_source
 from twin.errors import ConfigError, SourceError
 from twin.events import Event, Kind
 from twin.live import run
+from twin.secret import Secret
 from twin.settings import Document
 from twin.signals import SAMPLE, TICK, Phase, Quality, Samples, Ticks
 
@@ -262,7 +263,7 @@ def test_when_the_twin_has_stopped_nothing_is_good_any_more(results: Results) ->
         ({"host": "0.0.0.0"}, "is beyond this machine"),
         ({"host": "192.168.0.5", "policies": ["None", "Basic256Sha256"]}, "certificates"),
         ({"policies": ["Basic256Sha256"]}, "policies need certificates"),
-        ({"users": {"scada": "secret"}}, "a password is not sent in the clear"),
+        ({"users": {"scada": {"file": "secret"}}}, "a password is not sent in the clear"),
         ({"policies": []}, "at least 1"),
         ({"interval_ms": 1}, "greater than or equal to 20"),
     ],
@@ -305,7 +306,9 @@ def test_a_password_that_cannot_be_used(tmp_path: Path, content: str | None) -> 
     acquainted(tmp_path)
     if content is not None:
         (tmp_path / "password").write_text(content, encoding="utf-8")
-    settings = protected(tmp_path).model_copy(update={"users": {"scada": tmp_path / "password"}})
+    settings = protected(tmp_path).model_copy(
+        update={"users": {"scada": Secret(file=tmp_path / "password")}}
+    )
     with pytest.raises(ConfigError, match=r"users\.scada"), ResultsServer(settings, {}):
         pass
 
@@ -520,7 +523,7 @@ def test_a_client_that_hangs_holds_up_nobody(
 def test_node_opcua_comes_in_protected(tmp_path: Path, policy: str) -> None:
     acquainted(tmp_path)
     (tmp_path / "password").write_text("s3cret\n", encoding="utf-8")
-    settings = protected(tmp_path, users={"scada": tmp_path / "password"})
+    settings = protected(tmp_path, users={"scada": Secret(file=tmp_path / "password")})
     own = certificates.own(tmp_path / "ours", certificates.datetime.now(certificates.UTC))
     ours = {"certificate": str(own.path), "key": str(own.key), "uri": own.uri, "policy": policy}
     read = ["rig-01.Meas.Pressure"]

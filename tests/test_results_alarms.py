@@ -243,8 +243,8 @@ def test_who_is_allowed_to_acknowledges_and_others_are_not(tmp_path: Path) -> No
     acquainted(tmp_path)
     users = {}
     for name in ("ann", "guest"):
-        users[name] = tmp_path / name
-        users[name].write_text(f"{name}-s3cret\n", encoding="utf-8")
+        (tmp_path / name).write_text(f"{name}-s3cret\n", encoding="utf-8")
+        users[name] = {"file": tmp_path / name}
     table = {"opcua": True, "port": 0, "policies": ["Basic256Sha256"]}
     table |= {"certificates": tmp_path / "theirs", "users": users, "acknowledge": ["ann"]}
     own = certificates.own(tmp_path / "ours", datetime.now(UTC))

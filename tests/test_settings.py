@@ -84,7 +84,7 @@ def test_settings_are_frozen() -> None:
         ("delay_ms = 5.0", "delai_ms = 5.0", "cell.toml:7: driver.tags.pressure.delai_ms: unknown"),
         ('"unit" = "mbar"', '"unit" = "bar"', "cell.toml:8: driver.tags.pressure.unit: "),
         ("low = 1", 'low = "one"', "cell.toml:11: driver.limits.low: "),
-        ("high = 2", "hihg = 2", "cell.toml:12: driver.limits.hihg: unknown key (is 2)"),
+        ("high = 2", "hihg = 2", "cell.toml:12: driver.limits.hihg: unknown key"),
         ('host = "10.0.0.5"', "", "cell.toml:2: driver.host: Field required"),
         ('host = "10.0.0.5"', "host = 5", "cell.toml:3: driver.host: "),
         ("[ driver . limits ]", "[driver.limit]", "cell.toml:10: driver.limit: unknown key"),
@@ -153,7 +153,7 @@ def test_the_line_is_that_of_the_key(blank: int, tables: list[str], key: str) ->
     if tables[0] != "other":
         text = text[: text.rindex(other)]  # TOML allows no table twice
         message = complaint(text, *tables, kind=Limits)
-        assert message == f"cell.toml:{line}: {'.'.join([*tables, key])}: unknown key (is 7)"
+        assert message == f"cell.toml:{line}: {'.'.join([*tables, key])}: unknown key"
 
 
 @given(st.text(max_size=60))

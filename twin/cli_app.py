@@ -101,10 +101,11 @@ def say_if_cut(recorded: "Log | Wanted", log: Path, what: str) -> None:
 
 def say_if_new(url: str, document: "Document | None") -> None:
     """Say of the chosen database that what follows makes it, if it is not there."""
+    from twin.assets.engine import shown
     from twin.assets.place import chosen, is_new
 
     if is_new(url, document):
-        print(f"twin: making a new asset database, {chosen(url, document)}", file=sys.stderr)
+        print(f"twin: making a new asset database, {shown(chosen(url, document))}", file=sys.stderr)
 
 
 def read_config(path: Path) -> "Document":

@@ -16,6 +16,8 @@ from twin.errors import ConfigError, SourceError
 from twin.files import require_writable, write_json
 
 if TYPE_CHECKING:
+    from sqlalchemy import URL
+
     from twin.config import Config
     from twin.fleet.engines import Submit
     from twin.fleet.go import Told
@@ -167,18 +169,19 @@ class _Fleet:
     """What judges every log, and where answers go."""
 
     document: "Document | None"
-    assets: str | Path
+    assets: "URL"
     name: str
 
     @classmethod
     def of(cls, config: Path | None, assets: str, *, to_store: bool = True) -> "_Fleet":
         """The database is made where it is missing, if answers are ``to_store`` in it."""
+        from twin.assets.engine import shown
         from twin.assets.place import chosen, is_new, open_chosen
 
         document = None if config is None else read_config(config)
         if not to_store and is_new(assets, document):
             raise SourceError(
-                f"{chosen(assets, document)}: no such asset database",
+                f"{shown(chosen(assets, document))}: no such asset database",
                 "name logs, or folders of them",
             )
         say_if_new(assets, document)
@@ -195,7 +198,7 @@ class _Fleet:
         if work == "calibrate" and not unit:
             raise ConfigError(f"{log.path}: a log of no unit", "record it with [asset] id, or --id")
         calibrated = work != "calibrate"
-        config = Config.of(document, str(self.assets), unit, calibrated=calibrated, own=unit)
+        config = Config.of(document, self.assets, unit, calibrated=calibrated, own=unit)
         config.refuse_another(header, str(log.path))
         return config.of_rows(header)
 

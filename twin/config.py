@@ -29,6 +29,8 @@ from twin.settings import Document, Settings
 from twin.signals import MBAR
 
 if TYPE_CHECKING:  # a log brings its own data set, and need not wait for its SQLAlchemy
+    from sqlalchemy import URL
+
     from twin.assets.database import Assets
 
 TABLES = {
@@ -52,6 +54,9 @@ TABLES = {
 NO_TYPE = "unknown"
 FROM_AMBIENT = ("gauge", "vacuum")  # references of a tag
 COUNTED_FROM, AMBIENT = "counted_from", "ambient"  # in a log's metadata, of its pressure
+IN_A_LOG = {"asset", "data", "driver", "figures", "import", "log", "monitor"}  # heeded in one
+PLACES = {"url", "password", "keep"}  # keys of them that are not
+SHIPPED = "sqlite://"  # the data sets that come with the program
 HAND_WRITTEN = "[data] of the configuration"
 _WORDS = {"type": "object-specific data", "instance": "instance-specific data"}
 
@@ -96,7 +101,7 @@ class Config:
     def of(
         cls,
         document: Document,
-        assets: str = "",
+        assets: "str | URL" = "",
         unit: str = "",
         *,
         calibrated: bool = True,
@@ -136,7 +141,7 @@ class Config:
         SourceError names ``log`` and the key where this program cannot take either of them.
         """
         if "data" not in metadata:
-            return cls.of(document)
+            return cls.of(document, SHIPPED)
         known = _of_log(metadata, log)
         with _in_log(metadata, log):
             document.refuse_unknown_tables(TABLES)
@@ -236,14 +241,24 @@ def _counts_from_ambient(tables: Tables) -> bool:
 def document_in(header: LogHeader) -> Document:
     """The configuration that a log carries; ConfigError if it is not TOML.
 
+    A log may be anybody's. So what names places to open is left out: databases, files, services.
     Older ones have what a calibration found, which stands in the log itself as well.
     """
-    document = Document.parse(header.config_text, header.config_name)
-    monitor = document.tables.get("monitor", {})
-    if not isinstance(monitor, Mapping):
-        return document
-    without = {key: value for key, value in monitor.items() if key != "healthy"}
-    return replace(document, tables={**document.tables, "monitor": without})
+    document = Document.parse(header.config_text, Path(header.config_name).name)
+    document.refuse_unknown_tables(TABLES)
+    left_out = {"figures": PLACES, "monitor": {"healthy"}}
+    tables = {
+        name: _without(table, left_out.get(name, set()))
+        for name, table in document.tables.items()
+        if name in IN_A_LOG
+    }
+    return replace(document, tables=tables)
+
+
+def _without(table: Any, keys: set[str]) -> Any:
+    if not isinstance(table, Mapping):
+        return table
+    return {key: value for key, value in table.items() if key not in keys}
 
 
 def check_asset(document: Document, record: Record, database: "Assets") -> None:
@@ -444,6 +459,8 @@ def _of_log(metadata: Mapping[str, str], log: str) -> Known:
         known = Known.model_validate(stored)
         missing = list(_left_out(known.data.model_dump(mode="json"), stored["data"], "data"))
         problem = f"{', '.join(missing)}: missing" if missing else ""
+        if not problem and metadata.get("data_set", known.data.hash) != known.data.hash:
+            problem = "it is not as it was written: its hash is another one"
     except ValidationError as error:
         problem = _in_words(error)
     except (ValueError, RecursionError) as error:  # no JSON

@@ -1,15 +1,34 @@
-"""Files that answers are written to: refused before the work, whole or not at all after it."""
+"""Files that answers are written to: refused before the work, whole or not at all after it.
+
+And folders that nobody else may write to, and how much a file may make us hold in memory.
+"""
 
 import errno
 import json
 import math
 import os
+import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 from twin.errors import SourceError
+
+MEMORY_BUDGET = 64 << 20  # bytes; no record, batch of rows or package of ours is ever near it
+
+
+def require_within_budget(size: int, what: str) -> None:
+    """ValueError if what a file declares is too much to be held; ask before it is allocated."""
+    if size > MEMORY_BUDGET:
+        mib = MEMORY_BUDGET >> 20
+        raise ValueError(f"{what} claims {size / 2**20:.0f} MiB; more than {mib} MiB are not read")
+
+
+def unzipped_within_budget(archive: ZipFile) -> None:
+    """ValueError if all of an archive is too much to be held unpacked."""
+    require_within_budget(sum(one.file_size for one in archive.infolist()), "unpacked it")
 
 
 def require_writable(*paths: Path | None) -> None:
@@ -68,6 +87,50 @@ def write_whole(path: Path, content: bytes) -> None:
     finally:
         with suppress(OSError):
             part.unlink()
+
+
+def user_cache() -> Path:
+    """Where what can be made again is kept for this user, as the XDG specification has it.
+
+    SourceError for a user without a home.
+    """
+    chosen = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    if chosen.is_absolute():
+        return chosen / "ejector-twin"
+    try:
+        return Path.home() / ".cache" / "ejector-twin"
+    except RuntimeError as error:
+        raise SourceError("this user has no home folder", "set XDG_CACHE_HOME") from error
+
+
+def private_folder(folder: Path) -> Path:
+    """Make a folder for this user only, if it is not there; SourceError if it is not private.
+
+    Who may write into the folder above could exchange it: that one, too, is this user's.
+    """
+    with said_plainly(folder):
+        folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        _require_own(folder.parent.resolve(), stat.S_IWGRP | stat.S_IWOTH)
+        _require_own(folder, stat.S_IRWXG | stat.S_IRWXO)
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    return folder
+
+
+def _require_own(folder: Path, forbidden: int) -> None:
+    """SourceError where a folder is another user's, or others have a right of ``forbidden``."""
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode):
+        raise _unwritable(folder, "it is a link: somebody else may have put it there")
+    if found.st_uid != os.geteuid():
+        raise SourceError(
+            f"{folder} belongs to another user and is not trusted", "have it removed, or given back"
+        )
+    if found.st_mode & forbidden:
+        raise SourceError(
+            f"{folder}: others may use it, so it is not trusted", f"remove {folder}, or chmod 700"
+        )
 
 
 def _unwritable(path: Path, why: str) -> SourceError:

@@ -60,7 +60,7 @@ class Document:
         """Take TOML text that stands elsewhere, for example in a log."""
         try:
             return cls(name, text, tomllib.loads(text))
-        except tomllib.TOMLDecodeError as error:
+        except (tomllib.TOMLDecodeError, RecursionError) as error:
             raise ConfigError(f"{name}: not valid TOML: {error}") from error
 
     def refuse_unknown_tables(self, known: set[str]) -> None:
@@ -91,7 +91,8 @@ class Document:
             below = cause.keys if isinstance(cause, KeyedError) else ()
             keys = self._written((*path, *problem["loc"], *below))
             what = "unknown key" if problem["type"] == "extra_forbidden" else problem["msg"]
-            is_said = problem["type"] in ("missing", "value_error")  # or is a whole table
+            # Or it is a whole table; what an unknown key has may be a secret.
+            is_said = problem["type"] in ("missing", "value_error", "extra_forbidden")
             given = "" if is_said else f" (is {shorten(repr(problem['input']), 80)})"
             lines.append(f"{self.name}:{self._line(keys)}: {'.'.join(keys)}: {what}{given}")
         return "\n".join(lines)

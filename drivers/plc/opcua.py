@@ -196,7 +196,7 @@ async def serving(
     server.set_endpoint(f"opc.tcp://{settings.host}:{settings.port}/")
     server.set_server_name("ejector-twin simulated PLC")
     await server.set_application_uri(APPLICATION)
-    await secure(server, settings)
+    await secure(server, settings, settings.passwords())
     index = await _namespace(server, settings.namespace_index)
     for memory, registers in zip(served, memories, strict=True):
         await _Space(server, index, memory).build(registers.task.settings)

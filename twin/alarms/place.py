@@ -2,9 +2,11 @@
 
 from pathlib import Path
 
+from sqlalchemy import URL
+
 from twin.alarms.settings import AlarmSettings
 from twin.alarms.store import ALARM_DATABASE, Store, open_store
-from twin.assets.engine import parse_url, sqlite_file
+from twin.assets.engine import configured
 from twin.settings import Document
 
 FILE = "alarms.sqlite"
@@ -19,9 +21,8 @@ def open_chosen(named: str, document: Document | None, *, write: bool) -> Store:
     return open_store(named or place_of(document), create=write)
 
 
-def place_of(document: Document | None) -> str | Path:
-    """The URL or the SQLite file that a configuration names, else the default."""
+def place_of(document: Document | None) -> URL:
+    """The database that a configuration names, else the default."""
     folder = Path(document.name).parent if document else Path()
-    url = document.section(AlarmSettings, "alarms").url if document else ""
-    file = sqlite_file(parse_url(url or FILE, ALARM_DATABASE))
-    return url if file is None else folder / file
+    settings = document.section(AlarmSettings, "alarms") if document else AlarmSettings()
+    return configured(settings, folder, FILE, ALARM_DATABASE)

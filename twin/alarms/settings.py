@@ -4,16 +4,16 @@ from pathlib import Path
 
 from twin.alarms.rules import Rule, by_cause, default_rules, read_rules
 from twin.alarms.watch import NAMES
+from twin.assets.configured import DatabaseSettings
 from twin.errors import ConfigError
-from twin.settings import Document, Settings
+from twin.settings import Document
 
 
-class AlarmSettings(Settings):
+class AlarmSettings(DatabaseSettings):
     """Alarms of one ejector."""
 
     rules: str = ""  # a TOML file from the configuration's folder; else those of the program
     keep: bool = False  # twin run keeps states and episodes, and takes what people ask for
-    url: str = ""  # of the database, or an SQLite file from the configuration's folder
 
 
 def chosen_rules(document: Document | None) -> tuple[Rule, ...]:

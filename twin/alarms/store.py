@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sqlalchemy import (
+    URL,
     BigInteger,
     Boolean,
     Column,
@@ -27,7 +28,7 @@ from twin.alarms.state import Deed, Kept
 from twin.assets.engine import Database, Purpose
 from twin.assets.unit import Unit, of_unit
 
-ALARM_DATABASE = Purpose("alarm database", "--alarms")
+ALARM_DATABASE = Purpose("alarm database", "--alarms", "alarms")
 
 metadata = MetaData()
 
@@ -82,7 +83,7 @@ UNIT = Table("alarm_unit", metadata, *_whose())
 
 
 def open_store(
-    where: str | Path,
+    where: str | Path | URL,
     *,
     create: bool = True,
     busy_s: float = 5.0,

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sqlalchemy import ColumnElement, Connection, Row, func, select
+from sqlalchemy import URL, ColumnElement, Connection, Row, func, select
 
 from twin.assets.engine import ASSETS, Database
 from twin.assets.exchange import parse_export, to_export
@@ -37,7 +37,7 @@ Conditions = Sequence[ColumnElement[bool]]
 
 
 def open_assets(
-    where: str | Path,
+    where: str | Path | URL,
     *,
     create: bool = True,
     shipped: bool = True,

@@ -28,7 +28,9 @@ from sqlalchemy.engine.interfaces import DBAPIConnection
 from sqlalchemy.exc import ArgumentError, DBAPIError, OperationalError
 from sqlalchemy.pool import ConnectionPoolEntry, NullPool, StaticPool
 
+from twin.assets.configured import DatabaseSettings
 from twin.errors import ConfigError, SourceError
+from twin.secret import refuse_password
 
 
 @dataclass(frozen=True)
@@ -37,9 +39,10 @@ class Purpose:
 
     name: str
     option: str
+    table: str  # of a configuration
 
 
-ASSETS = Purpose("asset database", "--assets")
+ASSETS = Purpose("asset database", "--assets", "assets")
 POSTGRES = {"postgresql", "postgres", "postgresql+psycopg"}
 _WRITERS_LOCK = 0x656A6563  # any number that no other program takes in the same database
 
@@ -60,10 +63,19 @@ _ELSE = {
 }
 
 
-def parse_url(where: str | Path, purpose: Purpose) -> URL:
-    """The URL of a database: a URL, or the path of an SQLite file; ConfigError for other kinds."""
+def parse_url(where: str | Path | URL, purpose: Purpose) -> URL:
+    """The URL of a database: a URL, or the path of an SQLite file.
+
+    ConfigError for other kinds, and for a text with a password in it.
+    """
+    if isinstance(where, URL):
+        return where
     if isinstance(where, Path) or "://" not in where:
         return URL.create("sqlite", database=str(where))
+    try:
+        refuse_password(where, "take it out, and put it into PGPASSWORD or ~/.pgpass")
+    except ValueError as error:
+        raise ConfigError(f"the URL of the {purpose.name}: {error}") from error
     try:
         url = make_url(where)
     except (ArgumentError, ValueError) as error:  # ValueError: a port that is no number
@@ -73,6 +85,19 @@ def parse_url(where: str | Path, purpose: Purpose) -> URL:
     if url.drivername in POSTGRES:
         return url.set(drivername="postgresql+psycopg")
     raise _unknown_kind(f"{purpose.name}s of kind {url.drivername!r} are not supported")
+
+
+def configured(settings: DatabaseSettings, folder: Path, default: str, purpose: Purpose) -> URL:
+    """The database that the configuration in ``folder`` names, else the file ``default`` there.
+
+    ConfigError for a URL of an unknown kind, or a password that cannot be read.
+    """
+    url = parse_url(settings.url or default, purpose)
+    if (file := sqlite_file(url)) is not None:
+        return parse_url(folder / file, purpose)
+    if settings.password is None:
+        return url
+    return url.set(password=settings.password.read(f"[{purpose.table}] password", folder))
 
 
 class Database:
@@ -85,7 +110,7 @@ class Database:
 
     def __init__(
         self,
-        where: str | Path,
+        where: str | Path | URL,
         purpose: Purpose,
         busy_s: float,
         clock: Callable[[], int],

@@ -2,22 +2,23 @@
 
 from pathlib import Path
 
+from sqlalchemy import URL
+
+from twin.assets.configured import DatabaseSettings
 from twin.assets.database import Assets, open_assets
-from twin.assets.engine import ASSETS, parse_url, sqlite_file
-from twin.settings import Document, Settings
+from twin.assets.engine import ASSETS, configured, parse_url, sqlite_file
+from twin.settings import Document
 
 FILE = "assets.sqlite"
 MEMORY = "sqlite://"
 
 
-class AssetsSettings(Settings):
+class AssetsSettings(DatabaseSettings):
     """The table [assets] of a configuration."""
-
-    url: str = ""  # or the path of an SQLite file, from the configuration's folder
 
 
 def open_chosen(
-    named: str,
+    named: str | URL,
     document: Document | None,
     *,
     write: bool,
@@ -38,22 +39,16 @@ def open_chosen(
     return open_assets(where, create=write, shipped=shipped)
 
 
-def is_new(named: str, document: Document | None) -> bool:
+def is_new(named: str | URL, document: Document | None) -> bool:
     """Whether that database is a file that is not there yet."""
-    file = sqlite_file(parse_url(chosen(named, document), ASSETS))
+    file = sqlite_file(chosen(named, document))
     return file is not None and not file.exists()
 
 
-def chosen(named: str, document: Document | None) -> str | Path:
+def chosen(named: str | URL, document: Document | None) -> URL:
     """The URL or file of that database."""
     if named:
-        return named
+        return parse_url(named, ASSETS)
     folder = Path(document.name).parent if document else Path()
-    url = document.section(AssetsSettings, "assets").url if document else ""
-    return _beside(folder, url) if url else folder / FILE
-
-
-def _beside(folder: Path, url: str) -> str | Path:
-    """What a configuration names, with a file taken from its own folder."""
-    file = sqlite_file(parse_url(url, ASSETS))
-    return url if file is None else folder / file
+    settings = document.section(AssetsSettings, "assets") if document else AssetsSettings()
+    return configured(settings, folder, FILE, ASSETS)

@@ -12,7 +12,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 from uuid import UUID, uuid5
-from zipfile import is_zipfile
+from zipfile import ZipFile, is_zipfile
 
 from basyx.aas import model
 from basyx.aas.adapter.aasx import AASXReader, AASXWriter, DictSupplementaryFileContainer
@@ -30,6 +30,7 @@ from twin.exchange.submodels import (
     technical_data,
     time_series,
 )
+from twin.files import unzipped_within_budget
 
 JSON = "application/json"
 HINT = "take a package that twin assets export --aasx wrote, as it was written"
@@ -203,6 +204,8 @@ def _opened(path: Path) -> tuple[Store, DictSupplementaryFileContainer]:
     if not is_zipfile(content):
         raise ConfigError(f"{path}: not a whole AASX package: it is not a ZIP file", HINT)
     try:
+        with ZipFile(content) as archive:
+            unzipped_within_budget(archive)
         with AASXReader(content, failsafe=False) as reader:
             reader.read_into(store, files)
     except Exception as error:  # whatever the parsers of ZIP, OPC, XML and JSON have to say

@@ -8,6 +8,7 @@ from pathlib import Path
 from lxml import etree
 
 from twin.errors import ConfigError, SourceError
+from twin.files import unzipped_within_budget
 
 DESCRIPTION = "modelDescription.xml"
 MEDIA_TYPE = "application/x-fmu-sharedlibrary"
@@ -41,9 +42,10 @@ def read_fmu(path: Path) -> Fmu:
     parser = etree.XMLParser(resolve_entities=False, no_network=True)
     try:
         with zipfile.ZipFile(BytesIO(content)) as archive:
+            unzipped_within_budget(archive)
             root = etree.fromstring(archive.read(DESCRIPTION), parser)
         fmi = root.attrib["fmiVersion"]
-    except (zipfile.BadZipFile, KeyError, etree.XMLSyntaxError, OSError) as error:
+    except (zipfile.BadZipFile, KeyError, etree.XMLSyntaxError, OSError, ValueError) as error:
         hint = "take what twin export-fmu, or another program that exports FMUs, has written"
         raise ConfigError(f"{path}: not an FMU: {error}", hint) from error
     ways = tuple(words for tag, words in _WAYS.items() if root.find(tag) is not None)

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from twin.assets.engine import parse_url, sqlite_file
+from twin.assets.engine import configured
 from twin.figures.settings import FigureSettings
 from twin.figures.store import FIGURE_DATABASE, Store, open_store
 from twin.settings import Document
@@ -19,6 +19,5 @@ def open_chosen(named: str, document: Document | None, *, write: bool) -> Store:
     if named:
         return open_store(named, create=write)
     folder = Path(document.name).parent if document else Path()
-    url = document.section(FigureSettings, "figures").url if document else ""
-    file = sqlite_file(parse_url(url or FILE, FIGURE_DATABASE))
-    return open_store(url if file is None else folder / file, create=write)
+    settings = document.section(FigureSettings, "figures") if document else FigureSettings()
+    return open_store(configured(settings, folder, FILE, FIGURE_DATABASE), create=write)

@@ -5,9 +5,9 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
+from twin.assets.configured import DatabaseSettings
 from twin.figures.expected import leakage_from_rest, t1_from_rest
 from twin.model.dataset import DataSet
-from twin.settings import Settings
 
 Positive = Annotated[float, Field(gt=0.0)]
 LEAST_T1_MS = 50.0  # over what is usual: below is scatter
@@ -15,7 +15,7 @@ LEAST_LEAKAGE = 10.0  # mbar/s, the same
 LEAST_SUPPLY_BAR = 0.5  # the same
 
 
-class FigureSettings(Settings):
+class FigureSettings(DatabaseSettings):
     """What is permitted in a cycle, the field's defaults; and whether figures are kept."""
 
     permitted_t1_ms: Positive | None = None  # as the data set expects it, and the tolerance
@@ -26,7 +26,6 @@ class FigureSettings(Settings):
     energy_kwh_m3: Positive = 0.12  # to compress a standard cubic metre, whole compressor station
     autoset_tolerance: Annotated[float, Field(ge=0.0, le=10.0)] = 0.25  # over the last good cycles
     keep: bool = False  # twin run adds its cycles to the database
-    url: str = ""  # of the database, or an SQLite file from the configuration's folder
 
     @model_validator(mode="after")
     def _range_is_one(self) -> Self:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from sqlalchemy import (
+    URL,
     BigInteger,
     Column,
     Connection,
@@ -35,7 +36,7 @@ from twin.assets.engine import Database, Purpose
 from twin.assets.unit import Unit, of_unit
 from twin.figures.table import FIGURES
 
-FIGURE_DATABASE = Purpose("figure database", "--figures")
+FIGURE_DATABASE = Purpose("figure database", "--figures", "figures")
 SIDES = ("measured", "expected")
 _OWN = ("host_ns", "begin_ns", "cycle", "alarms", "warnings")
 VALUES = tuple(f"{name}_{side}" for name in FIGURES for side in SIDES)
@@ -93,7 +94,7 @@ class Counters:
 
 
 def open_store(
-    where: str | Path,
+    where: str | Path | URL,
     *,
     create: bool = True,
     busy_s: float = 5.0,

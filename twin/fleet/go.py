@@ -5,6 +5,8 @@ from concurrent.futures import Future, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
+from sqlalchemy import URL
+
 from twin.assets.database import open_assets
 from twin.config import Config
 from twin.errors import TwinError
@@ -47,10 +49,12 @@ def ask(work: str, logs: Iterable[Path], configure: Configure) -> Iterator[Wante
             yield Wanted(job, key, _begin_ns(log), log.complete)
         except (TwinError, OSError) as error:
             yield _failed(path, str(error))
+        except Exception as error:  # the others go on
+            yield _failed(path, f"a mistake of this program, please report it: {error!r}")
 
 
 def go(
-    wanted: Sequence[Wanted], submit: Submit, store: Store, assets: str | Path
+    wanted: Sequence[Wanted], submit: Submit, store: Store, assets: str | Path | URL
 ) -> Iterator[Told]:
     """Have jobs done; tell of each as it is done, and kept."""
     store.note({one.key.log_sha256: one.complete for one in wanted})
@@ -67,7 +71,7 @@ def go(
         yield _keep(future, futures.pop(future), store, assets)
 
 
-def _keep(future: Future[Done], one: Wanted, store: Store, assets: str | Path) -> Told:
+def _keep(future: Future[Done], one: Wanted, store: Store, assets: str | Path | URL) -> Told:
     log = one.job.log
     try:
         done = future.result()

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from sqlalchemy import (
+    URL,
     BigInteger,
     Boolean,
     Column,
@@ -98,7 +99,7 @@ def key_of(work: str, log: Log, config: Config) -> Key:
 
 
 def open_store(
-    where: str | Path, busy_s: float = 30.0, clock: Callable[[], int] = time.time_ns
+    where: str | Path | URL, busy_s: float = 30.0, clock: Callable[[], int] = time.time_ns
 ) -> "Store":
     """Open the answers in an asset database that is there."""
     store = Store(where, ASSETS, busy_s, clock)

@@ -34,6 +34,7 @@ class Report:
     restarts: int  # gaps after which the sequence begins anew
     time_back: int  # places where PLC time does not go forward
     bytes_per_sample: float  # of the files
+    checked: bool = True  # its head, by a checksum
     derived: str = ""  # how its commands were, where nobody recorded them
 
     @property
@@ -75,7 +76,8 @@ class Report:
     def _state(self) -> str:
         if any(not damage.torn for damage in self.damage):
             return "damaged"
-        return "complete" if self.complete else "unfinished, its writer was stopped"
+        end = "complete" if self.complete else "unfinished, its writer was stopped"
+        return end if self.checked else f"{end}; its head is unchecked: it has no checksum"
 
 
 class _Tally:
@@ -142,6 +144,7 @@ def _go_through(log: Log, take: Callable[[Samples, Ticks, Sequence[Event]], None
         restarts=tally.restarts,
         time_back=tally.time_back,
         bytes_per_sample=size / max(tally.samples, 1),
+        checked=log.checked,
         derived=log.header.derived,
     )
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
+from twin.files import require_within_budget
 from twin.log.schema import ADDED, COLUMNS, SAMPLES
 from twin.model.compiled import compiled, per_row
 from twin.signals import EXTRA, SAMPLE, TICK, Samples, Ticks
@@ -66,6 +67,7 @@ def decode(packed: bytes | memoryview) -> tuple[Samples, Ticks]:
     count = _find(raw, spans)
     if count < 1:
         raise ValueError("it is no message of rows")
+    require_within_budget(count * (SAMPLE.itemsize + TICK.itemsize), f"a message of {count} rows")
     spans = spans[_NUMBERS]
     if (wrong := _misfit(spans, count, _ADDED)) >= 0:
         raise ValueError(f"{COLUMNS[wrong]} is not packed for {count} rows")

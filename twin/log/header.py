@@ -1,10 +1,14 @@
 """What a log says about itself, so that it replays alone."""
 
+import hashlib
+import json
 from dataclasses import dataclass, field
 
 from twin.errors import ConfigError
 
-FORMAT = "ejector-twin-log/1"
+FORMAT = "ejector-twin-log/2"
+UNCHECKED = "ejector-twin-log/1"  # the same without a checksum of the head
+CHECKSUM = "sha256"
 HIL, DERIVED = "hil", "derived_commands"  # what of the rows was not measured, in free metadata
 
 
@@ -48,8 +52,11 @@ class Identity:
 
 
 def to_metadata(header: LogHeader, identity: Identity) -> dict[str, str]:
-    """All but the configuration's text and the free metadata, as MCAP stores it."""
-    return {
+    """All but the configuration's text and the free metadata, as MCAP stores it.
+
+    The checksum is over all three: MCAP has none for metadata.
+    """
+    own = {
         "format": FORMAT,
         "series": identity.series,
         "part": str(identity.part),
@@ -58,14 +65,23 @@ def to_metadata(header: LogHeader, identity: Identity) -> dict[str, str]:
         "config_name": header.config_name,
         "ambient_pa": repr(header.ambient),
     }
+    return own | {CHECKSUM: _checksum(own, header.config_text, header.metadata)}
 
 
 def from_metadata(
     stored: dict[str, str], config_text: str, metadata: dict[str, str]
-) -> tuple[LogHeader, Identity]:
-    """Reverse ``to_metadata``; KeyError or ValueError where it was not written by it."""
-    if stored["format"] != FORMAT:
+) -> tuple[LogHeader, Identity, bool]:
+    """Reverse ``to_metadata``; whether there was a checksum stands last.
+
+    KeyError or ValueError where it was not written by it, or is no longer as it was written.
+    """
+    if stored["format"] not in (FORMAT, UNCHECKED):
         raise ValueError(f"its format is {stored['format']!r}, not {FORMAT!r}")
+    is_checked = stored["format"] == FORMAT or CHECKSUM in stored
+    if is_checked:
+        own = {key: value for key, value in stored.items() if key != CHECKSUM}
+        if stored[CHECKSUM] != _checksum(own, config_text, metadata):
+            raise ValueError("its checksum is wrong: not all in it is as it was written")
     header = LogHeader(
         asset_type=stored["asset_type"],
         asset_id=stored["asset_id"],
@@ -74,4 +90,9 @@ def from_metadata(
         metadata=metadata,
         ambient=float(stored["ambient_pa"]),
     )
-    return header, Identity(stored["series"], int(stored["part"]))
+    return header, Identity(stored["series"], int(stored["part"])), is_checked
+
+
+def _checksum(own: dict[str, str], config_text: str, metadata: dict[str, str]) -> str:
+    head = json.dumps([own, metadata, config_text], sort_keys=True)
+    return hashlib.sha256(head.encode()).hexdigest()

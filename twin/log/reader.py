@@ -19,7 +19,7 @@ from twin.log.records import Damage, is_complete, messages, records
 from twin.log.schema import EVENTS, SAMPLES
 from twin.signals import Samples, Ticks
 
-_UNDECODABLE = (ValueError, struct.error, DecodeError)
+_UNDECODABLE = (ValueError, struct.error, DecodeError, RecursionError)  # the last: deep JSON
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,7 @@ class Log:
     header: LogHeader
     parts: tuple[Path, ...]
     complete: bool  # every part was finished by its writer
+    checked: bool = True  # every head by its checksum; logs of older programs have none
 
     def blocks(self, size: int = 10_000) -> Iterator[tuple[Samples, Ticks]]:
         """Rows of SAMPLE and TICK in written order, ``size`` at a time and the rest at the end."""
@@ -75,18 +76,18 @@ def decode_happening(part: Path, packed: memoryview) -> Event:
 
 
 def _other_version(part: Path, error: Exception) -> SourceError:
-    hint = "it was written by another version of the program: read it with that one"
+    hint = "it was damaged, or written by another version of the program: read it with that one"
     return SourceError(f"{part}: cannot be decoded: {error}", hint)
 
 
 def open_log(path: Path) -> Log:
     """Open a log at its first part; SourceError if it is none."""
-    header, identity = _head(path)
+    header, identity, checked = _head(path)
     parts = [path]
     complete = is_complete(path)
     while identity.part == 0 and (following := part_path(path, len(parts))).exists():
         try:
-            _, other = _head(following)
+            _, other, is_checked = _head(following)
         except SourceError:  # its writer was stopped before it could say anything
             complete = False
             break
@@ -94,10 +95,11 @@ def open_log(path: Path) -> Log:
             break  # left from another log of that name
         parts.append(following)
         complete &= is_complete(following)
-    return Log(path, header, tuple(parts), complete)
+        checked &= is_checked
+    return Log(path, header, tuple(parts), complete, checked)
 
 
-def _head(path: Path) -> tuple[LogHeader, Identity]:
+def _head(path: Path) -> tuple[LogHeader, Identity, bool]:
     try:
         _check_magic(path)
         return _read_head(path)
@@ -117,7 +119,7 @@ def _check_magic(path: Path) -> None:
         )
 
 
-def _read_head(path: Path) -> tuple[LogHeader, Identity]:
+def _read_head(path: Path) -> tuple[LogHeader, Identity, bool]:
     """From the records before the first chunk; only other tools put them behind."""
     stored: dict[str, dict[str, str]] = {}
     config: bytes | None = None

@@ -14,6 +14,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import lz4.frame
 import numpy as np
 import numpy.typing as npt
 import zstandard
@@ -29,9 +30,9 @@ from mcap.records import (
     Metadata,
     Statistics,
 )
-from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
+from twin.files import MEMORY_BUDGET, require_within_budget
 from twin.log.schema import CHANNELS, LIBRARY
 from twin.model.compiled import compiled, per_row
 
@@ -42,7 +43,6 @@ _MESSAGE_DATA = 22  # bytes before the data of a message: channel id, sequence a
 _MESSAGE, _CHANNEL = int(Opcode.MESSAGE), int(Opcode.CHANNEL)
 _CHUNK_MARK = re.compile(rb"\x06.{36}(\x04\x00\x00\x00zstd|\x03\x00\x00\x00lz4)", re.DOTALL)
 _CHUNK_MARK_LENGTH = 45  # at most
-_LARGEST = 64 << 20  # bytes; no record is ever near it
 _PIECE = 1 << 20
 _OPCODES = frozenset(Opcode)
 _KINDS: dict[int, type[Any]] = {
@@ -86,25 +86,36 @@ class _Space:
 
     def unpack(self, chunk: Chunk) -> memoryview:
         """Contents of a chunk, until the next one; one of ``_BROKEN`` if it is damaged."""
+        require_within_budget(chunk.uncompressed_size, "unpacked it")
         if chunk.compression == "zstd":
             contents = self._unpack_zstd(chunk)
+        elif chunk.compression == "lz4":
+            contents = _unpack_lz4(chunk)
+        elif chunk.compression:
+            raise ValueError(f"it is compressed by {chunk.compression!r}, which nobody knows here")
         else:
-            data, length = get_chunk_data_stream(chunk)
-            contents = memoryview(data.read(length))
+            contents = memoryview(chunk.data)
         if chunk.uncompressed_crc not in (0, zlib.crc32(contents)):
             raise ValueError("its checksum is wrong")
         return contents
 
     def _unpack_zstd(self, chunk: Chunk) -> memoryview:
         size = chunk.uncompressed_size
-        if size > _LARGEST:
-            raise ValueError("it is too large")
         if size > len(self._memory):
             self._memory = memoryview(bytearray(size))
         contents = self._memory[:size]
         if self._zstd.stream_reader(chunk.data).readinto(contents) < size:
             raise ValueError("it is too short")
         return contents.toreadonly()
+
+
+def _unpack_lz4(chunk: Chunk) -> memoryview:
+    size = chunk.uncompressed_size
+    unpacker = lz4.frame.LZ4FrameDecompressor()
+    contents = memoryview(unpacker.decompress(chunk.data, max_length=size + 1))
+    if len(contents) != size:
+        raise ValueError("it is not as long as it says")
+    return contents
 
 
 Damaged = Callable[[Damage], None]  # told of each damage; may raise
@@ -158,7 +169,7 @@ def _reason(error: Exception, torn: bool) -> str:
 def _record(file: BinaryIO, space: _Space) -> McapRecord | memoryview | None:
     """The record that stands here, None if it is of no use; one of ``_BROKEN`` if it is none."""
     opcode, length = _HEAD.unpack(file.read(_HEAD.size))
-    body = file.read(min(length, _LARGEST))
+    body = file.read(min(length, MEMORY_BUDGET))
     if opcode not in _OPCODES or len(body) < length:
         raise ValueError("not a record")
     if opcode == Opcode.MESSAGE_INDEX and length != _INDEX.size + _INDEX.unpack_from(body)[1]:

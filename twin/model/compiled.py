@@ -3,24 +3,29 @@
 Numba caches each function by the time stamp of its own file, so a change in a function it calls in
 another file goes unnoticed. Here the cache lies in a folder named by all sources that are compiled
 or hold constants for it.
+
+Numba unpickles what it finds there, and that runs whatever stands in it. So the folder is the
+user's own, and where it is not there is no cache.
 """
 
 import hashlib
 import logging
 import os
 import shutil
-import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import llvmlite.binding as llvm
 import numba
 from numba.core import event
-from numba.core.caching import FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserProvidedCacheLocator
 from numba.core.runtime.nrt import rtsys
 
+from twin.errors import TwinError
+from twin.files import private_folder, user_cache
 from twin.processor import njit
 
 DAY_S = 86_400.0
@@ -29,27 +34,36 @@ _log = logging.getLogger(__name__)
 _PACKAGE = Path(__file__).parent.parent
 
 
-def _cache_folder() -> Path:
+def _folder_name() -> str:
     sources = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*.py")):
         text = path.read_bytes()
         if path.parent.name == "model" or path.name in SHARED or b"model.compiled" in text:
             sources.update(text)
-    writable = os.access(_PACKAGE, os.W_OK)
-    root = _PACKAGE if writable else Path(tempfile.gettempdir()) / f"ejector-twin-{os.getuid()}"
-    return root / "__pycache__" / f"compiled-{sources.hexdigest()[:12]}"
+    return f"compiled-{sources.hexdigest()[:12]}"
 
 
 def _forget_others(folder: Path) -> None:
     """Delete what no version has used for a day; numba itself never does."""
+    os.utime(folder)
     for other in folder.parent.glob("compiled-*"):
         if other != folder and time.time() - other.stat().st_mtime > DAY_S:
             shutil.rmtree(other, ignore_errors=True)
 
 
-_FOLDER = _cache_folder()
-_forget_others(_FOLDER)
-numba.config.CACHE_DIR = str(_FOLDER)  # type: ignore[attr-defined]
+def _cache_folder() -> tuple[str, str]:
+    """The folder, or nothing and why."""
+    try:
+        folder = private_folder(private_folder(user_cache()) / _folder_name())
+        with suppress(FileNotFoundError):  # another process forgets the same
+            _forget_others(folder)
+    except TwinError as error:
+        return "", f"{error}; {error.hint}"
+    return str(folder), ""
+
+
+_FOLDER, _NO_CACHE = _cache_folder()
+numba.config.CACHE_DIR = _FOLDER  # type: ignore[attr-defined]
 
 # A loop over hypotheses reads and writes some fifty rows of three arrays. Whether rows overlap is
 # checked before such a loop is run four at a time, and by default LLVM balks at so many checks.
@@ -65,8 +79,9 @@ class _Waiting(event.Listener):
     def on_start(self, event: object) -> None:
         if not self.said:
             self.said = True
+            kept = f"and not kept: {_NO_CACHE}" if _NO_CACHE else "then kept"
             _log.warning(
-                "compiling what is not yet compiled for this processor: a minute at most, then kept"
+                "compiling what is not yet compiled for this processor: a minute at most, %s", kept
             )
 
     def on_end(self, event: object) -> None:
@@ -76,12 +91,20 @@ class _Waiting(event.Listener):
 event.register("numba:compile", _Waiting())  # type: ignore[no-untyped-call]
 
 
+class _InOwnFolder(CompileResultCacheImpl):
+    """Looks nowhere else: numba has folders to fall back on that nobody checks."""
+
+    _locator_classes = [UserProvidedCacheLocator]  # noqa: RUF012 - as numba has it
+
+
 class _Cache(FunctionCache):
     """Numba's cache; but what is found in it needs nothing of what numba can compile.
 
     Numba gets all of that ready before it looks, a sixth of the time that a command takes to start.
     Where nothing is found, its compiler does the same as it begins.
     """
+
+    _impl_class = _InOwnFolder
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         rtsys.initialize(target_context)
@@ -97,8 +120,10 @@ _with_arrays = njit(nogil=True, error_model="numpy", _nrt=True)  # type: ignore[
 def compiled(function: Callable[..., Any]) -> Any:
     """A function to be called from Python, or where inlining it is not worth it; kept on disk."""
     dispatcher = _with_arrays(function)
-    # What ``cache=True`` does with numba's own.
-    dispatcher._cache = _Cache(function)  # type: ignore[no-untyped-call]
+    if _FOLDER:
+        with suppress(RuntimeError):  # the disk is full
+            # What ``cache=True`` does with numba's own.
+            dispatcher._cache = _Cache(function)  # type: ignore[no-untyped-call]
     return dispatcher
 
 

@@ -9,6 +9,7 @@ from typing import Any, Literal, Self
 
 from pydantic import AwareDatetime, Field, ValidationError, model_validator
 from sqlalchemy import (
+    URL,
     BigInteger,
     Column,
     Integer,
@@ -110,7 +111,11 @@ UPLOADS = Table(
 
 
 def open_uploads(
-    where: str | Path, unit: Unit, *, busy_s: float = 5.0, clock: Callable[[], int] = time.time_ns
+    where: str | Path | URL,
+    unit: Unit,
+    *,
+    busy_s: float = 5.0,
+    clock: Callable[[], int] = time.time_ns,
 ) -> "Uploads":
     """Open what is asked of a unit in the alarm database at a URL or in an SQLite file.
 
@@ -126,7 +131,7 @@ class Uploads(Database):
     """What is asked of a unit. Several threads may open one each."""
 
     def __init__(
-        self, where: str | Path, unit: Unit, busy_s: float, clock: Callable[[], int]
+        self, where: str | Path | URL, unit: Unit, busy_s: float, clock: Callable[[], int]
     ) -> None:
         super().__init__(where, ALARM_DATABASE, busy_s, clock)
         self._unit = unit

@@ -25,7 +25,8 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 from twin.assets.unit import Unit
 from twin.outlets.message import Message, asset_of, of_status
 from twin.outlets.sender import ALARM, BATCH, LostError, Sent
-from twin.outlets.settings import MqttSettings, Say
+from twin.outlets.settings import MqttSettings
+from twin.secret import Say
 
 CONNECT_S = 5.0  # to connect, and then to be let in
 ANSWER_S = 20.0  # to take a batch

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sqlalchemy import (
+    URL,
     BigInteger,
     Column,
     ColumnElement,
@@ -54,7 +55,7 @@ ORDER = Index(
 
 
 def open_outbox(
-    where: str | Path,
+    where: str | Path | URL,
     unit: Unit,
     *,
     busy_s: float = 5.0,
@@ -74,7 +75,7 @@ class Outbox(Database):
     """An open outbox. Several threads may use one each; what is written is written whole."""
 
     def __init__(
-        self, where: str | Path, unit: Unit, busy_s: float, clock: Callable[[], int]
+        self, where: str | Path | URL, unit: Unit, busy_s: float, clock: Callable[[], int]
     ) -> None:
         super().__init__(where, ALARM_DATABASE, busy_s, clock)
         self._unit = unit

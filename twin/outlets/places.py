@@ -15,8 +15,9 @@ import urllib3
 from twin.assets.unit import Unit
 from twin.outlets.asked import File, RefusedError
 from twin.outlets.sender import LostError
-from twin.outlets.settings import Say, UploadSettings
+from twin.outlets.settings import UploadSettings
 from twin.outlets.webhook import LATER, sendable
+from twin.secret import Say
 
 PIECE = 1 << 20  # bytes read at once
 CONNECT_S = 10.0
@@ -130,8 +131,9 @@ class Address:
         ending: threading.Event,
         say: Say,
     ) -> None:
-        self._url = "/".join((settings.url.rstrip("/"), *_levels(unit)))
-        where = urlsplit(settings.url)
+        url = settings.address("outlets.upload", folder, say)
+        self._url = "/".join((url.rstrip("/"), *_levels(unit)))
+        where = urlsplit(url)
         self._where = f"{where.scheme}://{where.netloc}"  # what follows may be a secret
         self._ending = ending
         self._headers = {

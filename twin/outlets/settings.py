@@ -1,10 +1,7 @@
 """The tables ``[mqtt]`` and ``[webhook]``: where alarms go, and what protects them on the way."""
 
 import ipaddress
-import os
 import ssl
-import stat
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Self
 from urllib.parse import urlsplit
@@ -12,41 +9,8 @@ from urllib.parse import urlsplit
 from pydantic import Field, model_validator
 
 from twin.errors import ConfigError
+from twin.secret import Say, Secret, refuse_secrets
 from twin.settings import Document, Settings
-
-Say = Callable[[str], None]
-
-
-class Secret(Settings):
-    """What nobody else is to know; not in the configuration itself, which is copied into logs."""
-
-    file: Path | None = None  # a text file with it alone, from the configuration's folder
-    env: str = ""  # an environment variable
-
-    @model_validator(mode="after")
-    def _one_place(self) -> Self:
-        if (self.file is None) == (not self.env):
-            raise ValueError("needs one place: file or env")
-        return self
-
-    def read(self, key: str, folder: Path, say: Say) -> str:
-        """The secret of ``key``, one line; ConfigError where there is none.
-
-        A file that others may read is said.
-        """
-        if self.file is None:
-            found, where = os.environ.get(self.env, ""), f"environment variable {self.env}"
-        else:
-            found, where = _read(key, folder / self.file, say), str(folder / self.file)
-        found = found.strip("\r\n")  # as echo and editors leave them
-        if not found:
-            raise ConfigError(f"{key}: {where} is empty or not set", "put the secret there")
-        if not found.isprintable():
-            raise ConfigError(
-                f"{key}: {where} has a line break, or another character that cannot be seen, in it",
-                "put the secret there alone, on one line of plain text",
-            )
-        return found
 
 
 class Tls(Settings):
@@ -121,40 +85,56 @@ class MqttSettings(Outlet):
         return self
 
 
-class WebhookSettings(Outlet):
-    """An address that takes JSON by POST; none while ``url`` is empty."""
+class HttpSettings(Settings):
+    """An address of HTTP, and what protects what goes there."""
 
-    url: str = ""
+    url: str | Secret = ""
     headers: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9-]+$")], Secret] = Field(default={})
     tls: Tls = Tls()
-    timeout_s: float = Field(default=10.0, gt=0.0, le=60.0)
     unprotected: bool = False  # headers without https beyond this machine all the same
 
     @model_validator(mode="after")
     def _is_protected(self) -> Self:
-        if not self.url:
-            return self
-        _check_url(self.url, has_secrets=bool(self.headers) and not self.unprotected)
+        if self.url and isinstance(self.url, str):
+            self._check(self.url)
+            refuse_secrets(self.url)
         return self
 
+    def address(self, table: str, folder: Path, say: Say) -> str:
+        """The address, from wherever it stands; ConfigError if it is none."""
+        if isinstance(self.url, str):
+            return self.url
+        found = self.url.read(f"[{table}] url", folder, say)
+        try:
+            self._check(found)
+        except ValueError as error:
+            raise ConfigError(f"[{table}] {error}", "put an address there") from error
+        return found
 
-class UploadSettings(Settings):
-    """Where logs go when they are asked for, and the folder that they are taken from."""
+    def _check(self, url: str) -> None:
+        _check_url(url, has_secrets=bool(self.headers) and not self.unprotected)
+
+
+class WebhookSettings(HttpSettings, Outlet):
+    """An address that takes JSON by POST; none while ``url`` is empty."""
+
+    timeout_s: float = Field(default=10.0, gt=0.0, le=60.0)
+
+
+class UploadSettings(HttpSettings):
+    """Where logs go when they are asked for, and the folder that they are taken from.
+
+    ``url`` takes PUT of what lies below it.
+    """
 
     logs: Path  # where twin run writes them; nothing else is ever uploaded
-    url: str = ""  # takes PUT of what lies below it
     folder: Path | None = None  # or a folder, which may be a share
-    headers: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9-]+$")], Secret] = Field(default={})
-    tls: Tls = Tls()
     timeout_s: float = Field(default=60.0, gt=0.0, le=600.0)  # without a word
-    unprotected: bool = False  # headers without https beyond this machine all the same
 
     @model_validator(mode="after")
     def _one_place(self) -> Self:
         if (self.folder is None) == (not self.url):
             raise ValueError("needs one place: url or folder")
-        if self.url:
-            _check_url(self.url, has_secrets=bool(self.headers) and not self.unprotected)
         return self
 
 
@@ -192,27 +172,12 @@ def _check_url(url: str, *, has_secrets: bool) -> None:
     """ValueError for what is no address, or would show secrets."""
     where = urlsplit(url)
     if where.scheme not in ("http", "https") or not where.hostname:
-        raise ValueError(f'url: "{url}" is no address: https://HOST/PATH')
-    if where.password:
-        raise ValueError("url: a password does not stand in it; give it in headers")
+        raise ValueError("url is no address: https://HOST/PATH")
     if has_secrets and where.scheme == "http" and not _is_loopback(where.hostname):
         raise ValueError(
             f'"{where.hostname}" is beyond this machine, and headers are secrets: take https,'
             " or say unprotected = true"
         )
-
-
-def _read(key: str, path: Path, say: Say) -> str:
-    try:
-        mode = path.stat().st_mode
-        found = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(
-            f"{key} {path}: cannot be read: {error}", "a text file with the secret alone"
-        ) from error
-    if os.name == "posix" and mode & (stat.S_IRWXG | stat.S_IRWXO):
-        say(f"{key}: others may read {path}; keep it to yourself: chmod 600 {path}")
-    return found
 
 
 def _is_loopback(host: str) -> bool:

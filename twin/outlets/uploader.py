@@ -25,7 +25,7 @@ from twin.outlets.asked import (
 from twin.outlets.logs import Found
 from twin.outlets.message import Asset, Message, beside
 from twin.outlets.places import Place, StoppedError, described
-from twin.outlets.settings import Say
+from twin.secret import Say
 
 ANSWER_FORMAT = "ejector-twin-upload/1"
 UPLOAD = "upload"  # the topic of answers, below the unit's

@@ -14,7 +14,8 @@ from urllib3.response import HTTPResponse
 from twin.errors import ConfigError
 from twin.outlets.message import Message
 from twin.outlets.sender import ALARM, LostError, Sent
-from twin.outlets.settings import Say, Secret, WebhookSettings
+from twin.outlets.settings import WebhookSettings
+from twin.secret import Say, Secret
 
 LATER = (408, 425, 429)  # of the client's errors those that say: not now
 IDLE_S = 0.2
@@ -33,7 +34,8 @@ class Webhook:
             name: sendable(f"[webhook] headers.{name}", secret, folder, say)
             for name, secret in settings.headers.items()
         }
-        where = urlsplit(settings.url)
+        self._url = settings.address("webhook", folder, say)
+        where = urlsplit(self._url)
         self._where = f"{where.scheme}://{where.netloc}"  # what follows may be a secret
         secured = where.scheme == "https"
         self._pool = urllib3.PoolManager(
@@ -81,7 +83,7 @@ class Webhook:
         try:
             answer = self._pool.request(
                 "POST",
-                self._settings.url,
+                self._url,
                 body=message.body.encode(),
                 headers=headers,
                 preload_content=False,  # nobody reads it, however long it is

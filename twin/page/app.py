@@ -32,8 +32,9 @@ from twin.errors import TwinError
 from twin.page.ejector import Ejector
 from twin.page.hall import Hall
 from twin.page.hall_app import ALL, AllEjectors
-from twin.page.sessions import SESSION_S, Session, Sessions, Tries
+from twin.page.sessions import SESSION_S, Session, Sessions
 from twin.page.users import Users
+from twin.throttle import LoginThrottle
 
 COOKIE = "ejector-twin"
 TOKEN = "x-csrf-token"  # noqa: S105  # a header's name
@@ -44,7 +45,7 @@ STATE_S = 1.0  # between looks at alarms
 MOST_DIGITS = 18  # of a number, which then is one to a database too
 # What reading a body raises that has something else in it; also one nested without end.
 NO_REQUEST = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
-SLOWEST_S = 20.0  # for a browser to take one message
+SLOWEST_S = 20.0  # for a browser to take one message, or to send a request's body
 
 STATIC = {
     "icon.svg": "image/svg+xml",
@@ -116,7 +117,7 @@ class Page:
         self.hall = hall
         self.ejectors, self.users, self.sessions, self.access = ejectors, users, sessions, access
         self._states = [_Remembered(one.state) for one in ejectors]
-        self._by_address, self._by_name = Tries(60.0), Tries(10.0)
+        self._by_address, self._by_name = LoginThrottle(60.0), LoginThrottle(10.0)
         self._one_login = asyncio.Lock()  # at a time: its hash takes memory and time
         self._one_trend = asyncio.Lock()
         files = resources.files("twin.page").joinpath("static")
@@ -451,10 +452,14 @@ async def _send(socket: WebSocket, what: Any) -> None:
 async def _body(request: Request) -> bytes:
     """What was sent, up to MOST_BODY."""
     body = b""
-    async for part in request.stream():
-        body += part
-        if len(body) > MOST_BODY:
-            raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "that is too much")
+    try:
+        async with asyncio.timeout(SLOWEST_S):
+            async for part in request.stream():
+                body += part
+                if len(body) > MOST_BODY:
+                    raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "that is too much")
+    except TimeoutError as error:
+        raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, "that takes too long") from error
     return body
 
 

@@ -1,17 +1,21 @@
 """The web server under the page: where it listens, and how much it lets anybody do."""
 
+import asyncio
 import ipaddress
 import socket
 import ssl
 from dataclasses import dataclass
 from pathlib import Path
 
+import h11
 import uvicorn
 from starlette.types import ASGIApp
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from twin.errors import ConfigError, SourceError
 
 MOST_AT_ONCE = 200  # connections
+HEAD_S = 10.0  # a request whose head has not come by then will not come
 QUIET_S = 20.0  # a browser that does not answer for so long is gone
 
 
@@ -57,10 +61,40 @@ def address(place: Place, listening: socket.socket) -> str:
     return f"{place.scheme}://{shown}:{port}/"
 
 
+class _TimelyProtocol(H11Protocol):
+    """Lets go of who opens a connection and does not ask: uvicorn waits for the head for ever."""
+
+    _late: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin to wait for a request."""
+        super().connection_made(transport)
+        self._late = self.loop.call_later(HEAD_S, transport.close)
+
+    def data_received(self, data: bytes) -> None:
+        """A whole head ends the wait; the beginning of another one begins it."""
+        super().data_received(data)
+        if self.conn.their_state is not h11.IDLE:
+            self._forget()
+        elif self._late is None:
+            self._late = self.loop.call_later(HEAD_S, self.transport.close)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Nothing comes any more."""
+        self._forget()
+        super().connection_lost(exc)
+
+    def _forget(self) -> None:
+        if self._late is not None:
+            self._late.cancel()
+            self._late = None
+
+
 def make_server(app: ASGIApp, place: Place) -> uvicorn.Server:
     """What serves until Ctrl-C or SIGTERM; ConfigError where certificate or key are of no use."""
     config = uvicorn.Config(
         app,
+        http=_TimelyProtocol,
         ws="websockets-sansio",
         ws_max_size=64,
         ws_ping_interval=QUIET_S,

@@ -1,0 +1,18 @@
+"""What SECURITY.md promises is held by a test that is there."""
+
+import ast
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+ROW = re.compile(r"^\| (?P<promise>[^|]+) \| `(?P<file>tests/\w+\.py)::(?P<test>\w+)` \|$", re.M)
+
+
+def test_every_promise_has_its_test() -> None:
+    text = (ROOT / "SECURITY.md").read_text(encoding="utf-8")
+    table = [line for line in text.splitlines() if line.startswith("| ")][2:]
+    rows = list(ROW.finditer(text))
+    assert [row[0] for row in rows] == table
+    for row in rows:
+        tree = ast.parse((ROOT / row["file"]).read_text(encoding="utf-8"))
+        assert row["test"] in {one.name for one in tree.body if isinstance(one, ast.FunctionDef)}
