@@ -1,14 +1,15 @@
 """The command line: exit codes, messages for people, and logs that survive what is done to it."""
 
 import json
+import resource
 import signal
 import socket
 import subprocess
 import sys
 import time
 import weakref
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from plc_process import PlcProcess, start_plc
 
 from twin.alarms.loop import Alarms
 from twin.alarms.settings import board_rules
-from twin.cli import Console
+from twin.cli import Console, pair_of
 from twin.events import Event, Kind
 from twin.figures.cycle import KeyFigures
 from twin.live import run
@@ -288,7 +289,7 @@ def rows_in(log: Path) -> np.ndarray[tuple[int], np.dtype[np.void]]:
     return rows
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupt_ends_it_with_130_and_a_finished_log(
     plc: PlcProcess, tmp_path: Path, number: signal.Signals
 ) -> None:
@@ -301,6 +302,63 @@ def test_an_interrupt_ends_it_with_130_and_a_finished_log(
     assert "Traceback" not in said
     rows_in(log)
     assert open_log(log).complete
+
+
+def until(done: Callable[[], bool], process: "subprocess.Popen[str]") -> None:
+    """Wait for something while a process goes on."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not done():
+        assert time.monotonic() < deadline
+        assert process.poll() is None, process.communicate()[1]
+        time.sleep(0.05)
+
+
+def test_who_reads_what_it_says_may_go_and_it_goes_on(plc: PlcProcess, tmp_path: Path) -> None:
+    log = tmp_path / "a.mcap"
+    with started(*run_beside(plc, log)) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline()
+        process.stdout.close()
+        until_logged(log, process, 12)
+        cycles = [one for one in open_log(log).events() if one.kind is Kind.CYCLE]
+        until(lambda: len(list(open_log(log).events())) > len(cycles) + 2, process)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE_S) == 130
+    assert open_log(log).complete
+
+
+def test_a_file_that_may_grow_no_more_is_followed_by_another(
+    plc: PlcProcess, tmp_path: Path
+) -> None:
+    """A quota is met by a new part, with what the full one no longer took."""
+    log = tmp_path / "a.mcap"
+    with started(*run_beside(plc, log)) as process:
+        until_logged(log, process, 2)
+        most = log.stat().st_size + 20_000
+        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (most, resource.RLIM_INFINITY))
+        third = tmp_path / "a.0002.mcap"
+        until(third.exists, process)
+        no_limit = resource.RLIM_INFINITY, resource.RLIM_INFINITY
+        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, no_limit)
+        until_logged(third, process, 3)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE_S) == 130
+    assert (np.diff(rows_in(log)["sequence"]) == 1).all()
+    told = [one.kind for one in open_log(log).events()]
+    assert Kind.OUTPUT_DOWN in told
+    assert Kind.OUTPUT_BACK in told
+
+
+def test_an_interrupt_that_a_compiler_swallows_is_heeded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def swallows(_data: object) -> None:
+        with suppress(KeyboardInterrupt):  # as callbacks from C do
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("twin.live.compiled", swallows)
+    with pytest.raises(KeyboardInterrupt):
+        pair_of(rigs.config("gripper"))
 
 
 def test_a_kill_costs_half_a_second_at_most(plc: PlcProcess, tmp_path: Path) -> None:

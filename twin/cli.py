@@ -11,14 +11,14 @@ import re
 import signal
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from threading import Lock
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TextIO
 
 import typer
 
@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from twin.live import Adviser, Sink, Twin
     from twin.log.header import LogHeader
     from twin.monitor.detect import Monitor
+    from twin.monitor.listening import Notices
     from twin.settings import Document
     from twin.signals import Samples, Ticks
     from twin.view import Screen
@@ -153,13 +154,15 @@ def run(
             writer = closing.enter_context(open_writer(*at)) if hil else None
             file = _file_of(log, label)
             # The log comes last: what people are told does not wait for the disk.
-            sinks = _opened(
-                lambda: consoles[name],
-                (lambda: shown) if shown else None,
-                keeper_of(settings, _complain),
-                live_rows_of(settings, _complain),
-                view_of(name),
-                partial(_recorder, file, settings, hil=hil) if file else None,
+            opened = _opened(
+                {
+                    "console": lambda: consoles[name],
+                    "OPC UA results": (lambda: shown) if shown else None,
+                    "key figures": keeper_of(settings, _complain),
+                    "live page": live_rows_of(settings, _complain),
+                    "view": view_of(name),
+                    "log": partial(_recorder, file, settings, hil=hil) if file else None,
+                }
             )
             adviser = LiveDiagnosis(
                 settings,
@@ -169,8 +172,11 @@ def run(
                 reports=reports_of(settings),
             )
             # What is not measured has no faults. Alarms come last: they hear the diagnosis.
-            advisers: list[Adviser] = [] if hil else [adviser, board := alarms()]
-            sinks = [*([] if hil else _told(board.standing(), shown, outlets)), *sinks]
+            advised: dict[str, Adviser] = (
+                {} if hil else {"diagnosis": adviser, "alarms": (board := alarms())}
+            )
+            told = {} if hil else _told(board.standing(), shown, outlets)
+            sinks, advisers = _supervised({**told, **opened}, advised, plc.listening.notices)
             # It begins with the newest row: what came while all this was opened is not judged.
             source = _answering(plc.blocks(), settings, writer) if writer else plc.blocks()
             with _closed(source):
@@ -231,16 +237,17 @@ def replay(
         alarms = alarms_of(settings)()
     with _views_of({"": settings}, view, rrd) as view_of, _stop_on_signal(None) as stopped:
         console, kept = Console(), _Kept() if json_file else None
+        header = settings.log_header(recorded.header.unmeasured)
         sinks = _opened(
-            (lambda: Recorder(output, settings.log_header(recorded.header.unmeasured)))
-            if output
-            else None,
-            view_of(""),
-            lambda: console,
-            (lambda: kept) if kept else None,
+            {
+                "log": partial(Recorder, output, header) if output else None,
+                "view": view_of(""),
+                "console": lambda: console,
+                "events": (lambda: kept) if kept else None,
+            }
         )
         blocks = _progress((samples for samples, _ in recorded.blocks(REPLAYED)), "replaying")
-        run_loop(_until(stopped, blocks), twin, monitor, sinks, advisers=[alarms])
+        run_loop(_until(stopped, blocks), twin, monitor, [*sinks.values()], advisers=[alarms])
     if json_file is not None and kept is not None:
         write_json(json_file, {"log": str(log), "events": kept.events})
     alarmed = fail_on_alarm and console.alarmed
@@ -504,9 +511,10 @@ def import_(
         print(f"twin: {table.commands}", file=sys.stderr)
     twin, monitor = pair_of(settings, judges=not table.commands)
     with _whole(output) as part, _stop_on_signal(None) as stopped:
-        sinks = _opened(lambda: Recorder(part, settings.log_header(unmeasured)), Console)
+        header = settings.log_header(unmeasured)
+        sinks = _opened({"log": partial(Recorder, part, header), "console": Console})
         blocks = _until(stopped, _progress(table.blocks(), "importing"))
-        run_loop(blocks, twin, monitor, sinks)
+        run_loop(blocks, twin, monitor, [*sinks.values()])
     _leave(interrupted=stopped() == "interrupted")
 
 
@@ -623,7 +631,10 @@ class Console:
             self.alarmed |= event.severity is Severity.ALARM
             what = f"{event.severity:<7}  {event.kind:<17}  {_short(event, told)}"
             # In one piece, since others may be printing too.
-            print(f"{stamp(event.time_ns)}  {self._name}{what}\n", end="", flush=True)
+            try:
+                print(f"{stamp(event.time_ns)}  {self._name}{what}\n", end="", flush=True)
+            except OSError:  # a pipe that nobody reads any more, a terminal that was closed
+                _mute(sys.stdout)
 
     def close(self) -> None:
         """Nothing to finish."""
@@ -651,7 +662,17 @@ class _Kept:
 
 def _complain(what: str) -> None:
     """In one piece, since others may be printing too."""
-    print(f"twin: {what}\n", end="", file=sys.stderr, flush=True)
+    try:
+        print(f"twin: {what}\n", end="", file=sys.stderr, flush=True)
+    except OSError:
+        _mute(sys.stderr)
+
+
+def _mute(stream: TextIO) -> None:
+    """Have nothing more written to where nobody reads: each write would be an error."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
 
 
 def _named(ejectors: "Sequence[Config]") -> "dict[str, Config]":
@@ -690,7 +711,8 @@ def pair_of(settings: "Config", *, judges: bool = True) -> tuple["Twin", "Monito
     from twin.monitor.isolation import Isolation
     from twin.monitor.reports import ReportWatch
 
-    twin = compiled(settings.data)
+    with _heeded():
+        twin = compiled(settings.data)
     watch = settings.monitor
     isolation = (
         Isolation.of(settings.data, watch.healthy, watch.false_alarm_days)
@@ -703,6 +725,25 @@ def pair_of(settings: "Config", *, judges: bool = True) -> tuple["Twin", "Monito
     if settings.document.tables.get("driver", {}).get("mode") == "poll":
         monitor.clocks = None  # then time is that of the poll here
     return twin, monitor
+
+
+@contextmanager
+def _heeded() -> Iterator[None]:
+    """Have a Ctrl-C end what is done here: a compiler's callbacks swallow Python's exception."""
+    interrupted = False
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        nonlocal interrupted
+        interrupted = True
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if interrupted:
+        raise KeyboardInterrupt
 
 
 def _answering(
@@ -792,18 +833,38 @@ def _whole(path: Path) -> Iterator[Path]:
             part.unlink()
 
 
-def _opened(*makers: "Callable[[], Sink] | None") -> "list[Sink]":
+def _opened(makers: "Mapping[str, Callable[[], Sink] | None]") -> "dict[str, Sink]":
     """The sinks that are wanted; if one cannot be opened, those before it are closed."""
-    sinks: list[Sink] = []
+    sinks: dict[str, Sink] = {}
     try:
-        for make in makers:
+        for name, make in makers.items():
             if make is not None:
-                sinks.append(make())
+                sinks[name] = make()
     except BaseException:
-        for sink in sinks:
+        for sink in sinks.values():
             sink.close()
         raise
     return sinks
+
+
+def _supervised(
+    sinks: "Mapping[str, Sink]", advisers: "Mapping[str, Adviser]", notices: "Notices"
+) -> "tuple[list[Sink], list[Adviser]]":
+    """The same; one that fails does not end the run."""
+    from twin.log.recorder import Recorder
+    from twin.supervised import Outages, SupervisedAdviser, SupervisedSink
+
+    outages = Outages(notices)
+
+    def supervised(name: str, sink: "Sink") -> "Sink":
+        if isinstance(sink, Recorder):
+            return SupervisedSink(name, sink, sink.again, outages, keeps=True)
+        return SupervisedSink(name, sink, lambda: sink, outages)
+
+    return (
+        [supervised(*one) for one in sinks.items()],
+        [SupervisedAdviser(name, one, outages) for name, one in advisers.items()],
+    )
 
 
 @contextmanager
@@ -828,11 +889,13 @@ def _spared() -> "Iterator[None]":
         gc.unfreeze()
 
 
-def _told(standing: "Standing", shown: "Results | None", outlets: "Begin | None") -> "list[Sink]":
+def _told(
+    standing: "Standing", shown: "Results | None", outlets: "Begin | None"
+) -> "dict[str, Sink]":
     """Tell of the alarms that stand when a run begins; gives the sinks that tell of the others."""
     if shown is not None:
         shown.resume(standing, time.time_ns())
-    return [] if outlets is None else [outlets(standing)]
+    return {} if outlets is None else {"MQTT and webhook": outlets(standing)}
 
 
 @contextmanager
@@ -950,9 +1013,10 @@ def _stop_on_signal(duration: float | None) -> Iterator[Callable[..., str]]:
             reason = "duration"
         return reason
 
-    before = {
-        number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)
-    }
+    wanted = {signal.SIGINT, signal.SIGTERM}
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup
+        wanted.add(signal.SIGHUP)  # the terminal was closed
+    before = {number: signal.signal(number, interrupt) for number in wanted}
     try:
         yield why
     finally:

@@ -26,6 +26,8 @@ class Kind(StrEnum):
     PLC_BACK = "plc_back"
     TWIN_LATE = "twin_late"
     RESULTS_DOWN = "results_down"
+    OUTPUT_DOWN = "output_down"
+    OUTPUT_BACK = "output_back"
     SIGNAL_BAD = "signal_bad"
     SIGNAL_GOOD = "signal_good"
     SIGNAL_CONTRADICTS = "signal_contradicts"
@@ -48,6 +50,8 @@ SEVERITY: dict[Kind, Severity] = {
     Kind.PLC_BACK: Severity.INFO,
     Kind.TWIN_LATE: Severity.WARNING,
     Kind.RESULTS_DOWN: Severity.WARNING,
+    Kind.OUTPUT_DOWN: Severity.WARNING,  # a log, a console, a view
+    Kind.OUTPUT_BACK: Severity.INFO,
     Kind.SIGNAL_BAD: Severity.WARNING,
     Kind.SIGNAL_GOOD: Severity.INFO,
     Kind.SIGNAL_CONTRADICTS: Severity.WARNING,  # what is reported, and the pressure

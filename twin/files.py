@@ -106,12 +106,13 @@ def user_cache() -> Path:
 def private_folder(folder: Path) -> Path:
     """Make a folder for this user only, if it is not there; SourceError if it is not private.
 
-    Who may write into the folder above could exchange it: that one, too, is this user's.
+    Who may write into the folder above could exchange it: that one, too, is this user's. A group
+    may, as many systems give each user one of his own.
     """
     with said_plainly(folder):
         folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.mkdir(mode=0o700, exist_ok=True)
-        _require_own(folder.parent.resolve(), stat.S_IWGRP | stat.S_IWOTH)
+        _require_own(folder.parent.resolve(), stat.S_IWOTH)
         _require_own(folder, stat.S_IRWXG | stat.S_IRWXO)
         if not os.access(folder, os.W_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
@@ -129,7 +130,7 @@ def _require_own(folder: Path, forbidden: int) -> None:
         )
     if found.st_mode & forbidden:
         raise SourceError(
-            f"{folder}: others may use it, so it is not trusted", f"remove {folder}, or chmod 700"
+            f"{folder}: others may use it, so it is not trusted", f"chmod 700 {folder}"
         )
 
 

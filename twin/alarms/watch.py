@@ -19,6 +19,8 @@ _SWITCHED = {  # events that begin and end something
     Kind.SIGNAL_GOOD: ("signal_bad", 0.0),
     Kind.SIGNAL_CONTRADICTS: ("signal_contradicts", 1.0),
     Kind.SIGNAL_AGREES: ("signal_contradicts", 0.0),
+    Kind.OUTPUT_DOWN: ("output_down", 1.0),
+    Kind.OUTPUT_BACK: ("output_down", 0.0),
 }
 STREAM = frozenset(name for name, _ in _SWITCHED.values())  # nothing is wrong until it is said
 NAMES = STREAM | {DEVIATION} | set(CAUTIONS)
@@ -32,7 +34,7 @@ def values(event: Event) -> dict[str, float]:
     """
     if event.kind in _SWITCHED:
         name, value = _SWITCHED[event.kind]
-        return {name: 1.0 if event.data.get("standing") else value}  # others may contradict still
+        return {name: 1.0 if event.data.get("standing") else value}  # others may stand still
     if event.kind is Kind.DEVIATION:
         return deviating(known(str(event.data.get("effect"))))
     if event.kind is Kind.DEVIATION_CLEARED:
@@ -61,7 +63,7 @@ def quantity(value: str) -> str | None:
 
 def evidence(event: Event) -> dict[str, Evidence]:
     """What an event says for the alarms, by the value that it speaks for."""
-    if event.kind in (Kind.PLC_STALE, Kind.SIGNAL_BAD, Kind.SIGNAL_CONTRADICTS):
+    if event.kind in _SWITCHED and _SWITCHED[event.kind][1]:
         return {_SWITCHED[event.kind][0]: {"words": event.text}}
     if event.kind is Kind.DEVIATION:
         cause = known(str(event.data.get("effect")))

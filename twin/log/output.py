@@ -1,5 +1,6 @@
 """The file on disk below a log."""
 
+import errno
 import os
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -33,7 +34,12 @@ class Output:
         return self._raw.tell()
 
     def sync(self) -> None:
-        """Start bringing everything to the disk, unless that is still under way."""
+        """Start bringing everything to the disk, unless that is still under way.
+
+        OSError where that went wrong before, or somebody has deleted the file.
+        """
+        if os.fstat(self._raw.fileno()).st_nlink == 0:
+            raise FileNotFoundError(errno.ENOENT, "somebody has deleted it")
         if self._syncing is not None:
             if not self._syncing.done():
                 return

@@ -1,5 +1,8 @@
 """The log as one more sink of the loop."""
 
+import errno
+import os
+import shutil
 import time
 import uuid
 from collections.abc import Callable, Sequence
@@ -22,6 +25,7 @@ from twin.signals import SAMPLE, TICK, Samples, Ticks
 FLUSH_S = 0.25  # after this much a chunk is completed; a killed process loses no more than it
 SYNC_S = 1.0  # after this much the disk is asked to keep it
 BATCH = 10_000  # rows in a message where they come fast
+ROOM = 16 << 20  # bytes that a disk must have free for another part: some minutes of rows
 
 _SAMPLES, _SCALARS, _EVENTS, _LOG = CHANNELS
 
@@ -31,7 +35,7 @@ class Recorder:
 
     A part is closed once it is that long, so it may be longer by a chunk (1 MiB). Every method
     raises SourceError where the file cannot be written; what was written until then can be read,
-    and ``close`` is then quiet.
+    and ``close`` is then quiet. ``again`` goes on in another part.
     """
 
     def __init__(
@@ -49,6 +53,9 @@ class Recorder:
         self._tray = Tray(BATCH)
         self._scalars = Scalars(header.ambient)
         self._events: list[tuple[int, Event]] = []  # with ns of receipt
+        # Of the chunk under way, so that another part can begin with it:
+        self._in_chunk: list[tuple[Samples, Ticks]] = []
+        self._events_in_chunk: list[tuple[int, Event]] = []
         self._host_ns: int | None = None  # of the last row
         self._clocks: dict[str, str] = {}  # as last told of
         self._failure: SourceError | None = None
@@ -56,7 +63,7 @@ class Recorder:
         self._series = uuid.uuid4().hex
         self._number = 0
         encode(np.zeros(1, SAMPLE), np.zeros(1, TICK))  # compiled, not to fall into a block
-        self._begin()
+        self._begin(0)
 
     def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event] = ()) -> None:
         """Take row-aligned SAMPLE and TICK rows, maybe none, and what happened with them."""
@@ -80,6 +87,44 @@ class Recorder:
             self._finish()
         except OSError as error:
             raise self._fail(error) from error
+
+    def again(self) -> Self:
+        """After a failure go on in the next part, with what had not reached the file.
+
+        SourceError where that cannot be written either; then it can be asked again.
+        """
+        if self._failure is None:
+            return self
+        self._in_chunk.append(self._tray.take())
+        self._events_in_chunk += self._events
+        self._events = []
+        self._begin_next()
+        rows, events = self._in_chunk, self._events_in_chunk
+        self._forget_chunk()
+        try:
+            for block in rows:
+                self._add_rows(*block)
+            self._events += events
+            self._flush(self._clock())
+        except OSError as error:
+            self._in_chunk, self._events_in_chunk, self._events = rows, events, []
+            raise self._fail(error) from error
+        return self
+
+    def _begin_next(self) -> None:
+        """Begin another part where there is room for it."""
+        folder = self._path.parent
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            if shutil.disk_usage(folder).free < ROOM:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError as error:
+            raise self._fail(error) from error
+        self._begin(self._number + 1)
+        self._failure = None
+
+    def _forget_chunk(self) -> None:
+        self._in_chunk, self._events_in_chunk = [], []
 
     def __enter__(self) -> Self:
         return self
@@ -112,6 +157,7 @@ class Recorder:
         self._add_rows(*self._tray.take())
         self._add_events()
         self._writer.flush()
+        self._forget_chunk()
         self._flushed = now
         if now - self._synced >= SYNC_S:
             self._output.sync()
@@ -120,15 +166,17 @@ class Recorder:
     def _add_rows(self, samples: Samples, ticks: Ticks) -> None:
         if not len(samples):
             return
+        self._in_chunk.append((samples.copy(), ticks.copy()))
         host, plc = int(samples["host_ns"][0]), int(samples["time_ns"][0])
         self._writer.add_message(_SAMPLES, host, plc, encode(samples, ticks))
         self._writer.add_messages(_SCALARS, *self._scalars.messages(samples, ticks))
         if self._rotate_bytes is not None and self._output.tell() >= self._rotate_bytes:
             self._finish()
-            self._number += 1
-            self._begin()
+            self._forget_chunk()
+            self._begin(self._number + 1)
 
     def _add_events(self) -> None:
+        self._events_in_chunk += self._events
         for host_ns, event in self._events:
             self._writer.add_message(_EVENTS, host_ns, event.time_ns, encode_event(event))
             self._writer.add_message(_LOG, host_ns, event.time_ns, encode_log(event))
@@ -146,20 +194,23 @@ class Recorder:
         received: list[int] = host.tolist()
         return received
 
-    def _begin(self) -> None:
-        path = part_path(self._path, self._number)
+    def _begin(self, number: int) -> None:
+        path = part_path(self._path, number)
         try:
-            if self._number == 0 and part_path(path, 1).exists():
+            if number == 0 and part_path(path, 1).exists():
                 raise FileExistsError
             self._output = Output(path)
         except OSError as error:
             self._failure = _refused(path, error)
             raise self._failure from error
         try:
-            identity = Identity(self._series, self._number)
-            self._writer = write_head(self._output, self._header, identity)
+            self._writer = write_head(self._output, self._header, Identity(self._series, number))
         except OSError as error:
-            raise self._fail(error) from error
+            self._fail(error)
+            path.unlink(missing_ok=True)  # without a whole head it would end the log
+            self._failure = _refused(path, error)
+            raise self._failure from error
+        self._number = number
 
     def _finish(self) -> None:
         if self._clocks:

@@ -6,8 +6,10 @@ else. Rows carry what it decides (``Quality.OURS``), so that a replay decides th
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -17,25 +19,26 @@ from twin.signals import NS, Quality, Samples
 
 LONGEST_WAIT_NS = 500_000_000  # a driver gives a block at least this often: longer, we slept too
 ONCE_NS = 60_000_000_000  # a twin that is late again within this time has said so
-
-
 MOST_NOTICES = 100  # that may wait for the loop
+NO_DATA: Mapping[str, Any] = MappingProxyType({})
 
 
 @dataclass
 class Notices:
     """What threads beside the loop have to tell; the loop takes it, in the PLC's time."""
 
-    _told: deque[tuple[Kind, str]] = field(default_factory=lambda: deque(maxlen=MOST_NOTICES))
+    _told: deque[tuple[Kind, str, Mapping[str, Any]]] = field(
+        default_factory=lambda: deque(maxlen=MOST_NOTICES)
+    )
 
-    def tell(self, kind: Kind, text: str) -> None:
+    def tell(self, kind: Kind, text: str, data: Mapping[str, Any] = NO_DATA) -> None:
         """Have it said; any thread may, and none waits."""
-        self._told.append((kind, text))
+        self._told.append((kind, text, data))
 
     def taken(self, time_ns: int) -> list[Event]:
         """What was told since the last time, as events at ``time_ns``."""
         told = [self._told.popleft() for _ in range(len(self._told))]
-        return [Event(time_ns, kind, text) for kind, text in told]
+        return [Event(time_ns, kind, text, dict(data)) for kind, text, data in told]
 
 
 @dataclass

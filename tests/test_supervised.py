@@ -1,0 +1,246 @@
+"""An output of a run that fails does not end it: what it missed comes later, or is told as lost."""
+
+import errno
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from log_rows import HEADER, START_NS, course, rows_of
+
+from twin.alarms.watch import evidence, values
+from twin.errors import SourceError
+from twin.events import Event, Kind
+from twin.log.reader import open_log
+from twin.log.recorder import ROOM, Recorder
+from twin.monitor.listening import Notices
+from twin.signals import Samples, Ticks
+from twin.supervised import KEPT_ROWS, Outages, SupervisedAdviser, SupervisedSink
+
+
+class Clock:
+    """Time as the test wants it."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+class Fragile:
+    """A sink that takes nothing while it is ``broken``."""
+
+    def __init__(self) -> None:
+        self.broken, self.tries = False, 0
+        self.rows: list[bytes] = []
+        self.closed = False
+
+    def write(self, samples: Samples, _ticks: Ticks, _events: Sequence[Event]) -> None:
+        self.tries += 1
+        if self.broken:
+            raise SourceError("the disk is full", "make space")
+        self.rows.append(samples.tobytes())
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Run:
+    """A supervised sink with what is told of it."""
+
+    def __init__(self) -> None:
+        self.clock, self.notices, self.inner = Clock(), Notices(), Fragile()
+        outages = Outages(self.notices)
+        self.sink = SupervisedSink("log", self.inner, lambda: self.inner, outages, self.clock)
+
+    def write(self, samples: Samples, ticks: Ticks, block: int = 100) -> None:
+        for start in range(0, len(samples), block):
+            self.clock.now += block * 1e-3
+            self.sink.write(samples[start : start + block], ticks[start : start + block], [])
+
+    def told(self) -> list[Event]:
+        return self.notices.taken(START_NS)
+
+
+def test_what_came_while_it_was_broken_comes_later_and_both_are_told_once() -> None:
+    run, (samples, ticks) = Run(), course(20_000)
+    run.write(samples[:1000], ticks[:1000])
+    run.inner.broken = True
+    run.write(samples[1000:9000], ticks[1000:9000])
+    (down,) = run.told()
+    assert down.kind is Kind.OUTPUT_DOWN
+    assert "log: the disk is full" in down.text
+    run.inner.broken = False
+    run.write(samples[9000:], ticks[9000:])
+    (back,) = run.told()
+    assert (back.kind, back.data["rows_lost"], back.data["standing"]) == (Kind.OUTPUT_BACK, 0, [])
+    assert b"".join(run.inner.rows) == samples.tobytes()
+    run.sink.close()
+    assert run.inner.closed
+
+
+def test_pauses_double_up_to_a_minute() -> None:
+    run, (samples, ticks) = Run(), course(100)
+    run.inner.broken = True
+    for _ in range(600):  # a minute
+        run.write(samples, ticks)
+    assert run.inner.tries == 1 + 5  # after 1, 2, 4, 8 and 16 s
+    for _ in range(6000):
+        run.write(samples, ticks)
+    assert run.inner.tries == 6 + 10  # after 32 s, and then each minute
+
+
+def test_what_does_not_fit_into_memory_is_told_as_lost() -> None:
+    run, (samples, ticks) = Run(), course(KEPT_ROWS + 20_000)
+    run.inner.broken = True
+    run.write(samples, ticks)
+    run.inner.broken = False
+    run.clock.now += 100.0
+    run.write(samples[:100], ticks[:100])
+    *_, back = run.told()
+    kept = sum(map(len, run.inner.rows)) // samples.itemsize
+    assert kept <= KEPT_ROWS
+    assert back.data["rows_lost"] + kept == len(samples) + 100
+    assert f"{back.data['rows_lost']} rows are missing" in back.text
+
+
+def test_a_sink_that_is_down_at_the_end_says_so() -> None:
+    run, (samples, ticks) = Run(), course(500)
+    run.inner.broken = True
+    run.write(samples, ticks)
+    with pytest.raises(SourceError, match="log: the disk is full; 500 rows are missing") as caught:
+        run.sink.close()
+    assert caught.value.hint == "make space"
+
+
+def test_an_alarm_stands_while_any_output_is_down() -> None:
+    outages = Outages(notices := Notices())
+    for name in ("log", "console"):
+        outages.begin(name, OSError("no"), 0.0)
+    outages.end("log", 0, 5.0)
+    outages.end("console", 0, 6.0)
+    told = notices.taken(0)
+    assert [values(one) for one in told] == [{"output_down": up} for up in (1.0, 1.0, 1.0, 0.0)]
+    assert evidence(told[0]) == {"output_down": {"words": told[0].text}}
+
+
+def test_an_adviser_that_fails_is_told_once_and_asked_again() -> None:
+    class Advises:
+        broken = True
+
+        def follow(self, _samples: Samples, _events: Sequence[Event]) -> list[Event]:
+            if self.broken:
+                raise ZeroDivisionError("a mistake")
+            return [Event(0, Kind.DIAGNOSIS, "found")]
+
+        def finish(self) -> list[Event]:
+            return []
+
+        def close(self) -> None:
+            pass
+
+    adviser, notices = Advises(), Notices()
+    supervised = SupervisedAdviser("diagnosis", adviser, Outages(notices))
+    samples, _ = course(10)
+    assert [supervised.follow(samples, []) for _ in range(3)] == [[], [], []]
+    assert [one.kind for one in notices.taken(0)] == [Kind.OUTPUT_DOWN]
+    adviser.broken = False
+    assert [one.text for one in supervised.follow(samples, [])] == ["found"]
+    assert [one.kind for one in notices.taken(0)] == [Kind.OUTPUT_BACK]
+
+
+# The log.
+
+
+class Disk:
+    """A disk that is full at times."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.full, free = False, ROOM
+
+        def write(output: Any, data: bytes) -> None:
+            if self.full:
+                output._raw.write(data[: len(data) // 2])
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            output._raw.write(data)
+
+        def usage(_folder: Path) -> Any:
+            class Usage:
+                pass
+
+            found: Any = Usage()
+            found.free = 0 if self.full else free
+            return found
+
+        monkeypatch.setattr("twin.log.output.Output.write", write)
+        monkeypatch.setattr("twin.log.recorder.shutil.disk_usage", usage)
+
+
+def logged(path: Path, at: Callable[[float], None]) -> tuple[Samples, Ticks, list[Event]]:
+    """Rows written through a supervised log, ``at`` each time (s), and what was told."""
+    clock, notices = Clock(), Notices()
+    samples, ticks = course(20_000)
+    recorder = Recorder(path, HEADER, 200_000, clock)
+    sink = SupervisedSink("log", recorder, recorder.again, Outages(notices), clock, keeps=True)
+    for start in range(0, len(samples), 50):
+        clock.now = (start + 50) / 1000
+        at(clock.now)
+        happened = [Event(int(samples["time_ns"][start]), Kind.GAP, f"{start}")]
+        sink.write(samples[start : start + 50], ticks[start : start + 50], happened)
+    sink.close()
+    return samples, ticks, notices.taken(0)
+
+
+@pytest.mark.parametrize("begin", [0.0, 0.3, 4.02, 4.9])
+def test_a_disk_that_is_full_for_a_while_costs_no_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begin: float
+) -> None:
+    disk = Disk(monkeypatch)
+
+    def at(now: float) -> None:
+        disk.full = begin < now < begin + 6.0
+
+    samples, ticks, told = logged(tmp_path / "a.mcap", at)
+    assert [one.kind for one in told] == [Kind.OUTPUT_DOWN, Kind.OUTPUT_BACK]
+    log = open_log(tmp_path / "a.mcap")
+    assert len(log.parts) > 1
+    assert rows_of(log) == (samples.tobytes(), ticks.tobytes())
+    texts = [event.text for event in log.events()]
+    assert texts == [str(start) for start in range(0, len(samples), 50)]
+
+
+def test_a_folder_that_somebody_deletes_is_made_again(tmp_path: Path) -> None:
+    path = tmp_path / "logs" / "a.mcap"
+    path.parent.mkdir()
+    gone: list[float] = []
+
+    def at(now: float) -> None:
+        if now > 5.0 and not gone:
+            gone.append(now)
+            for file in path.parent.iterdir():
+                file.unlink()
+            path.parent.rmdir()
+
+    samples, _, told = logged(path, at)
+    assert [one.kind for one in told] == [Kind.OUTPUT_DOWN, Kind.OUTPUT_BACK]
+    assert "deleted" in told[0].text
+    parts = sorted(path.parent.iterdir())
+    after = np.concatenate([rows for rows, _ in open_log(parts[0]).blocks()])
+    # What was in the deleted file is lost, of what came after it at most a second and a half.
+    assert after["sequence"][0] - samples["sequence"][0] < 6500
+
+
+def test_another_log_of_that_name_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk, recorder = Disk(monkeypatch), Recorder(tmp_path / "a.mcap", HEADER, clock=Clock())
+    (tmp_path / "a.0001.mcap").write_bytes(b"somebody's")
+    disk.full = True
+    with pytest.raises(SourceError, match="No space left"):
+        recorder.close()
+    disk.full = False
+    with pytest.raises(SourceError, match=r"a\.0001\.mcap: there is already a log"):
+        recorder.again()
+    assert (tmp_path / "a.0001.mcap").read_bytes() == b"somebody's"

@@ -1,0 +1,167 @@
+"""Outputs of a run that may fail: one that does is set aside and tried again; the loop goes on.
+
+A full disk, a reader that has gone or a mistake of ours in one output is no reason to end
+monitoring. What happens to an output is told among the events of the run, once.
+"""
+
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from twin.errors import SourceError
+from twin.events import Event, Kind
+from twin.live import Adviser, Sink
+from twin.monitor.listening import Notices
+from twin.signals import Samples, Ticks
+
+KEPT_ROWS = 60_000  # that wait for an output: a minute of them each millisecond, some 5 MB
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # before an output is tried again
+
+
+@dataclass
+class Outages:
+    """Which outputs of one run are down."""
+
+    notices: Notices
+    _down: dict[str, float] = field(default_factory=dict)  # since when
+
+    def begin(self, name: str, why: Exception, now_s: float) -> None:
+        """Tell that an output has failed, unless that has been told."""
+        if name in self._down:
+            return
+        self._down[name] = now_s
+        text = f"{name}: {why}; monitoring goes on, and it is tried again"
+        self.notices.tell(Kind.OUTPUT_DOWN, text, {"output": name})
+
+    def end(self, name: str, lost: int, now_s: float) -> None:
+        """Tell that an output works again; ``lost`` rows did not wait for it."""
+        seconds = now_s - self._down.pop(name)
+        missing = f"; {lost} rows are missing in it" if lost else ""
+        text = f"{name}: works again after {seconds:.0f} s{missing}"
+        data = {"output": name, "seconds": seconds, "rows_lost": lost}
+        self.notices.tell(Kind.OUTPUT_BACK, text, data | {"standing": sorted(self._down)})
+
+
+class SupervisedSink:
+    """A sink (``twin.live.Sink``) that raises nothing while it is written to.
+
+    After a failure rows and events wait, up to KEPT_ROWS, and ``again`` is asked for a sink that
+    works, with a pause that doubles. A sink that ``keeps`` what it failed at is not given that
+    again. ``close`` raises what a sink says at its end.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        sink: Sink,
+        again: Callable[[], Sink],
+        outages: Outages,
+        clock: Callable[[], float] = time.monotonic,
+        *,
+        keeps: bool = False,
+    ) -> None:
+        self._name, self._sink, self._again = name, sink, again
+        self._outages, self._clock, self._keeps = outages, clock, keeps
+        self._failure: Exception | None = None
+        self._next_s, self._pause_s = 0.0, FIRST_PAUSE_S
+        self._waiting: deque[tuple[Samples, Ticks, Sequence[Event]]] = deque()
+        self._rows = self._lost = 0  # that wait, and that did not
+
+    def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
+        """Take rows, their ticks, and what happened."""
+        if self._failure is None:
+            try:
+                self._sink.write(samples, ticks, events)
+            except Exception as error:
+                self._set_aside(error)
+                if not self._keeps:
+                    self._keep(samples, ticks, events)
+            return
+        self._keep(samples, ticks, events)
+        if self._clock() >= self._next_s:
+            self._try_again()
+
+    def close(self) -> None:
+        """Finish; SourceError where something is missing in it."""
+        if self._failure is not None:
+            self._try_again()
+        if self._failure is not None:
+            raise SourceError(
+                f"{self._name}: {self._failure}; {self._rows + self._lost} rows are missing in it",
+                getattr(self._failure, "hint", ""),
+            ) from self._failure
+        self._sink.close()
+
+    def _keep(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
+        if len(samples) or events:
+            self._waiting.append((samples.copy(), ticks.copy(), list(events)))
+            self._rows += len(samples)
+        while self._rows > KEPT_ROWS:
+            self._lost += self._forget_oldest()
+
+    def _try_again(self) -> None:
+        try:
+            self._sink = self._again()
+            while self._waiting:
+                self._hand_over(self._waiting[0])
+        except Exception as error:
+            self._set_aside(error)
+            return
+        self._outages.end(self._name, self._lost, self._clock())
+        self._failure, self._lost, self._pause_s = None, 0, FIRST_PAUSE_S
+
+    def _hand_over(self, block: tuple[Samples, Ticks, Sequence[Event]]) -> None:
+        if self._keeps:
+            self._forget_oldest()
+            self._sink.write(*block)
+        else:
+            self._sink.write(*block)
+            self._forget_oldest()
+
+    def _forget_oldest(self) -> int:
+        rows = len(self._waiting.popleft()[0])
+        self._rows -= rows
+        return rows
+
+    def _set_aside(self, error: Exception) -> None:
+        now_s = self._clock()
+        self._outages.begin(self._name, error, now_s)
+        self._failure, self._next_s = error, now_s + self._pause_s
+        self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
+
+
+class SupervisedAdviser:
+    """An adviser (``twin.live.Adviser``) that says nothing to what it fails at."""
+
+    def __init__(
+        self,
+        name: str,
+        adviser: Adviser,
+        outages: Outages,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._name, self._adviser, self._outages = name, adviser, outages
+        self._clock = clock
+        self._failed = False
+
+    def follow(self, samples: Samples, events: Sequence[Event]) -> list[Event]:
+        """Take rows and what happened; give what has been found out by now."""
+        try:
+            said = self._adviser.follow(samples, events)
+        except Exception as error:
+            self._outages.begin(self._name, error, self._clock())
+            self._failed = True
+            return []
+        if self._failed and len(samples):
+            self._failed = False
+            self._outages.end(self._name, 0, self._clock())
+        return said
+
+    def finish(self) -> list[Event]:
+        """Give what is still to be said when the rows have ended."""
+        return self._adviser.finish()
+
+    def close(self) -> None:
+        """Let go of everything."""
+        self._adviser.close()
