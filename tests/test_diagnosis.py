@@ -20,7 +20,7 @@ from twin.calibration.calibrate import calibrate
 from twin.config import Config
 from twin.diagnosis import answer as answer_module
 from twin.diagnosis import search as search_module
-from twin.diagnosis.answer import Diagnosis, diagnose
+from twin.diagnosis.answer import EXPLAINED, Diagnosis, _left_in_all, diagnose
 from twin.diagnosis.evidence import HEALTHY, Hypothesis, _unsettled, collect, thinned
 from twin.diagnosis.fit import Fitted
 from twin.diagnosis.hypotheses import price
@@ -145,6 +145,25 @@ def test_a_cause_without_a_gain_on_unseen_cycles_is_none() -> None:
     some = frozenset(int(one) for one in healthy.evidence.numbers[1:5])
     for spurious in (chance, replace(chance, course=Course.INTERMITTENT, cycles=some)):
         assert confirmed(healthy, spurious) == ()
+
+
+def test_a_gain_that_is_sure_but_next_to_nothing_names_no_cause(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What acts in one cycle that was fitted shows in the unseen ones by rounding alone."""
+    leak = with_leak()
+    monkeypatch.setattr(search_module, "held_out_gain", lambda *_: (0.0003, 0.0088))
+    assert confirmed(leak, *leak.hypothesis) == ()
+
+
+def test_where_nothing_is_found_all_cycles_judge_the_twin() -> None:
+    for samples, is_consistent in (
+        (record(27.0, seed=24), True),
+        (record(27.0, "leakage=1.7", seed=21), False),
+    ):
+        evidence = collect(CONFIG, samples)
+        left = _left_in_all(evidence, covariance(evidence).of(evidence.judged))
+        assert (left < EXPLAINED) is is_consistent
 
 
 def test_a_gain_is_told_by_a_few_unseen_cycles_or_one() -> None:
