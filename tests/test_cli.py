@@ -289,12 +289,24 @@ def rows_in(log: Path) -> np.ndarray[tuple[int], np.dtype[np.void]]:
     return rows
 
 
+@contextmanager
+def not_ignored(number: signal.Signals) -> Iterator[None]:
+    """Have processes take a signal that they are to ignore where the tests run under nohup."""
+    before = signal.getsignal(number)
+    if before == signal.SIG_IGN:
+        signal.signal(number, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupt_ends_it_with_130_and_a_finished_log(
     plc: PlcProcess, tmp_path: Path, number: signal.Signals
 ) -> None:
     log = tmp_path / "a.mcap"
-    with started(*run_beside(plc, log)) as process:
+    with not_ignored(number), started(*run_beside(plc, log)) as process:
         until_logged(log, process, 4)
         process.send_signal(number)
         _, said = process.communicate(timeout=PATIENCE_S)
