@@ -260,6 +260,7 @@ def awkward(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OpcuaPlc]:
 def as_user(plc: OpcuaPlc, tmp_path: Path, password: str, **changes: Any) -> OpcuaSettings:
     file = tmp_path / "password"
     file.write_text(f"{password}\n", encoding="utf-8")
+    file.chmod(0o600)  # else it is said that others may read it
     user = {"name": "twin", "password": {"file": file}}
     return plc.settings(user=user, security=plc.secure("Basic256Sha256"), **changes)
 

@@ -23,6 +23,9 @@ Say = Callable[[str], None]
 INSTEAD = '{ file = "FILE" } or { env = "NAME" }'
 _TOKEN = re.compile(r"(?=[^/]*\d)(?=[^/]*[A-Za-z])[\w-]{20,}")  # a part of a path, as services have
 _log = logging.getLogger(__name__)
+_told = set[
+    Path
+]()  # of these files it was said that others may read them: each connection reads one
 
 
 class Secret(Settings):
@@ -103,6 +106,8 @@ def _read(key: str, path: Path, say: Say) -> str:
         raise ConfigError(
             f"{key} {path}: cannot be read: {error}", "a text file with the secret alone"
         ) from error
-    if os.name == "posix" and mode & (stat.S_IRWXG | stat.S_IRWXO):
+    is_open = os.name == "posix" and mode & (stat.S_IRWXG | stat.S_IRWXO)
+    if is_open and path not in _told:
+        _told.add(path)
         say(f"{key}: others may read {path}; keep it to yourself: chmod 600 {path}")
     return found
