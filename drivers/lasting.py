@@ -12,6 +12,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
+from twin.backoff import Backoff
 from twin.errors import SourceError, TwinError
 from twin.signals import SAMPLE, Samples
 
@@ -104,7 +105,7 @@ def lasting(
     Closing hangs up.
     """
     reasons = set[str]()  # that were told
-    pauses = Pauses()
+    backoff = Backoff(RETRY_S, LONGEST_RETRY_S)
     try:
         while True:
             connected = False
@@ -115,7 +116,8 @@ def lasting(
                     yield EMPTY  # connected is not yet answered
                 for block in source.samples(link):
                     if len(block):
-                        known, pauses = True, Pauses()
+                        known = True
+                        backoff.reset()
                         reasons.clear()
                     yield block
             except TwinError as error:
@@ -126,23 +128,10 @@ def lasting(
                     reasons.add(str(error))
                     away(error)
                 link.close()  # if it is not yet: what it knows of the PLC may no longer hold
-                yield from _pause(clock, pauses.after(connected=connected))
+                # Nobody there is asked as often as may be, so that no row is missed.
+                yield from _pause(clock, backoff.next_s() if connected else RETRY_S)
     finally:
         link.close()
-
-
-@dataclass
-class Pauses:
-    """How long to wait before the next attempt: longer each time that a PLC gives no rows."""
-
-    _next_s: float = RETRY_S
-
-    def after(self, *, connected: bool) -> float:
-        """Seconds; always ``RETRY_S`` where nobody could be connected to, so as to miss nothing."""
-        if not connected:
-            return RETRY_S
-        seconds, self._next_s = self._next_s, min(2.0 * self._next_s, LONGEST_RETRY_S)
-        return seconds
 
 
 def _pause(clock: Clock, seconds: float) -> Iterator[Samples]:

@@ -21,8 +21,6 @@ POLICIES = {
     "Basic256Sha256": ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt,
     "Aes256Sha256RsaPss": ua.SecurityPolicyType.Aes256Sha256RsaPss_SignAndEncrypt,
 }
-
-
 LONGEST_S = 10.0  # that somebody has to wait after wrong passwords, as on the page
 
 

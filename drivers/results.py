@@ -23,6 +23,7 @@ from typing import Any, Self
 
 from drivers.results_settings import ResultsSettings
 from drivers.results_state import Reading, Results
+from twin.backoff import Backoff
 from twin.errors import SourceError, TwinError
 
 PATIENCE_S = 60.0  # for the library to build its address space on a busy machine
@@ -207,7 +208,7 @@ class ResultsServer:
     # --- in its own thread ----------------------------------------------------------------------
 
     def _run(self) -> None:
-        pause_s, told = FIRST_PAUSE_S, False
+        backoff, told = Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S), False
         while not self._stop.is_set():
             begun = time.monotonic()
             try:
@@ -215,13 +216,14 @@ class ResultsServer:
                 self._show_until_stopped()
             except (DownError, TwinError) as error:
                 if time.monotonic() - begun > SOUND_S:
-                    pause_s, told = FIRST_PAUSE_S, False
+                    backoff.reset()
+                    told = False
                 self._server.close()
+                pause_s = backoff.next_s()
                 if not told:
                     self._say(str(error), pause_s)
                     told = True
                 self._wait(pause_s)
-                pause_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
         self._server.close()
 
     def _say(self, why: str, pause_s: float) -> None:

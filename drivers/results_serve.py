@@ -39,7 +39,7 @@ logging.getLogger("asyncua").setLevel(logging.CRITICAL + 1)
 
 NAMESPACE = "urn:ejector-twin:results"
 APPLICATION = "urn:ejector-twin:twin"
-PATIENCE_S = 60.0  # for the library to build its address space on a busy machine
+ANSWER_S = 60.0  # to acknowledge an alarm: it may wait for a database
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 SPANS: dict[str, tuple[str, float, float]] = {  # unit: UNECE code, and a range for displays
     "mbar": ("MBR", 0.0, 2000.0),
@@ -105,7 +105,7 @@ class Asking:
         self._waiting[number] = answer
         self.send(("acknowledge", number, asset, alarm, who))
         try:
-            refused = answer.result(PATIENCE_S)
+            refused = answer.result(ANSWER_S)
         except FutureTimeout as error:
             raise SourceError(f"{alarm} could not be acknowledged: no answer") from error
         finally:

@@ -46,13 +46,20 @@ def named(text: str) -> x509.Name:
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
 
 
-def authority(key: Key, *, ca: bool = True) -> x509.Certificate:
-    identifier = x509.SubjectKeyIdentifier.from_public_key(key.public_key())
+def begun(subject: str, key: Key) -> x509.CertificateBuilder:
+    """What all certificates of the works have."""
     return (
-        x509.CertificateBuilder(named("works"), named("works"), key.public_key())
+        x509.CertificateBuilder(named("works"), named(subject), key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(NOW - DAY)
         .not_valid_after(NOW + 30 * DAY)
+    )
+
+
+def authority(key: Key, *, ca: bool = True) -> x509.Certificate:
+    identifier = x509.SubjectKeyIdentifier.from_public_key(key.public_key())
+    return (
+        begun("works", key)
         .add_extension(x509.BasicConstraints(ca=ca, path_length=None), critical=True)
         .add_extension(identifier, critical=False)
         .sign(key, hashes.SHA256())
@@ -76,10 +83,7 @@ def issued(
     ]
     issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(by.public_key())
     return (
-        x509.CertificateBuilder(named("works"), named("plc"), key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(NOW - DAY)
-        .not_valid_after(NOW + 30 * DAY)
+        begun("plc", key)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(x509.SubjectAlternativeName(names), critical=False)
         .add_extension(x509.KeyUsage(*usage), critical=True)

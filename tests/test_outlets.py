@@ -15,6 +15,7 @@ from test_alarms_loop import APART, LEAK, NONE, UNIT, S, Stream, deviation, diag
 
 from twin.alarms.state import Deed
 from twin.assets.unit import Unit
+from twin.backoff import Backoff
 from twin.errors import SourceError
 from twin.events import Event, Kind
 from twin.outlets import dispatch, sender
@@ -331,15 +332,14 @@ def test_pauses_grow_and_begin_anew(bench: Bench, monkeypatch: pytest.MonkeyPatc
     paused: list[float] = []
     ending = bench.sender._ending
     monkeypatch.setattr(ending, "wait", paused.append)
-    monkeypatch.setattr(sender, "LONGEST_PAUSE_S", 0.008)
     bench.channel.down = True
-    bench.sender._pause_s = 0.001
+    bench.sender._backoff = Backoff(0.001, 0.008)
     bench.sender.start()
     wait_until(lambda: len(paused) >= 5)
     bench.channel.down = False
     assert bench.channel.idle_now.wait(10.0)
     assert paused[:5] == [0.001, 0.002, 0.004, 0.008, 0.008]
-    assert bench.sender._pause_s == sender.FIRST_PAUSE_S
+    assert bench.sender._backoff.next_s() == 0.001
 
 
 def test_what_is_refused_does_not_hold_up_others(bench: Bench) -> None:

@@ -16,7 +16,7 @@ from twin.events import Event, Kind
 from twin.log.reader import open_log
 from twin.log.recorder import ROOM, Recorder
 from twin.monitor.listening import Notices
-from twin.signals import Samples, Ticks
+from twin.signals import Quality, Samples, Ticks
 from twin.supervised import KEPT_ROWS, Outages, SupervisedAdviser, SupervisedSink
 
 
@@ -209,6 +209,26 @@ def test_a_disk_that_is_full_for_a_while_costs_no_row(
     assert rows_of(log) == (samples.tobytes(), ticks.tobytes())
     texts = [event.text for event in log.events()]
     assert texts == [str(start) for start in range(0, len(samples), 50)]
+
+
+def test_after_rows_that_were_lost_the_log_has_a_gap(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("twin.supervised.KEPT_ROWS", 1000)
+    disk = Disk(monkeypatch)
+
+    def at(now: float) -> None:
+        disk.full = 4.0 < now < 10.0
+
+    samples, _, told = logged(tmp_path / "a.mcap", at)
+    log = open_log(tmp_path / "a.mcap")
+    rows = np.concatenate([rows for rows, _ in log.blocks()])
+    lost = np.flatnonzero(np.diff(rows["sequence"]) != 1) + 1
+    assert len(lost) == 1
+    assert np.flatnonzero(rows["quality"] & Quality.GAP).tolist() == lost.tolist()
+    assert told[-1].data["rows_lost"] == len(samples) - len(rows)
+    texts = [event.text for event in log.events()]
+    assert texts == [str(start) for start in range(0, len(samples), 50)]  # events wait on
 
 
 def test_a_folder_that_somebody_deletes_is_made_again(tmp_path: Path) -> None:

@@ -320,9 +320,6 @@ def _kill_results(cell: Cell, _seconds: float) -> None:
     cell.results_server().kill()
 
 
-# Of the disk, a full one and a folder that is deleted: they belong here as well.
-ON_DISK: dict[str, Callable[[Cell, float], None]] = {}
-
 DISTURBANCES: dict[str, Callable[[Cell, float], None]] = {
     "the PLC lies": _through_proxy("lie"),
     "the wall clock is set": _set_wall_clock,
@@ -336,7 +333,6 @@ DISTURBANCES: dict[str, Callable[[Cell, float], None]] = {
     "answers are truncated": _through_proxy("truncate"),
     "answers are slow": _through_proxy("slow"),
     "answers are swallowed": _through_proxy("swallow"),
-    **ON_DISK,
 }
 
 

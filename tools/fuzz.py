@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import cache
 from hashlib import sha256
 from itertools import count
 from pathlib import Path
@@ -29,25 +30,14 @@ from drivers.lasting import Clock
 from drivers.link import ModbusSettings
 from drivers.opcua_settings import Node
 from drivers.ring import Trace
+from drivers.sources import settings_of
 from drivers.tags import Address, Words
 from twin.errors import SourceError, TwinError
 from twin.log.reader import open_log
+from twin.settings import Document
 
 NODE = Node("s=Fuzz")
-SETTINGS = ModbusSettings.model_validate(
-    {
-        "host": "plc",
-        "tags": {
-            "pressure": {
-                "address": "input:1",
-                "type": "float32",
-                "unit": "mbar",
-                "reference": "absolute",
-                "range": [0, 1300],
-            }
-        },
-    }
-)
+CONFIG = Document.read(Path(__file__).resolve().parents[1] / "configs" / "test_rig.toml")
 HEADER = struct.pack(">IqHHHHhH", 9, 10**18, 7, 1000, 4096, 4, 5000, 0)
 RECORDS = b"".join(struct.pack(">HHf", number, 0, 900.0) for number in (8, 9))
 DEPTH_BLOCKS = 4  # readings of the ring with one input
@@ -68,11 +58,18 @@ class Served:
         return self._words[places]
 
 
+@cache
+def _settings() -> ModbusSettings:
+    found = settings_of(CONFIG)
+    assert isinstance(found, ModbusSettings)
+    return found
+
+
 def ring(data: bytes) -> str:
     """The trace over Modbus."""
     ticks = count(step=5_000_000)  # so that a fetch is over soon
     clock = Clock(lambda: 0, lambda: next(ticks), lambda _seconds: None)
-    trace, rows = Trace(SETTINGS, clock), 0
+    trace, rows = Trace(_settings(), clock), 0
     link = Served(data)
     trace._header = trace.start(link)  # type: ignore[arg-type]
     for _ in range(DEPTH_BLOCKS):

@@ -9,13 +9,17 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from twin.backoff import Backoff
 from twin.errors import SourceError
 from twin.events import Event, Kind
 from twin.live import Adviser, Sink
 from twin.monitor.listening import Notices
-from twin.signals import Samples, Ticks
+from twin.signals import Quality, Samples, Ticks
 
 KEPT_ROWS = 60_000  # that wait for an output: a minute of them each millisecond, some 5 MB
+KEPT_EVENTS = 10_000  # of rows that were lost
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # before an output is tried again
 
 
@@ -64,7 +68,7 @@ class SupervisedSink:
         self._name, self._sink, self._again = name, sink, again
         self._outages, self._clock, self._keeps = outages, clock, keeps
         self._failure: Exception | None = None
-        self._next_s, self._pause_s = 0.0, FIRST_PAUSE_S
+        self._next_s, self._backoff = 0.0, Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S)
         self._waiting: deque[tuple[Samples, Ticks, Sequence[Event]]] = deque()
         self._rows = self._lost = 0  # that wait, and that did not
 
@@ -97,8 +101,19 @@ class SupervisedSink:
         if len(samples) or events:
             self._waiting.append((samples.copy(), ticks.copy(), list(events)))
             self._rows += len(samples)
-        while self._rows > KEPT_ROWS:
-            self._lost += self._forget_oldest()
+        while self._rows > KEPT_ROWS and len(self._waiting) > 1:
+            self._lose_oldest()
+
+    def _lose_oldest(self) -> None:
+        """Let its rows go, with a gap marked in the next ones; its events wait on."""
+        lost, _, before = self._waiting.popleft()
+        samples, ticks, events = self._waiting.popleft()
+        self._waiting.appendleft((samples, ticks, [*before, *events][-KEPT_EVENTS:]))
+        self._rows -= len(lost)
+        self._lost += len(lost)
+        later = next((rows for rows, *_ in self._waiting if len(rows)), None)
+        if len(lost) and later is not None:
+            later["quality"][0] |= np.uint8(Quality.GAP)
 
     def _try_again(self) -> None:
         try:
@@ -109,7 +124,8 @@ class SupervisedSink:
             self._set_aside(error)
             return
         self._outages.end(self._name, self._lost, self._clock())
-        self._failure, self._lost, self._pause_s = None, 0, FIRST_PAUSE_S
+        self._failure, self._lost = None, 0
+        self._backoff.reset()
 
     def _hand_over(self, block: tuple[Samples, Ticks, Sequence[Event]]) -> None:
         if self._keeps:
@@ -119,16 +135,13 @@ class SupervisedSink:
             self._sink.write(*block)
             self._forget_oldest()
 
-    def _forget_oldest(self) -> int:
-        rows = len(self._waiting.popleft()[0])
-        self._rows -= rows
-        return rows
+    def _forget_oldest(self) -> None:
+        self._rows -= len(self._waiting.popleft()[0])
 
     def _set_aside(self, error: Exception) -> None:
         now_s = self._clock()
         self._outages.begin(self._name, error, now_s)
-        self._failure, self._next_s = error, now_s + self._pause_s
-        self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
+        self._failure, self._next_s = error, now_s + self._backoff.next_s()
 
 
 class SupervisedAdviser:

@@ -28,7 +28,7 @@ enum { /* twin.model.theta.COEFFICIENTS */
     BLOW_OFF_TIME, COEFFICIENTS
 };
 enum { /* what a call computes only once, behind them */
-    K_SUCTION = COEFFICIENTS, K_END, K_BLOW_OFF, K_FLATTER, K_DENSER, K_HEAT, K_PORT_HEAT, K_LINE_HEAT,
+    K_SUCTION = COEFFICIENTS, K_END, K_BLOW_OFF, K_FLATTER, K_THINNER, K_HEAT, K_PORT_HEAT, K_LINE_HEAT,
     K_PLACE, K_STRETCH, K_SOFT, K_CLOSED, K_OPENS, PREPARED
 };
 enum { /* the state of twin.model.kernel */
@@ -116,7 +116,7 @@ static void prepare(const double *theta, double *k)
     double peak = max(1.0 - T(SUPPLY_CURVATURE) * off * off, 1e-3);
     K(K_SUCTION) = T(SUCTION) * (ambient / nominal) / peak;
     K(K_END) = T(END_RATIO) * ambient;
-    K(K_DENSER) = nominal / ambient;
+    K(K_THINNER) = nominal / ambient;
     K(K_BLOW_OFF) = T(BLOW_OFF) / (T(SUPPLY_NOMINAL) + nominal);
     K(K_FLATTER) = 1.0 / T(SUPPLY_OPTIMUM);
     K(K_HEAT) = T(FILM) * T(AREA) / CP;
@@ -135,7 +135,7 @@ static void prepare(const double *theta, double *k)
 INLINED Supplied at_supply(double supply, const double *k)
 {
     double ambient = K(AMBIENT);
-    double relative = supply * K(K_DENSER);
+    double relative = supply * K(K_THINNER);
     double off = relative * K(K_FLATTER) - 1.0;
     double suction = K(K_SUCTION) * max(1.0 - K(SUPPLY_CURVATURE) * off * off, 0.0);
     double missing = K(SUPPLY_NOMINAL) - relative;

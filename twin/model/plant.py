@@ -33,7 +33,7 @@ from twin.model.theta import Theta
     _SOFT,
     _CLOSED,
     _OPENS,
-    _DENSER,
+    _THINNER,
 ) = range(len(c.COEFFICIENTS), len(c.COEFFICIENTS) + 13)
 PREPARED = len(c.COEFFICIENTS) + 13
 
@@ -109,7 +109,7 @@ def prepare_one(k, i):  # type: ignore[no-untyped-def]
     peak = max(1.0 - k[c.SUPPLY_CURVATURE, i] * off * off, 1e-3)
     k[_SUCTION, i] = k[c.SUCTION, i] * (ambient / nominal) / peak
     k[_END, i] = k[c.END_RATIO, i] * ambient
-    k[_DENSER, i] = nominal / ambient
+    k[_THINNER, i] = nominal / ambient
     k[_BLOW_OFF, i] = k[c.BLOW_OFF, i] / (k[c.SUPPLY_NOMINAL, i] + nominal)
     k[_FLATTER, i] = 1.0 / k[c.SUPPLY_OPTIMUM, i]
     k[_HEAT, i] = k[c.FILM, i] * k[c.AREA, i] / CP
@@ -156,7 +156,7 @@ def at_supply(supply, k, i):  # type: ignore[no-untyped-def]
     proportional to absolute supply pressure.
     """
     ambient = k[c.AMBIENT, i]
-    relative = supply * k[_DENSER, i]  # that drives the jet alike at nominal ambient pressure
+    relative = supply * k[_THINNER, i]  # that drives the jet alike at nominal ambient pressure
     off = relative * k[_FLATTER, i] - 1.0
     suction = k[_SUCTION, i] * max(1.0 - k[c.SUPPLY_CURVATURE, i] * off * off, 0.0)
     missing = k[c.SUPPLY_NOMINAL, i] - relative

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from twin.backoff import Backoff
 from twin.errors import SourceError, TwinError
 from twin.outlets.message import Message, again
 from twin.outlets.outbox import Outbox
@@ -98,7 +99,7 @@ class Sender:
         self._to_restate = False
         self._complaint = ""
         self._refusal = ""
-        self._pause_s = FIRST_PAUSE_S
+        self._backoff = Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S)
         self._wake, self._ending = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._work, name=f"to {name}", daemon=True)
 
@@ -240,14 +241,14 @@ class Sender:
         if not self._complaint:
             self._say(f"alarms wait in the outbox: {self.name}: {error}")
         self._complaint = str(error)
-        self._ending.wait(self._pause_s)
-        self._pause_s = min(2 * self._pause_s, LONGEST_PAUSE_S)
+        self._ending.wait(self._backoff.next_s())
 
     def _succeed(self) -> None:
         if self._complaint:
             self._say(f"alarms go to {self.name} again")
         self._say_gone()
-        self._complaint, self._pause_s = "", FIRST_PAUSE_S
+        self._complaint = ""
+        self._backoff.reset()
 
     def _let_go(self) -> None:
         self._channel.hang_up()

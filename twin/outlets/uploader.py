@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from twin.backoff import Backoff
 from twin.errors import TwinError
 from twin.outlets.asked import (
     ACCEPTED,
@@ -56,7 +57,7 @@ class Uploader:
         self._find, self._place, self._say = find, place, say
         self._tell: Tell = lambda _message: None
         self._failed = False
-        self._pause_s = FIRST_PAUSE_S
+        self._backoff = Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S)
         self._ending, self._wake = ending, threading.Event()
         self._thread = threading.Thread(target=self._work, name="uploads", daemon=True)
 
@@ -120,7 +121,8 @@ class Uploader:
                 self._do(uploads, waiting[0])
                 if self._failed:
                     self._say("logs are uploaded again")
-                self._failed, self._pause_s = False, FIRST_PAUSE_S
+                self._failed = False
+                self._backoff.reset()
 
     def _do(self, uploads: Uploads, asked: Asked) -> None:
         """Upload what is still to be; LostError if it is to be tried again."""
@@ -149,6 +151,5 @@ class Uploader:
         if not self._failed:
             self._say(f"uploads wait: {error}")
         self._failed = True
-        self._ending.wait(self._pause_s)
-        self._pause_s = min(2 * self._pause_s, LONGEST_PAUSE_S)
+        self._ending.wait(self._backoff.next_s())
         self._wake.set()
