@@ -17,6 +17,7 @@ from mcap.reader import make_reader
 
 from twin.errors import SourceError
 from twin.events import Event, Kind
+from twin.log.part import first_parts
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
 from twin.signals import SAMPLE, TICK, Command, Samples, Ticks
@@ -286,6 +287,20 @@ def test_a_log_goes_on_in_parts(tmp_path: Path) -> None:
     assert second.header == HEADER
     assert second.parts == (log.parts[1],)
     assert rows_of(second)[0] in samples.tobytes()
+
+
+def test_where_the_first_parts_are_gone_the_next_one_begins_the_log(tmp_path: Path) -> None:
+    samples, ticks = course(20_000)
+    record(tmp_path / "run.mcap", samples, ticks, rotate_bytes=40_000)
+    parts = open_log(tmp_path / "run.mcap").parts
+    assert len(parts) > 3
+    for part in parts[:2]:
+        part.unlink()
+    assert first_parts(tmp_path) == [parts[2]]
+    log = open_log(parts[2])
+    assert log.parts == parts[2:]
+    assert samples.tobytes().endswith(rows_of(log)[0])
+    assert open_log(parts[3]).parts == (parts[3],)
 
 
 def test_parts_of_another_log_are_not_read(tmp_path: Path) -> None:

@@ -28,17 +28,28 @@ def refuse_other_suffix(path: Path) -> None:
         )
 
 
-def first_parts(folder: Path) -> list[Path]:
-    """The logs of a folder by their first files, in the order of their names."""
-    files = sorted(folder.glob(f"*{SUFFIX}"))
-    return [path for path in files if not _follows(path, set(files))]
-
-
-def _follows(path: Path, files: set[Path]) -> bool:
-    """Whether it is a later part of a log that is there."""
+def place_of(path: Path) -> tuple[Path, int]:
+    """Reverse ``part_path``: the first file's name, and the number of the part."""
     stem, _, number = path.stem.rpartition(".")
     first = path.with_name(f"{stem}{path.suffix}")
-    return number.isdigit() and first in files and path == part_path(first, int(number))
+    if stem and number.isdecimal() and path == part_path(first, int(number)):
+        return first, int(number)
+    return path, 0
+
+
+def first_parts(folder: Path) -> list[Path]:
+    """The logs of a folder by their first files, in the order of their names.
+
+    What came before may have been deleted: a log begins with the first part that is there.
+    """
+    files = sorted(folder.glob(f"*{SUFFIX}"))
+    return [path for path in files if not follows(path)]
+
+
+def follows(path: Path) -> bool:
+    """Whether it is a later part of a log of which the part before is there."""
+    first, number = place_of(path)
+    return number > 0 and part_path(first, number - 1).exists()
 
 
 def write_head(output: Output, header: LogHeader, identity: Identity) -> Writer:

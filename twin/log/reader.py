@@ -14,7 +14,7 @@ from twin.events import Event
 from twin.log.columns import Tray, decode
 from twin.log.header import Identity, LogHeader, from_metadata
 from twin.log.messages import decode_event
-from twin.log.part import FREE_METADATA, OWN_METADATA, part_path
+from twin.log.part import FREE_METADATA, OWN_METADATA, follows, part_path, place_of
 from twin.log.records import Damage, is_complete, messages, records
 from twin.log.schema import EVENTS, SAMPLES
 from twin.signals import Samples, Ticks
@@ -81,17 +81,22 @@ def _other_version(part: Path, error: Exception) -> SourceError:
 
 
 def open_log(path: Path) -> Log:
-    """Open a log at its first part; SourceError if it is none."""
+    """Open a log at its first part, or one part of it; SourceError if it is none.
+
+    Where parts before were deleted the first one that is left begins the log.
+    """
     header, identity, checked = _head(path)
     parts = [path]
     complete = is_complete(path)
-    while identity.part == 0 and (following := part_path(path, len(parts))).exists():
+    first, number = place_of(path) if identity.part else (path, 0)
+    alone = number != identity.part or (number > 0 and follows(path))
+    while not alone and (following := part_path(first, number + len(parts))).exists():
         try:
             _, other, is_checked = _head(following)
         except SourceError:  # its writer was stopped before it could say anything
             complete = False
             break
-        if other != Identity(identity.series, len(parts)):
+        if other != Identity(identity.series, number + len(parts)):
             break  # left from another log of that name
         parts.append(following)
         complete &= is_complete(following)
