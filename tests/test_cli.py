@@ -1,6 +1,7 @@
 """The command line: exit codes, messages for people, and logs that survive what is done to it."""
 
 import json
+import re
 import resource
 import signal
 import socket
@@ -399,6 +400,29 @@ def test_a_duration_ends_it_with_0(
     rows = rows_in(log)
     assert open_log(log).complete
     assert (rows["time_ns"][-1] - rows["time_ns"][0]) * 1e-9 > 0.3
+
+
+def test_in_a_folder_each_run_has_its_log_and_old_ones_make_room(
+    plc: PlcProcess,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    config, logs = tmp_path / "cell.toml", tmp_path / "logs"
+    config.write_text(GRIPPER.read_text() + "[log]\nkeep_gb = 1e-6\n")
+    logs.mkdir()
+    run_once = ("run", config, "--address", f"127.0.0.1:{plc.port}", "--log", logs)
+    assert twin(monkeypatch, *run_once, "--duration", "1") == 0
+    (first,) = logs.iterdir()
+    assert re.fullmatch(r"gripper-01\.\d{8}T\d{6}Z\.mcap", first.name)
+    assert "log_deleted" not in capsys.readouterr().out
+    assert twin(monkeypatch, *run_once, "--duration", "1") == 0
+    (second,) = logs.iterdir()
+    assert second != first
+    deleted = [one.text for one in open_log(second).events() if one.kind is Kind.LOG_DELETED]
+    assert len(deleted) == 1
+    assert deleted[0].startswith(f"{first.name} is deleted")
+    assert "log_deleted" in capsys.readouterr().out
 
 
 def test_a_plc_that_restarts_is_told_and_followed_on(tmp_path: Path) -> None:

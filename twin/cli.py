@@ -12,7 +12,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -95,7 +95,10 @@ def run(
         float | None,
         typer.Option(metavar="S", callback=not_negative, help="Stop after S seconds with the PLC."),
     ] = None,
-    log: Annotated[Path | None, typer.Option(metavar="FILE", help="Write an MCAP log.")] = None,
+    log: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write an MCAP log; a new one each time in a folder."),
+    ] = None,
     view: ViewFlag = False,
     rrd: RrdFile = None,
     address: Address = "",
@@ -113,25 +116,22 @@ def run(
 
     Several configurations are as many ejectors, each with its own twin and log (FILE gets the
     asset's id before its suffix). One that fails does not stop the others. A PLC that does not
-    answer yet is tried until it does.
+    answer yet is tried until it does. Where FILE is a folder, logs in it are named by asset and
+    time. The oldest logs make room for new ones, as [log] says.
     """
     from drivers.hil import open_writer
     from drivers.results_settings import open_results
     from drivers.shared import Lines
     from drivers.sources import open_source
-    from twin.diagnosis.process import LiveDiagnosis
     from twin.figures.table import FIGURES
     from twin.live import run as run_loop
     from twin.settings import Document
     from twin.together import run_together
 
     alone = len(configs) == 1
-    if not alone and unit:
-        raise ConfigError(
-            f"--id is for one ejector, and here are {len(configs)}",
-            "leave it out, and give each configuration its own under [asset]",
-        )
-    require_writable(log, rrd)  # the PLC may answer much later
+    if not alone:
+        _refuse_one_id(unit, len(configs))
+    _require_places(log, rrd)  # the PLC may answer much later
     ejectors = _named([_configured(Document.read(one), assets, unit) for one in configs])
     pairs = {name: pair_of(one) for name, one in ejectors.items()}  # compiled before time counts
     width = 0 if alone else max(map(len, ejectors))
@@ -152,7 +152,7 @@ def run(
                 return
             # So is what is wrong with [hil].
             writer = closing.enter_context(open_writer(*at)) if hil else None
-            file = _file_of(log, label)
+            file = _file_of(log, label, name)
             # The log comes last: what people are told does not wait for the disk.
             opened = _opened(
                 {
@@ -164,13 +164,8 @@ def run(
                     "log": partial(_recorder, file, settings, hil=hil) if file else None,
                 }
             )
-            adviser = LiveDiagnosis(
-                settings,
-                str(file or "live"),
-                lambda: stopped() == "interrupted",
-                _status if alone else _unsaid,
-                reports=reports_of(settings),
-            )
+            closing.enter_context(_retained(settings, opened.get("log"), plc.listening.notices))
+            adviser = _diagnosing(settings, file, stopped, alone=alone)
             # What is not measured has no faults. Alarms come last: they hear the diagnosis.
             advised: dict[str, Adviser] = (
                 {} if hil else {"diagnosis": adviser, "alarms": (board := alarms())}
@@ -689,18 +684,70 @@ def _named(ejectors: "Sequence[Config]") -> "dict[str, Config]":
     return named
 
 
-def _file_of(path: Path | None, name: str) -> Path | None:
-    """Where one of several writes: run.mcap becomes run.rig-01.mcap."""
-    return path.with_name(f"{path.stem}.{name}{path.suffix}") if path and name else path
+def _refuse_one_id(unit: str, ejectors: int) -> None:
+    """ConfigError if several are to be the one unit."""
+    if unit:
+        raise ConfigError(
+            f"--id is for one ejector, and here are {ejectors}",
+            "leave it out, and give each configuration its own under [asset]",
+        )
+
+
+def _diagnosing(
+    settings: "Config", log: Path | None, stopped: Callable[[], str], *, alone: bool
+) -> "Adviser":
+    """Who has the alarms of a live run diagnosed."""
+    from twin.diagnosis.process import LiveDiagnosis
+
+    return LiveDiagnosis(
+        settings,
+        str(log or "live"),
+        lambda: stopped() == "interrupted",
+        _status if alone else _unsaid,
+        reports=reports_of(settings),
+    )
+
+
+def _require_places(log: Path | None, rrd: Path | None) -> None:
+    """SourceError if no log or no view can be written there."""
+    require_writable(rrd)
+    if log is None or not log.is_dir():
+        require_writable(log)
+    elif not os.access(log, os.W_OK):
+        raise SourceError(f"{log}: cannot be written to", "see to the rights of the folder")
+
+
+def _file_of(path: Path | None, label: str, name: str) -> Path | None:
+    """Where one of several writes: run.mcap becomes run.rig-01.mcap; in a folder a new file."""
+    if path is not None and path.is_dir():
+        return path / time.strftime(f"{name}.%Y%m%dT%H%M%SZ.mcap", time.gmtime())
+    return path.with_name(f"{path.stem}.{label}{path.suffix}") if path and label else path
+
+
+def _retained(
+    settings: "Config", log: "Sink | None", notices: "Notices"
+) -> "AbstractContextManager[object]":
+    """What keeps the logs of a live run within the bounds of [log]."""
+    from twin.log.recorder import Recorder
+    from twin.log.retention import GB, Bounds, Retention
+
+    if not isinstance(log, Recorder):
+        return nullcontext()
+    kept, unit = settings.log, (settings.asset.type, settings.asset.id)
+    bounds = Bounds(kept.keep_days, kept.keep_gb and kept.keep_gb * GB, kept.disk_pct / 100)
+    tell = partial(notices.tell, Kind.LOG_DELETED)
+    return Retention(log.under_way.parent, unit, bounds, lambda: log.under_way, tell, _complain)
 
 
 def _recorder(file: Path, settings: "Config", *, hil: bool) -> "Sink":
     """The log of a live run."""
-    from twin.log.header import HIL
+    from twin.log.header import HIL, RECORDED
     from twin.log.recorder import Recorder
 
     rotate = round(settings.log.rotate_mb * 1e6)
-    own = {HIL: "the pressure is the model's own, as it was written to the PLC"} if hil else None
+    own = {RECORDED: "twin run"}
+    if hil:
+        own[HIL] = "the pressure is the model's own, as it was written to the PLC"
     return Recorder(file, settings.log_header(own), rotate_bytes=rotate)
 
 

@@ -75,6 +75,11 @@ class LogSettings(Settings):
     """How logs are kept."""
 
     rotate_mb: float = Field(64.0, gt=0.0)  # a new part begins beyond this size
+    keep_days: float | None = Field(
+        None, gt=0.0
+    )  # older ones are deleted; as long as there is room
+    keep_gb: float | None = Field(None, gt=0.0)  # of all logs of the unit in the folder
+    disk_pct: float = Field(80.0, gt=0.0, le=100.0)  # of the disk in use; beyond it the oldest go
 
 
 class Known(Settings):

@@ -28,6 +28,7 @@ class Kind(StrEnum):
     RESULTS_DOWN = "results_down"
     OUTPUT_DOWN = "output_down"
     OUTPUT_BACK = "output_back"
+    LOG_DELETED = "log_deleted"
     SIGNAL_BAD = "signal_bad"
     SIGNAL_GOOD = "signal_good"
     SIGNAL_CONTRADICTS = "signal_contradicts"
@@ -52,6 +53,7 @@ SEVERITY: dict[Kind, Severity] = {
     Kind.RESULTS_DOWN: Severity.WARNING,
     Kind.OUTPUT_DOWN: Severity.WARNING,  # a log, a console, a view
     Kind.OUTPUT_BACK: Severity.INFO,
+    Kind.LOG_DELETED: Severity.INFO,  # to make room, as [log] says
     Kind.SIGNAL_BAD: Severity.WARNING,
     Kind.SIGNAL_GOOD: Severity.INFO,
     Kind.SIGNAL_CONTRADICTS: Severity.WARNING,  # what is reported, and the pressure

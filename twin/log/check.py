@@ -8,6 +8,7 @@ import numpy as np
 
 from twin.events import Event
 from twin.log.columns import Tray
+from twin.log.header import RECOVERED
 from twin.log.reader import Log, decode_happening, decode_rows, open_log
 from twin.log.recorder import Recorder
 from twin.log.records import Damage, messages
@@ -117,7 +118,7 @@ def recover(path: Path, out: Path) -> Report:
     SourceError if it is no log, or if ``out`` exists or cannot be written.
     """
     log = open_log(path)
-    origin = log.header.metadata | {"recovered_from": path.name}
+    origin = log.header.metadata | {RECOVERED: path.name}
     with Recorder(out, replace(log.header, metadata=origin)) as recorder:
         return _go_through(log, recorder.write)
 

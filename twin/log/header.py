@@ -10,6 +10,7 @@ FORMAT = "ejector-twin-log/2"
 UNCHECKED = "ejector-twin-log/1"  # the same without a checksum of the head
 CHECKSUM = "sha256"
 HIL, DERIVED = "hil", "derived_commands"  # what of the rows was not measured, in free metadata
+RECORDED, RECOVERED = "recorded_by", "recovered_from"  # where the rows come from, there too
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,11 @@ class LogHeader:
     def derived(self) -> str:
         """How commands were derived from the pressure, in words; empty where they were recorded."""
         return self.metadata.get(DERIVED, "")
+
+    @property
+    def is_recorded(self) -> bool:
+        """Whether ``twin run`` wrote it beside a PLC; a copy that was recovered is no such log."""
+        return RECORDED in self.metadata and RECOVERED not in self.metadata
 
     def require_commands(self, log: str) -> None:
         """ConfigError where nobody recorded the commands: no twin can be fitted to such a log."""

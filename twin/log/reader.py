@@ -104,6 +104,12 @@ def open_log(path: Path) -> Log:
     return Log(path, header, tuple(parts), complete, checked)
 
 
+def read_header(path: Path) -> LogHeader:
+    """What one file says about itself; SourceError if it is no log."""
+    header, _, _ = _head(path)
+    return header
+
+
 def _head(path: Path) -> tuple[LogHeader, Identity, bool]:
     try:
         _check_magic(path)

@@ -88,6 +88,11 @@ class Recorder:
         except OSError as error:
             raise self._fail(error) from error
 
+    @property
+    def under_way(self) -> Path:
+        """The file of the part that is being written."""
+        return part_path(self._path, self._number)
+
     def again(self) -> Self:
         """After a failure go on in the next part, with what had not reached the file.
 
