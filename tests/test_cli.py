@@ -413,11 +413,11 @@ def test_in_a_folder_each_run_has_its_log_and_old_ones_make_room(
     logs.mkdir()
     run_once = ("run", config, "--address", f"127.0.0.1:{plc.port}", "--log", logs)
     assert twin(monkeypatch, *run_once, "--duration", "1") == 0
-    (first,) = logs.iterdir()
+    (first,) = logs.glob("*.mcap")
     assert re.fullmatch(r"gripper-01\.\d{8}T\d{6}Z\.mcap", first.name)
     assert "log_deleted" not in capsys.readouterr().out
     assert twin(monkeypatch, *run_once, "--duration", "1") == 0
-    (second,) = logs.iterdir()
+    (second,) = logs.glob("*.mcap")
     assert second != first
     deleted = [one.text for one in open_log(second).events() if one.kind is Kind.LOG_DELETED]
     assert len(deleted) == 1

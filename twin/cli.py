@@ -37,8 +37,11 @@ from twin.errors import ConfigError, SourceError, TwinError
 from twin.events import Event, Kind, Severity
 from twin.files import require_writable, write_json
 from twin.instants import stamp
+from twin.lock import only_run
 
 if TYPE_CHECKING:
+    from sqlalchemy import URL
+
     from drivers.hil import Writer
     from drivers.results_state import Results
     from twin.cli_outlets import Begin, Standing
@@ -147,7 +150,7 @@ def run(
         shown = (
             show(name, settings.asset.type, asker_of(settings), plc.results_down) if show else None
         )
-        with _closed(shown), ExitStack() as closing:
+        with _closed(shown), _locked(settings, log), ExitStack() as closing:
             if not plc.answers(stopped):  # said before a log is begun
                 return
             # So is what is wrong with [hil].
@@ -691,6 +694,34 @@ def _refuse_one_id(unit: str, ejectors: int) -> None:
             f"--id is for one ejector, and here are {ejectors}",
             "leave it out, and give each configuration its own under [asset]",
         )
+
+
+@contextmanager
+def _locked(settings: "Config", log: Path | None) -> Iterator[None]:
+    """Be the only run of the unit that writes where this one does; SourceError says who else is."""
+    unit = " ".join(part for part in (settings.asset.type, settings.asset.id) if part)
+    with ExitStack() as locks:
+        for folder in sorted(_written_by(settings, log)):
+            locks.enter_context(only_run(folder, unit, time.time_ns(), _complain))
+        yield
+
+
+def _written_by(settings: "Config", log: Path | None) -> set[Path]:
+    """The folders in which a second run of the unit would write the same once more."""
+    from twin.alarms.place import place_of as alarms_in
+    from twin.alarms.settings import AlarmSettings
+    from twin.assets.engine import sqlite_file
+    from twin.figures.place import place_of as figures_in
+    from twin.figures.settings import FigureSettings
+
+    document, places = settings.document, list["URL"]()
+    if document.section(AlarmSettings, "alarms").keep:
+        places.append(alarms_in(document))
+    if document.section(FigureSettings, "figures").keep:
+        places.append(figures_in(document))
+    files = (sqlite_file(place) or Path(document.name) for place in places)  # or a server
+    logs = [] if log is None else [log if log.is_dir() else log.parent]
+    return {folder.resolve() for folder in [*logs, *(Path(file).parent for file in files)]}
 
 
 def _diagnosing(

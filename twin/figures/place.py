@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from sqlalchemy import URL
+
 from twin.assets.engine import configured
 from twin.figures.settings import FigureSettings
 from twin.figures.store import FIGURE_DATABASE, Store, open_store
@@ -18,6 +20,11 @@ def open_chosen(named: str, document: Document | None, *, write: bool) -> Store:
     """
     if named:
         return open_store(named, create=write)
+    return open_store(place_of(document), create=write)
+
+
+def place_of(document: Document | None) -> URL:
+    """The database that a configuration names, else the default."""
     folder = Path(document.name).parent if document else Path()
     settings = document.section(FigureSettings, "figures") if document else FigureSettings()
-    return open_store(configured(settings, folder, FILE, FIGURE_DATABASE), create=write)
+    return configured(settings, folder, FILE, FIGURE_DATABASE)
