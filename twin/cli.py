@@ -38,6 +38,7 @@ from twin.events import Event, Kind, Severity
 from twin.files import require_writable, write_json
 from twin.instants import stamp
 from twin.lock import only_run
+from twin.service import Service
 
 if TYPE_CHECKING:
     from sqlalchemy import URL
@@ -150,7 +151,12 @@ def run(
         shown = (
             show(name, settings.asset.type, asker_of(settings), plc.results_down) if show else None
         )
-        with _closed(shown), _locked(settings, log), ExitStack() as closing:
+        with (
+            service.loop(name, stop) as stopped,
+            _closed(shown),
+            _locked(settings, log),
+            ExitStack() as closing,
+        ):
             if not plc.answers(stopped):  # said before a log is begun
                 return
             # So is what is wrong with [hil].
@@ -185,8 +191,9 @@ def run(
     with (
         open_results([one.document for one in ejectors.values()], units) as show,
         _views_of(ejectors, view, rrd) as view_of,
-        _stop_on_signal(duration) as stopped,
+        _stop_on_signal(duration) as stop,
         _spared(),
+        Service(os.environ) as service,
     ):
         if alone:
             beside(*next(iter(ejectors.items())))
@@ -196,7 +203,7 @@ def run(
         if failed:
             raise SourceError(f"{len(failed)} of {len(loops)} ejectors failed: {', '.join(failed)}")
         alarmed = any(console.alarmed for console in consoles.values())
-        _leave(fail_on_alarm and alarmed, interrupted=stopped() == "interrupted")
+        _leave(fail_on_alarm and alarmed, interrupted=stop() == "interrupted")
 
 
 @app.command()
