@@ -44,6 +44,19 @@ def test_what_is_not_known_beside_a_bin_does_not_spoil_its_mean() -> None:
     np.testing.assert_allclose(bins.through(kept, values), 1.0)
 
 
+def test_a_second_hold_of_a_cycle_is_another_place_by_turn() -> None:
+    parts = [Phase.SUCTION, Phase.HOLD, Phase.SUCTION, Phase.HOLD, Phase.IDLE]
+    cycle = np.repeat(parts, [90, 40, 30, 40, 20])
+    phase = np.tile(cycle, 3).astype(np.uint8)
+    starts = np.arange(3) * len(cycle)
+    bins = binned(phase, np.ones(len(phase), np.bool_), starts)
+    first, second = bins.stretch % 5 == 1, bins.stretch % 5 == 3
+    assert set(bins.place[first]) == set(bins.place[second])
+    assert not set(bins.place_by_turn[first]) & set(bins.place_by_turn[second])
+    for place in np.unique(bins.place_by_turn):  # each is in all cycles
+        assert sorted(bins.cycle[bins.place_by_turn == place]) == [0, 1, 2]
+
+
 # --- against plain NumPy ------------------------------------------------------------------------
 
 

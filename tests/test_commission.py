@@ -246,6 +246,33 @@ def test_a_fit_starts_with_cups_that_meet_a_part_late_and_without_where_the_reco
     assert all(coefficients(one)[c.COMPLIANCE] > 0.0 for one in late)
 
 
+@pytest.mark.parametrize(("grows", "share"), [(25, 1.0), (40, 0.5), (8, 0.1)])
+def test_how_long_suction_takes_to_grow_shows_where_that_is_slow_beside_the_fall(
+    grows: int, share: float
+) -> None:
+    rows = np.arange(3000.0)
+    strength = np.clip((rows - 12.0) / grows, 0.0, 1.0)  # of the suction, as a valve opens
+    fall = 250.0 + 750.0 * np.exp(-np.cumsum(strength) * share * 15e-3)
+    one = np.zeros(3200, SAMPLE)
+    one["pressure"] = np.concatenate([np.full(200, 1000.0), fall]) * MBAR
+    one["commands"][200:] = Command.SUCTION
+    record = np.tile(one, 4)
+    record["time_ns"] = np.arange(len(record)) * 1_000_000
+    record["sequence"] = np.arange(len(record))
+    found = read(record).grows / MS
+    assert found == pytest.approx(grows, rel=0.3) if share > 0.1 else np.isnan(found)
+
+
+def test_a_fit_starts_with_a_slow_jet_where_the_fall_grows_slowly() -> None:
+    data = config_of(logged(SEED, KIND).truth.readable).data
+    plain, slow = starts(data, np.nan), starts(data, np.nan, 25.0 * MS)
+    assert {one.ejector.ramp_up_ms for one in plain} == {data.ejector.ramp_up_ms}
+    assert {one.ejector.ramp_up_ms for one in slow} == {data.ejector.ramp_up_ms, 25.0}
+    assert {one.ejector.ramp_up_ms for one in starts(data, np.nan, 2.0)} == {
+        data.ejector.ramp_up_ms
+    }  # a tank that cups are behind is no slow jet
+
+
 def test_a_fit_starts_with_lips_that_spread_and_bellows_that_fold_where_there_are_cups() -> None:
     cups = config_of(logged(SEED, KIND).truth.readable).data
     tank = typed("test_rig").data

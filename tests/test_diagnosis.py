@@ -477,6 +477,29 @@ def test_what_stands_clearly_better_in_place_of_a_cause_takes_it(
     assert search_module._overtaking(found, [[], []]) is None
 
 
+def test_a_cause_does_not_stand_where_a_better_one_does_not_hold_in_unseen_cycles(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    evidence = collect(CONFIG, record(27.0, "leakage=1.7", seed=21))
+    fitted = evidence.judged[::2]
+    both = (Cause("leakage", {"sonic_flow": 1.7}), Cause("response_delay", {"delay": 0.5}))
+    rival = Fitted((Cause("slow_ramp_up", {}),), np.ones(1), np.eye(1), 100.0, -1e9, 150)
+
+    def rivals(*given: Any) -> list[list[Fitted]]:
+        found = given[3]
+        return [[rival] if effect == "response_delay" else [] for effect in found.effects]
+
+    monkeypatch.setattr(search_module, "_rivals", rivals)
+    monkeypatch.setattr(search_module, "_confirmed", lambda *_: None)
+    found = search_module._beside_rivals(
+        evidence, fitted, _about(evidence, fitted, both), list[Fitted]()
+    )
+    assert found is not None
+    assert found[0].found.effects == ("leakage",)
+    alone = _about(evidence, fitted, both[1:])
+    assert search_module._beside_rivals(evidence, fitted, alone, list[Fitted]()) is None
+
+
 def test_a_cause_that_became_too_small_beside_another_is_dropped() -> None:
     evidence = collect(CONFIG, record(27.0, "leakage=1.7", seed=21))
     fitted = evidence.judged[::2]

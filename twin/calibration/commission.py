@@ -4,7 +4,7 @@ The record says what the configuration need not: noise, thresholds, ambient pres
 system is opened, rough flows and delays. From there the fit goes wherever the market may be.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -23,7 +23,7 @@ from twin.calibration.calibrate import (
     scatter,
 )
 from twin.calibration.cycles import Cycles
-from twin.calibration.fit import Fitted, fit_from_afar
+from twin.calibration.fit import Fitted, as_fitted, fit_from_afar
 from twin.calibration.parameters import AMBIENT, AMBIENT_TOLD, FREE_IN_MARKET, Free
 from twin.calibration.readings import Readings, read
 from twin.calibration.verdict import Verdict, judge
@@ -57,6 +57,9 @@ PLACES, PORT_SHARES = (0.05, 0.95), (0.01, 0.1)
 NEARLY = 0.95  # of the deepest pressure of a suction that nothing ends but its command
 # How cups give way: the share of their volume that goes, softness, and stiff_mbar (System).
 RIGID, LIPS, BELLOWS = (0.0, 5.0, 30.0), (0.03, 5.0, 30.0), (0.4, 10.0, 300.0)
+# s in which suction grows, for the jet to be tried as the cause; the soonest that it comes.
+SLOW_JET, SOONEST_MS = (12.0 * MS, 100.0 * MS), 2.0
+_JET = ("ramp_up_ms", "ramp_down_ms", "response_ms", "response_off_ms")
 SAGS = {"droop_bar": 0.1, "lag_ms": 50.0}  # a supply, before anything is known of it
 CLEARLY = 15.0  # mbar by which a threshold must differ to be told; overshoot is part of a turn
 # Of the line, by which a sensor is at another place than told, and sigmas.
@@ -151,11 +154,11 @@ def commission(
     used = samples[samples["time_ns"] <= before[:MOST_FITTED][-1].end_ns]
     refuse_parted(Cycles.found(samples, guess))
     free = free_of(config, readings)
-    fitted = _fit(used, starts(guess, readings.meets), free, progress)
+    fitted = _fit(used, starts(guess, readings.meets, readings.grows), free, progress)
     if fitted.data.ambient != guess.ambient:  # thresholds are below ambient pressure
         remarks = by_flow + guessed(within(metered, fitted.data.ambient), readings)[1]
     progress("judging the fit")
-    verdict = judge(Cycles.found(samples, fitted.data), fitted.data, readings.noise)
+    verdict = judge(as_fitted(samples, fitted.data), fitted.data, readings.noise)
     if verdict.word != "refused":  # a fit that does not follow says nothing of places
         remarks += [*misplaced(config.data, fitted), *another_ambient(config.data, fitted)]
     cycles = complete(fitted.data, samples)
@@ -339,12 +342,13 @@ def _flows(ejector: dict[str, Any], readings: Readings, evacuated: float, ambien
         ejector["back_flow_sl_min"] = float(np.clip(back, 0.0, 2000.0))
 
 
-def starts(data: DataSet, meets: float) -> list[DataSet]:
+def starts(data: DataSet, meets: float, grows: float = np.nan) -> list[DataSet]:
     """``data``, and what may differ from it so much that no fit leads there.
 
     Where along the line the sensor sits, what gas is at the port, how a part leaves, whether cups
     spread or fold, and whether they meet the next part ``meets`` seconds after suction is
-    commanded, or (NaN) are on it by then.
+    commanded, or (NaN) are on it by then. Where the fall ``grows`` slowly (s), that may be the jet
+    as well as the sensor.
     """
     cups = sum(volume(part) for part in data.system.parts if isinstance(part, Cups)) / ML
     leaves = ("in_blow_off", "after_blow_off") if cups else (data.system.part_leaves,)
@@ -353,14 +357,33 @@ def starts(data: DataSet, meets: float) -> list[DataSet]:
     place = place_of(data)
     everything = _volume(data) / ML
     usual, softer = (LIPS, BELLOWS) if cups else (RIGID, LIPS)  # a vessel may have cups behind it
-    walls = [*product(PORT_SHARES, [usual]), (PORT_SHARES[0], softer)]
+    quick = {key: tables["ejector"][key] for key in _JET}
+    slow = _slow(quick, grows / MS) if SLOW_JET[0] < grows < SLOW_JET[1] else quick
+    inside = [
+        (PORT_SHARES[0], usual, slow),
+        (PORT_SHARES[1], usual, slow),
+        (PORT_SHARES[0], softer, slow),
+    ]
+    if slow is not quick:
+        inside.append((PORT_SHARES[0], usual, quick))
     found = []
-    for wait, way, at, (share, (shrinks, softness, stiff)) in product(waits, leaves, PLACES, walls):
+    for wait, way, at, (share, wall, jet) in product(waits, leaves, PLACES, inside):
+        shrinks, softness, stiff = wall
+        port = share * everything
         tables["system"].update(part_leaves=way, rim="turbulent", sensor_shift=at - place)
         tables["system"].update(part_meets_ms=wait, shrinks_ml=shrinks * (cups or everything))
         tables["system"].update(softness=softness, stiff_mbar=stiff)
-        tables["ejector"]["port_volume_ml"] = share * everything
+        tables["ejector"].update(jet, port_volume_ml=port)
         found.append(DataSet.model_validate(tables))
+    return found
+
+
+def _slow(jet: Mapping[str, float], ramp_ms: float) -> dict[str, float]:
+    """A jet that takes so long to come and to go, and is half there when ``jet`` is."""
+    found = dict.fromkeys(_JET, ramp_ms)
+    for way in ("response", "response_off"):
+        ramp = jet["ramp_up_ms" if way == "response" else "ramp_down_ms"]
+        found[f"{way}_ms"] = max(jet[f"{way}_ms"] + 0.5 * (ramp - ramp_ms), SOONEST_MS)
     return found
 
 

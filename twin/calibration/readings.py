@@ -36,6 +36,10 @@ MOST_SUCTIONS = 0.5  # of all suctions must turn for an ejector that saves air
 # Open cups draw some mbar before they meet a part: shares of the way down.
 FIRST_FALL, DRAWN = 0.005, (0.15, 0.35)
 LEAST_WAIT_MS = 15.0  # between them; ramp and sensor take less
+# Shares of the way down. Where suction grows evenly the fall grows with the square of time: it is
+# at the second twice as long after it began as at the first. Between the last two it is steepest.
+GROWING, STEEP = (0.01, 0.04), (0.1, 0.25)
+LEAST_GROWN = 0.05  # of the way, in the time between the first two at that slope: else it is short
 OPENED_MS = 40.0  # of an idle, over which its pressure is averaged
 OPENED_FROM, OPENED_TO = 0.6, 0.85  # of an idle, in which an opened system stands at ambient
 STILL = 3.0  # sigmas by which the pressure of an opened system may still move in that time
@@ -72,6 +76,7 @@ class Readings:
     draw_rate: float  # 1/s, −dp/dt over pressure as suction begins
     meets: float  # s after suction is commanded, when open cups meet a part; NaN if they have one
     back_rate: float  # 1/s, dp/dt over ambient at its steepest after suction, nothing commanded
+    grows: float  # s, in which suction grows to its full strength; NaN where that does not show
     barometer: float = np.nan  # Pa, its median
     part: float = np.nan  # Pa, at which the ejector itself reports a part
     part_unsure: float = np.nan  # Pa, as that may be late
@@ -158,6 +163,7 @@ def read(samples: Samples) -> Readings:
         draw_rate=_draw_rate(pressure, suctions, period),
         meets=_meets(pressure, suctions, period, noise),
         back_rate=_back_rate(pressure, found, period, idle),
+        grows=_grows(pressure, suctions, period, noise),
         barometer=told(samples).get("ambient", np.nan),
         part=_median([pascal for pascal, _ in parts]),
         part_unsure=_median([unsure for _, unsure in parts]),
@@ -293,6 +299,24 @@ def _meets(pressure: Floats, suctions: list[Stretch], period: float, noise: floa
             times.append(begins * period if known else np.nan)
     met = np.isfinite(times)
     return _median(np.array(times)[met].tolist()) if met.sum() > 0.5 * len(suctions) else np.nan
+
+
+def _grows(pressure: Floats, suctions: list[Stretch], period: float, noise: float) -> float:
+    """In what time (s) the fall grows to its full slope, where in most suctions it grows slowly."""
+    times = []
+    for one in suctions:
+        part = pressure[one.first : one.last]
+        part = part[: int(part.argmin()) + 1]
+        way = part[0] - part[-1]
+        if GROWING[0] * way < CLEAR * noise:
+            continue
+        rows = [int(np.argmax(part <= part[0] - share * way)) for share in (*GROWING, *STEEP)]
+        first, second, third, fourth = (row * period for row in rows)
+        share = (second - first) * (STEEP[1] - STEEP[0]) / max(fourth - third, period)
+        grows = (second - first) * share / (2.0 * GROWING[0])
+        times.append(grows if share > LEAST_GROWN else np.nan)
+    slow = np.isfinite(times)
+    return _median(np.array(times)[slow].tolist()) if slow.sum() > 0.5 * len(suctions) else np.nan
 
 
 def _fill_rate(pressure: Floats, found: list[Stretch], period: float, ambient: float) -> float:

@@ -67,12 +67,13 @@ def judge(cycles: Cycles, data: DataSet, noise: float) -> Verdict:
     """Judge the twin of ``data`` on ``cycles``; ``noise`` (Pa) is that of single readings."""
     off = _off(cycles, coefficients(data))
     bins = cycles.bins
+    places = bins.place_by_turn
     used = (bins.cycle >= 1) & np.isfinite(off)  # the model swings in in the first
     found = {}
     for phase in Phase:
         here = used & (_phase_of(bins.kind) == phase)
         if here.any():
-            of, place = off[here], bins.place[here]
+            of, place = off[here], places[here]
             left, floor = _left(of, place, bins.cycle[here], bins.count[here], noise)
             since = bins.since[here] * float(np.median(cycles.dt))
             found[phase] = Residual(left, floor, *_most(of, place, since))

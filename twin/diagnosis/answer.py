@@ -15,7 +15,7 @@ from twin.diagnosis.fit import Fitted, white
 from twin.diagnosis.healthy import left_in_each, usual_leftover
 from twin.diagnosis.hypotheses import hours, parameters, score_with_tempered_prior
 from twin.diagnosis.judge import Judged, gain, judge, rounded
-from twin.diagnosis.search import Search, search, sharpened
+from twin.diagnosis.search import Search, search, sharpened, stranger
 from twin.diagnosis.unlisted import STRANGE, Unlisted, extended, look
 from twin.diagnosis.unmodelled import Unmodelled
 from twin.diagnosis.weights import Weights, covariance
@@ -265,7 +265,7 @@ def _causes(
                 odds[number].of_cause(len(found.hypothesis), _weight(evidence, found, rivals)),
                 3,
             ),
-            "not_separable_from": [_stranger(one, found) for one in rivals],
+            "not_separable_from": [stranger(one, found) for one in rivals],
             "why": _why(evidence, cause, values, before),
         }
         if cause.course == Course.STEP:
@@ -279,11 +279,6 @@ def _causes(
         result.append(entry)
         first += count
     return result
-
-
-def _stranger(rival: Fitted, found: Fitted) -> str:
-    """The effect of a rival that is not among those found."""
-    return next(one for one in rival.effects if one not in found.effects)
 
 
 def _unmodelled(

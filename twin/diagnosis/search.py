@@ -111,7 +111,10 @@ def search(
     if confirmed is not here.found:
         here = _about(evidence, fitted, confirmed.hypothesis)
     progress("looking for what the log cannot tell apart")
-    here, rivals = _beside_rivals(evidence, fitted, here, singles)
+    beside = _beside_rivals(evidence, fitted, here, singles)
+    if beside is None:
+        return Search(known, healthy, None, singles, [], _NO_SIZES, [])
+    here, rivals = beside
     found = here.found
     onsets = [
         _onset_interval(evidence, here.judged, found.hypothesis, number, found.leftover)
@@ -168,10 +171,12 @@ def _added(
 
 def _beside_rivals(
     evidence: Evidence, fitted: Sequence[int], here: _Found, singles: list[Fitted]
-) -> tuple[_Found, list[list[Fitted]]]:
+) -> tuple[_Found, list[list[Fitted]]] | None:
     """What was found and, for each of its causes, what could stand in its place.
 
     Where that is clearly better, the way there led past it: it takes the place of what was found.
+    Where that in turn does not hold in cycles that it was not fitted to, nothing listed is what
+    acts there, and neither stays. None if no cause does.
     """
     looked = set[frozenset[tuple[str, Course]]]()
     while True:
@@ -185,9 +190,17 @@ def _beside_rivals(
         if better is None or better.kind in looked:
             break
         known = covariance(evidence, better.hypothesis)
-        if _confirmed(evidence, fitted, replace(here, found=better, known=known)) is not better:
+        confirmed = _confirmed(evidence, fitted, replace(here, found=better, known=known))
+        if confirmed is better:
+            here = _about(evidence, fitted, better.hypothesis)
+            continue
+        if confirmed and stranger(better, here.found) in confirmed.effects:
             break
-        here = _about(evidence, fitted, better.hypothesis)
+        place = next(number for number, some in enumerate(rivals) if _has(some, better))
+        others = here.found.hypothesis[:place] + here.found.hypothesis[place + 1 :]
+        if not others:
+            return None
+        here = _about(evidence, fitted, others)
     if here.found.effects == (WEATHER,):  # it may have come first by its prior alone
         found, *rivals[0] = sorted(
             [here.found, *rivals[0]],
@@ -196,6 +209,15 @@ def _beside_rivals(
         if found is not here.found:
             here = replace(here, found=found, known=covariance(evidence, found.hypothesis))
     return here, rivals
+
+
+def _has(some: Sequence[Fitted], one: Fitted) -> bool:
+    return any(other is one for other in some)
+
+
+def stranger(rival: Fitted, found: Fitted) -> str:
+    """The effect of a rival that is not among those found."""
+    return next(one for one in rival.effects if one not in found.effects)
 
 
 def _ends(evidence: Evidence, weights: Weights, found: Fitted) -> tuple[Floats, Floats]:
@@ -268,7 +290,7 @@ def _likeliest(
     progress("comparing the best, each with its own weights")
     ranked = sorted(tried, key=lambda one: one.score)
     near = [one for one in ranked if one.score < NEAR * ranked[0].score][:TRIED_ALONE]
-    near += [one for one in _weather(evidence, ranked) if not any(one is other for other in near)]
+    near += [one for one in _weather(evidence, ranked) if not _has(near, one)]
 
     def alone(first: Fitted) -> tuple[float, float, Fitted]:
         known = covariance(evidence, first.hypothesis, both_ways=False)

@@ -49,6 +49,18 @@ class Bins:
         """The same number for what is alike from cycle to cycle: kind and time."""
         return (self.kind << 16) + self.step
 
+    @property
+    def place_by_turn(self) -> Ints:
+        """The same, where the second hold of a cycle is another place than the first."""
+        stretches, first, number = np.unique(self.stretch, return_index=True, return_inverse=True)
+        cycle, kind = self.cycle[first], self.kind[first]
+        turn = np.zeros(len(stretches), np.int64)
+        for one in np.unique(kind):
+            here = np.flatnonzero(kind == one)
+            begins = np.searchsorted(cycle[here], cycle[here])  # stretches go by time
+            turn[here] = np.arange(len(here)) - begins
+        return (turn[number] << 24) + self.place
+
     def mean(self, values: Floats) -> Floats:
         """Mean over each bin of row-by-row ``values``, (rows, ...) to (bins, ...)."""
         used = np.flatnonzero(self.number >= 0)
