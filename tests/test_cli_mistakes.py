@@ -57,11 +57,16 @@ NEEDED = {
     "fleet diagnose": ("L",),
     "fleet replay": ("L",),
     "fleet report": ("L",),
+    "users list": (),
+    "users add": ("ann",),
+    "users role": ("ann", "look"),
+    "users password": ("ann",),
+    "users remove": ("ann",),
     "log check": ("L",),
     "log recover": ("L", "-o", "new.mcap"),
 }
 # Commands that do something useful without an argument.
-ALONE = {"effects", "paper", "init", "assets list", "assets export", "alarms rules"}
+ALONE = {"effects", "paper", "init", "assets list", "assets export", "alarms rules", "users list"}
 FILES = ("text.txt", "bytes.bin", "empty", "folder")  # of no command's kind
 
 

@@ -13,6 +13,7 @@ import pytest
 import uvicorn
 from page_site import LEAK, Run, S, config, write_config
 from playwright.sync_api import Browser, Locator, Page, expect
+from user_files import quick_users
 
 from twin.alarms import keeper as keeper_module
 from twin.assets.unit import Unit
@@ -23,7 +24,7 @@ from twin.page.app import Page as Served
 from twin.page.ejector import Ejector
 from twin.page.server import Place, address, listen, make_server
 from twin.page.sessions import Sessions
-from twin.page.users import Users
+from twin.users import Role
 
 WORD = "correct horse"
 PATIENCE_S = 30.0
@@ -104,7 +105,7 @@ class Server:
 
 @contextmanager
 def serving(configs: list[Path]) -> Iterator[tuple[str, Server]]:
-    users, place = Users(configs[0].parent / "users.toml"), Place("127.0.0.1", 0)
+    users, place = quick_users(configs[0].parent / "users.toml"), Place("127.0.0.1", 0)
     ejectors = [Ejector(config(one)) for one in configs]
     inner = make_server(Served(ejectors, users, Sessions(users), Access()).app(), place)
     with listen(place) as listening:
@@ -128,7 +129,7 @@ def site(
     monkeypatch.setattr(keeper_module, "POLL_S", 0.02)
     units = [f"gripper-0{number + 1}" for number in range(getattr(request, "param", 1))]
     paths = [write_config(tmp_path, unit) for unit in units]
-    Users(tmp_path / "users.toml").add("ann", WORD)
+    quick_users(tmp_path / "users.toml", ("ann", WORD, Role.CONFIGURE))
     runs = [Run(config(one), time.time_ns) for one in paths]
     with serving(paths) as (url, server):
         yield Site(url, browser, runs, server)

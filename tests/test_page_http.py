@@ -10,17 +10,17 @@ from page_site import KEPT, LEAK, NOW, Run, config, write_config
 from starlette.requests import Request
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
+from user_files import quick_users
 
 from twin.alarms import keeper as keeper_module
 from twin.errors import ConfigError
 from twin.events import Kind
 from twin.page import app as module
-from twin.page import users as users_module
 from twin.page.app import COOKIE, STATIC, Access, Page
 from twin.page.ejector import Ejector
 from twin.page.sessions import SESSION_S, Sessions
 from twin.page.settings import REPORTS, folder_of
-from twin.page.users import Users
+from twin.users import Role
 
 OURS = "http://127.0.0.1:8420"
 WORD = "correct horse"
@@ -33,7 +33,7 @@ class Site:
 
     def __init__(self, folder: Path, access: Access) -> None:
         self.config = config(write_config(folder))
-        self.users = Users(folder / "users.toml")
+        self.users = quick_users(folder / "users.toml")
         self.now, self.seconds = NOW, 0.0
         self.run: Run | None = None
         self.ejector = Ejector(self.config, lambda: self.now)
@@ -57,7 +57,6 @@ class Site:
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(users_module, "N", 2)
     monkeypatch.setattr(keeper_module, "POLL_S", 0.01)
     monkeypatch.setattr(module, "ROWS_S", 0.01)
     monkeypatch.setattr(module, "STATE_S", 0.01)
@@ -69,7 +68,7 @@ def opened(tmp_path: Path) -> Iterator[Callable[..., Site]]:
 
     def make(**access: Any) -> Site:
         site = Site(tmp_path, Access(**access))
-        site.users.add("ann", WORD)
+        site.users.add("ann", WORD, Role.CONFIGURE)
         site.client.__enter__()
         sites.append(site)
         return site
@@ -294,7 +293,7 @@ def test_logging_out_ends_the_session(site: Site) -> None:
 
 def test_without_users_the_form_says_how_to_make_one(site: Site) -> None:
     site.users.remove("ann")
-    assert "twin serve --add-user NAME" in site.client.get("/login").text
+    assert "twin users add NAME" in site.client.get("/login").text
 
 
 # --- to act ---------------------------------------------------------------------------------------
@@ -321,6 +320,37 @@ def test_who_is_logged_in_acknowledges(site: Site) -> None:
     state = site.ejector.state()
     assert (state["light"], state["alarms"][0]["seen_by"]) == ("yellow", "ann")
     assert state["alarms"][0]["asked"] == []
+
+
+@pytest.mark.parametrize(
+    ("role", "allowed"),
+    [
+        (Role.LOOK, []),
+        (Role.ACKNOWLEDGE, ["acknowledged", "shelved", "unshelved"]),
+        (
+            Role.CONFIGURE,
+            ["acknowledged", "shelved", "unshelved", "out_of_service", "in_service"],
+        ),
+    ],
+)
+def test_a_user_may_do_what_the_role_says(site: Site, role: Role, allowed: list[str]) -> None:
+    _leaking(site)
+    site.log_in()
+    site.users.set_role("ann", role)  # holds at once
+    assert site.client.get("/api/me").json()["may"] == allowed
+    for deed in ("acknowledged", "shelved", "unshelved", "out_of_service", "in_service"):
+        answer = site.ask(deed=deed, seconds=60.0)
+        assert answer.status_code == (202 if deed in allowed else 403)
+        if deed not in allowed:
+            assert "it needs the role" in answer.json()["error"]
+    assert sorted(one.deed.value for one in _asked(site)) == sorted(allowed)
+
+
+def test_a_user_with_a_name_of_any_letters_logs_in(site: Site) -> None:
+    site.users.add("Schlüssel", "Grüße aus Ölde", Role.LOOK)
+    assert site.log_in("Schlüssel", "Grüße aus Olde").status_code == 401
+    assert site.log_in("Schlüssel", "Grüße aus Ölde").status_code == 303
+    assert site.client.get("/api/me").json()["user"] == "Schlüssel"
 
 
 def test_nothing_is_written_without_login(site: Site) -> None:

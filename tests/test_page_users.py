@@ -1,23 +1,16 @@
-"""Who may act on the page: users in a file, sessions that end, guesses that take ever longer."""
+"""Who is logged in on the page: sessions that end, guesses that take ever longer."""
 
-import stat
 from pathlib import Path
 
 import pytest
+from user_files import quick_users
 
-from twin.errors import ConfigError
 from twin.page import sessions as module
-from twin.page import users
 from twin.page.sessions import SESSION_S, Sessions
-from twin.page.users import Users
 from twin.throttle import FREE_TRIES, LoginThrottle
+from twin.users import Role
 
-WORD = "correct horse"
-
-
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(users, "N", 2)
+ANN = ("ann", "correct horse", Role.LOOK)
 
 
 class Clock:
@@ -27,90 +20,8 @@ class Clock:
         return self.now
 
 
-def test_a_user_is_known_by_the_password_alone(tmp_path: Path) -> None:
-    known = Users(tmp_path / "users.toml")
-    known.add("ann", WORD)
-    assert known.check("ann", WORD)
-    assert not known.check("ann", WORD + " ")
-    assert not known.check("ann", "")
-    assert not known.check("bob", WORD)
-    assert not known.check("", "")
-    assert not known.check("bob", "nobody's")
-    assert known.names == ["ann"]
-
-
-def test_the_file_is_its_owners_and_has_no_password(tmp_path: Path) -> None:
-    path = tmp_path / "users.toml"
-    for name in ("ann", "bob"):
-        Users(path).add(name, WORD)
-    assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    text = path.read_text()
-    assert WORD not in text
-    ann, bob = (line.partition(" = ")[2] for line in text.splitlines()[1:])
-    assert ann != bob  # each has a salt
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_the_hash_is_scrypt_that_takes_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.undo()
-    assert 128 * users.N * users.R >= 2**25
-    assert users._is(WORD, users._hashed(WORD))
-
-
-def test_what_another_process_writes_holds_at_once(tmp_path: Path) -> None:
-    path = tmp_path / "users.toml"
-    here, there = Users(path), Users(path)
-    assert here.names == []
-    there.add("ann", WORD)
-    assert here.check("ann", WORD)
-    there.remove("ann")
-    assert not here.check("ann", WORD)
-    path.unlink()
-    assert here.names == []
-
-
-@pytest.mark.parametrize("name", ["ann", "bob"])
-def test_a_name_that_is_none_takes_as_long(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    known, hashed = Users(tmp_path / "users.toml"), list[str]()
-    known.add("ann", WORD)
-    plain = users._hashed
-    monkeypatch.setattr(users, "_hashed", lambda *how: (hashed.append(how[0]), plain(*how))[1])
-    assert known.check(name, "wrong horse") is False
-    assert hashed == ["wrong horse"]
-
-
-@pytest.mark.parametrize("name", ["", "a b", "a/b", "x" * 41, 'a"', "a\n"])
-def test_names_of_no_use_are_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(ConfigError, match="cannot be the name"):
-        Users(tmp_path / "u").add(name, WORD)
-
-
-def test_short_passwords_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="9 letters"):
-        Users(tmp_path / "u").add("ann", "x" * 9)
-    assert not (tmp_path / "u").exists()
-
-
-@pytest.mark.parametrize("text", ["users = 3", "[users]\nann = 3", "nonsense", "[other]\n"])
-def test_a_file_that_is_none_of_users_is_said(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "users.toml"
-    path.write_text(text)
-    with pytest.raises(ConfigError, match="not a file of users"):
-        _ = Users(path).names
-
-
-def test_a_hash_that_is_none_is_nobodys_password(tmp_path: Path) -> None:
-    path = tmp_path / "users.toml"
-    path.write_text('[users]\nann = "plain"\nbob = "scrypt$2$!$!"\n')
-    assert not Users(path).check("ann", "plain")
-    assert not Users(path).check("bob", "!")
-
-
 def test_a_session_ends_with_its_time_its_user_or_a_new_password(tmp_path: Path) -> None:
-    known, clock = Users(tmp_path / "users.toml"), Clock()
-    known.add("ann", WORD)
+    known, clock = quick_users(tmp_path / "users.toml", ANN), Clock()
     sessions = Sessions(known, clock)
     first = sessions.begin("ann")
     session = sessions.get(first)
@@ -121,7 +32,7 @@ def test_a_session_ends_with_its_time_its_user_or_a_new_password(tmp_path: Path)
     clock.now = SESSION_S
     assert sessions.get(first) is None
     second = sessions.begin("ann")
-    known.add("ann", "another horse")
+    known.set_password("ann", "another horse")
     assert sessions.get(second) is None
     third = sessions.begin("ann")
     known.remove("ann")
@@ -132,8 +43,7 @@ def test_sessions_and_their_tokens_differ_and_do_not_pile_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "MOST", 3)
-    known = Users(tmp_path / "users.toml")
-    known.add("ann", WORD)
+    known = quick_users(tmp_path / "users.toml", ANN)
     sessions = Sessions(known)
     tokens = [sessions.begin("ann") for _ in range(5)]
     there = [sessions.get(one) for one in tokens]

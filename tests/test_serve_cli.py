@@ -6,7 +6,6 @@ import os
 import pickle
 import socket
 import ssl
-import stat
 import subprocess
 import sys
 import urllib.request
@@ -29,16 +28,9 @@ from twin.cli_serve import live_rows_of, reports_of
 from twin.diagnosis import __main__ as diagnosing
 from twin.diagnosis import process, report
 from twin.diagnosis.process import LiveDiagnosis
-from twin.page import users as users_module
 from twin.page.ejector import REPORT
 from twin.page.ring import read
 from twin.page.settings import RING, folder_of
-from twin.page.users import Users
-
-
-@pytest.fixture(autouse=True)
-def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(users_module, "N", 2)
 
 
 def test_it_serves_until_it_is_told_to_end(tmp_path: Path) -> None:
@@ -86,34 +78,7 @@ def test_others_reach_no_page_without_users(
     assert twin(monkeypatch, "serve", "--config", path, "--host", host) == 2
     said = capsys.readouterr().err
     assert "it has no users" in said
-    assert "--add-user NAME" in said
-
-
-def test_users_are_made_on_the_command_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path, kept = write_config(tmp_path), tmp_path / "users.toml"
-    monkeypatch.setattr(sys, "stdin", io.StringIO("correct horse\n"))
-    assert twin(monkeypatch, "serve", "--config", path, "--add-user", "ann") == 0
-    assert capsys.readouterr().out == "ann may act on the page\n"
-    assert stat.S_IMODE(kept.stat().st_mode) == 0o600
-    assert Users(kept).check("ann", "correct horse")
-    assert twin(monkeypatch, "serve", "--config", path, "--remove-user", "bob") == 2
-    assert "no user is called 'bob'" in capsys.readouterr().err
-    assert twin(monkeypatch, "serve", "--config", path, "--remove-user", "ann") == 0
-    assert Users(kept).names == []
-
-
-def test_a_password_is_asked_for_twice(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    typed = iter(["correct horse", "correct house"])
-    monkeypatch.setattr("getpass.getpass", lambda _prompt: next(typed))
-    monkeypatch.setattr(sys, "stdin", io.StringIO())
-    monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
-    assert twin(monkeypatch, "serve", "--users", tmp_path / "u", "--add-user", "ann") == 2
-    assert "differ" in capsys.readouterr().err
-    assert not (tmp_path / "u").exists()
+    assert "twin users add NAME" in said
 
 
 def test_what_cannot_be_served_is_said(

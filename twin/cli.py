@@ -33,6 +33,7 @@ from twin.cli_fleet import fleet_app
 from twin.cli_init import init
 from twin.cli_outlets import outlets_of
 from twin.cli_serve import live_rows_of, reports_of, serve
+from twin.cli_users import users_app
 from twin.errors import ConfigError, SourceError, TwinError
 from twin.events import Event, Kind, Severity
 from twin.files import require_writable, write_json
@@ -66,6 +67,7 @@ app.add_typer(assets_app, name="assets")
 app.add_typer(figures_app, name="figures")
 app.add_typer(alarms_app, name="alarms")
 app.add_typer(fleet_app, name="fleet")
+app.add_typer(users_app, name="users")
 log_app = App("Look after logs.")
 app.add_typer(log_app, name="log")
 

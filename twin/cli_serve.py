@@ -1,6 +1,5 @@
 """``twin serve``: the technician's page, beside ``twin run`` or without it."""
 
-import getpass
 import sys
 import time
 from contextlib import contextmanager
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
     from twin.page.hall import Hall
     from twin.page.ring import LiveRows
     from twin.page.server import Place
-    from twin.page.users import Users
+    from twin.users import Users
 
 PORT = 8420
 
@@ -56,12 +55,6 @@ def serve(
             "--users", metavar="FILE", help="Default: users.toml beside the first CONFIG."
         ),
     ] = None,
-    add_user: Annotated[
-        str, typer.Option(metavar="NAME", help="Ask for a password, keep it, and end.")
-    ] = "",
-    remove_user: Annotated[
-        str, typer.Option(metavar="NAME", help="Remove this user, and end.")
-    ] = "",
     assets: Annotated[
         str, typer.Option(metavar="URL", help="Asset database, instead of the configured.")
     ] = "",
@@ -69,26 +62,22 @@ def serve(
     """Show traffic light, alarms, live pressure and trends in a browser; Ctrl-C ends it.
 
     A process of its own: it shows what twin run leaves, and stays when that ends. To acknowledge
-    needs a login, and so does everything where others than this machine reach it. With --broker
+    needs a login (twin users), and so does everything where others reach it. With --broker
     it shows what all ejectors publish, beside those of --config or alone.
     """
     _require_extra()
     from twin.config import Config
     from twin.page.server import Place
-    from twin.page.users import FILE, Users
     from twin.settings import Document
+    from twin.users import FILE, Users
 
     first = configs[0] if configs else broker
-    known = Users(users or (first.parent if first else Path()) / FILE)
-    if add_user or remove_user:
-        _change(known, add_user, remove_user)
-        return
     if first is None:
         hint = "name its configuration: --config CONFIG, or that of a broker: --broker CONFIG"
         raise ConfigError("no ejector to show", hint)
     if (certificate is None) != (key is None):
         raise ConfigError("--certificate and --key belong together", "give both, as PEM files")
-    place = Place(host, port, certificate, key)
+    place, known = Place(host, port, certificate, key), Users(users or first.parent / FILE)
     _require_users(place, known)
     settings = [Config.of(Document.read(one), assets) for one in configs or []]
     with _heard_of(broker) as hall:
@@ -155,31 +144,11 @@ def _require_users(place: "Place", users: "Users") -> None:
     if not users.names:
         raise ConfigError(
             f"{place.host}: others would reach the page, and it has no users",
-            "make one first: twin serve --config CONFIG --add-user NAME",
+            "make one first: twin users add NAME --config CONFIG",
         )
     if place.certificate is None:
         warning = "without --certificate others on the network can read passwords on their way"
         print(f"twin: {warning}", file=sys.stderr)
-
-
-def _change(users: "Users", add: str, remove: str) -> None:
-    """Add or remove a user, and say so."""
-    if add:
-        users.add(add, _password(add))
-        print(f"{add} may act on the page")
-    if remove:
-        users.remove(remove)
-        print(f"{remove} may not act on the page any more")
-
-
-def _password(name: str) -> str:
-    """Asked for twice on a terminal; from a pipe its first line."""
-    if not sys.stdin.isatty():
-        return sys.stdin.readline().rstrip("\r\n")
-    password = getpass.getpass(f"password of {name}: ")
-    if getpass.getpass("once more: ") != password:
-        raise ConfigError("the two passwords differ", "try again")
-    return password
 
 
 # --- for the loop -------------------------------------------------------------------------------

@@ -28,13 +28,14 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from twin.alarms.state import Deed
 from twin.errors import TwinError
 from twin.page.ejector import Ejector
 from twin.page.hall import Hall
 from twin.page.hall_app import ALL, AllEjectors
 from twin.page.sessions import SESSION_S, Session, Sessions
-from twin.page.users import Users
 from twin.throttle import LoginThrottle
+from twin.users import Role, Users
 
 COOKIE = "ejector-twin"
 TOKEN = "x-csrf-token"  # noqa: S105  # a header's name
@@ -46,6 +47,13 @@ MOST_DIGITS = 18  # of a number, which then is one to a database too
 # What reading a body raises that has something else in it; also one nested without end.
 NO_REQUEST = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
 SLOWEST_S = 20.0  # for a browser to take one message, or to send a request's body
+NEEDED: dict[str, Role] = {  # role for what is asked of an alarm
+    Deed.ACKNOWLEDGED: Role.ACKNOWLEDGE,
+    Deed.SHELVED: Role.ACKNOWLEDGE,
+    Deed.UNSHELVED: Role.ACKNOWLEDGE,
+    Deed.OUT_OF_SERVICE: Role.CONFIGURE,  # without an end, and for every shift
+    Deed.IN_SERVICE: Role.CONFIGURE,
+}
 
 STATIC = {
     "icon.svg": "image/svg+xml",
@@ -164,7 +172,7 @@ class Page:
         if not self._may_see(request):
             raise HTTPException(HTTPStatus.UNAUTHORIZED, "log in first")
 
-    def _require_right(self, request: Request) -> Session:
+    def _require_session(self, request: Request) -> Session:
         """Who asks for a change: logged in, from a page of ours, with its token."""
         if not self.access.is_own_origin(request.headers):
             raise HTTPException(HTTPStatus.FORBIDDEN, "this was not asked from the page itself")
@@ -175,13 +183,23 @@ class Page:
             raise HTTPException(HTTPStatus.FORBIDDEN, "the token is missing: load the page again")
         return session
 
+    def _require_role(self, session: Session, needed: Role) -> None:
+        """As the file of users has it now, not as it was at the login."""
+        role = self.users.role(session.user)
+        if role is None or not role.covers(needed):
+            raise HTTPException(
+                HTTPStatus.FORBIDDEN,
+                f"{session.user} may not do this: it needs the role {needed}; who looks after the"
+                " users gives it with twin users role",
+            )
+
     async def login_page(self, request: Request) -> Response:
         """The form."""
         return self._login_form(request)
 
     def _login_form(self, _request: Request, said: str = "", status: int = 200) -> Response:
         if not said and not self.users.names:
-            said = "There are no users yet. On the machine of the page: twin serve --add-user NAME"
+            said = "There are no users yet. On the machine of the page: twin users add NAME"
         role = ' role="alert"' if said else ""
         page = self._pages["login.html"].substitute(said=html.escape(said), role=role)
         return HTMLResponse(page, status)
@@ -220,7 +238,7 @@ class Page:
 
     async def logout(self, request: Request) -> Response:
         """End the session."""
-        self._require_right(request)
+        self._require_session(request)
         self.sessions.end(request.cookies.get(COOKIE))
         answer = JSONResponse({})
         answer.delete_cookie(COOKIE, httponly=True, samesite="strict", secure=self.access.secure)
@@ -230,7 +248,11 @@ class Page:
         """Who is logged in, the token for what he asks, and what there is to see."""
         self._require_sight(request)
         session = self._session(request)
-        own = {"user": session.user, "csrf": session.csrf} if session else {"user": ""}
+        own: dict[str, Any] = {"user": "", "may": []}
+        if session is not None:
+            role = self.users.role(session.user)
+            may = [deed for deed, needed in NEEDED.items() if role and role.covers(needed)]
+            own = {"user": session.user, "csrf": session.csrf, "may": may}
         ejectors = [{"name": one.name, "type": one.config.asset.type} for one in self.ejectors]
         figures = self.ejectors[0].figures() if self.ejectors else []
         known = {"ejectors": ejectors, "figures": figures, "all": self.hall is not None}
@@ -290,7 +312,7 @@ class Page:
 
     async def ask(self, request: Request) -> Response:
         """Ask the run something of an alarm; gives the number to look for the answer by."""
-        session = self._require_right(request)
+        session = self._require_session(request)
         ejector = self._ejector(request)
         try:
             asked = json.loads(await _body(request))
@@ -298,6 +320,7 @@ class Page:
             seconds = float(asked.get("seconds", 0.0))
         except NO_REQUEST as error:
             raise HTTPException(HTTPStatus.BAD_REQUEST, "not a request") from error
+        self._require_role(session, NEEDED.get(deed, Role.CONFIGURE))
         number = await run_sync(ejector.ask, alarm, deed, session.user, seconds)
         return JSONResponse({"request": number}, HTTPStatus.ACCEPTED)
 

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from twin.page.users import Users
+from twin.users import Users
 
 SESSION_S = 12 * 3600.0  # a shift
 MOST = 1000  # sessions

@@ -13,7 +13,7 @@ const KEPT_S = 300; // of them, to look back at
 const SHOWN = ["size", "how sure"]; // of what speaks for an alarm, at first sight
 const QUIET = ["shelved", "suppressed", "out_of_service"];
 
-let me = { user: "", csrf: "", ejectors: [], figures: [] };
+let me = { user: "", csrf: "", may: [], ejectors: [], figures: [] };
 let states = [];
 let chosen = 0;
 const mine = new Map(); // alarm -> what has become of what was asked here
@@ -170,7 +170,8 @@ function deeds(alarm) {
     return element("div", { class: "deeds" },
       element("a", { class: "button", href: "/login" }, "Log in to acknowledge"), reportLink(alarm));
   }
-  return element("div", { class: "deeds" }, ...possible.map((deed) => element(
+  const allowed = possible.filter((deed) => me.may.includes(deed));
+  return element("div", { class: "deeds" }, ...allowed.map((deed) => element(
     "button", {
       type: "button", class: deed === "acknowledged" ? "first" : false,
       "data-focus": `${deed} ${alarm.alarm}`,
@@ -196,7 +197,8 @@ function offerTimes(alarm) {
   }, text);
   $("shelve-times").replaceChildren(
     ...times.map(([seconds, text]) => choice(text, "shelved", seconds)),
-    choice("Until it is taken into service again", "out_of_service", 0));
+    ...(me.may.includes("out_of_service")
+      ? [choice("Until it is taken into service again", "out_of_service", 0)] : []));
   $("shelve").showModal();
 }
 

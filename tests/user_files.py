@@ -1,0 +1,17 @@
+"""Files of users whose passwords are quickly checked."""
+
+from pathlib import Path
+
+from argon2 import PasswordHasher
+
+from twin.users import Role, Users
+
+CHEAP = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
+
+
+def quick_users(path: Path, *added: tuple[str, str, Role]) -> Users:
+    """The users of a file, with some added: name, password and role."""
+    users = Users(path, CHEAP)
+    for name, password, role in added:
+        users.add(name, password, role)
+    return users

@@ -1,0 +1,97 @@
+"""``twin users``: who may look, acknowledge and configure, on the page and over OPC UA."""
+
+import getpass
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from twin.cli_app import App, read_config
+from twin.errors import ConfigError
+
+if TYPE_CHECKING:
+    from twin.users import Users
+
+users_app = App("Users of the page and of the OPC UA servers: roles, passwords.")
+
+Name = Annotated[str, typer.Argument(metavar="NAME", help="Letters, digits and . @ - _")]
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option("--config", metavar="CONFIG", help="users.toml beside it; default: in here."),
+]
+UsersFile = Annotated[
+    Path | None, typer.Option("--users", metavar="FILE", help="Another file of users.")
+]
+ROLES = "look, acknowledge (alarms, and shelve them), configure (take them out of service)"
+
+
+@users_app.command("list")
+def list_(config: ConfigFile = None, users: UsersFile = None) -> None:
+    """Print every user with the role."""
+    known = _users(config, users)
+    for name in known.names:
+        print(f"{known.role(name):<11}  {name}")
+    if not known.names:
+        print(f"{known.path}: no users", file=sys.stderr)
+
+
+@users_app.command()
+def add(
+    name: Name,
+    role: Annotated[str, typer.Option(metavar="ROLE", help=ROLES)] = "look",
+    config: ConfigFile = None,
+    users: UsersFile = None,
+) -> None:
+    """Ask for a password, and keep its hash; the file is for its owner only."""
+    from twin.users import role_of
+
+    known, wanted = _users(config, users), role_of(role)
+    known.add(name, _password(name), wanted)
+    print(f"{name} has the role {wanted}")
+
+
+@users_app.command()
+def role(
+    name: Name,
+    role: Annotated[str, typer.Argument(metavar="ROLE", help=ROLES)],
+    config: ConfigFile = None,
+    users: UsersFile = None,
+) -> None:
+    """Give a user another role; it holds at once."""
+    from twin.users import role_of
+
+    wanted = role_of(role)
+    _users(config, users).set_role(name, wanted)
+    print(f"{name} has the role {wanted}")
+
+
+@users_app.command()
+def password(name: Name, config: ConfigFile = None, users: UsersFile = None) -> None:
+    """Give a user a new password; the page's sessions with the old one end."""
+    _users(config, users).set_password(name, _password(name))
+    print(f"{name} has a new password")
+
+
+@users_app.command()
+def remove(name: Name, config: ConfigFile = None, users: UsersFile = None) -> None:
+    """Take a user away; it holds at once."""
+    _users(config, users).remove(name)
+    print(f"{name} is no user any more")
+
+
+def _users(config: Path | None, users: Path | None) -> "Users":
+    from twin.users import FILE, Users
+
+    folder = Path(read_config(config).name).parent if config else Path()
+    return Users(users or folder / FILE)
+
+
+def _password(name: str) -> str:
+    """Asked for twice on a terminal; from a pipe its first line."""
+    if not sys.stdin.isatty():
+        return sys.stdin.readline().rstrip("\r\n")
+    password = getpass.getpass(f"password of {name}: ")
+    if getpass.getpass("once more: ") != password:
+        raise ConfigError("the two passwords differ", "try again")
+    return password
