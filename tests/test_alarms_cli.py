@@ -19,6 +19,7 @@ from twin.alarms.rules import Rule, default_rules, read_rules, write_rules
 from twin.alarms.settings import board_rules
 from twin.alarms.store import open_store
 from twin.assets.unit import Unit
+from twin.audit import records
 from twin.cli_alarms import alarms_app
 from twin.errors import ConfigError, SourceError
 from twin.settings import Document
@@ -91,6 +92,19 @@ def test_alarms_are_taken_out_of_service_and_back(beside: Run) -> None:
     assert f"{LEAK}  out of service, since 2001-09-09 01:46:45, " in line
     assert beside("in-service", LEAK) == f"{LEAK}: in service\n"
     assert "unacknowledged" in beside("list")
+
+
+def test_the_trail_beside_the_configuration_says_who_asked(
+    beside: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LOGNAME", "technician")
+    (tmp_path / "cell.toml").write_text("[alarms]\nkeep = true\n")
+    beside("shelve", LEAK, "--hours", "1", "--config", "cell.toml", "--by", "ann")
+    beside("unshelve", LEAK, "--config", "cell.toml")
+    shelved, unshelved = records(tmp_path)[0]
+    assert (shelved["what"], shelved["alarm"], shelved["unit"]) == ("shelved", LEAK, UNIT.id)
+    assert (shelved["who"], shelved["by"], shelved["through"]) == ("technician", "ann", "command")
+    assert (unshelved["what"], unshelved["who"]) == ("unshelved", "technician")
 
 
 def test_a_refusal_is_an_error(beside: Run, tmp_path: Path) -> None:

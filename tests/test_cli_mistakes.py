@@ -62,11 +62,21 @@ NEEDED = {
     "users role": ("ann", "look"),
     "users password": ("ann",),
     "users remove": ("ann",),
+    "users audit": (),
     "log check": ("L",),
     "log recover": ("L", "-o", "new.mcap"),
 }
 # Commands that do something useful without an argument.
-ALONE = {"effects", "paper", "init", "assets list", "assets export", "alarms rules", "users list"}
+ALONE = {
+    "effects",
+    "paper",
+    "init",
+    "assets list",
+    "assets export",
+    "alarms rules",
+    "users list",
+    "users audit",
+}
 FILES = ("text.txt", "bytes.bin", "empty", "folder")  # of no command's kind
 
 

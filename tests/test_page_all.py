@@ -24,7 +24,7 @@ from plc_process import start_plc
 from starlette.testclient import TestClient
 from test_alarms_loop import LEAK
 from test_page_browser import Server, _is_fit
-from user_files import quick_users
+from user_files import authenticator_of, quick_users
 
 from twin.assets.unit import Unit
 from twin.outlets.message import Message, asset_of, beside, encoded, of_status
@@ -287,7 +287,7 @@ def test_odd_names_are_as_they_were(told: Told) -> None:
 def client(folder: Path, hall: Hall | None, *configs: Path, **access: Any) -> Iterator[TestClient]:
     users = quick_users(folder / "users.toml")
     ejectors = [Ejector(config(one)) for one in configs]
-    page = Page(ejectors, users, Sessions(users), Access(**access), hall)
+    page = Page(ejectors, authenticator_of(users), Sessions(users), Access(**access), hall)
     with TestClient(page.app(), OURS, follow_redirects=False) as made:
         yield made
 
@@ -318,7 +318,9 @@ def test_it_is_seen_by_whom_the_other_page_is(tmp_path: Path, told: Told) -> Non
 @contextmanager
 def site(folder: Path, port: int) -> Iterator[str]:
     users, place, hall = quick_users(folder / "users.toml"), Place("127.0.0.1", 0), Hall()
-    inner = make_server(Page([], users, Sessions(users), Access(), hall).app(), place)
+    inner = make_server(
+        Page([], authenticator_of(users), Sessions(users), Access(), hall).app(), place
+    )
     wanted = MqttSettings(host="127.0.0.1", port=port)
     with listening(wanted, folder, hall, pytest.fail), listen(place) as socket:
         sockets = {"sockets": [socket]}

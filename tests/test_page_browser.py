@@ -13,7 +13,7 @@ import pytest
 import uvicorn
 from page_site import LEAK, Run, S, config, write_config
 from playwright.sync_api import Browser, Locator, Page, expect
-from user_files import quick_users
+from user_files import authenticator_of, quick_users
 
 from twin.alarms import keeper as keeper_module
 from twin.assets.unit import Unit
@@ -107,7 +107,9 @@ class Server:
 def serving(configs: list[Path]) -> Iterator[tuple[str, Server]]:
     users, place = quick_users(configs[0].parent / "users.toml"), Place("127.0.0.1", 0)
     ejectors = [Ejector(config(one)) for one in configs]
-    inner = make_server(Served(ejectors, users, Sessions(users), Access()).app(), place)
+    inner = make_server(
+        Served(ejectors, authenticator_of(users), Sessions(users), Access()).app(), place
+    )
     with listen(place) as listening:
         sockets = {"sockets": [listening]}
         server = Server(inner, threading.Thread(target=inner.run, kwargs=sockets, name="page"))

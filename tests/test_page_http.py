@@ -10,9 +10,10 @@ from page_site import KEPT, LEAK, NOW, Run, config, write_config
 from starlette.requests import Request
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
-from user_files import quick_users
+from user_files import authenticator_of, quick_users
 
 from twin.alarms import keeper as keeper_module
+from twin.audit import records
 from twin.errors import ConfigError
 from twin.events import Kind
 from twin.page import app as module
@@ -38,7 +39,8 @@ class Site:
         self.run: Run | None = None
         self.ejector = Ejector(self.config, lambda: self.now)
         sessions = Sessions(self.users, lambda: self.seconds)
-        self.page = Page([self.ejector], self.users, sessions, access)
+        authenticator = authenticator_of(self.users)
+        self.page = Page([self.ejector], authenticator, sessions, access)
         self.client = TestClient(self.page.app(), OURS, follow_redirects=False)
 
     def begin(self) -> Run:
@@ -351,6 +353,33 @@ def test_a_user_with_a_name_of_any_letters_logs_in(site: Site) -> None:
     assert site.log_in("Schlüssel", "Grüße aus Olde").status_code == 401
     assert site.log_in("Schlüssel", "Grüße aus Ölde").status_code == 303
     assert site.client.get("/api/me").json()["user"] == "Schlüssel"
+
+
+def test_the_trail_says_who_did_what_from_where(site: Site, tmp_path: Path) -> None:
+    _leaking(site)
+    site.users.set_role("ann", Role.ACKNOWLEDGE)
+    site.log_in("ann", "wrong horse")
+    site.log_in()
+    site.ask()
+    site.ask(deed="shelved", seconds=60.0)
+    site.ask(deed="shelved", seconds=-1)  # no run would grant it
+    site.ask(deed="out_of_service")
+    csrf = site.client.get("/api/me").json()["csrf"]
+    site.client.post("/api/logout", headers={"origin": OURS, "x-csrf-token": csrf})
+    told, _ = records(tmp_path)
+    assert {(one["who"], one["through"], one["from"]) for one in told} == {
+        ("ann", "page", "testclient")
+    }
+    alarm = {"unit": "gripper-01", "alarm": LEAK}
+    known = ("time", "who", "through", "from")
+    assert [{name: one[name] for name in one if name not in known} for one in told] == [
+        {"what": "wrong_password"},
+        {"what": "logged_in"},
+        {"what": "acknowledged", **alarm},
+        {"what": "shelved", **alarm},
+        {"what": "denied", "wanted": "out_of_service"},
+        {"what": "logged_out"},
+    ]
 
 
 def test_nothing_is_written_without_login(site: Site) -> None:

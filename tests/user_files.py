@@ -2,8 +2,11 @@
 
 from pathlib import Path
 
+import pytest
 from argon2 import PasswordHasher
 
+from twin.audit import Audit
+from twin.login import Authenticator
 from twin.users import Role, Users
 
 CHEAP = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
@@ -15,3 +18,8 @@ def quick_users(path: Path, *added: tuple[str, str, Role]) -> Users:
     for name, password, role in added:
         users.add(name, password, role)
     return users
+
+
+def authenticator_of(users: Users) -> Authenticator:
+    """As the page has it; an audit trail that cannot be written fails the test."""
+    return Authenticator(users, Audit(users.path.parent, "page", pytest.fail))

@@ -1,6 +1,5 @@
 """``twin alarms``: what stands, what was, and what people do about it, beside a run or after it."""
 
-import getpass
 import sys
 import time
 from functools import partial
@@ -9,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from twin.cli_app import App, not_negative, read_config
+from twin.cli_app import App, audit_of, not_negative, read_config, user_here
 from twin.errors import ConfigError, known_names
 from twin.files import write_json
 from twin.instants import instant
@@ -341,9 +340,13 @@ def _ask(names: list[str], deed: "Deed", by: str, of: _From, seconds: float = 0.
         board[name]
     with _open(of.url, of.config) as store:
         whose = _chosen(store, of.config, of.unit)
-        asked = {
-            store.ask(whose, name, deed, by or getpass.getuser(), seconds): name for name in names
-        }
+        asked = dict[int, str]()
+        for name in names:
+            asked[store.ask(whose, name, deed, by or user_here(), seconds)] = name
+            if of.config is not None:
+                about = {"unit": whose.id or whose.type, "alarm": name}
+                about |= {"by": by} if by else {}
+                audit_of(of.config.parent).record(deed, user_here(), **about)
         refused = [
             why for number, name in asked.items() if (why := _answered(store, number, name, deed))
         ]

@@ -1,6 +1,8 @@
 """What commands have in common: plain help, ``-h`` and ``--version``, and what they say."""
 
+import getpass
 import math
+import os
 import sys
 from collections.abc import Callable
 from importlib.metadata import version
@@ -10,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
+
+from twin.audit import Audit
 
 if TYPE_CHECKING:
     from twin.fleet.go import Wanted
@@ -127,3 +131,16 @@ def not_negative(value: float | None) -> float | None:
     if value is not None and not (math.isfinite(value) and value >= 0.0):
         raise typer.BadParameter(f"{value:g} is not a finite number from 0 on")
     return value
+
+
+def audit_of(folder: Path) -> Audit:
+    """The trail of what is done by commands."""
+    return Audit(folder, "command", lambda what: print(f"twin: {what}", file=sys.stderr))
+
+
+def user_here() -> str:
+    """Who runs this program on this machine: a name, or a number where there is none."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # as in a container
+        return f"uid {os.getuid()}"

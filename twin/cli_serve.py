@@ -100,7 +100,7 @@ def _heard_of(broker: Path | None) -> "Iterator[Hall | None]":
     mqtt, _ = chosen(document)
     if not mqtt.host:
         raise ConfigError(f"{broker}: no [mqtt] in it", 'say where the broker is: host = "..."')
-    with listening(mqtt, broker.parent, hall, lambda what: print(f"twin: {what}", file=sys.stderr)):
+    with listening(mqtt, broker.parent, hall, _complain):
         yield hall
 
 
@@ -113,6 +113,8 @@ def _serve(
 ) -> None:
     import socket
 
+    from twin.audit import Audit
+    from twin.login import Authenticator
     from twin.page.app import Access, Page
     from twin.page.ejector import Ejector
     from twin.page.server import address, listen, make_server
@@ -120,7 +122,9 @@ def _serve(
 
     ours = {one.lower() for one in (*names, place.host, socket.gethostname()) if one}
     access = Access(frozenset(ours), place.scheme == "https", place.is_loopback)
-    page = Page([Ejector(one) for one in settings], users, Sessions(users), access, hall)
+    authenticator = Authenticator(users, Audit(users.path.parent, "page", _complain))
+    ejectors = [Ejector(one) for one in settings]
+    page = Page(ejectors, authenticator, Sessions(users), access, hall)
     server = make_server(page.app(), place)
     with listen(place) as listening:
         print(f"the page is at {address(place, listening)}", flush=True)
@@ -147,8 +151,11 @@ def _require_users(place: "Place", users: "Users") -> None:
             "make one first: twin users add NAME --config CONFIG",
         )
     if place.certificate is None:
-        warning = "without --certificate others on the network can read passwords on their way"
-        print(f"twin: {warning}", file=sys.stderr)
+        _complain("without --certificate others on the network can read passwords on their way")
+
+
+def _complain(what: str) -> None:
+    print(f"twin: {what}", file=sys.stderr)
 
 
 # --- for the loop -------------------------------------------------------------------------------

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.cli_app import App, read_config
-from twin.errors import ConfigError
+from twin.audit import Act, in_words, records
+from twin.cli_app import App, audit_of, read_config, user_here
+from twin.errors import ConfigError, SourceError
+from twin.files import write_json
 
 if TYPE_CHECKING:
     from twin.users import Users
@@ -22,6 +24,9 @@ ConfigFile = Annotated[
 ]
 UsersFile = Annotated[
     Path | None, typer.Option("--users", metavar="FILE", help="Another file of users.")
+]
+JsonFile = Annotated[
+    Path | None, typer.Option("--json", metavar="F", help="Write the same as JSON.")
 ]
 ROLES = "look, acknowledge (alarms, and shelve them), configure (take them out of service)"
 
@@ -48,6 +53,7 @@ def add(
 
     known, wanted = _users(config, users), role_of(role)
     known.add(name, _password(name), wanted)
+    _record(known, Act.USER_ADDED, name, role=wanted)
     print(f"{name} has the role {wanted}")
 
 
@@ -61,23 +67,47 @@ def role(
     """Give a user another role; it holds at once."""
     from twin.users import role_of
 
-    wanted = role_of(role)
-    _users(config, users).set_role(name, wanted)
+    known, wanted = _users(config, users), role_of(role)
+    known.set_role(name, wanted)
+    _record(known, Act.ROLE_CHANGED, name, role=wanted)
     print(f"{name} has the role {wanted}")
 
 
 @users_app.command()
 def password(name: Name, config: ConfigFile = None, users: UsersFile = None) -> None:
     """Give a user a new password; the page's sessions with the old one end."""
-    _users(config, users).set_password(name, _password(name))
+    known = _users(config, users)
+    known.set_password(name, _password(name))
+    _record(known, Act.PASSWORD_CHANGED, name)
     print(f"{name} has a new password")
 
 
 @users_app.command()
 def remove(name: Name, config: ConfigFile = None, users: UsersFile = None) -> None:
     """Take a user away; it holds at once."""
-    _users(config, users).remove(name)
+    known = _users(config, users)
+    known.remove(name)
+    _record(known, Act.USER_REMOVED, name)
     print(f"{name} is no user any more")
+
+
+@users_app.command()
+def audit(config: ConfigFile = None, users: UsersFile = None, json_file: JsonFile = None) -> None:
+    """Print who logged in, failed to, acknowledged, shelved or changed users; times are UTC.
+
+    The newest comes last. Acts of the page, the OPC UA servers and the commands with this --config.
+    """
+    folder = _users(config, users).path.parent
+    try:
+        found, broken = records(folder)
+    except OSError as error:
+        raise SourceError(f"the audit trail in {folder} cannot be read: {error}") from error
+    for one in found:
+        print(in_words(one))
+    if broken:
+        print(f"twin: {broken} lines of the audit trail cannot be read", file=sys.stderr)
+    if json_file is not None:
+        write_json(json_file, found)
 
 
 def _users(config: Path | None, users: Path | None) -> "Users":
@@ -85,6 +115,10 @@ def _users(config: Path | None, users: Path | None) -> "Users":
 
     folder = Path(read_config(config).name).parent if config else Path()
     return Users(users or folder / FILE)
+
+
+def _record(users: "Users", what: Act, whom: str, **details: str) -> None:
+    audit_of(users.path.parent).record(what, user_here(), user=whom, **details)
 
 
 def _password(name: str) -> str:

@@ -88,7 +88,7 @@ class Users:
 
     def add(self, name: str, password: str, role: Role) -> None:
         """Add somebody; ConfigError for a name that is there, or a name or password of no use."""
-        users, name = self._read(), _normal(name)
+        users, name = self._read(), normal(name)
         if not NAME.fullmatch(name):
             raise ConfigError(
                 f"{name!r} cannot be the name of a user", "up to 40 letters, digits and . @ - _"
@@ -112,17 +112,17 @@ class Users:
 
     def role(self, name: str) -> Role | None:
         """What a user may do; None where there is none."""
-        user = self._read().get(_normal(name))
+        user = self._read().get(normal(name))
         return user.role if user else None
 
     def proof(self, name: str) -> str:
         """What is stored of a user's password, other after a new one; empty where there is none."""
-        user = self._read().get(_normal(name))
+        user = self._read().get(normal(name))
         return user.hash if user else ""
 
     def check(self, name: str, password: str) -> Role | None:
         """The role of a user whose password that is; as slow for somebody whom there is not."""
-        user, nobody = self._read().get(_normal(name)), self._nobody
+        user, nobody = self._read().get(normal(name)), self._nobody
         right = self._is(password[: 4 * LONGEST], user.hash if user else nobody)
         return user.role if user and right else None
 
@@ -132,12 +132,12 @@ class Users:
 
     def _is(self, password: str, stored: str) -> bool:
         try:
-            return self._hasher.verify(stored, _normal(password))
+            return self._hasher.verify(stored, normal(password))
         except (VerificationError, InvalidHashError, UnicodeEncodeError):
             return False
 
     def _hashed(self, password: str) -> str:
-        password = _normal(password)
+        password = normal(password)
         if not SHORTEST <= len(password) <= LONGEST:
             raise ConfigError(
                 f"the password has {len(password)} letters", f"take {SHORTEST} to {LONGEST}"
@@ -148,15 +148,15 @@ class Users:
 
     def _of(self, name: str) -> User:
         users = self._read()
-        if _normal(name) not in users:
+        if normal(name) not in users:
             raise ConfigError(
                 f"{self.path}: no user is called {name!r}", known_names(name, sorted(users))
             )
-        return users[_normal(name)]
+        return users[normal(name)]
 
     def _change(self, name: str, **changes: object) -> None:
         changed = self._of(name).model_copy(update=changes)
-        self._write({**self._read(), _normal(name): changed})
+        self._write({**self._read(), normal(name): changed})
 
     # --- the file -------------------------------------------------------------------------------
 
@@ -208,9 +208,9 @@ def _parsed(path: Path) -> dict[str, User]:
         raise ConfigError(
             f"{path}: not a file of users", "take it away, and add them with twin users add NAME"
         ) from error
-    return {_normal(name): user for name, user in found.items()}
+    return {normal(name): user for name, user in found.items()}
 
 
-def _normal(text: str) -> str:
+def normal(text: str) -> str:
     """The same text for the same letters: keyboards differ in how they compose an ü."""
     return unicodedata.normalize("NFC", text)

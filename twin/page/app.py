@@ -12,6 +12,7 @@ import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from http import HTTPStatus
 from importlib import resources
 from string import Template
@@ -29,13 +30,14 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from twin.alarms.state import Deed
+from twin.audit import Act
 from twin.errors import TwinError
+from twin.login import Authenticator
 from twin.page.ejector import Ejector
 from twin.page.hall import Hall
 from twin.page.hall_app import ALL, AllEjectors
 from twin.page.sessions import SESSION_S, Session, Sessions
-from twin.throttle import LoginThrottle
-from twin.users import Role, Users
+from twin.users import Role
 
 COOKIE = "ejector-twin"
 TOKEN = "x-csrf-token"  # noqa: S105  # a header's name
@@ -117,15 +119,15 @@ class Page:
     def __init__(
         self,
         ejectors: Sequence[Ejector],
-        users: Users,
+        authenticator: Authenticator,
         sessions: Sessions,
         access: Access,
         hall: Hall | None = None,
     ) -> None:
         self.hall = hall
-        self.ejectors, self.users, self.sessions, self.access = ejectors, users, sessions, access
+        self.ejectors, self.sessions, self.access = ejectors, sessions, access
+        self._authenticator, self.users = authenticator, authenticator.users
         self._states = [_Remembered(one.state) for one in ejectors]
-        self._by_address, self._by_name = LoginThrottle(60.0), LoginThrottle(10.0)
         self._one_login = asyncio.Lock()  # at a time: its hash takes memory and time
         self._one_trend = asyncio.Lock()
         files = resources.files("twin.page").joinpath("static")
@@ -183,15 +185,20 @@ class Page:
             raise HTTPException(HTTPStatus.FORBIDDEN, "the token is missing: load the page again")
         return session
 
-    def _require_role(self, session: Session, needed: Role) -> None:
+    async def _require_role(self, request: Request, session: Session, deed: str) -> None:
         """As the file of users has it now, not as it was at the login."""
-        role = self.users.role(session.user)
+        role, needed = self.users.role(session.user), NEEDED.get(deed, Role.CONFIGURE)
         if role is None or not role.covers(needed):
+            await self._record(request, Act.DENIED, session.user, wanted=deed)
             raise HTTPException(
                 HTTPStatus.FORBIDDEN,
                 f"{session.user} may not do this: it needs the role {needed}; who looks after the"
                 " users gives it with twin users role",
             )
+
+    async def _record(self, request: Request, what: str, who: str, **details: str) -> None:
+        record = partial(self._authenticator.audit.record, **details)
+        await run_sync(record, what, who, _address(request))
 
     async def login_page(self, request: Request) -> Response:
         """The form."""
@@ -210,25 +217,20 @@ class Page:
             raise HTTPException(HTTPStatus.FORBIDDEN, "this was not asked from the page itself")
         form = parse_qs((await _body(request)).decode(errors="replace"), max_num_fields=5)
         name, password = (form.get(key, [""])[0] for key in ("name", "password"))
-        name = name.strip()[:100]
-        address = request.client.host if request.client else ""
         async with self._one_login:
-            wait = max(self._by_address.wait_s(address), self._by_name.wait_s(name))
-            if wait > 0.0:
-                said = f"Too many wrong passwords. Try again in {wait:.0f} s."
-                return self._login_form(request, said, HTTPStatus.TOO_MANY_REQUESTS)
-            if not await run_sync(self.users.check, name, password):
-                self._by_address.wrong(address)
-                self._by_name.wrong(name)
-                said = "Name or password is wrong."
-                return self._login_form(request, said, HTTPStatus.UNAUTHORIZED)
-            self._by_address.right(address)
-            self._by_name.right(name)
+            log_in = self._authenticator.log_in
+            login = await run_sync(log_in, name, password, _address(request))
+        if login.role is None:
+            said, status = "Name or password is wrong.", HTTPStatus.UNAUTHORIZED
+            if login.wait_s > 0.0:
+                said = f"Too many wrong passwords. Try again in {login.wait_s:.0f} s."
+                status = HTTPStatus.TOO_MANY_REQUESTS
+            return self._login_form(request, said, status)
         self.sessions.end(request.cookies.get(COOKIE))
         answer = RedirectResponse("/", HTTPStatus.SEE_OTHER)
         answer.set_cookie(
             COOKIE,
-            self.sessions.begin(name),
+            self.sessions.begin(login.user),
             max_age=round(SESSION_S),
             httponly=True,
             samesite="strict",
@@ -238,7 +240,8 @@ class Page:
 
     async def logout(self, request: Request) -> Response:
         """End the session."""
-        self._require_session(request)
+        session = self._require_session(request)
+        await self._record(request, Act.LOGGED_OUT, session.user)
         self.sessions.end(request.cookies.get(COOKIE))
         answer = JSONResponse({})
         answer.delete_cookie(COOKIE, httponly=True, samesite="strict", secure=self.access.secure)
@@ -320,8 +323,9 @@ class Page:
             seconds = float(asked.get("seconds", 0.0))
         except NO_REQUEST as error:
             raise HTTPException(HTTPStatus.BAD_REQUEST, "not a request") from error
-        self._require_role(session, NEEDED.get(deed, Role.CONFIGURE))
+        await self._require_role(request, session, deed)
         number = await run_sync(ejector.ask, alarm, deed, session.user, seconds)
+        await self._record(request, deed, session.user, unit=ejector.name, alarm=alarm)
         return JSONResponse({"request": number}, HTTPStatus.ACCEPTED)
 
     async def answer(self, request: Request) -> Response:
@@ -484,6 +488,10 @@ async def _body(request: Request) -> bytes:
     except TimeoutError as error:
         raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, "that takes too long") from error
     return body
+
+
+def _address(request: Request) -> str:
+    return request.client.host if request.client else ""
 
 
 def _number(request: Request, name: str) -> int:
