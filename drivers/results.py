@@ -5,6 +5,7 @@ pace and sends what has changed; it waits for each answer, so that nothing piles
 dies or does not answer is ended and started again, with all that it showed; the loops are told.
 """
 
+import logging
 import os
 import socket
 import struct
@@ -32,6 +33,8 @@ LOOK_S = 0.05  # between looks for what the server asks, and whether to stop
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # before a server is started again
 SOUND_S = 60.0  # a server that ran so long and dies is told of again
 NICE = 5  # beyond the loop's own
+
+_log = logging.getLogger(__name__)
 
 Acknowledge = Callable[[str, str], None]  # asks it: which alarm, and who does
 Tell = Callable[[str], None]  # told that the server is down, and why
@@ -303,6 +306,9 @@ class ResultsServer:
             while True:
                 self._server.send(self._answers.get_nowait())
         message = self._server.heard(seconds)
+        if message is not None and message[0] == "complaint":
+            _log.warning(message[1])
+            return None
         if message is None or message[0] != "acknowledge":
             return message
         threading.Thread(target=self._acknowledge, args=message[1:], daemon=True).start()

@@ -11,18 +11,21 @@ from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from typing import Any
 
 from asyncua import Server, ua
 from asyncua.common.events import Event
 from asyncua.common.instantiate_util import instantiate
-from asyncua.crypto.permission_rules import User
 from asyncua.server import monitored_item_service
 from asyncua.server.address_space import AddressSpace
-from asyncua.server.internal_server import InternalServer
-from asyncua.server.internal_session import InternalSession
 
+from drivers import opcua_security as security
+from drivers.opcua_security import GuardedServer, Person
+from twin.audit import Act
 from twin.errors import TwinError
+from twin.login import Authenticator
+from twin.users import Role
 
 Acknowledge = Callable[[str, str], None]  # asks it: which alarm, and who does
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -33,10 +36,10 @@ _T, _S, _I = ua.VariantType, ua.StatusCodes, ua.ObjectIds
 
 # --- who calls ----------------------------------------------------------------------------------
 
-CALLER: ContextVar[User | None] = ContextVar("caller", default=None)
+CALLER: ContextVar[Person | None] = ContextVar("caller", default=None)
 
 
-class Session(InternalSession):  # type: ignore[misc]  # the library's classes are untyped to us
+class Session(security.Session):
     """A session whose methods can know whose it is."""
 
     async def call(self, params: Any) -> Any:
@@ -48,14 +51,14 @@ class Session(InternalSession):  # type: ignore[misc]  # the library's classes a
             CALLER.reset(token)
 
 
-class KnowingServer(InternalServer):  # type: ignore[misc]
+class KnowingServer(GuardedServer):
     """What is inside of a server that refreshes conditions, and whose methods know who calls."""
 
     def __init__(self) -> None:
         super().__init__()
         self.bind_condition_methods = 100  # the severity of events around a refresh
 
-    def create_session(self, name: str, **options: Any) -> Session:
+    def create_session(self, name: Any, **options: Any) -> Session:
         """Begin a session."""
         return Session(self, self.aspace, self.subscription_service, name, **options)
 
@@ -126,10 +129,10 @@ class Condition:
 
 
 class Conditions:
-    """The conditions of a server; ``may_acknowledge`` are names of users."""
+    """The conditions of a server; ``authenticator`` knows the roles of users."""
 
-    def __init__(self, server: Server, may_acknowledge: tuple[str, ...]) -> None:
-        self._server, self._may = server, may_acknowledge
+    def __init__(self, server: Server, authenticator: Authenticator | None) -> None:
+        self._server, self._authenticator = server, authenticator
         self._known: dict[ua.NodeId, Condition] = {}
         method = ua.NodeId(_I.AcknowledgeableConditionType_Acknowledge)
         server.link_method(server.get_node(method), self._acknowledge)
@@ -169,26 +172,44 @@ class Conditions:
     async def _acknowledge(
         self, node: ua.NodeId, event: ua.Variant, comment: ua.Variant
     ) -> ua.StatusCode:
-        condition, user = self._known.get(node), CALLER.get()
+        condition, person = self._known.get(node), CALLER.get()
         if condition is None:
             return ua.StatusCode(_S.BadNodeIdUnknown)
-        if user is None or user.name not in self._may or condition.source.acknowledge is None:
+        if self._authenticator is None or person is None or not person.name:
             return ua.StatusCode(_S.BadUserAccessDenied)
-        if event.Value not in condition.events:
-            return ua.StatusCode(_S.BadEventIdUnknown)
-        if condition.acknowledged:
-            return ua.StatusCode(_S.BadConditionBranchAlreadyAcked)
-        who = _with_comment(user.name, comment.Value)
-        try:  # it may wait for a database
+        said = _text(comment.Value)
+        tell = partial(self._authenticator.audit.record, who=person.name, address=person.address)
+        about = {"unit": condition.source.name, "alarm": condition.name, "comment": said}
+        try:
+            role = self._authenticator.users.role(person.name)
+            if role is None or not role.covers(Role.ACKNOWLEDGE):
+                await asyncio.to_thread(tell, Act.DENIED, wanted="acknowledged", **about)
+                return ua.StatusCode(_S.BadUserAccessDenied)
+            if (refused := _refused(condition, event.Value)) is not None:
+                return refused
+            who = f"{person.name} ({said})" if said else person.name
+            assert condition.source.acknowledge is not None
+            # Both may wait: for a database, and for a disk.
             await asyncio.to_thread(condition.source.acknowledge, condition.name, who)
+            await asyncio.to_thread(tell, "acknowledged", **about)
         except TwinError:
             return ua.StatusCode(_S.BadResourceUnavailable)
         return ua.StatusCode(_S.Good)
 
 
-def _with_comment(user: str, comment: Any) -> str:
-    text = (getattr(comment, "Text", None) or "").strip()
-    return f"{user} ({text[:200]})" if text else user
+def _refused(condition: Condition, event: Any) -> ua.StatusCode | None:
+    """Why nobody can acknowledge an alarm by an event of it now."""
+    if condition.source.acknowledge is None:
+        return ua.StatusCode(_S.BadUserAccessDenied)
+    if event not in condition.events:
+        return ua.StatusCode(_S.BadEventIdUnknown)
+    if condition.acknowledged:
+        return ua.StatusCode(_S.BadConditionBranchAlreadyAcked)
+    return None
+
+
+def _text(comment: Any) -> str:
+    return (getattr(comment, "Text", None) or "").strip()[:200]
 
 
 def _event(condition: Condition, change: Mapping[str, Any]) -> Event:

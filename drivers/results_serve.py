@@ -27,11 +27,12 @@ from asyncua.common.connection import TransportLimits
 from asyncua.server import binary_server_asyncio
 
 from drivers.opcua_nodes import Names, Unit, add_quantity, add_state
-from drivers.opcua_security import secure
+from drivers.opcua_security import Say, authenticator_of, secure
 from drivers.results_alarms import Conditions, KnowingServer, Source
 from drivers.results_settings import ResultsSettings
 from drivers.results_state import MEANS, SIDES, Reading, Standing, Status
 from twin.errors import SourceError, TwinError
+from twin.login import Authenticator
 from twin.signals import Phase
 
 # It logs clients that hang up as errors; what stops the server is raised as well.
@@ -99,6 +100,10 @@ class Asking:
         with self._sending:
             self._pipe.send(message)
 
+    def complain(self, what: str) -> None:
+        """Have a trouble said on standard error, where somebody reads it."""
+        self.send(("complaint", what))
+
     def ask(self, asset: str, alarm: str, who: str) -> None:
         """Have an alarm acknowledged; SourceError if that is refused, or nobody answers."""
         number, answer = next(self._numbers), Future[str]()
@@ -130,11 +135,13 @@ class Serving:
 
     async def run(self, messages: "asyncio.Queue[tuple[Any, ...] | None]") -> None:
         """Serve until there are no more messages; SourceError where the address cannot be had."""
-        server = self._server = await _prepared(self._settings)
+        authenticator = authenticator_of(self._settings.users, self._asking.complain)
+        server = await _prepared(self._settings, authenticator, self._asking.complain)
+        self._server = server
         self._index = await server.register_namespace(NAMESPACE)
         names = ua.NodeId("EjectorTwin", self._index), ua.QualifiedName("EjectorTwin", self._index)
         self._root = await server.get_objects_node().add_object(*names)
-        self._conditions = Conditions(server, self._settings.acknowledge)
+        self._conditions = Conditions(server, authenticator)
         try:
             await server.start()
         except OSError as error:
@@ -293,14 +300,16 @@ def _bounded(server: Server) -> None:
     inside.max_pending_messages_per_connection = MOST_REQUESTS
 
 
-async def _prepared(settings: ResultsSettings) -> Server:
+async def _prepared(
+    settings: ResultsSettings, authenticator: Authenticator | None, say: Say
+) -> Server:
     server = Server(KnowingServer())
     await server.init()
     _bounded(server)
     server.set_endpoint(f"opc.tcp://{settings.host}:{settings.port}/")
     server.set_server_name("ejector-twin")
     await server.set_application_uri(APPLICATION)
-    await secure(server, settings, settings.passwords())
+    await secure(server, settings, authenticator, say)
     return server
 
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Literal, Self
 from pydantic import Field, model_validator
 
 from twin.errors import ConfigError
-from twin.secret import Secret
 from twin.settings import Document, Settings
+from twin.users import UsersFile
 
 if TYPE_CHECKING:
     from drivers.results_state import Results
@@ -27,8 +27,7 @@ class ResultsSettings(Settings):
     interval_ms: float = Field(default=100.0, ge=20, le=10_000)  # between two values
     policies: tuple[Policy, ...] = Field(default=("None",), min_length=1)
     certificates: Path | None = None  # a folder as twin cert makes it; the same as the driver's
-    users: dict[str, Secret] = Field(default={})  # with their passwords; if any, of all
-    acknowledge: tuple[str, ...] = ()  # of the users those who may acknowledge alarms
+    users: UsersFile | None = None  # as twin users makes it; with one, everybody logs in
     unprotected: bool = False  # beyond this machine without a policy all the same
 
     @model_validator(mode="after")
@@ -39,8 +38,6 @@ class ResultsSettings(Settings):
             raise ValueError(
                 "users need policies without None: a password is not sent in the clear"
             )
-        if unknown := set(self.acknowledge) - set(self.users):
-            raise ValueError(f"acknowledge: no such user: {', '.join(sorted(unknown))}")
         if "None" in self.policies and not _is_loopback(self.host) and not self.unprotected:
             raise ValueError(
                 f'"{self.host}" is beyond this machine: set policies without None, or say '
@@ -51,15 +48,8 @@ class ResultsSettings(Settings):
     def below(self, folder: Path) -> "ResultsSettings":
         """Give the same with files looked for in ``folder``, unless their paths are absolute."""
         pki = None if self.certificates is None else folder / self.certificates
-        users = {name: secret.below(folder) for name, secret in self.users.items()}
+        users = None if self.users is None else folder / self.users
         return self.model_copy(update={"certificates": pki, "users": users})
-
-    def passwords(self) -> dict[str, str]:
-        """Of every user; ConfigError where one cannot be read or is empty."""
-        return {
-            name: secret.read(f"[results] users.{name}", Path())
-            for name, secret in self.users.items()
-        }
 
 
 @contextmanager

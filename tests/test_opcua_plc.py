@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from asyncua import Client, ua
 from opcua_plc import OpcuaPlc, acquainted, start_opcua, started, trust
+from user_files import quick_users
 
 from drivers import certificates
 from drivers.lasting import REAL, Clock, LostError
@@ -24,6 +25,7 @@ from drivers.sources import open_source
 from twin.errors import ConfigError, SourceError
 from twin.settings import Document
 from twin.signals import SAMPLE, Quality, Samples
+from twin.users import Role
 
 SUBSCRIBE = {"mode": "subscribe", "interval_ms": 50, "sampling_ms": 5}
 
@@ -243,12 +245,12 @@ def awkward(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OpcuaPlc]:
     acquainted(folder)
     certificates.make(folder / "person", "someone")
     trust(folder / "theirs", folder / "person", certificates.USERS)
-    (folder / "twin").write_text("gehäuse-s3cret", encoding="utf-8")
+    users = quick_users(folder / "users.toml", ("twin", "gehäuse-s3cret", Role.LOOK))
     with start_opcua(
         folder,
         policies=["Basic256Sha256"],
         certificates=str(folder / "theirs"),
-        users={"twin": {"file": str(folder / "twin")}},
+        users=str(users.path),
         min_sampling_ms=20,
         min_publishing_ms=100,
         late_publishing_ms=30,

@@ -23,6 +23,7 @@ from independent import PEERS, free_port
 from opcua_plc import acquainted
 from plc_process import start_plc
 from pydantic import ValidationError
+from user_files import quick_users
 
 from drivers import certificates
 from drivers.results import ResultsServer
@@ -32,9 +33,9 @@ from drivers.sources import open_source
 from twin.errors import ConfigError, SourceError
 from twin.events import Event, Kind
 from twin.live import run
-from twin.secret import Secret
 from twin.settings import Document
 from twin.signals import SAMPLE, TICK, Phase, Quality, Samples, Ticks
+from twin.users import Role
 
 NAMESPACE = "urn:ejector-twin:results"
 FIGURES = {"t0": "ms", "max_vacuum": "mbar", "leakage": "mbar/s"}
@@ -263,7 +264,7 @@ def test_when_the_twin_has_stopped_nothing_is_good_any_more(results: Results) ->
         ({"host": "0.0.0.0"}, "is beyond this machine"),
         ({"host": "192.168.0.5", "policies": ["None", "Basic256Sha256"]}, "certificates"),
         ({"policies": ["Basic256Sha256"]}, "policies need certificates"),
-        ({"users": {"scada": {"file": "secret"}}}, "a password is not sent in the clear"),
+        ({"users": "users.toml"}, "a password is not sent in the clear"),
         ({"policies": []}, "at least 1"),
         ({"interval_ms": 1}, "greater than or equal to 20"),
     ],
@@ -301,16 +302,53 @@ def test_two_places_for_one_process_are_refused() -> None:
         pass
 
 
-@pytest.mark.parametrize("content", [None, ""])
-def test_a_password_that_cannot_be_used(tmp_path: Path, content: str | None) -> None:
+@pytest.mark.parametrize("text", [None, "", "nonsense"])
+def test_users_that_cannot_be_used(tmp_path: Path, text: str | None) -> None:
     acquainted(tmp_path)
-    if content is not None:
-        (tmp_path / "password").write_text(content, encoding="utf-8")
-    settings = protected(tmp_path).model_copy(
-        update={"users": {"scada": Secret(file=tmp_path / "password")}}
-    )
-    with pytest.raises(ConfigError, match=r"users\.scada"), ResultsServer(settings, {}):
-        pass
+    if text is not None:
+        (tmp_path / "users.toml").write_text(text, encoding="utf-8")
+        (tmp_path / "users.toml").chmod(0o600)
+    settings = protected(tmp_path, users=tmp_path / "users.toml")
+    with pytest.raises(ConfigError, match=r"users\.toml: no") as refused:
+        ResultsServer(settings, {}).__enter__()
+    assert "twin users add" in refused.value.hint
+
+
+def test_what_hinders_a_login_is_said_by_the_run(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    users = quick_users(tmp_path / "users.toml", ("scada", "correct horse", Role.LOOK))
+
+    def said() -> list[str]:
+        return [one.getMessage() for one in caplog.records if one.name == "drivers.results"]
+
+    async def come(url: str) -> None:
+        client = Client(url)
+        client.set_user("scada")
+        client.set_password("correct horse")
+        async with client:
+            pass
+
+    with ResultsServer(HERE.model_copy(update={"users": users.path}), {}) as server:
+        asyncio.run(come(server.url))
+        users.path.chmod(0o644)
+        with pytest.raises(ua.UaStatusCodeError, match="BadUserAccessDenied"):
+            asyncio.run(come(server.url))
+        end = time.monotonic() + 10.0
+        while not said() and time.monotonic() < end:
+            time.sleep(0.01)
+    (why,) = said()
+    assert "nobody can log in over OPC UA" in why
+    assert f"chmod 600 {users.path}" in why
+
+
+def test_users_stand_beside_the_configuration() -> None:
+    settings = ResultsSettings.model_validate(PROTECTED | {"users": "users.toml"})
+    assert settings.below(Path("/cell-7")).users == Path("/cell-7/users.toml")
+    assert ResultsSettings().below(Path("/cell-7")).users is None
+
+
+PROTECTED = {"policies": ["Basic256Sha256"], "certificates": "pki"}
 
 
 def protected(folder: Path, **changes: Any) -> ResultsSettings:
@@ -522,18 +560,18 @@ def test_a_client_that_hangs_holds_up_nobody(
 @pytest.mark.parametrize("policy", ["Basic256Sha256", "Aes256Sha256RsaPss"])
 def test_node_opcua_comes_in_protected(tmp_path: Path, policy: str) -> None:
     acquainted(tmp_path)
-    (tmp_path / "password").write_text("s3cret\n", encoding="utf-8")
-    settings = protected(tmp_path, users={"scada": Secret(file=tmp_path / "password")})
+    users = quick_users(tmp_path / "users.toml", ("scada", "correct horse", Role.LOOK))
+    settings = protected(tmp_path, users=users.path)
     own = certificates.own(tmp_path / "ours", certificates.datetime.now(certificates.UTC))
     ours = {"certificate": str(own.path), "key": str(own.key), "uri": own.uri, "policy": policy}
     read = ["rig-01.Meas.Pressure"]
     with ResultsServer(settings, FIGURES) as server:
         server.sink("rig-01", "").write(*rows(), [])
         time.sleep(0.3)
-        right = {"user": {"userName": "scada", "password": "s3cret"}}
+        right = {"user": {"userName": "scada", "password": "correct horse"}}
         found = by_node(server, tmp_path, read=read, **ours, **right)
         assert found["read"]["rig-01.Meas.Pressure"]["value"] == pytest.approx(400.0)
-        wrong = {"user": {"userName": "scada", "password": "secret"}}
+        wrong = {"user": {"userName": "scada", "password": "wrong horse"}}
         assert (
             "BadUserAccessDenied" in by_node(server, tmp_path, read=read, **ours, **wrong)["error"]
         )

@@ -51,13 +51,17 @@ def test_no_password_in_the_url_of_a_database(kind: type[Settings], url: str) ->
         ({"url": POSTGRES, "password": SECRET}, AlarmSettings),
         ({"host": "broker", "user": "ann", "password": SECRET}, MqttSettings),
         ({"url": "https://a", "headers": {"A": SECRET}}, WebhookSettings),
-        ({"opcua": True, **BASIC, "users": {"ann": SECRET}}, ResultsSettings),
-        ({**BASIC, "users": {"ann": SECRET}}, OpcuaServer),
         ({"name": "ann", "password": SECRET}, User),
     ],
 )
 def test_no_secret_itself(table: dict[str, Any], kind: type[Settings]) -> None:
     assert '{ file = "FILE" } or { env = "NAME" }' in refused(table, kind)
+
+
+@pytest.mark.parametrize("kind", [ResultsSettings, OpcuaServer])
+def test_no_password_of_a_user(kind: type[Settings]) -> None:
+    table = {**BASIC, "users": {"ann": SECRET}}
+    assert "the name of a file is needed; twin users makes it" in refused(table, kind)
 
 
 @pytest.mark.parametrize(

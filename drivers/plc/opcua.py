@@ -12,7 +12,7 @@ from asyncua import Node, Server, ua
 from asyncua.common.utils import ServiceError
 
 from drivers.opcua_nodes import Unit, add_quantity
-from drivers.opcua_security import secure
+from drivers.opcua_security import GuardedServer, authenticator_of, secure
 from drivers.plc.opcua_server import Behaviour
 from drivers.plc.partner import Written
 from drivers.plc.registers import Registers
@@ -23,6 +23,7 @@ from twin.signals import Command
 
 # It logs clients that hang up as errors; what stops the PLC is raised as well.
 logging.getLogger("asyncua").setLevel(logging.CRITICAL)
+_log = logging.getLogger(__name__)
 
 NAMESPACE = "urn:ejector-twin:plc"
 APPLICATION = "urn:ejector-twin:simulated-plc"
@@ -191,12 +192,13 @@ async def serving(
         memory, name = named[node]
         return memory.value(name, sequence)
 
-    server = Server()
+    server = Server(GuardedServer())
     await server.init()
     server.set_endpoint(f"opc.tcp://{settings.host}:{settings.port}/")
     server.set_server_name("ejector-twin simulated PLC")
     await server.set_application_uri(APPLICATION)
-    await secure(server, settings, settings.passwords())
+    authenticator = authenticator_of(settings.users, _log.warning)
+    await secure(server, settings, authenticator, _log.warning)
     index = await _namespace(server, settings.namespace_index)
     for memory, registers in zip(served, memories, strict=True):
         await _Space(server, index, memory).build(registers.task.settings)

@@ -6,8 +6,8 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from twin.errors import ConfigError
-from twin.secret import Secret
 from twin.settings import Settings
+from twin.users import UsersFile
 
 
 class Rig(Settings):
@@ -137,20 +137,13 @@ class OpcuaServer(Settings):
     drop_every_s: float = Field(default=0.0, ge=0)  # hang up on everybody so often; 0: never
     policies: tuple[Policy, ...] = ("None",)
     certificates: Path | None = None  # a folder as twin cert makes it
-    users: dict[str, Secret] = Field(default={})  # with their passwords; if any, of all
+    users: UsersFile | None = None  # as twin users makes it; with one, everybody logs in
 
     @model_validator(mode="after")
     def _can_be_secure(self) -> Self:
         if self.policies != ("None",) and self.certificates is None:
             raise ValueError("policies other than None need certificates, a folder by twin cert")
         return self
-
-    def passwords(self) -> dict[str, str]:
-        """Of every user; ConfigError where one cannot be read."""
-        return {
-            name: secret.read(f"[plc.opcua] users.{name}", Path())
-            for name, secret in self.users.items()
-        }
 
 
 class PlcSettings(Settings):
