@@ -205,6 +205,26 @@ def test_without_login_there_is_nothing_to_press(site: Site) -> None:
     expect(card(page).get_by_role("button")).to_have_count(0)
 
 
+def test_only_what_the_role_allows_can_be_pressed(site: Site, tmp_path: Path) -> None:
+    users, page = quick_users(tmp_path / "users.toml"), site.open()
+    site.run.leak()
+    users.set_role("ann", Role.LOOK)
+    site.log_in(page)
+    site.until_light(page, "red")
+    expect(card(page)).to_contain_text("ann may look, and acknowledges nothing")
+    expect(card(page).get_by_role("button")).to_have_count(0)
+    users.set_role("ann", Role.ACKNOWLEDGE)
+    page.reload()
+    expect(card(page).get_by_role("button", name="Acknowledge")).to_be_visible()
+    card(page).get_by_role("button", name="Keep quiet").click()
+    expect(page.get_by_role("button", name="1 hour")).to_be_visible()
+    expect(page.get_by_role("button", name="Until it is taken into service")).to_have_count(0)
+    users.set_role("ann", Role.CONFIGURE)
+    page.reload()
+    card(page).get_by_role("button", name="Keep quiet").click()
+    expect(page.get_by_role("button", name="Until it is taken into service")).to_be_visible()
+
+
 def test_a_request_waits_for_a_run_and_the_page_says_so(site: Site) -> None:
     page = site.open()
     site.log_in(page)

@@ -171,6 +171,10 @@ function deeds(alarm) {
       element("a", { class: "button", href: "/login" }, "Log in to acknowledge"), reportLink(alarm));
   }
   const allowed = possible.filter((deed) => me.may.includes(deed));
+  if (!me.may.length) {
+    return element("div", { class: "deeds" },
+      element("span", {}, `${me.user} may look, and acknowledges nothing`), reportLink(alarm));
+  }
   return element("div", { class: "deeds" }, ...allowed.map((deed) => element(
     "button", {
       type: "button", class: deed === "acknowledged" ? "first" : false,
