@@ -16,7 +16,7 @@ from cryptography import x509
 
 from drivers import certificates
 from drivers import opcua_trust as trust
-from twin.audit import Audit
+from twin.audit import Act, Audit
 from twin.errors import ConfigError, SourceError, TwinError
 from twin.login import Authenticator
 from twin.users import Users
@@ -114,6 +114,10 @@ class Door:
         if username:
             return self._logged_in(username, password or "")
         right = self.anybody or certificate in self._certificates
+        if self._authenticator is not None and certificate is not None:
+            act = Act.LOGGED_IN if right else Act.DENIED
+            who = certificates.described(x509.load_der_x509_certificate(certificate))
+            self._authenticator.audit.record(act, who, ADDRESS.get())
         return Person(UserRole.User, None, ADDRESS.get()) if right else None
 
     def _logged_in(self, name: str, password: str) -> Person | None:

@@ -9,8 +9,10 @@ import pytest
 from asyncua import Client, Server, ua
 from asyncua.common.utils import ServiceError
 from asyncua.ua import UaStatusCodeError
+from cryptography.hazmat.primitives.serialization import Encoding
 from user_files import quick_users
 
+from drivers import certificates
 from drivers.opcua_security import ADDRESS, Door, GuardedServer, Person, authenticator_of, secure
 from twin import login
 from twin.audit import Audit, records
@@ -91,6 +93,27 @@ def test_users_that_cannot_be_read_let_nobody_in(users: Users) -> None:
     assert not door.anybody
     (why,) = said
     assert "not a file of users" in why
+
+
+def test_a_certificate_is_told_by_its_name(users: Users, tmp_path: Path) -> None:
+    known = certificates.make(tmp_path / "person", "panel 7").certificate
+    other = certificates.make(tmp_path / "stranger", "nobody").certificate
+    pki = tmp_path / "pki"
+    (pki / certificates.USERS).mkdir(parents=True)
+    der = known.public_bytes(Encoding.DER)
+    (pki / certificates.USERS / "panel.der").write_bytes(der)
+    audit = Audit(users.path.parent, "opcua", pytest.fail)
+    door = Door(pki, Authenticator(users, audit), pytest.fail)
+    person = door.get_user(None, certificate=der)
+    assert person is not None
+    assert person.name is None
+    assert door.get_user(None, certificate=other.public_bytes(Encoding.DER)) is None
+    assert door.get_user(None) is None
+    inside, outside = records(users.path.parent)[0]
+    assert (inside["what"], outside["what"]) == ("logged_in", "denied")
+    assert inside["who"] == certificates.described(known)
+    assert "panel 7" in inside["who"]
+    assert "nobody" in outside["who"]
 
 
 def test_without_users_anybody_may_look_and_has_no_name() -> None:

@@ -63,7 +63,7 @@ class Audit:
         moment = f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest_ns // 1000:06d}Z"
         told = {"time": moment, "what": str(what), "who": who[:LONGEST]}
         told |= {"through": self._through, "from": address}
-        told |= {name: text[:LONGEST] for name, text in details.items()}
+        told |= {name: text[:LONGEST] for name, text in details.items() if text}
         line = json.dumps(told, ensure_ascii=False).encode(errors="replace") + b"\n"
         path = self._folder / (REFUSED if what in _REFUSALS else DONE)
         try:
