@@ -1,5 +1,7 @@
 """The fault run in short, and that it would see what it looks for."""
 
+import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +11,9 @@ from log_rows import HEADER
 
 from drivers.plc.live import WITNESSED
 from tools import fault_run
+from twin.events import Event, Kind
 from twin.log.recorder import Recorder
-from twin.signals import MBAR, Quality, Samples
+from twin.signals import MBAR, TICK, Quality, Samples
 
 
 def test_after_every_disturbance_the_log_is_true_and_the_twin_right(
@@ -39,12 +42,15 @@ def sampled() -> tuple[Samples, np.ndarray]:
     return samples, theirs
 
 
-def judged(folder: Path, samples: Samples, *boots: np.ndarray) -> list[str]:
+def judged(
+    folder: Path, samples: Samples, *boots: np.ndarray, happened: Sequence[Event] = ()
+) -> list[str]:
     paths = [folder / f"boot{number}.bin" for number in range(len(boots))]
     for path, theirs in zip(paths, boots, strict=True):
         theirs.tofile(path)
     twin, monitor = rigs.twin("test_rig"), rigs.monitor("test_rig")
     with Recorder(folder / "a.mcap", HEADER) as recorder:
+        recorder.write(samples[:0], np.empty(0, TICK), happened)
         for block in rigs.cut(samples, 1000):
             rows, ticks = twin.advance(block)
             recorder.write(rows, ticks, monitor.update(rows, ticks))
@@ -82,6 +88,39 @@ def test_a_hole_without_a_mark_is_seen(tmp_path: Path) -> None:
     samples, theirs = sampled()
     rows = np.delete(samples, np.s_[300:301])
     assert "gaps are not where rows are missing" in "; ".join(judged(tmp_path, rows, theirs))
+
+
+def test_an_outage_without_an_end_is_seen(tmp_path: Path) -> None:
+    samples, theirs = sampled()
+    told = [Event(0, Kind.OUTPUT_DOWN, "log: no space", {"output": "log"})]
+    assert judged(tmp_path, samples, theirs, happened=told) == [
+        "log: was down 1 times, and back 0 times"
+    ]
+
+
+def test_a_part_without_an_end_is_seen(tmp_path: Path) -> None:
+    samples, theirs = sampled()
+    judged(tmp_path, samples, theirs)
+    path = tmp_path / "a.mcap"
+    os.truncate(path, path.stat().st_size - 1)
+    verdict = fault_run.Verdict()
+    fault_run.judge(path, [tmp_path / "boot0.bin"], verdict)
+    assert verdict.problems == [
+        "not finished and not told of: ['a.mcap']",
+        "the log is not complete",
+    ]
+
+
+@pytest.mark.parametrize("name", ["the disk is full", "the folder of the log is deleted"])
+def test_disk_faults_cost_no_row(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fault_run, "GROWTH_MB", 60.0)
+    monkeypatch.setattr(fault_run, "DISTURBANCES", {name: fault_run.DISTURBANCES[name]})
+    verdict, _ = fault_run.run("modbus", 20.0, 1, 1, tmp_path)
+    assert verdict.problems == []
+    assert verdict.counts["log_down"] == 1
+    assert verdict.counts["parts"] == 2
 
 
 def test_rows_of_no_plc_are_seen(tmp_path: Path) -> None:

@@ -2,9 +2,11 @@
 
 Disturbances are drawn by seed; between the twin and the PLC stands a proxy that cuts, garbles,
 truncates, delays and lies. Strangers flood the port where results are served, that server is
-killed, and the clock here is set. The PLC keeps what it sampled, and the log is held against that:
-every sample is in it exactly once, bit for bit, or inside a recorded gap with the right bounds. The
-twin must be right again within a cycle, and its process must not grow.
+killed, and the clock here is set. The disk is full, and the folder of the log is deleted. The PLC
+keeps what it sampled, and the log is held against that: every sample is in it exactly once, bit for
+bit, or inside a recorded gap with the right bounds. Files that were deleted count with what the
+twin had written into them. The twin must be right again within a cycle, and its process must not
+grow.
 
     python tools/fault_run.py --protocol opcua --seconds 1200 --disturbances 40
 """
@@ -12,6 +14,8 @@ twin must be right again within a cycle, and its process must not grow.
 import argparse
 import asyncio
 import json
+import resource
+import shutil
 import signal
 import socket
 import struct
@@ -27,7 +31,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -36,8 +40,10 @@ import tomli_w
 from asyncua import Client, ua
 
 from drivers.plc.live import WITNESSED
-from twin.events import Kind
-from twin.log.reader import open_log
+from twin.events import Event, Kind
+from twin.log.part import SUFFIX, first_parts
+from twin.log.reader import Log, open_log
+from twin.log.records import is_complete
 from twin.signals import BREAK, MBAR, SAMPLE, TICK, Phase, Quality, Samples, Ticks
 
 ROOT = Path(__file__).parents[1]
@@ -184,6 +190,7 @@ class Cell:
     random: np.random.Generator
     boots: list[Path] = field(default_factory=list)  # what each PLC sampled
     seen: list[dict[str, float]] = field(default_factory=list)  # of the twin's process
+    deleted: dict[Path, BinaryIO] = field(default_factory=dict)  # logs, open to be read yet
 
     def __enter__(self) -> Self:
         self.proxy = Proxy(self.random)
@@ -191,7 +198,8 @@ class Cell:
         self.results_port = free_port()
         self._plc_config = self._configured("plc.toml", 0)
         self.start_plc()
-        self.log = self.folder / "run.mcap"
+        self.log = self.folder / "logs" / "run.mcap"
+        self.log.parent.mkdir()
         config = self._configured("twin.toml", self.proxy.port)
         command = [sys.executable, "-c", CLOCK, "run", str(config), "--log", str(self.log)]
         self._said = (self.folder / "twin.txt").open("w")
@@ -213,6 +221,8 @@ class Cell:
         self.plc.stdout.close()
         self._said.close()
         self.proxy.close()
+        for file in self.deleted.values():
+            file.close()
 
     def _configured(self, name: str, port: int) -> Path:
         tables: dict[str, Any] = tomllib.loads(
@@ -250,6 +260,23 @@ class Cell:
     def rows(self) -> int:
         """Bytes of log by now, which grow while rows come."""
         return self.log.stat().st_size if self.log.exists() else 0
+
+    def delete_logs(self) -> None:
+        """Delete the folder of the log; what the twin yet writes into its files can be read."""
+        folder = self.log.parent
+        while folder.exists():
+            for path in folder.iterdir():
+                if path.suffix == SUFFIX:
+                    self.deleted[path] = path.open("rb")
+                path.unlink()
+            with suppress(OSError):  # the twin has begun another part meanwhile
+                folder.rmdir()
+
+    def restore_logs(self) -> None:
+        """Put back what was deleted."""
+        for path, file in self.deleted.items():
+            with path.open("xb") as restored:
+                shutil.copyfileobj(file, restored)
 
     def watch(self) -> None:
         """Take down how big the twin's process is."""
@@ -320,7 +347,21 @@ def _kill_results(cell: Cell, _seconds: float) -> None:
     cell.results_server().kill()
 
 
+def _fill_disk(cell: Cell, seconds: float) -> None:
+    """No file of the twin can grow, as on a full disk; its other processes still can write."""
+    no_limit = resource.RLIM_INFINITY
+    resource.prlimit(cell.twin.pid, resource.RLIMIT_FSIZE, (0, no_limit))
+    time.sleep(seconds)
+    resource.prlimit(cell.twin.pid, resource.RLIMIT_FSIZE, (no_limit, no_limit))
+
+
+def _delete_logs(cell: Cell, _seconds: float) -> None:
+    cell.delete_logs()
+
+
 DISTURBANCES: dict[str, Callable[[Cell, float], None]] = {
+    "the disk is full": _fill_disk,
+    "the folder of the log is deleted": _delete_logs,
     "the PLC lies": _through_proxy("lie"),
     "the wall clock is set": _set_wall_clock,
     "the results port is flooded": _flood_results,
@@ -372,7 +413,8 @@ def judge(log: Path, boots: list[Path], verdict: Verdict) -> None:
     opened = open_log(log)
     pairs = [(np.empty(0, SAMPLE), np.empty(0, TICK)), *opened.blocks()]
     samples, ticks = (np.concatenate(column) for column in zip(*pairs, strict=True))
-    verdict.check(opened.complete, "the log is not complete")
+    events = list(opened.events())
+    lost = _judge_outages(opened, events, verdict)
     verdict.check(len(samples) > 0, "there is nothing in the log")
     sampled = [np.fromfile(path, WITNESSED) for path in boots]
     starts = np.flatnonzero(samples["quality"] & Quality.RESTART)
@@ -384,8 +426,8 @@ def judge(log: Path, boots: list[Path], verdict: Verdict) -> None:
             break
         _held_against(rows, sampled[boot], boot, verdict)
         boot += 1
-    events = list(opened.events())
     told = sum(event.data["missing"] for event in events if event.kind is Kind.GAP)
+    told += lost
     first = samples["quality"] & Quality.RESTART == 0
     steps = np.diff(samples["sequence"])
     missing = int((steps[first[1:]] - 1).sum()) if len(steps) else 0
@@ -400,6 +442,28 @@ def judge(log: Path, boots: list[Path], verdict: Verdict) -> None:
     alarms = [event.text for event in events if event.kind is Kind.DEVIATION]
     verdict.check(not alarms, f"healthy, and yet: {alarms}")
     _judge_twin(samples, ticks, verdict)
+
+
+def _judge_outages(log: Log, events: list[Event], verdict: Verdict) -> int:
+    """Each unfinished part is told of, and the last one is finished; gives how many rows the log
+    says it has lost itself.
+    """
+    down = [event for event in events if event.kind is Kind.OUTPUT_DOWN]
+    back = [event for event in events if event.kind is Kind.OUTPUT_BACK]
+    for name in {event.data["output"] for event in down + back}:
+        began, ended = (
+            sum(event.data["output"] == name for event in kind) for kind in (down, back)
+        )
+        verdict.check(began == ended, f"{name}: was down {began} times, and back {ended} times")
+    of_log = [event for event in down if event.data["output"] == "log"]
+    unfinished = [part.name for part in log.parts if not is_complete(part)]
+    verdict.check(len(unfinished) <= len(of_log), f"not finished and not told of: {unfinished}")
+    verdict.check(is_complete(log.parts[-1]), "the log is not complete")
+    files = len(list(log.path.parent.glob(f"*{SUFFIX}")))
+    verdict.check(len(log.parts) == files, f"{files - len(log.parts)} files are not part of it")
+    verdict.counts |= {"parts": len(log.parts), "log_down": len(of_log)}
+    verdict.counts["output_down"] = len(down)
+    return sum(event.data["rows_lost"] for event in back if event.data["output"] == "log")
 
 
 def _boot_of(rows: Samples, sampled: list[npt.NDArray[np.void]], first: int) -> int:
@@ -504,6 +568,9 @@ def run(
         verdict.check(_is_served(cell), "the results are not served any more")
         cell.twin.send_signal(signal.SIGINT)
         verdict.check(cell.twin.wait(60) == 130, "the twin did not end as it should")
+        left = first_parts(cell.log.parent)
+        verdict.check(len(left) == 1, f"what was not deleted is not one log: {left}")
+        cell.restore_logs()
     judge(cell.log, cell.boots, verdict)
     judge_growth(cell.seen, verdict)
     return verdict, done
