@@ -183,7 +183,9 @@ def logged(path: Path, at: Callable[[float], None]) -> tuple[Samples, Ticks, lis
     clock, notices = Clock(), Notices()
     samples, ticks = course(20_000)
     recorder = Recorder(path, HEADER, 200_000, clock)
-    sink = SupervisedSink("log", recorder, recorder.again, Outages(notices), clock, keeps=True)
+    sink = SupervisedSink(
+        "log", recorder, recorder.again, Outages(notices), clock, held=lambda: recorder.held
+    )
     for start in range(0, len(samples), 50):
         clock.now = (start + 50) / 1000
         at(clock.now)

@@ -945,7 +945,7 @@ def _supervised(
 
     def supervised(name: str, sink: "Sink") -> "Sink":
         if isinstance(sink, Recorder):
-            return SupervisedSink(name, sink, sink.again, outages, keeps=True)
+            return SupervisedSink(name, sink, sink.again, outages, held=lambda: sink.held)
         return SupervisedSink(name, sink, lambda: sink, outages)
 
     return (

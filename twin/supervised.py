@@ -51,8 +51,9 @@ class SupervisedSink:
     """A sink (``twin.live.Sink``) that raises nothing while it is written to.
 
     After a failure rows and events wait, up to KEPT_ROWS, and ``again`` is asked for a sink that
-    works, with a pause that doubles. A sink that ``keeps`` what it failed at is not given that
-    again. ``close`` raises what a sink says at its end.
+    works, with a pause that doubles. A sink that says how many rows it has ``held`` is not given
+    those again with which it raised SourceError, and is tried once more where it fails at its end.
+    ``close`` raises what a sink says at its end.
     """
 
     def __init__(
@@ -63,10 +64,10 @@ class SupervisedSink:
         outages: Outages,
         clock: Callable[[], float] = time.monotonic,
         *,
-        keeps: bool = False,
+        held: Callable[[], int] | None = None,
     ) -> None:
         self._name, self._sink, self._again = name, sink, again
-        self._outages, self._clock, self._keeps = outages, clock, keeps
+        self._outages, self._clock, self._held = outages, clock, held
         self._failure: Exception | None = None
         self._next_s, self._backoff = 0.0, Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S)
         self._waiting: deque[tuple[Samples, Ticks, Sequence[Event]]] = deque()
@@ -79,7 +80,7 @@ class SupervisedSink:
                 self._sink.write(samples, ticks, events)
             except Exception as error:
                 self._set_aside(error)
-                if not self._keeps:
+                if not self._is_held(error):
                     self._keep(samples, ticks, events)
             return
         self._keep(samples, ticks, events)
@@ -88,14 +89,24 @@ class SupervisedSink:
 
     def close(self) -> None:
         """Finish; SourceError where something is missing in it."""
+        if self._failure is None and self._held is not None:
+            try:
+                self._sink.close()
+            except Exception as error:
+                self._set_aside(error)
         if self._failure is not None:
             self._try_again()
         if self._failure is not None:
+            missing = self._rows + self._lost + (self._held() if self._held else 0)
             raise SourceError(
-                f"{self._name}: {self._failure}; {self._rows + self._lost} rows are missing in it",
+                f"{self._name}: {self._failure}; {missing} rows are missing in it",
                 getattr(self._failure, "hint", ""),
             ) from self._failure
         self._sink.close()
+
+    def _is_held(self, error: Exception) -> bool:
+        """Whether a sink that failed has the rows, to write them when it is tried again."""
+        return self._held is not None and isinstance(error, SourceError)
 
     def _keep(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
         if len(samples) or events:
@@ -128,12 +139,13 @@ class SupervisedSink:
         self._backoff.reset()
 
     def _hand_over(self, block: tuple[Samples, Ticks, Sequence[Event]]) -> None:
-        if self._keeps:
-            self._forget_oldest()
+        try:
             self._sink.write(*block)
-        else:
-            self._sink.write(*block)
-            self._forget_oldest()
+        except Exception as error:
+            if self._is_held(error):
+                self._forget_oldest()
+            raise
+        self._forget_oldest()
 
     def _forget_oldest(self) -> None:
         self._rows -= len(self._waiting.popleft()[0])

@@ -5,7 +5,7 @@ near), laid out byte plane by byte plane, most bytes are zero or repeat, and the
 compression takes them away. The coding is written down in twin.log.schema.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -280,6 +280,18 @@ def _unpack(packed, spans, places, n, rows):  # type: ignore[no-untyped-def]
                 for i in range(m):  # numba compiles seconds' worth of what a slice may not fit
                     short[i] = 0
             bits[column] = _sum(bits[column], short[:m], rows, size, at, width)
+
+
+def joined(blocks: Sequence[tuple[Samples, Ticks]]) -> tuple[Samples, Ticks]:
+    """The rows of n > 0 blocks in one."""
+    if len(blocks) == 1:
+        return blocks[0]
+    # As raw bytes: NumPy copies structured rows field by field, 20 times slower.
+    rows, beside = (
+        np.concatenate([one.view((np.void, one.itemsize)) for one in column])
+        for column in zip(*blocks, strict=True)
+    )
+    return rows.view(SAMPLE), beside.view(TICK)
 
 
 class Tray:

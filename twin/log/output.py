@@ -15,10 +15,10 @@ class Output:
     """
 
     def __init__(self, path: Path) -> None:
-        self._raw = path.open("xb", buffering=0)
         # The disk may take its time, hundreds of milliseconds on flash; the live loop has none.
         self._thread = ThreadPoolExecutor(1, "log-sync")
         self._syncing: Future[None] | None = None
+        self._raw = path.open("xb", buffering=0)  # last: what fails leaves no empty file
 
     def write(self, data: bytes) -> None:
         """Write all of it."""

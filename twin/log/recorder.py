@@ -8,13 +8,13 @@ import uuid
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Self, TypeAlias
 
 import numpy as np
 
 from twin.errors import SourceError
 from twin.events import Event, Kind
-from twin.log.columns import Tray, encode
+from twin.log.columns import encode, joined
 from twin.log.header import Identity, LogHeader
 from twin.log.messages import Scalars, encode_event, encode_log
 from twin.log.output import Output
@@ -29,13 +29,16 @@ ROOM = 16 << 20  # bytes that a disk must have free for another part: some minut
 
 _SAMPLES, _SCALARS, _EVENTS, _LOG = CHANNELS
 
+Block: TypeAlias = tuple[Samples, Ticks]
+
 
 class Recorder:
     """Writes a new log, in parts where ``rotate_bytes`` is given.
 
     A part is closed once it is that long, so it may be longer by a chunk (1 MiB). Every method
-    raises SourceError where the file cannot be written; what was written until then can be read,
-    and ``close`` is then quiet. ``again`` goes on in another part.
+    raises SourceError where the file cannot be written; what was written until then can be read.
+    Rows that ``write`` was given are then held, and ``again`` goes on with them in another part.
+    After any other error of ``write`` its rows have not been taken.
     """
 
     def __init__(
@@ -50,12 +53,14 @@ class Recorder:
         self._rotate_bytes = rotate_bytes
         self._clock = clock
         self._flushed = self._synced = clock()
-        self._tray = Tray(BATCH)
         self._scalars = Scalars(header.ambient)
-        self._events: list[tuple[int, Event]] = []  # with ns of receipt
-        # Of the chunk under way, so that another part can begin with it:
-        self._in_chunk: list[tuple[Samples, Ticks]] = []
-        self._events_in_chunk: list[tuple[int, Event]] = []
+        # Rows and events (with ns of receipt) come in here, are laid out as messages, and are
+        # forgotten once a whole chunk with them is in the file.
+        self._blocks: list[Block] = []
+        self._events: list[tuple[int, Event]] = []
+        self._laid_blocks: list[Block] = []
+        self._laid_events: list[tuple[int, Event]] = []
+        self._saved = 0, 0  # messages of rows and of events in this part, forgotten here
         self._host_ns: int | None = None  # of the last row
         self._clocks: dict[str, str] = {}  # as last told of
         self._failure: SourceError | None = None
@@ -71,27 +76,32 @@ class Recorder:
             raise ValueError(f"{len(samples)} samples but {len(ticks)} ticks")
         if self._failure:
             raise self._failure
+        self._take(samples, ticks, events)
         try:
-            self._take(samples, ticks, events)
-        except OSError as error:
+            self._write_on(not len(samples))
+        except Exception as error:
             raise self._fail(error) from error
 
     def close(self) -> None:
         """Write what is held back and the summary; further calls do nothing."""
         if self._closed or self._failure:
             return
-        self._closed = True
         try:
-            self._add_rows(*self._tray.take())
-            self._add_events()
+            self._lay_out()
             self._finish()
-        except OSError as error:
+            self._closed = True
+        except Exception as error:
             raise self._fail(error) from error
 
     @property
     def under_way(self) -> Path:
         """The file of the part that is being written."""
         return part_path(self._path, self._number)
+
+    @property
+    def held(self) -> int:
+        """Rows that are not in a file yet."""
+        return sum(len(rows) for rows, _ in [*self._laid_blocks, *self._blocks])
 
     def again(self) -> Self:
         """After a failure go on in the next part, with what had not reached the file.
@@ -100,36 +110,20 @@ class Recorder:
         """
         if self._failure is None:
             return self
-        self._in_chunk.append(self._tray.take())
-        self._events_in_chunk += self._events
-        self._events = []
-        self._begin_next()
-        rows, events = self._in_chunk, self._events_in_chunk
-        self._forget_chunk()
         try:
-            for block in rows:
-                self._add_rows(*block)
-            self._events += events
+            self._require_room()
+            self._begin(self._number + 1)
+            self._failure = None
             self._flush(self._clock())
-        except OSError as error:
-            self._in_chunk, self._events_in_chunk, self._events = rows, events, []
+        except Exception as error:
             raise self._fail(error) from error
         return self
 
-    def _begin_next(self) -> None:
-        """Begin another part where there is room for it."""
+    def _require_room(self) -> None:
         folder = self._path.parent
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            if shutil.disk_usage(folder).free < ROOM:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        except OSError as error:
-            raise self._fail(error) from error
-        self._begin(self._number + 1)
-        self._failure = None
-
-    def _forget_chunk(self) -> None:
-        self._in_chunk, self._events_in_chunk = [], []
+        folder.mkdir(parents=True, exist_ok=True)
+        if shutil.disk_usage(folder).free < ROOM:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def __enter__(self) -> Self:
         return self
@@ -143,54 +137,78 @@ class Recorder:
         self.close()
 
     def _take(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
-        if len(samples):
-            self._host_ns = int(samples["host_ns"][-1])
-        if events:
-            self._events += zip(self._received(events, samples), events, strict=True)
+        """Hold rows and events: all of them, or none."""
+        last = int(samples["host_ns"][-1]) if len(samples) else self._host_ns
+        received = [*zip(self._received(events, samples, last), events, strict=True)]
+        clocks = self._clocks
         for event in events:
             if event.kind is Kind.CLOCK:
                 at = {"time_ns": str(event.time_ns)}
-                self._clocks = at | {name: str(value) for name, value in event.data.items()}
-        for block in self._tray.add(samples, ticks):
-            self._add_rows(*block)
+                clocks = at | {name: str(value) for name, value in event.data.items()}
+        blocks = [(samples.copy(), ticks.copy())] if len(samples) else []
+        self._blocks, self._events, self._host_ns, self._clocks = (
+            self._blocks + blocks,
+            self._events + received,
+            last,
+            clocks,
+        )
+
+    def _write_on(self, idle: bool) -> None:
+        """Lay out what fills a message, and complete the chunk if it is time to."""
+        while sum(len(rows) for rows, _ in self._blocks) >= BATCH:
+            self._lay_out_rows()
         now = self._clock()
         # An empty block says that nothing comes just now: nothing to wait for.
-        if now - self._flushed >= FLUSH_S or not len(samples):
+        if now - self._flushed >= FLUSH_S or idle:
             self._flush(now)
 
     def _flush(self, now: float) -> None:
-        self._add_rows(*self._tray.take())
-        self._add_events()
+        self._lay_out()
         self._writer.flush()
-        self._forget_chunk()
+        self._forget_saved()
         self._flushed = now
         if now - self._synced >= SYNC_S:
             self._output.sync()
             self._synced = now
 
-    def _add_rows(self, samples: Samples, ticks: Ticks) -> None:
-        if not len(samples):
-            return
-        self._in_chunk.append((samples.copy(), ticks.copy()))
+    def _lay_out(self) -> None:
+        """Lay out all there is."""
+        while self._blocks:
+            self._lay_out_rows()
+        events = self._events
+        self._laid_events, self._events = self._laid_events + events, []
+        for host_ns, event in events:
+            self._writer.add_message(_EVENTS, host_ns, event.time_ns, encode_event(event))
+            self._writer.add_message(_LOG, host_ns, event.time_ns, encode_log(event))
+
+    def _lay_out_rows(self) -> None:
+        """Lay out one message of rows, and begin another part if this one is long enough."""
+        samples, ticks = joined(self._blocks)
+        rest = [(samples[BATCH:], ticks[BATCH:])] if len(samples) > BATCH else []
+        samples, ticks = samples[:BATCH], ticks[:BATCH]
+        self._laid_blocks, self._blocks = [*self._laid_blocks, (samples, ticks)], rest
         host, plc = int(samples["host_ns"][0]), int(samples["time_ns"][0])
         self._writer.add_message(_SAMPLES, host, plc, encode(samples, ticks))
         self._writer.add_messages(_SCALARS, *self._scalars.messages(samples, ticks))
+        self._forget_saved()
         if self._rotate_bytes is not None and self._output.tell() >= self._rotate_bytes:
             self._finish()
-            self._forget_chunk()
             self._begin(self._number + 1)
 
-    def _add_events(self) -> None:
-        self._events_in_chunk += self._events
-        for host_ns, event in self._events:
-            self._writer.add_message(_EVENTS, host_ns, event.time_ns, encode_event(event))
-            self._writer.add_message(_LOG, host_ns, event.time_ns, encode_log(event))
-        self._events.clear()
+    def _forget_saved(self) -> None:
+        """Hold no longer what whole chunks in the file have."""
+        rows, events = self._writer.saved(_SAMPLES), self._writer.saved(_EVENTS)
+        rows_before, events_before = self._saved
+        self._laid_blocks, self._laid_events, self._saved = (
+            self._laid_blocks[rows - rows_before :],
+            self._laid_events[events - events_before :],
+            (rows, events),
+        )
 
-    def _received(self, events: Sequence[Event], samples: Samples) -> list[int]:
+    def _received(self, events: Sequence[Event], samples: Samples, last: int | None) -> list[int]:
         """When the rows were received with which they happened: in a long block not the last."""
         times = np.array([event.time_ns for event in events], np.int64)
-        host = times if self._host_ns is None else np.full(len(times), self._host_ns)
+        host = times if last is None else np.full(len(times), last)
         if len(samples):
             # The PLC's clock may jump back: of the rows that are not later, the last one.
             earliest = np.minimum.accumulate(samples["time_ns"][::-1])[::-1]
@@ -204,32 +222,41 @@ class Recorder:
         try:
             if number == 0 and part_path(path, 1).exists():
                 raise FileExistsError
-            self._output = Output(path)
+            output = Output(path)
         except OSError as error:
-            self._failure = _refused(path, error)
-            raise self._failure from error
+            raise _refused(path, error) from error
         try:
-            self._writer = write_head(self._output, self._header, Identity(self._series, number))
-        except OSError as error:
-            self._fail(error)
+            writer = write_head(output, self._header, Identity(self._series, number))
+        except Exception as error:
+            output.abandon()
             path.unlink(missing_ok=True)  # without a whole head it would end the log
-            self._failure = _refused(path, error)
-            raise self._failure from error
-        self._number = number
+            if isinstance(error, OSError):
+                raise _refused(path, error) from error
+            raise
+        self._output, self._writer, self._number, self._saved = output, writer, number, (0, 0)
 
     def _finish(self) -> None:
+        """Complete the part; what was laid out is in it."""
         if self._clocks:
             self._writer.add_metadata(CLOCK_METADATA, self._clocks)
         self._writer.finish()
         self._output.finish()
+        self._forget_saved()
 
-    def _fail(self, error: OSError) -> SourceError:
+    def _fail(self, error: Exception) -> SourceError:
+        """Let go of the file, and hold what whole chunks in it do not have."""
         self._output.abandon()
-        path = part_path(self._path, self._number)
-        self._failure = SourceError(
-            f"{path}: cannot be written: {error.strerror}",
-            "make space or choose another disk; what was logged until then can be read",
-        )
+        self._forget_saved()
+        self._blocks, self._laid_blocks = self._laid_blocks + self._blocks, []
+        self._events, self._laid_events = self._laid_events + self._events, []
+        if isinstance(error, SourceError):
+            self._failure = error
+        else:
+            why = getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
+            self._failure = SourceError(
+                f"{self.under_way}: cannot be written: {why}",
+                "make space or choose another disk; what was logged until then can be read",
+            )
         return self._failure
 
 

@@ -95,6 +95,7 @@ class Writer:
         self._attachments: list[McapRecord] = []
         self._metadata: list[McapRecord] = []
         self._counts: dict[int, int] = {}  # messages by channel
+        self._saved: dict[int, int] = {}  # of them in chunks that are whole in the file
         self._first = self._last = 0  # log times
         output.write(MAGIC)
         output.write(_bytes(Header("", library)))
@@ -162,6 +163,10 @@ class Writer:
         if self._open.size > CHUNK:
             self.flush()
 
+    def saved(self, channel: int) -> int:
+        """How many messages of a channel are in the file, whatever fails from now on."""
+        return self._saved.get(channel, 0)
+
     def flush(self) -> None:
         """Complete the chunk under way, if it has messages: then it is in the file."""
         if not self._open.entries:
@@ -180,8 +185,9 @@ class Writer:
         self._write_chunk(chunk, {channel: _index(channel, joined[channel]) for channel in joined})
 
     def _write_chunk(self, chunk: Chunk, indexes: dict[int, bytes]) -> None:
-        start, raw = self._output.tell(), _bytes(chunk)
+        start, raw, counts = self._output.tell(), _bytes(chunk), dict(self._counts)
         self._output.write(raw)
+        self._saved = counts  # also where the index that follows cannot be written
         lengths = [len(index) for index in indexes.values()]
         offsets = self._output.tell() + np.cumsum([0, *lengths])
         self._output.write(b"".join(indexes.values()))
