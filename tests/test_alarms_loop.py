@@ -1,5 +1,6 @@
 """Alarms beside the loop: from events to episodes in the database, through restarts."""
 
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -350,6 +351,29 @@ def test_states_of_alarms_that_there_are_no_more_are_left() -> None:
 
 def kept(where: str | Path) -> Keeper:
     return Keeper(lambda: open_store(where), UNIT, pytest.fail)
+
+
+def test_a_defect_does_not_end_what_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("twin.alarms.keeper.POLL_S", 0.001)
+    monkeypatch.setattr("twin.alarms.keeper.RETRY_S", 0.001)
+    save, failures, said = Store.save, iter([MemoryError(), ValueError("a defect")]), list[str]()
+
+    def flaky(store: Store, *what: Any) -> None:
+        for error in failures:
+            raise error
+        save(store, *what)
+
+    monkeypatch.setattr(Store, "save", flaky)
+    keeper = Keeper(lambda: open_store(tmp_path / "a.sqlite"), UNIT, said.append)
+    keeper.begin()
+    keeper.take(News(answers={1: ""}))
+    end = time.monotonic() + 20.0
+    while len(said) < 2 and time.monotonic() < end:
+        time.sleep(0.002)
+    keeper.close()
+    assert said == ["alarms wait in memory: MemoryError: ", "alarms are stored again"]
 
 
 def test_the_loop_keeps_its_episodes_and_goes_on_after_a_restart(url: str) -> None:

@@ -107,6 +107,32 @@ def test_a_database_that_is_away_is_said_once_and_waited_for(
         assert store.history(UNIT).cycle.tolist() == [1, 2]
 
 
+def test_a_defect_does_not_end_what_is_stored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "BATCH_S", 0.001)
+    monkeypatch.setattr(module, "RETRY_S", 0.001)
+    failures, again = iter([MemoryError(), ValueError("a defect")]), threading.Event()
+
+    def flaky() -> Store:
+        for error in failures:
+            raise error
+        again.set()
+        return open_store(tmp_path / "f.sqlite")
+
+    said: list[str] = []
+    keeper = Keeper(flaky, UNIT, "a", said.append)
+    keeper.write(*NONE, [cycle(1)])
+    assert again.wait(20.0)
+    keeper.close()
+    assert said == [
+        "key figures wait in memory: MemoryError: ",
+        "key figures are stored again: 1 cycles had waited",
+    ]
+    with open_store(tmp_path / "f.sqlite") as store:
+        assert store.history(UNIT).cycle.tolist() == [1]
+
+
 def test_what_is_stored_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "BATCH_S", 0.01)
     batches: queue.Queue[list[int]] = queue.Queue()

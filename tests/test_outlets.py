@@ -422,22 +422,21 @@ def test_an_outbox_that_is_away_is_waited_for(bench: Bench) -> None:
     assert bench.settled() == ["1"]
 
 
-FALLS = pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_sender_goes_on_after_a_defect(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench.sender, "_backoff", Backoff(0.001, 0.001))
+    take, failures = bench.channel.take, iter([ValueError("a defect"), MemoryError()])
 
-
-@FALLS
-def test_a_sender_that_falls_says_so(bench: Bench) -> None:
-    def fall(_message: Message) -> str:
-        raise ValueError("a defect")
+    def fall(one: Message) -> str:
+        for error in failures:
+            raise error
+        return take(one)
 
     bench.channel.take = fall
     bench.put(message(1))
     bench.sender.start()
-    bench.sender.join()
-    assert bench.said == [
-        "alarms wait in the outbox: mqtt is given up in this run: ValueError: a defect"
-    ]
-    assert bench.outbox.count("mqtt") == 1
+    assert bench.settled() == ["1"]
+    assert bench.said[0] == "alarms wait in the outbox: mqtt: ValueError: a defect"
+    assert bench.said[1:] == ["alarms go to mqtt again"]
 
 
 # --- beside the loop ----------------------------------------------------------------------------
@@ -529,18 +528,25 @@ def test_the_end_does_not_wait_for_who_does_not_answer(
     assert to.join(20.0)
 
 
-@FALLS
-def test_a_thread_of_the_outbox_that_falls_says_so(tmp_path: Path) -> None:
-    said = list[str]()
+def test_the_outbox_is_written_after_a_defect(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dispatch, "RETRY_S", 0.001)
+    said, failures = list[str](), iter([ValueError("a defect"), MemoryError()])
 
     def opened() -> Outbox:
-        raise ValueError("a defect")
+        for error in failures:
+            raise error
+        return open_outbox(tmp_path / "a.sqlite", UNIT)
 
-    stream = Stream()
-    stream.at(5, deviation(5))
-    to = Sender("mqtt", Fake(), lambda: open_outbox(tmp_path / "a.sqlite", UNIT), Outlet(), print)
-    outlets = Outlets(UNIT, opened, [to], said.append)
+    outlets = Outlets(UNIT, opened, [], said.append)
     outlets.begin([])
-    outlets.write(NONE, NO_TICKS, stream.said)
+    outlets.tell("mqtt", message(1))
+    wait_until(lambda: len(said) == 2)
     outlets.close()
-    assert said == ["changes of alarms are not put into the outbox any more: ValueError: a defect"]
+    assert said == [
+        "changes of alarms wait in memory, not in the outbox: ValueError: a defect",
+        "changes of alarms are in the outbox again",
+    ]
+    with open_outbox(tmp_path / "a.sqlite", UNIT) as outbox:
+        assert outbox.count("mqtt") == 1

@@ -3,6 +3,7 @@
 import itertools
 import threading
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -150,24 +151,29 @@ def test_while_plc_time_stands_still_no_more_than_a_bound_is_held(path: Path) ->
     assert live.next == len(rows)
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_the_end_does_not_wait_for_a_thread_that_fell(
+def test_rows_that_cannot_be_written_are_left_out_and_said_once(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fall(*_told: object) -> None:
-        raise ValueError("a defect")
+    add, said, failures = (
+        ring._Writer.add,
+        list[str](),
+        iter([MemoryError(), ValueError("a defect")]),
+    )
 
-    monkeypatch.setattr(ring, "MOST_WAITING", 2)
+    def fall(writer: Any, rows: Any) -> None:
+        for error in failures:
+            raise error
+        add(writer, rows)
+
     monkeypatch.setattr(ring._Writer, "add", fall)
-    live = LiveRows(path, AMBIENT, lambda _what: None)
-    live.write(*flat(1), [])
-    live._thread.join()
-    for _ in range(3):
-        live.write(*flat(1), [])  # nobody takes them
-    ends = threading.Thread(target=live.close, daemon=True)
-    ends.start()
-    ends.join(20.0)
-    assert not ends.is_alive()
+    live = LiveRows(path, AMBIENT, said.append)
+    for at in range(5):
+        live.write(*flat(PER_ROW, at * ROW_NS), [])
+    live.close()
+    assert said == ["the page's live rows: some are missing: MemoryError: "]
+    found = read(path)
+    assert found is not None
+    assert found.next == 2  # a row is written once the next one begins
 
 
 def test_another_run_of_the_same_ejector_is_refused(path: Path) -> None:
@@ -189,7 +195,7 @@ def test_a_slow_disk_costs_rows_and_is_said_once(
     live = LiveRows(path, AMBIENT, said.append)
     for at in range(20):
         live.write(*flat(PER_ROW, at * ROW_NS), [])  # does not wait
-    assert said == ["the page's live rows cannot be written quickly enough: some are missing"]
+    assert said == ["the page's live rows: some are missing: cannot be written quickly enough"]
     slow.set()
     live.close()
 

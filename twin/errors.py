@@ -31,6 +31,11 @@ class SourceError(TwinError):
     exit_code = 3
 
 
+def in_words(error: Exception) -> str:
+    """What went wrong: a TwinError says it, of others the kind belongs to it."""
+    return str(error) if isinstance(error, TwinError) else f"{type(error).__name__}: {error}"
+
+
 def known_names(asked: str, names: Iterable[str]) -> str:
     """A hint where nothing is called ``asked``: the name that is nearest, and those there are."""
     there = sorted(set(names))

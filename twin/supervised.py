@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from twin.backoff import Backoff
-from twin.errors import SourceError
+from twin.errors import SourceError, in_words
 from twin.events import Event, Kind
 from twin.live import Adviser, Sink
 from twin.monitor.listening import Notices
@@ -35,7 +35,7 @@ class Outages:
         if name in self._down:
             return
         self._down[name] = now_s
-        text = f"{name}: {why}; monitoring goes on, and it is tried again"
+        text = f"{name}: {in_words(why)}; monitoring goes on, and it is tried again"
         self.notices.tell(Kind.OUTPUT_DOWN, text, {"output": name})
 
     def end(self, name: str, lost: int, now_s: float) -> None:
@@ -99,7 +99,7 @@ class SupervisedSink:
         if self._failure is not None:
             missing = self._rows + self._lost + (self._held() if self._held else 0)
             raise SourceError(
-                f"{self._name}: {self._failure}; {missing} rows are missing in it",
+                f"{self._name}: {in_words(self._failure)}; {missing} rows are missing in it",
                 getattr(self._failure, "hint", ""),
             ) from self._failure
         self._sink.close()

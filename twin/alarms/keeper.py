@@ -8,7 +8,7 @@ from twin.alarms.loop import Before, News
 from twin.alarms.requests import Request
 from twin.alarms.store import Store
 from twin.assets.unit import Unit
-from twin.errors import TwinError
+from twin.errors import TwinError, in_words
 
 POLL_S = 1.0  # between looks at what is asked; what has changed is written with it
 RETRY_S = 5.0  # after the database could not be reached
@@ -79,10 +79,10 @@ class Keeper:
                 self._store.save(self._unit, self._waiting)
             self._waiting = News()
             self._pass_on(self._store.requests(self._unit))
-        except TwinError as error:
+        except Exception as error:  # whatever it is, later ones are to be stored
             self._let_go()
             if not self._failed:
-                self._say(f"alarms wait in memory: {error}")
+                self._say(f"alarms wait in memory: {in_words(error)}")
             self._failed = True
             return False
         if self._failed:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from twin.assets.unit import Unit
-from twin.errors import TwinError
+from twin.errors import in_words
 from twin.events import Event, Kind, Severity
 from twin.figures.store import Store
 from twin.signals import Samples, Ticks
@@ -95,10 +95,10 @@ class Keeper:
         try:
             self._store = self._store or self._open_store()
             self._store.add(*self._whose, self._waiting)
-        except TwinError as error:
+        except Exception as error:  # whatever it is, later ones are to be stored
             self._let_go()
             if not self._failed:
-                self._say(f"key figures wait in memory: {error}")
+                self._say(f"key figures wait in memory: {in_words(error)}")
             self._failed = True
             return False
         if self._failed:

@@ -12,7 +12,7 @@ from typing import Self, TypeAlias
 
 import numpy as np
 
-from twin.errors import SourceError
+from twin.errors import SourceError, in_words
 from twin.events import Event, Kind
 from twin.log.columns import encode, joined
 from twin.log.header import Identity, LogHeader
@@ -252,7 +252,7 @@ class Recorder:
         if isinstance(error, SourceError):
             self._failure = error
         else:
-            why = getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
+            why = getattr(error, "strerror", None) or in_words(error)
             self._failure = SourceError(
                 f"{self.under_way}: cannot be written: {why}",
                 "make space or choose another disk; what was logged until then can be read",

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from twin.assets.unit import Unit
-from twin.errors import TwinError
+from twin.errors import in_words
 from twin.events import Event
 from twin.outlets.data import Teller
 from twin.outlets.message import Message, of_event, restated
@@ -124,16 +124,6 @@ class Outlets:
     # --- the thread -----------------------------------------------------------------------------
 
     def _work(self) -> None:
-        try:
-            self._write_until_the_end()
-        except Exception as error:  # ours, which is to be found in what is said
-            what = f"{type(error).__name__}: {error}"
-            self._say(f"changes of alarms are not put into the outbox any more: {what}")
-            raise
-        finally:
-            self._let_go()
-
-    def _write_until_the_end(self) -> None:
         while not self._ending.is_set():
             self._news.wait()
             self._news.clear()
@@ -144,6 +134,7 @@ class Outlets:
         left = len(self._waiting) + self._letters.qsize() + self._lost
         if left:
             self._say(f"{left} messages could not be put into the outbox")
+        self._let_go()
 
     def _write_all(self) -> bool:
         while self._waiting or not self._letters.empty():
@@ -158,10 +149,11 @@ class Outlets:
         try:
             self._outbox = self._outbox or self._open_outbox()
             self._outbox.put(self._waiting)
-        except TwinError as error:
+        except Exception as error:  # whatever it is, later ones are to be told
             self._let_go()
             if not self._failed:
-                self._say(f"changes of alarms wait in memory, not in the outbox: {error}")
+                why = in_words(error)
+                self._say(f"changes of alarms wait in memory, not in the outbox: {why}")
             self._failed = True
             return False
         if self._failed:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from twin.backoff import Backoff
-from twin.errors import SourceError, TwinError
+from twin.errors import SourceError, in_words
 from twin.outlets.message import Message, again
 from twin.outlets.outbox import Outbox
 from twin.outlets.settings import Outlet
@@ -124,22 +124,16 @@ class Sender:
     # --- the thread -----------------------------------------------------------------------------
 
     def _work(self) -> None:
-        try:
-            while not self._ending.is_set():
-                self._go_on_or_wait()
-            self._finish()
-        except Exception as error:  # ours, which is to be found in what is said
-            what = f"{type(error).__name__}: {error}"
-            self._say(f"alarms wait in the outbox: {self.name} is given up in this run: {what}")
-            raise
-        finally:
-            self._let_go()
+        while not self._ending.is_set():
+            self._go_on_or_wait()
+        self._finish()
+        self._let_go()
 
     def _go_on_or_wait(self) -> None:
         try:
             if not self._go_on():
                 self._rest()
-        except TwinError as error:
+        except Exception as error:  # whatever it is, later ones are to be delivered
             self._fail(error)
 
     def _go_on(self) -> bool:
@@ -235,12 +229,12 @@ class Sender:
 
     # --- when it goes wrong, and well again -----------------------------------------------------
 
-    def _fail(self, error: TwinError) -> None:
+    def _fail(self, error: Exception) -> None:
         """Say so if that is new, and wait; longer each time."""
         self._let_go()
         if not self._complaint:
-            self._say(f"alarms wait in the outbox: {self.name}: {error}")
-        self._complaint = str(error)
+            self._say(f"alarms wait in the outbox: {self.name}: {in_words(error)}")
+        self._complaint = in_words(error)
         self._ending.wait(self._backoff.next_s())
 
     def _succeed(self) -> None:
@@ -263,13 +257,13 @@ class Sender:
             while self._go_on() and time.monotonic() < end:
                 continue
             self._channel.close()
-        except TwinError as error:
-            self._complaint = str(error)
+        except Exception as error:
+            self._complaint = in_words(error)
         with_why = f": {self._complaint}" if self._complaint else ""
         try:
             self._outbox = self._outbox or self._open_outbox()
             self._say_gone()
             if left := sum(self._outbox.count(box) for box in (self.name, *self._lanes)):
                 self._say(f"{left} messages to {self.name} wait for the next run{with_why}")
-        except TwinError as error:
-            self._say(f"what waits for {self.name} is not known: {error}")
+        except Exception as error:
+            self._say(f"what waits for {self.name} is not known: {in_words(error)}")

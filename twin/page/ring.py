@@ -12,14 +12,13 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from twin.errors import SourceError
+from twin.errors import SourceError, in_words
 from twin.events import Event
 from twin.signals import SAMPLE, TICK, UNUSABLE, Samples, Ticks
 
@@ -55,7 +54,6 @@ DEPTH = 2400  # rows: a minute
 FILE = np.dtype([("head", HEAD), ("rows", ROW, (DEPTH,))])
 MOST_WAITING = 400  # blocks: 12 s at 30 ms
 MOST_HELD = 1000  # samples of a row that is not over: its time at 40 kHz
-CLOSE_S = 0.1  # between looks whether the thread is still there
 STALE_S = 5.0  # a driver yields a block at least every half a second
 
 _VALUES = [name for name in ROW.fields or () if name not in ("number", "again", "spare")]
@@ -91,25 +89,31 @@ class LiveRows:
         try:
             self._blocks.put_nowait((samples.copy(), ticks.copy()))
         except queue.Full:
-            if not self._behind:
-                self._say("the page's live rows cannot be written quickly enough: some are missing")
-            self._behind = True
+            self._fail("cannot be written quickly enough")
 
     def close(self) -> None:
         """Write what waits, and that the run has ended."""
-        while self._thread.is_alive():  # one that fell takes nothing any more
-            with suppress(queue.Full):
-                self._blocks.put(None, timeout=CLOSE_S)
-                break
+        self._blocks.put(None)
         self._thread.join()
         self._file.close()
 
+    def _fail(self, why: str) -> None:
+        """Say once that rows are left out."""
+        if not self._behind:
+            self._say(f"the page's live rows: some are missing: {why}")
+        self._behind = True
+
     def _work(self) -> None:
-        held: tuple[Samples, Ticks] = np.empty(0, SAMPLE), np.empty(0, TICK)
+        none: tuple[Samples, Ticks] = np.empty(0, SAMPLE), np.empty(0, TICK)
+        held = none
         while (block := self._blocks.get()) is not None:
-            held = np.concatenate([held[0], block[0]]), np.concatenate([held[1], block[1]])
-            rows, held = _binned(*held)
-            self._file.add(rows)
+            try:
+                held = np.concatenate([held[0], block[0]]), np.concatenate([held[1], block[1]])
+                rows, held = _binned(*held)
+                self._file.add(rows)
+            except Exception as error:  # whatever it is, later ones are to be shown
+                held = none
+                self._fail(in_words(error))
 
 
 def _binned(samples: Samples, ticks: Ticks) -> tuple[Rows, tuple[Samples, Ticks]]:
