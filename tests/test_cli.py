@@ -1,6 +1,7 @@
 """The command line: exit codes, messages for people, and logs that survive what is done to it."""
 
 import json
+import os
 import re
 import resource
 import signal
@@ -338,6 +339,34 @@ def test_who_reads_what_it_says_may_go_and_it_goes_on(plc: PlcProcess, tmp_path:
         process.send_signal(signal.SIGINT)
         assert process.wait(PATIENCE_S) == 130
     assert open_log(log).complete
+
+
+def test_a_reader_that_takes_nothing_holds_nothing_up(plc: PlcProcess, tmp_path: Path) -> None:
+    """As a paused pager does: the pipe is full before the run says its first word."""
+    log, (reads, writes) = tmp_path / "a.mcap", os.pipe()
+    os.set_blocking(writes, False)
+    with suppress(BlockingIOError):
+        while True:
+            os.write(writes, b"x" * 4096)
+    os.set_blocking(writes, True)
+    command = [sys.executable, "-m", "twin.cli", *map(str, run_beside(plc, log))]
+    with subprocess.Popen(
+        command, cwd=rigs.ROOT, stdout=writes, stderr=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            until_logged(log, process, 2)
+            until(lambda: len(list(open_log(log).events())) > 1, process)  # there was much to say
+            until_logged(log, process, 8)
+            process.send_signal(signal.SIGINT)
+            _, said = process.communicate(timeout=PATIENCE_S)
+        finally:
+            process.kill()
+        assert process.returncode == 130
+    assert "nobody took what was said last" in said
+    assert open_log(log).complete
+    assert (np.diff(rows_in(log)["sequence"]) == 1).all()
+    os.close(reads)
+    os.close(writes)
 
 
 def test_a_file_that_may_grow_no_more_is_followed_by_another(

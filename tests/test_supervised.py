@@ -106,6 +106,33 @@ def test_what_does_not_fit_into_memory_is_told_as_lost() -> None:
     assert f"{back.data['rows_lost']} rows are missing" in back.text
 
 
+def test_an_output_of_events_alone_keeps_no_rows_and_counts_events(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("twin.supervised.KEPT_BLOCKS", 5)
+    monkeypatch.setattr("twin.supervised.KEPT_EVENTS", 3)
+    clock, notices, seen = Clock(), Notices(), list[str]()
+
+    class Console(Fragile):
+        def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
+            super().write(samples, ticks, events)
+            seen.extend(event.text for event in events)
+
+    inner = Console()
+    sink = SupervisedSink("console", inner, lambda: inner, Outages(notices), clock, rows=False)
+    samples, ticks = course(100)
+    inner.broken = True
+    for number in range(12):
+        sink.write(samples, ticks, [Event(0, Kind.CYCLE, str(number))])
+    inner.broken, clock.now = False, 5.0
+    sink.write(samples, ticks, [])
+    assert set(inner.rows) == {b""}
+    assert seen == [str(number) for number in range(5, 12)]
+    back = notices.taken(0)[-1]
+    assert (back.data["rows_lost"], back.data["events_lost"]) == (0, 5)
+    assert back.text.endswith("; 5 events are missing in it")
+
+
 def test_a_sink_that_is_down_at_the_end_says_so() -> None:
     run, (samples, ticks) = Run(), course(500)
     run.inner.broken = True
@@ -119,8 +146,8 @@ def test_an_alarm_stands_while_any_output_is_down() -> None:
     outages = Outages(notices := Notices())
     for name in ("log", "console"):
         outages.begin(name, OSError("no"), 0.0)
-    outages.end("log", 0, 5.0)
-    outages.end("console", 0, 6.0)
+    outages.end("log", 5.0)
+    outages.end("console", 6.0)
     told = notices.taken(0)
     assert [values(one) for one in told] == [{"output_down": up} for up in (1.0, 1.0, 1.0, 0.0)]
     assert evidence(told[0]) == {"output_down": {"words": told[0].text}}

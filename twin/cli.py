@@ -39,6 +39,7 @@ from twin.events import Event, Kind, Severity
 from twin.files import require_writable, write_json
 from twin.instants import stamp
 from twin.lock import only_run
+from twin.printer import Printer
 from twin.service import Service
 
 if TYPE_CHECKING:
@@ -141,22 +142,21 @@ def run(
     ejectors = _named([_configured(Document.read(one), assets, unit) for one in configs])
     pairs = {name: pair_of(one) for name, one in ejectors.items()}  # compiled before time counts
     width = 0 if alone else max(map(len, ejectors))
-    consoles = {name: Console("" if alone else name.ljust(width)) for name in ejectors}
     lines = Lines()
 
     def beside(name: str, settings: "Config") -> None:
         label = "" if alone else name
         twin, monitor = pairs[name]
-        alarms, outlets = alarms_of(settings, _complain), outlets_of(settings, _complain)
+        alarms, outlets = alarms_of(settings, complain), outlets_of(settings, complain)
         at = settings.document, address, lines if hil or not alone else None
-        plc = _Plc(partial(open_source, *at), label, once=once)
+        plc = _Plc(partial(open_source, *at), label, complain, once=once)
         shown = (
             show(name, settings.asset.type, asker_of(settings), plc.results_down) if show else None
         )
         with (
             service.loop(name, stop) as stopped,
             _closed(shown),
-            _locked(settings, log),
+            _locked(settings, log, complain),
             ExitStack() as closing,
         ):
             if not plc.answers(stopped):  # said before a log is begun
@@ -169,13 +169,15 @@ def run(
                 {
                     "console": lambda: consoles[name],
                     "OPC UA results": (lambda: shown) if shown else None,
-                    "key figures": keeper_of(settings, _complain),
-                    "live page": live_rows_of(settings, _complain),
+                    "key figures": keeper_of(settings, complain),
+                    "live page": live_rows_of(settings, complain),
                     "view": view_of(name),
                     "log": partial(_recorder, file, settings, hil=hil) if file else None,
                 }
             )
-            closing.enter_context(_retained(settings, opened.get("log"), plc.listening.notices))
+            closing.enter_context(
+                _retained(settings, opened.get("log"), plc.listening.notices, complain)
+            )
             adviser = _diagnosing(settings, file, stopped, alone=alone)
             # What is not measured has no faults. Alarms come last: they hear the diagnosis.
             advised: dict[str, Adviser] = (
@@ -196,12 +198,16 @@ def run(
         _stop_on_signal(duration) as stop,
         _spared(),
         Service(os.environ) as service,
+        _printers() as (printer, complain),
     ):
+        consoles = {
+            name: Console("" if alone else name.ljust(width), printer.print) for name in ejectors
+        }
         if alone:
             beside(*next(iter(ejectors.items())))
         else:
             loops = {name: partial(beside, name, one) for name, one in ejectors.items()}
-            failed = run_together(loops, lambda name, why: _complain(f"{name}: {why}"))
+            failed = run_together(loops, lambda name, why: complain(f"{name}: {why}"))
         if failed:
             raise SourceError(f"{len(failed)} of {len(loops)} ejectors failed: {', '.join(failed)}")
         alarmed = any(console.alarmed for console in consoles.values())
@@ -625,23 +631,25 @@ def main() -> None:
 
 
 class Console:
-    """A sink that prints what happens, one line each, with whose loop says it."""
+    """A sink that prints what happens, one line each, with whose loop says it.
 
-    def __init__(self, name: str = "") -> None:
+    ``say`` prints lines in one piece, since others may be printing too.
+    """
+
+    def __init__(self, name: str = "", say: Callable[[str], None] | None = None) -> None:
         self.alarmed = False  # all it keeps: a loop runs for months
         self._name = f"{name}  " if name else ""
+        self._say = say or _print
 
     def write(self, _samples: "Samples", _ticks: "Ticks", events: Sequence[Event]) -> None:
         """Print what happened; an alarm does not say again what it is made of."""
-        told = {event.text for event in events}
+        told, lines = {event.text for event in events}, ""
         for event in events:
             self.alarmed |= event.severity is Severity.ALARM
             what = f"{event.severity:<7}  {event.kind:<17}  {_short(event, told)}"
-            # In one piece, since others may be printing too.
-            try:
-                print(f"{stamp(event.time_ns)}  {self._name}{what}\n", end="", flush=True)
-            except OSError:  # a pipe that nobody reads any more, a terminal that was closed
-                _mute(sys.stdout)
+            lines += f"{stamp(event.time_ns)}  {self._name}{what}\n"
+        if lines:
+            self._say(lines)
 
     def close(self) -> None:
         """Nothing to finish."""
@@ -665,6 +673,25 @@ class _Kept:
 
     def close(self) -> None:
         """Nothing to finish."""
+
+
+@contextmanager
+def _printers() -> Iterator[tuple[Printer, Callable[[str], None]]]:
+    """Give what prints to stdout, and what complains on stderr, without waiting for who reads."""
+    printer, talk = Printer(sys.stdout), Printer(sys.stderr)
+    try:
+        yield printer, lambda what: talk.say(f"twin: {what}\n")
+    finally:
+        if left := printer.close():
+            talk.say(f"twin: nobody took what was said last, in {left} parts\n")
+        talk.close()
+
+
+def _print(text: str) -> None:
+    try:
+        print(text, end="", flush=True)
+    except OSError:  # a pipe that nobody reads any more, a terminal that was closed
+        _mute(sys.stdout)
 
 
 def _complain(what: str) -> None:
@@ -706,12 +733,14 @@ def _refuse_one_id(unit: str, ejectors: int) -> None:
 
 
 @contextmanager
-def _locked(settings: "Config", log: Path | None) -> Iterator[None]:
+def _locked(
+    settings: "Config", log: Path | None, complain: Callable[[str], None]
+) -> Iterator[None]:
     """Be the only run of the unit that writes where this one does; SourceError says who else is."""
     unit = " ".join(part for part in (settings.asset.type, settings.asset.id) if part)
     with ExitStack() as locks:
         for folder in sorted(_written_by(settings, log)):
-            locks.enter_context(only_run(folder, unit, time.time_ns(), _complain))
+            locks.enter_context(only_run(folder, unit, time.time_ns(), complain))
         yield
 
 
@@ -765,7 +794,10 @@ def _file_of(path: Path | None, label: str, name: str) -> Path | None:
 
 
 def _retained(
-    settings: "Config", log: "Sink | None", notices: "Notices"
+    settings: "Config",
+    log: "Sink | None",
+    notices: "Notices",
+    complain: Callable[[str], None],
 ) -> "AbstractContextManager[object]":
     """What keeps the logs of a live run within the bounds of [log]."""
     from twin.log.recorder import Recorder
@@ -776,7 +808,7 @@ def _retained(
     kept, unit = settings.log, (settings.asset.type, settings.asset.id)
     bounds = Bounds(kept.keep_days, kept.keep_gb and kept.keep_gb * GB, kept.disk_pct / 100)
     tell = partial(notices.tell, Kind.LOG_DELETED)
-    return Retention(log.under_way.parent, unit, bounds, lambda: log.under_way, tell, _complain)
+    return Retention(log.under_way.parent, unit, bounds, lambda: log.under_way, tell, complain)
 
 
 def _recorder(file: Path, settings: "Config", *, hil: bool) -> "Sink":
@@ -946,7 +978,8 @@ def _supervised(
     def supervised(name: str, sink: "Sink") -> "Sink":
         if isinstance(sink, Recorder):
             return SupervisedSink(name, sink, sink.again, outages, held=lambda: sink.held)
-        return SupervisedSink(name, sink, lambda: sink, outages)
+        rows = not isinstance(sink, Console)
+        return SupervisedSink(name, sink, lambda: sink, outages, rows=rows)
 
     return (
         [supervised(*one) for one in sinks.items()],
@@ -1034,13 +1067,14 @@ class _Plc:
         self,
         opened: "Callable[..., Iterator[Samples]]",
         name: str,
+        complain: Callable[[str], None],
         *,
         once: bool,
     ) -> None:
         from twin.monitor.listening import Listening
 
         self.listening = Listening()
-        self._opened, self._once = opened, once
+        self._opened, self._complain, self._once = opened, complain, once
         self._said = f"{name}: " if name else ""
         self._waits = False  # it did not answer at first
         self._known = False  # it has given a row: whatever it sends from now on may pass
@@ -1061,7 +1095,7 @@ class _Plc:
                 if stopped(begun=False):
                     return False
         if self._waits:
-            _complain(f"{self._said}the PLC answers")
+            self._complain(f"{self._said}the PLC answers")
         return True
 
     def results_down(self, why: str) -> None:
@@ -1074,7 +1108,7 @@ class _Plc:
             return
         waits = "" if self._waits else f"\n  {WAITS}; with --once the run ends instead"
         self._waits = True
-        _complain(f"{self._said}{error}\n  {error.hint}{waits}")
+        self._complain(f"{self._said}{error}\n  {error.hint}{waits}")
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from twin.signals import Quality, Samples, Ticks
 
 KEPT_ROWS = 60_000  # that wait for an output: a minute of them each millisecond, some 5 MB
 KEPT_EVENTS = 10_000  # of rows that were lost
+KEPT_BLOCKS = 10_000  # of an output that takes no rows, or while none come
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # before an output is tried again
 
 
@@ -38,13 +39,19 @@ class Outages:
         text = f"{name}: {in_words(why)}; monitoring goes on, and it is tried again"
         self.notices.tell(Kind.OUTPUT_DOWN, text, {"output": name})
 
-    def end(self, name: str, lost: int, now_s: float) -> None:
-        """Tell that an output works again; ``lost`` rows did not wait for it."""
+    def end(self, name: str, now_s: float, rows: int = 0, events: int = 0) -> None:
+        """Tell that an output works again; so many rows and events did not wait for it."""
         seconds = now_s - self._down.pop(name)
-        missing = f"; {lost} rows are missing in it" if lost else ""
+        missing = f"; {lost(rows, events)}" if rows or events else ""
         text = f"{name}: works again after {seconds:.0f} s{missing}"
-        data = {"output": name, "seconds": seconds, "rows_lost": lost}
+        data = {"output": name, "seconds": seconds, "rows_lost": rows, "events_lost": events}
         self.notices.tell(Kind.OUTPUT_BACK, text, data | {"standing": sorted(self._down)})
+
+
+def lost(rows: int, events: int) -> str:
+    """What is missing in an output, in words."""
+    counts = [f"{rows} rows"] * bool(rows or not events) + [f"{events} events"] * bool(events)
+    return f"{' and '.join(counts)} are missing in it"
 
 
 class SupervisedSink:
@@ -53,7 +60,7 @@ class SupervisedSink:
     After a failure rows and events wait, up to KEPT_ROWS, and ``again`` is asked for a sink that
     works, with a pause that doubles. A sink that says how many rows it has ``held`` is not given
     those again with which it raised SourceError, and is tried once more where it fails at its end.
-    ``close`` raises what a sink says at its end.
+    One without ``rows`` is of events alone. ``close`` raises what a sink says at its end.
     """
 
     def __init__(
@@ -65,13 +72,16 @@ class SupervisedSink:
         clock: Callable[[], float] = time.monotonic,
         *,
         held: Callable[[], int] | None = None,
+        rows: bool = True,
     ) -> None:
         self._name, self._sink, self._again = name, sink, again
         self._outages, self._clock, self._held = outages, clock, held
+        self._takes_rows = rows
         self._failure: Exception | None = None
         self._next_s, self._backoff = 0.0, Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S)
         self._waiting: deque[tuple[Samples, Ticks, Sequence[Event]]] = deque()
         self._rows = self._lost = 0  # that wait, and that did not
+        self._events_lost = 0
 
     def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
         """Take rows, their ticks, and what happened."""
@@ -97,9 +107,10 @@ class SupervisedSink:
         if self._failure is not None:
             self._try_again()
         if self._failure is not None:
-            missing = self._rows + self._lost + (self._held() if self._held else 0)
+            rows = self._rows + self._lost + (self._held() if self._held else 0)
+            events = self._events_lost + sum(len(events) for *_, events in self._waiting)
             raise SourceError(
-                f"{self._name}: {in_words(self._failure)}; {missing} rows are missing in it",
+                f"{self._name}: {in_words(self._failure)}; {lost(rows, events)}",
                 getattr(self._failure, "hint", ""),
             ) from self._failure
         self._sink.close()
@@ -109,21 +120,27 @@ class SupervisedSink:
         return self._held is not None and isinstance(error, SourceError)
 
     def _keep(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
+        if not self._takes_rows:
+            samples, ticks = samples[:0], ticks[:0]
         if len(samples) or events:
             self._waiting.append((samples.copy(), ticks.copy(), list(events)))
             self._rows += len(samples)
-        while self._rows > KEPT_ROWS and len(self._waiting) > 1:
+        while len(self._waiting) > 1 and (
+            self._rows > KEPT_ROWS or len(self._waiting) > KEPT_BLOCKS
+        ):
             self._lose_oldest()
 
     def _lose_oldest(self) -> None:
         """Let its rows go, with a gap marked in the next ones; its events wait on."""
-        lost, _, before = self._waiting.popleft()
+        oldest, _, before = self._waiting.popleft()
         samples, ticks, events = self._waiting.popleft()
-        self._waiting.appendleft((samples, ticks, [*before, *events][-KEPT_EVENTS:]))
-        self._rows -= len(lost)
-        self._lost += len(lost)
+        together = [*before, *events]
+        self._waiting.appendleft((samples, ticks, together[-KEPT_EVENTS:]))
+        self._rows -= len(oldest)
+        self._lost += len(oldest)
+        self._events_lost += max(0, len(together) - KEPT_EVENTS)
         later = next((rows for rows, *_ in self._waiting if len(rows)), None)
-        if len(lost) and later is not None:
+        if len(oldest) and later is not None:
             later["quality"][0] |= np.uint8(Quality.GAP)
 
     def _try_again(self) -> None:
@@ -134,8 +151,8 @@ class SupervisedSink:
         except Exception as error:
             self._set_aside(error)
             return
-        self._outages.end(self._name, self._lost, self._clock())
-        self._failure, self._lost = None, 0
+        self._outages.end(self._name, self._clock(), self._lost, self._events_lost)
+        self._failure, self._lost, self._events_lost = None, 0, 0
         self._backoff.reset()
 
     def _hand_over(self, block: tuple[Samples, Ticks, Sequence[Event]]) -> None:
@@ -180,7 +197,7 @@ class SupervisedAdviser:
             return []
         if self._failed and len(samples):
             self._failed = False
-            self._outages.end(self._name, 0, self._clock())
+            self._outages.end(self._name, self._clock())
         return said
 
     def finish(self) -> list[Event]:
