@@ -6,7 +6,7 @@ BIN := .venv/bin
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 
-.PHONY: demo test peers check format docs bench battery audit coverage clean
+.PHONY: demo test peers check format docs bench battery soak audit coverage clean
 
 demo: .venv/run
 	$(BIN)/python tools/demo.py
@@ -38,6 +38,9 @@ bench: .venv/dev
 
 battery: .venv/dev  # one thread for matrices, as the command line has it: more wait for each other
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python tools/battery.py --cases battery.jsonl --write docs/battery.md
+
+soak: .venv/dev  # HOURS of compressed time and REAL_HOURS beside the simulated PLC
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tools.soak --hours $(or $(HOURS),24) --real-hours $(or $(REAL_HOURS),1)
 
 audit: .venv/dev .venv/audit/done  # without a network: ADVISORIES=all.zip, an export of osv.dev
 	$(BIN)/python tools/audit.py audit $(if $(ADVISORIES),--advisories '$(ADVISORIES)')

@@ -553,7 +553,7 @@ def run(
     kinds = [name for _ in range(disturbances) for name in DISTURBANCES]
     order = [str(name) for name in random.permutation(kinds[:disturbances])]
     with Cell(protocol, folder, random) as cell:
-        _until_logged(cell)
+        until_logged(cell)
         end = time.monotonic() + seconds
         for number, name in enumerate(order):
             rest = end - time.monotonic() - SETTLED_S * (len(order) - number)
@@ -576,7 +576,8 @@ def run(
     return verdict, done
 
 
-def _until_logged(cell: Cell) -> None:
+def until_logged(cell: Cell) -> None:
+    """Wait until the twin logs rows; SystemExit with what it said if it does not."""
     deadline = time.monotonic() + START_S
     while cell.rows() < 20_000:
         if time.monotonic() > deadline or cell.twin.poll() is not None:
