@@ -242,10 +242,14 @@ def connected(host: str, port: int, timeout_ms: float) -> socket.socket:
     something, and not wait for whole answers.
     """
     connection = socket.create_connection((host, port), timeout_ms * 1e-3)
-    connection.settimeout(None)
-    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     patience = struct.pack("@ll", 0, round(timeout_ms * 1e3))  # struct timeval: s, µs
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, patience)
+    try:
+        connection.settimeout(None)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, patience)
+    except OSError:
+        connection.close()
+        raise
     return connection
 
 
