@@ -1,13 +1,15 @@
-"""Every call that the log makes fails in turn, and no row is lost, in the manner of SQLite's tests.
+"""Every call of the log and every write of the other outputs fails in turn, and no row is lost.
 
-A first run without faults counts the calls, so that new ones are covered by themselves. Time is
-the test's own: nothing waits.
+In the manner of SQLite's tests. A first run without faults counts the calls, so that new ones are
+covered by themselves. Time is the test's own: nothing waits.
 """
 
 import errno
 import os
 import shutil
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from functools import cache, partial
@@ -22,14 +24,21 @@ import pytest
 import rigs
 
 import twin.log
+from twin.alarms.loop import Alarms
+from twin.alarms.settings import board_rules
+from twin.assets.unit import Unit
+from twin.cli import Console, _supervised
 from twin.errors import SourceError
 from twin.events import Event, Kind
+from twin.figures.keeper import Keeper
+from twin.figures.store import open_store
 from twin.live import Twin, run
 from twin.log.output import Output
 from twin.log.part import SUFFIX
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
 from twin.monitor.listening import Listening, Notices
+from twin.page.ring import LiveRows
 from twin.signals import SAMPLE, TICK, Quality, Samples, Ticks
 from twin.supervised import Outages, SupervisedSink
 
@@ -43,6 +52,7 @@ OVERLOOKED = {"npy_ctypes_check", "EnumType.__getattr__"}  # what libraries go o
 Site = tuple[str, int, str]  # file, line and what is called there
 
 
+UNIT = Unit("compact-ejector-35", "rig-01")
 OUTAGE = Kind.OUTPUT_DOWN, Kind.OUTPUT_BACK
 
 
@@ -309,3 +319,76 @@ def broken_for(seconds: float, number: int) -> Callable[[int], bool]:
         return bool(until) and Clock.now < until[0]
 
     return fails
+
+
+# --- the other outputs ----------------------------------------------------------------------------
+
+OUTPUTS = ("console", "key figures", "live page", "log", "alarms")
+
+
+class Beside:
+    """The loop with outputs as ``twin run`` has them; one call of one of them fails."""
+
+    def __init__(
+        self, folder: Path, output: str, fails: int, error: Callable[[], Exception]
+    ) -> None:
+        Clock.now, notices = 0.0, Notices()
+        self.lines: list[str] = []
+        self.path = folder / "a.mcap"
+        header = rigs.config("test_rig").log_header()
+        outputs: dict[str, Any] = {
+            "console": Console("", self.lines.append),
+            "key figures": Keeper(lambda: open_store(folder / "f.sqlite"), UNIT, "a", pytest.fail),
+            "live page": LiveRows(folder / "live.ring", 101_300.0, pytest.fail, Clock.ns),
+            "log": Recorder(self.path, header, ROTATE_BYTES, Clock.s),
+            "alarms": Alarms(board_rules(None), None),
+        }
+        self.calls = 0
+        name = "follow" if output == "alarms" else "write"
+        function = getattr(outputs[output], name)
+
+        def failing(*given: Any) -> Any:
+            self.calls += 1
+            if self.calls - 1 == fails:
+                raise error()
+            return function(*given)
+
+        setattr(outputs[output], name, failing)
+        alarms = outputs.pop("alarms")
+        sinks, advisers = _supervised(outputs, {"alarms": alarms}, notices)
+
+        def source() -> Iterator[Samples]:
+            for block in rigs.cut(rows(), BLOCK):
+                time.sleep(0)  # the threads beside the loop
+                Clock.now += BLOCK_S
+                yield block
+
+        run(
+            source(),
+            twin_beside(),
+            rigs.monitor("test_rig"),
+            sinks,
+            Listening(Clock.ns, notices),
+            advisers,
+        )
+
+
+@pytest.mark.parametrize("output", OUTPUTS)
+def test_whatever_call_of_an_output_fails_the_run_goes_on_and_tells(
+    output: str, folder: Callable[[], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("twin.supervised.FIRST_PAUSE_S", 0.0)
+    threads = threading.active_count()
+    calls = Beside(folder(), output, -1, MemoryError).calls
+    assert calls > len(rows()) // BLOCK
+    for number in range(0, calls - 4, 2):
+        for error in (MemoryError, full_disk):
+            done = Beside(folder(), output, number, error)
+            log = open_log(done.path)
+            logged = np.concatenate([samples for samples, _ in log.blocks()])
+            assert np.array_equal(logged["sequence"], rows()["sequence"]), number
+            told = [event for event in log.events() if event.kind in OUTAGE]
+            assert [event.kind for event in told] == list(OUTAGE), number
+            assert {event.data["output"] for event in told} == {output}
+            assert any("output_down" in line for line in done.lines), number
+    assert threading.active_count() == threads
