@@ -1,9 +1,10 @@
 """Fuzz what decodes bytes from elsewhere: whatever they are, there are rows or one clear error.
 
 Inputs are kept ones and pieces of them, changed at random. An input with a new outcome is kept in
-the corpus, and so is one that raises anything but an error for people: those count as found.
+the corpus, and so is one that raises anything but an error for people or takes too long: those
+count as found. Ctrl-C ends it, and what was done until then is said.
 
-    python -m tools.fuzz --inputs 10_000_000 --corpus fuzz    # a night
+    python -m tools.fuzz --inputs 10_000_000    # a night
 """
 
 import argparse
@@ -33,13 +34,20 @@ from drivers.ring import Trace
 from drivers.sources import settings_of
 from drivers.tags import Address, Words
 from twin.errors import SourceError, TwinError
+from twin.events import Event, Kind
+from twin.log.header import LogHeader
 from twin.log.reader import open_log
+from twin.log.recorder import Recorder
 from twin.settings import Document
+from twin.signals import SAMPLE, TICK
 
 NODE = Node("s=Fuzz")
 CONFIG = Document.read(Path(__file__).resolve().parents[1] / "configs" / "test_rig.toml")
 HEADER = struct.pack(">IqHHHHhH", 9, 10**18, 7, 1000, 4096, 4, 5000, 0)
 RECORDS = b"".join(struct.pack(">HHf", number, 0, 900.0) for number in (8, 9))
+CORPUS = Path(__file__).resolve().parents[1] / "tests" / "corpus"
+LONGEST_S = 5.0  # for one input
+TOLD = 1000  # inputs between two words on how far it is
 DEPTH_BLOCKS = 4  # readings of the ring with one input
 
 
@@ -121,8 +129,20 @@ def _seeds() -> dict[str, list[bytes]]:
     return {
         "ring": [HEADER + RECORDS, HEADER],
         "values": [to_binary(ua.DataValue, ua.DataValue(one)) for one in numbers],
-        "log": [b"\x89MCAP0\r\n" + bytes(40)],
+        "log": [b"\x89MCAP0\r\n" + bytes(40), _small_log()],
     }
+
+
+def _small_log() -> bytes:
+    """A whole log of a few rows and an event."""
+    rows, ticks = np.zeros(30, SAMPLE), np.zeros(30, TICK)
+    rows["sequence"] = range(30)
+    rows["time_ns"] = rows["host_ns"] = 10**18 + rows["sequence"] * 1_000_000
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.mcap"
+        with Recorder(path, LogHeader("type", "id", "a.toml", "[data]\n")) as recorder:
+            recorder.write(rows, ticks, [Event(10**18, Kind.GAP, "gap", {"missing": 1})])
+        return path.read_bytes()
 
 
 TARGETS: dict[str, Callable[[bytes], str]] = {"ring": ring, "values": values, "log": log}
@@ -148,8 +168,14 @@ def changed(data: bytes, others: list[bytes], random: np.random.Generator) -> by
     return bytes(new)
 
 
-def fuzz(name: str, inputs: int, corpus: Path, seed: int) -> list[str]:
-    """Try so many; gives what was found, with the files that show it."""
+def fuzz(
+    name: str,
+    inputs: int,
+    corpus: Path,
+    seed: int,
+    say: Callable[[int], None] = lambda _number: None,
+) -> list[str]:
+    """Try so many; gives what was found, with the files that show it. ``say`` hears how far."""
     target, random = TARGETS[name], np.random.default_rng(seed)
     folder = corpus / name
     folder.mkdir(parents=True, exist_ok=True)
@@ -161,13 +187,17 @@ def fuzz(name: str, inputs: int, corpus: Path, seed: int) -> list[str]:
             if number < len(kept)
             else changed(kept[int(random.integers(len(kept)))], kept, random)
         )
-        wrong = False
+        if number % TOLD == 0:
+            say(number)
+        wrong, begun = False, time.monotonic()
         try:
             outcome = target(data)
         except TwinError as error:
             outcome = str(error)
         except Exception as error:  # what is looked for
             outcome, wrong = f"{type(error).__name__}: {error}", True
+        if (seconds := time.monotonic() - begun) > LONGEST_S:
+            outcome, wrong = f"took {seconds:.0f} s: {outcome}", True
         outcome = re.sub(r"/\S+|-?\d+", "", outcome)
         if outcome not in outcomes:
             outcomes.add(outcome)
@@ -179,20 +209,36 @@ def fuzz(name: str, inputs: int, corpus: Path, seed: int) -> list[str]:
     return found
 
 
+def _tried(name: str, inputs: int, corpus: Path, seed: int) -> dict[str, object]:
+    """What came of it, for people."""
+    begun, done = time.monotonic(), 0
+
+    def say(number: int) -> None:
+        nonlocal done
+        done = number
+        if sys.stderr.isatty():
+            print(f"\r{name}: {number:,} of {inputs:,}", end="", file=sys.stderr, flush=True)
+
+    try:
+        found = fuzz(name, inputs, corpus, seed, say)
+        done = inputs
+    except KeyboardInterrupt:
+        found = ["interrupted: what was found until then is in the corpus"]
+    speed = round(done / (time.monotonic() - begun))
+    return {"inputs": done, "inputs_per_s": speed, "found": found}
+
+
 def main() -> int:
     """Run from the command line; 1 if anything was found."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--inputs", type=int, default=100_000, help="of each target")
-    parser.add_argument("--corpus", type=Path, default=Path("fuzz"))
+    parser.add_argument("--corpus", type=Path, default=CORPUS)
     parser.add_argument("--target", choices=sorted(TARGETS), action="append")
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
     answer: dict[str, dict[str, object]] = {}
     for name in given.target or TARGETS:
-        begun = time.monotonic()
-        found = fuzz(name, given.inputs, given.corpus, given.seed)
-        speed = round(given.inputs / (time.monotonic() - begun))
-        answer[name] = {"inputs": given.inputs, "inputs_per_s": speed, "found": found}
+        answer[name] = _tried(name, given.inputs, given.corpus, given.seed)
     print(json.dumps(answer, indent=1))
     return 1 if any(one["found"] for one in answer.values()) else 0
 
