@@ -1,16 +1,21 @@
 """Whatever a server puts into the trace in the middle of a session: no crash, nothing made up."""
 
+import importlib
+import inspect
 from typing import Any
 
 import numpy as np
 import pytest
 from asyncua import ua
+from asyncua.common.utils import Buffer
+from asyncua.ua.ua_binary import from_binary
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_opcua_block import DEPTH, Rig, T, TornServer, flags
 from test_opcua_subscribe import FakeLink, change, granted, publication, subscription
 
 from drivers.lasting import EMPTY, LostError
+from drivers.opcua_bounds import refuse_null_arrays
 from twin.errors import SourceError
 from twin.signals import BREAK, UNUSABLE, Quality, Samples
 
@@ -132,3 +137,25 @@ def raw_change(handle: int, ms: int, variant: ua.Variant, code: int) -> Any:
     made.ClientHandle = handle
     made.Value.Value = variant
     return made
+
+
+BOMB = bytes.fromhex("0180ffffff7f")  # a value: an array of Null with 2**31 - 1 of them
+
+
+def test_an_array_of_nothing_takes_no_memory() -> None:
+    """asyncua would make a list of them: minutes and gigabytes for six bytes."""
+    refuse_null_arrays()
+    with pytest.raises(ua.UaError, match="an array of 2147483647 Null values"):
+        from_binary(ua.DataValue, Buffer(BOMB))
+    empty = from_binary(ua.DataValue, Buffer(bytes.fromhex("018000000000")))
+    assert empty.Value.Value == []
+    null = from_binary(ua.DataValue, Buffer(bytes.fromhex("0100")))
+    assert null.Value.Value is None
+
+
+@pytest.mark.parametrize("program", ["drivers.opcua_link", "drivers.results_serve"])
+def test_who_reads_from_strangers_refuses_them(program: str) -> None:
+    """The link of a driver and the server of the results."""
+    source = importlib.import_module(program)
+    assert source.refuse_null_arrays is refuse_null_arrays
+    assert "    refuse_null_arrays()\n" in inspect.getsource(source)

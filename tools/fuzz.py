@@ -29,6 +29,7 @@ from asyncua.ua.ua_binary import from_binary, to_binary
 from drivers import opcua_values, telegram
 from drivers.lasting import Clock
 from drivers.link import ModbusSettings
+from drivers.opcua_bounds import refuse_null_arrays
 from drivers.opcua_settings import Node
 from drivers.ring import Trace
 from drivers.sources import settings_of
@@ -87,6 +88,7 @@ def ring(data: bytes) -> str:
 
 def values(data: bytes) -> str:
     """A value over OPC UA, as each kind that a node may be asked for."""
+    refuse_null_arrays()
     try:
         value = from_binary(ua.DataValue, Buffer(data))
     except Exception as error:  # the library's; the link makes a lost connection of it

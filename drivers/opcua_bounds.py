@@ -1,0 +1,27 @@
+"""What asyncua reads without a bound: an array of Null, whose elements take no bytes.
+
+A message of six bytes may say that it has two thousand million of them; the list of them takes
+minutes and gigabytes. Part 6 of OPC UA forbids such arrays.
+"""
+
+from collections.abc import Iterable
+from typing import Any
+
+from asyncua import ua
+from asyncua.ua import ua_binary
+
+
+class _NullArray:
+    """Reads what may not be there."""
+
+    @staticmethod
+    def unpack_array(_data: Any, length: int) -> Iterable[None]:
+        """Nothing; UaError where there is to be something."""
+        if length:
+            raise ua.UaError(f"an array of {length} Null values")
+        return ()
+
+
+def refuse_null_arrays() -> None:
+    """Have the library refuse them from now on, whoever sends them."""
+    ua_binary.Primitives1.Null = _NullArray
