@@ -56,7 +56,7 @@ def test_rows_go_on_for_ever(cycles: Samples) -> None:
 
 def test_two_minutes_of_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(soak, "LEAST_S", 0.001)
-    fills = {"memory_mb": 1e4, "handles": 1e4, "threads": 1e4, "database_mb": 1e4}
+    fills = {"handles": 1e4, "threads": 1e4, "database_mb": 1e4}
     monkeypatch.setattr(soak, "ALLOWED", soak.ALLOWED | fills)
     with soak.compressed(tmp_path) as (process, so_far):
         looks = soak.soak(process, so_far, 0.03, tmp_path)

@@ -37,7 +37,9 @@ from twin.signals import Command, Samples
 
 STRETCH_S = 600.0  # of the rig, over and over
 BLOCK = 1000  # rows
-SETTLED = 0.25  # of the run: caches and buffers fill first
+SETTLED = 0.25  # of the run, and this long, before the line begins: caches and histories fill first
+SETTLED_H = 0.75
+JUDGED_H = 0.9  # a shorter run says nothing of memory
 POINTS = 20  # means of so many stretches make the line: what lies near is alike
 LEAST_S = 0.2  # between two looks
 ENDS_S = 120.0  # to end in order
@@ -69,7 +71,8 @@ class Line:
 def fitted(hours: Sequence[float], values: Sequence[float], allowed: float) -> Line:
     """The line through the means of stretches, the first of which do not count."""
     x, y = np.array(hours), np.array(values)
-    settled = x >= x[0] + SETTLED * (x[-1] - x[0])
+    span = x[-1] - x[0]
+    settled = x - x[0] >= max(SETTLED * span, min(SETTLED_H, (1 - SETTLED) * span))
     parts = np.array_split(np.flatnonzero(settled), POINTS)
     x, y = (np.array([column[part].mean() for part in parts]) for column in (x, y))
     line = stats.linregress(x, y)
@@ -202,7 +205,7 @@ def judged(seen: dict[str, list[float]], folder: Path) -> dict[str, Any]:
         f"{name} grows by {line.slope:.3g} an hour ({line.low95:.3g} to {line.high95:.3g}), and"
         f" {line.allowed:g} is allowed"
         for name, line in lines.items()
-        if not line.is_good
+        if not (line.is_good or (name == "memory_mb" and seen["hours"][-1] < JUDGED_H))
     ]
     log = open_log(folder / "logs" / "run.mcap")
     rows, missing, last = 0, 0, None
