@@ -6,50 +6,54 @@ BIN := .venv/bin
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 
-.PHONY: demo test peers check format docs bench battery soak audit coverage clean
+.PHONY: help demo test peers check format docs bench battery soak audit coverage clean
 
-demo: .venv/run
+help:  ## say what there is (this)
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
+
+demo: .venv/run  ## a simulated PLC, a live twin beside it, a leak that opens half-way
 	$(BIN)/python tools/demo.py
 
-test: .venv/dev
+test: .venv/dev  ## the whole test suite
 	$(PYTEST)
 
 # What the tests speak to, if it is there: a broker, a browser, PLCs of other make.
-peers:
+peers:  ## a broker, a browser and PLCs of other make for the tests
 	$(PYTHON) tests/needs.py
 
-check: .venv/dev
+check: .venv/dev  ## what CI runs: format, lint, types, import contracts, tests
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(PYTEST)
 
-format: .venv/dev
+format: .venv/dev  ## format the code
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-docs: .venv/dev
+docs: .venv/dev  ## the documentation as pages in site/
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --fresh-env --quiet docs site
 	@echo "open site/index.html"
 
-bench: .venv/dev
+bench: .venv/dev  ## how fast it is, beside a floor in the same run
 	$(BIN)/python tools/bench.py
 
-battery: .venv/dev  # one thread for matrices, as the command line has it: more wait for each other
+# One thread for matrices, as the command line has it: more wait for each other.
+battery: .venv/dev  ## how often hidden effects are found, in two worlds (hours)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python tools/battery.py --cases battery.jsonl --write docs/battery.md
 
-soak: .venv/dev  # HOURS of compressed time and REAL_HOURS beside the simulated PLC
+soak: .venv/dev  ## what grows in a day of compressed time (HOURS=24) and an hour of real time (REAL_HOURS=1)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tools.soak --hours $(or $(HOURS),24) --real-hours $(or $(REAL_HOURS),1)
 
-audit: .venv/dev .venv/audit/done  # without a network: ADVISORIES=all.zip, an export of osv.dev
+audit: .venv/dev .venv/audit/done  ## materials, licences, known weaknesses (without a network: ADVISORIES=all.zip of osv.dev)
 	$(BIN)/python tools/audit.py audit $(if $(ADVISORIES),--advisories '$(ADVISORIES)')
 
-coverage: .venv/dev  # of branches, also in processes that tests start
+coverage: .venv/dev  ## which branches the tests take, also in processes that they start
 	$(PYTEST) --cov --cov-report=json:coverage.json --cov-report=
 	$(BIN)/python tools/coverage_table.py coverage.json
 
-clean:
+clean:  ## take away what was made here
 	rm -rf .venv demo site audit coverage.json .coverage*
 
 .venv/bin/python:

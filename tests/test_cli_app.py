@@ -1,13 +1,17 @@
 """What all commands have in common: help that says what was written, ``-h`` and ``--version``."""
 
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 from command_line import twin
 from typer.main import get_command
 
-from twin.cli import app
+from twin.cli import ORDER, app
 
 
 def _commands() -> Iterator[tuple[str, ...]]:
@@ -32,6 +36,24 @@ def test_every_command_has_short_help_and_a_version(
     assert "..." not in short.partition("Commands:")[2]  # no sentence is cut
     assert twin(monkeypatch, *command, "--version") == 0
     assert capsys.readouterr().out.startswith(f"twin {version('ejector-twin')} ")
+
+
+def test_the_help_begins_with_what_a_day_begins_with(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twin(monkeypatch, "-h") == 0
+    lines = capsys.readouterr().out.partition("Commands:")[2].splitlines()
+    shown = [line.split()[0] for line in lines if line.startswith("  ") and line[2] != " "]
+    assert shown == list(ORDER)
+
+
+def test_the_shell_completes_commands() -> None:
+    asked = {"_TWIN_COMPLETE": "complete_bash", "COMP_WORDS": "twin co", "COMP_CWORD": "1"}
+    program = Path(sys.executable).with_name("twin")
+    done = subprocess.run(
+        [program], env={**os.environ, **asked}, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["commission", "compare"]
 
 
 @pytest.mark.parametrize(

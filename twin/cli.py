@@ -63,7 +63,15 @@ INTERRUPTED = 130
 WAITS = "it is tried until it answers"  # a PLC that is off
 ALARMED = 1
 
-app = App("A live digital twin of pneumatic vacuum ejectors.")
+# As the days go: begin, run, ask why, look after what is kept, tools.
+ORDER = (
+    *("init", "probe", "import", "commission", "calibrate"),
+    *("run", "serve", "replay", "diagnose", "compare", "figures", "alarms"),
+    *("fleet", "log", "assets", "users", "cert"),
+    *("export", "export-fmu", "effects", "paper", "plc"),
+)
+
+app = App("A live digital twin of pneumatic vacuum ejectors.", ORDER)
 app.add_typer(assets_app, name="assets")
 app.add_typer(figures_app, name="figures")
 app.add_typer(alarms_app, name="alarms")

@@ -4,7 +4,7 @@ import getpass
 import math
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -75,18 +75,25 @@ class _Command(_Common, TyperCommand):
 
 
 class _Group(_Common, TyperGroup):
-    pass
+    order: Sequence[str] = ()  # of its commands in the help; as they were added where it is empty
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        names = super().list_commands(ctx)
+        return sorted(names, key=self.order.index) if self.order else names
 
 
 class App(typer.Typer):
-    """Commands whose help is text as it stands: Rich's markup would drop ``[table]`` from it."""
+    """Commands whose help is text as it stands: Rich's markup would drop ``[table]`` from it.
 
-    def __init__(self, help: str) -> None:  # noqa: A002 - Typer's name
+    ``order`` has the names of all its commands; with it the shell can complete them.
+    """
+
+    def __init__(self, help: str, order: Sequence[str] = ()) -> None:  # noqa: A002 - Typer's name
         super().__init__(
-            cls=_Group,
+            cls=type("_Ordered", (_Group,), {"order": order}),
             help=help,
             no_args_is_help=True,
-            add_completion=False,
+            add_completion=bool(order),
             rich_markup_mode=None,
             pretty_exceptions_enable=False,
             context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
