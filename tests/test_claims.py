@@ -41,7 +41,7 @@ CLAIMS = (
     ("outlets", "up to {} changes wait in memory", (), (dispatch.MOST_IN_MEMORY,)),
     ("page", "nothing was heard of the run for {:g} s", (), (ring.STALE_S,)),
     ("page", "A row stands for {:g} ms", (), (ring.ROW_NS * 1e-6,)),
-    ("page", "A session ends after {:g} h", (), (sessions.SESSION_S / 3600.0,)),
+    ("page", "It also ends after {:g} h", (), (sessions.SESSION_S / 3600.0,)),
     ("page", "After {} wrong passwords", ("five",), (throttle.FREE_TRIES,)),
     ("page", "one that does not answer for {:g} s is let go", (), (server.QUIET_S,)),
     ("live-fleet", "no values for {:g} s", (), (hall_words.SILENT_S,)),
@@ -158,7 +158,7 @@ def test_the_example_that_unpacks_a_column_of_a_log_unpacks_it() -> None:
 
 # --- rig and model: CONTRIBUTING.md, Tests --------------------------------------------------------
 
-VOCABULARY = ("signals", "errors", "settings", "secret", "events", "processor")
+VOCABULARY = ("signals", "errors", "settings", "secret", "users", "events", "processor")
 
 
 def test_rig_and_model_share_the_constants_that_are_said_to_be_shared() -> None:
