@@ -1,7 +1,6 @@
 """When the nozzle switched, from commands and pressure alone: on rigs that nobody tuned to."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -13,8 +12,7 @@ from nozzle_found import Score, leaky, scored, told
 from second_world.draw import draw_rig
 from second_world.records import record
 
-from twin.calibration.cycles import Cycles, _moved, _switches
-from twin.model.dataset import coefficients
+from twin.calibration.cycles import Cycles
 from twin.monitor.breaks import Noise, beside_parabolas
 from twin.monitor.nozzle import Switching, noise_of, switchings
 from twin.signals import MBAR, SAMPLE, Command, Phase, Quality, Samples
@@ -209,17 +207,3 @@ def test_where_no_air_is_saved_the_nozzle_never_goes_off_by_itself(name: str) ->
     without = data.model_copy(update={"ejector": ejector})
     assert (Cycles.found(samples, data).phase == Phase.HOLD).any()
     assert not (Cycles.found(samples, without).phase == Phase.HOLD).any()
-
-
-@pytest.mark.parametrize("name", rigs.NAMES)
-def test_a_model_that_fits_says_when_the_nozzle_went_off_where_it_was_seen_late(name: str) -> None:
-    samples, _ = rigs.recorded(name, 12.0)
-    data = rigs.config(name).data
-    theta = coefficients(data)
-    right = Cycles.found(samples, data).retimed(theta, 0.6 * MBAR)
-    offs = [row for row in _switches(right.phase) if right.phase[row] == Phase.HOLD]
-    late = replace(right, phase=_moved(right.phase, offs, [-15] * len(offs)))
-    again = late.retimed(theta, 0.6 * MBAR)
-    found = [row for row in _switches(again.phase) if again.phase[row] == Phase.HOLD]
-    assert len(found) == len(offs) > 0
-    assert np.median(np.abs(np.subtract(found, offs))) <= 2

@@ -23,7 +23,7 @@ from twin.calibration.calibrate import (
     scatter,
 )
 from twin.calibration.cycles import Cycles
-from twin.calibration.fit import Fitted, as_fitted, fit_from_afar
+from twin.calibration.fit import Fitted, fit_from_afar
 from twin.calibration.parameters import AMBIENT, AMBIENT_TOLD, FREE_IN_MARKET, Free
 from twin.calibration.readings import Readings, read
 from twin.calibration.verdict import Verdict, judge
@@ -158,7 +158,7 @@ def commission(
     if fitted.data.ambient != guess.ambient:  # thresholds are below ambient pressure
         remarks = by_flow + guessed(within(metered, fitted.data.ambient), readings)[1]
     progress("judging the fit")
-    verdict = judge(as_fitted(samples, fitted.data), fitted.data, readings.noise)
+    verdict = judge(Cycles.found(samples, fitted.data), fitted.data, readings.noise)
     if verdict.word != "refused":  # a fit that does not follow says nothing of places
         remarks += [*misplaced(config.data, fitted), *another_ambient(config.data, fitted)]
     cycles = complete(fitted.data, samples)

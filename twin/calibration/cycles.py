@@ -24,9 +24,6 @@ BINS = 6  # in each unit of warped time
 # and what is left of its lag, which is looked for among some.
 ZERO, SPAN, LAG = 10.0 * MBAR, 0.01, 1.0 * MS  # Pa, 1, s
 LAGS = np.array([0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0]) * MS
-# How far (s) a switching may be from where the pressure alone shows it, one standard deviation of
-# that, how many times between are tried, and in how many reaches behind it shows.
-MOST_EARLY, SEEN_WITHIN, TIMES, SHOWN = 40.0 * MS, 5.0 * MS, 41, 3
 Bytes = npt.NDArray[np.uint8]
 
 
@@ -108,59 +105,14 @@ class Cycles:
         left = np.abs(off - self.unsure @ np.linalg.lstsq(self.unsure, off)[0])
         return replace(self, lag=float(LAGS[np.average(left, axis=0).argmin()]))
 
-    def retimed(self, theta: Theta, error: float) -> "Cycles":
-        """The same with the nozzle switching when the model of ``theta`` fits best, each time.
-
-        Behind a chamber, or with a slow sensor, the turn of the pressure is round: by itself it
-        shows the time to some ten milliseconds only, and by how much the model must sink until then
-        to the millisecond. ``error`` (Pa) is what the model may be off by.
-        """
-        phase = self.phase
-        if float(np.median(self.dt)) > SEEN_WITHIN:  # a row earlier or later would be too much
-            return self
-        for on in (False, True):
-            rows = [row for row in _switches(phase) if (phase[row] == Phase.SUCTION) == on]
-            if rows:
-                timed = replace(self, phase=phase)
-                phase = _moved(phase, rows, timed._early(theta, rows, error))
-        if phase is self.phase:
-            return self
-        return self._of(self.samples, phase, self.level, theta, quickly=True)
-
-    def _early(self, theta: Theta, rows: Sequence[int], error: float) -> list[int]:
-        """By how many rows the nozzle switches before each of some ``rows``."""
-        period = float(np.median(self.dt))
-        reach = max(round(MOST_EARLY / period), 1)
-        early = np.unique(np.linspace(-reach, reach, TIMES).round().astype(int))
-        phases = np.stack([_moved(self.phase, rows, [one] * len(rows)) for one in early], axis=1)
-        off = self._off(np.repeat(theta[:, None], len(early), axis=1), phases)
-        changes = np.flatnonzero(np.diff(self.phase, prepend=self.phase[:1] + 1)).tolist()
-        ends = [*changes, len(self.phase)]
-        unlikely = (early * period / SEEN_WITHIN) ** 2
-        none, best = int(np.flatnonzero(early == 0)[0]), []
-        for row in rows:
-            place = changes.index(row)
-            begin, end = changes[max(place - 1, 0)], ends[place + 1]
-            here = self.bins.number[max(row - reach, begin) : min(row + SHOWN * reach, end)]
-            bins = np.unique(here[here >= 0])
-            carried = off[bins[:1]] - off[bins[:1], [none]]  # by switchings before this one
-            cost = np.sum(((off[bins] - carried) / error) ** 2, axis=0) + unlikely
-            may_be = (row - early > begin + (row - begin) // 2) & (row - early < (row + end) // 2)
-            best.append(int(early[np.where(may_be | (early == 0), cost, np.inf).argmin()]))
-        return best
-
     def off(self, theta: Floats, early: Sequence[int] = ()) -> Floats:
         """Measured minus expected pressure (Pa) in each bin for hypotheses, (coefficients, n).
 
         ``early`` says for each by how many rows the nozzle switches before it is seen to.
         """
-        moved = any(early)
-        return self._off(theta, self._phases(early) if moved else self.phase[:, None])
-
-    def _off(self, theta: Floats, phase: Bytes) -> Floats:
-        """The same with the phases of each hypothesis, or of all of them: (rows, n or 1)."""
         theta = self._sensed(theta)
-        moved = phase.shape[1] > 1
+        moved = any(early)
+        phase = self._phases(early) if moved else self.phase[:, None]
         changes = np.flatnonzero(np.diff(phase, axis=0).any(axis=1)) + 1
         drawn = np.unique(np.concatenate([self.drawn, changes - 1, changes]))
         dt = np.diff(np.cumsum(self.dt)[drawn], prepend=0.0)
@@ -190,8 +142,12 @@ class Cycles:
 
     def _phases(self, early: Sequence[int]) -> Bytes:
         """Phases with every switching moved, (rows, n)."""
-        rows = _switches(self.phase).tolist()
-        return np.stack([_moved(self.phase, rows, [one] * len(rows)) for one in early], axis=1)
+        moved = np.repeat(self.phase[:, None], len(early), axis=1)
+        for lane, rows in enumerate(early):
+            for row in _switches(self.phase):
+                begin, end = (row - rows, row) if rows > 0 else (row, row - rows)
+                moved[max(begin, 0) : end, lane] = self.phase[row if rows > 0 else row - 1]
+        return moved
 
 
 @dataclass(frozen=True)
@@ -220,15 +176,6 @@ def _switched(told: Bytes, found: Sequence[Switching]) -> Bytes:
         if told[one.row] == Phase.SUCTION:
             phase[one.row : end] = Phase.SUCTION if one.on else Phase.HOLD
     return phase
-
-
-def _moved(phase: Bytes, rows: Sequence[int], early: Sequence[int]) -> Bytes:
-    """``phase`` with the switching at each of some ``rows`` so many rows earlier."""
-    moved = phase.copy()
-    for row, by in zip(rows, early, strict=True):
-        begin, end = (row - by, row) if by > 0 else (row, row - by)
-        moved[max(begin, 0) : end] = phase[row if by > 0 else row - 1]
-    return moved
 
 
 def _switches(phase: Bytes) -> Ints:

@@ -78,7 +78,6 @@ NARROWING = (
     Round(2, 0.3, 0.6 * MBAR, 20, 1e-3),
     Round(1, 1.0, 0.6 * MBAR, 40, 1e-4),
 )
-TIMED = 2.0 * MBAR  # Pa, that a model must be nearer than to say when the nozzle switched
 # Sigmas, beyond which a residual pulls less than its square; below, it is what a fit gets wrong.
 ROBUST = 8.0
 
@@ -264,11 +263,7 @@ def fit_from_afar(
             progress("the second pressure is left out: the first would be followed less well")
     theta = coefficients(best.data)
     problem = _problem(
-        samples,
-        best,
-        noises,
-        NARROWING[-1].error,
-        lambda cycles, noise: weighted(cycles, theta, noise, fitted=True),
+        samples, best, noises, lambda cycles, noise: weighted(cycles, theta, noise, fitted=True)
     )
     pressure = samples["pressure"][(samples["quality"] & UNUSABLE) == 0]
     deepest = float(np.nanquantile(pressure, DEEPEST))
@@ -289,11 +284,7 @@ def _alone(samples: Samples, start: _Start, noises: Sequence[float]) -> float:
     """What is left of the first pressure alone, as a cost."""
     error = NARROWING[-1].error
     problem = _problem(
-        samples,
-        start,
-        noises,
-        error,
-        lambda cycles, noise: plain(cycles, noise, error, _late(start.data)),
+        samples, start, noises, lambda cycles, noise: plain(cycles, noise, error, _late(start.data))
     )
     return _cost(problem.residual(start.x))
 
@@ -314,26 +305,16 @@ def _problem(
     samples: Samples,
     start: _Start,
     noises: Sequence[float],
-    error: float,
     weigh: Callable[[Cycles, float], Weights],
 ) -> Problem:
-    """To follow the pressure from a start, and a second one where there are two ``noises`` (Pa).
-
-    The model may be off by ``error`` (Pa).
-    """
-    cycles = as_fitted(samples, start.data, error)
+    """To follow the pressure from a start, and a second one where there are two ``noises`` (Pa)."""
+    cycles = Cycles.found(samples, start.data)
     weights = weigh(cycles, noises[0])
     if len(noises) == 1:
         return Problem(start.space, cycles, weights)
     second = cycles.of_second(_other_end(start.data)).as_slow(coefficients(start.data))
     weights = weights.followed_by(weigh(second, noises[1]), len(cycles.measured))
     return Problem(start.space, Both(cycles, second), weights)
-
-
-def as_fitted(samples: Samples, data: DataSet, error: float = NARROWING[-1].error) -> Cycles:
-    """The cycles of a record as the fit has them that is off by ``error`` (Pa)."""
-    cycles = Cycles.found(samples, data)
-    return cycles.retimed(coefficients(data), error) if error < TIMED else cycles
 
 
 def _late(data: DataSet) -> float:
@@ -353,7 +334,6 @@ def _followed(samples: Samples, start: _Start, one: Round, noises: Sequence[floa
         samples,
         start,
         noises,
-        one.error,
         lambda cycles, noise: plain(cycles, noise, one.error, _late(start.data)),
     )
     # The last coordinate is how much sooner the nozzle switches than it was seen to.
