@@ -5,31 +5,21 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from user_files import authenticator_of, quick_users
+from user_files import Clock, authenticator_of, quick_users, throttled_by
 
-from twin import login as module
 from twin.audit import records
 from twin.errors import ConfigError
 from twin.login import ADDRESS_S, NAME_S, Authenticator, Login
-from twin.throttle import FREE_TRIES, LoginThrottle
+from twin.throttle import FREE_TRIES
 from twin.users import Role
 
 WORD = "correct horse"
 HERE, THERE = "192.0.2.7", "2001:db8::1"
 
 
-class Clock:
-    now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    clock = Clock()
-    monkeypatch.setattr(module, "LoginThrottle", lambda longest: LoginThrottle(longest, clock))
-    return clock
+    return throttled_by(monkeypatch)
 
 
 @pytest.fixture

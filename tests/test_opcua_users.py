@@ -10,32 +10,22 @@ from asyncua import Client, Server, ua
 from asyncua.common.utils import ServiceError
 from asyncua.ua import UaStatusCodeError
 from cryptography.hazmat.primitives.serialization import Encoding
-from user_files import quick_users
+from user_files import Clock, quick_users, throttled_by
 
 from drivers import certificates
 from drivers.opcua_security import ADDRESS, Door, GuardedServer, Person, authenticator_of, secure
-from twin import login
 from twin.audit import Audit, records
 from twin.errors import ConfigError
 from twin.login import ADDRESS_S, Authenticator
-from twin.throttle import FREE_TRIES, LoginThrottle
+from twin.throttle import FREE_TRIES
 from twin.users import Role, Users
 
 WORD = "correct horse"
 
 
-class Clock:
-    now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    clock = Clock()
-    monkeypatch.setattr(login, "LoginThrottle", lambda longest: LoginThrottle(longest, clock))
-    return clock
+    return throttled_by(monkeypatch)
 
 
 @pytest.fixture

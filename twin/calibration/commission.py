@@ -380,11 +380,13 @@ def starts(data: DataSet, meets: float, grows: float = np.nan) -> list[DataSet]:
 
 def _slow(jet: Mapping[str, float], ramp_ms: float) -> dict[str, float]:
     """A jet that takes so long to come and to go, and is half there when ``jet`` is."""
-    found = dict.fromkeys(_JET, ramp_ms)
-    for way in ("response", "response_off"):
-        ramp = jet["ramp_up_ms" if way == "response" else "ramp_down_ms"]
-        found[f"{way}_ms"] = max(jet[f"{way}_ms"] + 0.5 * (ramp - ramp_ms), SOONEST_MS)
-    return found
+    sooner_up, sooner_down = (0.5 * (ramp_ms - jet[f"ramp_{way}_ms"]) for way in ("up", "down"))
+    return {
+        "ramp_up_ms": ramp_ms,
+        "ramp_down_ms": ramp_ms,
+        "response_ms": max(jet["response_ms"] - sooner_up, SOONEST_MS),
+        "response_off_ms": max(jet["response_off_ms"] - sooner_down, SOONEST_MS),
+    }
 
 
 def within(data: DataSet, ambient: Ambient) -> DataSet:
