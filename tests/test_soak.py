@@ -36,6 +36,13 @@ def test_one_handle_more_an_hour_is_seen() -> None:
     assert soak.fitted(list(HOURS), [9.0] * len(HOURS), 0.0).is_good
 
 
+@pytest.mark.parametrize("looks", [1, 2, 5, 19])
+def test_a_fast_machine_gives_few_looks(looks: int) -> None:
+    line = soak.fitted(list(HOURS[:looks]), [9.0] * looks, 0.0)
+    assert line.is_good
+    assert (line.low95, line.high95) == (-np.inf, np.inf) or looks > 3
+
+
 @pytest.fixture(scope="module")
 def cycles() -> Samples:
     return soak.stretch(rigs.config("test_rig").document.section(PlcSettings, "plc"))

@@ -69,14 +69,20 @@ class Line:
 
 
 def fitted(hours: Sequence[float], values: Sequence[float], allowed: float) -> Line:
-    """The line through the means of stretches, the first of which do not count."""
+    """The line through the means of stretches, the first of which do not count.
+
+    Of fewer than three looks nothing can be told: its interval has no end.
+    """
     x, y = np.array(hours), np.array(values)
     span = x[-1] - x[0]
     settled = x - x[0] >= max(SETTLED * span, min(SETTLED_H, (1 - SETTLED) * span))
-    parts = np.array_split(np.flatnonzero(settled), POINTS)
+    points = min(POINTS, int(settled.sum()))
+    if points < 3:
+        return Line(0.0, -np.inf, np.inf, allowed)
+    parts = np.array_split(np.flatnonzero(settled), points)
     x, y = (np.array([column[part].mean() for part in parts]) for column in (x, y))
     line = stats.linregress(x, y)
-    reach = 0.0 if y.min() == y.max() else float(stats.t.ppf(0.975, POINTS - 2) * line.stderr)
+    reach = 0.0 if y.min() == y.max() else float(stats.t.ppf(0.975, points - 2) * line.stderr)
     slope = float(line.slope)
     return Line(slope, slope - reach, slope + reach, allowed)
 
