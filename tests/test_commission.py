@@ -549,6 +549,17 @@ def test_the_interval_of_what_is_scaled_is_one_of_its_logarithm() -> None:
     assert high == pytest.approx(leak * np.exp(SIGMAS_95))
 
 
+def test_the_interval_of_suction_counts_that_rigs_have_other_equations() -> None:
+    """However well a curve is followed, suction at ambient pressure is the model's own."""
+    fitted = commissioned().calibration.fitted
+    name = "ejector.suction_capacity_sl_min"
+    number = [one.name for one in fitted.free].index(name)
+    value, form = fitted.free[number].of(fitted.data), fitted.free[number].form
+    low, high = replace(fitted, covariance=0.0 * fitted.covariance).interval(name)
+    assert (low, high) == pytest.approx((value / 1.54, value * 1.54), rel=0.01)
+    assert fitted.interval(name)[0] < value * np.exp(-SIGMAS_95 * form)
+
+
 def test_a_sensor_at_another_place_than_told_is_said_where_the_fit_is_sure() -> None:
     fitted = commissioned().calibration.fitted
     number = [one.key for one in fitted.free].index("sensor_shift")

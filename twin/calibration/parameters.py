@@ -19,7 +19,9 @@ class Free:
     the value where ``relative``, else in its unit. ``healthy`` is how many of them below and above
     the type's value a unit is still taken for healthy; None where the value only shapes the curve.
     ``market`` is the spread where nobody knows the type: of the logarithm where the value is
-    ``scaled``, else in its unit. It is wide enough for any rig that is on the market.
+    ``scaled``, else in its unit. It is wide enough for any rig that is on the market. ``form`` is
+    one sigma of the logarithm by which a rig of other equations has it elsewhere though the curves
+    agree: it widens what is told of the value, and nothing else.
     """
 
     table: str
@@ -32,6 +34,7 @@ class Free:
     healthy: tuple[float, float] | None = None
     market: float = 0.0
     scaled: bool = True
+    form: float = 0.0
 
     @property
     def name(self) -> str:
@@ -51,7 +54,21 @@ _E = "ejector"
 _ANY = (4.0, 4.0)
 FREE = (
     # A worn nozzle moves less air; a unit that moves more than its type is only a good one.
-    Free(_E, "suction_capacity_sl_min", "sl/min", 0.1, 1.0, 1000.0, True, (1.2, 4.0), market=0.5),
+    # It is suction at ambient pressure, where the jet still grows and gas at the port makes up for
+    # it: on seven commissioned rigs of the tests' second world (seeds from 101000) it was off by
+    # 26 % rms, while the curves agreed to a millibar.
+    Free(
+        _E,
+        "suction_capacity_sl_min",
+        "sl/min",
+        0.1,
+        1.0,
+        1000.0,
+        True,
+        (1.2, 4.0),
+        market=0.5,
+        form=0.22,
+    ),
     Free(_E, "end_pressure_mbar", "mbar", 40.0, 10.0, 700.0, healthy=(4.0, 2.0), market=0.5),
     Free(_E, "bulge", "", 0.5, -1.0, 3.0, market=0.8, scaled=False),
     Free(_E, "skew", "", 0.2, -20.0, 20.0, market=0.5, scaled=False),
