@@ -5,7 +5,16 @@ import numpy.typing as npt
 import pytest
 from scipy.stats import kstest
 
-from twin.monitor.change import MOST_WAITING, WAITS, Changes, Patience, Reference, began, limit
+from twin.monitor.change import (
+    MOST_WAITING,
+    WAITS,
+    Changes,
+    Patience,
+    Reference,
+    Shape,
+    began,
+    limit,
+)
 
 Floats = npt.NDArray[np.float64]
 SUSPECTS = 12
@@ -154,3 +163,69 @@ def test_what_is_strange_again_and_again_is_learned_in_the_end() -> None:
     patience, strange = Patience[int](), np.array([4.0])
     learned = [patience.take(cycle, strange) for cycle in range(3 * MOST_WAITING)]
     assert [cycle for some in learned for cycle in some] == list(range(3 * MOST_WAITING))
+
+
+def shaped(rng: np.random.Generator, cycles: int) -> Floats:
+    """Standard scores, the first of them skewed as a log-normal variable, the second as gas keeps
+    some heat from cycle to cycle, the third neither."""
+    draws = rng.standard_normal((cycles, 3))
+    spread = 0.21  # a skewness of 0.65
+    log_normal = np.exp(spread * draws[:, 0])
+    mean, deviation = np.exp(0.5 * spread**2), np.sqrt(np.exp(spread**2) * np.expm1(spread**2))
+    keeps, kept = 0.3, np.zeros(cycles)
+    for cycle in range(1, cycles):
+        kept[cycle] = keeps * kept[cycle - 1] + np.sqrt(1 - keeps**2) * draws[cycle, 1]
+    return np.column_stack([(log_normal - mean) / deviation, kept, draws[:, 2]])
+
+
+def test_scores_become_normal_and_independent() -> None:
+    scores, shape = shaped(np.random.default_rng(1), 20_000), Shape(3)
+    found = []
+    for standard in scores:
+        step = shape.take(standard)
+        found.append(step.normal)
+        shape.learn(step)
+    late = np.array(found[2000:])
+    cubes, products = np.mean(late**3, axis=0), np.mean(late[1:] * late[:-1], axis=0)
+    assert np.mean(scores[:, 0] ** 3) > 0.5
+    assert np.abs(cubes).max() < 0.15
+    assert np.mean(scores[1:, 1] * scores[:-1, 1]) > 0.25
+    assert np.abs(products).max() < 0.05
+    assert late.std(axis=0) == pytest.approx(1.0, abs=0.03)
+    # The likelihood ratio of a change is 1 on average: that is what the sums' limit follows from.
+    for scores_of, within in ((late, 0.15), (scores[2000:], 0.0)):
+        ratio = np.exp(2.0 * np.clip(scores_of[:, 0], -5, 5) - 2.0).mean()
+        assert (abs(ratio - 1.0) < within) == bool(within)
+
+
+def test_what_is_not_shown_stays_so_and_what_was_before_stands() -> None:
+    shape = Shape(2)
+    for first, second in ((1.0, np.nan), (-0.5, 0.3), (np.nan, 0.2)):
+        step = shape.take(np.array([first, second]))
+        assert np.isnan(step.normal).tolist() == [np.isnan(first), np.isnan(second)]
+        shape.learn(step)
+    assert np.isfinite(shape.take(np.zeros(2)).normal).all()
+
+
+def test_far_scores_stay_far() -> None:
+    shape = Shape(1)
+    for standard in shaped(np.random.default_rng(2), 3000)[:, :1]:
+        shape.learn(shape.take(standard))
+    assert shape.take(np.array([12.0])).normal[0] > 5.0
+    assert shape.take(np.array([-12.0])).normal[0] < -12.0
+
+
+def test_sums_of_several_devices_are_those_of_each() -> None:
+    scores = np.random.default_rng(3).standard_normal((30, 4, SUSPECTS))
+    scores[7, 2, 5] = np.nan
+    together, each = (Changes(np.ones(SUSPECTS, bool), np.ones(SUSPECTS)) for _ in range(2))
+    for normal in scores:
+        together.take(normal)
+    for device in range(4):
+        each.begin()
+        for normal in scores[:, device]:
+            each.take(normal)
+        assert together.log_sums[device] == pytest.approx(each.log_sum)
+    together.begin_some(np.array([True, False, False, False]))
+    assert np.isneginf(together._log[0]).all()
+    assert np.isfinite(together.log_sums[1:]).all()

@@ -45,7 +45,7 @@ kind = "vessel"
 volume_ml = 90.0
 
 [monitor]
-raise_sigma = 5.0
+clear_cycles = 5
 """
 HEALTHY = {"figures": {"hold_rms": {"mean": 2.0, "sigma": 0.5}}}
 
@@ -156,7 +156,7 @@ def test_the_healthy_scatter_is_the_units_if_it_has_one(database: Assets, url: s
     assert taken(url).monitor.healthy == Healthy()
     add(database, {}, healthy=HEALTHY)
     assert taken(url).monitor.healthy == Healthy.model_validate(HEALTHY)
-    assert taken(url).monitor.raise_sigma == 5.0  # the configuration's
+    assert taken(url).monitor.clear_cycles == 5  # the configuration's
 
 
 def test_what_a_calibration_found_is_no_configuration(database: Assets, url: str) -> None:
@@ -397,7 +397,7 @@ def test_nothing_is_made_up_that_a_log_does_not_say(text: str, problem: str) -> 
     [
         ("[asset\n", "cell.toml: not valid TOML: "),
         (CELL + "[colours]\n", "cell.toml:20: unknown table [colours]"),
-        (CELL.replace("raise_", "rise_"), "cell.toml:19: monitor.rise_sigma: unknown key"),
+        (CELL.replace("clear_", "clean_"), "cell.toml:19: monitor.clean_cycles: unknown key"),
         (CELL.replace("id =", "ib ="), "cell.toml:3: asset.ib: unknown key"),
     ],
 )

@@ -21,6 +21,7 @@ from twin.figures.warnings import CAUTIONS, in_words, warnings
 from twin.figures.words import limit_of
 from twin.model.control import LEAK_SETTLE_S, PROTECTED_S, PROTECTED_SWITCHES
 from twin.model.dataset import DataSet, Ejector, Supply, System, Vessel
+from twin.monitor.detect import MonitorSettings
 from twin.signals import Phase
 
 ROOT = Path(__file__).parents[1]
@@ -30,7 +31,7 @@ DATA = DataSet(
     ejector=Ejector(air_consumption_sl_min=60.0, blow_off_sl_min=120.0),
 )
 UNIT = Unit(DATA, energy_kwh_m3=0.12)
-LIMITS = limits(FigureSettings(permitted_t1_ms=2000.0), DATA)
+LIMITS = limits(FigureSettings(permitted_t1_ms=2000.0), DATA, MonitorSettings())
 
 
 def course(
@@ -470,14 +471,14 @@ def test_a_slow_unit_has_a_limit_of_its_own() -> None:
     tank = DATA.model_copy(update={"system": System(parts=parts)})
     needs = t1_from_rest(tank)
     assert needs > 2000.0
-    assert limits(FigureSettings(), tank).t1 == pytest.approx(1.25 * needs)
-    assert limits(FigureSettings(permitted_t1_ms=2000.0), tank).t1 == 2000.0
+    assert limits(FigureSettings(), tank, MonitorSettings()).t1 == pytest.approx(1.25 * needs)
+    assert limits(FigureSettings(permitted_t1_ms=2000.0), tank, MonitorSettings()).t1 == 2000.0
 
 
 def test_a_unit_that_cannot_reach_h1_has_no_limit_of_t1() -> None:
     weak = DATA.model_copy(update={"effects": {"end_vacuum_loss": {"end_pressure_rise": 300.0}}})
-    assert limits(FigureSettings(), weak).t1 == math.inf
-    assert limit_of("t1", limits(FigureSettings(), weak)) is None
+    assert limits(FigureSettings(), weak, MonitorSettings()).t1 == math.inf
+    assert limit_of("t1", limits(FigureSettings(), weak, MonitorSettings())) is None
 
 
 def test_a_suction_that_is_to_end_before_h1_is_not_warned_of() -> None:
@@ -494,11 +495,13 @@ def beyond(**measured: float) -> tuple[str, ...]:
 
 def test_limits_are_the_units_where_nothing_is_set() -> None:
     t1 = 1.25 * t1_from_rest(DATA)
-    assert Limits(t1, 250.0, 540.0, (0.75 * 4.8, 1.25 * 4.8)) == limits(FigureSettings(), DATA)
+    assert Limits(t1, 250.0, 540.0, (0.75 * 4.8, 1.25 * 4.8)) == limits(
+        FigureSettings(), DATA, MonitorSettings()
+    )
     own = FigureSettings(
         permitted_leakage_mbar_s=90.0, permitted_free_flow_mbar=40.0, supply_low_bar=3.0
     )
-    found = limits(own, DATA)
+    found = limits(own, DATA, MonitorSettings())
     assert (found.leakage, found.free_flow, found.supply) == (90.0, 40.0, (3.0, 6.0))
     assert found.configured == {"leakage", "free_flow", "lowest_supply"}
 
@@ -510,7 +513,9 @@ def test_a_porous_part_has_a_limit_of_its_own() -> None:
     porous = DATA.model_copy(update={"system": System(parts=parts), "effects": effects})
     usual = leakage_from_rest(porous)
     assert usual > 250.0
-    assert limits(FigureSettings(), porous).leakage == pytest.approx(1.25 * usual)
+    assert limits(FigureSettings(), porous, MonitorSettings()).leakage == pytest.approx(
+        1.25 * usual
+    )
 
 
 def test_nothing_is_lost_where_no_hold_comes() -> None:
@@ -522,12 +527,12 @@ def test_nothing_is_lost_where_no_hold_comes() -> None:
 
 def test_a_unit_on_a_high_supply_has_a_range_of_its_own() -> None:
     high = DATA.model_copy(update={"supply": Supply(pressure_bar=6.8)})
-    assert limits(FigureSettings(), high).supply == pytest.approx((5.1, 8.5))
+    assert limits(FigureSettings(), high, MonitorSettings()).supply == pytest.approx((5.1, 8.5))
 
 
 def test_words_say_where_a_limit_comes_from() -> None:
     over = {"t1": 9000.0, "leakage": 400.0}
-    set_here = limits(FigureSettings(permitted_t1_ms=2000.0), DATA)
+    set_here = limits(FigureSettings(permitted_t1_ms=2000.0), DATA, MonitorSettings())
     t1, leakage = in_words(["t1_over_limit", "leakage_over_limit"], over, set_here)
     assert t1 == "t1 over limit (9000 of 2000 ms, set in [figures])"
     assert leakage == "leakage over limit (400 of 250 mbar/s, from the unit's data set)"
@@ -589,7 +594,7 @@ def test_the_page_has_the_tables_and_every_key() -> None:
     given = FigureSettings.model_validate(keys)
     assert "\n# password = " in example  # without a user in the URL there is none
     assert {*keys, "password"} == set(FigureSettings.model_fields)
-    found = limits(given, DATA)
+    found = limits(given, DATA, MonitorSettings())
     assert (found.t1, found.leakage, found.free_flow) == (2000.0, LIMITS.leakage, LIMITS.free_flow)
     assert found.supply == pytest.approx(LIMITS.supply)  # the defaults, as the page says
 

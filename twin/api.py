@@ -28,7 +28,6 @@ from twin.errors import ConfigError
 from twin.errors import TwinError as TwinError  # noqa: PLC0414 (``import twin`` has it)
 from twin.extras import install_hint
 from twin.figures.cycle import compiled as key_figures
-from twin.figures.settings import FigureSettings
 from twin.hil import Plant
 from twin.live import Twin
 from twin.log.header import DERIVED, LogHeader
@@ -123,8 +122,7 @@ class Log:
 
         What a cycle cannot tell is left out of it.
         """
-        figures = self.config.document.section(FigureSettings, "figures")
-        teller = key_figures(self.config.data, figures)
+        teller = key_figures(self.config)
         told = (teller.take(cycle) for cycle in cut(unbroken(self._rows())))
         return [one.plain() for one in told if one is not None]
 

@@ -53,13 +53,12 @@ def _read(path: Path) -> "Side":
     from twin.compare.side import side_of
     from twin.config import Config
     from twin.figures.cycle import compiled
-    from twin.figures.settings import FigureSettings
     from twin.log.reader import open_log
 
     log = open_log(path)
     say_if_cut(log, path, "compared")
     settings = Config.of_recorded(log.header, str(path))
-    figures = compiled(settings.data, settings.document.section(FigureSettings, "figures"))
+    figures = compiled(settings)
     return side_of(log, settings, figures)
 
 

@@ -199,9 +199,8 @@ def export(
 def key_figures_of(settings: "Config") -> "KeyFigures":
     """The key figures of a configuration's unit, compiled; ConfigError names a wrong key."""
     from twin.figures.cycle import compiled
-    from twin.figures.settings import FigureSettings
 
-    return compiled(settings.data, settings.document.section(FigureSettings, "figures"))
+    return compiled(settings)
 
 
 def keeper_of(settings: "Config", say: "Callable[[str], None]") -> "Callable[[], Keeper] | None":
@@ -252,11 +251,14 @@ def _settings(config: Path | None) -> "FigureSettings":
 def _limits(config: Path | None) -> "Limits":
     """The limits of a configuration's unit; without one the field's defaults."""
     from twin.config import Config
-    from twin.figures.settings import limits
+    from twin.figures.settings import FigureSettings, limits, limits_of
     from twin.model.dataset import DataSet
+    from twin.monitor.detect import MonitorSettings
 
     document = _document(config)
-    return limits(_settings(config), Config.of(document).data if document else DataSet())
+    if document:
+        return limits_of(Config.of(document))
+    return limits(FigureSettings(), DataSet(), MonitorSettings())
 
 
 def _of_log(recorded: "Log", log: Path, instead: Path | None) -> "Config":

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
+import numpy.typing as npt
 from scipy.linalg import block_diag
-from scipy.stats import chi2
 
 from twin.calibration.alike import refuse_changing
 from twin.calibration.cycles import Cycles
@@ -16,10 +16,12 @@ from twin.config import Config
 from twin.diagnosis.evidence import collect
 from twin.diagnosis.healthy import learned
 from twin.errors import ConfigError
+from twin.figures.cycle import KeyFigures
+from twin.figures.settings import LIMITED
 from twin.live import Twin
 from twin.model.dataset import DataSet, coefficients
 from twin.monitor.cycles import Cycle, figures, whole
-from twin.monitor.healthy import Healthy, Scatter
+from twin.monitor.healthy import Healthy, Scatter, sure
 from twin.monitor.knees import as_wide_as_needed
 from twin.monitor.reports import Contradiction, standing
 from twin.monitor.surroundings import taken_in
@@ -29,8 +31,7 @@ FEWEST = 5  # complete cycles
 MOST_FITTED = 12  # cycles that are fitted; what more there are tell the scatter
 MOST_SPOILT = 0.02  # share of samples that are saturated, stale or bad
 MOST_LEFT = 15.0  # mbar rms, above which no ejector of this kind is behind the log
-SURE = 0.9  # that the scatter is no larger than a few cycles show
-LEAST_SCATTER = 0.05  # mbar
+LEAST_SCATTER = 0.05  # of a figure, in its unit
 NOTHING: Mapping[str, float] = MappingProxyType({})
 
 
@@ -159,15 +160,16 @@ def scatter(data: DataSet, cycles: Sequence[Cycle]) -> dict[str, Scatter]:
     theta = coefficients(data)
     found = [figures(cycle, theta) for cycle in cycles]
     names = [f"{phase.name.lower()}_{kind}" for phase in Phase for kind in ("mean", "rms")]
-    result = {}
-    for name in [*names, "h1_level", "h1_low_level"]:
-        values = np.array([one[name] for one in found if name in one])
-        if len(values) >= FEWEST:
-            degrees = len(values) - 1
-            sigma = float(np.std(values, ddof=1) * np.sqrt(degrees / chi2.ppf(1.0 - SURE, degrees)))
-            sigma = max(sigma, LEAST_SCATTER)
-            result[name] = Scatter(mean=float(np.mean(values)), sigma=sigma)
-    return result
+    shown = {
+        name: np.array([one[name] for one in found if name in one])
+        for name in [*names, "h1_level", "h1_low_level"]
+    }
+    return {name: _scatter(values) for name, values in shown.items() if len(values) >= FEWEST}
+
+
+def _scatter(values: npt.NDArray[np.float64]) -> Scatter:
+    sigma = max(float(np.std(values, ddof=1)) * sure(len(values)), LEAST_SCATTER)
+    return Scatter(mean=float(np.mean(values)), sigma=sigma, cycles=len(values))
 
 
 def uncertain(fitted: Fitted, untold: Mapping[str, float]) -> dict[str, tuple[float, ...]]:
@@ -193,4 +195,14 @@ def like_these(
     """What healthy cycles are like beside the calibrated twin; ``untold`` as in ``uncertain``."""
     known = Healthy(figures=figures, uncertain=uncertain(fitted, untold))
     monitor = config.monitor.model_copy(update={"healthy": known})
-    return learned(collect(replace(config, data=fitted.data, monitor=monitor), [samples]))
+    healthy = learned(collect(replace(config, data=fitted.data, monitor=monitor), [samples]))
+    return healthy.model_copy(update={"key_figures": limited(fitted.data, samples)})
+
+
+def limited(data: DataSet, samples: Samples) -> dict[str, Scatter]:
+    """Those key figures of a healthy record that have limits, as far as enough cycles show them."""
+    teller = KeyFigures(data)
+    told = [*filter(None, map(teller.take, whole(Twin.of(data).over([samples]))))]
+    shown = {name: np.array([one.measured[name] for one in told]) for name in LIMITED}
+    shown = {name: values[np.isfinite(values)] for name, values in shown.items()}
+    return {name: _scatter(values) for name, values in shown.items() if len(values) >= FEWEST}

@@ -193,12 +193,13 @@ def _learned(diagnosis: Diagnosis, data: DataSet, healthy: Healthy) -> Healthy:
         values = [one[name] for one in found if name in one]
         if len(values) > 1:
             sigma = math.hypot(usual.sigma, float(np.std(values, ddof=1)))
-            learned[name] = Scatter(mean=float(np.mean(values)), sigma=sigma)
+            mean = float(np.mean(values))
+            learned[name] = Scatter(mean=mean, sigma=sigma, cycles=len(values))
     return healthy.model_copy(update={"figures": learned})
 
 
 def _widened(usual: Scatter, variance: float) -> Scatter:
-    return Scatter(mean=usual.mean, sigma=math.sqrt(usual.sigma**2 + variance))
+    return usual.model_copy(update={"sigma": math.sqrt(usual.sigma**2 + variance)})
 
 
 def _now(diagnosis: Diagnosis) -> Hypothesis:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from twin.config import Config
 from twin.figures.course import Rows, measured
 from twin.figures.expected import Expectation
 from twin.figures.settings import FigureSettings, Limits, limits
@@ -14,6 +15,7 @@ from twin.figures.table import FIGURES, UNKNOWN, Unit, figures
 from twin.figures.warnings import in_words, warnings
 from twin.model.dataset import DataSet
 from twin.monitor.cycles import LONGEST_PIECE, Cycle
+from twin.monitor.detect import MonitorSettings
 from twin.signals import (
     BREAK,
     MBAR,
@@ -96,13 +98,14 @@ class CycleFigures:
         return {**own, **both, "warnings": list(self.warnings), **warned}
 
 
-def compiled(data: DataSet, settings: FigureSettings) -> "KeyFigures":
+def compiled(config: Config) -> "KeyFigures":
     """Key figures whose path is compiled, which may take seconds: not to fall into the loop."""
     samples, ticks = np.zeros(3, SAMPLE), np.zeros(3, TICK)
     ticks["phase"] = Phase.SUCTION, Phase.HOLD, Phase.IDLE  # a cycle that is over
-    ticks["level"] = data.ambient.pressure_mbar * MBAR
-    KeyFigures(data, settings).take(Cycle(0, samples, ticks, True, False, True))
-    return KeyFigures(data, settings)
+    ticks["level"] = config.data.ambient.pressure_mbar * MBAR
+    settings = config.document.section(FigureSettings, "figures")
+    KeyFigures(config.data, settings).take(Cycle(0, samples, ticks, True, False, True))
+    return KeyFigures(config.data, settings, config.monitor)
 
 
 @dataclass
@@ -111,13 +114,14 @@ class KeyFigures:
 
     data: DataSet
     settings: FigureSettings = field(default_factory=FigureSettings)
+    watch: MonitorSettings = field(default_factory=MonitorSettings)
     _pieces: list[Cycle] = field(default_factory=list)  # of a long cycle that is not over
     _index: int = -1  # of the cycle that was last given or begun
     _ran: int = 0  # rows of the next piece over which the model has run already
 
     def __post_init__(self) -> None:
         self._unit = Unit(self.data, self.settings.energy_kwh_m3)
-        self._limits = limits(self.settings, self.data)
+        self._limits = limits(self.settings, self.data, self.watch)
         self._expectation = Expectation(self.data)
 
     def ahead(self, parts: Sequence[tuple[Samples, Ticks]], at_edge: bool) -> None:

@@ -1,18 +1,26 @@
 """The table ``[figures]``: permitted values, and where key figures are kept."""
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
 from twin.assets.configured import DatabaseSettings
+from twin.config import Config
 from twin.figures.expected import leakage_from_rest, t1_from_rest
 from twin.model.dataset import DataSet
+from twin.monitor.budget import LIMITS, cycles_between, student_limit
+from twin.monitor.detect import MonitorSettings
+from twin.monitor.healthy import Healthy
 
 Positive = Annotated[float, Field(gt=0.0)]
 LEAST_T1_MS = 50.0  # over what is usual: below is scatter
 LEAST_LEAKAGE = 10.0  # mbar/s, the same
 LEAST_SUPPLY_BAR = 0.5  # the same
+LIMITED = ("t1", "leakage", "free_flow", "lowest_supply", "highest_supply")
+NOWHERE = math.inf, -math.inf
+SHORTEST_CYCLE_S = 1.0  # for which a limit is no nearer than wanted
 
 
 class FigureSettings(DatabaseSettings):
@@ -58,8 +66,32 @@ def permitted(usual: float, tolerance: float, least: float) -> float:
     return usual + max(tolerance * usual, least)
 
 
-def limits(settings: FigureSettings, data: DataSet) -> Limits:
-    """The limits of a unit: what is not set follows from its data set."""
+def reaches(healthy: Healthy, days: float) -> dict[str, tuple[float, float]]:
+    """How low and how high key figures come in healthy cycles, by what a commissioning saw.
+
+    Beyond that one of them is once in a time that follows from ``days`` between all false alarms.
+    Figures that it did not see are not there.
+    """
+    cycles = cycles_between(days, LIMITS, SHORTEST_CYCLE_S)
+    found = {}
+    for name, one in healthy.key_figures.items():
+        reach = one.estimate * student_limit(cycles, len(LIMITED), one.cycles)
+        found[name] = one.mean - reach, one.mean + reach
+    return found
+
+
+def limits_of(config: Config) -> Limits:
+    """The limits of the unit of a configuration."""
+    settings = config.document.section(FigureSettings, "figures")
+    return limits(settings, config.data, config.monitor)
+
+
+def limits(settings: FigureSettings, data: DataSet, watch: MonitorSettings) -> Limits:
+    """The limits of a unit: what is not set follows from its data set.
+
+    None is so near that its healthy cycles come up to it more often than ``watch`` wants.
+    """
+    reach = dict.fromkeys(LIMITED, NOWHERE) | reaches(watch.healthy, watch.false_alarm_days)
     t1, leakage = settings.permitted_t1_ms, settings.permitted_leakage_mbar_s
     free_flow = settings.permitted_free_flow_mbar
     low, high = settings.supply_low_bar, settings.supply_high_bar
@@ -75,15 +107,16 @@ def limits(settings: FigureSettings, data: DataSet) -> Limits:
         data.supply.nozzle_bar,
     )
     if t1 is None:
-        t1 = permitted(t1_from_rest(data), tolerance, LEAST_T1_MS)
+        t1 = max(permitted(t1_from_rest(data), tolerance, LEAST_T1_MS), reach["t1"][1])
     if leakage is None:
         usual = permitted(leakage_from_rest(data), tolerance, LEAST_LEAKAGE)
-        leakage = max(usual, ejector.permitted_leakage_mbar_s)
+        leakage = max(usual, ejector.permitted_leakage_mbar_s, reach["leakage"][1])
     if free_flow is None:
-        free_flow = ejector.h2_mbar - ejector.h2_hysteresis_mbar
+        free_flow = max(ejector.h2_mbar - ejector.h2_hysteresis_mbar, reach["free_flow"][1])
     if low is None:
         low = nozzle_bar - max(tolerance * nozzle_bar, LEAST_SUPPLY_BAR)
+        low = min(low, reach["lowest_supply"][0])
     if high is None:
-        high = permitted(nozzle_bar, tolerance, LEAST_SUPPLY_BAR)
+        high = max(permitted(nozzle_bar, tolerance, LEAST_SUPPLY_BAR), reach["highest_supply"][1])
     configured = frozenset(name for name, value in chosen.items() if value is not None)
     return Limits(t1, leakage, free_flow, (low, high), configured)

@@ -7,7 +7,6 @@ import numpy as np
 
 from twin.config import Config
 from twin.figures.cycle import CycleFigures, compiled
-from twin.figures.settings import FigureSettings
 from twin.figures.table import FIGURES
 from twin.live import Twin
 from twin.monitor.bank import SUSPECTS, Bank, Suspect
@@ -22,7 +21,7 @@ def watched(config: Config, blocks: Iterable[Samples]) -> dict[str, Any]:
     """Run twin and hypotheses over a log; give what its cycles say on average."""
     listener, cutter = Listener.of(config.data, config.monitor.healthy), CycleCutter()
     bank = Bank(listener.theta)
-    teller = compiled(config.data, config.document.section(FigureSettings, "figures"))
+    teller = compiled(config)
     told: list[CycleFigures] = []
     heard: list[Said] = []
     for rows, ticks in Twin.of(config.data).over(bridged(blocks)):

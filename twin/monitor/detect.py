@@ -5,7 +5,6 @@ scatter. An alarm is raised when one figure is far out, or when the isolation sa
 differ where no single one does. It is cleared, with hysteresis, when all are back for some cycles.
 """
 
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -48,6 +47,7 @@ from twin.signals import (
 
 if TYPE_CHECKING:  # its SciPy would be imported with every configuration
     from twin.monitor.isolation import Heard, Isolation, Verdict
+    from twin.monitor.usual import Usual
 
 _UNFIT = int(Quality.OUT_OF_RANGE | Quality.OVERFLOW | Quality.STALE | Quality.BAD)
 # Of a cycle's samples, to judge it: commands seen late look like a deviation. Usual records lack up
@@ -59,6 +59,9 @@ ALIKE = 0.2  # of how far out a cycle is: by so much its figures may move before
 NAMED = 0.5  # of the squares a name explains at least: more than it leaves
 RENAMED = 3  # cycles in a row that must agree on another name before a standing alarm gets it
 LONGEST_RING_NS = 120_000_000_000  # of rows that a PLC keeps while nobody reads them
+CLEARS = 3.5  # sigmas of a figure, below which a cycle is as healthy ones
+LARGE = 6.0  # sigmas: from less nothing else is told to begin
+SHORTEST_S = 0.1  # that a cycle takes
 GREW = 2.0  # times as far out as any cycle before: something else has begun
 PHASES = {"h1": "suction", "h1_low": "hold"}  # which a level of the air saving ends
 
@@ -66,13 +69,11 @@ PHASES = {"h1": "suction", "h1_low": "hold"}  # which a level of the air saving 
 class MonitorSettings(Settings):
     """When a deviation is an alarm."""
 
-    raise_sigma: float = Field(6.0, gt=0.0)
-    clear_sigma: float = Field(3.5, gt=0.0)
+    false_alarm_days: float = Field(30.0, gt=0.0)  # between false alarms of any kind, of a unit
     clear_cycles: int = Field(3, ge=1)
     smallest_mbar: float = Field(0.5, ge=0.0)  # deviations below are never worth an alarm
     stale_ms: float = Field(500.0, gt=0.0)
     isolate: bool = True  # step a bank of hypotheses beside the twin, and sum over cycles
-    false_alarm_days: float = Field(30.0, gt=0.0)  # between false alarms by these sums
     healthy: Healthy = Healthy()
 
 
@@ -82,6 +83,7 @@ class Outlier(NamedTuple):
     figure: str
     excess: float  # mbar
     sigmas: float
+    normal: float  # the standard normal value that is as improbable
 
     @property
     def place(self) -> str:
@@ -119,6 +121,8 @@ class Monitor:
     judges: bool = True  # cycles; not where nobody recorded the commands
     _cutter: CycleCutter = field(default_factory=CycleCutter)
     _before: Cycle | None = None
+    _cycles: int = 0  # that were judged, and how long they took (s)
+    _seconds: float = 0.0
     _sought: Mapping[str, float] = field(default_factory=dict)  # figures, as the cause was sought
     _mixed: int | None = None  # the cycle in which something may have begun, not yet named
     _rival: tuple[str, int] = ("", 0)  # another name for the standing alarm, cycles that gave it
@@ -128,9 +132,13 @@ class Monitor:
     _fresh: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # the last that was
     _silences: set[int] = field(default_factory=set)  # told of, by PLC time of the row before
     _unfit: int = 0  # quality bits that stand
+    _usual: "Usual" = field(init=False)  # what each figure is in healthy cycles
 
     def __post_init__(self) -> None:
         """Have what is compiled at hand, not to fall into a block."""
+        from twin.monitor.usual import Usual  # noqa: PLC0415 - with SciPy
+
+        self._usual = Usual(self.settings.healthy)
         nothing = Cycle(0, np.zeros(1, SAMPLE), np.zeros(1, TICK), complete=False)
         figures(nothing, self.theta)
         drawn_rows(nothing.samples, nothing.ticks)  # where a cause is sought
@@ -312,15 +320,15 @@ class Monitor:
     def _conclude(self, look: Look, told: Told | None, heard: "Heard | None") -> list[Event]:
         """What there is to say of a cycle, and an alarm if it is one."""
         cycle, before, found, judged = look
-        worst = self._worst(found) if judged else None
+        worst, is_out = self._worst(cycle, found) if judged else (None, False)
         far = abs(worst.sigmas) if worst else 0.0
-        begins = far >= self.settings.raise_sigma and self._begins(cycle, far)
-        verdict = self._isolate(heard, far, begins)
+        begins = is_out and self._begins(cycle, far)
+        verdict = self._isolate(heard, far if is_out else 0.0, begins)
         events = [_summary(cycle, found, told, verdict)] if cycle.complete or told else []
         if not judged or (worst is None and verdict is None):
             return events
         quiet, self._quiet_cycles = self._quiet_cycles, 0
-        if worst and far >= self.settings.raise_sigma:
+        if worst and is_out:
             if begins:
                 events.append(self._begin(worst, cycle))
             elif not self._stands(cycle, worst, found, verdict):
@@ -328,12 +336,12 @@ class Monitor:
                 events += self._deviation(worst, before, cycle, verdict)
         elif verdict and self._is_to_tell(verdict):
             events.append(self._change(cycle, verdict))
-        elif self.active and far < self.settings.clear_sigma and not self._differs:
+        elif self.active and not self._is_far(worst) and not self._differs:
             self._quiet_cycles = quiet + 1
             if self._quiet_cycles >= self.settings.clear_cycles:
                 events.append(self._cleared(cycle))
                 self.active, self._rival = "", ("", 0)
-        if far < self.settings.raise_sigma:
+        if not is_out:
             self._mixed = None
         self._farthest = max(self._farthest, far) if self.active else 0.0
         return events
@@ -353,7 +361,7 @@ class Monitor:
         """
         if not self.active:
             return True
-        grew = far > GREW * max(self._farthest, self.settings.raise_sigma)
+        grew = far > GREW * max(self._farthest, LARGE)
         return grew and self._mixed is None and not cycle.cut_short
 
     def _is_to_tell(self, verdict: "Verdict") -> bool:
@@ -376,27 +384,33 @@ class Monitor:
         """What the isolation holds; it does not learn what is usual from what is far out."""
         if self.isolation is None or heard is None:
             return None
-        far = far if far >= self.settings.raise_sigma else 0.0
         verdict = self.isolation.judge(heard, far, begins=begins)
         return verdict if self._is_commissioned or verdict is None else verdict.unnamed()
 
-    def _worst(self, found: Mapping[str, float]) -> Outlier | None:
-        outliers = []
-        for figure, healthy in self.settings.healthy.figures.items():
-            if figure in found:
-                excess = found[figure] - healthy.mean
-                if figure.endswith("_rms"):
-                    excess = max(excess, 0.0)  # less than usual is no deviation
-                beyond = max(abs(excess) - self.settings.smallest_mbar, 0.0)
-                sigmas = math.copysign(beyond / healthy.sigma, excess)
-                outliers.append(Outlier(figure, excess, sigmas))
-        return max(outliers, key=self._weight, default=None)
+    def _worst(self, cycle: Cycle, found: Mapping[str, float]) -> tuple[Outlier | None, bool]:
+        """The figure that is farthest from healthy, and whether this alone is an alarm.
 
-    def _weight(self, outlier: Outlier) -> tuple[bool, float]:
-        """Sensors move the levels too, and say more about themselves in the course."""
-        far = abs(outlier.sigmas)
-        level = outlier.figure.endswith("_level")
-        return far >= self.settings.raise_sigma, far / 3.0 if level else far
+        An alarm that stands without a name is named by less.
+        """
+        self._cycles, self._seconds = self._cycles + 1, self._seconds + cycle.seconds
+        normal = self._usual.normal(found, self.settings.smallest_mbar)
+        excess = self._usual.excess(found)
+        columns = zip(self._usual.names, excess, excess / self._usual.sigma, normal, strict=True)
+        outliers = [
+            Outlier(name, *map(float, numbers)) for name, *numbers in columns if name in found
+        ]
+        if not outliers:
+            return None, False
+        seconds = max(self._seconds / self._cycles, SHORTEST_S)
+        limit = self._usual.limit(self.settings.false_alarm_days, seconds, len(outliers))
+        worst = max(outliers, key=lambda one: _weight(one, limit))
+        if not self.active:
+            self._usual.learn(found, normal)
+        return worst, abs(worst.normal) >= (CLEARS if self.active == UNKNOWN else limit)
+
+    def _is_far(self, worst: Outlier | None) -> bool:
+        """Whether one figure of a cycle keeps an alarm from being over."""
+        return worst is not None and abs(worst.normal) >= CLEARS
 
     def _change(self, cycle: Cycle, verdict: "Verdict") -> Event:
         """Raise the alarm for what no single cycle shows, or name the one that stands."""
@@ -523,6 +537,13 @@ class Monitor:
         begin = len(samples) - len(cycle.samples)
         ranking = likenesses(following(self.theta, samples), samples, ticks, begin)
         return ranking or [Likeness(UNKNOWN, None, "", 0.0)]  # not one sync in a long piece
+
+
+def _weight(outlier: Outlier, limit: float) -> tuple[bool, float]:
+    """Sensors move the levels too, and say more about themselves in the course."""
+    far = abs(outlier.sigmas)
+    level = outlier.figure.endswith("_level")
+    return abs(outlier.normal) >= limit, far / 3.0 if level else far
 
 
 def _names(verdict: "Verdict | None") -> bool:

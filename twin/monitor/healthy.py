@@ -1,5 +1,6 @@
 """What healthy cycles of one unit are like: a calibration learns it and stores it with the data."""
 
+import math
 from collections.abc import Mapping
 from typing import Self
 
@@ -7,14 +8,29 @@ from pydantic import Field, model_validator
 
 from twin.settings import Settings
 
+UNSEEN_LEVEL_MBAR = 3.0  # one sigma of a switching level that no cycle shows and somebody told
+SURE = 0.9  # that a scatter is no larger than is told of it
 NOT_COMMISSIONED = "not commissioned: causes are not named"
 
 
 class Scatter(Settings):
-    """What one figure is in healthy cycles: mean and one standard deviation, its unit in mbar."""
+    """What one figure was in some healthy cycles: its mean, and how it scatters; in its unit."""
 
     mean: float
-    sigma: float = Field(gt=0.0)
+    sigma: float = Field(gt=0.0)  # one standard deviation, which is SURE not to be exceeded
+    cycles: int = Field(12, ge=2)  # that showed it
+
+    @property
+    def estimate(self) -> float:
+        """One standard deviation as these cycles had it."""
+        return self.sigma / sure(self.cycles)
+
+
+def sure(cycles: int) -> float:
+    """How many times its estimate from so many cycles a sigma may be, with SURE."""
+    from scipy.special import chdtri  # noqa: PLC0415 - SciPy would come with each configuration
+
+    return math.sqrt((cycles - 1) / float(chdtri(cycles - 1, SURE)))
 
 
 class ModelError(Settings):
@@ -40,6 +56,8 @@ class Healthy(Settings):
     ``figures`` of a cycle; the model's ``error`` by kind of stretch; what differs from cycle to
     cycle (``scatter``: effect to one sigma of its size); in which ways the data set is
     ``uncertain`` (the lower Cholesky factor of its covariance, a row for each value).
+    ``unseen_level_mbar`` is one sigma of a switching level that no healthy cycle shows.
+    ``key_figures`` are those that have limits, in their own units.
     """
 
     figures: Mapping[str, Scatter] = Field(default_factory=dict)
@@ -47,6 +65,8 @@ class Healthy(Settings):
     scatter: Mapping[str, float] = Field(default_factory=dict)
     leftover: float = Field(1.0, gt=0.0)  # sigmas, by all this, that healthy cycles have
     uncertain: Mapping[str, tuple[float, ...]] = Field(default_factory=dict)
+    unseen_level_mbar: float = Field(UNSEEN_LEVEL_MBAR, gt=0.0)
+    key_figures: Mapping[str, Scatter] = Field(default_factory=dict)
 
     @property
     def is_known(self) -> bool:

@@ -23,12 +23,15 @@ from twin.model.effects import UNKNOWN
 from twin.model.term import KINDS
 from twin.monitor.bank import DELAY_STEPS, DELAYS, SUSPECTS, UNSURE_OF, Bank
 from twin.monitor.bins import Floats, averaged
+from twin.monitor.budget import SUMS, cycles_between
 from twin.monitor.change import (
     FARTHEST,
     MOST,
     Changes,
     Patience,
     Reference,
+    Shape,
+    Step,
     began,
     limit,
 )
@@ -38,7 +41,6 @@ from twin.monitor.signatures import Likeness
 from twin.monitor.statistics import Listener, Said
 from twin.signals import SAMPLE, TICK, Samples, Ticks
 
-DAY_S = 86_400.0
 KEPT = 400  # cycles that are remembered: a change is not sought further back
 RECENT = 60  # of them, the last ones from which a cause is named
 LEARNED = 10  # cycles before which nothing is said
@@ -99,15 +101,16 @@ class _Usual:
 class Isolation:
     """Takes the rows of the twin and its cycles; gives what is held of the causes.
 
-    ``days`` between false alarms, for one ejector.
+    ``days`` between false alarms of any kind, for one ejector.
     """
 
     def __init__(self, bank: Bank, listener: Listener, days: float) -> None:
         self._bank, self._listener = bank, listener
-        self._wanted_s = days * DAY_S
+        self._days = days
         self._reference, self._usual = Reference.of(len(SUSPECTS)), _Usual()
+        self._shape = Shape(len(SUSPECTS))
         self._learned = 0  # cycles
-        self._patience = Patience[tuple[Said, Floats]]()  # with their scores
+        self._patience = Patience[tuple[Said, Floats, Step]]()  # with their scores
         self._changes: Changes | None = None  # once it is known which suspects look alike
         self._kept: deque[tuple[Said, Floats]] = deque(maxlen=KEPT)  # with the normal scores
         self._cycles, self._seconds = 0, 0.0
@@ -167,22 +170,24 @@ class Isolation:
         said, scores, seconds = heard
         self._cycles += 1
         self._seconds += seconds
-        normal = self._reference.standard(scores)
+        step = self._shape.take(self._reference.standard(scores))
+        normal = step.normal
         self._kept.append((said, normal))
         verdict = self._conclude(self._changes, normal, far, begins) if self._changes else None
         if self.stands:
             self._patience.forget()
         elif self._changes is None and not far:
-            self._learn(said, scores)
+            self._learn(said, scores, step)
         elif not far and (verdict is None or not verdict.causes):
-            for one in self._patience.take((said, scores), normal):
+            for one in self._patience.take((said, scores, step), normal):
                 self._learn(*one)
         return verdict
 
-    def _learn(self, said: Said, scores: Floats) -> None:
+    def _learn(self, said: Said, scores: Floats, step: Step) -> None:
         """Take a cycle as usual; what is shown for the first time is looked for from now on."""
         new = np.isfinite(scores) & (self._reference.count == 0.0)
         self._reference.add(scores)
+        self._shape.learn(step)
         self._usual.add(said)
         self._learned += 1
         if new.any():
@@ -196,7 +201,7 @@ class Isolation:
     def _conclude(self, changes: Changes, normal: Floats, far: float, begins: bool) -> Verdict:
         changes.take(normal, FARTHEST if far else MOST)
         log_sum = changes.log_sum
-        cycles = self._wanted_s / (self._seconds / self._cycles)
+        cycles = cycles_between(self._days, SUMS, self._seconds / self._cycles)
         log_odds = log_sum - math.log(cycles)  # a fault is as rare as a false alarm
         none = 1.0 / (1.0 + math.exp(min(log_odds, 700.0)))
         raised = self._raised is None and log_sum >= limit(cycles)

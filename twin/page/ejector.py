@@ -19,7 +19,7 @@ from twin.assets.unit import Unit
 from twin.config import Config
 from twin.errors import ConfigError, TwinError
 from twin.figures.place import open_chosen as open_figures
-from twin.figures.settings import FigureSettings, limits
+from twin.figures.settings import limits_of
 from twin.figures.store import SIDES
 from twin.figures.table import FIGURES
 from twin.figures.trend import DAY_NS, Trend
@@ -55,7 +55,7 @@ class Ejector:
         self.config, self._clock = config, clock
         self.name = config.asset.id or config.asset.type
         self._rules = board_rules(document)
-        self._limits = limits(document.section(FigureSettings, "figures"), config.data)
+        self._limits = limits_of(config)
         self._folder = folder_of(document, config.asset)
         self._unit = Unit(config.asset.type, config.asset.id)
         self._asked: set[int] = set()  # through this page
