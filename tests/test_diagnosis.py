@@ -210,6 +210,22 @@ def test_drifted_thresholds_gain_in_the_switching_levels() -> None:
     assert before > 20.0
 
 
+@pytest.mark.parametrize("known_mbar", [3.0, 75.0])
+def test_a_hysteresis_that_nobody_knows_is_no_drift_where_a_leak_shows_it(
+    known_mbar: float,
+) -> None:
+    """In healthy cycles of this gripper the nozzle does not go on again."""
+    ejector = GRIPPER.data.ejector.model_copy(update={"h1_hysteresis_mbar": 110.0})
+    healthy = GRIPPER.monitor.healthy.model_copy(update={"unseen_level_mbar": known_mbar})
+    assert "h1_low_level" not in healthy.figures
+    monitor = GRIPPER.monitor.model_copy(update={"healthy": healthy})
+    data = GRIPPER.data.model_copy(update={"ejector": ejector})
+    leaks = blocks(GRIPPER_PLC, 36.0, [parse_fault("leakage=1.5")], seed=3)
+    answer = of(leaks, replace(GRIPPER, data=data, monitor=monitor)).json
+    drifts = ["threshold_drift"] if known_mbar < 10.0 else []
+    assert [one["effect"] for one in answer["causes"]] == ["leakage", *drifts]
+
+
 def test_a_leak_that_opens_half_way_is_a_step_with_its_onset() -> None:
     answer = with_leak().json
     (cause,) = answer["causes"]

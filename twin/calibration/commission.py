@@ -33,6 +33,7 @@ from twin.errors import ConfigError
 from twin.model import theta as c
 from twin.model.dataset import Ambient, DataSet, coefficients
 from twin.model.system import Cups, Part, Sensor, Tube, volume
+from twin.monitor.healthy import UNSEEN_LEVEL_MBAR
 from twin.monitor.reports import APART, Contradiction
 from twin.monitor.surroundings import taken_in
 from twin.signals import (
@@ -73,6 +74,9 @@ LEAST_LEFT = 0.1  # of what is not a tube, that a flow meter must leave of it
 # One sigma, of its value, where nobody told it. Suction then rises or falls by 6 % a bar about a
 # supply of 5 bar; momentum theory of ejectors on the market has up to 12 %.
 OPTIMUM_UNTOLD = 0.2
+# mbar, one sigma of the hysteresis where no cycle shows it and nobody told it: ejectors on the
+# market have 10 to 300.
+HYSTERESIS_UNTOLD = 75.0
 LEAST_OFFSET = 1.0  # mbar, of the sensor beside a barometer, to be taken for one
 
 
@@ -128,6 +132,7 @@ def commission(
     readings = read(samples)
     refuse_unreadable(readings)
     optimum_is_told = "optimum_bar" in config.data.supply.model_fields_set
+    unseen_level = _unseen_level(config.data, readings)
     config = replace(config, data=taken_in(config.data, samples))
     refuse_miswired(samples, readings, config.data.ambient.pressure_mbar * MBAR)
     guess, remarks = guessed(config.data, readings)
@@ -166,9 +171,16 @@ def commission(
     sigma = OPTIMUM_UNTOLD * fitted.data.supply.optimum_bar
     untold = {} if optimum_is_told else {"supply.optimum_bar": sigma}
     healthy = like_these(known, fitted, scatter(fitted.data, cycles), samples, untold)
+    healthy = healthy.model_copy(update={"unseen_level_mbar": unseen_level})
     times = samples["host_ns"]
     calibration = Calibration(fitted, healthy, len(cycles), int(times[0]), int(times[-1]))
     return Commissioned(calibration, readings, verdict, tuple(remarks), tuple(against), samples)
+
+
+def _unseen_level(told: DataSet, readings: Readings) -> float:
+    """One sigma (mbar) of where the nozzle goes on again, should a later record show it."""
+    is_told = "h1_hysteresis_mbar" in told.ejector.model_fields_set
+    return UNSEEN_LEVEL_MBAR if is_told or np.isfinite(readings.on) else HYSTERESIS_UNTOLD
 
 
 def switching(data: DataSet, samples: Samples) -> DataSet:

@@ -20,7 +20,8 @@ from twin.model import theta as c
 from twin.model.courses import Cause, Course, Schedule
 from twin.model.theta import Theta
 from twin.monitor.bins import Floats, Ints
-from twin.monitor.statistics import LEVELS, UNKNOWN_LEVEL_MBAR
+from twin.monitor.healthy import UNSEEN_LEVEL_MBAR
+from twin.monitor.statistics import LEVELS
 from twin.monitor.weights import SCATTER, from_cycle_to_cycle, lasting, model_error
 from twin.signals import MS, Phase
 
@@ -243,7 +244,7 @@ def _level_sigmas(evidence: Evidence, cycles: Sequence[int]) -> Floats:
     sigmas = []
     for _, number in _shown(evidence, cycles):
         healthy = evidence.healthy.figures.get(LEVELS[number])
-        sigmas.append(healthy.sigma if healthy else UNKNOWN_LEVEL_MBAR)
+        sigmas.append(healthy.sigma if healthy else UNSEEN_LEVEL_MBAR)
     return np.array(sigmas)
 
 
@@ -251,6 +252,6 @@ def _together(evidence: Evidence, cycles: Sequence[int]) -> Floats:
     """Covariance of levels that cycles have in common."""
     number = np.array([number for _, number in _shown(evidence, cycles)])
     known = np.array([LEVELS[n] in evidence.healthy.figures for n in number], bool)
-    size = np.where(known, LEVEL_MBAR, UNKNOWN_LEVEL_MBAR)
+    size = np.where(known, LEVEL_MBAR, evidence.healthy.unseen_level_mbar)
     common: Floats = np.outer(size, size) * (number[:, None] == number)
     return common

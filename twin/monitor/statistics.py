@@ -27,7 +27,6 @@ from twin.signals import MBAR
 
 PER_UNIT = 2  # bins in each unit of warped time
 LEVELS = ("h1_level", "h1_low_level")
-UNKNOWN_LEVEL_MBAR = 3.0  # one sigma of a level that healthy cycles do not show
 PLACES = 8  # that are remembered: of a program or two, with what jitters
 SUCTION = 4.0  # s, commanded to see where each suspect switches
 # Sigmas² of a step: nothing in the cycle depends on it. Hypotheses that are stepped apart from each
@@ -111,7 +110,9 @@ class Listener:
         known = [self.healthy.figures.get(name) for name in LEVELS]
         means = [one.mean if one else at for one, at in zip(known, vacuum[:, 0], strict=True)]
         self._means = np.nan_to_num(np.array(means))
-        self._sigmas = np.array([one.sigma if one else UNKNOWN_LEVEL_MBAR for one in known])
+        self._sigmas = np.array(
+            [one.sigma if one else self.healthy.unseen_level_mbar for one in known]
+        )
 
     def hear(
         self, cycle: Cycle, drawn: Ints, expected: Floats, figures: Mapping[str, float]
