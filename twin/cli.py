@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from twin.monitor.listening import Notices
     from twin.settings import Document
     from twin.signals import Samples, Ticks
+    from twin.tables.reader import Table
     from twin.view import Screen
 
 GARBAGE = 20_000  # objects made and not let go of, after which Python looks for garbage
@@ -495,16 +496,40 @@ def _recorded_cycles(
                 return
 
 
+def _known_zone(name: str) -> str:
+    """For ``--time-zone``: usage error unless there is such a zone."""
+    from twin.tables.settings import known_zone
+
+    try:
+        return known_zone(name) if name else name
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
+
+
 @app.command("import")
 def import_(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV or Parquet.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV, Excel (.xlsx) or Parquet.")],
     config: Annotated[Path, typer.Option(help="TOML configuration; [import] maps columns.")],
-    output: Annotated[Path, typer.Option("-o", metavar="LOG.mcap", help="Write the new log.")],
+    output: Annotated[
+        Path | None, typer.Option("-o", metavar="LOG.mcap", help="Write the new log.")
+    ] = None,
     unit: UnitId = "",
     assets: AssetsUrl = "",
+    time_zone: Annotated[
+        str,
+        typer.Option(
+            metavar="ZONE",
+            callback=_known_zone,
+            help="Of times that say none, as Europe/Berlin or UTC.",
+        ),
+    ] = "",
     derive_commands: Annotated[
         bool,
         typer.Option("--derive-commands", help="Find commands that FILE lacks from the pressure."),
+    ] = False,
+    dry_run: Annotated[
+        bool,
+        typer.Option("--dry-run", help="Write nothing; show how FILE is understood."),
     ] = False,
 ) -> None:
     """Make a log of a PLC's trace export, with what the twin expects beside it."""
@@ -517,12 +542,21 @@ def import_(
     from twin.tables.reader import open_table
     from twin.tables.settings import ImportSettings
 
-    refuse_other_suffix(output)
+    if output is not None:
+        refuse_other_suffix(output)
+    elif not dry_run:
+        raise typer.BadParameter("say with -o LOG.mcap where the log goes, or look with --dry-run")
     settings = _configured(Document.read(config), assets, unit)
     wanted = settings.document.section(ImportSettings, "import")
+    if time_zone:
+        wanted = wanted.model_copy(update={"time_zone": time_zone})
     ambient = settings.data.ambient.pressure_mbar * MBAR
     table = open_table(file, wanted, ambient, derive=derive_commands)
     settings = replace(settings, gauge=table.counts_from_ambient)
+    for note in table.notes:
+        print(f"twin: {file}: {note}", file=sys.stderr)
+    if dry_run or output is None:
+        return _show(table, derive=derive_commands)
     if table.ignored:
         print(f"twin: columns not taken: {', '.join(table.ignored)}", file=sys.stderr)
     unmeasured = {}
@@ -536,7 +570,21 @@ def import_(
         sinks = _opened({"log": partial(Recorder, part, header), "console": Console})
         blocks = _until(stopped, _progress(table.blocks(), "importing"))
         run_loop(blocks, twin, monitor, [*sinks.values()])
-    _leave(interrupted=stopped() == "interrupted")
+    return _leave(interrupted=stopped() == "interrupted")
+
+
+def _show(table: "Table", *, derive: bool) -> None:
+    """Print how a table is understood, also where it is then refused."""
+    from twin.tables.preview import Preview
+
+    preview = Preview(table)
+    try:
+        for block in _progress(table.blocks(), "reading"):
+            preview.see(block)
+    finally:
+        print(preview)
+    if derive:
+        print(table.with_commands().commands)
 
 
 @app.command()

@@ -82,10 +82,13 @@ class Unit(StrEnum):
     """Of the pressure, as it arrives."""
 
     MBAR = "mbar"
+    HPA = "hPa"
     BAR = "bar"
     KPA = "kPa"
     PA = "Pa"
     PSI = "psi"
+    IN_HG = "inHg"
+    TORR = "torr"
 
 
 class Reference(StrEnum):

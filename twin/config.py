@@ -239,7 +239,10 @@ def _counts_from_ambient(tables: Tables) -> bool:
     with suppress(KeyError, TypeError):
         return bool(tables["driver"]["tags"]["pressure"]["reference"] in FROM_AMBIENT)
     with suppress(KeyError, TypeError):
-        return any(str(name).startswith("vacuum_") for name in tables["import"]["columns"])
+        columns = tables["import"]["columns"]
+        said = columns.get("pressure")
+        gauge = isinstance(said, Mapping) and said.get("reference") in FROM_AMBIENT
+        return gauge or any(str(name).startswith("vacuum") for name in columns)
     return False
 
 
