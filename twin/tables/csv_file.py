@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 import pyarrow as pa
@@ -47,11 +47,13 @@ class CsvFile:
         self._encoding = settings.encoding or self._told_encoding()
         wanted = wanted_names(settings)
         rows = self._rows()
-        found = _find_header(islice(rows, _PREAMBLE), wanted)
-        if found is None:
+        header = _find_header(islice(rows, _PREAMBLE), wanted)
+        if header is None:
             raise SourceError(f"{path}: there is no header row", "name the columns in a first row")
-        self._head, header, self._separator = found
-        self.names = _cells(header, self._separator)
+        self._head, self._separator = header.line, header.separator
+        self.names = _cells(header.text, self._separator)
+        if header.before:
+            self.notes.append(f"the header is line {self._head}; what stands before it is not read")
         self._first = self._head + 1  # line of what may be values
         self._is_scope = scope.is_header(self.names)
         if self._is_scope:
@@ -162,18 +164,26 @@ class CsvFile:
                 first += len(cut)
 
 
-def _find_header(rows: Iterator[tuple[int, str]], wanted: set[str]) -> tuple[int, str, str] | None:
-    """Line, text and separator of the first row with a wanted name; else of that with most words."""
-    wordiest: tuple[int, int, str, str] | None = None
-    for number, row in rows:
+class _Header(NamedTuple):
+    line: int
+    text: str
+    separator: str
+    before: int  # rows
+
+
+def _find_header(rows: Iterator[tuple[int, str]], wanted: set[str]) -> _Header | None:
+    """The first row that has a wanted name, else the one with the most words."""
+    wordiest: tuple[int, _Header | None] = -1, None
+    for before, (line, row) in enumerate(rows):
         by_fit = {sign: len(wanted & set(_cells(row, sign))) for sign in _SEPARATORS if sign in row}
         separator = max(by_fit, key=by_fit.__getitem__, default=",")
+        header = _Header(line, row, separator, before)
         if by_fit and by_fit[separator]:
-            return number, row, separator
-        names = sum(any(map(str.isalpha, cell)) for cell in _cells(row, separator))
-        if wordiest is None or names > wordiest[0]:
-            wordiest = names, number, row, separator
-    return wordiest and wordiest[1:]
+            return header
+        words = sum(any(map(str.isalpha, cell)) for cell in _cells(row, separator))
+        if words > wordiest[0]:
+            wordiest = words, header
+    return wordiest[1]
 
 
 def _cells(line: str, separator: str) -> list[str]:

@@ -92,7 +92,7 @@ def find_meaning(
         raise _other_unit(column, source, said, place)
     unit = named or said
     if header in _ELECTRICAL and source.signal is None and source.is_name_only:
-        raise _electrical(column, source, place)
+        raise _electrical(source, place)
     if unit is None and header in _UNITS:
         return Meaning(_UNITS[header], reference, *source.line, from_header=True)
     if unit is None:
@@ -140,11 +140,11 @@ def _other_unit(column: Column, source: ColumnSource, said: Unit, place: str) ->
     )
 
 
-def _electrical(column: Column, source: ColumnSource, place: str) -> SourceError:
+def _electrical(source: ColumnSource, place: str) -> SourceError:
     unit, usual = _ELECTRICAL[_unit_of(source.name)]
     return SourceError(
         f"{place}: column {source.name!r} is in {unit}: which pressures do its ends mean?",
-        f"say it under [import.columns], for example: {_generic(column)} ="
+        "say it under [import.columns] instead, for example: pressure ="
         f' {{ name = "{source.name}", signal = {usual}, range = [0, -1000], unit = "mbar",'
         ' reference = "gauge" }',
     )

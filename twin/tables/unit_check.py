@@ -22,7 +22,8 @@ LEAST = 2.0 * MBAR
 LEAST_ABSOLUTE = -20.0 * MBAR  # Pa; a sensor's zero may be off by less
 MOST_AMBIENT = 1100.0 * MBAR  # Pa; the highest air pressure measured at sea level is 1085 mbar
 LEAST_AMBIENT = 500.0 * MBAR  # Pa, at 5.5 km; the highest towns lie at 5.1 km
-LEAST_VACUUM = 20.0 * MBAR  # Pa, that a record with suction shows
+LEAST_VACUUM = 50.0 * MBAR  # Pa, that a record with suction shows
+MOST_RELEASED = 1.5  # of ambient, that a blow-off comes to
 LONG_NS = 1_000_000_000
 MOST_ANSWERS = 4  # lines of a hint: more are not read
 
@@ -97,28 +98,30 @@ class UnitCheck:
         """Lines to write, first those that make the column one of an ejector."""
         yield "write under [import.columns] the one line that is right:"
         ends = [self._meaning.number(end, self.ambient) for end in (self._lowest, self._highest)]
-        fitting = list(_lines(name, min(ends), max(ends), self.ambient))
-        yield from fitting[:MOST_ANSWERS] or _any_line(name)
+        lines = _lines(name, min(ends), max(ends), self.ambient, self._meaning)
+        yield from lines[:MOST_ANSWERS] or _any_line(name)
         unit = self._meaning.unit
         yield f'or, if {unit} is right, say so under [import]: pressure_unit = "{unit}"'
 
 
-def _lines(name: str, low: float, high: float, ambient: float) -> Iterator[str]:
-    """What numbers from ``low`` to ``high`` can be, so that they are a vacuum and its release."""
+def _lines(name: str, low: float, high: float, ambient: float, taken: Meaning) -> list[str]:
+    """What numbers from ``low`` to ``high`` can be, in the same unit and the deepest vacuum first.
+
+    That is a vacuum and its release, in another unit or from another reference than it is taken as.
+    """
     references: tuple[Reference, ...] = ("absolute", "vacuum", "gauge")
+    found: list[tuple[bool, float, str]] = []
     for unit in get_args(Unit):
-        if unit == "hPa":  # is mbar
-            continue
         for reference in references:
-            ends = counted_from(
-                np.array([low, high]) * PASCAL[unit], reference, "absolute", ambient
-            )
-            least, most = sorted(ends.tolist())
-            is_vacuum = least < ambient - LEAST_VACUUM and least > LEAST_ABSOLUTE
-            if is_vacuum and LEAST_AMBIENT < most <= 2.0 * ambient:
-                yield f"{_line(name, unit, reference)}   # {least / MBAR:.0f} to" + (
-                    f" {most / MBAR:.0f} mbar absolute"
-                )
+            if unit == "hPa" or (unit, reference) == (taken.unit, taken.reference):
+                continue  # hPa is mbar
+            numbers = np.array([low, high]) * PASCAL[unit]
+            least, most = sorted(counted_from(numbers, reference, "absolute", ambient).tolist())
+            is_vacuum = LEAST_ABSOLUTE < least < ambient - LEAST_VACUUM
+            if is_vacuum and LEAST_AMBIENT < most <= MOST_RELEASED * ambient:
+                means = f"   # {least / MBAR:.0f} to {most / MBAR:.0f} mbar absolute"
+                found.append((unit != taken.unit, least, _line(name, unit, reference) + means))
+    return [line for *_, line in sorted(found)]
 
 
 def _any_line(name: str) -> list[str]:
