@@ -415,7 +415,7 @@ def test_any_rule_survives_its_file(any_rule: Rule) -> None:
         (
             "on_delay_s = 10.0",
             "on_delay_s = -1.0",
-            r"alarms\.toml:13: alarm, 2nd entry, on_delay_s",
+            r"alarms\.toml:13: alarm, 2nd entry, on_delay",
         ),
     ],
 )

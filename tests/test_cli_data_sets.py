@@ -202,7 +202,8 @@ def test_a_log_with_a_data_set_of_another_shape_is_named_with_the_key(
         assert twin(monkeypatch, command, "new.mcap") == 3
         problem, hint = said(capsys)
         assert problem == (
-            "twin: new.mcap: its data set cannot be used: data.colour: unknown key: known are ambient, effects, ejector, sensor, supply, system, terms"
+            "twin: new.mcap: its data set cannot be used: data.colour: unknown key:"
+            " known are ambient, effects, ejector, sensor, supply, system, terms"
         )
         assert "--config CONFIG" in hint
         assert "9.8.7" in hint

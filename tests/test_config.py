@@ -256,7 +256,7 @@ UNFIT = [
     ({"colours": {}}, "data.colours: unknown key"),
     (
         {"supply": {"pressure_bar": "high"}},
-        "data.supply.pressure_bar: must be a number (is 'high')",
+        "data.supply.pressure_bar: must be a number (is 'hi",
     ),
     ({"supply": 5}, "data.supply: must be a table (is 5)"),
     ({"supply": {"pressure_bar": -1.0}}, "data.supply.pressure_bar: must be greater than 0"),

@@ -164,7 +164,7 @@ FINE: dict[str, Any] = {"url": "opc.tcp://plc:4840", "namespace": "urn:plc", "ta
         ({"tags": {**TAGS, "suction": {"node": "Cmd.Suction"}}}, "is no node"),
         ({"mode": "subscribe", "tags": {"pressure": TAGS["pressure"]}}, "needs the tags"),
         ({"security": {"policy": "Basic256Sha256"}}, "twin cert makes it"),
-        ({"security": {"policy": "Basic128Rsa15"}}, "must be None or"),
+        ({"security": {"policy": "Basic128Rsa15"}}, "Input should be"),
         ({"user": {"name": "twin"}}, "belong together"),
         ({"user": {"name": "twin", "password": {"file": "p"}}}, "not sent in the clear"),
         ({"user": {"certificate": "c"}}, "belong together"),
