@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
 from twin.settings import Settings
 from twin.signals import (
@@ -96,7 +96,11 @@ class Address:
         return self.area in ("input", "holding")
 
 
-Place = Annotated[Address, BeforeValidator(Address.parse)]
+Place = Annotated[
+    Address,
+    BeforeValidator(Address.parse, json_schema_input_type=str),
+    PlainSerializer(lambda place: f"{place.area}:{place.offset}", return_type=str),
+]
 
 
 def numbers(words: Words, code: str, order: WordOrder) -> npt.NDArray[np.generic]:
@@ -109,8 +113,8 @@ def numbers(words: Words, code: str, order: WordOrder) -> npt.NDArray[np.generic
 class Tag(Settings):
     """A bit or a number in the PLC."""
 
-    address: Place
-    type: Type = "bit"
+    address: Place  # "40101" as in manuals, or "holding:100" counted from 0
+    type: Type = "bit"  # how it is coded
     bit: int | None = Field(default=None, ge=0, le=15)  # of a word, 0 the lowest
 
     @model_validator(mode="after")
@@ -145,8 +149,8 @@ class Tag(Settings):
 class Scaled(Settings):
     """What a number means: value = raw · scale + offset in its unit."""
 
-    scale: float = 1.0
-    offset: float = 0.0
+    scale: float = 1.0  # of the raw number
+    offset: float = 0.0  # added after scaling, in the unit
 
     @model_validator(mode="after")
     def _has_a_scale(self) -> Self:
@@ -163,7 +167,7 @@ class Scaled(Settings):
 class Thermometer(Scaled):
     """A temperature, of the gas or of what surrounds the ejector."""
 
-    unit: Literal["C", "K"]
+    unit: Literal["C", "K"]  # of value = raw · scale + offset
 
     def kelvin(self, raw: Floats) -> Floats:
         """Temperatures in K."""
@@ -173,7 +177,7 @@ class Thermometer(Scaled):
 class Flowmeter(Scaled):
     """A suction flow, positive into the ejector: standard or normal litres a minute."""
 
-    unit: Literal["sl/min", "Nl/min"]
+    unit: Literal["sl/min", "Nl/min"]  # of value = raw · scale + offset
 
     def mass_flow(self, raw: Floats) -> Floats:
         """Flows in kg/s."""
@@ -183,7 +187,7 @@ class Flowmeter(Scaled):
 class Quantity(Scaled):
     """What a number means: pressure = raw · scale + offset in ``unit``, from ``reference``."""
 
-    unit: Unit
+    unit: Unit  # of value = raw · scale + offset
     reference: Reference  # vacuum: positive below ambient
     range: tuple[float, float] | None = None  # in unit; beyond it a value is flagged, and kept
     overflow_above: int | None = Field(default=None, ge=0)  # raw; Siemens 32511; both signs
@@ -242,7 +246,7 @@ class Quantity(Scaled):
 class Pressure(Quantity, Tag):
     """A pressure in the PLC's registers."""
 
-    type: Type
+    type: Type  # how it is coded
 
     @model_validator(mode="after")
     def _is_a_number(self) -> Self:
@@ -266,13 +270,13 @@ class Pressure(Quantity, Tag):
 class Temperature(Thermometer, Tag):
     """A temperature in the PLC's registers."""
 
-    type: NumberType
+    type: NumberType  # how it is coded
 
 
 class Flow(Flowmeter, Tag):
     """A suction flow in the PLC's registers."""
 
-    type: NumberType
+    type: NumberType  # how it is coded
 
 
 def words_of(number: float, code: str, order: WordOrder) -> tuple[int, ...]:

@@ -27,6 +27,7 @@ from twin.cli_app import App, not_negative, read_config, say_if_cut, say_if_new
 from twin.cli_assets import assets_app
 from twin.cli_cert import cert
 from twin.cli_compare import compare
+from twin.cli_config import config_app
 from twin.cli_exchange import export_fmu
 from twin.cli_figures import figures_app, keeper_of, key_figures_of
 from twin.cli_fleet import fleet_app
@@ -66,7 +67,7 @@ ALARMED = 1
 
 # As the days go: begin, run, ask why, look after what is kept, tools.
 ORDER = (
-    *("init", "probe", "import", "commission", "calibrate"),
+    *("init", "config", "probe", "import", "commission", "calibrate"),
     *("run", "serve", "replay", "diagnose", "compare", "figures", "alarms"),
     *("fleet", "log", "assets", "users", "cert"),
     *("export", "export-fmu", "effects", "paper", "plc"),
@@ -78,6 +79,7 @@ app.add_typer(figures_app, name="figures")
 app.add_typer(alarms_app, name="alarms")
 app.add_typer(fleet_app, name="fleet")
 app.add_typer(users_app, name="users")
+app.add_typer(config_app, name="config")
 log_app = App("Look after logs.")
 app.add_typer(log_app, name="log")
 

@@ -66,8 +66,8 @@ Tables = Mapping[str, Any]  # as [data] has them
 class Asset(Settings):
     """The ejector: its type (object-specific data) and the one unit (instance-specific data)."""
 
-    type: str = NO_TYPE
-    id: str = ""
+    type: str = NO_TYPE  # of the ejector, as in the asset database (twin assets list)
+    id: str = ""  # of this one unit, as a calibration stores it
     batch: str = ""  # of production, as on the nameplate: what fleets are compared by
 
 

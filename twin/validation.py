@@ -100,7 +100,7 @@ def alike(asked: str, names: Iterable[str]) -> str:
 
 def models_at(annotation: Any, loc: Sequence[str | int] = ()) -> Iterator[type[BaseModel]]:
     """The kinds of table that may stand at a place below a type, given as Pydantic's errors do."""
-    for one in _alternatives(annotation):
+    for one in alternatives(annotation):
         is_model = isinstance(one, type) and issubclass(one, BaseModel)
         if not loc:
             if is_model:
@@ -112,7 +112,7 @@ def models_at(annotation: Any, loc: Sequence[str | int] = ()) -> Iterator[type[B
         elif is_model and key in _tags(one):
             yield from models_at(one, below)
         elif not is_model:
-            for inner in _elements(one):
+            for inner in elements(one):
                 yield from models_at(inner, below)
 
 
@@ -148,23 +148,27 @@ def _what(problem: Mapping[str, Any], kind: type[BaseModel], loc: Sequence[str |
 def _one_of(expected: str, given: object, what: str = "") -> str:
     """``expected`` as Pydantic writes it: quoted, with commas."""
     names = [name.strip(" '\"") for name in expected.replace(" or ", ", ").split(",")]
-    nearest = get_close_matches(str(given).lower(), names, n=1)
-    question = f": do you mean {nearest[0]}?" if nearest else ""
+    by_case = {name.lower(): name for name in names}
+    nearest = get_close_matches(str(given).lower(), by_case, n=1)
+    question = f": do you mean {by_case[nearest[0]]}?" if nearest else ""
+    if question and len(names) > _MOST_KEYS:
+        return f"{what}is none that is known{question}"
     return f"{what}must be {' or '.join(names)}{question}"
 
 
-def _alternatives(annotation: Any) -> Iterator[Any]:
+def alternatives(annotation: Any) -> Iterator[Any]:
+    """The types that a value may have, without what is said beside them."""
     origin = get_origin(annotation)
     if origin is Annotated:
-        yield from _alternatives(get_args(annotation)[0])
+        yield from alternatives(get_args(annotation)[0])
     elif origin in (Union, UnionType):
         for one in get_args(annotation):
-            yield from _alternatives(one)
+            yield from alternatives(one)
     else:
         yield annotation
 
 
-def _elements(annotation: Any) -> Iterator[Any]:
+def elements(annotation: Any) -> Iterator[Any]:
     """What a table of any keys, or a list, holds."""
     arguments = get_args(annotation)
     origin = get_origin(annotation)

@@ -66,11 +66,12 @@ PHASES = {"h1": "suction", "h1_low": "hold"}  # which a level of the air saving 
 class MonitorSettings(Settings):
     """When a deviation is an alarm."""
 
+    # Of healthy scatter, from which on a deviation is an alarm.
     raise_sigma: float = Field(6.0, gt=0.0)
-    clear_sigma: float = Field(3.5, gt=0.0)
-    clear_cycles: int = Field(3, ge=1)
+    clear_sigma: float = Field(3.5, gt=0.0)  # below which a cycle is as usual again
+    clear_cycles: int = Field(3, ge=1)  # so many usual ones in a row clear the alarm
     smallest_mbar: float = Field(0.5, ge=0.0)  # deviations below are never worth an alarm
-    stale_ms: float = Field(500.0, gt=0.0)
+    stale_ms: float = Field(500.0, gt=0.0)  # without a new row, after which the PLC is stale
     isolate: bool = True  # step a bank of hypotheses beside the twin, and sum over cycles
     false_alarm_days: float = Field(30.0, gt=0.0)  # between false alarms by these sums
     healthy: Healthy = Healthy()

@@ -116,6 +116,7 @@ class ImportSettings(Settings):
     ``columns`` says under which name the file has a known column: ``vacuum_mbar = "Vakuum"``.
     """
 
+    # The file's name of a known column (docs/csv.md lists them), or a table as below.
     columns: Mapping[Column, Source] = Field(default_factory=dict)
     values: Bad = Bad.REFUSE  # text in a number, NaN, an empty cell, too many or too few cells
     jumps: Bad = Bad.REFUSE  # time or sequence that does not go forward
