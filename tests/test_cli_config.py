@@ -57,7 +57,7 @@ SAID = (
     "21: import.columns.presure_mbar: is none that is known: do you mean pressure_mbar?",
     "24: monitor.raise_sigma: must be a number (is 'six')",
     "25: monitor.isolate: must be true or false (is 'perhaps')",
-    "28: unknown table [mqqt]; did you mean 'mqtt'?",
+    "27: unknown table [mqqt]; did you mean 'mqtt'?",
 )
 
 

@@ -90,6 +90,7 @@ class HttpSettings(Settings):
     """An address of HTTP, and what protects what goes there."""
 
     url: str | Secret = ""
+    # That go with each message, each a secret.
     headers: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9-]+$")], Secret] = Field(default={})
     tls: Tls = Tls()
     unprotected: bool = False  # headers without https beyond this machine all the same

@@ -23,7 +23,7 @@ from twin.tables.settings import Column, ImportSettings
 from twin.tables.unit_check import UnitCheck
 
 Bits = npt.NDArray[np.uint8]
-_READING = np.dtype([(name, SAMPLE[name]) for name in ("time_ns", "pressure", "quality")])
+READING = np.dtype([(name, SAMPLE[name]) for name in ("time_ns", "pressure", "quality")])
 
 
 class _File(Protocol):
@@ -92,14 +92,14 @@ class Table:
         for block in self.blocks():
             count += len(block)
             try:
-                require_within_budget(count * _READING.itemsize, "what commands are derived from")
+                require_within_budget(count * READING.itemsize, "what commands are derived from")
             except ValueError as error:
-                rows = MEMORY_BUDGET // _READING.itemsize
+                rows = MEMORY_BUDGET // READING.itemsize
                 message = f"{self._file.place}: {error}"
                 hint = f"import it in parts of at most {rows:,} rows".replace(",", " ")
                 raise SourceError(message, hint) from error
-            reading = np.empty(len(block), _READING)
-            for name in _READING.names or ():
+            reading = np.empty(len(block), READING)
+            for name in READING.names or ():
                 reading[name] = block[name]
             blocks.append(reading)
         return joined(*blocks)
