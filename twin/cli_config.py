@@ -158,8 +158,7 @@ def json_schema() -> dict[str, Any]:
     for name, by_kind in kinds.items():
         refs = [names[(kind, "validation")] for kind in by_kind.values()]
         tables[name] = refs[0] if len(refs) == 1 else {"anyOf": refs}
-    text = json.dumps([tables, definitions])
-    used = {name for name in definitions if f'#/$defs/{name}"' in text}
+    used = _named_by(tables, definitions)
     return {
         "$schema": _SCHEMA,
         "title": "Configuration of ejector-twin",
@@ -168,6 +167,17 @@ def json_schema() -> dict[str, Any]:
         "additionalProperties": False,
         "$defs": {name: table for name, table in definitions.items() if name in used},
     }
+
+
+def _named_by(schema: Any, definitions: dict[str, Any]) -> set[str]:
+    """The definitions that a schema names, and those that these name."""
+    found: set[str] = set()
+    here = [schema]
+    while here:
+        named = set(re.findall(r'#/\$defs/(\w+)"', json.dumps(here))) - found
+        found |= named
+        here = [definitions[name] for name in named]
+    return found
 
 
 def _describe(table: dict[str, Any], comments: dict[str, str], defaults: dict[str, Any]) -> None:
