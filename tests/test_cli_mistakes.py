@@ -33,8 +33,6 @@ NEEDED = {
     "serve": ("--config", "C"),
     "cert": ("pki",),
     "init": (),
-    "config check": ("C",),
-    "config schema": (),
     "assets list": (),
     "assets show": ("paper-unit",),
     "assets add": ("unit.toml",),
@@ -65,6 +63,8 @@ NEEDED = {
     "users password": ("ann",),
     "users remove": ("ann",),
     "users audit": (),
+    "config check": ("C",),
+    "config schema": (),
     "log check": ("L",),
     "log recover": ("L", "-o", "new.mcap"),
 }
