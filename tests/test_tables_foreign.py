@@ -9,12 +9,15 @@ from zoneinfo import ZoneInfo
 import numpy as np
 import pyarrow as pa
 import pytest
+import rigs
+from command_line import twin
 from openpyxl import Workbook
 from pyarrow import parquet
 from table_rows import AMBIENT, SMALL, taken, written
 
-from twin import files
+from twin import api, files
 from twin.errors import ConfigError, SourceError
+from twin.log.reader import open_log
 from twin.signals import PASCAL, Command, Samples, joined
 from twin.tables import reader
 from twin.tables.preview import FIRST, HEIGHT, WIDTH, Preview
@@ -471,3 +474,61 @@ def test_what_commands_are_derived_from_is_bounded(
     ) as out:
         table.with_commands()
     assert "import it in parts of at most 76 rows" in out.value.hint
+
+
+# --- where people meet it -----------------------------------------------------------------------
+
+CONFIG = rigs.path_of("test_rig")
+
+
+def test_a_dry_run_writes_nothing_and_shows_what_is_understood(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = cycle(tmp_path, lambda v: v, "vacuum_mbar")
+    before = set(tmp_path.iterdir())
+    assert twin(monkeypatch, "import", path, "--config", CONFIG, "--dry-run") == 0
+    out, _ = capsys.readouterr()
+    assert "200 rows, 1.990 s, every 10 ms" in out
+    assert set(tmp_path.iterdir()) == before
+
+
+def test_a_dry_run_shows_also_what_is_then_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = cycle(tmp_path, lambda v: v / 1000, "vacuum_mbar")
+    assert twin(monkeypatch, "import", path, "--config", CONFIG, "--dry-run") == 3
+    out, err = capsys.readouterr()
+    assert "200 rows" in out
+    assert 'vacuum_bar = "vacuum_mbar"' in err
+
+
+def test_an_import_says_nothing_of_rows_that_it_then_refuses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, log = cycle(tmp_path, lambda v: v / 1000, "vacuum_mbar"), tmp_path / "a.mcap"
+    assert twin(monkeypatch, "import", path, "--config", CONFIG, "-o", log) == 3
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "In which unit is it" in err
+    assert not log.exists()
+
+
+def test_a_zone_can_be_given_as_an_option(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = "".join(f"01.03.2026 12:00:00,{n:03};0;0;1000\n" for n in range(0, 100, 10))
+    path = written(tmp_path, "time;suction;blow_off;pressure_mbar\n" + rows)
+    log = tmp_path / "a.mcap"
+    for zone, code in (("", 3), ("Mars/Base", 2), ("Europe/Berlin", 0)):
+        flag = ("--time-zone", zone) if zone else ()
+        assert twin(monkeypatch, "import", path, "--config", CONFIG, "-o", log, *flag) == code
+    capsys.readouterr()
+    assert next(open_log(log).blocks())[0]["time_ns"][0] == BEGIN_NS
+    assert twin(monkeypatch, "import", path, "--config", CONFIG) == 2
+    assert "--dry-run" in capsys.readouterr().err
+
+
+def test_a_notebook_is_warned_of_an_encoding(tmp_path: Path) -> None:
+    path = written(tmp_path, f"# Größe\n{SMALL}".encode("cp1252"))
+    with pytest.warns(UserWarning, match="read as cp1252"):
+        api.open(path, CONFIG)

@@ -220,7 +220,7 @@ def open(  # noqa: A001  (as a module's open is called)
     assets: str = "",
     derive_commands: bool = False,
 ) -> Log:
-    """Open a log (MCAP), or a table (CSV, Parquet) of a PLC's trace.
+    """Open a log (MCAP), or a table (CSV, Excel, Parquet) of a PLC's trace.
 
     A log carries its configuration and the data set it was recorded beside; ``config``, a file or
     that of another log or calibration, takes its place. A table needs one. ``unit`` and ``assets``
@@ -232,6 +232,7 @@ def open(  # noqa: A001  (as a module's open is called)
     """
     path = Path(path)
     source: Source
+    notes: Sequence[str] = ()  # as of an encoding that had to be guessed
     if path.suffix.lower() == MCAP:
         source = open_log(path)
         settings = _of_log(source, config, assets, unit)
@@ -242,10 +243,12 @@ def open(  # noqa: A001  (as a module's open is called)
     else:
         settings = _configured(config, assets, unit)
         source = _table(path, settings, derive_commands)
-        settings = replace(settings, gauge=source.counts_from_ambient)
+        settings, notes = replace(settings, gauge=source.counts_from_ambient), source.notes
         remark = f"columns not taken: {', '.join(source.ignored)}" if source.ignored else ""
     log = Log(path, settings, assets, _source=source)
-    for what in filter(None, (remark, log._header.derived, settings.instead if unit else "")):
+    for what in filter(
+        None, (*notes, remark, log._header.derived, settings.instead if unit else "")
+    ):
         warnings.warn(what, stacklevel=2)
     return log
 

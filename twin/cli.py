@@ -566,6 +566,9 @@ def import_(
         table = table.with_commands()
         unmeasured[DERIVED] = table.commands
         print(f"twin: {table.commands}", file=sys.stderr)
+    else:  # a whole look first: nothing is said of rows that are then refused
+        for _ in _progress(table.blocks(), "reading"):
+            pass
     twin, monitor = pair_of(settings, judges=not table.commands)
     with _whole(output) as part, _stop_on_signal(None) as stopped:
         header = settings.log_header(unmeasured)
