@@ -97,8 +97,23 @@ def test_a_shipped_configuration_has_none(
     ],
 )
 def test_what_only_several_keys_show_is_told_too(text: str, said: str) -> None:
-    found = list(mistakes(Document.parse(text, "cell.toml")))
+    found = mistakes(Document.parse(text, "cell.toml"))
     assert any(said in line for line in found), found
+
+
+def test_what_follows_from_a_mistake_is_not_told() -> None:
+    text = """[data.supply]
+pressure_bar = "high"
+[[data.system.parts]]
+kind = "tube"
+lenght_mm = 3
+"""
+    found = mistakes(Document.parse(text, "cell.toml"))
+    assert [line.partition(": ")[2] for line in found] == [
+        "data.supply.pressure_bar: must be a number (is 'high')",
+        "data.system.parts, 1st entry, diameter_mm: is missing, and has no default",
+        "data.system.parts, 1st entry, lenght_mm: unknown key: do you mean length_mm?",
+    ]
 
 
 # --- words --------------------------------------------------------------------------------------

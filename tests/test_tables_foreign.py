@@ -505,7 +505,10 @@ def test_a_dry_run_shows_also_what_is_then_refused(
 def test_an_import_says_nothing_of_rows_that_it_then_refuses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path, log = cycle(tmp_path, lambda v: v / 1000, "vacuum_mbar"), tmp_path / "a.mcap"
+    vacuum = ([0.0] * 60 + [0.7] * 100 + [0.0] * 60) * 3
+    rows = [f"{10 * i};{int(30 < i % 220 < 160)};0;{v}" for i, v in enumerate(vacuum)]
+    path = written(tmp_path, "\n".join(["time_ms;suction;blow_off;vacuum_mbar", *rows]))
+    log = tmp_path / "a.mcap"
     assert twin(monkeypatch, "import", path, "--config", CONFIG, "-o", log) == 3
     out, err = capsys.readouterr()
     assert out == ""

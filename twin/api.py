@@ -7,7 +7,7 @@ units, as everywhere.
 """
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -246,9 +246,8 @@ def open(  # noqa: A001  (as a module's open is called)
         settings, notes = replace(settings, gauge=source.counts_from_ambient), source.notes
         remark = f"columns not taken: {', '.join(source.ignored)}" if source.ignored else ""
     log = Log(path, settings, assets, _source=source)
-    for what in filter(
-        None, (*notes, remark, log._header.derived, settings.instead if unit else "")
-    ):
+    instead = settings.instead if unit else ""
+    for what in filter(None, (*notes, remark, log._header.derived, instead)):
         warnings.warn(what, stacklevel=2)
     return log
 

@@ -31,8 +31,8 @@ def check(
     from twin.settings import Document
 
     document = Document.read(file)
-    found = list(dict.fromkeys(mistakes(document)))
-    for mistake in sorted(found, key=_line):
+    found = mistakes(document)
+    for mistake in found:
         print(mistake)
     if found:
         many = "1 mistake" if len(found) == 1 else f"{len(found)} mistakes"
@@ -84,8 +84,13 @@ def sections() -> "dict[str, dict[str, type[Settings]]]":
     }
 
 
-def mistakes(document: "Document") -> Iterator[str]:
+def mistakes(document: "Document") -> list[str]:
     """All that is wrong in a configuration, a line for each, with what to do about it."""
+    return sorted(dict.fromkeys(_mistakes(document)), key=_line)
+
+
+def _mistakes(document: "Document") -> Iterator[str]:
+    """The same as they are found, some more than once."""
     for problem in _checks(document):
         try:
             problem()
