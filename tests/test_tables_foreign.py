@@ -1,7 +1,9 @@
 """Tables as people have them: dates, units, signs, encodings, sheets, and what PLC tools export."""
 
+import zipfile
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from zoneinfo import ZoneInfo
@@ -20,6 +22,7 @@ from twin.errors import ConfigError, SourceError
 from twin.log.reader import open_log
 from twin.signals import PASCAL, Command, Samples, joined
 from twin.tables import reader
+from twin.tables.excel_file import ExcelFile
 from twin.tables.preview import FIRST, HEIGHT, WIDTH, Preview
 from twin.tables.reader import open_table
 from twin.tables.settings import ImportSettings
@@ -426,6 +429,20 @@ def test_a_sheet_that_unpacks_to_too_much_is_refused(
     with pytest.raises(SourceError, match="unpacked it claims") as caught:
         open_table(path, settings(), AMBIENT)
     assert "CSV" in caught.value.hint
+
+
+def test_a_sheet_whose_entities_grow_is_refused(tmp_path: Path) -> None:
+    whole = workbook(tmp_path / "whole.xlsx", ["time_ms", "suction"], [0, 0])
+    each = "".join(f'<!ENTITY {new} "{f"&{old};" * 10}">' for old, new in pairwise("abcdefghi"))
+    entities = f'<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa">{each}]><worksheet'
+    with zipfile.ZipFile(whole) as parts, zipfile.ZipFile(tmp_path / "t.xlsx", "w") as bomb:
+        for name in parts.namelist():
+            text = parts.read(name).decode()
+            if name.endswith("sheet1.xml"):
+                text = text.replace("<worksheet", entities, 1).replace("<v>0<", "<v>&i;<", 1)
+            bomb.writestr(name, text)
+    with pytest.raises(SourceError, match=r"t\.xlsx: cannot be read as an Excel file"):
+        list(ExcelFile(tmp_path / "t.xlsx", settings()).batches({}))
 
 
 # --- what it is understood as -------------------------------------------------------------------

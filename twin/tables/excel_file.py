@@ -1,5 +1,6 @@
 """A sheet of an Excel file as batches of text."""
 
+import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -7,7 +8,6 @@ from datetime import date, datetime, time
 from itertools import islice
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import ParseError
 
 import pyarrow as pa
 from openpyxl import load_workbook
@@ -75,7 +75,8 @@ class ExcelFile:
                 except ValueError as error:
                     message = f"{self._path}: {error}"
                     raise SourceError(message, "save the sheet as CSV: it has no bound") from error
-            book = load_workbook(file, read_only=True, data_only=True)
+            with warnings.catch_warnings(action="ignore"):  # of styles, which nobody wants
+                book = load_workbook(file, read_only=True, data_only=True)
             try:
                 names = book.sheetnames
                 wanted = self._settings.sheet or names[0]
@@ -100,15 +101,9 @@ class ExcelFile:
         except OSError as error:
             message = f"{self._path}: cannot be read: {error.strerror or error}"
             raise SourceError(message, "check the path") from error
-        except (
-            zipfile.BadZipFile,
-            ParseError,
-            ValueError,
-            KeyError,
-            TypeError,
-            IndexError,
-        ) as error:
-            message = f"{self._path}: cannot be read as an Excel file (.xlsx): {error}"
+        except Exception as error:  # the library lets through what zip, zlib and XML raise
+            what = str(error).partition("\n")[0] or type(error).__name__
+            message = f"{self._path}: cannot be read as an Excel file (.xlsx): {what}"
             raise SourceError(message, "save it anew as .xlsx, or as CSV") from error
 
 
