@@ -55,8 +55,9 @@ class CsvFile:
         if header.before:
             self.notes.append(f"the header is line {self._head}; what stands before it is not read")
         self._first = self._head + 1  # line of what may be values
-        self._is_scope = scope.is_header(self.names)
-        if self._is_scope:
+        self._is_row = _is_row
+        if scope.is_header(self.names):
+            self._is_row = _is_row_of_scope
             below = ((line, _cells(row, self._separator)) for line, row in islice(rows, _PREAMBLE))
             self._first, self.names = scope.columns(self.names, below, self.place)
             self.notes.append("it is of TwinCAT Scope: all channels have the time of the first one")
@@ -95,9 +96,6 @@ class CsvFile:
             )
             return "cp1252"
         return "utf-8"
-
-    def _is_row(self, line: str) -> bool:
-        return _is_row(line) and not (self._is_scope and line.strip() == scope.END)
 
     def _rows(self) -> Iterator[tuple[int, str]]:
         for first, lines in self._pieces():
@@ -162,6 +160,10 @@ class CsvFile:
             for piece in _whole_lines(self._path, self._encoding):
                 yield first, (cut := _cut(piece))
                 first += len(cut)
+
+
+def _is_row_of_scope(line: str) -> bool:
+    return _is_row(line) and line.strip() != scope.END
 
 
 class _Header(NamedTuple):
