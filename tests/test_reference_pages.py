@@ -22,7 +22,7 @@ def page(name: str) -> str:
 
 @pytest.mark.parametrize("name", PAGES)
 def test_a_page_is_the_programs(name: str) -> None:
-    assert page(name) == PAGES[name](), "run python -m tools.reference"
+    assert page(name) == PAGES[name](), "run python tools/reference.py"
 
 
 def test_every_table_has_its_settings() -> None:

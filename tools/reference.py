@@ -56,7 +56,7 @@ KINDS = {
 
 CONFIGURATION = """# All keys of a configuration
 
-Made from the program by `python -m tools.reference`.
+Made from the program by `python tools/reference.py`.
 `twin config check FILE` names all mistakes of a configuration at once.
 `twin config schema > twin.schema.json` makes a JSON Schema of these tables. An editor that knows
 TOML schemas (Taplo, Even Better TOML) then completes and checks keys, if the first line of a
@@ -66,7 +66,7 @@ Every table and key may be left out, unless it is *required*.
 """
 COMMANDS = """# All commands
 
-Made from the program by `python -m tools.reference`. `twin COMMAND --help` says the same.
+Made from the program by `python tools/reference.py`. `twin COMMAND --help` says the same.
 Results go to stdout, messages to stderr. Exit codes: 0 done, 1 bad news where an option asks for
 it, 2 usage or configuration, 3 a source or file could not be read, 130 interrupted.
 """
