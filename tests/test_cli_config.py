@@ -93,6 +93,8 @@ def test_a_shipped_configuration_has_none(
         ('[asset]\ntype = "nobody-knows"', "nobody-knows"),
         ('[driver]\nkind = "profinet"', "unknown driver 'profinet'; known: modbus, opcua"),
         ("[monitor.healthy]\nx = 1\n[data.supply]\npressure_bar = 5", "remove the table"),
+        ('[alarms]\nrules = "none.toml"\n[data.supply]\npressure_bar = 5', "none.toml: cannot be"),
+        ('[assets]\nurl = "oracle://x"\n[data.supply]\npressure_bar = 5', "oracle"),
         ("[data.ejector]\nh1_mbar = 500", "h1_mbar must be at least"),
     ],
 )

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from twin.cli_app import App
-from twin.errors import ConfigError
+from twin.errors import ConfigError, SourceError
 from twin.keys import UNWRITTEN
 
 if TYPE_CHECKING:
@@ -94,13 +94,13 @@ def _mistakes(document: "Document") -> Iterator[str]:
     for problem in _checks(document):
         try:
             problem()
-        except ConfigError as error:
+        except (ConfigError, SourceError) as error:  # a file or database that it names
             lines = str(error).splitlines()
             yield from lines[:-1]
             yield lines[-1] + _advice(error)
 
 
-def _advice(error: ConfigError) -> str:
+def _advice(error: ConfigError | SourceError) -> str:
     """What to do, where the mistake itself does not say it."""
     from twin.settings import ALL_MISTAKES
 
@@ -110,6 +110,7 @@ def _advice(error: ConfigError) -> str:
 def _checks(document: "Document") -> Iterator[Callable[[], Any]]:
     """What may raise ConfigError: each table by itself, then what only several tables show."""
     from drivers.sources import settings_of
+    from twin.alarms.settings import chosen_rules
     from twin.config import TABLES, Config
     from twin.outlets.settings import chosen, chosen_upload
 
@@ -127,6 +128,7 @@ def _checks(document: "Document") -> Iterator[Callable[[], Any]]:
     if "data" in document.tables:  # where what is wrong with [asset] hides it
         nobody = {name: document.tables[name] for name in TABLES & set(document.tables) - {"asset"}}
         yield partial(Config.of, replace(document, tables=nobody), to_store=True)
+    yield partial(chosen_rules, document)
     yield partial(chosen, document)
     yield partial(chosen_upload, document)
 
