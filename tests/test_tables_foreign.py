@@ -299,8 +299,9 @@ def test_what_stands_before_the_header_is_not_read(tmp_path: Path) -> None:
     assert any("header is line 4" in note for note in open_table(path, settings(), AMBIENT).notes)
 
 
-def test_tabs_and_words_for_bits(tmp_path: Path) -> None:
-    text = SMALL.replace(",0,", ",FALSE,").replace(",1,", ",true,")
+@pytest.mark.parametrize(("no", "yes"), [("FALSE", "true"), ("FALSCH", "WAHR")])
+def test_tabs_and_words_for_bits(tmp_path: Path, no: str, yes: str) -> None:
+    text = SMALL.replace(",0,", f",{no},").replace(",1,", f",{yes},")
     for sign in ("\t", " ", ";"):
         path = written(tmp_path, text.replace(",", sign).replace(".", ","))
         assert taken(path).tobytes() == taken(written(tmp_path, SMALL, "u.csv")).tobytes()

@@ -12,6 +12,7 @@ import pyarrow.compute as pc
 
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 _NO_VALUE = re.compile(r"[+-]?(nan|inf|infinity)", re.IGNORECASE)
+_WORDS = {"true": "1", "false": "0", "wahr": "1", "falsch": "0"}
 _MOST_DIGITS = 19  # of an int64
 
 Mask = npt.NDArray[np.bool_]
@@ -55,11 +56,11 @@ def floats(column: pa.Array) -> Numbers[np.float64]:
 
 
 def flags(column: pa.Array) -> Numbers[np.float64]:
-    """Read a column as 0 and 1; TRUE and FALSE, however they are written, are these."""
+    """Read a column as 0 and 1; TRUE and FALSE are these, as are WAHR and FALSCH."""
     cells = plain(column)
     if pa.types.is_string(cells.type):
         words = pc.utf8_lower(cells)
-        for word, number in (("true", "1"), ("false", "0")):
+        for word, number in _WORDS.items():
             cells = pc.if_else(pc.equal(words, word), number, cells)
     return floats(cells)
 
