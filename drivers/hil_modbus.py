@@ -31,7 +31,7 @@ class Counter(Written):
     """The watchdog: counts up with each block, and from the high end on from the low one."""
 
     type: Literal["int16", "uint16", "int32", "uint32"] = "uint16"
-    range: tuple[int, int] = (0, 32_767)
+    range: tuple[int, int] = (0, 32_767)  # it counts from the first to the last, again and again
 
     @model_validator(mode="after")
     def _counts(self) -> Self:

@@ -16,14 +16,14 @@ from twin.signals import MBAR
 class Signal(Settings):
     """A signal that is written, as the type of its node: a Boolean, or 0 and 1."""
 
-    node: NodeName
+    node: NodeName  # as of other tags
 
 
 class Counter(Settings):
     """The watchdog: counts up with each block, and from the high end on from the low one."""
 
-    node: NodeName
-    range: tuple[int, int] = (0, 32_767)
+    node: NodeName  # as of other tags
+    range: tuple[int, int] = (0, 32_767)  # it counts from the first to the last, again and again
 
     @model_validator(mode="after")
     def _counts(self) -> Self:

@@ -63,8 +63,8 @@ class Tags(Settings):
 class Ring(Settings):
     """Where the PLC's trace of its scans lies: header and ring of records."""
 
-    header: Place = Address("holding", 100)
-    records: Place = Address("holding", 1000)
+    header: Place = Address("holding", 100)  # its first register
+    records: Place = Address("holding", 1000)  # the first register of the ring
 
     @model_validator(mode="after")
     def _lies_in_words(self) -> Self:
@@ -77,15 +77,17 @@ class Ring(Settings):
 class ModbusSettings(Settings):
     """The ``[driver]`` table for a Modbus PLC."""
 
-    kind: Literal["modbus"] = "modbus"
-    host: str
-    port: int = Field(default=502, ge=1, le=65535)
-    unit: int = Field(default=1, ge=0, le=255)
+    kind: Literal["modbus"] = "modbus"  # of driver
+    host: str  # name or address of the PLC
+    port: int = Field(default=502, ge=1, le=65535)  # of Modbus TCP
+    unit: int = Field(default=1, ge=0, le=255)  # identifier of the PLC, where a gateway has several
+    # A ring that the PLC fills, or registers read one by one.
     mode: Literal["block", "poll"] = "block"
     interval_ms: float = Field(default=30.0, ge=5, le=100)  # between blocks
     timeout_ms: float = Field(default=200.0, ge=10, le=250)  # longer, and staleness is seen late
     gap_ms: int = Field(default=20, ge=1)  # polled: fewer missing slots are no gap
     word_order: WordOrder = "big"  # of 32-bit values: high word first, or low word first
+    # Absolute, where no barometer is read: gauge pressures count from it.
     ambient_mbar: float = Field(default=1013.25, ge=500, le=1200)
     tags: Tags
     ring: Ring = Ring()

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 from urllib.parse import urlsplit
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
 from drivers.reports import BITS, refuse_unclear
 from drivers.tags import Flowmeter, Quantity, Thermometer
@@ -50,32 +50,36 @@ class Node:
         return f"nsu={self.uri};{self.identifier}" if self.uri else self.identifier
 
 
-NodeName = Annotated[Node, BeforeValidator(Node.parse)]
+NodeName = Annotated[
+    Node,
+    BeforeValidator(Node.parse, json_schema_input_type=str),
+    PlainSerializer(str, return_type=str),
+]
 
 
 class NodeTag(Settings):
     """A value in the server that is on or off: a Boolean, or a bit of a number."""
 
-    node: NodeName
+    node: NodeName  # "s=Name", or with its namespace "nsu=URI;s=Name"
     bit: int | None = Field(default=None, ge=0, le=63)  # of a number, 0 the lowest
 
 
 class NodePressure(Quantity):
     """A pressure in the server: a number, and what it means."""
 
-    node: NodeName
+    node: NodeName  # as of other tags
 
 
 class NodeTemperature(Thermometer):
     """A temperature in the server."""
 
-    node: NodeName
+    node: NodeName  # as of other tags
 
 
 class NodeFlow(Flowmeter):
     """A suction flow in the server."""
 
-    node: NodeName
+    node: NodeName  # as of other tags
 
 
 class NodeTags(Settings):
@@ -114,6 +118,7 @@ class TraceNodes(Settings):
 class Security(Settings):
     """How the connection is protected. With a policy, all is signed and encrypted."""
 
+    # What is signed and encrypted with.
     policy: Literal["None", "Basic256Sha256", "Aes256Sha256RsaPss"] = "None"
     certificates: Path | None = None  # folder that twin cert makes: ours, and whom we trust
 
@@ -127,10 +132,10 @@ class Security(Settings):
 class User(Settings):
     """Who we are to the server: nobody, a name and password, or a certificate."""
 
-    name: str = ""
+    name: str = ""  # with a password
     password: Secret | None = None
-    certificate: Path | None = None
-    key: Path | None = None
+    certificate: Path | None = None  # PEM, instead of a name
+    key: Path | None = None  # PEM, of that certificate
 
     @model_validator(mode="after")
     def _is_one(self) -> Self:
@@ -146,14 +151,16 @@ class User(Settings):
 class OpcuaSettings(Settings):
     """The ``[driver]`` table for a PLC behind an OPC UA server."""
 
-    kind: Literal["opcua"] = "opcua"
-    url: str
+    kind: Literal["opcua"] = "opcua"  # of driver
+    url: str  # opc.tcp://HOST:PORT
     namespace: str = ""  # URI of the nodes' namespace; needed where they do not name it
+    # A trace that the PLC keeps, or values as they change.
     mode: Literal["block", "subscribe"] = "block"
     interval_ms: float = Field(default=50.0, ge=5, le=1000)  # between blocks, of publishing
     sampling_ms: float = Field(default=1.0, ge=0.1, le=1000)  # subscribed: asked of the server
     timeout_ms: float = Field(default=2000.0, ge=50, le=20_000)  # of one answer
     gap_ms: float = Field(default=20.0, ge=1)  # subscribed: less missing is no gap
+    # Absolute, where no barometer is read: gauge pressures count from it.
     ambient_mbar: float = Field(default=1013.25, ge=500, le=1200)
     security: Security = Security()
     user: User = User()

@@ -21,11 +21,11 @@ Policy = Literal["None", "Basic256Sha256", "Aes256Sha256RsaPss"]  # with sign-an
 class ResultsSettings(Settings):
     """Off unless ``opcua`` is set, and for this machine alone unless it is protected."""
 
-    opcua: bool = False
-    host: str = "127.0.0.1"
+    opcua: bool = False  # whether results are served
+    host: str = "127.0.0.1"  # where; beyond this machine only protected
     port: int = Field(default=4841, ge=0, le=65535)  # 0 takes any free one
     interval_ms: float = Field(default=100.0, ge=20, le=10_000)  # between two values
-    policies: tuple[Policy, ...] = Field(default=("None",), min_length=1)
+    policies: tuple[Policy, ...] = Field(default=("None",), min_length=1)  # that clients may use
     certificates: Path | None = None  # a folder as twin cert makes it; the same as the driver's
     users: UsersFile | None = None  # as twin users makes it; with one, everybody logs in
     unprotected: bool = False  # beyond this machine without a policy all the same

@@ -10,10 +10,19 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
 from twin.settings import Settings
-from twin.signals import BAR, MBAR, SL_MIN, UNUSABLE, ZERO_C, Quality
+from twin.signals import (
+    PASCAL,
+    SL_MIN,
+    UNUSABLE,
+    ZERO_C,
+    Quality,
+    Reference,
+    Unit,
+    counted_from,
+)
 
 Words = npt.NDArray[np.uint16]
 Floats = npt.NDArray[np.float64]
@@ -23,7 +32,6 @@ Area = Literal["coil", "discrete", "input", "holding"]
 Type = Literal["bit", "int16", "uint16", "int32", "uint32", "float32"]
 NumberType = Literal["int16", "uint16", "int32", "uint32", "float32"]
 WordOrder = Literal["big", "little"]
-Reference = Literal["absolute", "gauge", "vacuum"]
 
 REFERENCE_DIGIT: dict[Area, str] = {"coil": "0", "discrete": "1", "input": "3", "holding": "4"}
 CODE: dict[Type, str] = {  # as NumPy reads it once the high word stands first
@@ -37,7 +45,6 @@ CODE: dict[Type, str] = {  # as NumPy reads it once the high word stands first
 # kg/s in one litre a minute of air: standard as ISO 8778 has it, normal as DIN 1343 (0 °C, 1013.25
 # mbar, 1.2928 kg/m³).
 MASS_FLOW = {"sl/min": SL_MIN, "Nl/min": 1.2928e-3 / 60.0}
-PASCAL = {"Pa": 1.0, "mbar": MBAR, "kPa": 1000.0, "bar": BAR, "psi": 6894.757293168}
 
 
 @dataclass(frozen=True)
@@ -89,7 +96,11 @@ class Address:
         return self.area in ("input", "holding")
 
 
-Place = Annotated[Address, BeforeValidator(Address.parse)]
+Place = Annotated[
+    Address,
+    BeforeValidator(Address.parse, json_schema_input_type=str),
+    PlainSerializer(lambda place: f"{place.area}:{place.offset}", return_type=str),
+]
 
 
 def numbers(words: Words, code: str, order: WordOrder) -> npt.NDArray[np.generic]:
@@ -102,8 +113,8 @@ def numbers(words: Words, code: str, order: WordOrder) -> npt.NDArray[np.generic
 class Tag(Settings):
     """A bit or a number in the PLC."""
 
-    address: Place
-    type: Type = "bit"
+    address: Place  # "40101" as in manuals, or "holding:100" counted from 0
+    type: Type = "bit"  # how it is coded
     bit: int | None = Field(default=None, ge=0, le=15)  # of a word, 0 the lowest
 
     @model_validator(mode="after")
@@ -138,8 +149,8 @@ class Tag(Settings):
 class Scaled(Settings):
     """What a number means: value = raw · scale + offset in its unit."""
 
-    scale: float = 1.0
-    offset: float = 0.0
+    scale: float = 1.0  # of the raw number
+    offset: float = 0.0  # added after scaling, in the unit
 
     @model_validator(mode="after")
     def _has_a_scale(self) -> Self:
@@ -156,7 +167,7 @@ class Scaled(Settings):
 class Thermometer(Scaled):
     """A temperature, of the gas or of what surrounds the ejector."""
 
-    unit: Literal["C", "K"]
+    unit: Literal["C", "K"]  # of value = raw · scale + offset
 
     def kelvin(self, raw: Floats) -> Floats:
         """Temperatures in K."""
@@ -166,7 +177,7 @@ class Thermometer(Scaled):
 class Flowmeter(Scaled):
     """A suction flow, positive into the ejector: standard or normal litres a minute."""
 
-    unit: Literal["sl/min", "Nl/min"]
+    unit: Literal["sl/min", "Nl/min"]  # of value = raw · scale + offset
 
     def mass_flow(self, raw: Floats) -> Floats:
         """Flows in kg/s."""
@@ -176,7 +187,7 @@ class Flowmeter(Scaled):
 class Quantity(Scaled):
     """What a number means: pressure = raw · scale + offset in ``unit``, from ``reference``."""
 
-    unit: Literal["mbar", "bar", "kPa", "Pa", "psi"]
+    unit: Unit  # of value = raw · scale + offset
     reference: Reference  # vacuum: positive below ambient
     range: tuple[float, float] | None = None  # in unit; beyond it a value is flagged, and kept
     overflow_above: int | None = Field(default=None, ge=0)  # raw; Siemens 32511; both signs
@@ -196,7 +207,7 @@ class Quantity(Scaled):
         """
         with np.errstate(invalid="ignore", over="ignore"):  # whatever comes, it is judged
             value = self.value(raw)
-            pascal = _counted(value * PASCAL[self.unit], self.reference, onto, ambient)
+            pascal = counted_from(value * PASCAL[self.unit], self.reference, onto, ambient)
             column = pascal.astype(np.float32)
             quality = self._judge(raw, value)
         unreadable = ~np.isfinite(column)
@@ -209,7 +220,7 @@ class Quantity(Scaled):
 
         Beyond the range it is that of the range's end.
         """
-        counted = _counted(np.array([pressure]), "absolute", self.reference, ambient)
+        counted = counted_from(np.array([pressure]), "absolute", self.reference, ambient)
         value = float(counted[0]) / PASCAL[self.unit]
         low, high = self.range or (value, value)
         within = min(max(value, low), high)
@@ -235,7 +246,7 @@ class Quantity(Scaled):
 class Pressure(Quantity, Tag):
     """A pressure in the PLC's registers."""
 
-    type: Type
+    type: Type  # how it is coded
 
     @model_validator(mode="after")
     def _is_a_number(self) -> Self:
@@ -259,26 +270,16 @@ class Pressure(Quantity, Tag):
 class Temperature(Thermometer, Tag):
     """A temperature in the PLC's registers."""
 
-    type: NumberType
+    type: NumberType  # how it is coded
 
 
 class Flow(Flowmeter, Tag):
     """A suction flow in the PLC's registers."""
 
-    type: NumberType
+    type: NumberType  # how it is coded
 
 
 def words_of(number: float, code: str, order: WordOrder) -> tuple[int, ...]:
     """The words of a number of NumPy type ``code`` (big-endian), as ``numbers`` reads them."""
     words = np.array([number]).astype(code).view(">u2").tolist()
     return tuple(words if order == "big" else words[::-1])
-
-
-def _counted(
-    pascal: Floats, reference: Reference, onto: Reference, ambient: float | Floats
-) -> Floats:
-    """Pressures counted from ``reference`` as counted from ``onto``; ambient cancels exactly."""
-    zero: dict[Reference, float | Floats]
-    zero = {"absolute": 0.0, "gauge": ambient, "vacuum": ambient}
-    sign = {"absolute": 1.0, "gauge": 1.0, "vacuum": -1.0}
-    return sign[onto] * (sign[reference] * pascal + (zero[reference] - zero[onto]))

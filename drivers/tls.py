@@ -28,7 +28,7 @@ class Tls(Settings):
     trusted: Path  # PEM: the PLC's certificate, or the authority's that signed it
     name: str = ""  # in the PLC's certificate; "" means the host
     certificate: Path | None = None  # PEM, our own, where the PLC wants one
-    key: Path | None = None
+    key: Path | None = None  # PEM, of our own certificate
 
     @model_validator(mode="after")
     def _belong_together(self) -> Self:

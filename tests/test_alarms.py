@@ -406,13 +406,17 @@ def test_any_rule_survives_its_file(any_rule: Rule) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("above = 250.0", "", r"alarms\.toml:8: alarm\.1: .*needs one limit"),
+        ("above = 250.0", "", r"alarms\.toml:8: alarm, 2nd entry: .*needs one limit"),
         ("above = 250.0", "above = 250.0\nbelow = 3.0", "needs one limit: above or below"),
-        ("dead_band", "dead_bend", r"alarms\.toml:12: alarm\.1\.dead_bend: unknown key"),
+        ("dead_band", "dead_bend", r"alarms\.toml:12: alarm, 2nd entry, dead_bend: unknown key"),
         ('"stale"]', '"nobody"]', "leak is suppressed by nobody: no such alarm"),
         ('"stale"]', '"leak"]', "leak suppresses itself"),
         ('name = "leak"', 'name = "stale"', "several alarms are called stale"),
-        ("on_delay_s = 10.0", "on_delay_s = -1.0", r"alarms\.toml:13: alarm\.1\.on_delay_s"),
+        (
+            "on_delay_s = 10.0",
+            "on_delay_s = -1.0",
+            r"alarms\.toml:13: alarm, 2nd entry, on_delay",
+        ),
     ],
 )
 def test_a_rule_that_cannot_be_is_refused_with_its_place(old: str, new: str, said: str) -> None:

@@ -14,7 +14,7 @@ from drivers.plc import partner, rig
 from drivers.plc.plant import CV, R_GAS
 from drivers.results_state import KEPT
 from drivers.results_state import STALE_S as NO_ROW_S
-from twin import throttle
+from twin import files, throttle
 from twin.alarms.loop import AGREEING
 from twin.compare import compare, side
 from twin.figures import course, keeper, table, trend
@@ -31,6 +31,7 @@ from twin.monitor.isolation import LEARNED
 from twin.outlets import data, dispatch, sender, uploader
 from twin.page import hall, hall_words, ring, server, sessions
 from twin.signals import MBAR, MS, SAMPLE, TICK
+from twin.tables import reader, unit_check
 
 DOCS = rigs.ROOT / "docs"
 
@@ -60,6 +61,18 @@ CLAIMS = (
     ("fleet", "From {} logs of a unit on", ("six",), (peers.FEWEST_LOGS,)),
     ("fleet", "From {:g} sigmas of the others' scatter on", (), (report.STANDS_OUT,)),
     ("fleet", "if it is {} of its sigmas", ("four",), (peers.DRIFTS,)),
+    ("csv", "Unpacked, a file may have {:g} MiB", (), (files.MEMORY_BUDGET / 2**20,)),
+    ("csv", "A column that is never above {:g} mbar", (), (unit_check.LEAST / MBAR,)),
+    (
+        "csv",
+        "{:g} MiB at most: {:g} million rows, {:g} minutes at 1 kHz",
+        (),
+        (
+            files.MEMORY_BUDGET / 2**20,
+            round(files.MEMORY_BUDGET / reader.READING.itemsize / 1e6),
+            round(files.MEMORY_BUDGET / reader.READING.itemsize / 60e3),
+        ),
+    ),
     ("engineer", "Below {} cycles on a side", ("five",), (compare.FEWEST,)),
     (
         "engineer",

@@ -53,7 +53,7 @@ def test_the_shell_completes_commands() -> None:
     done = subprocess.run(
         [program], env={**os.environ, **asked}, capture_output=True, text=True, check=True
     )
-    assert done.stdout.split() == ["commission", "compare"]
+    assert done.stdout.split() == ["config", "commission", "compare"]
 
 
 @pytest.mark.parametrize(

@@ -63,6 +63,8 @@ NEEDED = {
     "users password": ("ann",),
     "users remove": ("ann",),
     "users audit": (),
+    "config check": ("C",),
+    "config schema": (),
     "log check": ("L",),
     "log recover": ("L", "-o", "new.mcap"),
 }
@@ -71,6 +73,7 @@ ALONE = {
     "effects",
     "paper",
     "init",
+    "config schema",
     "assets list",
     "assets export",
     "alarms rules",

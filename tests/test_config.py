@@ -252,14 +252,17 @@ def test_a_unit_of_another_type_is_refused(database: Assets, url: str) -> None:
 # --- who is to blame ----------------------------------------------------------------------------
 
 UNFIT = [
-    ({"ejector": {"colour": "red"}}, "data.ejector.colour: unknown key (is 'red')"),
+    ({"ejector": {"colour": "red"}}, "data.ejector.colour: unknown key"),
     ({"colours": {}}, "data.colours: unknown key"),
-    ({"supply": {"pressure_bar": "high"}}, "data.supply.pressure_bar: Input should be a valid num"),
-    ({"supply": 5}, "data.supply: Input should be a valid dictionary or instance of Supply (is 5)"),
-    ({"supply": {"pressure_bar": -1.0}}, "data.supply.pressure_bar: Input should be greater than"),
-    ({"ejector": {"h2_mbar": 700.0}}, "data.ejector: Value error, h1_mbar must be at least"),
-    ({"system": {"parts": [{"kind": "vessel"}]}}, "volume_ml: Field required"),
-    ({"system": {"parts": [{"volume_ml": 3.0}]}}, "data.system.parts.0: Unable to extract tag"),
+    (
+        {"supply": {"pressure_bar": "high"}},
+        "data.supply.pressure_bar: must be a number (is 'hi",
+    ),
+    ({"supply": 5}, "data.supply: must be a table (is 5)"),
+    ({"supply": {"pressure_bar": -1.0}}, "data.supply.pressure_bar: must be greater than 0"),
+    ({"ejector": {"h2_mbar": 700.0}}, "data.ejector: h1_mbar must be at least"),
+    ({"system": {"parts": [{"kind": "vessel"}]}}, "1st entry, volume_ml: is missing"),
+    ({"system": {"parts": [{"volume_ml": 3.0}]}}, "data.system.parts, 1st entry: needs a kind"),
 ]
 
 
@@ -282,15 +285,15 @@ def test_a_record_of_another_shape_is_named_with_its_key(
     [
         (
             {"figures": {"hold_rms": {"mean": 1.0}}},
-            "healthy.figures.hold_rms.sigma: Field required",
+            "healthy.figures.hold_rms.sigma: is missing",
         ),
         (
             {"figures": {"hold_rms": {"mean": 1.0, "sigma": 0.0}}},
-            "healthy.figures.hold_rms.sigma: Input",
+            "healthy.figures.hold_rms.sigma: must be",
         ),
         (
             {"figures": {"hold_rms": 1.0}},
-            "healthy.figures.hold_rms: Input should be a valid dictionary",
+            "healthy.figures.hold_rms: must be a table",
         ),
     ],
 )
@@ -312,14 +315,14 @@ def test_a_fault_of_the_configuration_is_its_own(database: Assets, url: str) -> 
     add(database, whole(url))
     for old, new, line, problem in (
         ("h2_mbar = 560.0", "h3_mbar = 560.0", 7, "data.ejector.h3_mbar: unknown key"),
-        ("volume_ml = 90.0", "volume_ml = 0.0", 16, "volume_ml: Input should be greater than 0"),
-        ("h2_mbar = 560.0", "h2_mbar = 700.0", 5, "data.ejector: Value error, h1_mbar must be"),
+        ("volume_ml = 90.0", "volume_ml = 0.0", 16, "volume_ml: must be greater than 0"),
+        ("h2_mbar = 560.0", "h2_mbar = 700.0", 5, "data.ejector: h1_mbar must be"),
     ):
         with pytest.raises(ConfigError) as caught:
             taken(url, CELL.replace(old, new))
         assert str(caught.value).startswith(f"cell.toml:{line}: ")
         assert problem in str(caught.value)
-    with pytest.raises(ConfigError, match=r"cell\.toml:.*data: Input should be a valid dictionary"):
+    with pytest.raises(ConfigError, match=r"cell\.toml:.*data: must be a table"):
         taken(url, f'data = 5\n[asset]\ntype = "{TYPE}"\n')
 
 
@@ -359,8 +362,8 @@ def test_a_logs_data_set_of_another_shape_is_named_with_its_key(
     [
         ("{", "line 1 column 2"),
         ('{"a":' * 100_000, "recursion"),
-        (whole_json(supply={"pressure_bar": math.inf}), "pressure_bar: Input should be a finite"),
-        ("5", "data: Input should be a valid dictionary"),
+        (whole_json(supply={"pressure_bar": math.inf}), "pressure_bar: must be a finite"),
+        ("5", "data: must be a table"),
         (
             "{}",
             "data.ambient, data.supply, data.ejector, data.sensor, data.system, data.effects,"

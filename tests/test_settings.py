@@ -85,11 +85,19 @@ def test_settings_are_frozen() -> None:
         ('"unit" = "mbar"', '"unit" = "bar"', "cell.toml:8: driver.tags.pressure.unit: "),
         ("low = 1", 'low = "one"', "cell.toml:11: driver.limits.low: "),
         ("high = 2", "hihg = 2", "cell.toml:12: driver.limits.hihg: unknown key"),
-        ('host = "10.0.0.5"', "", "cell.toml:2: driver.host: Field required"),
+        ('host = "10.0.0.5"', "", "cell.toml:2: driver.host: is missing"),
         ('host = "10.0.0.5"', "host = 5", "cell.toml:3: driver.host: "),
         ("[ driver . limits ]", "[driver.limit]", "cell.toml:10: driver.limit: unknown key"),
-        ("delay_ms = 5.0", "span = nan", "cell.toml:7: driver.tags.pressure.span: Input should"),
-        ("delay_ms = 5.0", "span = -inf", "cell.toml:7: driver.tags.pressure.span: Input should"),
+        (
+            "delay_ms = 5.0",
+            "span = nan",
+            "cell.toml:7: driver.tags.pressure.span: must be a finite number",
+        ),
+        (
+            "delay_ms = 5.0",
+            "span = -inf",
+            "cell.toml:7: driver.tags.pressure.span: must be a finite number",
+        ),
     ],
 )
 def test_what_is_wrong_is_named_with_its_line(old: str, new: str, wanted: str) -> None:
@@ -118,7 +126,7 @@ def test_unknown_tables_are_refused_with_their_line() -> None:
     document = Document.parse("[driver]\n\n[monitr]\nx = 1\n", "cell.toml")
     with pytest.raises(ConfigError, match=r"cell.toml:3: unknown table \[monitr\]") as refused:
         document.refuse_unknown_tables({"driver", "monitor"})
-    assert refused.value.hint == "known tables: driver, monitor"
+    assert refused.value.hint == "did you mean 'monitor'? known: driver, monitor"
 
 
 @pytest.mark.parametrize("text", ["[driver", "a = ", "a = 1\na = 2", "a = 1 2", "\x00"])
@@ -153,7 +161,8 @@ def test_the_line_is_that_of_the_key(blank: int, tables: list[str], key: str) ->
     if tables[0] != "other":
         text = text[: text.rindex(other)]  # TOML allows no table twice
         message = complaint(text, *tables, kind=Limits)
-        assert message == f"cell.toml:{line}: {'.'.join([*tables, key])}: unknown key"
+        place = ".".join([*tables, key])
+        assert message.startswith(f"cell.toml:{line}: {place}: unknown key: ")
 
 
 @given(st.text(max_size=60))
@@ -196,14 +205,16 @@ def test_an_impossible_data_set_is_refused_at_its_line() -> None:
     assert "data.supply.optimum_bar" in refused("optimum_bar = ", "optimum_bar = -")
     assert "data.sensor.noise_mbar" in refused("noise_mbar = ", "noise_mbar = -")
     message = refused("volume_ml = ", "volumen_ml = ")
-    assert "data.system.parts.4.volumen_ml: unknown key" in message
+    assert message.endswith(
+        "data.system.parts, 5th entry, volumen_ml: unknown key: do you mean volume_ml?"
+    )
 
 
 def test_a_part_of_the_system_is_refused_at_its_own_line() -> None:
     message = refused("tube_length_mm = 65.0", "tube_length_mm = -65.0")
-    assert "data.system.parts.2.tube_length_mm: Input should be greater than" in message
+    assert "data.system.parts, 3rd entry, tube_length_mm: must be at least 0 (is -65.0)" in message
     old = 'kind = "vessel"'
-    assert "data.system.parts.4: Input tag 'bucket'" in refused(
+    assert "data.system.parts, 5th entry: kind must be" in refused(
         old, old.replace("vessel", "bucket")
     )
 

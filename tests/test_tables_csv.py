@@ -133,12 +133,12 @@ def test_columns_not_taken_are_named(tmp_path: Path) -> None:
         ("time_s,suction,pressure_pa", "no column blow_off;"),
         (
             "time_s,suction,blow_off",
-            "no column pressure_mbar or pressure_pa or pressure_bar or vacuum_mbar or",
+            "no column pressure_mbar or pressure_pa or pressure_bar or pressure or vacuum_mbar or",
         ),
         ("time_s,time_ms,suction,blow_off,pressure_pa", "only one of .*'time_s', 'time_ms'"),
         ("time_s,suction,blow_off,pressure_pa,vacuum_pa", "only one of .*'pressure_pa', 'vac"),
         ("time_s,suction,suction,blow_off,pressure_pa", "column 'suction' stands there 2 times"),
-        ("time_s\tsuction\tblow_off\tpressure_pa", r"the columns are 'time_s\\tsuction"),
+        ("time_s|suction|blow_off|pressure_pa", r"the columns are 'time_s\|suction"),
     ],
 )
 def test_the_header_must_name_each_column_once(tmp_path: Path, header: str, what: str) -> None:
@@ -159,7 +159,7 @@ def test_a_mapped_name_must_be_there(tmp_path: Path) -> None:
     [
         (b"", "no header row"),
         (b"# only\n\n", "no header row"),
-        (SMALL.encode("utf-16"), ":1: this is no text"),
+        (SMALL.encode("utf-16-le"), ":1: this is no text"),
         (b"x" * 3_000_000, "a line of more than 1 MiB"),
         (SMALL.partition("\n")[0].encode(), "t.csv:1: no row follows"),
     ],
@@ -178,9 +178,9 @@ def test_what_cannot_be_opened_is_refused(tmp_path: Path, name: str) -> None:
 
 
 def test_another_suffix_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"t\.xlsx") as caught:
-        open_table(written(tmp_path, SMALL, "t.xlsx"), REFUSE, AMBIENT)
-    assert ".csv and .parquet" in caught.value.hint
+    with pytest.raises(ConfigError, match=r"t\.ods") as caught:
+        open_table(written(tmp_path, SMALL, "t.ods"), REFUSE, AMBIENT)
+    assert ".csv, .txt, .tsv, .xlsx, .parquet" in caught.value.hint
 
 
 # --- bad input ----------------------------------------------------------------------------------
@@ -420,7 +420,7 @@ def test_a_column_in_bar_is_not_taken_as_mbar(tmp_path: Path, kind: str) -> None
     path = tmp_path / "bar.csv"
     path.write_text("\n".join([f"time_s,suction,blow_off,{kind}_mbar", *rows]))
     ambient = 101_300.0
-    with pytest.raises(SourceError, match="is probably in bar") as caught:
+    with pytest.raises(SourceError, match="In which unit is it") as caught:
         list(open_table(path, ImportSettings(), ambient).blocks())
     assert f'{kind}_bar = "{kind}_mbar"' in caught.value.hint
     said = ImportSettings.model_validate({"columns": {f"{kind}_bar": f"{kind}_mbar"}})
@@ -438,7 +438,7 @@ def _dead(folder: Path, column: str = "vacuum_mbar") -> Path:
 
 def test_a_record_of_a_dead_ejector_is_taken_once_its_unit_is_said(tmp_path: Path) -> None:
     path, ambient = _dead(tmp_path), 101_300.0
-    with pytest.raises(SourceError, match="is probably in bar") as caught:
+    with pytest.raises(SourceError, match="In which unit is it") as caught:
         list(open_table(path, ImportSettings(), ambient).blocks())
     assert 'under [import]: pressure_unit = "mbar"' in caught.value.hint
     said = ImportSettings.model_validate({"pressure_unit": "mbar"})

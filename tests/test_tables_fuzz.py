@@ -1,6 +1,8 @@
 """Whatever a table holds: its rows, each of them, or one error that says where."""
 
+import io
 import tempfile
+import zipfile
 from pathlib import Path
 from unittest.mock import patch
 
@@ -9,6 +11,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from log_rows import HEADER, course
+from openpyxl import Workbook
 from table_rows import MARK, REFUSE, taken, written
 
 from twin.errors import SourceError, TwinError
@@ -25,7 +28,7 @@ IN_MBAR = ImportSettings(pressure_unit="mbar")  # however small: any float is va
 @settings(max_examples=150, deadline=None)
 @given(
     st.one_of(st.binary(max_size=200), st.text(max_size=200).map(str.encode)),
-    st.sampled_from(["t.csv", "t.parquet"]),
+    st.sampled_from(["t.csv", "t.txt", "t.xlsx", "t.parquet"]),
     st.sampled_from([REFUSE, MARK]),
 )
 def test_any_bytes(content: bytes, name: str, how: ImportSettings) -> None:
@@ -138,6 +141,34 @@ def test_any_damaged_cell(row: int, name: str, junk: str, piece: int, data: st.D
         assert marked["time_ns"].tolist() == [i * 1_000_000 for i in range(40)]
         assert marked["sequence"].tolist() == [i + 5 for i in range(40)]
         assert marked["commands"].tolist() == [1] * 40
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_a_damaged_excel_file(data: st.DataObject) -> None:
+    """Bytes of one part change, with a checksum that is right."""
+    book = Workbook()
+    sheet = book.active
+    assert sheet is not None
+    sheet.append(NAMES)
+    for row in range(20):
+        sheet.append([row, row, 0, 0, 1000.5, 5.5, 0])
+    whole = io.BytesIO()
+    book.save(whole)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "t.xlsx"
+        with zipfile.ZipFile(whole) as parts, zipfile.ZipFile(path, "w") as damaged:
+            chosen = data.draw(st.sampled_from(parts.namelist()))
+            for name in parts.namelist():
+                content = bytearray(parts.read(name))
+                for _ in range(data.draw(st.integers(0, 3)) if name == chosen else 0):
+                    place = data.draw(st.integers(0, len(content) - 1))
+                    content[place] = data.draw(st.sampled_from(list(b"<>&\"'/=0a ")))
+                damaged.writestr(name, bytes(content))
+        try:
+            assert len(taken(path, MARK)) <= 20
+        except TwinError as error:
+            assert str(path) in str(error)  # noqa: PT017
 
 
 @settings(max_examples=60, deadline=None)

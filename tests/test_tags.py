@@ -9,10 +9,10 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from drivers.tags import PASCAL, Address, Pressure, Tag
+from drivers.tags import Address, Pressure, Tag
 from twin.errors import ConfigError
 from twin.settings import Document
-from twin.signals import Quality
+from twin.signals import PASCAL, Quality
 
 AMBIENT = 101_325.0
 FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}

@@ -397,7 +397,7 @@ def test_it_is_off_by_default(tmp_path: Path, running: Broker) -> None:
     [
         ('logs = "a"', "needs one place: url or folder"),
         ('logs = "a"\nurl = "http://h/x"\nfolder = "b"', "needs one place: url or folder"),
-        ('folder = "b"', "outlets.upload.logs: Field required"),
+        ('folder = "b"', "outlets.upload.logs: is missing"),
         ('logs = "a"\nurl = "ftp://h/x"', "is no address"),
         ('logs = "a"\nurl = "http://h/x"\nheaders = {A = {env = "B"}}', "take https"),
     ],

@@ -7,7 +7,7 @@ units, as everywhere.
 """
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -218,7 +218,7 @@ def open(  # noqa: A001  (as a module's open is called)
     assets: str = "",
     derive_commands: bool = False,
 ) -> Log:
-    """Open a log (MCAP), or a table (CSV, Parquet) of a PLC's trace.
+    """Open a log (MCAP), or a table (CSV, Excel, Parquet) of a PLC's trace.
 
     A log carries its configuration and the data set it was recorded beside; ``config``, a file or
     that of another log or calibration, takes its place. A table needs one. ``unit`` and ``assets``
@@ -230,6 +230,7 @@ def open(  # noqa: A001  (as a module's open is called)
     """
     path = Path(path)
     source: Source
+    notes: Sequence[str] = ()  # as of an encoding that had to be guessed
     if path.suffix.lower() == MCAP:
         source = open_log(path)
         settings = _of_log(source, config, assets, unit)
@@ -240,10 +241,11 @@ def open(  # noqa: A001  (as a module's open is called)
     else:
         settings = _configured(config, assets, unit)
         source = _table(path, settings, derive_commands)
-        settings = replace(settings, gauge=source.counts_from_ambient)
+        settings, notes = replace(settings, gauge=source.counts_from_ambient), source.notes
         remark = f"columns not taken: {', '.join(source.ignored)}" if source.ignored else ""
     log = Log(path, settings, assets, _source=source)
-    for what in filter(None, (remark, log._header.derived, settings.instead if unit else "")):
+    instead = settings.instead if unit else ""
+    for what in filter(None, (*notes, remark, log._header.derived, instead)):
         warnings.warn(what, stacklevel=2)
     return log
 

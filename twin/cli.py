@@ -27,6 +27,7 @@ from twin.cli_app import App, not_negative, read_config, say_if_cut, say_if_new
 from twin.cli_assets import assets_app
 from twin.cli_cert import cert
 from twin.cli_compare import compare
+from twin.cli_config import config_app
 from twin.cli_exchange import export_fmu
 from twin.cli_figures import figures_app, keeper_of, key_figures_of
 from twin.cli_fleet import fleet_app
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
     from twin.monitor.listening import Notices
     from twin.settings import Document
     from twin.signals import Samples, Ticks
+    from twin.tables.reader import Table
     from twin.view import Screen
 
 GARBAGE = 20_000  # objects made and not let go of, after which Python looks for garbage
@@ -65,7 +67,7 @@ ALARMED = 1
 
 # As the days go: begin, run, ask why, look after what is kept, tools.
 ORDER = (
-    *("init", "probe", "import", "commission", "calibrate"),
+    *("init", "config", "probe", "import", "commission", "calibrate"),
     *("run", "serve", "replay", "diagnose", "compare", "figures", "alarms"),
     *("fleet", "log", "assets", "users", "cert"),
     *("export", "export-fmu", "effects", "paper", "plc"),
@@ -77,6 +79,7 @@ app.add_typer(figures_app, name="figures")
 app.add_typer(alarms_app, name="alarms")
 app.add_typer(fleet_app, name="fleet")
 app.add_typer(users_app, name="users")
+app.add_typer(config_app, name="config")
 log_app = App("Look after logs.")
 app.add_typer(log_app, name="log")
 
@@ -495,16 +498,40 @@ def _recorded_cycles(
                 return
 
 
+def _known_zone(name: str) -> str:
+    """For ``--time-zone``: usage error unless there is such a zone."""
+    from twin.tables.settings import known_zone
+
+    try:
+        return known_zone(name) if name else name
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
+
+
 @app.command("import")
 def import_(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV or Parquet.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV, Excel (.xlsx) or Parquet.")],
     config: Annotated[Path, typer.Option(help="TOML configuration; [import] maps columns.")],
-    output: Annotated[Path, typer.Option("-o", metavar="LOG.mcap", help="Write the new log.")],
+    output: Annotated[
+        Path | None, typer.Option("-o", metavar="LOG.mcap", help="Write the new log.")
+    ] = None,
     unit: UnitId = "",
     assets: AssetsUrl = "",
+    time_zone: Annotated[
+        str,
+        typer.Option(
+            metavar="ZONE",
+            callback=_known_zone,
+            help="Of times that say none, as Europe/Berlin or UTC.",
+        ),
+    ] = "",
     derive_commands: Annotated[
         bool,
         typer.Option("--derive-commands", help="Find commands that FILE lacks from the pressure."),
+    ] = False,
+    dry_run: Annotated[
+        bool,
+        typer.Option("--dry-run", help="Write nothing; show how FILE is understood."),
     ] = False,
 ) -> None:
     """Make a log of a PLC's trace export, with what the twin expects beside it."""
@@ -517,12 +544,21 @@ def import_(
     from twin.tables.reader import open_table
     from twin.tables.settings import ImportSettings
 
-    refuse_other_suffix(output)
+    if output is not None:
+        refuse_other_suffix(output)
+    elif not dry_run:
+        raise typer.BadParameter("say with -o LOG.mcap where the log goes, or look with --dry-run")
     settings = _configured(Document.read(config), assets, unit)
     wanted = settings.document.section(ImportSettings, "import")
+    if time_zone:
+        wanted = wanted.model_copy(update={"time_zone": time_zone})
     ambient = settings.data.ambient.pressure_mbar * MBAR
     table = open_table(file, wanted, ambient, derive=derive_commands)
     settings = replace(settings, gauge=table.counts_from_ambient)
+    for note in table.notes:
+        print(f"twin: {file}: {note}", file=sys.stderr)
+    if dry_run or output is None:
+        return _show(table, derive=derive_commands)
     if table.ignored:
         print(f"twin: columns not taken: {', '.join(table.ignored)}", file=sys.stderr)
     unmeasured = {}
@@ -530,13 +566,30 @@ def import_(
         table = table.with_commands()
         unmeasured[DERIVED] = table.commands
         print(f"twin: {table.commands}", file=sys.stderr)
+    else:  # a whole look first: nothing is said of rows that are then refused
+        for _ in _progress(table.blocks(), "reading"):
+            pass
     twin, monitor = pair_of(settings, judges=not table.commands)
     with _whole(output) as part, _stop_on_signal(None) as stopped:
         header = settings.log_header(unmeasured)
         sinks = _opened({"log": partial(Recorder, part, header), "console": Console})
         blocks = _until(stopped, _progress(table.blocks(), "importing"))
         run_loop(blocks, twin, monitor, [*sinks.values()])
-    _leave(interrupted=stopped() == "interrupted")
+    return _leave(interrupted=stopped() == "interrupted")
+
+
+def _show(table: "Table", *, derive: bool) -> None:
+    """Print how a table is understood, also where it is then refused."""
+    from twin.tables.preview import Preview
+
+    preview = Preview(table)
+    try:
+        for block in _progress(table.blocks(), "reading"):
+            preview.see(block)
+    finally:
+        print(preview)
+    if derive:
+        print(table.with_commands().commands)
 
 
 @app.command()

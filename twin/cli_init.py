@@ -82,10 +82,13 @@ class Unit(StrEnum):
     """Of the pressure, as it arrives."""
 
     MBAR = "mbar"
+    HPA = "hPa"
     BAR = "bar"
     KPA = "kPa"
     PA = "Pa"
     PSI = "psi"
+    IN_HG = "inHg"
+    TORR = "torr"
 
 
 class Reference(StrEnum):
@@ -472,13 +475,16 @@ def _driver(connection: Connection, sensor: Sensor) -> list[str]:
 
 def _no_driver(sensor: Sensor) -> list[str]:
     """A unit of which there are only files."""
-    kind = "vacuum" if sensor.reference is Reference.VACUUM else "pressure"
+    pressure = f'{{ name = "Pressure", unit = "{sensor.unit}", reference = "{sensor.reference}" }}'
     return [
         "# --- files of another program: docs/csv.md --------------------------------------",
         "",
+        "[import]",
+        '# time_zone = "Europe/Berlin"   # of times that say none',
+        "",
         "[import.columns]",
         '# time_s = "Time"               # the file\'s names, where they are others',
-        f'# {kind}_mbar = "Pressure"',
+        f"# pressure = {pressure}",
         *(OFFERED + BESIDE_COLUMNS).splitlines(),
     ]
 

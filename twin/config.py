@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 from pydantic import Field, ValidationError
@@ -27,6 +26,7 @@ from twin.monitor.detect import MonitorSettings
 from twin.monitor.healthy import Healthy
 from twin.settings import Document, Settings
 from twin.signals import MBAR
+from twin.validation import findings, path_in_words, without_tags
 
 if TYPE_CHECKING:  # a log brings its own data set, and need not wait for its SQLAlchemy
     from sqlalchemy import URL
@@ -66,8 +66,8 @@ Tables = Mapping[str, Any]  # as [data] has them
 class Asset(Settings):
     """The ejector: its type (object-specific data) and the one unit (instance-specific data)."""
 
-    type: str = NO_TYPE
-    id: str = ""
+    type: str = NO_TYPE  # of the ejector, as in the asset database (twin assets list)
+    id: str = ""  # of this one unit, as a calibration stores it
     batch: str = ""  # of production, as on the nameplate: what fleets are compared by
 
 
@@ -239,7 +239,10 @@ def _counts_from_ambient(tables: Tables) -> bool:
     with suppress(KeyError, TypeError):
         return bool(tables["driver"]["tags"]["pressure"]["reference"] in FROM_AMBIENT)
     with suppress(KeyError, TypeError):
-        return any(str(name).startswith("vacuum_") for name in tables["import"]["columns"])
+        columns = tables["import"]["columns"]
+        said = columns.get("pressure")
+        gauge = isinstance(said, Mapping) and said.get("reference") in FROM_AMBIENT
+        return gauge or any(str(name).startswith("vacuum") for name in columns)
     return False
 
 
@@ -398,7 +401,7 @@ def _laid(record: Record, below: Tables, check: Callable[[Tables], object]) -> T
         tables = _merged(_merged(below, diagram), record.data)
         DataSet.model_validate(tables)
     except (ConfigError, ValidationError) as error:
-        why = _in_words(error) if isinstance(error, ValidationError) else str(error)
+        why = _in_words(error, DataSet) if isinstance(error, ValidationError) else str(error)
         raise ConfigError(
             f"{record.kind} {record.name!r}: the model cannot follow its characteristic diagram:"
             f" {why}",
@@ -476,15 +479,12 @@ def _of_log(metadata: Mapping[str, str], log: str) -> Known:
     return known
 
 
-def _in_words(error: ValidationError) -> str:
+def _in_words(error: ValidationError, kind: type[Settings] = Known) -> str:
     """What is wrong with stored tables: key, what, and what stands there."""
-    lines = []
-    for problem in error.errors(include_url=False):
-        what = "unknown key" if problem["type"] == "extra_forbidden" else problem["msg"]
-        is_said = problem["type"] in ("missing", "value_error")  # or is a whole table
-        given = "" if is_said else f" (is {shorten(repr(problem['input']), 80)})"
-        lines.append(f"{'.'.join(map(str, problem['loc']))}: {what}{given}")
-    return "; ".join(lines)
+    return "; ".join(
+        f"{path_in_words(without_tags(kind, problem['loc']))}: {what}"
+        for problem, what in findings(error, kind)
+    )
 
 
 def _left_out(whole: Any, given: Any, at: str = "") -> Iterator[str]:

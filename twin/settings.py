@@ -10,12 +10,17 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from textwrap import shorten
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from twin.errors import ConfigError, SourceError
+from twin.errors import ConfigError, SourceError, known_names
+from twin.validation import findings, path_in_words
+
+ALL_MISTAKES = (
+    "twin config check FILE names all mistakes of a configuration at once, docs/configuration.md"
+    " has all keys"
+)
 
 
 class Settings(BaseModel):
@@ -69,7 +74,7 @@ class Document:
             if key not in known:
                 raise ConfigError(
                     f"{self.name}:{self._line((key,))}: unknown table [{key}]",
-                    f"known tables: {', '.join(sorted(known))}",
+                    known_names(key, known),
                 )
 
     def section(self, kind: type[S], *path: str) -> S:
@@ -80,31 +85,28 @@ class Document:
         try:
             return kind.model_validate(table)
         except ValidationError as error:
-            raise ConfigError(self._explain(path, error), "see the comments in configs/") from error
+            raise ConfigError(self._explain(path, kind, error), ALL_MISTAKES) from error
 
-    def _explain(self, path: tuple[str, ...], error: ValidationError) -> str:
+    def _explain(self, path: tuple[str, ...], kind: type[S], error: ValidationError) -> str:
         lines = []
-        problems = error.errors(include_url=False)
-        # A mistyped key first: that the right one is missing follows from it.
-        for problem in sorted(problems, key=lambda one: one["type"] != "extra_forbidden"):
+        for problem, what in findings(error, kind):
             cause = problem.get("ctx", {}).get("error")
             below = cause.keys if isinstance(cause, KeyedError) else ()
             keys = self._written((*path, *problem["loc"], *below))
-            what = "unknown key" if problem["type"] == "extra_forbidden" else problem["msg"]
-            # Or it is a whole table; what an unknown key has may be a secret.
-            is_said = problem["type"] in ("missing", "value_error", "extra_forbidden")
-            given = "" if is_said else f" (is {shorten(repr(problem['input']), 80)})"
-            lines.append(f"{self.name}:{self._line(keys)}: {'.'.join(keys)}: {what}{given}")
+            line = self._line(tuple(map(str, keys)))
+            lines.append(f"{self.name}:{line}: {path_in_words(keys)}: {what}")
         return "\n".join(lines)
 
-    def _written(self, path: tuple[str | int, ...]) -> tuple[str, ...]:
+    def _written(self, path: tuple[str | int, ...]) -> tuple[str | int, ...]:
         """Keys as they stand in the text: without the kind that tells a list's tables apart."""
-        keys: list[str] = []
+        keys: list[str | int] = []
         here: Any = self.tables
         for step in path:
             if isinstance(here, Mapping) and step == here.get("kind") and step not in here:
                 continue
-            keys.append(str(step))
+            if step == "[key]":  # of a name that is none of those a table can have
+                continue
+            keys.append(step)
             try:
                 here = here[step]
             except (KeyError, IndexError, TypeError):

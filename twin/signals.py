@@ -7,6 +7,7 @@ Everything flows in blocks: structured arrays of ``SAMPLE`` (what was measured) 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,33 @@ ZERO_C = 273.15  # K
 ML = 1e-6  # m³
 STANDARD_DENSITY = 1.185  # kg/m³ at 100 kPa, 20 °C, 65 % relative humidity (ISO 8778)
 SL_MIN = STANDARD_DENSITY * 1e-3 / 60.0  # kg/s in one standard litre per minute
+
+Unit = Literal["mbar", "hPa", "bar", "kPa", "Pa", "psi", "inHg", "torr"]
+Reference = Literal["absolute", "gauge", "vacuum"]  # vacuum: positive below ambient
+PASCAL: dict[Unit, float] = {  # in one unit of pressure
+    "mbar": MBAR,
+    "hPa": 100.0,
+    "bar": BAR,
+    "kPa": 1000.0,
+    "Pa": 1.0,
+    "psi": 6894.757293168,
+    "inHg": 3386.388640341,  # at 0 °C, NIST SP 811, B.9
+    "torr": 101_325.0 / 760.0,
+}
+
+
+def counted_from(
+    pascal: npt.NDArray[np.float64],
+    reference: Reference,
+    onto: Reference,
+    ambient: float | npt.NDArray[np.float64],
+) -> npt.NDArray[np.float64]:
+    """Pressures counted from ``reference`` as counted from ``onto``; ambient cancels exactly."""
+    zero: dict[Reference, float | npt.NDArray[np.float64]]
+    zero = {"absolute": 0.0, "gauge": ambient, "vacuum": ambient}
+    sign = {"absolute": 1.0, "gauge": 1.0, "vacuum": -1.0}
+    return sign[onto] * (sign[reference] * pascal + (zero[reference] - zero[onto]))
+
 
 SAMPLE = np.dtype(
     [

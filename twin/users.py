@@ -58,7 +58,9 @@ def _no_table(given: Any) -> Any:
     return given
 
 
-UsersFile = Annotated[Path, BeforeValidator(_no_table)]  # of a server's settings
+UsersFile = Annotated[
+    Path, BeforeValidator(_no_table, json_schema_input_type=str)
+]  # of a server's settings
 
 
 class User(Settings):

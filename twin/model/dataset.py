@@ -50,8 +50,8 @@ CONTROL_SENSORS = {"own": c.OWN, "plc": c.PLC}
 class Ambient(Settings):
     """The air around."""
 
-    pressure_mbar: float = Field(1013.0, ge=500.0, le=1100.0)
-    temperature_c: float = Field(20.0, ge=-20.0, le=60.0)
+    pressure_mbar: float = Field(1013.0, ge=500.0, le=1100.0)  # absolute
+    temperature_c: float = Field(20.0, ge=-20.0, le=60.0)  # of air and walls
 
 
 class Supply(Settings):
@@ -62,6 +62,7 @@ class Supply(Settings):
     lag_ms: float = Field(20.0, ge=1.0, le=1000.0)  # of the supply line
     # At which suction is greatest: an ejector is made for the pressure that it is run at.
     optimum_bar: float = Field(default_factory=lambda told: told["pressure_bar"], gt=0.0, le=10.0)
+    # Suction over its greatest is 1 − curvature · (supply / optimum − 1)².
     curvature: NotNegative = 1.0
     end_pressure_slope: NotNegative = 0.2  # relative rise of end pressure per bar missing
 
@@ -87,27 +88,34 @@ def closing_stage(x: npt.NDArray[np.float64], at: float) -> npt.NDArray[np.float
 class Ejector(Settings):
     """Characteristic, timing, blow-off and control of the ejector."""
 
-    suction_capacity_sl_min: Positive = 33.4
-    end_pressure_mbar: Positive = 150.0
+    suction_capacity_sl_min: Positive = 33.4  # at ambient and optimum supply
+    end_pressure_mbar: Positive = 150.0  # absolute, at optimum supply: no flow is left
+    # Of the characteristic over the straight line; 0 is straight.
     bulge: float = Field(0.0, ge=-1.0, le=3.0)
-    skew: float = Field(0.0, ge=-20.0, le=20.0)
-    bend_2: float = Field(0.0, ge=-40.0, le=40.0)
-    bend_3: float = Field(0.0, ge=-40.0, le=40.0)
-    kink: float = Field(0.0, ge=0.0, le=0.95)
+    skew: float = Field(0.0, ge=-20.0, le=20.0)  # the same, more near ambient
+    bend_2: float = Field(0.0, ge=-40.0, le=40.0)  # the same, of second order
+    bend_3: float = Field(0.0, ge=-40.0, le=40.0)  # the same, of third order
+    kink: float = Field(
+        0.0, ge=0.0, le=0.95
+    )  # share of the suction at ambient that a second stage has
+    # Where that stage closes, of the way from end pressure to ambient.
     kink_at: float = Field(0.4, ge=0.02, le=0.95)
-    port_volume_ml: Positive = 1.0
+    port_volume_ml: Positive = 1.0  # inside the ejector, before the hose
     air_consumption_sl_min: NotNegative = 80.0  # of the nozzle, at operating pressure
-    response_ms: float = Field(15.0, ge=0.0, le=500.0)
+    response_ms: float = Field(15.0, ge=0.0, le=500.0)  # from the command to the valve's action
+    # From the end of the command to the valve's action.
     response_off_ms: float = Field(12.0, ge=0.0, le=500.0)
-    ramp_up_ms: float = Field(8.0, ge=0.5, le=500.0)
+    ramp_up_ms: float = Field(8.0, ge=0.5, le=500.0)  # of the jet, in two equal stages
     jet_full_at: float = Field(1.0, ge=0.02, le=1.0)  # of a slow valve's opening; see plant.drawing
-    ramp_down_ms: float = Field(4.0, ge=0.5, le=500.0)
+    ramp_down_ms: float = Field(4.0, ge=0.5, le=500.0)  # of the jet as it ends, in two equal stages
     jet_depth: float = Field(1.0, ge=0.0, le=1.0)  # how much less deep a weaker jet draws
-    blow_off_sl_min: NotNegative = 100.0
+    blow_off_sl_min: NotNegative = 100.0  # into ambient pressure
     blow_off_shape: float = Field(0.0, ge=-0.9, le=3.0)  # how much more flows into full vacuum
+    # From the command to the valve's action.
     blow_off_response_ms: float = Field(15.0, ge=0.0, le=500.0)
+    # From the end of the command to the valve's action.
     blow_off_response_off_ms: float = Field(12.0, ge=0.0, le=500.0)
-    blow_off_ramp_ms: float = Field(5.0, ge=0.5, le=500.0)
+    blow_off_ramp_ms: float = Field(5.0, ge=0.5, le=500.0)  # time constant of the flow
     exhaust_follows: float = Field(0.0, ge=0.0, le=1.0)  # a loss of suction narrows it as well
     filter_before_sensor: float = Field(0.0, ge=0.0, le=1.0)  # 1: the sensor is behind its filter
     end_follows_supply: float = Field(1.0, ge=0.1, le=20.0)  # times as end_pressure_slope has it
@@ -115,15 +123,18 @@ class Ejector(Settings):
     exhaust_sl_min: NotNegative = 0.0  # the same, sonic, where the exhaust is an opening
     cracking_pressure_mbar: NotNegative = 0.0  # above ambient, where the check valve lets out
     back_flow_sl_min: NotNegative = 0.0  # in through it while off, sonic; no check valve
+    # Vacuum at which air saving switches the nozzle off.
     h1_mbar: float = Field(750.0, gt=0.0, le=998.0)
-    h1_hysteresis_mbar: float = Field(150.0, gt=0.0)
-    h2_mbar: float = Field(550.0, gt=0.0, le=998.0)
-    h2_hysteresis_mbar: float = Field(10.0, gt=0.0)
+    h1_hysteresis_mbar: float = Field(150.0, gt=0.0)  # below H1, at which it is on again
+    h2_mbar: float = Field(550.0, gt=0.0, le=998.0)  # vacuum at which the part is present
+    h2_hysteresis_mbar: float = Field(10.0, gt=0.0)  # below H2, at which the part is gone
+    # As it is set at the ejector.
     air_saving: Literal["off", "on", "leak_monitoring", "without_continuous"] = "on"
-    permitted_leakage_mbar_s: Positive = 250.0
+    permitted_leakage_mbar_s: Positive = 250.0  # above it leak_monitoring keeps the nozzle on
+    # By the command; a pulse after suction; or a pulse started from outside.
     blow_off: Literal["external", "internal", "timed"] = "external"
-    blow_off_time_ms: float = Field(200.0, ge=100.0, le=9990.0)
-    control_sensor: Literal["own", "plc"] = "own"
+    blow_off_time_ms: float = Field(200.0, ge=100.0, le=9990.0)  # of a pulse
+    control_sensor: Literal["own", "plc"] = "own"  # whose pressure H1 and H2 are compared with
 
     def share(self, x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Suction over suction capacity; ``x`` runs from 0 at end pressure to 1 at ambient."""
@@ -159,7 +170,7 @@ class Ejector(Settings):
 class Wiring(Settings):
     """The pressure sensor the PLC reads, as a signal."""
 
-    lag_ms: float = Field(3.0, ge=0.5, le=500.0)
+    lag_ms: float = Field(3.0, ge=0.5, le=500.0)  # of sensor and input, in two equal stages
     noise_mbar: float = Field(0.4, gt=0.0, le=50.0)  # one standard deviation, steps included
     sampling_ms: float = Field(1.0, ge=0.5, le=100.0)  # from row to row
 
@@ -167,6 +178,7 @@ class Wiring(Settings):
 class System(Settings):
     """What the ejector evacuates: its parts outwards from the port, and how they are joined."""
 
+    # Outwards from the ejector, each of its kind.
     parts: tuple[Part, ...] = (
         Tube(kind="tube", length_mm=100.0, diameter_mm=6.0),
         Vessel(kind="vessel", volume_ml=750.0),
@@ -187,7 +199,9 @@ class System(Settings):
     stiff_mbar: NotNegative = 0.0  # vacuum up to which cups hardly give way
     leak_sl_min: NotNegative = 0.3  # of seals and fittings, sonic
     leak_critical_ratio: float = Field(CRITICAL_RATIO, ge=0.1, le=0.6)  # up to which it is
-    part_leaves: Literal["in_blow_off", "after_blow_off"] = "in_blow_off"
+    part_leaves: Literal["in_blow_off", "after_blow_off"] = (
+        "in_blow_off"  # when a cup's part goes: at its release_mbar, or when blow-off ends
+    )
     part_meets_ms: NotNegative = 0.0  # after suction is commanded: cups that move to the part
 
     @model_validator(mode="after")
@@ -214,9 +228,9 @@ class DataSet(Settings):
     ejector: Ejector = Ejector()
     sensor: Wiring = Wiring()
     system: System = System()
-    # What a diagnosis found beside all that: effects with their sizes, and terms that data gave.
+    # What a diagnosis found beside all that: effects with their sizes, by name.
     effects: Mapping[str, Mapping[str, float]] = Field(default_factory=dict)
-    terms: tuple[Term, ...] = ()
+    terms: tuple[Term, ...] = ()  # the same: what data added where no effect is known
 
     @model_validator(mode="after")
     def _model_can_be_made(self) -> "DataSet":

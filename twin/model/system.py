@@ -28,50 +28,50 @@ BLUFF = 1.15  # a tank's area over a sphere's: a cylinder as long as it is wide
 class Tube(Settings):
     """A hose or pipe: its length and inner diameter give volume and flow resistance."""
 
-    kind: Literal["tube"]
-    length_mm: Positive
-    diameter_mm: Positive
+    kind: Literal["tube"]  # a hose or pipe
+    length_mm: Positive  # along the hose
+    diameter_mm: Positive  # inside
 
 
 class Tee(Settings):
     """A T-piece: what its run loses, and a little volume."""
 
-    kind: Literal["tee"]
-    diameter_mm: Positive
+    kind: Literal["tee"]  # a T-piece
+    diameter_mm: Positive  # inside
     loss: NotNegative = 0.0  # velocity heads; the straight run has next to none
-    volume_ml: NotNegative = 0.0
+    volume_ml: NotNegative = 0.0  # inside
 
 
 class Filter(Settings):
     """A vacuum filter, clean."""
 
-    kind: Literal["filter"]
+    kind: Literal["filter"]  # a vacuum filter
     pressure_drop_mbar: NotNegative  # at nominal suction from ambient
-    volume_ml: NotNegative = 0.0
+    volume_ml: NotNegative = 0.0  # inside
 
 
 class Sensor(Settings):
     """The place of the sensor that the PLC reads, with its tube. Without one it is at the port."""
 
-    kind: Literal["sensor"]
-    tube_length_mm: NotNegative = 0.0
-    tube_diameter_mm: Positive = 4.0
+    kind: Literal["sensor"]  # the place of the sensor
+    tube_length_mm: NotNegative = 0.0  # from the line to the sensor
+    tube_diameter_mm: Positive = 4.0  # inside
 
 
 class Vessel(Settings):
     """A rigid vessel."""
 
-    kind: Literal["vessel"]
-    volume_ml: Positive
+    kind: Literal["vessel"]  # a rigid vessel
+    volume_ml: Positive  # inside
     wall_area_cm2: Positive | None = None  # as a cylinder's, where it is not known
 
 
 class Cups(Settings):
     """Suction cups, alike."""
 
-    kind: Literal["cups"]
+    kind: Literal["cups"]  # suction cups
     volume_ml: Positive  # of one, with its connection
-    count: int = Field(1, ge=1)
+    count: int = Field(1, ge=1)  # how many there are
     wall_area_cm2: Positive | None = None  # of one
     shrinks_ml: NotNegative = 0.0  # of one, at full vacuum
     lip_leak_sl_min: NotNegative = 0.0  # of one, sonic

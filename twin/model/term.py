@@ -28,10 +28,12 @@ Bytes = npt.NDArray[np.uint8]
 class Term(Settings):
     """What to add to the expected pressure (mbar) at each knot, straight lines between them."""
 
-    where: Literal["idle", "suction", "hold", "blow_off", "suction_again"]
+    where: Literal[
+        "idle", "suction", "hold", "blow_off", "suction_again"
+    ]  # the stretch that it is added in
     over: Literal["vacuum", "time"]  # mbar below ambient, or ms since the stretch began
-    at: tuple[float, ...] = Field(min_length=1)
-    mbar: tuple[float, ...] = Field(min_length=1)
+    at: tuple[float, ...] = Field(min_length=1)  # the knots, rising
+    mbar: tuple[float, ...] = Field(min_length=1)  # at each knot
 
     @model_validator(mode="after")
     def _rising(self) -> Self:

@@ -18,7 +18,7 @@ class Tls(Settings):
 
     trusted: Path | None = None  # PEM: the server's certificate, or the authority's
     certificate: Path | None = None  # PEM, our own, where the server wants one
-    key: Path | None = None
+    key: Path | None = None  # PEM, of our own certificate
 
     @model_validator(mode="after")
     def _belong_together(self) -> Self:
@@ -47,7 +47,7 @@ class Outlet(Settings):
     """What every destination has: how much waits for it, and for how long."""
 
     most_waiting: int = Field(default=10_000, ge=100)  # messages; then the oldest are given up
-    longest_days: float = Field(default=30.0, gt=0.0)
+    longest_days: float = Field(default=30.0, gt=0.0)  # that a message waits
 
 
 class ValueSettings(Settings):
@@ -59,12 +59,13 @@ class ValueSettings(Settings):
 class MqttSettings(Outlet):
     """An MQTT broker; none while ``host`` is empty."""
 
-    host: str = ""
+    host: str = ""  # name or address of the broker
     port: int = Field(default=0, ge=0, le=65535)  # 0: 8883 with tls, else 1883
     tls: Tls | None = None
-    user: str = ""
+    user: str = ""  # name at the broker
     password: Secret | None = None
     unprotected: bool = False  # a password without tls beyond this machine all the same
+    # Of all topics.
     prefix: str = Field(default="ejector-twin", pattern=r"^[^+#\x00/]+(/[^+#\x00/]+)*$")
     keepalive_s: int = Field(default=30, ge=5, le=3600)  # gone for 1.5 of it, the twin is offline
     cycles: bool = False  # the key figures of each cycle too
@@ -89,6 +90,7 @@ class HttpSettings(Settings):
     """An address of HTTP, and what protects what goes there."""
 
     url: str | Secret = ""
+    # That go with each message, each a secret.
     headers: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9-]+$")], Secret] = Field(default={})
     tls: Tls = Tls()
     unprotected: bool = False  # headers without https beyond this machine all the same
@@ -118,7 +120,7 @@ class HttpSettings(Settings):
 class WebhookSettings(HttpSettings, Outlet):
     """An address that takes JSON by POST; none while ``url`` is empty."""
 
-    timeout_s: float = Field(default=10.0, gt=0.0, le=60.0)
+    timeout_s: float = Field(default=10.0, gt=0.0, le=60.0)  # of one answer
 
 
 class UploadSettings(HttpSettings):

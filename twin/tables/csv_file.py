@@ -1,38 +1,66 @@
 """A CSV file as batches of text; every line of it is a row, a comment or empty.
 
 Lines end where they end: a quoted cell does not go on in the next line, so that one stray quotation
-mark cannot swallow rows.
+mark cannot swallow rows. The header is the first row that has the name of a wanted column; what a
+program writes before it is not read.
 """
 
+import codecs
 import csv
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
+from typing import NamedTuple, get_args
 
 import numpy as np
 import pyarrow as pa
 from pyarrow import csv as arrow_csv
 
 from twin.errors import SourceError
+from twin.tables import scope
 from twin.tables.decode import Batch
-from twin.tables.settings import Column
+from twin.tables.layout import wanted_names
+from twin.tables.settings import Column, Encoding, ImportSettings
 
-_PIECE = 1 << 19  # bytes, about 10 000 rows
-_LONGEST_LINE = 1 << 20  # bytes
+_PIECE = 1 << 19  # characters, about 10 000 rows
+_LOOK = 1 << 19  # bytes, by which the encoding is told
+_LONGEST_LINE = 1 << 20  # characters
 _UNIT = "\x1f"  # stands between cells that had quotation marks
 _UNKNOWN = "\ufffd"
-_NO_CSV = "export it from the PLC's tool as CSV in UTF-8, with commas or semicolons"
+_SEPARATORS = (";", "\t", ",", " ")  # each where the header has it and those before it do not fit
+_PREAMBLE = 200  # rows that may stand before the header
+_NO_CSV = "export it from the PLC's tool as CSV, with commas, semicolons or tabs"
+_MARKS: tuple[tuple[bytes, Encoding], ...] = (
+    (codecs.BOM_UTF8, "utf-8"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+)
 
 
 class CsvFile:
     """A CSV file of which the header is read; SourceError where it is none."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, settings: ImportSettings) -> None:
         self._path = path
-        self._head, header = next(self._header(), (1, ""))
-        if not header:
+        self.notes: list[str] = []
+        self._encoding = settings.encoding or self._told_encoding()
+        wanted = wanted_names(settings)
+        rows = self._rows()
+        header = _find_header(islice(rows, _PREAMBLE), wanted)
+        if header is None:
             raise SourceError(f"{path}: there is no header row", "name the columns in a first row")
-        self._separator = ";" if ";" in header else ","
-        self.names = [name.strip() for name in self._cells(header)]
+        self._head, self._separator = header.line, header.separator
+        self.names = _cells(header.text, self._separator)
+        if header.before:
+            self.notes.append(f"the header is line {self._head}; what stands before it is not read")
+        self._first = self._head + 1  # line of what may be values
+        self._is_row = _is_row
+        if scope.is_header(self.names):
+            self._is_row = _is_row_of_scope
+            below = ((line, _cells(row, self._separator)) for line, row in islice(rows, _PREAMBLE))
+            self._first, self.names = scope.columns(self.names, below, self.place)
+            self.notes.append("it is of TwinCAT Scope: all channels have the time of the first one")
 
     @property
     def place(self) -> str:
@@ -42,38 +70,51 @@ class CsvFile:
     def batches(self, theirs: Mapping[Column, str]) -> Iterator[Batch]:
         """Give the rows in order, with the columns of these names in the file."""
         index = {name: self.names.index(there) for name, there in theirs.items()}
-        for first, piece in _pieces(self._path):
-            skipped = max(0, self._head + 1 - first)  # the header and what is before it
+        for first, piece in self._pieces():
+            skipped = max(0, self._first - first)  # the header and what is before it
             lines = piece[skipped:]
-            rows = [line for line in lines if _is_row(line)]
+            rows = [line for line in lines if self._is_row(line)]
             if rows:
                 yield self._batch(first + skipped, lines, rows, index)
 
-    def _header(self) -> Iterator[tuple[int, str]]:
-        for first, lines in _pieces(self._path):
+    def _told_encoding(self) -> Encoding:
+        """By the first bytes of the file, and by whether the first piece of it is UTF-8."""
+        with _opened(self._path), self._path.open("rb") as file:
+            start = file.read(_LOOK)
+        for mark, encoding in _MARKS:
+            if start.startswith(mark):
+                if encoding != "utf-8":
+                    self.notes.append("read as UTF-16, as its first bytes say")
+                return encoding
+        try:
+            codecs.getincrementaldecoder("utf-8")().decode(start)
+        except UnicodeDecodeError:
+            others = ", ".join(get_args(Encoding))
+            self.notes.append(
+                "it is not UTF-8: read as cp1252 (Windows, western Europe); if names look wrong,"
+                f" say encoding under [import], one of {others}"
+            )
+            return "cp1252"
+        return "utf-8"
+
+    def _rows(self) -> Iterator[tuple[int, str]]:
+        for first, lines in self._pieces():
             for number, line in enumerate(lines, first):
                 if "\0" in line:
-                    raise SourceError(f"{self._path}:{number}: this is no text", _NO_CSV)
+                    hint = f'{_NO_CSV}; if it is UTF-16, say encoding = "utf-16-le" under [import]'
+                    raise SourceError(f"{self._path}:{number}: this is no text", hint)
                 if _is_row(line):
                     yield number, line
-
-    def _cells(self, line: str) -> list[str]:
-        if '"' not in line:
-            return line.split(self._separator)
-        try:
-            return next(csv.reader([line], delimiter=self._separator))
-        except csv.Error:  # a cell longer than any number
-            return line.split(self._separator)
 
     def _batch(
         self, first: int, lines: list[str], rows: list[str], index: Mapping[Column, int]
     ) -> Batch:
         def place(row: int) -> str:
-            numbers = [number for number, line in enumerate(lines, first) if _is_row(line)]
+            numbers = [number for number, line in enumerate(lines, first) if self._is_row(line)]
             return f"{self._path}:{numbers[row]}"
 
         def cell(row: int, name: Column) -> str:
-            return self._cells(rows[row])[index[name]].strip()
+            return _cells(rows[row], self._separator)[index[name]]
 
         broken: dict[int, str] = {}
         table = self._split(rows, [str(position) for position in index.values()], broken)
@@ -83,11 +124,11 @@ class CsvFile:
     def _unquoted(self, rows: list[str]) -> tuple[str, str]:
         """Rows as lines with decimal points and without quotation marks, and their separator."""
         text, separator = "\n".join(rows), self._separator
-        if '"' in text:
-            cells = (self._cells(row.replace(_UNIT, _UNKNOWN)) for row in rows)
+        if '"' in text or separator == " ":
+            cells = (_cells(row.replace(_UNIT, _UNKNOWN), separator) for row in rows)
             # What is but a quotation mark is a row too; Arrow leaves out empty lines.
             text, separator = "\n".join(_UNIT.join(row) or _UNKNOWN for row in cells), _UNIT
-        return text.replace(",", ".") if self._separator == ";" else text, separator
+        return text if self._separator == "," else text.replace(",", "."), separator
 
     def _split(self, rows: list[str], wanted: list[str], broken: dict[int, str]) -> pa.Table:
         """Columns of text; a row with another number of cells is null and goes to ``broken``."""
@@ -112,6 +153,52 @@ class CsvFile:
         )
         return _with_gaps(table, broken, len(rows)) if broken else table
 
+    def _pieces(self) -> Iterator[tuple[int, list[str]]]:
+        """The lines of a file, many at a time, with the number of the first one."""
+        first = 1
+        with _opened(self._path):
+            for piece in _whole_lines(self._path, self._encoding):
+                yield first, (cut := _cut(piece))
+                first += len(cut)
+
+
+def _is_row_of_scope(line: str) -> bool:
+    return _is_row(line) and line.strip() != scope.END
+
+
+class _Header(NamedTuple):
+    line: int
+    text: str
+    separator: str
+    before: int  # rows
+
+
+def _find_header(rows: Iterator[tuple[int, str]], wanted: set[str]) -> _Header | None:
+    """The first row that has a wanted name, else the one with the most words."""
+    wordiest: tuple[int, _Header | None] = -1, None
+    for before, (line, row) in enumerate(rows):
+        by_fit = {sign: len(wanted & set(_cells(row, sign))) for sign in _SEPARATORS if sign in row}
+        separator = max(by_fit, key=by_fit.__getitem__, default=",")
+        header = _Header(line, row, separator, before)
+        if by_fit and by_fit[separator]:
+            return header
+        words = sum(any(map(str.isalpha, cell)) for cell in _cells(row, separator))
+        if words > wordiest[0]:
+            wordiest = words, header
+    return wordiest[1]
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    if separator == " ":
+        return line.split()
+    if '"' not in line:
+        return [cell.strip() for cell in line.split(separator)]
+    try:
+        cells = next(csv.reader([line], delimiter=separator))
+    except csv.Error:  # a cell longer than any number
+        cells = line.split(separator)
+    return [cell.strip() for cell in cells]
+
 
 def _with_gaps(table: pa.Table, missing: Mapping[int, str], count: int) -> pa.Table:
     """A table of ``count`` rows, those that are missing null."""
@@ -125,14 +212,11 @@ def _is_row(line: str) -> bool:
     return start not in {"", "#"}
 
 
-def _pieces(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """The lines of a file, many at a time, with the number of the first one."""
-    first = 1
+@contextmanager
+def _opened(path: Path) -> Iterator[None]:
+    """SourceError where a file cannot be opened or read inside."""
     try:
-        for piece in _whole_lines(path):
-            lines = piece.decode("utf-8-sig" if first == 1 else "utf-8", "replace")
-            yield first, (cut := _cut(lines))
-            first += len(cut)
+        yield
     except OSError as error:
         message = f"{path}: cannot be read: {error.strerror}"
         raise SourceError(message, "check the path") from error
@@ -144,11 +228,12 @@ def _cut(text: str) -> list[str]:
     return lines if lines[-1] else lines[:-1]
 
 
-def _whole_lines(path: Path) -> Iterator[bytes]:
-    rest = b""
-    with path.open("rb") as file:
+def _whole_lines(path: Path, encoding: Encoding) -> Iterator[str]:
+    rest = ""
+    known = "utf-8-sig" if encoding == "utf-8" else encoding
+    with path.open(encoding=known, errors="replace", newline="") as file:
         while piece := file.read(_PIECE):
-            head, end, rest = (rest + piece).rpartition(b"\n")
+            head, end, rest = (rest + piece).rpartition("\n")
             if len(rest) > _LONGEST_LINE:
                 raise SourceError(f"{path}: there is a line of more than 1 MiB", _NO_CSV)
             if end:

@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from twin.errors import SourceError
 from twin.signals import BREAK, SAMPLE, Quality, Samples
+from twin.tables.date_time import Calendar
 from twin.tables.decode import Batch, Spoilt, decode
 from twin.tables.layout import COMMANDS, DIGITS, REPORTED, Layout
 from twin.tables.numbers import Mask
@@ -49,6 +50,7 @@ class Intake:
     layout: Layout
     settings: ImportSettings
     ambient: float
+    calendar: Calendar
     _last: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # row taken
     _period: int | None = None  # ns
 
@@ -58,7 +60,7 @@ class Intake:
 
     def take(self, batch: Batch) -> Samples:
         """Give as many samples as there are rows; SourceError for the first one refused."""
-        rows, bad = decode(batch, self.layout, self.ambient)
+        rows, bad = decode(batch, self.layout, self.ambient, self.calendar)
         run = np.concatenate((self._last, rows))
         rows = run[len(self._last) :]
         self._replace(run, bad, batch)
@@ -141,7 +143,7 @@ class Intake:
         """SourceError for the first row with something that the settings do not let pass."""
         found: list[_Trouble] = []
         if self.settings.values is Bad.REFUSE:
-            found += _bad_cells(batch, bad)
+            found += _bad_cells(batch, bad, self.calendar)
         if self.settings.jumps is Bad.REFUSE:
             found += self._jumps(batch, breaks)
         if self.settings.gaps is Bad.REFUSE:
@@ -172,13 +174,15 @@ class Intake:
         return [_Trouble(row, Column.SEQUENCE if counted else self.layout.time, what, "gaps")]
 
 
-def _bad_cells(batch: Batch, bad: Spoilt) -> list[_Trouble]:
+def _bad_cells(batch: Batch, bad: Spoilt, calendar: Calendar) -> list[_Trouble]:
     found = []
     for name, mask in bad.items():
         if mask.any():
             row = int(mask.argmax())
             cell = "" if row in batch.broken else batch.cell(row, name)
             should_be = _SHOULD_BE.get(name, "a finite number")
+            if name is Column.TIME:
+                should_be = calendar.should_be
             what = f"{cell!r} is not {should_be}" if cell else "the cell is empty"
             found.append(_Trouble(row, name, what, "values"))
     return found

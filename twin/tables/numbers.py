@@ -12,6 +12,7 @@ import pyarrow.compute as pc
 
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 _NO_VALUE = re.compile(r"[+-]?(nan|inf|infinity)", re.IGNORECASE)
+_WORDS = {"true": "1", "false": "0", "wahr": "1", "falsch": "0"}
 _MOST_DIGITS = 19  # of an int64
 
 Mask = npt.NDArray[np.bool_]
@@ -46,12 +47,22 @@ def is_readable(kind: pa.DataType) -> bool:
 
 def floats(column: pa.Array) -> Numbers[np.float64]:
     """Read a column as float64; NaN and infinity are numbers here."""
-    cells = _plain(column)
+    cells = plain(column)
     try:
         numbers = cells.cast(pa.float64())
     except pa.ArrowInvalid:
         numbers = _one_by_one(cells, _float, pa.float64())
-    return _numbers(cells, numbers, np.nan)
+    return as_numbers(cells, numbers, np.nan)
+
+
+def flags(column: pa.Array) -> Numbers[np.float64]:
+    """Read a column as 0 and 1; TRUE and FALSE are these, as are WAHR and FALSCH."""
+    cells = plain(column)
+    if pa.types.is_string(cells.type):
+        words = pc.utf8_lower(cells)
+        for word, number in _WORDS.items():
+            cells = pc.if_else(pc.equal(words, word), number, cells)
+    return floats(cells)
 
 
 def integers(column: pa.Array, digits: int = 0) -> Numbers[np.int64]:
@@ -59,15 +70,15 @@ def integers(column: pa.Array, digits: int = 0) -> Numbers[np.int64]:
 
     Nothing is rounded to whole numbers: without digits 1.5 is unreadable.
     """
-    cells = _plain(column)
+    cells = plain(column)
     try:
         numbers = _scaled(cells, digits)
     except pa.ArrowInvalid:
         numbers = _one_by_one(cells, lambda text: _integer(text, digits), pa.int64())
-    return _numbers(cells, numbers, 0)
+    return as_numbers(cells, numbers, 0)
 
 
-def _plain(column: pa.Array) -> pa.Array:
+def plain(column: pa.Array) -> pa.Array:
     """Integers, decimals, or text without blanks around; empty is null."""
     if pa.types.is_dictionary(column.type):
         column = column.dictionary_decode()
@@ -116,7 +127,8 @@ def _integer(text: str, digits: int) -> int | None:
     return whole if digits or whole == scaled else None
 
 
-def _numbers(cells: pa.Array, numbers: pa.Array, none: float) -> Numbers[Any]:
+def as_numbers(cells: pa.Array, numbers: pa.Array, none: float) -> Numbers[Any]:
+    """The numbers read from cells, null where one is none; empty cells are null."""
     empty = cells.is_null().to_numpy(zero_copy_only=False)
     nothing = numbers.is_null().to_numpy(zero_copy_only=False)
     return Numbers(numbers.fill_null(none).to_numpy(zero_copy_only=False), empty, nothing & ~empty)

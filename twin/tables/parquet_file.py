@@ -10,7 +10,7 @@ from pyarrow import parquet
 from twin.errors import SourceError
 from twin.tables.decode import Batch
 from twin.tables.numbers import is_readable
-from twin.tables.settings import Column
+from twin.tables.settings import Column, ImportSettings
 
 _ROWS = 10_000
 _BUFFER = 1 << 20  # bytes read ahead of each column, instead of a whole row group
@@ -19,8 +19,9 @@ _BUFFER = 1 << 20  # bytes read ahead of each column, instead of a whole row gro
 class ParquetFile:
     """A Parquet file of which the schema is read; SourceError where it is none."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, _settings: ImportSettings) -> None:
         self._path = path
+        self.notes: list[str] = []
         with self._opened() as file:
             self._schema = file.schema_arrow
             self.names: list[str] = self._schema.names
@@ -32,9 +33,10 @@ class ParquetFile:
 
     def batches(self, theirs: Mapping[Column, str]) -> Iterator[Batch]:
         """Give the rows in order, with the columns of these names in the file."""
-        for there in theirs.values():
+        for name, there in theirs.items():
             kind = self._schema.field(there).type
-            if not is_readable(kind):
+            is_instant = name is Column.TIME and pa.types.is_timestamp(kind)
+            if not (is_instant or is_readable(kind)):
                 message = f"{self._path}: column {there!r} holds {kind}, which is no number"
                 raise SourceError(message, "write it as integers or floating point numbers")
         first = 1

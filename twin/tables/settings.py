@@ -2,11 +2,13 @@
 
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import Literal
+from typing import Annotated, Any, Literal, Self
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
-from pydantic import Field
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from twin.settings import Settings
+from twin.signals import Reference, Unit
 
 
 class Column(StrEnum):
@@ -16,6 +18,8 @@ class Column(StrEnum):
     TIME_MS = "time_ms"
     TIME_US = "time_us"
     TIME_NS = "time_ns"
+    TIME = "time"
+    DATE = "date"
     SEQUENCE = "sequence"
     SUCTION = "suction"
     BLOW_OFF = "blow_off"
@@ -25,7 +29,10 @@ class Column(StrEnum):
     PRESSURE_BAR = "pressure_bar"
     VACUUM_PA = "vacuum_pa"
     PRESSURE_PA = "pressure_pa"
+    VACUUM = "vacuum"
+    PRESSURE = "pressure"
     SUPPLY_BAR = "supply_bar"
+    SUPPLY = "supply"
     REPORTED_NOZZLE = "reported_nozzle"
     REPORTED_AIR_SAVING = "reported_air_saving"
     REPORTED_PART_PRESENT = "reported_part_present"
@@ -44,15 +51,80 @@ class Bad(StrEnum):
     MARK = "mark"  # keep the row and set its quality
 
 
+class ColumnSource(Settings):
+    """Which column of the file it is, and what its numbers mean: number · scale + offset.
+
+    A transmitter is said by what it gives and what that means: ``signal = [4, 20]`` (mA) and
+    ``range = [0, -1000]`` (in ``unit``).
+    """
+
+    name: str  # of the column in the file
+    unit: Unit | None = None  # of pressure, vacuum and supply
+    reference: Reference | None = None  # of pressure (absolute if not said) and supply (gauge)
+    scale: float = 1.0  # -1 turns the sign
+    offset: float = 0.0  # in unit
+    signal: tuple[float, float] | None = None  # two numbers of the file: mA, V or counts
+    range: tuple[float, float] | None = None  # what these two are, in unit
+
+    @model_validator(mode="after")
+    def _is_one_line(self) -> Self:
+        if self.scale == 0.0:
+            raise ValueError("scale must not be 0")
+        if (self.signal is None) != (self.range is None):
+            raise ValueError("signal and range go together: signal = [4, 20], range = [0, -1000]")
+        if self.signal is not None and self.signal[0] == self.signal[1]:
+            raise ValueError("the two numbers of signal must differ")
+        if self.signal is not None and (self.scale, self.offset) != (1.0, 0.0):
+            raise ValueError("say either scale and offset, or signal and range")
+        return self
+
+    @property
+    def line(self) -> tuple[float, float]:
+        """Scale and offset."""
+        if self.signal is None or self.range is None:
+            return self.scale, self.offset
+        slope = (self.range[1] - self.range[0]) / (self.signal[1] - self.signal[0])
+        return slope, self.range[0] - slope * self.signal[0]
+
+    @property
+    def is_name_only(self) -> bool:
+        """Whether nothing but the name is said."""
+        return self == ColumnSource(name=self.name)
+
+
+def _named(value: Any) -> Any:
+    return {"name": value} if isinstance(value, str) else value
+
+
+def known_zone(name: str) -> str:
+    """The name of a time zone; ValueError if there is none of that name."""
+    try:
+        ZoneInfo(name)
+    except (ZoneInfoNotFoundError, ValueError, OSError) as error:
+        raise ValueError(f"{name!r} is no time zone: write Europe/Berlin or UTC") from error
+    return name
+
+
+Zone = Annotated[str, AfterValidator(known_zone)]
+Source = Annotated[ColumnSource, BeforeValidator(_named, json_schema_input_type=str | ColumnSource)]
+Encoding = Literal["utf-8", "cp1252", "utf-16", "utf-16-le", "utf-16-be"]
+
+
 class ImportSettings(Settings):
-    """The table ``[import]``: how a table of another program is taken in.
+    """How a table of another program is taken in.
 
     ``columns`` says under which name the file has a known column: ``vacuum_mbar = "Vakuum"``.
     """
 
-    columns: Mapping[Column, str] = Field(default_factory=dict)
+    # The file's name of a known column (docs/csv.md lists them), or a table as below.
+    columns: Mapping[Column, Source] = Field(default_factory=dict)
     values: Bad = Bad.REFUSE  # text in a number, NaN, an empty cell, too many or too few cells
     jumps: Bad = Bad.REFUSE  # time or sequence that does not go forward
     gaps: Bad = Bad.REFUSE  # samples that are missing
-    pressure_unit: Literal["mbar", "bar", "Pa"] | None = None  # says that the column's is right
+    pressure_unit: Unit | None = None  # says that the unit of the pressure's column is right
     period_ms: float | None = Field(None, gt=0.0, le=60_000.0)  # else the median of the file's
+    time_zone: Zone | None = None  # of times without one, as Europe/Berlin
+    date_order: Literal["day", "month"] | None = None  # which comes first in 03/04/2026
+    encoding: Encoding | None = None  # of a CSV file; else as its bytes tell, and said
+    sheet: str = ""  # of an Excel file; else its first one
+    no_blow_off: bool = False  # the ejector has none: suction ends by itself

@@ -1,22 +1,31 @@
-"""Whether a column in mbar can be one: pressures in bar are a thousandth of what they should be."""
+"""Whether a column of pressure can be what it is taken as; if not, a person is asked what it is.
 
+A pressure in bar that is read as mbar is a thousandth of what it should be, and a vacuum that is
+written as gauge pressure is negative. Nothing of this is guessed: the answer is a line to write.
+"""
+
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 
 from twin.errors import SourceError
-from twin.signals import MBAR, Command, Samples
+from twin.signals import MBAR, PASCAL, UNUSABLE, Command, Reference, Samples, Unit, counted_from
 from twin.tables.layout import Layout
+from twin.tables.meaning import Meaning
 from twin.tables.settings import Column, ImportSettings
 
 # Ambient is about 1 bar: read as mbar, no absolute pressure or vacuum in bar comes to 2 mbar.
 # No ejector evacuates to as little, and only a dead one leaves as little after a second of suction.
 LEAST = 2.0 * MBAR
+LEAST_ABSOLUTE = -20.0 * MBAR  # Pa; a sensor's zero may be off by less
+MOST_AMBIENT = 1100.0 * MBAR  # Pa; the highest air pressure measured at sea level is 1085 mbar
+LEAST_AMBIENT = 500.0 * MBAR  # Pa, at 5.5 km; the highest towns lie at 5.1 km
+LEAST_VACUUM = 50.0 * MBAR  # Pa, that a record with suction shows
+MOST_RELEASED = 1.5  # of ambient, that a blow-off comes to
 LONG_NS = 1_000_000_000
-_IN_BAR = {
-    Column.VACUUM_MBAR: Column.VACUUM_BAR,
-    Column.PRESSURE_MBAR: Column.PRESSURE_BAR,
-}
+MOST_ANSWERS = 4  # lines of a hint: more are not read
 
 
 @dataclass
@@ -26,34 +35,109 @@ class UnitCheck:
     layout: Layout
     settings: ImportSettings
     ambient: float
-    _highest: float = -np.inf  # Pa, as the column counts it
+    _lowest: float = np.inf  # Pa, absolute, as it is taken
+    _highest: float = -np.inf
+    _most_vacuum: float = -np.inf  # Pa, while suction is commanded
+    _above: int = 0  # rows above any ambient pressure
+    _rows: int = 0
     _suction_ns: int = 0  # commanded so far
+    _run_ns: int = 0
 
     def see(self, block: Samples) -> None:
         """Take in a block of rows."""
         suction = (block["commands"] & Command.SUCTION.value) != 0
         steps = np.diff(block["time_ns"]).clip(0, LONG_NS)
         self._suction_ns += int(steps[suction[1:]].sum())
-        counted = block["pressure"].astype(np.float64)
-        if self.layout.pressure is Column.VACUUM_MBAR:
-            counted = self.ambient - counted[suction]
-        counted = counted[np.isfinite(counted)]
-        self._highest = max(self._highest, counted.max(initial=-np.inf))
+        self._run_ns += int(steps.sum())
+        usable = np.isfinite(block["pressure"]) & ((block["quality"] & UNUSABLE) == 0)
+        pressure = block["pressure"][usable].astype(np.float64)
+        self._rows += len(pressure)
+        self._above += int((pressure > MOST_AMBIENT).sum())
+        self._lowest = min(self._lowest, pressure.min(initial=np.inf))
+        self._highest = max(self._highest, pressure.max(initial=-np.inf))
+        vacuum = self.ambient - pressure[suction[usable]]
+        self._most_vacuum = max(self._most_vacuum, vacuum.max(initial=-np.inf))
 
     def refuse(self, place: str) -> None:
-        """SourceError after the last block if the column is hardly in mbar, and not said to be."""
-        if self.settings.pressure_unit is not None:
+        """SourceError after the last block if the column is hardly what it is taken as.
+
+        It asks what the column is. Nothing is asked where ``pressure_unit`` says it.
+        """
+        if self.settings.pressure_unit is not None or self._run_ns < LONG_NS or not self._rows:
             return
-        column = self.layout.pressure
-        better = _IN_BAR.get(column)
-        if better is None or self._suction_ns < LONG_NS or not self._highest < LEAST:
-            return
-        theirs = self.layout.theirs[column]
-        when = " while suction is commanded" if column is Column.VACUUM_MBAR else ""
-        raise SourceError(
-            f"{place}: column {theirs!r} is never above {self._highest / MBAR:.3g} mbar{when}: it"
-            " is probably in bar",
-            f'say so under [import.columns]: {better} = "{theirs}"; if it is negative under'
-            " suction, turn its sign in the file. If it is in mbar, say so under [import]:"
-            ' pressure_unit = "mbar"',
-        )
+        what = self._what_cannot_be()
+        if what:
+            name = self.layout.theirs[self.layout.pressure]
+            raise SourceError(
+                f"{place}: column {name!r} is taken as {self._meaning}: {what}. In which unit is"
+                " it, and what does it count from?",
+                "\n  ".join(self._answers(name)),
+            )
+
+    @property
+    def _meaning(self) -> Meaning:
+        return self.layout.meanings[self.layout.pressure]
+
+    def _what_cannot_be(self) -> str:
+        lowest, highest = self._lowest / MBAR, self._highest / MBAR
+        if self._meaning.reference == "absolute":
+            if self._suction_ns >= LONG_NS and self._highest < LEAST:
+                return f"it is never above {highest:.3g} mbar"
+        elif self._suction_ns >= LONG_NS and self._most_vacuum < LEAST:
+            if self._highest - self.ambient > LEAST_VACUUM:
+                return f"it goes {(self._highest - self.ambient) / MBAR:.0f} mbar above ambient"
+            most = max(self._most_vacuum, 0.0) / MBAR
+            return f"it is never more than {most:.3g} mbar of vacuum while suction is commanded"
+        if self._lowest < LEAST_ABSOLUTE:
+            return f"it comes down to {lowest:.0f} mbar absolute, which nothing can"
+        if 2 * self._above > self._rows:
+            return f"it is mostly above {MOST_AMBIENT / MBAR:.0f} mbar absolute, as no air is"
+        return ""
+
+    def _answers(self, name: str) -> Iterator[str]:
+        """Lines to write, first those that make the column one of an ejector."""
+        yield "write under [import.columns] the one line that is right:"
+        ends = [self._meaning.number(end, self.ambient) for end in (self._lowest, self._highest)]
+        lines = _lines(name, min(ends), max(ends), self.ambient, self._meaning)
+        yield from lines[:MOST_ANSWERS] or _any_line(name)
+        unit = self._meaning.unit
+        yield f'or, if {unit} is right, say so under [import]: pressure_unit = "{unit}"'
+
+
+def _lines(name: str, low: float, high: float, ambient: float, taken: Meaning) -> list[str]:
+    """What numbers from ``low`` to ``high`` can be, in the same unit and the deepest vacuum first.
+
+    That is a vacuum and its release, in another unit or from another reference than it is taken as.
+    """
+    references: tuple[Reference, ...] = ("absolute", "vacuum", "gauge")
+    found: list[tuple[bool, float, str]] = []
+    for unit in get_args(Unit):
+        for reference in references:
+            if unit == "hPa" or (unit, reference) == (taken.unit, taken.reference):
+                continue  # hPa is mbar
+            numbers = np.array([low, high]) * PASCAL[unit]
+            least, most = sorted(counted_from(numbers, reference, "absolute", ambient).tolist())
+            is_vacuum = LEAST_ABSOLUTE < least < ambient - LEAST_VACUUM
+            if is_vacuum and LEAST_AMBIENT < most <= MOST_RELEASED * ambient:
+                means = f"   # {least / MBAR:.0f} to {most / MBAR:.0f} mbar absolute"
+                found.append((unit != taken.unit, least, _line(name, unit, reference) + means))
+    return [line for *_, line in sorted(found)]
+
+
+def _any_line(name: str) -> list[str]:
+    units = ", ".join(get_args(Unit))
+    return [f'pressure = {{ name = "{name}", unit = "...", reference = "..." }}, of {units}']
+
+
+def _line(name: str, unit: Unit, reference: Reference) -> str:
+    known = {
+        ("bar", "vacuum"): Column.VACUUM_BAR,
+        ("mbar", "vacuum"): Column.VACUUM_MBAR,
+        ("Pa", "vacuum"): Column.VACUUM_PA,
+        ("bar", "absolute"): Column.PRESSURE_BAR,
+        ("mbar", "absolute"): Column.PRESSURE_MBAR,
+        ("Pa", "absolute"): Column.PRESSURE_PA,
+    }.get((unit, reference))
+    if known is not None:
+        return f'{known} = "{name}"'
+    return f'pressure = {{ name = "{name}", unit = "{unit}", reference = "{reference}" }}'

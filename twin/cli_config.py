@@ -1,0 +1,200 @@
+"""``twin config``: all mistakes of a configuration at once, and its schema for editors."""
+
+import json
+import re
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from twin.cli_app import App
+from twin.errors import ConfigError, SourceError
+from twin.keys import UNWRITTEN
+
+if TYPE_CHECKING:
+    from twin.settings import Document, Settings
+
+config_app = App("Check a configuration, and help editors to write one.")
+_SCHEMA = "https://json-schema.org/draft/2020-12/schema"
+_PLACE = re.compile(r":(\d+): ")
+
+
+@config_app.command()
+def check(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="TOML configuration.")],
+) -> None:
+    """Name all mistakes of a configuration at once: line, key, and what to write."""
+    from twin.settings import Document
+
+    document = Document.read(file)
+    found = mistakes(document)
+    for mistake in found:
+        print(mistake)
+    if found:
+        many = "1 mistake" if len(found) == 1 else f"{len(found)} mistakes"
+        print(f"twin: {file}: {many}", file=sys.stderr)
+        raise typer.Exit(2)
+    print(f"{file}: no mistake in {', '.join(f'[{name}]' for name in document.tables)}")
+
+
+@config_app.command()
+def schema() -> None:
+    """Print the JSON Schema of configurations, for editors that complete and check TOML."""
+    print(json.dumps(json_schema(), indent=1, ensure_ascii=False))
+
+
+def sections() -> "dict[str, dict[str, type[Settings]]]":
+    """The tables of a configuration by name, each with its settings by kind of driver or ""."""
+    from drivers import hil_modbus, hil_opcua
+    from drivers.link import ModbusSettings
+    from drivers.opcua_settings import OpcuaSettings
+    from drivers.plc.settings import PlcSettings
+    from drivers.results_settings import ResultsSettings
+    from twin.alarms.settings import AlarmSettings
+    from twin.assets.place import AssetsSettings
+    from twin.config import Asset, LogSettings
+    from twin.figures.settings import FigureSettings
+    from twin.model.dataset import DataSet
+    from twin.monitor.detect import MonitorSettings
+    from twin.outlets.settings import MqttSettings, OutletsSettings, WebhookSettings
+    from twin.page.settings import PageSettings
+    from twin.tables.settings import ImportSettings
+
+    return {
+        "asset": {"": Asset},
+        "data": {"": DataSet},
+        "driver": {"modbus": ModbusSettings, "opcua": OpcuaSettings},
+        "import": {"": ImportSettings},
+        "monitor": {"": MonitorSettings},
+        "log": {"": LogSettings},
+        "figures": {"": FigureSettings},
+        "alarms": {"": AlarmSettings},
+        "page": {"": PageSettings},
+        "mqtt": {"": MqttSettings},
+        "webhook": {"": WebhookSettings},
+        "outlets": {"": OutletsSettings},
+        "results": {"": ResultsSettings},
+        "assets": {"": AssetsSettings},
+        "hil": {"modbus": hil_modbus.HilSettings, "opcua": hil_opcua.HilSettings},
+        "plc": {"": PlcSettings},
+    }
+
+
+def mistakes(document: "Document") -> list[str]:
+    """All that is wrong in a configuration, a line for each, with what to do about it."""
+    return sorted(dict.fromkeys(_mistakes(document)), key=_line)
+
+
+def _mistakes(document: "Document") -> Iterator[str]:
+    """The same as they are found, some more than once."""
+    for problem in _checks(document):
+        try:
+            problem()
+        except (ConfigError, SourceError) as error:  # a file or database that it names
+            lines = str(error).splitlines()
+            yield from lines[:-1]
+            yield lines[-1] + _advice(error)
+
+
+def _advice(error: ConfigError | SourceError) -> str:
+    """What to do, where the mistake itself does not say it."""
+    from twin.settings import ALL_MISTAKES
+
+    return "" if error.hint in ("", ALL_MISTAKES) else f"; {error.hint}".replace("\n", ";")
+
+
+def _checks(document: "Document") -> Iterator[Callable[[], Any]]:
+    """What may raise ConfigError: each table by itself, then what only several tables show."""
+    from drivers.sources import settings_of
+    from twin.alarms.settings import chosen_rules
+    from twin.config import TABLES, Config
+    from twin.outlets.settings import chosen, chosen_upload
+
+    for name in document.tables:
+        yield partial(document.refuse_unknown_tables, TABLES | set(document.tables) - {name})
+    driver = document.tables.get("driver")
+    kind = driver.get("kind", "modbus") if isinstance(driver, dict) else "modbus"
+    for name, kinds in sections().items():
+        settings = kinds.get("") or kinds.get(kind)
+        if name in document.tables and name != "data" and settings is not None:
+            yield partial(document.section, settings, name)
+    if driver is not None:
+        yield partial(settings_of, document)
+    yield partial(Config.of, document, to_store=True)
+    if "data" in document.tables:  # where what is wrong with [asset] hides it
+        nobody = {name: document.tables[name] for name in TABLES & set(document.tables) - {"asset"}}
+        yield partial(Config.of, replace(document, tables=nobody), to_store=True)
+    yield partial(chosen_rules, document)
+    yield partial(chosen, document)
+    yield partial(chosen_upload, document)
+
+
+def _line(mistake: str) -> int:
+    found = _PLACE.search(mistake)
+    return int(found[1]) if found else 0
+
+
+# --- schema -------------------------------------------------------------------------------------
+
+
+def json_schema() -> dict[str, Any]:
+    """The JSON Schema (2020-12) of a configuration, made from the settings' classes.
+
+    What depends on several keys at once is not in it; ``twin config check`` knows that as well.
+    """
+    from pydantic.json_schema import models_json_schema
+
+    from twin.keys import comments_of, defaults_of, tables_below
+
+    kinds = sections()
+    every = {
+        one: None for by in kinds.values() for kind in by.values() for _, one in tables_below(kind)
+    }
+    names, schema = models_json_schema(
+        [(kind, "validation") for kind in every], ref_template="#/$defs/{model}"
+    )
+    definitions = schema["$defs"]
+    for kind in every:
+        name = names[(kind, "validation")]["$ref"].rpartition("/")[2]
+        _describe(definitions[name], comments_of(kind), defaults_of(kind))
+    tables = {}
+    for name, by_kind in kinds.items():
+        refs = [names[(kind, "validation")] for kind in by_kind.values()]
+        tables[name] = refs[0] if len(refs) == 1 else {"anyOf": refs}
+    used = _named_by(tables, definitions)
+    return {
+        "$schema": _SCHEMA,
+        "title": "Configuration of ejector-twin",
+        "type": "object",
+        "properties": tables,
+        "additionalProperties": False,
+        "$defs": {name: table for name, table in definitions.items() if name in used},
+    }
+
+
+def _named_by(schema: Any, definitions: dict[str, Any]) -> set[str]:
+    """The definitions that a schema names, and those that these name."""
+    found: set[str] = set()
+    here = [schema]
+    while here:
+        named = set(re.findall(r'#/\$defs/(\w+)"', json.dumps(here))) - found
+        found |= named
+        here = [definitions[name] for name in named]
+    return found
+
+
+def _describe(table: dict[str, Any], comments: dict[str, str], defaults: dict[str, Any]) -> None:
+    """Put into a table's schema what is said of its keys, and defaults as a file has them."""
+    for key in UNWRITTEN & set(table["properties"]):
+        del table["properties"][key]
+    for key, schema in table["properties"].items():
+        schema.pop("title", None)
+        schema.pop("default", None)
+        if comments[key]:
+            schema["description"] = comments[key]
+        if defaults.get(key) is not None:
+            schema["default"] = defaults[key]

@@ -1,0 +1,122 @@
+"""A sheet of an Excel file as batches of text."""
+
+import warnings
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from datetime import date, datetime, time
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from openpyxl import load_workbook
+
+from twin.errors import SourceError, known_names
+from twin.files import unzipped_within_budget
+from twin.tables.decode import Batch
+from twin.tables.layout import wanted_names
+from twin.tables.settings import Column, ImportSettings
+
+_ROWS = 10_000
+_PREAMBLE = 200  # rows that may stand before the header
+
+Cells = tuple[Any, ...]
+
+
+class ExcelFile:
+    """One sheet of an Excel file, of which the header is read; SourceError where it is none."""
+
+    def __init__(self, path: Path, settings: ImportSettings) -> None:
+        self._path, self._settings = path, settings
+        self.notes: list[str] = []
+        wanted = wanted_names(settings)
+        with self._rows(self.notes) as rows:
+            first = [(number, cells) for number, cells in islice(rows, _PREAMBLE) if any(cells)]
+        if not first:
+            raise SourceError(f"{path}: there is no header row", "name the columns in a first row")
+        fits = (row for row in first if wanted & {_text(cell) for cell in row[1]})
+        self._head, header = next(fits, max(first, key=lambda row: len(row[1])))
+        self.names = [_text(cell) for cell in header]
+
+    @property
+    def place(self) -> str:
+        """Where the header stands."""
+        return f"{self._path}: row {self._head}"
+
+    def batches(self, theirs: Mapping[Column, str]) -> Iterator[Batch]:
+        """Give the rows in order, with the columns of these names in the sheet."""
+        index = {name: self.names.index(there) for name, there in theirs.items()}
+        with self._rows([]) as rows:
+            filled = ((n, cells) for n, cells in rows if n > self._head and _has_value(cells))
+            while some := list(islice(filled, _ROWS)):
+                yield self._batch(some, index)
+
+    def _batch(self, rows: list[tuple[int, Cells]], index: Mapping[Column, int]) -> Batch:
+        def place(row: int) -> str:
+            return f"{self._path}: row {rows[row][0]}"
+
+        def cell(row: int, name: Column) -> str:
+            return columns[name][row].as_py() or ""
+
+        columns = {  # a row may end before its last columns
+            name: pa.array([_text(cells[at]) if at < len(cells) else "" for _, cells in rows])
+            for name, at in index.items()
+        }
+        return Batch(columns, len(rows), {}, place, cell)
+
+    @contextmanager
+    def _rows(self, notes: list[str]) -> Iterator[Iterator[tuple[int, Cells]]]:
+        """Rows with their numbers; ``notes`` gets what is to be said of the choice of a sheet."""
+        with self._said(), self._path.open("rb") as file:
+            with zipfile.ZipFile(file) as archive:
+                try:
+                    unzipped_within_budget(archive)
+                except ValueError as error:
+                    message = f"{self._path}: {error}"
+                    raise SourceError(message, "save the sheet as CSV: it has no bound") from error
+            with warnings.catch_warnings(action="ignore"):  # of styles, which nobody wants
+                book = load_workbook(file, read_only=True, data_only=True)
+            try:
+                names = book.sheetnames
+                wanted = self._settings.sheet or names[0]
+                if wanted not in names:
+                    what = f"{self._path}: no sheet is called {wanted!r}"
+                    raise SourceError(what, known_names(wanted, names))
+                if len(names) > 1 and not self._settings.sheet:
+                    notes.append(
+                        f"sheet {wanted!r} is read; another is chosen by sheet of [import]"
+                    )
+                yield enumerate(book[wanted].iter_rows(values_only=True), 1)
+            finally:
+                book.close()
+
+    @contextmanager
+    def _said(self) -> Iterator[None]:
+        """SourceError where the file cannot be opened or is no Excel file."""
+        try:
+            yield
+        except SourceError:
+            raise
+        except OSError as error:
+            message = f"{self._path}: cannot be read: {error.strerror or error}"
+            raise SourceError(message, "check the path") from error
+        except Exception as error:  # the library lets through what zip, zlib and XML raise
+            what = str(error).partition("\n")[0] or type(error).__name__
+            message = f"{self._path}: cannot be read as an Excel file (.xlsx): {what}"
+            raise SourceError(message, "save it anew as .xlsx, or as CSV") from error
+
+
+def _has_value(cells: Cells) -> bool:
+    return any(cell is not None and cell != "" for cell in cells)
+
+
+def _text(cell: Any) -> str:
+    """A cell as CSV would have it; dates as ISO 8601."""
+    if cell is None:
+        return ""
+    if isinstance(cell, datetime):
+        return cell.isoformat(" ")
+    if isinstance(cell, date | time):
+        return cell.isoformat()
+    return repr(cell) if isinstance(cell, float) else str(cell).strip()

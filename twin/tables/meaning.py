@@ -1,0 +1,150 @@
+"""What the numbers of a pressure's column mean: unit, reference, scale and offset."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from twin.errors import ConfigError, SourceError
+from twin.signals import PASCAL, Reference, Unit, counted_from
+from twin.tables.settings import Column, ColumnSource, ImportSettings
+
+Floats = npt.NDArray[np.float64]
+
+# Unit and reference of columns whose name says them; None is not said.
+PRESSURES: Mapping[Column, tuple[Unit | None, Reference]] = {
+    Column.PRESSURE_MBAR: ("mbar", "absolute"),
+    Column.PRESSURE_PA: ("Pa", "absolute"),
+    Column.PRESSURE_BAR: ("bar", "absolute"),
+    Column.PRESSURE: (None, "absolute"),
+    Column.VACUUM_MBAR: ("mbar", "vacuum"),
+    Column.VACUUM_PA: ("Pa", "vacuum"),
+    Column.VACUUM_BAR: ("bar", "vacuum"),
+    Column.VACUUM: (None, "vacuum"),
+}
+SUPPLIES: Mapping[Column, tuple[Unit | None, Reference]] = {
+    Column.SUPPLY_BAR: ("bar", "gauge"),
+    Column.SUPPLY: (None, "gauge"),
+}
+_UNITS = {unit.lower(): unit for unit in get_args(Unit)}
+_ELECTRICAL = {"v": ("V", "[0, 10]"), "ma": ("mA", "[4, 20]")}
+_BRACKET = re.compile(r"[\[(]\s*([^\])]+?)\s*(?:abs\.?|rel\.?)?\s*[\])]\s*$")
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """Pressure in ``unit``, counted from ``reference``, is number · scale + offset."""
+
+    unit: Unit
+    reference: Reference
+    scale: float = 1.0
+    offset: float = 0.0
+    from_header: bool = False  # whether the unit stands in the file's header alone
+
+    def pascal(self, numbers: Floats, ambient: float, onto: Reference) -> Floats:
+        """Pressures in Pa counted from ``onto``; ``ambient`` in Pa."""
+        values = numbers
+        if (self.scale, self.offset) != (1.0, 0.0):  # −0 + 0 is another zero
+            values = numbers * self.scale + self.offset
+        pascal = values * PASCAL[self.unit]
+        if self.reference == onto:
+            return pascal
+        return counted_from(pascal, self.reference, onto, ambient)
+
+    def number(self, pascal: float, ambient: float) -> float:
+        """The number that stands for an absolute pressure (Pa)."""
+        value = counted_from(np.array([pascal]), "absolute", self.reference, ambient)[0]
+        return float((value / PASCAL[self.unit] - self.offset) / self.scale)
+
+    def __str__(self) -> str:
+        counted = {
+            "absolute": "absolute",
+            "gauge": "gauge, negative below ambient",
+            "vacuum": "below ambient, positive",
+        }
+        text = f"{self.unit} {counted[self.reference]}"
+        if (self.scale, self.offset) != (1.0, 0.0):
+            text += f", number · {self.scale:g} + {self.offset:g}"
+        return text + (" (unit of the header)" if self.from_header else "")
+
+
+def find_meaning(
+    column: Column, source: ColumnSource, settings: ImportSettings, place: str
+) -> Meaning:
+    """The meaning of a column of pressure or supply, by all that says something of it.
+
+    SourceError where nothing says the unit, or two things say different ones.
+    """
+    named, reference = {**PRESSURES, **SUPPLIES}[column]
+    if source.reference is not None:
+        if reference == "vacuum" and source.reference != "vacuum":
+            kind = f'pressure = {{ name = "{source.name}", reference = "{source.reference}", ... }}'
+            raise ConfigError(
+                f"{place}: {column} counts from ambient, positive below", f"use {kind}"
+            )
+        reference = source.reference
+    header = _unit_of(source.name)
+    said = source.unit or (settings.pressure_unit if column in PRESSURES else None)
+    if named and said and said != named:
+        raise _other_unit(column, source, said, place)
+    unit = named or said
+    if header in _ELECTRICAL and source.signal is None and source.is_name_only:
+        raise _electrical(source, place)
+    if unit is None and header in _UNITS:
+        return Meaning(_UNITS[header], reference, *source.line, from_header=True)
+    if unit is None:
+        raise SourceError(
+            f"{place}: in which unit is column {source.name!r}?",
+            f"say it under [import.columns]: {_generic(column)} ="
+            f' {{ name = "{source.name}", unit = "mbar" }}; units are {", ".join(get_args(Unit))}',
+        )
+    if (
+        source.is_name_only
+        and not said
+        and header in _UNITS
+        and PASCAL[unit] != PASCAL[_UNITS[header]]
+    ):
+        raise SourceError(
+            f"{place}: column {source.name!r} is taken as {column}, and its name says"
+            f" {_UNITS[header]}: in which unit is it?",
+            f"if its name is right, say under [import.columns]: {_generic(column)} ="
+            f' {{ name = "{source.name}", unit = "{_UNITS[header]}" }}; if not: {column} ='
+            f' {{ name = "{source.name}", unit = "{unit}" }}',
+        )
+    return Meaning(unit, reference, *source.line)
+
+
+def _unit_of(name: str) -> str:
+    """The unit in brackets at the end of a column's name, in small letters; empty without one."""
+    found = _BRACKET.search(name)
+    return found[1].lower() if found else ""
+
+
+def _generic(column: Column) -> str:
+    return column.partition("_")[0]
+
+
+def _other_unit(column: Column, source: ColumnSource, said: Unit, place: str) -> ConfigError:
+    known = f"{_generic(column)}_{said.lower()}"
+    better = f'{known} = "{source.name}"'
+    if known not in tuple(Column):
+        better = f'{_generic(column)} = {{ name = "{source.name}", unit = "{said}" }}'
+    key = "unit" if source.unit else "pressure_unit"
+    return ConfigError(
+        f'{place}: {key} = "{said}" under [import], but column {source.name!r} is'
+        f" taken as {column}",
+        f"say under [import.columns]: {better}, or leave {key} out",
+    )
+
+
+def _electrical(source: ColumnSource, place: str) -> SourceError:
+    unit, usual = _ELECTRICAL[_unit_of(source.name)]
+    return SourceError(
+        f"{place}: column {source.name!r} is in {unit}: which pressures do its ends mean?",
+        "say it under [import.columns] instead, for example: pressure ="
+        f' {{ name = "{source.name}", signal = {usual}, range = [0, -1000], unit = "mbar",'
+        ' reference = "gauge" }',
+    )

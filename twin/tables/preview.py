@@ -1,0 +1,133 @@
+"""What a table is understood as, for a person: its columns, its first rows, and a small plot."""
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from twin.signals import MBAR, MS, NS, Command, Samples
+from twin.tables.layout import TIMES
+from twin.tables.reader import Table
+from twin.tables.settings import Column
+
+FIRST = 8  # rows that are shown
+WIDTH, HEIGHT = 72, 10  # of the plot, in characters
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass
+class Preview:
+    """A table's rows as they are seen, block after block; memory does not grow with them."""
+
+    table: Table
+    _first: Samples | None = None
+    _last_ns: int = 0
+    _rows: int = 0
+    _steps: list[int] = field(default_factory=list)  # ns, of the first block
+    _every: int = 1  # rows in a bin
+    _bins: Floats = field(default_factory=lambda: np.empty((0, 3)))  # low, high (Pa), suction
+    _rest: Floats = field(default_factory=lambda: np.empty((0, 3)))  # rows of no whole bin
+
+    def see(self, block: Samples) -> None:
+        """Take in a block of rows."""
+        if self._first is None:
+            self._first = block[:FIRST].copy()
+            self._steps = np.diff(block["time_ns"]).tolist()
+        self._last_ns = int(block["time_ns"][-1])
+        self._rows += len(block)
+        pressure = block["pressure"].astype(np.float64)
+        suction = (block["commands"] & Command.SUCTION.value) != 0
+        rows = np.concatenate((self._rest, np.stack((pressure, pressure, suction), axis=1)))
+        whole = len(rows) // self._every * self._every
+        self._bins = np.concatenate((self._bins, _binned(rows[:whole], self._every)))
+        self._rest = rows[whole:]
+        while len(self._bins) > 4 * WIDTH:
+            odd = len(self._bins) % 2
+            kept = self._bins[: len(self._bins) - odd]
+            self._bins = np.concatenate((_binned(kept, 2), self._bins[len(kept) :]))
+            self._every *= 2
+
+    def __str__(self) -> str:
+        lines = [*self._columns()]
+        if self._first is not None:
+            lines += ["", *self._table(), "", *self._plot()]
+        return "\n".join(lines)
+
+    def _columns(self) -> Iterator[str]:
+        layout, zone = self.table.layout, self.table.settings.time_zone
+        width = max(len(repr(there)) for there in layout.theirs.values())
+        for name, there in layout.theirs.items():
+            meaning = layout.meanings.get(name)
+            what = str(name)
+            if meaning is not None:
+                what = f"{name.partition('_')[0]} in {meaning}"
+            elif name is Column.TIME:
+                what = f"date and time, {f'where it says none in {zone}' if zone else 'as it says'}"
+            elif name in TIMES:
+                what = f"time in {name.rpartition('_')[2]}"
+            yield f"{there!r:{width}}  {what}"
+        for there in layout.ignored:
+            yield f"{there!r:{width}}  not taken"
+
+    def _table(self) -> Iterator[str]:
+        if self._first is None:
+            return
+        begin = int(self._first["time_ns"][0])
+        has_supply = bool(np.isfinite(self._first["supply"]).any())
+        names = ("ms since begin", "suction", "blow-off", "mbar abs.", "vacuum mbar", "supply bar")
+        widths = (14, 8, 8, 10, 12, 11)[: 6 if has_supply else 5]
+        yield " ".join(f"{name:>{width}}" for name, width in zip(names, widths, strict=False))
+        for row in self._first:
+            since = (int(row["time_ns"]) - begin) * NS / MS
+            bits = [int(bool(row["commands"] & bit.value)) for bit in Command]
+            absolute = float(row["pressure"])
+            text = f"{since:14.3f} {bits[0]:8d} {bits[1]:8d} {absolute / MBAR:10.1f}"
+            text += f" {(self.table.ambient - absolute) / MBAR:12.1f}"
+            yield text + (f" {float(row['supply']) / 1e5:11.2f}" if has_supply else "")
+
+    def _plot(self) -> Iterator[str]:
+        bins = np.concatenate((self._bins, self._rest))
+        known = np.isfinite(bins[:, 0])
+        lasted = (
+            (self._last_ns - int(self._first["time_ns"][0])) * NS
+            if self._first is not None
+            else 0.0
+        )
+        period = f", every {np.median(self._steps) * NS / MS:g} ms" if self._steps else ""
+        yield f"{self._rows} rows, {lasted:.3f} s{period}"
+        if not known.any():
+            yield "no pressure in them"
+            return
+        low, high = np.nanmin(bins[:, 0]), np.nanmax(bins[:, 1])
+        yield f"pressure from {low / MBAR:.1f} to {high / MBAR:.1f} mbar absolute"
+        edges = np.linspace(0, len(bins), min(WIDTH, len(bins)) + 1).astype(int)
+        parts = [bins[first:last] for first, last in itertools.pairwise(edges)]
+        yield from _curve(parts, float(low), float(high))
+        yield f"{'suction':>8} " + "".join("█" if part[:, 2].any() else "·" for part in parts)
+
+
+def _binned(rows: Floats, every: int) -> Floats:
+    """Low, high and suction of each ``every`` rows."""
+    parts = rows.reshape(-1, every, 3)
+    low = np.fmin.reduce(parts[:, :, 0], axis=1)
+    return np.stack(
+        (low, np.fmax.reduce(parts[:, :, 1], axis=1), parts[:, :, 2].max(axis=1)), axis=1
+    )
+
+
+def _curve(parts: list[Floats], low: float, high: float) -> Iterator[str]:
+    """Lines from the highest pressure (Pa) to the lowest, one character for each part."""
+    step = max(high - low, 1.0) / HEIGHT
+    for line in range(HEIGHT):
+        bottom = high - (line + 1) * step
+        marks = []
+        for part in parts:
+            least, most = np.fmin.reduce(part[:, 0]), np.fmax.reduce(part[:, 1])
+            top = bottom + step if line else np.inf
+            inside = most >= bottom and least < top
+            marks.append("█" if inside else " ")
+        level = high - (line + 0.5) * step
+        yield f"{level / MBAR:8.0f} " + "".join(marks).rstrip()
