@@ -140,10 +140,15 @@ def wholes(value: ua.DataValue, node: Node) -> Integers:
 def _array(value: ua.DataValue, node: Node, kinds: set[ua.VariantType], wanted: str) -> list[Any]:
     variant = value.Value
     fits = readable(value) and variant.is_array and variant.VariantType in kinds
-    if not fits or (variant.Dimensions and len(variant.Dimensions) > 1):
+    if not fits or (variant.Dimensions and not _is_flat(variant)):
         raise wrong_type(node, variant, wanted)
     listed: list[Any] = variant.Value
     return listed
+
+
+def _is_flat(variant: ua.Variant) -> bool:
+    """Whether an array is of one dimension; the library fills up what is missing with lists."""
+    return len(variant.Dimensions) == 1 and not any(isinstance(one, list) for one in variant.Value)
 
 
 def typed(number: float, kind: ua.VariantType, node: Node) -> ua.Variant:

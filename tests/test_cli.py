@@ -462,7 +462,9 @@ def test_without_a_word_old_logs_go_when_the_disk_is_four_fifths_full(
     usage = SimpleNamespace(total=100_000, used=used, free=100_000 - used)
     monkeypatch.setattr("twin.log.retention.shutil.disk_usage", lambda _: usage)
     for name in ("a", "b"):
-        assert twin(monkeypatch, *run_beside(plc, tmp_path / f"{name}.mcap"), "--duration", "1") == 0
+        assert (
+            twin(monkeypatch, *run_beside(plc, tmp_path / f"{name}.mcap"), "--duration", "1") == 0
+        )
     assert len(list(tmp_path.glob("*.mcap"))) == left
     assert (tmp_path / "b.mcap").exists()
 
