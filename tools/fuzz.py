@@ -111,7 +111,11 @@ class Campaign:
                 file.write(data)
                 file.truncate()
 
-            yield remember
+            try:
+                yield remember
+            except KeyboardInterrupt:
+                path.unlink()
+                raise
         path.unlink()
 
     def _try(self, data: bytes, remember: Callable[[bytes], None]) -> None:
