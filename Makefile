@@ -6,7 +6,7 @@ BIN := .venv/bin
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 
-.PHONY: help demo test peers check format docs bench battery soak audit coverage clean
+.PHONY: help demo test peers check format docs bench battery soak fuzz audit coverage clean
 
 help:  ## say what there is (this)
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
@@ -45,6 +45,9 @@ battery: .venv/dev  ## how often hidden effects are found, in two worlds (hours)
 
 soak: .venv/dev  ## what grows in a day of compressed time (HOURS=24) and an hour of real time (REAL_HOURS=1)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tools.soak --hours $(or $(HOURS),24) --real-hours $(or $(REAL_HOURS),1)
+
+fuzz: .venv/dev  ## ten million damaged inputs for all that decodes bytes from elsewhere, a night (INPUTS=100_000)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tools.fuzz --inputs $(or $(INPUTS),10_000_000)
 
 audit: .venv/dev .venv/audit/done  ## materials, licences, known weaknesses (without a network: ADVISORIES=all.zip of osv.dev)
 	$(BIN)/python tools/audit.py audit $(if $(ADVISORIES),--advisories '$(ADVISORIES)')

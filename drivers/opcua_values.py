@@ -88,12 +88,17 @@ def readable(value: ua.DataValue) -> bool:
     return value.Value is not None and value.Value.Value is not None
 
 
+def _is_many(variant: ua.Variant) -> bool:
+    """Whether it is an array; a single value that claims dimensions becomes one in the library."""
+    return bool(variant.is_array or isinstance(variant.Value, list))
+
+
 def number(value: ua.DataValue, node: Node) -> float:
     """One number; NaN where there is no value. SourceError if it is none."""
     if not readable(value):
         return float("nan")
     variant = value.Value
-    if variant.is_array or variant.VariantType not in NUMBERS:
+    if _is_many(variant) or variant.VariantType not in NUMBERS:
         raise wrong_type(node, variant, "a number")
     return float(variant.Value)
 
@@ -101,7 +106,7 @@ def number(value: ua.DataValue, node: Node) -> float:
 def whole(value: ua.DataValue, node: Node) -> int:
     """One whole number; SourceError if it is none, or none is there."""
     variant = value.Value
-    if not readable(value) or variant.is_array or variant.VariantType not in WHOLE:
+    if not readable(value) or _is_many(variant) or variant.VariantType not in WHOLE:
         raise wrong_type(node, variant, "a whole number")
     return int(variant.Value)
 
@@ -109,7 +114,7 @@ def whole(value: ua.DataValue, node: Node) -> int:
 def moment(value: ua.DataValue, node: Node) -> int:
     """A time in ns since 1970, from a whole number of them or a DateTime; 0 where it is before."""
     variant = value.Value
-    if readable(value) and not variant.is_array and variant.VariantType == _T.DateTime:
+    if readable(value) and not _is_many(variant) and variant.VariantType == _T.DateTime:
         ns = nanoseconds(variant.Value)
     else:
         ns = whole(value, node)
@@ -121,7 +126,7 @@ def truth(value: ua.DataValue, node: Node, bit: int | None) -> bool:
     variant = value.Value
     if bit is not None:
         return bool(whole(value, node) >> bit & 1)
-    if not readable(value) or variant.is_array or variant.VariantType != _T.Boolean:
+    if not readable(value) or _is_many(variant) or variant.VariantType != _T.Boolean:
         raise wrong_type(node, variant, "a Boolean (or a number, and bit = …)")
     return bool(variant.Value)
 
@@ -140,10 +145,15 @@ def wholes(value: ua.DataValue, node: Node) -> Integers:
 def _array(value: ua.DataValue, node: Node, kinds: set[ua.VariantType], wanted: str) -> list[Any]:
     variant = value.Value
     fits = readable(value) and variant.is_array and variant.VariantType in kinds
-    if not fits or (variant.Dimensions and len(variant.Dimensions) > 1):
+    if not fits or (variant.Dimensions and not _is_flat(variant)):
         raise wrong_type(node, variant, wanted)
     listed: list[Any] = variant.Value
     return listed
+
+
+def _is_flat(variant: ua.Variant) -> bool:
+    """Whether an array is of one dimension; the library fills up what is missing with lists."""
+    return len(variant.Dimensions) == 1 and not any(isinstance(one, list) for one in variant.Value)
 
 
 def typed(number: float, kind: ua.VariantType, node: Node) -> ua.Variant:

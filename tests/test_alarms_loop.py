@@ -67,11 +67,14 @@ class Desk:
 
     def __init__(self) -> None:
         self.news, self.wishes = News(), list[Request]()
+        self.fails = False
 
     def take(self, news: News) -> None:
         self.news.add(news)
 
     def asked(self) -> list[Request]:
+        if self.fails:
+            raise MemoryError
         asked, self.wishes = self.wishes, []
         return asked
 
@@ -133,6 +136,28 @@ def test_a_clock_that_is_set_shortens_no_delay(step_s: int, silent: bool) -> Non
     for seconds in (10, 30, 64):
         assert not said(seconds)
     assert [one.data["deed"] for one in said(66)] == ["raised"]
+
+
+def test_rows_that_come_late_shorten_no_delay() -> None:
+    (leak,) = (rule for rule in board_rules(None) if rule.name == LEAK)
+    rules = [leak.model_copy(update={"on_delay_s": 60.0, "suppressed_by": ()})]
+    now = 0.0
+    alarms = Alarms(rules, lambda: APART + round(now * S), steady=lambda: round(now * S))
+    assert not alarms.follow(rows(5), [deviation(5)])
+    now = 50.0  # those of 6 to 50 s come now
+    for seconds in range(6, 51):
+        assert not alarms.follow(rows(seconds), [])
+    now = 66.0
+    assert [one.data["deed"] for one in alarms.follow(rows(66), [])] == ["raised"]
+
+
+def test_what_was_found_out_before_a_failure_is_said_the_next_time() -> None:
+    stream = Stream()
+    stream.desk.fails = True
+    with pytest.raises(MemoryError):
+        stream.at(5, deviation(5))
+    stream.desk.fails = False
+    assert stream.at(5, deviation(5)) == [f"{LEAK} raised"]
 
 
 def test_a_deviation_is_the_alarm_of_its_cause_with_what_to_do() -> None:

@@ -6,13 +6,16 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import lz4.frame
 import numpy as np
+import pyarrow as pa
 import pytest
 import rigs
 from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk
+from pyarrow import parquet
 
 from twin.config import Config, document_in
 from twin.errors import ConfigError, SourceError
@@ -29,6 +32,8 @@ from twin.log.reader import open_log
 from twin.log.recorder import Recorder
 from twin.log.schema import COLUMNS, EVENTS, SAMPLES
 from twin.signals import SAMPLE, TICK
+from twin.tables.reader import open_table
+from twin.tables.settings import ImportSettings
 
 MUCH = 8 * MEMORY_BUDGET
 
@@ -82,6 +87,34 @@ def test_an_archive_that_unpacks_to_more_than_it_may(tmp_path: Path) -> None:
     for read in (read_package, read_fmu):
         with little_memory(), pytest.raises(ConfigError, match="claims 96 MiB"):
             read(path)
+
+
+def test_a_page_of_a_table_that_unpacks_to_more_than_it_may(tmp_path: Path) -> None:
+    path = tmp_path / "a.parquet"
+    table = {"time_ms": [0.0], "vacuum_mbar": [0.0], "note": [bytes(MEMORY_BUDGET + 1)]}
+    parquet.write_table(pa.table(table), path, use_dictionary=False, compression="zstd")
+    assert path.stat().st_size < 100_000
+    with little_memory(), pytest.raises(SourceError, match=r"a page claims 64 MiB"):
+        open_table(path, ImportSettings(), 1e5, derive=True)
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"data_page_version": "2.0", "write_statistics": True, "data_page_size": 1000},
+        {"use_dictionary": False, "compression": "none", "row_group_size": 700},
+        {"write_page_checksum": True, "write_page_index": True},
+    ],
+    ids=["version 2", "row groups", "checksums"],
+)
+def test_a_table_as_others_write_it_is_no_bomb(tmp_path: Path, how: dict[str, Any]) -> None:
+    path, count = tmp_path / "a.parquet", 5000
+    time_ms = np.arange(count) * 1.0
+    long = ["x" * 3000] * count  # its statistics are long
+    table = {"time_ms": time_ms, "vacuum_mbar": np.sin(time_ms), "note": long}
+    parquet.write_table(pa.table(table), path, **how)
+    read = open_table(path, ImportSettings(), 1e5, derive=True)
+    assert sum(map(len, read.blocks())) == count
 
 
 def test_an_event_that_is_nested_deeply(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

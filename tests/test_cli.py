@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -452,6 +453,20 @@ def test_in_a_folder_each_run_has_its_log_and_old_ones_make_room(
     assert len(deleted) == 1
     assert deleted[0].startswith(f"{first.name} is deleted")
     assert "log_deleted" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("used", "left"), [(79_000, 2), (81_000, 1)])
+def test_without_a_word_old_logs_go_when_the_disk_is_four_fifths_full(
+    plc: PlcProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, used: int, left: int
+) -> None:
+    usage = SimpleNamespace(total=100_000, used=used, free=100_000 - used)
+    monkeypatch.setattr("twin.log.retention.shutil.disk_usage", lambda _: usage)
+    for name in ("a", "b"):
+        assert (
+            twin(monkeypatch, *run_beside(plc, tmp_path / f"{name}.mcap"), "--duration", "1") == 0
+        )
+    assert len(list(tmp_path.glob("*.mcap"))) == left
+    assert (tmp_path / "b.mcap").exists()
 
 
 def test_a_plc_that_restarts_is_told_and_followed_on(tmp_path: Path) -> None:

@@ -223,6 +223,33 @@ def test_one_that_breaks_is_told_and_nothing_else_happens(
     assert not stream.asked
 
 
+def test_an_answer_that_cannot_be_read_is_told(
+    stream: Stream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(process, "COMMAND", (sys.executable, "-c", "print('{')"))
+    stream.cycles(7)
+    stream.cycle(alarm=True)
+    stream.cycles(2)
+    stream.answered()
+    assert stream.told[-1].text.startswith("no diagnosis: its answer cannot be read;")
+    stream.cycles(5)
+    assert not stream.asked
+
+
+def test_one_for_which_there_is_no_memory_is_told(
+    stream: Stream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(process.pickle, "dump", full)
+    stream.cycles(7)
+    stream.cycle(alarm=True)
+    stream.cycles(5)
+    (event,) = stream.told
+    assert "could not be started: MemoryError" in event.text
+
+
 def test_one_that_cannot_be_started_is_told(
     stream: Stream, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,8 +1,10 @@
 """One run at a time for a unit, and the second one is told who the first is."""
 
+import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import pytest
 import rigs
 from command_line import twin
 
+from twin import lock
 from twin.errors import SourceError
 from twin.lock import lock_file, only_run
 
@@ -61,6 +64,72 @@ def test_a_process_that_is_killed_holds_nothing(tmp_path: Path) -> None:
         other.kill()
         other.wait()
         held(tmp_path, "kind rig-01")
+
+
+def wait_until(what: Callable[[], bool]) -> None:
+    """Until that is so; fails if it is not within some seconds."""
+    end = time.monotonic() + 10.0
+    while not what():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def is_held(folder: Path) -> bool:
+    try:
+        held(folder)
+    except SourceError:
+        return True
+    return False
+
+
+def is_written(path: Path) -> bool:
+    """By who has locked it."""
+    return path.exists() and path.read_bytes().startswith(b"process ")
+
+
+def test_a_lock_is_held_after_its_folder_was_deleted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lock, "LOOK_S", 0.01)
+    folder, unit = tmp_path / "logs", "compact-ejector-35 gripper-01"
+    folder.mkdir()
+    with only_run(folder, unit, NOW_NS, pytest.fail):
+        for _ in range(2):
+            shutil.rmtree(folder)
+            folder.mkdir()
+            wait_until(lambda: is_written(lock_file(folder, unit)))
+            assert is_held(folder)
+        lock_file(folder, unit).unlink()
+        wait_until(lambda: is_written(lock_file(folder, unit)))
+        assert is_held(folder)
+    held(folder, unit)
+
+
+def test_a_run_whose_lock_somebody_else_has_taken_says_so_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lock, "LOOK_S", 0.01)
+    folder, unit, said, looks = tmp_path / "logs", "kind rig-01", list[str](), list[object]()
+    folder.mkdir()
+    hold = lock._Lock.hold
+
+    def seen(one: "lock._Lock") -> None:
+        looks.append(one)
+        hold(one)
+
+    monkeypatch.setattr(lock._Lock, "hold", seen)
+    with only_run(folder, unit, NOW_NS, said.append):
+        folder.rename(tmp_path / "aside")
+        (tmp_path / "new").mkdir()
+        with only_run(tmp_path / "new", unit, NOW_NS, pytest.fail):
+            (tmp_path / "new").rename(folder)  # with a file that is locked
+            wait_until(lambda: bool(said))
+            looks.clear()
+            wait_until(lambda: len(looks) > 5)  # and says it once
+        shutil.rmtree(folder)
+    (only,) = said
+    assert only.startswith("kind rig-01 is watched already: process ")
+    assert only.endswith("; this run goes on")
 
 
 def test_names_of_units_are_no_paths(tmp_path: Path) -> None:

@@ -99,6 +99,24 @@ def test_numbers_of_numpy_are_fine_in_an_event(tmp_path: Path) -> None:
     assert event.data == {"a": 0.5, "b": 3}
 
 
+def test_an_event_that_json_cannot_hold_is_logged_and_says_so(tmp_path: Path) -> None:
+    samples, ticks = course(100)
+    odd: dict[Any, Any] = {"raw": b"\xff", "nan": np.nan, ("a", 1): {1}, "cycle": 7}
+    happened = [
+        Event(START_NS, Kind.CYCLE, "half a \ud800 character", odd),
+        Event(START_NS, Kind.CYCLE, "the next"),
+    ]
+    with Recorder(tmp_path / "a.mcap", HEADER) as recorder:
+        recorder.write(samples, ticks, happened)
+    log = open_log(tmp_path / "a.mcap")
+    assert rows_of(log)[0] == samples.tobytes()
+    first, second = log.events()
+    assert first.text == "half a \\ud800 character"
+    assert first.data["raw"] == r"not JSON (bytes): b'\xff'"
+    assert (first.data["nan"], first.data["('a', 1)"], first.data["cycle"]) == (None, [1], 7)
+    assert second.text == "the next"
+
+
 def test_the_recorder_may_not_be_handed_unequal_rows(tmp_path: Path) -> None:
     samples, ticks = course(10)
     with (

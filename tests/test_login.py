@@ -5,13 +5,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from user_files import Clock, authenticator_of, quick_users, throttled_by
+from user_files import CHEAP, Clock, authenticator_of, quick_users, throttled_by
 
 from twin.audit import records
 from twin.errors import ConfigError
 from twin.login import ADDRESS_S, NAME_S, Authenticator, Login
 from twin.throttle import FREE_TRIES
-from twin.users import Role
+from twin.users import Role, Users
 
 WORD = "correct horse"
 HERE, THERE = "192.0.2.7", "2001:db8::1"
@@ -62,6 +62,16 @@ def test_an_address_has_to_wait_whatever_name_it_tries(door: Authenticator) -> N
         _wrong(door, 1, f"guess{number}", HERE)
     assert door.log_in("ann", WORD, HERE) == Login("ann", None, 1.0)
     assert door.log_in("ann", WORD, THERE).role is Role.ACKNOWLEDGE
+
+
+def test_what_was_wrong_on_one_way_in_counts_on_the_other(door: Authenticator) -> None:
+    """As the page and each results server have the same users."""
+    other = authenticator_of(Users(door.users.path, CHEAP))
+    for number, way in enumerate([door, other] * 3):
+        if number < FREE_TRIES:
+            _wrong(way, 1, "ann", f"192.0.2.{number}")
+    assert door.log_in("ann", WORD, THERE).wait_s == 1.0
+    assert other.log_in("ann", WORD, THERE).wait_s == 1.0
 
 
 @pytest.mark.parametrize(

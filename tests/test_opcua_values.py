@@ -7,6 +7,8 @@ from typing import Any
 
 import pytest
 from asyncua import ua
+from asyncua.common.utils import Buffer
+from asyncua.ua.ua_binary import from_binary, to_binary
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -99,6 +101,19 @@ def test_whatever_comes_is_a_value_or_a_clear_error(variant: ua.Variant | None, 
         assert array is None or (array.ndim == 1 and array.dtype.kind in "if")
     for bit in (None, 0, 63):
         assert isinstance(taken(partial(values.truth, bit=bit), value), bool | None)
+
+
+@pytest.mark.parametrize("kind", [values.numbers, values.wholes])
+def test_an_array_with_fewer_values_than_its_dimension_says_is_none(kind: Any) -> None:
+    """The library fills it up with empty lists."""
+    packed = to_binary(ua.Variant, ua.Variant([1, 2], T.Int32, [2], True))
+    short = packed[:-4] + (514).to_bytes(4, "little")
+    value = ua.DataValue(from_binary(ua.Variant, Buffer(short)))
+    assert len(value.Value.Value) == 514
+    with pytest.raises(SourceError, match="an array of Int32; expected is an array"):
+        kind(value, NODE)
+    whole = ua.DataValue(from_binary(ua.Variant, Buffer(packed)))
+    assert kind(whole, NODE).tolist() == [1, 2]
 
 
 def test_numbers_keep_their_value() -> None:

@@ -18,9 +18,10 @@ from twin.assets.unit import Unit
 from twin.backoff import Backoff
 from twin.errors import SourceError
 from twin.events import Event, Kind
+from twin.files import json_text
 from twin.outlets import dispatch, sender
 from twin.outlets.dispatch import Outlets
-from twin.outlets.message import Message, again, encoded, of_event, restated
+from twin.outlets.message import Message, again, of_event, restated
 from twin.outlets.outbox import Outbox, open_outbox
 from twin.outlets.sender import LostError, Sender, Sent
 from twin.outlets.settings import Outlet
@@ -97,7 +98,7 @@ def test_a_suppression_that_keeps_nothing_quiet_is_not_told() -> None:
 
 
 def test_what_is_no_number_is_null() -> None:
-    assert encoded({"a": math.nan, "b": [np.float64("inf"), np.int64(3)], "c": None}) == (
+    assert json_text({"a": math.nan, "b": [np.float64("inf"), np.int64(3)], "c": None}) == (
         '{"a": null, "b": [null, 3], "c": null}'
     )
 

@@ -27,7 +27,8 @@ from test_page_browser import Server, _is_fit
 from user_files import authenticator_of, quick_users
 
 from twin.assets.unit import Unit
-from twin.outlets.message import Message, asset_of, beside, encoded, of_status
+from twin.files import json_text
+from twin.outlets.message import Message, asset_of, beside, of_status
 from twin.outlets.mqtt import Mqtt
 from twin.outlets.settings import MqttSettings
 from twin.page import hall as hall_module
@@ -253,7 +254,7 @@ def test_odd_alarms_are_shown_as_far_as_they_go(told: Told, more: dict[str, Any]
     told.status("a", "online")
     told.tell("a", f"alarm/{LEAK}", alarm(Unit(TYPE, "a"), **more))
     assert told.lines()["a"]["light"] in ("red", "yellow")
-    encoded(told.one("a"))
+    json_text(told.one("a"))
     json.dumps(told.one("a"), allow_nan=False)
 
 

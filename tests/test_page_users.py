@@ -7,7 +7,6 @@ from user_files import quick_users
 
 from twin.page import sessions as module
 from twin.page.sessions import SESSION_S, Sessions
-from twin.throttle import FREE_TRIES, LoginThrottle
 from twin.users import Role
 
 ANN = ("ann", "correct horse", Role.LOOK)
@@ -51,26 +50,3 @@ def test_sessions_and_their_tokens_differ_and_do_not_pile_up(
     assert len({one.csrf for one in there if one}) == 3
     sessions.end(tokens[-1])
     assert sessions.get(tokens[-1]) is None
-
-
-def test_after_some_wrong_tries_each_takes_longer() -> None:
-    clock = Clock()
-    tries = LoginThrottle(60.0, clock)
-    waits = []
-    for _ in range(FREE_TRIES + 8):
-        tries.wrong("a")
-        waits.append(tries.wait_s("a"))
-    assert waits == [0.0] * (FREE_TRIES - 1) + [1, 2, 4, 8, 16, 32, 60, 60, 60]
-    assert tries.wait_s("b") == 0.0
-    clock.now = 59.0
-    assert tries.wait_s("a") == 1.0
-    tries.right("a")
-    assert tries.wait_s("a") == 0.0
-
-
-def test_who_has_tried_is_not_remembered_without_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twin.throttle.MOST", 10)
-    tries = LoginThrottle(60.0, Clock())
-    for number in range(100):
-        tries.wrong(str(number))
-    assert len(tries._wrong) == 10

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from log_rows import HEADER, START_NS, course, rows_of
 
+from twin.alarms.loop import Alarms
+from twin.alarms.settings import board_rules
 from twin.alarms.watch import evidence, values
 from twin.errors import SourceError
 from twin.events import Event, Kind
@@ -106,6 +108,21 @@ def test_what_does_not_fit_into_memory_is_told_as_lost() -> None:
     assert f"{back.data['rows_lost']} rows are missing" in back.text
 
 
+def test_rows_after_lost_ones_are_marked_also_where_none_wait(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("twin.supervised.KEPT_ROWS", 50)
+    run, (samples, ticks) = Run(), course(200)
+    run.inner.broken = True
+    run.sink.write(samples[:100], ticks[:100], [])
+    run.sink.write(samples[:0], ticks[:0], [Event(0, Kind.CYCLE, "a cycle")])
+    run.inner.broken, run.clock.now = False, 2.0
+    run.sink.write(samples[100:140], ticks[100:140], [])
+    rows = np.frombuffer(b"".join(run.inner.rows), samples.dtype)
+    assert np.flatnonzero(rows["quality"] & Quality.GAP).tolist() == [0]
+    assert rows["sequence"].tolist() == samples["sequence"][100:140].tolist()
+
+
 def test_an_output_of_events_alone_keeps_no_rows_and_counts_events(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -153,29 +170,164 @@ def test_an_alarm_stands_while_any_output_is_down() -> None:
     assert evidence(told[0]) == {"output_down": {"words": told[0].text}}
 
 
-def test_an_adviser_that_fails_is_told_once_and_asked_again() -> None:
-    class Advises:
-        broken = True
+class Advises:
+    """An adviser that fails while it is ``broken``, and at events that say ``poison``."""
 
-        def follow(self, _samples: Samples, _events: Sequence[Event]) -> list[Event]:
+    def __init__(self) -> None:
+        self.broken, self.closed, self.tries = False, False, 0
+        self.heard: list[str] = []
+        self.rows: list[Samples] = []
+
+    def follow(self, samples: Samples, events: Sequence[Event]) -> list[Event]:
+        self.tries += 1
+        if self.broken or any(event.text == "poison" for event in events):
+            raise ZeroDivisionError("a mistake")
+        self.rows.append(samples)
+        self.heard += [event.text for event in events]
+        return [Event(0, Kind.DIAGNOSIS, f"heard {event.text}") for event in events]
+
+    def finish(self) -> list[Event]:
+        if self.broken:
+            raise ZeroDivisionError("a mistake at the end")
+        return [Event(0, Kind.DIAGNOSIS, "the end")]
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Advised:
+    """A supervised adviser that is given a block each 0.1 s, with what is told of it."""
+
+    def __init__(self) -> None:
+        self.clock, self.notices, self.inner = Clock(), Notices(), Advises()
+        self.adviser = SupervisedAdviser("diagnosis", self.inner, Outages(self.notices), self.clock)
+        self.samples, _ = course(100)
+
+    def follow(self, *texts: str) -> list[str]:
+        self.clock.now += 0.1
+        events = [Event(0, Kind.CYCLE, text) for text in texts]
+        return [event.text for event in self.adviser.follow(self.samples, events)]
+
+    def told(self) -> list[tuple[Kind, int, int]]:
+        return [
+            (one.kind, one.data.get("rows_lost", 0), one.data.get("events_lost", 0))
+            for one in self.notices.taken(0)
+        ]
+
+
+def test_an_adviser_that_fails_hears_later_what_it_missed() -> None:
+    run = Advised()
+    assert run.follow("a") == ["heard a"]
+    run.inner.broken = True
+    assert [run.follow(text) for text in "bcd"] == [[], [], []]
+    assert run.told() == [(Kind.OUTPUT_DOWN, 0, 0)]
+    run.inner.broken, run.clock.now = False, 10.0
+    assert run.follow("e") == [f"heard {text}" for text in "bcde"]
+    assert run.follow("f") == ["heard f"]
+    assert run.told() == [(Kind.OUTPUT_BACK, 0, 0)]
+    assert sum(map(len, run.inner.rows)) == 600
+    assert [event.text for event in run.adviser.finish()] == ["the end"]
+    run.adviser.close()
+    assert run.inner.closed
+
+
+def test_an_adviser_that_is_down_is_tried_with_pauses_that_double() -> None:
+    run = Advised()
+    run.inner.broken = True
+    tries = []
+    for _ in range(800):
+        before = run.inner.tries
+        run.follow()
+        if run.inner.tries > before:
+            tries.append(round(run.clock.now))
+    assert tries == [0, 1, 3, 7, 15, 31, 63]
+
+
+def test_what_an_adviser_fails_at_again_is_left_out_and_counted() -> None:
+    run = Advised()
+    assert run.follow("a", "poison") == []
+    assert run.follow("b") == []
+    run.clock.now = 5.0
+    assert run.follow("c") == ["heard b", "heard c"]
+    assert run.told() == [(Kind.OUTPUT_DOWN, 0, 0), (Kind.OUTPUT_BACK, 100, 2)]
+
+
+def test_an_adviser_that_fails_at_each_cycle_is_told_of_more_and_more_seldom() -> None:
+    run = Advised()
+    for number in range(3000):  # five minutes
+        run.follow(*["poison"] * (number % 10 == 0))
+    told = run.told()
+    assert len(told) <= 2 * 10
+    assert told[-1][0] in (Kind.OUTPUT_DOWN, Kind.OUTPUT_BACK)
+    run.clock.now += 70.0  # it takes what waits
+    run.follow()
+    for _ in range(700):  # and works for more than a minute
+        run.follow()
+    run.told()
+    run.follow("poison")
+    for _ in range(12):  # then the first pause is a second again
+        run.follow()
+    assert [kind for kind, *_ in run.told()] == [Kind.OUTPUT_DOWN, Kind.OUTPUT_BACK]
+
+
+def test_an_adviser_that_is_down_for_long_loses_rows_and_no_events() -> None:
+    run = Advised()
+    run.inner.broken = True
+    for number in range(KEPT_ROWS // 100 + 50):
+        run.follow(f"{number}")
+    run.inner.broken, run.clock.now = False, 1000.0
+    run.follow("last")
+    assert run.inner.heard == [*map(str, range(KEPT_ROWS // 100 + 50)), "last"]
+    assert sum(map(len, run.inner.rows)) == KEPT_ROWS
+    assert run.told()[-1] == (Kind.OUTPUT_BACK, 5100, 0)
+    first = next(rows for rows in run.inner.rows if len(rows))
+    assert first["quality"][0] & Quality.GAP
+
+
+def test_an_adviser_that_is_down_at_the_end_says_so() -> None:
+    run = Advised()
+    run.inner.broken = True
+    run.follow("a")
+    assert run.adviser.finish() == []
+    with pytest.raises(SourceError, match="a mistake; 100 rows and 1 events are missing in it"):
+        run.adviser.close()
+    assert run.inner.closed
+
+
+def test_an_adviser_that_fails_at_its_last_words_says_so() -> None:
+    run = Advised()
+    run.follow("a")
+    run.inner.broken = True
+    assert run.adviser.finish() == []
+    with pytest.raises(SourceError, match="a mistake at the end"):
+        run.adviser.close()
+
+
+def test_the_end_of_an_alarm_is_heard_though_its_adviser_was_down() -> None:
+    class Faulty(Alarms):
+        broken = False
+
+        def follow(self, samples: Samples, events: Sequence[Event]) -> list[Event]:
             if self.broken:
-                raise ZeroDivisionError("a mistake")
-            return [Event(0, Kind.DIAGNOSIS, "found")]
+                raise MemoryError
+            return super().follow(samples, events)
 
-        def finish(self) -> list[Event]:
-            return []
+    clock, alarms = Clock(), Faulty(board_rules(None), None)
+    supervised = SupervisedAdviser("alarms", alarms, Outages(Notices()), clock)
+    samples, _ = course(20_000)
 
-        def close(self) -> None:
-            pass
+    def said(kind: Kind, at_ns: int, rows: Samples) -> list[str]:
+        events = [Event(at_ns, kind, "", {"effect": "leakage"})]
+        return [one.data["deed"] for one in supervised.follow(rows, events)]
 
-    adviser, notices = Advises(), Notices()
-    supervised = SupervisedAdviser("diagnosis", adviser, Outages(notices))
-    samples, _ = course(10)
-    assert [supervised.follow(samples, []) for _ in range(3)] == [[], [], []]
-    assert [one.kind for one in notices.taken(0)] == [Kind.OUTPUT_DOWN]
-    adviser.broken = False
-    assert [one.text for one in supervised.follow(samples, [])] == ["found"]
-    assert [one.kind for one in notices.taken(0)] == [Kind.OUTPUT_BACK]
+    assert said(Kind.DEVIATION, int(samples["time_ns"][0]), samples[:10]) == ["raised"]
+    alarms.broken = True
+    ended_ns = int(samples["time_ns"][100])
+    assert said(Kind.DEVIATION_CLEARED, ended_ns, samples[10:200]) == []
+    alarms.broken, clock.now = False, 2.0
+    (cleared,) = supervised.follow(samples[200:], [])
+    assert (cleared.data["deed"], cleared.time_ns) == ("cleared", ended_ns)
+    assert not any(alarm.active for alarm in alarms.board.alarms.values())
 
 
 # The log.

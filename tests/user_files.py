@@ -1,5 +1,6 @@
 """Files of users whose passwords are quickly checked, and a clock for who has to wait."""
 
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -39,5 +40,5 @@ class Clock:
 def throttled_by(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """The clock of all throttles that are made from now on."""
     clock = Clock()
-    monkeypatch.setattr(login, "LoginThrottle", lambda longest: LoginThrottle(longest, clock))
+    monkeypatch.setattr(login, "LoginThrottle", partial(LoginThrottle, clock=clock))
     return clock

@@ -7,6 +7,7 @@ import errno
 import json
 import math
 import os
+import reprlib
 import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -16,6 +17,8 @@ from zipfile import ZipFile
 
 from twin.errors import SourceError
 
+MOST_DEEP = 20  # levels of what is written as JSON; an answer of a diagnosis has eight
+LONGEST_BITS = 64  # of an integer there; Python refuses to print very long ones
 MEMORY_BUDGET = 64 << 20  # bytes; no record, batch of rows or package of ours is ever near it
 
 
@@ -62,19 +65,49 @@ def write_text(path: Path, text: str) -> None:
 
 def write_json(path: Path, document: object) -> None:
     """Write an answer for programs."""
-    text = json.dumps(finite(document), indent=1, ensure_ascii=False, allow_nan=False)
-    write_text(path, text + "\n")
+    write_text(path, json_text(document, indent=1) + "\n")
 
 
-def finite(value: Any) -> Any:
-    """What JSON can hold: null for a number that is not finite, plain numbers for NumPy's."""
-    if isinstance(value, Mapping):
-        return {str(key): finite(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(one) for one in value]
-    if hasattr(value, "item"):  # NumPy's numbers
-        value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def json_text(document: Any, indent: int | None = None) -> str:
+    """JSON that every reader takes; it never fails: what has no form there is said to have none."""
+    return json.dumps(finite(document), indent=indent, ensure_ascii=False, allow_nan=False)
+
+
+def finite(value: Any, deep: int = MOST_DEEP) -> Any:
+    """What JSON can hold: null for a number that is not finite, plain numbers for NumPy's.
+
+    Text for what it cannot hold, and for what nests deeper than ``deep``; half a character, which
+    UTF-8 cannot hold, as its number.
+    """
+    if isinstance(value, Mapping) and deep:
+        return {utf8(str(key)): finite(one, deep - 1) for key, one in value.items()}
+    if isinstance(value, list | tuple | set | frozenset) and deep:
+        return [finite(one, deep - 1) for one in value]
+    if hasattr(value, "tolist") and deep:  # NumPy's, which costs too much to import here
+        return finite(value.tolist(), deep - 1)
+    return _single(value)
+
+
+def _single(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or (isinstance(value, int) and value.bit_length() <= LONGEST_BITS):
+        return value
+    if isinstance(value, str):
+        return utf8(value)
+    return f"not JSON ({type(value).__name__}){_shown(value)}"
+
+
+def _shown(value: Any) -> str:
+    try:
+        return f": {reprlib.repr(value)}"
+    except ValueError:  # Python prints no integer of thousands of digits
+        return ""
+
+
+def utf8(text: str) -> str:
+    """A text that UTF-8 can hold: half a character is its number."""
+    return text.encode(errors="backslashreplace").decode()
 
 
 def write_whole(path: Path, content: bytes) -> None:

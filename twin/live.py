@@ -40,7 +40,10 @@ class Adviser(Protocol):
     """Whoever has more to say to what happens, once it has found out."""
 
     def follow(self, samples: Samples, events: Sequence[Event]) -> list[Event]:
-        """Take rows and what happened, without delay; give what has been found out by now."""
+        """Take rows and what happened, without delay; give what has been found out by now.
+
+        What it raised at may come once more.
+        """
 
     def finish(self) -> list[Event]:
         """Give what is still to be said when the rows have ended; this may take a while."""

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from twin.audit import Act, Audit
-from twin.throttle import LoginThrottle
+from twin.throttle import FILE, LoginThrottle
 from twin.users import Role, Users, normal
 
 LONGEST_NAME = 100  # letters that are looked at
@@ -20,24 +20,27 @@ class Login:
 
 
 class Authenticator:
-    """Lets users in; who guesses has to wait, by name and by address. One call at a time."""
+    """Lets users in; who guesses has to wait, by name and by address. One call at a time.
+
+    Tries are counted beside the users, for all processes that have them.
+    """
 
     def __init__(self, users: Users, audit: Audit) -> None:
         self.users, self.audit = users, audit
-        self._by_address, self._by_name = LoginThrottle(ADDRESS_S), LoginThrottle(NAME_S)
+        longest_s = {"address": ADDRESS_S, "name": NAME_S}
+        self._throttle = LoginThrottle(users.path.with_name(FILE), longest_s)
 
     def log_in(self, name: str, password: str, address: str) -> Login:
         """Try a password; TwinError where the users cannot be read. A hash takes its time."""
         name = normal(name.strip()[:LONGEST_NAME])
-        throttles = (self._by_address, address), (self._by_name, name)
-        wait_s = max(throttle.wait_s(who) for throttle, who in throttles)
-        if wait_s > 0.0:
-            news = [throttle.is_news(who) for throttle, who in throttles]
-            if any(news):
+        who = {"address": address, "name": name}
+        wait = self._throttle.take(who)
+        if wait.seconds > 0.0:
+            if wait.is_news:
                 self.audit.record(Act.THROTTLED, name, address)
-            return Login(name, None, wait_s)
+            return Login(name, None, wait.seconds)
         role = self.users.check(name, password)
-        for throttle, who in throttles:
-            (throttle.wrong if role is None else throttle.right)(who)
+        if role is not None:
+            self._throttle.right(who)
         self.audit.record(Act.LOGGED_IN if role else Act.WRONG_PASSWORD, name, address)
         return Login(name, role)

@@ -16,12 +16,15 @@ from twin.errors import SourceError, in_words
 from twin.events import Event, Kind
 from twin.live import Adviser, Sink
 from twin.monitor.listening import Notices
-from twin.signals import Quality, Samples, Ticks
+from twin.signals import TICK, Quality, Samples, Ticks
 
 KEPT_ROWS = 60_000  # that wait for an output: a minute of them each millisecond, some 5 MB
 KEPT_EVENTS = 10_000  # of rows that were lost
 KEPT_BLOCKS = 10_000  # of an output that takes no rows, or while none come
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # before an output is tried again
+SOUND_S = 60.0  # an adviser that worked so long begins with the first pause again
+
+Block = tuple[Samples, Ticks, Sequence[Event]]
 
 
 @dataclass
@@ -54,6 +57,61 @@ def lost(rows: int, events: int) -> str:
     return f"{' and '.join(counts)} are missing in it"
 
 
+class Backlog:
+    """Blocks that wait for an output: bounded, and what found no room is counted.
+
+    The first rows after some that were lost are marked as after a gap.
+    """
+
+    def __init__(self) -> None:
+        self.blocks: deque[Block] = deque()
+        self.rows = 0  # that wait
+        self.rows_lost = self.events_lost = 0
+        self._gap = False  # rows were lost, and none are there to mark yet
+
+    @property
+    def events(self) -> int:
+        """How many wait."""
+        return sum(len(events) for *_, events in self.blocks)
+
+    def keep(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
+        """Have a block wait, unless it is empty; the oldest rows make room."""
+        if len(samples) or events:
+            self.blocks.append((samples.copy(), ticks.copy(), list(events)))
+            self.rows += len(samples)
+            self._mark()
+        while len(self.blocks) > 1 and (self.rows > KEPT_ROWS or len(self.blocks) > KEPT_BLOCKS):
+            self._lose_oldest()
+
+    def forget_oldest(self) -> None:
+        """It has arrived."""
+        self.rows -= len(self.blocks.popleft()[0])
+
+    def clear(self) -> None:
+        """All of it has arrived, and what did not was told."""
+        self.blocks.clear()
+        self.rows = self.rows_lost = self.events_lost = 0
+        self._gap = False
+
+    def _lose_oldest(self) -> None:
+        """Let its rows go; its events wait on."""
+        oldest, _, before = self.blocks.popleft()
+        samples, ticks, events = self.blocks.popleft()
+        together = [*before, *events]
+        self.blocks.appendleft((samples, ticks, together[-KEPT_EVENTS:]))
+        self.rows -= len(oldest)
+        self.rows_lost += len(oldest)
+        self.events_lost += max(0, len(together) - KEPT_EVENTS)
+        self._gap |= len(oldest) > 0
+        self._mark()
+
+    def _mark(self) -> None:
+        later = next((rows for rows, *_ in self.blocks if len(rows)), None)
+        if self._gap and later is not None:
+            later["quality"][0] |= np.uint8(Quality.GAP)
+            self._gap = False
+
+
 class SupervisedSink:
     """A sink (``twin.live.Sink``) that raises nothing while it is written to.
 
@@ -79,9 +137,7 @@ class SupervisedSink:
         self._takes_rows = rows
         self._failure: Exception | None = None
         self._next_s, self._backoff = 0.0, Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S)
-        self._waiting: deque[tuple[Samples, Ticks, Sequence[Event]]] = deque()
-        self._rows = self._lost = 0  # that wait, and that did not
-        self._events_lost = 0
+        self._waiting = Backlog()
 
     def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
         """Take rows, their ticks, and what happened."""
@@ -107,8 +163,9 @@ class SupervisedSink:
         if self._failure is not None:
             self._try_again()
         if self._failure is not None:
-            rows = self._rows + self._lost + (self._held() if self._held else 0)
-            events = self._events_lost + sum(len(events) for *_, events in self._waiting)
+            waiting = self._waiting
+            rows = waiting.rows + waiting.rows_lost + (self._held() if self._held else 0)
+            events = waiting.events + waiting.events_lost
             raise SourceError(
                 f"{self._name}: {in_words(self._failure)}; {lost(rows, events)}",
                 getattr(self._failure, "hint", ""),
@@ -122,50 +179,30 @@ class SupervisedSink:
     def _keep(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
         if not self._takes_rows:
             samples, ticks = samples[:0], ticks[:0]
-        if len(samples) or events:
-            self._waiting.append((samples.copy(), ticks.copy(), list(events)))
-            self._rows += len(samples)
-        while len(self._waiting) > 1 and (
-            self._rows > KEPT_ROWS or len(self._waiting) > KEPT_BLOCKS
-        ):
-            self._lose_oldest()
-
-    def _lose_oldest(self) -> None:
-        """Let its rows go, with a gap marked in the next ones; its events wait on."""
-        oldest, _, before = self._waiting.popleft()
-        samples, ticks, events = self._waiting.popleft()
-        together = [*before, *events]
-        self._waiting.appendleft((samples, ticks, together[-KEPT_EVENTS:]))
-        self._rows -= len(oldest)
-        self._lost += len(oldest)
-        self._events_lost += max(0, len(together) - KEPT_EVENTS)
-        later = next((rows for rows, *_ in self._waiting if len(rows)), None)
-        if len(oldest) and later is not None:
-            later["quality"][0] |= np.uint8(Quality.GAP)
+        self._waiting.keep(samples, ticks, events)
 
     def _try_again(self) -> None:
+        waiting = self._waiting
         try:
             self._sink = self._again()
-            while self._waiting:
-                self._hand_over(self._waiting[0])
+            while waiting.blocks:
+                self._hand_over(waiting.blocks[0])
         except Exception as error:
             self._set_aside(error)
             return
-        self._outages.end(self._name, self._clock(), self._lost, self._events_lost)
-        self._failure, self._lost, self._events_lost = None, 0, 0
+        self._outages.end(self._name, self._clock(), waiting.rows_lost, waiting.events_lost)
+        self._failure = None
+        waiting.clear()
         self._backoff.reset()
 
-    def _hand_over(self, block: tuple[Samples, Ticks, Sequence[Event]]) -> None:
+    def _hand_over(self, block: Block) -> None:
         try:
             self._sink.write(*block)
         except Exception as error:
             if self._is_held(error):
-                self._forget_oldest()
+                self._waiting.forget_oldest()
             raise
-        self._forget_oldest()
-
-    def _forget_oldest(self) -> None:
-        self._rows -= len(self._waiting.popleft()[0])
+        self._waiting.forget_oldest()
 
     def _set_aside(self, error: Exception) -> None:
         now_s = self._clock()
@@ -174,7 +211,13 @@ class SupervisedSink:
 
 
 class SupervisedAdviser:
-    """An adviser (``twin.live.Adviser``) that says nothing to what it fails at."""
+    """An adviser (``twin.live.Adviser``) that raises nothing while rows come.
+
+    After a failure rows and events wait for it, up to KEPT_ROWS. With a pause that doubles it is
+    given all of them again, in order. Once it takes any of them, those that it still fails at are
+    left out and counted; as long as it takes none, they wait on. The pause begins anew after it
+    has worked for SOUND_S. ``close`` raises SourceError where it has failed to the end.
+    """
 
     def __init__(
         self,
@@ -185,25 +228,70 @@ class SupervisedAdviser:
     ) -> None:
         self._name, self._adviser, self._outages = name, adviser, outages
         self._clock = clock
-        self._failed = False
+        self._failure: Exception | None = None
+        self._next_s, self._backoff = 0.0, Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S)
+        self._back_s = 0.0  # when it worked again
+        self._waiting = Backlog()
 
     def follow(self, samples: Samples, events: Sequence[Event]) -> list[Event]:
         """Take rows and what happened; give what has been found out by now."""
-        try:
-            said = self._adviser.follow(samples, events)
-        except Exception as error:
-            self._outages.begin(self._name, error, self._clock())
-            self._failed = True
-            return []
-        if self._failed and len(samples):
-            self._failed = False
-            self._outages.end(self._name, self._clock())
-        return said
+        if self._failure is None:
+            try:
+                return self._adviser.follow(samples, events)
+            except Exception as error:
+                self._set_aside(error)
+        elif self._clock() >= self._next_s:
+            return self._try_again((samples, np.empty(0, TICK), events))
+        self._waiting.keep(samples, np.empty(0, TICK), events)
+        return []
 
     def finish(self) -> list[Event]:
         """Give what is still to be said when the rows have ended."""
-        return self._adviser.finish()
+        said = self._try_again() if self._failure is not None else []
+        if self._failure is None:
+            try:
+                said += self._adviser.finish()
+            except Exception as error:
+                self._set_aside(error)
+        return said
 
     def close(self) -> None:
-        """Let go of everything."""
+        """Let go of everything; SourceError where it has not heard all that happened."""
         self._adviser.close()
+        if self._failure is not None:
+            waiting = self._waiting
+            rows, events = waiting.rows + waiting.rows_lost, waiting.events + waiting.events_lost
+            raise SourceError(
+                f"{self._name}: {in_words(self._failure)}; {lost(rows, events)}",
+                getattr(self._failure, "hint", ""),
+            ) from self._failure
+
+    def _try_again(self, *newest: Block) -> list[Event]:
+        """Give it all that waits; what it says."""
+        waiting = self._waiting
+        for block in newest:
+            waiting.keep(*block)
+        said: list[Event] = []
+        blocks = [*waiting.blocks] or [*newest]
+        failures = list[tuple[Exception, Block]]()
+        for block in blocks:
+            try:
+                said += self._adviser.follow(block[0], block[2])
+            except Exception as error:
+                failures.append((error, block))
+        if blocks and len(failures) == len(blocks):
+            self._set_aside(failures[0][0])
+            return []
+        rows = waiting.rows_lost + sum(len(block[0]) for _, block in failures)
+        events = waiting.events_lost + sum(len(block[2]) for _, block in failures)
+        self._outages.end(self._name, self._clock(), rows, events)
+        self._failure, self._back_s = None, self._clock()
+        waiting.clear()
+        return said
+
+    def _set_aside(self, error: Exception) -> None:
+        now_s = self._clock()
+        if self._failure is None and now_s - self._back_s >= SOUND_S:
+            self._backoff.reset()
+        self._outages.begin(self._name, error, now_s)
+        self._failure, self._next_s = error, now_s + self._backoff.next_s()

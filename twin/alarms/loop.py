@@ -24,7 +24,7 @@ from twin.signals import Quality, Samples
 # Whole cycles without a deviation: then one that stood before a restart is over. The first ones
 # may not have been judged.
 AGREEING = 5
-SET_NS = 5_000_000_000  # a clock that was set by less cannot be told from a twin that was late
+SET_NS = 5_000_000_000  # a clock that is set by less shortens or lengthens a delay by no more
 
 
 @dataclass(frozen=True)
@@ -100,20 +100,22 @@ class Alarms:
         self._heard = False  # anything of the PLC
         self._now = self._plc_ns = 0  # of the last row
         self._news = News()
+        self._said: list[Event] = []  # by now; where something fails, it is said the next time
 
     def follow(self, samples: Samples, events: Sequence[Event]) -> list[Event]:
         """Take rows and what happened; give what that changes."""
         now = self._time(samples)
-        self._follow_clock(now)
+        self._follow_clock()
         if any(event.kind is Kind.DEVIATION for event in events):
             self._to_agree = 0  # it comes after its cycle, which does not agree
-        said = self._hear(samples, events, now)
+        self._said += self._hear(samples, events, now)
         for event in events:
-            said += self._take(event, _received(samples, event.time_ns, now))
-        said += self._say(self.board.see(now, {}), self._plc_ns)
+            self._said += self._take(event, _received(samples, event.time_ns, now))
+        self._said += self._say(self.board.see(now, {}), self._plc_ns)
         for request in self._office.asked() if self._office else ():
-            said += self._grant(request, now)
+            self._said += self._grant(request, now)
         self._hand_over()
+        said, self._said = self._said, []
         return said
 
     def standing(self) -> list[dict[str, Any]]:
@@ -134,11 +136,11 @@ class Alarms:
         if self._office is not None:
             self._office.close()
 
-    def _follow_clock(self, now: int) -> None:
+    def _follow_clock(self) -> None:
         """Leave delays as long as they are where the clock here was set."""
-        if self._steady is None:
+        if self._steady is None or self._clock is None:
             return
-        before, self._apart = self._apart, now - self._steady()
+        before, self._apart = self._apart, self._clock() - self._steady()
         if before is not None and abs(self._apart - before) > SET_NS:
             for alarm in self.board.alarms.values():
                 alarm.shift(self._apart - before)

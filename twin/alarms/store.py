@@ -27,6 +27,7 @@ from twin.alarms.requests import Request
 from twin.alarms.state import Deed, Kept
 from twin.assets.engine import Database, Purpose
 from twin.assets.unit import Unit, of_unit
+from twin.files import json_text
 
 ALARM_DATABASE = Purpose("alarm database", "--alarms", "alarms")
 
@@ -201,7 +202,7 @@ def _plain_state(kept: Kept) -> dict[str, Any]:
 def _plain_episode(episode: Episode) -> dict[str, Any]:
     names = ("raised_ns", "raised_as", "alarm", "cleared_ns", "acknowledged_ns", "acknowledged_by")
     plain = {name: getattr(episode, name) for name in names}
-    return {**plain, "evidence": json.dumps(dict(episode.evidence), ensure_ascii=False)}
+    return {**plain, "evidence": json_text(episode.evidence)}
 
 
 def _episode(row: Row[Any]) -> Episode:

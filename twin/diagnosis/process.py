@@ -24,6 +24,7 @@ import numpy as np
 
 from twin.config import Config
 from twin.diagnosis.words import Times, certainty, left_over, listed, sized, when
+from twin.errors import in_words
 from twin.events import Event, Kind
 from twin.instants import SECOND_NS
 from twin.model.effects import EFFECTS
@@ -136,9 +137,10 @@ class LiveDiagnosis:
         cycles, deadline = min(self._recent.cycles, CYCLES), self._clock() + PATIENCE_S
         try:
             self._asked = Asked(question, alarm, cycles, deadline)
-        except OSError as error:  # no reason to end the loop
+        except Exception as error:  # no processes or memory left: no reason to end the loop
             self._alarm = None
-            return [self._failed(alarm, f"it could not be started: {error.strerror}")]
+            why = getattr(error, "strerror", None) or in_words(error)
+            return [self._failed(alarm, f"it could not be started: {why}")]
         return []
 
     def _heard(self, asked: "Asked") -> list[Event]:
@@ -234,7 +236,10 @@ class Asked:
         """The answer of one that has ended, or why there is none."""
         if self._process.returncode == 0:
             self._said.seek(0)
-            found: dict[str, Any] = json.load(self._said)
+            try:
+                found: dict[str, Any] = json.load(self._said)
+            except ValueError:
+                return "its answer cannot be read"
             return found
         self._complaint.seek(0)
         *_, last = [b"it was killed", *self._complaint.read().splitlines()]

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.events import Event, Kind, Severity
+from twin.files import json_text, utf8
 from twin.log.schema import EVENTS, LOG, SCALARS
 from twin.signals import BAR, MBAR, Command, Samples, Ticks, deviation
 
@@ -104,13 +105,12 @@ class Scalars:
 
 
 def encode_event(event: Event) -> bytes:
-    """Serialise as ``ejector_twin.Event``."""
+    """Serialise as ``ejector_twin.Event``; what JSON cannot hold is said to be so, in its place."""
     message = EVENTS.message(
         kind=event.kind.value,
         severity=event.severity.value,
-        text=event.text,
-        # NumPy's numbers are no Python numbers to json; .item() makes them so.
-        data_json=json.dumps(dict(event.data), default=lambda number: number.item()),
+        text=utf8(event.text),
+        data_json=json_text(event.data),
     )
     _stamp(message, event.time_ns)
     packed: bytes = message.SerializeToString()
@@ -127,7 +127,7 @@ def decode_event(packed: bytes | memoryview) -> Event:
 def encode_log(event: Event) -> bytes:
     """Serialise as ``foxglove.Log``, for log panels."""
     level = _LEVEL[event.severity]
-    message = LOG.message(level=level, message=event.text, name=event.kind.value)
+    message = LOG.message(level=level, message=utf8(event.text), name=event.kind.value)
     _stamp(message, event.time_ns)
     packed: bytes = message.SerializeToString()
     return packed

@@ -9,7 +9,7 @@ from typing import Any
 
 from twin.assets.unit import Unit
 from twin.events import Event, Kind
-from twin.files import finite
+from twin.files import json_text
 
 ALARM_FORMAT = "ejector-twin-alarm/1"
 STATUS_FORMAT = "ejector-twin-status/1"
@@ -54,14 +54,14 @@ def again(message: Message, now_ns: int) -> Message:
     """The state that a message told, told once more under an ID of its own."""
     number = new_id()
     later = {"id": number, "time": moment(now_ns), "deed": "restated", "announced": False}
-    return Message(number, message.alarm, encoded({**json.loads(message.body), **later}))
+    return Message(number, message.alarm, json_text({**json.loads(message.body), **later}))
 
 
 def of_status(asset: Asset, status: str, since_ns: int | None, program: str) -> str:
     """Whether the twin is there, since when; who dies cannot say when."""
     since = None if since_ns is None else moment(since_ns)
     told = {"asset": asset, "status": status, "since": since, "program": program}
-    return encoded({"format": STATUS_FORMAT, **told})
+    return json_text({"format": STATUS_FORMAT, **told})
 
 
 def beside(form: str, asset: Asset, time_ns: int, told: Mapping[str, Any]) -> Message:
@@ -69,7 +69,7 @@ def beside(form: str, asset: Asset, time_ns: int, told: Mapping[str, Any]) -> Me
     number = new_id()
     head = {"format": form, "id": number, "asset": asset}
     at = {"time": moment(time_ns), "time_ns": time_ns}
-    return Message(number, "", encoded({**head, **at, **told}))
+    return Message(number, "", json_text({**head, **at, **told}))
 
 
 def asset_of(unit: Unit, batch: str) -> Asset:
@@ -81,11 +81,6 @@ def moment(ns: int) -> str:
     """A time as ISO 8601 has it, in UTC, to the microsecond."""
     at = EPOCH + timedelta(microseconds=ns // 1000)
     return at.isoformat(timespec="microseconds").replace("+00:00", "Z")
-
-
-def encoded(document: Mapping[str, Any]) -> str:
-    """JSON that every reader takes: without NaN, which is null."""
-    return json.dumps(finite(document), ensure_ascii=False, allow_nan=False)
 
 
 def new_id() -> str:
@@ -109,7 +104,7 @@ def _message(unit: Unit, plain: Mapping[str, Any], change: Mapping[str, Any]) ->
         "shelved_until": _moment(plain["shelved_until_ns"]),
         **{key: plain[key] for key in ("priority", "consequence", "action", "evidence")},
     }
-    return Message(number, str(plain["alarm"]), encoded(body))
+    return Message(number, str(plain["alarm"]), json_text(body))
 
 
 def _state(plain: Mapping[str, Any]) -> str:

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 import pyarrow as pa
 from pyarrow import parquet
@@ -10,6 +11,7 @@ from pyarrow import parquet
 from twin.errors import SourceError
 from twin.tables.decode import Batch
 from twin.tables.numbers import is_readable
+from twin.tables.parquet_pages import require_small_pages
 from twin.tables.settings import Column, ImportSettings
 
 _ROWS = 10_000
@@ -20,7 +22,7 @@ class ParquetFile:
     """A Parquet file of which the schema is read; SourceError where it is none."""
 
     def __init__(self, path: Path, _settings: ImportSettings) -> None:
-        self._path = path
+        self._path, self._is_checked = path, False
         self.notes: list[str] = []
         with self._opened() as file:
             self._schema = file.schema_arrow
@@ -60,17 +62,29 @@ class ParquetFile:
         columns = {name: table.column(there) for name, there in theirs.items()}
         return Batch(columns, table.num_rows, {}, place, cell)
 
+    def _checked(self) -> BinaryIO:
+        raw = self._path.open("rb")
+        try:
+            if not self._is_checked:  # once: it takes a look at each page
+                require_small_pages(raw)
+            raw.seek(0)
+        except BaseException:
+            raw.close()
+            raise
+        self._is_checked = True
+        return raw
+
     @contextmanager
     def _opened(self) -> Iterator[parquet.ParquetFile]:
         try:
             with (
-                self._path.open("rb") as raw,
+                self._checked() as raw,
                 parquet.ParquetFile(
                     raw, buffer_size=_BUFFER, pre_buffer=False, page_checksum_verification=True
                 ) as file,
             ):
                 yield file
-        except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        except (pa.ArrowException, OSError, ValueError) as error:
             what = getattr(error, "strerror", None) or str(error).strip().splitlines()[0]
             message = f"{self._path}: cannot be read as Parquet: {what}"
             raise SourceError(message, "check the path, or export the file anew") from error
