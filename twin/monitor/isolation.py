@@ -41,8 +41,8 @@ from twin.monitor.signatures import Likeness
 from twin.monitor.statistics import Listener, Said
 from twin.signals import SAMPLE, TICK, Samples, Ticks
 
-KEPT = 400  # cycles that are remembered: a change is not sought further back
-RECENT = 60  # of them, the last ones from which a cause is named
+KEPT = 400  # cycles whose scores are remembered: a change is not sought further back
+RECENT = 60  # of them, the last ones that are remembered whole: from them a cause is named
 LEARNED = 10  # cycles before which nothing is said
 SHOWN = 3.0  # sigmas: less by the cycles after the first, and it is not asked what differs
 DOUBTED = 0.05  # probability that anything differs, from which on it is asked what
@@ -112,7 +112,8 @@ class Isolation:
         self._learned = 0  # cycles
         self._patience = Patience[tuple[Said, Floats, Step]]()  # with their scores
         self._changes: Changes | None = None  # once it is known which suspects look alike
-        self._kept: deque[tuple[Said, Floats]] = deque(maxlen=KEPT)  # with the normal scores
+        self._kept: deque[Said] = deque(maxlen=RECENT)  # some 40 kB each
+        self._scored: deque[Floats] = deque(maxlen=KEPT)  # their normal scores, and of more cycles
         self._cycles, self._seconds = 0, 0.0
         self._raised: tuple[int, float] | None = None  # suspect, and sigmas a cycle
         self._since = 0  # cycles since it began, while raised
@@ -130,7 +131,7 @@ class Isolation:
     @property
     def heard(self) -> tuple[Said, Floats]:
         """What the last cycle said, and its scores as standard normal variables."""
-        return self._kept[-1]
+        return self._kept[-1], self._scored[-1]
 
     def ahead(self, parts: Sequence[tuple[Samples, Ticks]], at_edge: bool) -> None:
         """See the rows so far of the next cycle, to have less to do when it comes."""
@@ -172,7 +173,8 @@ class Isolation:
         self._seconds += seconds
         step = self._shape.take(self._reference.standard(scores))
         normal = step.normal
-        self._kept.append((said, normal))
+        self._kept.append(said)
+        self._scored.append(normal)
         verdict = self._conclude(self._changes, normal, far, begins) if self._changes else None
         if self.stands:
             self._patience.forget()
@@ -212,6 +214,7 @@ class Isolation:
             if self._is_back(normal):
                 changes.begin()
                 self._kept.clear()
+                self._scored.clear()
                 return Verdict(1.0, ())
         if self._raised is None and 1.0 - none < DOUBTED:
             return Verdict(none, ())
@@ -248,7 +251,7 @@ class Isolation:
 
     def _scores(self, suspect: int) -> Floats:
         """Of the cycles that are kept."""
-        return np.array([float(normal[suspect]) for _, normal in self._kept])
+        return np.array([float(normal[suspect]) for normal in self._scored])
 
     def _whole(self, changes: Changes, since: int) -> int:
         """How many of the last cycles have it from their beginning; 0 if they do not show it."""
@@ -293,8 +296,8 @@ class Isolation:
 
     def _mean(self, since: int) -> tuple[Said, Floats]:
         """The mean of the last cycles, less what was usual; and its covariance."""
-        last = self._kept[-1][0]
-        some = [said for said, _ in list(self._kept)[-since:]]
+        last = self._kept[-1]
+        some = list(self._kept)[-since:]
         often = np.mean([np.isin(last.place, said.place) for said in some], axis=0) > 0.5
         last = last.at(often)
         columns = np.column_stack([last.off, last.signatures, last.larger]) * 0.0
