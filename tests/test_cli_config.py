@@ -40,7 +40,7 @@ suction = { address = "coil:99999999" }
 presure_mbar = "Druck"
 
 [monitor]
-raise_sigma = "six"
+false_alarm_days = "six"
 isolate = "perhaps"
 
 [mqqt]
@@ -55,7 +55,7 @@ SAID = (
     "17: driver.tags.presure: unknown key: do you mean pressure?",
     '18: driver.tags.suction.address: "coil:99999999" is no address',
     "21: import.columns.presure_mbar: is none that is known: do you mean pressure_mbar?",
-    "24: monitor.raise_sigma: must be a number (is 'six')",
+    "24: monitor.false_alarm_days: must be a number (is 'six')",
     "25: monitor.isolate: must be true or false (is 'perhaps')",
     "27: unknown table [mqqt]; did you mean 'mqtt'?",
 )

@@ -14,6 +14,7 @@ from twin.figures.table import FIGURES
 from twin.figures.trend import DAY_NS, FARTHEST, Line, Trend, line_through, reach, trend_of
 from twin.figures.words import _give_or_take, in_words, limit_of, trend_plain
 from twin.model.dataset import DataSet
+from twin.monitor.detect import MonitorSettings
 
 TRIALS = 150
 
@@ -152,7 +153,7 @@ def test_a_limit_far_ahead_is_not_dated() -> None:
 
 # In words.
 
-LIMITS = limits(FigureSettings(), DataSet())
+LIMITS = limits(FigureSettings(), DataSet(), MonitorSettings())
 LEAKAGE = FIGURES["leakage"]
 
 

@@ -108,6 +108,8 @@ def pressure_or_none(server: ResultsServer) -> float | None:
         return pressure(server)
     except (OSError, TimeoutError, ConnectionError):
         return None
+    except TypeError:  # it answers, and has no value yet
+        return None
 
 
 def killed(server: ResultsServer) -> str:

@@ -25,8 +25,8 @@ from twin.diagnosis.weights import covariance
 from twin.inference.covariance import Covariance
 from twin.model.term import KINDS
 from twin.monitor.bins import warped
-from twin.monitor.healthy import Scatter
-from twin.monitor.statistics import LEVELS, UNKNOWN_LEVEL_MBAR
+from twin.monitor.healthy import UNSEEN_LEVEL_MBAR, Scatter
+from twin.monitor.statistics import LEVELS
 from twin.signals import Samples
 
 Floats = npt.NDArray[np.float64]
@@ -154,7 +154,7 @@ def levels_and_time(evidence: Evidence) -> Floats:
     """
     expected, healthy = evidence.seen(evidence.theta).levels, evidence.healthy.figures
     known = [
-        healthy.get(name) or Scatter(mean=level, sigma=UNKNOWN_LEVEL_MBAR)
+        healthy.get(name) or Scatter(mean=level, sigma=UNSEEN_LEVEL_MBAR)
         for name, level in zip(LEVELS, expected, strict=True)
     ]
     rows = []
