@@ -8,8 +8,8 @@ import math
 
 from scipy.special import ndtri, stdtrit
 
-# Of all false alarms. Sums keep what they are given; the others come far below theirs, since a figure
-# by itself is judged as if it had the longest tail, and little is gained by giving them more.
+# Of all false alarms. Sums keep what they are given; the others come far below theirs, since a
+# figure by itself is judged as if it had the longest tail. More would gain them little.
 SUMS, SINGLE_CYCLES, LIMITS = 0.9, 0.05, 0.05
 DAY_S = 86_400.0
 
