@@ -98,7 +98,7 @@ def test_after_the_first_cycles_nothing_is_learned_so_a_slow_change_shows() -> N
 
 
 def test_a_limit_of_a_key_figure_is_beyond_what_healthy_cycles_reach() -> None:
-    rng, days = np.random.default_rng(5), 0.01
+    rng, days = np.random.default_rng(5), 0.002
     wanted = cycles_between(days, LIMITS, SHORTEST_CYCLE_S)
     beyond, units = 0, 4000
     for _ in range(units):
