@@ -188,6 +188,7 @@ class Cell:
     protocol: str
     folder: Path
     random: np.random.Generator
+    rotate_mb: float = 64.0  # of a part of the log
     boots: list[Path] = field(default_factory=list)  # what each PLC sampled
     seen: list[dict[str, float]] = field(default_factory=list)  # of the twin's process
     deleted: dict[Path, BinaryIO] = field(default_factory=dict)  # logs, open to be read yet
@@ -231,6 +232,7 @@ class Cell:
         tables["plc"]["program"]["start_ms"] = 500.0
         tables["plc"]["server"]["port"] = 0
         tables["results"] = {"opcua": True, "port": self.results_port}
+        tables["log"] = {"rotate_mb": self.rotate_mb}
         if self.protocol == "opcua":
             tables["plc"]["opcua"]["port"] = 0
             tables["driver"]["url"] = f"opc.tcp://127.0.0.1:{port or 4840}"

@@ -42,6 +42,7 @@ SETTLED_H = 0.75
 JUDGED_H = 0.9  # a shorter run says nothing of memory
 POINTS = 20  # means of so many stretches make the line: what lies near is alike
 LEAST_S = 0.2  # between two looks
+ROTATE_MB = 1.0  # of a part of the log: some minutes in real time
 ENDS_S = 120.0  # to end in order
 # What may grow in an hour of the PLC's time, by what was taken down.
 ALLOWED = {
@@ -161,7 +162,8 @@ def configured() -> dict[str, Any]:
 @contextmanager
 def real(folder: Path) -> Iterator[tuple[psutil.Popen, Callable[[], float]]]:
     """The process beside a simulated PLC, and the hours so far."""
-    with Cell("modbus", folder, np.random.default_rng(1)) as cell:
+    # Of each half second the writer keeps a place in the index until its part of the log ends.
+    with Cell("modbus", folder, np.random.default_rng(1), rotate_mb=ROTATE_MB) as cell:
         until_logged(cell)
         begun = time.monotonic()
         yield cell.twin, lambda: (time.monotonic() - begun) / 3600
