@@ -52,6 +52,13 @@ NEEDS: Mapping[str, Need] = {
         probe=("node", "-e", "require.resolve('node-opcua-server')"),
         install=("npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund"),
     ),
+    "axe": Need(
+        ("node",),
+        ("nodejs", "npm"),
+        "whether the page is fit for keyboards and screen readers",
+        probe=("node", "-e", "require.resolve('axe-core')"),
+        install=("npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund"),
+    ),
     "cc": Need(
         ("cc",),
         ("gcc", "libc6-dev"),
@@ -186,11 +193,12 @@ def main() -> int:
     if packages := to_install(search_path()):
         install(packages)
     path = search_path()  # PostgreSQL brings a folder of its own
-    for name, need in NEEDS.items():
-        if need.install and find(name, path) and shutil.which(need.install[0]):
-            sys.stdout.write(f"{shlex.join(need.install)} (in {PEERS})\n")
+    wanted = (need.install for name, need in NEEDS.items() if need.install and find(name, path))
+    for command in dict.fromkeys(wanted):  # one of npm brings all of its packages
+        if shutil.which(command[0]):
+            sys.stdout.write(f"{shlex.join(command)} (in {PEERS})\n")
             sys.stdout.flush()
-            subprocess.run(need.install, cwd=PEERS, check=False)
+            subprocess.run(command, cwd=PEERS, check=False)
     missing = [name for name in NEEDS if not is_here(name, path)]
     for name in missing:
         sys.stdout.write(f"{name} is missing: {NEEDS[name].tested} stays untested\n")

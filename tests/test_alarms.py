@@ -16,6 +16,7 @@ from twin.alarms.rules import Priority, Rule, default_rules, read_rules, write_r
 from twin.alarms.settings import board_rules
 from twin.alarms.state import SECOND_NS, Alarm, Change, Deed, State
 from twin.alarms.watch import NAMES, deviating, values
+from twin.alarms.words import action_of
 from twin.errors import ConfigError
 from twin.events import Event, Kind
 from twin.model.effects import EFFECTS
@@ -471,7 +472,7 @@ def test_a_rule_on_the_deviation_is_one_for_each_cause() -> None:
     assert "deviation" not in made
     leakage = made["deviation_leakage"]
     assert leakage.value == "deviation.leakage"
-    assert leakage.action.startswith(f"Look at {EFFECTS['leakage'].look_at}. ")
+    assert action_of(leakage, {}).startswith(f"Look at {EFFECTS['leakage'].look_at}. ")
 
 
 def test_what_the_deviation_suppresses_every_cause_does(tmp_path: Path) -> None:

@@ -191,8 +191,14 @@ def test_figures_vacuum_and_what_comes_late(told: Told) -> None:
     line, one = told.lines()["a"], told.one("a")
     assert line["batch"] == "B7"
     assert line["figures"] == [
-        {"name": "t0", "unit": "ms", "measured": 191.0, "expected": 190.0},
-        {"name": "leakage", "unit": "mbar/s", "measured": 71.5, "expected": None},
+        {"name": "t0", "title": "t0", "unit": "ms", "measured": 191.0, "expected": 190.0},
+        {
+            "name": "leakage",
+            "title": "leakage",
+            "unit": "mbar/s",
+            "measured": 71.5,
+            "expected": None,
+        },
     ]
     assert (line["spark"]["low"][0], line["spark"]["high"][-1]) == (0, 750)
     assert len(line["spark"]["low"]) == 60

@@ -189,7 +189,9 @@ def test_errors_are_plain_pages_and_plain_json(site: Site) -> None:
     assert page.status_code == 404
     assert "<h1>Not Found</h1>" in page.text
     assert site.client.get("/api/ejectors/9/history").json() == {"error": "no such ejector"}
-    told = site.page._said(Request({"type": "http", "path": "/", "headers": []}), 400, "<b>")
+    told = site.page._said(
+        Request({"type": "http", "path": "/", "headers": [], "language": "en"}), 400, "<b>"
+    )
     assert b"<b>" not in told.body
     wrong = site.client.get("/api/ejectors/0/history?days=nan")
     assert (wrong.status_code, "days" in wrong.json()["error"]) == (400, True)
@@ -328,10 +330,10 @@ def test_who_is_logged_in_acknowledges(site: Site) -> None:
     ("role", "allowed"),
     [
         (Role.LOOK, []),
-        (Role.ACKNOWLEDGE, ["acknowledged", "shelved", "unshelved"]),
+        (Role.ACKNOWLEDGE, ["acknowledged", "shelved", "unshelved", "commented"]),
         (
             Role.CONFIGURE,
-            ["acknowledged", "shelved", "unshelved", "out_of_service", "in_service"],
+            ["acknowledged", "shelved", "unshelved", "commented", "out_of_service", "in_service"],
         ),
     ],
 )
@@ -345,7 +347,8 @@ def test_a_user_may_do_what_the_role_says(site: Site, role: Role, allowed: list[
         assert answer.status_code == (202 if deed in allowed else 403)
         if deed not in allowed:
             assert "it needs the role" in answer.json()["error"]
-    assert sorted(one.deed.value for one in _asked(site)) == sorted(allowed)
+    asked = [one for one in allowed if one != "commented"]
+    assert sorted(one.deed.value for one in _asked(site)) == sorted(asked)
 
 
 def test_a_user_with_a_name_of_any_letters_logs_in(site: Site) -> None:
@@ -532,7 +535,7 @@ def test_an_alarm_says_what_where_how_sure_and_what_to_do(site: Site) -> None:
     assert alarm["what"] == "Leakage"
     assert alarm["where"] == "hoses, fittings and cups"
     assert alarm["action"].startswith("Look at hoses")
-    assert dict(alarm["facts"])["how sure"].startswith("a first guess; it may as well be porous")
+    assert dict(alarm["facts"])["how sure"].startswith("a first guess, or porous leakage")
     (episode,) = site.client.get("/api/ejectors/0/history").json()
     assert (episode["what"], episode["cleared"], episode["priority"]) == ("Leakage", None, "medium")
 
@@ -557,8 +560,9 @@ def test_a_configuration_that_keeps_nothing_is_refused(tmp_path: Path, missing: 
 # --- what the tests share -------------------------------------------------------------------------
 
 
-def _socket(site: Site, origin: str = OURS) -> Any:
-    return site.client.websocket_connect("ws://127.0.0.1:8420/live", headers={"origin": origin})
+def _socket(site: Site, origin: str = OURS, **headers: str) -> Any:
+    headers |= {"origin": origin}
+    return site.client.websocket_connect("ws://127.0.0.1:8420/live", headers=headers)
 
 
 def _to_the_end(socket: Any) -> None:
@@ -589,3 +593,99 @@ def _until(true: Callable[[], Any]) -> None:
     """Until a thread has done what it does: the test's own time limit ends it."""
     while not true():
         pass
+
+
+# --- languages ------------------------------------------------------------------------------------
+
+GERMAN = {"accept-language": "de"}
+
+
+@pytest.mark.parametrize(
+    ("headers", "language", "log_in", "alarm"),
+    [({}, "en", "Log in", "Leakage"), (GERMAN, "de", "Anmelden", "Leckage")],
+)
+def test_pages_and_alarms_are_in_the_language_of_each_browser(
+    site: Site, headers: dict[str, str], language: str, log_in: str, alarm: str
+) -> None:
+    _leaking(site)
+    page = site.client.get("/login", headers=headers).text
+    assert f'<html lang="{language}">' in page
+    assert f"<h1>{log_in}</h1>" in page
+    with _socket(site, **headers) as socket:
+        (state,) = socket.receive_json()["states"]
+    assert state["alarms"][0]["what"] == alarm
+    texts = site.client.get("/static/texts.js", headers=headers).text
+    assert f'const LANGUAGE = "{language}";' in texts
+    assert ('"Shelve": "Zurückstellen"' in texts) is (language == "de")
+
+
+def test_errors_are_in_the_language_of_each_browser(site: Site) -> None:
+    answer = site.client.get("/api/ejectors/9/history", headers=GERMAN)
+    assert answer.json() == {"error": "Diesen Ejektor gibt es nicht"}
+    assert "<h1>Nicht gefunden</h1>" in site.client.get("/nothing", headers=GERMAN).text
+
+
+def test_who_chooses_a_language_keeps_it(site: Site) -> None:
+    answer = site.client.get("/language/de", headers={"referer": f"{OURS}/login"})
+    assert (answer.status_code, answer.headers["location"]) == (303, "/login")
+    assert "Anmelden" in site.client.get("/login", headers={"accept-language": "en"}).text
+    elsewhere = {"referer": "http://evil.example//evil.example/"}
+    assert site.client.get("/language/en", headers=elsewhere).headers["location"] == "/"
+    assert site.client.get("/language/xx").status_code == 404
+
+
+# --- comments -------------------------------------------------------------------------------------
+
+
+def _comment(site: Site, text: str, episode: Any = None, **headers: str) -> httpx2.Response:
+    (alarm,) = site.ejector.state()["alarms"]
+    csrf = site.client.get("/api/me").json().get("csrf", "")
+    return site.client.post(
+        "/api/ejectors/0/comments",
+        json={"episode": episode or alarm["episode"], "text": text},
+        headers={"origin": OURS, "x-csrf-token": csrf, **headers},
+    )
+
+
+def test_a_comment_stays_with_its_alarm_and_needs_no_run(site: Site, tmp_path: Path) -> None:
+    _leaking(site)
+    site.log_in()
+    assert site.run
+    site.run.close()
+    site.run = None
+    assert _comment(site, " new hose ordered ").status_code == 201
+    said = [{"who": "ann", "when": "22:13:20, 0 s ago", "text": "new hose ordered"}]
+    (alarm,), (episode,) = site.ejector.state()["alarms"], site.ejector.history(1.0)
+    assert alarm["comments"] == episode["comments"] == said
+    (record,) = [one for one in records(tmp_path)[0] if one["what"] == "commented"]
+    assert (record["who"], record["alarm"]) == ("ann", LEAK)
+
+
+@pytest.mark.parametrize(
+    ("text", "episode"),
+    [
+        ("", None),
+        ("x" * 501, None),
+        ("what", [LEAK, "1"]),
+        ("what", ["no_alarm", str(NOW)]),
+        ("what", [LEAK, "9" * 30]),
+        ("what", [LEAK, -1]),
+        ("what", [LEAK]),
+        ("what", 7),
+    ],
+)
+def test_a_comment_that_belongs_to_nothing_is_refused(site: Site, text: str, episode: Any) -> None:
+    _leaking(site)
+    site.log_in()
+    assert _comment(site, text, episode).status_code == 400
+    assert site.ejector.state()["alarms"][0]["comments"] == []
+
+
+def test_only_who_may_acknowledge_comments(site: Site) -> None:
+    _leaking(site)
+    assert _comment(site, "what").status_code == 401
+    site.log_in()
+    assert _comment(site, "what", origin="http://evil.example").status_code == 403
+    site.users.set_role("ann", Role.LOOK)
+    assert _comment(site, "what").status_code == 403
+    assert site.ejector.state()["alarms"][0]["comments"] == []

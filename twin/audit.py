@@ -34,6 +34,7 @@ class Act(StrEnum):
     PASSWORD_CHANGED = "password_changed"  # noqa: S105  # what happened
     WRONG_PASSWORD = "wrong_password"  # noqa: S105
     THROTTLED = "throttled"  # tried again before the time was over; the first such try is told
+    COMMENTED = "commented"  # an alarm
     DENIED = "denied"  # the role does not allow it
 
 

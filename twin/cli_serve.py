@@ -134,6 +134,7 @@ def _serve(
 def _require_extra() -> None:
     """ConfigError where the page's libraries are not installed."""
     try:
+        import babel  # noqa: F401
         import starlette  # noqa: F401
         import uvicorn  # noqa: F401
         import websockets  # noqa: F401

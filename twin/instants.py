@@ -5,6 +5,8 @@ Clock times are those of this computer's zone: what hangs on the wall beside it.
 
 import time
 
+from twin.language import tr
+
 SECOND_NS = 1_000_000_000
 CALENDAR_NS = 946_684_800 * SECOND_NS  # year 2000: a clock that reads less was never set
 
@@ -28,7 +30,9 @@ def dated(ns: int) -> str:
 def age(ns: int, now_ns: int) -> str:
     """How long ago it was, or how soon it comes."""
     seconds = (now_ns - ns) / SECOND_NS
-    return f"{lasting(seconds)} ago" if seconds >= 0.0 else f"in {lasting(-seconds)}"
+    if seconds >= 0.0:
+        return tr("{time} ago", time=lasting(seconds))
+    return tr("in {time}", time=lasting(-seconds))
 
 
 def lasting(seconds: float) -> str:
@@ -37,7 +41,9 @@ def lasting(seconds: float) -> str:
         return f"{seconds:.0f} s"
     if seconds < 7170.0:
         return f"{seconds / 60:.0f} min"
-    return f"{seconds / 3600:.0f} h" if seconds < 171_000.0 else f"{seconds / 86_400:.0f} days"
+    if seconds < 171_000.0:
+        return f"{seconds / 3600:.0f} h"
+    return tr("{count} days", count=f"{seconds / 86_400:.0f}")
 
 
 def zone(ns: int) -> int:

@@ -108,6 +108,17 @@ class Episode:
         return None if self.cleared_ns is None else (self.cleared_ns - self.raised_ns) / SECOND_NS
 
 
+@dataclass(frozen=True, slots=True)
+class Comment:
+    """What somebody wrote to an episode, which its first name and time tell from others."""
+
+    raised_ns: int
+    raised_as: str
+    written_ns: int
+    who: str
+    text: str
+
+
 class Diary:
     """The episodes that changes in their order make; of those that are over it knows nothing."""
 

@@ -12,6 +12,12 @@ def value_of(cause: str) -> str:
     return f"{DEVIATION}.{cause}"
 
 
+def cause_of(value: str) -> str:
+    """The cause that a value stands for; empty for a value that is none of the deviation."""
+    cause = value.removeprefix(f"{DEVIATION}.")
+    return cause if cause != value and cause in CAUSES else ""
+
+
 def known(effect: str) -> str:
     """The cause that an effect's name stands for; UNLISTED for one that is none."""
     return effect if effect in CAUSES else UNLISTED

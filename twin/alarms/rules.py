@@ -10,7 +10,6 @@ from pydantic import Field, model_validator
 
 from twin.alarms.causes import CAUSES, DEVIATION, value_of
 from twin.errors import ConfigError
-from twin.model.effects import EFFECTS
 from twin.settings import Document, Settings
 
 Seconds = Annotated[float, Field(ge=0.0, le=86_400.0)]
@@ -129,6 +128,4 @@ def _of_causes(rule: Rule) -> Iterator[Rule]:
         yield rule
         return
     for cause, name in zip(CAUSES, rule.alarms, strict=True):
-        first = f"Look at {EFFECTS[cause].look_at}. " if cause in EFFECTS else ""
-        changed = {"name": name, "value": value_of(cause)}
-        yield rule.model_copy(update={**changed, "action": f"{first}{rule.action}"})
+        yield rule.model_copy(update={"name": name, "value": value_of(cause)})

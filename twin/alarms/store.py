@@ -21,12 +21,13 @@ from sqlalchemy import (
     select,
 )
 
-from twin.alarms.board import Episode
+from twin.alarms.board import Comment, Episode
 from twin.alarms.loop import Before, News
 from twin.alarms.requests import Request
 from twin.alarms.state import Deed, Kept
 from twin.assets.engine import Database, Purpose
 from twin.assets.unit import Unit, of_unit
+from twin.errors import ConfigError
 from twin.files import json_text
 
 ALARM_DATABASE = Purpose("alarm database", "--alarms", "alarms")
@@ -77,6 +78,19 @@ REQUEST = Table(
     Column("answered_ns", BigInteger),
     Column("answer", Text),  # empty: done; else why not
     sqlite_autoincrement=True,
+)
+
+COMMENT = Table(
+    "alarm_comment",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("asset_type", Text, nullable=False),
+    Column("asset_id", Text, nullable=False),
+    Column("raised_ns", BigInteger, nullable=False),  # with the next one: which episode
+    Column("raised_as", Text, nullable=False),
+    Column("written_ns", BigInteger, nullable=False),
+    Column("who", Text, nullable=False),
+    Column("text", Text, nullable=False),
 )
 
 # What a run has once kept is a unit that can be asked for, whether or not an alarm was ever raised.
@@ -154,6 +168,27 @@ class Store(Database):
         with self._reading() as connection:
             answered_ns, answer = connection.execute(wanted).one()
         return None if answered_ns is None else str(answer)
+
+    def comment(self, unit: Unit, comment: Comment) -> None:
+        """Keep a comment; ConfigError where its episode is none of the unit's."""
+        own = {"asset_type": unit.type, "asset_id": unit.id}
+        which = {"raised_ns": comment.raised_ns, "raised_as": comment.raised_as}
+        there = [EPISODE.c[name] == value for name, value in (own | which).items()]
+        values = own | which | {"written_ns": comment.written_ns}
+        values |= {"who": comment.who, "text": comment.text}
+        with self._writing() as connection:
+            if connection.execute(select(EPISODE.c.alarm).where(*there)).first() is None:
+                raise ConfigError(f"no alarm {comment.raised_as} was raised then")
+            connection.execute(COMMENT.insert().values(values))
+
+    def comments(self, unit: Unit, since_ns: int = 0) -> list[Comment]:
+        """The comments to episodes of a unit (raised since then), in the order of writing."""
+        wanted = select(COMMENT).where(*of_unit(COMMENT, unit), COMMENT.c.raised_ns >= since_ns)
+        with self._reading() as connection:
+            rows = connection.execute(wanted.order_by(COMMENT.c.id)).all()
+        return [
+            Comment(row.raised_ns, row.raised_as, row.written_ns, row.who, row.text) for row in rows
+        ]
 
     def units(self) -> list[Unit]:
         """All units of which a run has kept alarms."""

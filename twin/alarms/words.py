@@ -4,10 +4,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from twin.alarms.board import Episode
+from twin.alarms.causes import cause_of
 from twin.alarms.rules import Rule, default_rules
 from twin.alarms.state import SECOND_NS, Alarm, Change, Deed, State
 from twin.alarms.watch import Evidence, quantity
 from twin.events import Event, Kind
+from twin.language import tr
+from twin.model.effects import EFFECTS
 
 COMMISSION = "Commission the unit (twin commission): then causes are named."
 STATES = {
@@ -45,8 +48,14 @@ def worth_saying(change: Change, alarm: Alarm) -> bool:
 
 
 def action_of(rule: Rule, evidence: Evidence) -> str:
-    """What to do; no diagnosis helps where the twin was never fitted to the unit."""
-    return COMMISSION if evidence.get("commissioned") is False else rule.action
+    """What to do, first where to look; no diagnosis helps where no unit was ever commissioned."""
+    if evidence.get("commissioned") is False:
+        return tr(COMMISSION)
+    cause = cause_of(rule.value)
+    if cause not in EFFECTS:
+        return tr(rule.action)
+    first = tr("Look at {where}.", where=tr(EFFECTS[cause].look_at))
+    return f"{first} {tr(rule.action)}".rstrip()
 
 
 def plain(alarm: Alarm, evidence: Evidence, episode: Episode | None) -> dict[str, Any]:

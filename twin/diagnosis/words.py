@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from twin.instants import SECOND_NS, dated, instant
+from twin.language import tr
 from twin.model.courses import Course
 from twin.model.effects import EFFECTS
 
@@ -225,11 +226,11 @@ def _all_of_it(times: Times, whole: str) -> str:
 
 def certainty(cause: Answer) -> str:
     """How sure it is, beside other listed causes and what nobody listed."""
-    alike = listed([spoken(name) for name in cause["not_separable_from"]], "or")
+    alike = listed([tr(spoken(name)) for name in cause["not_separable_from"]], tr("or"))
     percent = f"{100.0 * cause['probability']:.0f} %"
     if not alike:
-        return f"{percent}; no other listed cause fits as well"
-    return f"{percent}; this log cannot tell it from {alike}"
+        return tr("{percent}; no other listed cause fits as well", percent=percent)
+    return tr("{percent}; this log cannot tell it from {alike}", percent=percent, alike=alike)
 
 
 # --- numbers and lists ----------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from twin.figures.store import History
 from twin.figures.table import FIGURES, Figure
 from twin.figures.trend import FARTHEST, FEWEST_BINS, SURE, Line, Reach, Step, Trend, trend_of
 from twin.instants import clock, instant, lasting
+from twin.language import tr
 
 SHOWN = ("t0", "t1", "leakage", "free_flow", "max_vacuum", "nozzle_share", "air", "supply")
 NO_SCATTER = 1e-6  # of the level: where all values are alike, nothing says how sure they are
@@ -111,40 +112,60 @@ def limit_of(name: str, limits: Limits) -> float | None:
     return limit if math.isfinite(limit) else None
 
 
+def title_of(name: str) -> str:
+    """The name of a figure as people say it."""
+    return tr(name.replace("_", " "))
+
+
 def in_words(figure: Figure, trend: Trend, now_ns: int) -> str:
-    """How a figure runs, in a sentence; that it neither stepped nor drifts is said as well."""
+    """How a figure runs, in a sentence that begins with its name, as commands have it."""
+    return f"{figure.name}: {course_in_words(figure, trend, now_ns)}"
+
+
+def course_in_words(figure: Figure, trend: Trend, now_ns: int) -> str:
+    """How a figure runs; that it neither stepped nor drifts is said as well."""
     unit = NO_DASH.get(figure.unit, f" {figure.unit}")
     said = []
     if trend.lacking:
-        last = f"last measured at {instant(trend.end_ns, now_ns)}"
-        said.append(f"{last}, and not in the {trend.lacking} cycles since")
+        last = {"at": instant(trend.end_ns, now_ns), "count": trend.lacking}
+        said.append(tr("last measured at {at}, and not in the {count} cycles since", **last))
     if (step := trend.step) is not None:
         said.append(_stepped(step, unit, now_ns))
     if (line := trend.line) is not None:
         runs = _ran if trend.lacking else _runs
         said.append(runs(line, unit, since=step is not None))
     elif step is None and not trend.lacking:
-        return f"{figure.name}: not enough to say: fewer than {FEWEST_BINS} stretches with cycles"
+        return tr("not enough to say: fewer than {count} stretches with cycles", count=FEWEST_BINS)
     if trend.limit is not None:
-        said.append(_limited(trend, f"its limit of {trend.limit:.4g}{unit}"))
-    return f"{figure.name}: {'; '.join(filter(None, said))}"
+        said.append(_limited(trend, tr("its limit of {value}", value=f"{trend.limit:.4g}{unit}")))
+    return "; ".join(filter(None, said))
 
 
 def _stepped(step: Step, unit: str, now_ns: int) -> str:
-    levels = (
+    before, after = (
         f"{one:.4g}{_give_or_take(half, one)}"
         for one, half in ((step.before, step.before_half), (step.after, step.after_half))
     )
-    between = f"{clock(step.earliest_ns, now_ns)} to {clock(step.latest_ns, now_ns)}"
-    at = f"at {instant(step.host_ns, now_ns)} (95 %: {between})"
-    return f"stepped from {' to '.join(levels)}{unit} {at}"
+    return tr(
+        "stepped from {before} to {after} at {at} (95 %: {earliest} to {latest})",
+        before=before,
+        after=f"{after}{unit}",
+        at=instant(step.host_ns, now_ns),
+        earliest=clock(step.earliest_ns, now_ns),
+        latest=clock(step.latest_ns, now_ns),
+    )
 
 
 def _runs(line: Line, unit: str, *, since: bool) -> str:
     """What a line says since a step or through all of the record."""
     how = _changes(line, unit)
-    now, then = ("", " since then") if since else (f"{line.level:.4g}{unit}, ", "")
-    return f"{now}{how}{then}" if line.is_trend else f"{now}no trend{then} ({how})"
+    if line.is_trend:
+        runs = tr("{change} since then", change=how) if since else how
+    elif since:
+        runs = tr("no trend since then ({change})", change=how)
+    else:
+        runs = tr("no trend ({change})", change=how)
+    return runs if since else f"{line.level:.4g}{unit}, {runs}"
 
 
 def _ran(line: Line, unit: str, *, since: bool) -> str:
@@ -153,15 +174,20 @@ def _ran(line: Line, unit: str, *, since: bool) -> str:
     That it had none would sound as if all were well.
     """
     level = "" if since else f"{line.level:.4g}{unit}"
-    how = f"{_changes(line, unit)}{' after that' if since else ''}" if line.is_trend else ""
+    how = _changes(line, unit) if line.is_trend else ""
+    if how and since:
+        how = tr("{change} after that", change=how)
     return ", ".join(filter(None, [level, how]))
 
 
 def _changes(line: Line, unit: str) -> str:
     """By how much a line changes per day, or over a record that is shorter."""
-    span, per = (1.0, " per day") if line.is_rate else (line.span, "")
+    span = 1.0 if line.is_rate else line.span
     change = f"{line.slope * span:+.3g}{_give_or_take(line.slope_half() * span, line.level)}"
-    return f"{change}{unit}{per} over {lasting(line.span * 86_400.0)}"
+    known = {"change": f"{change}{unit}", "time": lasting(line.span * 86_400.0)}
+    if line.is_rate:
+        return tr("{change} per day over {time}", **known)
+    return tr("{change} over {time}", **known)
 
 
 def _give_or_take(half: float, level: float) -> str:
@@ -175,7 +201,7 @@ def _limited(trend: Trend, limit: str) -> str:
     line, step = trend.line, trend.step
     level = line.level if line is not None else step.after if step is not None else 0.0
     if level >= trend.limit and (step is not None or (line is not None and line.is_trend)):
-        return f"over {limit}"
+        return tr("over {limit}", limit=limit)
     if line is None or not line.is_trend or not line.is_rate or trend.lacking:
         return ""
     return _comes(trend.comes, line, limit)
@@ -183,11 +209,17 @@ def _limited(trend: Trend, limit: str) -> str:
 
 def _comes(comes: Reach | None, line: Line, limit: str) -> str:
     if comes is None:
-        return f"away from {limit}"
+        return tr("away from {limit}", limit=limit)
     if not math.isfinite(comes.expected):
-        return f"{limit} is more than {FARTHEST * line.span:.1f} days away"
-    latest = f"{comes.latest:.1f}" if math.isfinite(comes.latest) else "never"
-    return f"{limit} in {comes.expected:.1f} days ({comes.earliest:.1f} to {latest})"
+        far = f"{FARTHEST * line.span:.1f}"
+        return tr("{limit} is more than {days} days away", limit=limit, days=far)
+    return tr(
+        "{limit} in {days} days ({earliest} to {latest})",
+        limit=limit,
+        days=f"{comes.expected:.1f}",
+        earliest=f"{comes.earliest:.1f}",
+        latest=f"{comes.latest:.1f}" if math.isfinite(comes.latest) else tr("never"),
+    )
 
 
 def trend_plain(figure: Figure, trend: Trend) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import hmac
 import html
 import ipaddress
 import json
+import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -32,7 +33,9 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from twin.alarms.state import Deed
 from twin.audit import Act
 from twin.errors import TwinError
+from twin.language import speaking, tr
 from twin.login import Authenticator
+from twin.page.catalogues import Catalogues
 from twin.page.ejector import Ejector
 from twin.page.hall import Hall
 from twin.page.hall_app import ALL, AllEjectors
@@ -40,7 +43,11 @@ from twin.page.sessions import SESSION_S, Session, Sessions
 from twin.users import Role
 
 COOKIE = "ejector-twin"
+LANGUAGE = "ejector-twin-language"  # the cookie of who has chosen one
+LANGUAGE_S = 365 * 86_400
+MARKED = re.compile(r"\{\{(.+?)\}\}")  # a text of a page, to be said in each language
 TOKEN = "x-csrf-token"  # noqa: S105  # a header's name
+LONGEST_COMMENT = 500  # letters
 MOST_BODY = 4096  # bytes that anybody may send
 MOST_DAYS = 400.0
 ROWS_S = 0.03  # between batches of live rows: a block of the loop, about 20 batches a second
@@ -53,6 +60,7 @@ NEEDED: dict[str, Role] = {  # role for what is asked of an alarm
     Deed.ACKNOWLEDGED: Role.ACKNOWLEDGE,
     Deed.SHELVED: Role.ACKNOWLEDGE,
     Deed.UNSHELVED: Role.ACKNOWLEDGE,
+    Act.COMMENTED: Role.ACKNOWLEDGE,
     Deed.OUT_OF_SERVICE: Role.CONFIGURE,  # without an end, and for every shift
     Deed.IN_SERVICE: Role.CONFIGURE,
 }
@@ -67,13 +75,14 @@ STATIC = {
 }
 CSP = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self';"
-    " form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+    " frame-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
 # A report brings its style with it. Nothing in it is run.
 REPORT_CSP = (
     "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none';"
-    " frame-ancestors 'none'; sandbox allow-popups"
+    " frame-ancestors 'self'; sandbox allow-popups"
 )
+REPORT_HEADERS = {"content-security-policy": REPORT_CSP, "x-frame-options": "SAMEORIGIN"}
 HEADERS = {
     "content-security-policy": CSP,
     "x-content-type-options": "nosniff",
@@ -127,13 +136,16 @@ class Page:
         self.hall = hall
         self.ejectors, self.sessions, self.access = ejectors, sessions, access
         self._authenticator, self.users = authenticator, authenticator.users
-        self._states = [_Remembered(one.state) for one in ejectors]
+        self._catalogues = Catalogues()
+        self._states = [
+            {code: _Remembered(one.state) for code in self._catalogues.texts} for one in ejectors
+        ]
         self._one_login = asyncio.Lock()  # at a time: its hash takes memory and time
         self._one_trend = asyncio.Lock()
         files = resources.files("twin.page").joinpath("static")
         self._static = {name: files.joinpath(name).read_bytes() for name in STATIC}
         self._pages = {
-            name: Template(files.joinpath(name).read_text(encoding="utf-8"))
+            name: files.joinpath(name).read_text(encoding="utf-8")
             for name in ("index.html", "all.html", "login.html", "error.html")
         }
 
@@ -145,11 +157,14 @@ class Page:
             Route("/login", self.login_page),
             Route("/login", self.login, methods=["POST"]),
             Route("/api/logout", self.logout, methods=["POST"]),
+            Route("/static/texts.js", self.texts),
             Route("/static/{name}", self.static),
+            Route("/language/{code}", self.choose_language),
             Route("/api/me", self.me),
             Route(f"{one}/history", self.history),
             Route(f"{one}/trends/{{name}}", self.trend),
             Route(f"{one}/requests", self.ask, methods=["POST"]),
+            Route(f"{one}/comments", self.comment, methods=["POST"]),
             Route(f"{one}/requests/{{request_number}}", self.answer),
             Route("/reports/{number}/{name}", self.report),
             WebSocketRoute("/live", self.live),
@@ -160,7 +175,39 @@ class Page:
         handlers: dict[Any, Any] = {HTTPException: self.refused, TwinError: self.trouble}
 
         app = Starlette(routes=routes, exception_handlers=handlers)
-        return _Guard(app, self.access)
+        return _Guard(app, self.access, self._catalogues)
+
+    # --- languages ------------------------------------------------------------------------------
+
+    def _page(self, connection: HTTPConnection, name: str, **values: str) -> str:
+        """A page in the language of who reads it; ``values`` are HTML already."""
+        said = MARKED.sub(lambda found: html.escape(tr(found[1])), self._pages[name])
+        return Template(said).substitute(values, language=connection.scope["language"])
+
+    async def texts(self, request: Request) -> Response:
+        """What scripts say, in the language of who reads it."""
+        code = request.scope["language"]
+        texts = json.dumps(dict(self._catalogues.texts[code]), ensure_ascii=False)
+        script = f"const LANGUAGE = {json.dumps(code)};\nconst TEXTS = {texts};\n"
+        return Response(script, media_type="text/javascript")
+
+    async def choose_language(self, request: Request) -> Response:
+        """Keep what somebody chose, and lead back to where it was chosen."""
+        code = request.path_params["code"]
+        if code not in self._catalogues.texts:
+            raise HTTPException(HTTPStatus.NOT_FOUND)
+        before = urlsplit(request.headers.get("referer", "")).path
+        back = before if before in (ALL, "/login") else "/"
+        answer = RedirectResponse(back, HTTPStatus.SEE_OTHER)
+        answer.set_cookie(
+            LANGUAGE,
+            code,
+            max_age=LANGUAGE_S,
+            httponly=True,
+            samesite="strict",
+            secure=self.access.secure,
+        )
+        return answer
 
     # --- who it is ------------------------------------------------------------------------------
 
@@ -172,17 +219,18 @@ class Page:
 
     def _require_sight(self, request: Request) -> None:
         if not self._may_see(request):
-            raise HTTPException(HTTPStatus.UNAUTHORIZED, "log in first")
+            raise HTTPException(HTTPStatus.UNAUTHORIZED, tr("log in first"))
 
     def _require_session(self, request: Request) -> Session:
         """Who asks for a change: logged in, from a page of ours, with its token."""
         if not self.access.is_own_origin(request.headers):
-            raise HTTPException(HTTPStatus.FORBIDDEN, "this was not asked from the page itself")
+            raise HTTPException(HTTPStatus.FORBIDDEN, tr("this was not asked from the page itself"))
         session = self._session(request)
         if session is None:
-            raise HTTPException(HTTPStatus.UNAUTHORIZED, "log in first")
+            raise HTTPException(HTTPStatus.UNAUTHORIZED, tr("log in first"))
         if not _same(request.headers.get(TOKEN, ""), session.csrf):
-            raise HTTPException(HTTPStatus.FORBIDDEN, "the token is missing: load the page again")
+            missing = tr("the token is missing: load the page again")
+            raise HTTPException(HTTPStatus.FORBIDDEN, missing)
         return session
 
     async def _require_role(self, request: Request, session: Session, deed: str) -> None:
@@ -192,8 +240,12 @@ class Page:
             await self._record(request, Act.DENIED, session.user, wanted=deed)
             raise HTTPException(
                 HTTPStatus.FORBIDDEN,
-                f"{session.user} may not do this: it needs the role {needed}; who looks after the"
-                " users gives it with twin users role",
+                tr(
+                    "{user} may not do this: it needs the role {role}; who looks after the users"
+                    " gives it with twin users role",
+                    user=session.user,
+                    role=needed,
+                ),
             )
 
     async def _record(self, request: Request, what: str, who: str, **details: str) -> None:
@@ -204,26 +256,31 @@ class Page:
         """The form."""
         return self._login_form(request)
 
-    def _login_form(self, _request: Request, said: str = "", status: int = 200) -> Response:
+    def _login_form(self, request: Request, said: str = "", status: int = 200) -> Response:
         if not said and not self.users.names:
-            said = "There are no users yet. On the machine of the page: twin users add NAME"
+            said = tr("There are no users yet. On the machine of the page: twin users add NAME")
         role = ' role="alert"' if said else ""
-        page = self._pages["login.html"].substitute(said=html.escape(said), role=role)
-        return HTMLResponse(page, status)
+        languages = " ".join(
+            f'<a href="/language/{one["code"]}" lang="{one["code"]}">{html.escape(one["name"])}</a>'
+            for one in self._catalogues.names
+        )
+        shown = {"said": html.escape(said), "role": role, "languages": languages}
+        return HTMLResponse(self._page(request, "login.html", **shown), status)
 
     async def login(self, request: Request) -> Response:
         """Take name and password; slower after wrong ones."""
         if not self.access.is_own_origin(request.headers):
-            raise HTTPException(HTTPStatus.FORBIDDEN, "this was not asked from the page itself")
+            raise HTTPException(HTTPStatus.FORBIDDEN, tr("this was not asked from the page itself"))
         form = parse_qs((await _body(request)).decode(errors="replace"), max_num_fields=5)
         name, password = (form.get(key, [""])[0] for key in ("name", "password"))
         async with self._one_login:
             log_in = self._authenticator.log_in
             login = await run_sync(log_in, name, password, _address(request))
         if login.role is None:
-            said, status = "Name or password is wrong.", HTTPStatus.UNAUTHORIZED
+            said, status = tr("Name or password is wrong."), HTTPStatus.UNAUTHORIZED
             if login.wait_s > 0.0:
-                said = f"Too many wrong passwords. Try again in {login.wait_s:.0f} s."
+                wait = f"{login.wait_s:.0f}"
+                said = tr("Too many wrong passwords. Try again in {wait} s.", wait=wait)
                 status = HTTPStatus.TOO_MANY_REQUESTS
             return self._login_form(request, said, status)
         self.sessions.end(request.cookies.get(COOKIE))
@@ -259,6 +316,7 @@ class Page:
         ejectors = [{"name": one.name, "type": one.config.asset.type} for one in self.ejectors]
         figures = self.ejectors[0].figures() if self.ejectors else []
         known = {"ejectors": ejectors, "figures": figures, "all": self.hall is not None}
+        known["languages"] = self._catalogues.names
         return JSONResponse({**own, **known})
 
     # --- pages ----------------------------------------------------------------------------------
@@ -269,13 +327,13 @@ class Page:
             return RedirectResponse("/login", HTTPStatus.SEE_OTHER)
         if not self.ejectors:
             return RedirectResponse(ALL, HTTPStatus.SEE_OTHER)
-        return HTMLResponse(self._pages["index.html"].substitute())
+        return HTMLResponse(self._page(request, "index.html"))
 
     async def all_page(self, request: Request) -> Response:
         """The page over all ejectors of a broker."""
         if not self._may_see(request):
             return RedirectResponse("/login", HTTPStatus.SEE_OTHER)
-        return HTMLResponse(self._pages["all.html"].substitute())
+        return HTMLResponse(self._page(request, "all.html"))
 
     async def static(self, request: Request) -> Response:
         """What the page is made of."""
@@ -290,15 +348,15 @@ class Page:
         self._require_sight(request)
         found = await run_sync(self._ejector(request).report, request.path_params["name"])
         if found is None:
-            raise HTTPException(HTTPStatus.NOT_FOUND, "this report is not kept any more")
-        return HTMLResponse(found, headers={"content-security-policy": REPORT_CSP})
+            raise HTTPException(HTTPStatus.NOT_FOUND, tr("this report is not kept any more"))
+        return HTMLResponse(found, headers=REPORT_HEADERS)
 
     # --- what there is to know ------------------------------------------------------------------
 
     def _ejector(self, request: Request) -> Ejector:
         number = _number(request, "number")
         if number >= len(self.ejectors):
-            raise HTTPException(HTTPStatus.NOT_FOUND, "no such ejector")
+            raise HTTPException(HTTPStatus.NOT_FOUND, tr("no such ejector"))
         return self.ejectors[number]
 
     async def history(self, request: Request) -> Response:
@@ -327,6 +385,24 @@ class Page:
         number = await run_sync(ejector.ask, alarm, deed, session.user, seconds)
         await self._record(request, deed, session.user, unit=ejector.name, alarm=alarm)
         return JSONResponse({"request": number}, HTTPStatus.ACCEPTED)
+
+    async def comment(self, request: Request) -> Response:
+        """Keep what somebody writes to an alarm."""
+        session = self._require_session(request)
+        ejector = self._ejector(request)
+        try:
+            written = json.loads(await _body(request))
+            (name, raised), text = written["episode"], str(written["text"]).strip()
+            alarm, raised_ns = str(name), _instant(str(raised))
+        except NO_REQUEST as error:
+            raise HTTPException(HTTPStatus.BAD_REQUEST, "not a comment") from error
+        if not 0 < len(text) <= LONGEST_COMMENT:
+            wanted = tr("a comment has 1 to {most} letters", most=LONGEST_COMMENT)
+            raise HTTPException(HTTPStatus.BAD_REQUEST, wanted)
+        await self._require_role(request, session, Act.COMMENTED)
+        await run_sync(ejector.comment, alarm, raised_ns, session.user, text)
+        await self._record(request, Act.COMMENTED, session.user, unit=ejector.name, alarm=alarm)
+        return JSONResponse({}, HTTPStatus.CREATED)
 
     async def answer(self, request: Request) -> Response:
         """What has become of it: null while nobody has answered, empty if it was done."""
@@ -366,7 +442,8 @@ class Page:
             while self._may_see(socket):
                 if loop.time() >= next_state:
                     next_state = loop.time() + STATE_S
-                    states = [await one.get() for one in self._states]
+                    code = socket.scope["language"]
+                    states = [await one[code].get() for one in self._states]
                     await _send(socket, {"states": states})
                 await self._tell_rows(socket, watched)
                 await asyncio.sleep(ROWS_S)
@@ -397,10 +474,9 @@ class Page:
     def _said(self, request: Request, status: int, what: str) -> Response:
         if request.url.path.startswith("/api/"):
             return JSONResponse({"error": what}, status)
-        title = HTTPStatus(status).phrase
-        page = self._pages["error.html"]
-        text = page.substitute(title=html.escape(title), what=html.escape(what))
-        return HTMLResponse(text, status)
+        title, what = tr(HTTPStatus(status).phrase), tr(what)  # a refusal may have no other words
+        shown = {"title": html.escape(title), "what": html.escape(what)}
+        return HTMLResponse(self._page(request, "error.html", **shown), status)
 
 
 class _Remembered:
@@ -435,10 +511,13 @@ class _Watched:
 
 
 class _Guard:
-    """Before everything: hosts that are ours. After everything: the headers of every answer."""
+    """Before everything: hosts that are ours, and the language of who asks.
 
-    def __init__(self, app: ASGIApp, access: Access) -> None:
-        self._app, self._access = app, access
+    After everything: the headers of every answer.
+    """
+
+    def __init__(self, app: ASGIApp, access: Access, catalogues: Catalogues) -> None:
+        self._app, self._access, self._catalogues = app, access, catalogues
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
@@ -451,7 +530,12 @@ class _Guard:
             refused = Response("This page has another name.\n", HTTPStatus.BAD_REQUEST)
             await refused(scope, receive, _headed(send))
             return
-        await self._app(scope, receive, _headed(send))
+        asked = HTTPConnection(scope)
+        accepted = asked.headers.get("accept-language", "")
+        code = self._catalogues.choose(asked.cookies.get(LANGUAGE, ""), accepted)
+        scope["language"] = code
+        with speaking(self._catalogues.texts[code]):
+            await self._app(scope, receive, _headed(send))
 
 
 def _headed(send: Send) -> Send:
@@ -500,6 +584,13 @@ def _number(request: Request, name: str) -> int:
     if not (text.isascii() and text.isdigit() and len(text) <= MOST_DIGITS):
         raise HTTPException(HTTPStatus.NOT_FOUND)
     return int(text)
+
+
+def _instant(digits: str) -> int:
+    """Nanoseconds as a database can have them; ValueError for anything else."""
+    if not (digits.isascii() and digits.isdigit() and len(digits) <= MOST_DIGITS + 1):
+        raise ValueError
+    return min(int(digits), 2**63 - 1)
 
 
 def _days(request: Request) -> float:

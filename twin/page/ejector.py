@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from twin.alarms.board import Board
+from twin.alarms.board import Board, Comment
 from twin.alarms.place import open_chosen as open_alarms
 from twin.alarms.requests import ASKABLE
 from twin.alarms.settings import AlarmSettings, board_rules
@@ -21,12 +21,13 @@ from twin.errors import ConfigError, TwinError
 from twin.figures.place import open_chosen as open_figures
 from twin.figures.settings import limits_of
 from twin.figures.store import SIDES
-from twin.figures.table import FIGURES
+from twin.figures.table import FIGURES, Figure
 from twin.figures.trend import DAY_NS, Trend
-from twin.figures.words import in_words, trend_of_figure
+from twin.figures.words import course_in_words, title_of, trend_of_figure
 from twin.instants import zone
+from twin.language import tr
 from twin.page import ring
-from twin.page.light import S_NS, WORDS, Light, light_of, listed, said, told
+from twin.page.light import S_NS, WORDS, Light, light_of, listed, priority_words, said, told
 from twin.page.settings import REPORTS, RING, PageSettings, folder_of
 from twin.signals import BREAK, MBAR
 
@@ -76,27 +77,34 @@ class Ejector:
                 board = self._board(store, now)
                 episodes = store.episodes(self._unit, only_going_on=True)
                 waiting = store.requests(self._unit)
+                first = min((one.raised_ns for one in episodes), default=now)
+                comments = store.comments(self._unit, first)
         except TwinError as error:
-            grey = {"light": Light.GREY.value, "words": WORDS[Light.GREY], "alarms": []}
+            grey = {"light": Light.GREY.value, "words": tr(WORDS[Light.GREY]), "alarms": []}
             if live is None:  # before the first run there is none
                 return own | grey
-            return own | grey | {"words": "Alarms unknown", "trouble": _with_hint(error)}
+            return own | grey | {"words": tr("Alarms unknown"), "trouble": _with_hint(error)}
         light = light_of(board, running=running)
-        found = {"light": light.value, "words": WORDS[light]}
-        return own | found | {"alarms": listed(board, episodes, waiting, now)}
+        found = {"light": light.value, "words": tr(WORDS[light])}
+        return own | found | {"alarms": listed(board, episodes, waiting, now, comments)}
 
     def history(self, days: float) -> list[dict[str, Any]]:
         """Every time an alarm was active, the newest first."""
         values = {rule.name: rule.value for rule in self._rules}
         priorities = {rule.name: rule.priority.value for rule in self._rules}
         now = self._clock()
+        since = now - round(days * DAY_NS)
         with self._alarms() as store:
-            episodes = store.episodes(self._unit, now - round(days * DAY_NS))
+            episodes, comments = (
+                store.episodes(self._unit, since),
+                store.comments(self._unit, since),
+            )
         return [
             {
                 "alarm": one.alarm,
                 "priority": priorities.get(one.alarm, ""),
-                **told(one, values.get(one.alarm, ""), now),
+                "priority_words": priority_words(priorities.get(one.alarm, "")),
+                **told(one, values.get(one.alarm, ""), now, comments),
             }
             for one in reversed(episodes[-MOST_EPISODES:])
         ]
@@ -124,6 +132,11 @@ class Ejector:
             raise ConfigError(f"nothing was asked here with the number {number}")
         with self._alarms() as store:
             return store.answer(number)
+
+    def comment(self, raised_as: str, raised_ns: int, who: str, text: str) -> None:
+        """Keep what somebody writes to an alarm; no run is needed for it."""
+        with self._alarms() as store:
+            store.comment(self._unit, Comment(raised_ns, raised_as, self._clock(), who, text))
 
     # --- live -----------------------------------------------------------------------------------
 
@@ -157,7 +170,7 @@ class Ejector:
 
     def figures(self) -> list[dict[str, str]]:
         """What there are trends of."""
-        return [{"name": one.name, "unit": one.unit, "what": one.what} for one in FIGURES.values()]
+        return [figure_words(one) for one in FIGURES.values()]
 
     def trend(self, name: str, days: float) -> dict[str, Any]:
         """How a figure runs over days: cycles, line, band, limit, and when it comes to it."""
@@ -169,16 +182,14 @@ class Ejector:
         with open_figures("", self.config.document, write=False) as store:
             history = store.history(self._unit, since, columns)
         found: dict[str, Any] = {
-            "name": name,
-            "unit": figure.unit,
-            "what": figure.what,
+            **figure_words(figure),
             "cycles": len(history.cycle),
         }
         if not len(history.cycle):
-            return found | {"words": "no cycles in that time"}
+            return found | {"words": tr("no cycles in that time")}
         trend = trend_of_figure(history, figure, self._limits)
         every = max(1, math.ceil(len(history.cycle) / MOST_POINTS))
-        words = in_words(figure, trend, self._clock())
+        words = f"{title_of(name)}: {course_in_words(figure, trend, self._clock())}"
         found |= {"words": words, "limit": trend.limit, "every": every}
         found |= {"time": (history.host_ns[::every] / S_NS).tolist()}
         found |= {side: _plain(history.values[f"{name}_{side}"][::every]) for side in SIDES}
@@ -208,6 +219,12 @@ class Ejector:
         return board
 
 
+def figure_words(figure: Figure) -> dict[str, str]:
+    """A key figure as people read it."""
+    unit, what = figure.unit, tr(figure.what)
+    return {"name": figure.name, "title": title_of(figure.name), "unit": unit, "what": what}
+
+
 def _with_hint(error: TwinError) -> str:
     return f"{error}: {error.hint}" if error.hint else str(error)
 
@@ -223,12 +240,18 @@ def _drawn(trend: Trend) -> dict[str, Any]:
         return {}
     days, middle, half = trend.shape(trend.ahead(AHEAD))
     at = trend.end_ns / S_NS + days * 86_400.0
+    step = trend.step and {
+        "at": trend.step.host_ns / S_NS,
+        "from": trend.step.earliest_ns / S_NS,
+        "to": trend.step.latest_ns / S_NS,
+    }
     return {
+        "step": step,
         "line": {
             "time": at.tolist(),
             "middle": _plain(middle),
             "low": _plain(middle - half),
             "high": _plain(middle + half),
             "is_trend": trend.line is not None and trend.line.is_trend,
-        }
+        },
     }

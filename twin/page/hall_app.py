@@ -9,6 +9,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from twin.assets.unit import Unit
+from twin.language import tr
 from twin.page.hall import Hall
 from twin.page.hall_words import counted, details, of_one, overview
 
@@ -44,5 +45,5 @@ class AllEjectors:
             )
         )
         if told is None:
-            raise HTTPException(HTTPStatus.NOT_FOUND, "the broker knows no such ejector")
+            raise HTTPException(HTTPStatus.NOT_FOUND, tr("the broker knows no such ejector"))
         return JSONResponse(told | {"now": now})

@@ -8,30 +8,40 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from twin.alarms.causes import CAUSES, DEVIATION, value_of
-from twin.alarms.rules import Priority
+from twin.alarms.rules import Priority, by_cause, default_rules
 from twin.alarms.state import State
+from twin.alarms.words import action_of
 from twin.assets.unit import Unit
 from twin.figures.store import SIDES
 from twin.figures.table import FIGURES
+from twin.figures.words import title_of
 from twin.instants import SECOND_NS, instant, lasting, zone
+from twin.language import speaking, tr
+from twin.page.ejector import figure_words
 from twin.page.hall import COLUMNS, NOT_UNDERSTOOD, Document, Heard, Row
-from twin.page.light import Light, facts, named
+from twin.page.light import (
+    WORST_FIRST,
+    Light,
+    facts,
+    named,
+    priority_words,
+    rank,
+    state_words,
+)
 
 KEY_FIGURES = ("t0", "leakage", "air")  # that stand in the table
 SPARK_POINTS = 60
 SPARK_ROWS = 300
 SILENT_S = 15.0  # longer than three messages with values take
 BEHIND_S = 60.0  # values that come late are said to
-WORST_FIRST = (Light.RED, Light.GREY, Light.YELLOW, Light.GREEN)
 WORDS = {
     Light.RED: "Alarm",
     Light.YELLOW: "Look after it",
     Light.GREEN: "All right",
     Light.GREY: "Offline",
 }
+_RULES = {rule.name: rule for rule in by_cause(default_rules())}
 SILENT, NOT_KNOWN = "Silent", "Not known"
-_PRIORITIES = [one.value for one in (Priority.HIGH, Priority.MEDIUM, Priority.LOW)]
-_STANDING = [one.value for one in (State.UNACKNOWLEDGED, State.ACKNOWLEDGED, State.RETURNED)]
 
 
 def overview(heard: Sequence[Heard], trouble: str, since: float, now: float) -> dict[str, Any]:
@@ -67,7 +77,7 @@ def _line(heard: Heard, now: float, trouble: str) -> dict[str, Any]:
         "batch": heard.batch,
         "name": heard.unit.id or heard.unit.type,
         "light": light.value,
-        "words": words,
+        "words": tr(words),
         "since": since,
         "times": {
             "since": _said(since, now),
@@ -109,8 +119,9 @@ def _without_alarm(heard: Heard, words: str) -> str:
     """What there is to say where no alarm stands."""
     if words == WORDS[Light.GREY]:
         died = heard.status == "offline" and heard.since is None
-        return "gone without a word" if died else "stopped" if heard.status else "never came"
-    return "no values come" if words == SILENT else "" if words == NOT_KNOWN else "no alarm"
+        gone = tr("stopped") if heard.status else tr("never came")
+        return tr("gone without a word") if died else gone
+    return tr("no values come") if words == SILENT else "" if words == NOT_KNOWN else tr("no alarm")
 
 
 def _patience(heard: Heard) -> float:
@@ -130,10 +141,7 @@ def _standing(heard: Heard) -> list[Document]:
 
 
 def _rank(alarm: Document) -> tuple[int, int, float]:
-    state, priority = alarm["state"], alarm["priority"]
-    first = _STANDING.index(state) if state in _STANDING else len(_STANDING)
-    second = _PRIORITIES.index(priority) if priority in _PRIORITIES else len(_PRIORITIES)
-    return first, second, alarm["since"] or 0.0
+    return *rank(alarm["state"], alarm["priority"]), alarm["since"] or 0.0
 
 
 # --- alarms -------------------------------------------------------------------------------------
@@ -146,8 +154,22 @@ def _card(alarm: Document, now: float) -> dict[str, Any]:
     except NOT_UNDERSTOOD:  # another program's
         known = []
     kept = {key: alarm[key] for key in alarm if key != "evidence"}
+    kept |= {"state_words": state_words(str(alarm["state"]))}
+    kept |= {"priority_words": priority_words(str(alarm["priority"]))}
+    kept |= _advice(alarm)
     times = {"times": {"since": _said(alarm["since"], now)}}
     return kept | _title(str(alarm["alarm"])) | {"facts": known} | times
+
+
+def _advice(alarm: Document) -> dict[str, Any]:
+    """What follows and what to do, in the language of who reads it where the rule is ours."""
+    rule = _RULES.get(str(alarm["alarm"]))
+    said = {key: alarm.get(key, "") for key in ("consequence", "action")}
+    with speaking({}):
+        published = {"consequence": rule.consequence, "action": action_of(rule, {})} if rule else {}
+    if rule is None or said != published:
+        return said
+    return {"consequence": tr(rule.consequence), "action": action_of(rule, {})}
 
 
 def _said(seconds: float | None, now: float) -> str:
@@ -175,7 +197,8 @@ def _newest(heard: Heard) -> list[dict[str, Any]]:
             measured, expected = (values[COLUMNS.index(f"{name}_{side}")] for side in SIDES)
             if math.isfinite(measured):
                 sides = {"measured": _plain(measured), "expected": _plain(expected)}
-                found.append({"name": name, "unit": FIGURES[name].unit, **sides})
+                known = {"name": name, "title": title_of(name), "unit": FIGURES[name].unit}
+                found.append(known | sides)
                 break
     return found
 
@@ -190,8 +213,7 @@ def _trends(heard: Heard) -> list[dict[str, Any]]:
             for side in SIDES
         }
         if any(one is not None for one in sides["measured"]):
-            known = {"name": name, "unit": figure.unit, "what": figure.what}
-            made.append({**known, "time": times, **sides})
+            made.append({**figure_words(figure), "time": times, **sides})
     return made
 
 

@@ -2,7 +2,9 @@
 "use strict";
 
 const LOOK_MS = 2000;
-const LIGHTS = { red: "with an alarm", grey: "not known", yellow: "to be looked after", green: "all right" };
+const LIGHTS = {
+  red: t("with an alarm"), grey: t("not known"), yellow: t("to be looked after"), green: t("all right"),
+};
 
 let me = { user: "", csrf: "" };
 let told = null; // what the server said last
@@ -33,13 +35,13 @@ function showList() {
   $("counts").textContent = Object.entries(LIGHTS).filter(([light]) => told.counts[light])
     .map(([light, words]) => `${told.counts[light]} ${words}`).join(", ");
   $("none").hidden = shown.length > 0;
-  $("none").textContent = told.ejectors.length ? "No ejector is like that."
-    : "No ejector has published anything to this broker yet.";
+  $("none").textContent = told.ejectors.length ? t("No ejector is like that.")
+    : t("No ejector has published anything to this broker yet.");
 }
 
 function line(ejector) {
   const name = element("a", { href: hrefOf(ejector) }, ejector.name);
-  const batch = ejector.batch ? `, batch ${ejector.batch}` : "";
+  const batch = ejector.batch ? `, ${t("batch")} ${ejector.batch}` : "";
   const row = element("tr", { class: ejector.light, "data-light": ejector.light, "data-name": ejector.name },
     element("td", { class: "light" }, icon(ejector.light), element("b", {}, ejector.words)),
     element("th", { scope: "row" }, name, element("span", { class: "dim" }, ejector.type + batch)),
@@ -52,20 +54,21 @@ function line(ejector) {
 }
 
 function what(ejector) {
-  const more = ejector.alarms_count > 1 ? ` and ${ejector.alarms_count - 1} more` : "";
-  const since = ejector.since ? `since ${ejector.times.since}` : "";
+  const others = ejector.alarms_count - 1;
+  const more = others > 0 ? " " + t("and {count} more", { count: others }) : "";
+  const since = ejector.since ? t("since {time}", { time: ejector.times.since }) : "";
   return [element("b", {}, ejector.what + more),
     element("span", { class: "dim" }, since)];
 }
 
 function seen(ejector) {
-  const behind = ejector.behind ? `values ${ejector.times.behind} behind` : "";
-  return [element("span", {}, ejector.times.seen || "never"), element("span", { class: "dim" }, behind)];
+  const behind = ejector.behind ? t("values {time} behind", { time: ejector.times.behind }) : "";
+  return [element("span", {}, ejector.times.seen || t("never")), element("span", { class: "dim" }, behind)];
 }
 
-function figure({ name, unit, measured, expected }) {
+function figure({ title, unit, measured, expected }) {
   const beside = expected === null ? "" : ` (${brief(expected)})`;
-  return element("span", {}, `${name.replaceAll("_", " ")} ${brief(measured)}${beside} ${unit}`);
+  return element("span", {}, `${title} ${brief(measured)}${beside} ${unit}`);
 }
 
 function brief(value) {
@@ -82,7 +85,8 @@ function spark({ low, high }) {
   const there = high.filter((value) => value !== null);
   const top = Math.max(100, ...there);
   const last = there.length ? there[there.length - 1] : null;
-  svg.setAttribute("aria-label", last === null ? "no vacuum yet" : `vacuum up to ${Math.max(...there)} mbar`);
+  svg.setAttribute("aria-label", last === null ? t("no vacuum yet")
+    : t("vacuum up to {value} mbar", { value: Math.max(...there) }));
   const x = (i) => (120 * i) / Math.max(1, high.length - 1);
   const y = (value) => 39 - (38 * Math.max(0, value)) / top;
   let d = "";
@@ -104,25 +108,25 @@ function showOne() {
   const light = $("one-light");
   light.className = `ejector ${one.light}`;
   light.dataset.light = one.light;
-  const since = one.since ? `since ${one.times.since}` : "";
+  const since = one.since ? t("since {time}", { time: one.times.since }) : "";
   light.replaceChildren(icon(one.light), element("b", {}, one.words), element("span", {}, since));
   $("one-alarms").replaceChildren(...(one.alarms.length ? one.alarms.map(card)
-    : [element("p", { class: "nothing" }, "No alarm stands.")]));
-  const known = [["batch", one.batch], ["last seen", one.times.seen || "never"],
-    ["twin", one.status], ["program", one.program]];
+    : [element("p", { class: "nothing" }, t("No alarm stands."))]));
+  const known = [[t("batch"), one.batch], [t("last seen"), one.times.seen || t("never")],
+    [t("twin"), one.status], [t("program"), one.program]];
   $("one-facts").replaceChildren(...rows(known).childNodes);
   showPlots();
 }
 
 function card(alarm) {
-  const since = alarm.since ? `since ${alarm.times.since}` : "";
+  const since = alarm.since ? t("since {time}", { time: alarm.times.since }) : "";
   return element("article", { class: `alarm ${alarm.state} ${alarm.priority}`, "data-alarm": alarm.alarm },
     element("div", { class: "top" }, element("h3", {}, alarm.what),
-      element("span", { class: "chip" }, `${alarm.priority} priority`),
-      element("span", { class: "chip state" }, STATES[alarm.state] || alarm.state)),
+      element("span", { class: "chip" }, alarm.priority_words),
+      element("span", { class: "chip state" }, alarm.state_words)),
     element("p", { class: "since" }, since),
     element("p", { class: "todo" }, alarm.action),
-    rows([["where", alarm.where], ...alarm.facts, ["if nobody acts", alarm.consequence]]));
+    rows([[t("where"), alarm.where], ...alarm.facts, [t("if nobody acts"), alarm.consequence]]));
 }
 
 function showPlots() {
@@ -134,11 +138,11 @@ function showPlots() {
   const names = one.trends.map((trend) => trend.name);
   if ([...select.options].map((option) => option.value).join() !== names.join()) {
     const before = select.value;
-    select.replaceChildren(...names.map((name) => element("option", { value: name }, name.replaceAll("_", " "))));
+    select.replaceChildren(...names.map((name) => element("option", { value: name }, one.trends.find((trend) => trend.name === name).title)));
     select.value = names.includes(before) ? before : names[0] || "";
   }
   const trend = one.trends.find((each) => each.name === select.value);
-  $("figure-what").textContent = trend ? `${trend.what}, ${trend.unit}` : "No cycle has been told yet.";
+  $("figure-what").textContent = trend ? `${trend.what}, ${trend.unit}` : t("No cycle has been told yet.");
   const { time: at, measured, expected: beside, unit } = trend || { time: [], measured: [], expected: [], unit: "" };
   draw("figure", unit, [{ time: at, low: measured, colour: "--grey", dots: true },
     { time: at, low: beside, ...model }]);
@@ -191,16 +195,16 @@ function show() {
   if (!told) return;
   const silent = performance.now() - heardMs > SILENT_MS;
   if (silent) {
-    const lost = (ejector) => ({ ...ejector, light: "grey", words: "No connection" });
+    const lost = (ejector) => ({ ...ejector, light: "grey", words: t("No connection") });
     told = { ...told, ejectors: told.ejectors.map(lost), counts: { grey: told.ejectors.length } };
     one = one && lost(one);
   }
-  const said = silent ? "No connection to the page: nothing here is up to date" : "connected";
+  const said = silent ? t("No connection to the page: nothing here is up to date") : t("connected");
   $("connection").classList.toggle("bad", silent);
   if ($("connection").textContent !== said) $("connection").textContent = said;
   if (!wanted() || one) {
-    const since = told.trouble_since ? ` since ${told.trouble_since}` : "";
-    showBanner(told.trouble ? `${told.trouble}${since}. What follows is as it was then.` : "");
+    const since = told.trouble_since ? t("since {time}", { time: told.trouble_since }) : "";
+    showBanner(told.trouble ? `${told.trouble} ${since}. ${t("What follows is as it was then.")}` : "");
   }
   $("list").hidden = Boolean(wanted());
   $("one").hidden = !wanted() || !one;
@@ -220,6 +224,7 @@ async function lookOn() {
 
 async function begin() {
   me = await get("/api/me");
+  offerLanguages(me.languages);
   $("who").textContent = me.user;
   $("login").hidden = Boolean(me.user);
   $("logout").hidden = !me.user;

@@ -6,6 +6,7 @@ const BOTTOM_PX = 26; // room for what stands at the ticks of time
 const SIDE_PX = 28; // half of the widest of them
 const TICK_PX = { time: 90, value: 44 }; // between two ticks, at least
 const ZOOM = 2; // by one press
+const DATES = LANGUAGE === "en" ? "en-GB" : LANGUAGE; // the day before the month, and 24 hours
 const DAY_S = 86400;
 const MONDAY_S = 4 * DAY_S; // the first one after 1970 began
 const STEPS_S = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200,
@@ -45,8 +46,8 @@ function dateText(tick, step) {
   const then = there(tick);
   const midnight = then.getHours() === 0 && then.getMinutes() === 0 && then.getSeconds() === 0;
   const seconds = step < 60 ? { second: "2-digit" } : {};
-  return midnight ? then.toLocaleDateString("en-GB", { day: "numeric", month: "short" })
-    : then.toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit", ...seconds });
+  return midnight ? then.toLocaleDateString(DATES, { day: "numeric", month: "short" })
+    : then.toLocaleTimeString(DATES, { hour: "2-digit", minute: "2-digit", ...seconds });
 }
 
 function roomy(low, high) { // a range of values with some room around
@@ -101,11 +102,12 @@ function runs(points) { // between gaps
    [from, to], as far as it can be seen; least: s, the shortest stretch; values: (low, high) =>
    [low, high] of the axis, which are undefined where there is nothing; ticks: () => (from, to, most)
    => [{at, text}]; unit; tools: where buttons go; back: the text of one; bands: (from, to) => [{from,
-   to, colour}]; marks: () => [{at, text, colour}]; moved: called when another stretch is shown.
+   to, colour, text}]; marks: () => [{at, text, colour, dash, from, to}], from and to of when it may
+   have been; moved: called when another stretch is shown.
    A series: {time, low, high, colour, width, dash, fill, dots}; high is low if it is not given. */
 class Chart {
   constructor(box, options) {
-    this.options = { bands: () => [], marks: () => [], moved: () => {}, unit: "", back: "All", ...options };
+    this.options = { bands: () => [], marks: () => [], moved: () => {}, unit: "", back: t("All"), ...options };
     this.series = [];
     this.width = this.end = null; // s: what a person has chosen to see
     this.fingers = new Map();
@@ -116,7 +118,7 @@ class Chart {
     const press = (text, label, onclick) => element("button", { type: "button", "aria-label": label, onclick }, text);
     this.home = press(this.options.back, this.options.back, () => this.goHome());
     this.options.tools.replaceChildren(this.home,
-      press("−", "Zoom out", () => this.zoom(ZOOM)), press("+", "Zoom in", () => this.zoom(1 / ZOOM)));
+      press("−", t("Zoom out"), () => this.zoom(ZOOM)), press("+", t("Zoom in"), () => this.zoom(1 / ZOOM)));
     this.listen(box);
     this.moved();
   }
@@ -277,8 +279,20 @@ class Chart {
     for (const band of this.options.bands(from, to)) {
       this.ctx.fillStyle = colour(band.colour);
       const left = Math.round(x(band.from));
-      this.ctx.fillRect(left, this.area.top, Math.round(x(band.to)) - left, this.area.height);
+      const right = Math.round(x(band.to));
+      this.ctx.fillRect(left, this.area.top, right - left, this.area.height);
+      if (band.text) this.nameBand(band.text, left, right);
     }
+  }
+
+  nameBand(text, left, right) { // where there is room for it
+    const { ctx, area } = this;
+    const [from, to] = [Math.max(left, area.left), Math.min(right, area.left + area.width)];
+    if (ctx.measureText(text).width + 8 > to - from) return;
+    ctx.fillStyle = colour("--ink");
+    ctx.textAlign = "left";
+    ctx.textBaseline = "bottom";
+    ctx.fillText(text, from + 4, area.top + area.height - 3);
   }
 
   drawTicks(values, times, x, y) {
@@ -351,14 +365,25 @@ class Chart {
     ctx.lineWidth = 2;
     ctx.textAlign = "left";
     ctx.textBaseline = "top";
-    this.options.marks().forEach(({ at, text, colour: name }, i) => {
+    this.options.marks().forEach(({ at, text, colour: name, dash = [], from, to }, i) => {
       ctx.strokeStyle = ctx.fillStyle = colour(name);
+      if (from !== undefined) this.shade(x(from), x(to));
+      ctx.setLineDash(dash);
       ctx.beginPath();
       this.line(x(at), area.top, null, area.top + area.height);
       ctx.stroke();
+      ctx.setLineDash([]);
+      if (x(at) < area.left || x(at) > area.left + area.width) return;
       const begin = x(at) + 6 + ctx.measureText(text).width > area.left + area.width
         ? x(at) - 6 - ctx.measureText(text).width : x(at) + 6;
       ctx.fillText(text, begin, area.top + 4 + 18 * (i % 3)); // beside those of the same moment
     });
+  }
+
+  shade(left, right) {
+    const { ctx, area } = this;
+    ctx.globalAlpha = 0.2;
+    ctx.fillRect(left, area.top, Math.max(right - left, 2), area.height);
+    ctx.globalAlpha = 1;
   }
 }

@@ -1,16 +1,21 @@
 // What the pages share. What comes from the server is put in as text, never as markup.
 "use strict";
 
-const STATES = {
-  unacknowledged: "not acknowledged", acknowledged: "acknowledged",
-  returned: "gone, not acknowledged", shelved: "kept quiet",
-  suppressed: "explained by another alarm", out_of_service: "out of service",
-};
 const SILENT_MS = 5000; // without a word from the page's own server
 
 const $ = (id) => document.getElementById(id);
 let skew = 0; // seconds that the server's clock is ahead of the one here
 let zone = null; // seconds that the server's zone is ahead of UTC: all times are told in it
+
+// --- languages -----------------------------------------------------------------------------------
+
+const t = (text, values = {}) => (TEXTS[text] ?? text).replace(/\{(\w+)\}/g, (_, name) => values[name]);
+
+function offerLanguages(languages) {
+  $("language").replaceChildren(...languages.map(({ code, name }) => element(
+    "option", { value: code, lang: code, selected: code === LANGUAGE }, name)));
+  $("language").onchange = () => location.assign(`/language/${$("language").value}`);
+}
 
 // --- small things --------------------------------------------------------------------------------
 

@@ -1,21 +1,22 @@
 // The technician's page. What comes from the server is put in as text, never as markup.
 "use strict";
 
-const PHASES = ["idle", "suction", "hold", "blow-off"];
+const PHASES = [t("idle"), t("suction"), t("hold"), t("blow-off")];
 const PHASE_COLOURS = ["--idle", "--suction", "--hold", "--blow"];
 const DEEDS = {
-  acknowledged: "Acknowledge", shelved: "Keep quiet", unshelved: "Let it speak",
-  out_of_service: "Take out of service", in_service: "Back into service",
+  acknowledged: t("Acknowledge"), shelved: t("Shelve"), unshelved: t("Unshelve"),
+  out_of_service: t("Take out of service"), in_service: t("Return to service"),
 };
-const TIMES = [[900, "15 minutes"], [3600, "1 hour"], [4 * 3600, "4 hours"], [8 * 3600, "8 hours"]];
-const WINDOW_S = 10; // of live rows, at first
+const TIMES = [[900, t("15 minutes")], [3600, t("1 hour")], [4 * 3600, t("4 hours")], [8 * 3600, t("8 hours")]];
 const KEPT_S = 300; // of them, to look back at
-const SHOWN = ["size", "how sure"]; // of what speaks for an alarm, at first sight
+const SHOWN = [t("size"), t("how sure")]; // of what speaks for an alarm, at first sight
+const LIGHTS = ["red", "grey", "yellow", "green"]; // the worst first
+const MOST_MARKS = 20; // of alarms in a trend
 const QUIET = ["shelved", "suppressed", "out_of_service"];
 
 let me = { user: "", csrf: "", may: [], ejectors: [], figures: [] };
 let states = [];
-let chosen = 0;
+let chosen = null; // the ejector whose curves are shown; at first the worst
 const mine = new Map(); // alarm -> what has become of what was asked here
 
 async function post(path, what) {
@@ -33,37 +34,61 @@ function summary(state) {
   const standing = state.alarms.filter((one) => !QUIET.includes(one.state)).length;
   const quiet = state.alarms.length - standing;
   const parts = [];
-  if (!state.running) parts.push(state.last ? `since ${state.last_seen}` : "never yet");
-  if (standing) parts.push(standing === 1 ? "1 alarm" : `${standing} alarms`);
-  if (quiet) parts.push(`${quiet} kept quiet`);
-  return parts.join(", ") || "no alarm";
+  if (!state.running) parts.push(state.last ? t("since {time}", { time: state.last_seen }) : t("never yet"));
+  if (standing) parts.push(t("alarms: {count}", { count: standing }));
+  if (quiet) parts.push(t("shelved: {count}", { count: quiet }));
+  return parts.join(", ") || t("no alarm");
 }
 
-function showLights() {
-  const old = $("ejectors");
-  const focused = [...old.children].indexOf(document.activeElement);
-  const lights = states.map((state, number) => element(
+function worstFirst() { // numbers of the ejectors; of the same light, the one with the worse alarm
+  const key = (number) => {
+    const [first] = states[number].alarms;
+    const rank = first ? first.rank : [9, 9];
+    return [LIGHTS.indexOf(states[number].light), ...rank, number];
+  };
+  return states.map((_, number) => number).sort((a, b) => inOrder(key(a), key(b)));
+}
+
+function inOrder(one, other) { // of lists of numbers, as of words
+  const at = one.findIndex((value, i) => value !== other[i]);
+  return at < 0 ? 0 : one[at] - other[at];
+}
+
+function light(number) {
+  const state = states[number];
+  return element(
     "button",
     {
       type: "button", class: `ejector ${state.light}`, "aria-pressed": String(number === chosen),
-      "data-light": state.light, onclick: () => choose(number),
+      "data-light": state.light, "data-number": number, onclick: () => choose(number, true),
     },
     icon(state.light),
     element("b", {}, state.words),
     element("span", {}, `${state.name}: ${summary(state)}`),
-  ));
+  );
+}
+
+function showLights() {
+  const old = $("ejectors");
+  const focused = old.contains(document.activeElement) ? document.activeElement.dataset.number : null;
+  const lights = worstFirst().map(light);
   const key = lights.map((one) => one.outerHTML).join("");
   if (old.dataset.key === key) return;
   old.dataset.key = key;
   old.replaceChildren(...lights);
-  if (focused >= 0 && lights[focused]) lights[focused].focus();
-  document.title = `${states.map((one) => one.words).join(" / ")} – ejectors`;
+  const again = lights.find((one) => one.dataset.number === focused);
+  if (again) again.focus();
+  const worst = lights.map((one) => one.dataset.number)[0];
+  document.title = `${states[worst].words} – ${states[worst].name}`;
 }
 
-function choose(number) {
-  chosen = number;
-  live.clear();
-  if (socket && socket.readyState === WebSocket.OPEN) socket.send(String(number));
+function choose(number, alone = false) { // its curves; with its alarms alone, or among all others
+  if (alone && states.length > 1) $("whose").value = String(number);
+  if (number !== chosen) {
+    chosen = number;
+    live.clear();
+    watch();
+  }
   showStates();
   if (!$("trends").hidden) showTrend();
   if (!$("history").hidden) loadHistory();
@@ -73,11 +98,13 @@ function showBanner() {
   const state = states[chosen];
   const said = [];
   if (!state.running) {
-    const how = state.ended ? "twin run has ended" : "twin run does not answer";
-    said.push(state.last ? `Not running since ${state.last_seen}: ${how}. What follows is as it was then.`
-      : "Not running: twin run has not been started yet.");
+    const how = state.ended ? t("twin run has ended") : t("twin run does not answer");
+    said.push(state.last
+      ? t("Not running since {time}: {why}. What follows is as it was then.", { time: state.last_seen, why: how })
+      : t("Not running: twin run has not been started yet."));
   }
   if (state.trouble) said.push(state.trouble);
+  if (states.length > 1 && said.length) said.unshift(`${state.name}:`);
   $("banner").hidden = !said.length;
   if ($("banner").textContent !== said.join(" ")) $("banner").textContent = said.join(" ");
   document.querySelector(".live").classList.toggle("stale", !state.running);
@@ -94,107 +121,152 @@ function isShown(alarm) {
   return true;
 }
 
+function offerEjectors() {
+  $("whose-label").hidden = states.length < 2;
+  const names = [["", t("all")], ...states.map(({ name }, number) => [String(number), name])];
+  if ([...$("whose").options].map((one) => one.text).join() === names.map(([, name]) => name).join()) return;
+  $("whose").replaceChildren(...names.map(([value, name]) => element("option", { value }, name)));
+}
+
+function allAlarms() { // of all ejectors, or of the one that is wanted alone; the worst first
+  const whose = $("whose").value;
+  const found = states.flatMap((state, of) => state.alarms.map((alarm) => ({ ...alarm, of })))
+    .filter(({ of }) => !whose || whose === String(of));
+  const key = ({ rank, raised }) => [...rank, raised || 0];
+  return found.sort((one, other) => inOrder(key(one), key(other)));
+}
+
+const keyOf = (alarm) => `${alarm.of} ${alarm.alarm}`;
+
 function showAlarms() {
-  const state = states[chosen];
-  const shown = state.alarms.filter(isShown);
-  $("count").textContent = state.alarms.length ? `(${state.alarms.length})` : "";
+  const known = allAlarms();
+  const shown = known.filter(isShown);
+  $("count").textContent = known.length ? `(${known.length})` : "";
   const box = $("alarms");
-  const ageless = (name, value) => (["times", "quiet_until"].includes(name) ? undefined : value);
-  const key = JSON.stringify([chosen, me.user, shown, [...mine]], ageless);
+  const ageless = (name, value) => (["times", "quiet_until", "comments"].includes(name) ? undefined : value);
+  const comments = shown.map((one) => one.comments.length);
+  const key = JSON.stringify([chosen, $("whose").value, me.user, states.map((one) => one.running), shown, comments, [...mine]], ageless);
   if (box.dataset.key !== key) {
-    const open = new Set([...box.querySelectorAll("details[open]")].map((one) => one.dataset.alarm));
+    const open = new Set([...box.querySelectorAll("details[open]")].map((one) => one.dataset.key));
     const focused = document.activeElement && document.activeElement.dataset.focus;
     box.dataset.key = key;
-    box.replaceChildren(...(shown.length ? shown.map((one) => alarmCard(one, open)) : [nothing(state)]));
+    box.replaceChildren(...(shown.length ? shown.map((one) => alarmCard(one, open)) : [nothing(known)]));
     const again = focused && box.querySelector(`[data-focus="${CSS.escape(focused)}"]`);
     if (again) again.focus();
   }
   for (const one of box.querySelectorAll("[data-since]")) {
-    one.textContent = since(shown.find((alarm) => alarm.alarm === one.dataset.since));
+    one.textContent = since(shown.find((alarm) => keyOf(alarm) === one.dataset.since));
   }
 }
 
 function since(alarm) {
   const { raised, cleared, seen } = alarm.times || {};
-  const said = raised ? [`since ${raised}`] : [];
-  if (cleared) said.push(`gone since ${cleared}`);
-  if (seen) said.push(`acknowledged ${seen} by ${alarm.seen_by}`);
-  if (alarm.quiet_until) said.push(`quiet until ${alarm.quiet_until}`);
+  const said = raised ? [t("since {time}", { time: raised })] : [];
+  if (cleared) said.push(t("gone since {time}", { time: cleared }));
+  if (seen) said.push(t("acknowledged {time} by {who}", { time: seen, who: alarm.seen_by }));
+  if (alarm.quiet_until) said.push(t("shelved until {time}", { time: alarm.quiet_until }));
   return said.join("; ");
 }
 
-function nothing(state) {
-  const none = state.alarms.length ? "No alarm is like that." : "No alarm stands.";
-  const unknown = state.trouble || state.last === null;
-  return element("p", { class: "nothing" }, unknown ? "The alarms are not known." : none);
+function nothing(known) {
+  const whose = $("whose").value;
+  const looked = whose ? [states[whose]] : states;
+  const unknown = looked.some((state) => state.trouble || state.last === null);
+  const none = known.length ? t("No alarm is like that.") : t("No alarm stands.");
+  return element("p", { class: "nothing" }, unknown ? t("The alarms are not known.") : none);
 }
 
 function alarmCard(alarm, open) {
-  const where = [states[chosen].name, alarm.where].filter(Boolean).join(": ");
+  const where = [states[alarm.of].name, alarm.where].filter(Boolean).join(": ");
   return element(
-    "article", { class: `alarm ${alarm.state} ${alarm.priority}`, "data-alarm": alarm.alarm },
+    "article", { class: `alarm ${alarm.state} ${alarm.priority}`, "data-alarm": alarm.alarm, "data-of": alarm.of },
     element("div", { class: "top" }, element("h3", {}, alarm.what),
-      element("span", { class: "chip" }, `${alarm.priority} priority`),
-      element("span", { class: "chip state" }, STATES[alarm.state])),
-    element("p", { class: "since", "data-since": alarm.alarm }),
+      element("span", { class: "chip" }, alarm.priority_words),
+      element("span", { class: "chip state" }, alarm.state_words)),
+    element("p", { class: "since", "data-since": keyOf(alarm) }),
     element("p", { class: "todo" }, alarm.action),
-    rows([["where", where], ...alarm.facts.filter(([name]) => SHOWN.includes(name))]),
+    rows([[t("where"), where], ...alarm.facts.filter(([name]) => SHOWN.includes(name))]),
+    ...comments(alarm),
     evidence(alarm, open),
     deeds(alarm),
     ...asked(alarm),
   );
 }
 
+function comments({ comments: said }) {
+  return said.map((one) => element("p", { class: "comment" },
+    element("q", {}, one.text), ` ${one.who}, ${one.when}`));
+}
+
 function evidence(alarm, open) {
   const facts = alarm.facts.filter(([name]) => !SHOWN.includes(name));
   return element(
-    "details", { "data-alarm": alarm.alarm, open: open.has(alarm.alarm) },
-    element("summary", { "data-focus": `why ${alarm.alarm}` }, "Evidence"),
-    rows([["what it is", alarm.sentence], ["if nobody acts", alarm.consequence], ...facts, ["alarm", alarm.alarm]]));
+    "details", { "data-key": keyOf(alarm), open: open.has(keyOf(alarm)) },
+    element("summary", { "data-focus": `why ${keyOf(alarm)}` }, t("Evidence")),
+    rows([[t("what it is"), alarm.sentence], [t("if nobody acts"), alarm.consequence], ...facts, [t("alarm"), alarm.alarm]]));
 }
 
-function reportLink(one) {
-  if (!one.report) return null;
-  const href = `/reports/${chosen}/${one.report}`;
-  return element("a", { class: "button", href, target: "_blank", rel: "noopener" },
-    "See diagnosis");
+function reportButton(of, { report, alarm }) {
+  if (!report) return null;
+  const onclick = () => {
+    const href = `/reports/${of}/${report}`;
+    $("report-open").href = $("report-frame").src = href;
+    $("report").showModal();
+  };
+  return element("button", { type: "button", "data-focus": `report ${of} ${alarm}`, onclick }, t("See diagnosis"));
+}
+
+function curveButton(alarm) {
+  if (alarm.of === chosen) return null;
+  return element("button", {
+    type: "button", "data-focus": `curve ${keyOf(alarm)}`, onclick: () => choose(alarm.of),
+  }, t("Show its curve"));
+}
+
+function possible(alarm) {
+  const found = alarm.acknowledged ? [] : ["acknowledged"];
+  if (alarm.state === "shelved") return [...found, "unshelved"];
+  return [...found, alarm.state === "out_of_service" ? "in_service" : "shelved"];
 }
 
 function deeds(alarm) {
-  const possible = [];
-  if (!alarm.acknowledged) possible.push("acknowledged");
-  if (alarm.state === "shelved") possible.push("unshelved");
-  else if (alarm.state === "out_of_service") possible.push("in_service");
-  else possible.push("shelved");
+  const besides = [reportButton(alarm.of, alarm), curveButton(alarm)];
   if (!me.user) {
     return element("div", { class: "deeds" },
-      element("a", { class: "button", href: "/login" }, "Log in to acknowledge"), reportLink(alarm));
+      element("a", { class: "button", href: "/login" }, t("Log in to acknowledge")), ...besides);
   }
-  const allowed = possible.filter((deed) => me.may.includes(deed));
   if (!me.may.length) {
-    return element("div", { class: "deeds" },
-      element("span", {}, `${me.user} may look, and acknowledges nothing`), reportLink(alarm));
+    const said = t("{user} may look, and acknowledges nothing", { user: me.user });
+    return element("div", { class: "deeds" }, element("span", {}, said), ...besides);
   }
-  return element("div", { class: "deeds" }, ...allowed.map((deed) => element(
-    "button", {
-      type: "button", class: deed === "acknowledged" ? "first" : false,
-      "data-focus": `${deed} ${alarm.alarm}`,
-      disabled: alarm.asked.some((one) => one.deed === deed),
-      onclick: () => (deed === "shelved" ? offerTimes(alarm) : ask(alarm, deed)),
-    }, deed === "shelved" ? `${DEEDS[deed]} …` : DEEDS[deed])), reportLink(alarm));
+  const allowed = possible(alarm).filter((deed) => me.may.includes(deed));
+  const comment = element("button", {
+    type: "button", "data-focus": `comment ${keyOf(alarm)}`, onclick: () => offerComment(alarm),
+  }, t("Comment …"));
+  return element("div", { class: "deeds" }, ...allowed.map((deed) => deedButton(alarm, deed)),
+    alarm.episode && me.may.includes("commented") ? comment : null, ...besides);
+}
+
+function deedButton(alarm, deed) {
+  return element("button", {
+    type: "button", class: deed === "acknowledged" ? "first" : false,
+    "data-focus": `${deed} ${keyOf(alarm)}`,
+    disabled: alarm.asked.some((one) => one.deed === deed),
+    onclick: () => (deed === "shelved" ? offerTimes(alarm) : ask(alarm, deed)),
+  }, deed === "shelved" ? `${DEEDS[deed]} …` : DEEDS[deed]);
 }
 
 function asked(alarm) {
-  const waits = states[chosen].running ? "asked, a moment …" : "asked; waits for the next run";
+  const waits = states[alarm.of].running ? t("asked, a moment …") : t("asked; waits for the next run");
   const said = alarm.asked.map((one) => element(
     "p", { class: "asked", role: "status" }, `${DEEDS[one.deed]}: ${waits} (${one.who})`));
-  const own = mine.get(`${chosen} ${alarm.alarm}`);
+  const own = mine.get(keyOf(alarm));
   if (own) said.push(element("p", { class: "asked refused", role: "alert" }, own));
   return said;
 }
 
 function offerTimes(alarm) {
-  $("shelve-what").textContent = `${alarm.what} says nothing for a time; then it speaks again by itself.`;
+  $("shelve-what").textContent = t("{alarm} is not announced for a time; then it is by itself.", { alarm: alarm.what });
   const times = TIMES.filter(([seconds]) => seconds <= alarm.longest_shelving_s);
   const choice = (text, deed, seconds) => element("button", {
     type: "button", onclick: () => { $("shelve").close(); ask(alarm, deed, seconds); },
@@ -202,21 +274,37 @@ function offerTimes(alarm) {
   $("shelve-times").replaceChildren(
     ...times.map(([seconds, text]) => choice(text, "shelved", seconds)),
     ...(me.may.includes("out_of_service")
-      ? [choice("Until it is taken into service again", "out_of_service", 0)] : []));
+      ? [choice(t("Out of service, until it is returned to service"), "out_of_service", 0)] : []));
   $("shelve").showModal();
 }
 
+function offerComment(alarm) {
+  $("comment-what").textContent = `${states[alarm.of].name}: ${alarm.what}`;
+  $("comment-text").value = "";
+  $("comment-form").onsubmit = () => comment(alarm, $("comment-text").value);
+  $("comment").showModal();
+}
+
+async function comment(alarm, text) {
+  try {
+    await post(`/api/ejectors/${alarm.of}/comments`, { episode: alarm.episode, text });
+    mine.delete(keyOf(alarm));
+  } catch (error) {
+    mine.set(keyOf(alarm), `${t("Comment")}: ${error.message}`);
+  }
+  showAlarms();
+}
+
 async function ask(alarm, deed, seconds = 0) {
-  const number = chosen;
-  const key = `${number} ${alarm.alarm}`;
-  const path = `/api/ejectors/${number}/requests`;
+  const key = keyOf(alarm);
+  const path = `/api/ejectors/${alarm.of}/requests`;
   mine.delete(key);
   try {
     const { request } = await post(path, { alarm: alarm.alarm, deed, seconds });
     alarm.asked.push({ deed, who: me.user });
     showAlarms();
     const why = await answered(`${path}/${request}`);
-    if (why) mine.set(key, `${DEEDS[deed]}: refused. ${why}`);
+    if (why) mine.set(key, t("{deed}: refused. {why}", { deed: DEEDS[deed], why }));
   } catch (error) {
     mine.set(key, `${DEEDS[deed]}: ${error.message}`);
   }
@@ -240,10 +328,13 @@ const NO_ROWS = () => ({
 const live = {
   chart: null,
   rows: NO_ROWS(),
+  marks: new Map(), // alarms of the ejector that is shown, also those that are over
 
   clear() {
     this.rows = NO_ROWS();
     for (const id of ["measured", "expected", "difference", "phase"]) $(id).textContent = "–";
+    this.marks = new Map();
+    this.note();
     if (this.chart) this.chart.goHome();
     this.show();
   },
@@ -302,10 +393,10 @@ const live = {
   begin() {
     const home = () => {
       const end = this.rows.time.length ? this.end() : 0;
-      return [end - WINDOW_S, end];
+      return [end - Number($("window").value), end];
     };
     this.chart = new Chart($("plot"), {
-      home, least: 0.5, unit: "mbar", tools: $("plot-tools"), back: "Back to live",
+      home, least: 0.5, unit: "mbar", tools: $("plot-tools"), back: t("Back to live"),
       all: () => [Math.min(home()[0], this.rows.time[0] ?? 0), home()[1]],
       values: (low = 0, high = 0) => [Math.min(low, -20), Math.max(high * 1.05, 100)],
       ticks: () => secondTicks(home()[1]),
@@ -319,9 +410,10 @@ const live = {
     if (!this.chart) return;
     const [from, to] = this.chart.range().map((time) => Math.max(0, this.end() - time));
     const brief = (seconds) => number(seconds, seconds < 10 && seconds % 1 > 0.05 ? 1 : 0);
-    $("plot-head").textContent = this.chart.end === null || !this.rows.time.length
-      ? `Vacuum, the last ${brief(this.rows.time.length ? from : WINDOW_S)} s`
-      : `Vacuum, ${brief(from)} to ${brief(to)} s ago`;
+    const said = this.chart.end === null || !this.rows.time.length
+      ? t("Vacuum, the last {from} s", { from: brief(this.rows.time.length ? from : Number($("window").value)) })
+      : t("Vacuum, {from} to {to} s ago", { from: brief(from), to: brief(to) });
+    $("plot-head").textContent = states.length > 1 ? `${states[chosen].name}: ${said}` : said;
   },
 
   phases(from, to) {
@@ -332,17 +424,29 @@ const live = {
       const last = bands[bands.length - 1];
       if (last) last.to = time[i];
       if (!last || last.phase !== phase[i]) {
-        bands.push({ phase: phase[i], colour: PHASE_COLOURS[phase[i]], from: time[i], to: time[i] });
+        const look = { colour: PHASE_COLOURS[phase[i]], text: PHASES[phase[i]] };
+        bands.push({ phase: phase[i], ...look, from: time[i], to: time[i] });
       }
     }
     return bands;
   },
 
-  alarms() { // where they were raised, by the clock of the run
+  note() { // what becomes of alarms: a cause may be named later, and one that is over leaves the list
+    const there = chosen === null ? [] : states[chosen].alarms.filter(({ raised }) => raised);
+    for (const [raised, mark] of this.marks) {
+      if (!there.some((one) => one.raised === raised)) mark.cleared ??= now();
+    }
+    for (const { raised, cleared, what } of there) this.marks.set(raised, { raised, cleared, what });
+  },
+
+  alarms() { // where they were raised and were over, by the clock of the run
     const { time, host } = this.rows;
-    const isSeen = ({ raised }) => raised && host[0] <= raised && raised <= host[host.length - 1];
-    return (states[chosen] ? states[chosen].alarms : []).filter(isSeen).map(({ raised, what }) => (
-      { at: time[firstAfter(host, raised)] ?? this.end(), text: what, colour: "--alarm" }));
+    const isSeen = (at) => at && host[0] <= at && at <= host[host.length - 1];
+    const mark = (at, text, dash) => ({ at: time[firstAfter(host, at)] ?? this.end(), text, colour: "--alarm", dash });
+    return [...this.marks.values()].flatMap(({ raised, cleared, what }) => [
+      ...(isSeen(raised) ? [mark(raised, what, [])] : []),
+      ...(isSeen(cleared) ? [mark(cleared, t("{alarm}: over", { alarm: what }), [2, 4])] : []),
+    ]);
   },
 };
 
@@ -351,14 +455,19 @@ const live = {
 let trendChart = null;
 let trendSpan = [0, 1]; // s
 let trendAsked = 0;
+let trendMarks = [];
 
 async function showTrend() {
+  if (chosen === null) return;
   const turn = ++trendAsked;
   const figure = $("figure").value;
   const days = $("trend-days").value;
   let trend;
+  let raised = [];
   try {
-    trend = await get(`/api/ejectors/${chosen}/trends/${figure}?days=${days}`);
+    const ejector = `/api/ejectors/${chosen}`;
+    [trend, raised] = await Promise.all(
+      [get(`${ejector}/trends/${figure}?days=${days}`), get(`${ejector}/history?days=${days}`)]);
   } catch (error) {
     trend = { words: error.message, unit: "" };
   }
@@ -366,8 +475,39 @@ async function showTrend() {
   const known = me.figures.find((one) => one.name === figure);
   $("trend-what").textContent = known ? known.what : "";
   $("trend-words").textContent = trend.words;
-  $("trend-plot").hidden = $("trend-tools").hidden = $("trend-legend").hidden = !trend.time;
-  if (trend.time) drawTrend(trend);
+  for (const id of ["trend-plot", "trend-tools", "trend-legend", "trend-range"]) $(id).hidden = !trend.time;
+  if (!trend.time) return;
+  trendMarks = marksOf(trend, raised);
+  drawTrend(trend);
+}
+
+function marksOf({ step }, raised) { // the step of a figure, and the newest alarms
+  const alarms = raised.slice(0, MOST_MARKS).map((one) => ({ at: one.raised, text: one.what, colour: "--alarm" }));
+  return step ? [{ ...step, text: t("step"), colour: "--step" }, ...alarms] : alarms;
+}
+
+function showTrendRange() { // as the fields of a range have it, by the server's clock
+  const [from, to] = trendChart.range();
+  $("trend-from").value = fieldOf(from);
+  $("trend-to").value = fieldOf(to);
+}
+
+function fieldOf(seconds) {
+  const then = there(seconds);
+  const two = (value) => String(value).padStart(2, "0");
+  const date = [then.getFullYear(), two(then.getMonth() + 1), two(then.getDate())].join("-");
+  return `${date}T${[then.getHours(), then.getMinutes(), then.getSeconds()].map(two).join(":")}`;
+}
+
+function chooseTrendRange() {
+  const [from, to] = ["trend-from", "trend-to"].map((id) => secondsOf($(id).value));
+  if (Number.isFinite(from) && Number.isFinite(to) && from < to) trendChart.show(from, to);
+  else showTrendRange();
+}
+
+function secondsOf(field) {
+  const then = new Date(field);
+  return then.getTime() / 1000 - (zone === null ? 0 : zone + then.getTimezoneOffset() * 60);
 }
 
 function drawTrend(trend) {
@@ -382,6 +522,7 @@ function drawTrend(trend) {
     trendChart = new Chart($("trend-plot"), {
       home: () => trendSpan, all: () => trendSpan, least: 10, tools: $("trend-tools"),
       values: (low = 0, high = 1) => roomy(low, high), ticks: () => dateTicks,
+      marks: () => trendMarks, moved: () => trendChart && showTrendRange(),
     });
   }
   trendChart.options.unit = trend.unit;
@@ -400,6 +541,7 @@ function drawTrend(trend) {
 let episodes = [];
 
 async function loadHistory() {
+  if (chosen === null) return;
   try {
     episodes = await get(`/api/ejectors/${chosen}/history?days=${$("history-days").value}`);
     showHistory();
@@ -414,17 +556,19 @@ function showHistory() {
   const shown = episodes.filter((one) => (!priority || one.priority === priority)
     && (!wanted || JSON.stringify(one).toLowerCase().includes(wanted)));
   $("episodes").replaceChildren(...(shown.length ? shown.map(episodeCard)
-    : [element("p", { class: "nothing" }, "No alarm in that time is like that.")]));
+    : [element("p", { class: "nothing" }, t("No alarm in that time is like that."))]));
 }
 
 function episodeCard(one) {
-  const end = one.cleared ? `${one.times.cleared}, after ${one.times.lasted}` : "still active";
-  const seen = one.seen ? `${one.times.seen} by ${one.seen_by}` : "not yet";
+  const end = one.cleared ? t("{time}, after {lasted}", { time: one.times.cleared, lasted: one.times.lasted })
+    : t("still active");
+  const seen = one.seen ? t("{time} by {who}", { time: one.times.seen, who: one.seen_by }) : t("not yet");
   return element("article", { class: "episode" },
     element("div", { class: "top" }, element("h3", {}, one.what),
-      element("span", { class: "chip" }, `${one.priority} priority`)),
-    rows([["raised", one.times.raised], ["ended", end], ["acknowledged", seen], ...one.facts]),
-    reportLink(one));
+      element("span", { class: "chip" }, one.priority_words)),
+    rows([[t("raised"), one.times.raised], [t("ended"), end], [t("acknowledged"), seen], ...one.facts]),
+    ...comments(one),
+    reportButton(chosen, one));
 }
 
 // --- the connection ------------------------------------------------------------------------------
@@ -432,10 +576,21 @@ function episodeCard(one) {
 let socket = null;
 let heardMs = 0;
 
+let watched = 0; // the ejector of which the server sends rows; at first the first one
+
+function watch() {
+  if (chosen === null || chosen === watched || socket.readyState !== WebSocket.OPEN) return;
+  watched = chosen;
+  socket.send(String(chosen));
+}
+
 function connect() {
   const scheme = location.protocol === "https:" ? "wss" : "ws";
   socket = new WebSocket(`${scheme}://${location.host}/live`);
-  socket.addEventListener("open", () => socket.send(String(chosen)));
+  socket.addEventListener("open", () => {
+    watched = 0;
+    watch();
+  });
   socket.addEventListener("message", (event) => hear(JSON.parse(event.data)));
   socket.addEventListener("close", (event) => {
     if (event.code === 1008) begin().catch(() => {}); // the session may be over
@@ -449,10 +604,24 @@ function hear(told) {
     states = told.states;
     skew = states[0].now - Date.now() / 1000;
     zone = states[0].zone;
+    offerEjectors();
+    if (chosen === null) choose(worstFirst()[0]);
+    live.note();
+    announce();
     showStates();
   }
   if (told.rows && told.of === chosen) live.take(told.rows);
   showConnection();
+}
+
+let announced = null; // alarms that were there before
+
+function announce() { // to who hears the page: alarms that are new
+  const active = states.flatMap((state, of) => state.alarms.filter((one) => one.state === "unacknowledged")
+    .map((one) => [`${of} ${one.raised}`, `${state.name}: ${one.what}`]));
+  const fresh = announced ? active.filter(([key]) => !announced.has(key)).map(([, text]) => text) : [];
+  announced = new Set(active.map(([key]) => key));
+  if (fresh.length) $("news").textContent = t("New alarm: {alarms}", { alarms: fresh.join("; ") });
 }
 
 function showStates() {
@@ -464,21 +633,24 @@ function showStates() {
 
 function showConnection() {
   const silent = performance.now() - heardMs > SILENT_MS;
-  const said = silent ? "No connection to the page: nothing here is up to date" : "connected";
+  const said = silent ? t("No connection to the page: nothing here is up to date") : t("connected");
   $("connection").classList.toggle("bad", silent);
   if ($("connection").textContent !== said) $("connection").textContent = said;
   if (silent && states.length) {
-    states = states.map((one) => ({ ...one, light: "grey", words: "No connection" }));
+    states = states.map((one) => ({ ...one, light: "grey", words: t("No connection") }));
     showLights();
   }
 }
 
 // --- the beginning -------------------------------------------------------------------------------
 
+const TABS = ["now", "trends", "history"];
+
 function showTab(name) {
-  for (const one of ["now", "trends", "history"]) {
+  for (const one of TABS) {
     $(one).hidden = one !== name;
     $(`tab-${one}`).setAttribute("aria-selected", String(one === name));
+    $(`tab-${one}`).tabIndex = one === name ? 0 : -1;
   }
   if (name === "trends") showTrend();
   if (name === "history") loadHistory();
@@ -487,21 +659,37 @@ function showTab(name) {
 async function begin() {
   me = await get("/api/me");
   $("who").textContent = me.user;
+  offerLanguages(me.languages);
   $("all").hidden = !me.all;
   $("login").hidden = Boolean(me.user);
   $("logout").hidden = !me.user;
   if (!$("figure").children.length) {
     $("figure").replaceChildren(...me.figures.map((one) => element("option", { value: one.name },
-      one.name.replaceAll("_", " "))));
+      one.title)));
     $("figure").value = "leakage";
   }
   showStates();
 }
 
+function moveTab(event, at) { // as tabs go by keyboard
+  const to = { ArrowLeft: at - 1, ArrowRight: at + 1, Home: 0, End: TABS.length - 1 }[event.key];
+  if (to === undefined) return;
+  event.preventDefault();
+  const name = TABS[(to + TABS.length) % TABS.length];
+  showTab(name);
+  $(`tab-${name}`).focus();
+}
+
 function listen() {
-  for (const name of ["now", "trends", "history"]) {
+  TABS.forEach((name, at) => {
     $(`tab-${name}`).addEventListener("click", () => showTab(name));
-  }
+    $(`tab-${name}`).addEventListener("keydown", (event) => moveTab(event, at));
+  });
+  $("window").addEventListener("change", () => live.chart && live.chart.goHome());
+  $("whose").addEventListener("change", () => ($("whose").value ? choose(Number($("whose").value)) : showStates()));
+  for (const id of ["trend-from", "trend-to"]) $(id).addEventListener("change", chooseTrendRange);
+  $("comment-cancel").addEventListener("click", () => $("comment").close());
+  $("report-close").addEventListener("click", () => $("report").close());
   $("which").addEventListener("change", showAlarms);
   $("figure").addEventListener("change", showTrend);
   $("trend-days").addEventListener("change", showTrend);

@@ -1,0 +1,64 @@
+"""The languages of the page: gettext catalogues, and which of them a browser asks for."""
+
+from collections.abc import Mapping, Sequence
+from importlib import resources
+
+from babel import Locale
+from babel.messages.pofile import read_po
+
+from twin.language import Texts
+
+ENGLISH = "en"
+MOST_ASKED = 20  # languages of a browser that are looked at
+
+
+class Catalogues:
+    """All languages that come with the program: ``twin/locale/de.po`` and its like."""
+
+    def __init__(self) -> None:
+        folder = resources.files("twin").joinpath("locale")
+        files = sorted(file.name for file in folder.iterdir() if file.name.endswith(".po"))
+        self.texts: Mapping[str, Texts] = {ENGLISH: {}} | {
+            name.removesuffix(".po"): _read(folder.joinpath(name).read_bytes()) for name in files
+        }
+
+    @property
+    def names(self) -> list[dict[str, str]]:
+        """Each language as it calls itself."""
+        return [{"code": code, "name": _own_name(code)} for code in self.texts]
+
+    def choose(self, chosen: str, accepted: str) -> str:
+        """The code of a language: the ``chosen`` one, else the best that a browser accepts."""
+        known = {code.lower(): code for code in self.texts}
+        for language in (chosen, *_preferred(accepted)):
+            whole = language.lower()
+            if found := known.get(whole) or known.get(whole.partition("-")[0]):
+                return found
+        return ENGLISH
+
+
+def _read(file: bytes) -> Texts:
+    messages = read_po(file.splitlines(keepends=True))
+    return {
+        str(one.id): str(one.string) for one in messages if one.id and one.string and not one.fuzzy
+    }
+
+
+def _own_name(code: str) -> str:
+    locale = Locale.parse(code, sep="-")
+    name = locale.get_display_name(locale) or code
+    return name[:1].upper() + name[1:]
+
+
+def _preferred(accepted: str) -> Sequence[str]:
+    """The languages of an Accept-Language header (RFC 9110), the most wanted first."""
+    wanted = []
+    for part in accepted.split(",")[:MOST_ASKED]:
+        language, _, weight = part.partition(";")
+        try:
+            quality = float(weight.strip().removeprefix("q=") or 1.0)
+        except ValueError:
+            continue
+        if language.strip() and quality > 0.0:
+            wanted.append((quality, language.strip()))
+    return [language for _, language in sorted(wanted, key=lambda one: -one[0])]
