@@ -66,6 +66,18 @@ def beside(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterato
     thread.join()
 
 
+def test_a_comment_and_statistics_need_no_run(run: Run, tmp_path: Path) -> None:
+    begun(tmp_path / "alarms.sqlite").close()
+    assert run("comment", LEAK, "new hose ordered", "--by", "ann") == f"{LEAK}: commented\n"
+    assert re.search(r"\n {8}ann, .* ago: new hose ordered\n", run("history"))
+    with pytest.raises(ConfigError, match="plc_stale does not stand"):
+        run("comment", "plc_stale", "why")
+    shown = run("statistics", "--days", "1", "--json", "s.json")
+    assert re.search(rf"standing for over 24 h +gripper-01 {LEAK} \(2001-09-09", shown)
+    plain = json.loads(Path("s.json").read_text())
+    assert (plain["alarms"], plain["standing"][0]["alarm"]) == (0, LEAK)
+
+
 def test_an_alarm_is_acknowledged_beside_a_run(beside: Run) -> None:
     assert beside("acknowledge", LEAK, "--by", "ann") == f"{LEAK}: acknowledged\n"
     shown = beside("list", "--json", "l.json")

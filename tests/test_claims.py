@@ -15,6 +15,7 @@ from drivers.plc.plant import CV, R_GAS
 from drivers.results_state import KEPT
 from drivers.results_state import STALE_S as NO_ROW_S
 from twin import files, throttle
+from twin.alarms import statistics
 from twin.alarms.loop import AGREEING
 from twin.compare import compare, side
 from twin.figures import course, keeper, table, trend
@@ -41,6 +42,20 @@ CLAIMS = (
     ("outlets", "pauses from {:g} s to {:g} s", (), (sender.FIRST_PAUSE_S, sender.LONGEST_PAUSE_S)),
     ("outlets", "up to {} changes wait in memory", (), (dispatch.MOST_IN_MEMORY,)),
     ("page", "nothing was heard of the run for {:g} s", (), (ring.STALE_S,)),
+    ("alarms", "active for over {:g} h", (), (statistics.STANDING_NS / 3600e9,)),
+    (
+        "alarms",
+        "share of the stretches of 10 min with more than {} alarms",
+        (),
+        (statistics.FLOOD,),
+    ),
+    ("alarms", "in 10 min on the average | up to {:g}", (), (statistics.MANAGEABLE,)),
+    (
+        "alarms",
+        "raised {} times or more within {:g} s",
+        (),
+        (statistics.CHATTERING, statistics.CHATTER_NS / 1e9),
+    ),
     ("page", "A row stands for {:g} ms", (), (ring.ROW_NS * 1e-6,)),
     ("page", "It also ends after {:g} h", (), (sessions.SESSION_S / 3600.0,)),
     ("page", "After {} wrong passwords", ("five",), (throttle.FREE_TRIES,)),

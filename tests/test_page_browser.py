@@ -402,7 +402,7 @@ def test_two_fingers_and_the_wheel_look_closer(site: Site) -> None:
     assert page.evaluate("live.chart.width") is None
     page.keyboard.down("Control")
     page.mouse.wheel(0, -50)
-    page.wait_for_function("live.chart.width !== null && live.chart.width < 7")
+    page.wait_for_function("() => live.chart.width !== null && live.chart.width < 7")
 
 
 def _drag(page: Page, seconds: float) -> None:
@@ -490,7 +490,7 @@ def test_a_peak_of_one_row_is_seen_among_thousands(site: Site) -> None:
           live.chart.zoom(100);
         }"""
     )
-    page.wait_for_function("live.chart.waits === false")
+    page.wait_for_function("() => live.chart.waits === false")
     assert _highest(page, "--blue") > 0.9
     points = page.evaluate(
         """() => {

@@ -96,7 +96,13 @@ def abroad(opened: Callable[..., Site]) -> Site:
 # --- to see ---------------------------------------------------------------------------------------
 
 SEEN = (
-    *("/", "/api/me", "/api/ejectors/0/history", "/api/ejectors/0/trends/leakage"),
+    *(
+        "/",
+        "/api/me",
+        "/api/statistics",
+        "/api/ejectors/0/history",
+        "/api/ejectors/0/trends/leakage",
+    ),
     *(f"{ASK}/1", f"/reports/0/{REPORT}"),
 )
 
@@ -632,6 +638,19 @@ def test_who_chooses_a_language_keeps_it(site: Site) -> None:
     elsewhere = {"referer": "http://evil.example//evil.example/"}
     assert site.client.get("/language/en", headers=elsewhere).headers["location"] == "/"
     assert site.client.get("/language/xx").status_code == 404
+
+
+# --- statistics -----------------------------------------------------------------------------------
+
+
+def test_statistics_are_of_what_was_raised(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module.time, "time_ns", lambda: NOW + 60 * 10**9)
+    _leaking(site)
+    figures = dict(site.client.get("/api/statistics?days=1").json())
+    assert figures["most frequent"] == "gripper-01: Leakage (100 %)"
+    german = dict(site.client.get("/api/statistics?days=1", headers=GERMAN).json())
+    assert german["am häufigsten"] == "gripper-01: Leckage (100 %)"
+    assert site.client.get("/api/statistics?days=0").status_code == 400
 
 
 # --- comments -------------------------------------------------------------------------------------

@@ -97,11 +97,77 @@ def history(
     """
     since = None if days is None else time.time_ns() - round(days * 86_400e9)
     with _open(alarms, config) as store:
-        episodes = store.episodes(_chosen(store, config, unit), since)
+        whose = _chosen(store, config, unit)
+        episodes, comments = store.episodes(whose, since), store.comments(whose, since or 0)
     for one in episodes:
         print(_episode_in_words(one, time.time_ns()))
+        for said in comments:
+            if said.is_of(one):
+                print(
+                    f"        {said.who}, {instant(said.written_ns, time.time_ns())}: {said.text}"
+                )
     if json_file is not None:
         write_json(json_file, [_plain_episode(one) for one in episodes])
+
+
+@alarms_app.command()
+def statistics(
+    configs: ConfigFiles = None,
+    unit: UnitId = "",
+    alarms: Url = "",
+    days: Annotated[
+        float, typer.Option(metavar="N", min=0.01, max=3650.0, help="Over the last N days.")
+    ] = 30.0,
+    json_file: JsonFile = None,
+) -> None:
+    """How many alarms people get, after EEMUA 191: rate, floods, standing, chattering, top ten.
+
+    Several configurations are the ejectors that one person looks after, counted together.
+    """
+    from twin.alarms.statistics import DAY_NS, in_words, plain
+    from twin.alarms.statistics import statistics as statistics_of
+
+    now_ns = time.time_ns()
+    named: list[tuple[str, Episode]] = []
+    since_ns = now_ns - round(days * DAY_NS)
+    for config in configs or (None,):
+        with _open(alarms, config) as store:
+            whose = _chosen(store, config, unit)
+            episodes = store.episodes_around(whose, since_ns)
+        named += [(whose.id or whose.type, one) for one in episodes]
+    found = statistics_of(named, since_ns, now_ns)
+    for what, said in in_words(found, " ".join, now_ns):
+        print(f"{what:<32} {said}")
+    if json_file is not None:
+        write_json(json_file, plain(found))
+
+
+@alarms_app.command()
+def comment(
+    name: Annotated[str, typer.Argument(metavar="ALARM", help="As twin alarms list says.")],
+    text: Annotated[str, typer.Argument(metavar="TEXT", help="What others should know.")],
+    config: ConfigFile = None,
+    unit: UnitId = "",
+    alarms: Url = "",
+    by: Who = "",
+) -> None:
+    """Write a comment to an alarm that stands; needs no run. The page and history show it."""
+    from twin.alarms.board import Comment
+    from twin.audit import Act
+
+    with _open(alarms, config) as store:
+        whose = _chosen(store, config, unit)
+        found = [one for one in store.episodes(whose, only_going_on=True) if one.alarm == name]
+        if not found:
+            hint = "twin alarms list says which ones do"
+            raise ConfigError(f"{name} does not stand, so there is nothing to comment", hint)
+        who, episode = by or user_here(), found[-1]
+        said = Comment(episode.raised_ns, episode.raised_as, time.time_ns(), who, text)
+        store.comment(whose, said)
+    if config is not None:
+        about = {"unit": whose.id or whose.type, "alarm": name} | ({"by": by} if by else {})
+        audit_of(config.parent).record(Act.COMMENTED, user_here(), **about)
+    print(f"{name}: commented")
 
 
 @alarms_app.command()

@@ -118,6 +118,10 @@ class Comment:
     who: str
     text: str
 
+    def is_of(self, episode: "Episode") -> bool:
+        """Whether it was written to that one."""
+        return (self.raised_ns, self.raised_as) == (episode.raised_ns, episode.raised_as)
+
 
 class Diary:
     """The episodes that changes in their order make; of those that are over it knows nothing."""

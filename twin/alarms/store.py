@@ -169,6 +169,13 @@ class Store(Database):
             answered_ns, answer = connection.execute(wanted).one()
         return None if answered_ns is None else str(answer)
 
+    def episodes_around(self, unit: Unit, since_ns: int) -> list[Episode]:
+        """The episodes of a unit that were raised since then, and those from before that go on."""
+        before = [
+            one for one in self.episodes(unit, only_going_on=True) if one.raised_ns < since_ns
+        ]
+        return [*before, *self.episodes(unit, since_ns)]
+
     def comment(self, unit: Unit, comment: Comment) -> None:
         """Keep a comment; ConfigError where its episode is none of the unit's."""
         own = {"asset_type": unit.type, "asset_id": unit.id}

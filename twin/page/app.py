@@ -10,6 +10,7 @@ import html
 import ipaddress
 import json
 import re
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -31,6 +32,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from twin.alarms.state import Deed
+from twin.alarms.statistics import DAY_NS, in_words, statistics
 from twin.audit import Act
 from twin.errors import TwinError
 from twin.language import speaking, tr
@@ -161,6 +163,7 @@ class Page:
             Route("/static/{name}", self.static),
             Route("/language/{code}", self.choose_language),
             Route("/api/me", self.me),
+            Route("/api/statistics", self.statistics),
             Route(f"{one}/history", self.history),
             Route(f"{one}/trends/{{name}}", self.trend),
             Route(f"{one}/requests", self.ask, methods=["POST"]),
@@ -363,6 +366,23 @@ class Page:
         """Every time an alarm was active."""
         self._require_sight(request)
         return JSONResponse(await run_sync(self._ejector(request).history, _days(request)))
+
+    async def statistics(self, request: Request) -> Response:
+        """How many alarms people get, of all ejectors of the page together."""
+        self._require_sight(request)
+        now_ns = time.time_ns()
+        since_ns = now_ns - round(_days(request) * DAY_NS)
+        return JSONResponse(await run_sync(self._statistics, since_ns, now_ns))
+
+    def _statistics(self, since_ns: int, now_ns: int) -> list[tuple[str, str]]:
+        episodes = [found for one in self.ejectors for found in one.episodes(since_ns)]
+        of_name = {one.name: one for one in self.ejectors}
+
+        def title(known: tuple[str, str]) -> str:
+            name, alarm = known
+            return f"{name}: {of_name[name].title(alarm)}"
+
+        return in_words(statistics(episodes, since_ns, now_ns), title, now_ns)
 
     async def trend(self, request: Request) -> Response:
         """How a figure runs over days; one at a time."""

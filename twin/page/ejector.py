@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from twin.alarms.board import Board, Comment
+from twin.alarms.board import Board, Comment, Episode
 from twin.alarms.place import open_chosen as open_alarms
 from twin.alarms.requests import ASKABLE
 from twin.alarms.settings import AlarmSettings, board_rules
@@ -27,7 +27,7 @@ from twin.figures.words import course_in_words, title_of, trend_of_figure
 from twin.instants import zone
 from twin.language import tr
 from twin.page import ring
-from twin.page.light import S_NS, WORDS, Light, light_of, listed, priority_words, said, told
+from twin.page.light import S_NS, WORDS, Light, light_of, listed, named, priority_words, said, told
 from twin.page.settings import REPORTS, RING, PageSettings, folder_of
 from twin.signals import BREAK, MBAR
 
@@ -108,6 +108,16 @@ class Ejector:
             }
             for one in reversed(episodes[-MOST_EPISODES:])
         ]
+
+    def episodes(self, since_ns: int) -> list[tuple[str, Episode]]:
+        """Every time an alarm was active since then, and what stood before and goes on."""
+        with self._alarms() as store:
+            return [(self.name, one) for one in store.episodes_around(self._unit, since_ns)]
+
+    def title(self, alarm: str) -> str:
+        """An alarm as people say it."""
+        values = {rule.name: rule.value for rule in self._rules}
+        return str(named(alarm, values.get(alarm, ""))["what"])
 
     # --- what people ask ------------------------------------------------------------------------
 

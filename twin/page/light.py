@@ -177,7 +177,7 @@ def told(
         "comments": [
             {"who": one.who, "when": said(one.written_ns, now_ns), "text": one.text}
             for one in comments
-            if (one.raised_as, one.raised_ns) == (episode.raised_as, raised)
+            if one.is_of(episode)
         ],
     }
 

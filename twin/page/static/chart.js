@@ -365,7 +365,8 @@ class Chart {
     ctx.lineWidth = 2;
     ctx.textAlign = "left";
     ctx.textBaseline = "top";
-    this.options.marks().forEach(({ at, text, colour: name, dash = [], from, to }, i) => {
+    const inTime = this.options.marks().sort((one, other) => one.at - other.at);
+    inTime.forEach(({ at, text, colour: name, dash = [], from, to }, i) => {
       ctx.strokeStyle = ctx.fillStyle = colour(name);
       if (from !== undefined) this.shade(x(from), x(to));
       ctx.setLineDash(dash);
@@ -374,10 +375,21 @@ class Chart {
       ctx.stroke();
       ctx.setLineDash([]);
       if (x(at) < area.left || x(at) > area.left + area.width) return;
-      const begin = x(at) + 6 + ctx.measureText(text).width > area.left + area.width
-        ? x(at) - 6 - ctx.measureText(text).width : x(at) + 6;
-      ctx.fillText(text, begin, area.top + 4 + 18 * (i % 3)); // beside those of the same moment
+      const { width } = ctx.measureText(text);
+      const begin = x(at) + 6 + width > area.left + area.width ? x(at) - 6 - width : x(at) + 6;
+      this.label(text, begin, area.top + 4 + 18 * (i % 3), width); // beside those of the same moment
     });
+  }
+
+  label(text, left, top, width) { // to be read over whatever is there
+    const { ctx } = this;
+    const ink = ctx.fillStyle;
+    ctx.globalAlpha = 0.8;
+    ctx.fillStyle = colour("--card");
+    ctx.fillRect(left - 2, top - 1, width + 4, 17);
+    ctx.globalAlpha = 1;
+    ctx.fillStyle = ink;
+    ctx.fillText(text, left, top);
   }
 
   shade(left, right) {

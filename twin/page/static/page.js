@@ -543,7 +543,11 @@ let episodes = [];
 async function loadHistory() {
   if (chosen === null) return;
   try {
-    episodes = await get(`/api/ejectors/${chosen}/history?days=${$("history-days").value}`);
+    const days = $("history-days").value;
+    const [known, figures] = await Promise.all(
+      [get(`/api/ejectors/${chosen}/history?days=${days}`), get(`/api/statistics?days=${days}`)]);
+    episodes = known;
+    $("statistics-rows").replaceChildren(rows(figures));
     showHistory();
   } catch (error) {
     $("episodes").replaceChildren(element("p", { class: "nothing" }, error.message));
