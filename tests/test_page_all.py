@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 import rigs
 import tomli_w
+from accessible import violations
 from command_line import twin
 from mosquitto import Broker, broker
 from page_site import config, write_config
@@ -400,6 +401,30 @@ def test_forty_ejectors_and_one_that_dies(tmp_path: Path, browser: Browser) -> N
         expect(page.locator("#counts")).to_have_text("40 not known")
         assert said == []
         assert [one for one in asked if not one.startswith(url)] == []
+
+
+@pytest.mark.needs("axe", "mosquitto")
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_no_violation_and_a_german_browser_reads_german(
+    tmp_path: Path, browser: Browser, scheme: Any
+) -> None:
+    with ExitStack() as closing:
+        running = closing.enter_context(broker(tmp_path))
+        edges = publishers(running, 2, closing)
+        edges[1].send([Message("1", LEAK, alarm(Unit(TYPE, "cell-01")))])
+        url = closing.enter_context(site(tmp_path, running.port))
+        context = browser.new_context(color_scheme=scheme, locale="de-DE", bypass_csp=True)
+        page = context.new_page()
+        page.goto(url)
+        expect(page.locator("#all-rows tr")).to_have_count(2)
+        expect(page.locator("tr[data-name=cell-01]")).to_contain_text("Leckage")
+        assert violations(page) == []
+        page.locator("tr[data-name=cell-01] td").nth(1).click()
+        card = page.locator("#one-alarms article")
+        expect(card).to_contain_text("Leckage")
+        expect(card).to_contain_text("unquittiert")
+        assert violations(page) == []
+        context.close()
 
 
 @pytest.mark.needs("mosquitto")

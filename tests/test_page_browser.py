@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import uvicorn
-from needs import PEERS
+from accessible import violations
 from page_site import LEAK, Run, S, config, write_config
 from playwright.sync_api import Browser, Locator, Page, expect
 from test_texts import catalogue
@@ -711,35 +711,23 @@ def test_axe_finds_no_violation(site: Site, scheme: str) -> None:
     site.run.suck(2.0)
     _kept_figures(site)
     page = site.open("login", "phone", color_scheme=scheme, bypass_csp=True)
-    assert _violations(page) == []
+    assert violations(page) == []
     site.log_in(page)
     site.until_light(page, "red")
     expect(card(page)).to_be_visible()
-    assert _violations(page) == []
+    assert violations(page) == []
     card(page).locator("summary").click()
-    assert _violations(page) == []
+    assert violations(page) == []
     for tab, seen in (("Trends", "#trend-plot canvas"), ("History", "#episodes article")):
         page.get_by_role("tab", name=tab).click()
         expect(page.locator(seen)).to_be_visible()
-        assert _violations(page) == []
+        assert violations(page) == []
     page.get_by_role("tab", name="Now").click()
     for button, dialog in (("Shelve", "#shelve"), ("Comment", "#comment")):
         card(page).get_by_role("button", name=button).click()
-        assert _violations(page) == []
+        assert violations(page) == []
         page.keyboard.press("Escape")
         expect(page.locator(dialog)).to_be_hidden()
-
-
-def _violations(page: Page) -> list[str]:
-    """What axe-core finds wrong, with where."""
-    if not page.evaluate("typeof axe !== 'undefined'"):
-        axe = PEERS / "node_modules" / "axe-core" / "axe.min.js"
-        page.add_script_tag(content=axe.read_text())
-    found: list[str] = page.evaluate(
-        """async () => (await axe.run()).violations.map(
-          ({ id, nodes }) => `${id}: ${nodes.map((one) => one.html.slice(0, 120)).join(" | ")}`)"""
-    )
-    return found
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
