@@ -11,7 +11,7 @@ from twin.monitor.change import (
     Changes,
     Patience,
     Reference,
-    Shape,
+    ScoreNormalizer,
     began,
     limit,
 )
@@ -179,7 +179,7 @@ def shaped(rng: np.random.Generator, cycles: int) -> Floats:
 
 
 def test_scores_become_normal_and_independent() -> None:
-    scores, shape = shaped(np.random.default_rng(1), 20_000), Shape(3)
+    scores, shape = shaped(np.random.default_rng(1), 20_000), ScoreNormalizer(3)
     found = []
     for standard in scores:
         step = shape.take(standard)
@@ -199,7 +199,7 @@ def test_scores_become_normal_and_independent() -> None:
 
 
 def test_what_is_not_shown_stays_so_and_what_was_before_stands() -> None:
-    shape = Shape(2)
+    shape = ScoreNormalizer(2)
     for first, second in ((1.0, np.nan), (-0.5, 0.3), (np.nan, 0.2)):
         step = shape.take(np.array([first, second]))
         assert np.isnan(step.normal).tolist() == [np.isnan(first), np.isnan(second)]
@@ -208,7 +208,7 @@ def test_what_is_not_shown_stays_so_and_what_was_before_stands() -> None:
 
 
 def test_far_scores_stay_far() -> None:
-    shape = Shape(1)
+    shape = ScoreNormalizer(1)
     for standard in shaped(np.random.default_rng(2), 3000)[:, :1]:
         shape.learn(shape.take(standard))
     assert shape.take(np.array([12.0])).normal[0] > 5.0

@@ -554,7 +554,7 @@ def test_the_interval_of_suction_counts_that_rigs_have_other_equations() -> None
     fitted = commissioned().calibration.fitted
     name = "ejector.suction_capacity_sl_min"
     number = [one.name for one in fitted.free].index(name)
-    value, form = fitted.free[number].of(fitted.data), fitted.free[number].form
+    value, form = fitted.free[number].of(fitted.data), fitted.free[number].model_form
     low, high = replace(fitted, covariance=0.0 * fitted.covariance).interval(name)
     assert (low, high) == pytest.approx((value / 1.54, value * 1.54), rel=0.01)
     assert fitted.interval(name)[0] < value * np.exp(-SIGMAS_95 * form)

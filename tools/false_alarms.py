@@ -30,11 +30,11 @@ from twin.config import Config
 from twin.figures.cycle import KeyFigures
 from twin.figures.settings import LIMITED, Limits, limits_of
 from twin.live import Twin
+from twin.monitor.baseline import LEARNED, Baseline
 from twin.monitor.budget import LIMITS, SINGLE_CYCLES, SUMS, cycles_between, normal_limit
 from twin.monitor.change import Changes, limit
 from twin.monitor.cycles import CycleCutter, Look, figures
 from twin.monitor.isolation import Isolation, looked_for
-from twin.monitor.usual import LEARNED, Usual
 from twin.settings import Document
 
 Floats = npt.NDArray[np.float64]
@@ -69,7 +69,7 @@ def device(seed: int, cycles: int) -> Device:
     config, rig = Config.of(document), document.section(PlcSettings, "plc")
     rig = rig.model_copy(update={"program": rig.program.model_copy(update=PROGRAM)})
     healthy, smallest = config.monitor.healthy, config.monitor.smallest_mbar
-    isolation, usual = Isolation.of(config.data, healthy, days=1e9), Usual(healthy)
+    isolation, baseline = Isolation.of(config.data, healthy, days=1e9), Baseline(healthy)
     teller = KeyFigures(config.data, watch=config.monitor)
     scores, farthest, alike, shown, told = [], [], np.eye(0), 0, []
     for look in _looks(config, rig, (LEARNED + cycles) * CYCLE_S, seed):
@@ -82,8 +82,8 @@ def device(seed: int, cycles: int) -> Device:
         said, normal = isolation.heard
         alike = said.alike()
         scores.append(normal)
-        normal = usual.normal(look.figures, smallest)
-        usual.learn(look.figures, normal)
+        normal = baseline.normal(look.figures, smallest)
+        baseline.learn(look.figures, normal)
         farthest.append(float(np.nanmax(np.abs(normal))))
         shown = int(np.isfinite(normal).sum())
     found = np.array(scores[LEARNED:]), alike, np.array(farthest[LEARNED:]), shown

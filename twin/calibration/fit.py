@@ -192,7 +192,7 @@ class Fitted:
         free, reach = self.free[number], SIGMAS_95 * float(self.spread[number])
         value = free.of(self.data)
         if self.scaled[number] and value > 0.0:
-            reach = float(np.hypot(reach / value, SIGMAS_95 * free.form))
+            reach = float(np.hypot(reach / value, SIGMAS_95 * free.model_form))
             factor = float(np.exp(min(reach, MOST_FACTOR)))
             return max(value / factor, free.low), min(value * factor, free.high)
         return max(value - reach, free.low), min(value + reach, free.high)

@@ -19,9 +19,9 @@ class Free:
     the value where ``relative``, else in its unit. ``healthy`` is how many of them below and above
     the type's value a unit is still taken for healthy; None where the value only shapes the curve.
     ``market`` is the spread where nobody knows the type: of the logarithm where the value is
-    ``scaled``, else in its unit. It is wide enough for any rig that is on the market. ``form`` is
-    one sigma of the logarithm by which a rig of other equations has it elsewhere though the curves
-    agree: it widens what is told of the value, and nothing else.
+    ``scaled``, else in its unit. It is wide enough for any rig that is on the market.
+    ``model_form`` is one sigma of the logarithm by which a rig of other equations has it elsewhere
+    though the curves agree: it widens the interval that is told, and nothing else.
     """
 
     table: str
@@ -34,7 +34,7 @@ class Free:
     healthy: tuple[float, float] | None = None
     market: float = 0.0
     scaled: bool = True
-    form: float = 0.0
+    model_form: float = 0.0
 
     @property
     def name(self) -> str:
@@ -67,7 +67,7 @@ FREE = (
         True,
         (1.2, 4.0),
         market=0.5,
-        form=0.22,
+        model_form=0.22,
     ),
     Free(_E, "end_pressure_mbar", "mbar", 40.0, 10.0, 700.0, healthy=(4.0, 2.0), market=0.5),
     Free(_E, "bulge", "", 0.5, -1.0, 3.0, market=0.8, scaled=False),

@@ -66,7 +66,7 @@ def permitted(usual: float, tolerance: float, least: float) -> float:
     return usual + max(tolerance * usual, least)
 
 
-def reaches(healthy: Healthy, days: float) -> dict[str, tuple[float, float]]:
+def healthy_range(healthy: Healthy, days: float) -> dict[str, tuple[float, float]]:
     """How low and how high key figures come in healthy cycles, by what a commissioning saw.
 
     Beyond that one of them is once in a time that follows from ``days`` between all false alarms.
@@ -91,7 +91,7 @@ def limits(settings: FigureSettings, data: DataSet, watch: MonitorSettings) -> L
 
     None is so near that its healthy cycles come up to it more often than ``watch`` wants.
     """
-    reach = dict.fromkeys(LIMITED, NOWHERE) | reaches(watch.healthy, watch.false_alarm_days)
+    reach = dict.fromkeys(LIMITED, NOWHERE) | healthy_range(watch.healthy, watch.false_alarm_days)
     t1, leakage = settings.permitted_t1_ms, settings.permitted_leakage_mbar_s
     free_flow = settings.permitted_free_flow_mbar
     low, high = settings.supply_low_bar, settings.supply_high_bar

@@ -77,16 +77,16 @@ class Reference:
 
 
 @dataclass(frozen=True)
-class Step:
-    """What one cycle adds to the ``Shape`` of scores."""
+class NormalScores:
+    """The scores of one cycle, and what they were made normal from."""
 
     standard: Floats  # NaN where there is no score, as in all of these
-    even: Floats  # the same, not skewed any more
+    unskewed: Floats  # the same, not skewed any more
     before: Floats  # that of the cycle before
     normal: Floats  # less what it has in common with that
 
 
-class Shape:
+class ScoreNormalizer:
     """How standard scores of healthy cycles differ from independent normal ones.
 
     Some are skewed: what is late moves an edge by more than what is early. And gas and walls keep
@@ -98,26 +98,28 @@ class Shape:
         self._count, self._cubes, self._products = np.zeros((3, suspects))
         self._before = np.full(suspects, np.nan)
 
-    def take(self, standard: Floats) -> Step:
+    def take(self, standard: Floats) -> NormalScores:
         """Make the scores of the next cycle normal and independent of those before."""
-        even = _even(standard, self._cubes / (self._count + UNSKEWED))
+        unskewed = _unskewed(standard, self._cubes / (self._count + UNSKEWED))
         alike = self._products / (self._count + UNSKEWED)
         goes_on = np.where(np.isfinite(self._before), self._before, 0.0) * alike
-        step = Step(standard, even, self._before, (even - goes_on) / np.sqrt(1.0 - alike**2))
-        self._before = np.where(np.isfinite(even), even, self._before)
-        return step
+        normal = (unskewed - goes_on) / np.sqrt(1.0 - alike**2)
+        scores = NormalScores(standard, unskewed, self._before, normal)
+        self._before = np.where(np.isfinite(unskewed), unskewed, self._before)
+        return scores
 
-    def learn(self, step: Step) -> None:
+    def learn(self, scores: NormalScores) -> None:
         """Take a healthy cycle in."""
-        standard, even, before = (
-            np.clip(one, -COUNTS, COUNTS) for one in (step.standard, step.even, step.before)
+        standard, unskewed, before = (
+            np.clip(one, -COUNTS, COUNTS)
+            for one in (scores.standard, scores.unskewed, scores.before)
         )
         self._count = self._count + np.isfinite(standard)
         self._cubes = self._cubes + np.nan_to_num(standard**3)
-        self._products = self._products + np.nan_to_num(even * before)
+        self._products = self._products + np.nan_to_num(unskewed * before)
 
 
-def _even(standard: Floats, skewness: Floats) -> Floats:
+def _unskewed(standard: Floats, skewness: Floats) -> Floats:
     """Standard scores of such a skewness as normal ones, as if they were log-normal."""
     skewness = np.clip(skewness, -SKEWED, SKEWED)
     sign, size = np.where(skewness < 0.0, -1.0, 1.0), np.maximum(np.abs(skewness), LEAST_SKEW)

@@ -46,8 +46,8 @@ from twin.signals import (
 )
 
 if TYPE_CHECKING:  # its SciPy would be imported with every configuration
+    from twin.monitor.baseline import Baseline
     from twin.monitor.isolation import Heard, Isolation, Verdict
-    from twin.monitor.usual import Usual
 
 _UNFIT = int(Quality.OUT_OF_RANGE | Quality.OVERFLOW | Quality.STALE | Quality.BAD)
 # Of a cycle's samples, to judge it: commands seen late look like a deviation. Usual records lack up
@@ -132,13 +132,13 @@ class Monitor:
     _fresh: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # the last that was
     _silences: set[int] = field(default_factory=set)  # told of, by PLC time of the row before
     _unfit: int = 0  # quality bits that stand
-    _usual: "Usual" = field(init=False)  # what each figure is in healthy cycles
+    _baseline: "Baseline" = field(init=False)  # what each figure is in healthy cycles
 
     def __post_init__(self) -> None:
         """Have what is compiled at hand, not to fall into a block."""
-        from twin.monitor.usual import Usual  # noqa: PLC0415 - with SciPy
+        from twin.monitor.baseline import Baseline  # noqa: PLC0415 - with SciPy
 
-        self._usual = Usual(self.settings.healthy)
+        self._baseline = Baseline(self.settings.healthy)
         nothing = Cycle(0, np.zeros(1, SAMPLE), np.zeros(1, TICK), complete=False)
         figures(nothing, self.theta)
         drawn_rows(nothing.samples, nothing.ticks)  # where a cause is sought
@@ -393,19 +393,20 @@ class Monitor:
         An alarm that stands without a name is named by less.
         """
         self._cycles, self._seconds = self._cycles + 1, self._seconds + cycle.seconds
-        normal = self._usual.normal(found, self.settings.smallest_mbar)
-        excess = self._usual.excess(found)
-        columns = zip(self._usual.names, excess, excess / self._usual.sigma, normal, strict=True)
+        normal = self._baseline.normal(found, self.settings.smallest_mbar)
+        excess = self._baseline.excess(found)
+        sigmas = excess / self._baseline.sigma
+        columns = zip(self._baseline.names, excess, sigmas, normal, strict=True)
         outliers = [
             Outlier(name, *map(float, numbers)) for name, *numbers in columns if name in found
         ]
         if not outliers:
             return None, False
         seconds = max(self._seconds / self._cycles, SHORTEST_S)
-        limit = self._usual.limit(self.settings.false_alarm_days, seconds, len(outliers))
+        limit = self._baseline.limit(self.settings.false_alarm_days, seconds, len(outliers))
         worst = max(outliers, key=lambda one: _weight(one, limit))
         if not self.active:
-            self._usual.learn(found, normal)
+            self._baseline.learn(found, normal)
         return worst, abs(worst.normal) >= (CLEARS if self.active == UNKNOWN else limit)
 
     def _is_far(self, worst: Outlier | None) -> bool:

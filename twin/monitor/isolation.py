@@ -28,10 +28,10 @@ from twin.monitor.change import (
     FARTHEST,
     MOST,
     Changes,
+    NormalScores,
     Patience,
     Reference,
-    Shape,
-    Step,
+    ScoreNormalizer,
     began,
     limit,
 )
@@ -108,9 +108,9 @@ class Isolation:
         self._bank, self._listener = bank, listener
         self._days = days
         self._reference, self._usual = Reference.of(len(SUSPECTS)), _Usual()
-        self._shape = Shape(len(SUSPECTS))
+        self._normalizer = ScoreNormalizer(len(SUSPECTS))
         self._learned = 0  # cycles
-        self._patience = Patience[tuple[Said, Floats, Step]]()  # with their scores
+        self._patience = Patience[tuple[Said, Floats, NormalScores]]()  # with their scores
         self._changes: Changes | None = None  # once it is known which suspects look alike
         self._kept: deque[Said] = deque(maxlen=RECENT)  # some 40 kB each
         self._scored: deque[Floats] = deque(maxlen=KEPT)  # their normal scores, and of more cycles
@@ -171,7 +171,7 @@ class Isolation:
         said, scores, seconds = heard
         self._cycles += 1
         self._seconds += seconds
-        step = self._shape.take(self._reference.standard(scores))
+        step = self._normalizer.take(self._reference.standard(scores))
         normal = step.normal
         self._kept.append(said)
         self._scored.append(normal)
@@ -185,11 +185,11 @@ class Isolation:
                 self._learn(*one)
         return verdict
 
-    def _learn(self, said: Said, scores: Floats, step: Step) -> None:
+    def _learn(self, said: Said, scores: Floats, step: NormalScores) -> None:
         """Take a cycle as usual; what is shown for the first time is looked for from now on."""
         new = np.isfinite(scores) & (self._reference.count == 0.0)
         self._reference.add(scores)
-        self._shape.learn(step)
+        self._normalizer.learn(step)
         self._usual.add(said)
         self._learned += 1
         if new.any():

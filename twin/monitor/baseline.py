@@ -14,10 +14,10 @@ from twin.monitor.change import Floats, Reference, as_normal
 from twin.monitor.healthy import Healthy
 
 LEARNED = 300  # healthy cycles of its own: then a scatter is known to 4 %
-LIKELY = 3.5  # sigmas up to which a cycle is learned from
+LEARNED_WITHIN = 3.5  # sigmas up to which a cycle is learned from
 
 
-class Usual:
+class Baseline:
     """The figures of one unit's healthy cycles, in the order of ``names``; all values in mbar.
 
     How an ``_rms`` is spread hangs on how many things scatter. One makes it the size of a normal
@@ -68,7 +68,7 @@ class Usual:
 
     def learn(self, figures: Mapping[str, float], normal: Floats) -> None:
         """Take a cycle in that is healthy by its ``normal`` values, while too few are known."""
-        if self._learned < LEARNED and not (np.abs(normal) > LIKELY).any():
+        if self._learned < LEARNED and not (np.abs(normal) > LEARNED_WITHIN).any():
             self._learned += 1
             self._reference.add(self._values(figures))
 

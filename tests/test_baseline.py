@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import rigs
 
-from twin.figures.settings import SHORTEST_CYCLE_S, reaches
+from twin.figures.settings import SHORTEST_CYCLE_S, healthy_range
+from twin.monitor.baseline import LEARNED, Baseline
 from twin.monitor.budget import (
     LIMITS,
     SINGLE_CYCLES,
@@ -14,14 +15,13 @@ from twin.monitor.budget import (
     student_limit,
 )
 from twin.monitor.healthy import Healthy, Scatter, sure
-from twin.monitor.usual import LEARNED, Usual
 
 NAMES = ("idle_mean", "suction_mean", "hold_mean", "h1_level")
 MEAN, SIGMA = 3.0, 2.0
 SMALLEST = 0.0
 
 
-def commissioned(rng: np.random.Generator, cycles: int, names: tuple[str, ...] = NAMES) -> Usual:
+def commissioned(rng: np.random.Generator, cycles: int, names: tuple[str, ...] = NAMES) -> Baseline:
     """A unit whose figures are independent and normal, known by so many cycles."""
     seen = rng.normal(MEAN, SIGMA, (cycles, len(names)))
     if names[0].endswith("_rms"):
@@ -31,7 +31,7 @@ def commissioned(rng: np.random.Generator, cycles: int, names: tuple[str, ...] =
         name: Scatter(mean=mean, sigma=sigma * sure(cycles), cycles=cycles)
         for name, mean, sigma in known
     }
-    return Usual(Healthy(figures=figures))
+    return Baseline(Healthy(figures=figures))
 
 
 def test_the_shares_are_of_one_budget() -> None:
@@ -104,7 +104,7 @@ def test_a_limit_of_a_key_figure_is_beyond_what_healthy_cycles_reach() -> None:
     for _ in range(units):
         seen = rng.normal(500.0, 8.0, 12)
         one = Scatter(mean=seen.mean(), sigma=seen.std(ddof=1) * sure(12), cycles=12)
-        low, high = reaches(Healthy(key_figures={"t1": one}), days)["t1"]
+        low, high = healthy_range(Healthy(key_figures={"t1": one}), days)["t1"]
         later = rng.normal(500.0, 8.0, 200)
         beyond += int((later > high).sum())
         assert low < seen.min()
