@@ -45,6 +45,8 @@ NEEDED = {
     "figures export": ("-o", "new.csv"),
     "alarms list": (),
     "alarms history": (),
+    "alarms statistics": (),
+    "alarms comment": ("plc_stale", "seen"),
     "alarms export": ("-o", "new.csv"),
     "alarms acknowledge": ("plc_stale",),
     "alarms shelve": ("plc_stale",),
