@@ -75,9 +75,8 @@ def test_of_noise_alone_something_unlisted_is_improbable_and_of_a_course_in_it_s
     noise = np.ones(RESIDUALS)
 
     def probability(white: Floats) -> float:
-        return unmodelled.of_nothing_listed(
-            unmodelled.log_likelihoods(courses, white, noise, 1.0)[None]
-        )
+        logs = unmodelled.log_likelihoods(courses, white, noise, 1.0)
+        return unmodelled.Odds.of(logs[None]).alone()
 
     assert probability(left) < 0.1
     assert probability(left + courses @ np.ones(WAYS)) == unmodelled.MOST_SURE

@@ -108,7 +108,8 @@ def diagnose(
     progress("looking for what nobody listed")
     beside = Unmodelled(evidence, known.of(evidence.judged), found)
     odds = [beside.odds(number) for number in range(len(found))]
-    likely = any(one.of_unlisted(len(found)) > LIKELY for one in odds)
+    alone = 0.0 if found else beside.alone()
+    likely = any(one.of_unlisted(len(found)) > LIKELY for one in odds) or alone > LIKELY
     strange = look(known, found, fitted, held_out, least=0.0 if likely else STRANGE)
     # Where nothing was fitted, all cycles are unseen.
     left = after.leftover if found else _left_in_all(evidence, healthy.of(evidence.judged))
@@ -128,9 +129,7 @@ def diagnose(
         "verdict": verdict,
         "causes": _causes(evidence, searched, odds, before) if found else [],
         "runners_up": _runners_up(searched),
-        "unmodelled_probability": _unmodelled(
-            evidence, searched, odds, healthy.of(evidence.judged)
-        ),
+        "unmodelled_probability": _unmodelled(evidence, searched, odds, alone, verdict),
         "unlisted": _unlisted(strange) if verdict == "unlisted" else None,
         "cycles": {
             "total": whole.cycles,
@@ -282,14 +281,15 @@ def _causes(
 
 
 def _unmodelled(
-    evidence: Evidence, searched: Search, odds: Sequence[Odds], weights: Weights
+    evidence: Evidence, searched: Search, odds: Sequence[Odds], alone: float, verdict: str
 ) -> float:
-    """Probability of something unlisted in place of the first cause, or of any where none stands.
+    """Probability of something unlisted in place of the first cause; ``alone`` where none stands.
 
-    With the probability of that cause and those of its rivals it sums to one.
+    With the probability of that cause and those of its rivals it sums to one. Where more is left
+    than noise it is likelier than not, whatever its course: no smooth one has to come again.
     """
     if searched.found is None:
-        return round(Unmodelled(evidence, weights, HEALTHY).alone(), 3)
+        return round(max(alone, LIKELY) if verdict == "unlisted" else alone, 3)
     found = searched.found
     rivals = _weight(evidence, found, searched.rivals[0])
     return round(odds[0].instead(len(found.hypothesis), rivals), 3)

@@ -9,7 +9,7 @@ from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.fit import white
 from twin.diagnosis.unlisted import OVER, smooth
 from twin.diagnosis.weights import Weights
-from twin.inference.unmodelled import Odds, log_likelihoods, of_nothing_listed
+from twin.inference.unmodelled import Odds, log_likelihoods
 from twin.model.courses import Cause, Course
 from twin.monitor.bins import Floats
 
@@ -54,9 +54,9 @@ class Unmodelled:
         """Probability that something unlisted acts, where no cause was found."""
         left, noise = self._left[:, 0], np.ones(len(self._left))
         courses = [self.weights.white(course) for course in self._courses]
-        return of_nothing_listed(
+        return Odds.of(
             np.array([log_likelihoods(one, left, noise, 1.0) for one in courses])
-        )
+        ).alone()
 
 
 def _acts(evidence: Evidence, cause: Cause) -> Floats:

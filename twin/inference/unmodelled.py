@@ -59,18 +59,16 @@ class Odds:
         strange = BESIDE * self.ratio + self._instead(causes)
         return strange / (1.0 + strange)
 
+    def alone(self) -> float:
+        """Probability that something unlisted acts where no listed effect does.
+
+        The twin beside healthy cycles is a little off as well, by a share of the noise.
+        """
+        strange = UNLISTED * self.ratio
+        return min(strange / (1.0 + strange), MOST_SURE)
+
     def _instead(self, causes: int) -> float:
         return UNLISTED * self.ratio / FURTHER ** (causes - 1)
-
-
-def of_nothing_listed(log_likelihoods: Floats) -> float:
-    """Probability that something unlisted acts where no listed effect does.
-
-    ``log_likelihoods`` are those with each of SHARES of the noise left, (·, shares).
-    """
-    ratio = np.exp(np.minimum(log_likelihoods, np.log(MOST))).mean(axis=0) @ _ANY
-    strange = UNLISTED * float(ratio)
-    return min(strange / (1.0 + strange), MOST_SURE)
 
 
 def log_likelihoods(courses: Floats, left: Floats, explained: Floats, scale: float) -> Floats:
