@@ -276,11 +276,19 @@ def test_a_valve_whose_closing_no_healthy_cycle_shows_is_nothing_unlisted(flow: 
     )
 
 
-def test_an_effect_outside_the_table_gets_a_term_that_takes_it_away() -> None:
+def no_mechanism(*_known: Any) -> None:
+    """What is found where none explains most of what is off."""
+
+
+def test_what_no_mechanism_explains_gets_a_term_that_takes_it_away(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(answer_module, "explain", no_mechanism)
     diagnosis = of(record(27.0, "lip_lift=5", seed=22))
     answer = diagnosis.json
     assert (answer["verdict"], answer["unlisted"]["where"]) == ("unlisted", "suction")
     assert answer["unlisted"]["depends_on"] == ["vacuum"]  # the lip lifts above 500 mbar
+    assert answer["unlisted"]["mechanism"] is None
     assert {term.where for term in diagnosis.terms} >= {"suction"}
     assert answer["extended"]["rms_mbar"] < 0.5 * answer["baseline"]["rms_mbar"]
 
@@ -296,6 +304,7 @@ def test_a_term_that_takes_nothing_away_in_mbar_is_no_extension(
         terms = zip(found.terms, upside_down, strict=True)
         return replace(found, terms=tuple(one.model_copy(update=mbar) for one, mbar in terms))
 
+    monkeypatch.setattr(answer_module, "explain", no_mechanism)
     monkeypatch.setattr(answer_module, "look", worse)
     diagnosis = of(record(27.0, "lip_lift=5", seed=22))
     answer = diagnosis.json

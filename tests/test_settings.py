@@ -14,7 +14,7 @@ from pydantic import Field
 from twin.config import TABLES, Config
 from twin.errors import ConfigError, SourceError
 from twin.model.dataset import DataSet, coefficients
-from twin.model.theta import COEFFICIENTS
+from twin.model.theta import COEFFICIENTS, MECHANISMS
 from twin.settings import Document, Settings
 
 TEXT = """\
@@ -270,7 +270,8 @@ def test_every_coefficient_is_filled_in() -> None:
     modes = {"CONTROL_SENSOR", "BLOW_OFF_MODE"}  # the first of each
     opening = {"EXHAUST", "HOLE", "CRACKING_PRESSURE", "KINK"}
     cups = {"COMPLIANCE", "SOFTNESS", "STIFF_UNTIL", "CONTACT"}
-    assert zero == {"BLOW_OFF_SHAPE"} | cups | opening | convection | effects | modes
+    mechanisms = set(list(COEFFICIENTS)[MECHANISMS:])
+    assert zero == {"BLOW_OFF_SHAPE"} | cups | opening | convection | effects | modes | mechanisms
 
 
 def test_the_hash_tells_data_sets_apart() -> None:

@@ -11,16 +11,22 @@ from twin.figures.table import table as figures_table
 from twin.figures.warnings import table as warnings_table
 from twin.model.courses import table as courses_table
 from twin.model.effects import table as effects_table
+from twin.model.mechanism import places_table, whens_table
 
 ROOT = Path(__file__).parent.parent
 PAGES = (
     ROOT / "README.md",
-    *(ROOT / "docs" / name for name in ("alarms.md", "effects.md", "key-figures.md")),
+    *(
+        ROOT / "docs" / name
+        for name in ("alarms.md", "effects.md", "key-figures.md", "mechanisms.md")
+    ),
 )
 TABLES = {
     "register map": register_table,
     "effects": effects_table,
     "courses": courses_table,
+    "places": places_table,
+    "ways of acting": whens_table,
     "key figures": figures_table,
     "curve figures": curve_table,
     "warnings": warnings_table,

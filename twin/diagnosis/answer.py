@@ -15,6 +15,7 @@ from twin.diagnosis.fit import Fitted, white
 from twin.diagnosis.healthy import left_in_each, usual_leftover
 from twin.diagnosis.hypotheses import hours, parameters, score_with_tempered_prior
 from twin.diagnosis.judge import Judged, gain, judge, rounded
+from twin.diagnosis.mechanisms import Explained, explain
 from twin.diagnosis.search import Search, search, sharpened, stranger
 from twin.diagnosis.unlisted import STRANGE, Unlisted, extended, look
 from twin.diagnosis.unmodelled import Unmodelled
@@ -23,7 +24,8 @@ from twin.inference.levels import SIGMAS_95
 from twin.inference.unmodelled import Odds
 from twin.instants import CALENDAR_NS, SECOND_NS
 from twin.model.courses import Cause, Course
-from twin.model.effects import EFFECTS
+from twin.model.effects import effect_of
+from twin.model.mechanism import MECHANISMS
 from twin.model.term import Term
 from twin.monitor.bins import Floats
 from twin.monitor.cycles import Cycle
@@ -57,11 +59,25 @@ class Diagnosis:
     data_set: str  # content hash of the calibrated twin's
     search: Search | None
     hypothesis: Hypothesis  # the causes found
-    terms: tuple[Term, ...]  # what data gave where nobody listed a cause
+    terms: tuple[Term, ...]  # what data gave where no mechanism is known either
     before: Judged | None
     after: Judged | None
     held_out: list[int]
     json: dict[str, Any]
+    mechanism: Explained | None = None  # what acts beside the causes that nobody listed
+
+    @property
+    def acting(self) -> Hypothesis:
+        """All that the extended model has: the causes, then the mechanism."""
+        return (*self.hypothesis, *((self.mechanism.cause,) if self.mechanism else ()))
+
+    @property
+    def told(self) -> list[dict[str, Any]]:
+        """What the answer tells of each of them."""
+        return [
+            *self.json["causes"],
+            *([self.json["unlisted"]["mechanism"]] if self.mechanism else []),
+        ]
 
 
 def diagnose(
@@ -114,23 +130,25 @@ def diagnose(
     # Where nothing was fitted, all cycles are unseen.
     left = after.leftover if found else _left_in_all(evidence, healthy.of(evidence.judged))
     verdict, terms = _verdict(found, before, after, left, strange, likely), tuple[Term, ...]()
+    mechanism = None
     if verdict == "unlisted":
         if not _sure(found, before, after):
             searched, found = replace(searched, found=None), HEALTHY
             strange = look(healthy, found, fitted, held_out)
             after = before
-        with_terms = extended(evidence, strange.terms)
-        mended = judge(with_terms, covariance(with_terms, found).of(held_out), found)
-        if mended.rms < after.rms:
-            terms, after = strange.terms, mended
-        else:  # less in sigmas, but not in mbar, is no better model
-            strange = replace(strange, terms=())
+        mechanism, mended = _mechanism_found(evidence, found, after, fitted, held_out, progress)
+        if mechanism and not mechanism.beside:
+            searched, found = replace(searched, found=None), HEALTHY
+        if mended is None:
+            strange, mended = _term_found(evidence, found, after, strange, held_out)
+            terms = strange.terms
+        after = mended or after
     answer = head | {
         "verdict": verdict,
         "causes": _causes(evidence, searched, odds, before) if found else [],
         "runners_up": _runners_up(searched),
         "unmodelled_probability": _unmodelled(evidence, searched, odds, alone, verdict),
-        "unlisted": _unlisted(strange) if verdict == "unlisted" else None,
+        "unlisted": _unlisted(evidence, strange, mechanism) if verdict == "unlisted" else None,
         "cycles": {
             "total": whole.cycles,
             "fitted": [int(evidence.numbers[one]) for one in fitted],
@@ -143,8 +161,49 @@ def diagnose(
         "next_experiment": next_experiment(evidence, searched),
     }
     return Diagnosis(
-        evidence, config.data.hash, searched, found, terms, before, after, held_out, answer
+        evidence,
+        config.data.hash,
+        searched,
+        found,
+        terms,
+        before,
+        after,
+        held_out,
+        answer,
+        mechanism,
     )
+
+
+def _mechanism_found(
+    evidence: Evidence,
+    found: Hypothesis,
+    after: Judged,
+    fitted: Sequence[int],
+    held_out: Sequence[int],
+    progress: Callable[[str], None],
+) -> tuple[Explained | None, Judged | None]:
+    """What acts that nobody listed, where it brings the twin nearer to cycles it has not seen."""
+    one = explain(evidence, fitted, found, progress)
+    if one is None:
+        return None, None
+    hypothesis = one.fitted.hypothesis
+    mended = judge(evidence, covariance(evidence, hypothesis).of(held_out), hypothesis)
+    return (one, mended) if mended.rms < after.rms else (None, None)
+
+
+def _term_found(
+    evidence: Evidence,
+    found: Hypothesis,
+    after: Judged,
+    strange: Unlisted,
+    held_out: Sequence[int],
+) -> tuple[Unlisted, Judged | None]:
+    """The term from data, where it brings the twin nearer; it holds for this program only."""
+    with_terms = extended(evidence, strange.terms)
+    mended = judge(with_terms, covariance(with_terms, found).of(held_out), found)
+    if mended.rms < after.rms:
+        return strange, mended
+    return replace(strange, terms=()), None  # less in sigmas, but not in mbar, is no better model
 
 
 def _signals(evidence: Evidence) -> list[dict[str, str]]:
@@ -335,17 +394,21 @@ def _parameters(
 ) -> dict[str, dict[str, Any]]:
     """Values with intervals; a ramp's are rates, and what they have come to at the log's end."""
     found = {}
-    ramp = cause.course == Course.RAMP
-    sized = zip(EFFECTS[cause.effect].parameters, x, lowest, highest, strict=True)
+    ramp, theta = cause.course == Course.RAMP, evidence.theta
+    sized = zip(effect_of(cause.effect).parameters, x, lowest, highest, strict=True)
     for p, size, below, above in sized:
-        if not above - below < WIDEST * abs(p.high - p.low) / p.typical:
+        whole = p.steps_to(p.high, theta) - p.steps_to(p.low, theta)
+        if not above - below < WIDEST * whole:
             continue  # nothing in this log depends on it
-        at_neutral = p.neutral(evidence.theta)
+        at_neutral = p.neutral(theta)
         neutral = 0.0 if ramp else at_neutral
-        value = neutral + float(size) * p.typical
+        value, least, most = (
+            one * p.typical if ramp else p.after(one, theta)
+            for one in map(float, (size, below, above))
+        )
         scale = OF_HEAT if cause.effect == "heat_exchange" else RELATIVE
         unsure = SIGMAS_95 * scale * value
-        down, up = (math.hypot(float(end - size) * p.typical, unsure) for end in (below, above))
+        down, up = (math.hypot(end - value, unsure) for end in (least, most))
         shift = at_neutral - neutral  # of a ramp these are changes, and the bounds are not
         low, high = max(value - down, p.low - shift), min(value + up, p.high - shift)
         per_hour = 1.0 / hours(evidence, cause) if ramp else 1.0
@@ -364,7 +427,7 @@ def _parameters(
 def _why(
     evidence: Evidence, cause: Cause, values: dict[str, dict[str, Any]], before: Judged
 ) -> str:
-    effect = EFFECTS[cause.effect]
+    effect = effect_of(cause.effect)
     size = ", ".join(
         f"{name.replace('_', ' ')} {one.get('at_end', one['value']):.3g}"
         f" {one['unit'].removesuffix('/h')}"
@@ -385,12 +448,28 @@ def _why(
 # --- what is left ---------------------------------------------------------------------------------
 
 
-def _unlisted(strange: Unlisted) -> dict[str, Any]:
-    """Where something is that no listed effect explains, and on what it depends."""
+def _unlisted(evidence: Evidence, strange: Unlisted, one: Explained | None) -> dict[str, Any]:
+    """Where something is that no listed effect explains, on what it depends, and what it may be."""
     return {
         "where": strange.where,
         "depends_on": [strange.depends_on],
         "shape": strange.shape,
+        "mechanism": _mechanism(evidence, one) if one else None,
+    }
+
+
+def _mechanism(evidence: Evidence, one: Explained) -> dict[str, Any]:
+    """A mechanism in words, as a formula and with intervals, and what it is not told from."""
+    mechanism, first = MECHANISMS[one.cause.effect], len(parameters(one.beside))
+    low, high = (end[first:] for end in one.ends)
+    return {
+        "name": mechanism.name,
+        "sentence": mechanism.sentence(one.cause.values),
+        "formula": mechanism.formula(one.cause.values),
+        "parameters": _parameters(evidence, one.cause, one.fitted.x[first:], low, high),
+        "not_separable_from": [
+            MECHANISMS[rival.effect].sentence(rival.values) for rival in one.rivals
+        ],
     }
 
 

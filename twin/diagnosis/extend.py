@@ -21,7 +21,8 @@ from twin.inference.sensitivities import derivatives
 from twin.live import Twin
 from twin.model.courses import Cause, Course
 from twin.model.dataset import DataSet, coefficients
-from twin.model.effects import EFFECTS, Parameter, apply
+from twin.model.effects import Parameter, apply, effect_of
+from twin.model.mechanism import MECHANISMS
 from twin.model.term import AGAIN
 from twin.monitor.bins import Floats
 from twin.monitor.cycles import figures, whole
@@ -43,7 +44,7 @@ def extended(diagnosis: Diagnosis, config: Config) -> Known | None:
     if not found and not terms:
         return None
     for effect, sizes in found.items():
-        law = EFFECTS[effect].law
+        law = effect_of(effect).law
         if law and law.name in sizes:
             ejector = data.ejector.model_copy(update={law.name: sizes[law.name]})
             data = data.model_copy(update={"ejector": ejector})
@@ -64,7 +65,9 @@ def remarks(diagnosis: Diagnosis) -> Iterator[str]:
         elif cause.course == Course.RAMP:
             rates = (f"{p['value']:.3g} {p['unit']}" for p in answer["parameters"].values())
             yield f"{name} goes on growing ({', '.join(rates)}): it is stored as it was at the end"
-    if diagnosis.json["verdict"] == "unlisted" and not diagnosis.terms:
+    if diagnosis.terms:
+        yield "the term from data holds for this program of commands only"
+    elif diagnosis.json["verdict"] == "unlisted" and not diagnosis.mechanism:
         yield "what no listed effect explains is not in it"
 
 
@@ -95,7 +98,7 @@ def store(
             "cycles": diagnosis.evidence.cycles,
             "extends": f"{config.asset.id or config.asset.type}, data set {diagnosis.data_set}",
             "from": config.origin,
-            "causes": [cause.effect for cause in diagnosis.hypothesis if _is_always(cause)],
+            "causes": [cause.effect for cause in diagnosis.acting if _is_always(cause)],
             "terms": len(diagnosis.terms),
         },
         valid_from_ns=provenance.valid_from(_since(diagnosis)),
@@ -115,19 +118,27 @@ def _always(diagnosis: Diagnosis) -> Iterator[tuple[str, Sizes]]:
     """What was found that goes on: laws and sizes at the end, but of what nothing depends on."""
     evidence = diagnosis.evidence
     at_end = float(evidence.seconds[-1]), int(evidence.numbers[-1])
-    for cause, answer in zip(diagnosis.hypothesis, diagnosis.json["causes"], strict=True):
+    for cause, answer in zip(diagnosis.acting, diagnosis.told, strict=True):
         sizes = cause.at(evidence.theta, *at_end)
         known = {name: sizes[name] for name in answer["parameters"] if _is_always(cause)}
-        if known:
+        if cause.effect in MECHANISMS:
+            yield cause.effect, sizes  # its times are needed, known well or not
+        elif known:
             yield cause.effect, {**cause.law(), **known}
 
 
 def _joined(data: DataSet, effect: str, found: Sizes) -> dict[str, float]:
     """Sizes that alone do what those of the data set and those found do one after the other."""
     before = data.effects.get(effect, {})
+    if effect in MECHANISMS:
+        sizes = {one.name for one in MECHANISMS[effect].place.parameters}
+        return {
+            name: float(f"{value + before.get(name, 0.0) * (name in sizes):.6g}")
+            for name, value in found.items()
+        }
     goal = apply(coefficients(data), effect, found)
     together = dict(before)
-    for parameter in EFFECTS[effect].parameters:
+    for parameter in effect_of(effect).parameters:
         name = parameter.name
         if name in before and name in found:
             together[name] = _solved(data, effect, parameter, goal)
@@ -209,12 +220,14 @@ def _now(diagnosis: Diagnosis) -> Hypothesis:
 
 def _doubts(diagnosis: Diagnosis) -> Iterator[Hypothesis]:
     """The same with one size after the other a sigma away."""
-    answers = {answer["effect"]: answer["parameters"] for answer in diagnosis.json["causes"]}
+    names = [cause.effect for cause in diagnosis.acting]
+    parameters = [answer["parameters"] for answer in diagnosis.told]
+    answers = dict(zip(names, parameters, strict=True))
     now = _now(diagnosis)
     for number, cause in enumerate(now):
-        for p in EFFECTS[cause.effect].parameters:
-            if value := cause.values.get(p.name, 0.0):
-                known = answers[cause.effect][p.name]  # of a ramp they are rates
+        for p in effect_of(cause.effect).parameters:
+            value, known = cause.values.get(p.name, 0.0), answers[cause.effect].get(p.name)
+            if value and known:  # of a ramp they are rates
                 sigma = abs(
                     value * (known["high95"] - known["low95"]) / (2 * SIGMAS_95 * known["value"])
                 )
@@ -254,6 +267,6 @@ def _since(diagnosis: Diagnosis) -> int:
     """When (ns) the rows were received from which on all that was found is there."""
     evidence = diagnosis.evidence
     timed = (Course.STEP, Course.RAMP)
-    onsets = [cause.onset_s for cause in diagnosis.hypothesis if cause.course in timed]
+    onsets = [cause.onset_s for cause in diagnosis.acting if cause.course in timed]
     row = int(np.searchsorted(evidence.seconds, max(onsets, default=0.0)))
     return int(evidence.samples["host_ns"][min(row, len(evidence.samples) - 1)])

@@ -8,7 +8,7 @@ import numpy as np
 
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.model.courses import HOUR, Cause, Course
-from twin.model.effects import EFFECTS, Effect, Parameter
+from twin.model.effects import EFFECTS, Effect, Parameter, effect_of
 from twin.monitor.bins import Floats
 
 WEATHER = "ambient_pressure"  # its typical size is one sigma of what the weather does
@@ -20,23 +20,23 @@ LOCAL_ONSETS = 20  # as many onsets in a cycle can be told apart
 
 def parameters(hypothesis: Hypothesis) -> list[Parameter]:
     """What can be sized in a hypothesis, in order."""
-    return [one for cause in hypothesis for one in EFFECTS[cause.effect].parameters]
+    return [one for cause in hypothesis for one in effect_of(cause.effect).parameters]
 
 
 def by_each_law(hypothesis: Hypothesis, place: int) -> list[Hypothesis]:
     """A hypothesis with one of its causes acting by each law that it may act by."""
     cause = hypothesis[place]
     causes = [
-        replace(cause, values={**cause.values, **law}) for law in EFFECTS[cause.effect].laws()
+        replace(cause, values={**cause.values, **law}) for law in effect_of(cause.effect).laws()
     ]
     return [(*hypothesis[:place], one, *hypothesis[place + 1 :]) for one in causes]
 
 
 def bounds(evidence: Evidence, hypothesis: Hypothesis) -> tuple[Floats, Floats]:
     """Least and greatest sizes, in typical ones away from neutral."""
-    table = [(p, p.neutral(evidence.theta)) for p in parameters(hypothesis)]
-    low = np.array([(p.low - neutral) / p.typical for p, neutral in table])
-    high = np.array([(p.high - neutral) / p.typical for p, neutral in table])
+    table, theta = parameters(hypothesis), evidence.theta
+    low = np.array([p.steps_to(p.low, theta) for p in table])
+    high = np.array([p.steps_to(p.high, theta) for p in table])
     return low, high
 
 
@@ -52,13 +52,12 @@ def sized(evidence: Evidence, hypothesis: Hypothesis, x: Floats) -> Hypothesis:
 
 def _sized(evidence: Evidence, cause: Cause, sizes: Iterator[float]) -> Cause:
     values = cause.law()
-    for p in EFFECTS[cause.effect].parameters:
-        change = float(next(sizes)) * p.typical
+    for p in effect_of(cause.effect).parameters:
+        size = float(next(sizes))
         if cause.course == Course.RAMP:
-            values[p.name] = change / hours(evidence, cause)
+            values[p.name] = size * p.typical / hours(evidence, cause)
         else:
-            neutral = p.neutral(evidence.theta)
-            values[p.name] = float(np.clip(neutral + change, p.low, p.high))
+            values[p.name] = float(np.clip(p.after(size, evidence.theta), p.low, p.high))
     return replace(cause, values=values)
 
 
@@ -66,13 +65,13 @@ def sizes(evidence: Evidence, hypothesis: Hypothesis) -> Floats:
     """The sizes of a hypothesis: the inverse of ``sized``."""
     found = []
     for cause in hypothesis:
-        for p in EFFECTS[cause.effect].parameters:
-            neutral = p.neutral(evidence.theta)
+        for p in effect_of(cause.effect).parameters:
             if cause.course == Course.RAMP:
                 change = cause.values.get(p.name, 0.0) * hours(evidence, cause)
+                found.append(change / p.typical)
             else:
-                change = cause.values.get(p.name, neutral) - neutral
-            found.append(change / p.typical)
+                value = cause.values.get(p.name, p.neutral(evidence.theta))
+                found.append(p.steps_to(value, evidence.theta))
     return np.array(found)
 
 
@@ -94,7 +93,7 @@ def often(evidence: Evidence, effect: Effect) -> float:
 
 def rarity(evidence: Evidence, hypothesis: Hypothesis) -> float:
     """What of a price is how seldom its effects come, beside what wears; the log says the rest."""
-    return sum(-2.0 * math.log(often(evidence, EFFECTS[cause.effect])) for cause in hypothesis)
+    return sum(-2.0 * math.log(often(evidence, effect_of(cause.effect))) for cause in hypothesis)
 
 
 def score_without_prior(evidence: Evidence, score: float, hypothesis: Hypothesis) -> float:
@@ -108,7 +107,7 @@ def score_with_tempered_prior(evidence: Evidence, score: float, hypothesis: Hypo
 
 
 def _price(evidence: Evidence, cause: Cause) -> float:
-    effect, cycles = EFFECTS[cause.effect], len(evidence.judged)
+    effect, cycles = effect_of(cause.effect), len(evidence.judged)
     ways = len(EFFECTS) * len(effect.laws()) / often(evidence, effect)
     if cause.course == Course.STEP:
         ways *= LOCAL_ONSETS * cycles

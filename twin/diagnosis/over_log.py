@@ -11,7 +11,7 @@ from twin.diagnosis.judge import Judged
 from twin.diagnosis.pictures import Found, spread
 from twin.diagnosis.words import LONG_S, spoken
 from twin.model.courses import Cause, Course
-from twin.model.effects import EFFECTS, Parameter
+from twin.model.effects import Parameter, effect_of
 from twin.monitor.bins import Floats
 from twin.signals import MBAR
 
@@ -71,8 +71,8 @@ def _deviations(axes: Axes, found: Found) -> None:
 
 
 def _sized_causes(found: Found) -> list[tuple[Cause, dict[str, Any]]]:
-    """The causes with what the answer says of them."""
-    return list(zip(found.causes, found.answer["causes"], strict=True))
+    """The listed causes, which stand first, with what the answer says of them."""
+    return list(zip(found.causes, found.answer["causes"], strict=False))
 
 
 def _course(
@@ -81,7 +81,7 @@ def _course(
     """Draw how big a cause is over the log, with the interval of its size."""
     several = len(known["parameters"]) > 1
     scale, _ = _scale(evidence)
-    for p in EFFECTS[cause.effect].parameters:
+    for p in effect_of(cause.effect).parameters:
         if p.name not in known["parameters"]:
             continue  # nothing in this log depends on it
         seconds, (value, low, high) = size_over_log(evidence, cause, p, known["parameters"][p.name])

@@ -185,7 +185,7 @@ def draw_left(found: Found, laid: Laid, alt: str) -> str:
     The terms that take it away are drawn over it.
     """
     evidence = found.evidence
-    off = off_in(evidence, laid, [found.causes])[:, 0]
+    off = off_in(evidence, laid, [found.listed])[:, 0]
     ambient = float(evidence.theta[c.AMBIENT])
     vacuum = evidence.bins.mean(ambient - evidence.samples["pressure"])[laid.bins] / MBAR
     where = found.answer["unlisted"]["where"]

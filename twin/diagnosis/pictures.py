@@ -51,7 +51,7 @@ class Found:
 
     evidence: Evidence
     search: Search
-    causes: Hypothesis
+    causes: Hypothesis  # and the mechanism beside them, where there is one
     terms: Sequence[Term]  # that data gave for what no listed effect explains
     before: Judged
     after: Judged
@@ -68,7 +68,7 @@ class Found:
         return cls(
             evidence=diagnosis.evidence,
             search=search,
-            causes=diagnosis.hypothesis,
+            causes=diagnosis.acting,
             terms=diagnosis.terms,
             before=before,
             after=after,
@@ -82,11 +82,17 @@ class Found:
         return bool(self.causes or self.terms)
 
     @property
+    def listed(self) -> Hypothesis:
+        """The causes that are in the table of effects."""
+        return self.causes[: len(self.answer["causes"])]
+
+    @property
     def name(self) -> str:
         """What the extended model has, short."""
-        names = [spoken(cause.effect) for cause in self.causes]
+        names = [spoken(cause.effect) for cause in self.listed]
         if len(names) > 1:
             names = ["all causes"]
+        names += ["the mechanism"] * (len(self.causes) - len(self.listed))
         return " and ".join([*names, *["a term from data"] * bool(self.terms)])
 
     def numbers(self, cycles: Sequence[int] | Ints) -> list[int]:

@@ -40,6 +40,7 @@ from twin.diagnosis.words import (
     left_over,
     lines,
     listed,
+    mechanism_of,
     number,
     signals,
     sized,
@@ -110,8 +111,11 @@ def _steps(answer: Answer, times: Times) -> Iterator[str]:
     steps = dict(to_do(answer))
     record = {name: steps.pop(name) for name in ("next", "next recording") if name in steps}
     if answer["verdict"] == "unlisted":
-        title = "Something that no listed cause explains"
-        yield page.card(title, f"Left in {left_over(answer)}.", steps.items())
+        title, text = "Something that no listed cause explains", f"Left in {left_over(answer)}."
+        if mechanism := mechanism_of(answer):
+            title, text = "What suits best, though nobody listed it", f"{mechanism['sentence']}."
+            steps.pop("mechanism")
+        yield page.card(title, text, steps.items())
     for one in signals(answer):
         yield page.box(f"The signal {one['signal']}", f"{one['what']}: {one['do']}.")
     for title, text in record.items():
@@ -199,7 +203,8 @@ def _verdict_in_numbers(answer: Answer) -> str:
     rms = f"{change(answer, 'rms_mbar')} mbar rms"
     if not answer["causes"]:
         fits = answer["verdict"] == "consistent"
-        term = " with a term from data" if extended(answer) else ""
+        by = "the mechanism" if mechanism_of(answer) else "a term from data"
+        term = f" with {by}" if extended(answer) else ""
         return f"The twin as it stands {'fits' if fits else 'does not fit'}: {rms}{term}"
     said = listed([sized(cause) for cause in answer["causes"]])
     one = len(answer["causes"]) == 1

@@ -9,7 +9,7 @@ from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.fit import white
 from twin.diagnosis.unlisted import OVER, smooth
 from twin.diagnosis.weights import Weights
-from twin.inference.unmodelled import Odds, log_likelihoods
+from twin.inference.unmodelled import Odds, alone, log_likelihoods
 from twin.model.courses import Cause, Course
 from twin.monitor.bins import Floats
 
@@ -51,12 +51,14 @@ class Unmodelled:
         return Odds.of(logs)
 
     def alone(self) -> float:
-        """Probability that something unlisted acts, where no cause was found."""
+        """Probability that something unlisted acts, where no cause was found.
+
+        What is left is as wide as it is: one odd cycle is no course that comes again.
+        """
         left, noise = self._left[:, 0], np.ones(len(self._left))
+        scale = max(float(np.mean(left**2)), 1.0)
         courses = [self.weights.white(course) for course in self._courses]
-        return Odds.of(
-            np.array([log_likelihoods(one, left, noise, 1.0) for one in courses])
-        ).alone()
+        return alone(np.array([log_likelihoods(one, left, noise, scale) for one in courses]))
 
 
 def _acts(evidence: Evidence, cause: Cause) -> Floats:

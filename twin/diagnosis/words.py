@@ -88,6 +88,9 @@ def headline(answer: Answer, now_ns: int) -> str:
             names = (spoken(cause["effect"]) for cause in causes)
             named = listed([f"{name} ({one})" for name, one in zip(names, each, strict=True)])
             return f"{COUNTED[len(causes)]} causes together: {named}."
+        case "unlisted" if mechanism := mechanism_of(answer):
+            known = f"{_known(causes)} {spoken(answer['unlisted']['where'])}"
+            return f"{known}. What suits best: {_small(mechanism['sentence'])}."
         case "unlisted":
             return f"{_known(causes)} {left_over(answer)}."
     return f"The log cannot answer: {answer['next_experiment']}."
@@ -99,6 +102,22 @@ def _known(causes: Sequence[Answer]) -> str:
     verb = "explains" if len(causes) == 1 else "explain"
     named = listed([sized(cause) for cause in causes])
     return f"{_capital(named)} {verb} a part; no listed cause explains what is left in"
+
+
+def mechanism_of(answer: Answer) -> Answer | None:
+    """What nobody listed, as physics; None where it is a curve or nothing is left."""
+    unlisted: Answer = answer["unlisted"] or {}
+    found: Answer | None = unlisted.get("mechanism")
+    return found
+
+
+def _mechanism(found: Answer) -> Iterator[tuple[str, str]]:
+    """What is known of a mechanism."""
+    yield "mechanism", found["sentence"]
+    yield "in the model", found["formula"]
+    yield "sizes", "; ".join(_sizes(found))
+    for other in found["not_separable_from"]:
+        yield "or it may be", other
 
 
 def left_over(answer: Answer) -> str:
@@ -164,6 +183,8 @@ def about(cause: Answer, times: Times, *, sure: bool) -> Iterator[tuple[str, str
 
 def to_do(answer: Answer) -> Iterator[tuple[str, str]]:
     """What to find out and to record next."""
+    if found := mechanism_of(answer):
+        yield from _mechanism(found)
     if answer["verdict"] == "unlisted":
         where, depends = spoken(answer["unlisted"]["where"]), answer["unlisted"]["depends_on"]
         yield "find out", f"what in {where} differs from when the twin was calibrated"
@@ -310,6 +331,10 @@ def listed(parts: Sequence[str], last: str = "and") -> str:
 def spoken(name: str) -> str:
     """A name as people say it."""
     return name.replace("blow_off", "blow-off").replace("_", " ")
+
+
+def _small(text: str) -> str:
+    return text[:1].lower() + text[1:]
 
 
 def _capital(text: str) -> str:

@@ -47,6 +47,7 @@ static int whole(double x) { return x > -1e9 ? (x < 1e9 ? (int)x : 1000000000) :
 # What is called of Python and of NumPy, on one value.
 _CALLED: Mapping[object, tuple[str, Kind]] = {
     math.sqrt: ("sqrt({})", NUMBER),
+    math.sin: ("sin({})", NUMBER),
     math.ceil: ("whole(ceil({}))", WHOLE),
     math.isnan: ("isnan({})", WHOLE),
     np.log: ("log({})", NUMBER),

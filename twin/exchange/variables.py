@@ -125,9 +125,14 @@ class Component:
 
     @classmethod
     def of(cls, data: DataSet, where: Where) -> "Component":
-        """The component of a data set; what it has of effects is where the effects start."""
-        theta = coefficients(data.model_copy(update={"effects": {}}))
-        names = [*data.effects, *(name for name in EFFECTS if name not in data.effects)]
+        """The component of a data set; what it has of effects is where the effects start.
+
+        A mechanism beside the table is a part of it: its coefficients hold it.
+        """
+        given = {name: sizes for name, sizes in data.effects.items() if name in EFFECTS}
+        beside = {name: sizes for name, sizes in data.effects.items() if name not in EFFECTS}
+        theta = coefficients(data.model_copy(update={"effects": beside}))
+        names = [*given, *(name for name in EFFECTS if name not in given)]
         kept = [name for name in names if where == "inside" or name not in OF_THE_VESSEL]
         acting = _acting(theta, data.effects, kept)
         sources = {**_PORTS, **_VESSEL[where]}

@@ -11,6 +11,7 @@ that is small.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import t as student
 
 from twin.inference.covariance import Floats
 
@@ -24,6 +25,10 @@ _EDGES = np.concatenate([[0.0], np.sqrt(SHARES[1:] * SHARES[:-1]), [1.0]])
 _ANY = np.diff(_EDGES)  # of an effect that nobody listed all shares are as probable
 _LITTLE = _ANY * np.exp(-0.5 * (SHARES / MISMATCH) ** 2)  # of one that is: as its waveform is off
 _LITTLE /= _LITTLE.sum()
+# Beside healthy cycles of another record a twin is off as well; by much on some rigs, as its
+# equations are not theirs: Student's t, on 16 records of rigs from another world.
+_TWIN = _ANY * student.pdf(SHARES / MISMATCH, 2)
+_TWIN /= _TWIN.sum()
 MOST_SURE = 0.99  # nobody knows the whole table, nor all that may not be in it
 MOST = 1e9  # beyond it nothing changes any more
 
@@ -40,9 +45,7 @@ class Odds:
     @classmethod
     def of(cls, log_likelihoods: Floats) -> "Odds":
         """From the log likelihoods with each of SHARES left, (·, shares): courses are averaged."""
-        likelihoods = np.exp(log_likelihoods - log_likelihoods.max()).mean(axis=0)
-        listed, unlisted = float(likelihoods @ _LITTLE), float(likelihoods @ _ANY)
-        return cls(unlisted / max(listed, unlisted / MOST))
+        return cls(_ratio(log_likelihoods, _LITTLE))
 
     def of_cause(self, causes: int, rivals: float) -> float:
         """Probability that a cause acts, one of so many; ``rivals`` weigh so much beside it."""
@@ -59,16 +62,24 @@ class Odds:
         strange = BESIDE * self.ratio + self._instead(causes)
         return strange / (1.0 + strange)
 
-    def alone(self) -> float:
-        """Probability that something unlisted acts where no listed effect does.
-
-        The twin beside healthy cycles is a little off as well, by a share of the noise.
-        """
-        strange = UNLISTED * self.ratio
-        return min(strange / (1.0 + strange), MOST_SURE)
-
     def _instead(self, causes: int) -> float:
         return UNLISTED * self.ratio / FURTHER ** (causes - 1)
+
+
+def alone(log_likelihoods: Floats) -> float:
+    """Probability that something unlisted acts where no listed effect does.
+
+    ``log_likelihoods`` are those with each of SHARES of the noise left, (·, shares).
+    """
+    strange = UNLISTED * _ratio(log_likelihoods, _TWIN)
+    return min(strange / (1.0 + strange), MOST_SURE)
+
+
+def _ratio(log_likelihoods: Floats, expected: Floats) -> float:
+    """Likelihood of any share beside that of the shares that are ``expected``, at most MOST."""
+    likelihoods = np.exp(log_likelihoods - log_likelihoods.max()).mean(axis=0)
+    usual, unlisted = float(likelihoods @ expected), float(likelihoods @ _ANY)
+    return unlisted / max(usual, unlisted / MOST)
 
 
 def log_likelihoods(courses: Floats, left: Floats, explained: Floats, scale: float) -> Floats:

@@ -11,8 +11,7 @@ from enum import StrEnum
 import numpy as np
 import numpy.typing as npt
 
-from twin.errors import ConfigError
-from twin.model.effects import EFFECTS, apply
+from twin.model.effects import apply, effect_of
 from twin.model.theta import Theta
 
 HOUR = 3600.0  # s
@@ -51,7 +50,7 @@ class Cause:
 
     def law(self) -> dict[str, float]:
         """The law that it acts by, where that is told beside the sizes."""
-        law = EFFECTS[self.effect].law
+        law = effect_of(self.effect).law
         return {law.name: self.values[law.name]} if law and law.name in self.values else {}
 
     def at(self, theta: Theta, second: float, cycle: int) -> Mapping[str, float]:
@@ -65,7 +64,7 @@ class Cause:
         if self.course == Course.STEP:
             return self.values
         grown = self.law()
-        for parameter in EFFECTS[self.effect].parameters:
+        for parameter in effect_of(self.effect).parameters:
             rate = self.values.get(parameter.name, 0.0)
             value = parameter.neutral(theta) + rate * (second - self.onset_s) / HOUR
             grown[parameter.name] = min(max(value, parameter.low), parameter.high)
@@ -100,8 +99,7 @@ def _changes(
     """Rows at which any cause changes, row 0 first."""
     rows = {0}
     for cause in causes:
-        if cause.effect not in EFFECTS:
-            raise ConfigError(f"unknown effect {cause.effect!r}", "twin effects lists them")
+        effect_of(cause.effect)
         times: npt.NDArray[np.float64] = np.empty(0)
         if cause.course == Course.STEP:
             times = np.array([cause.onset_s])

@@ -4,6 +4,7 @@ Every effect is always compiled in; at neutral it changes nothing to the last bi
 them by their signatures, the diagnosis searches their parameters, an extended model sets them.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -22,8 +23,9 @@ UNKNOWN = "unknown"  # stands for an effect where a deviation has no name yet
 class Parameter:
     """One number of an effect, in the field's unit.
 
-    ``typical`` is a change worth an alarm. Neutral is zero, or the data set's own value where the
-    parameter replaces a ``coefficient`` rather than adding to it.
+    ``typical`` is a change worth an alarm; of a ``ratio`` it is a factor. Neutral is zero, or the
+    data set's own value where the parameter replaces a ``coefficient`` rather than adding to it;
+    of a ratio, which only says how an effect acts, it is the lowest value.
     """
 
     name: str
@@ -32,10 +34,25 @@ class Parameter:
     high: float
     typical: float
     coefficient: int | None = None
+    ratio: bool = False  # what matters is how many times as large it is: a time constant
 
     def neutral(self, theta: Theta) -> float:
         """Return the value at which the effect changes nothing."""
+        if self.ratio:
+            return self.low
         return 0.0 if self.coefficient is None else float(theta[self.coefficient])
+
+    def steps_to(self, value: float, theta: Theta) -> float:
+        """How many typical changes lie between neutral and ``value``."""
+        if self.ratio:
+            return math.log(value / self.low) / math.log(self.typical)
+        return (value - self.neutral(theta)) / self.typical
+
+    def after(self, steps: float, theta: Theta) -> float:
+        """The value so many typical changes from neutral: the inverse of ``steps_to``."""
+        if self.ratio:
+            return float(self.low * self.typical**steps)
+        return self.neutral(theta) + steps * self.typical
 
     def range(self, theta: Theta) -> tuple[float, float]:
         """Return the bounds of a change from neutral."""
@@ -331,6 +348,22 @@ _TABLE = (
 EFFECTS: Mapping[str, Effect] = {effect.name: effect for effect in _TABLE}
 
 
+_BESIDE: dict[str, Effect] = {}  # what acts beside the table
+
+
+def add_beside(effects: Mapping[str, Effect]) -> None:
+    """Let effects beside the table be known by name; the search for causes passes them over."""
+    _BESIDE.update(effects)
+
+
+def effect_of(name: str) -> Effect:
+    """The effect of a name, of the table or beside it. ConfigError where there is none."""
+    found = EFFECTS.get(name) or _BESIDE.get(name)
+    if found is None:
+        raise ConfigError(f"unknown effect {name!r}", "twin effects lists them")
+    return found
+
+
 def acting_on(theta: Theta) -> list[Effect]:
     """The effects that can act on a unit: what cannot is no hypothesis about it."""
     return [effect for effect in _TABLE if effect.acts(theta)]
@@ -342,9 +375,7 @@ def apply(theta: Theta, name: str, values: Mapping[str, float]) -> Theta:
     A law may stand beside them; where it is missing, the data set's holds.
     Raises ConfigError for an unknown effect or parameter and for a value out of bounds.
     """
-    effect = EFFECTS.get(name)
-    if effect is None:
-        raise ConfigError(f"unknown effect {name!r}", "twin effects lists them")
+    effect = effect_of(name)
     known = {parameter.name for parameter in effect.parameters}
     known |= {effect.law.name} if effect.law else set()
     if unknown := set(values) - known:

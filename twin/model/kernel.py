@@ -16,13 +16,41 @@ from twin.model import theta as c
 from twin.model.compiled import compiled, inlined, per_row
 from twin.model.control import air_saving, new_timer, nothing_done, part_present, switch, timed
 from twin.model.gas import GAMMA, R
+from twin.model.mechanism import (
+    ABOVE,
+    ALSO_ON,
+    ALSO_SIZE,
+    ALWAYS,
+    BEGINS,
+    BEYOND,
+    ENDS,
+    FADES,
+    GATHERED,
+    NOZZLE_OFF,
+    NOZZLE_ON,
+    ON,
+    PERIOD,
+    SETS_IN,
+    SHIFT,
+    SIZE,
+    SLOTS,
+    SWINGING,
+    USED_UP,
+    WHEN,
+    WIDTH,
+)
+from twin.model.mechanism import (
+    BLOWING as IN_BLOW_OFF,
+)
 from twin.model.plant import (
     LOWEST,
     ORDER,
     PREPARED,
     TINY,
+    UNMOVED,
     Gas,
     Lags,
+    derive,
     prepare,
     put,
     reading,
@@ -37,15 +65,20 @@ PORT, PORT_MASS, LINE, LINE_MASS, VESSEL, VESSEL_MASS, NEAR, FAR = range(8)
 DRIVE, JET, BLOWING, SUPPLIED, FELT, SENSED = range(8, ORDER)
 # ... then the valves (position, what is commanded, for how long), how roughly the pressures run
 # (Pa/s³), the phase, the open cup, whether the model stands on a measurement at all, and the
-# switching signals it hands out.
+# switching signals it hands out. Last how far each mechanism has set in (0 to 1), by which share
+# of its size it acts, whether the vacuum that it waits for is reached, and for how long (s) the
+# model has run.
 NOZZLE, NOZZLE_COMMAND, NOZZLE_AGE, BLOW, BLOW_COMMAND, BLOW_AGE = range(ORDER, ORDER + 6)
 ROUGH, PHASE, OPEN, VALID, SIGNALS = range(ORDER + 6, ORDER + 11)
-STATE = ORDER + 11
+SET_IN, ACTS, REACHED = ORDER + 11, ORDER + 11 + SLOTS, ORDER + 11 + 2 * SLOTS
+RUN = REACHED + SLOTS
+STATE = RUN + 1
 
 LANES = 8  # hypotheses that are run together, with a step that suits them all
 LONGEST_STEP = 0.01  # s
 LONGEST_BRIDGE = 0.1  # s; after a longer silence the model waits for the next sync
 NEVER = 1e9  # s, an age that is past every delay
+AT_ONCE = 1e-4  # s, of a mechanism that sets in or fades without delay
 # A step in which a valve moves, a cup opens or blow-off passes ambient pressure (the exhaust opens)
 # is done in the most steps; any other in as many as keep each within the tolerance.
 FINEST = 24  # steps, within TOLERANCE; as many fewer where it is wider as any step then needs
@@ -350,11 +383,95 @@ def _substep(state, k, h, guess):  # type: ignore[no-untyped-def]
 
 
 @inlined
+def _drives(state, k, slot, i):  # type: ignore[no-untyped-def]
+    """How strongly, 0 to 1, the mechanism of a slot is driven to set in, and to fade.
+
+    A relay remembers whether its vacuum was reached.
+    """
+    first = c.MECHANISMS + slot * WIDTH
+    when, begins = k[first + WHEN, i], k[first + BEGINS, i]
+    ambient = k[c.AMBIENT, i]
+    vacuum, jet = ambient - state[VESSEL, i], min(state[JET, i], 1.0)
+    reached = 1.0 if vacuum >= begins else 0.0 if vacuum < k[first + ENDS, i] else 2.0
+    reached = state[REACHED + slot, i] if reached > 1.0 else reached
+    state[REACHED + slot, i] = reached
+    beyond = min(max((vacuum - begins) / (ambient - begins), 0.0), 1.0)
+    drive = 1.0 if when == ALWAYS else 0.0
+    drive = 1.0 if when == SWINGING else drive
+    drive = jet if when == NOZZLE_ON else drive
+    drive = jet if when == GATHERED else drive
+    drive = 1.0 - jet if when == NOZZLE_OFF else drive
+    drive = min(state[BLOWING, i], 1.0) if when == IN_BLOW_OFF else drive
+    drive = reached if when == ABOVE else drive
+    drive = beyond if when == BEYOND else drive
+    drive = 1.0 - beyond if when == USED_UP else drive
+    return drive, min(state[BLOWING, i], 1.0) if when == GATHERED else 1.0 - drive
+
+
+@inlined
+def _set_in(state, k, slot, h, i):  # type: ignore[no-untyped-def]
+    """Let the mechanism of a slot set in or fade for ``h`` seconds of drives that stay.
+
+    It does so exponentially; meanwhile it acts as it does half-way.
+    """
+    first, share = c.MECHANISMS + slot * WIDTH, state[SET_IN + slot, i]
+    drive, away = _drives(state, k, slot, i)
+    rise = drive / max(k[first + SETS_IN, i], AT_ONCE)
+    rate = rise + away / max(k[first + FADES, i], AT_ONCE)
+    there = rise / rate if rate > 0.0 else share
+    passed = (state[RUN, i] + 0.5 * h - k[first + SHIFT, i]) / k[first + PERIOD, i]
+    turn = math.sin(2.0 * math.pi * passed) if k[first + WHEN, i] == SWINGING else 1.0
+    state[ACTS + slot, i] = turn * (there + (share - there) * np.exp(-0.5 * rate * h))
+    state[SET_IN + slot, i] = there + (share - there) * np.exp(-rate * h)
+
+
+@inlined
+def _has_mechanism(k, i):  # type: ignore[no-untyped-def]
+    """Whether anything acts beside the effects of the table."""
+    return k[c.MECHANISMS + SIZE, i] != 0.0 or k[c.MECHANISMS + WIDTH + SIZE, i] != 0.0
+
+
+@compiled
+def _put_in(state, k, i):  # type: ignore[no-untyped-def]
+    """Let coefficients be what they are by what mechanisms make of them; give the vessel's room."""
+    for slot in range(SLOTS):
+        first, unmoved = c.MECHANISMS + slot * WIDTH, UNMOVED + 2 * slot
+        k[int(k[first + ON, i]), i] = k[unmoved, i]
+        k[int(k[first + ALSO_ON, i]), i] = k[unmoved + 1, i]
+    for slot in range(SLOTS):
+        first, share = c.MECHANISMS + slot * WIDTH, state[ACTS + slot, i]
+        k[int(k[first + ON, i]), i] += share * k[first + SIZE, i]
+        k[int(k[first + ALSO_ON, i]), i] += share * k[first + ALSO_SIZE, i]
+    derive(k, i)
+    volume, _ = room(state[VESSEL, i], k, i)
+    return volume
+
+
+@compiled
+def _mechanisms(state, k, h):  # type: ignore[no-untyped-def]
+    """Let mechanisms act for the next ``h`` seconds as they do half-way; for 0 s as they did.
+
+    Where walls give way the gas is squeezed.
+    """
+    for i in range(state.shape[1]):
+        if _has_mechanism(k, i):
+            before = _put_in(state, k, i)
+            if h > 0.0:
+                for slot in range(SLOTS):
+                    _set_in(state, k, slot, h, i)
+                state[RUN, i] += h
+                after = _put_in(state, k, i)
+                if state[VALID, i] > 0.0:
+                    state[VESSEL, i] *= np.exp(GAMMA * np.log(before / after))
+
+
+@inlined
 def _step(state, k, dt, tolerance):  # type: ignore[no-untyped-def]
     """Advance by ``dt`` seconds under the commands of the last sample."""
     count = max(math.ceil(dt / LONGEST_STEP - 1e-6), 1)
     h = dt / count
     for _ in range(count):
+        _mechanisms(state, k, h)
         finer = _finer(state, k, h, tolerance)
         for _ in range(finer):
             _substep(state, k, h / finer, 0)
@@ -471,6 +588,7 @@ def _together(state, all_k, driven, out, first, width, tolerance):  # type: igno
     for i in range(width):
         put(mine, i, state, min(first + i, last))
         put(k, i, all_k, min(first + i, last))
+    _mechanisms(mine, k, 0.0)
     for row in range(dt.shape[0]):
         if dt[row] < 0.0 or dt[row] > LONGEST_BRIDGE:
             mine[VALID] = 0.0
@@ -552,6 +670,7 @@ def _free(state, all_k, driven, out, first, width, tolerance):  # type: ignore[n
         controls[i], timers[i] = control[min(first + i, last)], timer[min(first + i, last)]
         mode, pulse = k[c.BLOW_OFF_MODE, i], k[c.BLOW_OFF_TIME, i]
         timed(timers[i], commands, dt, mode, pulse, told[:, i])
+    _mechanisms(mine, k, 0.0)
     for row in range(dt.shape[0]):
         if dt[row] > 0.0:
             _step(mine, k, dt[row], tolerance)

@@ -17,6 +17,7 @@ import numpy as np
 from twin.model import theta as c
 from twin.model.compiled import compiled, inlined
 from twin.model.gas import CP, CRITICAL_RATIO, GAMMA, R, opening
+from twin.model.mechanism import ALSO_ON, ON, SLOTS, WIDTH
 from twin.model.theta import Theta
 
 # What a step needs and a call computes only once, in rows behind the coefficients.
@@ -35,7 +36,8 @@ from twin.model.theta import Theta
     _OPENS,
     _THINNER,
 ) = range(len(c.COEFFICIENTS), len(c.COEFFICIENTS) + 13)
-PREPARED = len(c.COEFFICIENTS) + 13
+UNMOVED = len(c.COEFFICIENTS) + 13  # what each mechanism changes, as it is without it: two a slot
+PREPARED = UNMOVED + 2 * SLOTS
 
 # A runaway hypothesis stays a number; a node that is flushed many times in a step keeps its gas.
 LIGHTEST = 1e-15  # kg
@@ -103,7 +105,20 @@ ORDER = len(Gas._fields) + len(Lags._fields)
 
 @compiled
 def prepare_one(k, i):  # type: ignore[no-untyped-def]
-    """Write what follows from the coefficients of hypothesis ``i`` below them."""
+    """Write what follows from the coefficients of hypothesis ``i`` below them.
+
+    And what a coefficient is without the mechanism that changes it.
+    """
+    for slot in range(SLOTS):
+        first, unmoved = c.MECHANISMS + slot * WIDTH, UNMOVED + 2 * slot
+        k[unmoved, i] = k[int(k[first + ON, i]), i]
+        k[unmoved + 1, i] = k[int(k[first + ALSO_ON, i]), i]
+    derive(k, i)
+
+
+@compiled
+def derive(k, i):  # type: ignore[no-untyped-def]
+    """Write what follows from the coefficients of hypothesis ``i`` as they are now."""
     ambient, nominal = k[c.AMBIENT, i], k[c.AMBIENT_NOMINAL, i]
     off = k[c.SUPPLY_NOMINAL, i] / k[c.SUPPLY_OPTIMUM, i] - 1.0
     peak = max(1.0 - k[c.SUPPLY_CURVATURE, i] * off * off, 1e-3)

@@ -41,6 +41,7 @@ from twin.model.plant import G, Gas, at_sensor, prepare, put
 
 TOLERANCE = 0.05  # Pa, of a step: within 0.4 of the exact solution on the shipped rigs
 LONGEST_STEP = 15e-3  # s; the course between its ends does not follow further
+MECHANISM_STEP = 2e-3  # s, where a mechanism acts: it changes from step to step
 SHORTEST_STEP = 40e-6  # s, after a jump of a valve or a cup, and where the exhaust opens
 LONGER = 2.0  # at most so many times as long as the step before
 TOO_FAR = 1.5  # times the tolerance: the step is done again, shorter
@@ -144,6 +145,7 @@ def _planned(begin, k, moving, before, tolerance):  # type: ignore[no-untyped-de
     rough = begin[ROUGH, 0]
     longest = LONGEST_STEP * (tolerance / TOLERANCE) ** (1.0 / 6.0)  # for what is read
     h = min(longest, LONGER * before)
+    h = min(h, MECHANISM_STEP) if kernel._has_mechanism(k, 0) else h
     h = min(h, (tolerance / rough) ** (1.0 / 3.0)) if rough > 0.0 else h
     while h > SHORTEST_STEP and kernel._release(begin, k, h, 0):
         h *= 0.5
@@ -172,6 +174,7 @@ def _stride(begin, end, clock, k, longest, tolerance):  # type: ignore[no-untype
         put(mine, 0, begin, 0)
         for row in range(GAS):
             mine[_GUESS + row, 0] = begin[row, 0] + G * h * mine[_RATE + row, 0]
+        kernel._mechanisms(mine, k, h)
         kernel._substep(mine, k, h, _GUESS)
         off = mine[ROUGH, 0] * h * h * h
         if not off > TOO_FAR * tolerance or h <= SHORTEST_STEP:  # what is no number ends as well
@@ -256,6 +259,7 @@ def _advance(carried, theta, driven, out, tolerance):  # type: ignore[no-untyped
     k, now = prepare(theta), carried[0]
     (dt, phase, level), (expected, signals) = driven, out
     said, handed = np.empty(1), np.empty(1, np.uint8)
+    kernel._mechanisms(now, k, 0.0)
     for row in range(dt.shape[0]):
         broken = dt[row] < 0.0 or dt[row] > LONGEST_BRIDGE
         if not broken and now[VALID, 0] > 0.0 and dt[row] > 0.0:
@@ -278,6 +282,7 @@ def _run_on(carried, controls, theta, driven, out, tolerance):  # type: ignore[n
     timed(timer[0], commands, dt, mode, pulse, told)
     said, handed = np.empty(1), np.empty(1, np.uint8)
     asked, decided = np.empty(1, np.uint8), np.empty(1, np.uint8)
+    kernel._mechanisms(now, k, 0.0)
     for row in range(dt.shape[0]):
         if dt[row] > 0.0:
             _on(carried, k, dt[row], tolerance)

@@ -8,6 +8,25 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
+
+def _of_mechanism(slot: int) -> Mapping[str, tuple[str, str]]:
+    """Coefficients of one of the mechanisms that can act beside the effects (``mechanism.py``)."""
+    of = f"mechanism {slot}: "
+    return {
+        f"MECHANISM_{slot}_ON": ("1", of + "number of the coefficient that it changes"),
+        f"MECHANISM_{slot}_SIZE": ("1", of + "added to that where it acts fully; 0: there is none"),
+        f"MECHANISM_{slot}_ALSO_ON": ("1", of + "number of another one that it changes as well"),
+        f"MECHANISM_{slot}_ALSO_SIZE": ("1", of + "added to that"),
+        f"MECHANISM_{slot}_WHEN": ("1", of + "when it acts, one of WHEN"),
+        f"MECHANISM_{slot}_BEGINS": ("Pa", of + "vacuum from which on it acts"),
+        f"MECHANISM_{slot}_ENDS": ("Pa", of + "vacuum below which it ends again"),
+        f"MECHANISM_{slot}_SETS_IN": ("s", of + "time constant with which it sets in"),
+        f"MECHANISM_{slot}_FADES": ("s", of + "time constant with which it fades"),
+        f"MECHANISM_{slot}_PERIOD": ("s", of + "of one that swings"),
+        f"MECHANISM_{slot}_SHIFT": ("s", of + "when its first swing begins"),
+    }
+
+
 # The coefficients by name, each with its unit (1: a plain number) and what it is; the kernel and
 # the effects index the vector with the numbers below, in the same order.
 COEFFICIENTS: Mapping[str, tuple[str, str]] = {
@@ -97,6 +116,8 @@ COEFFICIENTS: Mapping[str, tuple[str, str]] = {
     "PERMITTED_LEAKAGE": ("Pa/s", "for leak monitoring"),
     "BLOW_OFF_MODE": ("1", "EXTERNAL to TIMED"),
     "BLOW_OFF_TIME": ("s", "of a timed pulse"),
+    **_of_mechanism(1),
+    **_of_mechanism(2),
 }
 (
     AMBIENT,
@@ -176,7 +197,9 @@ COEFFICIENTS: Mapping[str, tuple[str, str]] = {
     PERMITTED_LEAKAGE,
     BLOW_OFF_MODE,
     BLOW_OFF_TIME,
+    *_mechanisms,
 ) = range(len(COEFFICIENTS))
+MECHANISMS = _mechanisms[0]  # where the coefficients of the mechanisms begin
 
 KINK_WIDTH = 0.03  # of the way from end pressure to ambient, over which a stage closes
 

@@ -1,0 +1,178 @@
+"""What acts beside the table of effects: in the model, found in a log, and on other programs."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import rigs
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.plc.settings import PlcSettings
+from tools import battery_first
+from tools.calibration_coverage import recorded
+from tools.mechanism_trial import longer
+from twin.diagnosis.another_log import judged_on
+from twin.diagnosis.answer import Diagnosis, diagnose
+from twin.diagnosis.extend import extended
+from twin.diagnosis.words import lines
+from twin.errors import ConfigError
+from twin.model import kernel
+from twin.model import mechanism as m
+from twin.model import theta as c
+from twin.model.dataset import coefficients
+from twin.model.effects import EFFECTS, apply, effect_of
+from twin.model.theta import Theta
+from twin.signals import MBAR, Command
+
+ROWS = 7000
+DT = np.full(ROWS, 1e-3)
+
+
+@cache
+def commands() -> kernel.Bytes:
+    """Two cycles."""
+    told = np.zeros(ROWS, np.uint8)
+    for begin in (200, 3700):
+        told[begin : begin + 1500] = Command.SUCTION
+        told[begin + 1500 : begin + 1800] = Command.BLOW_OFF
+    return told
+
+
+def run(theta: Theta, cut: int = ROWS) -> tuple[kernel.Floats, kernel.State]:
+    """Pressure (Pa) of a free run, in parts that end at ``cut``, and the state at its end."""
+    state, control = kernel.at_rest(theta), kernel.Control.anew()
+    out = np.empty(ROWS, np.uint8), np.empty(ROWS), np.empty(ROWS, np.uint8)
+    for part in (slice(0, cut), slice(cut, ROWS)):
+        some = out[0][part], out[1][part], out[2][part]
+        kernel.run_on(state, control, theta, DT[part], commands()[part], some)
+    return out[1], state
+
+
+def with_mechanism(name: str, times: float = 2.0, theta: Theta | None = None) -> Theta:
+    """The test rig with a mechanism so many times its typical size."""
+    one, theta = m.MECHANISMS[name], rigs.theta("test_rig") if theta is None else theta
+    values = {p.name: times * p.typical for p in one.place.parameters}
+    shape = zip((p.name for p in one.when.parameters), one.when.starts[0], strict=True)
+    return apply(theta, name, values | dict(shape))
+
+
+def test_a_mechanism_that_acts_all_the_time_is_the_effect_on_its_coefficient() -> None:
+    theta = rigs.theta("test_rig")
+    always = theta.copy()
+    m.Mechanism(m.PLACES["opening"], m.WHENS["always"])._act(always, 3.0)
+    leak = apply(theta, "leakage", {"sonic_flow": 3.0})
+    assert np.abs(run(always)[0] - run(leak)[0]).max() < 1e-6
+    assert np.abs(run(always)[0] - run(theta)[0]).max() > 10.0 * MBAR
+
+
+@pytest.mark.parametrize("name", sorted(m.MECHANISMS))
+def test_every_mechanism_acts_and_is_neutral_at_size_zero(name: str) -> None:
+    plain, _ = run(rigs.theta("test_rig"))
+    assert np.array_equal(run(with_mechanism(name, 0.0))[0], plain)
+    moved = np.abs(run(with_mechanism(name))[0] - plain)
+    assert np.isfinite(moved).all()
+    assert moved.max() > 0.5 * MBAR
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.sampled_from(sorted(m.MECHANISMS)), st.integers(1, ROWS - 1))
+def test_however_rows_are_cut_a_mechanism_acts_the_same_to_the_last_bit(
+    name: str, cut: int
+) -> None:
+    theta = with_mechanism(name)
+    assert np.array_equal(run(theta, cut)[0], run(theta)[0])
+
+
+def test_a_mechanism_sets_in_and_fades_with_its_time_constants() -> None:
+    """Warming up for as long as three time constants, it is there but for exp(-3)."""
+    theta = apply(
+        rigs.theta("test_rig"), "sensor_warming_up", {"offset": 10.0, "sets_in": ROWS / 3000.0}
+    )
+    pressure, state = run(theta)
+    assert state[kernel.SET_IN] == pytest.approx(1.0 - np.exp(-3.0), abs=1e-3)
+    plain, _ = run(rigs.theta("test_rig"))
+    assert (pressure - plain)[-1] / MBAR == pytest.approx(10.0 * (1.0 - np.exp(-3.0)), abs=0.01)
+
+
+def test_a_relay_begins_at_one_vacuum_and_ends_at_another() -> None:
+    theta = apply(
+        rigs.theta("test_rig"),
+        "sensor_above",
+        {"offset": 10.0, "begins": 500.0, "ends_below": 200.0},
+    )
+    off = run(theta)[0] - run(rigs.theta("test_rig"))[0]
+    vacuum = (theta[c.AMBIENT] - run(rigs.theta("test_rig"))[0]) / MBAR
+    first = slice(200, 2000)  # of the first cycle
+    acts = np.flatnonzero(off[first] > 5.0 * MBAR) + 200
+    assert vacuum[acts[0]] == pytest.approx(500.0, abs=20.0)
+    assert vacuum[acts[-1]] == pytest.approx(300.0, abs=40.0)
+
+
+def test_two_mechanisms_act_at_once_and_a_third_is_refused() -> None:
+    one = with_mechanism("opening_nozzle_on")
+    two = with_mechanism("sensor_nozzle_off", theta=one)
+    assert not np.array_equal(run(two)[0], run(one)[0])
+    with pytest.raises(ConfigError, match="2 mechanisms act already") as refused:
+        with_mechanism("heat_nozzle_on", theta=two)
+    assert "data set" in refused.value.hint
+
+
+def test_mechanisms_are_known_by_name_and_stay_beside_the_table() -> None:
+    assert not set(m.MECHANISMS) & set(EFFECTS)
+    one = effect_of("end_pressure_nozzle_on_slowly")
+    assert [p.name for p in one.parameters] == ["end_pressure_rise", "sets_in", "fades"]
+    with pytest.raises(ConfigError, match="unknown effect 'ghosts'"):
+        effect_of("ghosts")
+
+
+@pytest.mark.parametrize("name", sorted(m.MECHANISMS))
+def test_every_mechanism_has_a_sentence_and_a_formula_with_its_values(name: str) -> None:
+    one = m.MECHANISMS[name]
+    values = {p.name: 1.23 if p.ratio else 2.0 * p.typical for p in one.effect.parameters}
+    assert "{" not in one.sentence(values) + one.formula(values)
+    for p in one.place.parameters:
+        assert f"{values[p.name]:.3g} {p.unit}" in one.sentence(values)
+
+
+# --- found in a log -------------------------------------------------------------------------------
+
+
+@cache
+def iced() -> tuple[battery_first.Unit, battery_first.Hidden, Diagnosis]:
+    """Ice that grows in a calibrated gripper's nozzle while it runs, and melts while it does not."""
+    unit, (hidden,), samples = battery_first.drawn_case("unlisted", 900003, 2)
+    assert (unit.name, hidden.effect) == ("gripper", "nozzle_icing")
+    return unit, hidden, diagnose(unit.config, [samples], "ice.mcap", lambda _: None)
+
+
+def test_what_nobody_listed_becomes_a_nozzle_that_gives_less_the_longer_it_runs() -> None:
+    _, _, diagnosis = iced()
+    answer = diagnosis.json
+    mechanism = answer["unlisted"]["mechanism"]
+    assert (answer["verdict"], answer["causes"]) == ("unlisted", [])
+    assert mechanism["name"] in {"suction_nozzle_on_slowly", "nozzle_nozzle_on_slowly"}
+    assert "builds up over" in mechanism["sentence"]
+    assert "suction capacity changes by loss" in mechanism["formula"]
+    known = mechanism["parameters"]
+    assert set(known) >= {"loss", "sets_in"}
+    assert all(one["low95"] <= one["value"] <= one["high95"] for one in known.values())
+    assert answer["extended"]["rms_mbar"] < 0.25 * answer["baseline"]["rms_mbar"]
+    assert mechanism["sentence"][1:] in lines(answer, 0)
+
+
+@pytest.mark.parametrize("times", [0.5, 2.0])
+def test_a_mechanism_holds_on_a_program_that_it_has_not_seen(times: float) -> None:
+    """Most of what can be reached is: a curve of millibars would be carried to no other program."""
+    unit, hidden, diagnosis = iced()
+    known = extended(diagnosis, unit.config)
+    assert known is not None
+    assert set(known.data.effects) >= {diagnosis.json["unlisted"]["mechanism"]["name"]}
+    assert not known.data.terms
+    assert coefficients(known.data)[c.MECHANISMS + m.SIZE] != 0.0
+    plc: PlcSettings = longer(unit.plc, times)
+    log = recorded(plc, 8, 17, [battery_first.fault(np.random.default_rng(1), plc, hidden)])
+    judged = judged_on(diagnosis, unit.config, "other.mcap", [log])
+    assert judged is not None
+    assert judged["gain"]["share_of_achievable_pct"] > 80.0
+    assert judged["extended"]["rms_mbar"] < judged["baseline"]["rms_mbar"]

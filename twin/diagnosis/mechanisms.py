@@ -1,0 +1,168 @@
+"""What nobody listed, as physics: where it acts on the plant, when and how, fitted and compared.
+
+Every mechanism that can be made of a place and a way of acting is tried in the same model as the
+listed effects, alone and beside the causes that were found. A small size of each tells how well it
+suits; the best are fitted with all that they leave open and compared by what they leave and how
+much they need for it. Nothing here has seen the held-out cycles.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
+from twin.diagnosis.fit import Fitted, fit, interval, white
+from twin.diagnosis.weights import Weights, covariance
+from twin.inference.levels import CHI2_999
+from twin.model.courses import Cause
+from twin.model.mechanism import MECHANISMS, Mechanism
+from twin.monitor.bins import Floats
+
+Progress = Callable[[str], None]
+
+TRIED_LARGER, FITTED = 40, 8  # starts that are tried at their size, mechanisms that are fitted
+AROUND = (0.5, 1.0, 2.0)  # times the size that the linear model promises
+# Of what is off beyond healthy cycles, in sigmas and in mbar (squares), on the cycles that it is
+# fitted to: a mechanism that leaves more is not what acts. Chosen: effects of the other world leave
+# up to a tenth of their own.
+MOST_LEFT = 0.3
+# A mechanism that leaves less by itself needs no listed cause beside it: that would mend the model.
+ENOUGH = 0.1
+WORTH = 20.0  # chi-square that a listed cause must gain beside a mechanism, in times what is left
+
+
+@dataclass(frozen=True)
+class Explained:
+    """A mechanism that explains what no listed effect does, with the causes that stand beside."""
+
+    fitted: Fitted  # the causes beside it, then the mechanism
+    ends: tuple[Floats, Floats]  # 95 % interval of each of its sizes
+    rivals: tuple[Cause, ...]  # other mechanisms that the log does not tell from it
+    left: float  # of what is off beyond healthy cycles, on those that it was fitted to
+
+    @property
+    def cause(self) -> Cause:
+        """The mechanism with what was found of it."""
+        return self.fitted.hypothesis[-1]
+
+    @property
+    def beside(self) -> Hypothesis:
+        """The listed causes that act as well."""
+        return self.fitted.hypothesis[:-1]
+
+
+def explain(
+    evidence: Evidence, fitted: Sequence[int], found: Hypothesis, progress: Progress
+) -> Explained | None:
+    """The mechanism that suits the ``fitted`` cycles best, alone or beside what was ``found``.
+
+    None where none explains most of what is off.
+    """
+    progress("trying mechanisms")
+    alone = _explained(evidence, fitted, _best(evidence, fitted, HEALTHY, progress))
+    if not found or (alone and alone.left < ENOUGH):
+        return alone
+    beside = _explained(evidence, fitted, _best(evidence, fitted, found, progress))
+    if alone is None or beside is None:
+        return alone or beside
+    worth = WORTH * max(beside.fitted.leftover**2, 1.0) * len(found)
+    return beside if beside.fitted.score + worth < alone.fitted.score else alone
+
+
+def _best(
+    evidence: Evidence, fitted: Sequence[int], causes: Hypothesis, progress: Progress
+) -> list[Fitted]:
+    """Mechanisms beside some causes, the best first: fitted with weights about what is best."""
+    weights = covariance(evidence, causes, both_ways=False).of(fitted)
+    starts = _promising(evidence, weights, causes)
+    progress(f"fitting {len(starts)} mechanisms")
+    ranked = _ranked(fit(evidence, weights, starts, best_only=True))
+    known = covariance(evidence, ranked[0].hypothesis, both_ways=False).of(fitted)
+    again = [one.hypothesis for one in ranked if one.score < 2.0 * ranked[0].score]
+    return _ranked(fit(evidence, known, again))
+
+
+def _ranked(fits: Sequence[Fitted]) -> list[Fitted]:
+    return sorted(fits, key=lambda one: one.score)
+
+
+def _promising(evidence: Evidence, weights: Weights, causes: Hypothesis) -> list[Hypothesis]:
+    """One start of each of the mechanisms that promise most, at its sizes."""
+    starts = [_Start(one, shape) for one in MECHANISMS.values() for shape in one.when.starts]
+    gains, sizes = _linear(evidence, weights, causes, starts)
+    order = np.argsort(-gains)[:TRIED_LARGER]
+    tried = [(*causes, starts[i].cause(times * sizes[i])) for i in order for times in AROUND]
+    chi2 = np.sum(white(evidence, weights, tried) ** 2, axis=0)
+    best: dict[str, tuple[float, Hypothesis]] = {}
+    for hypothesis, misfit in zip(tried, chi2, strict=True):
+        name = hypothesis[-1].effect
+        if name not in best or misfit < best[name][0]:
+            best[name] = float(misfit), hypothesis
+    return [one for _, one in sorted(best.values(), key=lambda some: some[0])[:FITTED]]
+
+
+@dataclass(frozen=True)
+class _Start:
+    """A mechanism with values of what is to be known beside its sizes."""
+
+    mechanism: Mechanism
+    shape: tuple[float, ...]
+
+    def cause(self, sizes: Floats) -> Cause:
+        """The same with its ``sizes``, in typical ones, kept within their bounds."""
+        place, when = self.mechanism.place, self.mechanism.when
+        values = {
+            one.name: float(np.clip(size * one.typical, one.low, one.high))
+            for one, size in zip(place.parameters, sizes, strict=True)
+        }
+        shape = zip((one.name for one in when.parameters), self.shape, strict=True)
+        return Cause(self.mechanism.name, values | dict(shape))
+
+
+def _linear(
+    evidence: Evidence, weights: Weights, causes: Hypothesis, starts: Sequence[_Start]
+) -> tuple[Floats, list[Floats]]:
+    """Chi-square that each start would gain were it linear in its sizes, and these sizes."""
+    units = [np.eye(len(one.mechanism.place.parameters)) for one in starts]
+    tried = [
+        (*causes, one.cause(unit)) for one, some in zip(starts, units, strict=True) for unit in some
+    ]
+    found = white(evidence, weights, [causes, *tried])
+    left, moves = found[:, 0], found[:, 1:] - found[:, :1]
+    ends = np.cumsum([len(some) for some in units])[:-1]
+    gains, sizes = [], []
+    for start, some in zip(starts, np.split(moves, ends, axis=1), strict=True):
+        table = start.mechanism.place.parameters
+        low = np.array([one.low / one.typical for one in table])
+        high = np.array([one.high / one.typical for one in table])
+        size = lsq_linear(some, -left, (low, high)).x
+        sizes.append(size)
+        gains.append(float(left @ left - np.sum((left + some @ size) ** 2)))
+    return np.array(gains), sizes
+
+
+def _explained(
+    evidence: Evidence, fitted: Sequence[int], ranked: Sequence[Fitted]
+) -> Explained | None:
+    best = ranked[0]
+    known = covariance(evidence, best.hypothesis)
+    weights = known.of(fitted)
+    (best,) = fit(evidence, weights, [best.hypothesis])
+    nothing = float(np.sum(white(evidence, weights, [HEALTHY]) ** 2))
+    left = (best.chi2 - best.count) / max(nothing - best.count, 1.0)
+    left = max(left, _left_in_mbar(evidence, weights, best.hypothesis))
+    if left > MOST_LEFT:
+        return None
+    near = CHI2_999 * max(best.leftover**2, 1.0)
+    rivals = tuple(one.hypothesis[-1] for one in ranked[1:] if one.score < ranked[0].score + near)
+    return Explained(best, interval(evidence, weights, best), rivals, left)
+
+
+def _left_in_mbar(evidence: Evidence, weights: Weights, hypothesis: Hypothesis) -> float:
+    """Share of the mean square deviation, beyond that of healthy cycles, which is left."""
+    off = evidence.off([HEALTHY, hypothesis])[weights.bins]
+    before, after = np.average(off**2, axis=0, weights=evidence.bins.count[weights.bins])
+    usual = weights.usual**2
+    return float((after - usual) / max(before - usual, 1e-9)) if before > usual else 1.0
