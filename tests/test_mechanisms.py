@@ -140,7 +140,7 @@ def test_every_mechanism_has_a_sentence_and_a_formula_with_its_values(name: str)
 
 @cache
 def iced() -> tuple[battery_first.Unit, battery_first.Hidden, Diagnosis]:
-    """Ice that grows in a calibrated gripper's nozzle while it runs, and melts while it does not."""
+    """Ice that grows in a gripper's nozzle while it runs, and melts while it does not."""
     unit, (hidden,), samples = battery_first.drawn_case("unlisted", 900003, 2)
     assert (unit.name, hidden.effect) == ("gripper", "nozzle_icing")
     return unit, hidden, diagnose(unit.config, [samples], "ice.mcap", lambda _: None)
