@@ -23,6 +23,9 @@ from twin.monitor.bins import Floats
 Progress = Callable[[str], None]
 
 TRIED_LARGER, FITTED = 40, 8  # starts that are tried at their size, mechanisms that are fitted
+# Typical sizes that a start is run with; the larger one where the twin is off by more than so many
+# sigmas, as what acts there is far from linear.
+PROBES, GROSS = (1.0, 5.0), 5.0
 AROUND = (0.5, 1.0, 2.0)  # times the size that the linear model promises
 # Of what is off beyond healthy cycles, in sigmas and in mbar (squares), on the cycles that it is
 # fitted to: a mechanism that leaves more is not what acts. Chosen: effects of the other world leave
@@ -40,6 +43,7 @@ class Explained:
     fitted: Fitted  # the causes beside it, then the mechanism
     ends: tuple[Floats, Floats]  # 95 % interval of each of its sizes
     rivals: tuple[Cause, ...]  # other mechanisms that the log does not tell from it
+    score: float  # with what wide weights cost
     left: float  # of what is off beyond healthy cycles, on those that it was fitted to
 
     @property
@@ -68,7 +72,7 @@ def explain(
     if alone is None or beside is None:
         return alone or beside
     worth = WORTH * max(beside.fitted.leftover**2, 1.0) * len(found)
-    return beside if beside.fitted.score + worth < alone.fitted.score else alone
+    return beside if beside.score + worth < alone.score else alone
 
 
 def _best(
@@ -91,7 +95,10 @@ def _ranked(fits: Sequence[Fitted]) -> list[Fitted]:
 def _promising(evidence: Evidence, weights: Weights, causes: Hypothesis) -> list[Hypothesis]:
     """One start of each of the mechanisms that promise most, at its sizes."""
     starts = [_Start(one, shape) for one in MECHANISMS.values() for shape in one.when.starts]
-    gains, sizes = _linear(evidence, weights, causes, starts)
+    left = white(evidence, weights, [causes])[:, 0]
+    probes = PROBES if float(np.mean(left**2)) > GROSS**2 else PROBES[:1]
+    gains, sizes = _linear(evidence, weights, left, causes, starts * len(probes), probes)
+    starts *= len(probes)
     order = np.argsort(-gains)[:TRIED_LARGER]
     tried = [(*causes, starts[i].cause(times * sizes[i])) for i in order for times in AROUND]
     chi2 = np.sum(white(evidence, weights, tried) ** 2, axis=0)
@@ -122,23 +129,34 @@ class _Start:
 
 
 def _linear(
-    evidence: Evidence, weights: Weights, causes: Hypothesis, starts: Sequence[_Start]
+    evidence: Evidence,
+    weights: Weights,
+    left: Floats,
+    causes: Hypothesis,
+    starts: Sequence[_Start],
+    probes: Sequence[float],
 ) -> tuple[Floats, list[Floats]]:
-    """Chi-square that each start would gain were it linear in its sizes, and these sizes."""
-    units = [np.eye(len(one.mechanism.place.parameters)) for one in starts]
+    """Chi-square that each start would gain were it linear in its sizes, and these sizes.
+
+    How it moves the pressure is a secant to so many typical sizes as its part of ``probes``.
+    """
+    each = np.repeat(probes, len(starts) // len(probes))
+    units = [
+        probe * np.eye(len(one.mechanism.place.parameters))
+        for one, probe in zip(starts, each, strict=True)
+    ]
     tried = [
         (*causes, one.cause(unit)) for one, some in zip(starts, units, strict=True) for unit in some
     ]
-    found = white(evidence, weights, [causes, *tried])
-    left, moves = found[:, 0], found[:, 1:] - found[:, :1]
+    moves = white(evidence, weights, tried) - left[:, None]
     ends = np.cumsum([len(some) for some in units])[:-1]
     gains, sizes = [], []
-    for start, some in zip(starts, np.split(moves, ends, axis=1), strict=True):
+    for start, probe, some in zip(starts, each, np.split(moves, ends, axis=1), strict=True):
         table = start.mechanism.place.parameters
-        low = np.array([one.low / one.typical for one in table])
-        high = np.array([one.high / one.typical for one in table])
+        low = np.array([one.low / one.typical for one in table]) / probe
+        high = np.array([one.high / one.typical for one in table]) / probe
         size = lsq_linear(some, -left, (low, high)).x
-        sizes.append(size)
+        sizes.append(size * probe)
         gains.append(float(left @ left - np.sum((left + some @ size) ** 2)))
     return np.array(gains), sizes
 
@@ -157,7 +175,8 @@ def _explained(
         return None
     near = CHI2_999 * max(best.leftover**2, 1.0)
     rivals = tuple(one.hypothesis[-1] for one in ranked[1:] if one.score < ranked[0].score + near)
-    return Explained(best, interval(evidence, weights, best), rivals, left)
+    ends, score = interval(evidence, weights, best), best.score + weights.volume
+    return Explained(best, ends, rivals, score, left)
 
 
 def _left_in_mbar(evidence: Evidence, weights: Weights, hypothesis: Hypothesis) -> float:
