@@ -176,3 +176,12 @@ def test_a_mechanism_holds_on_a_program_that_it_has_not_seen(times: float) -> No
     assert judged is not None
     assert judged["gain"]["share_of_achievable_pct"] > 80.0
     assert judged["extended"]["rms_mbar"] < judged["baseline"]["rms_mbar"]
+
+
+def test_three_listed_causes_that_mimic_one_mechanism_are_dropped() -> None:
+    """Together they explain a little ice to 5.5 mbar; on longer suction they made the twin worse."""
+    unit, _, samples = battery_first.drawn_case("unlisted", 910008, 2)
+    answer = diagnose(unit.config, [samples], "ice.mcap", lambda _: None).json
+    assert (answer["verdict"], answer["causes"]) == ("unlisted", [])
+    assert answer["unlisted"]["mechanism"]["name"] == "suction_nozzle_on_slowly"
+    assert answer["gain"]["share_of_achievable_pct"] > 90.0

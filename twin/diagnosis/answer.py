@@ -14,8 +14,8 @@ from twin.diagnosis.experiments import next_experiment
 from twin.diagnosis.fit import Fitted, white
 from twin.diagnosis.healthy import left_in_each, usual_leftover
 from twin.diagnosis.hypotheses import hours, parameters, score_with_tempered_prior
-from twin.diagnosis.judge import Judged, gain, judge, rounded
-from twin.diagnosis.mechanisms import Explained, explain
+from twin.diagnosis.judge import LITTLE, Judged, gain, judge, rounded
+from twin.diagnosis.mechanisms import Explained, explain, explain_alone
 from twin.diagnosis.search import Search, search, sharpened, stranger
 from twin.diagnosis.unlisted import STRANGE, Unlisted, extended, look
 from twin.diagnosis.unmodelled import Unmodelled
@@ -131,6 +131,9 @@ def diagnose(
     left = after.leftover if found else _left_in_all(evidence, healthy.of(evidence.judged))
     verdict, terms = _verdict(found, before, after, left, strange, likely), tuple[Term, ...]()
     mechanism = None
+    several = verdict == "explained" and len(found) > 1 and after.rms > LITTLE * before.usual
+    if several and explain_alone(evidence, fitted, found, progress):
+        verdict, strange = "unlisted", look(healthy, HEALTHY, fitted, held_out)  # they mimic it
     if verdict == "unlisted":
         if not _sure(found, before, after):
             searched, found = replace(searched, found=None), HEALTHY

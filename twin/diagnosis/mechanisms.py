@@ -63,11 +63,20 @@ def explain(
     Listed causes stand unless a mechanism alone leaves far less than they do: then they mimic it.
     None where none explains most of what is off, beside them of what they leave.
     """
-    progress("trying mechanisms")
-    alone = _explained(evidence, fitted, HEALTHY, _best(evidence, fitted, HEALTHY, progress))
-    if not found or (alone and _displaces(evidence, fitted, alone, found)):
+    alone = explain_alone(evidence, fitted, found, progress)
+    if alone or not found:
         return alone
     return _explained(evidence, fitted, found, _best(evidence, fitted, found, progress))
+
+
+def explain_alone(
+    evidence: Evidence, fitted: Sequence[int], found: Hypothesis, progress: Progress
+) -> Explained | None:
+    """The mechanism that suits best by itself; None if it does not displace what was ``found``."""
+    progress("trying mechanisms")
+    alone = _explained(evidence, fitted, HEALTHY, _best(evidence, fitted, HEALTHY, progress))
+    displaces = alone and (not found or _displaces(evidence, fitted, alone, found))
+    return alone if displaces else None
 
 
 def _displaces(
