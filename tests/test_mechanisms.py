@@ -179,7 +179,7 @@ def test_a_mechanism_holds_on_a_program_that_it_has_not_seen(times: float) -> No
 
 
 def test_three_listed_causes_that_mimic_one_mechanism_are_dropped() -> None:
-    """Together they explain a little ice to 5.5 mbar; on longer suction they made the twin worse."""
+    """They explain a little ice to 5.5 mbar; on longer suction they made the twin worse."""
     unit, _, samples = battery_first.drawn_case("unlisted", 910008, 2)
     answer = diagnose(unit.config, [samples], "ice.mcap", lambda _: None).json
     assert (answer["verdict"], answer["causes"]) == ("unlisted", [])
