@@ -142,6 +142,27 @@ def test_what_a_diagnosis_found_is_where_the_effects_start() -> None:
 
 
 @pytest.mark.needs("cc")
+@pytest.mark.parametrize(
+    ("mechanism", "values"),
+    [
+        ("suction_nozzle_on_slowly", {"loss": 40.0, "sets_in": 1.0, "fades": 2.0}),
+        ("opening_above", {"sonic_flow": 3.0, "begins": 400.0, "ends_below": 100.0}),
+        ("supply_swinging", {"drop": 1.0, "period": 0.7, "shift": 0.1}),
+    ],
+)
+def test_a_mechanism_of_the_data_set_is_in_the_fmu(
+    mechanism: str, values: dict[str, float]
+) -> None:
+    data = rigs.config("gripper").data.model_copy(update={"effects": {mechanism: values}})
+    commands = cycles("gripper", 2)
+    with stepped(fmus.of_data(data)) as (one,):
+        one.begin()
+        seen = one.run(commands[:-1])
+    assert np.abs(seen - by_twin(coefficients(data), commands)[1:]).max() < BOUND
+    assert np.abs(seen - by_twin(rigs.theta("gripper"), commands)[1:]).max() > 10 * BOUND
+
+
+@pytest.mark.needs("cc")
 def test_steps_may_be_of_any_length() -> None:
     commands = cycles("gripper", 1)  # all edges at 50 ms
     with stepped(made("gripper"), 3) as (fine, coarse, odd):

@@ -1,5 +1,7 @@
 """What acts beside the table of effects: in the model, found in a log, and on other programs."""
 
+import subprocess
+import sys
 from functools import cache
 
 import numpy as np
@@ -126,6 +128,15 @@ def test_mechanisms_are_known_by_name_and_stay_beside_the_table() -> None:
         effect_of("ghosts")
 
 
+def test_a_data_set_may_have_a_mechanism_wherever_it_is_read() -> None:
+    """Also where nothing has imported the mechanisms for another reason."""
+    program = (
+        "from twin.model.dataset import DataSet; "
+        "DataSet(effects={'opening_nozzle_on': {'sonic_flow': 2.0}})"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
 @pytest.mark.parametrize("name", sorted(m.MECHANISMS))
 def test_every_mechanism_has_a_sentence_and_a_formula_with_its_values(name: str) -> None:
     one = m.MECHANISMS[name]
@@ -159,6 +170,10 @@ def test_what_nobody_listed_becomes_a_nozzle_that_gives_less_the_longer_it_runs(
     assert all(one["low95"] <= one["value"] <= one["high95"] for one in known.values())
     assert answer["extended"]["rms_mbar"] < 0.25 * answer["baseline"]["rms_mbar"]
     assert mechanism["sentence"][1:] in lines(answer, 0)
+    assert mechanism["not_separable_from"]
+    assert "part the mechanism" in answer["next_experiment"] or answer[
+        "next_experiment"
+    ].startswith("record ")
 
 
 @pytest.mark.parametrize("times", [0.5, 2.0])

@@ -647,6 +647,28 @@ def test_a_term_is_part_of_the_extended_model(tmp_path: Path) -> None:
     assert "  gain           95.3 % less" in in_words(one)
 
 
+def test_a_mechanism_is_told_with_its_formula_and_all_that_it_may_be_as_well(
+    tmp_path: Path,
+) -> None:
+    size = {"value": 43.4, "unit": "%", "low95": 36.3, "high95": 51.9}
+    mechanism = {
+        "name": "suction_nozzle_on",
+        "sentence": "The ejector moves less air (loss 43.4 %), while the nozzle runs",
+        "formula": "suction capacity changes by loss 43.4 % times the share; share = jet",
+        "parameters": {"loss": size},
+        "not_separable_from": ["First another one", "Then one more"],
+    }
+    unlisted = LEFT | {"mechanism": mechanism}
+    one = unexplained("unlisted", unlisted=unlisted, extended=AFTER, next_experiment="record it")
+    page, words = page_of(one, tmp_path), in_words(one)
+    assert "with the mechanism" in page
+    for text in (mechanism["formula"], "First another one", "Then one more", "36.3 to 51.9"):
+        assert text in page
+        assert text in words
+    assert "What suits best: the ejector moves less air" in words
+    assert page.count("Record it.") == 1
+
+
 def test_people_are_told_the_cycles_numbers_in_the_log(tmp_path: Path) -> None:
     late = replace(evidence(), numbers=evidence().numbers + 100)
     page = page_of(replace(explained(), evidence=late), tmp_path)

@@ -161,7 +161,7 @@ def diagnose(
         "baseline": before.figures,
         "extended": after.figures,
         "gain": gain(before, after),
-        "next_experiment": next_experiment(evidence, searched),
+        "next_experiment": next_experiment(evidence, searched, mechanism),
     }
     return Diagnosis(
         evidence,

@@ -11,6 +11,7 @@ import numpy as np
 
 from twin.diagnosis.evidence import Evidence, Hypothesis, of_log
 from twin.diagnosis.fit import fit
+from twin.diagnosis.mechanisms import Explained
 from twin.diagnosis.search import Search
 from twin.diagnosis.weights import covariance
 from twin.model import kernel
@@ -76,25 +77,41 @@ TESTS = (
 )
 
 
-def next_experiment(evidence: Evidence, searched: Search) -> str | None:
-    """What to record so that causes this log cannot tell apart come apart; None if none are."""
-    if searched.found is None or not any(searched.rivals):
+def next_experiment(
+    evidence: Evidence, searched: Search, mechanism: Explained | None = None
+) -> str | None:
+    """What to record so that causes this log cannot tell apart come apart; None if none are.
+
+    Where a ``mechanism`` acts, so that it comes apart from what else it may be.
+    """
+    if mechanism is not None:
+        others = [(*mechanism.beside, one) for one in mechanism.rivals[:1]]  # the nearest
+        found = mechanism.fitted.hypothesis
+        return _recording(evidence, found, others, "the mechanism", "what else it may be")
+    if searched.found is None:
         return None
-    found = _settled(evidence, searched.found.hypothesis)
     rivals = [one for some in searched.rivals for one in some][:MOST_RIVALS]
+    names = ", ".join(
+        dict.fromkeys(e for one in rivals for e in one.effects if e not in searched.found.effects)
+    )
+    this, found = " and ".join(searched.found.effects), searched.found.hypothesis
+    return _recording(evidence, found, [one.hypothesis for one in rivals], this, names)
+
+
+def _recording(
+    evidence: Evidence, found: Hypothesis, rivals: Sequence[Hypothesis], this: str, names: str
+) -> str | None:
+    """The cheapest test that parts what was found from its rivals, else the one that does most."""
+    if not rivals:
+        return None
+    settled, others = _settled(evidence, found), [_settled(evidence, one) for one in rivals]
     parted = []
     for test in TESTS:
-        apart = _apart(
-            evidence, found, [_settled(evidence, one.hypothesis) for one in rivals], test
-        )
+        apart = _apart(evidence, settled, others[:MOST_RIVALS], test)
         parted.append((test, apart))
         if apart >= ENOUGH:
             break
     test, apart = parted[-1] if parted[-1][1] >= ENOUGH else max(parted, key=lambda one: one[1])
-    names = ", ".join(
-        dict.fromkeys(e for one in rivals for e in one.effects if e not in searched.found.effects)
-    )
-    this = " and ".join(searched.found.effects)
     if apart < 2.0:
         return (
             f"no recording of this sensor is predicted to part {this} from {names}"

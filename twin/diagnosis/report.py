@@ -59,6 +59,7 @@ from twin.signals import BAR, MBAR, ML, SL_MIN
 
 Clock = Callable[[], int]  # UTC, ns
 
+RECORD = ("next", "next recording")  # of what is to be done: boxes of their own
 # Colour, mark and words of each verdict's banner.
 BANNER = {
     "consistent": ("#1b6e2e", "✔", "Nothing wrong"),
@@ -108,18 +109,18 @@ def _steps(answer: Answer, times: Times) -> Iterator[str]:
         title = spoken(cause["effect"]).capitalize()
         known = [row for row in about(cause, times, sure=sure) if row[1] != spoken(cause["effect"])]
         yield page.card(title, f"{EFFECTS[cause['effect']].sentence}.", known)
-    steps = dict(to_do(answer))
-    record = {name: steps.pop(name) for name in ("next", "next recording") if name in steps}
+    steps = [step for step in to_do(answer) if step[0] not in RECORD]
     if answer["verdict"] == "unlisted":
         title, text = "Something that no listed cause explains", f"Left in {left_over(answer)}."
         if mechanism := mechanism_of(answer):
             title, text = "What suits best, though nobody listed it", f"{mechanism['sentence']}."
-            steps.pop("mechanism")
-        yield page.card(title, text, steps.items())
+            steps = [step for step in steps if step[0] != "mechanism"]
+        yield page.card(title, text, steps)
     for one in signals(answer):
         yield page.box(f"The signal {one['signal']}", f"{one['what']}: {one['do']}.")
-    for title, text in record.items():
-        yield page.box(title.capitalize(), f"{text[:1].upper()}{text[1:]}.")
+    for title, text in to_do(answer):
+        if title in RECORD:
+            yield page.box(title.capitalize(), f"{text[:1].upper()}{text[1:]}.")
     if answer["verdict"] == "consistent":
         yield page.paragraph("Nothing: no cause is worth naming.")
 

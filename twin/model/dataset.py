@@ -15,6 +15,7 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from twin.errors import ConfigError
+from twin.model import mechanism as _mechanism  # noqa: F401 - what a data set may have of effects
 from twin.model import theta as c
 from twin.model.effects import FLATTEST, apply
 from twin.model.gas import CRITICAL_RATIO, GAMMA, R
