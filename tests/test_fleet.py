@@ -176,6 +176,21 @@ def test_a_worker_with_other_code_is_refused(logs: Path) -> None:
     assert "another version" in done.error
 
 
+def test_a_worker_does_each_work_and_tells_what_stopped_it(logs: Path, tmp_path: Path) -> None:
+    """In this process, whatever pools and clusters do with it."""
+    replayed = here(Job("replay", logs / "A1-0.mcap", rigs.config("test_rig"), ""))
+    assert (replayed.error, replayed.record) == ("", None)
+    assert replayed.answer
+    diagnosed = here(Job("diagnose", logs / "A3-2.mcap", rigs.config("test_rig"), ""))
+    assert diagnosed.answer
+    assert diagnosed.answer["log"].endswith("A3-2.mcap")
+    missing = here(Job("calibrate", tmp_path / "nothing.mcap", rigs.config("test_rig"), ""))
+    assert missing.answer is None
+    assert "nothing.mcap" in missing.error
+    strange = here(Job("dance", logs / "A1-0.mcap", rigs.config("test_rig"), ""))
+    assert "a mistake of this program, please report it: KeyError('dance')" in strange.error
+
+
 def at_a_loss(job: Job) -> Done:
     """As ``run``; but at one log its process dies."""
     if DIES in job.log.name:
