@@ -77,6 +77,15 @@ def test_every_mechanism_acts_and_is_neutral_at_size_zero(name: str) -> None:
     assert moved.max() > 0.5 * MBAR
 
 
+@pytest.mark.parametrize("size", ["loss", "end_pressure_rise"])
+def test_each_of_two_sizes_acts_by_itself(size: str) -> None:
+    theta = rigs.theta("test_rig")
+    alone = apply(theta, "nozzle_nozzle_on", {size: 20.0})
+    assert np.abs(run(alone)[0] - run(theta)[0]).max() > 5.0 * MBAR
+    with pytest.raises(ConfigError, match="act already"):
+        with_mechanism("heat_nozzle_on", theta=with_mechanism("heat_nozzle_on", theta=alone))
+
+
 @settings(max_examples=10, deadline=None)
 @given(st.sampled_from(sorted(m.MECHANISMS)), st.integers(1, ROWS - 1))
 def test_however_rows_are_cut_a_mechanism_acts_the_same_to_the_last_bit(

@@ -71,8 +71,8 @@ def _deviations(axes: Axes, found: Found) -> None:
 
 
 def _sized_causes(found: Found) -> list[tuple[Cause, dict[str, Any]]]:
-    """The listed causes, which stand first, with what the answer says of them."""
-    return list(zip(found.causes, found.answer["causes"], strict=False))
+    """The listed causes with what the answer says of them."""
+    return list(zip(found.listed, found.answer["causes"], strict=True))
 
 
 def _course(

@@ -428,7 +428,11 @@ def _set_in(state, k, slot, h, i):  # type: ignore[no-untyped-def]
 @inlined
 def _has_mechanism(k, i):  # type: ignore[no-untyped-def]
     """Whether anything acts beside the effects of the table."""
-    return k[c.MECHANISMS + SIZE, i] != 0.0 or k[c.MECHANISMS + WIDTH + SIZE, i] != 0.0
+    for slot in range(SLOTS):
+        first = c.MECHANISMS + slot * WIDTH
+        if k[first + SIZE, i] != 0.0 or k[first + ALSO_SIZE, i] != 0.0:
+            return True
+    return False
 
 
 @compiled

@@ -20,7 +20,7 @@ from twin.signals import BAR, MBAR, ML, SL_MIN
 SLOTS = 2  # mechanisms that can act at once
 # Coefficients of one mechanism, from ``c.MECHANISMS`` on; each has WIDTH of them.
 ON, SIZE, ALSO_ON, ALSO_SIZE, WHEN, BEGINS, ENDS, SETS_IN, FADES, PERIOD, SHIFT = range(11)
-WIDTH = 11
+WIDTH = (len(c.COEFFICIENTS) - c.MECHANISMS) // SLOTS
 # When it acts: always; while the nozzle runs, or does not; in blow-off; from a vacuum on, until it
 # is below another; the more the higher the vacuum is above one; gathered while the nozzle runs and
 # cleared by blow-off; all the time but where the vacuum used it up; to and fro.
@@ -276,13 +276,13 @@ WHENS = {
         ),
     )
 }
-# What a place is not combined with: there it is an effect of the table, or cannot be told at all.
-_LISTED = {"opening", "seepage", "suction", "end_pressure", "supply", "blow_off", "volume"}
-_LISTED |= {"line", "heat", "sensor"}
-_SIGNED = {c.INFLOW, c.SENSOR_OFFSET}
-_SWING = {"supply", "inflow"}  # what has a rhythm of its own: a compressor, another consumer
+_SIGNED = {c.INFLOW, c.SENSOR_OFFSET}  # coefficients that may be negative
+# What is combined with these places alone: others that act always are effects of the table, and
+# only these have a rhythm of their own, by a compressor or another consumer.
+_ONLY = {"always": {"inflow"}, "swinging": {"supply", "inflow"}}
+# What a place is not combined with, as nothing would be seen of it.
 _NOT = {
-    "nozzle": {"always", "nozzle_off", "in_blow_off"},
+    "nozzle": {"nozzle_off", "in_blow_off"},
     "blow_off": {"nozzle_on", "nozzle_off", "nozzle_on_slowly", "above", "used_up"},
     "suction": {"nozzle_off", "in_blow_off"},
     "end_pressure": {"nozzle_off", "in_blow_off"},
@@ -302,11 +302,15 @@ class Mechanism:
         return f"{self.place.name}_{self.when.name}"
 
     @property
+    def _begin(self) -> str:
+        return self.place.sentence[0].upper() + self.place.sentence[1:]
+
+    @property
     def effect(self) -> Effect:
         """The effect that it is, with a size and what else is to be known."""
         return Effect(
             self.name,
-            f"{self.place.sentence[0].upper()}{self.place.sentence[1:]}: {self.when.name}",
+            f"{self._begin}: {self.when.name}",
             "",
             (*self.place.parameters, *self.when.parameters),
             self._act,
@@ -315,8 +319,7 @@ class Mechanism:
     def sentence(self, values: Mapping[str, float]) -> str:
         """What it does, in words, with its values."""
         sizes = ", ".join(_told(one, values) for one in self.place.parameters)
-        begin = f"{self.place.sentence[0].upper()}{self.place.sentence[1:]}"
-        return f"{begin} ({sizes}), {self.when.sentence.format(**self._shown(values))}"
+        return f"{self._begin} ({sizes}), {self.when.sentence.format(**self._shown(values))}"
 
     def formula(self, values: Mapping[str, float]) -> str:
         """What it adds in the model, and how the share of that runs."""
@@ -332,7 +335,8 @@ class Mechanism:
     def _act(self, theta: Theta, *values: float) -> None:
         """Take the first slot that is free. ConfigError where there is none."""
         begins = [c.MECHANISMS + slot * WIDTH for slot in range(SLOTS)]
-        first = next((one for one in begins if theta[one + SIZE] == 0.0), None)
+        sizes_of = [SIZE, ALSO_SIZE]
+        first = next((one for one in begins if not theta[one : one + WIDTH][sizes_of].any()), None)
         if first is None:
             raise ConfigError(
                 f"{self.name}: {SLOTS} mechanisms act already, and more cannot act at once",
@@ -370,9 +374,7 @@ MECHANISMS = {
     one.name: one
     for place in PLACES.values()
     for when in WHENS.values()
-    if when.name not in _NOT.get(place.name, set())
-    and (when.name != "swinging" or place.name in _SWING)
-    and not (when.name == "always" and place.name in _LISTED)
+    if when.name not in _NOT.get(place.name, set()) and place.name in _ONLY.get(when.name, PLACES)
     for one in (Mechanism(place, when),)
 }
 add_beside({name: one.effect for name, one in MECHANISMS.items()})
