@@ -209,3 +209,15 @@ def test_three_listed_causes_that_mimic_one_mechanism_are_dropped() -> None:
     assert (answer["verdict"], answer["causes"]) == ("unlisted", [])
     assert answer["unlisted"]["mechanism"]["name"] == "suction_nozzle_on_slowly"
     assert answer["gain"]["share_of_achievable_pct"] > 90.0
+
+
+def test_one_listed_cause_that_mimics_a_mechanism_is_dropped() -> None:
+    """A porous leak explains a lip that lifts to 4.8 mbar; healthy cycles have 2.8."""
+    unit, (hidden,), samples = battery_first.drawn_case("unlisted", 900000, 2)
+    assert hidden.effect == "lip_lift"
+    answer = diagnose(unit.config, [samples], "lip.mcap", lambda _: None).json
+    assert (answer["verdict"], answer["causes"]) == ("unlisted", [])
+    mechanism = answer["unlisted"]["mechanism"]
+    assert mechanism["name"] == "opening_above"
+    flow = mechanism["parameters"]["sonic_flow"]
+    assert flow["low95"] <= hidden.size <= flow["high95"]

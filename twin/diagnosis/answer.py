@@ -45,6 +45,7 @@ MOST_SATURATED = 0.05  # share of samples
 MOST_JUDGED = 24  # cycles of a long log that are looked at, evenly spread
 MOST_NAMED = 4  # runners-up
 WIDEST = 0.9  # of a parameter's range: an interval as wide says nothing
+MIMICS = 1.6  # times the usual deviation: one cause that leaves more may mimic what nobody listed
 LIKELY = 0.5  # that something acts which nobody listed: more, and it is said
 # Of a size, that the data set's own scale is not known better: volume and suction; and how the
 # wall's heat is shared between vessel and line.
@@ -131,8 +132,8 @@ def diagnose(
     left = after.leftover if found else _left_in_all(evidence, healthy.of(evidence.judged))
     verdict, terms = _verdict(found, before, after, left, strange, likely), tuple[Term, ...]()
     mechanism = None
-    several = verdict == "explained" and len(found) > 1 and after.rms > LITTLE * before.usual
-    if several and explain_alone(evidence, fitted, found, progress):
+    rough = verdict == "explained" and after.rms > (LITTLE, MIMICS)[len(found) == 1] * before.usual
+    if rough and explain_alone(evidence, fitted, found, progress):
         verdict, strange = "unlisted", look(healthy, HEALTHY, fitted, held_out)  # they mimic it
     if verdict == "unlisted":
         if not _sure(found, before, after):
