@@ -33,6 +33,7 @@ from twin.log.reader import open_log
 from twin.log.recorder import Recorder
 from twin.model.courses import table as courses
 from twin.model.effects import table
+from twin.model.mechanism import PLACES, WHENS
 from twin.signals import SAMPLE, TICK
 
 GRIPPER = rigs.path_of("gripper")
@@ -81,7 +82,8 @@ def test_effects_are_listed(
 ) -> None:
     assert twin(monkeypatch, "effects") == 0
     out = capsys.readouterr().out
-    assert out.strip() == f"{table('; ')}\n\n{courses()}"
+    assert out.startswith(f"{table('; ')}\n\n{courses()}")
+    assert all(f"| `{name}` |" in out for name in (*PLACES, *WHENS))
     assert "| `h1_shift` -200 to 200 mbar; `h2_shift` -200 to 200 mbar |" in out  # for a terminal
     assert "<" not in out
 

@@ -26,7 +26,6 @@ NEEDED = {
     "commission": ("L", "--config", "C"),
     "import": ("rows.csv", "--config", "C", "-o", "new.mcap"),
     "export": ("L", "-o", "new.csv"),
-    "effects": (),
     "paper": (),
     "compare": ("L", "L"),
     "export-fmu": ("--config", "C"),
@@ -67,12 +66,12 @@ NEEDED = {
     "users audit": (),
     "config check": ("C",),
     "config schema": (),
+    "effects add": ("effect.toml", "--untested"),
     "log check": ("L",),
     "log recover": ("L", "-o", "new.mcap"),
 }
 # Commands that do something useful without an argument.
 ALONE = {
-    "effects",
     "paper",
     "init",
     "config schema",
@@ -137,7 +136,7 @@ INIT = {  # values that say nothing of a machine
     "--pressure": ("somewhere",),
     "--suction": ("30005/77",),
 }
-READ = ("C", "L", "rows.csv", "unit.toml", "here.json")  # arguments that are files
+READ = ("C", "L", "rows.csv", "unit.toml", "here.json", "effect.toml")  # arguments that are files
 
 
 def _mistakes(command: str, needed: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], set[int]]]:

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import rigs
 
+from twin.alarms import watch
 from twin.events import Event, Kind
 from twin.model.effects import UNKNOWN
+from twin.model.known import KnownEffect
 from twin.monitor.bank import SUSPECTS, Bank, hypotheses
 from twin.monitor.cycles import Cycle, Look, cut, figures
 from twin.monitor.detect import Monitor, MonitorSettings
@@ -116,6 +118,41 @@ def test_what_nobody_listed_is_an_alternative_to_the_name(
         said.append(told[max(told)].get(UNKNOWN, 0.0))
     assert said[0] < 0.05
     assert said[1] > 0.25
+
+
+def test_an_effect_that_was_taken_in_is_named_like_any_other() -> None:
+    """And those of the table keep their names beside it."""
+    lip = KnownEffect.model_validate(
+        {
+            "mechanism": "opening_above",
+            "sentence": "A lip lifts off",
+            "look_at": "the lips of the cups",
+            "parameters": {
+                "sonic_flow": {"low": 0.0, "high": 60.0, "found": 1.7},
+                "begins": {"low": 180.0, "high": 900.0, "found": 554.0},
+                "ends_below": {"low": 10.0, "high": 400.0, "found": 147.0},
+            },
+        }
+    )
+    config = rigs.config("gripper")
+    data = config.data.model_copy(update={"catalogue": {"lifting_lip": lip}})
+    for fault, effect, size in (
+        ("lip_lift=1.5", "lifting_lip", 1.5),
+        ("leakage=0.5", "leakage", 0.5),
+    ):
+        watched = rigs.isolating("gripper")
+        watched.isolation = Isolation.of(data, config.monitor.healthy, 30.0)
+        samples, _ = rigs.recorded("gripper", CYCLES * 2.3, (f"{fault}@c{BEGINS}",), 11)
+        twin, told = rigs.twin("gripper"), list[Event]()
+        for block in rigs.cut(samples, 1000):
+            told += watched.update(*twin.advance(block))
+        first = named(told)[0]
+        assert first.data["effect"] == effect
+        assert first.data["size"] == pytest.approx(size, rel=0.3)
+        evidence = watch.evidence(first)
+        (found,) = evidence.values()
+        words = {"name": effect, "sentence": "A lip lifts off", "look_at": "the lips of the cups"}
+        assert found.get("taken_in") == (words if effect == "lifting_lip" else None)
 
 
 def test_what_is_told_does_not_depend_on_blocks() -> None:

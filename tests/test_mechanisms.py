@@ -2,7 +2,9 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from tools.mechanism_trial import longer
 from twin.diagnosis.another_log import judged_on
 from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.diagnosis.extend import extended
+from twin.diagnosis.propose import Proposal, proposed
 from twin.diagnosis.words import lines
 from twin.errors import ConfigError
 from twin.model import kernel
@@ -200,6 +203,36 @@ def test_a_mechanism_holds_on_a_program_that_it_has_not_seen(times: float) -> No
     assert judged is not None
     assert judged["gain"]["share_of_achievable_pct"] > 80.0
     assert judged["extended"]["rms_mbar"] < judged["baseline"]["rms_mbar"]
+
+
+def test_what_one_unit_had_is_named_on_another(tmp_path: Path) -> None:
+    """Taken in as an effect, it is found like any other: by its name, with its size."""
+    unit, hidden, diagnosis = iced()
+    log, file = tmp_path / "ice.mcap", tmp_path / "ice_in_the_nozzle.toml"
+    log.write_bytes(b"only its content is noted")
+    text = proposed(diagnosis, unit.config, log, file)
+    assert text is not None
+    file.write_text(text, encoding="utf-8")
+    proposal = Proposal.read(file)
+    assert proposal.name == "ice_in_the_nozzle"
+    assert "{" not in proposal.effect.sentence
+    assert proposal.effect.mechanism == diagnosis.json["unlisted"]["mechanism"]["name"]
+    assert proposal.effect.parameters["sets_in"].low < proposal.effect.parameters["sets_in"].found
+
+    another = battery_first.unit(unit.name, 4711)
+    less = battery_first.Hidden(hidden.effect, "constant", 0.8 * hidden.size)
+    fault = battery_first.fault(np.random.default_rng(2), another.plc, less)
+    samples = recorded(another.plc, 11, 29, [fault])
+    data = another.config.data.model_copy(update={"catalogue": {proposal.name: proposal.effect}})
+    told = diagnose(replace(another.config, data=data), [samples], "new.mcap", lambda _: None)
+    (cause,) = told.json["causes"]
+    assert (told.json["verdict"], cause["effect"]) == ("explained", "ice_in_the_nozzle")
+    assert cause["probability"] > 0.9
+    assert "Ice" not in lines(told.json, 0)
+    assert proposal.effect.sentence in lines(told.json, 0)
+    known = extended(told, another.config)
+    assert known is not None
+    assert list(known.data.effects) == [proposal.effect.mechanism]  # read without the catalogue
 
 
 def test_three_listed_causes_that_mimic_one_mechanism_are_dropped() -> None:

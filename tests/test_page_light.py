@@ -5,6 +5,7 @@ import pytest
 from twin.alarms.board import Board, Episode
 from twin.alarms.rules import Priority, Rule
 from twin.alarms.state import Kept
+from twin.alarms.words import action_of
 from twin.instants import instant
 from twin.page.light import S_NS, Light, light_of, listed, told
 
@@ -52,6 +53,16 @@ def test_what_is_active_and_unseen_is_listed_first() -> None:
         }
     )
     assert [alarm["alarm"] for alarm in listed(one, [], [], 0)] == ["low", "seen", "gone", "quiet"]
+
+
+def test_an_effect_that_was_taken_in_is_told_in_the_words_of_who_did() -> None:
+    words = {"name": "lifting_lip", "sentence": "A lip lifts off", "look_at": "the lips: worn"}
+    episode = Episode("deviation_unlisted", 10, None, None, "", evidence={"taken_in": words})
+    said = told(episode, "deviation.unlisted", 20)
+    assert (said["what"], said["sentence"]) == ("Lifting lip", "A lip lifts off.")
+    assert said["where"] == "the lips"
+    rule = Rule(name="deviation_unlisted", value="deviation.unlisted", above=0.5)
+    assert action_of(rule, episode.evidence).startswith("Look at the lips: worn.")
 
 
 def test_instants_are_worded_as_everywhere() -> None:

@@ -28,6 +28,7 @@ from twin.cli_assets import assets_app
 from twin.cli_cert import cert
 from twin.cli_compare import compare
 from twin.cli_config import config_app
+from twin.cli_effects import effects_app
 from twin.cli_exchange import export_fmu
 from twin.cli_figures import figures_app, keeper_of, key_figures_of
 from twin.cli_fleet import fleet_app
@@ -37,7 +38,7 @@ from twin.cli_serve import live_rows_of, reports_of, serve
 from twin.cli_users import users_app
 from twin.errors import ConfigError, SourceError, TwinError
 from twin.events import Event, Kind, Severity
-from twin.files import require_writable, write_json
+from twin.files import require_writable, write_json, write_whole
 from twin.instants import stamp
 from twin.lock import only_run
 from twin.printer import Printer
@@ -80,6 +81,7 @@ app.add_typer(alarms_app, name="alarms")
 app.add_typer(fleet_app, name="fleet")
 app.add_typer(users_app, name="users")
 app.add_typer(config_app, name="config")
+app.add_typer(effects_app, name="effects")
 log_app = App("Look after logs.")
 app.add_typer(log_app, name="log")
 
@@ -342,6 +344,10 @@ def diagnose(
         Path | None,
         typer.Option(metavar="OTHER.mcap", help="Measure the gain on another log as well."),
     ] = None,
+    propose: Annotated[
+        Path | None,
+        typer.Option(metavar="F.toml", help="Write what acts, unlisted, for twin effects add."),
+    ] = None,
 ) -> None:
     """Say what the simulation gets wrong on a log, why, and what knowing it gains."""
     from twin.diagnosis.another_log import judged_on
@@ -351,7 +357,7 @@ def diagnose(
     from twin.diagnosis.words import on_another_log
     from twin.log.reader import open_log
 
-    require_writable(json_file, report)
+    require_writable(json_file, report, propose)
     recorded = open_log(log)
     say_if_cut(recorded, log, "diagnosed")
     other = open_log(judge_on) if judge_on else None
@@ -378,6 +384,8 @@ def diagnose(
         write_report(diagnosis, report)
     if save_as:
         _save(diagnosis, settings, save_as, assets, log)
+    if propose is not None:
+        _propose(diagnosis, settings, log, propose)
 
 
 @app.command()
@@ -605,15 +613,6 @@ def export(
     recorded = open_log(log)
     say_if_cut(recorded, log, "exported")
     write_table(recorded.blocks(ROWS), recorded.header, output)
-
-
-@app.command()
-def effects() -> None:
-    """List the effects, the ways a real ejector can differ from its data set, and their courses."""
-    from twin.model.courses import table as courses
-    from twin.model.effects import table
-
-    print(table("; "), courses(), sep="\n\n")
 
 
 @app.command()
@@ -994,6 +993,19 @@ def _save(diagnosis: "Diagnosis", settings: "Config", unit: str, assets: str, lo
     say_if_new(assets, settings.document)
     record, where = store(known, diagnosis, settings, unit, assets, log)
     print(f"stored as {unit} in {where}, record {record.id[:8]}; use it: --id {unit}")
+
+
+def _propose(diagnosis: "Diagnosis", settings: "Config", log: Path, file: Path) -> None:
+    """Write what acts that nobody listed as an effect to be taken in, or say why there is none."""
+    from twin.diagnosis.propose import proposed
+
+    text = proposed(diagnosis, settings, log, file)
+    print()
+    if text is None:
+        print(f"nothing is written to {file}: no mechanism that nobody listed was found")
+        return
+    write_whole(file, text.encode())
+    print(f"proposed as an effect in {file}; read it, then: twin effects add {file}")
 
 
 @contextmanager

@@ -85,14 +85,21 @@ class _Group(_Common, TyperGroup):
 class App(typer.Typer):
     """Commands whose help is text as it stands: Rich's markup would drop ``[table]`` from it.
 
-    ``order`` has the names of all its commands; with it the shell can complete them.
+    ``order`` has the names of all its commands; with it the shell can complete them. ``alone`` says
+    that it does something without any of them.
     """
 
-    def __init__(self, help: str, order: Sequence[str] = ()) -> None:  # noqa: A002 - Typer's name
+    def __init__(
+        self,
+        help: str,  # noqa: A002 - Typer's name
+        order: Sequence[str] = (),
+        *,
+        alone: bool = False,
+    ) -> None:
         super().__init__(
             cls=type("_Ordered", (_Group,), {"order": order}),
             help=help,
-            no_args_is_help=True,
+            no_args_is_help=not alone,
             add_completion=bool(order),
             rich_markup_mode=None,
             pretty_exceptions_enable=False,

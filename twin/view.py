@@ -282,7 +282,8 @@ def _colour_of(cause: str) -> tuple[int, int, int]:
         return 230, 230, 230
     if cause == UNKNOWN:
         return 130, 130, 130
-    hue = list(EFFECTS).index(cause) * 0.618 % 1.0
+    number = list(EFFECTS).index(cause) if cause in EFFECTS else sum(cause.encode())
+    hue = number * 0.618 % 1.0
     red, green, blue = (round(255 * part) for part in colorsys.hsv_to_rgb(hue, 0.6, 0.95))
     return red, green, blue
 

@@ -1,6 +1,6 @@
 """The causes that a deviation can have: each has an alarm of its own."""
 
-from twin.model.effects import EFFECTS, UNKNOWN
+from twin.model.effects import EFFECTS, UNKNOWN, meaning
 
 DEVIATION = "deviation"
 UNLISTED = "unlisted"  # a deviation that no effect explains
@@ -21,3 +21,11 @@ def cause_of(value: str) -> str:
 def known(effect: str) -> str:
     """The cause that an effect's name stands for; UNLISTED for one that is none."""
     return effect if effect in CAUSES else UNLISTED
+
+
+def taken_in(effect: str) -> dict[str, dict[str, str]]:
+    """Words for an effect of a catalogue, which has no alarm of its own, beside other evidence."""
+    found = None if effect in CAUSES else meaning(effect)
+    if found is None:
+        return {}
+    return {"taken_in": {"name": effect, "sentence": found.sentence, "look_at": found.look_at}}

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from twin.alarms.causes import CAUSES, DEVIATION, known, value_of
+from twin.alarms.causes import CAUSES, DEVIATION, known, taken_in, value_of
 from twin.events import Event, Kind
 from twin.figures.table import FIGURES
 from twin.figures.warnings import CAUTIONS
@@ -66,10 +66,12 @@ def evidence(event: Event) -> dict[str, Evidence]:
     if event.kind in _SWITCHED and _SWITCHED[event.kind][1]:
         return {_SWITCHED[event.kind][0]: {"words": event.text}}
     if event.kind is Kind.DEVIATION:
-        cause = known(str(event.data.get("effect")))
+        effect = str(event.data.get("effect"))
+        cause = known(effect)
         measured = {key: event.data[key] for key in _MEASURE if key in event.data}
         guess = {} if cause == UNKNOWN else {"guess": cause}
-        return {value_of(cause): {"words": event.text, **guess, **measured, **_in(event)}}
+        told = {"words": event.text, **guess, **measured, **taken_in(effect), **_in(event)}
+        return {value_of(cause): told}
     if event.kind is Kind.CYCLE:
         standing = event.data.get("warnings", ())
         return {name: _figure(name, event) for name in standing}

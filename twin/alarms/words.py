@@ -51,10 +51,11 @@ def action_of(rule: Rule, evidence: Evidence) -> str:
     """What to do, first where to look; no diagnosis helps where no unit was ever commissioned."""
     if evidence.get("commissioned") is False:
         return tr(COMMISSION)
-    cause = cause_of(rule.value)
-    if cause not in EFFECTS:
+    cause, known = cause_of(rule.value), evidence.get("taken_in")
+    if cause not in EFFECTS and not known:
         return tr(rule.action)
-    first = tr("Look at {where}.", where=tr(EFFECTS[cause].look_at))
+    where = known["look_at"] if known else tr(EFFECTS[cause].look_at)
+    first = tr("Look at {where}.", where=where)
     return f"{first} {tr(rule.action)}".rstrip()
 
 

@@ -1,8 +1,11 @@
 """A calibration becomes a record of the asset database, with where it came from."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from twin.assets import provenance
+from twin.assets.catalogue import carried_on
+from twin.assets.database import Assets
 from twin.assets.place import open_chosen
 from twin.assets.record import Record
 from twin.calibration.calibrate import Calibration
@@ -15,7 +18,7 @@ OF_TYPE = ("supply", "ejector")  # tables of a data set that say what a type is
 def store(calibration: Calibration, config: Config, assets: str, log: Path) -> tuple[Record, str]:
     """Add the unit's data set to the database; give the record and the database's name."""
     with open_chosen(assets, config.document, write=True) as database:
-        return database.add(record_of(calibration, config, log)), database.name
+        return add(database, record_of(calibration, config, log)), database.name
 
 
 def store_first(
@@ -30,7 +33,12 @@ def store_first(
             provenance_ = dict(unit.provenance) | note
             kind = Record("type", unit.type, unit.type, own, provenance=provenance_)
             database.add(kind)
-        return database.add(unit), database.name
+        return add(database, unit), database.name
+
+
+def add(database: Assets, unit: Record) -> Record:
+    """Add a calibrated unit's record; what was taken in for this unit alone stays with it."""
+    return database.add(replace(unit, data=carried_on(database, unit.name, unit.data)))
 
 
 def record_of(calibration: Calibration, config: Config, log: Path) -> Record:

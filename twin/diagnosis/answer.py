@@ -397,13 +397,13 @@ def _parameters(
     highest: Floats,
 ) -> dict[str, dict[str, Any]]:
     """Values with intervals; a ramp's are rates, and what they have come to at the log's end."""
-    found = {}
-    ramp, theta = cause.course == Course.RAMP, evidence.theta
+    found, theta = {}, evidence.theta
     sized = zip(effect_of(cause.effect).parameters, x, lowest, highest, strict=True)
     for p, size, below, above in sized:
         whole = p.steps_to(p.high, theta) - p.steps_to(p.low, theta)
         if not above - below < WIDEST * whole:
             continue  # nothing in this log depends on it
+        ramp = cause.course == Course.RAMP and not p.shapes
         at_neutral = p.neutral(theta)
         neutral = 0.0 if ramp else at_neutral
         value, least, most = (

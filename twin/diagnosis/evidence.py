@@ -24,6 +24,8 @@ from twin.model import kernel
 from twin.model import theta as c
 from twin.model.courses import Cause, Schedule, schedule
 from twin.model.dataset import DataSet, coefficients
+from twin.model.effects import Effect, acting_on
+from twin.model.known import KnownEffect, effects_in
 from twin.model.plant import reading_of, sensed_of
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
@@ -96,12 +98,19 @@ class Evidence:
     gauge: bool  # the pressure sensor counts from ambient
     told: frozenset[str] = frozenset()  # surroundings that somebody measures
     another_day: bool = True  # than that of the calibration
+    catalogue: Mapping[str, KnownEffect] = field(default_factory=dict)  # known beside the table
     _seen: dict[bytes, Seen] = field(default_factory=dict)  # by coefficients
 
     @property
     def cycles(self) -> int:
         """How many complete cycles there are."""
         return len(self.starts) - 1
+
+    @cached_property
+    def effects(self) -> list[Effect]:
+        """What can act: of the table, and of what was found before."""
+        known = effects_in(self.catalogue)
+        return [*acting_on(self.theta), *(one for one in known if one.acts(self.theta))]
 
     @cached_property
     def seconds(self) -> Floats:
@@ -385,6 +394,7 @@ def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
         uncertain=tuple(_uncertain(config)),
         calibrated=theta,
         gauge=config.gauge,
+        catalogue=config.data.catalogue,
     )
     return of_log(nothing, blocks)
 

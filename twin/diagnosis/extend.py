@@ -9,6 +9,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from twin.assets import provenance
+from twin.assets.catalogue import carried_on
 from twin.assets.place import open_chosen
 from twin.assets.record import Record
 from twin.config import Config, Known
@@ -22,6 +23,7 @@ from twin.live import Twin
 from twin.model.courses import Cause, Course
 from twin.model.dataset import DataSet, coefficients
 from twin.model.effects import Parameter, apply, effect_of
+from twin.model.known import mechanism_of
 from twin.model.mechanism import MECHANISMS
 from twin.model.term import AGAIN
 from twin.monitor.bins import Floats
@@ -104,6 +106,7 @@ def store(
         valid_from_ns=provenance.valid_from(_since(diagnosis)),
     )
     with open_chosen(assets, config.document, write=True) as database:
+        record = replace(record, data=carried_on(database, unit, record.data))
         return database.add(record), database.name
 
 
@@ -121,8 +124,9 @@ def _always(diagnosis: Diagnosis) -> Iterator[tuple[str, Sizes]]:
     for cause, answer in zip(diagnosis.acting, diagnosis.told, strict=True):
         sizes = cause.at(evidence.theta, *at_end)
         known = {name: sizes[name] for name in answer["parameters"] if _is_always(cause)}
-        if cause.effect in MECHANISMS:
-            yield cause.effect, sizes  # its times are needed, known well or not
+        mechanism = mechanism_of(cause.effect)
+        if mechanism in MECHANISMS and sizes and _is_always(cause):
+            yield mechanism, sizes  # its times are needed, known well or not
         elif known:
             yield cause.effect, {**cause.law(), **known}
 
@@ -220,7 +224,7 @@ def _now(diagnosis: Diagnosis) -> Hypothesis:
 
 def _doubts(diagnosis: Diagnosis) -> Iterator[Hypothesis]:
     """The same with one size after the other a sigma away."""
-    names = [cause.effect for cause in diagnosis.acting]
+    names = [mechanism_of(cause.effect) for cause in diagnosis.acting]
     parameters = [answer["parameters"] for answer in diagnosis.told]
     answers = dict(zip(names, parameters, strict=True))
     now = _now(diagnosis)

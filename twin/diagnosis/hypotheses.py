@@ -54,7 +54,7 @@ def _sized(evidence: Evidence, cause: Cause, sizes: Iterator[float]) -> Cause:
     values = cause.law()
     for p in effect_of(cause.effect).parameters:
         size = float(next(sizes))
-        if cause.course == Course.RAMP:
+        if cause.course == Course.RAMP and not p.shapes:
             values[p.name] = size * p.typical / hours(evidence, cause)
         else:
             values[p.name] = float(np.clip(p.after(size, evidence.theta), p.low, p.high))
@@ -66,7 +66,7 @@ def sizes(evidence: Evidence, hypothesis: Hypothesis) -> Floats:
     found = []
     for cause in hypothesis:
         for p in effect_of(cause.effect).parameters:
-            if cause.course == Course.RAMP:
+            if cause.course == Course.RAMP and not p.shapes:
                 change = cause.values.get(p.name, 0.0) * hours(evidence, cause)
                 found.append(change / p.typical)
             else:

@@ -17,6 +17,7 @@ from twin.diagnosis.fit import Fitted, fit, interval, white
 from twin.diagnosis.weights import Weights, covariance
 from twin.inference.levels import CHI2_999
 from twin.model.courses import Cause
+from twin.model.known import has_room
 from twin.model.mechanism import MECHANISMS, Mechanism
 from twin.monitor.bins import Floats
 
@@ -34,6 +35,9 @@ MOST_LEFT = 0.3
 # Of what listed causes leave (mbar, squares), below which a mechanism alone takes their place.
 # Chosen: icing leaves 0.53 of what an end vacuum loss with a porous leak does that mimic it.
 DISPLACES = 0.6
+
+
+_ANY = next(iter(MECHANISMS))
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,8 @@ def explain(
     None where none explains most of what is off, beside them of what they leave.
     """
     alone = explain_alone(evidence, fitted, found, progress)
-    if alone or not found:
+    names = (*(cause.effect for cause in found), _ANY)
+    if alone or not found or not has_room(evidence.theta, names):
         return alone
     return _explained(evidence, fitted, found, _best(evidence, fitted, found, progress))
 
@@ -73,6 +78,8 @@ def explain_alone(
     evidence: Evidence, fitted: Sequence[int], found: Hypothesis, progress: Progress
 ) -> Explained | None:
     """The mechanism that suits best by itself; None if it does not displace what was ``found``."""
+    if not has_room(evidence.theta, (_ANY,)):
+        return None
     progress("trying mechanisms")
     alone = _explained(evidence, fitted, HEALTHY, _best(evidence, fitted, HEALTHY, progress))
     displaces = alone and (not found or _displaces(evidence, fitted, alone, found))

@@ -27,7 +27,7 @@ from twin.diagnosis.words import Times, certainty, left_over, listed, sized, whe
 from twin.errors import in_words
 from twin.events import Event, Kind
 from twin.instants import SECOND_NS
-from twin.model.effects import EFFECTS
+from twin.model.effects import effect_of
 from twin.signals import NEW_TIME, SAMPLE, Samples
 
 CYCLES = 13  # that are kept: all but the first are judged, in which the model swings in
@@ -271,8 +271,8 @@ def in_a_line(answer: Mapping[str, Any]) -> str:
 
 
 def _cause(cause: Mapping[str, Any], times: Times) -> str:
-    look_at = [EFFECTS[cause["effect"]].look_at]
-    look_at += [EFFECTS[name].look_at for name in cause["not_separable_from"]]
+    look_at = [effect_of(cause["effect"]).look_at]
+    look_at += [effect_of(name).look_at for name in cause["not_separable_from"]]
     return (
         f"{sized(cause)}, {when(cause, times)}; how sure: {certainty(cause)};"
         f" look at {listed(look_at, 'or')}"

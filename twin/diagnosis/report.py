@@ -53,7 +53,7 @@ from twin.files import write_text
 from twin.instants import dated
 from twin.model import theta as c
 from twin.model.courses import Course
-from twin.model.effects import EFFECTS
+from twin.model.effects import effect_of
 from twin.model.theta import Theta
 from twin.signals import BAR, MBAR, ML, SL_MIN
 
@@ -108,7 +108,7 @@ def _steps(answer: Answer, times: Times) -> Iterator[str]:
     for cause in answer["causes"]:
         title = spoken(cause["effect"]).capitalize()
         known = [row for row in about(cause, times, sure=sure) if row[1] != spoken(cause["effect"])]
-        yield page.card(title, f"{EFFECTS[cause['effect']].sentence}.", known)
+        yield page.card(title, f"{effect_of(cause['effect']).sentence}.", known)
     steps = [step for step in to_do(answer) if step[0] not in RECORD]
     if answer["verdict"] == "unlisted":
         title, text = "Something that no listed cause explains", f"Left in {left_over(answer)}."

@@ -15,7 +15,8 @@ from twin.diagnosis.hypotheses import price, sized
 from twin.diagnosis.weights import Weights, levels
 from twin.inference.sensitivities import derivatives
 from twin.model.courses import Cause, Course
-from twin.model.effects import EFFECTS, Parameter, acting_on
+from twin.model.effects import Parameter, effect_of
+from twin.model.known import has_room
 from twin.monitor.bins import Floats, Ints
 
 # Of its typical size, at which an effect's signature is taken. A delay moves what is sharp: a small
@@ -90,9 +91,10 @@ def signatures(
     """Simulate each parameter a little away from a hypothesis, in all cycles alike."""
     taken = [
         (Cause(effect.name, law), p, share)
-        for effect in acting_on(evidence.theta)
+        for effect in evidence.effects
         for law in effect.laws()
         for p in effect.parameters
+        if not p.shapes
         for share in (SHARES_OF_TIMES if p.unit == "ms" else SHARES)
     ]
     names, shares = [(cause, p) for cause, p, _ in taken], np.array([share for *_, share in taken])
@@ -163,7 +165,10 @@ def pairs(
         one, other = (options[i] for i in two)
         square = gram[np.ix_(two, two)]
         apart = square[0, 0] * square[1, 1] - square[0, 1] ** 2
-        if one.cause.effect == other.cause.effect or apart <= ALIKE * square[0, 0] * square[1, 1]:
+        effects = one.cause.effect, other.cause.effect
+        if effects[0] == effects[1] or not has_room(evidence.theta, effects):
+            continue
+        if apart <= ALIKE * square[0, 0] * square[1, 1]:
             continue
         sizes = np.linalg.solve(square, pull[list(two)])
         if found.allowed(one.number, sizes[0]) and found.allowed(other.number, sizes[1]):
@@ -258,7 +263,7 @@ def share_of_cycles(evidence: Evidence, weights: Weights, cause: Cause) -> Float
 
 def _with_size(evidence: Evidence, cause: Cause, parameter: Parameter, size: float) -> Cause:
     """A cause with one of its parameters that many typical sizes away from neutral."""
-    effect = EFFECTS[cause.effect]
+    effect = effect_of(cause.effect)
     x = np.array([size if p is parameter else 0.0 for p in effect.parameters])
     (whole,) = sized(evidence, (cause,), x)
     return replace(whole, values={**whole.law(), parameter.name: whole.values[parameter.name]})

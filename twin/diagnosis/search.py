@@ -29,6 +29,7 @@ from twin.diagnosis.screen import Columns, Signatures, columns, pairs, promises,
 from twin.diagnosis.weights import Covariance, Weights, covariance
 from twin.inference.levels import CHI2_95, CHI2_999, SIGMAS_95
 from twin.model.courses import Cause, Course
+from twin.model.known import has_room
 from twin.monitor.bins import Floats
 from twin.signals import MS
 
@@ -359,7 +360,7 @@ def _best_addition(
     about = found.hypothesis
     beside = signatures(evidence, judged.cycles, about)
     promised = promises(evidence, judged, columns(evidence, judged, beside), each=2)
-    new = [one for one in promised if one.hypothesis[0].effect not in found.effects]
+    new = [one for one in promised if _can_join(evidence, one.hypothesis[0], about)]
     new = [one for one in new[:TRIED_MORE] if one.gain > HOPEFUL]
     candidates = _started(evidence, judged, [(*about, *one.hypothesis) for one in new])
     if len(about) == 1:
@@ -373,6 +374,12 @@ def _best_addition(
     return None
 
 
+def _can_join(evidence: Evidence, cause: Cause, others: Hypothesis) -> bool:
+    """Whether a cause can act beside others: another one, and the model has room for it."""
+    names = [one.effect for one in others]
+    return cause.effect not in names and has_room(evidence.theta, (*names, cause.effect))
+
+
 def _linear_pairs(evidence: Evidence, judged: Weights, alone: Columns) -> list[Hypothesis]:
     """Pairs that explain more than any single cause in the linear model."""
     singles = promises(evidence, judged, alone, each=2)
@@ -384,7 +391,11 @@ def _fitted_pairs(
     evidence: Evidence, weights: Weights, singles: Sequence[Fitted], found: Fitted
 ) -> list[Hypothesis]:
     """Pairs of single causes, each as it was fitted: delays are far from linear."""
-    both = [(*one.hypothesis, *two.hypothesis) for one, two in combinations(singles, 2)]
+    both = [
+        (*one.hypothesis, *two.hypothesis)
+        for one, two in combinations(singles, 2)
+        if has_room(evidence.theta, (*one.effects, *two.effects))
+    ]
     chi2 = np.sum(white(evidence, weights, both) ** 2, axis=0)
     best = np.argsort(chi2)[:TRIED_MORE]
     return [both[i] for i in best if chi2[i] < found.chi2]
@@ -417,9 +428,10 @@ def _sizes_of_causes(fitted: Fitted) -> list[float]:
     """The size of each cause, in typical ones: of the parameter that is farthest from neutral."""
     first, sizes = 0, []
     for cause in fitted.hypothesis:
-        count = len(parameters((cause,)))
-        sizes.append(float(np.abs(fitted.x[first : first + count]).max()))
-        first += count
+        own = parameters((cause,))
+        much = [not one.shapes for one in own]
+        sizes.append(float(np.abs(fitted.x[first : first + len(own)][much]).max()))
+        first += len(own)
     return sizes
 
 
@@ -506,6 +518,7 @@ def _rivals(
                 (*others, *one.hypothesis)
                 for one in promised
                 if one.hypothesis[0].effect not in found.effects
+                and _can_join(evidence, one.hypothesis[0], others)
                 and one.gain > NEARLY * promised[0].gain
             ][:TRIED_PAIRS]
             timed = _timed(evidence, judged, tried)

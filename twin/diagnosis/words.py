@@ -10,7 +10,7 @@ from typing import Any
 from twin.instants import SECOND_NS, dated, instant
 from twin.language import tr
 from twin.model.courses import Course
-from twin.model.effects import EFFECTS
+from twin.model.effects import effect_of
 
 Answer = Mapping[str, Any]
 MOST_LISTED = 12  # cycles named one by one
@@ -82,7 +82,7 @@ def headline(answer: Answer, now_ns: int) -> str:
             return f"The ejector does what its twin expects; {left} mbar rms left over are healthy."
         case "explained" if len(causes) == 1:
             (cause,) = causes
-            return f"{EFFECTS[cause['effect']].sentence} – {size(cause)}, {when(cause, times)}."
+            return f"{effect_of(cause['effect']).sentence} – {size(cause)}, {when(cause, times)}."
         case "explained":
             each = (f"{size(cause)}, {when(cause, times)}" for cause in causes)
             names = (spoken(cause["effect"]) for cause in causes)
@@ -176,9 +176,9 @@ def about(cause: Answer, times: Times, *, sure: bool) -> Iterator[tuple[str, str
     yield "when", when(cause, times, interval=True)
     if sure:
         yield "how sure", certainty(cause)
-    yield "look at", EFFECTS[cause["effect"]].look_at
+    yield "look at", effect_of(cause["effect"]).look_at
     for name in cause["not_separable_from"]:
-        yield "or it may be", f"{spoken(name)}; then look at {EFFECTS[name].look_at}"
+        yield "or it may be", f"{spoken(name)}; then look at {effect_of(name).look_at}"
 
 
 def to_do(answer: Answer) -> Iterator[tuple[str, str]]:

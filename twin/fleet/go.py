@@ -8,6 +8,7 @@ from pathlib import Path
 from sqlalchemy import URL
 
 from twin.assets.database import open_assets
+from twin.calibration.store import add as add_calibrated
 from twin.config import Config
 from twin.errors import TwinError
 from twin.fleet.engines import Submit, died
@@ -83,7 +84,7 @@ def _keep(future: Future[Done], one: Wanted, store: Store, assets: str | Path | 
         return _failed(log, done.error)
     if done.record is not None:
         with open_assets(assets) as database:
-            database.add(done.record)
+            add_calibrated(database, done.record)
     store.add(one.key, one.job.config, log, one.begin_ns, done.answer)
     return Told(log, "done", one.key, complete=one.complete)
 

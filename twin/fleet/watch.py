@@ -20,7 +20,7 @@ FORMAT = "ejector-twin-watched/1"
 def watched(config: Config, blocks: Iterable[Samples]) -> dict[str, Any]:
     """Run twin and hypotheses over a log; give what its cycles say on average."""
     listener, cutter = Listener.of(config.data, config.monitor.healthy), CycleCutter()
-    bank = Bank(listener.theta)
+    bank = Bank(listener.theta, listener.suspects)
     teller = compiled(config)
     told: list[CycleFigures] = []
     heard: list[Said] = []

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from twin.model.effects import EFFECTS, apply
+from twin.model.effects import apply, effect_of
 from twin.model.theta import Theta
 
 Floats = npt.NDArray[np.float64]
@@ -64,6 +64,6 @@ def coefficients_at(theta: Theta, changes: Sequence[Change], at: Floats) -> Floa
 
 
 def _changed(theta: Theta, name: str, sizes: Mapping[str, float], times: float) -> Theta:
-    parameters = [p for p in EFFECTS[name].parameters if p.name in sizes]
+    parameters = [p for p in effect_of(name).parameters if p.name in sizes]
     values = {p.name: p.neutral(theta) + times * sizes[p.name] for p in parameters}
     return apply(theta, name, values)

@@ -65,8 +65,10 @@ class Cause:
             return self.values
         grown = self.law()
         for parameter in effect_of(self.effect).parameters:
-            rate = self.values.get(parameter.name, 0.0)
-            value = parameter.neutral(theta) + rate * (second - self.onset_s) / HOUR
+            neutral = parameter.neutral(theta)
+            told = self.values.get(parameter.name, neutral if parameter.shapes else 0.0)
+            grows = neutral + told * (second - self.onset_s) / HOUR
+            value = told if parameter.shapes else grows
             grown[parameter.name] = min(max(value, parameter.low), parameter.high)
         return grown
 

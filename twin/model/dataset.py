@@ -12,13 +12,13 @@ from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from twin.errors import ConfigError
-from twin.model import mechanism as _mechanism  # noqa: F401 - what a data set may have of effects
 from twin.model import theta as c
 from twin.model.effects import FLATTEST, apply
 from twin.model.gas import CRITICAL_RATIO, GAMMA, R
+from twin.model.known import KnownEffect, refuse_name
 from twin.model.system import Part, Tube, Vessel, lumped
 from twin.model.term import Term
 from twin.model.theta import Theta
@@ -232,6 +232,18 @@ class DataSet(Settings):
     # What a diagnosis found beside all that: effects with their sizes, by name.
     effects: Mapping[str, Mapping[str, float]] = Field(default_factory=dict)
     terms: tuple[Term, ...] = ()  # the same: what data added where no effect is known
+    # Effects that were found before and taken in: the search has them beside its table, by name.
+    catalogue: Mapping[str, KnownEffect] = Field(default_factory=dict)
+
+    @field_validator("catalogue")
+    @classmethod
+    def _named(cls, catalogue: Mapping[str, KnownEffect]) -> Mapping[str, KnownEffect]:
+        try:
+            for name in catalogue:
+                refuse_name(name)
+        except ConfigError as error:
+            raise ValueError(str(error)) from error
+        return catalogue
 
     @model_validator(mode="after")
     def _model_can_be_made(self) -> "DataSet":
@@ -256,7 +268,8 @@ class DataSet(Settings):
     @property
     def hash(self) -> str:
         """Content hash: two data sets with the same hash expect the same pressures."""
-        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
+        expects = self.model_dump_json(exclude={"catalogue"})
+        return hashlib.sha256(expects.encode()).hexdigest()[:16]
 
 
 def coefficients(data: DataSet) -> Theta:

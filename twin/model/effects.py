@@ -25,7 +25,7 @@ class Parameter:
 
     ``typical`` is a change worth an alarm; of a ``ratio`` it is a factor. Neutral is zero, or the
     data set's own value where the parameter replaces a ``coefficient`` rather than adding to it;
-    of a ratio, which only says how an effect acts, it is the lowest value.
+    of a ratio, which only says how an effect acts, it is the lowest value, or what is ``usual``.
     """
 
     name: str
@@ -35,9 +35,17 @@ class Parameter:
     typical: float
     coefficient: int | None = None
     ratio: bool = False  # what matters is how many times as large it is: a time constant
+    usual: float | None = None  # of what shapes an effect that was seen before
+
+    @property
+    def shapes(self) -> bool:
+        """Whether it says how an effect acts that was seen before, and not how much."""
+        return self.usual is not None
 
     def neutral(self, theta: Theta) -> float:
-        """Return the value at which the effect changes nothing."""
+        """Return the value at which the effect changes nothing, or what is usual."""
+        if self.usual is not None:
+            return self.usual
         if self.ratio:
             return self.low
         return 0.0 if self.coefficient is None else float(theta[self.coefficient])
@@ -45,13 +53,13 @@ class Parameter:
     def steps_to(self, value: float, theta: Theta) -> float:
         """How many typical changes lie between neutral and ``value``."""
         if self.ratio:
-            return math.log(value / self.low) / math.log(self.typical)
+            return math.log(value / self.neutral(theta)) / math.log(self.typical)
         return (value - self.neutral(theta)) / self.typical
 
     def after(self, steps: float, theta: Theta) -> float:
         """The value so many typical changes from neutral: the inverse of ``steps_to``."""
         if self.ratio:
-            return float(self.low * self.typical**steps)
+            return float(self.neutral(theta) * self.typical**steps)
         return self.neutral(theta) + steps * self.typical
 
     def range(self, theta: Theta) -> tuple[float, float]:
@@ -356,9 +364,14 @@ def add_beside(effects: Mapping[str, Effect]) -> None:
     _BESIDE.update(effects)
 
 
+def meaning(name: str) -> Effect | None:
+    """The effect of a name, of the table or beside it; None where it is not known here."""
+    return EFFECTS.get(name) or _BESIDE.get(name)
+
+
 def effect_of(name: str) -> Effect:
-    """The effect of a name, of the table or beside it. ConfigError where there is none."""
-    found = EFFECTS.get(name) or _BESIDE.get(name)
+    """The same. ConfigError where there is none."""
+    found = meaning(name)
     if found is None:
         raise ConfigError(f"unknown effect {name!r}", "twin effects lists them")
     return found

@@ -8,7 +8,7 @@ share. So it has a state, and holds for every program of commands.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 from twin.errors import ConfigError
@@ -67,6 +67,7 @@ class When:
     starts: tuple[tuple[float, ...], ...]
     sentence: str  # with the parameters' values
     formula: str
+    briefly: str = ""  # the same without values, where the sentence has some
 
 
 _P = Parameter
@@ -196,8 +197,16 @@ WHENS = {
             ((10.0,), (60.0,)),
             "which sets in over {sets_in}",
             "d share/dt = (1 - share) / {sets_in}",
+            "which sets in slowly",
         ),
-        When("nozzle_on", NOZZLE_ON, (), ((),), "while the nozzle runs", "share = jet"),
+        When(
+            "nozzle_on",
+            NOZZLE_ON,
+            (),
+            ((),),
+            "while the nozzle runs",
+            "share = jet",
+        ),
         When(
             "nozzle_on_slowly",
             NOZZLE_ON,
@@ -214,9 +223,24 @@ WHENS = {
             "which builds up over {sets_in} while the nozzle runs and goes back over {fades}"
             " while it does not",
             "d share/dt = jet (1 - share) / {sets_in} - (1 - jet) share / {fades}",
+            "which builds up while the nozzle runs and goes back while it does not",
         ),
-        When("nozzle_off", NOZZLE_OFF, (), ((),), "while the nozzle is off", "share = 1 - jet"),
-        When("in_blow_off", BLOWING, (), ((),), "during blow-off", "share = blow-off valve"),
+        When(
+            "nozzle_off",
+            NOZZLE_OFF,
+            (),
+            ((),),
+            "while the nozzle is off",
+            "share = 1 - jet",
+        ),
+        When(
+            "in_blow_off",
+            BLOWING,
+            (),
+            ((),),
+            "during blow-off",
+            "share = blow-off valve",
+        ),
         When(
             "above",
             ABOVE,
@@ -228,6 +252,7 @@ WHENS = {
             ),
             "above {begins} of vacuum, until it is {ends_below} below that",
             "share = 1 from {begins} of vacuum on, until {ends_below} below that; else 0",
+            "above some vacuum, until it has fallen well below that",
         ),
         When(
             "beyond",
@@ -236,6 +261,7 @@ WHENS = {
             ((20.0,), (200.0,), (400.0,), (550.0,), (680.0,)),
             "the more the higher the vacuum is above {begins}",
             "share = (vacuum - {begins}) / (ambient - {begins}), at least 0",
+            "the more the higher the vacuum is above some value",
         ),
         When(
             "beyond_slowly",
@@ -244,6 +270,7 @@ WHENS = {
             ((20.0, 0.5), (20.0, 2.0), (20.0, 8.0), (400.0, 1.0)),
             "the more the higher the vacuum is above {begins}, with a delay of {sets_in}",
             "d share/dt = ((vacuum - {begins}) / (ambient - {begins}) - share) / {sets_in}",
+            "the more the higher the vacuum is above some value, with a delay",
         ),
         When(
             "gathered",
@@ -253,6 +280,7 @@ WHENS = {
             "which gathers over {sets_in} while the nozzle runs and is cleared by blow-off"
             " over {fades}",
             "d share/dt = jet (1 - share) / {sets_in} - blow-off share / {fades}",
+            "which gathers while the nozzle runs and is cleared by blow-off",
         ),
         When(
             "used_up",
@@ -261,6 +289,7 @@ WHENS = {
             ((0.1, 0.2), (0.1, 1.0), (1.0, 1.0), (5.0, 5.0)),
             "which vacuum uses up over {fades} and ambient pressure renews over {sets_in}",
             "d share/dt = pressure (1 - share) / {sets_in} - vacuum share / {fades}, of ambient",
+            "which vacuum uses up and ambient pressure renews",
         ),
         When(
             "swinging",
@@ -273,6 +302,7 @@ WHENS = {
             ),
             "to and fro with a period of {period}",
             "share = sin(2 pi (t - {shift}) / {period})",
+            "to and fro",
         ),
     )
 }
@@ -334,9 +364,7 @@ class Mechanism:
 
     def _act(self, theta: Theta, *values: float) -> None:
         """Take the first slot that is free. ConfigError where there is none."""
-        begins = [c.MECHANISMS + slot * WIDTH for slot in range(SLOTS)]
-        sizes_of = [SIZE, ALSO_SIZE]
-        first = next((one for one in begins if not theta[one : one + WIDTH][sizes_of].any()), None)
+        first = next(_free(theta), None)
         if first is None:
             raise ConfigError(
                 f"{self.name}: {SLOTS} mechanisms act already, and more cannot act at once",
@@ -356,6 +384,18 @@ class Mechanism:
         theta[first + FADES] = told.get("fades", sets_in)
         theta[first + PERIOD] = told.get("period", 1.0)
         theta[first + SHIFT] = told.get("shift", 0.0)
+
+
+def _free(theta: Theta) -> Iterator[int]:
+    """Where the coefficients of each slot begin in which nothing acts."""
+    for begin in range(c.MECHANISMS, len(c.COEFFICIENTS), WIDTH):
+        if not theta[[begin + SIZE, begin + ALSO_SIZE]].any():
+            yield begin
+
+
+def free_slots(theta: Theta) -> int:
+    """How many mechanisms more can act."""
+    return sum(1 for _ in _free(theta))
 
 
 def _kept(theta: Theta, coefficient: int, added: float) -> float:

@@ -5,7 +5,7 @@ expects less what the unchanged one does is the effect's signature in the cycles
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,9 @@ import numpy.typing as npt
 from twin.model import kernel
 from twin.model import theta as c
 from twin.model.compiled import compiled
-from twin.model.effects import EFFECTS, Parameter, apply
+from twin.model.dataset import DataSet
+from twin.model.effects import EFFECTS, Effect, Parameter, apply
+from twin.model.known import effects_in
 from twin.model.theta import Theta
 from twin.monitor.bins import Floats, Ints, sparse_rows
 from twin.monitor.cycles import Cycle
@@ -69,11 +71,16 @@ class Suspect:
         return apply(theta, self.effect, {self.parameter.name: size})
 
 
-SUSPECTS: Sequence[Suspect] = tuple(
-    Suspect(effect.name, parameter)
-    for effect in EFFECTS.values()
-    for parameter in effect.parameters
-)
+def _suspects(effects: Iterable[Effect]) -> tuple[Suspect, ...]:
+    return tuple(Suspect(one.name, p) for one in effects for p in one.parameters if not p.shapes)
+
+
+SUSPECTS: Sequence[Suspect] = _suspects(EFFECTS.values())
+
+
+def suspects_of(data: DataSet, theta: Theta) -> Sequence[Suspect]:
+    """Those of the table of effects, then those of the data set's own catalogue."""
+    return (*SUSPECTS, *_suspects(one for one in effects_in(data.catalogue) if one.acts(theta)))
 
 
 # How suction and end pressure follow the supply is the type's, since only one supply was ever
@@ -86,8 +93,8 @@ LARGER = len(DELAY_STEPS) - 1  # sizes beside the step
 SEEN_LATER = {Phase.HOLD: ("sensor_lag",), Phase.SUCTION: ("sensor_lag", "slow_ramp_up")}
 
 
-def hypotheses(theta: Theta) -> list[Theta]:
-    """The unchanged data set, each suspect, and further ones.
+def hypotheses(theta: Theta, suspects: Sequence[Suspect] = SUSPECTS) -> list[Theta]:
+    """The unchanged data set, each of the suspects, and further ones.
 
     These are the larger sizes of what delays, and a low supply in each way it is unsure.
     """
@@ -99,7 +106,7 @@ def hypotheses(theta: Theta) -> list[Theta]:
         ways.append(way)
     steps = [size / DELAY_STEPS[0] for size in DELAY_STEPS[1:]]
     larger = [SUSPECTS[number].of(theta, some) for number in DELAYS for some in steps]
-    return [theta, *(one.of(theta) for one in SUSPECTS), *larger, *ways]
+    return [theta, *(one.of(theta) for one in suspects), *larger, *ways]
 
 
 class Bank:
@@ -111,8 +118,8 @@ class Bank:
     stand where that one ended.
     """
 
-    def __init__(self, theta: Theta) -> None:
-        self._theta = np.stack(hypotheses(theta), axis=1)
+    def __init__(self, theta: Theta, suspects: Sequence[Suspect] = SUSPECTS) -> None:
+        self._theta = np.stack(hypotheses(theta, suspects), axis=1)
         self._state = kernel.new_state(self._theta.shape[1])
         self._drawings = Drawings()
         self._last_ns: int | None = None  # PLC time of the newest row

@@ -536,7 +536,8 @@ class Monitor:
         samples = np.concatenate([part.samples for part in parts])
         ticks = np.concatenate([part.ticks for part in parts])
         begin = len(samples) - len(cycle.samples)
-        ranking = likenesses(following(self.theta, samples), samples, ticks, begin)
+        known = self.isolation.known if self.isolation else ()
+        ranking = likenesses(following(self.theta, samples), samples, ticks, begin, known)
         return ranking or [Likeness(UNKNOWN, None, "", 0.0)]  # not one sync in a long piece
 
 

@@ -19,9 +19,9 @@ import numpy as np
 from twin.inference.covariance import Covariance, fading, low_rank
 from twin.inference.unmodelled import MISMATCH, Odds, hats, knots_over, log_likelihoods
 from twin.model.dataset import DataSet
-from twin.model.effects import UNKNOWN
+from twin.model.effects import EFFECTS, UNKNOWN, Effect, effect_of
 from twin.model.term import KINDS
-from twin.monitor.bank import DELAY_STEPS, DELAYS, SUSPECTS, UNSURE_OF, Bank
+from twin.monitor.bank import DELAY_STEPS, DELAYS, SUSPECTS, UNSURE_OF, Bank, Suspect
 from twin.monitor.bins import Floats, averaged
 from twin.monitor.budget import SUMS, cycles_between
 from twin.monitor.change import (
@@ -107,8 +107,9 @@ class Isolation:
     def __init__(self, bank: Bank, listener: Listener, days: float) -> None:
         self._bank, self._listener = bank, listener
         self._days = days
-        self._reference, self._usual = Reference.of(len(SUSPECTS)), _Usual()
-        self._normalizer = ScoreNormalizer(len(SUSPECTS))
+        self._suspects, count = listener.suspects, len(listener.suspects)
+        self._reference, self._usual = Reference.of(count), _Usual()
+        self._normalizer = ScoreNormalizer(count)
         self._learned = 0  # cycles
         self._patience = Patience[tuple[Said, Floats, NormalScores]]()  # with their scores
         self._changes: Changes | None = None  # once it is known which suspects look alike
@@ -118,15 +119,21 @@ class Isolation:
         self._raised: tuple[int, float] | None = None  # suspect, and sigmas a cycle
         self._since = 0  # cycles since it began, while raised
         self._back = 0.0  # logarithm of the odds that it is as before
-        self._alike = np.zeros((len(SUSPECTS), len(SUSPECTS)))  # cosines, as far as known
-        ends = [one.parameter.range(listener.theta) for one in SUSPECTS]
-        steps = np.array([one.step for one in SUSPECTS])
+        self._alike = np.zeros((count, count))  # cosines, as far as known
+        ends = [one.parameter.range(listener.theta) for one in self._suspects]
+        steps = np.array([one.step for one in self._suspects])
         self._bounds = np.array(ends) / steps[:, None]
 
     @property
     def stands(self) -> bool:
         """Whether it was beyond the limit, and has not come back since."""
         return self._raised is not None
+
+    @property
+    def known(self) -> list[Effect]:
+        """The effects beside the table that are looked for."""
+        names = dict.fromkeys(one.effect for one in self._suspects if one.effect not in EFFECTS)
+        return [effect_of(name) for name in names]
 
     @property
     def heard(self) -> tuple[Said, Floats]:
@@ -141,12 +148,12 @@ class Isolation:
     def of(cls, data: DataSet, healthy: Healthy, days: float) -> "Isolation":
         """The isolation beside the twin of a data set; compiled, not to fall into a block."""
         listener = Listener.of(data, healthy)
-        first = Bank(listener.theta)
+        first = Bank(listener.theta, listener.suspects)
         drawn, expected = first.take(
             Cycle(0, np.zeros(2, SAMPLE), np.zeros(2, TICK), complete=False)
         )
         averaged(np.zeros(2, np.uint8), np.zeros(2), drawn, expected)
-        return cls(Bank(listener.theta), listener, days)
+        return cls(Bank(listener.theta, listener.suspects), listener, days)
 
     def hear(self, looks: Sequence[Look]) -> list[Heard | None]:
         """Take cycles and pieces, in order, and what the monitor has of them; say what they say."""
@@ -196,7 +203,7 @@ class Isolation:
             alike = said.alike()
             self._alike = np.where(alike != 0.0, alike, self._alike)
         if self._learned == LEARNED:
-            self._changes = looked_for()
+            self._changes = looked_for(self._suspects)
         if self._changes and (new.any() or self._learned == LEARNED):
             self._changes.weigh(self._alike)
 
@@ -272,7 +279,7 @@ class Isolation:
         columns = np.column_stack([mean.off, mean.signatures, mean.larger])
         known = Covariance.of(covariance)
         white = known.white(columns)
-        off, signatures, larger = np.split(white, [1, 1 + len(SUSPECTS)], axis=1)
+        off, signatures, larger = np.split(white, [1, 1 + len(self._suspects)], axis=1)
         sizes, left = _fitted(off, signatures, self._bounds)
         for number in DELAYS:
             grows, most = _grows(number, signatures, larger), float(self._bounds[number, 1])
@@ -309,7 +316,7 @@ class Isolation:
         columns /= counts[:, None]
         usual, seen = self._usual.of(last)
         off = columns[:, 0] - usual
-        signatures, larger = np.split(columns[:, 1:], [len(SUSPECTS)], axis=1)
+        signatures, larger = np.split(columns[:, 1:], [len(self._suspects)], axis=1)
         own = np.hypot(last.common / np.sqrt(1.0 + seen), MISMATCH * off)
         usually = 1.0 / np.sqrt(1.0 + seen)
         scatter = last.alone / len(some) + last.alone * np.outer(usually, usually)
@@ -320,7 +327,7 @@ class Isolation:
         """Parameters of one effect belong together; the most probable one gives the size."""
         found: dict[str, Likeness] = {}
         for number in np.argsort(-share).tolist():
-            one, mine = SUSPECTS[number], float(share[number])
+            one, mine = self._suspects[number], float(share[number])
             if first := found.get(one.effect):
                 found[one.effect] = replace(first, share=first.share + mine)
                 continue
@@ -329,10 +336,10 @@ class Isolation:
         return sorted(found.values(), key=lambda likeness: -likeness.share)
 
 
-def looked_for() -> Changes:
+def looked_for(suspects: Sequence[Suspect] = SUSPECTS) -> Changes:
     """Sums for all suspects, with nothing seen yet."""
-    both_ways = np.array([one.both_ways for one in SUSPECTS])
-    return Changes(both_ways, np.array([one.often for one in SUSPECTS]))
+    both_ways = np.array([one.both_ways for one in suspects])
+    return Changes(both_ways, np.array([one.often for one in suspects]))
 
 
 def _fitted(off: Floats, signatures: Floats, bounds: Floats) -> tuple[Floats, Floats]:

@@ -12,7 +12,7 @@ import numpy as np
 from twin.inference.sensitivities import coefficients_at, sensitivities
 from twin.model import kernel
 from twin.model.compiled import compiled
-from twin.model.effects import EFFECTS, UNKNOWN
+from twin.model.effects import EFFECTS, UNKNOWN, Effect, meaning
 from twin.model.theta import Theta
 from twin.monitor.bins import Floats, Ints, drawn
 from twin.signals import BREAK, MBAR, NS, Samples, Ticks, deviation
@@ -35,7 +35,8 @@ class Likeness:
     @property
     def is_small(self) -> bool:
         """Whether what it does is about in proportion to its size: typical ones are the limit."""
-        typical = EFFECTS[self.effect].parameters[0].typical if self.effect in EFFECTS else 0.0
+        effect = meaning(self.effect)
+        typical = effect.parameters[0].typical if effect else 0.0
         return self.size is not None and abs(self.size) <= typical
 
     @property
@@ -78,8 +79,12 @@ def drawn_rows(samples: Samples, ticks: Ticks) -> Ints:
     return drawn(steps(samples, None), begins)
 
 
-def likenesses(theta: Theta, samples: Samples, ticks: Ticks, begin: int) -> list[Likeness]:
-    """Rank the effects by how much of the deviation from row ``begin`` on they explain.
+def likenesses(
+    theta: Theta, samples: Samples, ticks: Ticks, begin: int, known: Sequence[Effect] = ()
+) -> list[Likeness]:
+    """Rank the effects, also ``known`` ones beside the table, by how much they explain.
+
+    That is of the deviation from row ``begin`` on.
 
     The rows before ``begin`` let the model swing in. Each effect is fitted by its typical size, and
     then by what it does in the size found: what is large is not in proportion to what is typical.
@@ -88,8 +93,11 @@ def likenesses(theta: Theta, samples: Samples, ticks: Ticks, begin: int) -> list
     off = deviation(samples, ticks) / MBAR
     rows = np.isfinite(off)
     rows[:begin] = False
-    firsts = [effect.parameters[0] for effect in EFFECTS.values()]
-    typical = [(one.name, {p.name: p.typical for p in one.parameters}) for one in EFFECTS.values()]
+    effects = [*EFFECTS.values(), *known]
+    firsts = [effect.parameters[0] for effect in effects]
+    typical = [
+        (one.name, {p.name: p.typical for p in one.parameters if not p.shapes}) for one in effects
+    ]
     bounds = [np.array(first.range(theta)) / first.typical for first in firsts]
     sizes, shares = np.ones(len(typical)), np.zeros(len(typical))
 

@@ -15,7 +15,7 @@ from twin.inference.covariance import Covariance
 from twin.inference.sensitivities import derivatives
 from twin.model.dataset import DataSet, coefficients
 from twin.model.theta import Theta
-from twin.monitor.bank import DELAYS, LARGER, SUSPECTS, UNSURE_OF, hypotheses
+from twin.monitor.bank import DELAYS, LARGER, SUSPECTS, UNSURE_OF, Suspect, hypotheses, suspects_of
 from twin.monitor.bins import Bins, Floats, Ints, averaged
 from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import Healthy
@@ -32,7 +32,6 @@ SUCTION = 4.0  # s, commanded to see where each suspect switches
 # Sigmas² of a step: nothing in the cycle depends on it. Hypotheses that are stepped apart from each
 # other are a pascal apart, which looks like some 0.002; the least that depends has 3.
 WEAK = 0.01
-_COLUMNS = (len(SUSPECTS), len(SUSPECTS) + len(DELAYS) * LARGER)  # of hypotheses: what ends where
 
 
 @dataclass(frozen=True)
@@ -92,6 +91,7 @@ class Listener:
     healthy: Healthy
     noise: float  # mbar, of a row
     knees: Knees
+    suspects: Sequence[Suspect] = SUSPECTS
     _levels: Floats = field(init=False)  # mbar, by which each level moves, (levels, hypotheses)
     _means: Floats = field(init=False)  # mbar, of each level in healthy cycles
     _sigmas: Floats = field(init=False)
@@ -101,10 +101,11 @@ class Listener:
     def of(cls, data: DataSet, healthy: Healthy) -> "Listener":
         """The one for cycles beside the twin of a data set."""
         theta, noise = coefficients(data), data.sensor.noise_mbar
-        return cls(theta, healthy, noise, knees_of(data))
+        return cls(theta, healthy, noise, knees_of(data), suspects_of(data, theta))
 
     def __post_init__(self) -> None:
-        found = seen(hypotheses(self.theta), round(SUCTION / self.knees.period), self.knees)
+        looked = hypotheses(self.theta, self.suspects)
+        found = seen(looked, round(SUCTION / self.knees.period), self.knees)
         vacuum = np.array([one.levels for one in found]).T
         self._levels = np.nan_to_num(derivatives(vacuum)[1])
         known = [self.healthy.figures.get(name) for name in LEVELS]
@@ -129,7 +130,8 @@ class Listener:
         at = self._places(bins, shown)
         through = through[at.first]
         moved = np.concatenate([derivatives(through / MBAR)[1], self._levels[shown]])
-        suspects, larger, ways = np.split(moved, _COLUMNS, axis=1)
+        count = len(self.suspects)
+        suspects, larger, ways = np.split(moved, (count, count + len(DELAYS) * LARGER), axis=1)
         moves = self._moves(suspects[: len(at.first)])
         covariance = from_cycle_to_cycle(bins, at.first, at.goes_on, moves, self.noise)
         return Said(
@@ -163,7 +165,7 @@ class Listener:
     def _scatters(self) -> tuple[list[int], list[float]]:
         """Which suspects scatter in healthy cycles, and one sigma of each in its steps."""
         numbers, sigmas = [], []
-        for number, one in enumerate(SUSPECTS):
+        for number, one in enumerate(self.suspects):
             parameter, usual = SCATTER.get(one.effect, ("", 0.0))
             if parameter == one.parameter.name:
                 numbers.append(number)

@@ -160,7 +160,7 @@ def told(
     """
     raised, cleared, seen = episode.raised_ns, episode.cleared_ns, episode.acknowledged_ns
     return {
-        **named(episode.alarm, value),
+        **named(episode.alarm, value, episode.evidence.get("taken_in")),
         "raised": raised / S_NS,
         "cleared": cleared and cleared / S_NS,
         "seen": seen and seen / S_NS,
@@ -182,8 +182,11 @@ def told(
     }
 
 
-def named(alarm: str, value: str) -> dict[str, Any]:
-    """What it is, and where to look, as people say it."""
+def named(alarm: str, value: str, known: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """What it is, and where to look, as people say it; ``known`` says it of an effect taken in."""
+    if known:
+        what, where = _title(spoken(known["name"])), known["look_at"].partition(":")[0]
+        return {"what": what, "sentence": f"{known['sentence']}.", "where": where}
     cause = cause_of(value)
     if cause in EFFECTS:
         return {

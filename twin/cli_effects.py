@@ -1,0 +1,124 @@
+"""``twin effects``: how a real ejector can differ from its data set, and what more was found."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from twin.cli_app import App, read_config, say_if_new
+from twin.errors import ConfigError, SourceError
+
+if TYPE_CHECKING:
+    from twin.assets.database import Assets
+    from twin.assets.record import Record
+    from twin.diagnosis.propose import Proposal
+
+effects_app = App("The ways a real ejector can differ from its data set.", alone=True)
+
+
+@effects_app.callback(invoke_without_command=True)
+def list_(context: typer.Context) -> None:
+    """List the effects, their courses, and what a mechanism that nobody listed can be made of.
+
+    Those that were taken in stand with their type or unit: twin assets show NAME.
+    """
+    if context.invoked_subcommand:
+        return
+    from twin.model.courses import table as courses
+    from twin.model.effects import table
+    from twin.model.mechanism import places_table, whens_table
+
+    both = (one.replace("<br>", "; ") for one in (places_table(), whens_table()))
+    beside = "Where and when something can act that is none of these:"
+    print(table("; "), courses(), beside, *both, sep="\n\n")
+
+
+@effects_app.command()
+def add(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE.toml", help="As twin diagnose --propose wrote it.")
+    ],
+    *,
+    unit: Annotated[str, typer.Option("--id", metavar="ID", help="For this unit alone.")] = "",
+    kind: Annotated[
+        str, typer.Option("--type", metavar="TYPE", help="For all of a type, not the file's.")
+    ] = "",
+    site: Annotated[
+        bool, typer.Option("--site", help="For all types that the database has.")
+    ] = False,
+    log: Annotated[
+        Path | None, typer.Option(metavar="LOG.mcap", help="Where the log of its test is now.")
+    ] = None,
+    untested: Annotated[bool, typer.Option("--untested", help="Take it without its test.")] = False,
+    assets: Annotated[str, typer.Option("--assets", metavar="URL", help="Asset database.")] = "",
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            "--config", metavar="CONFIG", help="Take [assets] url, or the file beside it."
+        ),
+    ] = None,
+) -> None:
+    """Take an effect that was found into a catalogue: from then on it is searched for, and named.
+
+    Its test comes first: with it in the catalogue, a diagnosis of the log that it was found in must
+    name it.
+    """
+    from twin.assets.catalogue import take_in
+    from twin.assets.place import open_chosen
+    from twin.diagnosis.propose import Proposal
+
+    if sum(map(bool, (unit, kind, site))) > 1:
+        raise ConfigError("--id, --type and --site exclude each other", "take one of them")
+    proposal = Proposal.read(file)
+    document = read_config(config) if config else None
+    with open_chosen(assets, document, write=False, to_store=True) as database:
+        _targets(database, proposal, unit, kind, site)  # before the test takes its time
+    if untested:
+        print("not tested", file=sys.stderr)
+    else:
+        _test(proposal, file, log, assets)
+    say_if_new(assets, document)
+    entry = proposal.effect.model_dump(mode="json")
+    with open_chosen(assets, document, write=True) as database:
+        for target in _targets(database, proposal, unit, kind, site):
+            record = take_in(database, target, proposal.name, entry, file.name)
+            print(f"{record.name}: {proposal.name} added, {record.hash} in {database.name}")
+
+
+def _targets(
+    database: "Assets", proposal: "Proposal", unit: str, kind: str, site: bool
+) -> "list[Record]":
+    """The records that it is taken into."""
+    from twin.assets.catalogue import target_of
+
+    if site:
+        types = sorted({record.name for record in database.records("type")})
+        return [target_of(database, one, "") for one in types]
+    return [target_of(database, kind or proposal.type, unit)]
+
+
+def _test(proposal: "Proposal", file: Path, log: Path | None, assets: str) -> None:
+    """ConfigError if a diagnosis of its log does not name it, or the log is another one."""
+    from twin.assets.provenance import of_log
+    from twin.config import Config
+    from twin.diagnosis.propose import named_on
+    from twin.log.reader import open_log
+
+    path = log or Path(proposal.test.log)
+    skip = "say where it is with --log LOG.mcap, or take the effect without its test: --untested"
+    if not path.exists():
+        raise SourceError(f"{path}: the log of the test of {file} is not there", skip)
+    if of_log(path)["log_sha256"] != proposal.test.log_sha256:
+        raise ConfigError(f"{path}: not the log that the effect was found in", skip)
+    recorded = open_log(path)
+    known = Config.of_recorded(recorded.header, str(path))
+    if known.data.hash != proposal.effect.found_in.get("data_set"):  # it was found beside another
+        known = Config.of_recorded(recorded.header, str(path), assets=assets, unit=proposal.unit)
+    print(f"testing on {path}", file=sys.stderr)
+    if said := named_on(proposal, known, recorded, str(path)):
+        raise ConfigError(
+            f"{file}: with it in the catalogue, a diagnosis of {path} does not name it: {said}",
+            "widen low and high of its parameters, or take it without its test: --untested",
+        )
+    print(f"{proposal.name} is named on {path}")
