@@ -42,7 +42,7 @@ from twin.calibration.parameters import (
     values,
     with_values,
 )
-from twin.calibration.readings import Readings, read, turns
+from twin.calibration.readings import Readings, deep, read, turns
 from twin.calibration.report import commissioned_as_json, commissioned_in_words, headline
 from twin.calibration.store import store_first
 from twin.calibration.verdict import Residual, Verdict, judge
@@ -375,6 +375,17 @@ def test_a_turn_needs_what_noise_does_not_make() -> None:
     assert turns(smooth, 1.0) == ([49], [99])
     assert turns(smooth, 3.0) == ([], [])
     assert turns(fall, 1.0) == ([], [])
+
+
+@pytest.mark.parametrize(("falls", "again"), [(18.0, [60]), (2.0, [])])
+def test_the_nozzle_is_on_again_where_the_pressure_falls_to_where_it_went_off(
+    falls: float, again: list[int]
+) -> None:
+    """A wave after the nozzle is off, and what then rises on, is no hysteresis of 2 mbar."""
+    down, up = np.linspace(1000.0, 400.0, 41), np.linspace(400.0, 420.0, 21)[1:]
+    after = np.linspace(420.0, 420.0 - falls, 11)[1:]
+    smooth = np.concatenate([down, up, after, np.linspace(after[-1], 440.0, 20)])
+    assert deep(smooth, *turns(smooth, 1.0)) == ([40, 70] if again else [40], again)
 
 
 def test_the_record_corrects_the_configuration_and_says_the_line() -> None:

@@ -30,6 +30,7 @@ CLEAR = 6.0  # sigmas of the smoothed pressure that make a turn
 LEAST_TURN = 1.5 * MBAR  # Pa
 EDGE_MS = 30.0  # after a command, in which a turn is still the valve's delay
 DEEP = 0.3  # of the way down, from the lowest, in which the nozzle may go off
+AGAIN = 0.5  # of a rise, by which the pressure falls after it where the nozzle is on again
 STEEP_MS, BACK_MS = 10.0, 200.0  # what flows back without a check valve does so at once
 LEAST_VACUUM = 20.0 * MBAR  # Pa
 MOST_SUCTIONS = 0.5  # of all suctions must turn for an ejector that saves air
@@ -223,7 +224,22 @@ def deep(smooth: Floats, lows: list[int], highs: list[int]) -> tuple[list[int], 
         return [], []
     lowest = smooth.min()
     lows = [row for row in lows if smooth[row] - lowest < DEEP * (smooth[0] - lowest)]
-    return lows, [row for row in highs if lows and row > lows[0]]
+    return drawn_again(smooth, lows, [row for row in highs if lows and row > lows[0]])
+
+
+def drawn_again(smooth: Floats, lows: list[int], highs: list[int]) -> tuple[list[int], list[int]]:
+    """Without the turns of a rise that goes on: waves in the line, and walls that warm the gas.
+
+    Where the nozzle goes on again, it draws down to where it went off.
+    """
+    kept, on = lows[:1], list[int]()
+    for high in highs:
+        after = next((row for row in lows if row > high), high + int(np.argmin(smooth[high:])))
+        risen, fallen = smooth[high] - smooth[[kept[-1], after]]
+        if fallen > AGAIN * risen:
+            on.append(high)
+            kept += [after] if after in lows else []
+    return kept, on
 
 
 def _smoothed(pressure: Floats, width: int) -> Floats:
