@@ -60,11 +60,18 @@ def suction_flow(theta: Theta, p: float, jet: float, supply: float) -> float:
     end = theta[c.END_RATIO] * ambient * (1.0 + theta[c.END_SLOPE] * missing)
     end = min(max(end, 0.0), 0.98 * ambient)
     deep = 1.0 - theta[c.JET_DEPTH] * (1.0 - jet)
-    x = min(max(deep - (ambient - p) / (ambient - end), 0.0), 1.2)
+    x = max(deep - (ambient - p) / (ambient - end), 0.0)
+    share = max(characteristic(theta, min(x, 1.0)), 0.0)
+    if x > 1.0:  # above ambient it goes on straight
+        rise = (characteristic(theta, 1.0) - characteristic(theta, 1.0 - 1e-6)) / 1e-6
+        share += (x - 1.0) * max(rise, 0.0)
+    return float(jet * capacity * share)
+
+
+def characteristic(theta: Theta, x: float) -> float:
     bend = np.polyval(theta[[c.BEND_3, c.BEND_2, c.SKEW, c.BULGE]], x)
     first = x * (1.0 + (1.0 - x) * bend)
-    share = (1.0 - theta[c.KINK]) * first + theta[c.KINK] * second_stage(x, theta[c.KINK_AT])
-    return float(jet * capacity * max(share, 0.0))
+    return float((1.0 - theta[c.KINK]) * first + theta[c.KINK] * second_stage(x, theta[c.KINK_AT]))
 
 
 def second_stage(x: float, closes: float) -> float:

@@ -152,6 +152,17 @@ def test_the_slope_is_that_of_the_characteristic(
     assert share == pytest.approx(float(shape[0]))
 
 
+def test_above_ambient_the_characteristic_goes_on_straight_whatever_its_bends() -> None:
+    """A vessel that blow-off has filled to 1.4 bar is drawn faster than one at ambient."""
+    k = bent(bulge=-0.6, skew=5.2, bend_2=-10.8, bend_3=7.0)
+    share, slope = characteristic(1.0, k, 0)
+    assert (share, slope) == (1.0, pytest.approx(1.0 - (-0.6 + 5.2 - 10.8 + 7.0)))
+    for x in (1.1, 1.5):
+        assert characteristic(x, k, 0) == (pytest.approx(1.0 + (x - 1.0) * slope), slope)
+    flat = bent(bulge=1.0)  # at ambient it rises no more
+    assert characteristic(1.3, flat, 0) == (1.0, 0.0)
+
+
 @pytest.mark.parametrize(("second", "depth"), [(0.3, 0.5), (0.45, 0.35), (0.6, 0.7)])
 def test_the_kink_of_a_second_stage_is_that_of_the_simulated_rig(
     second: float, depth: float

@@ -147,7 +147,8 @@ INLINED Supplied at_supply(double supply, const double *k)
 INLINED Tangent characteristic(double x, const double *k)
 {
     double b0 = K(BULGE), b1 = K(SKEW), b2 = K(BEND_2), b3 = K(BEND_3);
-    x = min(max(x, 0.0), 1.2);
+    double above = max(x - 1.0, 0.0);
+    x = min(max(x, 0.0), 1.0);
     double bend = b0 + x * (b1 + x * (b2 + x * b3));
     double slope = b1 + x * (2.0 * b2 + x * 3.0 * b3);
     double beyond = x - K(KINK_AT), first = 1.0 - K(KINK);
@@ -155,8 +156,8 @@ INLINED Tangent characteristic(double x, const double *k)
     double share = first * x * (1.0 + (1.0 - x) * bend) + K(K_OPENS) * (root + beyond - K(K_CLOSED));
     double rise = first * (1.0 + (1.0 - 2.0 * x) * bend + x * (1.0 - x) * slope);
     rise += K(K_OPENS) * (beyond / root + 1.0);
-    share = max(share, 0.0);
-    return (Tangent){share, x > 0.0 ? max(rise, 0.0) : 0.0};
+    rise = x > 0.0 ? max(rise, 0.0) : 0.0;
+    return (Tangent){max(share, 0.0) + above * rise, rise};
 }
 
 INLINED Port at_port(double p, const Driven *driven, const double *k)

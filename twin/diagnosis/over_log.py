@@ -79,9 +79,10 @@ def _course(
     axes: Axes, evidence: Evidence, cause: Cause, known: dict[str, Any], colour: str
 ) -> None:
     """Draw how big a cause is over the log, with the interval of its size."""
-    several = len(known["parameters"]) > 1
+    sizes = [p for p in effect_of(cause.effect).parameters if not p.shapes]
+    several = sum(p.name in known["parameters"] for p in sizes) > 1
     scale, _ = _scale(evidence)
-    for p in effect_of(cause.effect).parameters:
+    for p in sizes:
         if p.name not in known["parameters"]:
             continue  # nothing in this log depends on it
         seconds, (value, low, high) = size_over_log(evidence, cause, p, known["parameters"][p.name])

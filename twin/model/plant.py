@@ -186,10 +186,12 @@ def characteristic(x, k, i):  # type: ignore[no-untyped-def]
 
     ``x`` runs from 0 at end pressure to 1 at ambient. Straight (the founding paper's shape) where
     all bends are zero. A second stage opens where the first is moved enough by itself, a KINK.
-    Below end pressure the check valve closes: no flow back.
+    Below end pressure the check valve closes: no flow back. Above ambient it goes on straight:
+    bends are fitted below it, and say nothing of a vessel that blow-off has filled.
     """
     b0, b1, b2, b3 = k[c.BULGE, i], k[c.SKEW, i], k[c.BEND_2, i], k[c.BEND_3, i]
-    x = min(max(x, 0.0), 1.2)
+    above = max(x - 1.0, 0.0)
+    x = min(max(x, 0.0), 1.0)
     bend = b0 + x * (b1 + x * (b2 + x * b3))
     slope = b1 + x * (2.0 * b2 + x * 3.0 * b3)
     beyond, first = x - k[c.KINK_AT, i], 1.0 - k[c.KINK, i]
@@ -197,7 +199,8 @@ def characteristic(x, k, i):  # type: ignore[no-untyped-def]
     share = first * x * (1.0 + (1.0 - x) * bend) + k[_OPENS, i] * (root + beyond - k[_CLOSED, i])
     rise = first * (1.0 + (1.0 - 2.0 * x) * bend + x * (1.0 - x) * slope)
     rise += k[_OPENS, i] * (beyond / root + 1.0)
-    return max(share, 0.0), (max(rise, 0.0) if x > 0.0 else 0.0)
+    rise = max(rise, 0.0) if x > 0.0 else 0.0
+    return max(share, 0.0) + above * rise, rise
 
 
 def suction_at(theta: Theta, p: float) -> float:
