@@ -19,8 +19,7 @@ def carried_on(database: Assets, unit: str, data: Mapping[str, Any]) -> dict[str
     """
     before = holding(database.records("instance", unit), time.time_ns())
     own = before.data.get(CATALOGUE, {}) if before else {}
-    rest = {key: value for key, value in data.items() if key != CATALOGUE}
-    return rest | ({CATALOGUE: own} if own else {})
+    return {**data, CATALOGUE: own} if own or CATALOGUE in data else dict(data)
 
 
 def take_in(
