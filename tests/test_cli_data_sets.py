@@ -203,7 +203,7 @@ def test_a_log_with_a_data_set_of_another_shape_is_named_with_the_key(
         problem, hint = said(capsys)
         assert problem == (
             "twin: new.mcap: its data set cannot be used: data.colour: unknown key:"
-            " known are ambient, effects, ejector, sensor, supply, system, terms"
+            " known are ambient, catalogue, effects, ejector, sensor, supply, system, terms"
         )
         assert "--config CONFIG" in hint
         assert "9.8.7" in hint

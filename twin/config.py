@@ -488,14 +488,17 @@ def _in_words(error: ValidationError, kind: type[Settings] = Known) -> str:
 
 
 def _left_out(whole: Any, given: Any, at: str = "") -> Iterator[str]:
-    """The keys of ``whole`` that are not in ``given``, where both have tables or lists."""
+    """The keys of ``whole`` that are not in ``given``, where both have tables or lists.
+
+    An empty catalogue of effects may be left out: it says nothing of the pressure.
+    """
     if isinstance(whole, Mapping) and isinstance(given, Mapping):
         for key, value in whole.items():
             here = f"{at}.{key}".removeprefix(".")
-            if key not in given:
-                yield here
-            else:
+            if key in given:
                 yield from _left_out(value, given[key], here)
+            elif value or key != "catalogue":
+                yield here
     elif isinstance(whole, list | tuple) and isinstance(given, list | tuple):
         for number, (one, other) in enumerate(zip(whole, given, strict=True)):
             yield from _left_out(one, other, f"{at}.{number}")

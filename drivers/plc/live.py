@@ -81,9 +81,11 @@ async def _run(
     boot = start_ns // 10_000_000 & 0xFFFF
     memories = [Registers(task, start_ns, boot) for task in tasks]
     _let_clock_be_set(memories)
-    if witness is not None:
-        tasks[0].witness = _witness(witness, memories[0])
-    async with listening(memories, catch_up) as port, _opcua(memories, catch_up) as opcua:
+    async with (
+        _witnessed(tasks[0], memories[0], witness),
+        listening(memories, catch_up) as port,
+        _opcua(memories, catch_up) as opcua,
+    ):
         ready(tasks[0].settings.server.host, port)
         if opcua:
             print(f"OPC UA on {opcua.url}", flush=True)  # noqa: T201 - as above
@@ -107,18 +109,29 @@ def _let_clock_be_set(memories: Sequence[Registers]) -> None:
     loop.add_signal_handler(signal.SIGUSR2, set_by, -SET_NS)
 
 
-def _witness(path: Path, memory: Registers) -> Callable[[Scans], None]:
-    """What keeps scans in a file; without a buffer, so that nothing is lost with the process."""
-    file = path.open("wb", buffering=0)
+@asynccontextmanager
+async def _witnessed(task: Task, memory: Registers, path: Path | None) -> AsyncIterator[None]:
+    """Keep scans in a file, if one is wanted; no buffer, so that nothing is lost with the process.
 
-    def keep(scans: Scans) -> None:
-        rows = np.empty(len(scans), WITNESSED)
-        for name in ("sequence", "pressure", "status"):
-            rows[name] = scans[name]
-        rows["time_ns"] = memory.start_ns + scans["sequence"] * PERIOD_NS
-        file.write(rows.tobytes())
+    The last scans come as the servers end, so it closes after them.
+    """
+    if path is None:
+        yield
+        return
+    with path.open("wb", buffering=0) as file:
 
-    return keep
+        def keep(scans: Scans) -> None:
+            rows = np.empty(len(scans), WITNESSED)
+            for name in ("sequence", "pressure", "status"):
+                rows[name] = scans[name]
+            rows["time_ns"] = memory.start_ns + scans["sequence"] * PERIOD_NS
+            file.write(rows.tobytes())
+
+        nobody, task.witness = task.witness, keep
+        try:
+            yield
+        finally:
+            task.witness = nobody
 
 
 @asynccontextmanager
