@@ -10,8 +10,8 @@ import rigs
 
 from twin.alarms import watch
 from twin.events import Event, Kind
+from twin.model.catalogue import CatalogueEffect
 from twin.model.effects import UNKNOWN
-from twin.model.known import KnownEffect
 from twin.monitor.bank import SUSPECTS, Bank, hypotheses
 from twin.monitor.cycles import Cycle, Look, cut, figures
 from twin.monitor.detect import Monitor, MonitorSettings
@@ -122,7 +122,7 @@ def test_what_nobody_listed_is_an_alternative_to_the_name(
 
 def test_an_effect_that_was_taken_in_is_named_like_any_other() -> None:
     """And those of the table keep their names beside it."""
-    lip = KnownEffect.model_validate(
+    lip = CatalogueEffect.model_validate(
         {
             "mechanism": "opening_above",
             "sentence": "A lip lifts off",

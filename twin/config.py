@@ -20,6 +20,7 @@ from twin.assets.diagram import FLOW, SUPPLY, VACUUM
 from twin.assets.record import Found, Record, UnknownAssetError
 from twin.errors import ConfigError, SourceError, known_names
 from twin.log.header import LogHeader
+from twin.model.catalogue import effects_in
 from twin.model.dataset import DataSet
 from twin.model.diagram import reduce
 from twin.monitor.detect import MonitorSettings
@@ -227,6 +228,7 @@ class Config:
 
     @classmethod
     def _checked(cls, document: Document, asset: Asset, known: Known, origin: str) -> "Config":
+        effects_in(known.data.catalogue)  # known by name from here on, in words as in alarms
         monitor = document.section(MonitorSettings, "monitor")
         monitor = monitor.model_copy(update={"healthy": known.healthy})
         log = document.section(LogSettings, "log")

@@ -1,6 +1,6 @@
 """The causes that a deviation can have: each has an alarm of its own."""
 
-from twin.model.effects import EFFECTS, UNKNOWN, meaning
+from twin.model.effects import EFFECTS, UNKNOWN, find_effect
 
 DEVIATION = "deviation"
 UNLISTED = "unlisted"  # a deviation that no effect explains
@@ -23,9 +23,9 @@ def known(effect: str) -> str:
     return effect if effect in CAUSES else UNLISTED
 
 
-def taken_in(effect: str) -> dict[str, dict[str, str]]:
+def catalogue_words(effect: str) -> dict[str, dict[str, str]]:
     """Words for an effect of a catalogue, which has no alarm of its own, beside other evidence."""
-    found = None if effect in CAUSES else meaning(effect)
+    found = None if effect in CAUSES else find_effect(effect)
     if found is None:
         return {}
     return {"taken_in": {"name": effect, "sentence": found.sentence, "look_at": found.look_at}}

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from twin.alarms.board import Board, Diary, Episode, joined
-from twin.alarms.causes import CAUSES, UNLISTED, known, taken_in, value_of
+from twin.alarms.causes import CAUSES, UNLISTED, catalogue_words, known, value_of
 from twin.alarms.requests import Request, grant
 from twin.alarms.rules import Rule
 from twin.alarms.state import Alarm, Change, Deed, Kept
@@ -321,4 +321,6 @@ def _received(samples: Samples, time_ns: int, else_ns: int) -> int:
 def _sizes(cause: Mapping[str, Any]) -> dict[str, Any]:
     """What a diagnosis says of one cause."""
     wanted = ("effect", "course", "parameters", "probability", "not_separable_from")
-    return {key: cause[key] for key in wanted if key in cause} | taken_in(cause.get("effect", ""))
+    return {key: cause[key] for key in wanted if key in cause} | catalogue_words(
+        cause.get("effect", "")
+    )

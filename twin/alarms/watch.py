@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from twin.alarms.causes import CAUSES, DEVIATION, known, taken_in, value_of
+from twin.alarms.causes import CAUSES, DEVIATION, catalogue_words, known, value_of
 from twin.events import Event, Kind
 from twin.figures.table import FIGURES
 from twin.figures.warnings import CAUTIONS
@@ -70,7 +70,7 @@ def evidence(event: Event) -> dict[str, Evidence]:
         cause = known(effect)
         measured = {key: event.data[key] for key in _MEASURE if key in event.data}
         guess = {} if cause == UNKNOWN else {"guess": cause}
-        told = {"words": event.text, **guess, **measured, **taken_in(effect), **_in(event)}
+        told = {"words": event.text, **guess, **measured, **catalogue_words(effect), **_in(event)}
         return {value_of(cause): told}
     if event.kind is Kind.CYCLE:
         standing = event.data.get("warnings", ())

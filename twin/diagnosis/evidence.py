@@ -22,10 +22,10 @@ from twin.config import Config
 from twin.live import Twin
 from twin.model import kernel
 from twin.model import theta as c
+from twin.model.catalogue import CatalogueEffect, effects_in
 from twin.model.courses import Cause, Schedule, schedule
 from twin.model.dataset import DataSet, coefficients
 from twin.model.effects import Effect, acting_on
-from twin.model.known import KnownEffect, effects_in
 from twin.model.plant import reading_of, sensed_of
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
@@ -98,7 +98,7 @@ class Evidence:
     gauge: bool  # the pressure sensor counts from ambient
     told: frozenset[str] = frozenset()  # surroundings that somebody measures
     another_day: bool = True  # than that of the calibration
-    catalogue: Mapping[str, KnownEffect] = field(default_factory=dict)  # known beside the table
+    catalogue: Mapping[str, CatalogueEffect] = field(default_factory=dict)  # known beside the table
     _seen: dict[bytes, Seen] = field(default_factory=dict)  # by coefficients
 
     @property

@@ -20,10 +20,10 @@ from twin.errors import ConfigError
 from twin.inference.levels import SIGMAS_95
 from twin.inference.sensitivities import derivatives
 from twin.live import Twin
+from twin.model.catalogue import mechanism_of
 from twin.model.courses import Cause, Course
 from twin.model.dataset import DataSet, coefficients
 from twin.model.effects import Parameter, apply, effect_of
-from twin.model.known import mechanism_of
 from twin.model.mechanism import MECHANISMS
 from twin.model.term import AGAIN
 from twin.monitor.bins import Floats
@@ -106,7 +106,7 @@ def store(
         valid_from_ns=provenance.valid_from(_since(diagnosis)),
     )
     with open_chosen(assets, config.document, write=True) as database:
-        record = replace(record, data=carried_on(database, unit, record.data))
+        record = replace(record, data=carried_on(database, config.asset.id or unit, record.data))
         return database.add(record), database.name
 
 

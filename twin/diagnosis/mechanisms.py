@@ -16,8 +16,8 @@ from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.fit import Fitted, fit, interval, white
 from twin.diagnosis.weights import Weights, covariance
 from twin.inference.levels import CHI2_999
+from twin.model.catalogue import has_room
 from twin.model.courses import Cause
-from twin.model.known import has_room
 from twin.model.mechanism import MECHANISMS, Mechanism
 from twin.monitor.bins import Floats
 
@@ -39,9 +39,6 @@ DISPLACES = 0.6
 # better where listed causes leave no more than healthy cycles have, and it is told from how it
 # does. Chosen: a lip that lifts is 115 better than the porous leak that mimics it, with 0.24.
 LIKELIER, HALF = 30.0, 0.5
-
-
-_ANY = next(iter(MECHANISMS))
 
 
 @dataclass(frozen=True)
@@ -72,8 +69,8 @@ def explain(
     None where none explains most of what is off, beside them of what they leave.
     """
     alone = explain_alone(evidence, fitted, found, progress)
-    names = (*(cause.effect for cause in found), _ANY)
-    if alone or not found or not has_room(evidence.theta, names):
+    names = [cause.effect for cause in found]
+    if alone or not found or not has_room(evidence.theta, names, more=1):
         return alone
     return _explained(evidence, fitted, found, _best(evidence, fitted, found, progress))
 
@@ -82,7 +79,7 @@ def explain_alone(
     evidence: Evidence, fitted: Sequence[int], found: Hypothesis, progress: Progress
 ) -> Explained | None:
     """The mechanism that suits best by itself; None if it does not displace what was ``found``."""
-    if not has_room(evidence.theta, (_ANY,)):
+    if not has_room(evidence.theta, (), more=1):
         return None
     progress("trying mechanisms")
     alone = _explained(evidence, fitted, HEALTHY, _best(evidence, fitted, HEALTHY, progress))

@@ -15,8 +15,8 @@ from twin.config import Config
 from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.errors import ConfigError
 from twin.log.reader import Log
+from twin.model.catalogue import CatalogueEffect, Range, refuse_name
 from twin.model.effects import Parameter
-from twin.model.known import NAME, KnownEffect, Range, refuse_name
 from twin.model.mechanism import MECHANISMS, Mechanism
 from twin.settings import Document, Settings
 
@@ -49,7 +49,7 @@ class Proposal(Settings):
     name: str  # as answers call it
     type: str  # of the ejectors that it was found on
     unit: str = ""  # on which it was found
-    effect: KnownEffect
+    effect: CatalogueEffect
     test: Test
 
     @classmethod
@@ -80,7 +80,7 @@ def proposed(diagnosis: Diagnosis, config: Config, log: Path, file: Path) -> str
         "effect": {
             "mechanism": mechanism.name,
             "sentence": _sentence(mechanism),
-            "look_at": "what was found where it was seen first",
+            "look_at": CatalogueEffect.model_fields["look_at"].default,
             "parameters": {
                 one.name: _range(mechanism, one, values[one.name], told.get(one.name))
                 for one in mechanism.effect.parameters
@@ -89,7 +89,7 @@ def proposed(diagnosis: Diagnosis, config: Config, log: Path, file: Path) -> str
         },
         "test": {"log": str(log.resolve()), "log_sha256": of_log["log_sha256"]},
     }
-    KnownEffect.model_validate(tables["effect"])  # what add would refuse is not proposed
+    CatalogueEffect.model_validate(tables["effect"])  # what add would refuse is not proposed
     said = diagnosis.json["unlisted"]["mechanism"]["sentence"]
     return INTRODUCTION.format(sentence=said, file=file) + "\n" + tomli_w.dumps(tables)
 
@@ -111,7 +111,7 @@ def _can_be_a_name(name: str) -> bool:
         refuse_name(name)
     except ConfigError:
         return False
-    return bool(NAME.fullmatch(name))
+    return True
 
 
 def _sentence(mechanism: Mechanism) -> str:

@@ -14,9 +14,9 @@ from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.hypotheses import price, sized
 from twin.diagnosis.weights import Weights, levels
 from twin.inference.sensitivities import derivatives
+from twin.model.catalogue import has_room
 from twin.model.courses import Cause, Course
 from twin.model.effects import Parameter, effect_of
-from twin.model.known import has_room
 from twin.monitor.bins import Floats, Ints
 
 # Of its typical size, at which an effect's signature is taken. A delay moves what is sharp: a small

@@ -28,8 +28,8 @@ from twin.diagnosis.hypotheses import (
 from twin.diagnosis.screen import Columns, Signatures, columns, pairs, promises, signatures
 from twin.diagnosis.weights import Covariance, Weights, covariance
 from twin.inference.levels import CHI2_95, CHI2_999, SIGMAS_95
+from twin.model.catalogue import has_room
 from twin.model.courses import Cause, Course
-from twin.model.known import has_room
 from twin.monitor.bins import Floats
 from twin.signals import MS
 

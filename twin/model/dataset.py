@@ -16,9 +16,9 @@ from pydantic import Field, field_validator, model_validator
 
 from twin.errors import ConfigError
 from twin.model import theta as c
+from twin.model.catalogue import CatalogueEffect, refuse_name
 from twin.model.effects import FLATTEST, apply
 from twin.model.gas import CRITICAL_RATIO, GAMMA, R
-from twin.model.known import KnownEffect, refuse_name
 from twin.model.system import Part, Tube, Vessel, lumped
 from twin.model.term import Term
 from twin.model.theta import Theta
@@ -233,11 +233,11 @@ class DataSet(Settings):
     effects: Mapping[str, Mapping[str, float]] = Field(default_factory=dict)
     terms: tuple[Term, ...] = ()  # the same: what data added where no effect is known
     # Effects that were found before and taken in: the search has them beside its table, by name.
-    catalogue: Mapping[str, KnownEffect] = Field(default_factory=dict)
+    catalogue: Mapping[str, CatalogueEffect] = Field(default_factory=dict)
 
     @field_validator("catalogue")
     @classmethod
-    def _named(cls, catalogue: Mapping[str, KnownEffect]) -> Mapping[str, KnownEffect]:
+    def _named(cls, catalogue: Mapping[str, CatalogueEffect]) -> Mapping[str, CatalogueEffect]:
         try:
             for name in catalogue:
                 refuse_name(name)

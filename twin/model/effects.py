@@ -364,14 +364,14 @@ def add_beside(effects: Mapping[str, Effect]) -> None:
     _BESIDE.update(effects)
 
 
-def meaning(name: str) -> Effect | None:
+def find_effect(name: str) -> Effect | None:
     """The effect of a name, of the table or beside it; None where it is not known here."""
     return EFFECTS.get(name) or _BESIDE.get(name)
 
 
 def effect_of(name: str) -> Effect:
-    """The same. ConfigError where there is none."""
-    found = meaning(name)
+    """The effect of a name, of the table or beside it. ConfigError where there is none."""
+    found = find_effect(name)
     if found is None:
         raise ConfigError(f"unknown effect {name!r}", "twin effects lists them")
     return found

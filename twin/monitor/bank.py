@@ -13,10 +13,10 @@ import numpy.typing as npt
 
 from twin.model import kernel
 from twin.model import theta as c
+from twin.model.catalogue import effects_in
 from twin.model.compiled import compiled
 from twin.model.dataset import DataSet
 from twin.model.effects import EFFECTS, Effect, Parameter, apply
-from twin.model.known import effects_in
 from twin.model.theta import Theta
 from twin.monitor.bins import Floats, Ints, sparse_rows
 from twin.monitor.cycles import Cycle

@@ -12,7 +12,7 @@ import numpy as np
 from twin.inference.sensitivities import coefficients_at, sensitivities
 from twin.model import kernel
 from twin.model.compiled import compiled
-from twin.model.effects import EFFECTS, UNKNOWN, Effect, meaning
+from twin.model.effects import EFFECTS, UNKNOWN, Effect, find_effect
 from twin.model.theta import Theta
 from twin.monitor.bins import Floats, Ints, drawn
 from twin.signals import BREAK, MBAR, NS, Samples, Ticks, deviation
@@ -35,7 +35,7 @@ class Likeness:
     @property
     def is_small(self) -> bool:
         """Whether what it does is about in proportion to its size: typical ones are the limit."""
-        effect = meaning(self.effect)
+        effect = find_effect(self.effect)
         typical = effect.parameters[0].typical if effect else 0.0
         return self.size is not None and abs(self.size) <= typical
 

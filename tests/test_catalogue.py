@@ -1,5 +1,6 @@
 """Effects that were found and taken in: a file that a person reads, a catalogue, a name."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +18,10 @@ from twin.diagnosis.propose import Proposal
 from twin.errors import ConfigError
 from twin.exchange.aas import read_package, write_package
 from twin.model import theta as c
+from twin.model.catalogue import CatalogueEffect, effects_in, has_room, mechanism_of
 from twin.model.courses import HOUR, Cause, Course
 from twin.model.dataset import DataSet, coefficients
-from twin.model.effects import apply, effect_of
-from twin.model.known import KnownEffect, effects_in, has_room, mechanism_of
+from twin.model.effects import apply, effect_of, find_effect
 from twin.model.mechanism import MECHANISMS, SLOTS, free_slots
 from twin.settings import Document
 
@@ -38,8 +39,8 @@ LIP = {
 KIND = "compact-ejector-35"
 
 
-def known(**changes: object) -> KnownEffect:
-    return KnownEffect.model_validate(LIP | changes)
+def known(**changes: object) -> CatalogueEffect:
+    return CatalogueEffect.model_validate(LIP | changes)
 
 
 def proposal(folder: Path, **changes: object) -> Path:
@@ -151,6 +152,16 @@ def test_it_is_taken_in_for_a_type_and_comes_with_each_unit(
     assert config.data.hash == before.data.hash  # the same pressures are expected
 
 
+def test_its_name_is_known_wherever_a_configuration_is() -> None:
+    """An answer from another process names it: whoever puts that into words has only this."""
+    config = rigs.config("gripper")
+    data = config.data.model_copy(update={"catalogue": {"only_in_this_log": known()}})
+    header = replace(config, data=data).log_header()
+    assert find_effect("only_in_this_log") is None
+    Config.of_recorded(header, "x.mcap")
+    assert effect_of("only_in_this_log").look_at == "the lips of the cups"
+
+
 def test_without_its_log_it_is_not_taken_in_untested(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -188,5 +199,5 @@ def test_it_goes_with_the_asset_in_shells(tmp_path: Path) -> None:
 def test_a_log_has_the_catalogue_that_it_was_recorded_with() -> None:
     config = rigs.config("gripper")
     data = config.data.model_copy(update={"catalogue": {"lifting_lip": known()}})
-    header = Config(config.document, config.asset, data, config.monitor, config.log).log_header()
+    header = replace(config, data=data).log_header()
     assert Config.of_recorded(header, "x.mcap").data.catalogue["lifting_lip"] == known()

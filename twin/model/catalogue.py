@@ -37,7 +37,7 @@ class Range(Settings):
         return self
 
 
-class KnownEffect(Settings):
+class CatalogueEffect(Settings):
     """A mechanism that was found, with words for people and the range of each of its numbers."""
 
     mechanism: str  # what acts where and when; docs/mechanisms.md lists them
@@ -47,7 +47,7 @@ class KnownEffect(Settings):
     found_in: Mapping[str, str] = Field(default_factory=dict)  # unit, log, data set, program
 
     @model_validator(mode="after")
-    def _is_one_of_the_mechanisms(self) -> "KnownEffect":
+    def _is_one_of_the_mechanisms(self) -> "CatalogueEffect":
         if self.mechanism not in MECHANISMS:
             raise ValueError(
                 f"mechanism {self.mechanism!r} is none; {known_names(self.mechanism, MECHANISMS)}"
@@ -95,7 +95,7 @@ def _has_room(theta: Theta) -> bool:
     return free_slots(theta) > 0
 
 
-_REGISTERED: dict[str, KnownEffect] = {}
+_REGISTERED: dict[str, CatalogueEffect] = {}
 
 
 def refuse_name(name: str) -> None:
@@ -109,7 +109,7 @@ def refuse_name(name: str) -> None:
         )
 
 
-def effects_in(catalogue: Mapping[str, KnownEffect]) -> list[Effect]:
+def effects_in(catalogue: Mapping[str, CatalogueEffect]) -> list[Effect]:
     """The effects of a catalogue; from then on they are known by name in this process.
 
     ConfigError where a name stands for another mechanism already.
@@ -132,6 +132,6 @@ def mechanism_of(name: str) -> str:
     return _REGISTERED[name].mechanism if name in _REGISTERED else name
 
 
-def has_room(theta: Theta, effects: Iterable[str]) -> bool:
-    """Whether so many effects beside the table can act at once."""
-    return sum(one not in EFFECTS for one in effects) <= free_slots(theta)
+def has_room(theta: Theta, effects: Iterable[str], more: int = 0) -> bool:
+    """Whether those of the effects that are beside the table, and so many more, can act at once."""
+    return more + sum(one not in EFFECTS for one in effects) <= free_slots(theta)
