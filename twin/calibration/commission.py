@@ -65,6 +65,10 @@ SAGS = {"droop_bar": 0.1, "lag_ms": 50.0}  # a supply, before anything is known 
 CLEARLY = 15.0  # mbar by which a threshold must differ to be told; overshoot is part of a turn
 # Of the line, by which a sensor is at another place than told, and sigmas.
 ELSEWHERE, SURELY = 0.6, 4.0
+# Above ambient (mbar), from where on a record that goes so high has met a relief valve. It opens at
+# about half of that.
+RELIEVED, RELIEVES = 60.0, 0.5
+DRAINS = 0.2  # of the rate at which blow-off fills, by which it drains a reservoir of its own
 LITTLE_VACUUM = 200.0  # mbar; flow ejectors on leaking parts make more
 AMBIENT_CLEARLY = 3.0  # mbar, the same for ambient pressure
 # Share by which the evacuated volume must differ from what is told: nearly twice what a flow meter
@@ -349,6 +353,10 @@ def _flows(ejector: dict[str, Any], readings: Readings, evacuated: float, ambien
         ejector["blow_off_sl_min"] = float(np.clip(blow_off, 1.0, 2000.0))
         ejector["exhaust_sl_min"] = ejector["blow_off_sl_min"]
         ejector["relief_sl_min"] = 0.3 * ejector["blow_off_sl_min"]
+        ejector["blow_off_drain_per_s"] = DRAINS * readings.fill_rate
+    highest = (readings.highest - ambient) / MBAR
+    relieved = RELIEVES * highest if highest > RELIEVED else ejector["cracking_pressure_mbar"]
+    ejector["relief_pressure_mbar"] = relieved
     back = readings.back_flow(evacuated, ambient, ROOM_TEMPERATURE) / SL_MIN
     if np.isfinite(back):
         ejector["back_flow_sl_min"] = float(np.clip(back, 0.0, 2000.0))

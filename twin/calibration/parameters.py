@@ -70,10 +70,10 @@ FREE = (
         model_form=0.22,
     ),
     Free(_E, "end_pressure_mbar", "mbar", 40.0, 10.0, 700.0, healthy=(4.0, 2.0), market=0.5),
-    Free(_E, "bulge", "", 0.5, -1.0, 3.0, market=0.8, scaled=False),
-    Free(_E, "skew", "", 0.2, -20.0, 20.0, market=0.5, scaled=False),
-    Free(_E, "bend_2", "", 0.15, -40.0, 40.0, market=0.4, scaled=False),
-    Free(_E, "bend_3", "", 0.05, -40.0, 40.0, market=0.2, scaled=False),
+    Free(_E, "bulge", "", 0.5, -1.0, 4.0, market=1.0, scaled=False),
+    Free(_E, "skew", "", 0.2, -20.0, 20.0, market=0.7, scaled=False),
+    Free(_E, "bend_2", "", 0.15, -40.0, 40.0, market=0.5, scaled=False),
+    Free(_E, "bend_3", "", 0.05, -40.0, 40.0, market=0.3, scaled=False),
     Free(_E, "response_ms", "ms", 5.0, 0.0, 400.0, healthy=_ANY, market=0.6),
     Free(_E, "response_off_ms", "ms", 4.0, 0.0, 400.0, market=0.6),
     Free(_E, "ramp_up_ms", "ms", 3.0, 0.5, 200.0, market=0.7),
@@ -104,6 +104,35 @@ _SMOOTH = np.array(
     ]
 )
 
+# A characteristic may also be said by how much it rises in each of five parts, as the coefficients
+# of Bernstein's polynomials do, and with such rises above zero it rises everywhere: bends from
+# them, (bends, parts).
+_FROM_RISES = np.array(
+    [
+        [4.0, -1.0, -1.0, -1.0, -1.0],
+        [-6.0, 9.0, -1.0, -1.0, -1.0],
+        [4.0, -11.0, 9.0, -1.0, -1.0],
+        [-1.0, 4.0, -6.0, 4.0, -1.0],
+    ]
+)
+_PARTS = _FROM_RISES.shape[1]
+# Courses of the logarithm of the rises over the parts, the finer ones last, (parts, bends).
+_TILTS = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, _PARTS), len(_BENDS))[:, 1:]
+LEAST_RISE = 1e-3  # of all, in a part of a characteristic from which a fit begins
+
+
+def _rises(bends: Floats) -> Floats:
+    """The rises of a characteristic, which add up to 1, from its bends."""
+    both = np.vstack([_FROM_RISES, np.ones(_PARTS)])
+    found: Floats = np.maximum(np.linalg.solve(both, np.append(bends, 1.0)), LEAST_RISE)
+    return found / found.sum()
+
+
+def _tilted(rises: Floats, tilts: Floats) -> Floats:
+    """Rises whose logarithms are tilted."""
+    found: Floats = rises * np.exp(_TILTS @ tilts - np.max(_TILTS @ tilts))
+    return found / found.sum()
+
 
 # What is free beside these where nobody knows the type.
 FREE_IN_MARKET = (
@@ -114,8 +143,11 @@ FREE_IN_MARKET = (
     Free(_E, "jet_depth", "", 0.2, 0.0, 1.0, market=0.3, scaled=False),
     Free(_E, "exhaust_sl_min", "sl/min", 0.4, 0.0, 5000.0, True, market=1.5),
     Free(_E, "cracking_pressure_mbar", "mbar", 2.0, 0.0, 100.0, market=5.0, scaled=False),
+    Free(_E, "relief_pressure_mbar", "mbar", 10.0, 0.0, 2000.0, market=100.0, scaled=False),
     Free(_E, "back_flow_sl_min", "sl/min", 0.4, 0.0, 5000.0, True, market=1.5),
     Free(_E, "blow_off_shape", "", 0.1, -0.9, 3.0, market=0.4, scaled=False),
+    Free(_E, "blow_off_drain_per_s", "1/s", 0.4, 0.0, 200.0, True, market=1.5),
+    Free(_E, "blow_off_refill", "", 0.2, 0.0, 5.0, True, market=1.0),
     Free("system", "free_convection", "", 0.2, 0.0, 1.0, market=0.3, scaled=False),
     Free("system", "forced_convection", "", 0.2, 0.0, 20.0, market=1.0),
     Free("supply", "droop_bar", "bar", 0.1, 0.0, 1.0, market=1.0),
@@ -128,6 +160,7 @@ FREE_IN_MARKET = (
     Free("system", "softness", "", 0.5, 0.0, 500.0, True, market=1.0),
     Free("system", "stiff_mbar", "mbar", 20.0, 0.0, 2000.0, market=1.0),
     Free("system", "part_meets_ms", "ms", 5.0, 0.0, 5000.0, market=0.3),
+    Free("system", "release_shift_mbar", "mbar", 5.0, -60.0, 200.0, market=15.0, scaled=False),
 )
 # What is free beside these where an absolute sensor reads a system that is never open to ambient:
 # nothing else tells ambient pressure. Told, it is known to some mbar; else places differ by height.
@@ -184,7 +217,8 @@ class Space:
 
     ``ways`` are (parameters, n). A parameter that is ``scaled`` is multiplied by the exponential of
     its coordinate, any other is added to. A search stays between ``low`` and ``high``: outside,
-    where nothing moves, it would find no way back.
+    where nothing moves, it would find no way back. Where nobody knows the type, the coordinates of
+    the bends tilt the characteristic so that it rises ``everywhere``.
     """
 
     data: DataSet
@@ -193,6 +227,7 @@ class Space:
     scaled: npt.NDArray[np.bool_]
     low: Floats
     high: Floats
+    everywhere: bool = False
 
     @classmethod
     def of_type(cls, data: DataSet) -> "Space":
@@ -203,13 +238,11 @@ class Space:
     @classmethod
     def of_market(cls, data: DataSet, free: tuple[Free, ...] = FREE_IN_MARKET) -> "Space":
         """Any ejector on the market and what may hang on it; ``data`` is a guess."""
-        spread = np.array([one.market for one in free])
-        ways = np.diag(spread)
-        ways[np.ix_(_BENDS, _BENDS)] = _SMOOTH * spread[_BENDS]
+        ways = np.diag([one.market for one in free])
         scaled = np.array([one.scaled for one in free])
         low, high = np.array([_reach(one, data) for one in free]).T
         low[_BENDS], high[_BENDS] = -np.inf, np.inf  # each coordinate moves several of them
-        return cls(data, free, ways, scaled, low, high)
+        return cls(data, free, ways, scaled, low, high, everywhere=True)
 
     def values(self, x: Floats) -> Floats:
         """Values of the free parameters at ``x``, kept within their bounds."""
@@ -222,11 +255,20 @@ class Space:
 
     def slopes(self, x: Floats) -> Floats:
         """(parameters, n): derivatives of the values."""
-        return np.where(self.scaled, self._unbound(x), 1.0)[:, None] * self.ways
+        slopes = np.where(self.scaled, self._unbound(x), 1.0)[:, None] * self.ways
+        if self.everywhere:
+            tilts = np.ix_(_BENDS, _BENDS)
+            rises = _tilted(_rises(values(self.data, self.free)[_BENDS]), (self.ways @ x)[_BENDS])
+            per_tilt = (np.diag(rises) - np.outer(rises, rises)) @ _TILTS
+            slopes[tilts] = _FROM_RISES @ per_tilt @ self.ways[tilts]
+        return slopes
 
     def _unbound(self, x: Floats) -> Floats:
         moved = self.ways @ x
         centre = values(self.data, self.free)
+        if self.everywhere:
+            rises = _tilted(_rises(centre[_BENDS]), moved[_BENDS])
+            moved[_BENDS] = _FROM_RISES @ rises - centre[_BENDS]
         least = np.array([max(one.low, SMALLEST) for one in self.free])
         scale = np.exp(np.clip(moved, -FARTHEST, FARTHEST))
         return np.where(self.scaled, np.maximum(centre, least) * scale, centre + moved)

@@ -92,7 +92,7 @@ class Ejector(Settings):
     suction_capacity_sl_min: Positive = 33.4  # at ambient and optimum supply
     end_pressure_mbar: Positive = 150.0  # absolute, at optimum supply: no flow is left
     # Of the characteristic over the straight line; 0 is straight.
-    bulge: float = Field(0.0, ge=-1.0, le=3.0)
+    bulge: float = Field(0.0, ge=-1.0, le=4.0)
     skew: float = Field(0.0, ge=-20.0, le=20.0)  # the same, more near ambient
     bend_2: float = Field(0.0, ge=-40.0, le=40.0)  # the same, of second order
     bend_3: float = Field(0.0, ge=-40.0, le=40.0)  # the same, of third order
@@ -112,6 +112,9 @@ class Ejector(Settings):
     jet_depth: float = Field(1.0, ge=0.0, le=1.0)  # how much less deep a weaker jet draws
     blow_off_sl_min: NotNegative = 100.0  # into ambient pressure
     blow_off_shape: float = Field(0.0, ge=-0.9, le=3.0)  # how much more flows into full vacuum
+    # Rate at which it drains a reservoir of its own; 0: it comes from the supply.
+    blow_off_drain_per_s: NotNegative = 0.0
+    blow_off_refill: NotNegative = 0.3  # rate at which that fills again, over that
     # From the command to the valve's action.
     blow_off_response_ms: float = Field(15.0, ge=0.0, le=500.0)
     # From the end of the command to the valve's action.
@@ -120,9 +123,13 @@ class Ejector(Settings):
     exhaust_follows: float = Field(0.0, ge=0.0, le=1.0)  # a loss of suction narrows it as well
     filter_before_sensor: float = Field(0.0, ge=0.0, le=1.0)  # 1: the sensor is behind its filter
     end_follows_supply: float = Field(1.0, ge=0.1, le=20.0)  # times as end_pressure_slope has it
-    relief_sl_min: NotNegative = 200.0  # out through the exhaust at 100 mbar above ambient
-    exhaust_sl_min: NotNegative = 0.0  # the same, sonic, where the exhaust is an opening
+    relief_sl_min: NotNegative = 200.0  # out 100 mbar above the pressure where the relief opens
+    exhaust_sl_min: NotNegative = 0.0  # out through the exhaust, sonic, where it is an opening
     cracking_pressure_mbar: NotNegative = 0.0  # above ambient, where the check valve lets out
+    # Above ambient, where the relief opens: with the check valve, or a valve of its own.
+    relief_pressure_mbar: NotNegative = Field(
+        default_factory=lambda told: told["cracking_pressure_mbar"]
+    )
     back_flow_sl_min: NotNegative = 0.0  # in through it while off, sonic; no check valve
     # Vacuum at which air saving switches the nozzle off.
     h1_mbar: float = Field(750.0, gt=0.0, le=998.0)
@@ -203,6 +210,7 @@ class System(Settings):
     part_leaves: Literal["in_blow_off", "after_blow_off"] = (
         "in_blow_off"  # when a cup's part goes: at its release_mbar, or when blow-off ends
     )
+    release_shift_mbar: float = 0.0  # more vacuum than its cup's release_mbar, at which it goes
     part_meets_ms: NotNegative = 0.0  # after suction is commanded: cups that move to the part
 
     @model_validator(mode="after")
@@ -314,10 +322,13 @@ def _set_ejector(theta: Theta, ejector: Ejector, end_ratio: float) -> None:
     theta[c.RAMP_DOWN] = ejector.ramp_down_ms * MS / 2.0
     theta[c.BLOW_OFF] = ejector.blow_off_sl_min * SL_MIN
     theta[c.BLOW_OFF_SHAPE] = ejector.blow_off_shape
+    theta[c.BLOW_OFF_DRAIN] = ejector.blow_off_drain_per_s
+    theta[c.BLOW_OFF_REFILL] = ejector.blow_off_refill
     theta[c.BLOW_OFF_RESPONSE] = ejector.blow_off_response_ms * MS
     theta[c.BLOW_OFF_RESPONSE_OFF] = ejector.blow_off_response_off_ms * MS
     theta[c.BLOW_OFF_RAMP] = ejector.blow_off_ramp_ms * MS
     theta[c.RELIEF] = ejector.relief_sl_min * SL_MIN / (100.0 * MBAR)
+    theta[c.RELIEF_PRESSURE] = ejector.relief_pressure_mbar * MBAR
     theta[c.BACK_FLOW] = ejector.back_flow_sl_min * SL_MIN
     theta[c.EXHAUST] = ejector.exhaust_sl_min * SL_MIN
     theta[c.CRACKING_PRESSURE] = ejector.cracking_pressure_mbar * MBAR
@@ -365,7 +376,8 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     wide = c.OPENING if system.rim == "laminar" else c.HOLE
     theta[wide] = (total.opening if wide == c.OPENING else total.hole) * system.opening_factor
     late = system.part_leaves == "after_blow_off" and not math.isnan(total.release)
-    theta[c.RELEASE] = AFTER_BLOW_OFF if late else total.release
+    release = total.release + system.release_shift_mbar * MBAR
+    theta[c.RELEASE] = AFTER_BLOW_OFF if late else release
     theta[c.CONTACT] = system.part_meets_ms * MS
 
 

@@ -62,7 +62,7 @@ from twin.signals import Command, Phase, Signal
 
 # Rows of the state: what plant carries on ...
 PORT, PORT_MASS, LINE, LINE_MASS, VESSEL, VESSEL_MASS, NEAR, FAR = range(8)
-DRIVE, JET, BLOWING, SUPPLIED, FELT, SENSED = range(8, ORDER)
+DRIVE, JET, BLOWING, DRAINED, SUPPLIED, FELT, SENSED = range(8, ORDER)
 # ... then the valves (position, what is commanded, for how long), how roughly the pressures run
 # (Pa/s³), the phase, the open cup, whether the model stands on a measurement at all, and the
 # switching signals it hands out. Last how far each mechanism has set in (0 to 1), by which share
@@ -306,13 +306,15 @@ def _jumps(state, k, h, i):  # type: ignore[no-untyped-def]
 
 @inlined
 def _passes(state, k, h, i):  # type: ignore[no-untyped-def]
-    """Whether blow-off brings the port as near to where the exhaust opens as it moves in ``h``.
+    """Whether blow-off brings the port as near as it moves in ``h`` to where it opens
+    exhaust or relief.
 
     The sensor's first stage follows it, so the distance between them tells how quickly it moves.
     """
     moves = abs(state[PORT, i] - state[FELT, i]) / k[c.SENSOR_LAG, i] * h
-    opens = k[c.AMBIENT, i] + k[c.CRACKING_PRESSURE, i]
-    return state[BLOWING, i] > 0.01 and abs(state[PORT, i] - opens) < moves
+    above = state[PORT, i] - k[c.AMBIENT, i]
+    opens = min(abs(above - k[c.CRACKING_PRESSURE, i]), abs(above - k[c.RELIEF_PRESSURE, i]))
+    return state[BLOWING, i] > 0.01 and opens < moves
 
 
 @compiled
@@ -352,6 +354,7 @@ def _substep(state, k, h, guess):  # type: ignore[no-untyped-def]
             state[DRIVE, i],
             state[JET, i],
             state[BLOWING, i],
+            state[DRAINED, i],
             state[SUPPLIED, i],
             state[FELT, i],
             state[SENSED, i],
@@ -375,7 +378,8 @@ def _substep(state, k, h, guess):  # type: ignore[no-untyped-def]
         state[LINE, i], state[LINE_MASS, i] = gas.line, gas.line_mass
         state[NEAR, i], state[FAR, i] = gas.near, gas.far
         state[DRIVE, i], state[JET, i], state[BLOWING, i] = lags.drive, lags.jet, lags.valve
-        state[SUPPLIED, i], state[FELT, i], state[SENSED, i] = lags.supply, lags.felt, lags.sensed
+        state[DRAINED, i], state[SUPPLIED, i] = lags.drained, lags.supply
+        state[FELT, i], state[SENSED, i] = lags.felt, lags.sensed
         opened = _opened(before, gas, state[BLOW_COMMAND, i], k, i)
         opened = min(open_cup, 1.0) if open_cup > 0.0 else opened
         state[OPEN, i] = 0.0 if left < h else opened

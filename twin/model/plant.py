@@ -85,6 +85,7 @@ class Lags(NamedTuple):
     drive: float  # 0 to 1, first stage of the jet
     jet: float  # 0 to 1
     valve: float  # 0 to 1, of the blow-off
+    drained: float  # 0 to 1, of the reservoir that it comes from
     supply: float  # Pa gauge, at the nozzle
     felt: float  # Pa, first stage of the sensor
     sensed: float  # Pa, at the sensor
@@ -230,9 +231,9 @@ def at_port(p, driven, k, i):  # type: ignore[no-untyped-def]
     share, rise = characteristic(depth - (ambient - p) * per_pa, k, i)
     out_slope = driven.jet * driven.suction * per_pa * rise
     out = driven.jet * driven.suction * share - out_slope * p
-    opens = ambient + k[c.CRACKING_PRESSURE, i]
+    opens, relieves = ambient + k[c.CRACKING_PRESSURE, i], ambient + k[c.RELIEF_PRESSURE, i]
     relief = k[c.RELIEF, i]
-    relief = relief if p > opens else 0.0
+    relief = relief if p > relieves else 0.0
     forward = p if p < ambient else p - k[c.CRACKING_PRESSURE, i]
     share, rise = opening(forward, ambient, CRITICAL_RATIO)
     back = k[c.BACK_FLOW, i] * (1.0 - min(driven.jet, 1.0))
@@ -241,7 +242,7 @@ def at_port(p, driven, k, i):  # type: ignore[no-untyped-def]
     vent = vent if p > opens else 0.0
     fuller = driven.blow_off * k[c.BLOW_OFF_SHAPE, i]
     return (
-        out - relief * opens - vent * (share - rise * p),
+        out - relief * relieves - vent * (share - rise * p),
         out_slope + relief - vent * rise,
         driven.blow_off + fuller + back * (share - rise * p),
         back * rise - fuller / ambient,
@@ -413,6 +414,13 @@ def lag(known, target, step, slow):  # type: ignore[no-untyped-def]
 
 
 @inlined
+def drain(drained, valve, step, k, i):  # type: ignore[no-untyped-def]
+    """Implicit stage of the reservoir that a blow-off comes from: sonic out, and filled again."""
+    rate = step * k[c.BLOW_OFF_DRAIN, i]
+    return (drained + rate * valve) / (1.0 + rate * (valve + k[c.BLOW_OFF_REFILL, i]))
+
+
+@inlined
 def drawing(opening, k, i):  # type: ignore[no-untyped-def]
     """Strength of the jet, 0 to 1, that a valve which opens slowly lets through at its opening.
 
@@ -450,10 +458,11 @@ def stage(guess, known, lags, step, valves, passes, k, i):  # type: ignore[no-un
     drive = lag(lags.drive, nozzle, step, first if rising else fall)
     jet = lag(lags.jet, drawing(drive, k, i) if rising else drive, step, rise if rising else fall)
     valve = lag(lags.valve, blow, step, k[c.BLOW_OFF_RAMP, i])
+    drained = drain(lags.drained, valve, step, k, i)
     regulated = max(k[c.SUPPLY, i] - k[c.DROOP, i] * max(nozzle, blow), 0.0)
     supply = lag(lags.supply, regulated, step, k[c.SUPPLY_LAG, i])
     suction, end, blow_off = at_supply(supply, k, i)
-    driven = Driven(jet, suction, end, blow_off * valve, open_cup)
+    driven = Driven(jet, suction, end, blow_off * valve * (1.0 - drained), open_cup)
     gas = solve(guess, known, step, driven, k, i)
     moved = max(abs(gas.port - guess.port), abs(gas.vessel - guess.vessel))
     if passes > 1 or moved * step > CLOSE:
@@ -463,7 +472,7 @@ def stage(guess, known, lags, step, valves, passes, k, i):  # type: ignore[no-un
     slow = k[c.SENSOR_LAG, i]
     felt = lag(lags.felt, at_sensor(gas.port, gas.vessel, k, i), step, slow)
     sensed = lag(lags.sensed, felt, step, slow + k[c.SLOW_SENSOR, i])
-    return gas, Lags(drive, jet, valve, supply, felt, sensed)
+    return gas, Lags(drive, jet, valve, drained, supply, felt, sensed)
 
 
 @inlined
@@ -488,6 +497,7 @@ def lags_on(start, begin, end, share):  # type: ignore[no-untyped-def]
         start.drive + share * (end.drive - begin.drive),
         start.jet + share * (end.jet - begin.jet),
         start.valve + share * (end.valve - begin.valve),
+        start.drained + share * (end.drained - begin.drained),
         start.supply + share * (end.supply - begin.supply),
         start.felt + share * (end.felt - begin.felt),
         start.sensed + share * (end.sensed - begin.sensed),
@@ -541,6 +551,7 @@ def ended(lags):  # type: ignore[no-untyped-def]
         lags.drive if lags.drive > FAINTEST else 0.0,
         lags.jet if lags.jet > FAINTEST else 0.0,
         lags.valve if lags.valve > FAINTEST else 0.0,
+        lags.drained if lags.drained > FAINTEST else 0.0,
         lags.supply,
         lags.felt,
         lags.sensed,

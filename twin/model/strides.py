@@ -140,7 +140,7 @@ def _planned(begin, k, moving, before, tolerance):  # type: ignore[no-untyped-de
     """Length of the next step (s): smooth within, and ending where a valve acts.
 
     So it ends where blow-off brings the port, ``moving`` by so much (Pa/s), to the pressure at
-    which the exhaust opens.
+    which the exhaust or the relief opens.
     """
     rough = begin[ROUGH, 0]
     longest = LONGEST_STEP * (tolerance / TOLERANCE) ** (1.0 / 6.0)  # for what is read
@@ -149,9 +149,10 @@ def _planned(begin, k, moving, before, tolerance):  # type: ignore[no-untyped-de
     h = min(h, (tolerance / rough) ** (1.0 / 3.0)) if rough > 0.0 else h
     while h > SHORTEST_STEP and kernel._release(begin, k, h, 0):
         h *= 0.5
-    opens = (k[c.AMBIENT, 0] + k[c.CRACKING_PRESSURE, 0] - begin[PORT, 0]) / moving
-    if begin[BLOWING, 0] > 0.01 and 0.0 < opens < h:
-        h = opens
+    for opening in (c.CRACKING_PRESSURE, c.RELIEF_PRESSURE):
+        opens = (k[c.AMBIENT, 0] + k[opening, 0] - begin[PORT, 0]) / moving
+        if begin[BLOWING, 0] > 0.01 and 0.0 < opens < h:
+            h = opens
     h = max(h, SHORTEST_STEP)
     jump = _until_jump(begin, k)
     if jump < 1e-9:
