@@ -106,9 +106,9 @@ def film(theta: Theta, vessel: float, vessel_t: float, far: float) -> float:
 
 
 def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
-    """d/dt of three pressures, three masses, two flows, drive, jet, valve, supply, sensor."""
+    """d/dt of three pressures, three masses, two flows, and of what a row has behind these."""
     port, line, vessel, port_mass, line_mass, vessel_mass, near, far = y[:8]
-    drive, jet, valve, supply, felt, sensed = y[8:]
+    drive, jet, valve, drained, supply, felt, sensed = y[8:]
     ambient, outside = theta[c.AMBIENT], theta[c.TEMPERATURE]
     volume, stretch = room(theta, vessel)
     port_t = port * theta[c.PORT_VOLUME] / (R * port_mass)
@@ -124,9 +124,15 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
         far = 2.0 * difference / (linear + root)
 
     forward = port - theta[c.CRACKING_PRESSURE]  # behind a check valve that is open
-    out = suction_flow(theta, port, jet, supply) + theta[c.RELIEF] * max(forward - ambient, 0.0)
+    relief = theta[c.RELIEF] * max(port - ambient - theta[c.RELIEF_PRESSURE], 0.0)
+    out = suction_flow(theta, port, jet, supply) + relief
     out += max(-through_hole(theta[c.EXHAUST], forward, ambient), 0.0)
-    blown = valve * theta[c.BLOW_OFF] * (1.0 + theta[c.BLOW_OFF_SHAPE] * (1.0 - port / ambient))
+    blown = (
+        valve
+        * (1.0 - drained)
+        * theta[c.BLOW_OFF]
+        * (1.0 + theta[c.BLOW_OFF_SHAPE] * (1.0 - port / ambient))
+    )
     blown *= (supply + ambient) / (theta[c.SUPPLY_NOMINAL] + theta[c.AMBIENT_NOMINAL])
     if port < ambient:
         blown += through_hole(theta[c.BACK_FLOW] * (1.0 - min(jet, 1.0)), port, ambient)
@@ -145,10 +151,6 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
     into_vessel = CP * (leak * leak_t - far * far_t)
     into_vessel += film(theta, vessel, vessel_t, far) * theta[c.AREA] * (outside - vessel_t)
 
-    rising = valves.nozzle > drive
-    rise, fall = theta[c.RAMP_UP], theta[c.RAMP_DOWN]
-    first, second = (rise + theta[c.SLOW_RAMP_UP], rise) if rising else (fall, fall)
-    strength = strength_of_jet(theta, drive) if rising else drive
     regulated = theta[c.SUPPLY] - theta[c.DROOP] * max(valves.nozzle, valves.blow)
     friction = theta[c.NEAR_RESISTANCE] + theta[c.RESISTANCE]
     place = min(theta[c.PLACE] / friction, 1.0) if friction > 0.0 else 0.0
@@ -169,14 +171,24 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
             far - near,
             leak - far,
             *pushes,
-            (valves.nozzle - drive) / first,
-            (strength - jet) / second,
+            *jet_rates(theta, valves.nozzle, drive, jet),
             (valves.blow - valve) / theta[c.BLOW_OFF_RAMP],
+            theta[c.BLOW_OFF_DRAIN]
+            * (valve * (1.0 - drained) - theta[c.BLOW_OFF_REFILL] * drained),
             (regulated - supply) / theta[c.SUPPLY_LAG],
             (there - felt) / theta[c.SENSOR_LAG],
             (felt - sensed) / (theta[c.SENSOR_LAG] + theta[c.SLOW_SENSOR]),
         ]
     )
+
+
+def jet_rates(theta: Theta, nozzle: float, drive: float, jet: float) -> tuple[float, float]:
+    """d/dt of the two stages in which the jet comes and goes."""
+    rise, fall = theta[c.RAMP_UP], theta[c.RAMP_DOWN]
+    if nozzle <= drive:
+        return (nozzle - drive) / fall, (drive - jet) / fall
+    first = rise + theta[c.SLOW_RAMP_UP]
+    return (nozzle - drive) / first, (strength_of_jet(theta, drive) - jet) / rise
 
 
 def strength_of_jet(theta: Theta, opening: float) -> float:
@@ -200,7 +212,7 @@ def _that_keeps_them_equal(
 def at_rest(theta: Theta) -> Floats:
     ambient, gas = theta[c.AMBIENT], R * theta[c.TEMPERATURE]
     masses = ambient * theta[[c.PORT_VOLUME, c.LINE_VOLUME, c.VOLUME]] / gas
-    return np.array([*[ambient] * 3, *masses, *[0.0] * 5, theta[c.SUPPLY], *[ambient] * 2])
+    return np.array([*[ambient] * 3, *masses, *[0.0] * 6, theta[c.SUPPLY], *[ambient] * 2])
 
 
 def reference(theta: Theta, moves: Sequence[Valves], times: Floats) -> Floats:
@@ -214,12 +226,12 @@ def reference(theta: Theta, moves: Sequence[Valves], times: Floats) -> Floats:
 
     closed.terminal = True  # type: ignore[attr-defined]
     y, rows, is_open = at_rest(theta), [], 0.0
-    size = np.array([*[1e5] * 3, 1e-6, 1e-6, 1e-4, *[1e-3] * 2, *[1.0] * 3, *[1e5] * 3])
+    size = np.array([*[1e5] * 3, 1e-6, 1e-6, 1e-4, *[1e-3] * 2, *[1.0] * 4, *[1e5] * 3])
     for move, end in zip(moves, [*(move.time for move in moves[1:]), times[-1]], strict=True):
         begin = move.time
         is_open = is_open if move.open is None else move.open
         while begin < end:
-            lets_go = move.blow > 0.0 and is_open == 0.0 and theta[c.RELEASE] >= 0.0
+            lets_go = move.blow > 0.0 and is_open == 0.0 and not np.isnan(theta[c.RELEASE])
             found = solve_ivp(
                 rates,
                 (begin, end),

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calibrations import log_of, quiet, typed
+from hypothesis import given
+from hypothesis import strategies as st
 from second_rigs import UNKNOWN_TYPE, config_of, samples_of
 from second_world.draw import draw_rig
 from second_world.faults import Fault
@@ -30,7 +32,7 @@ from twin.calibration.commission import (
     within,
 )
 from twin.calibration.cycles import Cycles
-from twin.calibration.fit import BEST_END, END_PRESSURE, RISING, falling, soft
+from twin.calibration.fit import BENDS, BEST_END, END_PRESSURE, falling
 from twin.calibration.left_out import with_left_out
 from twin.calibration.page import write_page
 from twin.calibration.parameters import (
@@ -46,11 +48,9 @@ from twin.calibration.readings import Readings, deep, read, turns
 from twin.calibration.report import commissioned_as_json, commissioned_in_words, headline
 from twin.calibration.store import store_first
 from twin.calibration.verdict import Residual, Verdict, judge
-from twin.calibration.weights import Weights
 from twin.config import Asset
 from twin.diagnosis.answer import diagnose
 from twin.errors import ConfigError
-from twin.inference.covariance import Covariance
 from twin.inference.levels import SIGMAS_95
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
@@ -151,12 +151,30 @@ def test_a_search_stays_where_values_move() -> None:
             assert space.values(x)[number] == pytest.approx(beyond)
 
 
-def test_a_loss_that_is_soft_for_residuals_keeps_the_characteristic_falling() -> None:
-    weights = Weights([(np.arange(3), Covariance(np.eye(3)))])
-    cost = soft(weights)(np.full(3 + RISING + 2, 400.0))
-    assert cost[0, :3] == pytest.approx(2.0 * (np.sqrt(401.0) - 1.0))
-    assert cost[0, 3:-2] == pytest.approx(400.0)
-    assert cost[1, 3:-2] == pytest.approx(1.0)
+@given(st.lists(st.floats(-3.0, 3.0), min_size=4, max_size=4))
+def test_in_a_market_every_characteristic_falls_with_vacuum(tilts: list[float]) -> None:
+    """And its derivatives are those of its bends."""
+    space = Space.of_market(typed("test_rig").data)
+    x = np.zeros(len(space.free))
+    bends = [number for number, one in enumerate(space.free) if one.key in BENDS]
+    x[bends] = tilts
+    rises = np.diff(space.at(x).ejector.share(np.linspace(0.0, 1.0, 101)))
+    assert (rises > -1e-12).all()
+    for number in bends:
+        ahead, behind = x.copy(), x.copy()
+        ahead[number] += 1e-5
+        behind[number] -= 1e-5
+        slope = (space.values(ahead) - space.values(behind)) / 2e-5
+        assert space.slopes(x)[:, number] == pytest.approx(slope, abs=1e-5)
+
+
+def test_a_market_begins_with_the_characteristic_of_the_guess() -> None:
+    data = typed("gripper").data
+    space = Space.of_market(data)
+    found = space.at(np.zeros(len(space.free))).ejector
+    assert [getattr(found, key) for key in BENDS] == pytest.approx(
+        [getattr(data.ejector, key) for key in BENDS]
+    )
 
 
 # What a record shows without a model.

@@ -47,7 +47,7 @@ def cycle_of(name: str) -> list[tuple[Phase, int]]:
 
 def moves_of(theta: Theta, phases: list[tuple[Phase, int]]) -> list[Valves]:
     """What valves and cup do in ``cycle_of``; a phase begins after its first row."""
-    cup = 1.0 if theta[c.RELEASE] >= 0.0 else 0.0
+    cup = 0.0 if np.isnan(theta[c.RELEASE]) else 1.0
     begins = [(1 + sum(rows for _, rows in phases[:n])) * MS for n in range(len(phases))]
     _, suction, hold, blow_off, idle = begins
     late = theta[c.CONTACT] > 0.0
@@ -98,6 +98,19 @@ def test_so_it_is_where_gas_convects_behind_a_check_valve() -> None:
     times = (np.arange(len(expected)) + 1) * MS
     exact = radau.reference(theta, moves_of(theta, phases), times)
     assert np.abs(expected - exact[:, kernel.SENSED]).max() < 0.5
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_so_it_is_where_blow_off_drains_a_reservoir_against_a_relief_valve(name: str) -> None:
+    theta = between_samples(name, soft_and_late=False)
+    theta[[c.BLOW_OFF_DRAIN, c.BLOW_OFF_REFILL]] = 6.0, 0.4
+    theta[[c.RELIEF_PRESSURE, c.RELEASE]] = 45.0 * MBAR, theta[c.RELEASE] - 30.0 * MBAR
+    phases = cycle_of(name)
+    expected = advance(theta, phases)
+    times = (np.arange(len(expected)) + 1) * MS
+    exact = radau.reference(theta, moves_of(theta, phases), times)
+    assert np.abs(expected - exact[:, kernel.SENSED]).max() < 0.5
+    assert exact[:, kernel.DRAINED].max() > 0.3
 
 
 @pytest.mark.parametrize("parts", [TANK, HOSE], ids=["tank", "hose"])

@@ -23,6 +23,7 @@ from twin.model.plant import (
     at_vessel,
     characteristic,
     convection,
+    drain,
     prepare,
     reading,
     sensed_at,
@@ -232,6 +233,26 @@ def test_a_check_valve_lets_out_from_its_cracking_pressure_on() -> None:
     assert flow_out(theta, theta[c.AMBIENT] + 106 * MBAR, 0.0) == pytest.approx(lets_out)
 
 
+def test_a_relief_valve_lets_out_from_its_own_pressure_on() -> None:
+    told = {"relief_sl_min": 200.0, "cracking_pressure_mbar": 6.0, "relief_pressure_mbar": 250.0}
+    theta = theta_of(ejector=told)
+    assert flow_out(theta, theta[c.AMBIENT] + 249 * MBAR, 0.0) == 0.0
+    assert flow_out(theta, theta[c.AMBIENT] + 300 * MBAR, 0.0) == pytest.approx(100 * SL_MIN)
+
+
+def test_a_blow_off_drains_its_own_reservoir_and_that_fills_again() -> None:
+    """To where as much comes in as goes out, and back to full, exponentially."""
+    theta = theta_of(ejector={"blow_off_drain_per_s": 5.0, "blow_off_refill": 0.25})
+    k, step = prepare(theta.reshape(-1, 1)), 1e-4
+    drained = [0.0]
+    for row in range(30000):
+        valve = 1.0 if row < 15000 else 0.0
+        drained.append(drain.py_func(drained[-1], valve, step, k, 0))
+    assert drained[15000] == pytest.approx(0.8, rel=1e-3)
+    assert drained[1600] == pytest.approx(0.8 * (1.0 - np.exp(-1.0)), rel=1e-3)
+    assert drained[15000 + 8000] == pytest.approx(0.8 * np.exp(-1.0), rel=1e-3)
+
+
 def test_a_check_valve_leaks_only_while_the_nozzle_is_off() -> None:
     theta = theta_of()
     theta[c.BACK_FLOW] = 3.0 * SL_MIN
@@ -398,7 +419,7 @@ def test_blow_off_settles_where_exhaust_and_flow_are_equal() -> None:
 
 def test_after_blow_off_a_closed_vessel_stays_at_the_cracking_pressure() -> None:
     theta = closed(film_coefficient=3000.0, tube_film_coefficient=3000.0)
-    theta[c.CRACKING_PRESSURE] = 8 * MBAR
+    theta[[c.CRACKING_PRESSURE, c.RELIEF_PRESSURE]] = 8 * MBAR
     rows = states(theta, [(Phase.BLOW_OFF, 4000), (Phase.IDLE, 3000)], standing(theta, 0.3e5))
     above = rows[-1, [kernel.PORT, kernel.VESSEL]] - theta[c.AMBIENT]
     assert above == pytest.approx(8 * MBAR, abs=0.05 * MBAR)

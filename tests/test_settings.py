@@ -268,10 +268,11 @@ def test_every_coefficient_is_filled_in() -> None:
     }
     convection = {"FREE_CONVECTION", "FORCED_CONVECTION"}
     modes = {"CONTROL_SENSOR", "BLOW_OFF_MODE"}  # the first of each
-    opening = {"EXHAUST", "HOLE", "CRACKING_PRESSURE", "KINK"}
+    opening = {"EXHAUST", "HOLE", "CRACKING_PRESSURE", "RELIEF_PRESSURE", "KINK"}
     cups = {"COMPLIANCE", "SOFTNESS", "STIFF_UNTIL", "CONTACT"}
     mechanisms = set(list(COEFFICIENTS)[MECHANISMS:])
-    assert zero == {"BLOW_OFF_SHAPE"} | cups | opening | convection | effects | modes | mechanisms
+    blow_off = {"BLOW_OFF_SHAPE", "BLOW_OFF_DRAIN"}
+    assert zero == blow_off | cups | opening | convection | effects | modes | mechanisms
 
 
 def test_the_hash_tells_data_sets_apart() -> None:

@@ -18,9 +18,9 @@ enum { /* twin.model.theta.COEFFICIENTS */
     AMBIENT, AMBIENT_NOMINAL, TEMPERATURE, SUPPLY, DROOP, SUPPLY_LAG, SUPPLY_NOMINAL,
     SUPPLY_OPTIMUM, SUPPLY_CURVATURE, END_SLOPE, SUCTION, END_RATIO, EXHAUST_FOLLOWS, FILTER_AT,
     END_FOLLOWS, BULGE, SKEW, BEND_2, BEND_3, KINK, KINK_AT, RESPONSE, RESPONSE_OFF, RAMP_UP, SLOW_RAMP_UP,
-    JET_FULL_AT, JET_DEPTH, RAMP_DOWN, BLOW_OFF, BLOW_OFF_SHAPE, BLOW_OFF_RESPONSE,
-    BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, RELIEF, EXHAUST, CRACKING_PRESSURE, PORT_VOLUME,
-    PORT_HEAT, LINE_VOLUME, LINE_HEAT, VOLUME, COMPLIANCE, SOFTNESS, STIFF_UNTIL, FILM,
+    JET_FULL_AT, JET_DEPTH, RAMP_DOWN, BLOW_OFF, BLOW_OFF_SHAPE, BLOW_OFF_DRAIN,
+    BLOW_OFF_REFILL, BLOW_OFF_RESPONSE, BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, RELIEF,
+    RELIEF_PRESSURE, EXHAUST, CRACKING_PRESSURE, PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT, VOLUME, COMPLIANCE, SOFTNESS, STIFF_UNTIL, FILM,
     FREE_CONVECTION, FORCED_CONVECTION, AREA, NEAR_RESISTANCE, NEAR_LAMINAR, NEAR_INERTANCE,
     RESISTANCE, LAMINAR, INERTANCE, PLACE, LEAK, LEAK_CRITICAL, LAMINAR_LEAK, INFLOW, BACK_FLOW,
     OPENING, HOLE, SENSOR_LAG, SLOW_SENSOR, SENSOR_OFFSET, SENSOR_GAIN, H1, H1_LOW, H2, H2_LOW,
@@ -33,7 +33,7 @@ enum { /* what a call computes only once, behind them */
 };
 enum { /* the state of twin.model.kernel */
     S_PORT, S_PORT_MASS, S_LINE, S_LINE_MASS, S_VESSEL, S_VESSEL_MASS, S_NEAR, S_FAR,
-    S_DRIVE, S_JET, S_BLOWING, S_SUPPLIED, S_FELT, S_SENSED,
+    S_DRIVE, S_JET, S_BLOWING, S_DRAINED, S_SUPPLIED, S_FELT, S_SENSED,
     NOZZLE, NOZZLE_COMMAND, NOZZLE_AGE, BLOW, BLOW_COMMAND, BLOW_AGE,
     ROUGH, PHASE, OPEN, VALID, SIGNALS, STATE
 };
@@ -99,7 +99,7 @@ INLINED Tangent opening(double p, double ambient, double critical)
 typedef struct {
     double port, port_mass, line, line_mass, vessel, vessel_mass, near, far;
 } Gas;
-typedef struct { double drive, jet, valve, supply, felt, sensed; } Lags;
+typedef struct { double drive, jet, valve, drained, supply, felt, sensed; } Lags;
 typedef struct { double jet, suction, end, blow_off, open; } Driven;
 typedef struct { double nozzle, blow, open; } Valves;
 typedef struct { double suction, end, blow_off; } Supplied;
@@ -168,15 +168,15 @@ INLINED Port at_port(double p, const Driven *driven, const double *k)
     Tangent curve = characteristic(depth - (ambient - p) * per_pa, k);
     double out_slope = driven->jet * driven->suction * per_pa * curve.slope;
     double out = driven->jet * driven->suction * curve.level - out_slope * p;
-    double opens = ambient + K(CRACKING_PRESSURE);
-    double relief = p > opens ? K(RELIEF) : 0.0;
+    double opens = ambient + K(CRACKING_PRESSURE), relieves = ambient + K(RELIEF_PRESSURE);
+    double relief = p > relieves ? K(RELIEF) : 0.0;
     Tangent flow = opening(p < ambient ? p : p - K(CRACKING_PRESSURE), ambient, CRITICAL_RATIO);
     double back = K(BACK_FLOW) * (1.0 - min(driven->jet, 1.0));
     back = p < ambient ? back : 0.0;
     double vent = p > opens ? K(EXHAUST) : 0.0;
     double fuller = driven->blow_off * K(BLOW_OFF_SHAPE);
     return (Port){
-        out - relief * opens - vent * (flow.level - flow.slope * p),
+        out - relief * relieves - vent * (flow.level - flow.slope * p),
         out_slope + relief - vent * flow.slope,
         driven->blow_off + fuller + back * (flow.level - flow.slope * p),
         back * flow.slope - fuller / ambient,
@@ -338,10 +338,12 @@ INLINED Stage stage(const Gas *guess, const Gas *known, const Lags *lags, double
     double drive = lag(lags->drive, valves->nozzle, step, rising ? first : fall);
     double jet = lag(lags->jet, rising ? drawing(drive, k) : drive, step, rising ? rise : fall);
     double valve = lag(lags->valve, valves->blow, step, K(BLOW_OFF_RAMP));
+    double rate = step * K(BLOW_OFF_DRAIN);
+    double drained = (lags->drained + rate * valve) / (1.0 + rate * (valve + K(BLOW_OFF_REFILL)));
     double regulated = max(K(SUPPLY) - K(DROOP) * max(valves->nozzle, valves->blow), 0.0);
     double supply = lag(lags->supply, regulated, step, K(SUPPLY_LAG));
     Supplied at = at_supply(supply, k);
-    Driven driven = {jet, at.suction, at.end, at.blow_off * valve, valves->open};
+    Driven driven = {jet, at.suction, at.end, at.blow_off * valve * (1.0 - drained), valves->open};
     Gas gas = solve(*guess, known, step, &driven, k);
     gas = solve(gas, known, step, &driven, k);
     if (far_off)
@@ -350,7 +352,7 @@ INLINED Stage stage(const Gas *guess, const Gas *known, const Lags *lags, double
     double slow = K(SENSOR_LAG);
     double felt = lag(lags->felt, there, step, slow);
     double sensed = lag(lags->sensed, felt, step, slow + K(SLOW_SENSOR));
-    return (Stage){gas, {drive, jet, valve, supply, felt, sensed}};
+    return (Stage){gas, {drive, jet, valve, drained, supply, felt, sensed}};
 }
 
 #define ON(of) start->of + share * (end->of - begin->of)
@@ -365,7 +367,9 @@ INLINED Gas gas_on(const Gas *start, const Gas *begin, const Gas *end, double sh
 
 INLINED Lags lags_on(const Lags *start, const Lags *begin, const Lags *end, double share)
 {
-    return (Lags){ON(drive), ON(jet), ON(valve), ON(supply), ON(felt), ON(sensed)};
+    return (Lags){
+        ON(drive), ON(jet), ON(valve), ON(drained), ON(supply), ON(felt), ON(sensed),
+    };
 }
 
 INLINED Gas positive(Gas gas)
@@ -389,6 +393,7 @@ INLINED Lags ended(Lags lags)
         lags.drive > FAINTEST ? lags.drive : 0.0,
         lags.jet > FAINTEST ? lags.jet : 0.0,
         lags.valve > FAINTEST ? lags.valve : 0.0,
+        lags.drained > FAINTEST ? lags.drained : 0.0,
         lags.supply, lags.felt, lags.sensed,
     };
 }
@@ -486,7 +491,9 @@ static int jumps(const double *state, const double *k, double h)
 static int passes(const double *state, const double *k, double h)
 {
     double moved = fabs(S(S_PORT) - S(S_FELT)) / K(SENSOR_LAG) * h;
-    return S(S_BLOWING) > 0.01 && fabs(S(S_PORT) - (K(AMBIENT) + K(CRACKING_PRESSURE))) < moved;
+    double above = S(S_PORT) - K(AMBIENT);
+    double opens = min(fabs(above - K(CRACKING_PRESSURE)), fabs(above - K(RELIEF_PRESSURE)));
+    return S(S_BLOWING) > 0.01 && opens < moved;
 }
 
 static int finer(const double *state, const double *k, double h)
@@ -507,7 +514,7 @@ INLINED void substep(double *state, const double *k, double h)
         S(S_VESSEL), S(S_VESSEL_MASS), S(S_NEAR), S(S_FAR),
     };
     Lags lags = {
-        S(S_DRIVE), S(S_JET), S(S_BLOWING),
+        S(S_DRIVE), S(S_JET), S(S_BLOWING), S(S_DRAINED),
         S(S_SUPPLIED), S(S_FELT), S(S_SENSED),
     };
     double before = gas.vessel;
@@ -518,7 +525,8 @@ INLINED void substep(double *state, const double *k, double h)
     S(S_LINE) = next.gas.line, S(S_LINE_MASS) = next.gas.line_mass;
     S(S_NEAR) = next.gas.near, S(S_FAR) = next.gas.far;
     S(S_DRIVE) = next.lags.drive, S(S_JET) = next.lags.jet;
-    S(S_BLOWING) = next.lags.valve, S(S_SUPPLIED) = next.lags.supply;
+    S(S_BLOWING) = next.lags.valve, S(S_DRAINED) = next.lags.drained;
+    S(S_SUPPLIED) = next.lags.supply;
     S(S_FELT) = next.lags.felt, S(S_SENSED) = next.lags.sensed;
     double now = opened(before, &next.gas, S(BLOW_COMMAND), k);
     S(OPEN) = until < h ? 0.0 : open_cup > 0.0 ? min(open_cup, 1.0) : now;
@@ -561,8 +569,8 @@ static void enter(double *state, int phase, const double *k)
         (before == SUCTION_PHASE && phase == HOLD_PHASE))
         S(NOZZLE_AGE) = NEVER;
     if (phase == SUCTION_PHASE && before != HOLD_PHASE)
-        S(OPEN) = K(CONTACT) > 0.0 && K(RELEASE) >= 0.0 ? S(OPEN) : 0.0;
-    if (phase == IDLE_PHASE && before == BLOW_OFF_PHASE && K(RELEASE) >= 0.0)
+        S(OPEN) = K(CONTACT) > 0.0 && !isnan(K(RELEASE)) ? S(OPEN) : 0.0;
+    if (phase == IDLE_PHASE && before == BLOW_OFF_PHASE && !isnan(K(RELEASE)))
         S(OPEN) = 1.0;
 }
 
@@ -593,7 +601,7 @@ static void shift_by(double *state, double shift)
 static void synchronise(double *state, double level, const double *k)
 {
     int idle = S(PHASE) == IDLE_PHASE;
-    if (K(RELEASE) >= 0.0 && (idle || (S(OPEN) > 0.0 && S(PHASE) != SUCTION_PHASE))) {
+    if (!isnan(K(RELEASE)) && (idle || (S(OPEN) > 0.0 && S(PHASE) != SUCTION_PHASE))) {
         settle(state, k, K(AMBIENT));
         S(OPEN) = 1.0;
     } else if (S(VALID) > 0.0) {

@@ -6,7 +6,7 @@ model's own error leave of it. All derivatives come from one run of the bank of 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Literal
 
@@ -32,8 +32,8 @@ MOST_STEPS = 8  # in a round
 FIRST_SHARE = 0.4  # of the log, for the first round: it has the longest way to go
 DETERMINED = 0.5  # of what the type leaves open: what is known better comes from the log
 SWITCHING = 6.0  # rows, one standard deviation of when the nozzle switched
-# Sigmas of the market, for a derivative. With five times as much a fit of 46 values stopped far from
-# the best: what the step made of the strong directions hid what the weak ones are.
+# Sigmas of the market, for a derivative. With five times as much a fit of 46 values stopped far
+# from the best: what the step made of the strong directions hid what the weak ones are.
 STEP = 0.01
 # s, one standard deviation of when a valve acts from stroke to stroke: edges are known no better.
 JITTER = 0.5 * MS

@@ -124,14 +124,17 @@ LEAST_RISE = 1e-3  # of all, in a part of a characteristic from which a fit begi
 def _rises(bends: Floats) -> Floats:
     """The rises of a characteristic, which add up to 1, from its bends."""
     both = np.vstack([_FROM_RISES, np.ones(_PARTS)])
-    found: Floats = np.maximum(np.linalg.solve(both, np.append(bends, 1.0)), LEAST_RISE)
-    return found / found.sum()
+    found = np.maximum(np.linalg.solve(both, np.append(bends, 1.0)), LEAST_RISE)
+    shares: Floats = found / found.sum()
+    return shares
 
 
 def _tilted(rises: Floats, tilts: Floats) -> Floats:
     """Rises whose logarithms are tilted."""
-    found: Floats = rises * np.exp(_TILTS @ tilts - np.max(_TILTS @ tilts))
-    return found / found.sum()
+    logarithms = _TILTS @ tilts
+    found = rises * np.exp(logarithms - logarithms.max())
+    shares: Floats = found / found.sum()
+    return shares
 
 
 # What is free beside these where nobody knows the type.
