@@ -84,8 +84,8 @@ def second_stage(x: float, closes: float) -> float:
     return (rounded(x - closes) - least) / (rounded(1.0 - closes) - least)
 
 
-def room(theta: Theta, vessel: float) -> tuple[float, float]:
-    """Volume of a vessel that shrinks with vacuum (m³), and its slope (m³/Pa)."""
+def shrinkage(theta: Theta, vessel: float) -> tuple[float, float]:
+    """By how much a vessel shrinks with vacuum in the end (m³), and its slope (m³/Pa)."""
     early, ambient, stiff = theta[c.SOFTNESS], theta[c.AMBIENT], theta[c.STIFF_UNTIL]
 
     def shrunk(vacuum: float) -> float:
@@ -94,8 +94,7 @@ def room(theta: Theta, vessel: float) -> tuple[float, float]:
         return float(theta[c.COMPLIANCE] * (1.0 + early) * pull / (most + early * abs(pull)))
 
     vacuum, by = ambient - vessel, 1e-3 * ambient
-    slope = (shrunk(vacuum + by) - shrunk(vacuum - by)) / (2.0 * by)
-    return theta[c.VOLUME] - shrunk(vacuum), slope
+    return shrunk(vacuum), (shrunk(vacuum + by) - shrunk(vacuum - by)) / (2.0 * by)
 
 
 def film(theta: Theta, vessel: float, vessel_t: float, far: float) -> float:
@@ -108,9 +107,12 @@ def film(theta: Theta, vessel: float, vessel_t: float, far: float) -> float:
 def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
     """d/dt of three pressures, three masses, two flows, and of what a row has behind these."""
     port, line, vessel, port_mass, line_mass, vessel_mass, near, far = y[:8]
-    drive, jet, valve, drained, supply, felt, sensed = y[8:]
+    yielded, drive, jet, valve, drained, supply, felt, sensed = y[8:]
     ambient, outside = theta[c.AMBIENT], theta[c.TEMPERATURE]
-    volume, stretch = room(theta, vessel)
+    shrunk, stretch = shrinkage(theta, vessel)
+    at_once = 1.0 - theta[c.CREEP]
+    volume = theta[c.VOLUME] - at_once * shrunk - yielded
+    yielding = (theta[c.CREEP] * shrunk - yielded) / theta[c.CREEP_TIME]
     port_t = port * theta[c.PORT_VOLUME] / (R * port_mass)
     line_t = line * theta[c.LINE_VOLUME] / (R * line_mass)
     vessel_t = vessel * volume / (R * vessel_mass)
@@ -166,11 +168,13 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
         [
             (GAMMA - 1.0) * port_gain / theta[c.PORT_VOLUME],
             (GAMMA - 1.0) * line_gain / theta[c.LINE_VOLUME],
-            (GAMMA - 1.0) * into_vessel / (volume + GAMMA * vessel * stretch),
+            ((GAMMA - 1.0) * into_vessel + GAMMA * vessel * yielding)
+            / (volume + GAMMA * vessel * at_once * stretch),
             near - out + blown,
             far - near,
             leak - far,
             *pushes,
+            yielding,
             *jet_rates(theta, valves.nozzle, drive, jet),
             (valves.blow - valve) / theta[c.BLOW_OFF_RAMP],
             theta[c.BLOW_OFF_DRAIN]
@@ -212,7 +216,7 @@ def _that_keeps_them_equal(
 def at_rest(theta: Theta) -> Floats:
     ambient, gas = theta[c.AMBIENT], R * theta[c.TEMPERATURE]
     masses = ambient * theta[[c.PORT_VOLUME, c.LINE_VOLUME, c.VOLUME]] / gas
-    return np.array([*[ambient] * 3, *masses, *[0.0] * 6, theta[c.SUPPLY], *[ambient] * 2])
+    return np.array([*[ambient] * 3, *masses, *[0.0] * 7, theta[c.SUPPLY], *[ambient] * 2])
 
 
 def reference(theta: Theta, moves: Sequence[Valves], times: Floats) -> Floats:
@@ -226,7 +230,7 @@ def reference(theta: Theta, moves: Sequence[Valves], times: Floats) -> Floats:
 
     closed.terminal = True  # type: ignore[attr-defined]
     y, rows, is_open = at_rest(theta), [], 0.0
-    size = np.array([*[1e5] * 3, 1e-6, 1e-6, 1e-4, *[1e-3] * 2, *[1.0] * 4, *[1e5] * 3])
+    size = np.array([*[1e5] * 3, 1e-6, 1e-6, 1e-4, *[1e-3] * 2, 1e-4, *[1.0] * 4, *[1e5] * 3])
     for move, end in zip(moves, [*(move.time for move in moves[1:]), times[-1]], strict=True):
         begin = move.time
         is_open = is_open if move.open is None else move.open

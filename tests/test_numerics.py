@@ -69,7 +69,7 @@ def between_samples(name: str, soft_and_late: bool) -> Theta:
     theta[[c.RESPONSE, c.BLOW_OFF_RESPONSE]] += [0.37 * MS, 0.61 * MS]
     if soft_and_late:
         theta[[c.COMPLIANCE, c.SOFTNESS, c.STIFF_UNTIL]] = 0.2 * theta[c.VOLUME], 5.0, 3e4
-        theta[c.CONTACT] = 60.43 * MS
+        theta[[c.CREEP, c.CREEP_TIME, c.CONTACT]] = 0.6, 45.0 * MS, 60.43 * MS
     return theta
 
 

@@ -47,7 +47,7 @@ def one(theta: Theta) -> Prepared:
 
 def still(vessel: float) -> Gas:
     """Gas that does not flow, of which only the pressure in the vessel matters."""
-    return Gas(vessel, 1.0, vessel, 1.0, vessel, 1.0, 0.0, 0.0)
+    return Gas(vessel, 1.0, vessel, 1.0, vessel, 1.0, 0.0, 0.0, 0.0)
 
 
 def supplied(theta: Theta, missing: float = 0.0) -> tuple[float, float, float]:

@@ -269,7 +269,7 @@ def test_every_coefficient_is_filled_in() -> None:
     convection = {"FREE_CONVECTION", "FORCED_CONVECTION"}
     modes = {"CONTROL_SENSOR", "BLOW_OFF_MODE"}  # the first of each
     opening = {"EXHAUST", "HOLE", "CRACKING_PRESSURE", "RELIEF_PRESSURE", "KINK"}
-    cups = {"COMPLIANCE", "SOFTNESS", "STIFF_UNTIL", "CONTACT"}
+    cups = {"COMPLIANCE", "SOFTNESS", "STIFF_UNTIL", "CREEP", "CONTACT"}
     mechanisms = set(list(COEFFICIENTS)[MECHANISMS:])
     blow_off = {"BLOW_OFF_SHAPE", "BLOW_OFF_DRAIN"}
     assert zero == blow_off | cups | opening | convection | effects | modes | mechanisms

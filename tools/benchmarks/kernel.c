@@ -20,7 +20,8 @@ enum { /* twin.model.theta.COEFFICIENTS */
     END_FOLLOWS, BULGE, SKEW, BEND_2, BEND_3, KINK, KINK_AT, RESPONSE, RESPONSE_OFF, RAMP_UP, SLOW_RAMP_UP,
     JET_FULL_AT, JET_DEPTH, RAMP_DOWN, BLOW_OFF, BLOW_OFF_SHAPE, BLOW_OFF_DRAIN,
     BLOW_OFF_REFILL, BLOW_OFF_RESPONSE, BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, RELIEF,
-    RELIEF_PRESSURE, EXHAUST, CRACKING_PRESSURE, PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT, VOLUME, COMPLIANCE, SOFTNESS, STIFF_UNTIL, FILM,
+    RELIEF_PRESSURE, EXHAUST, CRACKING_PRESSURE, PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT, VOLUME, COMPLIANCE, SOFTNESS, STIFF_UNTIL, CREEP,
+    CREEP_TIME, FILM,
     FREE_CONVECTION, FORCED_CONVECTION, AREA, NEAR_RESISTANCE, NEAR_LAMINAR, NEAR_INERTANCE,
     RESISTANCE, LAMINAR, INERTANCE, PLACE, LEAK, LEAK_CRITICAL, LAMINAR_LEAK, INFLOW, BACK_FLOW,
     OPENING, HOLE, SENSOR_LAG, SLOW_SENSOR, SENSOR_OFFSET, SENSOR_GAIN, H1, H1_LOW, H2, H2_LOW,
@@ -32,7 +33,7 @@ enum { /* what a call computes only once, behind them */
     K_PLACE, K_STRETCH, K_SOFT, K_CLOSED, K_OPENS, PREPARED
 };
 enum { /* the state of twin.model.kernel */
-    S_PORT, S_PORT_MASS, S_LINE, S_LINE_MASS, S_VESSEL, S_VESSEL_MASS, S_NEAR, S_FAR,
+    S_PORT, S_PORT_MASS, S_LINE, S_LINE_MASS, S_VESSEL, S_VESSEL_MASS, S_NEAR, S_FAR, S_YIELDED,
     S_DRIVE, S_JET, S_BLOWING, S_DRAINED, S_SUPPLIED, S_FELT, S_SENSED,
     NOZZLE, NOZZLE_COMMAND, NOZZLE_AGE, BLOW, BLOW_COMMAND, BLOW_AGE,
     ROUGH, PHASE, OPEN, VALID, SIGNALS, STATE
@@ -97,7 +98,7 @@ INLINED Tangent opening(double p, double ambient, double critical)
 #define PORT_COUNTS 0.1
 
 typedef struct {
-    double port, port_mass, line, line_mass, vessel, vessel_mass, near, far;
+    double port, port_mass, line, line_mass, vessel, vessel_mass, near, far, yielded;
 } Gas;
 typedef struct { double drive, jet, valve, drained, supply, felt, sensed; } Lags;
 typedef struct { double jet, suction, end, blow_off, open; } Driven;
@@ -215,15 +216,20 @@ INLINED double per_joule(double mass)
     return 1.0 / (R * mass);
 }
 
-typedef struct { double volume, stretch; } Room;
+typedef struct { double shrunk, stretch; } Shrinkage;
 
-INLINED Room room(double vessel, const double *k)
+INLINED Shrinkage shrinkage(double vessel, const double *k)
 {
     double vacuum = K(AMBIENT) - vessel;
     double held = K(STIFF_UNTIL) / (fabs(vacuum) + K(STIFF_UNTIL) + TINY);
     double pull = vacuum * (1.0 - held);
     double left = 1.0 / (1.0 + K(K_SOFT) * fabs(pull)), stretch = K(K_STRETCH) * left;
-    return (Room){K(VOLUME) - stretch * pull, stretch * left * (1.0 - held * held)};
+    return (Shrinkage){stretch * pull, stretch * left * (1.0 - held * held)};
+}
+
+INLINED double room(double vessel, double yielded, const double *k)
+{
+    return K(VOLUME) - (1.0 - K(CREEP)) * shrinkage(vessel, k).shrunk - yielded;
 }
 
 INLINED double convection(const Gas *y, double warmer, const double *k)
@@ -241,10 +247,15 @@ INLINED Gas solve(Gas y, const Gas *known, double step, const Driven *driven, co
     double out = at.out, out_slope = at.out_slope, blown = at.in, blown_slope = at.in_slope;
     Tangent leaking = at_vessel(y.vessel, driven, k);
     double leak = leaking.level, leak_slope = leaking.slope;
-    Room shrunk = room(y.vessel, k);
-    double volume = shrunk.volume, stretch = shrunk.stretch;
+    Shrinkage gives = shrinkage(y.vessel, k);
+    double shrunk = gives.shrunk, stretch = gives.stretch;
+    double creep = K(CREEP), follows = step / (K(CREEP_TIME) + step);
+    double yields = follows * (creep * shrunk - known->yielded);
+    double yielded = known->yielded + yields;
+    double volume = K(VOLUME) - (1.0 - creep) * shrunk - yielded;
     double port_stored = K(PORT_VOLUME) * per_pa, line_stored = K(LINE_VOLUME) * per_pa;
-    double vessel_stored = (volume + GAMMA * y.vessel * stretch) * per_pa;
+    double vessel_stored = (volume + GAMMA * y.vessel * stretch * (1.0 - creep)) * per_pa;
+    double creeping = GAMMA * y.vessel * stretch * creep * follows * per_pa;
     double port_warmth = K(K_PORT_HEAT), line_warmth = K(K_LINE_HEAT);
 
     /* Gas leaves a node at the node's temperature. */
@@ -274,8 +285,9 @@ INLINED Gas solve(Gas y, const Gas *known, double step, const Driven *driven, co
     double line_rest = (line_stored * known->line + line_warmth * outside) * weight;
     double line_fall = near_t * weight, line_rise = far_t * weight;
     cooling = warmth * volume * per_joule(y.vessel_mass);
-    weight = 1.0 / (vessel_stored - leak_slope * leak_t + cooling);
+    weight = 1.0 / (vessel_stored - leak_slope * leak_t + cooling + creeping);
     gained = vessel_stored * known->vessel + leak * leak_t + warmth * outside;
+    gained += creeping * y.vessel + GAMMA * y.vessel * yields * per_pa;
     double vessel_rest = gained * weight, vessel_fall = far_t * weight;
 
     double inertia = K(NEAR_INERTANCE) * (y.line + y.port) * per_s;
@@ -312,6 +324,7 @@ INLINED Gas solve(Gas y, const Gas *known, double step, const Driven *driven, co
         kept(known->vessel_mass + step * (leak + leak_slope * vessel - far), vessel * volume),
         min(max(near, -MOST), MOST),
         min(max(far, -MOST), MOST),
+        yielded,
     };
 }
 
@@ -361,7 +374,7 @@ INLINED Gas gas_on(const Gas *start, const Gas *begin, const Gas *end, double sh
 {
     return (Gas){
         ON(port), ON(port_mass), ON(line), ON(line_mass),
-        ON(vessel), ON(vessel_mass), ON(near), ON(far),
+        ON(vessel), ON(vessel_mass), ON(near), ON(far), ON(yielded),
     };
 }
 
@@ -378,7 +391,7 @@ INLINED Gas positive(Gas gas)
         max(gas.port, LOWEST), max(gas.port_mass, LIGHTEST),
         max(gas.line, LOWEST), max(gas.line_mass, LIGHTEST),
         max(gas.vessel, LOWEST), max(gas.vessel_mass, LIGHTEST),
-        gas.near, gas.far,
+        gas.near, gas.far, gas.yielded,
     };
 }
 
@@ -511,7 +524,7 @@ INLINED void substep(double *state, const double *k, double h)
     double blow = valve_over(state, BLOW, h, k, BLOW_OFF_RESPONSE);
     Gas gas = {
         S(S_PORT), S(S_PORT_MASS), S(S_LINE), S(S_LINE_MASS),
-        S(S_VESSEL), S(S_VESSEL_MASS), S(S_NEAR), S(S_FAR),
+        S(S_VESSEL), S(S_VESSEL_MASS), S(S_NEAR), S(S_FAR), S(S_YIELDED),
     };
     Lags lags = {
         S(S_DRIVE), S(S_JET), S(S_BLOWING), S(S_DRAINED),
@@ -523,7 +536,7 @@ INLINED void substep(double *state, const double *k, double h)
     S(S_PORT) = next.gas.port, S(S_PORT_MASS) = next.gas.port_mass;
     S(S_VESSEL) = next.gas.vessel, S(S_VESSEL_MASS) = next.gas.vessel_mass;
     S(S_LINE) = next.gas.line, S(S_LINE_MASS) = next.gas.line_mass;
-    S(S_NEAR) = next.gas.near, S(S_FAR) = next.gas.far;
+    S(S_NEAR) = next.gas.near, S(S_FAR) = next.gas.far, S(S_YIELDED) = next.gas.yielded;
     S(S_DRIVE) = next.lags.drive, S(S_JET) = next.lags.jet;
     S(S_BLOWING) = next.lags.valve, S(S_DRAINED) = next.lags.drained;
     S(S_SUPPLIED) = next.lags.supply;
@@ -577,7 +590,8 @@ static void enter(double *state, int phase, const double *k)
 static void settle(double *state, const double *k, double pressure)
 {
     double temperature = K(TEMPERATURE);
-    double volume = room(pressure, k).volume;
+    S(S_YIELDED) = K(CREEP) * shrinkage(pressure, k).shrunk;
+    double volume = room(pressure, S(S_YIELDED), k);
     S(S_PORT) = S(S_LINE) = S(S_VESSEL) = pressure;
     S(S_FELT) = S(S_SENSED) = pressure;
     S(S_PORT_MASS) = pressure * K(PORT_VOLUME) / (R * temperature);

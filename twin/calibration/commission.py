@@ -68,7 +68,9 @@ ELSEWHERE, SURELY = 0.6, 4.0
 # Above ambient (mbar), from where on a record that goes so high has met a relief valve. It opens at
 # about half of that.
 RELIEVED, RELIEVES = 60.0, 0.5
+CREEPS = 0.3  # share of what cups give way by, that comes later, before anything is known of them
 DRAINS = 0.2  # of the rate at which blow-off fills, by which it drains a reservoir of its own
+COMES = 40.0  # ms after suction, at which cups meet a part where the record does not show it
 LITTLE_VACUUM = 200.0  # mbar; flow ejectors on leaking parts make more
 AMBIENT_CLEARLY = 3.0  # mbar, the same for ambient pressure
 # Share by which the evacuated volume must differ from what is told: nearly twice what a flow meter
@@ -291,6 +293,7 @@ def guessed(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:
     tables["sensor"]["noise_mbar"] = max(readings.noise / MBAR, 0.05)
     remarks += [*_air_saving(tables["ejector"], readings, ambient), *_questions(readings)]
     tables["system"].update(free_convection=0.5, forced_convection=1.0, leak_critical_ratio=0.4)
+    tables["system"]["creep_share"] = CREEPS
     tables["supply"].update(SAGS)
     _flows(tables["ejector"], readings, _volume(data), ambient * MBAR)
     return DataSet.model_validate(tables), remarks
@@ -366,13 +369,14 @@ def starts(data: DataSet, meets: float, grows: float = np.nan) -> list[DataSet]:
     """``data``, and what may differ from it so much that no fit leads there.
 
     Where along the line the sensor sits, what gas is at the port, how a part leaves, whether cups
-    spread or fold, and whether they meet the next part ``meets`` seconds after suction is
-    commanded, or (NaN) are on it by then. Where the fall ``grows`` slowly (s), that may be the jet
-    as well as the sensor.
+    spread or fold, and whether they meet the next part after suction is commanded, ``meets``
+    seconds (NaN: the record does not show it), or are on it by then. Where the fall ``grows``
+    slowly (s), that may be the jet as well as the sensor.
     """
     cups = sum(volume(part) for part in data.system.parts if isinstance(part, Cups)) / ML
     leaves = ("in_blow_off", "after_blow_off") if cups else (data.system.part_leaves,)
-    waits = (0.0, meets / MS) if cups and np.isfinite(meets) else (0.0,)
+    comes = meets / MS if np.isfinite(meets) else COMES
+    waits = (0.0, comes) if cups else (0.0,)
     tables = data.model_dump()
     place = place_of(data)
     everything = _volume(data) / ML

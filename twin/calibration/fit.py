@@ -36,7 +36,7 @@ SWITCHING = 6.0  # rows, one standard deviation of when the nozzle switched
 # from the best: what the step made of the strong directions hid what the weak ones are.
 STEP = 0.01
 # s, one standard deviation of when a valve acts from stroke to stroke: edges are known no better.
-JITTER = 0.5 * MS
+JITTER = 0.3 * MS
 INSIDE = 0.1  # sigmas from a bound, where a search begins at most: on it, it would not move
 RISING = 40  # steps over the characteristic, in which suction is looked at
 END_PRESSURE = "ejector.end_pressure_mbar"

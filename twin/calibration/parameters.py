@@ -162,7 +162,9 @@ FREE_IN_MARKET = (
     Free("system", "shrinks_ml", "ml", 0.3, 0.0, 5000.0, True, market=1.5),
     Free("system", "softness", "", 0.5, 0.0, 500.0, True, market=1.0),
     Free("system", "stiff_mbar", "mbar", 20.0, 0.0, 2000.0, market=1.0),
-    Free("system", "part_meets_ms", "ms", 5.0, 0.0, 5000.0, market=0.3),
+    Free("system", "creep_share", "", 0.1, 0.0, 1.0, market=0.3, scaled=False),
+    Free("system", "creep_ms", "ms", 10.0, 1.0, 1000.0, market=0.7),
+    Free("system", "part_meets_ms", "ms", 5.0, 0.0, 5000.0, market=0.6),
     Free("system", "release_shift_mbar", "mbar", 5.0, -60.0, 200.0, market=15.0, scaled=False),
 )
 # What is free beside these where an absolute sensor reads a system that is never open to ambient:

@@ -205,6 +205,8 @@ class System(Settings):
     shrinks_ml: NotNegative = 0.0  # at full vacuum, beside what the cups say
     softness: NotNegative = 0.0  # 0: shrinks in proportion to vacuum, n: half by 1/(n + 2) of it
     stiff_mbar: NotNegative = 0.0  # vacuum up to which cups hardly give way
+    creep_share: float = Field(0.0, ge=0.0, le=1.0)  # of what they shrink by, that comes later
+    creep_ms: Positive = 50.0  # time constant of that
     leak_sl_min: NotNegative = 0.3  # of seals and fittings, sonic
     leak_critical_ratio: float = Field(CRITICAL_RATIO, ge=0.1, le=0.6)  # up to which it is
     part_leaves: Literal["in_blow_off", "after_blow_off"] = (
@@ -357,6 +359,7 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     theta[c.COMPLIANCE] = min(total.shrinks + system.shrinks_ml * ML, FLATTEST * theta[c.VOLUME])
     theta[c.SOFTNESS] = system.softness
     theta[c.STIFF_UNTIL] = system.stiff_mbar * MBAR
+    theta[[c.CREEP, c.CREEP_TIME]] = system.creep_share, system.creep_ms * MS
     theta[c.FILM] = system.film_coefficient
     theta[c.FREE_CONVECTION] = system.free_convection
     if theta[c.BLOW_OFF] > 0.0:

@@ -56,13 +56,14 @@ from twin.model.plant import (
     reading,
     room,
     sensed_at,
+    shrinkage,
 )
 from twin.model.plant import advance as advance_gas
 from twin.signals import Command, Phase, Signal
 
 # Rows of the state: what plant carries on ...
-PORT, PORT_MASS, LINE, LINE_MASS, VESSEL, VESSEL_MASS, NEAR, FAR = range(8)
-DRIVE, JET, BLOWING, DRAINED, SUPPLIED, FELT, SENSED = range(8, ORDER)
+PORT, PORT_MASS, LINE, LINE_MASS, VESSEL, VESSEL_MASS, NEAR, FAR, YIELDED = range(9)
+DRIVE, JET, BLOWING, DRAINED, SUPPLIED, FELT, SENSED = range(9, ORDER)
 # ... then the valves (position, what is commanded, for how long), how roughly the pressures run
 # (Pa/s³), the phase, the open cup, whether the model stands on a measurement at all, and the
 # switching signals it hands out. Last how far each mechanism has set in (0 to 1), by which share
@@ -211,7 +212,7 @@ def take_over(state: State, before: c.Theta, after: c.Theta) -> None:
     """
     for mass, volume in ((PORT_MASS, c.PORT_VOLUME), (LINE_MASS, c.LINE_VOLUME)):
         state[mass] *= after[volume] / before[volume]
-    room, _ = _room(state[VESSEL], before)
+    room, _ = _room(state[VESSEL], state[YIELDED], before)
     joined = room + (after[c.VOLUME] - before[c.VOLUME])
     state[VESSEL_MASS] *= joined / room
     walls = after[c.COMPLIANCE] != before[c.COMPLIANCE]
@@ -221,28 +222,32 @@ def take_over(state: State, before: c.Theta, after: c.Theta) -> None:
     moved = walls & (state[VALID] > 0.0)
     if moved.any():
         vessel = np.where(moved, state[VESSEL], LOWEST)
-        state[VESSEL] = np.where(moved, _squeezed(vessel, joined, after), state[VESSEL])
+        squeezed = _squeezed(vessel, state[YIELDED], joined, after)
+        state[VESSEL] = np.where(moved, squeezed, state[VESSEL])
 
 
-def _room(vessel: State, theta: c.Theta) -> tuple[State, State]:
-    """Volume of the vessel at a pressure (m³), shrunk by its vacuum, and its rise (m³/Pa)."""
+def _room(vessel: State, yielded: State, theta: c.Theta) -> tuple[State, State]:
+    """Volume of the vessel at a pressure (m³), shrunk by its vacuum, and its rise (m³/Pa) at once.
+
+    It has ``yielded`` (m³) of what comes later.
+    """
     ambient, stiff = theta[c.AMBIENT], theta[c.STIFF_UNTIL]
     vacuum, most = ambient - vessel, ambient / (1.0 + stiff / ambient)
     held = stiff / (abs(vacuum) + stiff + TINY)
     pull, softness = vacuum * (1.0 - held) / most, theta[c.SOFTNESS]
     left = 1.0 / (1.0 + softness * abs(pull))
-    stretch = theta[c.COMPLIANCE] * (1.0 + softness) * left
-    return theta[c.VOLUME] - stretch * pull, stretch * left * (1.0 - held * held) / most
+    stretch = theta[c.COMPLIANCE] * (1.0 + softness) * left * (1.0 - theta[c.CREEP])
+    return theta[c.VOLUME] - stretch * pull - yielded, stretch * left * (1.0 - held * held) / most
 
 
-def _squeezed(vessel: State, joined: State, theta: c.Theta) -> State:
+def _squeezed(vessel: State, yielded: State, joined: State, theta: c.Theta) -> State:
     """Pressure (Pa) of gas that filled ``joined`` (m³) once its walls stand as they do now.
 
     Without time for heat: p V^γ stays, and V depends on p. Newton's method on the logarithm.
     """
     pressure = vessel.copy()
     for _ in range(SQUEEZES):
-        room, rise = _room(pressure, theta)
+        room, rise = _room(pressure, yielded, theta)
         off = np.log(pressure / vessel) + GAMMA * np.log(room / joined)
         slope = 1.0 / pressure + GAMMA * rise / room
         pressure *= np.exp(-off / slope / pressure)
@@ -349,6 +354,7 @@ def _substep(state, k, h, guess):  # type: ignore[no-untyped-def]
             state[VESSEL_MASS, i],
             state[NEAR, i],
             state[FAR, i],
+            state[YIELDED, i],
         )
         lags = Lags(
             state[DRIVE, i],
@@ -368,6 +374,7 @@ def _substep(state, k, h, guess):  # type: ignore[no-untyped-def]
             state[guess + VESSEL_MASS, i],
             state[guess + NEAR, i],
             state[guess + FAR, i],
+            state[guess + YIELDED, i],
         )
         before = gas.vessel
         open_cup = state[OPEN, i] * max(left, 0.0) / h if left < h else state[OPEN, i]
@@ -376,7 +383,7 @@ def _substep(state, k, h, guess):  # type: ignore[no-untyped-def]
         state[PORT, i], state[PORT_MASS, i] = gas.port, gas.port_mass
         state[VESSEL, i], state[VESSEL_MASS, i] = gas.vessel, gas.vessel_mass
         state[LINE, i], state[LINE_MASS, i] = gas.line, gas.line_mass
-        state[NEAR, i], state[FAR, i] = gas.near, gas.far
+        state[NEAR, i], state[FAR, i], state[YIELDED, i] = gas.near, gas.far, gas.yielded
         state[DRIVE, i], state[JET, i], state[BLOWING, i] = lags.drive, lags.jet, lags.valve
         state[DRAINED, i], state[SUPPLIED, i] = lags.drained, lags.supply
         state[FELT, i], state[SENSED, i] = lags.felt, lags.sensed
@@ -451,8 +458,7 @@ def _put_in(state, k, i):  # type: ignore[no-untyped-def]
         k[int(k[first + ON, i]), i] += share * k[first + SIZE, i]
         k[int(k[first + ALSO_ON, i]), i] += share * k[first + ALSO_SIZE, i]
     derive(k, i)
-    volume, _ = room(state[VESSEL, i], k, i)
-    return volume
+    return room(state[VESSEL, i], state[YIELDED, i], k, i)
 
 
 @compiled
@@ -515,7 +521,9 @@ def _enter(state, phases, k):  # type: ignore[no-untyped-def]
 def _settle(state, k, i, pressure):  # type: ignore[no-untyped-def]
     """Let gas, sensor and supply stand at ``pressure``, as warm as the wall."""
     temperature = k[c.TEMPERATURE, i]
-    volume, _ = room(pressure, k, i)
+    shrunk, _ = shrinkage(pressure, k, i)
+    state[YIELDED, i] = k[c.CREEP, i] * shrunk
+    volume = room(pressure, state[YIELDED, i], k, i)
     state[PORT, i] = state[LINE, i] = state[VESSEL, i] = pressure
     state[FELT, i] = state[SENSED, i] = pressure
     state[PORT_MASS, i] = pressure * k[c.PORT_VOLUME, i] / (R * temperature)

@@ -77,6 +77,7 @@ class Gas(NamedTuple):
     vessel_mass: float  # kg
     near: float  # kg/s, line to port
     far: float  # kg/s, vessel to line
+    yielded: float  # m³, by which the vessel has shrunk of what comes later
 
 
 class Lags(NamedTuple):
@@ -293,14 +294,37 @@ def per_joule(mass):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def room(vessel, k, i):  # type: ignore[no-untyped-def]
-    """Volume (m³) of a vessel that shrinks with vacuum, and how much it grows per Pa."""
+def shrinkage(vessel, k, i):  # type: ignore[no-untyped-def]
+    """By how much a vessel shrinks in the end at its vacuum (m³), and how much less so per Pa."""
     vacuum = k[c.AMBIENT, i] - vessel
     held = k[c.STIFF_UNTIL, i] / (abs(vacuum) + k[c.STIFF_UNTIL, i] + TINY)
     pull = vacuum * (1.0 - held)
     left = 1.0 / (1.0 + k[_SOFT, i] * abs(pull))
     stretch = k[_STRETCH, i] * left
-    return k[c.VOLUME, i] - stretch * pull, stretch * left * (1.0 - held * held)
+    return stretch * pull, stretch * left * (1.0 - held * held)
+
+
+@inlined
+def room(vessel, yielded, k, i):  # type: ignore[no-untyped-def]
+    """Volume (m³) of a vessel that shrinks with vacuum, a share of it at once, the rest later."""
+    shrunk, _ = shrinkage(vessel, k, i)
+    return k[c.VOLUME, i] - (1.0 - k[c.CREEP, i]) * shrunk - yielded
+
+
+@inlined
+def walls(vessel, before, step, k, i):  # type: ignore[no-untyped-def]
+    """A vessel after ``step`` in which what comes later goes on from what had yielded ``before``.
+
+    Its volume, what has yielded by then (m³), γ p dV/dp (m³) at once and of what comes later, and
+    γ p times by how much that yields (J).
+    """
+    shrunk, stretch = shrinkage(vessel, k, i)
+    creep, follows = k[c.CREEP, i], step / (k[c.CREEP_TIME, i] + step)
+    yields = follows * (creep * shrunk - before)
+    yielded, rise = before + yields, GAMMA * vessel * stretch
+    volume = k[c.VOLUME, i] - (1.0 - creep) * shrunk - yielded
+    at_once, later = rise * (1.0 - creep), rise * creep * follows
+    return volume, yielded, at_once, later, GAMMA * vessel * yields
 
 
 @inlined
@@ -347,9 +371,9 @@ def solve(y, known, step, driven, k, i):  # type: ignore[no-untyped-def]
     per_s, per_pa, per_k = 1.0 / step, 1.0 / (GAMMA * R * step), 1.0 / outside
     out, out_slope, blown, blown_slope = at_port(y.port, driven, k, i)
     leak, leak_slope = at_vessel(y.vessel, driven, k, i)
-    volume, stretch = room(y.vessel, k, i)
+    volume, yielded, at_once, later, yields = walls(y.vessel, known.yielded, step, k, i)
     port_stored, line_stored = k[c.PORT_VOLUME, i] * per_pa, k[c.LINE_VOLUME, i] * per_pa
-    vessel_stored = (volume + GAMMA * y.vessel * stretch) * per_pa
+    vessel_stored, creeping = (volume + at_once) * per_pa, later * per_pa
     port_warmth, line_warmth = k[_PORT_HEAT, i], k[_LINE_HEAT, i]
 
     entering, drawn = blown + blown_slope * y.port, max(out + out_slope * y.port, 0.0)
@@ -369,8 +393,9 @@ def solve(y, known, step, driven, k, i):  # type: ignore[no-untyped-def]
     line_rest = (line_stored * known.line + line_warmth * outside) * weight
     line_fall, line_rise = near_t * weight, far_t * weight
     cooling = warmth * volume * per_joule(y.vessel_mass)
-    weight = 1.0 / (vessel_stored - leak_slope * leak_t + cooling)
+    weight = 1.0 / (vessel_stored - leak_slope * leak_t + cooling + creeping)
     gained = vessel_stored * known.vessel + leak * leak_t + warmth * outside
+    gained += creeping * y.vessel + yields * per_pa
     vessel_rest, vessel_fall = gained * weight, far_t * weight
 
     inertia = k[c.NEAR_INERTANCE, i] * (y.line + y.port) * per_s
@@ -404,6 +429,7 @@ def solve(y, known, step, driven, k, i):  # type: ignore[no-untyped-def]
         kept(known.vessel_mass + step * (leak + leak_slope * vessel - far), vessel * volume),
         min(max(near, -MOST), MOST),
         min(max(far, -MOST), MOST),
+        yielded,
     )
 
 
@@ -487,6 +513,7 @@ def gas_on(start, begin, end, share):  # type: ignore[no-untyped-def]
         start.vessel_mass + share * (end.vessel_mass - begin.vessel_mass),
         start.near + share * (end.near - begin.near),
         start.far + share * (end.far - begin.far),
+        start.yielded + share * (end.yielded - begin.yielded),
     )
 
 
@@ -516,6 +543,7 @@ def positive(gas):  # type: ignore[no-untyped-def]
         max(gas.vessel_mass, LIGHTEST),
         gas.near,
         gas.far,
+        gas.yielded,
     )
 
 
