@@ -112,7 +112,8 @@ def _phase_of(kind: Ints) -> Ints:
 def _left(off: Floats, place: Ints, cycle: Ints, count: Ints, noise: float) -> tuple[float, float]:
     """Rms over rows (Pa) of what is left, and of the floor.
 
-    The noise of single readings is added to the means of bins.
+    The noise of single readings is added to the means of bins. Both are of the places that enough
+    cycles show: where one goes on for longer than others, nobody knows what is scatter.
 
     A cycle in which something went wrong says little of the model and of the floor: it counts no
     more in either than one that is ODD times as far from the mean as the middle one.
@@ -125,10 +126,10 @@ def _left(off: Floats, place: Ints, cycle: Ints, count: Ints, noise: float) -> t
     if not shown.any():
         return float(np.sqrt(np.average(off**2 + single, weights=count))), noise
     _, turn = np.unique(cycle, return_inverse=True)
-    rows, rows_shown = np.bincount(turn, count), np.bincount(turn, count * shown)
-    each = np.bincount(turn, count * shown * (apart + single)) / np.maximum(rows_shown, 1)
-    middle = np.median(each[rows_shown > 0])
+    rows = np.bincount(turn, count * shown)
+    each = np.bincount(turn, count * shown * (apart + single)) / np.maximum(rows, 1)
+    middle = np.median(each[rows > 0])
     trust = np.minimum(1.0, ODD**2 * middle / np.maximum(each, middle))
-    left = np.sum(trust * np.bincount(turn, count * (off**2 + single))) / np.sum(rows)
-    floor = np.mean((trust * each)[rows_shown > 0])
+    left = np.sum(trust * np.bincount(turn, count * shown * (off**2 + single))) / np.sum(rows)
+    floor = np.mean((trust * each)[rows > 0])
     return float(np.sqrt(left)), float(np.sqrt(floor))
