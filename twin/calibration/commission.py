@@ -380,13 +380,14 @@ def starts(data: DataSet, meets: float, grows: float = np.nan) -> list[DataSet]:
     tables = data.model_dump()
     place = place_of(data)
     everything = _volume(data) / ML
-    usual, softer = (LIPS, BELLOWS) if cups else (RIGID, LIPS)  # a vessel may have cups behind it
+    usual = LIPS if cups else RIGID
+    softer = (BELLOWS,) if cups else (LIPS, BELLOWS)  # a vessel may be cups on a part that stays
     quick = {key: tables["ejector"][key] for key in _JET}
     slow = _slow(quick, grows / MS) if SLOW_JET[0] < grows < SLOW_JET[1] else quick
     inside = [
         (PORT_SHARES[0], usual, slow),
         (PORT_SHARES[1], usual, slow),
-        (PORT_SHARES[0], softer, slow),
+        *((PORT_SHARES[0], wall, slow) for wall in softer),
     ]
     if slow is not quick:
         inside.append((PORT_SHARES[0], usual, quick))

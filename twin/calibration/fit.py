@@ -32,9 +32,6 @@ MOST_STEPS = 8  # in a round
 FIRST_SHARE = 0.4  # of the log, for the first round: it has the longest way to go
 DETERMINED = 0.5  # of what the type leaves open: what is known better comes from the log
 SWITCHING = 6.0  # rows, one standard deviation of when the nozzle switched
-# Sigmas of the market, for a derivative. With five times as much a fit of 46 values stopped far
-# from the best: what the step made of the strong directions hid what the weak ones are.
-STEP = 0.01
 # s, one standard deviation of when a valve acts from stroke to stroke: edges are known no better.
 JITTER = 0.3 * MS
 INSIDE = 0.1  # sigmas from a bound, where a search begins at most: on it, it would not move
@@ -105,7 +102,7 @@ class Problem:
         """Derivatives of ``residual``."""
         n = len(self.space.free)
         steps = np.append(
-            inside(x[:n], self.space.high, STEP), np.full(len(x) - n, 1.0 / SWITCHING)
+            inside(x[:n], self.space.high, self.space.step), np.full(len(x) - n, 1.0 / SWITCHING)
         )
         return sensitivities(self._predict, self._whole(x), steps)[1]
 

@@ -68,7 +68,7 @@ def judge(cycles: Cycles, data: DataSet, noise: float) -> Verdict:
     off = _off(cycles, coefficients(data))
     bins = cycles.bins
     places = bins.place_by_turn
-    used = (bins.cycle >= 1) & np.isfinite(off)  # the model swings in in the first
+    used = (bins.cycle >= 1) & np.isfinite(off)  # the model swings in in the first, as in ``_off``
     found = {}
     for phase in Phase:
         here = used & (_phase_of(bins.kind) == phase)
@@ -97,7 +97,7 @@ def _off(cycles: Cycles, theta: Theta) -> Floats:
     most = max(round(MOST_EARLY / float(np.median(cycles.dt))), 1)
     early = range(-most, most + 1)
     off = cycles.off(np.repeat(theta[:, None], len(early), axis=1), early)
-    usable = np.isfinite(off).all(axis=1)
+    usable = np.isfinite(off).all(axis=1) & (cycles.bins.cycle >= 1)
     left = np.average(off[usable] ** 2, axis=0, weights=cycles.bins.count[usable])
     best: Floats = off[:, int(np.argmin(left))]
     return best

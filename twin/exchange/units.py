@@ -31,6 +31,7 @@ UNITS: Mapping[str, Unit] = {
     "bar": Unit(_PRESSURE, BAR),
     "Pa/s": Unit({"kg": 1, "m": -1, "s": -3}),
     "1/Pa": Unit({"kg": -1, "m": 1, "s": 2}),
+    "1/s": Unit({"s": -1}),
     "K": Unit({"K": 1}),
     "s": Unit(_TIME),
     "ms": Unit(_TIME, MS),
