@@ -20,6 +20,7 @@ from twin.monitor.signatures import steps
 from twin.signals import MBAR, MS, UNUSABLE, Phase, Samples
 
 BINS = 6  # in each unit of warped time
+MOST_EARLY = 15.0 * MS  # s (a row at least), by which the nozzle may be seen early or late
 # What a second sensor may be off the first by: 1 % of a vacuum sensor's bar, of its span as well,
 # and what is left of its lag, which is looked for among some.
 ZERO, SPAN, LAG = 10.0 * MBAR, 0.01, 1.0 * MS  # Pa, 1, s
@@ -85,6 +86,11 @@ class Cycles:
         tolerance = kernel.ROUGHLY if quickly else kernel.TOLERANCE
         unsure = np.empty((len(measured), 0))
         return cls(rows, dt, phase, level, bins, measured, drawn, tolerance, unsure=unsure)
+
+    @property
+    def most_early(self) -> int:
+        """Rows by which the nozzle may be seen to switch early or late, the same in all cycles."""
+        return max(round(MOST_EARLY / float(np.median(self.dt))), 1)
 
     def of_second(self, end: Literal["port", "vessel"]) -> "Cycles":
         """The same of the second pressure, which is measured at an ``end`` of the line."""
@@ -161,6 +167,11 @@ class Both:
     def bins(self) -> Bins:
         """Those of the first."""
         return self.first.bins
+
+    @property
+    def most_early(self) -> int:
+        """Rows by which the nozzle may be seen early or late."""
+        return self.first.most_early
 
     def off(self, theta: Floats, early: Sequence[int] = ()) -> Floats:
         """As of ``Cycles``."""

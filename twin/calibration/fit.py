@@ -31,7 +31,7 @@ ROUNDS = (1e-2, 1e-2, 1e-3)
 MOST_STEPS = 8  # in a round
 FIRST_SHARE = 0.4  # of the log, for the first round: it has the longest way to go
 DETERMINED = 0.5  # of what the type leaves open: what is known better comes from the log
-SWITCHING = 6.0  # rows, one standard deviation of when the nozzle switched
+SWITCHING = 0.4  # of the most that the nozzle may be seen early or late, one standard deviation
 # s, one standard deviation of when a valve acts from stroke to stroke: edges are known no better.
 JITTER = 0.3 * MS
 INSIDE = 0.1  # sigmas from a bound, where a search begins at most: on it, it would not move
@@ -93,30 +93,40 @@ class Problem:
         n, whole = len(self.space.free), self._whole(x)
         if n == len(x):
             return self._predict(x[:, None])[:, 0]
-        after = whole + np.append(np.zeros(n), 1.0 / SWITCHING)
-        share = SWITCHING * (x[n] - whole[n])
+        after = whole + np.append(np.zeros(n), 1.0 / self._rows)
+        share = self._rows * (x[n] - whole[n])
         both: Floats = self._predict(np.stack([whole, after], axis=1)) @ [1.0 - share, share]
         return both
 
     def jacobian(self, x: Floats) -> Floats:
         """Derivatives of ``residual``."""
         n = len(self.space.free)
-        steps = np.append(
-            inside(x[:n], self.space.high, self.space.step), np.full(len(x) - n, 1.0 / SWITCHING)
-        )
+        row = np.full(len(x) - n, 1.0 / self._rows)
+        steps = np.append(inside(x[:n], self.space.high, self.space.step), row)
         return sensitivities(self._predict, self._whole(x), steps)[1]
+
+    @property
+    def bounds(self) -> tuple[Floats, Floats]:
+        """Of the coordinates and of when the nozzle switches."""
+        most = self.cycles.most_early / self._rows
+        return np.append(self.space.low, -most), np.append(self.space.high, most)
+
+    @property
+    def _rows(self) -> float:
+        """Rows by which the nozzle switches sooner or later, one standard deviation."""
+        return SWITCHING * self.cycles.most_early
 
     def _whole(self, x: Floats) -> Floats:
         """``x`` with the nozzle switching at the row before."""
         n, whole = len(self.space.free), x.copy()
-        whole[n:] = np.floor(x[n:] * SWITCHING) / SWITCHING
+        whole[n:] = np.floor(x[n:] * self._rows) / self._rows
         return whole
 
     def _predict(self, points: Floats) -> Floats:
         """Residuals at points, (coordinates, n) to (residuals, n)."""
         n = len(self.space.free)
         moved = [self.space.at(one) for one in points[:n].T]
-        early = np.rint(points[n:] * SWITCHING).astype(int).ravel().tolist()
+        early = np.rint(points[n:] * self._rows).astype(int).ravel().tolist()
         off = self.cycles.off(np.stack([coefficients(data) for data in moved], axis=1), early)
         white = np.concatenate([*self.weights.white(off), points])
         if self.space.everywhere:
@@ -351,8 +361,7 @@ def _solved(
     tolerance: float,
     loss: Literal["linear", "soft_l1"] = "linear",
 ) -> Floats:
-    rest = np.full(len(x) - len(problem.space.free), np.inf)
-    low, high = np.append(problem.space.low, -rest), np.append(problem.space.high, rest)
+    low, high = (bound[: len(x)] for bound in problem.bounds)
     found = least_squares(
         problem.residual,
         np.clip(x, low + INSIDE, high - INSIDE),

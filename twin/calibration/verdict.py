@@ -19,7 +19,6 @@ from twin.signals import MBAR, Phase
 GOOD, USABLE = 1.5, 2.0  # times the floor
 LEAST_FLOOR = 0.3 * MBAR  # Pa; nobody needs a twin nearer than that
 ODD = 2.0  # times the middle cycle's rms
-MOST_EARLY = 15e-3  # s (a row at least), by which the nozzle may be seen early or late
 FEWEST = 3  # cycles that show one place, to tell what is common from what scatters
 WEAKENS = {
     Phase.IDLE: "leaks and heat while nothing is commanded",
@@ -94,8 +93,7 @@ def _off(cycles: Cycles, theta: Theta) -> Floats:
     It is seen in the pressure a little off, the same in all cycles. The live twin is set on the
     pressure where it sees it.
     """
-    most = max(round(MOST_EARLY / float(np.median(cycles.dt))), 1)
-    early = range(-most, most + 1)
+    early = range(-cycles.most_early, cycles.most_early + 1)
     off = cycles.off(np.repeat(theta[:, None], len(early), axis=1), early)
     usable = np.isfinite(off).all(axis=1) & (cycles.bins.cycle >= 1)
     left = np.average(off[usable] ** 2, axis=0, weights=cycles.bins.count[usable])
