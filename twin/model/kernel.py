@@ -311,8 +311,7 @@ def _jumps(state, k, h, i):  # type: ignore[no-untyped-def]
 
 @inlined
 def _passes(state, k, h, i):  # type: ignore[no-untyped-def]
-    """Whether blow-off brings the port as near as it moves in ``h`` to where it opens
-    exhaust or relief.
+    """Whether blow-off can bring the port within ``h`` to where the exhaust or the relief opens.
 
     The sensor's first stage follows it, so the distance between them tells how quickly it moves.
     """
