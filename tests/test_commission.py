@@ -48,7 +48,7 @@ from twin.calibration.parameters import (
 from twin.calibration.readings import Readings, deep, read, turns
 from twin.calibration.report import commissioned_as_json, commissioned_in_words, headline
 from twin.calibration.store import store_first
-from twin.calibration.verdict import Residual, Verdict, judge
+from twin.calibration.verdict import Residual, Verdict, _left, judge
 from twin.config import Asset
 from twin.diagnosis.answer import diagnose
 from twin.errors import ConfigError
@@ -540,6 +540,16 @@ def test_the_nozzle_may_be_seen_late_the_same_in_all_cycles() -> None:
     moved = replace(cycles, phase=cycles._phases([-6])[:, 0].copy())
     one, other = (judge(each, data, 0.0).residuals[Phase.HOLD].left for each in (cycles, moved))
     assert other == pytest.approx(one, rel=0.1)
+
+
+def test_what_few_cycles_show_counts_neither_as_left_nor_as_floor() -> None:
+    """A hold that goes on for longer than others: nobody knows what of it is scatter."""
+    off = np.array([1.0, 2.0, 3.0, 4.0, 2.0, 3.0]) * MBAR
+    place, cycle = np.array([0, 1, 0, 1, 0, 1]), np.array([1, 1, 2, 2, 3, 3])
+    longer = np.append(off, 50.0 * MBAR), np.append(place, 2), np.append(cycle, 3)
+    known = _left(off, place, cycle, np.ones(6), 0.0)
+    assert _left(*longer, np.ones(7), 0.0) == pytest.approx(known)
+    assert known[1] == pytest.approx(MBAR)
 
 
 def verdict(**times: float) -> Verdict:
