@@ -25,6 +25,7 @@ from twin.diagnosis.evidence import HEALTHY, Hypothesis, _unsettled, collect, th
 from twin.diagnosis.fit import Fitted
 from twin.diagnosis.hypotheses import price
 from twin.diagnosis.judge import gain, judge
+from twin.diagnosis.screen import signatures
 from twin.diagnosis.search import _about, _confirmed, held_out_gain, tried_in_or_out
 from twin.diagnosis.unlisted import Unlisted, look
 from twin.diagnosis.weights import covariance, levels
@@ -176,6 +177,17 @@ def test_a_gain_is_told_by_a_few_unseen_cycles_or_one() -> None:
         assert low == high == 0.0  # nothing is gained by nothing
 
 
+def test_one_odd_cycle_does_not_take_away_a_cause() -> None:
+    """Where a leak has the nozzle go on once more in one cycle of five, that one is off by much."""
+    before, after = with_leak().before, with_leak().after
+    assert before
+    assert after
+    hypothesis = with_leak().hypothesis
+    odd = replace(after, leftover=0.8 * before.leftover)
+    assert answer_module._sure(hypothesis, before, odd)
+    assert not answer_module._sure(hypothesis, before, replace(odd, steady=0.8 * before.steady))
+
+
 @pytest.mark.parametrize("cycles", [1, 4])
 def test_fewer_than_five_unseen_cycles_give_a_gain_no_interval(cycles: int) -> None:
     leak = with_leak()
@@ -237,6 +249,18 @@ def test_a_leak_that_opens_half_way_is_a_step_with_its_onset() -> None:
     assert answer["extended"]["leftover_sigma"] < 1.25 < answer["baseline"]["leftover_sigma"]
     assert answer["gain"]["rms_reduction_pct"] > 50
     assert answer["gain"]["share_of_achievable_pct"] > 90
+
+
+def test_what_grows_to_a_great_size_comes_first_with_its_course() -> None:
+    """By a linear model, a filter that clogs to many times what is usual looks like weather."""
+    evidence = collect(CONFIG, record(40.0, "filter_clogging=130/ramp:39", seed=24))
+    fitted, _ = answer_module.split(evidence)
+    known = covariance(evidence)
+    judged, weights = known.of(evidence.judged), known.of(fitted)
+    alone = signatures(evidence, evidence.judged)
+    singles = search_module._fit_singles(evidence, judged, weights, alone, quiet)
+    first = search_module._ranked(evidence, judged, singles)[0]
+    assert first.kind == {("filter_clogging", Course.RAMP)}
 
 
 @pytest.mark.parametrize(

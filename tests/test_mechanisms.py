@@ -19,12 +19,14 @@ from tools.mechanism_trial import longer
 from twin.diagnosis.another_log import judged_on
 from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.diagnosis.extend import extended
+from twin.diagnosis.mechanisms import is_a_course_of
 from twin.diagnosis.propose import Proposal, proposed
 from twin.diagnosis.words import lines
 from twin.errors import ConfigError
 from twin.model import kernel
 from twin.model import mechanism as m
 from twin.model import theta as c
+from twin.model.courses import Cause
 from twin.model.dataset import coefficients
 from twin.model.effects import EFFECTS, apply, effect_of
 from twin.model.theta import Theta
@@ -233,6 +235,25 @@ def test_what_one_unit_had_is_named_on_another(tmp_path: Path) -> None:
     known = extended(told, another.config)
     assert known is not None
     assert list(known.data.effects) == [proposal.effect.mechanism]  # read without the catalogue
+
+
+@pytest.mark.parametrize(
+    ("mechanism", "cause", "same"),
+    [
+        ("line_warming_up", "filter_clogging", True),
+        ("seepage_warming_up", "leakage", True),
+        ("inflow_warming_up", "porous_leakage", True),
+        ("suction_warming_up", "suction_loss", True),
+        ("nozzle_warming_up", "end_vacuum_loss", True),
+        ("sensor_warming_up", "leakage", False),
+        ("opening_above", "leakage", False),
+        ("line_nozzle_on_slowly", "filter_clogging", False),
+    ],
+)
+def test_what_only_grows_where_a_listed_cause_acts_is_that_cause(
+    mechanism: str, cause: str, same: bool
+) -> None:
+    assert is_a_course_of(rigs.theta("test_rig"), Cause(mechanism, {}), Cause(cause, {})) is same
 
 
 def test_three_listed_causes_that_mimic_one_mechanism_are_dropped() -> None:

@@ -19,7 +19,7 @@ from twin.diagnosis.mechanisms import Explained, explain, explain_alone
 from twin.diagnosis.search import Search, search, sharpened, stranger
 from twin.diagnosis.unlisted import STRANGE, Unlisted, extended, look
 from twin.diagnosis.unmodelled import Unmodelled
-from twin.diagnosis.weights import Weights, covariance
+from twin.diagnosis.weights import Covariance, Weights, covariance
 from twin.inference.levels import SIGMAS_95
 from twin.inference.unmodelled import Odds
 from twin.instants import CALENDAR_NS, SECOND_NS
@@ -130,29 +130,17 @@ def diagnose(
     strange = look(known, found, fitted, held_out, least=0.0 if likely else STRANGE)
     # Where nothing was fitted, all cycles are unseen.
     left = after.leftover if found else _left_in_all(evidence, healthy.of(evidence.judged))
-    verdict, terms = _verdict(found, before, after, left, strange, likely), tuple[Term, ...]()
-    mechanism = None
-    rough = verdict == "explained" and after.rms > (LITTLE, MIMICS)[len(found) == 1] * before.usual
-    if rough and explain_alone(evidence, fitted, found, progress):
-        verdict, strange = "unlisted", look(healthy, HEALTHY, fitted, held_out)  # they mimic it
-    if verdict == "unlisted":
-        if not _sure(found, before, after):
-            searched, found = replace(searched, found=None), HEALTHY
-            strange = look(healthy, found, fitted, held_out)
-            after = before
-        mechanism, mended = _mechanism_found(evidence, found, after, fitted, held_out, progress)
-        if mechanism and not mechanism.beside:
-            searched, found = replace(searched, found=None), HEALTHY
-        if mended is None:
-            strange, mended = _term_found(evidence, found, after, strange, held_out)
-            terms = strange.terms
-        after = mended or after
+    verdict = _verdict(found, before, after, left, strange, likely)
+    known_by_now = _Found(verdict, searched, found, after, strange)
+    it = _with_unlisted(evidence, fitted, held_out, healthy, before, known_by_now, progress)
     answer = head | {
-        "verdict": verdict,
-        "causes": _causes(evidence, searched, odds, before) if found else [],
-        "runners_up": _runners_up(searched),
-        "unmodelled_probability": _unmodelled(evidence, searched, odds, alone, verdict),
-        "unlisted": _unlisted(evidence, strange, mechanism) if verdict == "unlisted" else None,
+        "verdict": it.verdict,
+        "causes": _causes(evidence, it.searched, odds, before) if it.found else [],
+        "runners_up": _runners_up(it.searched),
+        "unmodelled_probability": _unmodelled(evidence, it.searched, odds, alone, it.verdict),
+        "unlisted": _unlisted(evidence, it.strange, it.mechanism)
+        if it.verdict == "unlisted"
+        else None,
         "cycles": {
             "total": whole.cycles,
             "fitted": [int(evidence.numbers[one]) for one in fitted],
@@ -160,34 +148,84 @@ def diagnose(
             **part,
         },
         "baseline": before.figures,
-        "extended": after.figures,
-        "gain": gain(before, after),
-        "next_experiment": next_experiment(evidence, searched, mechanism),
+        "extended": it.after.figures,
+        "gain": gain(before, it.after),
+        "next_experiment": next_experiment(evidence, it.searched, it.mechanism),
     }
     return Diagnosis(
         evidence,
         config.data.hash,
-        searched,
-        found,
-        terms,
+        it.searched,
+        it.found,
+        it.terms,
         before,
-        after,
+        it.after,
         held_out,
         answer,
-        mechanism,
+        it.mechanism,
     )
 
 
-def _mechanism_found(
+@dataclass(frozen=True)
+class _Found:
+    """What is known of a log: the causes, what they leave, and what beside them acts."""
+
+    verdict: str
+    searched: Search
+    found: Hypothesis
+    after: Judged
+    strange: Unlisted
+    terms: tuple[Term, ...] = ()
+    mechanism: Explained | None = None
+
+    @property
+    def without_causes(self) -> "_Found":
+        """The same where the causes do not stand."""
+        return replace(self, searched=replace(self.searched, found=None), found=HEALTHY)
+
+
+def _with_unlisted(
     evidence: Evidence,
-    found: Hypothesis,
-    after: Judged,
     fitted: Sequence[int],
     held_out: Sequence[int],
+    healthy: Covariance,
+    before: Judged,
+    it: _Found,
     progress: Callable[[str], None],
+) -> _Found:
+    """With what nobody listed: a mechanism, where none is a term from data.
+
+    Causes that leave more than cycles differ by may mimic a mechanism, and do not stand beside one
+    that alone does better.
+    """
+    little = MIMICS if len(it.found) == 1 else LITTLE
+    if it.verdict == "explained" and it.after.rms > little * before.usual:
+        alone = explain_alone(evidence, fitted, it.found, progress)
+        mechanism, mended = _on_unseen(evidence, alone, it.after, held_out)
+        if mechanism is None:
+            return it
+        strange = look(healthy, HEALTHY, fitted, held_out)
+        it = replace(it, verdict="unlisted", strange=strange)
+    elif it.verdict == "unlisted":
+        if not _sure(it.found, before, it.after):
+            strange = look(healthy, HEALTHY, fitted, held_out)
+            it = replace(it.without_causes, strange=strange, after=before)
+        explained = explain(evidence, fitted, it.found, progress)
+        mechanism, mended = _on_unseen(evidence, explained, it.after, held_out)
+    else:
+        return it
+    if mechanism and not mechanism.beside:
+        it = it.without_causes
+    if mended is None:
+        strange, mended = _term_found(evidence, it.found, it.after, it.strange, held_out)
+        it = replace(it, strange=strange, terms=strange.terms)
+    return replace(it, after=mended or it.after, mechanism=mechanism)
+
+
+def _on_unseen(
+    evidence: Evidence, one: Explained | None, after: Judged, held_out: Sequence[int]
 ) -> tuple[Explained | None, Judged | None]:
-    """What acts that nobody listed, where it brings the twin nearer to cycles it has not seen."""
-    one = explain(evidence, fitted, found, progress)
+    """A mechanism, where it brings the twin nearer to unseen cycles than ``after``."""
     if one is None:
         return None, None
     hypothesis = one.fitted.hypothesis
@@ -223,7 +261,7 @@ def _signals(evidence: Evidence) -> list[dict[str, str]]:
 
 def _left_in_all(evidence: Evidence, weights: Weights) -> float:
     """Sigmas left of the twin without a cause in all cycles; one odd one counts little."""
-    residuals = white(evidence, weights, [HEALTHY])[:, 0]
+    residuals = white(evidence, weights, [HEALTHY])[: len(weights.bins), 0]
     return usual_leftover(left_in_each(evidence, weights, residuals))
 
 
@@ -246,10 +284,11 @@ def _sure(found: Hypothesis, before: Judged, after: Judged) -> bool:
     """Whether causes stand although something is left: they take away nearly all of it.
 
     Several together can look like something nobody listed, so little may be left of them, in
-    sigmas or beside what they take away.
+    sigmas or beside what they take away. One odd cycle, as where the nozzle went on once more,
+    counts little.
     """
-    left = after.leftover
-    share = (left**2 - 1.0) / max(before.leftover**2 - 1.0, 1e-9)
+    left = after.steady
+    share = (left**2 - 1.0) / max(before.steady**2 - 1.0, 1e-9)
     return share < MOST_LEFT and (len(found) == 1 or left < SEVERAL or share < NEARLY_ALL)
 
 

@@ -54,13 +54,17 @@ def learned(evidence: Evidence) -> Healthy:
 def _left(seen: _Healthy, healthy: Healthy, cycles: Sequence[int]) -> Floats:
     """Chi-square per residual that each cycle has by what was learned from others."""
     weights = seen.by(healthy).of(cycles)
-    return left_in_each(seen.evidence, weights, weights.white(seen.off[:, None])[:, 0])
+    white = weights.white(seen.off[:, None])[: len(weights.bins), 0]
+    return left_in_each(seen.evidence, weights, white)
 
 
 def left_in_each(evidence: Evidence, weights: Weights, white: Floats) -> Floats:
-    """Chi-square per residual in each cycle of ``weights``, from ``white`` residuals of bins."""
-    cycle = evidence.bins.cycle[weights.bins]
-    squares = white[: len(cycle)] ** 2
+    """Chi-square per residual in each cycle of ``weights``, from ``white`` ones.
+
+    They are of bins, or of bins and then levels.
+    """
+    cycle = np.concatenate([evidence.bins.cycle[weights.bins], weights.level_cycles])
+    cycle, squares = cycle[: len(white)], white**2
     return np.array([np.mean(squares[cycle == one]) for one in weights.cycles if one in cycle])
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from twin.diagnosis.evidence import Evidence, Hypothesis
+from twin.diagnosis.healthy import left_in_each, usual_leftover
 from twin.diagnosis.weights import Weights, levels
 from twin.inference.levels import UPPER_95
 from twin.model import theta as c
@@ -27,6 +28,7 @@ class Judged:
     off: Floats  # mbar, of each bin
     squares: Floats  # mean square deviation of each held-out cycle, mbar²
     leftover: float  # sigmas
+    steady: float  # sigmas, where one odd cycle counts little
     usual: float  # mbar rms, of healthy cycles like these
     unmeasured: float  # mbar rms, that may be left of what no healthy cycle can have shown
     figures: dict[str, float | None]
@@ -62,6 +64,7 @@ def judge(evidence: Evidence, weights: Weights, hypothesis: Hypothesis) -> Judge
         off,
         squares,
         leftover,
+        usual_leftover(left_in_each(evidence, weights, white[:, 0])),
         weights.usual,
         weights.unmeasured,
         {name: None if one is None else rounded(one) for name, one in figures.items()},

@@ -16,9 +16,12 @@ from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.fit import Fitted, fit, interval, white
 from twin.diagnosis.weights import Weights, covariance
 from twin.inference.levels import CHI2_999
+from twin.model import theta as c
 from twin.model.catalogue import has_room
 from twin.model.courses import Cause
-from twin.model.mechanism import MECHANISMS, Mechanism
+from twin.model.effects import effect_of
+from twin.model.mechanism import ALWAYS, MECHANISMS, Mechanism
+from twin.model.theta import Theta
 from twin.monitor.bins import Floats
 
 Progress = Callable[[str], None]
@@ -39,6 +42,8 @@ DISPLACES = 0.6
 # better where listed causes leave no more than healthy cycles have, and it is told from how it
 # does. Chosen: a lip that lifts is 115 better than the porous leak that mimics it, with 0.24.
 LIKELIER, HALF = 30.0, 0.5
+# Coefficients that say the same of a plant: what flows in, and what narrows its line.
+ALIKE = ({c.LEAK, c.LAMINAR_LEAK, c.INFLOW}, {c.NEAR_RESISTANCE, c.RESISTANCE})
 
 
 @dataclass(frozen=True)
@@ -82,9 +87,29 @@ def explain_alone(
     if not has_room(evidence.theta, (), more=1):
         return None
     progress("trying mechanisms")
-    alone = _explained(evidence, fitted, HEALTHY, _best(evidence, fitted, HEALTHY, progress))
+    ranked = _best(evidence, fitted, HEALTHY, progress)
+    if any(is_a_course_of(evidence.theta, ranked[0].hypothesis[-1], cause) for cause in found):
+        return None
+    alone = _explained(evidence, fitted, HEALTHY, ranked)
     displaces = alone and (not found or _displaces(evidence, fitted, alone, found))
     return alone if displaces else None
+
+
+def is_a_course_of(theta: Theta, mechanism: Cause, cause: Cause) -> bool:
+    """Whether a mechanism is a listed cause that only comes in another way as time goes on.
+
+    It acts at all times, on what that cause acts on. What flows in is one, and so is a line.
+    """
+    known, effect = MECHANISMS[mechanism.effect], effect_of(cause.effect)
+    if known.when.code != ALWAYS:
+        return False
+    moved = theta.copy()
+    effect.act(moved, *(p.after(1.0, theta) for p in effect.parameters))
+    changed = set(np.flatnonzero(moved != theta).tolist())
+    alike = set(known.place.coefficients)
+    for some in ALIKE:
+        alike |= some if alike & some else set()
+    return not changed.isdisjoint(alike)
 
 
 def _displaces(

@@ -51,6 +51,9 @@ NEAR = 2.5  # times the least score, up to which they are
 QUIET = 1.2  # sigmas left, below which there is nothing to compare
 HOPEFUL = 5.0  # chi-square that the linear model must promise of one more cause
 TRIED_PAIRS, TRIED_MORE, TRIED_TIMES = 12, 8, 6
+# Sigmas that the best single cause leaves, above which sizes are so great that a linear model does
+# not tell courses apart. Where pairs of usual sizes act, one of them leaves less.
+GREAT = 10.0
 SECOND = 0.5  # of the best gain, above which an effect's second course is fitted as well
 NEARLY = 0.3  # of the best gain, above which an effect may turn out to be a rival
 START = np.array([0.4, 1.4, 4.0])  # typical sizes to begin a fit from
@@ -261,7 +264,8 @@ def _fit_singles(
     evidence: Evidence, judged: Weights, weights: Weights, alone: Signatures, progress: Progress
 ) -> list[Fitted]:
     """Fit every effect with its most promising courses."""
-    promised = promises(evidence, judged, columns(evidence, judged, alone), each=2)
+    linear = columns(evidence, judged, alone)
+    promised = promises(evidence, judged, linear, each=2)
     first = {one.hypothesis[0].effect: one for one in reversed(promised)}
     hypotheses = [
         one.hypothesis
@@ -270,7 +274,13 @@ def _fit_singles(
     ]
     progress("fitting single causes")
     started = _started(evidence, judged, hypotheses)
-    return fit(evidence, weights, _timed(evidence, judged, started))
+    tried = fit(evidence, weights, _timed(evidence, judged, started))
+    if min(one.leftover for one in tried) < GREAT:
+        return tried
+    progress("what acts is great: fitting each cause with every course")
+    more = [one.hypothesis for one in promises(evidence, judged, linear, each=len(Course))]
+    started = _started(evidence, judged, [one for one in more if one not in hypotheses])
+    return tried + fit(evidence, weights, _timed(evidence, judged, started))
 
 
 def _likeliest(
