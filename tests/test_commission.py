@@ -28,7 +28,6 @@ from twin.calibration.commission import (
     free_of,
     guessed,
     misplaced,
-    place_of,
     starts,
     within,
 )
@@ -54,7 +53,7 @@ from twin.diagnosis.answer import diagnose
 from twin.errors import ConfigError
 from twin.inference.levels import SIGMAS_95
 from twin.model import theta as c
-from twin.model.dataset import DataSet, coefficients
+from twin.model.dataset import DataSet, coefficients, sensor_place
 from twin.signals import BREAK, MBAR, MS, SAMPLE, Command, Phase, Quality, Samples, bridged
 
 CYCLES = 9
@@ -150,6 +149,22 @@ def test_a_search_stays_where_values_move() -> None:
             beyond = space.values(x)[number]
             x[number] -= step
             assert space.values(x)[number] == pytest.approx(beyond)
+
+
+@pytest.mark.parametrize("place", [0.0, 0.3, 1.0])
+def test_the_sensor_is_found_between_the_ends_of_the_line(place: float) -> None:
+    """Beyond an end nothing moves: a record would seem to leave open where it is."""
+    data = typed("test_rig").data
+    shift = data.system.sensor_shift + place - sensor_place(data)
+    system = data.system.model_copy(update={"sensor_shift": shift})
+    space = Space.of_market(data.model_copy(update={"system": system})).on_the_line
+    number = [one.key for one in space.free].index("sensor_shift")
+    for end, bound in ((0.0, space.low), (1.0, space.high)):
+        x = np.zeros(len(space.free))
+        x[number] = bound[number]
+        assert sensor_place(space.at(x)) == pytest.approx(end)
+        x[number] += 0.1 if end == 0.0 else -0.1
+        assert sensor_place(space.at(x)) != pytest.approx(end)
 
 
 @given(st.lists(st.floats(-3.0, 3.0), min_size=4, max_size=4))
@@ -609,7 +624,7 @@ def test_a_sensor_at_another_place_than_told_is_said_where_the_fit_is_sure() -> 
         for shift in (-1.0, 1.0)
     )
     fitted = replace(fitted, data=near)
-    apart = abs(place_of(told) - place_of(fitted.data))
+    apart = abs(sensor_place(told) - sensor_place(fitted.data))
     assert apart > ELSEWHERE
     for unsure, said in ((0.1 * apart, True), (0.5 * apart, False)):
         covariance = fitted.covariance.copy()

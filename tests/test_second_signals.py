@@ -12,7 +12,7 @@ from second_world.records import Record, record
 
 from twin.calibration import commission as module
 from twin.calibration import fit as fitting
-from twin.calibration.commission import as_metered, commission, guessed, place_of, starts
+from twin.calibration.commission import as_metered, commission, guessed, starts
 from twin.calibration.cycles import LAG, SPAN, ZERO, Cycles
 from twin.calibration.fit import Fitted, Round, fit_from_afar, second_noise
 from twin.calibration.meter import stored
@@ -21,7 +21,7 @@ from twin.calibration.weights import plain, weighted
 from twin.config import Config
 from twin.model import kernel
 from twin.model import theta as c
-from twin.model.dataset import DataSet, coefficients
+from twin.model.dataset import DataSet, coefficients, sensor_place
 from twin.model.system import Cups, Filter, Sensor, Tube, Vessel
 from twin.signals import MBAR, ML, MS, Reported, Samples
 
@@ -181,7 +181,7 @@ LONG_LINE = 80021  # a gripper with its sensor at the ejector, 52 mbar from its 
 
 def with_sensor_at(data: DataSet, place: float) -> DataSet:
     """The same with the sensor that the PLC reads elsewhere along the line."""
-    shift = data.system.sensor_shift + place - place_of(data)
+    shift = data.system.sensor_shift + place - sensor_place(data)
     system = data.system.model_copy(update={"sensor_shift": shift})
     return data.model_copy(update={"system": system})
 
@@ -279,7 +279,7 @@ def test_it_is_followed_where_most_rows_have_one() -> None:
 def quickly(samples: Samples, steps: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Fitted, str]:
     """One round, from a guess that has the sensor where it is, and what was told of it."""
     monkeypatch.setattr(fitting, "NARROWING", (Round(1, 1.0, 1.5 * MBAR, steps, 1e-3),))
-    start = next(one for one in starts(first_guess(LONG_LINE), np.nan) if place_of(one) < 0.5)
+    start = next(one for one in starts(first_guess(LONG_LINE), np.nan) if sensor_place(one) < 0.5)
     told_of: list[str] = []
     return fit_from_afar(samples, [start], told_of.append), told_of[-1]
 

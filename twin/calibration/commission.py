@@ -30,8 +30,7 @@ from twin.calibration.verdict import Verdict, judge
 from twin.calibration.wiring import refuse_miswired
 from twin.config import Config
 from twin.errors import ConfigError
-from twin.model import theta as c
-from twin.model.dataset import Ambient, DataSet, coefficients
+from twin.model.dataset import Ambient, DataSet, sensor_place
 from twin.model.system import Cups, Part, Sensor, Tube, volume
 from twin.monitor.healthy import UNSEEN_LEVEL_MBAR
 from twin.monitor.reports import APART, Contradiction
@@ -378,7 +377,7 @@ def starts(data: DataSet, meets: float, grows: float = np.nan) -> list[DataSet]:
     comes = meets / MS if np.isfinite(meets) else COMES
     waits = (0.0, comes) if cups else (0.0,)
     tables = data.model_dump()
-    place = place_of(data)
+    place = sensor_place(data)
     everything = _volume(data) / ML
     usual = LIPS if cups else RIGID
     softer = (BELLOWS,) if cups else (LIPS, BELLOWS)  # a vessel may be cups on a part that stays
@@ -443,7 +442,7 @@ def another_ambient(told: DataSet, fitted: Fitted) -> Iterator[Remark]:
 
 def misplaced(told: DataSet, fitted: Fitted) -> Iterator[Remark]:
     """A remark where the pressure is clearly read at another place than ``told``."""
-    was, found = place_of(told), place_of(fitted.data)
+    was, found = sensor_place(told), sensor_place(fitted.data)
     unsure = float(fitted.spread[[one.key for one in fitted.free].index("sensor_shift")])
     if abs(found - was) > ELSEWHERE and abs(found - was) > SURELY * unsure:
         here, there = ("the vessel", "the port") if found > was else ("the port", "the vessel")
@@ -451,12 +450,6 @@ def misplaced(told: DataSet, fitted: Fitted) -> Iterator[Remark]:
         order = "after" if found > was else "before"
         line = f'[[data.system.parts]] kind = "sensor", {order} the tubes'
         yield Remark(f"{text} {there}", line)
-
-
-def place_of(data: DataSet) -> float:
-    """Where along the line the sensor is: 0 at the port, 1 at the vessel."""
-    theta = coefficients(data)
-    return float(theta[c.PLACE] / (theta[c.NEAR_RESISTANCE] + theta[c.RESISTANCE]))
 
 
 def _thresholds(ejector: dict[str, Any], readings: Readings, ambient: float) -> list[Remark]:

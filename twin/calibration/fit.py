@@ -21,8 +21,7 @@ from twin.calibration.readings import noise_of
 from twin.calibration.weights import Weights, plain, weighted
 from twin.inference.levels import SIGMAS_95
 from twin.inference.sensitivities import derivatives, inside, sensitivities
-from twin.model import theta as c
-from twin.model.dataset import RIPPLE, DataSet, coefficients
+from twin.model.dataset import RIPPLE, DataSet, coefficients, sensor_place
 from twin.model.system import Tube
 from twin.signals import MBAR, MS, NS, UNUSABLE, Samples
 
@@ -308,9 +307,7 @@ def _cost(residual: Floats) -> float:
 
 def _other_end(data: DataSet) -> Literal["port", "vessel"]:
     """The end of the line that the sensor of ``data`` is farther from."""
-    theta = coefficients(data)
-    line = theta[c.NEAR_RESISTANCE] + theta[c.RESISTANCE]
-    return "port" if theta[c.PLACE] > 0.5 * line else "vessel"
+    return "port" if sensor_place(data) > 0.5 else "vessel"
 
 
 def _problem(
@@ -379,7 +376,9 @@ def _solved(
 
 def _fitted(problem: Problem, x: Floats) -> Fitted:
     """What the fit found at ``x``, and how sure it is."""
+    problem = replace(problem, space=problem.space.on_the_line)
     space, cycles = problem.space, problem.cycles
+    x = np.clip(x, space.low, space.high)
     best = DataSet.model_validate(falling(space.at(x)).model_dump())
     ways = space.slopes(x)
     off = cycles.off(np.stack(with_left_out(best), axis=1))

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.inference.sensitivities import STEP
-from twin.model.dataset import DataSet
+from twin.model.dataset import DataSet, sensor_place
 
 Floats = npt.NDArray[np.float64]
 
@@ -220,6 +220,15 @@ def _reach(one: Free, data: DataSet) -> tuple[float, float]:
     return float(np.log(low / centre)) / one.market, float(np.log(high / centre)) / one.market
 
 
+def _on_the_line(one: Free, data: DataSet) -> Free:
+    """The same; a sensor's place is bounded by the ends of the line of ``data``."""
+    if one.key != "sensor_shift":
+        return one
+    told = data.model_copy(update={"system": data.system.model_copy(update={one.key: 0.0})})
+    place = sensor_place(told)
+    return replace(one, low=-place, high=1.0 - place)
+
+
 @dataclass(frozen=True)
 class Space:
     """Where a fit may go: coordinates in standard deviations about a data set, 0 at the data set.
@@ -253,6 +262,21 @@ class Space:
         low, high = np.array([_reach(one, data) for one in free]).T
         low[_BENDS], high[_BENDS] = -np.inf, np.inf  # each coordinate moves several of them
         return cls(data, free, ways, scaled, low, high, MARKET_STEP, everywhere=True)
+
+    @property
+    def on_the_line(self) -> "Space":
+        """The same, with the sensor no farther than an end of the line.
+
+        A search may pass an end, so that it does not stop there. But beyond it nothing moves: a
+        record would seem to leave open where the sensor is.
+        """
+        free = tuple(_on_the_line(one, self.data) for one in self.free)
+        low, high = self.low.copy(), self.high.copy()
+        for number, one in enumerate(free):
+            if one is not self.free[number]:
+                ends = np.array([one.low, one.high]) - one.of(self.data)
+                low[number], high[number] = ends / self.ways[number, number]
+        return replace(self, free=free, low=low, high=high)
 
     def values(self, x: Floats) -> Floats:
         """Values of the free parameters at ``x``, kept within their bounds."""

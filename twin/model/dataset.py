@@ -384,6 +384,13 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     theta[c.CONTACT] = system.part_meets_ms * MS
 
 
+def sensor_place(data: DataSet) -> float:
+    """Where along the line the sensor is: 0 at the port, 1 at the vessel."""
+    theta = coefficients(data)
+    line = float(theta[c.NEAR_RESISTANCE] + theta[c.RESISTANCE])
+    return float(theta[c.PLACE]) / line if line > 0.0 else 0.0
+
+
 def _swings(theta: Theta, inertance: float) -> float:
     """Whether the line's gas swings slowly enough to be seen; a shorter line is only friction.
 
