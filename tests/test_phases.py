@@ -336,6 +336,22 @@ def test_knees_are_apart_where_the_line_rings_and_by_less_than_the_hysteresis() 
     assert expected_knees(theta, rigs.knees("gripper").noise).apart <= 40.0 * MBAR
 
 
+def test_a_swing_that_the_model_does_not_show_is_no_knee() -> None:
+    """The window is then as long as the swing: over that a line that rings is level."""
+    plc, data = on_other_tubes(4)
+    parts = zip(*with_truth(plc, SECONDS, [], 4), strict=True)
+    samples, truth = (np.concatenate(column) for column in parts)
+    theta, noise = coefficients(data), data.sensor.noise_mbar * MBAR
+    rings = replace(expected_knees(theta, noise), apart=0.0)
+    theta[[c.NEAR_RESISTANCE, c.RESISTANCE]] *= 30.0
+    damped = expected_knees(theta, noise)
+    assert damped.apart == 0.0
+    assert damped.window >= 3 * rings.window
+    with pytest.raises(AssertionError, match="never were"):
+        found_where_true(samples, truth, rings)
+    assert len(found_where_true(samples, truth, replace(rings, window=damped.window))) >= 10
+
+
 def found_late(name: str, factor: float) -> tuple[float, float]:
     """Median rows by which the nozzle is said to go off and on too late, with a slower sensor."""
     plc = rigs.config(name).document.section(PlcSettings, "plc").model_dump()

@@ -391,12 +391,16 @@ def sensor_place(data: DataSet) -> float:
     return float(theta[c.PLACE]) / line if line > 0.0 else 0.0
 
 
+def swing(theta: Theta, inertance: float) -> float:
+    """Period (s) in which a line of ``inertance`` (1/m) swings against its and the port's gas."""
+    stored = (theta[c.PORT_VOLUME] + theta[c.LINE_VOLUME]) / (GAMMA * R * theta[c.TEMPERATURE])
+    return 2.0 * math.pi * math.sqrt(inertance * float(stored))
+
+
 def _swings(theta: Theta, inertance: float) -> float:
     """Whether the line's gas swings slowly enough to be seen; a shorter line is only friction.
 
     From 0 to 1 without a step: a fit that meets one goes no further.
     """
-    stored = (theta[c.PORT_VOLUME] + theta[c.LINE_VOLUME]) / (GAMMA * R * theta[c.TEMPERATURE])
-    period = 2.0 * math.pi * math.sqrt(inertance * stored)
-    share = (period - UNSEEN_SWING) / (SHORTEST_SWING - UNSEEN_SWING)
+    share = (swing(theta, inertance) - UNSEEN_SWING) / (SHORTEST_SWING - UNSEEN_SWING)
     return min(max(share, 0.0), 1.0)

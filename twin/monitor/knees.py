@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from twin.model import theta as c
-from twin.model.dataset import DataSet, coefficients
+from twin.model.dataset import DataSet, coefficients, swing
 from twin.model.gas import GAMMA, R
 from twin.model.plant import suction_at
 from twin.model.theta import Theta
@@ -77,8 +77,9 @@ def _as_seen(knees: Knees, theta: Theta, most: float) -> Knees:
     """The same, seen as in a free run, which reaches H1 by ``most`` rows: as late, as far apart.
 
     Jet and sensor delay a knee; the step at the port pulls it forward. As that step swings in the
-    line, the slope breaks as at a knee, but near the last one's level. A flow back into another run
-    lets the pressure come down to where the nozzle goes on.
+    line, the slope breaks as at a knee, but near the last one's level. Where the free run does not
+    show how high, the window is as long as the swing, over which it is level, or as it may last. A
+    flow back into another run lets the pressure come down to where the nozzle goes on.
     """
     gas = (theta[c.VOLUME] + theta[c.PORT_VOLUME]) / (R * theta[c.TEMPERATURE])
     leaky = theta.copy()
@@ -86,6 +87,11 @@ def _as_seen(knees: Knees, theta: Theta, most: float) -> Knees:
     leaky[c.AIR_SAVING] = c.WITHOUT_CONTINUOUS
     rows = min(int(most + HELD / knees.period) + 2 * LONGEST_WINDOW, LONGEST_RUN)
     tight, leaking = seen([theta, leaky], rows, replace(knees, on_shift=0))
+    swings = round(swing(theta, float(theta[c.NEAR_INERTANCE] + theta[c.INERTANCE])) / knees.period)
+    wide = min(swings, knees.again)
+    if tight.rings == 0.0 and knees.settled != NEVER and wide > knees.window:
+        knees = replace(knees, window=wide, longest=max(knees.longest, wide))
+        tight, leaking = seen([theta, leaky], rows, replace(knees, on_shift=0))
     most_rows = knees.on_shift + knees.window  # more: it is another knee
     if AT_ONCE < tight.off_rows <= most_rows:
         knees = replace(knees, off_shift=tight.off_rows)
