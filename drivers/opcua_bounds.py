@@ -1,7 +1,7 @@
-"""What asyncua reads without a bound: an array of Null, whose elements take no bytes.
+"""What asyncua reads without a bound: arrays of Null, or of a type that no standard has.
 
-A message of six bytes may say that it has two thousand million of them; the list of them takes
-minutes and gigabytes. Part 6 of OPC UA forbids such arrays.
+Their elements may take no bytes, and a message of six bytes may say that it has two thousand
+million of them; the list of them takes minutes and gigabytes. Part 6 of OPC UA forbids such arrays.
 """
 
 from collections.abc import Iterable
@@ -18,10 +18,11 @@ class _NullArray:
     def unpack_array(_data: Any, length: int) -> Iterable[None]:
         """Nothing; UaError where there is to be something."""
         if length:
-            raise ua.UaError(f"an array of {length} Null values")
+            raise ua.UaError(f"an array of {length} values of no type")
         return ()
 
 
 def refuse_null_arrays() -> None:
     """Have the library refuse them from now on, whoever sends them."""
     ua_binary.Primitives1.Null = _NullArray
+    ua_binary.Primitives1.Custom = _NullArray  # the library's name for types beyond the standard's
