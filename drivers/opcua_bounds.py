@@ -11,7 +11,7 @@ from asyncua import ua
 from asyncua.ua import ua_binary
 
 
-class _NullArray:
+class _ArrayOfNothing:
     """Reads what may not be there."""
 
     @staticmethod
@@ -22,7 +22,9 @@ class _NullArray:
         return ()
 
 
-def refuse_null_arrays() -> None:
+def refuse_arrays_of_nothing() -> None:
     """Have the library refuse them from now on, whoever sends them."""
-    ua_binary.Primitives1.Null = _NullArray
-    ua_binary.Primitives1.Custom = _NullArray  # the library's name for types beyond the standard's
+    ua_binary.Primitives1.Null = _ArrayOfNothing
+    ua_binary.Primitives1.Custom = (
+        _ArrayOfNothing  # the library's name for types beyond the standard's
+    )

@@ -15,7 +15,7 @@ from test_opcua_block import DEPTH, Rig, T, TornServer, flags
 from test_opcua_subscribe import FakeLink, change, granted, publication, subscription
 
 from drivers.lasting import EMPTY, LostError
-from drivers.opcua_bounds import refuse_null_arrays
+from drivers.opcua_bounds import refuse_arrays_of_nothing
 from twin.errors import SourceError
 from twin.signals import BREAK, UNUSABLE, Quality, Samples
 
@@ -142,7 +142,7 @@ def raw_change(handle: int, ms: int, variant: ua.Variant, code: int) -> Any:
 @pytest.mark.parametrize("kind", ["80", "9c"])  # of Null; of 28, which is no standard's
 def test_an_array_of_nothing_takes_no_memory(kind: str) -> None:
     """asyncua would make a list of 2**31 - 1 of them: minutes and gigabytes for six bytes."""
-    refuse_null_arrays()
+    refuse_arrays_of_nothing()
     with pytest.raises(ua.UaError, match="an array of 2147483647 values of no type"):
         from_binary(ua.DataValue, Buffer(bytes.fromhex(f"01{kind}ffffff7f")))
     empty = from_binary(ua.DataValue, Buffer(bytes.fromhex("018000000000")))
@@ -155,5 +155,5 @@ def test_an_array_of_nothing_takes_no_memory(kind: str) -> None:
 def test_who_reads_from_strangers_refuses_them(program: str) -> None:
     """The link of a driver and the server of the results."""
     source = importlib.import_module(program)
-    assert source.refuse_null_arrays is refuse_null_arrays
-    assert "    refuse_null_arrays()\n" in inspect.getsource(source)
+    assert source.refuse_arrays_of_nothing is refuse_arrays_of_nothing
+    assert "    refuse_arrays_of_nothing()\n" in inspect.getsource(source)

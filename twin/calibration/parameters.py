@@ -220,15 +220,6 @@ def _reach(one: Free, data: DataSet) -> tuple[float, float]:
     return float(np.log(low / centre)) / one.market, float(np.log(high / centre)) / one.market
 
 
-def _on_the_line(one: Free, data: DataSet) -> Free:
-    """The same; a sensor's place is bounded by the ends of the line of ``data``."""
-    if one.key != "sensor_shift":
-        return one
-    told = data.model_copy(update={"system": data.system.model_copy(update={one.key: 0.0})})
-    place = sensor_place(told)
-    return replace(one, low=-place, high=1.0 - place)
-
-
 @dataclass(frozen=True)
 class Space:
     """Where a fit may go: coordinates in standard deviations about a data set, 0 at the data set.
@@ -270,12 +261,14 @@ class Space:
         A search may pass an end, so that it does not stop there. But beyond it nothing moves: a
         record would seem to leave open where the sensor is.
         """
-        free = tuple(_on_the_line(one, self.data) for one in self.free)
+        system = self.data.system.model_copy(update={"sensor_shift": 0.0})
+        told = sensor_place(self.data.model_copy(update={"system": system}))
+        number = [one.key for one in self.free].index("sensor_shift")
+        one = replace(self.free[number], low=-told, high=1.0 - told)
+        ends = np.array([one.low, one.high]) - one.of(self.data)
         low, high = self.low.copy(), self.high.copy()
-        for number, one in enumerate(free):
-            if one is not self.free[number]:
-                ends = np.array([one.low, one.high]) - one.of(self.data)
-                low[number], high[number] = ends / self.ways[number, number]
+        low[number], high[number] = ends / self.ways[number, number]
+        free = (*self.free[:number], one, *self.free[number + 1 :])
         return replace(self, free=free, low=low, high=high)
 
     def values(self, x: Floats) -> Floats:

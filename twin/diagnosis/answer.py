@@ -168,7 +168,7 @@ def diagnose(
 
 @dataclass(frozen=True)
 class _Found:
-    """What is known of a log: the causes, what they leave, and what beside them acts."""
+    """What is known of a log: the causes, what they leave, and what acts beside them."""
 
     verdict: str
     searched: Search
@@ -193,7 +193,7 @@ def _with_unlisted(
     it: _Found,
     progress: Callable[[str], None],
 ) -> _Found:
-    """With what nobody listed: a mechanism, where none is a term from data.
+    """With what nobody listed: a mechanism, or a term from data where there is none.
 
     Causes that leave more than cycles differ by may mimic a mechanism, and do not stand beside one
     that alone does better.

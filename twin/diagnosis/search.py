@@ -52,7 +52,7 @@ QUIET = 1.2  # sigmas left, below which there is nothing to compare
 HOPEFUL = 5.0  # chi-square that the linear model must promise of one more cause
 TRIED_PAIRS, TRIED_MORE, TRIED_TIMES = 12, 8, 6
 # Sigmas that the best single cause leaves, above which sizes are so great that a linear model does
-# not tell courses apart. Where pairs of usual sizes act, one of them leaves less.
+# not tell courses apart. Chosen: in pairs of the second world's batteries one leaves up to 4.
 GREAT = 10.0
 SECOND = 0.5  # of the best gain, above which an effect's second course is fitted as well
 NEARLY = 0.3  # of the best gain, above which an effect may turn out to be a rival
