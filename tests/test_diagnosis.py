@@ -254,8 +254,8 @@ def test_a_leak_that_opens_half_way_is_a_step_with_its_onset() -> None:
 def test_what_grows_to_a_great_size_comes_first_with_its_course() -> None:
     """By a linear model, a filter that clogs to many times what is usual looks like weather."""
     evidence = collect(CONFIG, record(40.0, "filter_clogging=130/ramp:39", seed=24))
-    fitted, _ = answer_module.split(evidence)
     known = covariance(evidence)
+    fitted, _ = answer_module.split(evidence, known)
     judged, weights = known.of(evidence.judged), known.of(fitted)
     alone = signatures(evidence, evidence.judged)
     singles = search_module._fit_singles(evidence, judged, weights, alone, quiet)
@@ -470,6 +470,14 @@ def test_what_comes_in_every_second_cycle_is_fitted_and_judged() -> None:
     assert {cycle % 2 for cycle in cause["cycles"]} == {0}
     assert set(answer["cycles"]["fitted"]) & set(cause["cycles"])
     assert set(answer["cycles"]["held_out"]) & set(cause["cycles"])
+
+
+def test_what_comes_in_two_cycles_only_is_fitted_in_one_and_judged_in_the_other() -> None:
+    evidence = collect(CONFIG, record(30.0, "leakage=1.5/every:4", seed=35))
+    parts = answer_module.split(evidence, covariance(evidence))
+    assert [len({4, 8} & set(part)) for part in parts] == [1, 1]
+    assert sorted([*parts[0], *parts[1]]) == evidence.judged
+    assert abs(len(parts[0]) - len(parts[1])) <= 2
 
 
 def test_thresholds_that_come_and_go_are_found_by_the_levels() -> None:

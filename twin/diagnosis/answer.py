@@ -12,7 +12,7 @@ from twin.config import Config
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, collect, thinned
 from twin.diagnosis.experiments import next_experiment
 from twin.diagnosis.fit import Fitted, white
-from twin.diagnosis.healthy import left_in_each, usual_leftover
+from twin.diagnosis.healthy import are_odd, left_in_each, usual_leftover
 from twin.diagnosis.hypotheses import hours, parameters, score_with_tempered_prior
 from twin.diagnosis.judge import LITTLE, Judged, gain, judge, rounded
 from twin.diagnosis.mechanisms import Explained, explain, explain_alone
@@ -111,8 +111,8 @@ def diagnose(
         answer = head | _insufficient(evidence, part, reason)
         return Diagnosis(evidence, config.data.hash, None, HEALTHY, (), None, None, [], answer)
     whole, evidence = evidence, thinned(evidence, evidence.judged, MOST_JUDGED)
-    fitted, held_out = split(evidence)
     healthy = covariance(evidence)
+    fitted, held_out = split(evidence, healthy)
     searched = search(evidence, fitted, healthy, progress)
     if searched.found and whole.cycles > evidence.cycles:
         progress("looking for when it began")
@@ -320,14 +320,17 @@ def insufficient(evidence: Evidence) -> str:
     return ""
 
 
-def split(evidence: Evidence) -> tuple[list[int], list[int]]:
+def split(evidence: Evidence, healthy: Covariance) -> tuple[list[int], list[int]]:
     """Cycles to fit on and to judge by, about half of each, in Thue and Morse's order.
 
-    That has no period: what comes in every second or third cycle falls into both.
+    That has no period: what comes in every second or third cycle falls into both. The few cycles
+    that are odd come first, so that what acts in them alone falls into both as well.
     """
-    odd = [(place + 3).bit_count() % 2 == 1 for place in range(len(evidence.judged))]
-    both = list(zip(evidence.judged, odd, strict=True))
-    return [one for one, held in both if not held], [one for one, held in both if held]
+    alone = [white(evidence, healthy.of([one]), [HEALTHY]) for one in evidence.judged]
+    odd = are_odd(np.array([np.mean(of**2) for of in alone]))
+    odd_first = [one for first in (True, False) for one in np.array(evidence.judged)[odd == first]]
+    held_out = {int(one) for place, one in enumerate(odd_first) if (place + 3).bit_count() % 2}
+    return [one for one in evidence.judged if one not in held_out], sorted(held_out)
 
 
 def _runners_up(searched: Search) -> list[dict[str, Any]]:

@@ -8,7 +8,7 @@ import numpy as np
 from twin.diagnosis.evidence import HEALTHY, Evidence
 from twin.diagnosis.weights import Covariance, Weights, moved, scatter
 from twin.model.term import KINDS
-from twin.monitor.bins import Floats, Ints, unwarped
+from twin.monitor.bins import Bools, Floats, Ints, unwarped
 from twin.monitor.healthy import Healthy, ModelError
 from twin.monitor.weights import FIRST_ERROR, SCATTER
 from twin.signals import MS
@@ -16,7 +16,7 @@ from twin.signals import MS
 ROUNDS = 3
 FEWEST = 6  # cycles, to judge on others what was learned from some
 LEAST_COMMON, LEAST_ALONE = 0.15, 0.1  # mbar
-ODD = 3.0  # times the median of cycles' chi-square, beyond which one counts no more
+ODD = 3.0  # times the median of cycles' chi-square, beyond which one is odd and counts no more
 HIDDEN = 1.3  # the error over what is left of it once the data set was fitted to the same cycles
 LEAST_SCATTER, MOST_SCATTER = 0.2, 5.0  # of what is usual
 
@@ -74,6 +74,11 @@ def usual_leftover(left: Floats) -> float:
     What is learned in the end has seen that one as well.
     """
     return float(np.sqrt(np.mean(np.minimum(left, ODD * np.median(left)))))
+
+
+def are_odd(left: Floats) -> Bools:
+    """Which cycles are off by far more than most, from chi-square in each."""
+    return left > ODD * np.median(left)
 
 
 def _learned(seen: _Healthy, cycles: Sequence[int]) -> Healthy:
