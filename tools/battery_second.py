@@ -286,10 +286,11 @@ def truths(met: Met, scale: float) -> dict[str, float]:
     are beside that value; ``scale`` is told over true volume.
     """
     rig = met.rig
-    sagging = _sagging(rig)
-    end = _end_pressure(sagging) + rig.ejector.check_opening
+    fed = _as_fed(rig)
+    opening = rig.ejector.check_opening if rig.ejector.has_check_valve else 0.0
+    end = _end_pressure(fed) + opening
     found = {
-        "ejector.suction_capacity_sl_min": scale * _capacity(sagging) / SL_MIN,
+        "ejector.suction_capacity_sl_min": scale * _capacity(fed) / SL_MIN,
         "ejector.end_pressure_mbar": _as_read(met, end) / MBAR,
     }
     if not rig.vessel.porous:
@@ -297,11 +298,22 @@ def truths(met: Met, scale: float) -> dict[str, float]:
     return found
 
 
-def _sagging(rig: Rig) -> Rig:
-    """The rig with the supply that its nozzle leaves."""
-    supply, flow = rig.supply, _primary(rig)
-    sag = supply.supply_droop * flow + supply.supply_resistance * flow**2
-    return replace(rig, supply=replace(supply, supply_gauge=supply.supply_gauge - sag))
+def _as_fed(rig: Rig) -> Rig:
+    """The rig with the supply that its regulator and its suction valve leave its nozzle."""
+    here, supply = rig.surroundings, rig.supply
+    ambient, t = here.ambient_pressure, here.ambient_temperature
+    low, high = 0.0, supply.supply_gauge
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        fed = replace(rig, supply=replace(supply, supply_gauge=middle))
+        flow = _primary(fed)
+        sag = supply.supply_droop * flow + supply.supply_resistance * flow**2
+        before = ambient + supply.supply_gauge - sag
+        through = orifice.py_func(
+            supply.valve_conductance, CRITICAL_VALVE, before, ambient + middle, t
+        )
+        low, high = (middle, high) if through > flow else (low, middle)
+    return fed
 
 
 def _capacity(rig: Rig) -> float:
