@@ -166,6 +166,9 @@ def _conclusions(separation: Separation) -> list[str]:
         f" {BIG.volume_ml / 1e3:g} l take {_span(big, '.0f')} ms. But the smallest and the largest"
         f" film coefficient differ there by {abs(percent_more(big[0], big[-1])):.1f} % only, so"
         " the hold is the surer way.",
+        "Whole cycles, blow-off and idle included, tell wall heat and bulge apart on one volume:"
+        " docs/founding-model.md takes the paper's model as the nominal one and lets a fit find"
+        " both.",
     ]
 
 
