@@ -1,13 +1,18 @@
-"""What asyncua reads without a bound: arrays of Null, or of a type that no standard has.
+"""What asyncua reads without an end, and is refused here.
 
-Their elements may take no bytes, and a message of six bytes may say that it has two thousand
-million of them; the list of them takes minutes and gigabytes. Part 6 of OPC UA forbids such arrays.
+- Arrays of Null, or of a type that no standard has: their elements may take no bytes, and a message
+  of six bytes may say that it has two thousand million of them. Part 6 of OPC UA forbids them.
+- A text or byte string of a length below -1: the library goes back by as much, and reads the same
+  bytes again for each of as many elements as the array claims.
+
+Either takes minutes and gigabytes.
 """
 
 from collections.abc import Iterable
 from typing import Any
 
 from asyncua import ua
+from asyncua.common.utils import Buffer
 from asyncua.ua import ua_binary
 
 
@@ -22,9 +27,20 @@ class _ArrayOfNothing:
         return ()
 
 
-def refuse_arrays_of_nothing() -> None:
+_read, _skip = Buffer.read, Buffer.skip
+
+
+def _forwards(size: int) -> int:
+    """A number of bytes; UaError where it goes back."""
+    if size < 0:
+        raise ua.UaError(f"a length of {size} bytes")
+    return size
+
+
+def refuse_endless_arrays() -> None:
     """Have the library refuse them from now on, whoever sends them."""
     ua_binary.Primitives1.Null = _ArrayOfNothing
-    ua_binary.Primitives1.Custom = (
-        _ArrayOfNothing  # the library's name for types beyond the standard's
-    )
+    # The library's name for types beyond the standard's.
+    ua_binary.Primitives1.Custom = _ArrayOfNothing
+    Buffer.read = lambda self, size: _read(self, _forwards(size))
+    Buffer.skip = lambda self, size: _skip(self, _forwards(size))

@@ -16,7 +16,7 @@ from cryptography import x509
 from drivers import certificates
 from drivers import opcua_trust as trust
 from drivers.lasting import AbsentError, Clock, LostError, unreachable
-from drivers.opcua_bounds import refuse_arrays_of_nothing
+from drivers.opcua_bounds import refuse_endless_arrays
 from drivers.opcua_settings import Node, OpcuaSettings
 from drivers.opcua_values import (
     CODE,
@@ -81,7 +81,7 @@ class OpcuaLink:
     """
 
     def __init__(self, settings: OpcuaSettings, clock: Clock) -> None:
-        refuse_arrays_of_nothing()
+        refuse_endless_arrays()
         self._settings = settings
         self._clock = clock
         self._runner: asyncio.Runner | None = None

@@ -26,7 +26,7 @@ from asyncua import Node, Server, ua
 from asyncua.common.connection import TransportLimits
 from asyncua.server import binary_server_asyncio
 
-from drivers.opcua_bounds import refuse_arrays_of_nothing
+from drivers.opcua_bounds import refuse_endless_arrays
 from drivers.opcua_nodes import Names, Unit, add_quantity, add_state
 from drivers.opcua_security import Say, authenticator_of, secure
 from drivers.results_alarms import Conditions, KnowingServer, Source
@@ -375,7 +375,7 @@ async def serve(pipe: Connection) -> None:
 
 def main() -> None:
     """Run as a process; the number of the connection is the argument."""
-    refuse_arrays_of_nothing()
+    refuse_endless_arrays()
     with suppress(BrokenPipeError), Connection(int(sys.argv[1])) as pipe:
         asyncio.run(serve(pipe))
 

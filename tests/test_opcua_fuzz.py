@@ -15,7 +15,7 @@ from test_opcua_block import DEPTH, Rig, T, TornServer, flags
 from test_opcua_subscribe import FakeLink, change, granted, publication, subscription
 
 from drivers.lasting import EMPTY, LostError
-from drivers.opcua_bounds import refuse_arrays_of_nothing
+from drivers.opcua_bounds import refuse_endless_arrays
 from twin.errors import SourceError
 from twin.signals import BREAK, UNUSABLE, Quality, Samples
 
@@ -142,7 +142,7 @@ def raw_change(handle: int, ms: int, variant: ua.Variant, code: int) -> Any:
 @pytest.mark.parametrize("kind", ["80", "9c"])  # of Null; of 28, which is no standard's
 def test_an_array_of_nothing_takes_no_memory(kind: str) -> None:
     """asyncua would make a list of 2**31 - 1 of them: minutes and gigabytes for six bytes."""
-    refuse_arrays_of_nothing()
+    refuse_endless_arrays()
     with pytest.raises(ua.UaError, match="an array of 2147483647 values of no type"):
         from_binary(ua.DataValue, Buffer(bytes.fromhex(f"01{kind}ffffff7f")))
     empty = from_binary(ua.DataValue, Buffer(bytes.fromhex("018000000000")))
@@ -151,9 +151,19 @@ def test_an_array_of_nothing_takes_no_memory(kind: str) -> None:
     assert null.Value.Value is None
 
 
+@pytest.mark.parametrize("length", ["fcffffff", "00000080"])
+def test_a_text_that_goes_back_is_no_text(length: str) -> None:
+    """asyncua would read it again for each of 2**31 - 1 elements: minutes for eleven bytes."""
+    refuse_endless_arrays()
+    with pytest.raises(ua.UaError, match="a length of -"):
+        from_binary(ua.DataValue, Buffer(bytes.fromhex(f"018cffffff7f{length}ff")))
+    texts = from_binary(ua.DataValue, Buffer(bytes.fromhex("018c02000000ffffffff0100000041")))
+    assert texts.Value.Value == [None, "A"]
+
+
 @pytest.mark.parametrize("program", ["drivers.opcua_link", "drivers.results_serve"])
 def test_who_reads_from_strangers_refuses_them(program: str) -> None:
     """The link of a driver and the server of the results."""
     source = importlib.import_module(program)
-    assert source.refuse_arrays_of_nothing is refuse_arrays_of_nothing
-    assert "    refuse_arrays_of_nothing()\n" in inspect.getsource(source)
+    assert source.refuse_endless_arrays is refuse_endless_arrays
+    assert "    refuse_endless_arrays()\n" in inspect.getsource(source)

@@ -32,7 +32,7 @@ from asyncua.ua.ua_binary import from_binary, to_binary
 from drivers import opcua_values, telegram
 from drivers.lasting import Clock
 from drivers.link import Link, ModbusSettings
-from drivers.opcua_bounds import refuse_arrays_of_nothing
+from drivers.opcua_bounds import refuse_endless_arrays
 from drivers.opcua_settings import Node
 from drivers.poll import Poller
 from drivers.ring import Trace
@@ -151,7 +151,7 @@ def _followed(link: object) -> int:
 
 def values(data: bytes) -> str:
     """A value over OPC UA, as each kind that a node may be asked for."""
-    refuse_arrays_of_nothing()
+    refuse_endless_arrays()
     try:
         value = from_binary(ua.DataValue, Buffer(data))
     except Exception as error:  # the library's; the link makes a lost connection of it
