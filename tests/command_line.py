@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import rigs
 
-from twin.cli import main
+from twin.cli.main import main
 
 
 def twin(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:

@@ -27,7 +27,7 @@ from playwright.sync_api import Browser, expect, sync_playwright
 from plc_process import PlcProcess, start_plc
 from postgres import make_schema, postgres_server
 
-from twin.cli import pair_of
+from twin.cli.setup import pair_of
 
 _ME = psutil.Process()
 _SCHEMAS = itertools.count()

@@ -11,7 +11,6 @@ import rigs
 from command_line import twin
 from test_alarms_loop import APART, LEAK, NONE, UNIT, S, deviation, rows
 
-from twin import cli_alarms
 from twin.alarms import keeper as module
 from twin.alarms.keeper import Keeper
 from twin.alarms.loop import Alarms
@@ -20,7 +19,8 @@ from twin.alarms.settings import board_rules
 from twin.alarms.store import open_store
 from twin.assets.unit import Unit
 from twin.audit import records
-from twin.cli_alarms import alarms_app
+from twin.cli import alarms as cli_alarms
+from twin.cli.alarms import alarms_app
 from twin.errors import ConfigError, SourceError
 from twin.settings import Document
 

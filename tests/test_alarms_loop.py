@@ -20,7 +20,7 @@ from twin.alarms.settings import board_rules
 from twin.alarms.state import Deed, Kept, State
 from twin.alarms.store import Store, open_store
 from twin.assets.unit import Unit
-from twin.cli_alarms import alarms_of
+from twin.cli.alarms import alarms_of
 from twin.config import Config
 from twin.errors import ConfigError, SourceError
 from twin.events import Event, Kind

@@ -10,7 +10,7 @@ import pytest
 from twin.assets.database import open_assets
 from twin.assets.place import open_chosen
 from twin.assets.record import Record
-from twin.cli_assets import assets_app
+from twin.cli.assets import assets_app
 from twin.errors import ConfigError, SourceError, TwinError
 from twin.settings import Document
 

@@ -24,7 +24,8 @@ from plc_process import PlcProcess, start_plc
 
 from twin.alarms.loop import Alarms
 from twin.alarms.settings import board_rules
-from twin.cli import Console, pair_of
+from twin.cli.console import Console
+from twin.cli.setup import pair_of
 from twin.events import Event, Kind
 from twin.figures.cycle import KeyFigures
 from twin.live import run

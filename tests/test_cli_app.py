@@ -11,7 +11,7 @@ import pytest
 from command_line import twin
 from typer.main import get_command
 
-from twin.cli import ORDER, app
+from twin.cli.main import ORDER, app
 
 
 def _commands() -> Iterator[tuple[str, ...]]:

@@ -11,7 +11,7 @@ import rigs
 from command_line import twin
 from pydantic import BaseModel
 
-from twin.cli_config import json_schema, mistakes, sections
+from twin.cli.config import json_schema, mistakes, sections
 from twin.keys import comments_of, defaults_of, tables_below
 from twin.settings import Document
 from twin.validation import alike, models_at, ordinal, path_in_words

@@ -9,7 +9,7 @@ from rigs import Collect
 
 from twin.alarms.loop import Alarms
 from twin.alarms.settings import board_rules
-from twin.cli import Console
+from twin.cli.console import Console
 from twin.events import Kind
 from twin.figures.cycle import KeyFigures
 from twin.live import run

@@ -12,7 +12,7 @@ import rigs
 from pyarrow import parquet
 
 from twin.assets.unit import Unit
-from twin.cli_figures import figures_app
+from twin.cli.figures import figures_app
 from twin.errors import ConfigError, SourceError
 from twin.figures.store import VALUES, open_store
 from twin.live import run as run_loop

@@ -12,7 +12,7 @@ import pytest
 import rigs
 
 from twin.assets.unit import Unit
-from twin.cli_figures import keeper_of, key_figures_of
+from twin.cli.figures import keeper_of, key_figures_of
 from twin.config import Config
 from twin.errors import ConfigError, SourceError
 from twin.events import Event, Kind

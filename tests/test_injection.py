@@ -27,7 +27,8 @@ import twin.log
 from twin.alarms.loop import Alarms
 from twin.alarms.settings import board_rules
 from twin.assets.unit import Unit
-from twin.cli import Console, _supervised
+from twin.cli.console import Console
+from twin.cli.run import _supervised
 from twin.errors import SourceError
 from twin.events import Event, Kind
 from twin.figures.keeper import Keeper

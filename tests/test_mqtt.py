@@ -19,7 +19,7 @@ from test_outlets import NO_TICKS, Bench, message, wait_until
 
 from twin.alarms.store import open_store
 from twin.assets.unit import Unit
-from twin.cli_outlets import outlets_of
+from twin.cli.outlets import outlets_of
 from twin.config import Config
 from twin.errors import ConfigError
 from twin.events import Event, Kind

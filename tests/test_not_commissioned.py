@@ -10,7 +10,7 @@ from rigs import Collect
 from twin.alarms.loop import Alarms
 from twin.alarms.settings import board_rules
 from twin.alarms.words import COMMISSION
-from twin.cli import pair_of
+from twin.cli.setup import pair_of
 from twin.config import Config
 from twin.diagnosis.answer import diagnose
 from twin.diagnosis.process import LiveDiagnosis

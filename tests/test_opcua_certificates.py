@@ -15,7 +15,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from drivers import certificates
 from drivers.opcua_trust import Peer, check
-from twin.cli_cert import cert
+from twin.cli.cert import cert
 from twin.errors import ConfigError, SourceError
 
 NOW = datetime.now(UTC)

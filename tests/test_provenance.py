@@ -134,7 +134,7 @@ EXTRAS = PROJECT["project"]["optional-dependencies"]
 # the base alone.
 NEEDS_EXTRA = {
     "twin/api.py": "notebook",
-    "twin/cli_serve.py": "serve",
+    "twin/cli/serve.py": "serve",
     "twin/exchange/aas.py": "aas",
     "twin/exchange/elements.py": "aas",
     "twin/exchange/fmu_file.py": "aas",

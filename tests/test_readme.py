@@ -6,7 +6,7 @@ from pathlib import Path
 from typer.main import get_command
 
 from tools.readme import PAGES, filled
-from twin.cli import app
+from twin.cli.main import app
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()

@@ -9,8 +9,8 @@ import rigs
 from typer.main import get_command
 
 from tools.reference import PAGES
-from twin.cli import app
-from twin.cli_config import json_schema, sections
+from twin.cli.config import json_schema, sections
+from twin.cli.main import app
 from twin.config import TABLES
 
 DOCS = rigs.ROOT / "docs"

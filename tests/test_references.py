@@ -24,7 +24,7 @@ from drivers.plc.settings import PlcSettings
 from drivers.results_settings import ResultsSettings
 from twin.alarms.settings import AlarmSettings
 from twin.assets.place import AssetsSettings
-from twin.cli import app
+from twin.cli.main import app
 from twin.config import TABLES, Asset, LogSettings
 from twin.errors import ConfigError
 from twin.figures.settings import FigureSettings

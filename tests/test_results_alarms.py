@@ -37,7 +37,7 @@ from twin.alarms.loop import Alarms
 from twin.alarms.settings import board_rules
 from twin.alarms.state import Deed
 from twin.audit import records
-from twin.cli_alarms import asker_of
+from twin.cli.alarms import asker_of
 from twin.config import Config
 from twin.errors import SourceError
 from twin.events import Kind

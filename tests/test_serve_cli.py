@@ -24,7 +24,7 @@ from test_alarms_loop import deviation, diagnosis
 from test_live_diagnosis import ANSWER, Stream, answering, quiet
 
 from drivers import certificates
-from twin.cli_serve import live_rows_of, reports_of
+from twin.cli.serve import live_rows_of, reports_of
 from twin.diagnosis import __main__ as diagnosing
 from twin.diagnosis import process, report
 from twin.diagnosis.process import LiveDiagnosis

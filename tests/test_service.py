@@ -15,7 +15,7 @@ import pytest
 import rigs
 from plc_process import PlcProcess
 
-from twin.cli import INTERRUPTED
+from twin.cli.stopping import INTERRUPTED
 from twin.errors import ConfigError
 from twin.service import FEEDS, Service
 

@@ -21,7 +21,7 @@ from test_alarms_loop import Stream
 from test_mqtt import begun, impatient  # noqa: F401 - a fixture
 from test_outlets import wait_until
 
-from twin.cli_outlets import outlets_of
+from twin.cli.outlets import outlets_of
 from twin.config import Config
 from twin.errors import ConfigError
 from twin.log.header import LogHeader

@@ -17,7 +17,7 @@ from test_alarms_loop import LEAK, NONE, Stream, deviation
 from test_mqtt import certificate
 from test_outlets import NO_TICKS, Bench, message, wait_until
 
-from twin.cli_outlets import outlets_of
+from twin.cli.outlets import outlets_of
 from twin.config import Config
 from twin.errors import ConfigError
 from twin.outlets import sender

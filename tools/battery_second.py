@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from tools.battery_cases import STORED, Case, Hidden
 from twin.calibration.commission import Commissioned, commission
 from twin.calibration.report import commissioned_as_json, headline
-from twin.cli_init import Answer, End, Place, Reference, Sensor, System, Unit, configuration
+from twin.cli.init import Answer, End, Place, Reference, Sensor, System, Unit, configuration
 from twin.config import Config
 from twin.diagnosis.answer import diagnose
 from twin.errors import TwinError

@@ -26,7 +26,9 @@ import numpy as np
 from drivers.plc.faults import parse_fault
 from drivers.plc.settings import PlcSettings
 from drivers.plc.simulate import blocks
-from twin.cli import INTERRUPTED, WAITS, pair_of
+from twin.cli.run import WAITS
+from twin.cli.setup import pair_of
+from twin.cli.stopping import INTERRUPTED
 from twin.config import Config
 from twin.diagnosis.answer import diagnose
 from twin.events import Event, Kind

@@ -65,7 +65,7 @@ def set_by(seconds):
     ahead_ns += seconds * 10**9
 signal.signal(signal.SIGUSR1, lambda *_: set_by(3600))
 signal.signal(signal.SIGUSR2, lambda *_: set_by(-3600))
-from twin.cli import main
+from twin.cli.main import main
 main()
 """
 START_S = 300.0  # the kernels may have to be compiled, on a busy machine

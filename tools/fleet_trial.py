@@ -32,7 +32,7 @@ LISTED, FOUND = 15, 11  # rows of the report, and how many of twelve faults are 
 DAY_NS = 86_400 * 10**9
 NEW_NS = 1_767_225_600 * 10**9  # 2026-01-01
 TODAY = 120  # days later
-TWIN = [sys.executable, "-c", "from twin.cli import main; main()"]
+TWIN = [sys.executable, "-c", "from twin.cli.main import main; main()"]
 
 
 def hidden(units: int, faults: int, seed: int) -> Mapping[int, str]:

@@ -42,7 +42,7 @@ from twin.assets.exchange import parse_export, to_export
 from twin.assets.record import Record, checked
 from twin.assets.unit import Unit
 from twin.audit import Audit
-from twin.cli_assets import _read_json
+from twin.cli.assets import _read_json
 from twin.config import SHIPPED, Config
 from twin.errors import SourceError
 from twin.events import Event, Kind

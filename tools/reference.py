@@ -13,8 +13,8 @@ from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 from typer.main import get_command
 
-from twin.cli import app
-from twin.cli_config import sections
+from twin.cli.config import sections
+from twin.cli.main import app
 from twin.keys import UNWRITTEN, comments_of, defaults_of, tables_below
 from twin.validation import models_at
 

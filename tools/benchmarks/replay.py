@@ -14,7 +14,7 @@ from benchmarks.kernel import Advance, first_rows, in_c, timed
 from benchmarks.machine import TWIN_CORE, on_core
 from benchmarks.processes import TWIN, usage
 from benchmarks.recording import HOUR_S, MINUTE, hour, new_twin
-from twin.cli import pair_of
+from twin.cli.setup import pair_of
 from twin.live import REPLAYED
 from twin.log.recorder import Recorder
 from twin.signals import Samples, Ticks

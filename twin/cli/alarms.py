@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from twin.cli_app import App, audit_of, not_negative, read_config, user_here
+from twin.cli.app import App, audit_of, not_negative, read_config, user_here
 from twin.errors import ConfigError, known_names
 from twin.files import write_json
 from twin.instants import instant

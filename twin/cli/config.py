@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from twin.cli_app import App
+from twin.cli.app import App
 from twin.errors import ConfigError, SourceError
 from twin.keys import UNWRITTEN
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.cli_app import read_config
+from twin.cli.app import read_config
 from twin.errors import ConfigError
 from twin.extras import install_hint
 

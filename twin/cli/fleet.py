@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from twin.cli_app import App, read_config, say_if_cut, say_if_new
+from twin.cli.app import App, read_config, say_if_cut, say_if_new
 from twin.errors import ConfigError, SourceError
 from twin.files import require_writable, write_json
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from twin.cli_app import App, read_config, say_if_new
+from twin.cli.app import App, read_config, say_if_new
 from twin.errors import ConfigError, SourceError, known_names
 from twin.extras import install_hint
 from twin.files import write_whole

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.audit import Act, in_words, records
-from twin.cli_app import App, audit_of, read_config, user_here
+from twin.cli.app import App, audit_of, read_config, user_here
 from twin.errors import ConfigError, SourceError
 from twin.files import write_json
 

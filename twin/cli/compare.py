@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.cli_app import say_if_cut
+from twin.cli.app import say_if_cut
 from twin.errors import ConfigError
 from twin.files import require_writable, write_json
 

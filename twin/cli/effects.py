@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.cli_app import App, read_config, say_if_new
+from twin.cli.app import App, read_config, say_if_new
 from twin.errors import ConfigError, SourceError
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.cli_app import App, not_negative, read_config, say_if_cut
+from twin.cli.app import App, not_negative, read_config, say_if_cut
 from twin.errors import ConfigError, known_names
 from twin.files import require_writable, write_json
 

@@ -1,0 +1,107 @@
+"""``twin diagnose``: what the simulation gets wrong on a log, and why."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from twin.cli.app import say_if_cut, say_if_new
+from twin.cli.console import status
+from twin.cli.options import AsOf, AssetsUrl, ConfigOption, JsonFile, LogFile, UnitId
+from twin.cli.setup import settings_of
+from twin.files import require_writable, write_json, write_whole
+
+if TYPE_CHECKING:
+    from twin.config import Config
+    from twin.diagnosis.answer import Diagnosis
+
+
+def diagnose(
+    log: LogFile,
+    *,
+    config: ConfigOption = None,
+    unit: UnitId = "",
+    assets: AssetsUrl = "",
+    as_of: AsOf = "",
+    json_file: JsonFile = None,
+    report: Annotated[
+        Path | None, typer.Option(metavar="F.html", help="Write a page with pictures.")
+    ] = None,
+    save_as: Annotated[
+        str, typer.Option(metavar="NEWID", help="Keep the extended model as that of a unit.")
+    ] = "",
+    judge_on: Annotated[
+        Path | None,
+        typer.Option(metavar="OTHER.mcap", help="Measure the gain on another log as well."),
+    ] = None,
+    propose: Annotated[
+        Path | None,
+        typer.Option(metavar="F.toml", help="Write what acts, unlisted, for twin effects add."),
+    ] = None,
+) -> None:
+    """Say what the simulation gets wrong on a log, why, and what knowing it gains."""
+    from twin.diagnosis.another_log import judged_on
+    from twin.diagnosis.answer import diagnose as find_cause
+    from twin.diagnosis.extend import nothing
+    from twin.diagnosis.report import in_words, write_report
+    from twin.diagnosis.words import on_another_log
+    from twin.log.reader import open_log
+
+    require_writable(json_file, report, propose)
+    recorded = open_log(log)
+    say_if_cut(recorded, log, "diagnosed")
+    other = open_log(judge_on) if judge_on else None
+    if other is not None and judge_on is not None:
+        other.header.require_commands(str(judge_on))
+        say_if_cut(other, judge_on, "judged on")
+    store = bool(save_as)
+    settings = settings_of(recorded.header, log, config, assets, unit, as_of, to_store=store)
+    if not unit:
+        settings.refuse_another(recorded.header, str(log))
+    with status() as say:
+        blocks = (rows for rows, _ in recorded.blocks())
+        diagnosis = find_cause(settings, blocks, str(log), say, derived=recorded.header.derived)
+        if other is not None:
+            say(f"judging on {judge_on}")
+            blocks = (rows for rows, _ in other.blocks())
+            diagnosis.json["judged_on"] = judged_on(diagnosis, settings, str(judge_on), blocks)
+    print(in_words(diagnosis))
+    if other is not None:
+        print(on_another_log(diagnosis.json, nothing(diagnosis)))
+    if json_file is not None:
+        write_json(json_file, diagnosis.json)
+    if report is not None:
+        write_report(diagnosis, report)
+    if save_as:
+        _save(diagnosis, settings, save_as, assets, log)
+    if propose is not None:
+        _propose(diagnosis, settings, log, propose)
+
+
+def _save(diagnosis: "Diagnosis", settings: "Config", unit: str, assets: str, log: Path) -> None:
+    """Keep the extended model, or say why there is none."""
+    from twin.diagnosis.extend import extended, nothing, remarks, store
+
+    print()
+    for line in remarks(diagnosis):
+        print(line)
+    known = extended(diagnosis, settings)
+    if known is None:
+        print(f"nothing is stored as {unit}: {nothing(diagnosis)}")
+        return
+    say_if_new(assets, settings.document)
+    record, where = store(known, diagnosis, settings, unit, assets, log)
+    print(f"stored as {unit} in {where}, record {record.id[:8]}; use it: --id {unit}")
+
+
+def _propose(diagnosis: "Diagnosis", settings: "Config", log: Path, file: Path) -> None:
+    """Write what acts that nobody listed as an effect to be taken in, or say why there is none."""
+    from twin.diagnosis.propose import proposed
+
+    text = proposed(diagnosis, settings, log, file)
+    print()
+    if text is None:
+        print(f"nothing is written to {file}: no mechanism that nobody listed was found")
+        return
+    write_whole(file, text.encode())
+    print(f"proposed as an effect in {file}; read it, then: twin effects add {file}")

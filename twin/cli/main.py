@@ -1,0 +1,79 @@
+"""The command line: the only place where the twin meets the drivers.
+
+Imports of what a command does stand inside it so that ``twin --help`` is quick. What a command
+finds goes to stdout, what it has to say about its work to stderr.
+"""
+
+import atexit
+import gc
+import os
+import sys
+
+from twin.cli.alarms import alarms_app
+from twin.cli.app import App
+from twin.cli.assets import assets_app
+from twin.cli.calibrate import calibrate, commission
+from twin.cli.cert import cert
+from twin.cli.compare import compare
+from twin.cli.config import config_app
+from twin.cli.console import complain
+from twin.cli.diagnose import diagnose
+from twin.cli.effects import effects_app
+from twin.cli.exchange import export_fmu
+from twin.cli.figures import figures_app
+from twin.cli.fleet import fleet_app
+from twin.cli.init import init
+from twin.cli.logs import log_app
+from twin.cli.paper import paper
+from twin.cli.plc import plc, probe
+from twin.cli.replay import replay
+from twin.cli.run import run
+from twin.cli.serve import serve
+from twin.cli.stopping import INTERRUPTED
+from twin.cli.tables import export, import_
+from twin.cli.users import users_app
+from twin.errors import TwinError
+
+GARBAGE = 20_000  # objects made and not let go of, after which Python looks for garbage
+
+# As the days go: begin, run, ask why, look after what is kept, tools.
+ORDER = (
+    *("init", "config", "probe", "import", "commission", "calibrate"),
+    *("run", "serve", "replay", "diagnose", "compare", "figures", "alarms"),
+    *("fleet", "log", "assets", "users", "cert"),
+    *("export", "export-fmu", "effects", "paper", "plc"),
+)
+
+app = App("A live digital twin of pneumatic vacuum ejectors.", ORDER)
+for name, some in {
+    "assets": assets_app,
+    "figures": figures_app,
+    "alarms": alarms_app,
+    "fleet": fleet_app,
+    "users": users_app,
+    "config": config_app,
+    "effects": effects_app,
+    "log": log_app,
+}.items():
+    app.add_typer(some, name=name)
+for one in (
+    *(init, probe, commission, calibrate, run, serve, replay, diagnose, compare, cert),
+    *(export, export_fmu, paper, plc),
+):
+    app.command()(one)
+app.command("import")(import_)
+
+
+def main() -> None:
+    """Run the command line; errors become one message with a hint, and the exit code."""
+    # Matrices are small here: more threads only wait for each other, on cores that others need.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when a command imports NumPy
+    gc.set_threshold(GARBAGE)  # of what is imported nothing is: looking is a tenth of the start
+    atexit.register(gc.freeze)  # what is left ends with the process: no 0.2 s for its garbage
+    try:
+        app(prog_name="twin")
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+    except TwinError as error:
+        complain(f"{error}\n  {error.hint}" if error.hint else str(error))
+        sys.exit(error.exit_code)

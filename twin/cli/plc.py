@@ -1,0 +1,52 @@
+"""``twin plc`` and ``twin probe``: the simulated PLC, and what a real one answers."""
+
+from typing import Annotated
+
+import typer
+
+from twin.cli.app import not_negative, read_config
+from twin.cli.options import Address, ConfigFile, ConfigFiles
+from twin.errors import ConfigError
+
+
+def plc(
+    configs: ConfigFiles,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE[@START][/COURSE]", help="For example leakage=2.0@10."),
+    ] = None,
+    port: Annotated[int | None, typer.Option(help="Modbus TCP port; 0 takes any free.")] = None,
+    seed: Annotated[
+        int, typer.Option(min=0, help="For all that is random: same seed, same run.")
+    ] = 0,
+    duration: Annotated[
+        float | None,
+        typer.Option(metavar="S", callback=not_negative, help="Stop after S seconds."),
+    ] = None,
+) -> None:
+    """Run the simulated PLC with an ejector behind it, for trials and tests.
+
+    With several configurations as many ejectors are behind it, each with its own unit and prefix
+    of nodes; the first one says where it listens and has the faults.
+    """
+    from drivers.plc.faults import parse_fault
+    from drivers.plc.live import run_plc
+    from drivers.plc.settings import PlcSettings
+
+    documents = [read_config(one) for one in configs]
+    for document in documents:
+        if "plc" not in document.tables:
+            raise ConfigError(
+                f"{document.name}: there is no [plc] table",
+                "say what is simulated, as configs/test_rig.toml does",
+            )
+    settings = [one.section(PlcSettings, "plc").on_port(port) for one in documents]
+    run_plc(settings, [parse_fault(text) for text in fault or []], seed, duration)
+
+
+def probe(config: ConfigFile, address: Address = "") -> None:
+    """Say what a PLC at the configured address answers, word order included."""
+    from drivers.sources import probe_source
+
+    for line in probe_source(read_config(config), address):
+        print(line)

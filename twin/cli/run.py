@@ -1,0 +1,379 @@
+"""``twin run``: the twin beside a PLC."""
+
+import gc
+import os
+import re
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from twin.cli.alarms import alarms_of, asker_of
+from twin.cli.app import not_negative
+from twin.cli.console import Console, printers, status, unsaid
+from twin.cli.figures import keeper_of
+from twin.cli.options import Address, AssetsUrl, ConfigFiles, FailOnAlarm, RrdFile, UnitId, ViewFlag
+from twin.cli.outlets import outlets_of
+from twin.cli.serve import live_rows_of, reports_of
+from twin.cli.setup import configured, pair_of
+from twin.cli.sinks import open_sinks, views_of
+from twin.cli.stopping import closed, leave, stop_on_signal, until
+from twin.errors import ConfigError, SourceError, TwinError
+from twin.events import Kind
+from twin.files import require_writable
+from twin.lock import only_run
+from twin.service import Service
+
+if TYPE_CHECKING:
+    from sqlalchemy import URL
+
+    from drivers.hil import Writer
+    from drivers.results_state import Results
+    from twin.cli.outlets import Begin, Standing
+    from twin.config import Config
+    from twin.live import Adviser, Sink
+    from twin.monitor.listening import Notices
+    from twin.signals import Samples
+
+WAITS = "it is tried until it answers"  # a PLC that is off
+
+
+def run(
+    configs: ConfigFiles,
+    *,
+    duration: Annotated[
+        float | None,
+        typer.Option(metavar="S", callback=not_negative, help="Stop after S seconds with the PLC."),
+    ] = None,
+    log: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write an MCAP log; a new one each time in a folder."),
+    ] = None,
+    view: ViewFlag = False,
+    rrd: RrdFile = None,
+    address: Address = "",
+    unit: UnitId = "",
+    assets: AssetsUrl = "",
+    hil: Annotated[
+        bool, typer.Option("--hil", help="Be the plant of the PLC: write what [hil.tags] lists.")
+    ] = False,
+    once: Annotated[
+        bool, typer.Option("--once", help="End if the PLC does not answer at the start.")
+    ] = False,
+    fail_on_alarm: FailOnAlarm = False,
+) -> None:
+    """Run the twin beside a PLC: read, expect, compare, log, alarm, diagnose. Ctrl-C ends it.
+
+    Several configurations are as many ejectors, each with its own twin and log (FILE gets the
+    asset's id before its suffix). One that fails does not stop the others. A PLC that does not
+    answer yet is tried until it does. Where FILE is a folder, logs in it are named by asset and
+    time. The oldest logs make room for new ones, as [log] says.
+    """
+    from drivers.hil import open_writer
+    from drivers.results_settings import open_results
+    from drivers.shared import Lines
+    from drivers.sources import open_source
+    from twin.figures.table import FIGURES
+    from twin.live import run as run_loop
+    from twin.settings import Document
+    from twin.together import run_together
+
+    alone = len(configs) == 1
+    if not alone:
+        _refuse_one_id(unit, len(configs))
+    _require_places(log, rrd)  # the PLC may answer much later
+    ejectors = _named([configured(Document.read(one), assets, unit) for one in configs])
+    pairs = {name: pair_of(one) for name, one in ejectors.items()}  # compiled before time counts
+    width = 0 if alone else max(map(len, ejectors))
+    lines = Lines()
+
+    def beside(name: str, settings: "Config") -> None:
+        label = "" if alone else name
+        twin, monitor = pairs[name]
+        alarms, outlets = alarms_of(settings, complain), outlets_of(settings, complain)
+        at = settings.document, address, lines if hil or not alone else None
+        plc = _Plc(partial(open_source, *at), label, complain, once=once)
+        shown = (
+            show(name, settings.asset.type, asker_of(settings), plc.results_down) if show else None
+        )
+        with (
+            service.loop(name, stop) as stopped,
+            closed(shown),
+            _locked(settings, log, complain),
+            ExitStack() as closing,
+        ):
+            if not plc.answers(stopped):  # said before a log is begun
+                return
+            # So is what is wrong with [hil].
+            writer = closing.enter_context(open_writer(*at)) if hil else None
+            file = _file_of(log, label, name)
+            # The log comes last: what people are told does not wait for the disk.
+            opened = open_sinks(
+                {
+                    "console": lambda: consoles[name],
+                    "OPC UA results": (lambda: shown) if shown else None,
+                    "key figures": keeper_of(settings, complain),
+                    "live page": live_rows_of(settings, complain),
+                    "view": view_of(name),
+                    "log": partial(_recorder, file, settings, hil=hil) if file else None,
+                }
+            )
+            closing.enter_context(
+                _retained(settings, opened.get("log"), plc.listening.notices, complain)
+            )
+            adviser = _diagnosing(settings, file, stopped, alone=alone)
+            # What is not measured has no faults. Alarms come last: they hear the diagnosis.
+            advised: dict[str, Adviser] = (
+                {} if hil else {"diagnosis": adviser, "alarms": (board := alarms())}
+            )
+            told = {} if hil else _told(board.standing(), shown, outlets)
+            sinks, advisers = _supervised({**told, **opened}, advised, plc.listening.notices)
+            # It begins with the newest row: what came while all this was opened is not judged.
+            source = _answering(plc.blocks(), settings, writer) if writer else plc.blocks()
+            with closed(source):
+                run_loop(until(stopped, source), twin, monitor, sinks, plc.listening, advisers)
+
+    failed: list[str] = []
+    units = {figure.name: figure.unit for figure in FIGURES.values()}
+    with (
+        open_results([one.document for one in ejectors.values()], units) as show,
+        views_of(ejectors, view, rrd) as view_of,
+        stop_on_signal(duration) as stop,
+        _spared(),
+        Service(os.environ) as service,
+        printers() as (printer, complain),
+    ):
+        consoles = {
+            name: Console("" if alone else name.ljust(width), printer.print) for name in ejectors
+        }
+        if alone:
+            beside(*next(iter(ejectors.items())))
+        else:
+            loops = {name: partial(beside, name, one) for name, one in ejectors.items()}
+            failed = run_together(loops, lambda name, why: complain(f"{name}: {why}"))
+        if failed:
+            raise SourceError(f"{len(failed)} of {len(loops)} ejectors failed: {', '.join(failed)}")
+        alarmed = any(console.alarmed for console in consoles.values())
+        leave(fail_on_alarm and alarmed, interrupted=stop() == "interrupted")
+
+
+class _Plc:
+    """The PLC of one ejector: tried until it answers, unless it is to answer at ``once``."""
+
+    def __init__(
+        self,
+        opened: "Callable[..., Iterator[Samples]]",
+        name: str,
+        complain: Callable[[str], None],
+        *,
+        once: bool,
+    ) -> None:
+        from twin.monitor.listening import Listening
+
+        self.listening = Listening()
+        self._opened, self._complain, self._once = opened, complain, once
+        self._said = f"{name}: " if name else ""
+        self._waits = False  # it did not answer at first
+        self._known = False  # it has given a row: whatever it sends from now on may pass
+
+    def blocks(self) -> "Iterator[Samples]":
+        """Its samples from now on; errors as from ``drivers.sources.open_source``."""
+        away = None if self._once and not self._known else self._away
+        return self._opened(away, known=self._known)
+
+    def answers(self, stopped: Callable[..., str]) -> bool:
+        """Wait for a row and hang up; False if the run is interrupted before there is one."""
+        source = self.blocks()
+        with closed(source):
+            for block in source:
+                if len(block):
+                    self._known = True
+                    break
+                if stopped(begun=False):
+                    return False
+        if self._waits:
+            self._complain(f"{self._said}the PLC answers")
+        return True
+
+    def results_down(self, why: str) -> None:
+        """Have it said with the events of this ejector."""
+        self.listening.notices.tell(Kind.RESULTS_DOWN, why)
+
+    def _away(self, error: TwinError) -> None:
+        if self._known:
+            self.listening.notices.tell(Kind.PLC_LOST, str(error))
+            return
+        waits = "" if self._waits else f"\n  {WAITS}; with --once the run ends instead"
+        self._waits = True
+        self._complain(f"{self._said}{error}\n  {error.hint}{waits}")
+
+
+def _named(ejectors: "Sequence[Config]") -> "dict[str, Config]":
+    """The configurations by asset; ConfigError where two are of the same."""
+    named: dict[str, Config] = {}
+    for settings in ejectors:
+        name = re.sub(r"[^\w.-]", "_", settings.asset.id) or Path(settings.document.name).stem
+        if name in named:
+            raise ConfigError(
+                f"{named[name].document.name} and {settings.document.name} are both of {name}",
+                "give each ejector its own id under [asset]",
+            )
+        named[name] = settings
+    return named
+
+
+def _refuse_one_id(unit: str, ejectors: int) -> None:
+    """ConfigError if several are to be the one unit."""
+    if unit:
+        raise ConfigError(
+            f"--id is for one ejector, and here are {ejectors}",
+            "leave it out, and give each configuration its own under [asset]",
+        )
+
+
+def _require_places(log: Path | None, rrd: Path | None) -> None:
+    """SourceError if no log or no view can be written there."""
+    require_writable(rrd)
+    if log is None or not log.is_dir():
+        require_writable(log)
+    elif not os.access(log, os.W_OK):
+        raise SourceError(f"{log}: cannot be written to", "see to the rights of the folder")
+
+
+def _file_of(path: Path | None, label: str, name: str) -> Path | None:
+    """Where one of several writes: run.mcap becomes run.rig-01.mcap; in a folder a new file."""
+    if path is not None and path.is_dir():
+        return path / time.strftime(f"{name}.%Y%m%dT%H%M%SZ.mcap", time.gmtime())
+    return path.with_name(f"{path.stem}.{label}{path.suffix}") if path and label else path
+
+
+@contextmanager
+def _locked(
+    settings: "Config", log: Path | None, complain: Callable[[str], None]
+) -> Iterator[None]:
+    """Be the only run of the unit that writes where this one does; SourceError says who else is."""
+    unit = " ".join(part for part in (settings.asset.type, settings.asset.id) if part)
+    with ExitStack() as locks:
+        for folder in sorted(_written_by(settings, log)):
+            locks.enter_context(only_run(folder, unit, time.time_ns(), complain))
+        yield
+
+
+def _written_by(settings: "Config", log: Path | None) -> set[Path]:
+    """The folders in which a second run of the unit would write the same once more."""
+    from twin.alarms.place import place_of as alarms_in
+    from twin.alarms.settings import AlarmSettings
+    from twin.assets.engine import sqlite_file
+    from twin.figures.place import place_of as figures_in
+    from twin.figures.settings import FigureSettings
+
+    document, places = settings.document, list["URL"]()
+    if document.section(AlarmSettings, "alarms").keep:
+        places.append(alarms_in(document))
+    if document.section(FigureSettings, "figures").keep:
+        places.append(figures_in(document))
+    files = (sqlite_file(place) or Path(document.name) for place in places)  # or a server
+    logs = [] if log is None else [log if log.is_dir() else log.parent]
+    return {folder.resolve() for folder in [*logs, *(Path(file).parent for file in files)]}
+
+
+def _recorder(file: Path, settings: "Config", *, hil: bool) -> "Sink":
+    """The log of a live run."""
+    from twin.log.header import HIL, RECORDED
+    from twin.log.recorder import Recorder
+
+    rotate = round(settings.log.rotate_mb * 1e6)
+    own = {RECORDED: "twin run"}
+    if hil:
+        own[HIL] = "the pressure is the model's own, as it was written to the PLC"
+    return Recorder(file, settings.log_header(own), rotate_bytes=rotate)
+
+
+def _retained(
+    settings: "Config",
+    log: "Sink | None",
+    notices: "Notices",
+    complain: Callable[[str], None],
+) -> "AbstractContextManager[object]":
+    """What keeps the logs of a live run within the bounds of [log]."""
+    from twin.log.recorder import Recorder
+    from twin.log.retention import GB, Bounds, Retention
+
+    if not isinstance(log, Recorder):
+        return nullcontext()
+    kept, unit = settings.log, (settings.asset.type, settings.asset.id)
+    bounds = Bounds(kept.keep_days, kept.keep_gb and kept.keep_gb * GB, kept.disk_pct / 100)
+    tell = partial(notices.tell, Kind.LOG_DELETED)
+    return Retention(log.under_way.parent, unit, bounds, lambda: log.under_way, tell, complain)
+
+
+def _diagnosing(
+    settings: "Config", log: Path | None, stopped: Callable[[], str], *, alone: bool
+) -> "Adviser":
+    """Who has the alarms of a live run diagnosed."""
+    from twin.diagnosis.process import LiveDiagnosis
+
+    return LiveDiagnosis(
+        settings,
+        str(log or "live"),
+        lambda: stopped() == "interrupted",
+        status if alone else unsaid,
+        reports=reports_of(settings),
+    )
+
+
+def _answering(
+    source: "Iterator[Samples]", settings: "Config", writer: "Writer"
+) -> "Iterator[Samples]":
+    """The blocks with the model as the plant, which answers what the PLC commands."""
+    from drivers.hil import Outputs
+    from twin.hil import Plant, in_place
+    from twin.model.dataset import coefficients
+
+    plant = Plant(coefficients(settings.data), settings.data.terms)
+    return in_place(source, plant, lambda *values: writer.put(Outputs(*values)))
+
+
+def _supervised(
+    sinks: "Mapping[str, Sink]", advisers: "Mapping[str, Adviser]", notices: "Notices"
+) -> "tuple[list[Sink], list[Adviser]]":
+    """The same; one that fails does not end the run."""
+    from twin.log.recorder import Recorder
+    from twin.supervised import Outages, SupervisedAdviser, SupervisedSink
+
+    outages = Outages(notices)
+
+    def supervised(name: str, sink: "Sink") -> "Sink":
+        if isinstance(sink, Recorder):
+            return SupervisedSink(name, sink, sink.again, outages, held=lambda: sink.held)
+        rows = not isinstance(sink, Console)
+        return SupervisedSink(name, sink, lambda: sink, outages, rows=rows)
+
+    return (
+        [supervised(*one) for one in sinks.items()],
+        [SupervisedAdviser(name, one, outages) for name, one in advisers.items()],
+    )
+
+
+def _told(
+    standing: "Standing", shown: "Results | None", outlets: "Begin | None"
+) -> "dict[str, Sink]":
+    """Tell of the alarms that stand when a run begins; gives the sinks that tell of the others."""
+    if shown is not None:
+        shown.resume(standing, time.time_ns())
+    return {} if outlets is None else {"MQTT and webhook": outlets(standing)}
+
+
+@contextmanager
+def _spared() -> "Iterator[None]":
+    """Keep the garbage collector from all there is: going through it holds a block up by 0.2 s."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()

@@ -1,0 +1,80 @@
+"""What a command begins with: the configuration of an ejector, its twin and its monitor."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from twin.cli.figures import key_figures_of
+from twin.cli.stopping import heeded
+
+if TYPE_CHECKING:
+    from twin.config import Config
+    from twin.live import Twin
+    from twin.log.header import LogHeader
+    from twin.monitor.detect import Monitor
+    from twin.settings import Document
+
+
+def configured(document: "Document", assets: str, unit: str) -> "Config":
+    """The configuration with what is known of its unit; says so if one that is named is unknown."""
+    from twin.config import Config
+
+    settings = Config.of(document, assets, unit)
+    _say_instead(settings, unit)
+    return settings
+
+
+def settings_of(
+    header: "LogHeader",
+    log: Path,
+    instead: Path | None,
+    assets: str,
+    unit: str,
+    as_of: str,
+    *,
+    to_store: bool = False,
+) -> "Config":
+    """The configuration a log carries, with the data set it was made with; or another one.
+
+    ``to_store`` something in the asset database: it may be new.
+    """
+    from twin.assets.file import parse_time
+    from twin.config import Config
+    from twin.settings import Document
+
+    document = Document.read(instead) if instead is not None else None
+    known = parse_time(as_of) if as_of else None
+    settings = Config.of_recorded(
+        header, str(log), document, assets, unit, known, to_store=to_store
+    )
+    _say_instead(settings, unit)
+    return settings
+
+
+def _say_instead(settings: "Config", unit: str) -> None:
+    """Say so if a unit that is named is unknown."""
+    if unit and settings.instead:
+        print(f"twin: {settings.instead}", file=sys.stderr)
+
+
+def pair_of(settings: "Config", *, judges: bool = True) -> tuple["Twin", "Monitor"]:
+    """The twin of a configuration and its monitor, which may be one that ``judges`` no cycle."""
+    from twin.live import compiled
+    from twin.monitor.detect import Monitor
+    from twin.monitor.isolation import Isolation
+    from twin.monitor.reports import ReportWatch
+
+    with heeded():
+        twin = compiled(settings.data)
+    watch = settings.monitor
+    isolation = (
+        Isolation.of(settings.data, watch.healthy, watch.false_alarm_days)
+        if watch.isolate and judges
+        else None
+    )
+    teller = key_figures_of(settings) if judges else None
+    monitor = Monitor(watch, twin.theta, teller=teller, isolation=isolation, judges=judges)
+    monitor.reports = ReportWatch(twin.theta, twin.knees) if judges else None
+    if settings.document.tables.get("driver", {}).get("mode") == "poll":
+        monitor.clocks = None  # then time is that of the poll here
+    return twin, monitor
