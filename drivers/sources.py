@@ -4,17 +4,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers import modbus
-from drivers.lasting import Away
-from drivers.link import ModbusSettings
-from drivers.probe import Line, probe
-from drivers.shared import Lines
+from drivers.modbus import source as modbus
+from drivers.modbus.link import ModbusSettings
+from drivers.modbus.probe import probe
+from drivers.modbus.shared import Lines
+from drivers.probe import Line
+from drivers.reconnect import Away
 from twin.errors import ConfigError, SourceError
 from twin.settings import Document
 from twin.signals import Samples
 
 if TYPE_CHECKING:
-    from drivers.opcua import OpcuaSettings
+    from drivers.opcua.source import OpcuaSettings
 
 KINDS = ("modbus", "opcua")
 
@@ -37,7 +38,7 @@ def open_source(
     settings = settings_of(document, address)
     if isinstance(settings, ModbusSettings):
         return modbus.blocks(settings, lines=lines, away=away, known=known)
-    from drivers import opcua  # noqa: PLC0415 - the library takes its time
+    from drivers.opcua import source as opcua  # noqa: PLC0415 - the library takes its time
 
     return opcua.blocks(settings, away=away, known=known)
 
@@ -61,7 +62,7 @@ def probe_source(document: Document, address: str = "") -> Iterator[str]:
 def _probed(settings: "ModbusSettings | OpcuaSettings") -> list[Line]:
     if isinstance(settings, ModbusSettings):
         return probe(settings)
-    from drivers import opcua_probe  # noqa: PLC0415 - the library takes its time
+    from drivers.opcua import probe as opcua_probe  # noqa: PLC0415 - the library takes its time
 
     return opcua_probe.probe(settings)
 
@@ -87,6 +88,6 @@ def _configured(document: Document) -> "ModbusSettings | OpcuaSettings":
     folder = Path(document.name).parent  # files lie there, wherever the program was started
     if kind == "modbus":
         return document.section(ModbusSettings, "driver").below(folder)
-    from drivers.opcua_settings import OpcuaSettings  # noqa: PLC0415 - as above
+    from drivers.opcua.settings import OpcuaSettings  # noqa: PLC0415 - as above
 
     return document.section(OpcuaSettings, "driver").below(folder)

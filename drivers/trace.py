@@ -12,7 +12,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from drivers.lasting import EMPTY, Clock, LostError
+from drivers.reconnect import EMPTY, Clock, LostError
 from twin.errors import SourceError
 from twin.settings import KeyedError
 from twin.signals import Quality, Samples

@@ -6,7 +6,7 @@ import sys
 import rigs
 from numba.core.dispatcher import Dispatcher
 
-from twin import cli
+from twin.cli.setup import pair_of
 
 
 def compiled() -> dict[str, int]:
@@ -18,7 +18,7 @@ def compiled() -> dict[str, int]:
 def main(name: str) -> None:
     """Run it over cycles with a gross fault, which brings everything about that can happen."""
     samples, _ = rigs.recorded(name, 30.0, ("leakage=3@c6",), 3)
-    twin, monitor = cli.pair_of(rigs.config(name))
+    twin, monitor = pair_of(rigs.config(name))
     before = compiled()
     for block in rigs.cut(samples, 50):
         monitor.update(*twin.advance(block))

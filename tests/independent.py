@@ -22,7 +22,7 @@ import rigs
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from drivers import certificates
+from drivers.opcua import certificates
 from drivers.plc.settings import PlcSettings
 from drivers.plc.simulate import blocks as simulated_blocks
 

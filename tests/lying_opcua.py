@@ -9,7 +9,7 @@ import numpy as np
 from asyncua import Server, ua
 from test_opcua_block import NODES, TornServer
 
-from drivers.opcua_settings import Node
+from drivers.opcua.settings import Node
 
 T = ua.VariantType
 NAMESPACE = "urn:plc"

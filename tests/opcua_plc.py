@@ -12,8 +12,8 @@ import rigs
 import tomli_w
 from plc_process import PlcProcess, start_plc
 
-from drivers import certificates
-from drivers.opcua_settings import OpcuaSettings
+from drivers.opcua import certificates
+from drivers.opcua.settings import OpcuaSettings
 
 
 @dataclass(frozen=True)

@@ -68,4 +68,6 @@ def test_the_bench_takes_as_many_threads_as_the_command_line() -> None:
         command, cwd=TOOLS, env=environment, capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "1"
-    assert f'os.environ.setdefault("{name}", "1")' in (ROOT / "twin" / "cli.py").read_text()
+    assert (
+        f'os.environ.setdefault("{name}", "1")' in (ROOT / "twin" / "cli" / "main.py").read_text()
+    )

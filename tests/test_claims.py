@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import rigs
 
+from drivers.outputs.state import KEPT
+from drivers.outputs.state import STALE_S as NO_ROW_S
 from drivers.plc import partner, rig
 from drivers.plc.plant import CV, R_GAS
-from drivers.results_state import KEPT
-from drivers.results_state import STALE_S as NO_ROW_S
 from twin import files, throttle
 from twin.alarms import statistics
 from twin.alarms.loop import AGREEING

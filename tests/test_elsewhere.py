@@ -13,7 +13,12 @@ sys.modules["fcntl"] = None
 del signal.SIGUSR1, signal.SIGUSR2, os.getuid, os.getpriority, os.setpriority
 """
 MODULES = ["twin.cli", "twin.page.ring", "twin.model.compiled", "drivers.plc.live"]
-MODULES += ["drivers.results", "drivers.link", "drivers.sources", "twin.diagnosis.process"]
+MODULES += [
+    "drivers.outputs.results",
+    "drivers.modbus.link",
+    "drivers.sources",
+    "twin.diagnosis.process",
+]
 
 
 @pytest.mark.parametrize("module", MODULES)

@@ -27,16 +27,16 @@ from plc_process import PlcProcess, start_plc
 from pymodbus.framer.socket import FramerSocket
 from pymodbus.pdu import DecodePDU
 
-from drivers import modbus
-from drivers.hil import Outputs, Writer
-from drivers.hil_modbus import HilSettings, RegisterOutlet
-from drivers.hil_opcua import HilSettings as OpcuaHilSettings
-from drivers.lasting import LostError
-from drivers.link import Link, ModbusSettings
+from drivers.modbus import source as modbus
+from drivers.modbus.hil import HilSettings, RegisterOutlet
+from drivers.modbus.link import Link, ModbusSettings
+from drivers.modbus.telegram import Store
+from drivers.opcua.hil import HilSettings as OpcuaHilSettings
+from drivers.outputs.writer import Outputs, Writer
 from drivers.plc.partner import LONGEST_PICK, NO_PART, PATIENCE, TRIPPED, PartnerTask
 from drivers.plc.settings import PlcSettings
+from drivers.reconnect import LostError
 from drivers.tags import Address
-from drivers.telegram import Store
 from twin.errors import ConfigError, SourceError
 from twin.hil import LONGEST_GAP_S, Plant, in_place
 from twin.log.reader import open_log
@@ -742,7 +742,7 @@ def test_the_log_of_a_loop_replays(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_hil_needs_its_table_in_the_configuration() -> None:
-    from drivers.hil import open_writer
+    from drivers.outputs.open import open_writer
 
     with pytest.raises(ConfigError, match=r"hil\.tags"):
         open_writer(Document.read(rigs.path_of("test_rig")))

@@ -21,7 +21,7 @@ from test_modbus_block import clock_of, settings_for
 from test_outlets import message
 from test_webhook import At, Server
 
-from drivers.modbus import blocks
+from drivers.modbus.source import blocks
 from twin.outlets import sender
 from twin.signals import SAMPLE, UNUSABLE, Samples
 

@@ -19,10 +19,10 @@ from test_modbus_block import clock_of, settings_for
 from test_opcua_block import TornServer
 from test_opcua_block import settings_for as opcua_settings
 
-from drivers.lasting import lasting
-from drivers.modbus import blocks
-from drivers.opcua_link import OpcuaLink
-from drivers.opcua_trace import NodeTrace
+from drivers.modbus.source import blocks
+from drivers.opcua.link import OpcuaLink
+from drivers.opcua.trace import NodeTrace
+from drivers.reconnect import reconnecting
 from twin.errors import TwinError
 from twin.events import Kind
 from twin.live import run
@@ -75,7 +75,7 @@ def test_lies_over_opcua_end_nothing_and_make_nothing_up() -> None:
     clock = clock_of(time)
     with LyingNodes(plc, seed=1) as server:
         settings = opcua_settings(url=server.url, timeout_ms=1000)
-        stream: Iterator[Samples] = lasting(
+        stream: Iterator[Samples] = reconnecting(
             NodeTrace(settings, clock),
             OpcuaLink(settings, clock),
             clock,

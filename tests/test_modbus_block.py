@@ -12,8 +12,8 @@ import rigs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.lasting import Away, Clock
-from drivers.modbus import ModbusSettings, blocks
+from drivers.modbus.source import ModbusSettings, blocks
+from drivers.reconnect import Away, Clock
 from tests.modbus_server import CUT, HALF, SILENT, ModbusServer, PlcTime, TracePlc
 from twin.errors import ConfigError, SourceError, TwinError
 from twin.events import Kind

@@ -22,10 +22,10 @@ from pymodbus.pdu.register_message import (
 )
 from rigs import path_of
 
-from drivers.lasting import LostError
-from drivers.link import Link, ModbusSettings, received
+from drivers.modbus.link import Link, ModbusSettings, received
+from drivers.modbus.telegram import FUNCTION, HEAD, MOST_WORDS, Request, belongs, exception
+from drivers.reconnect import LostError
 from drivers.tags import Address
-from drivers.telegram import FUNCTION, HEAD, MOST_WORDS, Request, belongs, exception
 from twin.errors import SourceError
 
 PYMODBUS = FramerSocket(DecodePDU(is_server=True))

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.lasting import Clock, LostError
-from drivers.link import Link, ModbusSettings
-from drivers.modbus import blocks
-from drivers.plan import plan
-from drivers.poll import Poller
+from drivers.modbus.link import Link, ModbusSettings
+from drivers.modbus.plan import plan
+from drivers.modbus.poll import Poller
+from drivers.modbus.source import blocks
+from drivers.reconnect import Clock, LostError
 from drivers.tags import Tag
 from tests.modbus_server import CUT, ModbusServer, PlcTime
 from twin.errors import SourceError

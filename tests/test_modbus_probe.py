@@ -10,9 +10,10 @@ import pytest
 import rigs
 from command_line import edited, twin
 
-from drivers.lasting import Clock
-from drivers.link import ModbusSettings
-from drivers.probe import Line, probe, word_order_of
+from drivers.modbus.link import ModbusSettings
+from drivers.modbus.probe import probe, word_order_of
+from drivers.probe import Line
+from drivers.reconnect import Clock
 from tests.modbus_server import SILENT, ModbusServer, PlcTime, TracePlc
 
 TAGS: dict[str, Any] = {

@@ -15,13 +15,13 @@ from cryptography.hazmat.primitives.serialization import Encoding, load_pem_priv
 from independent import pem
 from pydantic import ValidationError
 
-from drivers import certificates
-from drivers.lasting import LostError
-from drivers.link import Link, ModbusSettings
+from drivers.modbus.link import Link, ModbusSettings
+from drivers.modbus.telegram import Request
+from drivers.modbus.tls import Tls, secured
+from drivers.opcua import certificates
+from drivers.reconnect import LostError
 from drivers.sources import open_source
 from drivers.tags import Address
-from drivers.telegram import Request
-from drivers.tls import Tls, secured
 from twin.errors import ConfigError, SourceError
 from twin.settings import Document
 

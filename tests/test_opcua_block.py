@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from modbus_server import PlcTime
 
-from drivers.lasting import AbsentError, Away, Clock, LostError, lasting
-from drivers.opcua_settings import Node, OpcuaSettings
-from drivers.opcua_trace import NodeTrace
+from drivers.opcua.settings import Node, OpcuaSettings
+from drivers.opcua.trace import NodeTrace
+from drivers.reconnect import AbsentError, Away, Clock, LostError, reconnecting
 from twin.errors import SourceError
 from twin.events import Event, Kind
 from twin.monitor.clock import ClockWatch
@@ -140,7 +140,7 @@ class Rig:
         self.time = server.clock = PlcTime(server.scan)
         clock = Clock(self.time.wall_ns, self.time.now_ns, self.time.sleep)
         trace = NodeTrace(settings_for(**changes), clock)
-        self.stream: Iterator[Samples] = lasting(trace, server, clock, away)  # type: ignore[type-var]
+        self.stream: Iterator[Samples] = reconnecting(trace, server, clock, away)  # type: ignore[type-var]
 
     def take(self, count: int) -> Samples:
         return np.concatenate([np.empty(0, SAMPLE), *islice(self.stream, count)])

@@ -13,8 +13,8 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import rsa
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from drivers import certificates
-from drivers.opcua_trust import Peer, check
+from drivers.opcua import certificates
+from drivers.opcua.trust import Peer, check
 from twin.cli.cert import cert
 from twin.errors import ConfigError, SourceError
 

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from test_opcua_block import DEPTH, Rig, T, TornServer, flags
 from test_opcua_subscribe import FakeLink, change, granted, publication, subscription
 
-from drivers.lasting import EMPTY, LostError
-from drivers.opcua_bounds import refuse_endless_arrays
+from drivers.opcua.bounds import refuse_endless_arrays
+from drivers.reconnect import EMPTY, LostError
 from twin.errors import SourceError
 from twin.signals import BREAK, UNUSABLE, Quality, Samples
 
@@ -161,7 +161,7 @@ def test_a_text_that_goes_back_is_no_text(length: str) -> None:
     assert texts.Value.Value == [None, "A"]
 
 
-@pytest.mark.parametrize("program", ["drivers.opcua_link", "drivers.results_serve"])
+@pytest.mark.parametrize("program", ["drivers.opcua.link", "drivers.outputs.serve"])
 def test_who_reads_from_strangers_refuses_them(program: str) -> None:
     """The link of a driver and the server of the results."""
     source = importlib.import_module(program)

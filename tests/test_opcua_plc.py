@@ -16,11 +16,11 @@ from asyncua import Client, ua
 from opcua_plc import OpcuaPlc, acquainted, start_opcua, started, trust
 from user_files import quick_users
 
-from drivers import certificates
-from drivers.lasting import REAL, Clock, LostError
-from drivers.opcua import blocks
-from drivers.opcua_probe import probe
-from drivers.opcua_settings import OpcuaSettings
+from drivers.opcua import certificates
+from drivers.opcua.probe import probe
+from drivers.opcua.settings import OpcuaSettings
+from drivers.opcua.source import blocks
+from drivers.reconnect import REAL, Clock, LostError
 from drivers.sources import open_source
 from twin.errors import ConfigError, SourceError
 from twin.settings import Document
@@ -69,8 +69,8 @@ def test_the_trace_comes_whole_and_is_the_one_that_modbus_serves(opcua: OpcuaPlc
 
 def by_modbus(opcua: OpcuaPlc, samples: Samples) -> Samples:
     """The same scans, from the registers of the ring."""
-    from drivers.link import Link, ModbusSettings
-    from drivers.ring import Trace
+    from drivers.modbus.link import Link, ModbusSettings
+    from drivers.modbus.ring import Trace
 
     tags = {"pressure": {"address": "input:1", "type": "float32", "unit": "mbar"}}
     tags["pressure"]["reference"] = "absolute"

@@ -12,7 +12,7 @@ from asyncua import Client, ua
 from opcua_plc import tables
 from pydantic import ValidationError
 
-from drivers.opcua_values import lost_some
+from drivers.opcua.values import lost_some
 from drivers.plc.opcua import NAMESPACE, serving
 from drivers.plc.opcua_server import Item
 from drivers.plc.registers import Registers

@@ -11,11 +11,11 @@ from asyncua import ua
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.lasting import Clock, LostError
-from drivers.opcua_link import Subscribed
-from drivers.opcua_settings import Node, OpcuaSettings
-from drivers.opcua_subscribe import Subscription
-from drivers.opcua_values import EPOCH
+from drivers.opcua.link import Subscribed
+from drivers.opcua.settings import Node, OpcuaSettings
+from drivers.opcua.subscribe import Subscription
+from drivers.opcua.values import EPOCH
+from drivers.reconnect import Clock, LostError
 from twin.errors import SourceError
 from twin.signals import SAMPLE, Command, Quality, Samples
 

@@ -12,8 +12,8 @@ from asyncua.ua import UaStatusCodeError
 from cryptography.hazmat.primitives.serialization import Encoding
 from user_files import Clock, quick_users, throttled_by
 
-from drivers import certificates
-from drivers.opcua_security import ADDRESS, Door, GuardedServer, Person, authenticator_of, secure
+from drivers.opcua import certificates
+from drivers.opcua.security import ADDRESS, Door, GuardedServer, Person, authenticator_of, secure
 from twin.audit import Audit, records
 from twin.errors import ConfigError
 from twin.login import ADDRESS_S, Authenticator

@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from drivers import opcua_values as values
-from drivers.lasting import REAL, LostError
-from drivers.opcua_link import OpcuaLink
-from drivers.opcua_settings import Node, OpcuaSettings
+from drivers.opcua import values
+from drivers.opcua.link import OpcuaLink
+from drivers.opcua.settings import Node, OpcuaSettings
+from drivers.reconnect import REAL, LostError
 from twin.errors import SourceError
 from twin.signals import Quality
 

@@ -28,10 +28,12 @@ from independent import (
 )
 from plc_process import start_plc
 
-from drivers import certificates, modbus, opcua
-from drivers.lasting import LostError
-from drivers.link import ModbusSettings
-from drivers.opcua_settings import OpcuaSettings
+from drivers.modbus import source as modbus
+from drivers.modbus.link import ModbusSettings
+from drivers.opcua import certificates
+from drivers.opcua import source as opcua
+from drivers.opcua.settings import OpcuaSettings
+from drivers.reconnect import LostError
 from twin.errors import ConfigError, SourceError
 from twin.signals import SAMPLE, Quality, Samples
 

@@ -11,13 +11,13 @@ import pytest
 import tomli_w
 from modbus_server import ModbusServer, PlcTime, TracePlc
 
-from drivers import opcua
-from drivers.lasting import Clock
-from drivers.link import ModbusSettings
-from drivers.modbus import blocks
-from drivers.opcua_settings import OpcuaSettings
+from drivers.modbus.link import ModbusSettings
+from drivers.modbus.source import blocks
+from drivers.opcua import source as opcua
+from drivers.opcua.settings import OpcuaSettings
 from drivers.plc.settings import PlcSettings
 from drivers.plc.simulate import with_truth
+from drivers.reconnect import Clock
 from twin.errors import ConfigError
 from twin.settings import Document
 from twin.signals import MBAR, SAMPLE, SL_MIN, Command, Reported, Samples

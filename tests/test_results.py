@@ -25,10 +25,11 @@ from plc_process import start_plc
 from pydantic import ValidationError
 from user_files import quick_users
 
-from drivers import certificates
-from drivers.results import ResultsServer
-from drivers.results_settings import ResultsSettings, open_results
-from drivers.results_state import MEANS, Results, Standing, Status
+from drivers.opcua import certificates
+from drivers.outputs.open import open_results
+from drivers.outputs.results import ResultsServer
+from drivers.outputs.settings import ResultsSettings
+from drivers.outputs.state import MEANS, Results, Standing, Status
 from drivers.sources import open_source
 from twin.errors import ConfigError, SourceError
 from twin.events import Event, Kind
@@ -320,7 +321,7 @@ def test_what_hinders_a_login_is_said_by_the_run(
     users = quick_users(tmp_path / "users.toml", ("scada", "correct horse", Role.LOOK))
 
     def said() -> list[str]:
-        return [one.getMessage() for one in caplog.records if one.name == "drivers.results"]
+        return [one.getMessage() for one in caplog.records if one.name == "drivers.outputs.results"]
 
     async def come(url: str) -> None:
         client = Client(url)
@@ -411,7 +412,7 @@ def test_everything_has_its_type_unit_and_time(server: ResultsServer, rig: Resul
 
 
 def ua_ns(stamp: Any) -> int:
-    from drivers.opcua_values import nanoseconds
+    from drivers.opcua.values import nanoseconds
 
     return nanoseconds(stamp)
 

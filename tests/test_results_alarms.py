@@ -28,10 +28,10 @@ from test_outlets import NO_TICKS
 from test_results import FIGURES, HERE, asked
 from user_files import quick_users
 
-from drivers import certificates
-from drivers.results import ResultsServer
-from drivers.results_settings import ResultsSettings
-from drivers.results_state import Results
+from drivers.opcua import certificates
+from drivers.outputs.results import ResultsServer
+from drivers.outputs.settings import ResultsSettings
+from drivers.outputs.state import Results
 from twin.alarms import keeper as keeper_module
 from twin.alarms.loop import Alarms
 from twin.alarms.settings import board_rules

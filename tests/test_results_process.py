@@ -11,9 +11,9 @@ import psutil
 import pytest
 from test_results import FIGURES, HERE, asked, rows
 
-from drivers import results
-from drivers.results import ResultsServer
-from drivers.results_state import Results
+from drivers.outputs import results
+from drivers.outputs.results import ResultsServer
+from drivers.outputs.state import Results
 
 PATIENCE_S = 60.0
 SESSION_WITHIN_S = 10.0  # as the server has it

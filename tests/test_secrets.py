@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from drivers.opcua_settings import User
+from drivers.opcua.settings import User
+from drivers.outputs.settings import ResultsSettings
 from drivers.plc.settings import OpcuaServer
-from drivers.results_settings import ResultsSettings
 from twin.alarms.place import place_of
 from twin.alarms.settings import AlarmSettings
 from twin.assets.engine import ASSETS, Database, parse_url, shown

@@ -23,7 +23,7 @@ from test_alarms_loop import Stream as Alarming
 from test_alarms_loop import deviation, diagnosis
 from test_live_diagnosis import ANSWER, Stream, answering, quiet
 
-from drivers import certificates
+from drivers.opcua import certificates
 from twin.cli.serve import live_rows_of, reports_of
 from twin.diagnosis import __main__ as diagnosing
 from twin.diagnosis import process, report

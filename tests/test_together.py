@@ -22,10 +22,10 @@ from command_line import twin
 from modbus_server import CUT, SILENT, ModbusServer
 from plc_process import PlcProcess, start_plc
 
-from drivers.lasting import LostError
-from drivers.link import ModbusSettings
-from drivers.opcua_settings import TraceNodes
-from drivers.shared import Line, Lines, SharedLink
+from drivers.modbus.link import ModbusSettings
+from drivers.modbus.shared import Line, Lines, SharedLink
+from drivers.opcua.settings import TraceNodes
+from drivers.reconnect import LostError
 from drivers.tags import Address
 from twin.errors import SourceError
 from twin.events import Kind

@@ -256,7 +256,7 @@ class Cell:
 
     def results_server(self) -> psutil.Process:
         """The process that serves the results."""
-        (found,) = (one for one in self.twin.children() if "drivers.results_serve" in one.cmdline())
+        (found,) = (one for one in self.twin.children() if "drivers.outputs.serve" in one.cmdline())
         return found
 
     def rows(self) -> int:

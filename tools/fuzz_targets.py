@@ -29,13 +29,14 @@ from asyncua import ua
 from asyncua.common.utils import Buffer
 from asyncua.ua.ua_binary import from_binary, to_binary
 
-from drivers import opcua_values, telegram
-from drivers.lasting import Clock
-from drivers.link import Link, ModbusSettings
-from drivers.opcua_bounds import refuse_endless_arrays
-from drivers.opcua_settings import Node
-from drivers.poll import Poller
-from drivers.ring import Trace
+from drivers.modbus import telegram
+from drivers.modbus.link import Link, ModbusSettings
+from drivers.modbus.poll import Poller
+from drivers.modbus.ring import Trace
+from drivers.opcua import values as opcua_values
+from drivers.opcua.bounds import refuse_endless_arrays
+from drivers.opcua.settings import Node
+from drivers.reconnect import Clock
 from drivers.sources import settings_of
 from drivers.tags import Address, Words
 from twin.assets.exchange import parse_export, to_export

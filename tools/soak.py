@@ -117,7 +117,7 @@ def endless(cycles: Samples, told: Callable[[float], None]) -> Iterator[Samples]
 def run_compressed(config: Path, log: Path, progress: Path) -> None:
     """``twin run`` with these rows instead of a PLC's, in this process, until it is interrupted."""
     from drivers import sources  # noqa: PLC0415 - of the child alone
-    from twin import cli  # noqa: PLC0415
+    from twin.cli.main import main as run_command  # noqa: PLC0415
 
     cycles = stretch(Document.read(config).section(PlcSettings, "plc"))
     with progress.open("w") as file:
@@ -129,7 +129,7 @@ def run_compressed(config: Path, log: Path, progress: Path) -> None:
 
         sources.open_source = lambda *_given, **_named: endless(cycles, told)
         sys.argv = ["twin", "run", str(config), "--log", str(log)]
-        cli.main()
+        run_command()
 
 
 @contextmanager

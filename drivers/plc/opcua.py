@@ -11,8 +11,8 @@ import numpy as np
 from asyncua import Node, Server, ua
 from asyncua.common.utils import ServiceError
 
-from drivers.opcua_nodes import Unit, add_quantity
-from drivers.opcua_security import GuardedServer, authenticator_of, secure
+from drivers.opcua.security import GuardedServer, authenticator_of, secure
+from drivers.outputs.nodes import Unit, add_quantity
 from drivers.plc.opcua_server import Behaviour
 from drivers.plc.partner import Written
 from drivers.plc.registers import Registers

@@ -27,12 +27,12 @@ from asyncua import Client, ua
 from benchmarks.figures import Measured, Run
 from benchmarks.machine import PLC_CORE, TWIN_CORE, on_core
 from benchmarks.processes import ROOT, live
-from drivers import certificates
-from drivers.lasting import REAL
-from drivers.opcua_settings import Node, OpcuaSettings
-from drivers.opcua_trace import NodeTrace
+from drivers.opcua import certificates
+from drivers.opcua.settings import Node, OpcuaSettings
+from drivers.opcua.trace import NodeTrace
 from drivers.plc.settings import PlcSettings
 from drivers.plc.simulate import blocks
+from drivers.reconnect import REAL
 from twin.log.reader import open_log
 from twin.settings import Document
 from twin.signals import MBAR, Command, Samples

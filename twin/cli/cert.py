@@ -13,7 +13,7 @@ def cert(
     name: Annotated[str, typer.Option(help="Of this application, for people.")] = "ejector-twin",
 ) -> None:
     """Make a certificate and key of our own, beside folders for those we trust."""
-    from drivers import certificates
+    from drivers.opcua import certificates
 
     with said_plainly(folder):
         own = certificates.make(folder, name)

@@ -49,11 +49,12 @@ def schema() -> None:
 
 def sections() -> "dict[str, dict[str, type[Settings]]]":
     """The tables of a configuration by name, each with its settings by kind of driver or ""."""
-    from drivers import hil_modbus, hil_opcua
-    from drivers.link import ModbusSettings
-    from drivers.opcua_settings import OpcuaSettings
+    from drivers.modbus import hil as hil_modbus
+    from drivers.modbus.link import ModbusSettings
+    from drivers.opcua import hil as hil_opcua
+    from drivers.opcua.settings import OpcuaSettings
+    from drivers.outputs.settings import ResultsSettings
     from drivers.plc.settings import PlcSettings
-    from drivers.results_settings import ResultsSettings
     from twin.alarms.settings import AlarmSettings
     from twin.assets.place import AssetsSettings
     from twin.config import Asset, LogSettings

@@ -31,8 +31,8 @@ from twin.service import Service
 if TYPE_CHECKING:
     from sqlalchemy import URL
 
-    from drivers.hil import Writer
-    from drivers.results_state import Results
+    from drivers.outputs.state import Results
+    from drivers.outputs.writer import Writer
     from twin.cli.outlets import Begin, Standing
     from twin.config import Config
     from twin.live import Adviser, Sink
@@ -73,9 +73,8 @@ def run(
     answer yet is tried until it does. Where FILE is a folder, logs in it are named by asset and
     time. The oldest logs make room for new ones, as [log] says.
     """
-    from drivers.hil import open_writer
-    from drivers.results_settings import open_results
-    from drivers.shared import Lines
+    from drivers.modbus.shared import Lines
+    from drivers.outputs.open import open_results, open_writer
     from drivers.sources import open_source
     from twin.figures.table import FIGURES
     from twin.live import run as run_loop
@@ -330,7 +329,7 @@ def _answering(
     source: "Iterator[Samples]", settings: "Config", writer: "Writer"
 ) -> "Iterator[Samples]":
     """The blocks with the model as the plant, which answers what the PLC commands."""
-    from drivers.hil import Outputs
+    from drivers.outputs.writer import Outputs
     from twin.hil import Plant, in_place
     from twin.model.dataset import coefficients
 

@@ -13,10 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from asyncua import ua
 
-from drivers.lasting import EMPTY, Clock, LostError
-from drivers.opcua_link import OpcuaLink, Subscribed
-from drivers.opcua_settings import Node, NodeTag, OpcuaSettings
-from drivers.opcua_values import (
+from drivers.opcua.link import OpcuaLink, Subscribed
+from drivers.opcua.settings import Node, NodeTag, OpcuaSettings
+from drivers.opcua.values import (
     code_of,
     lost_some,
     number,
@@ -25,6 +24,7 @@ from drivers.opcua_values import (
     time_ns,
     truth,
 )
+from drivers.reconnect import EMPTY, Clock, LostError
 from drivers.reports import BITS, VALUES, ambient_of, put_bits, put_values
 from twin.errors import SourceError
 from twin.signals import MBAR, SAMPLE, UNUSABLE, Command, Quality, Samples

@@ -13,12 +13,10 @@ from asyncua import Client, ua
 from asyncua.crypto import security_policies
 from cryptography import x509
 
-from drivers import certificates
-from drivers import opcua_trust as trust
-from drivers.lasting import AbsentError, Clock, LostError, unreachable
-from drivers.opcua_bounds import refuse_endless_arrays
-from drivers.opcua_settings import Node, OpcuaSettings
-from drivers.opcua_values import (
+from drivers.opcua import certificates, trust
+from drivers.opcua.bounds import refuse_endless_arrays
+from drivers.opcua.settings import Node, OpcuaSettings
+from drivers.opcua.values import (
     CODE,
     SEVERITY,
     UNCERTAIN,
@@ -28,6 +26,7 @@ from drivers.opcua_values import (
     typed,
     wrong_type,
 )
+from drivers.reconnect import AbsentError, Clock, LostError, unreachable
 from twin.errors import ConfigError, SourceError
 
 # It logs whatever goes wrong, tracebacks and all; what matters is raised as well.
@@ -342,7 +341,7 @@ class OpcuaLink:
         """Write numbers, by one request, each as its node's type; Booleans as unlike 0.
 
         LostError if no answer comes; SourceError if a node cannot be written or cannot hold its
-        number. Only hardware in the loop does (drivers/hil_opcua.py).
+        number. Only hardware in the loop does (drivers/opcua/hil.py).
         """
         nodes = tuple(values)
         if nodes not in self._kinds:

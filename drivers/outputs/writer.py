@@ -11,13 +11,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol, Self
 
-from drivers.lasting import RETRY_S, LostError
-from drivers.link import ModbusSettings
-from drivers.shared import Lines
-from drivers.sources import settings_of
+from drivers.reconnect import RETRY_S, LostError
 from drivers.tags import Quantity
-from twin.errors import ConfigError, SourceError
-from twin.settings import Document
+from twin.errors import SourceError
 from twin.signals import MBAR
 
 log = logging.getLogger(__name__)
@@ -158,23 +154,3 @@ def refuse_empty(limits: tuple[int, int]) -> None:
     """ValueError where there is nothing to count."""
     if not limits[0] < limits[1]:
         raise ValueError("range must be [low, high] with low < high")
-
-
-def open_writer(document: Document, address: str = "", lines: Lines | None = None) -> Writer:
-    """Whoever writes to the PLC that ``[driver]`` names what ``[hil]`` lists.
-
-    Raises ConfigError where nothing is listed, SourceError where the PLC does not answer.
-    """
-    if not document.tables.get("hil", {}).get("tags"):
-        raise ConfigError(
-            f"{document.name}: nothing is listed under [hil.tags]",
-            "list what may be written; docs/hil.md has an example",
-        )
-    settings = settings_of(document, address)
-    if isinstance(settings, ModbusSettings):
-        from drivers import hil_modbus  # noqa: PLC0415 - each protocol when it is needed
-
-        return hil_modbus.writer(settings, document, lines)
-    from drivers import hil_opcua  # noqa: PLC0415 - the library takes its time
-
-    return hil_opcua.writer(settings, document)

@@ -14,8 +14,7 @@ from asyncua.server.internal_server import InternalServer
 from asyncua.server.internal_session import InternalSession
 from cryptography import x509
 
-from drivers import certificates
-from drivers import opcua_trust as trust
+from drivers.opcua import certificates, trust
 from twin.audit import Act, Audit
 from twin.errors import ConfigError, SourceError, TwinError
 from twin.login import Authenticator

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from drivers.lasting import Clock
-from drivers.link import Link, ModbusSettings, span
-from drivers.plan import Answers, plan
+from drivers.modbus.link import Link, ModbusSettings, span
+from drivers.modbus.plan import Answers, plan
+from drivers.reconnect import Clock
 from drivers.reports import BITS, VALUES, ambient_of, once, put_bits, put_values
 from drivers.tags import WordOrder, Words, numbers
 from drivers.trace import COMMANDS, OVERFLOW_BIT, RESERVE, WRAP, Follower, refusal

@@ -9,9 +9,9 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from drivers.lasting import RETRY_S, LostError
-from drivers.link import Link, ModbusSettings
-from drivers.telegram import Request, Store
+from drivers.modbus.link import Link, ModbusSettings
+from drivers.modbus.telegram import Request, Store
+from drivers.reconnect import RETRY_S, LostError
 
 FRESH_S = RETRY_S / 2  # so long the failure of one to connect is that of all
 

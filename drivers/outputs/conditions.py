@@ -20,8 +20,8 @@ from asyncua.common.instantiate_util import instantiate
 from asyncua.server import monitored_item_service
 from asyncua.server.address_space import AddressSpace
 
-from drivers import opcua_security as security
-from drivers.opcua_security import GuardedServer, Person
+from drivers.opcua import security
+from drivers.opcua.security import GuardedServer, Person
 from twin.audit import Act
 from twin.errors import TwinError
 from twin.login import Authenticator

@@ -4,11 +4,11 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from drivers.hil import Outputs, Ranged, Writer, counted, refuse_empty, refuse_no_range
-from drivers.link import Link, ModbusSettings
-from drivers.shared import Lines, SharedLink
+from drivers.modbus.link import Link, ModbusSettings
+from drivers.modbus.shared import Lines, SharedLink
+from drivers.modbus.telegram import MOST_STORED, STORING
+from drivers.outputs.writer import Outputs, Ranged, Writer, counted, refuse_empty, refuse_no_range
 from drivers.tags import CODE, Address, Pressure, Tag, words_of
-from drivers.telegram import MOST_STORED, STORING
 from twin.settings import Document, Settings
 from twin.signals import MBAR
 

@@ -1,19 +1,16 @@
 """The ``[results]`` table: whether others may read what the twin finds, where, and who."""
 
 import ipaddress
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import Field, model_validator
 
-from twin.errors import ConfigError
-from twin.settings import Document, Settings
+from twin.settings import Settings
 from twin.users import UsersFile
 
 if TYPE_CHECKING:
-    from drivers.results_state import Results
+    pass
 
 Policy = Literal["None", "Basic256Sha256", "Aes256Sha256RsaPss"]  # with sign-and-encrypt
 
@@ -50,42 +47,6 @@ class ResultsSettings(Settings):
         pki = None if self.certificates is None else folder / self.certificates
         users = None if self.users is None else folder / self.users
         return self.model_copy(update={"certificates": pki, "users": users})
-
-
-@contextmanager
-def open_results(
-    documents: Sequence[Document], figures: Mapping[str, str]
-) -> Iterator["Callable[..., Results] | None"]:
-    """Serve the results of all configurations that want it, at one place; None if none does.
-
-    Gives ``ResultsServer.sink``, which makes a sink of an asset. ConfigError if two name different
-    places; for the others see ``ResultsServer``.
-    """
-    wanted = _wanted(documents)
-    if wanted is None:
-        yield None
-        return
-    from drivers.results import ResultsServer  # noqa: PLC0415 - the library takes its time
-
-    with ResultsServer(wanted, figures) as server:
-        yield server.sink
-
-
-def _wanted(documents: Sequence[Document]) -> ResultsSettings | None:
-    """The settings that all agree on who serve their results."""
-    first: tuple[str, ResultsSettings] | None = None
-    for document in documents:
-        folder = Path(document.name).parent  # files lie there, wherever the program was started
-        one = document.section(ResultsSettings, "results").below(folder)
-        if not one.opcua:
-            continue
-        if first is not None and first[1] != one:
-            raise ConfigError(
-                f"{first[0]} and {document.name} serve their results differently under [results]",
-                "one server stands for all ejectors of a process: write the same in both",
-            )
-        first = document.name, one
-    return first[1] if first else None
 
 
 def _is_loopback(host: str) -> bool:

@@ -2,11 +2,11 @@
 
 from collections.abc import Generator
 
-from drivers.lasting import REAL, Away, Clock, in_thread, lasting
-from drivers.link import Link, ModbusSettings
-from drivers.poll import Poller
-from drivers.ring import Trace
-from drivers.shared import Lines, SharedLink
+from drivers.modbus.link import Link, ModbusSettings
+from drivers.modbus.poll import Poller
+from drivers.modbus.ring import Trace
+from drivers.modbus.shared import Lines, SharedLink
+from drivers.reconnect import REAL, Away, Clock, in_thread, reconnecting
 from twin.signals import Samples
 
 __all__ = ["ModbusSettings", "blocks"]
@@ -30,7 +30,9 @@ def blocks(
     has no millisecond to wait for others.
     """
     if settings.mode == "poll":
-        return in_thread(lasting(Poller(settings, clock), Link(settings), clock, away, known=known))
+        return in_thread(
+            reconnecting(Poller(settings, clock), Link(settings), clock, away, known=known)
+        )
     link = Link(settings) if lines is None else SharedLink(settings, lines.to(settings))
-    stream = lasting(Trace(settings, clock), link, clock, away, known=known)
+    stream = reconnecting(Trace(settings, clock), link, clock, away, known=known)
     return stream if settings.tls is None else in_thread(stream)  # shaking hands takes time

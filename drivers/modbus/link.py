@@ -8,11 +8,11 @@ from typing import Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from drivers.lasting import AbsentError, LostError, unreachable
+from drivers.modbus.telegram import HEAD, Request, Store, belongs, exception
+from drivers.modbus.tls import Tls, secured
+from drivers.reconnect import AbsentError, LostError, unreachable
 from drivers.reports import BITS, refuse_unclear
 from drivers.tags import Address, Flow, Place, Pressure, Tag, Temperature, WordOrder, Words
-from drivers.telegram import HEAD, Request, Store, belongs, exception
-from drivers.tls import Tls, secured
 from drivers.trace import COMMAND_BITS, no_effect, refuse_unused
 from twin.errors import SourceError
 from twin.settings import KeyedError, Settings
@@ -230,7 +230,7 @@ class Link:
     def write(self, address: Address, values: tuple[int, ...]) -> None:
         """Write words (to coils 0 or 1) from ``address`` on; errors as from ``read``.
 
-        Only hardware in the loop does (drivers/hil.py).
+        Only hardware in the loop does (drivers/outputs/writer.py).
         """
         store = Store(address, values)
         if self.ask(store) != store.echo:

@@ -11,7 +11,7 @@ from typing import Any, Self
 
 from pydantic import model_validator
 
-from drivers.lasting import LostError
+from drivers.reconnect import LostError
 from twin.errors import ConfigError, SourceError
 from twin.settings import Settings
 

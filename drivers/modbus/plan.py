@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from drivers.modbus.telegram import MOST_WORDS, Request
 from drivers.tags import Tag, WordOrder, Words
-from drivers.telegram import MOST_WORDS, Request
 
 
 def plan(tags: Iterable[Tag], most: int = MOST_WORDS) -> list[Request]:

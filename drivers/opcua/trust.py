@@ -18,7 +18,7 @@ from asyncua.crypto.validator import CertificateValidator
 from asyncua.crypto.validator import CertificateValidatorOptions as _Options
 from cryptography import x509
 
-from drivers import certificates
+from drivers.opcua import certificates
 from twin.errors import SourceError
 
 # What it refuses is said by us; it would write a traceback.

@@ -4,10 +4,10 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from drivers.hil import Outputs, Ranged, Writer, counted, refuse_empty, refuse_no_range
-from drivers.lasting import REAL
-from drivers.opcua_link import OpcuaLink
-from drivers.opcua_settings import Node, NodeName, NodePressure, OpcuaSettings
+from drivers.opcua.link import OpcuaLink
+from drivers.opcua.settings import Node, NodeName, NodePressure, OpcuaSettings
+from drivers.outputs.writer import Outputs, Ranged, Writer, counted, refuse_empty, refuse_no_range
+from drivers.reconnect import REAL
 from twin.errors import ConfigError
 from twin.settings import Document, Settings
 from twin.signals import MBAR

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from drivers.lasting import Clock, LostError
-from drivers.opcua_link import OpcuaLink
-from drivers.opcua_settings import Node, OpcuaSettings
-from drivers.opcua_values import (
+from drivers.opcua.link import OpcuaLink
+from drivers.opcua.settings import Node, OpcuaSettings
+from drivers.opcua.values import (
     SEVERITY,
     code_of,
     moment,
@@ -27,6 +26,7 @@ from drivers.opcua_values import (
     whole,
     wholes,
 )
+from drivers.reconnect import Clock, LostError
 from drivers.reports import BITS, VALUES, ambient_of, once, put_bits, put_values
 from drivers.trace import (
     COMMANDS,

@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 from asyncua import ua
 
-from drivers.lasting import AbsentError
-from drivers.opcua_settings import Node
+from drivers.opcua.settings import Node
+from drivers.reconnect import AbsentError
 from drivers.trace import LATEST_NS
 from twin.errors import SourceError
 from twin.signals import Quality

@@ -1,4 +1,4 @@
-"""What the twin finds, served over OPC UA by a process of its own (``drivers.results_serve``).
+"""What the twin finds, served over OPC UA by a process of its own (``drivers.outputs.serve``).
 
 The loops leave what is newest in their ``Results`` and go on. A thread here takes it at an even
 pace and sends what has changed; it waits for each answer, so that nothing piles up. A server that
@@ -22,8 +22,8 @@ from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import Any, Self
 
-from drivers.results_settings import ResultsSettings
-from drivers.results_state import Reading, Results
+from drivers.outputs.settings import ResultsSettings
+from drivers.outputs.state import Reading, Results
 from twin.backoff import Backoff
 from twin.errors import SourceError, TwinError
 
@@ -88,7 +88,7 @@ class Server:
             ours.setsockopt(socket.SOL_SOCKET, option, seconds)
         self._complaint = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
         with theirs:
-            command = [sys.executable, "-m", "drivers.results_serve", str(theirs.fileno())]
+            command = [sys.executable, "-m", "drivers.outputs.serve", str(theirs.fileno())]
             self._process = subprocess.Popen(  # noqa: S603  # our own program
                 command,
                 pass_fds=[theirs.fileno()],

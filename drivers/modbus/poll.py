@@ -9,9 +9,9 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
-from drivers.lasting import Clock
-from drivers.link import Link, ModbusSettings
-from drivers.plan import Answers, holds, plan
+from drivers.modbus.link import Link, ModbusSettings
+from drivers.modbus.plan import Answers, holds, plan
+from drivers.reconnect import Clock
 from drivers.reports import BITS, VALUES, ambient_of, put_bits, put_values
 from drivers.tags import Flags
 from twin.errors import SourceError

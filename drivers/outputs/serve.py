@@ -1,9 +1,9 @@
-"""The process that serves over OPC UA what the twin finds (``python -m drivers.results_serve FD``).
+"""The process that serves over OPC UA what the twin finds (``python -m drivers.outputs.serve FD``).
 
 A SCADA can read it; nobody can write. Alarms are conditions, which some users may acknowledge
-(``drivers.results_alarms``). What is to be shown comes over a connection from ``drivers.results``,
-so that whatever a client does here, the loops do not feel it. How it is laid out stands in
-docs/opcua.md.
+(``drivers.outputs.conditions``). What is to be shown comes over a connection from
+``drivers.outputs.results``, so that whatever a client does here, the loops do not feel it. How it
+is laid out stands in docs/opcua.md.
 """
 
 import asyncio
@@ -26,12 +26,12 @@ from asyncua import Node, Server, ua
 from asyncua.common.connection import TransportLimits
 from asyncua.server import binary_server_asyncio
 
-from drivers.opcua_bounds import refuse_endless_arrays
-from drivers.opcua_nodes import Names, Unit, add_quantity, add_state
-from drivers.opcua_security import Say, authenticator_of, secure
-from drivers.results_alarms import Conditions, KnowingServer, Source
-from drivers.results_settings import ResultsSettings
-from drivers.results_state import MEANS, SIDES, Reading, Standing, Status
+from drivers.opcua.bounds import refuse_endless_arrays
+from drivers.opcua.security import Say, authenticator_of, secure
+from drivers.outputs.conditions import Conditions, KnowingServer, Source
+from drivers.outputs.nodes import Names, Unit, add_quantity, add_state
+from drivers.outputs.settings import ResultsSettings
+from drivers.outputs.state import MEANS, SIDES, Reading, Standing, Status
 from twin.errors import SourceError, TwinError
 from twin.login import Authenticator
 from twin.signals import Phase

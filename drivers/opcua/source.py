@@ -2,11 +2,11 @@
 
 from collections.abc import Generator
 
-from drivers.lasting import REAL, Away, Clock, in_thread, lasting
-from drivers.opcua_link import OpcuaLink
-from drivers.opcua_settings import OpcuaSettings
-from drivers.opcua_subscribe import Subscription
-from drivers.opcua_trace import NodeTrace
+from drivers.opcua.link import OpcuaLink
+from drivers.opcua.settings import OpcuaSettings
+from drivers.opcua.subscribe import Subscription
+from drivers.opcua.trace import NodeTrace
+from drivers.reconnect import REAL, Away, Clock, in_thread, reconnecting
 from twin.signals import Samples
 
 __all__ = ["OpcuaSettings", "blocks"]
@@ -29,5 +29,5 @@ def blocks(
     """
     link = OpcuaLink(settings, clock)
     if settings.mode == "block":
-        return in_thread(lasting(NodeTrace(settings, clock), link, clock, away, known=known))
-    return in_thread(lasting(Subscription(settings, clock), link, clock, away, known=known))
+        return in_thread(reconnecting(NodeTrace(settings, clock), link, clock, away, known=known))
+    return in_thread(reconnecting(Subscription(settings, clock), link, clock, away, known=known))

@@ -89,7 +89,7 @@ class Source(Protocol[C_contra]):
         ...
 
 
-def lasting(
+def reconnecting(
     source: Source[C_contra],
     link: C_contra,
     clock: Clock,

@@ -3,13 +3,13 @@
 import statistics
 from functools import partial
 
-from drivers.lasting import REAL, Clock
-from drivers.opcua_link import OpcuaLink
-from drivers.opcua_settings import Node, OpcuaSettings
-from drivers.opcua_subscribe import Subscription
-from drivers.opcua_trace import NodeTrace
-from drivers.opcua_values import code_of, readable, status_name
+from drivers.opcua.link import OpcuaLink
+from drivers.opcua.settings import Node, OpcuaSettings
+from drivers.opcua.subscribe import Subscription
+from drivers.opcua.trace import NodeTrace
+from drivers.opcua.values import code_of, readable, status_name
 from drivers.probe import TIMES, Line, looked_at, watched
+from drivers.reconnect import REAL, Clock
 from twin.errors import SourceError
 
 

@@ -1,0 +1,1 @@
+"""Modbus TCP: settings, requests, polling and the trace ring."""

@@ -1,0 +1,1 @@
+"""OPC UA: settings, subscriptions and the trace ring, certificates and bounds."""

@@ -1,0 +1,73 @@
+"""What of a configuration is opened for others: what is written to its PLC, and its results."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drivers.modbus.link import ModbusSettings
+from drivers.modbus.shared import Lines
+from drivers.outputs.settings import ResultsSettings
+from drivers.outputs.writer import Writer
+from drivers.sources import settings_of
+from twin.errors import ConfigError
+from twin.settings import Document
+
+if TYPE_CHECKING:
+    from drivers.outputs.state import Results
+
+
+def open_writer(document: Document, address: str = "", lines: Lines | None = None) -> Writer:
+    """Whoever writes to the PLC that ``[driver]`` names what ``[hil]`` lists.
+
+    Raises ConfigError where nothing is listed, SourceError where the PLC does not answer.
+    """
+    if not document.tables.get("hil", {}).get("tags"):
+        raise ConfigError(
+            f"{document.name}: nothing is listed under [hil.tags]",
+            "list what may be written; docs/hil.md has an example",
+        )
+    settings = settings_of(document, address)
+    if isinstance(settings, ModbusSettings):
+        from drivers.modbus import hil as hil_modbus  # noqa: PLC0415 - each protocol when it is needed
+
+        return hil_modbus.writer(settings, document, lines)
+    from drivers.opcua import hil as hil_opcua  # noqa: PLC0415 - the library takes its time
+
+    return hil_opcua.writer(settings, document)
+
+
+@contextmanager
+def open_results(
+    documents: Sequence[Document], figures: Mapping[str, str]
+) -> Iterator["Callable[..., Results] | None"]:
+    """Serve the results of all configurations that want it, at one place; None if none does.
+
+    Gives ``ResultsServer.sink``, which makes a sink of an asset. ConfigError if two name different
+    places; for the others see ``ResultsServer``.
+    """
+    wanted = _wanted(documents)
+    if wanted is None:
+        yield None
+        return
+    from drivers.outputs.results import ResultsServer  # noqa: PLC0415 - the library takes its time
+
+    with ResultsServer(wanted, figures) as server:
+        yield server.sink
+
+
+def _wanted(documents: Sequence[Document]) -> ResultsSettings | None:
+    """The settings that all agree on who serve their results."""
+    first: tuple[str, ResultsSettings] | None = None
+    for document in documents:
+        folder = Path(document.name).parent  # files lie there, wherever the program was started
+        one = document.section(ResultsSettings, "results").below(folder)
+        if not one.opcua:
+            continue
+        if first is not None and first[1] != one:
+            raise ConfigError(
+                f"{first[0]} and {document.name} serve their results differently under [results]",
+                "one server stands for all ejectors of a process: write the same in both",
+            )
+        first = document.name, one
+    return first[1] if first else None
