@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drivers.modbus import source as modbus
-from drivers.modbus.link import ModbusSettings
+from drivers.modbus.client import ModbusSettings
+from drivers.modbus.connection_pool import ConnectionPool
 from drivers.modbus.probe import probe
-from drivers.modbus.shared import Lines
 from drivers.probe import Line
 from drivers.reconnect import Away
 from twin.errors import ConfigError, SourceError
@@ -23,7 +23,7 @@ KINDS = ("modbus", "opcua")
 def open_source(
     document: Document,
     address: str = "",
-    lines: Lines | None = None,
+    lines: ConnectionPool | None = None,
     away: Away | None = None,
     *,
     known: bool = False,

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import rigs
 
-from twin.alarms.keeper import Keeper
+from twin.alarms.database import open_store
 from twin.alarms.loop import Alarms
 from twin.alarms.settings import board_rules
-from twin.alarms.store import open_store
+from twin.alarms.writer import Keeper
 from twin.assets.unit import Unit
 from twin.config import Config
 from twin.events import Event, Kind

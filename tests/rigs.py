@@ -15,10 +15,10 @@ from twin.events import Event, Kind
 from twin.live import Twin, run
 from twin.model.dataset import coefficients
 from twin.model.theta import Theta
-from twin.monitor.detect import Monitor
+from twin.monitor.detector_window import expected_knees
 from twin.monitor.isolation import Isolation
-from twin.monitor.knees import expected_knees
-from twin.monitor.phases import Knees
+from twin.monitor.monitor import Monitor
+from twin.monitor.phase_detector import Knees
 from twin.settings import Document
 from twin.signals import MBAR, Quality, Samples, Ticks
 

@@ -15,8 +15,8 @@ from twin.alarms.board import Board, Diary, Episode
 from twin.alarms.rules import Priority, Rule, default_rules, read_rules, write_rules
 from twin.alarms.settings import board_rules
 from twin.alarms.state import SECOND_NS, Alarm, Change, Deed, State
+from twin.alarms.text import action_of
 from twin.alarms.watch import NAMES, deviating, values
-from twin.alarms.words import action_of
 from twin.errors import ConfigError
 from twin.events import Event, Kind
 from twin.model.effects import EFFECTS

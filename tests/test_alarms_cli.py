@@ -11,12 +11,12 @@ import rigs
 from command_line import twin
 from test_alarms_loop import APART, LEAK, NONE, UNIT, S, deviation, rows
 
-from twin.alarms import keeper as module
-from twin.alarms.keeper import Keeper
+from twin.alarms import writer as module
+from twin.alarms.database import open_store
 from twin.alarms.loop import Alarms
 from twin.alarms.rules import Rule, default_rules, read_rules, write_rules
 from twin.alarms.settings import board_rules
-from twin.alarms.store import open_store
+from twin.alarms.writer import Keeper
 from twin.assets.unit import Unit
 from twin.audit import records
 from twin.cli import alarms as cli_alarms

@@ -11,14 +11,14 @@ import pytest
 import rigs
 from rigs import Collect
 
-from twin.alarms import keeper as module
-from twin.alarms.keeper import Keeper
+from twin.alarms import writer as module
+from twin.alarms.database import Store, open_store
 from twin.alarms.loop import Alarms, Before, News
 from twin.alarms.requests import Request
 from twin.alarms.rules import Rule, by_cause, default_rules
 from twin.alarms.settings import board_rules
 from twin.alarms.state import Deed, Kept, State
-from twin.alarms.store import Store, open_store
+from twin.alarms.writer import Keeper
 from twin.assets.unit import Unit
 from twin.cli.alarms import alarms_of
 from twin.config import Config
@@ -26,7 +26,7 @@ from twin.errors import ConfigError, SourceError
 from twin.events import Event, Kind
 from twin.figures.cycle import KeyFigures
 from twin.live import run
-from twin.monitor.detect import Monitor
+from twin.monitor.monitor import Monitor
 from twin.settings import Document
 from twin.signals import SAMPLE, Quality, Samples
 
@@ -381,8 +381,8 @@ def kept(where: str | Path) -> Keeper:
 def test_a_defect_does_not_end_what_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("twin.alarms.keeper.POLL_S", 0.001)
-    monkeypatch.setattr("twin.alarms.keeper.RETRY_S", 0.001)
+    monkeypatch.setattr("twin.alarms.writer.POLL_S", 0.001)
+    monkeypatch.setattr("twin.alarms.writer.RETRY_S", 0.001)
     save, failures, said = Store.save, iter([MemoryError(), ValueError("a defect")]), list[str]()
 
     def flaky(store: Store, *what: Any) -> None:

@@ -11,16 +11,16 @@ import rigs
 from twin.config import Config
 from twin.diagnosis.another_day import unsure
 from twin.diagnosis.answer import diagnose
+from twin.diagnosis.covariance import covariance
 from twin.diagnosis.evidence import HEALTHY, Evidence, collect
 from twin.diagnosis.hypotheses import often, price
-from twin.diagnosis.screen import columns, promises, signatures
-from twin.diagnosis.weights import covariance
+from twin.diagnosis.linear_screening import columns, promises, signatures
 from twin.model import theta as c
 from twin.model.courses import Cause
 from twin.model.effects import EFFECTS
 from twin.model.theta import Theta
-from twin.monitor.knees import as_wide_as_needed, expected_knees
-from twin.monitor.phases import PhaseFinder
+from twin.monitor.detector_window import as_wide_as_needed, expected_knees
+from twin.monitor.phase_detector import PhaseFinder
 from twin.settings import Document
 from twin.signals import MBAR, Phase, Samples
 

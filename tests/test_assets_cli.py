@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from twin.assets.database import open_assets
-from twin.assets.place import open_chosen
+from twin.assets.database_url import open_chosen
 from twin.assets.record import Record
 from twin.cli.assets import assets_app
 from twin.errors import ConfigError, SourceError, TwinError

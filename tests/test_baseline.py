@@ -6,7 +6,7 @@ import rigs
 
 from twin.figures.settings import SHORTEST_CYCLE_S, healthy_range
 from twin.monitor.baseline import LEARNED, Baseline
-from twin.monitor.budget import (
+from twin.monitor.false_alarm_budget import (
     LIMITS,
     SINGLE_CYCLES,
     SUMS,

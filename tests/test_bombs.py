@@ -23,7 +23,7 @@ from twin.events import Event, Kind
 from twin.exchange.aas import read_package
 from twin.exchange.fmu_file import read_fmu
 from twin.files import MEMORY_BUDGET
-from twin.fleet.go import Told, ask
+from twin.fleet.runner import Told, ask
 from twin.log import recorder
 from twin.log.check import check
 from twin.log.columns import decode

@@ -11,14 +11,14 @@ import rigs
 from calibrations import CYCLES, beside, calibrated, log_of, quiet, rig, typed
 
 from tools.calibration_coverage import SYSTEMS, TRUE, drawn, misses, recorded
-from twin.calibration.alike import refuse_changing
 from twin.calibration.calibrate import calibrate
 from twin.calibration.cycles import Cycles
 from twin.calibration.fit import fit
-from twin.calibration.left_out import with_left_out
+from twin.calibration.line_discrepancy import with_left_out
 from twin.calibration.parameters import FREE, Space, directions, values, with_values
 from twin.calibration.report import as_json, in_words
-from twin.calibration.store import store
+from twin.calibration.save import store
+from twin.calibration.stationarity import refuse_changing
 from twin.config import Config
 from twin.diagnosis.answer import diagnose
 from twin.errors import ConfigError
@@ -28,7 +28,7 @@ from twin.model.dataset import coefficients
 from twin.model.theta import Theta
 from twin.monitor.bins import warped
 from twin.monitor.cycles import PAPER_VACUUM, CycleCutter, time_to_vacuum
-from twin.monitor.detect import Monitor
+from twin.monitor.monitor import Monitor
 from twin.signals import MBAR, Phase, Quality, Samples
 
 HELD_OUT = (21, 22, 23)

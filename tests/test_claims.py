@@ -18,19 +18,26 @@ from twin import files, throttle
 from twin.alarms import statistics
 from twin.alarms.loop import AGREEING
 from twin.compare import compare, side
-from twin.figures import course, keeper, table, trend
+from twin.figures import cycle_view as course
+from twin.figures import table, trend
+from twin.figures import writer as keeper
 from twin.fleet import peers, report
 from twin.hil import LONGEST_GAP_S
 from twin.log import recorder
 from twin.log.columns import encode
 from twin.log.schema import SAMPLES
 from twin.model import gas
-from twin.monitor import change, clock, drawings, knees
-from twin.monitor.bank import SUSPECTS
+from twin.monitor import change_detection as change
+from twin.monitor import clock
+from twin.monitor import detector_window as knees
+from twin.monitor import prediction_cache as drawings
 from twin.monitor.cycles import LONGEST_PIECE
 from twin.monitor.isolation import LEARNED
-from twin.outlets import data, dispatch, sender, uploader
-from twin.page import hall, hall_words, ring, server, sessions
+from twin.monitor.model_bank import SUSPECTS
+from twin.notifications import data, dispatch, sender, uploader
+from twin.page import plant_overview as hall
+from twin.page import plant_overview_text as hall_words
+from twin.page import ring, server, sessions
 from twin.signals import MBAR, MS, SAMPLE, TICK
 from twin.tables import reader, unit_check
 
@@ -186,7 +193,7 @@ def test_the_example_that_unpacks_a_column_of_a_log_unpacks_it() -> None:
 
 # --- rig and model: CONTRIBUTING.md, Tests --------------------------------------------------------
 
-VOCABULARY = ("signals", "errors", "settings", "secret", "users", "events", "processor")
+VOCABULARY = ("signals", "errors", "settings", "secret", "users", "events", "cpu_target")
 
 
 def test_rig_and_model_share_the_constants_that_are_said_to_be_shared() -> None:

@@ -13,7 +13,7 @@ import rigs
 import tomli_w
 from command_line import edited, twin
 
-from twin.assets import place
+from twin.assets import database_url as place
 from twin.assets.database import open_assets
 from twin.assets.record import Record
 from twin.log.header import LogHeader

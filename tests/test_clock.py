@@ -13,7 +13,7 @@ from twin.events import Event, Kind
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
 from twin.monitor.clock import EVERY, WINDOW_NS, ClockWatch, line, slope_pm
-from twin.monitor.detect import Monitor, MonitorSettings
+from twin.monitor.monitor import Monitor, MonitorSettings
 from twin.signals import SAMPLE, TICK, Quality, Samples
 
 S, MS = 1_000_000_000, 1_000_000

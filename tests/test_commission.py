@@ -17,7 +17,7 @@ from second_world.faults import Fault
 from second_world.records import Record as Logged
 from second_world.records import record
 
-from twin.assets.place import open_chosen
+from twin.assets.database_url import open_chosen
 from twin.calibration.calibrate import complete
 from twin.calibration.commission import (
     COMES,
@@ -33,7 +33,7 @@ from twin.calibration.commission import (
 )
 from twin.calibration.cycles import Cycles
 from twin.calibration.fit import BENDS, BEST_END, END_PRESSURE, falling
-from twin.calibration.left_out import with_left_out
+from twin.calibration.line_discrepancy import with_left_out
 from twin.calibration.page import write_page
 from twin.calibration.parameters import (
     AMBIENT,
@@ -46,7 +46,7 @@ from twin.calibration.parameters import (
 )
 from twin.calibration.readings import Readings, deep, read, turns
 from twin.calibration.report import commissioned_as_json, commissioned_in_words, headline
-from twin.calibration.store import store_first
+from twin.calibration.save import store_first
 from twin.calibration.verdict import Residual, Verdict, _left, judge
 from twin.config import Asset
 from twin.diagnosis.answer import diagnose

@@ -22,7 +22,7 @@ from twin.compare.compare import (
 )
 from twin.compare.picture import bins, difference
 from twin.compare.side import BIN_S, Curve, Side, side_of, whole
-from twin.compare.words import conclusion, in_words, plain, remarks
+from twin.compare.text import conclusion, in_words, plain, remarks
 from twin.figures.cycle import KeyFigures
 from twin.figures.table import FIGURES
 from twin.live import run as run_loop

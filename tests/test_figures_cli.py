@@ -14,7 +14,7 @@ from pyarrow import parquet
 from twin.assets.unit import Unit
 from twin.cli.figures import figures_app
 from twin.errors import ConfigError, SourceError
-from twin.figures.store import VALUES, open_store
+from twin.figures.database import VALUES, open_store
 from twin.live import run as run_loop
 from twin.log.header import LogHeader
 from twin.log.recorder import Recorder

@@ -25,7 +25,7 @@ from twin.model.dataset import DataSet
 from twin.model.term import Term
 from twin.monitor.cycles import LONGEST_PIECE, CycleCutter
 from twin.monitor.cycles import figures as old_figures
-from twin.monitor.detect import Monitor
+from twin.monitor.monitor import Monitor
 from twin.signals import (
     BREAK,
     MBAR,

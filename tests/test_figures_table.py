@@ -12,16 +12,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tools.readme import filled
-from twin.figures.course import LAST_S, LEAK_WINDOW_S, LEAST_WINDOW_S, LONGEST_HOLE, Floats, Rows
-from twin.figures.course import course as found_in
+from twin.figures.cycle_view import (
+    LAST_S,
+    LEAK_WINDOW_S,
+    LEAST_WINDOW_S,
+    LONGEST_HOLE,
+    Floats,
+    Rows,
+)
+from twin.figures.cycle_view import course as found_in
 from twin.figures.expected import leakage_from_rest, t1_from_rest
 from twin.figures.settings import FigureSettings, Limits, limits
 from twin.figures.table import FIGURES, Unit, figures, table
+from twin.figures.text import limit_of
 from twin.figures.warnings import CAUTIONS, in_words, warnings
-from twin.figures.words import limit_of
 from twin.model.control import LEAK_SETTLE_S, PROTECTED_S, PROTECTED_SWITCHES
 from twin.model.dataset import DataSet, Ejector, Supply, System, Vessel
-from twin.monitor.detect import MonitorSettings
+from twin.monitor.monitor import MonitorSettings
 from twin.signals import Phase
 
 ROOT = Path(__file__).parents[1]

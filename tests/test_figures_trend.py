@@ -11,10 +11,10 @@ from scipy.signal import lfilter
 
 from twin.figures.settings import FigureSettings, limits
 from twin.figures.table import FIGURES
+from twin.figures.text import _give_or_take, in_words, limit_of, trend_plain
 from twin.figures.trend import DAY_NS, FARTHEST, Line, Trend, line_through, reach, trend_of
-from twin.figures.words import _give_or_take, in_words, limit_of, trend_plain
 from twin.model.dataset import DataSet
-from twin.monitor.detect import MonitorSettings
+from twin.monitor.monitor import MonitorSettings
 
 TRIALS = 150
 

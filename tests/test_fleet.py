@@ -17,8 +17,8 @@ from command_line import twin
 
 from tools.dask_cluster import cluster
 from twin.assets.database import open_assets
-from twin.fleet import go as going
-from twin.fleet.works import Done, Job, code, run
+from twin.fleet import runner as going
+from twin.fleet.tasks import Done, Job, code, run
 
 UNITS = ("A1", "A2", "A3")
 DIES = "dies"  # in the name of a log
@@ -79,7 +79,7 @@ def test_other_code_answers_anew(
 ) -> None:
     asked = ("fleet", "replay", logs / "A1-0.mcap", "--assets", tmp_path / "f.sqlite")
     assert twin(monkeypatch, *asked) == 0
-    for module in ("store", "go", "works"):
+    for module in ("results_database", "runner", "tasks"):
         monkeypatch.setattr(f"twin.fleet.{module}.code", lambda: "another")
     monkeypatch.setattr(going, "run", here)
     capsys.readouterr()

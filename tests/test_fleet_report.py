@@ -12,11 +12,11 @@ import pytest
 from twin.assets.record import Record
 from twin.calibration.parameters import FREE
 from twin.errors import SourceError
-from twin.fleet.kinds import estimates
 from twin.fleet.peers import DAY_NS, FEWEST_PEERS, standings
 from twin.fleet.report import Refused, Report, State, report
-from twin.fleet.store import Key, Result
-from twin.fleet.words import headline, in_words, write_page
+from twin.fleet.results_database import Key, Result
+from twin.fleet.text import headline, in_words, write_page
+from twin.fleet.type_statistics import estimates
 
 EFFECTS = {"leakage": "sl/min", "suction_loss": "%", "sensor_offset": "mbar"}
 STEP = 0.1  # of size, in a sigma

@@ -28,9 +28,9 @@ from pymodbus.framer.socket import FramerSocket
 from pymodbus.pdu import DecodePDU
 
 from drivers.modbus import source as modbus
+from drivers.modbus.client import ModbusClient, ModbusSettings
 from drivers.modbus.hil import HilSettings, RegisterOutlet
-from drivers.modbus.link import Link, ModbusSettings
-from drivers.modbus.telegram import Store
+from drivers.modbus.pdu import Store
 from drivers.opcua.hil import HilSettings as OpcuaHilSettings
 from drivers.outputs.writer import Outputs, Writer
 from drivers.plc.partner import LONGEST_PICK, NO_PART, PATIENCE, TRIPPED, PartnerTask
@@ -182,7 +182,7 @@ def hil(text: str = MODBUS, **tags: Any) -> HilSettings:
 
 def outlet(order: str = "big", **tags: Any) -> RegisterOutlet:
     to = driver(word_order=order)
-    return RegisterOutlet(Link(to), to, hil(**tags).tags)
+    return RegisterOutlet(ModbusClient(to), to, hil(**tags).tags)
 
 
 def f32(number: float) -> tuple[int, int]:
@@ -644,7 +644,7 @@ def latency_ms(model: Samples, plc: Samples) -> np.ndarray:
 
 
 def status(port: int, unit: int = 1) -> int:
-    link = Link(driver(port).model_copy(update={"unit": unit}))
+    link = ModbusClient(driver(port).model_copy(update={"unit": unit}))
     link.open()
     with closing(link):
         return int(link.read(Address("input", 4), 1)[0])

@@ -31,14 +31,14 @@ from twin.cli.console import Console
 from twin.cli.run import _supervised
 from twin.errors import SourceError
 from twin.events import Event, Kind
-from twin.figures.keeper import Keeper
-from twin.figures.store import open_store
+from twin.figures.database import open_store
+from twin.figures.writer import Keeper
 from twin.live import Twin, run
 from twin.log.output import Output
 from twin.log.part import SUFFIX
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
-from twin.monitor.listening import Listening, Notices
+from twin.monitor.staleness import Listening, Notices
 from twin.page.ring import LiveRows
 from twin.signals import SAMPLE, TICK, Quality, Samples, Ticks
 from twin.supervised import Outages, SupervisedSink

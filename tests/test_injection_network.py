@@ -18,11 +18,11 @@ import psutil
 import pytest
 from modbus_server import ModbusServer, PlcTime, TracePlc
 from test_modbus_block import clock_of, settings_for
-from test_outlets import message
+from test_notifications import message
 from test_webhook import At, Server
 
 from drivers.modbus.source import blocks
-from twin.outlets import sender
+from twin.notifications import sender
 from twin.signals import SAMPLE, UNUSABLE, Samples
 
 CALLS = ("connect", "sendall", "send", "recv", "recv_into", "setsockopt", "settimeout")

@@ -12,11 +12,11 @@ from twin.alarms import watch
 from twin.events import Event, Kind
 from twin.model.catalogue import CatalogueEffect
 from twin.model.effects import UNKNOWN
-from twin.monitor.bank import SUSPECTS, Bank, hypotheses
-from twin.monitor.cycles import Cycle, Look, cut, figures
-from twin.monitor.detect import Monitor, MonitorSettings
+from twin.monitor.cycles import Cycle, CycleView, cut, figures
 from twin.monitor.healthy import Healthy
 from twin.monitor.isolation import Isolation
+from twin.monitor.model_bank import SUSPECTS, ModelBank, hypotheses
+from twin.monitor.monitor import Monitor, MonitorSettings
 from twin.signals import SAMPLE, TICK, Samples, Ticks
 
 BEGINS, CYCLES = 30, 42
@@ -190,7 +190,7 @@ def test_only_what_is_fit_to_be_judged_says_something() -> None:
     samples, _ = rigs.recorded("gripper", 12.0)
     cycles = list(cut([rigs.expectation(rigs.twin("gripper"), [samples])]))
     theta = rigs.theta("gripper")
-    looks = [Look(one, None, figures(one, theta), fit=one.index != 2) for one in cycles]
+    looks = [CycleView(one, None, figures(one, theta), fit=one.index != 2) for one in cycles]
     isolation = rigs.isolating("gripper").isolation
     assert isolation
     heard = isolation.hear(looks)
@@ -241,7 +241,7 @@ def test_sizes_are_possible_ones() -> None:
 def test_the_bank_expects_what_the_twin_expects_where_it_is_drawn() -> None:
     samples, _ = rigs.recorded("gripper", 6.0)
     rows, ticks = rigs.expectation(rigs.twin("gripper"), [samples])
-    bank = Bank(rigs.theta("gripper"))
+    bank = ModelBank(rigs.theta("gripper"))
     for end in range(700, len(rows), 700):
         bank.ahead([(rows[:end], ticks[:end])], at_edge=False)
     drawn, together = bank.take(piece(rows, ticks))
@@ -260,7 +260,7 @@ def test_the_bank_expects_what_the_twin_expects_where_it_is_drawn() -> None:
 def test_what_the_bank_draws_does_not_depend_on_blocks(size: int) -> None:
     samples, _ = rigs.recorded("gripper", 3.0)
     rows, ticks = rigs.expectation(rigs.twin("gripper"), [samples])
-    whole, cut = Bank(rigs.theta("gripper")), Bank(rigs.theta("gripper"))
+    whole, cut = ModelBank(rigs.theta("gripper")), ModelBank(rigs.theta("gripper"))
     for end in range(size, len(rows), size):
         cut.ahead([(rows[:end], ticks[:end])], at_edge=False)
     all_of_it = piece(rows, ticks)

@@ -20,7 +20,7 @@ from twin.live import run
 from twin.log.header import LogHeader
 from twin.log.reader import Log, open_log
 from twin.log.recorder import Recorder
-from twin.monitor.listening import Listening
+from twin.monitor.staleness import Listening
 from twin.signals import SAMPLE, Command, Phase, Quality, Samples, Ticks
 
 EMPTY = np.empty(0, SAMPLE)

@@ -8,7 +8,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from log_rows import awkward, course
 
-from twin.log.columns import Tray, decode, encode
+from twin.log.columns import RowBuffer, decode, encode
 from twin.log.schema import SAMPLES
 from twin.signals import SAMPLE, TICK, Samples, Ticks
 
@@ -104,7 +104,7 @@ def test_a_tray_changes_the_cuts_and_nothing_else(lengths: list[int], size: int)
 def through_tray(
     samples: Samples, ticks: Ticks, lengths: list[int], size: int
 ) -> Iterator[tuple[Samples, Ticks]]:
-    tray = Tray(size)
+    tray = RowBuffer(size)
     start = 0
     for length in lengths:
         yield from tray.add(samples[start : start + length], ticks[start : start + length])
@@ -114,7 +114,7 @@ def through_tray(
 
 def test_what_a_tray_gave_away_is_not_overwritten() -> None:
     samples, ticks = course(20)
-    tray = Tray(10)
+    tray = RowBuffer(10)
     first, second = tray.add(samples, ticks)
     assert first[0].tobytes() == samples[:10].tobytes()
     assert second[0].tobytes() == samples[10:].tobytes()

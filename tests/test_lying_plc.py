@@ -20,7 +20,7 @@ from test_opcua_block import TornServer
 from test_opcua_block import settings_for as opcua_settings
 
 from drivers.modbus.source import blocks
-from drivers.opcua.link import OpcuaLink
+from drivers.opcua.client import OpcuaClient
 from drivers.opcua.trace import NodeTrace
 from drivers.reconnect import reconnecting
 from twin.errors import TwinError
@@ -28,7 +28,7 @@ from twin.events import Kind
 from twin.live import run
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
-from twin.monitor.listening import Listening, Notices
+from twin.monitor.staleness import Listening, Notices
 from twin.signals import BREAK, SAMPLE, UNUSABLE, Quality, Samples
 
 BLOCKS = 400  # with lies, and half as many after them
@@ -77,7 +77,7 @@ def test_lies_over_opcua_end_nothing_and_make_nothing_up() -> None:
         settings = opcua_settings(url=server.url, timeout_ms=1000)
         stream: Iterator[Samples] = reconnecting(
             NodeTrace(settings, clock),
-            OpcuaLink(settings, clock),
+            OpcuaClient(settings, clock),
             clock,
             lambda error: told.append(str(error)),
         )  # type: ignore[type-var]

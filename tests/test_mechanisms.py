@@ -21,7 +21,7 @@ from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.diagnosis.extend import extended
 from twin.diagnosis.mechanisms import is_a_course_of
 from twin.diagnosis.propose import Proposal, proposed
-from twin.diagnosis.words import lines
+from twin.diagnosis.text import lines
 from twin.errors import ConfigError
 from twin.model import kernel
 from twin.model import mechanism as m

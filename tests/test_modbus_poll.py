@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.modbus.link import Link, ModbusSettings
+from drivers.modbus.client import ModbusClient, ModbusSettings
 from drivers.modbus.plan import plan
 from drivers.modbus.poll import Poller
 from drivers.modbus.source import blocks
@@ -59,7 +59,7 @@ class Rig:
         self.time = PlcTime(self.plc.scan)
         settings = settings_for(server, **changes)
         self.clock = Clock(self.time.wall_ns, self.time.now_ns, self.time.sleep)
-        self.link = Link(settings)
+        self.link = ModbusClient(settings)
         self.poller = Poller(settings, self.clock)
 
     def take(self, count: int) -> Samples:

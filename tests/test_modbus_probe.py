@@ -10,7 +10,7 @@ import pytest
 import rigs
 from command_line import edited, twin
 
-from drivers.modbus.link import ModbusSettings
+from drivers.modbus.client import ModbusSettings
 from drivers.modbus.probe import probe, word_order_of
 from drivers.probe import Line
 from drivers.reconnect import Clock

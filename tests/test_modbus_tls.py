@@ -15,8 +15,8 @@ from cryptography.hazmat.primitives.serialization import Encoding, load_pem_priv
 from independent import pem
 from pydantic import ValidationError
 
-from drivers.modbus.link import Link, ModbusSettings
-from drivers.modbus.telegram import Request
+from drivers.modbus.client import ModbusClient, ModbusSettings
+from drivers.modbus.pdu import Request
 from drivers.modbus.tls import Tls, secured
 from drivers.opcua import certificates
 from drivers.reconnect import LostError
@@ -67,15 +67,17 @@ class Plc:
 
 
 @pytest.fixture
-def linked(tmp_path: Path) -> Iterator[Callable[[Callable[[ssl.SSLSocket], None]], Link]]:
-    opened: list[Link | Plc] = []
+def linked(tmp_path: Path) -> Iterator[Callable[[Callable[[ssl.SSLSocket], None]], ModbusClient]]:
+    opened: list[ModbusClient | Plc] = []
 
-    def link_to(act: Callable[[ssl.SSLSocket], None]) -> Link:
+    def link_to(act: Callable[[ssl.SSLSocket], None]) -> ModbusClient:
         plc = Plc(tmp_path, act)
         tag = {"address": "30002", "type": "float32", "unit": "mbar", "reference": "absolute"}
         table = {"host": "127.0.0.1", "port": plc.port, "timeout_ms": TIMEOUT_MS}
         tls = {"trusted": tmp_path / certificates.OWN, "name": socket.gethostname()}
-        link = Link(ModbusSettings.model_validate(table | {"tags": {"pressure": tag}, "tls": tls}))
+        link = ModbusClient(
+            ModbusSettings.model_validate(table | {"tags": {"pressure": tag}, "tls": tls})
+        )
         opened.extend((link, plc))
         link.open()
         return link
@@ -85,7 +87,7 @@ def linked(tmp_path: Path) -> Iterator[Callable[[Callable[[ssl.SSLSocket], None]
         one.close()
 
 
-def test_an_answer_comes_in_pieces(linked: Callable[..., Link]) -> None:
+def test_an_answer_comes_in_pieces(linked: Callable[..., ModbusClient]) -> None:
     def act(client: ssl.SSLSocket) -> None:
         for piece in (ANSWER[:3], ANSWER[3:10], ANSWER[10:]):
             client.sendall(piece)
@@ -102,7 +104,7 @@ def dribble(client: ssl.SSLSocket) -> None:
 
 @pytest.mark.parametrize("act", [lambda client: None, dribble], ids=["silent", "dribbling"])
 def test_one_that_does_not_answer_in_time_is_lost(
-    linked: Callable[..., Link], act: Callable[[ssl.SSLSocket], None]
+    linked: Callable[..., ModbusClient], act: Callable[[ssl.SSLSocket], None]
 ) -> None:
     link = linked(act)
     begun = time.monotonic()
@@ -113,7 +115,7 @@ def test_one_that_does_not_answer_in_time_is_lost(
         link.read(FOUR.address, 4)
 
 
-def test_one_that_hangs_up_at_once_may_not_want_us(linked: Callable[..., Link]) -> None:
+def test_one_that_hangs_up_at_once_may_not_want_us(linked: Callable[..., ModbusClient]) -> None:
     link = linked(lambda client: client.close())
     with pytest.raises(LostError, match="it does not trust our certificate, or wants one"):
         link.read(FOUR.address, 4)
@@ -123,12 +125,14 @@ def test_one_that_hangs_up_at_once_may_not_want_us(linked: Callable[..., Link]) 
 
 
 @contextmanager
-def reaching(plc: Plc, folder: Path, **changes: object) -> Iterator[Link]:
+def reaching(plc: Plc, folder: Path, **changes: object) -> Iterator[ModbusClient]:
     """A link to a PLC whose files are in ``folder``; both end."""
     tag = {"address": "30002", "type": "float32", "unit": "mbar", "reference": "absolute"}
     table = {"host": "127.0.0.1", "port": plc.port, "timeout_ms": 250}
     tls = {"trusted": folder / certificates.OWN, "name": socket.gethostname()} | changes
-    link = Link(ModbusSettings.model_validate(table | {"tags": {"pressure": tag}, "tls": tls}))
+    link = ModbusClient(
+        ModbusSettings.model_validate(table | {"tags": {"pressure": tag}, "tls": tls})
+    )
     with closing(plc), closing(link):
         yield link
 
@@ -187,7 +191,7 @@ def test_a_plc_that_wants_a_certificate_takes_the_one_it_knows(tmp_path: Path, k
             _opened_and_read(link)
 
 
-def _opened_and_read(link: Link) -> list[int]:
+def _opened_and_read(link: ModbusClient) -> list[int]:
     link.open()
     return [*link.read(FOUR.address, 4).tolist()]
 

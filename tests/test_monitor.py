@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from twin.events import Event, Kind, Severity
 from twin.model.effects import EFFECTS, UNKNOWN
-from twin.monitor import detect
-from twin.monitor.detect import Monitor, MonitorSettings
+from twin.monitor import monitor as detect
 from twin.monitor.healthy import Healthy, Scatter
+from twin.monitor.monitor import Monitor, MonitorSettings
 from twin.monitor.signatures import likenesses
 from twin.signals import MBAR, NS, SAMPLE, TICK, Phase, Quality, Samples, Ticks
 

@@ -15,21 +15,21 @@ import tomli_w
 from mosquitto import Broker, Listener, Relay, broker
 from plc_process import start_plc
 from test_alarms_loop import LEAK, NONE, UNIT, Stream, deviation
-from test_outlets import NO_TICKS, Bench, message, wait_until
+from test_notifications import NO_TICKS, Bench, message, wait_until
 
-from twin.alarms.store import open_store
+from twin.alarms.database import open_store
 from twin.assets.unit import Unit
-from twin.cli.outlets import outlets_of
+from twin.cli.notifications import outlets_of
 from twin.config import Config
 from twin.errors import ConfigError
 from twin.events import Event, Kind
-from twin.outlets import mqtt, sender
-from twin.outlets.dispatch import Outlets
-from twin.outlets.message import Message
-from twin.outlets.mqtt import Mqtt
-from twin.outlets.outbox import open_outbox
-from twin.outlets.sender import LostError
-from twin.outlets.settings import MqttSettings, Secret, Tls
+from twin.notifications import mqtt, sender
+from twin.notifications.dispatch import Outlets
+from twin.notifications.message import Message
+from twin.notifications.mqtt import Mqtt
+from twin.notifications.outbox import open_outbox
+from twin.notifications.sender import LostError
+from twin.notifications.settings import MqttSettings, Secret, Tls
 from twin.settings import Document
 
 BASE = f"ejector-twin/{UNIT.type}/{UNIT.id}"

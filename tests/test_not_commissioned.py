@@ -9,7 +9,7 @@ from rigs import Collect
 
 from twin.alarms.loop import Alarms
 from twin.alarms.settings import board_rules
-from twin.alarms.words import COMMISSION
+from twin.alarms.text import COMMISSION
 from twin.cli.setup import pair_of
 from twin.config import Config
 from twin.diagnosis.answer import diagnose
@@ -18,7 +18,7 @@ from twin.events import Kind
 from twin.live import run
 from twin.model.effects import UNKNOWN
 from twin.monitor.healthy import NOT_COMMISSIONED, Healthy
-from twin.page.light import facts
+from twin.page.ejector_status import facts
 
 SECONDS, LEAK = 60.0, "leakage=4@30"
 

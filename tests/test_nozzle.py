@@ -13,7 +13,7 @@ from second_world.draw import draw_rig
 from second_world.records import record
 
 from twin.calibration.cycles import Cycles
-from twin.monitor.breaks import Noise, beside_parabolas
+from twin.monitor.breakpoints import Noise, beside_parabolas
 from twin.monitor.nozzle import Switching, noise_of, switchings
 from twin.signals import MBAR, SAMPLE, Command, Phase, Quality, Samples
 

@@ -161,7 +161,7 @@ def test_a_text_that_goes_back_is_no_text(length: str) -> None:
     assert texts.Value.Value == [None, "A"]
 
 
-@pytest.mark.parametrize("program", ["drivers.opcua.link", "drivers.outputs.serve"])
+@pytest.mark.parametrize("program", ["drivers.opcua.client", "drivers.outputs.serve"])
 def test_who_reads_from_strangers_refuses_them(program: str) -> None:
     """The link of a driver and the server of the results."""
     source = importlib.import_module(program)

@@ -69,14 +69,14 @@ def test_the_trace_comes_whole_and_is_the_one_that_modbus_serves(opcua: OpcuaPlc
 
 def by_modbus(opcua: OpcuaPlc, samples: Samples) -> Samples:
     """The same scans, from the registers of the ring."""
-    from drivers.modbus.link import Link, ModbusSettings
+    from drivers.modbus.client import ModbusClient, ModbusSettings
     from drivers.modbus.ring import Trace
 
     tags = {"pressure": {"address": "input:1", "type": "float32", "unit": "mbar"}}
     tags["pressure"]["reference"] = "absolute"
     table = {"host": "127.0.0.1", "port": opcua.process.port, "tags": tags}
     settings = ModbusSettings.model_validate(table)
-    link, trace = Link(settings), Trace(settings, REAL)
+    link, trace = ModbusClient(settings), Trace(settings, REAL)
     with closing(link):
         link.open()
         trace._header = trace.start(link)

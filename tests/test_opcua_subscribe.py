@@ -11,7 +11,7 @@ from asyncua import ua
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.opcua.link import Subscribed
+from drivers.opcua.client import Subscribed
 from drivers.opcua.settings import Node, OpcuaSettings
 from drivers.opcua.subscribe import Subscription
 from drivers.opcua.values import EPOCH

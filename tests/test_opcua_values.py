@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from drivers.opcua import values
-from drivers.opcua.link import OpcuaLink
+from drivers.opcua.client import OpcuaClient
 from drivers.opcua.settings import Node, OpcuaSettings
 from drivers.reconnect import REAL, LostError
 from twin.errors import SourceError
@@ -208,7 +208,7 @@ def test_what_would_have_no_effect_is_refused(changes: dict[str, Any], message: 
 
 
 def test_a_node_that_was_there_and_is_not_is_waited_for() -> None:
-    link = OpcuaLink(OpcuaSettings.model_validate(FINE), REAL)
+    link = OpcuaClient(OpcuaSettings.model_validate(FINE), REAL)
     with pytest.raises(SourceError, match="there is no node") as never:
         link._refuse(NODE, S.BadNodeIdUnknown)
     link._known = True  # it has once served all of it

@@ -29,15 +29,15 @@ from user_files import authenticator_of, quick_users
 
 from twin.assets.unit import Unit
 from twin.files import json_text
-from twin.outlets.message import Message, asset_of, beside, of_status
-from twin.outlets.mqtt import Mqtt
-from twin.outlets.settings import MqttSettings
-from twin.page import hall as hall_module
+from twin.notifications.message import Message, asset_of, beside, of_status
+from twin.notifications.mqtt import Mqtt
+from twin.notifications.settings import MqttSettings
+from twin.page import plant_overview as hall_module
 from twin.page.app import Access, Page
 from twin.page.ejector import Ejector
-from twin.page.hall import Hall
-from twin.page.hall_line import listening
-from twin.page.hall_words import counted, details, of_one, overview
+from twin.page.plant_overview import PlantOverview
+from twin.page.plant_overview_client import listening
+from twin.page.plant_overview_text import counted, details, of_one, overview
 from twin.page.server import Place, address, listen, make_server
 from twin.page.sessions import Sessions
 
@@ -89,7 +89,7 @@ class Told:
 
     def __init__(self) -> None:
         self.now = NOW
-        self.hall = Hall(lambda: self.now)
+        self.hall = PlantOverview(lambda: self.now)
         self.hall.connected()
 
     def tell(self, name: str, topic: str, body: str, *, kept: bool = False) -> None:
@@ -292,7 +292,9 @@ def test_odd_names_are_as_they_were(told: Told) -> None:
 
 
 @contextmanager
-def client(folder: Path, hall: Hall | None, *configs: Path, **access: Any) -> Iterator[TestClient]:
+def client(
+    folder: Path, hall: PlantOverview | None, *configs: Path, **access: Any
+) -> Iterator[TestClient]:
     users = quick_users(folder / "users.toml")
     ejectors = [Ejector(config(one)) for one in configs]
     page = Page(ejectors, authenticator_of(users), Sessions(users), Access(**access), hall)
@@ -325,7 +327,7 @@ def test_it_is_seen_by_whom_the_other_page_is(tmp_path: Path, told: Told) -> Non
 
 @contextmanager
 def site(folder: Path, port: int) -> Iterator[str]:
-    users, place, hall = quick_users(folder / "users.toml"), Place("127.0.0.1", 0), Hall()
+    users, place, hall = quick_users(folder / "users.toml"), Place("127.0.0.1", 0), PlantOverview()
     inner = make_server(
         Page([], authenticator_of(users), Sessions(users), Access(), hall).app(), place
     )

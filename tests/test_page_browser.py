@@ -18,10 +18,10 @@ from test_texts import catalogue
 from user_files import authenticator_of, quick_users
 
 from tools.texts import texts
-from twin.alarms import keeper as keeper_module
+from twin.alarms import writer as keeper_module
 from twin.assets.unit import Unit
 from twin.events import Kind
-from twin.figures.store import open_store
+from twin.figures.database import open_store
 from twin.page.app import Access
 from twin.page.app import Page as Served
 from twin.page.ejector import Ejector

@@ -12,7 +12,7 @@ from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 from user_files import authenticator_of, quick_users
 
-from twin.alarms import keeper as keeper_module
+from twin.alarms import writer as keeper_module
 from twin.audit import records
 from twin.errors import ConfigError
 from twin.events import Kind

@@ -31,7 +31,7 @@ from twin.paper.evacuation import (
 from twin.paper.picture import draw
 from twin.paper.separation import AT_EJECTOR, BIG, IN_CUPS, Separation, fitted, separate
 from twin.paper.tables import Row, late_by, recomputed
-from twin.paper.words import in_words
+from twin.paper.text import in_words
 
 PRINTED = {
     ("rig", "equation (1)"): 1569,

@@ -16,15 +16,15 @@ import numpy.typing as npt
 import pytest
 from asyncua import ua
 
-from drivers.modbus.link import ModbusSettings
+from drivers.modbus.client import ModbusSettings
 from drivers.modbus.ring import Header, Trace
 from drivers.opcua.settings import BIT_NODES, Node, OpcuaSettings
 from drivers.opcua.trace import NodeTrace
+from drivers.optional_signals import BITS
 from drivers.plc.opcua import MEASURED, TRACE
 from drivers.plc.registers import HEADER, HEADER_SIZE, MAP, RECORD, RING, Registers
 from drivers.plc.scan import OVERFLOW, PERIOD_NS
 from drivers.reconnect import Clock
-from drivers.reports import BITS
 from drivers.tags import Address
 from tests.structured_text import Block, iec, parsed
 from twin.settings import Document

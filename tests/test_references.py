@@ -18,20 +18,20 @@ from typer import BadParameter
 from typer.main import get_command
 
 from drivers.modbus import hil as hil_modbus
-from drivers.modbus.link import ModbusSettings
+from drivers.modbus.client import ModbusSettings
 from drivers.opcua import hil as hil_opcua
 from drivers.opcua.settings import OpcuaSettings
 from drivers.outputs.settings import ResultsSettings
 from drivers.plc.settings import PlcSettings
 from twin.alarms.settings import AlarmSettings
-from twin.assets.place import AssetsSettings
+from twin.assets.database_url import AssetsSettings
 from twin.cli.main import app
 from twin.config import TABLES, Asset, LogSettings
 from twin.errors import ConfigError
 from twin.figures.settings import FigureSettings
 from twin.model.dataset import DataSet
-from twin.monitor.detect import MonitorSettings
-from twin.outlets.settings import MqttSettings, OutletsSettings, WebhookSettings
+from twin.monitor.monitor import MonitorSettings
+from twin.notifications.settings import MqttSettings, OutletsSettings, WebhookSettings
 from twin.page.settings import PageSettings
 from twin.settings import Document, Settings
 from twin.tables.settings import ImportSettings

@@ -15,15 +15,16 @@ import rigs
 
 from twin.diagnosis import drawing
 from twin.diagnosis.answer import Diagnosis, diagnose
+from twin.diagnosis.covariance import covariance
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, collect
 from twin.diagnosis.fit import Fitted
-from twin.diagnosis.judge import Judged, judge
-from twin.diagnosis.over_log import (
+from twin.diagnosis.held_out import Judged, judge
+from twin.diagnosis.log_picture import (
     cycle_rms,
     draw_log,
     size_over_log,
 )
-from twin.diagnosis.over_phases import (
+from twin.diagnosis.phase_pictures import (
     Laid,
     acting,
     draw_left,
@@ -43,8 +44,7 @@ from twin.diagnosis.pictures import (
 )
 from twin.diagnosis.report import in_words, write_report
 from twin.diagnosis.search import Search
-from twin.diagnosis.weights import covariance
-from twin.diagnosis.words import Times, certainty, when
+from twin.diagnosis.text import Times, certainty, when
 from twin.errors import SourceError
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS

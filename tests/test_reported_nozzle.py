@@ -10,7 +10,7 @@ import rigs
 from drivers.plc.settings import PlcSettings
 from drivers.plc.simulate import with_truth
 from twin.monitor.nozzle import noise_of, switchings
-from twin.monitor.phases import PhaseFinder, commanded
+from twin.monitor.phase_detector import PhaseFinder, commanded
 from twin.signals import Command, Phase, Reported, Samples
 
 NEAR = 60  # rows within which a switching found is that of the valve

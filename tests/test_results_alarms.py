@@ -24,7 +24,7 @@ from test_alarms_loop import (
     kept,
     rows,
 )
-from test_outlets import NO_TICKS
+from test_notifications import NO_TICKS
 from test_results import FIGURES, HERE, asked
 from user_files import quick_users
 
@@ -32,7 +32,7 @@ from drivers.opcua import certificates
 from drivers.outputs.results import ResultsServer
 from drivers.outputs.settings import ResultsSettings
 from drivers.outputs.state import Results
-from twin.alarms import keeper as keeper_module
+from twin.alarms import writer as keeper_module
 from twin.alarms.loop import Alarms
 from twin.alarms.settings import board_rules
 from twin.alarms.state import Deed

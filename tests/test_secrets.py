@@ -8,14 +8,14 @@ import pytest
 from drivers.opcua.settings import User
 from drivers.outputs.settings import ResultsSettings
 from drivers.plc.settings import OpcuaServer
-from twin.alarms.place import place_of
+from twin.alarms.database_url import place_of
 from twin.alarms.settings import AlarmSettings
+from twin.assets.database_url import AssetsSettings, chosen
 from twin.assets.engine import ASSETS, Database, parse_url, shown
-from twin.assets.place import AssetsSettings, chosen
 from twin.errors import ConfigError
 from twin.figures.settings import FigureSettings
-from twin.outlets.settings import MqttSettings, OutletsSettings, WebhookSettings
-from twin.outlets.webhook import Webhook
+from twin.notifications.settings import MqttSettings, OutletsSettings, WebhookSettings
+from twin.notifications.webhook import Webhook
 from twin.secret import Secret
 from twin.settings import Document, Settings
 

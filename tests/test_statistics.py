@@ -7,16 +7,16 @@ import numpy.typing as npt
 import pytest
 import rigs
 
-from twin.monitor.bank import SUSPECTS, Bank
 from twin.monitor.cycles import Cycle, cut, figures
-from twin.monitor.statistics import PLACES, WEAK, Listener, Said
+from twin.monitor.model_bank import SUSPECTS, ModelBank
+from twin.monitor.statistics import PLACES, WEAK, CycleResidual, ScoreExtractor
 
 Floats = npt.NDArray[np.float64]
 Heard = tuple[Cycle, npt.NDArray[np.int64], Floats, dict[str, float]]
 
 
-def listener() -> Listener:
-    return Listener.of(rigs.config("gripper").data, rigs.config("gripper").monitor.healthy)
+def listener() -> ScoreExtractor:
+    return ScoreExtractor.of(rigs.config("gripper").data, rigs.config("gripper").monitor.healthy)
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def heard() -> list[Heard]:
     """Cycles that have swung in, with what a bank and the monitor say of them."""
     rows = rigs.expectation(rigs.twin("gripper"), [rigs.recorded("gripper", 20.0)[0]])
     theta = rigs.theta("gripper")
-    bank = Bank(theta)
+    bank = ModelBank(theta)
     found = [(cycle, *bank.take(cycle), figures(cycle, theta)) for cycle in cut([rows])]
     return [one for one in found if one[0].complete and one[0].settled]
 
@@ -50,10 +50,10 @@ def test_scores_and_sizes_are_those_of_the_inverse_covariance(heard: list[Heard]
     np.testing.assert_allclose(np.diag(said.alike())[shown], 1.0)
 
 
-def assert_same(one: Said | None, other: Said | None) -> None:
+def assert_same(one: CycleResidual | None, other: CycleResidual | None) -> None:
     assert one
     assert other
-    for name in (field.name for field in fields(Said)):
+    for name in (field.name for field in fields(CycleResidual)):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
 
 

@@ -17,9 +17,9 @@ from twin.errors import SourceError
 from twin.events import Event, Kind
 from twin.log.reader import open_log
 from twin.log.recorder import ROOM, Recorder
-from twin.monitor.listening import Notices
+from twin.monitor.staleness import Notices
 from twin.signals import Quality, Samples, Ticks
-from twin.supervised import KEPT_ROWS, Outages, SupervisedAdviser, SupervisedSink
+from twin.supervised import KEPT_ROWS, Outages, SupervisedEnricher, SupervisedSink
 
 
 class Clock:
@@ -200,7 +200,9 @@ class Advised:
 
     def __init__(self) -> None:
         self.clock, self.notices, self.inner = Clock(), Notices(), Advises()
-        self.adviser = SupervisedAdviser("diagnosis", self.inner, Outages(self.notices), self.clock)
+        self.adviser = SupervisedEnricher(
+            "diagnosis", self.inner, Outages(self.notices), self.clock
+        )
         self.samples, _ = course(100)
 
     def follow(self, *texts: str) -> list[str]:
@@ -313,7 +315,7 @@ def test_the_end_of_an_alarm_is_heard_though_its_adviser_was_down() -> None:
             return super().follow(samples, events)
 
     clock, alarms = Clock(), Faulty(board_rules(None), None)
-    supervised = SupervisedAdviser("alarms", alarms, Outages(Notices()), clock)
+    supervised = SupervisedEnricher("alarms", alarms, Outages(Notices()), clock)
     samples, _ = course(20_000)
 
     def said(kind: Kind, at_ns: int, rows: Samples) -> list[str]:

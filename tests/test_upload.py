@@ -19,16 +19,17 @@ from paho.mqtt import publish
 from paho.mqtt.client import MQTTv5
 from test_alarms_loop import Stream
 from test_mqtt import begun, impatient  # noqa: F401 - a fixture
-from test_outlets import wait_until
+from test_notifications import wait_until
 
-from twin.cli.outlets import outlets_of
+from twin.cli.notifications import outlets_of
 from twin.config import Config
 from twin.errors import ConfigError
 from twin.log.header import LogHeader
 from twin.log.part import part_path
 from twin.log.recorder import Recorder
-from twin.outlets import asked, uploader
-from twin.outlets.dispatch import Outlets
+from twin.notifications import upload_requests as asked
+from twin.notifications import uploader
+from twin.notifications.dispatch import Outlets
 from twin.settings import Document
 
 TYPE, ID = "compact-ejector-35", "gripper-01"
@@ -361,7 +362,10 @@ def test_nothing_in_a_folder_is_replaced_and_a_share_is_waited_for(
 ) -> None:
     (log,) = record(tmp_path / "logs" / "today.mcap")
     share = tmp_path / "share"
-    with Listener(running.port) as heard, Edge(tmp_path, running.port, folder="share") as edge:
+    with (
+        Listener(running.port) as heard,
+        Edge(tmp_path, running.port, folder="share") as edge,
+    ):
         heard.until("/status", status="online")
         ask(running.port, "1", log="today.mcap")
         wait_until(lambda: bool(edge.said))

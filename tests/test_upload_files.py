@@ -14,10 +14,10 @@ from log_rows import START_NS, course
 from twin.assets.unit import Unit
 from twin.log.header import LogHeader
 from twin.log.recorder import Recorder
-from twin.outlets import logs
-from twin.outlets.asked import REQUEST_FORMAT, RefusedError, UploadRequest
-from twin.outlets.places import Share, StoppedError, described
-from twin.outlets.sender import LostError
+from twin.notifications import logs
+from twin.notifications.sender import LostError
+from twin.notifications.upload_destinations import Share, StoppedError, described
+from twin.notifications.upload_requests import REQUEST_FORMAT, RefusedError, UploadRequest
 
 UNIT = Unit("kind", "rig-01")
 S = 1_000_000_000

@@ -15,15 +15,15 @@ import pytest
 from independent import free_port
 from test_alarms_loop import LEAK, NONE, Stream, deviation
 from test_mqtt import certificate
-from test_outlets import NO_TICKS, Bench, message, wait_until
+from test_notifications import NO_TICKS, Bench, message, wait_until
 
-from twin.cli.outlets import outlets_of
+from twin.cli.notifications import outlets_of
 from twin.config import Config
 from twin.errors import ConfigError
-from twin.outlets import sender
-from twin.outlets.sender import LostError, Sent
-from twin.outlets.settings import Secret, Tls, WebhookSettings
-from twin.outlets.webhook import Webhook
+from twin.notifications import sender
+from twin.notifications.sender import LostError, Sent
+from twin.notifications.settings import Secret, Tls, WebhookSettings
+from twin.notifications.webhook import Webhook
 from twin.settings import Document
 
 

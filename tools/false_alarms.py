@@ -31,9 +31,15 @@ from twin.figures.cycle import KeyFigures
 from twin.figures.settings import LIMITED, Limits, limits_of
 from twin.live import Twin
 from twin.monitor.baseline import LEARNED, Baseline
-from twin.monitor.budget import LIMITS, SINGLE_CYCLES, SUMS, cycles_between, normal_limit
-from twin.monitor.change import Changes, limit
-from twin.monitor.cycles import CycleCutter, Look, figures
+from twin.monitor.change_detection import ChangeDetector, limit
+from twin.monitor.cycles import CycleCutter, CycleView, figures
+from twin.monitor.false_alarm_budget import (
+    LIMITS,
+    SINGLE_CYCLES,
+    SUMS,
+    cycles_between,
+    normal_limit,
+)
 from twin.monitor.isolation import Isolation, looked_for
 from twin.settings import Document
 
@@ -98,11 +104,11 @@ def _bounds(known: Limits) -> Floats:
     return np.array([lower, [known.t1, known.leakage, known.free_flow, nowhere, high]])
 
 
-def _looks(config: Config, rig: PlcSettings, seconds: float, seed: int) -> Iterator[Look]:
+def _looks(config: Config, rig: PlcSettings, seconds: float, seed: int) -> Iterator[CycleView]:
     twin, cutter = Twin.of(config.data), CycleCutter()
     for block in blocks(rig, seconds, seed=seed, block=20_000):
         for one in cutter.push(*twin.advance(block)):
-            yield Look(one, None, figures(one, twin.theta), one.complete and one.settled)
+            yield CycleView(one, None, figures(one, twin.theta), one.complete and one.settled)
 
 
 @dataclass(frozen=True)
@@ -138,7 +144,7 @@ def of_sums(devices: Sequence[Device], drawn: int, seed: int) -> Rate:
     return Rate("sums over cycles", SUMS, *times.tolist(), f"{alarms} in {cycles:,} drawn cycles")
 
 
-def _changes(devices: Sequence[Device]) -> Changes:
+def _changes(devices: Sequence[Device]) -> ChangeDetector:
     changes = looked_for()
     changes.weigh(devices[0].alike)
     return changes

@@ -29,8 +29,8 @@ from asyncua import ua
 from asyncua.common.utils import Buffer
 from asyncua.ua.ua_binary import from_binary, to_binary
 
-from drivers.modbus import telegram
-from drivers.modbus.link import Link, ModbusSettings
+from drivers.modbus import pdu as telegram
+from drivers.modbus.client import ModbusClient, ModbusSettings
 from drivers.modbus.poll import Poller
 from drivers.modbus.ring import Trace
 from drivers.opcua import values as opcua_values
@@ -54,12 +54,12 @@ from twin.log.header import LogHeader
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
 from twin.login import Authenticator
-from twin.outlets.asked import REQUEST_FORMAT, parse
-from twin.outlets.message import asset_of, beside, of_status
+from twin.notifications.message import asset_of, beside, of_status
+from twin.notifications.upload_requests import REQUEST_FORMAT, parse
 from twin.page.app import COOKIE, Access, Page
 from twin.page.ejector import Ejector
-from twin.page.hall import Hall
-from twin.page.hall_words import details, of_one, overview
+from twin.page.plant_overview import PlantOverview
+from twin.page.plant_overview_text import details, of_one, overview
 from twin.page.sessions import SESSION_S, Session, Sessions
 from twin.settings import Document
 from twin.signals import SAMPLE, TICK
@@ -197,7 +197,7 @@ class Wire:
 
 def modbus(data: bytes) -> str:
     """Answers over Modbus, as they come from the socket."""
-    link = Link(_settings())
+    link = ModbusClient(_settings())
     link._socket = Wire(data)  # type: ignore[assignment]
     outcome = ""
     for request in ASKED:
@@ -334,7 +334,7 @@ def users(data: bytes) -> str:
 
 def mqtt(data: bytes) -> str:
     """Messages of ejectors over a broker: topic and text in each line."""
-    hall = Hall(lambda: 1.8e9)
+    hall = PlantOverview(lambda: 1.8e9)
     hall.connected()
     for line in data.split(b"\n"):
         topic, _, payload = line.partition(b" ")
@@ -387,7 +387,7 @@ def _page() -> Any:
     sessions = Sessions(known, lambda: 0.0)
     sessions._by_token[TOKEN] = Session("ann", known.proof("ann"), SESSION_S, TOKEN)
     authenticator = Authenticator(known, Audit(folder, "page", print))
-    return Page([_ejector(folder)], authenticator, sessions, Access(), Hall()).app()
+    return Page([_ejector(folder)], authenticator, sessions, Access(), PlantOverview()).app()
 
 
 def http(data: bytes) -> str:

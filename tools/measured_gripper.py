@@ -23,7 +23,7 @@ from twin.compare.compare import WRONGLY, chance
 from twin.config import Config
 from twin.diagnosis.drawing import AFTER, ANONYMOUS, BEFORE, MEASURED, QUIET, STYLE
 from twin.figures.curve import CURVE, Reading, Stretch, readings, stretches
-from twin.figures.words import curve_table
+from twin.figures.text import curve_table
 from twin.settings import Document
 from twin.signals import MBAR, NS, Samples
 from twin.tables.derive import derive

@@ -26,8 +26,8 @@ from twin.events import Event, Kind
 from twin.live import Twin
 from twin.model.dataset import coefficients
 from twin.model.effects import EFFECTS, UNKNOWN
-from twin.monitor.detect import Monitor
 from twin.monitor.isolation import Isolation
+from twin.monitor.monitor import Monitor
 from twin.settings import Document
 
 ROOT = Path(__file__).parents[1]

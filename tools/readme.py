@@ -4,8 +4,8 @@ import re
 from pathlib import Path
 
 from drivers.plc.registers import table as register_table
-from twin.alarms.words import rules_table as alarm_rules_table
-from twin.alarms.words import table as alarm_states_table
+from twin.alarms.text import rules_table as alarm_rules_table
+from twin.alarms.text import table as alarm_states_table
 from twin.figures.curve import table as curve_table
 from twin.figures.table import table as figures_table
 from twin.figures.warnings import table as warnings_table

@@ -16,12 +16,13 @@ from babel.messages.pofile import read_po, write_po
 
 from twin.alarms.causes import cause_of
 from twin.alarms.rules import by_cause, default_rules
-from twin.alarms.words import COMMISSION
-from twin.diagnosis.words import spoken
+from twin.alarms.text import COMMISSION
+from twin.diagnosis.text import spoken
 from twin.figures.table import FIGURES
 from twin.model.effects import EFFECTS
 from twin.monitor.healthy import NOT_COMMISSIONED
-from twin.page import hall_words, light
+from twin.page import ejector_status as light
+from twin.page import plant_overview_text as hall_words
 from twin.page.app import MARKED
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -62,15 +63,15 @@ def _in_tables() -> Iterator[Text]:
         yield "twin/figures/table.py", figure.name.replace("_", " ")
         yield "twin/figures/table.py", figure.what
     yield "twin/monitor/healthy.py", NOT_COMMISSIONED
-    yield "twin/alarms/words.py", COMMISSION
+    yield "twin/alarms/text.py", COMMISSION
     for table in (light.WITHOUT, light.WORDS, light.STATES, light.PRIORITIES):
-        yield from (("twin/page/light.py", one) for one in table.values())
+        yield from (("twin/page/ejector_status.py", one) for one in table.values())
     for text in (*hall_words.WORDS.values(), hall_words.SILENT, hall_words.NOT_KNOWN):
-        yield "twin/page/hall_words.py", text
+        yield "twin/page/plant_overview_text.py", text
     for status in (400, 401, 403, 404, 503):
         yield "twin/page/app.py", HTTPStatus(status).phrase
     for phase in ("idle", "suction", "hold", "blow-off"):
-        yield "twin/page/light.py", phase
+        yield "twin/page/ejector_status.py", phase
 
 
 def _place(path: Path) -> str:

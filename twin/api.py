@@ -19,7 +19,7 @@ from twin.assets.record import Record
 from twin.calibration import report as calibration_report
 from twin.calibration.calibrate import Calibration
 from twin.calibration.calibrate import calibrate as fit_unit
-from twin.calibration.store import store
+from twin.calibration.save import store
 from twin.config import Config
 from twin.diagnosis.answer import Diagnosis
 from twin.diagnosis.answer import diagnose as find_cause

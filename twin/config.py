@@ -23,8 +23,8 @@ from twin.log.header import LogHeader
 from twin.model.catalogue import effects_in
 from twin.model.dataset import DataSet
 from twin.model.diagram import reduce
-from twin.monitor.detect import MonitorSettings
 from twin.monitor.healthy import Healthy
+from twin.monitor.monitor import MonitorSettings
 from twin.settings import Document, Settings
 from twin.signals import MBAR
 from twin.validation import findings, path_in_words, without_tags
@@ -123,7 +123,7 @@ class Config:
         new. ``as_of_ns`` (UTC) takes what the database knew then. ``to_store`` allows a database
         that is not there yet.
         """
-        from twin.assets.place import open_chosen
+        from twin.assets.database_url import open_chosen
 
         document.refuse_unknown_tables(TABLES)
         _refuse_calibrated(document)
@@ -171,7 +171,7 @@ class Config:
         Where a database, a unit or a time is named the data set is looked up anew, as in ``of``.
         A database that is to be made knows nothing to look up.
         """
-        from twin.assets.place import is_new
+        from twin.assets.database_url import is_new
 
         with _in_log(header.metadata, log):
             document = instead or document_in(header)

@@ -8,18 +8,18 @@ from typing import Protocol
 import numpy as np
 
 from twin.events import Event
-from twin.model import strides
+from twin.model import dense_solver as strides
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
-from twin.model.strides import Strides
+from twin.model.dense_solver import DenseSolver
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
-from twin.monitor.detect import Monitor, in_order
+from twin.monitor.detector_window import knees_of
 from twin.monitor.gaps import ShortGaps
-from twin.monitor.knees import knees_of
-from twin.monitor.listening import Listening
-from twin.monitor.phases import Found, Knees, PhaseFinder
+from twin.monitor.monitor import Monitor, in_order
+from twin.monitor.phase_detector import Found, Knees, PhaseFinder
 from twin.monitor.signatures import steps
+from twin.monitor.staleness import Listening
 from twin.monitor.surroundings import are_told, following, stretches
 from twin.signals import SAMPLE, TICK, Phase, Samples, Ticks
 
@@ -36,7 +36,7 @@ class Sink(Protocol):
         """Finish; nothing comes after it."""
 
 
-class Adviser(Protocol):
+class EventEnricher(Protocol):
     """Whoever has more to say to what happens, once it has found out."""
 
     def follow(self, samples: Samples, events: Sequence[Event]) -> list[Event]:
@@ -59,7 +59,7 @@ class Twin:
     theta: Theta
     knees: Knees
     terms: Sequence[Term] = ()
-    _strides: Strides = field(default_factory=Strides)
+    _strides: DenseSolver = field(default_factory=DenseSolver)
     _last_ns: int | None = None
     _phase: int = Phase.IDLE  # of the newest row
 
@@ -127,7 +127,7 @@ def run(
     monitor: Monitor,
     sinks: Sequence[Sink],
     listening: Listening | None = None,
-    advisers: Sequence[Adviser] = (),
+    advisers: Sequence[EventEnricher] = (),
 ) -> None:
     """Take every block of ``source`` through twin and monitor to the sinks; close them at the end.
 
@@ -165,7 +165,9 @@ def _marked(
         yield gaps.on(samples), ticks, in_order([*events, *gaps.told()])
 
 
-def _advised(advisers: Sequence[Adviser], samples: Samples, events: list[Event]) -> list[Event]:
+def _advised(
+    advisers: Sequence[EventEnricher], samples: Samples, events: list[Event]
+) -> list[Event]:
     """What happened with what advisers say to it, in the order of time; each hears those before it.
 
     Rows and events are of one PLC time.
@@ -175,7 +177,7 @@ def _advised(advisers: Sequence[Adviser], samples: Samples, events: list[Event])
     return events
 
 
-def _last_words(advisers: Sequence[Adviser], none: Samples) -> list[Event]:
+def _last_words(advisers: Sequence[EventEnricher], none: Samples) -> list[Event]:
     """The same when the rows have ended."""
     said: list[Event] = []
     for adviser in advisers:

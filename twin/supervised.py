@@ -14,8 +14,8 @@ import numpy as np
 from twin.backoff import Backoff
 from twin.errors import SourceError, in_words
 from twin.events import Event, Kind
-from twin.live import Adviser, Sink
-from twin.monitor.listening import Notices
+from twin.live import EventEnricher, Sink
+from twin.monitor.staleness import Notices
 from twin.signals import TICK, Quality, Samples, Ticks
 
 KEPT_ROWS = 60_000  # that wait for an output: a minute of them each millisecond, some 5 MB
@@ -210,8 +210,8 @@ class SupervisedSink:
         self._failure, self._next_s = error, now_s + self._backoff.next_s()
 
 
-class SupervisedAdviser:
-    """An adviser (``twin.live.Adviser``) that raises nothing while rows come.
+class SupervisedEnricher:
+    """An adviser (``twin.live.EventEnricher``) that raises nothing while rows come.
 
     After a failure rows and events wait for it, up to KEPT_ROWS. With a pause that doubles it is
     given all of them again, in order. Once it takes any of them, those that it still fails at are
@@ -222,7 +222,7 @@ class SupervisedAdviser:
     def __init__(
         self,
         name: str,
-        adviser: Adviser,
+        adviser: EventEnricher,
         outages: Outages,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:

@@ -4,9 +4,9 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from drivers.modbus.link import Link, ModbusSettings
-from drivers.modbus.shared import Lines, SharedLink
-from drivers.modbus.telegram import MOST_STORED, STORING
+from drivers.modbus.client import ModbusClient, ModbusSettings
+from drivers.modbus.connection_pool import ConnectionPool, PooledClient
+from drivers.modbus.pdu import MOST_STORED, STORING
 from drivers.outputs.writer import Outputs, Ranged, Writer, counted, refuse_empty, refuse_no_range
 from drivers.tags import CODE, Address, Pressure, Tag, words_of
 from twin.settings import Document, Settings
@@ -69,7 +69,7 @@ class HilSettings(Settings):
 class RegisterOutlet:
     """Registers and coils; what lies side by side goes in one request, the watchdog last."""
 
-    def __init__(self, link: Link, driver: ModbusSettings, tags: HilTags) -> None:
+    def __init__(self, link: ModbusClient, driver: ModbusSettings, tags: HilTags) -> None:
         self._link, self._tags, self._order = link, tags, driver.word_order
         ambient = driver.ambient_mbar * MBAR
         self._pressure = tags.pressure and Ranged(tags.pressure, ambient, driver.where)
@@ -106,9 +106,11 @@ class RegisterOutlet:
         return tag.address, words_of(whole, CODE[tag.type], self._order)
 
 
-def writer(driver: ModbusSettings, document: Document, lines: Lines | None = None) -> Writer:
+def writer(
+    driver: ModbusSettings, document: Document, lines: ConnectionPool | None = None
+) -> Writer:
     """Whoever writes to this PLC, over the connection of others where there are ``lines``."""
     settings = document.section(HilSettings, "hil")
-    link = Link(driver) if lines is None else SharedLink(driver, lines.to(driver))
+    link = ModbusClient(driver) if lines is None else PooledClient(driver, lines.to(driver))
     outlet = RegisterOutlet(link, driver, settings.tags)
     return Writer(outlet, driver.where, settings.min_interval_ms)

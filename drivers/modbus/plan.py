@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from drivers.modbus.telegram import MOST_WORDS, Request
+from drivers.modbus.pdu import MOST_WORDS, Request
 from drivers.tags import Tag, WordOrder, Words
 
 

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
-from drivers.modbus.link import Link, ModbusSettings
+from drivers.modbus.client import ModbusClient, ModbusSettings
 from drivers.modbus.plan import Answers, holds, plan
+from drivers.optional_signals import BITS, VALUES, ambient_of, put_bits, put_values
 from drivers.reconnect import Clock
-from drivers.reports import BITS, VALUES, ambient_of, put_bits, put_values
 from drivers.tags import Flags
 from twin.errors import SourceError
 from twin.signals import MBAR, SAMPLE, Command, Quality, Samples
@@ -40,12 +40,12 @@ class Poller:
         self._beat: np.generic | None = None
         self._beat_ns = 0
 
-    def samples(self, link: Link) -> Iterator[Samples]:
+    def samples(self, link: ModbusClient) -> Iterator[Samples]:
         """Blocks of the slots that were read; ends only by an exception."""
         while True:
             yield self._block(link)
 
-    def _block(self, link: Link) -> Samples:
+    def _block(self, link: ModbusClient) -> Samples:
         """The slots of one interval; where the connection breaks, those before it."""
         if self._failure is not None:
             failure, self._failure = self._failure, None
@@ -79,7 +79,7 @@ class Poller:
         while self._clock.now_ns() < due:
             pass
 
-    def _ask(self, link: Link) -> tuple[bytes, int, int]:
+    def _ask(self, link: ModbusClient) -> tuple[bytes, int, int]:
         """One slot: the data of all answers, when the last was asked for and when it came."""
         row, asked_ns = b"", 0
         for request in self._requests:

@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from drivers.modbus.link import Link, ModbusSettings
+from drivers.modbus.client import ModbusClient, ModbusSettings
 from drivers.modbus.plan import plan
 from drivers.modbus.ring import RECORDS_AT_ONCE, Trace
 from drivers.probe import TIMES, Line, looked_at, watched
@@ -23,7 +23,7 @@ POSSIBLE = 2.0 * MBAR, 17.0 * BAR
 
 def probe(settings: ModbusSettings, clock: Clock = REAL) -> list[Line]:
     """Connect, read everything the settings name, and say what came; never raises SourceError."""
-    link = Link(settings)
+    link = ModbusClient(settings)
     try:
         connected = looked_at("connection", lambda: _connect(link, settings, clock))
         return [connected, *_look(link, settings, clock)] if connected.good else [connected]
@@ -31,7 +31,7 @@ def probe(settings: ModbusSettings, clock: Clock = REAL) -> list[Line]:
         link.close()
 
 
-def _look(link: Link, settings: ModbusSettings, clock: Clock) -> list[Line]:
+def _look(link: ModbusClient, settings: ModbusSettings, clock: Clock) -> list[Line]:
     lines = [looked_at("round trip", lambda: _round_trip(link, settings, clock))]
     if lines[0].lost:
         return lines  # nothing else would be answered, and each question takes its time
@@ -47,13 +47,13 @@ def _look(link: Link, settings: ModbusSettings, clock: Clock) -> list[Line]:
     return lines
 
 
-def _connect(link: Link, settings: ModbusSettings, clock: Clock) -> str:
+def _connect(link: ModbusClient, settings: ModbusSettings, clock: Clock) -> str:
     started = clock.now_ns()
     link.open()
     return f"{settings.where}: connected in {(clock.now_ns() - started) * 1e-6:.1f} ms"
 
 
-def _round_trip(link: Link, settings: ModbusSettings, clock: Clock) -> str:
+def _round_trip(link: ModbusClient, settings: ModbusSettings, clock: Clock) -> str:
     """Median time of one request; SourceError if that is too slow for the mode."""
     tags = [tag for _, tag in settings.tags if tag is not None]
     requests = 1 if settings.mode == "block" else len(plan(tags))
@@ -72,7 +72,7 @@ def _round_trip(link: Link, settings: ModbusSettings, clock: Clock) -> str:
     return text
 
 
-def _show(link: Link, tag: Tag, settings: ModbusSettings) -> str:
+def _show(link: ModbusClient, tag: Tag, settings: ModbusSettings) -> str:
     link.open()
     words = link.read(tag.address, tag.size).reshape(1, tag.size)
     hexadecimal = " ".join(f"0x{word:04X}" for word in words[0])
@@ -120,7 +120,7 @@ def word_order_of(words: Words) -> WordOrder | None:
     return None
 
 
-def _word_order(link: Link, settings: ModbusSettings) -> Line:
+def _word_order(link: ModbusClient, settings: ModbusSettings) -> Line:
     """Test registers are a courtesy of the PLC: having none is no fault."""
     try:
         link.open()
@@ -135,7 +135,7 @@ def _word_order(link: Link, settings: ModbusSettings) -> Line:
     return Line("word order", text, False, f'set word_order = "{order}" in [driver]')
 
 
-def _header(link: Link, trace: Trace) -> str:
+def _header(link: ModbusClient, trace: Trace) -> str:
     link.open()
     header = trace.header(link)
     trace.refuse_other(header)
@@ -145,13 +145,13 @@ def _header(link: Link, trace: Trace) -> str:
     )
 
 
-def _records(link: Link, trace: Trace) -> str:
+def _records(link: ModbusClient, trace: Trace) -> str:
     link.open()
     header = trace.start(link)
     return f"the newest carry the header's sequence ({header.sequence})"
 
 
-def _rate(link: Link, trace: Trace, clock: Clock) -> str:
+def _rate(link: ModbusClient, trace: Trace, clock: Clock) -> str:
     """Scans per second by the clock here; SourceError if they are not those of the period."""
     link.open()
     return watched(lambda: trace.header(link), clock)

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from drivers.modbus.link import Link, ModbusSettings, span
+from drivers.modbus.client import ModbusClient, ModbusSettings, span
 from drivers.modbus.plan import Answers, plan
+from drivers.optional_signals import BITS, VALUES, ambient_of, once, put_bits, put_values
 from drivers.reconnect import Clock
-from drivers.reports import BITS, VALUES, ambient_of, once, put_bits, put_values
 from drivers.tags import WordOrder, Words, numbers
 from drivers.trace import COMMANDS, OVERFLOW_BIT, RESERVE, WRAP, Follower, refusal
 from drivers.trace import Header as AnyHeader
@@ -51,7 +51,7 @@ class Header(AnyHeader):
         return self.record_words == RECORD_WORDS and super().ready
 
 
-class Trace(Follower[Header, Link]):
+class Trace(Follower[Header, ModbusClient]):
     """Where we are in the ring of one PLC; it outlives connections."""
 
     def __init__(self, settings: ModbusSettings, clock: Clock) -> None:
@@ -64,13 +64,13 @@ class Trace(Follower[Header, Link]):
         }
         self._requests = plan(self._values.values())
 
-    def start(self, link: Link) -> Header:
+    def start(self, link: ModbusClient) -> Header:
         """Begin at the newest record; SourceError if there is no ring as configured."""
         header = self._proven(link)
         self._begin(header)
         return header
 
-    def _proven(self, link: Link) -> Header:
+    def _proven(self, link: ModbusClient) -> Header:
         """A header that follows the last one, or announces what the ring holds; else SourceError.
 
         It may be torn: one that surprises is read again. Some PLCs announce a record a little
@@ -111,19 +111,19 @@ class Trace(Follower[Header, Link]):
                 "program running?",
             )
 
-    def header(self, link: Link) -> Header:
+    def header(self, link: ModbusClient) -> Header:
         """Read the header."""
         words = link.read(self._settings.ring.header, HEADER_WORDS)
         return Header.parse(words, self._settings.word_order)
 
-    def _announced(self, link: Link, header: Header) -> bool:
+    def _announced(self, link: ModbusClient, header: Header) -> bool:
         """Whether the two newest records are those that the header announces."""
         for sequence in range(max(0, header.sequence - 1), header.sequence + 1):
             if not self._fetch(link, header, sequence, sequence + 1)[1].all():
                 return False
         return True
 
-    def _read(self, link: Link) -> Samples:
+    def _read(self, link: ModbusClient) -> Samples:
         """Whatever is new, as far as the time for one block goes."""
         started = self._clock.now_ns()
         beside = self._read_values(link)
@@ -139,7 +139,7 @@ class Trace(Follower[Header, Link]):
         sequence = self._pass(first, valid)
         return self._stamp(self._decode(header, records[valid], beside), header, sequence)
 
-    def _read_values(self, link: Link) -> dict[str, float]:
+    def _read_values(self, link: ModbusClient) -> dict[str, float]:
         """What is not in the ring, as it stands in the PLC: read once a block."""
         if not self._values:
             return {}
@@ -149,7 +149,7 @@ class Trace(Follower[Header, Link]):
         order = self._settings.word_order
         return {name: float(answers.floats(tag, order)[0]) for name, tag in self._values.items()}
 
-    def _next_header(self, link: Link) -> Header:
+    def _next_header(self, link: ModbusClient) -> Header:
         """Read the header, as evenly in time as it can be.
 
         Torn between sequence and time it does not surprise: its time is another scan's.
@@ -157,7 +157,7 @@ class Trace(Follower[Header, Link]):
         return self._steadied(self._proven(link), 1)
 
     def _fetch(
-        self, link: Link, header: Header, first: int, end: int
+        self, link: ModbusClient, header: Header, first: int, end: int
     ) -> tuple[Words, npt.NDArray[np.bool_]]:
         """Records (rows, 4) from sequence ``first`` on, at most to ``end``, and which are valid."""
         deadline = self._clock.now_ns() + LONGEST_FETCH_NS
@@ -175,7 +175,7 @@ class Trace(Follower[Header, Link]):
         expected = np.arange(first, sequence).astype(np.uint16)  # the low 16 bits
         return records, records[:, 0] == expected
 
-    def _overwritten(self, link: Link, header: Header) -> int:
+    def _overwritten(self, link: ModbusClient, header: Header) -> int:
         """Sequence up to which the PLC may have overwritten records since ``header``."""
         scans = self.header(link).advance(header)
         if scans is None:  # it restarted: nothing of what was read can be trusted

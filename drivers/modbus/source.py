@@ -2,10 +2,10 @@
 
 from collections.abc import Generator
 
-from drivers.modbus.link import Link, ModbusSettings
+from drivers.modbus.client import ModbusClient, ModbusSettings
+from drivers.modbus.connection_pool import ConnectionPool, PooledClient
 from drivers.modbus.poll import Poller
 from drivers.modbus.ring import Trace
-from drivers.modbus.shared import Lines, SharedLink
 from drivers.reconnect import REAL, Away, Clock, in_thread, reconnecting
 from twin.signals import Samples
 
@@ -15,7 +15,7 @@ __all__ = ["ModbusSettings", "blocks"]
 def blocks(
     settings: ModbusSettings,
     clock: Clock = REAL,
-    lines: Lines | None = None,
+    lines: ConnectionPool | None = None,
     away: Away | None = None,
     *,
     known: bool = False,
@@ -31,8 +31,8 @@ def blocks(
     """
     if settings.mode == "poll":
         return in_thread(
-            reconnecting(Poller(settings, clock), Link(settings), clock, away, known=known)
+            reconnecting(Poller(settings, clock), ModbusClient(settings), clock, away, known=known)
         )
-    link = Link(settings) if lines is None else SharedLink(settings, lines.to(settings))
+    link = ModbusClient(settings) if lines is None else PooledClient(settings, lines.to(settings))
     stream = reconnecting(Trace(settings, clock), link, clock, away, known=known)
     return stream if settings.tls is None else in_thread(stream)  # shaking hands takes time

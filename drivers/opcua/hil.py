@@ -4,7 +4,7 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from drivers.opcua.link import OpcuaLink
+from drivers.opcua.client import OpcuaClient
 from drivers.opcua.settings import Node, NodeName, NodePressure, OpcuaSettings
 from drivers.outputs.writer import Outputs, Ranged, Writer, counted, refuse_empty, refuse_no_range
 from drivers.reconnect import REAL
@@ -59,7 +59,7 @@ class HilSettings(Settings):
 class NodeOutlet:
     """Nodes of one server."""
 
-    def __init__(self, link: OpcuaLink, driver: OpcuaSettings, tags: HilTags) -> None:
+    def __init__(self, link: OpcuaClient, driver: OpcuaSettings, tags: HilTags) -> None:
         self._link, self._tags = link, tags
         ambient = driver.ambient_mbar * MBAR
         self._pressure = tags.pressure and Ranged(tags.pressure, ambient, driver.where)
@@ -92,5 +92,5 @@ def writer(driver: OpcuaSettings, document: Document) -> Writer:
             f"{document.name}: the nodes of [hil.tags] need a namespace",
             'give its URI as namespace in [driver], or write "nsu=URI;s=Name"',
         )
-    outlet = NodeOutlet(OpcuaLink(driver, REAL), driver, settings.tags)
+    outlet = NodeOutlet(OpcuaClient(driver, REAL), driver, settings.tags)
     return Writer(outlet, driver.where, settings.min_interval_ms)

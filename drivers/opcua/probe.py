@@ -3,7 +3,7 @@
 import statistics
 from functools import partial
 
-from drivers.opcua.link import OpcuaLink
+from drivers.opcua.client import OpcuaClient
 from drivers.opcua.settings import Node, OpcuaSettings
 from drivers.opcua.subscribe import Subscription
 from drivers.opcua.trace import NodeTrace
@@ -15,7 +15,7 @@ from twin.errors import SourceError
 
 def probe(settings: OpcuaSettings, clock: Clock = REAL) -> list[Line]:
     """Connect, read everything the settings name, and say what came; never raises SourceError."""
-    link = OpcuaLink(settings, clock)
+    link = OpcuaClient(settings, clock)
     try:
         connected = looked_at("connection", lambda: _connect(link, settings, clock))
         return [connected, *_look(link, settings, clock)] if connected.good else [connected]
@@ -23,7 +23,7 @@ def probe(settings: OpcuaSettings, clock: Clock = REAL) -> list[Line]:
         link.close()
 
 
-def _look(link: OpcuaLink, settings: OpcuaSettings, clock: Clock) -> list[Line]:
+def _look(link: OpcuaClient, settings: OpcuaSettings, clock: Clock) -> list[Line]:
     lines: list[Line] = []
     for name, tag in settings.tags:
         if tag is not None:
@@ -42,21 +42,21 @@ def _look(link: OpcuaLink, settings: OpcuaSettings, clock: Clock) -> list[Line]:
     ]
 
 
-def _connect(link: OpcuaLink, settings: OpcuaSettings, clock: Clock) -> str:
+def _connect(link: OpcuaClient, settings: OpcuaSettings, clock: Clock) -> str:
     started = clock.now_ns()
     link.open()
     took_ms = (clock.now_ns() - started) * 1e-6
     return f"{settings.where}: connected in {took_ms:.0f} ms, security {settings.security.policy}"
 
 
-def _show(link: OpcuaLink, node: Node) -> str:
+def _show(link: OpcuaClient, node: Node) -> str:
     link.open()
     value = link.read((node,))[0]
     held = f"{value.Value.VariantType.name} {value.Value.Value}" if readable(value) else "nothing"
     return f"{node}: {held}, {status_name(code_of(value))}, of {value.SourceTimestamp} UTC"
 
 
-def _granted(link: OpcuaLink, subscription: Subscription, settings: OpcuaSettings) -> str:
+def _granted(link: OpcuaClient, subscription: Subscription, settings: OpcuaSettings) -> str:
     """What the server grants; SourceError if it samples too seldom to see anything."""
     link.open()
     granted = link.subscribe(subscription.nodes, subscription.queue)
@@ -69,7 +69,7 @@ def _granted(link: OpcuaLink, subscription: Subscription, settings: OpcuaSetting
     return text
 
 
-def _round_trip(link: OpcuaLink, trace: NodeTrace, settings: OpcuaSettings, clock: Clock) -> str:
+def _round_trip(link: OpcuaClient, trace: NodeTrace, settings: OpcuaSettings, clock: Clock) -> str:
     """Median time to read the whole trace; SourceError if that is too slow."""
     link.open()
     took_ms = []
@@ -84,7 +84,7 @@ def _round_trip(link: OpcuaLink, trace: NodeTrace, settings: OpcuaSettings, cloc
     return text
 
 
-def _ring(link: OpcuaLink, trace: NodeTrace) -> str:
+def _ring(link: OpcuaClient, trace: NodeTrace) -> str:
     link.open()
     header = trace.start(link)
     return (
@@ -93,7 +93,7 @@ def _ring(link: OpcuaLink, trace: NodeTrace) -> str:
     )
 
 
-def _rate(link: OpcuaLink, trace: NodeTrace, clock: Clock) -> str:
+def _rate(link: OpcuaClient, trace: NodeTrace, clock: Clock) -> str:
     """Scans per second by the clock here; SourceError if they are not those of the period."""
     link.open()
     return watched(lambda: trace.ask(link).header, clock)

@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
-from drivers.reports import BITS, refuse_unclear
+from drivers.optional_signals import BITS, refuse_unclear
 from drivers.tags import Flowmeter, Quantity, Thermometer
 from drivers.trace import COMMAND_BITS, no_effect, refuse_unused
 from twin.secret import Secret

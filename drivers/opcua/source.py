@@ -2,7 +2,7 @@
 
 from collections.abc import Generator
 
-from drivers.opcua.link import OpcuaLink
+from drivers.opcua.client import OpcuaClient
 from drivers.opcua.settings import OpcuaSettings
 from drivers.opcua.subscribe import Subscription
 from drivers.opcua.trace import NodeTrace
@@ -27,7 +27,7 @@ def blocks(
     come out. ``away`` is told why there are no rows. It runs in a thread, since connecting may take
     seconds. Closing releases all.
     """
-    link = OpcuaLink(settings, clock)
+    link = OpcuaClient(settings, clock)
     if settings.mode == "block":
         return in_thread(reconnecting(NodeTrace(settings, clock), link, clock, away, known=known))
     return in_thread(reconnecting(Subscription(settings, clock), link, clock, away, known=known))

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from asyncua import ua
 
-from drivers.opcua.link import OpcuaLink, Subscribed
+from drivers.opcua.client import OpcuaClient, Subscribed
 from drivers.opcua.settings import Node, NodeTag, OpcuaSettings
 from drivers.opcua.values import (
     code_of,
@@ -24,8 +24,8 @@ from drivers.opcua.values import (
     time_ns,
     truth,
 )
+from drivers.optional_signals import BITS, VALUES, ambient_of, put_bits, put_values
 from drivers.reconnect import EMPTY, Clock, LostError
-from drivers.reports import BITS, VALUES, ambient_of, put_bits, put_values
 from twin.errors import SourceError
 from twin.signals import MBAR, SAMPLE, UNUSABLE, Command, Quality, Samples
 
@@ -87,7 +87,7 @@ class Subscription:
         self._last_ns = 0  # and its source time
         self._break = 0  # Quality bits for the next row
 
-    def samples(self, link: OpcuaLink) -> Iterator[Samples]:
+    def samples(self, link: OpcuaClient) -> Iterator[Samples]:
         """Blocks as they are published; ends only by an exception."""
         for place, value in enumerate(link.read(self.nodes)):
             self._number(place, value)  # says so if it has another type

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from drivers.opcua.link import OpcuaLink
+from drivers.opcua.client import OpcuaClient
 from drivers.opcua.settings import Node, OpcuaSettings
 from drivers.opcua.values import (
     SEVERITY,
@@ -26,8 +26,8 @@ from drivers.opcua.values import (
     whole,
     wholes,
 )
+from drivers.optional_signals import BITS, VALUES, ambient_of, once, put_bits, put_values
 from drivers.reconnect import Clock, LostError
-from drivers.reports import BITS, VALUES, ambient_of, once, put_bits, put_values
 from drivers.trace import (
     COMMANDS,
     OVERFLOW_BIT,
@@ -59,7 +59,7 @@ class Ring:
     overwritten: int  # records up to this one, counted from the header's, may be
 
 
-class NodeTrace(Follower[Header, OpcuaLink]):
+class NodeTrace(Follower[Header, OpcuaClient]):
     """Where we are in the ring of one PLC; it outlives connections."""
 
     def __init__(self, settings: OpcuaSettings, clock: Clock) -> None:
@@ -80,13 +80,13 @@ class NodeTrace(Follower[Header, OpcuaLink]):
         """What is read, one after the other: the header, and all else."""
         return self._header_nodes, (*self._arrays, *self._single.values())
 
-    def start(self, link: OpcuaLink) -> Header:
+    def start(self, link: OpcuaClient) -> Header:
         """Begin at the newest record; SourceError if there is no ring as configured."""
         header = self._proven(link).header
         self._begin(header)
         return header
 
-    def _proven(self, link: OpcuaLink) -> Ring:
+    def _proven(self, link: OpcuaClient) -> Ring:
         """A ring that follows the last one, or holds what it announces; else SourceError.
 
         It may be torn: one that surprises is read again.
@@ -116,7 +116,7 @@ class NodeTrace(Follower[Header, OpcuaLink]):
                 "check [driver.trace] against the PLC's trace block; is its program running?",
             )
 
-    def ask(self, link: OpcuaLink) -> Ring:
+    def ask(self, link: OpcuaClient) -> Ring:
         """Read everything; LostError where the server has no values, SourceError for other ones."""
         header, rest = self.requests
         asked_ns = self._clock.now_ns()
@@ -181,7 +181,7 @@ class NodeTrace(Follower[Header, OpcuaLink]):
     def _quality(self, given: dict[Node, Any]) -> int:
         return quality(code_of(given[self._settings.trace.pressures]))
 
-    def _read(self, link: OpcuaLink) -> Samples:
+    def _read(self, link: OpcuaClient) -> Samples:
         """Whatever is new and was announced."""
         ring = self._proven(link)
         self._place(ring.header)

@@ -51,7 +51,7 @@ class Session(security.Session):
             CALLER.reset(token)
 
 
-class KnowingServer(GuardedServer):
+class CallerAwareServer(GuardedServer):
     """What is inside of a server that refreshes conditions, and whose methods know who calls."""
 
     def __init__(self) -> None:

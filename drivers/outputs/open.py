@@ -5,8 +5,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers.modbus.link import ModbusSettings
-from drivers.modbus.shared import Lines
+from drivers.modbus.client import ModbusSettings
+from drivers.modbus.connection_pool import ConnectionPool
 from drivers.outputs.settings import ResultsSettings
 from drivers.outputs.writer import Writer
 from drivers.sources import settings_of
@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from drivers.outputs.state import Results
 
 
-def open_writer(document: Document, address: str = "", lines: Lines | None = None) -> Writer:
+def open_writer(
+    document: Document, address: str = "", lines: ConnectionPool | None = None
+) -> Writer:
     """Whoever writes to the PLC that ``[driver]`` names what ``[hil]`` lists.
 
     Raises ConfigError where nothing is listed, SourceError where the PLC does not answer.

@@ -28,7 +28,7 @@ from asyncua.server import binary_server_asyncio
 
 from drivers.opcua.bounds import refuse_endless_arrays
 from drivers.opcua.security import Say, authenticator_of, secure
-from drivers.outputs.conditions import Conditions, KnowingServer, Source
+from drivers.outputs.conditions import CallerAwareServer, Conditions, Source
 from drivers.outputs.nodes import Names, Unit, add_quantity, add_state
 from drivers.outputs.settings import ResultsSettings
 from drivers.outputs.state import MEANS, SIDES, Reading, Standing, Status
@@ -304,7 +304,7 @@ def _bounded(server: Server) -> None:
 async def _prepared(
     settings: ResultsSettings, authenticator: Authenticator | None, say: Say
 ) -> Server:
-    server = Server(KnowingServer())
+    server = Server(CallerAwareServer())
     await server.init()
     _bounded(server)
     server.set_endpoint(f"opc.tcp://{settings.host}:{settings.port}/")

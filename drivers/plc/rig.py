@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from drivers.plc.faults import Rows
 from drivers.plc.plant import CV, R_GAS, Record
-from twin.processor import njit
+from twin.cpu_target import njit
 from twin.signals import MBAR
 
 SCAN = 1e-3  # s, period of the PLC's task

@@ -22,9 +22,9 @@ from benchmarks.isolation import heard
 from benchmarks.processes import ROOT
 from drivers.plc.settings import PlcSettings
 from twin.config import Config
-from twin.monitor.bank import SUSPECTS
-from twin.monitor.change import Changes, limit
+from twin.monitor.change_detection import ChangeDetector, limit
 from twin.monitor.isolation import looked_for
+from twin.monitor.model_bank import SUSPECTS
 from twin.settings import Document
 
 Floats = npt.NDArray[np.float64]
@@ -82,7 +82,7 @@ def _device(seed: int) -> tuple[Floats, Floats]:
     return np.array(scores), alike
 
 
-def _changes(alike: Floats) -> Changes:
+def _changes(alike: Floats) -> ChangeDetector:
     changes = looked_for()
     changes.weigh(alike)
     return changes
@@ -103,7 +103,7 @@ def _false_alarms(devices: Sequence[Floats], alike: Floats, asked: float) -> Mea
     return Measured([alarms * asked / cycles], note=note)
 
 
-def _running(pool: Floats, alike: Floats) -> list[Changes]:
+def _running(pool: Floats, alike: Floats) -> list[ChangeDetector]:
     """Sums in healthy cycles, as they are when a change begins; an alarm begins them anew."""
     changes, found, rng = _changes(alike), [], np.random.default_rng(0)
     for cycle in range(1, RUN_IN + APART * DRAWS):
@@ -116,7 +116,7 @@ def _running(pool: Floats, alike: Floats) -> list[Changes]:
 
 
 def _late(
-    pool: Floats, alike: Floats, shift: float, begins: Sequence[Changes], healthy: int
+    pool: Floats, alike: Floats, shift: float, begins: Sequence[ChangeDetector], healthy: int
 ) -> Measured:
     """Mean of the effects' median delays, and the mean delay of a CUSUM for one of them alone."""
     names = [one.effect for one in SUSPECTS]
@@ -130,7 +130,7 @@ def _late(
     return Measured([float(np.mean(medians))], [_optimum(shift, healthy)], note=note)
 
 
-def _delay(pool: Floats, changes: Changes, added: Floats, rng: np.random.Generator) -> int:
+def _delay(pool: Floats, changes: ChangeDetector, added: Floats, rng: np.random.Generator) -> int:
     for cycle in range(1, NEVER):
         changes.take(pool[rng.integers(len(pool))] + added)
         if changes.log_sum >= limit(MONTH):

@@ -23,12 +23,12 @@ from twin.events import Event, Kind
 from twin.live import Twin
 from twin.model.dataset import coefficients
 from twin.model.effects import EFFECTS
-from twin.monitor.bank import SUSPECTS, UNSURE_OF
 from twin.monitor.bins import Floats
-from twin.monitor.cycles import CycleCutter, Look, figures
-from twin.monitor.detect import RIVAL, Monitor
+from twin.monitor.cycles import CycleCutter, CycleView, figures
 from twin.monitor.isolation import Isolation
-from twin.monitor.statistics import Said
+from twin.monitor.model_bank import SUSPECTS, UNSURE_OF
+from twin.monitor.monitor import RIVAL, Monitor
+from twin.monitor.statistics import CycleResidual
 from twin.settings import Document
 
 SYSTEMS = ("test_rig", "gripper")
@@ -95,7 +95,7 @@ def outcome(seed: int) -> Outcome:
     return Outcome(system, effect.name, size, parameter.unit, _told(events))
 
 
-def least(healthy: Sequence[Said], number: int) -> float:
+def least(healthy: Sequence[CycleResidual], number: int) -> float:
     """Steps of a suspect that some cycles can show and tell from every other effect."""
     effect = SUSPECTS[number].effect
     others = [i for i, one in enumerate(SUSPECTS) if one.effect != effect]
@@ -108,7 +108,7 @@ def least(healthy: Sequence[Said], number: int) -> float:
     return max(FOUND, float(apart)) * scatter / np.sqrt(power)
 
 
-def _unknown(said: Said, number: int) -> Floats:
+def _unknown(said: CycleResidual, number: int) -> Floats:
     """Covariance (mbar²) of what a suspect is to be told from; a low supply may be another."""
     ways = said.unsure if number == UNSURE_OF else said.unsure[:, :0]
     covariance: Floats = said.alone + ways @ ways.T
@@ -117,14 +117,14 @@ def _unknown(said: Said, number: int) -> Floats:
 
 def heard(
     config: Config, rig: PlcSettings, seconds: float, seed: int
-) -> Iterator[tuple[Said, Floats]]:
+) -> Iterator[tuple[CycleResidual, Floats]]:
     """What each cycle of a healthy rig says, and its scores as standard normal variables."""
     twin, cutter = Twin.of(config.data), CycleCutter()
     isolation = Isolation.of(config.data, config.monitor.healthy, days=1e9)
     for block in blocks(rig, seconds, seed=seed, block=20_000):
         rows, ticks = twin.advance(block)
         looks = [
-            Look(one, None, figures(one, twin.theta), one.complete and one.settled)
+            CycleView(one, None, figures(one, twin.theta), one.complete and one.settled)
             for one in cutter.push(rows, ticks)
         ]
         for said in isolation.hear(looks):

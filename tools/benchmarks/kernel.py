@@ -15,7 +15,8 @@ from benchmarks.figures import Line, Measured, Run, medians
 from benchmarks.machine import TWIN_CORE, on_core
 from benchmarks.native import PLAIN, library
 from benchmarks.recording import Recording, hour
-from twin.model import kernel, strides
+from twin.model import dense_solver as strides
+from twin.model import kernel
 from twin.model.effects import EFFECTS, Effect, apply
 from twin.model.theta import Theta
 from twin.monitor.signatures import steps
@@ -104,7 +105,7 @@ def _strided(theta: Theta, driven: Driven, native: Advance | None) -> Measured:
 
 
 def _in_strides(_: Floats, *given: Any) -> None:
-    strides.advance(strides.Strides(), *given)
+    strides.advance(strides.DenseSolver(), *given)
 
 
 def _many(

@@ -1,4 +1,4 @@
-"""Alarms beside the loop (``twin.live.Adviser``): events in, changes of alarms out as events.
+"""Alarms beside the loop (``twin.live.EventEnricher``): events in, changes of alarms out as events.
 
 Alarms live in the time in which rows were received, which goes on through a restart of the PLC; a
 replay has it in its log.
@@ -14,8 +14,8 @@ from twin.alarms.causes import CAUSES, UNLISTED, catalogue_words, known, value_o
 from twin.alarms.requests import Request, grant
 from twin.alarms.rules import Rule
 from twin.alarms.state import Alarm, Change, Deed, Kept
+from twin.alarms.text import SUPPRESSIONS, event_of, plain, worth_saying
 from twin.alarms.watch import STREAM, deviating, evidence, values
-from twin.alarms.words import SUPPRESSIONS, event_of, plain, worth_saying
 from twin.errors import TwinError
 from twin.events import Event, Kind
 from twin.model.effects import UNKNOWN

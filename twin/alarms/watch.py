@@ -6,8 +6,8 @@ from typing import Any
 from twin.alarms.causes import CAUSES, DEVIATION, catalogue_words, known, value_of
 from twin.events import Event, Kind
 from twin.figures.table import FIGURES
+from twin.figures.text import NO_DASH
 from twin.figures.warnings import CAUTIONS
-from twin.figures.words import NO_DASH
 from twin.model.effects import UNKNOWN
 
 Evidence = Mapping[str, Any]  # what JSON can hold; "words" for people

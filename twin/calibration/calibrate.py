@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import block_diag
 
-from twin.calibration.alike import refuse_changing
 from twin.calibration.cycles import Cycles
 from twin.calibration.fit import Fitted, fit
 from twin.calibration.parameters import FREE, Space
+from twin.calibration.stationarity import refuse_changing
 from twin.config import Config
 from twin.diagnosis.evidence import collect
 from twin.diagnosis.healthy import learned
@@ -21,9 +21,9 @@ from twin.figures.settings import LIMITED
 from twin.live import Twin
 from twin.model.dataset import DataSet, coefficients
 from twin.monitor.cycles import Cycle, figures, whole
+from twin.monitor.detector_window import as_wide_as_needed
 from twin.monitor.healthy import Healthy, Scatter, sure
-from twin.monitor.knees import as_wide_as_needed
-from twin.monitor.reports import Contradiction, standing
+from twin.monitor.signal_checks import Contradiction, standing
 from twin.monitor.surroundings import taken_in
 from twin.signals import BREAK, MBAR, SAMPLE, UNUSABLE, Command, Phase, Samples, bridged
 

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from twin.calibration.alike import refuse_parted
 from twin.calibration.calibrate import (
     MOST_FITTED,
     Calibration,
@@ -26,6 +25,7 @@ from twin.calibration.cycles import Cycles
 from twin.calibration.fit import Fitted, fit_from_afar
 from twin.calibration.parameters import AMBIENT, AMBIENT_TOLD, FREE_IN_MARKET, Free
 from twin.calibration.readings import Readings, read
+from twin.calibration.stationarity import refuse_parted
 from twin.calibration.verdict import Verdict, judge
 from twin.calibration.wiring import refuse_miswired
 from twin.config import Config
@@ -33,7 +33,7 @@ from twin.errors import ConfigError
 from twin.model.dataset import Ambient, DataSet, sensor_place
 from twin.model.system import Cups, Part, Sensor, Tube, volume
 from twin.monitor.healthy import UNSEEN_LEVEL_MBAR
-from twin.monitor.reports import APART, Contradiction
+from twin.monitor.signal_checks import APART, Contradiction
 from twin.monitor.surroundings import taken_in
 from twin.signals import (
     MBAR,

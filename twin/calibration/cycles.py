@@ -13,9 +13,9 @@ from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, binned, drawn
-from twin.monitor.knees import as_wide_as_needed, knees_of
+from twin.monitor.detector_window import as_wide_as_needed, knees_of
 from twin.monitor.nozzle import Switching, noise_of, switchings
-from twin.monitor.phases import PhaseFinder, commanded
+from twin.monitor.phase_detector import PhaseFinder, commanded
 from twin.monitor.signatures import steps
 from twin.signals import MBAR, MS, UNUSABLE, Phase, Samples
 

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from twin.alarms.board import Board, Episode
+    from twin.alarms.database import Store
     from twin.alarms.loop import Alarms
     from twin.alarms.state import Alarm, Deed
-    from twin.alarms.store import Store
     from twin.assets.unit import Unit
     from twin.config import Config
     from twin.settings import Document
@@ -267,8 +267,8 @@ def outbox(
     ] = False,
 ) -> None:
     """What waits to be told to the outside, and what was refused there."""
-    from twin.alarms.place import place_of
-    from twin.outlets.outbox import open_outbox
+    from twin.alarms.database_url import place_of
+    from twin.notifications.outbox import open_outbox
 
     with _open(alarms, config) as store:
         whose = _chosen(store, config, unit)
@@ -314,9 +314,9 @@ def alarms_of(
     if not wanted.keep:
         return lambda: Alarms(by_cause, time.time_ns, steady=time.monotonic_ns)
 
-    from twin.alarms.keeper import Keeper  # its SQLAlchemy is only loaded for who keeps them
-    from twin.alarms.place import open_chosen
-    from twin.alarms.store import ALARM_DATABASE
+    from twin.alarms.database import ALARM_DATABASE
+    from twin.alarms.database_url import open_chosen
+    from twin.alarms.writer import Keeper  # its SQLAlchemy is only loaded for who keeps them
     from twin.assets.engine import parse_url
     from twin.assets.unit import Unit
 
@@ -328,7 +328,7 @@ def alarms_of(
 
 def asker_of(settings: "Config") -> "Callable[[str, str], None] | None":
     """What asks the run to acknowledge an alarm, as the command does; None where none are kept."""
-    from twin.alarms.place import open_chosen
+    from twin.alarms.database_url import open_chosen
     from twin.alarms.settings import AlarmSettings
     from twin.alarms.state import Deed
     from twin.assets.unit import Unit
@@ -359,7 +359,7 @@ def _document(config: Path | None) -> "Document | None":
 
 
 def _open(url: str, config: Path | None) -> "Store":
-    from twin.alarms.place import open_chosen
+    from twin.alarms.database_url import open_chosen
 
     store = open_chosen(url, _document(config), write=False)
     print(f"alarm database: {store.name}", file=sys.stderr)
@@ -437,7 +437,7 @@ def _answered(store: "Store", number: int, name: str, deed: "Deed") -> str:
 
 
 def _plain_alarm(alarm: "Alarm", episode: "Episode | None", unit: "Unit") -> dict[str, Any]:
-    from twin.alarms.words import action_of
+    from twin.alarms.text import action_of
 
     rule = alarm.rule
     return {

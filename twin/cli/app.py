@@ -16,7 +16,7 @@ from typer.main import get_command
 from twin.audit import Audit
 
 if TYPE_CHECKING:
-    from twin.fleet.go import Wanted
+    from twin.fleet.runner import Wanted
     from twin.log.reader import Log
     from twin.settings import Document
 
@@ -119,8 +119,8 @@ def say_if_cut(recorded: "Log | Wanted", log: Path, what: str) -> None:
 
 def say_if_new(url: str, document: "Document | None") -> None:
     """Say of the chosen database that what follows makes it, if it is not there."""
+    from twin.assets.database_url import chosen, is_new
     from twin.assets.engine import shown
-    from twin.assets.place import chosen, is_new
 
     if is_new(url, document):
         print(f"twin: making a new asset database, {shown(chosen(url, document))}", file=sys.stderr)

@@ -183,14 +183,14 @@ def export(
 
 def _to_store(url: str, config: Path | None, *, shipped: bool = True) -> "Assets":
     """The database in which something is to be stored, to look into first; it may be new."""
-    from twin.assets.place import open_chosen
+    from twin.assets.database_url import open_chosen
 
     document = read_config(config) if config else None
     return open_chosen(url, document, write=False, shipped=shipped, to_store=True)
 
 
 def _open(url: str, config: Path | None, *, write: bool, shipped: bool = True) -> "Assets":
-    from twin.assets.place import open_chosen
+    from twin.assets.database_url import open_chosen
 
     document = read_config(config) if config else None
     if write:

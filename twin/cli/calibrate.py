@@ -28,7 +28,7 @@ def calibrate(
     """Fit the instance-specific data set of one unit to healthy cycles, and store it."""
     from twin.calibration.calibrate import calibrate as fit_unit
     from twin.calibration.report import as_json, in_words
-    from twin.calibration.store import store
+    from twin.calibration.save import store
     from twin.config import Config
     from twin.log.reader import open_log
     from twin.settings import Document
@@ -74,7 +74,7 @@ def commission(
     from twin.calibration.commission import commission as fit_unit
     from twin.calibration.page import write_page
     from twin.calibration.report import commissioned_as_json, commissioned_in_words
-    from twin.calibration.store import store_first
+    from twin.calibration.save import store_first
     from twin.config import Config, document_in
     from twin.log.reader import open_log
     from twin.settings import Document

@@ -29,7 +29,7 @@ def compare(
 ) -> None:
     """Say what differs between two logs: key figures and courses, from the suction edge on."""
     from twin.compare.compare import compare as beside
-    from twin.compare.words import in_words, plain, remarks
+    from twin.compare.text import in_words, plain, remarks
 
     _refuse_before_work(json_file, picture, rrd)
     found = beside(_read(a), _read(b))

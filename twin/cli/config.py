@@ -50,18 +50,18 @@ def schema() -> None:
 def sections() -> "dict[str, dict[str, type[Settings]]]":
     """The tables of a configuration by name, each with its settings by kind of driver or ""."""
     from drivers.modbus import hil as hil_modbus
-    from drivers.modbus.link import ModbusSettings
+    from drivers.modbus.client import ModbusSettings
     from drivers.opcua import hil as hil_opcua
     from drivers.opcua.settings import OpcuaSettings
     from drivers.outputs.settings import ResultsSettings
     from drivers.plc.settings import PlcSettings
     from twin.alarms.settings import AlarmSettings
-    from twin.assets.place import AssetsSettings
+    from twin.assets.database_url import AssetsSettings
     from twin.config import Asset, LogSettings
     from twin.figures.settings import FigureSettings
     from twin.model.dataset import DataSet
-    from twin.monitor.detect import MonitorSettings
-    from twin.outlets.settings import MqttSettings, OutletsSettings, WebhookSettings
+    from twin.monitor.monitor import MonitorSettings
+    from twin.notifications.settings import MqttSettings, OutletsSettings, WebhookSettings
     from twin.page.settings import PageSettings
     from twin.tables.settings import ImportSettings
 
@@ -113,7 +113,7 @@ def _checks(document: "Document") -> Iterator[Callable[[], Any]]:
     from drivers.sources import settings_of
     from twin.alarms.settings import chosen_rules
     from twin.config import TABLES, Config
-    from twin.outlets.settings import chosen, chosen_upload
+    from twin.notifications.settings import chosen, chosen_upload
 
     for name in document.tables:
         yield partial(document.refuse_unknown_tables, TABLES | set(document.tables) - {name})

@@ -44,7 +44,7 @@ def diagnose(
     from twin.diagnosis.answer import diagnose as find_cause
     from twin.diagnosis.extend import nothing
     from twin.diagnosis.report import in_words, write_report
-    from twin.diagnosis.words import on_another_log
+    from twin.diagnosis.text import on_another_log
     from twin.log.reader import open_log
 
     require_writable(json_file, report, propose)

@@ -65,7 +65,7 @@ def add(
     name it.
     """
     from twin.assets.catalogue import take_in
-    from twin.assets.place import open_chosen
+    from twin.assets.database_url import open_chosen
     from twin.diagnosis.propose import Proposal
 
     if sum(map(bool, (unit, kind, site))) > 1:

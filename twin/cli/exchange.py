@@ -90,7 +90,7 @@ def _document(config: Path | None, name: str, assets: str) -> "tuple[Document, s
 
     Without a configuration it is one that names a unit or type that the database knows.
     """
-    from twin.assets.place import open_chosen
+    from twin.assets.database_url import open_chosen
     from twin.settings import Document
 
     if config is not None:

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from twin.assets.unit import Unit
     from twin.config import Config
     from twin.figures.cycle import KeyFigures
-    from twin.figures.keeper import Keeper
+    from twin.figures.database import History, Store
     from twin.figures.settings import FigureSettings, Limits
-    from twin.figures.store import History, Store
     from twin.figures.table import Figure
+    from twin.figures.writer import Keeper
     from twin.log.reader import Log
     from twin.settings import Document
 
@@ -58,10 +58,10 @@ def show(
     """Key figures of every cycle of a log: measured, expected, and read off the curve."""
     from twin.assets.unit import Unit
     from twin.figures.curve import stretches, volume_of
+    from twin.figures.database import open_store
     from twin.figures.export import to_table
     from twin.figures.read import of_log
-    from twin.figures.store import open_store
-    from twin.figures.words import curve_plain, curve_table, cycles_table
+    from twin.figures.text import curve_plain, curve_table, cycles_table
     from twin.log.reader import open_log
     from twin.tables.sheet import export as export_table
 
@@ -109,8 +109,8 @@ def trend(
     ] = None,
 ) -> None:
     """How figures run, whether they stepped or drift, and when they come to their limits."""
-    from twin.figures.store import SIDES
-    from twin.figures.words import in_words, trend_of_figure, trend_plain
+    from twin.figures.database import SIDES
+    from twin.figures.text import in_words, trend_of_figure, trend_plain
 
     wanted = _wanted(names, picture)
     limits = _limits(config)
@@ -210,10 +210,10 @@ def keeper_of(settings: "Config", say: "Callable[[str], None]") -> "Callable[[],
     """
     from twin.assets.engine import parse_url
     from twin.assets.unit import Unit
-    from twin.figures.keeper import Keeper
-    from twin.figures.place import open_chosen
+    from twin.figures.database import FIGURE_DATABASE
+    from twin.figures.database_url import open_chosen
     from twin.figures.settings import FigureSettings
-    from twin.figures.store import FIGURE_DATABASE
+    from twin.figures.writer import Keeper
 
     wanted = settings.document.section(FigureSettings, "figures")
     if not wanted.keep:
@@ -234,7 +234,7 @@ def _document(config: Path | None) -> "Document | None":
 
 
 def _open(url: str, config: Path | None, *, write: bool) -> "Store":
-    from twin.figures.place import open_chosen
+    from twin.figures.database_url import open_chosen
 
     store = open_chosen(url, _document(config), write=write)
     print(f"figure database: {store.name}", file=sys.stderr)
@@ -253,7 +253,7 @@ def _limits(config: Path | None) -> "Limits":
     from twin.config import Config
     from twin.figures.settings import FigureSettings, limits, limits_of
     from twin.model.dataset import DataSet
-    from twin.monitor.detect import MonitorSettings
+    from twin.monitor.monitor import MonitorSettings
 
     document = _document(config)
     if document:

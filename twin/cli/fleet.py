@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from twin.config import Config
     from twin.fleet.engines import Submit
-    from twin.fleet.go import Told
+    from twin.fleet.runner import Told
     from twin.log.reader import Log
     from twin.settings import Document
 
@@ -107,8 +107,8 @@ def report(
     from twin.assets.database import open_assets
     from twin.fleet.report import Refused
     from twin.fleet.report import report as put_together
-    from twin.fleet.store import open_store
-    from twin.fleet.words import in_words, write_page
+    from twin.fleet.results_database import open_store
+    from twin.fleet.text import in_words, write_page
 
     require_writable(json_file, page)
     files, workers_of = _files(logs or []), _Engine(engine, scheduler, workers)
@@ -175,8 +175,8 @@ class _Fleet:
     @classmethod
     def of(cls, config: Path | None, assets: str, *, to_store: bool = True) -> "_Fleet":
         """The database is made where it is missing, if answers are ``to_store`` in it."""
+        from twin.assets.database_url import chosen, is_new, open_chosen
         from twin.assets.engine import shown
-        from twin.assets.place import chosen, is_new, open_chosen
 
         document = None if config is None else read_config(config)
         if not to_store and is_new(assets, document):
@@ -205,8 +205,8 @@ class _Fleet:
 
 def _done(work: str, files: Sequence[Path], fleet: _Fleet, engine: _Engine) -> "list[Told]":
     """Do what is missing; say what became of each log, and of all; gives them as they are named."""
-    from twin.fleet.go import Told, ask, go
-    from twin.fleet.store import open_store
+    from twin.fleet.results_database import open_store
+    from twin.fleet.runner import Told, ask, go
 
     asking = ask(work, files, lambda log: fleet.config_of(log, work))
     asked = list(_progress(asking, len(files), "reading logs"))
@@ -264,7 +264,7 @@ def _progress(over: "Iterable[One]", total: int, what: str) -> "Iterator[One]":
 
 def _plain(told: "Iterable[Told]", fleet: _Fleet) -> list[dict[str, object]]:
     """As JSON: what became of every log, with its answer."""
-    from twin.fleet.store import open_store
+    from twin.fleet.results_database import open_store
 
     with open_store(fleet.assets) as store:
         return [

@@ -20,7 +20,7 @@ def paper(
     """Recompute the founding paper's tables 2 and 4, and say what they can tell."""
     from twin.paper.separation import separate
     from twin.paper.tables import late_by, recomputed
-    from twin.paper.words import in_words
+    from twin.paper.text import in_words
 
     require_writable(json_file, picture)
     rows = recomputed()

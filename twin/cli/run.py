@@ -16,8 +16,8 @@ from twin.cli.alarms import alarms_of, asker_of
 from twin.cli.app import not_negative
 from twin.cli.console import Console, printers, status, unsaid
 from twin.cli.figures import keeper_of
+from twin.cli.notifications import outlets_of
 from twin.cli.options import Address, AssetsUrl, ConfigFiles, FailOnAlarm, RrdFile, UnitId, ViewFlag
-from twin.cli.outlets import outlets_of
 from twin.cli.serve import live_rows_of, reports_of
 from twin.cli.setup import configured, pair_of
 from twin.cli.sinks import open_sinks, views_of
@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 
     from drivers.outputs.state import Results
     from drivers.outputs.writer import Writer
-    from twin.cli.outlets import Begin, Standing
+    from twin.cli.notifications import Begin, Standing
     from twin.config import Config
-    from twin.live import Adviser, Sink
-    from twin.monitor.listening import Notices
+    from twin.live import EventEnricher, Sink
+    from twin.monitor.staleness import Notices
     from twin.signals import Samples
 
 WAITS = "it is tried until it answers"  # a PLC that is off
@@ -73,13 +73,13 @@ def run(
     answer yet is tried until it does. Where FILE is a folder, logs in it are named by asset and
     time. The oldest logs make room for new ones, as [log] says.
     """
-    from drivers.modbus.shared import Lines
+    from drivers.modbus.connection_pool import ConnectionPool
     from drivers.outputs.open import open_results, open_writer
     from drivers.sources import open_source
     from twin.figures.table import FIGURES
     from twin.live import run as run_loop
+    from twin.run_many import run_together
     from twin.settings import Document
-    from twin.together import run_together
 
     alone = len(configs) == 1
     if not alone:
@@ -88,7 +88,7 @@ def run(
     ejectors = _named([configured(Document.read(one), assets, unit) for one in configs])
     pairs = {name: pair_of(one) for name, one in ejectors.items()}  # compiled before time counts
     width = 0 if alone else max(map(len, ejectors))
-    lines = Lines()
+    lines = ConnectionPool()
 
     def beside(name: str, settings: "Config") -> None:
         label = "" if alone else name
@@ -126,7 +126,7 @@ def run(
             )
             adviser = _diagnosing(settings, file, stopped, alone=alone)
             # What is not measured has no faults. Alarms come last: they hear the diagnosis.
-            advised: dict[str, Adviser] = (
+            advised: dict[str, EventEnricher] = (
                 {} if hil else {"diagnosis": adviser, "alarms": (board := alarms())}
             )
             told = {} if hil else _told(board.standing(), shown, outlets)
@@ -171,7 +171,7 @@ class _Plc:
         *,
         once: bool,
     ) -> None:
-        from twin.monitor.listening import Listening
+        from twin.monitor.staleness import Listening
 
         self.listening = Listening()
         self._opened, self._complain, self._once = opened, complain, once
@@ -264,10 +264,10 @@ def _locked(
 
 def _written_by(settings: "Config", log: Path | None) -> set[Path]:
     """The folders in which a second run of the unit would write the same once more."""
-    from twin.alarms.place import place_of as alarms_in
+    from twin.alarms.database_url import place_of as alarms_in
     from twin.alarms.settings import AlarmSettings
     from twin.assets.engine import sqlite_file
-    from twin.figures.place import place_of as figures_in
+    from twin.figures.database_url import place_of as figures_in
     from twin.figures.settings import FigureSettings
 
     document, places = settings.document, list["URL"]()
@@ -312,7 +312,7 @@ def _retained(
 
 def _diagnosing(
     settings: "Config", log: Path | None, stopped: Callable[[], str], *, alone: bool
-) -> "Adviser":
+) -> "EventEnricher":
     """Who has the alarms of a live run diagnosed."""
     from twin.diagnosis.process import LiveDiagnosis
 
@@ -338,11 +338,11 @@ def _answering(
 
 
 def _supervised(
-    sinks: "Mapping[str, Sink]", advisers: "Mapping[str, Adviser]", notices: "Notices"
-) -> "tuple[list[Sink], list[Adviser]]":
+    sinks: "Mapping[str, Sink]", advisers: "Mapping[str, EventEnricher]", notices: "Notices"
+) -> "tuple[list[Sink], list[EventEnricher]]":
     """The same; one that fails does not end the run."""
     from twin.log.recorder import Recorder
-    from twin.supervised import Outages, SupervisedAdviser, SupervisedSink
+    from twin.supervised import Outages, SupervisedEnricher, SupervisedSink
 
     outages = Outages(notices)
 
@@ -354,7 +354,7 @@ def _supervised(
 
     return (
         [supervised(*one) for one in sinks.items()],
-        [SupervisedAdviser(name, one, outages) for name, one in advisers.items()],
+        [SupervisedEnricher(name, one, outages) for name, one in advisers.items()],
     )
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from twin.config import Config
-    from twin.page.hall import Hall
+    from twin.page.plant_overview import PlantOverview
     from twin.page.ring import LiveRows
     from twin.page.server import Place
     from twin.users import Users
@@ -85,17 +85,17 @@ def serve(
 
 
 @contextmanager
-def _heard_of(broker: Path | None) -> "Iterator[Hall | None]":
+def _heard_of(broker: Path | None) -> "Iterator[PlantOverview | None]":
     """What all ejectors publish, while it is listened to; None without a broker."""
     if broker is None:
         yield None
         return
     from twin.config import TABLES
-    from twin.outlets.settings import chosen
-    from twin.page.hall import Hall
-    from twin.page.hall_line import listening
+    from twin.notifications.settings import chosen
+    from twin.page.plant_overview import PlantOverview
+    from twin.page.plant_overview_client import listening
 
-    document, hall = read_config(broker), Hall()
+    document, hall = read_config(broker), PlantOverview()
     document.refuse_unknown_tables(TABLES)
     mqtt, _ = chosen(document)
     if not mqtt.host:
@@ -109,7 +109,7 @@ def _serve(
     settings: "list[Config]",
     users: "Users",
     names: list[str],
-    hall: "Hall | None",
+    hall: "PlantOverview | None",
 ) -> None:
     import socket
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from twin.config import Config
     from twin.live import Twin
     from twin.log.header import LogHeader
-    from twin.monitor.detect import Monitor
+    from twin.monitor.monitor import Monitor
     from twin.settings import Document
 
 
@@ -60,9 +60,9 @@ def _say_instead(settings: "Config", unit: str) -> None:
 def pair_of(settings: "Config", *, judges: bool = True) -> tuple["Twin", "Monitor"]:
     """The twin of a configuration and its monitor, which may be one that ``judges`` no cycle."""
     from twin.live import compiled
-    from twin.monitor.detect import Monitor
     from twin.monitor.isolation import Isolation
-    from twin.monitor.reports import ReportWatch
+    from twin.monitor.monitor import Monitor
+    from twin.monitor.signal_checks import ReportWatch
 
     with heeded():
         twin = compiled(settings.data)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from twin.compare.compare import Comparison
 from twin.compare.side import BIN_S, LONGEST_S, Curve, Floats, Side
-from twin.compare.words import conclusion
+from twin.compare.text import conclusion
 from twin.diagnosis.drawing import ANONYMOUS, STYLE
 from twin.files import said_plainly
 from twin.inference.levels import SIGMAS_95

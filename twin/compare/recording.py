@@ -9,7 +9,7 @@ import numpy as np
 from twin.compare.compare import Comparison
 from twin.compare.picture import bins, difference
 from twin.compare.side import Curve, Floats
-from twin.compare.words import conclusion, remarks
+from twin.compare.text import conclusion, remarks
 from twin.errors import SourceError
 from twin.signals import NS
 from twin.view import import_rerun

@@ -6,10 +6,10 @@ from typing import Any
 
 from twin.config import Config
 from twin.diagnosis.answer import Diagnosis, insufficient
+from twin.diagnosis.covariance import covariance
 from twin.diagnosis.evidence import HEALTHY, Evidence, collect
 from twin.diagnosis.extend import extended
-from twin.diagnosis.judge import Judged, gain, judge
-from twin.diagnosis.weights import covariance
+from twin.diagnosis.held_out import Judged, gain, judge
 from twin.errors import SourceError
 from twin.signals import Samples
 

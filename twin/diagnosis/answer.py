@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 
 from twin.config import Config
+from twin.diagnosis.covariance import Covariance, Weights, covariance
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, collect, thinned
 from twin.diagnosis.experiments import next_experiment
 from twin.diagnosis.fit import Fitted, white
 from twin.diagnosis.healthy import are_odd, left_in_each, usual_leftover
+from twin.diagnosis.held_out import LITTLE, Judged, gain, judge, rounded
 from twin.diagnosis.hypotheses import hours, parameters, score_with_tempered_prior
-from twin.diagnosis.judge import LITTLE, Judged, gain, judge, rounded
 from twin.diagnosis.mechanisms import Explained, explain, explain_alone
 from twin.diagnosis.search import Search, search, sharpened, stranger
 from twin.diagnosis.unlisted import STRANGE, Unlisted, extended, look
 from twin.diagnosis.unmodelled import Unmodelled
-from twin.diagnosis.weights import Covariance, Weights, covariance
 from twin.inference.levels import SIGMAS_95
 from twin.inference.unmodelled import Odds
 from twin.instants import CALENDAR_NS, SECOND_NS
@@ -30,7 +30,7 @@ from twin.model.term import Term
 from twin.monitor.bins import Floats
 from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import NOT_COMMISSIONED
-from twin.monitor.reports import standing
+from twin.monitor.signal_checks import standing
 from twin.signals import Quality, Samples
 
 FORMAT = "ejector-twin-diagnosis/1"

@@ -31,12 +31,12 @@ from twin.model.term import Term, Terms
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, binned
 from twin.monitor.cycles import figures, whole
+from twin.monitor.detector_window import as_wide_as_needed, knees_of
 from twin.monitor.healthy import Healthy
-from twin.monitor.knees import as_wide_as_needed, knees_of
-from twin.monitor.phases import Knees
+from twin.monitor.phase_detector import Knees
 from twin.monitor.signatures import drawn_rows, steps
+from twin.monitor.simulated_switching import Seen, seen
 from twin.monitor.surroundings import are_told, following, told
-from twin.monitor.switching import Seen, seen
 from twin.signals import (
     MBAR,
     NS,

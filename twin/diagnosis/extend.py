@@ -10,12 +10,12 @@ from scipy.optimize import brentq
 
 from twin.assets import provenance
 from twin.assets.catalogue import carried_on
-from twin.assets.place import open_chosen
+from twin.assets.database_url import open_chosen
 from twin.assets.record import Record
 from twin.config import Config, Known
 from twin.diagnosis.answer import Diagnosis
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
-from twin.diagnosis.words import spoken
+from twin.diagnosis.text import spoken
 from twin.errors import ConfigError
 from twin.inference.levels import SIGMAS_95
 from twin.inference.sensitivities import derivatives
@@ -29,7 +29,7 @@ from twin.model.term import AGAIN
 from twin.monitor.bins import Floats
 from twin.monitor.cycles import figures, whole
 from twin.monitor.healthy import Healthy, Scatter
-from twin.monitor.weights import SCATTER
+from twin.monitor.scatter_covariance import SCATTER
 from twin.signals import Phase
 
 Sizes = Mapping[str, float]

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import lsq_linear
 
+from twin.diagnosis.covariance import Weights, levels
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.hypotheses import bounds, price, sized, sizes
-from twin.diagnosis.weights import Weights, levels
 from twin.inference.levels import CHI2_95
 from twin.inference.profile import profile_interval
 from twin.inference.sensitivities import derivatives, inside, points

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from twin.diagnosis.covariance import Covariance, Weights, moved, scatter
 from twin.diagnosis.evidence import HEALTHY, Evidence
-from twin.diagnosis.weights import Covariance, Weights, moved, scatter
 from twin.model.term import KINDS
 from twin.monitor.bins import Bools, Floats, Ints, unwarped
 from twin.monitor.healthy import Healthy, ModelError
-from twin.monitor.weights import FIRST_ERROR, SCATTER
+from twin.monitor.scatter_covariance import FIRST_ERROR, SCATTER
 from twin.signals import MS
 
 ROUNDS = 3

@@ -22,9 +22,9 @@ from twin.diagnosis.drawing import (
 )
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.fit import Fitted
-from twin.diagnosis.judge import Judged
+from twin.diagnosis.held_out import Judged
 from twin.diagnosis.search import Search
-from twin.diagnosis.words import Answer, spoken
+from twin.diagnosis.text import Answer, spoken
 from twin.model import theta as c
 from twin.model.term import Term
 from twin.monitor.bins import Floats, Ints

@@ -23,7 +23,7 @@ from uuid import uuid4
 import numpy as np
 
 from twin.config import Config
-from twin.diagnosis.words import Times, certainty, left_over, listed, sized, when
+from twin.diagnosis.text import Times, certainty, left_over, listed, sized, when
 from twin.errors import in_words
 from twin.events import Event, Kind
 from twin.instants import SECOND_NS
@@ -48,7 +48,7 @@ Status = Callable[[], AbstractContextManager[Callable[[str], None]]]
 
 
 class LiveDiagnosis:
-    """Follows the live loop, and has each alarm diagnosed (``twin.live.Adviser``).
+    """Follows the live loop, and has each alarm diagnosed (``twin.live.EventEnricher``).
 
     Alarms of a unit that is not commissioned are not: their causes are not named.
     ``status`` gives a function that says what is waited for at the end, until ``stopped`` says that

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from twin.diagnosis import page
 from twin.diagnosis.answer import Diagnosis
-from twin.diagnosis.over_log import (
+from twin.diagnosis.log_picture import (
     draw_log,
 )
-from twin.diagnosis.over_phases import (
+from twin.diagnosis.phase_pictures import (
     Laid,
     acting,
     draw_left,
@@ -26,7 +26,7 @@ from twin.diagnosis.pictures import (
     draw_ranking,
     worst_cycle,
 )
-from twin.diagnosis.words import (
+from twin.diagnosis.text import (
     FIGURES,
     Answer,
     Times,

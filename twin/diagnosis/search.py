@@ -13,6 +13,7 @@ from itertools import chain, combinations
 
 import numpy as np
 
+from twin.diagnosis.covariance import Covariance, Weights, covariance
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, at_once, thinned
 from twin.diagnosis.fit import Fitted, fit, interval, profiled, white
 from twin.diagnosis.hypotheses import (
@@ -25,8 +26,14 @@ from twin.diagnosis.hypotheses import (
     sized,
     sizes,
 )
-from twin.diagnosis.screen import Columns, Signatures, columns, pairs, promises, signatures
-from twin.diagnosis.weights import Covariance, Weights, covariance
+from twin.diagnosis.linear_screening import (
+    Columns,
+    Signatures,
+    columns,
+    pairs,
+    promises,
+    signatures,
+)
 from twin.inference.levels import CHI2_95, CHI2_999, SIGMAS_95
 from twin.model.catalogue import has_room
 from twin.model.courses import Cause, Course

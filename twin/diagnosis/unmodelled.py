@@ -5,10 +5,10 @@ from functools import cached_property
 
 import numpy as np
 
+from twin.diagnosis.covariance import Weights
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.fit import white
 from twin.diagnosis.unlisted import OVER, smooth
-from twin.diagnosis.weights import Weights
 from twin.inference.unmodelled import Odds, alone, log_likelihoods
 from twin.model.courses import Cause, Course
 from twin.monitor.bins import Floats

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.errors import ConfigError
+from twin.figures.database import History
 from twin.figures.settings import LEAST_LEAKAGE, LEAST_T1_MS, permitted
-from twin.figures.store import History
 
 GOOD_CYCLES = 5  # the last ones; more tell no more of today
 

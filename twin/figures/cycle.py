@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from twin.config import Config
-from twin.figures.course import Rows, measured
+from twin.figures.cycle_view import Rows, measured
 from twin.figures.expected import Expectation
 from twin.figures.settings import FigureSettings, Limits, limits
 from twin.figures.table import FIGURES, UNKNOWN, Unit, figures
 from twin.figures.warnings import in_words, warnings
 from twin.model.dataset import DataSet
 from twin.monitor.cycles import LONGEST_PIECE, Cycle
-from twin.monitor.detect import MonitorSettings
+from twin.monitor.monitor import MonitorSettings
 from twin.signals import (
     BREAK,
     MBAR,

@@ -11,11 +11,12 @@ from functools import cached_property
 
 import numpy as np
 
-from twin.figures.course import Bytes, Floats, Rows, course
-from twin.model import kernel, strides
+from twin.figures.cycle_view import Bytes, Floats, Rows, course
+from twin.model import dense_solver as strides
+from twin.model import kernel
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
-from twin.model.strides import Strides
+from twin.model.dense_solver import DenseSolver
 from twin.model.term import Terms
 from twin.model.theta import Theta
 from twin.monitor.cycles import STALE
@@ -36,7 +37,7 @@ class Expectation:
     """
 
     data: DataSet
-    _strides: Strides | None = None  # None until there is a level to begin at
+    _strides: DenseSolver | None = None  # None until there is a level to begin at
     _control: kernel.Control = field(default_factory=kernel.Control.anew)
     _last_ns: int | None = None
     _edges: int = 0  # since it began
@@ -66,7 +67,7 @@ class Expectation:
         if begin is None or self._stale:
             return
         if self._strides is None:
-            self._strides, dt[begin], first = Strides(), -1.0, True
+            self._strides, dt[begin], first = DenseSolver(), -1.0, True
         rows = slice(begin, None)
         level = ticks[begin] if first else None
         self._parts.append(self._run(self._strides, dt[rows], samples[rows], level))
@@ -103,7 +104,7 @@ class Expectation:
         return float(opened[c.AMBIENT] - expected[-1]) / MBAR
 
     def _run(
-        self, model: Strides, dt: Floats, samples: Samples, first: np.void | None
+        self, model: DenseSolver, dt: Floats, samples: Samples, first: np.void | None
     ) -> tuple[Floats, Bytes]:
         """Pressure (Pa) and phase: the ``first`` row as the twin has it, all others free."""
         phase, pressure = np.empty(len(dt), np.uint8), np.empty(len(dt))

@@ -3,7 +3,7 @@
 import pyarrow as pa
 
 from twin.assets.unit import Unit
-from twin.figures.store import SIDES, History
+from twin.figures.database import SIDES, History
 from twin.figures.table import FIGURES
 
 UNITS = {f"{one.name}_{side}": one.unit for one in FIGURES.values() for side in SIDES}

@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Picture
 
 from twin.errors import SourceError
-from twin.figures.store import History
+from twin.figures.database import History
 from twin.figures.table import Figure
 from twin.figures.trend import DAY_NS, Trend
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from twin.figures.cycle import CycleFigures, KeyFigures
-from twin.figures.keeper import Alarms
+from twin.figures.writer import Alarms
 from twin.log.reader import Log
 from twin.monitor.cycles import cut
 from twin.signals import unbroken

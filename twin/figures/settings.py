@@ -10,9 +10,9 @@ from twin.assets.configured import DatabaseSettings
 from twin.config import Config
 from twin.figures.expected import leakage_from_rest, t1_from_rest
 from twin.model.dataset import DataSet
-from twin.monitor.budget import LIMITS, cycles_between, student_limit
-from twin.monitor.detect import MonitorSettings
+from twin.monitor.false_alarm_budget import LIMITS, cycles_between, student_limit
 from twin.monitor.healthy import Healthy
+from twin.monitor.monitor import MonitorSettings
 
 Positive = Annotated[float, Field(gt=0.0)]
 LEAST_T1_MS = 50.0  # over what is usual: below is scatter

@@ -9,7 +9,7 @@ from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from twin.figures.course import Course, Rows, course
+from twin.figures.cycle_view import Course, Rows, course
 from twin.model.dataset import DataSet
 from twin.signals import BAR, MBAR
 

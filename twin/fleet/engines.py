@@ -16,7 +16,7 @@ from pebble import ProcessExpired, ProcessPool
 
 from twin.errors import ConfigError, SourceError
 from twin.extras import install_hint
-from twin.fleet.works import Done, Job
+from twin.fleet.tasks import Done, Job
 
 Submit = Callable[[Callable[[Job], Done], Job], Future[Done]]
 CONNECT_S = 10.0

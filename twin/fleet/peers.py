@@ -17,9 +17,9 @@ import numpy.typing as npt
 from scipy.stats import median_abs_deviation, theilslopes
 
 from twin.figures.trend import LEAST_SPAN, trend_of
-from twin.fleet.store import Result
+from twin.fleet.results_database import Result
 from twin.fleet.watch import name_of
-from twin.monitor.bank import SUSPECTS
+from twin.monitor.model_bank import SUSPECTS
 
 FEWEST_PEERS = 8  # of a type, by which the others are judged
 FEWEST_LOGS = 6  # of a unit, in which a drift can be seen

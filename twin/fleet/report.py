@@ -11,9 +11,9 @@ from enum import StrEnum
 from typing import Any
 
 from twin.assets.record import Record
-from twin.fleet.kinds import Estimate, estimates
 from twin.fleet.peers import FEWEST_PEERS, Drift, Standing, standings
-from twin.fleet.store import Result
+from twin.fleet.results_database import Result
+from twin.fleet.type_statistics import Estimate, estimates
 
 FORMAT = "ejector-twin-fleet/2"
 STANDS_OUT = 4.5  # sigmas from the others: one of a thousand units by chance, in twenty effects

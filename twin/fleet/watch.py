@@ -9,9 +9,9 @@ from twin.config import Config
 from twin.figures.cycle import CycleFigures, compiled
 from twin.figures.table import FIGURES
 from twin.live import Twin
-from twin.monitor.bank import SUSPECTS, Bank, Suspect
 from twin.monitor.cycles import CycleCutter, figures
-from twin.monitor.statistics import Listener, Said
+from twin.monitor.model_bank import SUSPECTS, ModelBank, Suspect
+from twin.monitor.statistics import CycleResidual, ScoreExtractor
 from twin.signals import Samples, bridged
 
 FORMAT = "ejector-twin-watched/1"
@@ -19,11 +19,11 @@ FORMAT = "ejector-twin-watched/1"
 
 def watched(config: Config, blocks: Iterable[Samples]) -> dict[str, Any]:
     """Run twin and hypotheses over a log; give what its cycles say on average."""
-    listener, cutter = Listener.of(config.data, config.monitor.healthy), CycleCutter()
-    bank = Bank(listener.theta, listener.suspects)
+    listener, cutter = ScoreExtractor.of(config.data, config.monitor.healthy), CycleCutter()
+    bank = ModelBank(listener.theta, listener.suspects)
     teller = compiled(config)
     told: list[CycleFigures] = []
-    heard: list[Said] = []
+    heard: list[CycleResidual] = []
     for rows, ticks in Twin.of(config.data).over(bridged(blocks)):
         for cycle in cutter.push(rows, ticks):
             drawn = bank.take(cycle)
@@ -62,7 +62,7 @@ def _figures(told: Sequence[CycleFigures]) -> dict[str, dict[str, float]]:
     return means
 
 
-def _effects(heard: Sequence[Said]) -> dict[str, dict[str, Any]]:
+def _effects(heard: Sequence[CycleResidual]) -> dict[str, dict[str, Any]]:
     """Of every effect on its own: sigmas a cycle, how they scatter, the size that fits best."""
     if not heard:
         return {}

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from twin.events import Event
-from twin.log.columns import Tray
+from twin.log.columns import RowBuffer
 from twin.log.header import RECOVERED
 from twin.log.reader import Log, decode_happening, decode_rows, open_log
 from twin.log.recorder import Recorder
@@ -152,7 +152,7 @@ def _go_through(log: Log, take: Callable[[Samples, Ticks, Sequence[Event]], None
 
 def _pieces(log: Log, damage: list[Damage]) -> Iterator[Piece]:
     """Each message of rows with the events after it: those that happened in it."""
-    samples, ticks = Tray(0).take()
+    samples, ticks = RowBuffer(0).take()
     events: list[Event] = []
     for part in log.parts:
         for topic, packed in messages(part, (SAMPLES.topic, EVENTS.topic), damage.append):

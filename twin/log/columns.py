@@ -294,7 +294,7 @@ def joined(blocks: Sequence[tuple[Samples, Ticks]]) -> tuple[Samples, Ticks]:
     return rows.view(SAMPLE), beside.view(TICK)
 
 
-class Tray:
+class RowBuffer:
     """Collects rows from blocks of any size into full blocks of ``size`` rows."""
 
     def __init__(self, size: int) -> None:

@@ -11,7 +11,7 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from twin.errors import SourceError
 from twin.events import Event
-from twin.log.columns import Tray, decode
+from twin.log.columns import RowBuffer, decode
 from twin.log.header import Identity, LogHeader, from_metadata
 from twin.log.messages import decode_event
 from twin.log.part import FREE_METADATA, OWN_METADATA, follows, part_path, place_of
@@ -38,7 +38,7 @@ class Log:
 
     def blocks(self, size: int = 10_000) -> Iterator[tuple[Samples, Ticks]]:
         """Rows of SAMPLE and TICK in written order, ``size`` at a time and the rest at the end."""
-        tray = Tray(size)
+        tray = RowBuffer(size)
         for part in self.parts:
             for _, packed in messages(part, (SAMPLES.topic,), _refuse):
                 yield from tray.add(*decode_rows(part, packed))

@@ -24,9 +24,9 @@ from numba.core import event
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserProvidedCacheLocator
 from numba.core.runtime.nrt import rtsys
 
+from twin.cpu_target import njit
 from twin.errors import TwinError
 from twin.files import private_folder, user_cache
-from twin.processor import njit
 
 DAY_S = 86_400.0
 SHARED = ("signals.py", "processor.py")

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from twin.monitor.budget import SINGLE_CYCLES, cycles_between, normal_limit
-from twin.monitor.change import Floats, Reference, as_normal
+from twin.monitor.change_detection import Floats, Reference, as_normal
+from twin.monitor.false_alarm_budget import SINGLE_CYCLES, cycles_between, normal_limit
 from twin.monitor.healthy import Healthy
 
 LEARNED = 300  # healthy cycles of its own: then a scatter is known to 4 %

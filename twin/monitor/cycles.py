@@ -77,7 +77,7 @@ class Cycle:
         return bool((self.samples["quality"] & STALE).any())
 
 
-class Look(NamedTuple):
+class CycleView(NamedTuple):
     """What is seen of a cycle before anything is judged."""
 
     cycle: Cycle

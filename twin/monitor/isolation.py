@@ -21,24 +21,24 @@ from twin.inference.unmodelled import MISMATCH, Odds, hats, knots_over, log_like
 from twin.model.dataset import DataSet
 from twin.model.effects import EFFECTS, UNKNOWN, Effect, effect_of
 from twin.model.term import KINDS
-from twin.monitor.bank import DELAY_STEPS, DELAYS, SUSPECTS, UNSURE_OF, Bank, Suspect
 from twin.monitor.bins import Floats, averaged
-from twin.monitor.budget import SUMS, cycles_between
-from twin.monitor.change import (
+from twin.monitor.change_detection import (
     FARTHEST,
     MOST,
-    Changes,
+    ChangeDetector,
+    LearningGuard,
     NormalScores,
-    Patience,
     Reference,
     ScoreNormalizer,
     began,
     limit,
 )
-from twin.monitor.cycles import Cycle, Look
+from twin.monitor.cycles import Cycle, CycleView
+from twin.monitor.false_alarm_budget import SUMS, cycles_between
 from twin.monitor.healthy import Healthy
+from twin.monitor.model_bank import DELAY_STEPS, DELAYS, SUSPECTS, UNSURE_OF, ModelBank, Suspect
 from twin.monitor.signatures import Likeness
-from twin.monitor.statistics import Listener, Said
+from twin.monitor.statistics import CycleResidual, ScoreExtractor
 from twin.signals import SAMPLE, TICK, Samples, Ticks
 
 KEPT = 400  # cycles whose scores are remembered: a change is not sought further back
@@ -54,7 +54,7 @@ FEWEST_BACK = 3  # cycles to be sure of that, however far it was
 class Heard(NamedTuple):
     """What a cycle that is fit to be judged says."""
 
-    said: Said
+    said: CycleResidual
     scores: Floats
     seconds: float  # how long it was
 
@@ -88,12 +88,12 @@ class _Usual:
     count: Floats = field(default_factory=lambda: np.zeros(len(KINDS) << 16))  # by place
     mean: Floats = field(default_factory=lambda: np.zeros(len(KINDS) << 16))
 
-    def add(self, said: Said) -> None:
+    def add(self, said: CycleResidual) -> None:
         at = said.place  # levels, which are below zero, at the end
         self.count[at] += 1.0
         self.mean[at] += (said.off - self.mean[at]) / self.count[at]
 
-    def of(self, said: Said) -> tuple[Floats, Floats]:
+    def of(self, said: CycleResidual) -> tuple[Floats, Floats]:
         """Mean (mbar) at the places of a cycle, and in how many cycles they were seen."""
         return self.mean[said.place], self.count[said.place]
 
@@ -104,16 +104,18 @@ class Isolation:
     ``days`` between false alarms of any kind, for one ejector.
     """
 
-    def __init__(self, bank: Bank, listener: Listener, days: float) -> None:
+    def __init__(self, bank: ModelBank, listener: ScoreExtractor, days: float) -> None:
         self._bank, self._listener = bank, listener
         self._days = days
         self._suspects, count = listener.suspects, len(listener.suspects)
         self._reference, self._usual = Reference.of(count), _Usual()
         self._normalizer = ScoreNormalizer(count)
         self._learned = 0  # cycles
-        self._patience = Patience[tuple[Said, Floats, NormalScores]]()  # with their scores
-        self._changes: Changes | None = None  # once it is known which suspects look alike
-        self._kept: deque[Said] = deque(maxlen=RECENT)  # some 40 kB each
+        self._guard = LearningGuard[
+            tuple[CycleResidual, Floats, NormalScores]
+        ]()  # with their scores
+        self._changes: ChangeDetector | None = None  # once it is known which suspects look alike
+        self._kept: deque[CycleResidual] = deque(maxlen=RECENT)  # some 40 kB each
         self._scored: deque[Floats] = deque(maxlen=KEPT)  # their normal scores, and of more cycles
         self._cycles, self._seconds = 0, 0.0
         self._raised: tuple[int, float] | None = None  # suspect, and sigmas a cycle
@@ -136,7 +138,7 @@ class Isolation:
         return [effect_of(name) for name in names]
 
     @property
-    def heard(self) -> tuple[Said, Floats]:
+    def heard(self) -> tuple[CycleResidual, Floats]:
         """What the last cycle said, and its scores as standard normal variables."""
         return self._kept[-1], self._scored[-1]
 
@@ -147,15 +149,15 @@ class Isolation:
     @classmethod
     def of(cls, data: DataSet, healthy: Healthy, days: float) -> "Isolation":
         """The isolation beside the twin of a data set; compiled, not to fall into a block."""
-        listener = Listener.of(data, healthy)
-        first = Bank(listener.theta, listener.suspects)
+        listener = ScoreExtractor.of(data, healthy)
+        first = ModelBank(listener.theta, listener.suspects)
         drawn, expected = first.take(
             Cycle(0, np.zeros(2, SAMPLE), np.zeros(2, TICK), complete=False)
         )
         averaged(np.zeros(2, np.uint8), np.zeros(2), drawn, expected)
-        return cls(Bank(listener.theta, listener.suspects), listener, days)
+        return cls(ModelBank(listener.theta, listener.suspects), listener, days)
 
-    def hear(self, looks: Sequence[Look]) -> list[Heard | None]:
+    def hear(self, looks: Sequence[CycleView]) -> list[Heard | None]:
         """Take cycles and pieces, in order, and what the monitor has of them; say what they say."""
         drawn = [self._bank.take(look.cycle) for look in looks]
         said = [
@@ -184,15 +186,15 @@ class Isolation:
         self._scored.append(normal)
         verdict = self._conclude(self._changes, normal, far, begins) if self._changes else None
         if self.stands:
-            self._patience.forget()
+            self._guard.forget()
         elif self._changes is None and not far:
             self._learn(said, scores, step)
         elif not far and (verdict is None or not verdict.causes):
-            for one in self._patience.take((said, scores, step), normal):
+            for one in self._guard.take((said, scores, step), normal):
                 self._learn(*one)
         return verdict
 
-    def _learn(self, said: Said, scores: Floats, step: NormalScores) -> None:
+    def _learn(self, said: CycleResidual, scores: Floats, step: NormalScores) -> None:
         """Take a cycle as usual; what is shown for the first time is looked for from now on."""
         new = np.isfinite(scores) & (self._reference.count == 0.0)
         self._reference.add(scores)
@@ -207,7 +209,9 @@ class Isolation:
         if self._changes and (new.any() or self._learned == LEARNED):
             self._changes.weigh(self._alike)
 
-    def _conclude(self, changes: Changes, normal: Floats, far: float, begins: bool) -> Verdict:
+    def _conclude(
+        self, changes: ChangeDetector, normal: Floats, far: float, begins: bool
+    ) -> Verdict:
         changes.take(normal, FARTHEST if far else MOST)
         log_sum = changes.log_sum
         cycles = cycles_between(self._days, SUMS, self._seconds / self._cycles)
@@ -230,7 +234,7 @@ class Isolation:
         since, sigmas = self._differ(changes)
         return Verdict(none, self._causes(changes, since, 1.0 - none), raised, since, sigmas)
 
-    def _raise(self, changes: Changes) -> None:
+    def _raise(self, changes: ChangeDetector) -> None:
         self._since, sigmas = self._differ(changes)
         self._raised = (changes.foremost()[0], sigmas)
         self._back = 0.0
@@ -248,7 +252,7 @@ class Isolation:
         self._raised, self._since = None, 0
         return True
 
-    def _differ(self, changes: Changes) -> tuple[int, float]:
+    def _differ(self, changes: ChangeDetector) -> tuple[int, float]:
         """How many of the last cycles differ, and by how many sigmas each."""
         suspect, sign = changes.foremost()
         scores = self._scores(suspect)
@@ -260,14 +264,14 @@ class Isolation:
         """Of the cycles that are kept."""
         return np.array([float(normal[suspect]) for normal in self._scored])
 
-    def _whole(self, changes: Changes, since: int) -> int:
+    def _whole(self, changes: ChangeDetector, since: int) -> int:
         """How many of the last cycles have it from their beginning; 0 if they do not show it."""
         whole = since - 1
         scores = self._scores(changes.foremost()[0])[-whole:] if whole else np.empty(0)
         shown = scores[np.isfinite(scores)]
         return whole if abs(shown.sum()) >= SHOWN * math.sqrt(max(len(shown), 1)) else 0
 
-    def _causes(self, changes: Changes, since: int, changed: float) -> list[Likeness]:
+    def _causes(self, changes: ChangeDetector, since: int, changed: float) -> list[Likeness]:
         """How probable each effect is, and one that nobody listed, which comes last.
 
         Together they are as probable as that something ``changed``.
@@ -301,7 +305,7 @@ class Isolation:
         found = self._by_effect(share * (listed / share.sum()), sizes)
         return [*found, Likeness(UNKNOWN, None, "", changed - listed)]
 
-    def _mean(self, since: int) -> tuple[Said, Floats]:
+    def _mean(self, since: int) -> tuple[CycleResidual, Floats]:
         """The mean of the last cycles, less what was usual; and its covariance."""
         last = self._kept[-1]
         some = list(self._kept)[-since:]
@@ -336,10 +340,10 @@ class Isolation:
         return sorted(found.values(), key=lambda likeness: -likeness.share)
 
 
-def looked_for(suspects: Sequence[Suspect] = SUSPECTS) -> Changes:
+def looked_for(suspects: Sequence[Suspect] = SUSPECTS) -> ChangeDetector:
     """Sums for all suspects, with nothing seen yet."""
     both_ways = np.array([one.both_ways for one in suspects])
-    return Changes(both_ways, np.array([one.often for one in suspects]))
+    return ChangeDetector(both_ways, np.array([one.often for one in suspects]))
 
 
 def _fitted(off: Floats, signatures: Floats, bounds: Floats) -> tuple[Floats, Floats]:
@@ -366,7 +370,7 @@ def _grows(number: int, signatures: Floats, larger: Floats) -> Floats:
     return np.column_stack([np.zeros(len(some)), signatures[:, number], some])
 
 
-def _smooth(said: Said) -> Floats:
+def _smooth(said: CycleResidual) -> Floats:
     """Smooth courses over the time of each kind of stretch, (places, courses)."""
     courses = [np.zeros((len(said.kind), 0))]
     for kind in np.unique(said.kind[said.kind >= 0]):

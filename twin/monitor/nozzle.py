@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.inference.levels import MAD_TO_SIGMA
-from twin.monitor.aligned import Knee, align
-from twin.monitor.breaks import (
+from twin.monitor.alignment import Knee, align
+from twin.monitor.breakpoints import (
     Course,
     Floats,
     Noise,

@@ -15,14 +15,22 @@ from twin.inference.covariance import Covariance
 from twin.inference.sensitivities import derivatives
 from twin.model.dataset import DataSet, coefficients
 from twin.model.theta import Theta
-from twin.monitor.bank import DELAYS, LARGER, SUSPECTS, UNSURE_OF, Suspect, hypotheses, suspects_of
 from twin.monitor.bins import Bins, Floats, Ints, averaged
 from twin.monitor.cycles import Cycle
+from twin.monitor.detector_window import knees_of
 from twin.monitor.healthy import Healthy
-from twin.monitor.knees import knees_of
-from twin.monitor.phases import Knees
-from twin.monitor.switching import seen
-from twin.monitor.weights import SCATTER, from_cycle_to_cycle, lasting, model_error
+from twin.monitor.model_bank import (
+    DELAYS,
+    LARGER,
+    SUSPECTS,
+    UNSURE_OF,
+    Suspect,
+    hypotheses,
+    suspects_of,
+)
+from twin.monitor.phase_detector import Knees
+from twin.monitor.scatter_covariance import SCATTER, from_cycle_to_cycle, lasting, model_error
+from twin.monitor.simulated_switching import seen
 from twin.signals import MBAR
 
 PER_UNIT = 2  # bins in each unit of warped time
@@ -35,7 +43,7 @@ WEAK = 0.01
 
 
 @dataclass(frozen=True)
-class Said:
+class CycleResidual:
     """What a cycle says, place by place: a bin at the same time in every cycle, or a level."""
 
     place: Ints  # no two the same
@@ -48,12 +56,12 @@ class Said:
     alone: Floats  # mbar², covariance of what differs from cycle to cycle
     common: Floats  # mbar, one sigma of what is off in all cycles
 
-    def at(self, places: npt.NDArray[np.bool_]) -> "Said":
+    def at(self, places: npt.NDArray[np.bool_]) -> "CycleResidual":
         """What it says of some places."""
         columns = {
             one.name: getattr(self, one.name)[places] for one in fields(self) if one.name != "alone"
         }
-        return Said(alone=self.alone[np.ix_(places, places)], **columns)
+        return CycleResidual(alone=self.alone[np.ix_(places, places)], **columns)
 
     def scores(self) -> Floats:
         """How many sigmas of each signature there are; NaN for what this cycle does not show."""
@@ -84,7 +92,7 @@ class Said:
 
 
 @dataclass
-class Listener:
+class ScoreExtractor:
     """Makes statistics of cycles."""
 
     theta: Theta
@@ -98,7 +106,7 @@ class Listener:
     _seen: dict[bytes, "_Places"] = field(default_factory=dict)  # by where the bins are
 
     @classmethod
-    def of(cls, data: DataSet, healthy: Healthy) -> "Listener":
+    def of(cls, data: DataSet, healthy: Healthy) -> "ScoreExtractor":
         """The one for cycles beside the twin of a data set."""
         theta, noise = coefficients(data), data.sensor.noise_mbar
         return cls(theta, healthy, noise, knees_of(data), suspects_of(data, theta))
@@ -117,7 +125,7 @@ class Listener:
 
     def hear(
         self, cycle: Cycle, drawn: Ints, expected: Floats, figures: Mapping[str, float]
-    ) -> Said | None:
+    ) -> CycleResidual | None:
         """What a whole cycle says; ``drawn`` rows and ``expected`` (Pa) there are the bank's.
 
         ``figures`` are the monitor's.
@@ -134,7 +142,7 @@ class Listener:
         suspects, larger, ways = np.split(moved, (count, count + len(DELAYS) * LARGER), axis=1)
         moves = self._moves(suspects[: len(at.first)])
         covariance = from_cycle_to_cycle(bins, at.first, at.goes_on, moves, self.noise)
-        return Said(
+        return CycleResidual(
             at.place,
             at.kind,
             at.time,

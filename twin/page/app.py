@@ -39,8 +39,8 @@ from twin.language import speaking, tr
 from twin.login import Authenticator
 from twin.page.catalogues import Catalogues
 from twin.page.ejector import Ejector
-from twin.page.hall import Hall
-from twin.page.hall_app import ALL, AllEjectors
+from twin.page.plant_overview import PlantOverview
+from twin.page.plant_overview_app import ALL, AllEjectors
 from twin.page.sessions import SESSION_S, Session, Sessions
 from twin.users import Role
 
@@ -133,7 +133,7 @@ class Page:
         authenticator: Authenticator,
         sessions: Sessions,
         access: Access,
-        hall: Hall | None = None,
+        hall: PlantOverview | None = None,
     ) -> None:
         self.hall = hall
         self.ejectors, self.sessions, self.access = ejectors, sessions, access

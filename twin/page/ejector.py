@@ -10,24 +10,34 @@ from collections.abc import Callable
 from typing import Any
 
 from twin.alarms.board import Board, Comment, Episode
-from twin.alarms.place import open_chosen as open_alarms
+from twin.alarms.database import Store as AlarmStore
+from twin.alarms.database_url import open_chosen as open_alarms
 from twin.alarms.requests import ASKABLE
 from twin.alarms.settings import AlarmSettings, board_rules
 from twin.alarms.state import Deed
-from twin.alarms.store import Store as AlarmStore
 from twin.assets.unit import Unit
 from twin.config import Config
 from twin.errors import ConfigError, TwinError
-from twin.figures.place import open_chosen as open_figures
+from twin.figures.database import SIDES
+from twin.figures.database_url import open_chosen as open_figures
 from twin.figures.settings import limits_of
-from twin.figures.store import SIDES
 from twin.figures.table import FIGURES, Figure
+from twin.figures.text import course_in_words, title_of, trend_of_figure
 from twin.figures.trend import DAY_NS, Trend
-from twin.figures.words import course_in_words, title_of, trend_of_figure
 from twin.instants import zone
 from twin.language import tr
 from twin.page import ring
-from twin.page.light import S_NS, WORDS, Light, light_of, listed, named, priority_words, said, told
+from twin.page.ejector_status import (
+    S_NS,
+    WORDS,
+    Light,
+    light_of,
+    listed,
+    named,
+    priority_words,
+    said,
+    told,
+)
 from twin.page.settings import REPORTS, RING, PageSettings, folder_of
 from twin.signals import BREAK, MBAR
 

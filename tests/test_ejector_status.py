@@ -1,0 +1,82 @@
+"""The traffic light: red for what nobody has taken care of, green only where nothing is."""
+
+import pytest
+
+from twin.alarms.board import Board, Episode
+from twin.alarms.rules import Priority, Rule
+from twin.alarms.state import Kept
+from twin.alarms.text import action_of
+from twin.instants import instant
+from twin.page.ejector_status import S_NS, Light, light_of, listed, told
+
+STATES = {
+    "normal": (Kept(), Light.GREEN, Light.GREEN),
+    "unacknowledged": (Kept(True, False), Light.RED, Light.YELLOW),
+    "acknowledged": (Kept(True, True), Light.YELLOW, Light.YELLOW),
+    "returned": (Kept(False, False), Light.YELLOW, Light.YELLOW),
+    "shelved, active": (Kept(True, False, 9), Light.YELLOW, Light.YELLOW),
+    "shelved, active, acknowledged": (Kept(True, True, 9), Light.YELLOW, Light.YELLOW),
+    "shelved, nothing to say": (Kept(False, True, 9), Light.GREEN, Light.GREEN),
+    "out of service": (Kept(False, True, None, True), Light.YELLOW, Light.YELLOW),
+    "out of service, active": (Kept(True, False, None, True), Light.YELLOW, Light.YELLOW),
+}
+
+
+def board(**priorities: Priority) -> Board:
+    return Board([Rule(name=n, value=n, above=0.5, priority=p) for n, p in priorities.items()])
+
+
+@pytest.mark.parametrize("priority", list(Priority))
+@pytest.mark.parametrize("state", STATES)
+def test_the_light_of_each_state(state: str, priority: Priority) -> None:
+    kept, urgent, low = STATES[state]
+    one = board(a=priority, other=Priority.HIGH)
+    one.resume({"a": kept})
+    assert light_of(one, running=True) is (low if priority is Priority.LOW else urgent)
+    assert light_of(one, running=False) is Light.GREY
+
+
+def test_the_worst_alarm_counts() -> None:
+    one = board(a=Priority.LOW, b=Priority.MEDIUM, c=Priority.HIGH)
+    one.resume({"a": Kept(True, False), "b": Kept(True, False), "c": Kept(True, True)})
+    assert light_of(one, running=True) is Light.RED
+
+
+def test_what_is_active_and_unseen_is_listed_first() -> None:
+    one = board(seen=Priority.HIGH, gone=Priority.HIGH, low=Priority.LOW, quiet=Priority.HIGH)
+    one.resume(
+        {
+            "seen": Kept(True, True),
+            "gone": Kept(False, False),
+            "low": Kept(True, False),
+            "quiet": Kept(True, False, 9),
+        }
+    )
+    assert [alarm["alarm"] for alarm in listed(one, [], [], 0)] == ["low", "seen", "gone", "quiet"]
+
+
+def test_an_effect_that_was_taken_in_is_told_in_the_words_of_who_did() -> None:
+    words = {"name": "lifting_lip", "sentence": "A lip lifts off", "look_at": "the lips: worn"}
+    episode = Episode("deviation_unlisted", 10, None, None, "", evidence={"taken_in": words})
+    said = told(episode, "deviation.unlisted", 20)
+    assert (said["what"], said["sentence"]) == ("Lifting lip", "A lip lifts off.")
+    assert said["where"] == "the lips"
+    rule = Rule(name="deviation_unlisted", value="deviation.unlisted", above=0.5)
+    assert action_of(rule, episode.evidence).startswith("Look at the lips: worn.")
+
+
+def test_instants_are_worded_as_everywhere() -> None:
+    begin = 1_790_000_000 * S_NS  # 2026-09-21 14:13:20 UTC
+    now = begin + 480 * S_NS
+    episode = Episode("plc_stale", begin, begin + 60 * S_NS, begin + 120 * S_NS, "ann")
+    assert told(episode, "plc_stale", now)["times"] == {
+        "raised": "14:13:20, 8 min ago",
+        "cleared": "14:14:20, 7 min ago",
+        "seen": "14:15:20, 6 min ago",
+        "lasted": "60 s",
+    }
+    assert told(episode, "plc_stale", now)["times"]["raised"] == instant(begin, now)
+    one = board(quiet=Priority.HIGH)
+    one.resume({"quiet": Kept(True, False, now + 1200 * S_NS)})
+    (alarm,) = listed(one, [], [], now)
+    assert alarm["quiet_until"] == "14:41:20, in 20 min"

@@ -1,0 +1,224 @@
+"""Key figures on their way from the loop into the database."""
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rigs
+
+from twin.assets.unit import Unit
+from twin.cli.figures import keeper_of, key_figures_of
+from twin.config import Config
+from twin.errors import ConfigError, SourceError
+from twin.events import Event, Kind
+from twin.figures import writer as module
+from twin.figures.cycle import KeyFigures
+from twin.figures.database import Store, open_store
+from twin.figures.read import of_log
+from twin.figures.writer import Alarms, Keeper
+from twin.live import run
+from twin.log.header import LogHeader
+from twin.log.reader import open_log
+from twin.log.recorder import Recorder
+from twin.monitor.monitor import Monitor
+from twin.settings import Document
+from twin.signals import SAMPLE, TICK
+
+UNIT = Unit("compact-ejector-35", "gripper-01")
+NONE = np.empty(0, SAMPLE), np.empty(0, TICK)
+
+
+def cycle(number: int) -> Event:
+    begin = 3_000_000_000 * number
+    data = {"cycle": number, "begin_ns": begin, "end_ns": begin + 10, "host_ns": begin}
+    return Event(begin + 10, Kind.CYCLE, "", {**data, "warnings": [], "t0_measured": 1.0})
+
+
+def alarm(time_ns: int) -> Event:
+    return Event(time_ns, Kind.DEVIATION, "")
+
+
+def keep(open_it: Callable[[], Store], *batches: list[Event]) -> list[str]:
+    """Hand events to a keeper and close it; gives what it said."""
+    said: list[str] = []
+    keeper = Keeper(open_it, UNIT, "a", said.append)
+    for events in batches:
+        keeper.write(*NONE, events)
+    keeper.close()
+    return said
+
+
+def test_cycles_and_their_alarms_are_kept(tmp_path: Path) -> None:
+    path = tmp_path / "f.sqlite"
+    first, second = cycle(1), cycle(2)
+    batches = [[first, alarm(first.time_ns)], [], [alarm(first.time_ns + 5)], [second], [alarm(1)]]
+    assert keep(lambda: open_store(path), *batches) == []
+    with open_store(path) as store:
+        found = store.history(UNIT)
+    assert found.cycle.tolist() == [1, 2]
+    assert found.alarms.tolist() == [1, 1]
+
+
+def test_a_cycle_that_carries_no_key_figures_is_not_kept(tmp_path: Path) -> None:
+    path = tmp_path / "f.sqlite"
+    keep(lambda: open_store(path), [Event(5, Kind.CYCLE, "", {"cycle": 1})])
+    assert not path.exists()
+
+
+def test_alarms_belong_to_the_cycle_they_were_raised_in() -> None:
+    alarms = Alarms()
+    alarms.see([alarm(5), alarm(12), cycle(0), alarm(10)])
+    assert (alarms.until(10), alarms.until(11), alarms.until(12)) == (2, 0, 1)
+
+
+def test_a_database_that_is_away_is_said_once_and_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "BATCH_S", 0.01)
+    monkeypatch.setattr(module, "RETRY_S", 0.01)
+    tries, there = threading.Semaphore(0), threading.Event()
+    said: list[str] = []
+
+    def flaky() -> Store:
+        tries.release()
+        if not there.is_set():
+            raise SourceError("server: figure database: connection refused")
+        return open_store(tmp_path / "f.sqlite")
+
+    keeper = Keeper(flaky, UNIT, "a", said.append)
+    keeper.write(*NONE, [cycle(1)])
+    for _ in range(3):
+        assert tries.acquire(timeout=10)
+    keeper.write(*NONE, [cycle(2)])
+    there.set()
+    end = time.monotonic() + 10
+    while len(said) < 2 and time.monotonic() < end:
+        time.sleep(0.005)
+    keeper.close()
+    assert said[0] == "key figures wait in memory: server: figure database: connection refused"
+    assert said[1].startswith("key figures are stored again: ")
+    assert len(said) == 2
+    with open_store(tmp_path / "f.sqlite") as store:
+        assert store.history(UNIT).cycle.tolist() == [1, 2]
+
+
+def test_a_defect_does_not_end_what_is_stored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "BATCH_S", 0.001)
+    monkeypatch.setattr(module, "RETRY_S", 0.001)
+    failures, again = iter([MemoryError(), ValueError("a defect")]), threading.Event()
+
+    def flaky() -> Store:
+        for error in failures:
+            raise error
+        again.set()
+        return open_store(tmp_path / "f.sqlite")
+
+    said: list[str] = []
+    keeper = Keeper(flaky, UNIT, "a", said.append)
+    keeper.write(*NONE, [cycle(1)])
+    assert again.wait(20.0)
+    keeper.close()
+    assert said == [
+        "key figures wait in memory: MemoryError: ",
+        "key figures are stored again: 1 cycles had waited",
+    ]
+    with open_store(tmp_path / "f.sqlite") as store:
+        assert store.history(UNIT).cycle.tolist() == [1]
+
+
+def test_what_is_stored_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "BATCH_S", 0.01)
+    batches: queue.Queue[list[int]] = queue.Queue()
+
+    class Counting:
+        def add(self, _unit: Unit, _data: str, _source: str, cycles: list[dict[str, int]]) -> None:
+            batches.put([one["cycle"] for one in cycles])
+
+        def close(self) -> None: ...
+
+    keeper = Keeper(Counting, UNIT, "a", print)  # type: ignore[arg-type]
+    for number in (1, 2):
+        keeper.write(*NONE, [cycle(number)])
+        assert batches.get(timeout=10) == [number]
+    keeper.close()
+    assert batches.empty()
+
+
+def test_what_cannot_be_stored_to_the_end_is_said() -> None:
+    def away() -> Store:
+        raise SourceError("gone")
+
+    said = keep(away, [cycle(1), cycle(2)])
+    assert said[0] == "key figures wait in memory: gone"
+    assert said[1].startswith("key figures of 2 cycles could not be stored; from a log: twin fig")
+
+
+def test_the_memory_for_what_waits_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MOST_WAITING", 3)
+
+    def away() -> Store:
+        raise SourceError("gone")
+
+    said = keep(away, [cycle(number) for number in range(9)])
+    assert said[1].startswith("key figures of 3 cycles")
+
+
+def configured(folder: Path, table: str) -> Config:
+    """The gripper with a table [figures]."""
+    path = folder / "cell.toml"
+    path.write_text(table)
+    return replace(rigs.config("gripper"), document=Document.read(path))
+
+
+def test_a_configuration_says_whether_and_where_figures_are_kept(tmp_path: Path) -> None:
+    said: list[str] = []
+    assert keeper_of(configured(tmp_path, ""), said.append) is None
+    opened = keeper_of(configured(tmp_path, "[figures]\nkeep = true\n"), said.append)
+    assert opened is not None
+    keeper = opened()
+    keeper.write(*NONE, [cycle(1)])
+    keeper.close()
+    assert said == []
+    with open_store(tmp_path / "figures.sqlite") as store:
+        assert store.history(UNIT).cycle.tolist() == [1]
+
+
+def test_what_is_wrong_in_the_configuration_is_said_before_the_run(tmp_path: Path) -> None:
+    wrong = configured(tmp_path, '[figures]\nkeep = true\nurl = "mysql://host/name"\n')
+    with pytest.raises(ConfigError, match="figure databases of kind 'mysql'"):
+        keeper_of(wrong, print)
+    wrong = configured(tmp_path, "[figures]\npermitted_t1 = 5\n")
+    with pytest.raises(ConfigError, match=r"cell\.toml:2: figures\.permitted_t1: unknown key"):
+        key_figures_of(wrong)
+
+
+def test_the_loop_and_its_log_give_the_same_rows(tmp_path: Path) -> None:
+    """Stored live, then read from the log of that run: not one new row, alarms included."""
+    config = rigs.config("gripper")
+    header = LogHeader(*UNIT, "gripper.toml", config.document.text)
+    said: list[str] = []
+    keeper = Keeper(lambda: open_store(tmp_path / "f.sqlite"), UNIT, "a", said.append)
+    sinks = [Recorder(tmp_path / "run.mcap", header), keeper]
+    monitor = Monitor(config.monitor, rigs.theta("gripper"), KeyFigures(config.data))
+    recorded = rigs.cut(rigs.recorded("gripper", 20.0, ("leakage=2.0@8",))[0], 30)
+    run(recorded, rigs.twin("gripper"), monitor, sinks)
+    log = open_log(tmp_path / "run.mcap")
+    cycles = [kept for _, kept in of_log(log, KeyFigures(config.data))]
+    with open_store(tmp_path / "f.sqlite") as store, open_store(tmp_path / "g.sqlite") as other:
+        live = store.history(UNIT)
+        assert store.add(UNIT, "a", "run.mcap", cycles) == 0
+        assert other.add(UNIT, "a", "run.mcap", cycles) == len(cycles) == len(live.cycle)
+        from_log = other.history(UNIT)
+    assert said == []
+    assert live.alarms.sum() >= 1
+    assert live.alarms.tolist() == from_log.alarms.tolist()
+    assert live.warnings == from_log.warnings
+    for name, column in live.values.items():
+        assert np.array_equal(column, from_log.values[name], equal_nan=True), name

@@ -1,0 +1,479 @@
+"""Phases from commands and pressure: every unseen switch of the air saving, and no other."""
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import rigs
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.plc.faults import parse_fault
+from drivers.plc.settings import PlcSettings
+from drivers.plc.simulate import blocks, with_truth
+from tools.calibration_coverage import drawn
+from twin.model import theta as c
+from twin.model.dataset import DataSet, coefficients
+from twin.monitor.detector_window import LONGEST_WINDOW, as_wide_as_needed, expected_knees, knees_of
+from twin.monitor.phase_detector import IDLE_ROWS, SHORTEST_WINDOW, Knees, PhaseFinder
+from twin.signals import (
+    BREAK,
+    MBAR,
+    MS,
+    SAMPLE,
+    Command,
+    Phase,
+    Quality,
+    Samples,
+    sampling_ms,
+)
+
+NEAR = 20  # rows between a switch and where it is found, lag of sensor and jet included
+SECONDS = 24.0
+CONDITIONS = {
+    "healthy": (),
+    "slow sensor": ("sensor_lag=20",),
+    "sticking sensor": ("sensor_backlash=10",),
+    "leak": ("leakage=5",),
+    "small leak": ("leakage=2",),
+    "worn nozzle": ("suction_loss=15",),
+    "leaking check valve": ("check_valve_leak=3",),
+}
+Found = tuple[Samples, npt.NDArray[np.uint8], npt.NDArray[np.float64]]
+
+
+def find(samples: Samples, knees: Knees, block: int = 1000) -> Found:
+    finder = PhaseFinder(knees)
+    parts = [finder.push(part) for part in rigs.cut(samples, block)]
+    parts.append(finder.flush())
+    rows, phase, level = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return rows, phase, level
+
+
+def switches(on: npt.NDArray[np.bool_], suction: npt.NDArray[np.bool_]) -> set[tuple[int, bool]]:
+    """Rows at which ``on`` changes while suction is and stays commanded, and what it becomes."""
+    rows = np.flatnonzero(np.diff(on.astype(int))) + 1
+    return {(int(row), bool(on[row])) for row in rows if suction[row - 1] and suction[row]}
+
+
+def since_edge(suction: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+    """Rows since ``suction`` last changed."""
+    row = np.arange(len(suction))
+    edges = np.concatenate(([True], suction[1:] != suction[:-1]))
+    return row - np.maximum.accumulate(np.where(edges, row, 0))
+
+
+def compare(
+    name: str, faults: tuple[str, ...], seed: int, air_saving: bool = True, bad: float = 0.0
+) -> list[int]:
+    """Rows by which each switch is found late, with a share ``bad`` of rows without a pressure."""
+    samples, truth = rigs.recorded(name, SECONDS, faults, seed, air_saving)
+    if bad:
+        samples = rigs.spoilt(samples, bad, seed)
+    return found_where_true(samples, truth, rigs.knees(name))
+
+
+def found_where_true(samples: Samples, truth: npt.NDArray[np.void], knees: Knees) -> list[int]:
+    """Rows by which each switch is found late; an assertion fails where one is not or is no one.
+
+    A switch just before the end of suction cannot be told from it; one just after its beginning
+    is the valve's answer to the command.
+    """
+    _, phase, _ = find(samples, knees)
+    suction = samples["commands"] == Command.SUCTION
+    to_end = since_edge(suction[::-1])[::-1]
+    true = switches(truth["nozzle"] == 1, suction)
+    true = {(row, on) for row, on in true if since_edge(suction)[row] > knees.settled}
+    late = []
+    found = switches(phase == Phase.SUCTION, suction)
+    for row, on in sorted(true):
+        near = [one for one in found if one[1] == on and abs(one[0] - row) <= NEAR]
+        if not near and to_end[row] <= knees.lag + NEAR:
+            continue
+        assert len(near) == 1, f"the nozzle switched to {on} at row {row}, found: {sorted(found)}"
+        found -= set(near)
+        late.append(near[0][0] - row)
+    assert not found, "switches that never were"
+    return late
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+@pytest.mark.parametrize("condition", CONDITIONS)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_every_switch_is_found_and_none_invented(name: str, condition: str, seed: int) -> None:
+    late = compare(name, CONDITIONS[condition], seed)
+    reaches_h1 = (name, condition) != ("test_rig", "leak")
+    assert (len(late) > 3) == reaches_h1
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_a_few_bad_rows_hide_no_switch_and_make_none(name: str, seed: int) -> None:
+    compare(name, (), seed, bad=0.05)
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_without_air_saving_there_is_no_switch(name: str) -> None:
+    assert compare(name, (), seed=1, air_saving=False) == []
+
+
+def test_a_gripper_that_leaks_switches_on_again() -> None:
+    samples, truth = rigs.recorded("gripper", SECONDS, ("leakage=2",), 1)
+    suction = samples["commands"] == Command.SUCTION
+    again = {row for row, on in switches(truth["nozzle"] == 1, suction) if on}
+    again = {row for row in again if since_edge(suction)[row] > rigs.knees("gripper").settled}
+    assert len(again) >= 9  # so that the comparison above sees both directions
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_the_level_at_a_knee_is_that_of_the_control(name: str) -> None:
+    samples, _ = rigs.recorded(name, SECONDS)
+    _, phase, level = find(samples, rigs.knees(name))
+    vacuum = (
+        rigs.theta(name)[c.AMBIENT] - level[(phase == Phase.HOLD) & np.isfinite(level)]
+    ) / MBAR
+    assert len(vacuum) >= 6
+    assert vacuum == pytest.approx(750, abs=10)
+    assert vacuum.std() < 2
+
+
+# What commands say.
+
+
+KNEES = Knees(window=10, noise=30.0, off_shift=0, on_shift=4, settled=30, again=30, longest=60)
+
+
+def stream(commands: npt.ArrayLike, pressure: float | npt.ArrayLike = 1e5) -> Samples:
+    samples = np.zeros(np.size(commands), SAMPLE)
+    samples["commands"] = commands
+    samples["pressure"] = pressure
+    samples["sequence"] = np.arange(len(samples))
+    samples["time_ns"] = samples["host_ns"] = 1_000_000 * samples["sequence"]
+    return samples
+
+
+@settings(deadline=None)  # the first call compiles
+@given(st.lists(st.integers(0, 255), min_size=1, max_size=200), st.integers(1, 50))
+def test_at_constant_pressure_the_commands_are_the_phases(commands: list[int], block: int) -> None:
+    rows, phase, _ = find(stream(commands), KNEES, block)
+    wanted = [
+        Phase.BLOW_OFF if value & 2 else Phase.SUCTION if value & 1 else Phase.IDLE
+        for value in commands
+    ]
+    assert phase.tolist() == wanted
+    assert rows["commands"].tolist() == commands
+
+
+@given(st.integers(1, 40), st.integers(1, 100))
+@settings(deadline=None)
+def test_a_timed_pulse_is_as_long_as_the_ejector_makes_it(command_rows: int, block: int) -> None:
+    knees = replace(KNEES, blow_off=(float(c.TIMED), 0.1))
+    commands = [1] * 50 + [2] * command_rows + [0] * (200 - command_rows)
+    _, phase, _ = find(stream(commands), knees, block)
+    assert phase.tolist() == [1] * 50 + [3] * 100 + [0] * 100
+
+
+def test_an_internal_pulse_follows_suction_by_itself() -> None:
+    knees = replace(KNEES, blow_off=(float(c.INTERNAL), 0.1))
+    _, phase, _ = find(stream([1] * 50 + [0] * 200), knees, 30)
+    assert phase.tolist() == [1] * 50 + [3] * 100 + [0] * 100
+
+
+def test_blow_off_wins() -> None:
+    _, phase, _ = find(stream([1] * 50 + [3] * 50 + [1] * 50), KNEES)
+    assert phase.tolist() == [1] * 50 + [3] * 50 + [1] * 50
+
+
+@pytest.mark.parametrize("noise", [1.0, 30.0])
+@pytest.mark.parametrize("command", [0, 1, 2])
+def test_noise_alone_makes_no_knee(noise: float, command: int) -> None:
+    pressure = 3e4 + noise * np.random.default_rng(5).standard_normal(40_000)
+    _, phase, _ = find(stream(np.full(40_000, command), pressure), KNEES)
+    assert len(set(phase.tolist())) == 1
+
+
+# Synchronisation.
+
+
+@pytest.mark.parametrize("slope", [0.0, -5.0, 5.0])  # Pa per row: a closed vessel cools or warms
+@pytest.mark.parametrize("block", [7, 1000])
+def test_a_cycle_begins_where_the_last_idle_rows_lead(slope: float, block: int) -> None:
+    pressure = 1e5 + slope * np.arange(150) + np.random.default_rng(1).normal(0.0, 3.0, 150)
+    pressure[100:] = 5e4  # suction has no say in it
+    _, _, level = find(stream([0] * 100 + [1] * 50, pressure), KNEES, block)
+    assert np.flatnonzero(np.isfinite(level)).tolist() == [IDLE_ROWS - 1, 100]
+    for row in (IDLE_ROWS - 1, 100):
+        assert level[row] == pytest.approx(1e5 + slope * row, abs=6 + abs(slope))
+
+
+def test_a_few_idle_rows_give_their_mean() -> None:
+    pressure = 1e5 + np.arange(80.0)
+    _, _, level = find(stream([1] * 20 + [0] * 10 + [1] * 50, pressure), KNEES)
+    assert level[30] == pytest.approx(pressure[20:30].mean())
+
+
+def test_unreadable_rows_have_no_say_in_it() -> None:
+    samples = stream([0] * 60 + [1] * 50)
+    for row, flag in ((30, Quality.BAD), (40, Quality.STALE), (50, Quality.OVERFLOW)):
+        samples["pressure"][row] = 5e5
+        samples["quality"][row] = flag
+    samples["pressure"][55] = np.nan
+    _, _, level = find(samples, KNEES)
+    assert level[60] == 1e5
+
+
+def test_too_short_an_idle_says_nothing() -> None:
+    samples = stream([1] * 50 + [0] * 4 + [1] * 50)
+    _, _, level = find(samples, KNEES)
+    assert np.isnan(level).all()
+
+
+def test_rows_before_a_break_say_nothing_about_those_after_it() -> None:
+    samples = stream([0] * 60 + [1] * 50)
+    samples["pressure"][:58] = 0.5e5
+    samples["quality"][58] = Quality.CLOCK
+    _, _, level = find(samples, KNEES)
+    assert np.flatnonzero(np.isfinite(level)).tolist() == [IDLE_ROWS - 1]
+
+
+@pytest.mark.parametrize("flag", Quality(BREAK))
+def test_a_break_is_no_knee(flag: Quality) -> None:
+    falling = 1e5 - 100.0 * np.arange(300)
+    samples = stream([1] * 600, np.concatenate([falling, np.full(300, falling[-1])]))
+    samples["quality"][300] = flag
+    _, phase, _ = find(samples, KNEES)
+    assert (phase == Phase.SUCTION).all()
+    samples["quality"][300] = 0
+    _, phase, _ = find(samples, KNEES)
+    assert (phase == Phase.HOLD).any()
+
+
+def test_a_jump_is_no_knee() -> None:
+    samples = stream([1] * 600, 1e5 - 100.0 * np.arange(600))
+    samples["pressure"][300:] += 2500.0
+    _, phase, level = find(samples, KNEES)
+    assert (phase == Phase.SUCTION).all()
+    assert not np.isfinite(level[1:]).any()
+
+
+@pytest.mark.parametrize(("name", "rows"), [("gripper", 2), ("test_rig", 2), ("test_rig", 3)])
+def test_a_sensor_that_is_slower_than_the_rows_hides_no_switch(name: str, rows: int) -> None:
+    """It holds each reading for some rows: then the pressure goes in steps, and none is a jump."""
+    samples, truth = rigs.recorded(name, SECONDS, ("leakage=2",) if name == "gripper" else (), 1)
+    samples = samples.copy()
+    samples["pressure"] = np.repeat(samples["pressure"][::rows], rows)[: len(samples)]
+    assert len(found_where_true(samples, truth, rigs.knees(name))) > 3
+
+
+def test_a_line_that_rings_does_not_hide_the_knee() -> None:
+    """Pressure may rise as fast as if it jumped, but it takes some rows for it."""
+    rise = [2.4, 9.1, 16.6, 25.1, 29.2, 29.4, 28.0, 25.2, 22.7, 22.9, 23.9, 26.0, 28.8, 29.8]
+    ringing = [*rise, 30.0, 28.5, 26.5, 24.0, 21.4, 20.1, *np.full(280, 20.0)]  # as on a gripper
+    falling = -0.42 * np.arange(-300, 1)
+    mbar = 261.0 + np.concatenate([falling, ringing])
+    noise = np.random.default_rng(0).normal(0.0, 0.31, len(mbar))
+    knees = Knees(window=11, noise=31.0, off_shift=0, on_shift=9, settled=36, again=36, longest=60)
+    _, phase, _ = find(stream([1] * len(mbar), 100.0 * (mbar + noise)), knees)
+    (knee,) = np.flatnonzero(np.diff(phase)) + 1
+    assert phase[knee] == Phase.HOLD
+    assert abs(int(knee) - 301) <= 4
+
+
+def test_the_nozzle_may_go_off_again_before_a_valve_could_have_followed_a_command() -> None:
+    """It acts at once where the air saving switches; only lines ring."""
+    slopes = np.repeat([-100.0, 20.0, -100.0, 20.0], [300, 100, 35, 200])  # Pa per row
+    samples = stream([1] * len(slopes), 9e4 + np.cumsum(slopes))
+    samples["pressure"] += np.random.default_rng(0).normal(0.0, KNEES.noise, len(slopes))
+    _, phase, level = find(samples, KNEES)
+    knees = np.flatnonzero(np.isfinite(level[1:])) + 1
+    assert phase[knees].tolist() == [Phase.HOLD, Phase.SUCTION, Phase.HOLD]
+    assert knees == pytest.approx([300, 400, 435], abs=3)
+
+
+def on_other_tubes(seed: int) -> tuple[PlcSettings, DataSet]:
+    """The gripper as another unit, on shorter or longer tubes, and its data set."""
+    factor = float(np.random.default_rng([2, seed]).uniform(0.6, 2.5))
+    document = rigs.config("gripper").document
+    plc = drawn(document.section(PlcSettings, "plc"), seed).model_dump()
+    plc["rig"]["line_length_m"] *= factor
+    plc["rig"]["line_ml"] *= factor
+    plc["program"]["start_ms"] = 500.0
+    data = rigs.config("gripper").data.model_dump()
+    for part in data["system"]["parts"]:
+        if part["kind"] == "tube":
+            part["length_mm"] *= factor
+    data["ejector"]["end_pressure_mbar"] = plc["ejector"]["end_pressure_mbar"]
+    return PlcSettings.model_validate(plc), DataSet.model_validate(data)
+
+
+@pytest.mark.parametrize("fault", ["leakage=0", "leakage=2"])
+@pytest.mark.parametrize("seed", range(6))
+def test_a_tube_that_rings_does_not_switch_the_nozzle(seed: int, fault: str) -> None:
+    plc, data = on_other_tubes(seed)
+    parts = zip(*with_truth(plc, SECONDS, [parse_fault(fault)], seed), strict=True)
+    samples, truth = (np.concatenate(column) for column in parts)
+    knees = expected_knees(coefficients(data), data.sensor.noise_mbar * MBAR)
+    assert len(found_where_true(samples, truth, knees)) >= 10
+
+
+def test_no_knee_is_near_the_level_of_the_last() -> None:
+    """The slope breaks as it does where the nozzle goes on, but the pressure has hardly risen."""
+    slopes = np.repeat([-100.0, 100.0, -30.0, 10.0, -100.0], [300, 40, 40, 400, 200])  # Pa per row
+    samples = stream([1] * len(slopes), 9e4 + np.cumsum(slopes))
+    samples["pressure"] += np.random.default_rng(0).normal(0.0, KNEES.noise, len(slopes))
+    for apart, first_on in ((0.0, 340), (5000.0, 780)):
+        _, phase, _ = find(samples, replace(KNEES, on_shift=0, apart=apart))
+        on = np.flatnonzero((phase[1:] == Phase.SUCTION) & (phase[:-1] == Phase.HOLD)) + 1
+        assert on[0] == pytest.approx(first_on, abs=3)
+
+
+def test_knees_are_apart_where_the_line_rings_and_by_less_than_the_hysteresis() -> None:
+    assert rigs.knees("test_rig").apart == 0.0
+    assert rigs.knees("gripper").apart > 20.0 * MBAR
+    theta = rigs.theta("gripper")
+    theta[c.H1_LOW] = theta[c.H1] - 60.0 * MBAR
+    assert expected_knees(theta, rigs.knees("gripper").noise).apart <= 40.0 * MBAR
+
+
+def test_a_swing_that_the_model_does_not_show_is_no_knee() -> None:
+    """The window is then as long as the swing: over that a line that rings is level."""
+    plc, data = on_other_tubes(4)
+    parts = zip(*with_truth(plc, SECONDS, [], 4), strict=True)
+    samples, truth = (np.concatenate(column) for column in parts)
+    theta, noise = coefficients(data), data.sensor.noise_mbar * MBAR
+    rings = replace(expected_knees(theta, noise), apart=0.0)
+    theta[[c.NEAR_RESISTANCE, c.RESISTANCE]] *= 30.0
+    damped = expected_knees(theta, noise)
+    assert damped.apart == 0.0
+    assert damped.window >= 3 * rings.window
+    with pytest.raises(AssertionError, match="never were"):
+        found_where_true(samples, truth, rings)
+    assert len(found_where_true(samples, truth, replace(rings, window=damped.window))) >= 10
+
+
+def found_late(name: str, factor: float) -> tuple[float, float]:
+    """Median rows by which the nozzle is said to go off and on too late, with a slower sensor."""
+    plc = rigs.config(name).document.section(PlcSettings, "plc").model_dump()
+    plc["sensor"]["lag_ms"] *= factor
+    plc["program"]["suction_ms"] = {"gripper": 2500.0, "test_rig": 9000.0}[name]
+    rig, leak = PlcSettings.model_validate(plc), [parse_fault("leakage=2")]
+    parts = zip(*with_truth(rig, 30.0, leak, 1), strict=True)
+    samples, truth = (np.concatenate(column) for column in parts)
+    theta = rigs.theta(name)
+    theta[c.SENSOR_LAG] *= factor
+    _, phase, _ = find(samples, expected_knees(theta, rigs.knees(name).noise))
+    suction = samples["commands"] == Command.SUCTION
+    true, found = (switches(on, suction) for on in (truth["nozzle"] == 1, phase == Phase.SUCTION))
+    off, on = (
+        [min((row - one for one, as_well in true if as_well == to), key=abs) for row in rows]
+        for to in (False, True)
+        for rows in ([row for row, what in found if what == to],)
+    )
+    assert min(len(off), len(on)) >= 6
+    return float(np.median(off)), float(np.median(on))
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_a_slow_sensor_does_not_change_when_the_nozzle_is_said_to_switch(name: str) -> None:
+    assert found_late(name, 6.0) == pytest.approx(found_late(name, 1.0), abs=3.0)
+
+
+@pytest.mark.parametrize("every", [2, 5, 10])
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_in_rows_further_apart_each_switch_is_found_at_its_time(name: str, every: int) -> None:
+    samples, truth = rigs.recorded(name, SECONDS, ("leakage=2",))
+    samples, truth = samples[::every].copy(), truth[::every]
+    samples["sequence"] = np.arange(len(samples))
+    knees = knees_of(rigs.config(name).data, sampling_ms(samples))
+    assert knees.period == pytest.approx(every * MS)
+    late = found_where_true(samples, truth, knees)
+    assert len(late) >= 6
+    assert max(map(abs, late)) <= 5  # rows; the port's step pulls a knee forward
+    assert max(late) - min(late) <= 5
+
+
+# The window.
+
+
+@settings(max_examples=30)
+@given(st.floats(1.0, 5000.0), st.sampled_from(rigs.NAMES))
+def test_the_window_has_its_bounds(noise: float, name: str) -> None:
+    knees = expected_knees(rigs.theta(name), noise)
+    assert SHORTEST_WINDOW <= knees.window <= LONGEST_WINDOW
+    assert knees.noise == noise
+    assert knees.lag < 2 * LONGEST_WINDOW
+
+
+def test_the_knee_of_a_large_tank_is_flat_but_seen() -> None:
+    """Ten times the volume, and a noisy sensor: the slope breaks by 0.04 mbar a row."""
+    plc = rigs.config("test_rig").document.section(PlcSettings, "plc").model_dump()
+    plc["rig"]["vessel_ml"] *= 10.0
+    plc["sensor"]["noise_mbar"] = 0.5
+    plc["program"] |= {"suction_ms": 26_000.0, "blow_off_ms": 3000.0}
+    theta = rigs.theta("test_rig")
+    theta[c.VOLUME] *= 10.0
+    stream = list(blocks(PlcSettings.model_validate(plc), 58.0))
+    _, phase, _ = find(np.concatenate(stream), expected_knees(theta, 50.0))
+    off = np.count_nonzero((phase[1:] == Phase.HOLD) & (phase[:-1] == Phase.SUCTION))
+    assert off == 2
+
+
+def test_more_noise_takes_a_longer_window() -> None:
+    theta = rigs.theta("test_rig")
+    assert expected_knees(theta, 10.0).window < expected_knees(theta, 50.0).window
+
+
+@given(st.integers(1, 400))
+def test_a_row_is_held_back_only_where_a_knee_may_be(block: int) -> None:
+    finder = PhaseFinder(replace(KNEES, window=12))
+    commands = [0] * 300 + [1] * 700 + [0] * 100 + [1] * 20 + [2] * 100
+    first = 300 + finder.knees.settled + finder.knees.window + 1  # row that may be at a knee
+    pushed = given_out = 0
+    for part in rigs.cut(stream(commands), block):
+        pushed += len(part)
+        given_out += len(finder.push(part)[0])
+        searched = max(pushed - finder.knees.window, first)
+        assert given_out == (min(pushed, searched) if pushed <= 1000 else pushed)
+    assert given_out == len(commands)
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_no_row_is_held_back_longer_than_the_lag(name: str) -> None:
+    samples, _ = rigs.recorded(name, SECONDS)
+    finder = PhaseFinder(rigs.knees(name))
+    pushed = given_out = longest = 0
+    for part in rigs.cut(samples, 10):
+        pushed += len(part)
+        given_out += len(finder.push(part)[0])
+        longest = max(longest, pushed - given_out)
+        if part["commands"][-1] != Command.SUCTION:
+            assert given_out == pushed
+    assert finder.knees.window <= longest <= finder.knees.lag
+
+
+def test_a_slow_sensor_takes_a_longer_window() -> None:
+    theta = rigs.theta("test_rig")
+    as_built = expected_knees(theta, 31.0).window
+    theta[c.SENSOR_LAG] = 25e-3
+    assert as_built + 5 < expected_knees(theta, 31.0).window <= LONGEST_WINDOW
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_as_it_should_be_the_window_is_as_wide_as_needed(name: str) -> None:
+    samples, _ = rigs.recorded(name, SECONDS)
+    assert as_wide_as_needed(rigs.knees(name), rigs.cut(samples, 1000)) == rigs.knees(name)
+
+
+@pytest.mark.parametrize(("name", "lag"), [("test_rig", 50), ("gripper", 100)])
+def test_where_a_sensor_is_too_slow_for_its_window_a_wider_one_sees_more(
+    name: str, lag: int
+) -> None:
+    samples, _ = rigs.recorded(name, SECONDS, (f"sensor_lag={lag}",))
+    wider = as_wide_as_needed(rigs.knees(name), [samples])
+    assert rigs.knees(name).window < wider.window <= rigs.knees(name).longest
+    few, most = (
+        int(np.count_nonzero((phase[1:] == Phase.HOLD) & (phase[:-1] == Phase.SUCTION)))
+        for _, phase, _ in (find(samples, knees) for knees in (rigs.knees(name), wider))
+    )
+    assert few < most >= SECONDS // 3.2 - 1  # cycles are 3.2 s long

@@ -1,0 +1,103 @@
+"""Alarms into the database and what people ask for out of it; the loop never waits for it."""
+
+import queue
+import threading
+from collections.abc import Callable
+
+from twin.alarms.database import Store
+from twin.alarms.loop import Before, News
+from twin.alarms.requests import Request
+from twin.assets.unit import Unit
+from twin.errors import TwinError, in_words
+
+POLL_S = 1.0  # between looks at what is asked; what has changed is written with it
+RETRY_S = 5.0  # after the database could not be reached
+
+
+class Keeper:
+    """Keeps the alarms of a unit, in a thread of its own (``twin.alarms.loop.Office``).
+
+    What cannot be written is said once and kept until it can be; the loop goes on in every case.
+    """
+
+    def __init__(
+        self, open_store: Callable[[], Store], unit: Unit, say: Callable[[str], None]
+    ) -> None:
+        self._open_store, self._unit, self._say = open_store, unit, say
+        self._store: Store | None = None
+        self._waiting = News()
+        self._failed = False
+        self._news: queue.SimpleQueue[News] = queue.SimpleQueue()
+        self._requests: queue.SimpleQueue[Request] = queue.SimpleQueue()
+        self._passed_on = 0  # the newest request that was
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="alarms", daemon=True)
+
+    def begin(self) -> Before:
+        """Give what another run left, and begin; without a database nothing is known of before."""
+        before = Before()
+        try:
+            self._store = self._open_store()
+            before = self._store.before(self._unit)
+        except TwinError as error:
+            self._let_go()
+            self._failed = True
+            self._say(f"alarms begin anew, and wait in memory: {error}")
+        self._thread.start()
+        return before
+
+    def take(self, news: News) -> None:
+        """Keep it."""
+        self._news.put(news)
+
+    def asked(self) -> list[Request]:
+        """What people have asked for since the last time."""
+        return [self._requests.get() for _ in range(self._requests.qsize())]
+
+    def close(self) -> None:
+        """Write what is left; a database that is away is not waited for much longer."""
+        self._ending.set()
+        self._thread.join()
+
+    # --- the thread -----------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        pause = POLL_S
+        while not self._ending.wait(pause):
+            pause = POLL_S if self._exchange() else RETRY_S
+        if not self._exchange() and self._waiting:
+            self._say(f"{len(self._waiting.episodes)} episodes of alarms could not be stored")
+        self._let_go()
+
+    def _exchange(self) -> bool:
+        """Write what has changed and look at what is asked; says so if that begins to fail."""
+        while not self._news.empty():
+            self._waiting.add(self._news.get())
+        try:
+            self._store = self._store or self._open_store()
+            if self._waiting:
+                self._store.save(self._unit, self._waiting)
+            self._waiting = News()
+            self._pass_on(self._store.requests(self._unit))
+        except Exception as error:  # whatever it is, later ones are to be stored
+            self._let_go()
+            if not self._failed:
+                self._say(f"alarms wait in memory: {in_words(error)}")
+            self._failed = True
+            return False
+        if self._failed:
+            self._say("alarms are stored again")
+        self._failed = False
+        return True
+
+    def _pass_on(self, requests: list[Request]) -> None:
+        """Hand over each request once; it stays in the database until it is answered."""
+        for request in requests:
+            if request.id > self._passed_on:
+                self._passed_on = request.id
+                self._requests.put(request)
+
+    def _let_go(self) -> None:
+        if self._store is not None:
+            self._store.close()
+        self._store = None

@@ -1,0 +1,134 @@
+"""Where the alarms of ``twin run`` go, as its configurations have it."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from twin.errors import ConfigError
+
+if TYPE_CHECKING:
+    from twin.config import Config
+    from twin.notifications.data import Teller
+    from twin.notifications.dispatch import Outlets
+    from twin.notifications.sender import Channel, Lane
+    from twin.notifications.settings import MqttSettings, Outlet
+    from twin.notifications.uploader import Uploader
+
+Say = Callable[[str], None]
+Standing = Sequence[Mapping[str, Any]]  # alarms as they are
+Begin = Callable[[Standing], "Outlets"]
+
+
+def outlets_of(settings: "Config", say: Say) -> Begin | None:
+    """What begins the outlets of a configuration, with its alarms as they are; None without any.
+
+    ConfigError names a wrong key, or a secret or certificate that cannot be used.
+    """
+    from twin.alarms.database_url import place_of
+    from twin.alarms.settings import AlarmSettings
+    from twin.assets.unit import Unit
+    from twin.notifications.settings import chosen, chosen_upload
+
+    document = settings.document
+    mqtt, webhook = chosen(document)
+    chosen_upload(document)
+    if not (mqtt.host or webhook.url):
+        return None
+    if not document.section(AlarmSettings, "alarms").keep:
+        raise ConfigError(
+            f"{document.name}: [mqtt] and [webhook] keep what waits in the alarm database,"
+            " and [alarms] does not",
+            "set keep = true under [alarms]",
+        )
+    from twin.notifications.dispatch import Outlets
+    from twin.notifications.mqtt import Mqtt
+    from twin.notifications.outbox import open_outbox
+    from twin.notifications.sender import Sender
+    from twin.notifications.webhook import Webhook
+
+    folder, unit = Path(document.name).parent, Unit(settings.asset.type, settings.asset.id)
+    outbox = partial(open_outbox, place_of(document), unit)
+    channels: dict[str, tuple[Channel, Outlet]] = {}
+    uploader = _uploader_of(settings, say)
+    if mqtt.host:
+        batch, hear = settings.asset.batch, uploader.hear if uploader else None
+        channels["mqtt"] = Mqtt(mqtt, unit, folder, say, batch=batch, hear_request=hear), mqtt
+    if webhook.url:
+        channels["webhook"] = Webhook(webhook, folder, say), webhook
+
+    def begin(standing: Standing) -> "Outlets":
+        tellers = {"mqtt": _tellers_of(settings, mqtt)} if mqtt.host else {}
+        lanes = {"mqtt": _lanes_of(mqtt)}
+        senders = [
+            Sender(name, channel, outbox, limits, say, lanes=lanes.get(name, ()))
+            for name, (channel, limits) in channels.items()
+        ]
+        restating = [name for name in channels if name == "mqtt"]
+        outlets = Outlets(
+            unit,
+            outbox,
+            senders,
+            say,
+            restating=restating,
+            tellers=tellers,
+            uploader=uploader,
+        )
+        outlets.begin(standing)
+        return outlets
+
+    return begin
+
+
+def _uploader_of(settings: "Config", say: Say) -> "Uploader | None":
+    """What uploads logs when asked, where ``[outlets.upload]`` is there."""
+    import threading
+
+    from twin.alarms.database_url import place_of as database_of
+    from twin.assets.unit import Unit
+    from twin.notifications.logs import find
+    from twin.notifications.message import asset_of
+    from twin.notifications.settings import chosen_upload
+    from twin.notifications.upload_destinations import place_of
+    from twin.notifications.upload_requests import open_uploads
+    from twin.notifications.uploader import Uploader
+
+    upload = chosen_upload(settings.document)
+    if upload is None:
+        return None
+    folder, ending = Path(settings.document.name).parent, threading.Event()
+    unit = Unit(settings.asset.type, settings.asset.id)
+    return Uploader(
+        asset_of(unit, settings.asset.batch),
+        partial(open_uploads, database_of(settings.document), unit),
+        partial(find, folder / upload.logs, unit),
+        place_of(upload, unit, folder, ending, say),
+        ending,
+        say,
+    )
+
+
+def _tellers_of(settings: "Config", mqtt: "MqttSettings") -> "list[Teller]":
+    """What goes to the broker beside alarms."""
+    from twin.assets.unit import Unit
+    from twin.notifications.data import Cycles, Values
+    from twin.notifications.message import asset_of
+    from twin.signals import MBAR
+
+    asset = asset_of(Unit(settings.asset.type, settings.asset.id), settings.asset.batch)
+    tellers: list[Teller] = [Cycles(asset)] if mqtt.cycles else []
+    if mqtt.values is not None:
+        ambient = settings.data.ambient.pressure_mbar * MBAR
+        tellers.append(Values(asset, mqtt.values.period_s, ambient))
+    return tellers
+
+
+def _lanes_of(mqtt: "MqttSettings") -> "list[Lane]":
+    """How that waits: also what an earlier run has left of what is not told any more."""
+    from twin.notifications.data import CYCLE, VALUES
+    from twin.notifications.sender import Lane
+    from twin.notifications.uploader import UPLOAD
+
+    answers = Lane(UPLOAD, "answers about uploads", mqtt.keep_hours, most=1000)
+    what = {CYCLE: "key figures", VALUES: "values"}
+    return [answers, *(Lane(topic, words, mqtt.keep_hours) for topic, words in what.items())]

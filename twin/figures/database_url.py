@@ -1,0 +1,30 @@
+"""Which figure database: the one that is named, else a file beside the configuration."""
+
+from pathlib import Path
+
+from sqlalchemy import URL
+
+from twin.assets.engine import configured
+from twin.figures.database import FIGURE_DATABASE, Store, open_store
+from twin.figures.settings import FigureSettings
+from twin.settings import Document
+
+FILE = "figures.sqlite"
+
+
+def open_chosen(named: str, document: Document | None, *, write: bool) -> Store:
+    """Open the database named on the command line, else in the configuration, else the default.
+
+    The default is a file beside the configuration, without one in the current folder. Only who
+    writes makes a file; SourceError if there is none to read.
+    """
+    if named:
+        return open_store(named, create=write)
+    return open_store(place_of(document), create=write)
+
+
+def place_of(document: Document | None) -> URL:
+    """The database that a configuration names, else the default."""
+    folder = Path(document.name).parent if document else Path()
+    settings = document.section(FigureSettings, "figures") if document else FigureSettings()
+    return configured(settings, folder, FILE, FIGURE_DATABASE)

@@ -1,0 +1,112 @@
+"""Key figures into the database, from the loop or from a log; the loop never waits for it."""
+
+import queue
+import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+from twin.assets.unit import Unit
+from twin.errors import in_words
+from twin.events import Event, Kind, Severity
+from twin.figures.database import Store
+from twin.signals import Samples, Ticks
+
+BATCH_S = 2.0  # cycles of so long are written together
+RETRY_S = 5.0  # after the database could not be written
+MOST_WAITING = 20_000  # cycles that wait for a database that is away: most of a day
+
+
+class Alarms:
+    """Counts alarms for the cycles they were raised in."""
+
+    def __init__(self) -> None:
+        self._open: list[int] = []  # PLC times of those that no cycle has counted
+
+    def see(self, events: Iterable[Event]) -> None:
+        """Take events; those that are alarms count."""
+        self._open += [event.time_ns for event in events if event.severity is Severity.ALARM]
+
+    def until(self, end_ns: int) -> int:
+        """How many there were to the end of a cycle since the cycle before."""
+        later = [time_ns for time_ns in self._open if time_ns > end_ns]
+        found, self._open = len(self._open) - len(later), later
+        return found
+
+
+class Keeper:
+    """A sink that stores the key figures which CYCLE events carry, in a thread of its own.
+
+    What cannot be written is said once and kept until it can be; the loop goes on in every case.
+    """
+
+    def __init__(  # everything that makes a row whole
+        self,
+        open_store: Callable[[], Store],
+        unit: Unit,
+        data_set: str,
+        say: Callable[[str], None],
+        source: str = "live",
+    ) -> None:
+        self._open_store = open_store
+        self._whose = unit, data_set, source
+        self._say = say
+        self._alarms = Alarms()
+        self._store: Store | None = None
+        self._waiting: list[Mapping[str, Any]] = []
+        self._failed = False
+        self._cycles: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="key figures", daemon=True)
+        self._thread.start()
+
+    def write(self, _samples: Samples, _ticks: Ticks, events: Sequence[Event]) -> None:
+        """Take what happened."""
+        if not events:
+            return
+        self._alarms.see(events)
+        for event in events:
+            if event.kind is Kind.CYCLE and "begin_ns" in event.data:
+                alarms = self._alarms.until(int(event.data["end_ns"]))
+                self._cycles.put({**event.data, "alarms": alarms})
+
+    def close(self) -> None:
+        """Write what is left; a database that is away is not waited for much longer."""
+        self._ending.set()
+        self._thread.join()
+
+    # --- the thread -----------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        pause = BATCH_S
+        while not self._ending.wait(pause):
+            pause = BATCH_S if self._write_waiting() else RETRY_S
+        if not self._write_waiting():
+            left = f"key figures of {len(self._waiting)} cycles could not be stored"
+            self._say(f"{left}; from a log: twin figures show LOG --keep")
+        self._let_go()
+
+    def _write_waiting(self) -> bool:
+        """Write all there is; says so if it fails for the first time, or works again."""
+        while not self._cycles.empty():
+            self._waiting.append(self._cycles.get())
+        del self._waiting[:-MOST_WAITING]
+        if not self._waiting:
+            return True
+        try:
+            self._store = self._store or self._open_store()
+            self._store.add(*self._whose, self._waiting)
+        except Exception as error:  # whatever it is, later ones are to be stored
+            self._let_go()
+            if not self._failed:
+                self._say(f"key figures wait in memory: {in_words(error)}")
+            self._failed = True
+            return False
+        if self._failed:
+            self._say(f"key figures are stored again: {len(self._waiting)} cycles had waited")
+        self._failed, self._waiting = False, []
+        return True
+
+    def _let_go(self) -> None:
+        if self._store is not None:
+            self._store.close()
+        self._store = None

@@ -1,0 +1,235 @@
+"""A fleet's report for people: lines for a terminal, and a page that needs no network."""
+
+import html
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from matplotlib.ticker import FuncFormatter
+
+from twin.diagnosis.drawing import AFTER, BEFORE, QUIET, as_svg, empty, legend, logarithmic
+from twin.diagnosis.page import PAGE, card, paragraph, picture, section, table
+from twin.diagnosis.text import spoken
+from twin.files import write_text
+from twin.fleet.peers import FEWEST_PEERS, Drift
+from twin.fleet.report import STANDS_OUT, Report, Row, State
+from twin.fleet.type_statistics import Estimate
+from twin.instants import dated
+
+MOST_LISTED = 15  # units, in the terminal
+GOOD, BAD, UNKNOWN = "#2e7d4f", "#b3261e", "#555555"
+HEAD = ("unit", "batch", "stands out by", "most like", "drift", "diagnosis")
+NOT_JUDGED = ("unit", "batch", "why")
+REFUSED = ("log", "why")
+CUT = ("unit", "batch", "log", "judged by what is there")
+GROUPS = ("type", "batch", "units", "stand out", "do not", "not judged", "log cut off", "causes")
+SAID = {
+    State.STANDS_OUT: "stands out",
+    State.DOES_NOT: "does not stand out",
+    State.NOT_JUDGED: "could not be judged",
+}
+
+
+def in_words(report: Report) -> str:
+    """Worst units first, then what is not known, types and batches, and what units say of types."""
+    lines = [headline(report)]
+    out = [(str(n), *_cells(row)) for n, row in enumerate(report.of(State.STANDS_OUT), 1)]
+    lines += _listed("", ("", *HEAD), out)
+    if any(not row.verdict for row in report.of(State.STANDS_OUT)):
+        lines += ["", _DIAGNOSE]
+    lines += _listed("could not be judged", NOT_JUDGED, _reasons(report))
+    if advice := _advice(report):
+        lines += ["", advice]
+    lines += _listed("log cut off", CUT, _cut(report))
+    lines += _listed("could not be used", REFUSED, _refused(report))
+    lines += ["", *_columns([GROUPS, *_groups(report)])]
+    for kind, rows in _kinds(report):
+        lines += ["", f"{kind} by its calibrated units", *_columns(rows)]
+    return "\n".join(lines)
+
+
+def headline(report: Report) -> str:
+    """The whole in one sentence: the only count there is."""
+    out, fine, unknown = (len(report.of(state)) for state in State)
+    said = [f"{out or 'none'} {'stands' if out < 2 else 'stand'} out"]
+    said += [f"{fine} {'does' if fine == 1 else 'do'} not"] if fine and (out or unknown) else []
+    said += [f"{unknown} could not be judged"] if unknown else []
+    counted = (
+        (len(report.cut()), "cut off: judged by what is there"),
+        (len(report.refused), "could not be used"),
+    )
+    logs = [f"{count} {_some('log', count)} {what}" for count, what in counted if count]
+    units = f"{len(report.rows)} {_some('unit', len(report.rows))}"
+    return f"{units}: {'; '.join([', '.join(said), *logs])}"
+
+
+def write_page(report: Report, path: Path) -> None:
+    """Write the report as one HTML file; SourceError if it cannot be written."""
+    out = report.of(State.STANDS_OUT)
+    parts = []
+    if out:
+        rows = [(str(rank), *_cells(row)) for rank, row in enumerate(out, 1)]
+        parts.append(section("Worst first", table("Units to look at", ("", *HEAD), rows, (0,))))
+    if unknown := _reasons(report):
+        advice = paragraph(_advice(report)) if _advice(report) else ""
+        parts.append(section("Could not be judged", table("", NOT_JUDGED, unknown) + advice))
+    if cut := _cut(report):
+        parts.append(section("Log cut off", table("", CUT, cut)))
+    if lost := _refused(report):
+        cards = "\n".join(card(log, why, ()) for log, why in lost)
+        parts.append(section("Logs that could not be used", cards))
+    parts += _drawn(report)
+    parts.append(section("By type and batch", table("", GROUPS, _groups(report), range(2, 7))))
+    for kind, (top, *values) in _kinds(report):
+        body = table("", top, values, range(1, 6))
+        parts.append(section(f"{kind}, by its calibrated units", body + paragraph(_MEAN)))
+    colour, mark = (BAD, "▲") if out else (UNKNOWN, "?") if unknown or cut or lost else (GOOD, "✓")
+    page = PAGE.substitute(
+        title="Fleet",
+        colour=colour,
+        mark=mark,
+        verdict="Fleet",
+        headline=html.escape(headline(report)),
+        body="\n".join(parts),
+        footer=html.escape(
+            f"A unit stands out from {STANDS_OUT:g} sigmas of the others of its type on, judged by "
+            f"its newest log; of a type with fewer than {FEWEST_PEERS} units the diagnosis counts."
+        ),
+    )
+    write_text(path, page)
+
+
+_DIAGNOSE = "What stands out says little of the cause: twin fleet diagnose LOGS names it."
+_FEW = (
+    f"Fewer than {FEWEST_PEERS} units of a type cannot be compared. Their diagnoses judge them:"
+    " run twin fleet diagnose LOGS, then this report again."
+)
+_MEAN = (
+    "Mean of the units, each counting by how well its log determines the value; the spread is from "
+    "unit to unit. Values that too few logs determine are left out."
+)
+
+
+def _some(what: str, count: int) -> str:
+    return what if count == 1 else f"{what}s"
+
+
+def _name(row: Row) -> str:
+    return row.id or Path(row.log).stem
+
+
+def _reasons(report: Report) -> list[tuple[str, ...]]:
+    """The units that could not be judged, each with why."""
+    return [(_name(row), row.batch, row.reason) for row in report.of(State.NOT_JUDGED)]
+
+
+def _advice(report: Report) -> str:
+    """What judges units that nobody has judged yet; empty where there is none."""
+    few = (row.standing and not row.compared for row in report.of(State.NOT_JUDGED))
+    return _FEW if any(few) else ""
+
+
+def _cut(report: Report) -> list[tuple[str, ...]]:
+    """The units whose newest log was cut off, and how they are judged all the same."""
+    rows = report.cut()
+    return [(_name(row), row.batch, Path(row.log).name, SAID[row.state]) for row in rows]
+
+
+def _refused(report: Report) -> list[tuple[str, str]]:
+    """The logs that nothing could be done with, each with why."""
+    return [(one.log, one.why.removeprefix(f"{one.log}: ")) for one in report.refused]
+
+
+def _listed(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """A part of the text, as many rows as one reads; nothing where there are none."""
+    if not rows:
+        return []
+    left = len(rows) - MOST_LISTED
+    more = [f"and {left} more; --json and --html have all"] if left > 0 else []
+    return ["", *([title] if title else []), *_columns([head, *rows[:MOST_LISTED]]), *more]
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    standing, drift = row.compared, row.drifts[0] if row.drifts else None
+    beyond = f"{standing.beyond:.1f} sigma" if standing else ""
+    what = spoken(standing.effect) if standing else ""
+    if standing and standing.size is not None:
+        what += f" {standing.size:+.3g} {standing.unit}"
+    moves = _moves(drift) if drift else ""
+    causes = ", ".join(spoken(str(one["effect"])) for one in row.causes) or row.verdict
+    return _name(row), row.batch, beyond, what, moves, causes or "not yet"
+
+
+def _moves(drift: Drift) -> str:
+    if drift.step is not None and drift.step_ns is not None:
+        size = f"{drift.step:+.2g} {drift.unit}"
+        return f"{spoken(drift.effect)} stepped {size} by {dated(drift.step_ns)}"
+    return (
+        f"{spoken(drift.effect)} {drift.per_day:+.2g} {drift.unit}/day over {drift.days:.0f} days"
+    )
+
+
+def _groups(report: Report) -> list[tuple[str, ...]]:
+    return [
+        (
+            group["type"],
+            group["batch"],
+            str(group["units"]),
+            *(str(group[state]) for state in State),
+            str(group["log_cut"]),
+            ", ".join(f"{spoken(cause)} ({count})" for cause, count in group["causes"].items()),
+        )
+        for group in report.groups()
+    ]
+
+
+def _kinds(report: Report) -> list[tuple[str, list[tuple[str, ...]]]]:
+    head: tuple[str, ...] = ("value", "units", "mean", "± 1 sigma", "spread", "type has", "unit")
+    return [(kind, [head, *map(_value, every)]) for kind, every in report.kinds.items() if every]
+
+
+def _value(one: Estimate) -> tuple[str, ...]:
+    has = "" if one.type_has is None else f"{one.type_has:.4g}"
+    known = f"{one.mean:.4g}", f"{one.sigma:.2g}", f"{one.spread:.2g}"
+    return one.parameter, str(one.units), *known, has, one.unit
+
+
+def _drawn(report: Report) -> list[str]:
+    """How far units are from the others of their type, where there are enough to compare."""
+    far = [(row, standing.beyond) for row in report.rows if (standing := row.compared)]
+    if not far:
+        return []
+    far.sort(key=lambda one: -one[1])
+    title = f"Furthest from the others: {_name(far[0][0])}, by {far[0][1]:.1f} sigma"
+    with empty("fleet", 3.6) as figure:
+        axes = figure.subplots()
+        for colour, label, wanted in (
+            (BEFORE, "stands out", True),
+            (AFTER, "does not", False),
+        ):
+            ranks = [n for n, (row, _) in enumerate(far) if row.stands_out is wanted]
+            beyond = [max(far[n][1], 0.0) for n in ranks]
+            axes.plot([n + 1 for n in ranks], beyond, ".", color=colour, label=label)
+        axes.axhline(STANDS_OUT, color=QUIET, lw=0.8, ls="--")
+        logarithmic(axes)
+        axes.set_yscale("symlog", linthresh=STANDS_OUT)
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
+        axes.set_ylim(bottom=0.0)
+        axes.set_xlabel("rank")
+        axes.set_ylabel("furthest from the others\n(sigmas of their scatter)")
+        legend(figure, [axes])
+        svg = as_svg(figure, title)
+    caption = (
+        "Each unit by the effect in which it is furthest from the others of its type. The dashed"
+        f" line is at {STANDS_OUT:g} sigma; a unit below it may stand out by its drift."
+    )
+    return [picture(title, svg, caption)]
+
+
+def _columns(rows: Iterable[Sequence[str]]) -> list[str]:
+    """Lines with their cells below each other."""
+    every = list(rows)
+    wide = [max(len(cell) for cell in column) for column in zip(*every, strict=True)]
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, wide, strict=True)).rstrip()
+        for row in every
+    ]

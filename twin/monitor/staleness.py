@@ -1,0 +1,99 @@
+"""One clock decides what is stale: the time that the twin has listened without hearing anything.
+
+It runs on evenly, whatever happens to the wall clock. It stands while the twin does something
+else. Rows carry what it decides (``Quality.OURS``), so that a replay decides the same.
+"""
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from twin.events import Event, Kind
+from twin.monitor.monitor import Monitor
+from twin.signals import NS, Quality, Samples
+
+LONGEST_WAIT_NS = 500_000_000  # a driver gives a block at least this often: longer, we slept too
+ONCE_NS = 60_000_000_000  # a twin that is late again within this time has said so
+MOST_NOTICES = 100  # that may wait for the loop
+NO_DATA: Mapping[str, Any] = MappingProxyType({})
+
+
+@dataclass
+class Notices:
+    """What threads beside the loop have to tell; the loop takes it, in the PLC's time."""
+
+    _told: deque[tuple[Kind, str, Mapping[str, Any]]] = field(
+        default_factory=lambda: deque(maxlen=MOST_NOTICES)
+    )
+
+    def tell(self, kind: Kind, text: str, data: Mapping[str, Any] = NO_DATA) -> None:
+        """Have it said; any thread may, and none waits."""
+        self._told.append((kind, text, data))
+
+    def taken(self, time_ns: int) -> list[Event]:
+        """What was told since the last time, as events at ``time_ns``."""
+        told = [self._told.popleft() for _ in range(len(self._told))]
+        return [Event(time_ns, kind, text, dict(data)) for kind, text, data in told]
+
+
+@dataclass
+class Listening:
+    """Times the blocks of a live source; a replay needs none of it."""
+
+    clock: Callable[[], int] = time.perf_counter_ns  # runs on evenly
+    notices: Notices = field(default_factory=Notices)
+    _last: Samples | None = None  # the last fresh row, as an array of one
+    _heard_ns: int = 0  # when that was, by ``clock``
+    _listened_ns: int = 0  # since then
+    _late_ns: int | None = field(default=None)  # when the twin was late, by ``clock``
+
+    def over(
+        self, source: Iterable[Samples], monitor: Monitor
+    ) -> Iterator[tuple[Samples, list[Event]]]:
+        """The blocks, with what the time they took makes happen, in the PLC's time before them."""
+        blocks = iter(source)
+        asked_ns = self.clock()
+        while (block := next(blocks, None)) is not None:
+            now_ns = self.clock()
+            self._listened_ns += min(now_ns - asked_ns, LONGEST_WAIT_NS)
+            last = self._last
+            notices = [] if last is None else self.notices.taken(int(last["time_ns"][0]))
+            rows, events = self._judge(block, monitor, now_ns)
+            yield rows, notices + events
+            asked_ns = self.clock()
+
+    def _judge(self, block: Samples, monitor: Monitor, now_ns: int) -> tuple[Samples, list[Event]]:
+        fresh = np.flatnonzero((block["quality"] & Quality.STALE) == 0)
+        last = self._last
+        if not len(fresh):
+            stale = [] if last is None else monitor.silent(last[0], self._listened_ns)
+            return block, stale
+        events: list[Event] = []
+        if last is not None and not monitor.is_stale(last[0]):
+            first = fresh[:1]
+            if (block["host_ns"][first] - last["host_ns"] > monitor.stale_ns).any():
+                block = block.copy()
+                block["quality"][first] |= Quality.OURS.value
+            events = self._late(int(last["time_ns"][0]), now_ns, monitor.stale_ns)
+        self._last, self._heard_ns, self._listened_ns = block[fresh[-1:]].copy(), now_ns, 0
+        return block, events
+
+    def _late(self, time_ns: int, now_ns: int, stale_ns: int) -> list[Event]:
+        """Say that the twin was late, unless it said so a short time ago."""
+        late_ns = now_ns - self._heard_ns
+        if late_ns <= stale_ns:
+            return []
+        before, self._late_ns = self._late_ns, now_ns
+        if before is not None and now_ns - before < ONCE_NS:
+            return []
+        seconds = late_ns * NS
+        text = (
+            f"the twin was late: it took no samples for {seconds:.1f} s; the PLC is not stale. "
+            "Is this machine too busy?"
+        )
+        return [Event(time_ns, Kind.TWIN_LATE, text, {"seconds": seconds})]

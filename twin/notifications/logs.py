@@ -1,0 +1,98 @@
+"""Which files a request means: finished parts of the unit's own logs in the one folder of logs.
+
+Nothing that was asked becomes part of a path: a name is looked up among those that are there.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from mcap.exceptions import McapError
+from mcap.reader import SeekingReader
+
+from twin.assets.unit import Unit
+from twin.errors import SourceError
+from twin.log.part import first_parts
+from twin.log.reader import Log, open_log
+from twin.log.records import is_complete
+from twin.notifications.upload_requests import RefusedError, UploadRequest
+
+MOST_PARTS = 1000  # of one request
+
+
+@dataclass(frozen=True)
+class Found:
+    """Finished files, and the names of others that are still written, or whose writer died."""
+
+    parts: tuple[Path, ...]
+    unfinished: tuple[str, ...]
+
+
+def find(folder: Path, unit: Unit, request: UploadRequest) -> Found:
+    """What a request means in a folder of logs; RefusedError where that is nothing."""
+    parts, unfinished = list[Path](), list[str]()
+    for log in _named(folder, unit, request.log) if request.log else _all(folder, unit):
+        for part in log.parts:
+            if not _is_own(part):
+                continue
+            if not is_complete(part):
+                unfinished.append(part.name)
+            elif _is_within(part, request):
+                parts.append(part)
+    if not parts:
+        why = "no finished file of a log is like that"
+        still = f"; not finished: {', '.join(unfinished[:5])}" if unfinished else ""
+        raise RefusedError(f"{why}{still}")
+    if len(parts) > MOST_PARTS:
+        raise RefusedError(f"that is {len(parts)} files, more than {MOST_PARTS}: ask for less")
+    return Found(tuple(parts), tuple(unfinished))
+
+
+def _named(folder: Path, unit: Unit, name: str) -> list[Log]:
+    there = {path.name: path for path in first_parts(folder) if _is_own(path)}
+    if name not in there:
+        raise RefusedError("there is no log of that name")
+    log = _opened(there[name])
+    if log is None:
+        raise RefusedError("the file of that name cannot be read as a log")
+    if _unit_of(log) != unit:
+        raise RefusedError("that is the log of another asset")
+    return [log]
+
+
+def _all(folder: Path, unit: Unit) -> Iterator[Log]:
+    for path in first_parts(folder):
+        if _is_own(path) and (log := _opened(path)) and _unit_of(log) == unit:
+            yield log
+
+
+def _opened(path: Path) -> Log | None:
+    try:
+        return open_log(path)
+    except SourceError:
+        return None
+
+
+def _unit_of(log: Log) -> Unit:
+    return Unit(log.header.asset_type, log.header.asset_id)
+
+
+def _is_own(path: Path) -> bool:
+    """A link may lead anywhere."""
+    return path.is_file() and not path.is_symlink()
+
+
+def _is_within(part: Path, request: UploadRequest) -> bool:
+    """Whether anything in it was received in the range of time."""
+    if request.begin is None or request.end is None:
+        return True
+    try:
+        with part.open("rb") as file:
+            summary = SeekingReader(file).get_summary()
+    except (McapError, OSError, ValueError):
+        return False
+    if summary is None or summary.statistics is None or not summary.statistics.message_count:
+        return False
+    said = summary.statistics
+    begin, end = (round(at.timestamp() * 1e9) for at in (request.begin, request.end))
+    return said.message_start_time < end and said.message_end_time >= begin
