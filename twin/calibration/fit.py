@@ -193,7 +193,7 @@ class Fitted:
     def interval(self, name: str) -> tuple[float, float]:
         """95 % interval of a parameter (``table.key``), in its unit.
 
-        An end pressure that the record does not come near is known to be below its deepest: how the
+        What the log does not determine may be nothing, where that can be: a leak. An end pressure that the record does not come near is known to be below its deepest: how the
         characteristic goes on from there is nobody's knowledge.
         """
         if name == END_PRESSURE and not self.reaches_end:
@@ -204,7 +204,9 @@ class Fitted:
         if self.scaled[number] and value > 0.0:
             reach = float(np.hypot(reach / value, SIGMAS_95 * free.model_form))
             factor = float(np.exp(min(reach, MOST_FACTOR)))
-            return max(value / factor, free.low), min(value * factor, free.high)
+            may_be_nothing = free.low == 0.0 and not self.determined[number]
+            low = 0.0 if may_be_nothing else max(value / factor, free.low)
+            return low, min(value * factor, free.high)
         return max(value - reach, free.low), min(value + reach, free.high)
 
     def _number(self, name: str) -> int:
