@@ -69,7 +69,11 @@ def beside(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterato
 def test_a_comment_and_statistics_need_no_run(run: Run, tmp_path: Path) -> None:
     begun(tmp_path / "alarms.sqlite").close()
     assert run("comment", LEAK, "new hose ordered", "--by", "ann") == f"{LEAK}: commented\n"
-    assert re.search(r"\n {8}ann, .* ago: new hose ordered\n", run("history"))
+    assert re.search(r"\n {8}ann, .* ago: new hose ordered\n", run("history", "--json", "h.json"))
+    (episode,) = json.loads(Path("h.json").read_text())
+    assert [(one["who"], one["text"]) for one in episode["comments"]] == [
+        ("ann", "new hose ordered")
+    ]
     with pytest.raises(ConfigError, match="plc_stale does not stand"):
         run("comment", "plc_stale", "why")
     shown = run("statistics", "--days", "1", "--json", "s.json")

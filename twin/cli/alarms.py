@@ -16,7 +16,7 @@ from twin.instants import instant
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from twin.alarms.board import Board, Episode
+    from twin.alarms.board import Board, Comment, Episode
     from twin.alarms.database import Store
     from twin.alarms.loop import Alarms
     from twin.alarms.state import Alarm, Deed
@@ -99,15 +99,15 @@ def history(
     with _open(alarms, config) as store:
         whose = _chosen(store, config, unit)
         episodes, comments = store.episodes(whose, since), store.comments(whose, since or 0)
-    for one in episodes:
-        print(_episode_in_words(one, time.time_ns()))
-        for said in comments:
-            if said.is_of(one):
-                print(
-                    f"        {said.who}, {instant(said.written_ns, time.time_ns())}: {said.text}"
-                )
+    plain = []
+    for episode in episodes:
+        print(_episode_in_words(episode, time.time_ns()))
+        of_it = [one for one in comments if one.is_of(episode)]
+        for one in of_it:
+            print(f"        {one.who}, {instant(one.written_ns, time.time_ns())}: {one.text}")
+        plain.append(_plain_episode(episode) | {"comments": [_plain_comment(one) for one in of_it]})
     if json_file is not None:
-        write_json(json_file, [_plain_episode(one) for one in episodes])
+        write_json(json_file, plain)
 
 
 @alarms_app.command()
@@ -462,6 +462,10 @@ def _plain_episode(episode: "Episode") -> dict[str, Any]:
         "acknowledged_by": episode.acknowledged_by,
         "evidence": dict(episode.evidence),
     }
+
+
+def _plain_comment(comment: "Comment") -> dict[str, Any]:
+    return {"written_ns": comment.written_ns, "who": comment.who, "text": comment.text}
 
 
 def _alarm_in_words(plain: dict[str, Any], now_ns: int) -> str:
