@@ -193,8 +193,9 @@ class Fitted:
     def interval(self, name: str) -> tuple[float, float]:
         """95 % interval of a parameter (``table.key``), in its unit.
 
-        What the log does not determine may be nothing, where that can be: a leak. An end pressure that the record does not come near is known to be below its deepest: how the
-        characteristic goes on from there is nobody's knowledge.
+        What the log does not determine may be nothing, where that can be: a leak. An end pressure
+        that the record does not come near is known to be below its deepest: how the characteristic
+        goes on from there is nobody's knowledge.
         """
         if name == END_PRESSURE and not self.reaches_end:
             return min(BEST_END, self.deepest) / MBAR, self.deepest / MBAR
