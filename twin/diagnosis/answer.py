@@ -43,6 +43,7 @@ NEARLY_ALL = 0.1  # or this of chi-square beyond noise: gross effects leave many
 MOST_LEFT = 0.5  # of chi-square beyond noise, that a cause may leave and still be sure
 MOST_SATURATED = 0.05  # share of samples
 MOST_JUDGED = 24  # cycles of a long log that are looked at, evenly spread
+FEW = 0.25  # of the cycles, up to which odd ones are shared out by themselves
 MOST_NAMED = 4  # runners-up
 WIDEST = 0.9  # of a parameter's range: an interval as wide says nothing
 MIMICS = 1.6  # times the usual deviation: one cause that leaves more may mimic what nobody listed
@@ -323,11 +324,14 @@ def insufficient(evidence: Evidence) -> str:
 def split(evidence: Evidence, healthy: Covariance) -> tuple[list[int], list[int]]:
     """Cycles to fit on and to judge by, about half of each, in Thue and Morse's order.
 
-    That has no period: what comes in every second or third cycle falls into both. The few cycles
-    that are odd come first, so that what acts in them alone falls into both as well.
+    That has no period: what comes in every second or third cycle falls into both. Where few cycles
+    are odd they come first, so that what acts in them alone falls into both as well. One alone
+    cannot, and stays where it is: a nozzle that went on once more is no cause to be fitted.
     """
     alone = [white(evidence, healthy.of([one]), [HEALTHY]) for one in evidence.judged]
     odd = are_odd(np.array([np.mean(of**2) for of in alone]))
+    if not 2 <= np.count_nonzero(odd) <= FEW * len(odd):
+        odd[:] = False
     odd_first = [one for first in (True, False) for one in np.array(evidence.judged)[odd == first]]
     held_out = {int(one) for place, one in enumerate(odd_first) if (place + 3).bit_count() % 2}
     return [one for one in evidence.judged if one not in held_out], sorted(held_out)
