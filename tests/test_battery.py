@@ -13,7 +13,7 @@ from tools.battery import SEEDS, first_world, line, second_world
 from tools.battery_cases import Case, CaseFile, spread
 from tools.battery_page import ASKED, likely
 from tools.battery_second import CADENCES, drawn, record, truths
-from tools.version import commit
+from tools.version import ROOT, commit
 from twin.signals import MBAR
 
 CHANCE = 0.01  # of so bad a count where what is asked for holds just so
@@ -44,6 +44,7 @@ def test_first_world() -> None:
 def test_each_commit_has_seeds_of_its_own() -> None:
     assert seed_of("0e3a093") == seed_of("0e3a093-dirty") == 0x0E3A093 % SEEDS
     assert seed_of("unknown") == 0
+    assert not (ROOT / ".git").exists() or commit() != "unknown"  # on the empty path of a test
 
 
 @pytest.mark.timeout(1200)  # two commissionings, on a computer that does other things beside
