@@ -1,6 +1,5 @@
 """``twin serve``: the technician's page, beside ``twin run`` or without it."""
 
-import sys
 import time
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli.app import read_config
+from twin.cli.console import complain
 from twin.errors import ConfigError
 from twin.extras import install_hint
 
@@ -100,7 +100,7 @@ def _heard_of(broker: Path | None) -> "Iterator[PlantOverview | None]":
     mqtt, _ = chosen(document)
     if not mqtt.host:
         raise ConfigError(f"{broker}: no [mqtt] in it", 'say where the broker is: host = "..."')
-    with listening(mqtt, broker.parent, hall, _complain):
+    with listening(mqtt, broker.parent, hall, complain):
         yield hall
 
 
@@ -122,7 +122,7 @@ def _serve(
 
     ours = {one.lower() for one in (*names, place.host, socket.gethostname()) if one}
     access = Access(frozenset(ours), place.scheme == "https", place.is_loopback)
-    authenticator = Authenticator(users, Audit(users.path.parent, "page", _complain))
+    authenticator = Authenticator(users, Audit(users.path.parent, "page", complain))
     ejectors = [Ejector(one) for one in settings]
     page = Page(ejectors, authenticator, Sessions(users), access, hall)
     server = make_server(page.app(), place)
@@ -152,11 +152,7 @@ def _require_users(place: "Place", users: "Users") -> None:
             "make one first: twin users add NAME --config CONFIG",
         )
     if place.certificate is None:
-        _complain("without --certificate others on the network can read passwords on their way")
-
-
-def _complain(what: str) -> None:
-    print(f"twin: {what}", file=sys.stderr)
+        complain("without --certificate others on the network can read passwords on their way")
 
 
 # --- for the loop -------------------------------------------------------------------------------
