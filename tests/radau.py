@@ -213,6 +213,10 @@ def _that_keeps_them_equal(
     return heat / (CP * (line_t if heat >= 0.0 else port_t))
 
 
+# How large each state becomes, in the order of `rates`: tolerances are shares of these.
+SIZES = np.array([*[1e5] * 3, 1e-6, 1e-6, 1e-4, *[1e-3] * 2, 1e-4, *[1.0] * 4, *[1e5] * 3])
+
+
 def at_rest(theta: Theta) -> Floats:
     ambient, gas = theta[c.AMBIENT], R * theta[c.TEMPERATURE]
     masses = ambient * theta[[c.PORT_VOLUME, c.LINE_VOLUME, c.VOLUME]] / gas
@@ -230,7 +234,6 @@ def reference(theta: Theta, moves: Sequence[Valves], times: Floats) -> Floats:
 
     closed.terminal = True  # type: ignore[attr-defined]
     y, rows, is_open = at_rest(theta), [], 0.0
-    size = np.array([*[1e5] * 3, 1e-6, 1e-6, 1e-4, *[1e-3] * 2, 1e-4, *[1.0] * 4, *[1e5] * 3])
     for move, end in zip(moves, [*(move.time for move in moves[1:]), times[-1]], strict=True):
         begin = move.time
         is_open = is_open if move.open is None else move.open
@@ -244,7 +247,7 @@ def reference(theta: Theta, moves: Sequence[Valves], times: Floats) -> Floats:
                 np.unique(np.append(times[(times > begin) & (times <= end)], end)),
                 events=closed if lets_go else None,
                 rtol=1e-10,
-                atol=1e-10 * size,
+                atol=1e-10 * SIZES,
                 args=(theta, replace(move, open=is_open)),
                 max_step=5e-3,
             )

@@ -38,3 +38,14 @@ def test_the_benchs_c_gives_the_models_bits(
     np.testing.assert_array_equal(theirs, ours)
     np.testing.assert_array_equal(told, handed)
     assert np.isfinite(ours[10:]).all()
+
+
+def test_the_benchs_scipy_solves_the_models_equations(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(TOOLS))
+    run = importlib.import_module("benchmarks.figures").Run(
+        long=False, folder=tmp_path, tell=lambda _: None
+    )
+    (measured,) = importlib.import_module("benchmarks.solver").evacuation(run)
+    assert measured.values

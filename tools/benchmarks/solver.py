@@ -54,7 +54,6 @@ def _by_model(theta: Theta) -> tuple[float, Floats]:
 
 def _by_scipy(theta: Theta, known: dict[str, object]) -> tuple[float, Floats]:
     """In two parts: the valve opens a response after the command."""
-    size = np.array([*[1e5] * 3, 1e-6, 1e-6, 1e-4, *[1e-3] * 2, *[1.0] * 3, *[1e5] * 3])
     times, y, rows = np.arange(1, ROWS + 1) * MS, known["at_rest"](theta), []
     opens = float(theta[c.RESPONSE])
     begin = time.thread_time()
@@ -68,7 +67,7 @@ def _by_scipy(theta: Theta, known: dict[str, object]) -> tuple[float, Floats]:
             "Radau",
             wanted,
             rtol=RELATIVE,
-            atol=RELATIVE * size,
+            atol=RELATIVE * known["SIZES"],
             args=(theta, valves),
         )
         assert found.success
