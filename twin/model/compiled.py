@@ -29,7 +29,7 @@ from twin.errors import TwinError
 from twin.files import private_folder, user_cache
 
 DAY_S = 86_400.0
-SHARED = ("signals.py", "processor.py")
+SHARED = ("signals.py", "cpu_target.py")
 _log = logging.getLogger(__name__)
 _PACKAGE = Path(__file__).parent.parent
 
