@@ -2,15 +2,19 @@
 
 import os
 import pickle
+import re
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+import rigs
 
 from twin import files
 from twin.errors import SourceError
 from twin.files import private_folder
+from twin.model import compiled, kernel
 
 LOADING = """
 import sys
@@ -84,3 +88,16 @@ def test_a_folder_in_one_that_all_may_write_to_is_refused(tmp_path: Path) -> Non
     tmp_path.chmod(0o1777)  # as temporary files have it
     with pytest.raises(SourceError, match="others may use it"):
         private_folder(tmp_path / "guessable")
+
+
+def test_a_step_is_taken_for_several_hypotheses_at_a_time() -> None:
+    """One at a time they take three times as long, which nothing else would tell."""
+    theta = np.stack([rigs.theta("test_rig")] * kernel.LANES, axis=1)
+    rows = np.zeros(2)
+    expected = np.empty((2, kernel.LANES))
+    kernel.advance(kernel.at_rest(theta), theta, rows, rows.astype(np.uint8), rows, expected)
+    again = compiled._with_arrays(kernel._advance.py_func)  # what is cached cannot be looked at
+    again.compile(kernel._advance.signatures[0])
+    (assembly,) = again.inspect_asm().values()
+    divisions = re.findall(r"\bv?divpd\b|\bfdiv\s+v\d+\.2d", assembly)
+    assert len(divisions) > 100

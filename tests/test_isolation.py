@@ -14,7 +14,8 @@ from twin.model.catalogue import CatalogueEffect
 from twin.model.effects import UNKNOWN
 from twin.monitor.cycles import Cycle, CycleView, cut, figures
 from twin.monitor.healthy import Healthy
-from twin.monitor.isolation import Isolation
+from twin.monitor.isolation import Isolation, Verdict
+from twin.monitor.likeness import Likeness
 from twin.monitor.model_bank import SUSPECTS, ModelBank, hypotheses
 from twin.monitor.monitor import Monitor, MonitorSettings
 from twin.signals import SAMPLE, TICK, Samples, Ticks
@@ -323,3 +324,12 @@ def test_the_name_of_a_gross_fault_stays(name: str, fault: str, seed: int) -> No
     told = events(name, [fault], 31, seed)
     assert raised(told)[0].data["effect"] == UNKNOWN
     assert [event.data["effect"] for event in named(told)] == [fault.split("=", maxsplit=1)[0]]
+
+
+def test_where_it_is_known_that_something_differs_the_causes_share_all_of_it() -> None:
+    """A cycle that is far out by itself has changed, whatever the sums over cycles hold of it."""
+    leak, other = Likeness("leakage", 1.0, "sl/min", 0.03), Likeness(UNKNOWN, None, "", 0.01)
+    found = Verdict(0.96, [leak, other]).where_changed()
+    assert found.none == 0.0
+    assert [one.share for one in found.causes] == pytest.approx([0.75, 0.25])
+    assert Verdict(1.0, ()).where_changed().causes == []

@@ -18,7 +18,7 @@ from twin.monitor.detector_window import knees_of
 from twin.monitor.gaps import ShortGaps
 from twin.monitor.monitor import Monitor, in_order
 from twin.monitor.phase_detector import Found, Knees, PhaseFinder
-from twin.monitor.signatures import steps
+from twin.monitor.rows import time_steps
 from twin.monitor.staleness import Listening
 from twin.monitor.surroundings import are_told, following, stretches
 from twin.signals import SAMPLE, TICK, Phase, Samples, Ticks
@@ -95,7 +95,7 @@ class Twin:
         ticks = np.empty(len(samples), TICK)
         ticks["phase"], ticks["level"] = phase, level
         expected = np.empty(len(samples))
-        dt = steps(samples, self._last_ns)
+        dt = time_steps(samples, self._last_ns)
         level, signals = ticks["level"].astype("f8"), np.empty(len(samples), "u1")
         for rows, telling in self._surrounded(samples, ticks):
             self._around = following(self._around, telling)

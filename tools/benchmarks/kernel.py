@@ -19,7 +19,7 @@ from twin.model import dense_solver as strides
 from twin.model import kernel
 from twin.model.effects import EFFECTS, Effect, apply
 from twin.model.theta import Theta
-from twin.monitor.signatures import steps
+from twin.monitor.rows import time_steps
 
 ROWS = 100_000
 REPEATS = 11
@@ -181,7 +181,7 @@ def first_rows(recording: Recording, rows: int) -> Driven:
     """Time steps, phases and levels of the first ``rows``."""
     samples, ticks = recording.samples[:rows], recording.ticks[:rows]
     phase = np.ascontiguousarray(ticks["phase"])
-    return steps(samples, None), phase, ticks["level"].astype(np.float64)
+    return time_steps(samples, None), phase, ticks["level"].astype(np.float64)
 
 
 def timed(advance: Advance, theta: Theta, driven: Driven) -> tuple[float, Floats]:

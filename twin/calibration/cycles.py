@@ -16,7 +16,7 @@ from twin.monitor.bins import Bins, Floats, Ints, binned, drawn
 from twin.monitor.detector_window import as_wide_as_needed, knees_of
 from twin.monitor.nozzle import Switching, noise_of, switchings
 from twin.monitor.phase_detector import PhaseFinder, commanded
-from twin.monitor.signatures import steps
+from twin.monitor.rows import time_steps
 from twin.signals import MBAR, MS, UNUSABLE, Phase, Samples
 
 BINS = 6  # in each unit of warped time
@@ -76,7 +76,7 @@ class Cycles:
         cls, rows: Samples, phase: Bytes, level: Floats, theta: Floats, *, quickly: bool
     ) -> "Cycles":
         """Those of ``phase`` and ``level``, as far as the model of ``theta`` has a say in them."""
-        dt = steps(rows, None)
+        dt = time_steps(rows, None)
         expected = _expected(theta.reshape(-1, 1), dt, phase, level)[:, 0]
         usable = ((rows["quality"] & UNUSABLE) == 0) & np.isfinite(rows["pressure"])
         bins = binned(phase, usable & np.isfinite(expected), _edges(phase), BINS)

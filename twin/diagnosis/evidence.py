@@ -34,7 +34,7 @@ from twin.monitor.cycles import figures, whole
 from twin.monitor.detector_window import as_wide_as_needed, knees_of
 from twin.monitor.healthy import Healthy
 from twin.monitor.phase_detector import Knees
-from twin.monitor.signatures import drawn_rows, steps
+from twin.monitor.rows import drawn_rows, time_steps
 from twin.monitor.simulated_switching import Seen, seen
 from twin.monitor.surroundings import are_told, following, told
 from twin.signals import (
@@ -126,7 +126,7 @@ class Evidence:
     @cached_property
     def _times(self) -> Floats:
         """The same as the kernel counts it: less by 1 where time does not run on."""
-        return np.cumsum(steps(self.samples, None))
+        return np.cumsum(time_steps(self.samples, None))
 
     @cached_property
     def _measured(self) -> Floats:

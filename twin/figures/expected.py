@@ -20,7 +20,7 @@ from twin.model.dense_solver import DenseSolver
 from twin.model.term import Terms
 from twin.model.theta import Theta
 from twin.monitor.cycles import STALE
-from twin.monitor.signatures import steps
+from twin.monitor.rows import time_steps
 from twin.signals import BREAK, MBAR, MS, Command, Phase, Samples, Ticks
 
 LONGEST_SUCTION_S = 60.0  # in which H1 is to be reached from rest
@@ -59,7 +59,7 @@ class Expectation:
         if not len(samples):
             return
         first, self._rows = self._rows == 0, self._rows + len(samples)
-        dt, self._last_ns = steps(samples, self._last_ns), int(samples["time_ns"][-1])
+        dt, self._last_ns = time_steps(samples, self._last_ns), int(samples["time_ns"][-1])
         self._stale |= bool((samples["quality"] & STALE).any())
         if self._stale or (first and samples["quality"][0] & BREAK):
             self.lose()

@@ -75,8 +75,8 @@ SET_IN, ACTS, REACHED = ORDER + 11, ORDER + 11 + SLOTS, ORDER + 11 + 2 * SLOTS
 RUN = REACHED + SLOTS
 STATE = RUN + 1
 
-# Hypotheses that are run together, with a step that suits them all. LLVM weighs the checks that rows
-# do not overlap against so many: eight it ran one at a time, three times slower.
+# Hypotheses that are run together, with a step that suits them all. LLVM weighs the checks that no
+# rows overlap against so many: eight it ran one at a time, three times slower.
 LANES = 12
 LONGEST_STEP = 0.01  # s
 LONGEST_BRIDGE = 0.1  # s; after a longer silence the model waits for the next sync

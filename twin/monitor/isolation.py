@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from twin.inference.covariance import Covariance, fading, low_rank
-from twin.inference.unmodelled import MISMATCH, Odds, hats, knots_over, log_likelihoods
+from twin.inference.unmodelled import MISMATCH
 from twin.model.dataset import DataSet
 from twin.model.effects import EFFECTS, UNKNOWN, Effect, effect_of
 from twin.model.term import KINDS
@@ -36,8 +36,9 @@ from twin.monitor.change_detection import (
 from twin.monitor.cycles import Cycle, CycleView
 from twin.monitor.false_alarm_budget import SUMS, cycles_between
 from twin.monitor.healthy import Healthy
+from twin.monitor.likeness import Likeness
 from twin.monitor.model_bank import DELAY_STEPS, DELAYS, SUSPECTS, UNSURE_OF, ModelBank, Suspect
-from twin.monitor.signatures import Likeness
+from twin.monitor.naming import LEAST_SURE, listed_share
 from twin.monitor.statistics import CycleResidual, ScoreExtractor
 from twin.signals import SAMPLE, TICK, Samples, Ticks
 
@@ -73,6 +74,13 @@ class Verdict:
         """The same without names: what differs is one unknown cause."""
         share = sum(one.share for one in self.causes)
         return replace(self, causes=[Likeness(UNKNOWN, None, "", share)] if self.causes else ())
+
+    def where_changed(self) -> "Verdict":
+        """The same where it is known that something differs."""
+        total = sum(one.share for one in self.causes) or 1.0
+        return replace(
+            self, none=0.0, causes=[replace(one, share=one.share / total) for one in self.causes]
+        )
 
     def plain(self) -> dict[str, float]:
         """The probabilities, of what has at least one in a hundred."""
@@ -299,10 +307,10 @@ class Isolation:
         best = int(np.argmin(left))
         suits = wider if best == UNSURE_OF else known
         effect = _effect(best, float(sizes[best]), mean.signatures, mean.larger)
-        white = suits.white(np.column_stack([mean.off - effect, effect, _smooth(mean)]))
-        likely = log_likelihoods(white[:, 2:], white[:, 0], white[:, 1], 1.0)
-        listed = changed * Odds.of(likely[None]).of_cause(1, 0.0)
+        listed = changed * listed_share(suits, mean.off, effect, mean.kind, mean.time)
         found = self._by_effect(share * (listed / share.sum()), sizes)
+        if found[0].share < LEAST_SURE * changed:
+            return [Likeness(UNKNOWN, None, "", changed)]
         return [*found, Likeness(UNKNOWN, None, "", changed - listed)]
 
     def _mean(self, since: int) -> tuple[CycleResidual, Floats]:
@@ -368,15 +376,6 @@ def _grows(number: int, signatures: Floats, larger: Floats) -> Floats:
     """What a delay does at each of DELAYS_AT, (places, sizes)."""
     some = np.split(larger, len(DELAYS), axis=1)[DELAYS.index(number)]
     return np.column_stack([np.zeros(len(some)), signatures[:, number], some])
-
-
-def _smooth(said: CycleResidual) -> Floats:
-    """Smooth courses over the time of each kind of stretch, (places, courses)."""
-    courses = [np.zeros((len(said.kind), 0))]
-    for kind in np.unique(said.kind[said.kind >= 0]):
-        here = said.kind == kind
-        courses.append(hats(said.time, knots_over(said.time[here])) * here[:, None])
-    return np.hstack(courses)
 
 
 def _fitted_along(off: Floats, grows: Floats, most: float) -> tuple[float, float]:

@@ -29,8 +29,8 @@ from twin.monitor.cycles import (
 )
 from twin.monitor.gaps import gap_event
 from twin.monitor.healthy import NOT_COMMISSIONED, Healthy
+from twin.monitor.likeness import Likeness
 from twin.monitor.signal_checks import ReportWatch
-from twin.monitor.signatures import Likeness, drawn_rows, likenesses, look_alikes
 from twin.monitor.surroundings import following
 from twin.settings import Settings
 from twin.signals import (
@@ -53,10 +53,8 @@ _UNFIT = int(Quality.OUT_OF_RANGE | Quality.OVERFLOW | Quality.STALE | Quality.B
 # Of a cycle's samples, to judge it: commands seen late look like a deviation. Usual records lack up
 # to a twentieth of their rows.
 FEWEST_SHARE = 0.9
-RIVAL = 0.05  # probability from which on another cause is named as well
-STANDING = 0.8  # of the best fit's gain: then the name of a standing alarm still holds
+RIVAL = 0.05  # probability from which on another cause is named as well, or a standing name holds
 ALIKE = 0.2  # of how far out a cycle is: by so much its figures may move before the cause is sought
-NAMED = 0.5  # of the squares a name explains at least: more than it leaves
 RENAMED = 3  # cycles in a row that must agree on another name before a standing alarm gets it
 LONGEST_RING_NS = 120_000_000_000  # of rows that a PLC keeps while nobody reads them
 CLEARS = 3.5  # sigmas of a figure, below which a cycle is as healthy ones
@@ -136,12 +134,13 @@ class Monitor:
 
     def __post_init__(self) -> None:
         """Have what is compiled at hand, not to fall into a block."""
+        from twin.monitor import naming  # noqa: PLC0415 - with SciPy
         from twin.monitor.baseline import Baseline  # noqa: PLC0415 - with SciPy
 
         self._baseline = Baseline(self.settings.healthy)
         nothing = Cycle(0, np.zeros(1, SAMPLE), np.zeros(1, TICK), complete=False)
         figures(nothing, self.theta)
-        drawn_rows(nothing.samples, nothing.ticks)  # where a cause is sought
+        naming.compiled_for(nothing)
 
     def update(self, samples: Samples, ticks: Ticks) -> list[Event]:
         """Take rows with the twin's ticks; give what they make happen."""
@@ -415,14 +414,11 @@ class Monitor:
 
     def _change(self, cycle: Cycle, verdict: "Verdict") -> Event:
         """Raise the alarm for what no single cycle shows, or name the one that stands."""
-        best = verdict.causes[0]
-        self.active, self._sought = best.effect, {}
-        others = [one for one in verdict.causes[1:] if one.effect != UNKNOWN]
-        also = [one.effect for one in others if one.share >= RIVAL]
+        self.active, self._sought = verdict.causes[0].effect, {}
         what = f"{verdict.since} cycles: {abs(verdict.sigmas):.1f} sigma off in each"
         measured: dict[str, float | int | str] = {"figure": "cycles", "cycles": verdict.since}
         measured["sigma"] = verdict.sigmas
-        return self._raised(cycle, what, measured, best, also)
+        return self._raised(cycle, what, measured, verdict.causes)
 
     def _begin(self, worst: Outlier, cycle: Cycle) -> Event:
         """Raise the alarm with the first cycle that shows it.
@@ -434,7 +430,7 @@ class Monitor:
             f"something has changed, most in {worst.phase}:"
             f" {worst.excess:+.1f} mbar from healthy ({worst.sigmas:+.0f} sigma)"
         )
-        return self._raised(cycle, what, worst.plain(), Likeness(UNKNOWN, None, "", 0.0), [])
+        return self._raised(cycle, what, worst.plain(), [Likeness(UNKNOWN, None, "", 1.0)])
 
     def _stands(
         self, cycle: Cycle, worst: Outlier, found: Mapping[str, float], verdict: "Verdict | None"
@@ -468,16 +464,15 @@ class Monitor:
         if not self._is_commissioned:
             return []
         ranking = self._name(worst, before, cycle, verdict)
-        best = ranking[0]
         self._mixed = None
-        if best.effect == UNKNOWN or best.share < NAMED:
+        if not ranking:
             self._rival = ("", 0)
             return []
         if not self._is_renamed(ranking):
             return []
-        self.active = best.effect
+        self.active = ranking[0].effect
         what = f"{worst.place}: {worst.excess:+.1f} mbar from healthy ({worst.sigmas:+.0f} sigma)"
-        return [self._raised(cycle, what, worst.plain(), best, look_alikes(ranking))]
+        return [self._raised(cycle, what, worst.plain(), ranking)]
 
     def _small(self, verdict: "Verdict | None") -> Sequence[Likeness]:
         """Causes by the isolation, if the foremost is as small as its signatures are.
@@ -486,17 +481,18 @@ class Monitor:
         """
         if not verdict or not verdict.causes or not verdict.causes[0].is_small:
             return ()
-        return verdict.causes if self.active in (UNKNOWN, verdict.causes[0].effect) else ()
+        causes = verdict.where_changed().causes
+        return causes if self.active in (UNKNOWN, causes[0].effect) else ()
 
     def _is_renamed(self, ranking: Sequence[Likeness]) -> bool:
         """Whether the best of a ranking becomes the alarm's name.
 
         The first name does at once. Another one does after ``RENAMED`` cycles in a row in which
-        the standing name fits badly, so that a single odd cycle changes nothing.
+        the standing name is improbable, so that a single odd cycle changes nothing.
         """
         best = ranking[0]
         standing = max((one.share for one in ranking if one.effect == self.active), default=0.0)
-        if standing >= STANDING * best.share:
+        if standing >= RIVAL and self.active != UNKNOWN:
             self._rival = ("", 0)
             return False
         name, cycles = self._rival
@@ -511,10 +507,11 @@ class Monitor:
         cycle: Cycle,
         what: str,
         measured: Mapping[str, float | int | str],
-        best: Likeness,
-        also: Sequence[str],
+        causes: Sequence[Likeness],
     ) -> Event:
-        """The alarm: ``what`` is off, and what fits it."""
+        """The alarm: ``what`` is off, and what fits it, the most probable first."""
+        best, *others = causes
+        also = [one.effect for one in others if one.effect != UNKNOWN and one.share >= RIVAL]
         why = best.words if self._is_commissioned else NOT_COMMISSIONED
         text = "; ".join([what, why]) + "".join(f", or {', '.join(also)}" for _ in also[:1])
         data = {"cycle": cycle.index, **measured, **best.plain(), "also": ",".join(also)}
@@ -525,20 +522,28 @@ class Monitor:
     def _name(
         self, worst: Outlier, before: Cycle | None, cycle: Cycle, verdict: "Verdict | None"
     ) -> Sequence[Likeness]:
-        """Rank the causes of a cycle's deviation; the cycle before lets the model swing in."""
+        """Rank the causes of a cycle's deviation; the cycle before lets the model swing in.
+
+        Empty where nothing in the table fits.
+        """
+        from twin.inference.unmodelled import MOST_SURE  # noqa: PLC0415 - with SciPy
+        from twin.monitor.naming import likenesses  # noqa: PLC0415 - with SciPy
+
         if small := self._small(verdict):
             return small
         if worst.figure.endswith("_level"):  # and nothing else: only the thresholds moved
+            if verdict is not None and _names(verdict):
+                return verdict.where_changed().causes
             shift = EFFECTS["threshold_drift"].parameters[0]
             size = shift.reported(worst.excess, self.theta)
-            return [Likeness("threshold_drift", size, shift.unit, 1.0)]
+            return [Likeness("threshold_drift", size, shift.unit, MOST_SURE)]
         parts = [cycle] if before is None else [before, cycle]
         samples = np.concatenate([part.samples for part in parts])
         ticks = np.concatenate([part.ticks for part in parts])
         begin = len(samples) - len(cycle.samples)
         known = self.isolation.known if self.isolation else ()
-        ranking = likenesses(following(self.theta, samples), samples, ticks, begin, known)
-        return ranking or [Likeness(UNKNOWN, None, "", 0.0)]  # not one sync in a long piece
+        theta = following(self.theta, samples)
+        return likenesses(theta, self.settings.healthy, samples, ticks, begin, known)
 
 
 def _weight(outlier: Outlier, limit: float) -> tuple[bool, float]:

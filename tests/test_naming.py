@@ -5,10 +5,11 @@ import pytest
 import rigs
 
 from twin.model import kernel
-from twin.model.effects import EFFECTS
+from twin.model.effects import EFFECTS, UNKNOWN
 from twin.model.theta import Theta
-from twin.monitor import signatures
-from twin.monitor.signatures import drawn_rows, likenesses, steps
+from twin.monitor import naming
+from twin.monitor.naming import likenesses
+from twin.monitor.rows import drawn_rows, time_steps
 from twin.signals import Quality, Samples, Ticks
 
 BEGIN = 3600  # rows that let the models swing in
@@ -30,11 +31,12 @@ def test_few_rows_say_what_all_of_them_do(
 ) -> None:
     theta, samples, ticks = beside(name, fault)
     assert len(drawn_rows(samples, ticks)) < 0.3 * len(samples)
-    few = {one.effect: one for one in likenesses(theta, samples, ticks, BEGIN)}
-    monkeypatch.setattr(signatures, "drawn_rows", lambda samples, _: np.arange(len(samples)))
+    healthy = rigs.config(name).monitor.healthy
+    few = {one.effect: one for one in likenesses(theta, healthy, samples, ticks, BEGIN)}
+    monkeypatch.setattr(naming, "drawn_rows", lambda samples, _: np.arange(len(samples)))
     monkeypatch.setattr(kernel, "ROUGHLY", kernel.TOLERANCE)
-    every = {one.effect: one for one in likenesses(theta, samples, ticks, BEGIN)}
-    assert few.keys() == every.keys() == EFFECTS.keys()
+    every = {one.effect: one for one in likenesses(theta, healthy, samples, ticks, BEGIN)}
+    assert few.keys() == every.keys() == {*EFFECTS, UNKNOWN}
     for effect, one in every.items():
         assert few[effect].share == pytest.approx(one.share, abs=0.01)
         if one.share > 0.1:
@@ -43,7 +45,7 @@ def test_few_rows_say_what_all_of_them_do(
 
 def test_time_that_stands_still_or_jumps_is_drawn() -> None:
     _, samples, ticks = beside("test_rig", "leakage=2.0")
-    dt = steps(samples, None)
+    dt = time_steps(samples, None)
     odd = np.flatnonzero((dt < 0.0005) | (dt > 0.0015))
     assert len(odd)
     assert np.isin(odd, drawn_rows(samples, ticks)).all()

@@ -1,0 +1,32 @@
+"""Rows of a stream: the time between them, and which of them suffice to draw a curve."""
+
+import numpy as np
+
+from twin.model.compiled import compiled
+from twin.monitor.bins import Floats, Ints, drawn
+from twin.signals import BREAK, NS, Samples, Ticks
+
+
+def time_steps(samples: Samples, before_ns: int | None) -> Floats:
+    """Seconds from row to row, −1 where time does not run on; ``before_ns`` is the row before."""
+    dt = np.empty(len(samples))
+    if len(dt):
+        _time_steps(samples, int(samples["time_ns"][0]) if before_ns is None else before_ns, dt)
+    return dt
+
+
+@compiled
+def _time_steps(samples, before_ns, dt):  # type: ignore[no-untyped-def]
+    for row in range(len(dt)):
+        time_ns = samples[row].time_ns
+        dt[row] = -1.0 if samples[row].quality & BREAK else (time_ns - before_ns) * NS
+        before_ns = time_ns
+
+
+def drawn_rows(samples: Samples, ticks: Ticks) -> Ints:
+    """Rows that suffice to draw what is expected: every one where something changes."""
+    begins = np.diff(ticks["phase"], prepend=255) != 0
+    begins |= np.isfinite(ticks["level"])
+    known = np.isfinite(ticks["expected"])
+    begins |= np.diff(known, prepend=False) != 0
+    return drawn(time_steps(samples, None), begins)
