@@ -111,17 +111,7 @@ def tables(cases: Sequence[Case]) -> str:
 
 def reliability(cases: Sequence[Case]) -> Iterator[str]:
     """How often causes act that were stated with some probability; how far that is off in all."""
-    rows = list[Sequence[str]]()
-    for low, high, here in _by_probability(cases):
-        said, acts = here.mean(axis=0)
-        ends = binomtest(int(here[:, 1].sum()), len(here)).proportion_ci(0.95)
-        chance = f"{ends.low:.0%} to {ends.high:.0%}"
-        said_of = f"{low:.0%} to {min(high, 1.0):.0%}"
-        rows.append((said_of, str(len(here)), f"{said:.1%}", f"{acts:.1%}", chance))
-    if rows:
-        yield table(("probability stated", "causes", "mean", "act", "by chance"), iter(rows))
-        off, causes = calibration_error(cases), sum(len(one.stated) for one in cases)
-        yield f"Expected calibration error: {off:.3f}, over {causes} causes."
+    yield from by_probability([each for one in cases for each in one.stated])
     ranks = [one.rank for one in cases if one.rank is not None]
     if ranks:
         test = kstest(ranks, "uniform")
@@ -132,9 +122,24 @@ def reliability(cases: Sequence[Case]) -> Iterator[str]:
         )
 
 
-def calibration_error(cases: Sequence[Case]) -> float:
+def by_probability(stated: Sequence[tuple[float, bool]]) -> Iterator[str]:
+    """The table of probabilities stated and how often they are right, and the mean error."""
+    rows = list[Sequence[str]]()
+    for low, high, here in _by_probability(stated):
+        said, acts = here.mean(axis=0)
+        ends = binomtest(int(here[:, 1].sum()), len(here)).proportion_ci(0.95)
+        chance = f"{ends.low:.0%} to {ends.high:.0%}"
+        said_of = f"{low:.0%} to {min(high, 1.0):.0%}"
+        rows.append((said_of, str(len(here)), f"{said:.1%}", f"{acts:.1%}", chance))
+    if rows:
+        yield table(("probability stated", "causes", "mean", "act", "by chance"), iter(rows))
+        off = calibration_error(stated)
+        yield f"Expected calibration error: {off:.3f}, over {len(stated)} causes."
+
+
+def calibration_error(stated: Sequence[tuple[float, bool]]) -> float:
     """By how much causes act more or less often than stated, mean over all; NaN without any."""
-    groups = [here for _, _, here in _by_probability(cases)]
+    groups = [here for _, _, here in _by_probability(stated)]
     if not groups:
         return float("nan")
     off = [abs(float(np.diff(here.mean(axis=0))[0])) for here in groups]
@@ -142,12 +147,12 @@ def calibration_error(cases: Sequence[Case]) -> float:
 
 
 def _by_probability(
-    cases: Sequence[Case],
+    stated: Sequence[tuple[float, bool]],
 ) -> Iterator[tuple[float, float, npt.NDArray[np.float64]]]:
     """Causes stated with a probability from a bound to the next: probability, and 1 if it acts."""
-    stated = np.array([each for one in cases for each in one.stated], np.float64).reshape(-1, 2)
+    pairs = np.array(stated, np.float64).reshape(-1, 2)
     for low, high in pairwise(STATED):
-        here = stated[(stated[:, 0] >= low) & (stated[:, 0] < high)]
+        here = pairs[(pairs[:, 0] >= low) & (pairs[:, 0] < high)]
         if len(here):
             yield low, high, here
 

@@ -30,7 +30,7 @@ from twin.model.dataset import DataSet
 from twin.model.system import volume
 from twin.monitor.healthy import Healthy
 from twin.settings import Document
-from twin.signals import MBAR, ML, SL_MIN, Samples
+from twin.signals import MBAR, ML, MS, SL_MIN, Samples
 from twin.tables.reader import open_table
 from twin.tables.settings import Bad, ImportSettings
 
@@ -39,7 +39,7 @@ sys.path.append(str(Path(__file__).parent.parent / "tests"))  # where the second
 from second_world import Fault, draw_rig, faults, record
 from second_world.gas import nozzle_flow, orifice
 from second_world.plant import CRITICAL_VALVE
-from second_world.records import Record
+from second_world.records import Record, plan_cycles
 from second_world.rig import Rig
 
 NAME = "second"
@@ -433,6 +433,18 @@ def fault(hidden: Hidden, rng: np.random.Generator, seconds: float) -> Fault:
     if hidden.course == "intermittent":
         return Fault(hidden.effect, sizes, "intermittent", share=rng.uniform(0.35, 0.65))
     return Fault(hidden.effect, sizes)
+
+
+def stepped(
+    met: Met, hidden: Hidden, seed: int, cycles: tuple[int, int], rng: np.random.Generator
+) -> Record:
+    """A record of some cycles without a fault and some with it; it begins anywhere within one."""
+    before, after = cycles
+    plan = plan_cycles(met.rig, seed, before + after)
+    onset_ms = rng.uniform(plan[before].suction_on, plan[before].end)
+    name = next(iter(faults.EVERYTHING[hidden.effect]))
+    begun = Fault(hidden.effect, {name: hidden.size}, "step", onset_ms * MS)
+    return record(met.rig, seed, before + after, [begun])
 
 
 def diagnosed(met: Met, kind: str, number: int, hidden: Sequence[Hidden]) -> Case:

@@ -92,7 +92,9 @@ def figures(cases: Sequence[Case]) -> dict[str, str]:
     if widths := half_widths(cases):
         found["half of that interval over the size, median"] = f"±{np.median(widths):.0%}"
     if any(one.stated for one in cases):
-        found["expected calibration error"] = f"{calibration_error(cases):.3f}"
+        found["expected calibration error"] = (
+            f"{calibration_error([each for one in cases for each in one.stated]):.3f}"
+        )
     return found
 
 
