@@ -265,6 +265,7 @@ def test_several_ejectors_each_with_its_twin_and_log(tmp_path: Path) -> None:
             until(process, lambda: Kind.PLC_STALE in kinds(open_log(logs[2])))
             with start_plc(gripper, port=other.port):
                 until(process, lambda: Kind.PLC_BACK in kinds(open_log(logs[2])))
+                until(process, lambda: Kind.CYCLE in kinds(open_log(logs[0])))
                 process.send_signal(signal.SIGINT)
                 said, complaints = process.communicate(timeout=PATIENCE_S)
             assert process.returncode == 130, complaints

@@ -80,11 +80,11 @@ def tables(runs: Sequence[Run]) -> str:
         name, stated = f"{KINDS[kind]}, {world} world", _all(mine)
         commits = ", ".join(f"{one.commit} ({len(one.stated)})" for one in mine)
         rows.append((name, *_line(stated)))
-        parts += [f"### {name.capitalize()}", f"Commits: {commits}.", *by_probability(stated)]
+        parts += [f"## {name.capitalize()}", f"Commits: {commits}.", *by_probability(stated)]
     rows.append(("all", *_line(_all(runs))))
     head = "statements", "how many", "right", f"stated with {SURE:.0%} or more", "of these right"
     lines = table((*head, "expected calibration error"), iter(rows))
-    return "\n\n".join([lines, "### All", *by_probability(_all(runs)), *parts])
+    return "\n\n".join([lines, "## All", *by_probability(_all(runs)), *parts])
 
 
 def _all(runs: Iterable[Run]) -> Stated:
