@@ -121,12 +121,13 @@ def _many(
         return Measured(ours, note=f"{note}; no C compiler"), Measured(ours)
     _compared(alone, np.transpose([timed(native, theta, rows)[1] for theta in bank]))
     lanes = in_lanes(bank)
-    at_once = _compared(expected, np.hstack([timed(vectors, eight, rows)[1] for eight in lanes]))
+    in_c_at_once = np.hstack([timed(vectors, some, rows)[1] for some in lanes])
+    at_once = _compared(expected, in_c_at_once[:, : len(bank)])
     ours, c, simd = [], [], []
     for _ in range(BANK_REPEATS):
         ours.append(timed(kernel.advance, together, rows)[0])
         c.append(float(np.mean([timed(native, theta, rows)[0] for theta in bank])))
-        simd.append(float(np.mean([timed(vectors, eight, rows)[0] for eight in lanes])))
+        simd.append(float(np.mean([timed(vectors, some, rows)[0] for some in lanes])))
     return Measured(ours, c, note), Measured(ours, simd, at_once)
 
 
@@ -154,9 +155,13 @@ def _cut(theta: Theta, driven: Driven, rows: int, whole: Floats) -> float:
 
 
 def in_lanes(bank: Sequence[Theta]) -> list[Theta]:
-    """Hypotheses as the C takes them that runs many at once: (coefficients, lanes) each."""
-    starts = range(0, len(bank), kernel.LANES)
-    return [np.ascontiguousarray(np.transpose(bank[at : at + kernel.LANES])) for at in starts]
+    """Hypotheses as the C takes them that runs many at once: (coefficients, lanes) each.
+
+    The last lanes are copies of the last hypothesis where there are fewer.
+    """
+    whole = [*bank, *[bank[-1]] * (-len(bank) % kernel.LANES)]
+    starts = range(0, len(whole), kernel.LANES)
+    return [np.ascontiguousarray(np.transpose(whole[at : at + kernel.LANES])) for at in starts]
 
 
 def _compared(expected: Floats, native: Floats) -> str:
