@@ -1,6 +1,5 @@
 """What acts beside the table of effects: in the model, found in a log, and on other programs."""
 
-import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -272,15 +271,11 @@ def test_one_listed_cause_that_mimics_a_mechanism_is_dropped() -> None:
     assert hidden.effect == "lip_lift"
     answer = diagnose(unit.config, [samples], "lip.mcap", lambda _: None).json
     assert (answer["verdict"], answer["causes"]) == ("unlisted", [])
-    # To be mended: with twelve lanes the fit of the lip ends short of its best, and air that
-    # gathers while the nozzle runs comes first, the lip beside it. With eight lanes the lip does.
     mechanism = answer["unlisted"]["mechanism"]
+    assert mechanism["name"] == "opening_above"
+    flow = mechanism["parameters"]["sonic_flow"]
+    assert flow["low95"] <= hidden.size <= flow["high95"]
+    # Where nearly the same flow may come in another way, as by another calibration it did.
     alike = mechanism["not_separable_from"]
     assert any(one.startswith("Air seeps in") for one in alike)
-    if mechanism["name"] != "opening_above":
-        lip = next(one for one in alike if one.startswith("An opening") and "until it is" in one)
-        flow = float(re.search(r"sonic flow ([0-9.]+)", lip)[1])
-        assert flow == pytest.approx(hidden.size, rel=0.3)
-    else:
-        found = mechanism["parameters"]["sonic_flow"]
-        assert found["low95"] <= hidden.size <= found["high95"]
+    assert not any("gathers over" in one for one in alike)
