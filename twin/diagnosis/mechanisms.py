@@ -20,7 +20,7 @@ from twin.model import theta as c
 from twin.model.catalogue import has_room
 from twin.model.courses import Cause
 from twin.model.effects import effect_of
-from twin.model.mechanism import ALWAYS, MECHANISMS, Mechanism
+from twin.model.mechanism import ABOVE, ALWAYS, MECHANISMS, Mechanism
 from twin.model.theta import Theta
 from twin.monitor.bins import Floats
 
@@ -47,7 +47,7 @@ LIKELIER, HALF = 30.0, 0.5
 # and 0.54 to 0.6 from one that gathers; one calibration has the opening first, another the seepage.
 APART = 0.5
 # A level is passed between two rows, so that the misfit over it has steps, and a fit ends at one.
-# Typical changes of what tells when a mechanism acts that are tried from there, and how often.
+# Typical changes of levels that are tried from there, and how often.
 AFAR, LEAPS = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0), 4
 # Coefficients that say the same of a plant: what flows in, and what narrows its line.
 ALIKE = ({c.LEAK, c.LAMINAR_LEAK, c.INFLOW}, {c.NEAR_RESISTANCE, c.RESISTANCE})
@@ -176,7 +176,8 @@ def _farther_off(
 ) -> list[Hypothesis | None]:
     """The best leap from each fit; None where all are worse than the fit."""
     leaps = [list(_leaps(evidence, one.hypothesis)) for one in fits]
-    chi2 = np.sum(white(evidence, weights, [leap for some in leaps for leap in some]) ** 2, axis=0)
+    every = [leap for some in leaps for leap in some]
+    chi2 = np.sum(white(evidence, weights, every) ** 2, axis=0) if every else np.empty(0)
     ends, found = np.cumsum([len(some) for some in leaps])[:-1], list[Hypothesis | None]()
     for one, some, misfits in zip(fits, leaps, np.split(chi2, ends), strict=True):
         least = int(np.argmin(misfits)) if some else 0
@@ -185,9 +186,10 @@ def _farther_off(
 
 
 def _leaps(evidence: Evidence, hypothesis: Hypothesis) -> Iterator[Hypothesis]:
-    """The same with each of what tells when its mechanism acts changed by much."""
+    """The same with the levels at which its mechanism begins and ends changed by much."""
     *beside, last = hypothesis
-    for p in MECHANISMS[last.effect].when.parameters:
+    when = MECHANISMS[last.effect].when
+    for p in when.parameters if when.code == ABOVE else ():
         for steps in AFAR:
             value = p.after(p.steps_to(last.values[p.name], evidence.theta) + steps, evidence.theta)
             if p.low <= value <= p.high:
