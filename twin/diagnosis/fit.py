@@ -1,28 +1,25 @@
-"""Many hypotheses fitted at once: damped Gauss-Newton, all of them in one run of the bank."""
+"""Many hypotheses fitted at once, all of them in one run of the bank for each step."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
 from twin.diagnosis.covariance import Weights, levels
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.hypotheses import bounds, price, sized, sizes
+from twin.inference.gauss_newton import Descent, descend, information
 from twin.inference.levels import CHI2_95
 from twin.inference.profile import profile_interval
 from twin.inference.sensitivities import derivatives, inside, points
 from twin.model.courses import Course
 from twin.monitor.bins import Floats
 
-MOST_ROUNDS = 10
-LONGEST = 6.0  # typical sizes that one round may move
-CONVERGED = 0.05  # chi-square that one more round would gain, in times what a residual has
 HOPELESS = 3.0  # times the chi-square of the best, after some rounds: not worth going on
 # Where only the best is asked for: what a fit may still gain, in times its last step's gain, and
 # how far above the best, in chi-square per residual of that, it need not go on from there.
 PACE, FAR = 3.0, 60.0
-BACK = 0.3  # of a step that made it worse
 
 
 @dataclass(frozen=True)
@@ -52,25 +49,11 @@ class Fitted:
         return frozenset((cause.effect, cause.course) for cause in self.hypothesis)
 
 
-@dataclass
-class _Trial:
-    """One fit on its way: the best point so far, and the one to look at next."""
+@dataclass(kw_only=True)
+class _Trial(Descent):
+    """The fit of a hypothesis on its way."""
 
     hypothesis: Hypothesis
-    low: Floats
-    high: Floats
-    x: Floats
-    chi2: float = np.inf
-    residual: Floats = field(default_factory=lambda: np.empty(0))
-    jacobian: Floats = field(default_factory=lambda: np.empty((0, 0)))
-    next: Floats = field(default_factory=lambda: np.empty(0))
-    gained: float = np.inf  # in chi-square, by the last step that helped
-    done: bool = False
-
-    @property
-    def scale(self) -> float:
-        """Chi-square per residual, 1 where it is less: what is left is as wide as that."""
-        return max(self.chi2 / max(len(self.residual), 1), 1.0)
 
     @property
     def kind(self) -> frozenset[object]:
@@ -78,31 +61,6 @@ class _Trial:
         return frozenset(
             (c.effect, *c.law().values(), c.course, c.onset_s, c.cycles) for c in self.hypothesis
         )
-
-    def moves(self) -> Floats:
-        """Steps for derivatives at the next point, one per size, away from the nearer bound."""
-        return inside(self.next, self.high)
-
-    def take(self, white: Floats) -> None:
-        """Take the residuals at the next point and beside it; choose the point after it."""
-        residual, jacobian = derivatives(white, self.moves())
-        chi2 = float(residual @ residual)
-        if not chi2 < self.chi2:
-            back = self.x + BACK * (self.next - self.x)
-            self.done = bool(np.abs(self.next - self.x).max(initial=0.0) < 0.01)
-            self.next = back
-            return
-        self.gained = self.chi2 - chi2
-        self.x, self.chi2, self.residual, self.jacobian = self.next, chi2, residual, jacobian
-        q, r = np.linalg.qr(self.jacobian)
-        pull = q.T @ residual
-        low = np.maximum(self.low - self.x, -LONGEST) - 1e-9
-        high = np.minimum(self.high - self.x, LONGEST) + 1e-9
-        r = np.concatenate([r, 1e-4 * np.eye(len(low))])  # where nothing holds a size, it stays
-        step = lsq_linear(r, -np.concatenate([pull, np.zeros(len(low))]), (low, high)).x
-        gain = float(pull @ pull - np.sum((pull + r[: len(low)] @ step) ** 2))
-        self.next = np.clip(self.x + step, self.low, self.high)
-        self.done = gain < CONVERGED * self.scale
 
 
 def white(evidence: Evidence, weights: Weights, hypotheses: Sequence[Hypothesis]) -> Floats:
@@ -122,25 +80,12 @@ def fit(
     What is given up on the way keeps its best point: its score is at least that of its best fit.
     Where only the best is asked for, what will not come near it is given up as well.
     """
-    trials = [_trial(evidence, one) for one in hypotheses]
-    for turn in range(MOST_ROUNDS):
-        if turn >= 2:
-            _give_up(trials)
-            if best_only:
-                _give_up_behind(trials)
-        going = [trial for trial in trials if not trial.done]
-        if not going:
-            break
-        around = [points(trial.next, trial.moves()).T for trial in going]
-        asked = [
-            sized(evidence, trial.hypothesis, point)
-            for trial, some in zip(going, around, strict=True)
-            for point in some
-        ]
-        ends = np.cumsum([len(some) for some in around])[:-1]
-        found = np.split(white(evidence, weights, asked), ends, axis=1)
-        for trial, some in zip(going, found, strict=True):
-            trial.take(some)
+    trials = [_trial(evidence, hypothesis) for hypothesis in hypotheses]
+
+    def residuals(asked: Sequence[tuple[_Trial, Floats]]) -> Floats:
+        return white(evidence, weights, [sized(evidence, one.hypothesis, x) for one, x in asked])
+
+    descend(trials, residuals, partial(_give_up, trials, best_only=best_only))
     return [_fitted(evidence, trial) for trial in trials]
 
 
@@ -158,7 +103,7 @@ def profiled(evidence: Evidence, weights: Weights, hypotheses: Sequence[Hypothes
     ):
         residual, jacobian = derivatives(found, steps)
         pull = jacobian.T @ residual
-        explained = pull @ np.linalg.solve(_information(jacobian), pull)
+        explained = pull @ np.linalg.solve(information(jacobian), pull)
         misfits.append(float(residual @ residual - explained))
     return np.array(misfits)
 
@@ -179,10 +124,15 @@ def interval(evidence: Evidence, weights: Weights, fitted: Fitted) -> tuple[Floa
     return profile_interval(misfit, fitted.x, fitted.covariance, limits, rise)
 
 
-def _give_up(trials: Sequence[_Trial]) -> None:
+def _give_up(trials: Sequence[_Trial], turn: int, *, best_only: bool) -> None:
+    """From the third round on, give up what is hopeless, and what will not be the best."""
+    if turn < 2:
+        return
     best = min(trial.chi2 for trial in trials)
     for trial in trials:
         trial.done = trial.done or trial.chi2 > HOPELESS * best + HOPELESS * len(trial.residual)
+    if best_only:
+        _give_up_behind(trials)
 
 
 def _give_up_behind(trials: Sequence[_Trial]) -> None:
@@ -194,21 +144,14 @@ def _give_up_behind(trials: Sequence[_Trial]) -> None:
         ahead.add(trial.kind)
 
 
-def _information(jacobian: Floats) -> Floats:
-    """Fisher's information of the sizes; a little where nothing depends on one."""
-    information: Floats = jacobian.T @ jacobian + 1e-6 * np.eye(jacobian.shape[1])
-    return information
-
-
 def _trial(evidence: Evidence, hypothesis: Hypothesis) -> _Trial:
     low, high = bounds(evidence, hypothesis)
-    x = np.clip(sizes(evidence, hypothesis), low, high)
-    return _Trial(hypothesis, low, high, x, next=x, done=not len(x))
+    return _Trial(low, high, sizes(evidence, hypothesis), hypothesis=hypothesis)
 
 
 def _fitted(evidence: Evidence, trial: _Trial) -> Fitted:
     hypothesis = sized(evidence, trial.hypothesis, trial.x)
-    covariance = np.asarray(np.linalg.inv(_information(trial.jacobian)), np.float64)
+    covariance = np.asarray(np.linalg.inv(trial.information), np.float64)
     cost = price(evidence, hypothesis)
     return Fitted(
         hypothesis, trial.x, covariance, trial.chi2, trial.chi2 + cost, len(trial.residual)
