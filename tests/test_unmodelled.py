@@ -39,6 +39,16 @@ def test_the_ratio_is_that_of_two_normal_densities(seed: int) -> None:
         assert ratio == pytest.approx(expected, abs=1e-8)
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_in_place_each_course_is_as_large_as_it_is(seed: int) -> None:
+    courses, left, _ = drawn(seed)
+    found = unmodelled.log_likelihoods_in_place(courses, left)
+    for share, ratio in zip(SHARES, found, strict=True):
+        both = multivariate_normal(cov=np.eye(RESIDUALS) + share**2 * courses @ courses.T)
+        expected = both.logpdf(left) - multivariate_normal(cov=np.eye(RESIDUALS)).logpdf(left)
+        assert ratio == pytest.approx(expected, abs=1e-8)
+
+
 def test_both_ways_to_leave_something_are_distributions() -> None:
     assert unmodelled._ANY.sum() == pytest.approx(1.0)
     assert unmodelled._LITTLE.sum() == pytest.approx(1.0)

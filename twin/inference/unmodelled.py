@@ -19,7 +19,7 @@ MISMATCH = 0.08  # of what an effect explains, that its waveform is off
 # How probable things are beforehand, beside a single listed effect. Chosen: something that is not
 # in the table is a tenth as probable, beside a listed effect a fifth; of two listed ones at once
 # each is a third as probable. UNLISTED halved or doubled moves 0.96 to 0.98 or 0.93.
-UNLISTED, BESIDE, FURTHER = 0.1, 0.2, 0.3
+UNLISTED, BESIDE, FURTHER = 0.1, 0.15, 0.3
 SHARES = np.geomspace(0.003, 1.0, 9)  # of what was explained, that may be left of it
 _EDGES = np.concatenate([[0.0], np.sqrt(SHARES[1:] * SHARES[:-1]), [1.0]])
 _ANY = np.diff(_EDGES)  # of an effect that nobody listed all shares are as probable
@@ -87,12 +87,26 @@ def log_likelihoods(courses: Floats, left: Floats, explained: Floats, scale: flo
 
     A share is of the root mean square; sizes of courses are normal. ``scale`` is the variance.
     """
-    ways, sizes, _ = np.linalg.svd(courses, full_matrices=False)
-    power = (ways.T @ left) ** 2 / scale
+    sizes, power = _along(courses, left)
     total = float(explained @ explained) / scale
-    variance = SHARES[:, None] ** 2 * total * sizes**2 / max(float(sizes @ sizes), 1e-12)
-    gains = power * variance / (1.0 + variance) - np.log1p(variance)
-    logs: Floats = 0.5 * gains.sum(axis=1)
+    normed = total / max(float(sizes @ sizes), 1e-12) * sizes**2
+    return _gained(SHARES[:, None] ** 2 * normed, power / scale)
+
+
+def log_likelihoods_in_place(courses: Floats, left: Floats) -> Floats:
+    """The same where each course is as large as what is explained in its place."""
+    sizes, power = _along(courses, left)
+    return _gained(SHARES[:, None] ** 2 * sizes**2, power)
+
+
+def _along(courses: Floats, left: Floats) -> tuple[Floats, Floats]:
+    """How large courses are along their principal directions, and the squares left in these."""
+    directions, sizes, _ = np.linalg.svd(courses, full_matrices=False)
+    return sizes, (directions.T @ left) ** 2
+
+
+def _gained(variance: Floats, power: Floats) -> Floats:
+    logs: Floats = 0.5 * (power * variance / (1.0 + variance) - np.log1p(variance)).sum(axis=1)
     return logs
 
 

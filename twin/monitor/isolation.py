@@ -38,7 +38,7 @@ from twin.monitor.false_alarm_budget import SUMS, cycles_between
 from twin.monitor.healthy import Healthy
 from twin.monitor.likeness import Likeness
 from twin.monitor.model_bank import DELAY_STEPS, DELAYS, SUSPECTS, UNSURE_OF, ModelBank, Suspect
-from twin.monitor.naming import LEAST_SURE, listed_share
+from twin.monitor.naming import EXPLAINED, LEAST_SURE, listed_share
 from twin.monitor.statistics import CycleResidual, ScoreExtractor
 from twin.signals import SAMPLE, TICK, Samples, Ticks
 
@@ -307,6 +307,8 @@ class Isolation:
         best = int(np.argmin(left))
         suits = wider if best == UNSURE_OF else known
         effect = _effect(best, float(sizes[best]), mean.signatures, mean.larger)
+        if not _explains(suits, mean.off, effect):
+            return [Likeness(UNKNOWN, None, "", changed)]
         listed = changed * listed_share(suits, mean.off, effect, mean.kind, mean.time)
         found = self._by_effect(share * (listed / share.sum()), sizes)
         if found[0].share < LEAST_SURE * changed:
@@ -359,6 +361,12 @@ def _fitted(off: Floats, signatures: Floats, bounds: Floats) -> tuple[Floats, Fl
     power = np.maximum(np.sum(signatures**2, axis=0), 1e-12)
     sizes = np.clip(np.sum(signatures * off, axis=0) / power, *bounds.T)
     return sizes, np.sum((off - sizes * signatures) ** 2, axis=0)
+
+
+def _explains(known: Covariance, off: Floats, effect: Floats) -> bool:
+    """Whether an effect takes away most of what is ``off`` (mbar) beyond chance."""
+    before, after = np.sum(known.white(np.column_stack([off, off - effect])) ** 2, axis=0)
+    return bool(before - after >= EXPLAINED * (before - len(off)))
 
 
 def _effect(number: int, size: float, signatures: Floats, larger: Floats) -> Floats:

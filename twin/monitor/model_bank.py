@@ -86,7 +86,8 @@ def suspects_of(data: DataSet, theta: Theta) -> Sequence[Suspect]:
 # How suction and end pressure follow the supply is the type's, since only one supply was ever
 # measured; of its value, one sigma. So it is not known well what a low supply does.
 UNSURE = {c.END_SLOPE: 0.5, c.SUPPLY_CURVATURE: 0.5, c.SUPPLY_OPTIMUM: 0.03}
-UNSURE_OF = next(i for i, one in enumerate(SUSPECTS) if one.effect == "supply_pressure_drop")
+SUPPLY = "supply_pressure_drop"
+UNSURE_OF = next(i for i, one in enumerate(SUSPECTS) if one.effect == SUPPLY)
 DELAYS = tuple(i for i, one in enumerate(SUSPECTS) if one.delays)
 LARGER = len(DELAY_STEPS) - 1  # sizes beside the step
 # With a step of these the air saving's switching off, or on, is seen a row later than it acts.

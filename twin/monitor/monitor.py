@@ -54,6 +54,9 @@ _UNFIT = int(Quality.OUT_OF_RANGE | Quality.OVERFLOW | Quality.STALE | Quality.B
 # to a twentieth of their rows.
 FEWEST_SHARE = 0.9
 RIVAL = 0.05  # probability from which on another cause is named as well, or a standing name holds
+# Probability of something unlisted, from which on a cause found by its signature does not suit, and
+# is sought in the size that it has. Where one suits, that is 0.01 to 0.05; else up to a third.
+UNSUITED = 0.1
 ALIKE = 0.2  # of how far out a cycle is: by so much its figures may move before the cause is sought
 RENAMED = 3  # cycles in a row that must agree on another name before a standing alarm gets it
 LONGEST_RING_NS = 120_000_000_000  # of rows that a PLC keeps while nobody reads them
@@ -475,14 +478,15 @@ class Monitor:
         return [self._raised(cycle, what, worst.plain(), ranking)]
 
     def _small(self, verdict: "Verdict | None") -> Sequence[Likeness]:
-        """Causes by the isolation, if the foremost is as small as its signatures are.
+        """Causes by the isolation, if the foremost is as small as its signatures are and suits.
 
         None against another name that stands: of something large they say nothing.
         """
         if not verdict or not verdict.causes or not verdict.causes[0].is_small:
             return ()
         causes = verdict.where_changed().causes
-        return causes if self.active in (UNKNOWN, causes[0].effect) else ()
+        suits = causes[-1].share < UNSUITED
+        return causes if suits and self.active in (UNKNOWN, causes[0].effect) else ()
 
     def _is_renamed(self, ranking: Sequence[Likeness]) -> bool:
         """Whether the best of a ranking becomes the alarm's name.

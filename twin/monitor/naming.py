@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from twin.inference.covariance import Covariance, fading
+from twin.inference.covariance import Covariance, fading, low_rank
 from twin.inference.sensitivities import coefficients_at, derivatives, points
-from twin.inference.unmodelled import MISMATCH, Odds, hats, knots_over, log_likelihoods
+from twin.inference.unmodelled import MISMATCH, Odds, hats, knots_over, log_likelihoods_in_place
 from twin.model import kernel
 from twin.model.effects import EFFECTS, UNKNOWN, Effect
 from twin.model.theta import Theta
@@ -20,6 +20,7 @@ from twin.monitor.bins import Bins, Floats, Ints, averaged
 from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import Healthy
 from twin.monitor.likeness import Likeness
+from twin.monitor.model_bank import SUPPLY, UNSURE
 from twin.monitor.rows import drawn_rows, time_steps
 from twin.monitor.scatter_covariance import SCATTER, from_cycle_to_cycle, lasting, model_error
 from twin.monitor.statistics import PER_UNIT
@@ -40,15 +41,15 @@ def likenesses(
     samples: Samples,
     ticks: Ticks,
     begin: int,
-    known: Sequence[Effect] = (),
+    catalogue: Sequence[Effect] = (),
 ) -> list[Likeness]:
-    """Rank the effects, also ``known`` ones beside the table, by how probable each is.
+    """Rank the effects, also those of a ``catalogue`` beside the table, by how probable each is.
 
     That is by the deviation from row ``begin`` on; the rows before it let the model swing in.
     Something that nobody listed stands last. Empty where the best effect does not explain half of
     what differs, where too many fit alike, or where nothing can be compared.
     """
-    effects = [*EFFECTS.values(), *known]
+    effects = [*EFFECTS.values(), *catalogue]
     firsts = [effect.parameters[0] for effect in effects]
     typical = np.array([first.typical for first in firsts])
     bounds = np.array([first.range(theta) for first in firsts]) / typical[:, None]
@@ -56,14 +57,18 @@ def likenesses(
     cycle = expect.at(np.ones(len(effects)))
     if not len(cycle.off):
         return []
-    known_by = Covariance.of(cycle.covariance(healthy, effects, typical))
-    fits = _Fits.of(known_by, cycle, bounds)
+    covariance = cycle.covariance(healthy, effects, typical)
+    known = Covariance.of(covariance)
+    fits = _Fits.of(known, cycle.off, bounds, np.ones(len(effects)), cycle.slopes)
     fits.search(expect)
+    low = next(number for number, one in enumerate(effects) if one.name == SUPPLY)
+    wider = fits.widen(low, expect, covariance)
     best = int(np.argmin(fits.left))
     rest = cycle.squares(cycle.off - fits.does[:, best])
     if rest > (1.0 - EXPLAINED) * cycle.squares(cycle.off):
         return []
-    listed = listed_share(known_by, cycle.off, fits.does[:, best], cycle.kind, cycle.time)
+    suits = wider if best == low else known
+    listed = listed_share(suits, cycle.off, fits.does[:, best], cycle.kind, cycle.time)
     shares = np.exp(0.5 * (fits.left[best] - fits.left))
     shares *= listed / shares.sum()
     if shares[best] < LEAST_SURE:
@@ -87,16 +92,16 @@ def compiled_for(cycle: Cycle) -> None:
 def listed_share(known: Covariance, off: Floats, effect: Floats, kind: Ints, time: Floats) -> float:
     """Probability that a listed effect acts, where the best of them does ``effect`` (mbar).
 
-    The alternative is something that nobody listed: smooth courses over the warped ``time`` of
-    each ``kind`` of stretch, in what is ``off`` (mbar).
+    The alternative is something that nobody listed. Of what is explained in each place it leaves a
+    share, smooth over the warped ``time`` of each ``kind`` of stretch. What is off elsewhere speaks
+    for neither: a steep edge that comes a row later leaves much beside every effect.
     """
     courses = [np.zeros((len(kind), 0))]
     for one in np.unique(kind[kind >= 0]):
         here = kind == one
-        courses.append(hats(time, knots_over(time[here])) * here[:, None])
-    white = known.white(np.column_stack([off - effect, effect, *courses]))
-    likely = log_likelihoods(white[:, 2:], white[:, 0], white[:, 1], 1.0)
-    return Odds.of(likely[None]).of_cause(1, 0.0)
+        courses.append(hats(time, knots_over(time[here])) * (here * effect)[:, None])
+    white = known.white(np.column_stack([off - effect, *courses]))
+    return Odds.of(log_likelihoods_in_place(white[:, 1:], white[:, 0])[None]).of_cause(1, 0.0)
 
 
 @dataclass(frozen=True)
@@ -155,11 +160,27 @@ class _Expected:
 
     def at(self, sizes: Floats) -> _Cycle:
         """The cycle with each effect in a size, in typical ones; empty where nothing compares."""
+        return self._cycle(self._with(points(np.zeros(len(sizes)), sizes)), sizes)
+
+    def unsure(self, size: float) -> Floats:
+        """What its law leaves open of the first effect, a low supply: mbar by one sigma each."""
+        sizes = np.zeros((len(self.effects), 1))
+        sizes[0] = size
+        theta = np.repeat(self._with(sizes), 1 + len(UNSURE), axis=1)
+        for way, (coefficient, share) in enumerate(UNSURE.items(), start=1):
+            theta[coefficient, way] *= 1.0 + share
+        return self._cycle(theta, np.ones(len(UNSURE))).slopes
+
+    def _with(self, sizes: Floats) -> Floats:
+        """Coefficients with so many typical sizes of each effect, (effects, n)."""
         changes = [
             (one.name, {p.name: p.typical for p in one.parameters if not p.shapes})
             for one in self.effects
         ]
-        theta = coefficients_at(self.theta, changes, points(np.zeros(len(sizes)), sizes))
+        return coefficients_at(self.theta, changes, sizes)
+
+    def _cycle(self, theta: Floats, sizes: Floats) -> _Cycle:
+        """The cycle by the first coefficients, and slopes to the others, so far from it."""
         here = self.drawn >= self.begin
         expected = self._expected(theta)[here] / MBAR
         expected = np.where(np.isfinite(expected), expected, expected[:, :1])  # it has no answer
@@ -188,7 +209,7 @@ class _Fits:
     """Of each effect the size that fits best so far; sizes are in typical ones."""
 
     known: Covariance
-    off: Floats  # whitened, (places, 1)
+    off: Floats  # mbar
     bounds: Floats
     size: Floats
     does: Floats  # mbar in that size, (places, effects)
@@ -197,15 +218,15 @@ class _Fits:
     hoped: Floats  # sigmas² that they would leave, were they in proportion
 
     @classmethod
-    def of(cls, known: Covariance, cycle: _Cycle, bounds: Floats) -> "_Fits":
-        """With what each effect does in its typical size, in which ``cycle`` is."""
-        off, shape = known.white(cycle.off[:, None]), cycle.slopes.shape
-        count, total = shape[1], float(np.sum(off**2))
-        none, all_left = np.zeros(count), np.full(count, total)
-        fits = cls(
-            known, off, bounds, none, np.zeros(shape), all_left, none.copy(), all_left.copy()
-        )
-        fits._take(np.arange(count), np.ones(count), cycle.slopes)
+    def of(
+        cls, known: Covariance, off: Floats, bounds: Floats, sizes: Floats, slopes: Floats
+    ) -> "_Fits":
+        """With what each effect does in a size, by its ``slopes`` (mbar) for a typical one."""
+        left = np.full(len(sizes), float(np.sum(known.white(off[:, None]) ** 2)))
+        none = np.zeros(len(sizes))
+        does = np.zeros(slopes.shape)
+        fits = cls(known, off, bounds, none, does, left, none.copy(), left.copy())
+        fits._take(np.arange(len(sizes)), sizes, slopes)
         return fits
 
     def search(self, expect: "_Expected") -> None:
@@ -218,11 +239,25 @@ class _Fits:
             trial = np.clip(np.full(len(every), start), *self.bounds.T)
             self._take(every, trial, expect.at(trial).slopes)
         finalists = np.argsort(self.hoped)[:FINALISTS]
-        some = replace(expect, effects=[expect.effects[one] for one in finalists])
+        self._refine(finalists, replace(expect, effects=[expect.effects[i] for i in finalists]))
+
+    def widen(self, low: int, expect: "_Expected", covariance: Floats) -> Covariance:
+        """Fit a low supply again with what its law leaves open; give the covariance with that."""
+        alone, bounds = replace(expect, effects=[expect.effects[low]]), self.bounds[[low]]
+        size = np.clip(self.size[[low]], NEARLY_NONE, None)
+        wider = Covariance.of(covariance + low_rank(alone.unsure(float(size[0]))))
+        fits = _Fits.of(wider, self.off, bounds, size, alone.at(size).slopes)
+        fits._refine(np.zeros(1, np.int64), alone)
+        self.size[low], self.does[:, low] = fits.size[0], fits.does[:, 0]
+        self.left[low] = fits.left[0] + wider.log_pdet - self.known.log_pdet
+        return wider
+
+    def _refine(self, which: Ints, expect: "_Expected") -> None:
+        """Go on with some effects, which are those of ``expect``."""
         for _ in range(ROUNDS):
-            trial = self.wanted[finalists]
+            trial = self.wanted[which]
             trial = np.where(trial == 0.0, NEARLY_NONE, trial)
-            self._take(finalists, trial, some.at(trial).slopes, back=True)
+            self._take(which, trial, expect.at(trial).slopes, back=True)
 
     def _take(self, which: Ints, trial: Floats, slopes: Floats, *, back: bool = False) -> None:
         """Take what some effects do in sizes on trial, ``slopes`` (mbar) for each typical size.
@@ -231,12 +266,13 @@ class _Fits:
         suddenly: that of a blow-off too weak to release a part. Where it does not, the next one is
         half the way ``back``.
         """
-        white = self.known.white(slopes)
+        white = self.known.white(np.column_stack([slopes, self.off]))
+        white, off = white[:, :-1], white[:, -1:]
         seen = np.sqrt(np.mean((slopes * trial) ** 2, axis=0)) > NOTHING
         power = np.where(seen, np.sum(white**2, axis=0), np.inf)
-        best = np.clip(np.sum(white * self.off, axis=0) / power, *self.bounds[which].T) * seen
-        leaves = np.sum((self.off - trial * white) ** 2, axis=0)
-        hoped = np.sum((self.off - best * white) ** 2, axis=0)
+        best = np.clip(np.sum(white * off, axis=0) / power, *self.bounds[which].T) * seen
+        leaves = np.sum((off - trial * white) ** 2, axis=0)
+        hoped = np.sum((off - best * white) ** 2, axis=0)
         better = (leaves < self.left[which]) & seen
         self.size[which] = np.where(better, trial, self.size[which])
         self.left[which] = np.where(better, leaves, self.left[which])
