@@ -1,9 +1,9 @@
-"""What an ejector or its surroundings tell besides: as columns of ``SAMPLE``, whatever carries it.
+"""Optional signals of an ejector and its surroundings, as columns of ``SAMPLE``, for any protocol.
 
-An ejector on IO-Link reports in its process data whether it saves air, or how its nozzle stands,
-and whether it holds a part. In block mode these are bits of a record's status. A barometer, a
-thermometer, a second pressure and a flow are read once a block: what stands still for that long
-counts for all of its rows, what moves for the newest alone.
+An ejector on IO-Link reports in its process data whether it saves air or its nozzle is on, and
+whether it holds a part. In block mode these are bits of a record's status. A barometer, a
+thermometer, a second pressure and a flow are read once a block. A slow value counts for all rows of
+the block, a fast one for the newest row alone.
 """
 
 from collections.abc import Mapping
@@ -16,9 +16,9 @@ from drivers.tags import Flowmeter, Quantity, Thermometer
 from twin.signals import UNUSABLE, Command, Reported, Samples
 
 BITS = {"nozzle": 2, "air_saving": 3, "part_present": 4}  # in the status of a record
-STANDING, MOVING = ("ambient", "temperature"), ("pressure_2", "flow")
-VALUES = (*STANDING, *MOVING)
-# Where an ejector works at all: another reading is none of a barometer, or of a thermometer.
+SLOW, FAST = ("ambient", "temperature"), ("pressure_2", "flow")
+VALUES = (*SLOW, *FAST)
+# Plausible readings: no ejector works beyond these limits.
 AMBIENT, TEMPERATURE = (50_000.0, 120_000.0), (233.15, 373.15)  # Pa, K
 
 KNOWN = {Reported.NOZZLE: Reported.NOZZLE_KNOWN, Reported.PART: Reported.PART_KNOWN}
@@ -27,7 +27,7 @@ Floats = npt.NDArray[np.float64]
 
 
 class ReportTags(Protocol):
-    """What tags of either transport say of the values."""
+    """Tags of optional values, of either protocol."""
 
     @property
     def ambient(self) -> Quantity | None:
@@ -47,7 +47,7 @@ class ReportTags(Protocol):
 
 
 def refuse_unclear(nozzle: object, air_saving: object, ambient: Quantity | None) -> None:
-    """ValueError where two tags say the same, or a barometer would count from what it measures."""
+    """ValueError if two tags report the same nozzle, or the barometer is not absolute."""
     if nozzle is not None and air_saving is not None:
         raise ValueError("nozzle and air_saving say the same of the nozzle: leave one of them out")
     if ambient is not None and ambient.reference != "absolute":
@@ -58,38 +58,38 @@ def refuse_unclear(nozzle: object, air_saving: object, ambient: Quantity | None)
 
 
 def put_bits(block: Samples, bits: Mapping[str, Floats]) -> None:
-    """Put what the ejector says of nozzle and part into ``reported``, once the commands are there.
+    """Set ``reported`` from the bits for nozzle and part; ``commands`` must be set before.
 
-    ``bits`` are 0 or 1 row by row, NaN where nothing is known, by the tags' names. An ejector that
-    saves air has its nozzle off.
+    ``bits`` holds a column by tag name: 0 or 1, NaN where unknown. While the ejector saves air its
+    nozzle is off.
     """
-    asked = (block["commands"] & (Command.SUCTION | Command.BLOW_OFF)) == Command.SUCTION
+    suction_on = (block["commands"] & (Command.SUCTION | Command.BLOW_OFF)) == Command.SUCTION
     for name, value in bits.items():
-        known = ~np.isnan(value)
+        is_reported = ~np.isnan(value)
         if name == "part_present":
             on, bit = value != 0.0, Reported.PART
         else:
-            on = asked & (value == 0.0) if name == "air_saving" else value != 0.0
+            on = suction_on & (value == 0.0) if name == "air_saving" else value != 0.0
             bit = Reported.NOZZLE
-        block["reported"] |= known * np.uint8(KNOWN[bit]) + (known & on) * np.uint8(bit)
+        block["reported"] |= is_reported * np.uint8(KNOWN[bit]) + (is_reported & on) * np.uint8(bit)
 
 
 def once(value: float, name: str, rows: int) -> Floats:
-    """A value that was read once, as a column: NaN in the rows for which it does not count."""
-    column = np.full(rows, value if name in STANDING else np.nan)
+    """A value read once a block, as a column: NaN in rows for which it does not count."""
+    column = np.full(rows, value if name in SLOW else np.nan)
     column[-1:] = value
     return column
 
 
 def ambient_of(block: Samples, tags: ReportTags, raw: Mapping[str, Floats], fixed: float) -> Floats:
-    """Put the barometer's pressures into ``ambient``; gives what ambient pressure is, row by row.
+    """Set ``ambient`` from the barometer; return the ambient pressure of each row (Pa).
 
-    ``fixed`` (Pa) is it where no barometer tells. ``raw`` are columns as they stand in the PLC.
+    ``fixed`` (Pa) applies where no barometer reads. ``raw`` holds columns as they stand in the PLC.
     """
     if tags.ambient is not None:
         pascal, quality = tags.ambient.pressure(raw["ambient"], fixed)
-        good = ((quality & UNUSABLE) == 0) & (pascal > AMBIENT[0]) & (pascal < AMBIENT[1])
-        block["ambient"] = np.where(good, pascal, 0.0)
+        plausible = ((quality & UNUSABLE) == 0) & (pascal > AMBIENT[0]) & (pascal < AMBIENT[1])
+        block["ambient"] = np.where(plausible, pascal, 0.0)
     ambient: Floats = np.where(block["ambient"] > 0.0, block["ambient"], fixed).astype(np.float64)
     return ambient
 
@@ -97,17 +97,17 @@ def ambient_of(block: Samples, tags: ReportTags, raw: Mapping[str, Floats], fixe
 def put_values(
     block: Samples, tags: ReportTags, raw: Mapping[str, Floats], ambient: Floats
 ) -> None:
-    """Put the other values into their columns; ``raw`` and ``ambient`` as in ``ambient_of``."""
+    """Set the columns of the other values; ``raw`` and ``ambient`` as in ``ambient_of``."""
     if tags.temperature is not None:
         kelvin = tags.temperature.kelvin(raw["temperature"])
-        good = (kelvin > TEMPERATURE[0]) & (kelvin < TEMPERATURE[1])
-        block["temperature"] = np.where(good, kelvin, 0.0)
+        plausible = (kelvin > TEMPERATURE[0]) & (kelvin < TEMPERATURE[1])
+        block["temperature"] = np.where(plausible, kelvin, 0.0)
     if tags.pressure_2 is not None:
         pascal, quality = tags.pressure_2.pressure(raw["pressure_2"], ambient)
-        good = ((quality & UNUSABLE) == 0) & (pascal > 0.0)
-        block["pressure_2"] = np.where(good, pascal, 0.0)
+        plausible = ((quality & UNUSABLE) == 0) & (pascal > 0.0)
+        block["pressure_2"] = np.where(plausible, pascal, 0.0)
     if tags.flow is not None:
         flow = tags.flow.mass_flow(raw["flow"])
-        good = np.isfinite(flow)
-        block["flow"] = np.where(good, flow, 0.0)
-        block["reported"] |= np.where(good, np.uint8(Reported.FLOW_KNOWN), np.uint8(0))
+        plausible = np.isfinite(flow)
+        block["flow"] = np.where(plausible, flow, 0.0)
+        block["reported"] |= np.where(plausible, np.uint8(Reported.FLOW_KNOWN), np.uint8(0))

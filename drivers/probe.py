@@ -1,4 +1,4 @@
-"""What a PLC shows of itself, line by line, whatever it speaks."""
+"""Inspection of a PLC, line by line; shared by all protocols."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,14 +9,14 @@ from twin.errors import SourceError
 
 TIMES = 20  # requests to measure the round trip with
 WATCHED_S = 0.5  # to measure the scan rate
-# Of the time watched: a clock in a PLC is off by less than a thousandth, a task that misses its
-# period or a sequence with its words swapped by much more.
+# Fraction of the time watched. A PLC's clock is off by less than a thousandth. A task that misses
+# its period, or a sequence with swapped words, is off by much more.
 RATE_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True)
 class Line:
-    """One thing that was looked at."""
+    """The result of one inspection."""
 
     what: str
     text: str
@@ -25,38 +25,38 @@ class Line:
     lost: bool = False  # nothing came at all
 
 
-def looked_at(what: str, look: Callable[[], str]) -> Line:
-    """What ``look`` says, or why it could not."""
+def looked_at(subject: str, inspect: Callable[[], str]) -> Line:
+    """The result of ``inspect``, or the error that prevented it."""
     try:
-        return Line(what, look())
+        return Line(subject, inspect())
     except SourceError as error:
-        return Line(what, str(error), False, error.hint, isinstance(error, LostError))
+        return Line(subject, str(error), False, error.hint, isinstance(error, LostError))
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """A header, and between when and when (ns) the PLC sent it."""
+class _TimedHeader:
+    """A header, with the times (ns) of its request and of its arrival."""
 
     header: Header
-    asked: int
-    answered: int
+    asked_ns: int
+    answered_ns: int
 
 
 def watched(ask: Callable[[], Header], clock: Clock) -> str:
-    """Scans per second by the clock here; SourceError if they are not those of the period."""
-    first = _seen(ask, clock)
+    """Scans per second by this machine's clock; SourceError if they do not fit the period."""
+    first = _timed_header(ask, clock)
     clock.sleep(WATCHED_S)
-    return scan_rate(first, _seen(ask, clock))
+    return scan_rate(first, _timed_header(ask, clock))
 
 
-def _seen(ask: Callable[[], Header], clock: Clock) -> _Seen:
-    asked = clock.now_ns()
+def _timed_header(ask: Callable[[], Header], clock: Clock) -> _TimedHeader:
+    asked_ns = clock.now_ns()
     header = ask()
-    return _Seen(header, asked, clock.now_ns())
+    return _TimedHeader(header, asked_ns, clock.now_ns())
 
 
-def scan_rate(first: _Seen, last: _Seen) -> str:
-    """Scans per second between two headers; SourceError if they are not those of the period."""
+def scan_rate(first: _TimedHeader, last: _TimedHeader) -> str:
+    """Scans per second between two headers; SourceError if they do not fit the period."""
     scans = last.header.advance(first.header)
     if not scans:
         raise SourceError(
@@ -65,12 +65,14 @@ def scan_rate(first: _Seen, last: _Seen) -> str:
             "does the PLC's program run, or did it restart just now?",
         )
     nominal = 1e9 / first.header.period_ns
-    text = f"{scans / (last.answered - first.answered) * 1e9:.1f} scans/s, nominal {nominal:.1f}"
-    # The requests took their time: at least and at most so many nanoseconds lie between the two.
-    shortest, longest = last.asked - first.answered, last.answered - first.asked
-    due = scans * first.header.period_ns
-    if due > longest * (1.0 + RATE_TOLERANCE):
+    text = (
+        f"{scans / (last.answered_ns - first.answered_ns) * 1e9:.1f} scans/s, nominal {nominal:.1f}"
+    )
+    # Requests take time: the headers lie at least and at most so many nanoseconds apart.
+    shortest_ns, longest_ns = last.asked_ns - first.answered_ns, last.answered_ns - first.asked_ns
+    expected_ns = scans * first.header.period_ns
+    if expected_ns > longest_ns * (1.0 + RATE_TOLERANCE):
         raise SourceError(text, "does word_order fit, and is the scan period that of the task?")
-    if due < shortest * (1.0 - RATE_TOLERANCE):
+    if expected_ns < shortest_ns * (1.0 - RATE_TOLERANCE):
         raise SourceError(text, "does the task keep its period, and does each scan make a record?")
     return text

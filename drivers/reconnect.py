@@ -1,4 +1,4 @@
-"""Connections that come and go, whatever protocol they speak: retried for ever, in one stream."""
+"""Connections that are retried for ever, as one stream of blocks, for any protocol."""
 
 import errno
 import queue
@@ -32,31 +32,31 @@ class AbsentError(SourceError):
     """An answer without what is wanted: it was never there, or the PLC is still starting."""
 
 
-def unreachable(where: str, error: OSError | UnicodeError, server: str) -> LostError:
-    """Say why nobody could be connected to at ``where``; ``server`` is what should listen there.
+def unreachable(address: str, error: OSError | UnicodeError, server: str) -> LostError:
+    """The error for a failed connection to ``address``, where a ``server`` should listen.
 
-    A name that nobody knows, a port that nobody listens on and silence want different remedies.
+    An unknown name, a closed port and silence need different remedies.
     """
     if isinstance(error, socket.gaierror | UnicodeError):
-        what, hint = "no such host", "is the name right, and known here? An IP address always is"
+        cause, hint = "no such host", "is the name right, and known here? An IP address always is"
     elif f"[Errno {errno.ECONNREFUSED}]" in str(error):  # asyncio's may be of several addresses
-        what = "the machine refuses this port"
+        cause = "the machine refuses this port"
         hint = f"is the {server} started there, and is the port right?"
     elif isinstance(error, TimeoutError):
-        what = "no answer"
+        cause = "no answer"
         hint = (
             "is the PLC on and its cable in, is the address right, does a firewall stand between? "
             f"Does a {server} listen there?"
         )
     else:
-        what = (error.strerror or str(error)).lower() or type(error).__name__
+        cause = (error.strerror or str(error)).lower() or type(error).__name__
         hint = "is this machine in the PLC's network, and is the address right?"
-    return LostError(f"{where}: no connection: {what}", hint)
+    return LostError(f"{address}: no connection: {cause}", hint)
 
 
 @dataclass(frozen=True)
 class Clock:
-    """What time it is, and waiting; tests pass their own."""
+    """Time and sleeping; tests pass their own."""
 
     wall_ns: Callable[[], int] = time.time_ns
     now_ns: Callable[[], int] = time.perf_counter_ns  # runs on evenly
@@ -76,13 +76,13 @@ class Connection(Protocol):
         """Hang up."""
 
 
-Away = Callable[[TwinError], None]  # told why a PLC gives no rows, once for each reason
+Away = Callable[[TwinError], None]  # receives why a PLC gives no rows, each reason once
 
 C_contra = TypeVar("C_contra", bound=Connection, contravariant=True)
 
 
 class Source(Protocol[C_contra]):
-    """Where we are in the samples of one PLC; it outlives connections."""
+    """The reading position in the samples of one PLC; it outlives connections."""
 
     def samples(self, link: C_contra) -> Iterator[Samples]:
         """Blocks as they come; ends only by an exception."""
@@ -97,14 +97,13 @@ def reconnecting(
     *,
     known: bool = False,
 ) -> Generator[Samples, None, None]:
-    """Samples of ``source`` over one connection after the other; empty blocks in between.
+    """Samples of ``source`` over successive connections; empty blocks in between.
 
-    A PLC that is ``known``, or gave rows, is retried for ever, whatever it sends: the connection
-    counts as lost. Before that it is retried where it is not there or lacks what is wanted, and
-    there is ``away``; other errors come out. ``away`` is told each reason once until rows come.
-    Closing hangs up.
+    A PLC that is ``known``, or has given rows, is retried for ever: any error counts as a lost
+    connection. Before that, only LostError and AbsentError are retried, and only with ``away``;
+    other errors are raised. ``away`` receives each reason once until rows come. Closing hangs up.
     """
-    reasons = set[str]()  # that were told
+    reasons = set[str]()  # already reported
     backoff = Backoff(RETRY_S, LONGEST_RETRY_S)
     try:
         while True:
@@ -113,7 +112,7 @@ def reconnecting(
                 link.open()
                 connected = True
                 if known or reasons:
-                    yield EMPTY  # connected is not yet answered
+                    yield EMPTY  # a connection is no answer yet
                 for block in source.samples(link):
                     if len(block):
                         known = True
@@ -121,21 +120,21 @@ def reconnecting(
                         reasons.clear()
                     yield block
             except TwinError as error:
-                passes = isinstance(error, LostError | AbsentError) and away is not None
-                if not known and not passes:
+                may_pass = isinstance(error, LostError | AbsentError) and away is not None
+                if not known and not may_pass:
                     raise
                 if away is not None and str(error) not in reasons:
                     reasons.add(str(error))
                     away(error)
-                link.close()  # if it is not yet: what it knows of the PLC may no longer hold
-                # Nobody there is asked as often as may be, so that no row is missed.
+                link.close()  # what it remembers of the PLC may no longer hold
+                # An absent PLC is retried at the shortest interval, so that no row is missed.
                 yield from _pause(clock, backoff.next_s() if connected else RETRY_S)
     finally:
         link.close()
 
 
 def _pause(clock: Clock, seconds: float) -> Iterator[Samples]:
-    """Empty blocks until the next try, and around whatever may take its time."""
+    """Empty blocks until the next attempt; the first before any wait."""
     yield EMPTY
     for _ in range(round(2 * seconds / RETRY_S)):
         clock.sleep(RETRY_S / 2)
@@ -143,9 +142,9 @@ def _pause(clock: Clock, seconds: float) -> Iterator[Samples]:
 
 
 def in_thread(source: Generator[Samples, None, None]) -> Generator[Samples, None, None]:
-    """Run ``source`` in its own thread; empty blocks while it has nothing, once it has begun.
+    """Run ``source`` in its own thread; after its first block, empty ones while it has nothing.
 
-    Its exception comes out here; closing this closes it.
+    Its exception is raised here; closing this generator closes it.
     """
     blocks: queue.Queue[Samples | Exception] = queue.Queue(WAITING)
     stop = threading.Event()
@@ -163,7 +162,7 @@ def in_thread(source: Generator[Samples, None, None]) -> Generator[Samples, None
                 block = EMPTY
     finally:
         stop.set()
-        if threading.current_thread() is not thread:  # forgotten, and collected over there
+        if threading.current_thread() is not thread:  # unless it is garbage-collected there
             thread.join()
 
 
@@ -177,14 +176,14 @@ def _pump(
             for block in source:
                 if not _put(block, blocks, stop):
                     return
-        except Exception as error:  # it is raised where the blocks are taken
+        except Exception as error:  # in_thread raises it again
             _put(error, blocks, stop)
 
 
 def _put(
     item: Samples | Exception, blocks: "queue.Queue[Samples | Exception]", stop: threading.Event
 ) -> bool:
-    """Hand over, however long it takes; False once nobody takes any more."""
+    """Queue ``item``, however long it takes; False once the consumer has stopped."""
     while not stop.is_set():
         try:
             blocks.put(item, timeout=LONGEST_SILENCE_S)

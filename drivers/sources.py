@@ -28,12 +28,12 @@ def open_source(
     *,
     known: bool = False,
 ) -> Iterator[Samples]:
-    """The blocks of the source that ``[driver]`` names; ``address`` (host:port) goes before it.
+    """The blocks of the source that ``[driver]`` names; ``address`` (host:port) overrides its own.
 
-    Several that are opened with the same ``lines`` share a connection where that can be done.
-    Raises ConfigError for an unknown kind or bad settings, SourceError if it does not answer; with
-    ``away``, which is told why, it is tried until it does. One that is ``known`` has given rows
-    before: whatever it sends, it is tried again.
+    Sources opened with the same ``lines`` share a connection where the protocol allows it.
+    Raises ConfigError for an unknown kind or bad settings, SourceError if the PLC does not answer.
+    With ``away``, which receives the reason, it is retried until it answers. A ``known`` source has
+    given rows before: it is retried whatever it sends.
     """
     settings = settings_of(document, address)
     if isinstance(settings, ModbusSettings):
@@ -44,19 +44,19 @@ def open_source(
 
 
 def probe_source(document: Document, address: str = "") -> Iterator[str]:
-    """Say, line by line, what the source answers; each hint once, behind the line that needs it.
+    """Lines on what the source answers; each hint once, below the line that needs it.
 
-    SourceError after the last line if anything in them is wrong.
+    SourceError after the last line if any inspection failed.
     """
-    said: set[str] = set()
+    shown_hints: set[str] = set()
     lines = _probed(settings_of(document, address))
     for line in lines:
         yield f"{'ok ' if line.good else '!! '} {line.what:<14} {line.text}"
-        if line.hint and line.hint not in said:
-            said.add(line.hint)
+        if line.hint and line.hint not in shown_hints:
+            shown_hints.add(line.hint)
             yield f"{'':19}{line.hint}"
-    if wrong := [line.what for line in lines if not line.good]:
-        raise SourceError(f"{document.name}: not as configured: {', '.join(wrong)}")
+    if failed := [line.what for line in lines if not line.good]:
+        raise SourceError(f"{document.name}: not as configured: {', '.join(failed)}")
 
 
 def _probed(settings: "ModbusSettings | OpcuaSettings") -> list[Line]:

@@ -49,7 +49,7 @@ MASS_FLOW = {"sl/min": SL_MIN, "Nl/min": 1.2928e-3 / 60.0}
 
 @dataclass(frozen=True)
 class Address:
-    """A place in a PLC: 0-based in the protocol, 1-based with the area's digit in manuals."""
+    """An address in a PLC: 0-based in the protocol, 1-based with the area's digit in manuals."""
 
     area: Area
     offset: int
@@ -92,14 +92,14 @@ class Address:
 
     @property
     def of_words(self) -> bool:
-        """Whether registers lie there, and not single bits."""
+        """Whether the area holds registers, not single bits."""
         return self.area in ("input", "holding")
 
 
 Place = Annotated[
     Address,
     BeforeValidator(Address.parse, json_schema_input_type=str),
-    PlainSerializer(lambda place: f"{place.area}:{place.offset}", return_type=str),
+    PlainSerializer(lambda address: f"{address.area}:{address.offset}", return_type=str),
 ]
 
 
@@ -141,7 +141,7 @@ class Tag(Settings):
         return values if self.bit is None else (values.astype(np.uint16) >> self.bit) & 1
 
     def floats(self, words: Words, order: WordOrder) -> Floats:
-        """The same as numbers of one kind, whatever they are."""
+        """The same numbers as float64."""
         with np.errstate(invalid="ignore"):  # signalling NaNs too
             return self.raw(words, order).astype(np.float64)
 
@@ -160,7 +160,7 @@ class Scaled(Settings):
 
     def value(self, raw: Floats) -> Floats:
         """In the unit of the tag."""
-        with np.errstate(invalid="ignore", over="ignore"):  # whatever comes, it is judged
+        with np.errstate(invalid="ignore", over="ignore"):  # callers flag what is not finite
             return raw * self.scale + self.offset
 
 
@@ -203,9 +203,9 @@ class Quantity(Scaled):
     ) -> tuple[npt.NDArray[np.float32], Flags]:
         """Pressures in Pa, counted from ``onto``, and quality bits.
 
-        ``ambient`` is in Pa, one or row by row. NaN and infinite values become NaN and BAD.
+        ``ambient`` (Pa) is a number or a column. NaN and infinite values become NaN and BAD.
         """
-        with np.errstate(invalid="ignore", over="ignore"):  # whatever comes, it is judged
+        with np.errstate(invalid="ignore", over="ignore"):  # flagged as BAD below
             value = self.value(raw)
             pascal = counted_from(value * PASCAL[self.unit], self.reference, onto, ambient)
             column = pascal.astype(np.float32)
@@ -216,9 +216,9 @@ class Quantity(Scaled):
         return column, quality
 
     def raw_of(self, pressure: float, ambient: float) -> tuple[float, bool]:
-        """What stands in the PLC for ``pressure`` (Pa, absolute), and whether that is within range.
+        """The PLC's number for ``pressure`` (Pa, absolute), and whether it is within range.
 
-        Beyond the range it is that of the range's end.
+        Beyond the range it is the number of the nearer end.
         """
         counted = counted_from(np.array([pressure]), "absolute", self.reference, ambient)
         value = float(counted[0]) / PASCAL[self.unit]
@@ -237,7 +237,7 @@ class Quantity(Scaled):
         return quality
 
     def gauge(self, raw: Floats, ambient: float | Floats) -> npt.NDArray[np.float32]:
-        """Pressures in Pa gauge; NaN where they are none."""
+        """Pressures in Pa gauge; NaN where unusable."""
         pascal, quality = self.pressure(raw, ambient, onto="gauge")
         pascal[(quality & UNUSABLE) != 0] = np.nan
         return pascal
@@ -263,7 +263,7 @@ class Pressure(Quantity, Tag):
     def supply(
         self, words: Words, order: WordOrder, ambient: float | Floats
     ) -> npt.NDArray[np.float32]:
-        """Supply pressures in Pa gauge from words (rows, size); NaN where they are none."""
+        """Supply pressures in Pa gauge from words (rows, size); NaN where unusable."""
         return self.gauge(self.floats(words, order), ambient)
 
 

@@ -1,7 +1,7 @@
-"""A PLC's ring of scans, followed without losing one, whatever transports it.
+"""Follow a PLC's ring of scans without losing one, over any protocol.
 
 The PLC writes a record per scan into a ring and counts them in a header. A record proves itself by
-its sequence; whatever is missing shows as a missing number and as a flag on the sample after it.
+its sequence number. A lost record shows as a missing number, and as a flag on the next sample.
 """
 
 from abc import ABC, abstractmethod
@@ -22,7 +22,7 @@ COMMAND_BITS = {"suction": 0, "blow_off": 1}  # the same by the tags' names
 OVERFLOW_BIT = 8  # in the status of a record
 RESERVE = 64  # records at the old end of the ring that the PLC may overwrite while they are read
 CLOCK_TOLERANCE_NS = 50_000_000  # PLC time against sequence
-LONGEST_PERIOD_NS = 1_000_000_000  # of scans that can be called so
+LONGEST_PERIOD_NS = 1_000_000_000  # of a PLC's scans
 LATEST_NS = 1 << 62  # the year 2116; beyond it is no time
 WRAP = 1 << 32  # the PLC counts with 32 bits
 
@@ -36,7 +36,7 @@ class Header:
     boot: int  # differs after every restart
     period_ns: int
     depth: int  # records
-    unsure_ns: int = field(default=0, kw_only=True)  # so far off its time may be
+    unsure_ns: int = field(default=0, kw_only=True)  # how far off its time may be
 
     @property
     def ready(self) -> bool:
@@ -46,7 +46,7 @@ class Header:
 
     @property
     def blank(self) -> bool:
-        """Whether nothing was written yet: so it is of a PLC that just starts."""
+        """Whether nothing was written yet, as in a PLC that just starts."""
         return not (self.sequence or self.time_ns or self.period_ns)
 
     def advance(self, earlier: "Header") -> int | None:
@@ -55,9 +55,9 @@ class Header:
         return None if self.boot != earlier.boot or scans >= WRAP // 2 else scans
 
     def clock_jumped(self, earlier: "Header", scans: int) -> bool:
-        """Whether PLC time did not run with the sequence."""
-        ran = self.time_ns - earlier.time_ns - scans * self.period_ns
-        return abs(ran) > CLOCK_TOLERANCE_NS
+        """Whether PLC time and sequence disagree beyond the tolerance."""
+        drift_ns = self.time_ns - earlier.time_ns - scans * self.period_ns
+        return abs(drift_ns) > CLOCK_TOLERANCE_NS
 
     def follows(self, earlier: "Header") -> bool:
         """Whether nothing happened but a few more scans."""
@@ -70,33 +70,33 @@ class Header:
         )
 
 
-def no_effect(tag: str, bit: int, place: object, single: str) -> KeyedError:
-    """The error for a bit's tag in block mode that is not where the trace has that bit.
+def no_effect(tag: str, bit: int, address: object, single_mode: str) -> KeyedError:
+    """The error for a bit's tag in block mode whose address differs from the trace's.
 
-    ``single`` is the mode that reads single values.
+    ``single_mode`` is the mode that reads single values.
     """
     return KeyedError(
-        f"{place} has no effect in block mode: each record has {tag} in bit {bit} of "
+        f"{address} has no effect in block mode: each record has {tag} in bit {bit} of "
         f"its status. Have the PLC write it there and leave out [driver.tags.{tag}], or read "
-        f'single values with mode = "{single}" in [driver]',
+        f'single values with mode = "{single_mode}" in [driver]',
         "tags",
         tag,
     )
 
 
-def refuse_unused(given: Collection[str], names: Collection[str], single: str) -> None:
-    """KeyedError if one of the settings that are ``given`` is for the mode ``single`` alone."""
+def refuse_unused(present: Collection[str], names: Collection[str], single_mode: str) -> None:
+    """KeyedError if a ``present`` setting among ``names`` is for ``single_mode`` alone."""
     for name in names:
-        if name in given:
+        if name in present:
             raise KeyedError(
                 "has no effect in block mode: a missing record shows in the sequence. Leave it "
-                f'out, or set mode = "{single}" in [driver]',
+                f'out, or set mode = "{single_mode}" in [driver]',
                 name,
             )
 
 
 def refusal(header: Header) -> type[SourceError]:
-    """The error for a ring that cannot be followed: lost, if the PLC may only be starting."""
+    """Type of error for a ring that cannot be followed; LostError if the PLC may be starting."""
     return LostError if header.blank else SourceError
 
 
@@ -114,7 +114,7 @@ L = TypeVar("L")
 
 
 class Follower(ABC, Generic[H, L]):
-    """Where we are in the ring of one PLC; it outlives connections."""
+    """The reading position in the ring of one PLC; it outlives connections."""
 
     def __init__(self, settings: Paced, clock: Clock) -> None:
         self._interval_ns = round(settings.interval_ms * 1e6)
@@ -139,7 +139,7 @@ class Follower(ABC, Generic[H, L]):
 
     @abstractmethod
     def _read(self, link: L) -> Samples:
-        """Whatever is new, as far as the time for one block goes."""
+        """New samples, as many as fit into the time for one block."""
 
     def samples(self, link: L) -> Iterator[Samples]:
         """Blocks of what is new, one every interval; ends only by an exception."""
@@ -148,9 +148,9 @@ class Follower(ABC, Generic[H, L]):
         while True:
             started = self._clock.now_ns()
             yield self._read(link)
-            rest = started + self._interval_ns - self._clock.now_ns()
-            if rest > 0:
-                self._clock.sleep(rest * 1e-9)
+            remaining_ns = started + self._interval_ns - self._clock.now_ns()
+            if remaining_ns > 0:
+                self._clock.sleep(remaining_ns * 1e-9)
 
     def _begin(self, header: H) -> None:
         """Take the newest record as the first."""
@@ -158,13 +158,13 @@ class Follower(ABC, Generic[H, L]):
         self._next, self._last = header.sequence, header.sequence - 1
         self._last_ns = header.time_ns - header.period_ns
 
-    def _place(self, header: H) -> None:
-        """Say where ``header`` is and what broke on the way there."""
+    def _advance_to(self, header: H) -> None:
+        """Move to ``header``, and note what broke since the last one."""
         assert self._header is not None
         self.refuse_other(header)
         scans = header.advance(self._header)
         if scans is None:
-            self._break |= Quality.RESTART | Quality.GAP  # what ran meanwhile was never seen
+            self._break |= Quality.RESTART | Quality.GAP  # scans in between were never read
             self._newest, self._next, self._last = header.sequence, 0, -1
         else:
             self._newest += scans
@@ -173,45 +173,44 @@ class Follower(ABC, Generic[H, L]):
         self._header = header
         self._next = max(self._next, self._newest - header.depth + RESERVE)
 
-    def _steadied(self, header: H, scans_apart: int) -> H:
-        """The same with its time as the scans say, as far as that can be.
+    def _smoothed(self, header: H, scans_apart: int) -> H:
+        """The header with its time smoothed by the count of scans.
 
-        Time and sequence may be of moments up to ``scans_apart`` from each other: they tell the
-        time of a scan only to within that. Within it, time runs on evenly. Where the count of time
-        begins it may be that far off; as this shows, it is put right little by little, so that
-        time never steps.
+        Time and sequence may be read up to ``scans_apart`` scans apart, so the time of a scan is
+        known only to that tolerance. Within it, time runs on evenly. The first time may be off by
+        as much. Once that shows, it is corrected little by little, so that time never jumps.
         """
-        off = scans_apart * header.period_ns
+        tolerance_ns = scans_apart * header.period_ns
         scans = header.advance(self._header) if self._header else None
         if self._header is None or scans is None:
-            return replace(header, unsure_ns=off)
+            return replace(header, unsure_ns=tolerance_ns)
         expected = self._header.time_ns + scans * header.period_ns
-        ran = header.time_ns - expected
-        if abs(ran) > max(CLOCK_TOLERANCE_NS, off + self._header.unsure_ns):
-            return replace(header, unsure_ns=off)  # the clock was set
-        shift = min(max(0, ran - off), ran + off)
-        if abs(shift) <= self._header.unsure_ns:
-            earliest, latest = self._evenly(header, scans)
-            shift = max(shift, min(earliest - expected, 0))
-            shift = min(shift, max(latest - expected, 0))
-        unsure = min(self._header.unsure_ns, abs(ran - shift) + off)
-        return replace(header, time_ns=expected + shift, unsure_ns=unsure)
+        deviation_ns = header.time_ns - expected
+        if abs(deviation_ns) > max(CLOCK_TOLERANCE_NS, tolerance_ns + self._header.unsure_ns):
+            return replace(header, unsure_ns=tolerance_ns)  # the clock was set
+        shift_ns = min(max(0, deviation_ns - tolerance_ns), deviation_ns + tolerance_ns)
+        if abs(shift_ns) <= self._header.unsure_ns:
+            earliest, latest = self._half_period_window(header, scans)
+            shift_ns = max(shift_ns, min(earliest - expected, 0))
+            shift_ns = min(shift_ns, max(latest - expected, 0))
+        unsure_ns = min(self._header.unsure_ns, abs(deviation_ns - shift_ns) + tolerance_ns)
+        return replace(header, time_ns=expected + shift_ns, unsure_ns=unsure_ns)
 
-    def _evenly(self, header: H, scans: int) -> tuple[int, int]:
-        """Times for ``header`` with which the next sample is half a period early, or late."""
+    def _half_period_window(self, header: H, scans: int) -> tuple[int, int]:
+        """Times of ``header`` at which the next sample is half a period early, or late (ns)."""
         to_next = self._newest + scans - self._last - 1
         due = self._last_ns + (to_next + 1) * header.period_ns
         return due - header.period_ns // 2, due + header.period_ns // 2
 
-    def _pass(self, first: int, valid: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
-        """Sequences of the valid ones of the records from ``first`` on; go on after them."""
+    def _consume(self, first: int, valid: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+        """Sequences of the valid records from ``first`` on; the position moves behind them."""
         sequence = first + np.flatnonzero(valid)
-        # Records behind the last valid one may only be late; without any there is no use waiting.
+        # Records after the last valid one may only be late. If none is valid, waiting is useless.
         self._next = int(sequence[-1]) + 1 if len(sequence) else first + len(valid)
         return sequence
 
     def _stamp(self, block: Samples, header: H, sequence: npt.NDArray[np.int64]) -> Samples:
-        """Give decoded records their numbers and times, and mark where they do not run on."""
+        """Set numbers and times of decoded records, and flag breaks."""
         if not len(block):
             return EMPTY
         block["sequence"] = sequence

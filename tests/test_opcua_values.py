@@ -211,7 +211,7 @@ def test_a_node_that_was_there_and_is_not_is_waited_for() -> None:
     link = OpcuaClient(OpcuaSettings.model_validate(FINE), REAL)
     with pytest.raises(SourceError, match="there is no node") as never:
         link._refuse(NODE, S.BadNodeIdUnknown)
-    link._known = True  # it has once served all of it
+    link._has_served = True  # it has once served all of it
     with pytest.raises(LostError, match="there is no node"):
         link._refuse(NODE, S.BadNodeIdUnknown)
     assert not isinstance(never.value, LostError)

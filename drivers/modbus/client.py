@@ -107,13 +107,13 @@ class ModbusSettings(Settings):
         return self
 
     def _refuse_without_effect(self) -> None:
-        """KeyedError for what is read from the tags alone, and not from the ring."""
+        """KeyedError for a tag or setting that block mode does not use."""
         for name, bit in (COMMAND_BITS | BITS).items():
             tag = getattr(self.tags, name)
             same = [(STATUS, bit), *([(COILS + bit, None)] if name in COMMAND_BITS else [])]
             if tag is not None and (tag.address, tag.bit) not in same:
-                place = tag.address if tag.bit is None else f"{tag.address} bit {tag.bit}"
-                raise no_effect(name, bit, place, "poll")
+                address = tag.address if tag.bit is None else f"{tag.address} bit {tag.bit}"
+                raise no_effect(name, bit, address, "poll")
         if self.tags.heartbeat is not None:
             raise KeyedError(
                 "has no effect in block mode: the ring's sequence shows whether the PLC's program "
@@ -134,7 +134,7 @@ class ModbusSettings(Settings):
 
     @property
     def where(self) -> str:
-        """Whom messages are about."""
+        """The PLC as messages name it."""
         return f"{self.host}:{self.port}, unit {self.unit}"
 
 
@@ -194,7 +194,7 @@ class ModbusClient:
         raise self._unexpected(request, head, expected)
 
     def _unexpected(self, request: Request | Store, head: bytes, expected: bytes) -> SourceError:
-        """What is wrong with an answer that does not begin as it should."""
+        """The error for an answer with an unexpected head."""
         if not belongs(head, expected):
             return self._lost(request, "no answer")
         code = exception(head)
@@ -202,18 +202,18 @@ class ModbusClient:
             return self._lost(request, "the answer has the wrong length")
         return self._refused(request, code)
 
-    def _lost(self, request: Request | Store, what: str) -> LostError:
-        """Close too: a late answer must not be taken for that to the next request."""
+    def _lost(self, request: Request | Store, cause: str) -> LostError:
+        """Close, and give the error: a late answer must not be taken for the next one."""
         self.close()
         return LostError(
-            f"{self._about(request)}: {what}",
+            f"{self._about(request)}: {cause}",
             "is the unit id right, is it a Modbus TCP server, does it answer within timeout_ms? "
             "A secure port (often 802) needs [driver.tls]",
         )
 
     def _refused(self, request: Request | Store, code: int) -> SourceError:
-        what = EXCEPTIONS.get(code, "an exception unknown to the protocol")
-        text = f"{self._about(request)}: {what} (Modbus exception {code})"
+        cause = EXCEPTIONS.get(code, "an exception unknown to the protocol")
+        text = f"{self._about(request)}: {cause} (Modbus exception {code})"
         if code not in (*OURS, ABSENT):
             self.close()
             return LostError(text, "is the unit id right, and does the PLC run?")
@@ -240,8 +240,8 @@ class ModbusClient:
 def connected(host: str, port: int, timeout_ms: float) -> socket.socket:
     """Connect a socket that waits ``timeout_ms`` for an answer; OSError if it cannot.
 
-    The waiting is left to the kernel: Python's own would ask before each read whether there is
-    something, and not wait for whole answers.
+    The kernel does the waiting. Python's own timeout would poll before each read, and could not
+    wait for whole answers.
     """
     connection = socket.create_connection((host, port), timeout_ms * 1e-3)
     patience = struct.pack("@ll", 0, round(timeout_ms * 1e3))  # struct timeval: s, µs

@@ -13,12 +13,12 @@ from drivers.modbus.client import ModbusClient, ModbusSettings
 from drivers.modbus.pdu import Request, Store
 from drivers.reconnect import RETRY_S, LostError
 
-FRESH_S = RETRY_S / 2  # so long the failure of one to connect is that of all
+FRESH_S = RETRY_S / 2  # so long a failed attempt of one user counts for all
 
 
 @dataclass
 class Line:
-    """A connection that several use; one that broke is closed for all of them."""
+    """A connection that several clients share; once broken it is closed for all of them."""
 
     lock: threading.RLock = field(default_factory=threading.RLock)
     connection: socket.socket | None = None
@@ -30,7 +30,7 @@ class Line:
         """The connection, made with ``connect`` unless there is one; LostError if that fails."""
         if self.connection is None:
             if self.failure is not None and time.monotonic() - self.failed_s < FRESH_S:
-                # Nobody waits for as many tries as there are users.
+                # Otherwise each user would wait for the failed attempts of all others.
                 raise LostError(str(self.failure), self.failure.hint)
             try:
                 self.connection, self.users = connect(), 0
@@ -41,7 +41,7 @@ class Line:
         return self.connection
 
     def leave(self, connection: socket.socket | None) -> None:
-        """One user less; the last one hangs up."""
+        """Count one user less; the last one closes the connection."""
         if connection is not None and connection is self.connection:
             self.users -= 1
             if not self.users:
@@ -55,19 +55,19 @@ class Line:
 
 
 class ConnectionPool:
-    """The lines to all PLCs of a process."""
+    """The shared connections to all PLCs of a process."""
 
     def __init__(self) -> None:
-        self._lines: dict[str, Line] = {}  # by what makes a connection
+        self._lines: dict[str, Line] = {}  # by the settings of the connection
 
     def to(self, settings: ModbusSettings) -> Line:
-        """Give the one line to this PLC, whatever unit is asked there."""
-        own = settings.model_dump_json(include={"host", "port", "timeout_ms", "tls"})
-        return self._lines.setdefault(own, Line())
+        """Give the one connection to this PLC, for all of its units."""
+        key = settings.model_dump_json(include={"host", "port", "timeout_ms", "tls"})
+        return self._lines.setdefault(key, Line())
 
 
 class PooledClient(ModbusClient):
-    """A link over a line that others use too: the same calls, and the same errors."""
+    """A client over a shared connection, with the same calls and errors."""
 
     def __init__(self, settings: ModbusSettings, line: Line) -> None:
         super().__init__(settings)
@@ -80,7 +80,7 @@ class PooledClient(ModbusClient):
                 self._socket = self._line.join(self._connected)
 
     def close(self) -> None:
-        """Leave the line to the others."""
+        """Leave the connection to the others."""
         with self._line.lock:
             connection, self._socket = self._socket, None
             self._line.leave(connection)
@@ -94,7 +94,7 @@ class PooledClient(ModbusClient):
         super().open()
         return self._socket
 
-    def _lost(self, request: Request | Store, what: str) -> LostError:
+    def _lost(self, request: Request | Store, cause: str) -> LostError:
         with self._line.lock:
             self._line.hang_up(self._socket)
-            return super()._lost(request, what)
+            return super()._lost(request, cause)

@@ -67,7 +67,7 @@ class HilSettings(Settings):
 
 
 class RegisterOutlet:
-    """Registers and coils; what lies side by side goes in one request, the watchdog last."""
+    """Writes registers and coils; adjacent ones in one request, the watchdog last."""
 
     def __init__(self, link: ModbusClient, driver: ModbusSettings, tags: HilTags) -> None:
         self._link, self._tags, self._order = link, tags, driver.word_order
@@ -81,7 +81,7 @@ class RegisterOutlet:
             self._link.write(address, values)
 
     def groups(self, outputs: Outputs, watchdog: int) -> list[Group]:
-        """What is written, in order; neighbours in one."""
+        """The writes in order; those to adjacent addresses are joined."""
         tags, groups = self._tags, list[Group]()
         if tags.pressure and self._pressure:
             groups.append(self._words(tags.pressure, self._pressure.raw(outputs.pressure)))
@@ -93,23 +93,23 @@ class RegisterOutlet:
             groups.append(self._words(tags.watchdog, counted(watchdog, tags.watchdog.range)))
         joined: list[Group] = []
         for address, values in groups:
-            before, so_far = joined[-1] if joined else (None, ())
-            fits = before is not None and len(so_far) + len(values) <= MOST_STORED
-            if before is not None and fits and before + len(so_far) == address:
-                joined[-1] = before, (*so_far, *values)
+            start, words = joined[-1] if joined else (None, ())
+            fits = start is not None and len(words) + len(values) <= MOST_STORED
+            if start is not None and fits and start + len(words) == address:
+                joined[-1] = start, (*words, *values)
             else:
                 joined.append((address, values))
         return joined
 
     def _words(self, tag: Tag, number: float) -> Group:
-        whole = number if tag.type == "float32" else round(number)
-        return tag.address, words_of(whole, CODE[tag.type], self._order)
+        value = number if tag.type == "float32" else round(number)
+        return tag.address, words_of(value, CODE[tag.type], self._order)
 
 
 def writer(
     driver: ModbusSettings, document: Document, lines: ConnectionPool | None = None
 ) -> Writer:
-    """Whoever writes to this PLC, over the connection of others where there are ``lines``."""
+    """The writer to this PLC, over a shared connection where there are ``lines``."""
     settings = document.section(HilSettings, "hil")
     link = ModbusClient(driver) if lines is None else PooledClient(driver, lines.to(driver))
     outlet = RegisterOutlet(link, driver, settings.tags)

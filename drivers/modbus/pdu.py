@@ -1,4 +1,4 @@
-"""Modbus TCP telegrams: the request as bytes, its answer as bytes and as words."""
+"""Modbus TCP messages: requests as bytes, answers as bytes and as words."""
 
 import struct
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ STORING: dict[Area, int] = {"coil": 15, "holding": 16}
 REFUSAL = 0x80  # set in the function code of an answer that brings an exception
 
 QUESTION = struct.Struct(">HHHBBHH")  # transaction, protocol 0, length, unit, function, from, count
-# Transaction, protocol 0, length, unit, function, bytes of data to follow; or in the last place,
-# and then nothing follows, the exception. The length counts from the unit on.
+# Transaction, protocol 0, length, unit, function, number of data bytes that follow. An exception
+# has its code in place of that number, and nothing follows. The length counts from the unit on.
 HEAD = struct.Struct(">HHHBBB")
 
 
@@ -38,7 +38,7 @@ class Request:
         return QUESTION.pack(transaction, 0, 6, unit, function, self.address.offset, self.count)
 
     def head(self, transaction: int, unit: int) -> bytes:
-        """How the answer begins that brings the data; only the data follow."""
+        """The head of an answer that brings the data; only the data follow."""
         function = FUNCTION[self.address.area]
         return HEAD.pack(transaction, 0, 3 + self.size, unit, function, self.size)
 
@@ -51,7 +51,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Store:
-    """Words, or bits as 0 and 1, to write at once; the answer repeats where and how many."""
+    """Words, or bits as 0 and 1, to write at once; the answer repeats address and count."""
 
     address: Address
     values: tuple[int, ...]
@@ -68,7 +68,7 @@ class Store:
 
     @property
     def echo(self) -> bytes:
-        """The rest of the answer: the second byte of where, and how many."""
+        """The rest of the answer: the low byte of the address, and the count."""
         return struct.pack(">BH", self.address.offset & 0xFF, self.count)
 
     def question(self, transaction: int, unit: int) -> bytes:
@@ -81,19 +81,19 @@ class Store:
         return QUESTION.pack(*head) + bytes([len(data)]) + data
 
     def head(self, transaction: int, unit: int) -> bytes:
-        """How the answer begins, where it was written."""
+        """The head of the answer to a successful write."""
         function, high = STORING[self.address.area], self.address.offset >> 8
         return HEAD.pack(transaction, 0, 6, unit, function, high)
 
 
 def belongs(head: bytes, expected: bytes) -> bool:
-    """Whether an answer that begins so is one to the request whose answer was to begin so."""
-    *whose, _, unit, function, _ = HEAD.unpack(head)
-    *wanted, _, wanted_unit, wanted_function, _ = HEAD.unpack(expected)
-    return (whose, unit, function & ~REFUSAL) == (wanted, wanted_unit, wanted_function)
+    """Whether ``head`` answers the request whose answer should begin with ``expected``."""
+    *stamp, _, unit, function, _ = HEAD.unpack(head)
+    *expected_stamp, _, expected_unit, expected_function, _ = HEAD.unpack(expected)
+    return (stamp, unit, function & ~REFUSAL) == (expected_stamp, expected_unit, expected_function)
 
 
 def exception(head: bytes) -> int | None:
-    """Code of the exception that an answer brings; None if it brings none."""
+    """Code of the exception in an answer; None if it has none."""
     *_, length, _, function, code = HEAD.unpack(head)
     return code if function & REFUSAL and length == 3 else None

@@ -1,4 +1,4 @@
-"""Tags of a Modbus PLC read in as few requests as can be."""
+"""Plan of the fewest requests that read all tags of a Modbus PLC."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -35,30 +35,30 @@ def holds(request: Request, tag: Tag) -> bool:
 
 def _column(request: Request, tag: Tag) -> slice | None:
     """Where in the answer the tag lies, if it does."""
-    at = tag.address.offset - request.address.offset
-    inside = tag.address.area == request.address.area and 0 <= at < request.count
-    return slice(at, at + tag.size) if inside else None
+    start = tag.address.offset - request.address.offset
+    inside = tag.address.area == request.address.area and 0 <= start < request.count
+    return slice(start, start + tag.size) if inside else None
 
 
 @dataclass(frozen=True)
 class Answers:
-    """What came to some requests, asked again and again: words (rows, count) for each."""
+    """Answers to repeated requests: for each request, words (rows, count)."""
 
     requests: Sequence[Request]
-    found: Sequence[Words]
+    answers: Sequence[Words]
 
     @classmethod
     def of(cls, requests: Sequence[Request], rows: Sequence[bytes]) -> "Answers":
-        """From the data of all answers, one behind the other, row by row."""
+        """From rows, each the data of all answers one behind the other."""
         data = np.frombuffer(b"".join(rows), np.uint8).reshape(len(rows), -1)
         starts = np.cumsum([request.size for request in requests])
-        parts = np.split(data, starts[:-1], axis=1)
-        words = [request.words(part) for request, part in zip(requests, parts, strict=True)]
+        columns = np.split(data, starts[:-1], axis=1)
+        words = [request.words(column) for request, column in zip(requests, columns, strict=True)]
         return cls(requests, words)
 
     def words(self, tag: Tag) -> Words:
         """Words of one tag (rows, size)."""
-        for request, words in zip(self.requests, self.found, strict=True):
+        for request, words in zip(self.requests, self.answers, strict=True):
             if (columns := _column(request, tag)) is not None:
                 return words[:, columns]
         raise AssertionError(f"{tag.address} is in no request")
@@ -68,5 +68,5 @@ class Answers:
         return tag.raw(self.words(tag), order)
 
     def floats(self, tag: Tag, order: WordOrder) -> npt.NDArray[np.float64]:
-        """The same as numbers of one kind, whatever they are."""
+        """The same numbers as float64."""
         return tag.floats(self.words(tag), order)

@@ -1,7 +1,7 @@
 """Poll mode: read the tags once a millisecond, for PLCs that keep no trace.
 
-It cannot be lossless on a general-purpose machine: slots are numbered, and a missed one is a
-missing number. Time is that of the middle of the request here.
+A general-purpose machine cannot do this without loss: slots are numbered, and a missed one is a
+missing number. The time of a sample is the middle of its request, by this machine's clock.
 """
 
 from collections.abc import Iterator
@@ -23,20 +23,20 @@ HEARTBEAT_NS = 100_000_000  # unchanged for longer: the PLC's program stands sti
 
 
 class Poller:
-    """The slots of one PLC; it outlives connections."""
+    """Reads one PLC slot by slot; it outlives connections."""
 
     def __init__(self, settings: ModbusSettings, clock: Clock) -> None:
         tags = settings.tags
         self._settings = settings
         self._clock = clock
         self._requests = plan(tag for _, tag in tags if tag is not None)
-        # The pressure last, so that a slow answer for the rest does not put its time off.
+        # The pressure comes last: slow answers to other requests do not shift its time.
         self._requests.sort(key=lambda request: holds(request, tags.pressure))
         self._start_ns = clock.now_ns()
         self._wall_ns = clock.wall_ns() - self._start_ns  # anchored once: time never runs back
         self._slot = 0  # to be read next
         self._last = -1  # slot of the last sample given
-        self._failure: SourceError | None = None  # after the rows that were given
+        self._failure: SourceError | None = None  # raised after the rows before it
         self._beat: np.generic | None = None
         self._beat_ns = 0
 
@@ -46,7 +46,7 @@ class Poller:
             yield self._block(link)
 
     def _block(self, link: ModbusClient) -> Samples:
-        """The slots of one interval; where the connection breaks, those before it."""
+        """Samples of one interval; if the connection breaks, those before that."""
         if self._failure is not None:
             failure, self._failure = self._failure, None
             raise failure
@@ -70,17 +70,17 @@ class Poller:
         return (self._clock.now_ns() - self._start_ns) // SLOT_NS
 
     def _wait(self) -> None:
-        """Until the slot begins; slots that are over are left out."""
+        """Wait until the slot begins; slots that are over are skipped."""
         self._slot = max(self._slot, self._now_slot())
         due = self._start_ns + self._slot * SLOT_NS
-        rest = due - SPIN_NS - self._clock.now_ns()
-        if rest > 0:
-            self._clock.sleep(rest * 1e-9)
+        remaining_ns = due - SPIN_NS - self._clock.now_ns()
+        if remaining_ns > 0:
+            self._clock.sleep(remaining_ns * 1e-9)
         while self._clock.now_ns() < due:
             pass
 
     def _ask(self, link: ModbusClient) -> tuple[bytes, int, int]:
-        """One slot: the data of all answers, when the last was asked for and when it came."""
+        """Data of all answers of a slot; request and arrival time of the last answer (ns)."""
         row, asked_ns = b"", 0
         for request in self._requests:
             asked_ns = self._clock.now_ns()
@@ -94,13 +94,15 @@ class Poller:
         block["time_ns"] = slots[:, 1] + self._wall_ns
         block["host_ns"] = slots[:, 2] + self._wall_ns
         for tag, command in ((tags.suction, Command.SUCTION), (tags.blow_off, Command.BLOW_OFF)):
-            assert tag is not None  # the settings see to it
+            assert tag is not None  # the settings check it
             bits = answers.raw(tag, order).astype(np.uint8)
             block["commands"] |= bits * np.uint8(command)
-        told = {name: getattr(tags, name) for name in BITS if getattr(tags, name) is not None}
-        put_bits(block, {name: answers.floats(tag, order) for name, tag in told.items()})
-        read = {name: getattr(tags, name) for name in VALUES if getattr(tags, name) is not None}
-        raw = {name: answers.floats(tag, order) for name, tag in read.items()}
+        bit_tags = {name: getattr(tags, name) for name in BITS if getattr(tags, name) is not None}
+        put_bits(block, {name: answers.floats(tag, order) for name, tag in bit_tags.items()})
+        value_tags = {
+            name: getattr(tags, name) for name in VALUES if getattr(tags, name) is not None
+        }
+        raw = {name: answers.floats(tag, order) for name, tag in value_tags.items()}
         fixed = self._settings.ambient_mbar * MBAR
         ambient = ambient_of(block, tags, raw, fixed)
         put_values(block, tags, raw, ambient)
@@ -121,10 +123,10 @@ class Poller:
         return np.where(missing > self._settings.gap_ms, Quality.GAP.value, 0).astype(np.uint8)
 
     def _stale(self, beats: npt.NDArray[np.generic], at_ns: npt.NDArray[np.int64]) -> Flags:
-        """Flag what was read while the heartbeat had been at rest for too long."""
+        """Flags for samples that were read while the heartbeat had been at rest for too long."""
         before = beats[0] if self._beat is None else self._beat
         changed = np.diff(beats, prepend=before) != 0
         changed[0] |= self._beat is None
-        since = np.maximum.accumulate(np.where(changed, at_ns, self._beat_ns))
-        self._beat, self._beat_ns = beats[-1], int(since[-1])
-        return np.where(at_ns - since > HEARTBEAT_NS, Quality.STALE.value, 0).astype(np.uint8)
+        changed_ns = np.maximum.accumulate(np.where(changed, at_ns, self._beat_ns))
+        self._beat, self._beat_ns = beats[-1], int(changed_ns[-1])
+        return np.where(at_ns - changed_ns > HEARTBEAT_NS, Quality.STALE.value, 0).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""What a Modbus PLC shows of itself, line by line: for the first hour with an unknown PLC."""
+"""Inspection of a Modbus PLC, line by line: for the first hour with an unknown PLC."""
 
 import statistics
 from functools import partial
@@ -16,8 +16,8 @@ from twin.signals import BAR, MBAR
 
 TEST_REGISTERS = Address("holding", 0)
 ORDERS: tuple[WordOrder, ...] = ("big", "little")
-# Absolute pressures that can be: no ejector evacuates to 2 mbar, and no network of compressed air
-# has more than PN 16. Beyond are numbers of another type, or with their words swapped.
+# Plausible absolute pressures: no ejector evacuates to 2 mbar, and no network of compressed air
+# has more than PN 16. Numbers beyond are of another type, or have their words swapped.
 POSSIBLE = 2.0 * MBAR, 17.0 * BAR
 
 
@@ -26,18 +26,18 @@ def probe(settings: ModbusSettings, clock: Clock = REAL) -> list[Line]:
     link = ModbusClient(settings)
     try:
         connected = looked_at("connection", lambda: _connect(link, settings, clock))
-        return [connected, *_look(link, settings, clock)] if connected.good else [connected]
+        return [connected, *_inspect(link, settings, clock)] if connected.good else [connected]
     finally:
         link.close()
 
 
-def _look(link: ModbusClient, settings: ModbusSettings, clock: Clock) -> list[Line]:
+def _inspect(link: ModbusClient, settings: ModbusSettings, clock: Clock) -> list[Line]:
     lines = [looked_at("round trip", lambda: _round_trip(link, settings, clock))]
     if lines[0].lost:
-        return lines  # nothing else would be answered, and each question takes its time
+        return lines  # nothing else would be answered, and each request would time out
     for name, tag in settings.tags:
         if tag is not None:
-            lines.append(looked_at(name, partial(_show, link, tag, settings)))
+            lines.append(looked_at(name, partial(_tag_text, link, tag, settings)))
     lines.append(_word_order(link, settings))
     if settings.mode == "block":
         trace = Trace(settings, clock)
@@ -72,7 +72,7 @@ def _round_trip(link: ModbusClient, settings: ModbusSettings, clock: Clock) -> s
     return text
 
 
-def _show(link: ModbusClient, tag: Tag, settings: ModbusSettings) -> str:
+def _tag_text(link: ModbusClient, tag: Tag, settings: ModbusSettings) -> str:
     link.open()
     words = link.read(tag.address, tag.size).reshape(1, tag.size)
     hexadecimal = " ".join(f"0x{word:04X}" for word in words[0])
@@ -83,19 +83,19 @@ def _show(link: ModbusClient, tag: Tag, settings: ModbusSettings) -> str:
         values.append(f"configured {settings.word_order}")
     text = f"{tag.address}: {hexadecimal} = {', '.join(values)}"
     if isinstance(tag, Pressure) and not _is_possible(tag, words, settings.word_order, settings):
-        fits = [order for order in orders if _is_possible(tag, words, order, settings)]
-        look = "check its address, type, scale, unit and range under [driver.tags]"
+        plausible_orders = [order for order in orders if _is_possible(tag, words, order, settings)]
+        check = "check its address, type, scale, unit and range under [driver.tags]"
         raise SourceError(
             f"{text}: this pressure cannot be",
-            f'word_order = "{fits[0]}" in [driver] gives one that can be; or {look}'
-            if fits
-            else look,
+            f'word_order = "{plausible_orders[0]}" in [driver] gives one that can be; or {check}'
+            if plausible_orders
+            else check,
         )
     return text
 
 
 def _is_possible(tag: Pressure, words: Words, order: WordOrder, settings: ModbusSettings) -> bool:
-    """Whether there is an ejector at such a pressure, and it is in the range that the tag has."""
+    """Whether an ejector can have this pressure, and it lies within the tag's range."""
     pascal, quality = tag.decode(words, order, settings.ambient_mbar * MBAR)
     return not quality[0] and POSSIBLE[0] <= float(pascal[0]) <= POSSIBLE[1]
 
@@ -110,18 +110,18 @@ def _value(tag: Tag, words: Words, order: WordOrder, settings: ModbusSettings) -
 
 
 def word_order_of(words: Words) -> WordOrder | None:
-    """Which word order the test registers show; None if they are none. ``words``: 6 words."""
+    """The word order that the test registers (6 words) show; None if they are no such registers."""
     if words[0] != 0x1234 or words[1] != 0x10000 - 12345:
         return None
     for order in ORDERS:
-        whole, real = numbers(words[2:4], ">u4", order), numbers(words[4:6], ">f4", order)
-        if whole == 0x12345678 and real == np.float32(123.456):
+        integer, real = numbers(words[2:4], ">u4", order), numbers(words[4:6], ">f4", order)
+        if integer == 0x12345678 and real == np.float32(123.456):
             return order
     return None
 
 
 def _word_order(link: ModbusClient, settings: ModbusSettings) -> Line:
-    """Test registers are a courtesy of the PLC: having none is no fault."""
+    """Test registers are optional: a PLC without them is not at fault."""
     try:
         link.open()
         order = word_order_of(link.read(TEST_REGISTERS, 6))
@@ -152,6 +152,6 @@ def _records(link: ModbusClient, trace: Trace) -> str:
 
 
 def _rate(link: ModbusClient, trace: Trace, clock: Clock) -> str:
-    """Scans per second by the clock here; SourceError if they are not those of the period."""
+    """Scans per second by this machine's clock; SourceError if they do not fit the period."""
     link.open()
     return watched(lambda: trace.header(link), clock)

@@ -47,18 +47,20 @@ class Header(AnyHeader):
 
     @property
     def ready(self) -> bool:
-        """Whether it describes a ring as we know it."""
+        """Whether it describes a ring with records of the known size."""
         return self.record_words == RECORD_WORDS and super().ready
 
 
 class Trace(Follower[Header, ModbusClient]):
-    """Where we are in the ring of one PLC; it outlives connections."""
+    """The reading position in the ring of one PLC; it outlives connections."""
 
     def __init__(self, settings: ModbusSettings, clock: Clock) -> None:
         super().__init__(settings, clock)
         self._settings = settings
         tags = settings.tags
-        self._told = {name: bit for name, bit in BITS.items() if getattr(tags, name) is not None}
+        self._status_bits = {
+            name: bit for name, bit in BITS.items() if getattr(tags, name) is not None
+        }
         self._values = {
             name: getattr(tags, name) for name in VALUES if getattr(tags, name) is not None
         }
@@ -66,15 +68,15 @@ class Trace(Follower[Header, ModbusClient]):
 
     def start(self, link: ModbusClient) -> Header:
         """Begin at the newest record; SourceError if there is no ring as configured."""
-        header = self._proven(link)
+        header = self._verified_header(link)
         self._begin(header)
         return header
 
-    def _proven(self, link: ModbusClient) -> Header:
-        """A header that follows the last one, or announces what the ring holds; else SourceError.
+    def _verified_header(self, link: ModbusClient) -> Header:
+        """A header that follows the last one, or fits the ring's records; else SourceError.
 
-        It may be torn: one that surprises is read again. Some PLCs announce a record a little
-        before it can be read.
+        A read may be torn: an unexpected header is read again. Some PLCs announce a record a
+        little before it can be read.
         """
         last = self._header
         for attempt in range(TRIES):
@@ -82,7 +84,7 @@ class Trace(Follower[Header, ModbusClient]):
             if last is not None and header.follows(last):
                 return header
             read_again = attempt > 0 or last is None
-            if read_again and self._fits(header) and self._announced(link, header):
+            if read_again and self._fits(header) and self._has_announced_records(link, header):
                 return header
         self.refuse_other(header)
         ring = self._settings.ring
@@ -116,7 +118,7 @@ class Trace(Follower[Header, ModbusClient]):
         words = link.read(self._settings.ring.header, HEADER_WORDS)
         return Header.parse(words, self._settings.word_order)
 
-    def _announced(self, link: ModbusClient, header: Header) -> bool:
+    def _has_announced_records(self, link: ModbusClient, header: Header) -> bool:
         """Whether the two newest records are those that the header announces."""
         for sequence in range(max(0, header.sequence - 1), header.sequence + 1):
             if not self._fetch(link, header, sequence, sequence + 1)[1].all():
@@ -124,11 +126,11 @@ class Trace(Follower[Header, ModbusClient]):
         return True
 
     def _read(self, link: ModbusClient) -> Samples:
-        """Whatever is new, as far as the time for one block goes."""
+        """New samples, as many as fit into the time for one block."""
         started = self._clock.now_ns()
-        beside = self._read_values(link)
+        values = self._read_values(link)
         header = self._next_header(link)
-        self._place(header)
+        self._advance_to(header)
         first = self._next
         records, valid = self._fetch(link, header, first, self._newest + 1)
         end = first + len(valid)
@@ -136,11 +138,11 @@ class Trace(Follower[Header, ModbusClient]):
         if took_ns > header.period_ns * (first - self._newest + header.depth) // 2:
             overwritten = self._overwritten(link, header)
             valid &= np.arange(first, end) > overwritten
-        sequence = self._pass(first, valid)
-        return self._stamp(self._decode(header, records[valid], beside), header, sequence)
+        sequence = self._consume(first, valid)
+        return self._stamp(self._decode(header, records[valid], values), header, sequence)
 
     def _read_values(self, link: ModbusClient) -> dict[str, float]:
-        """What is not in the ring, as it stands in the PLC: read once a block."""
+        """Present values that are not in the ring; they are read once a block."""
         if not self._values:
             return {}
         answers = Answers.of(
@@ -150,11 +152,11 @@ class Trace(Follower[Header, ModbusClient]):
         return {name: float(answers.floats(tag, order)[0]) for name, tag in self._values.items()}
 
     def _next_header(self, link: ModbusClient) -> Header:
-        """Read the header, as evenly in time as it can be.
+        """Read the header, and smooth its time.
 
-        Torn between sequence and time it does not surprise: its time is another scan's.
+        A read torn between sequence and time stays unnoticed: the time is another scan's.
         """
-        return self._steadied(self._proven(link), 1)
+        return self._smoothed(self._verified_header(link), 1)
 
     def _fetch(
         self, link: ModbusClient, header: Header, first: int, end: int
@@ -182,15 +184,16 @@ class Trace(Follower[Header, ModbusClient]):
             return self._newest
         return self._newest + scans - header.depth + 1  # one is being written
 
-    def _decode(self, header: Header, records: Words, beside: dict[str, float]) -> Samples:
+    def _decode(self, header: Header, records: Words, values: dict[str, float]) -> Samples:
         tags, order = self._settings.tags, self._settings.word_order
         block = np.zeros(len(records), SAMPLE)
         status = records[:, 1]
         block["commands"] = status & COMMANDS
         put_bits(
-            block, {name: (status >> bit & 1).astype(float) for name, bit in self._told.items()}
+            block,
+            {name: (status >> bit & 1).astype(float) for name, bit in self._status_bits.items()},
         )
-        raw = {name: once(value, name, len(block)) for name, value in beside.items()}
+        raw = {name: once(value, name, len(block)) for name, value in values.items()}
         fixed = self._settings.ambient_mbar * MBAR
         ambient = ambient_of(block, tags, raw, fixed)
         put_values(block, tags, raw, ambient)

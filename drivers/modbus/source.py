@@ -22,12 +22,12 @@ def blocks(
 ) -> Generator[Samples, None, None]:
     """Samples as they come: a block at least every 0.5 s, empty while there is nothing.
 
-    Once there were rows, or the PLC is ``known`` to have given some, whatever it sends is at worst
-    a lost connection: it is retried for ever and shows as empty blocks and flags. Before that a PLC
-    that is not there or does not serve an address is retried where there is ``away``; other
-    SourceErrors come out. ``away`` is told why there are no rows. Closing releases all.
-    Blocks come over a connection that they share with others, where there are ``lines``; polling
-    has no millisecond to wait for others.
+    A PLC that has given rows, or is ``known`` to have, is retried for ever: any error counts as a
+    lost connection, and shows as empty blocks and flags. Before that, a PLC that is absent or does
+    not serve an address is retried only with ``away``; other SourceErrors are raised. ``away``
+    receives why there are no rows. Closing releases all.
+    With ``lines``, block mode shares its connection with others; polling has no millisecond to wait
+    for them.
     """
     if settings.mode == "poll":
         return in_thread(

@@ -1,6 +1,6 @@
-"""Modbus/TCP Security: the same telegrams inside TLS, to a PLC whose certificate we trust.
+"""Modbus/TCP Security: the same messages inside TLS, to a PLC whose certificate we trust.
 
-The PLC is known by its own certificate or that of the authority that signed it, and by its name.
+The PLC proves itself by its own certificate or that of the authority that signed it, and its name.
 """
 
 import socket
@@ -38,22 +38,22 @@ class Tls(Settings):
 
     def below(self, folder: Path) -> "Tls":
         """Give the same with files looked for in ``folder``, unless their paths are absolute."""
-        given = {key: getattr(self, key) for key in ("trusted", "certificate", "key")}
-        found = {key: folder / path for key, path in given.items() if path is not None}
-        return self.model_copy(update=found)
+        paths = {key: getattr(self, key) for key in ("trusted", "certificate", "key")}
+        resolved = {key: folder / path for key, path in paths.items() if path is not None}
+        return self.model_copy(update=resolved)
 
 
 class Secured(ssl.SSLSocket):
     """A connection inside TLS; ``recv`` waits for all that is asked for, as MSG_WAITALL does."""
 
-    where = ""  # whom messages are about
-    heard = False  # it has answered at least once
+    address = ""  # host:port, for messages
+    has_answered = False  # it has answered at least once
 
     def recv(self, buflen: int = 1024, flags: int = 0) -> bytes:
-        """Exactly ``buflen`` bytes, or fewer where the other side ends; OSError if too late.
+        """Exactly ``buflen`` bytes, or fewer if the PLC closes; OSError after the timeout.
 
-        SourceError if it does not want us, which TLS 1.3 says only now; LostError where it
-        hangs up instead.
+        SourceError if the PLC rejects our certificate, which TLS 1.3 reports only now; LostError
+        if it hangs up instead.
         """
         patience = self.gettimeout()
         assert patience is not None
@@ -62,16 +62,16 @@ class Secured(ssl.SSLSocket):
         try:
             while len(data) < buflen:
                 self.settimeout(max(end - time.monotonic(), 1e-3))
-                if not (part := super().recv(buflen - len(data))):
+                if not (chunk := super().recv(buflen - len(data))):
                     break
-                data += part
+                data += chunk
         except (ssl.SSLError, ConnectionError) as error:
             raise self._hung_up(error) from error
         finally:
             self.settimeout(patience)
-        if not data and not self.heard:
-            raise _unwanted(self.where, LostError)
-        self.heard = True
+        if not data and not self.has_answered:
+            raise _unwanted(self.address, LostError)
+        self.has_answered = True
         return bytes(data)
 
     def sendall(self, data: Any, flags: int = 0) -> None:
@@ -82,36 +82,36 @@ class Secured(ssl.SSLSocket):
             raise self._hung_up(error) from error
 
     def _hung_up(self, error: OSError) -> Exception:
-        """What an error means: right after the handshake, that it did not want us."""
+        """The error to raise: right after the handshake it means that the PLC rejected us."""
         if isinstance(error, ssl.SSLError) and _refuses(error):
-            return _unwanted(self.where)
-        return error if self.heard else _unwanted(self.where, LostError)
+            return _unwanted(self.address)
+        return error if self.has_answered else _unwanted(self.address, LostError)
 
 
-def secured(connection: socket.socket, tls: Tls, where: str, timeout_ms: float) -> Secured:
-    """Shake hands on ``connection`` to ``where`` (host:port); it is closed where that fails.
+def secured(connection: socket.socket, tls: Tls, address: str, timeout_ms: float) -> Secured:
+    """Do the TLS handshake on ``connection`` to ``address`` (host:port); closes it on failure.
 
-    SourceError if the PLC's certificate is not to be trusted or the PLC does not want ours,
-    LostError if it does not speak TLS, ConfigError where our own files cannot be used.
+    SourceError if the PLC's certificate is not trusted or the PLC rejects ours, LostError if it
+    does not speak TLS, ConfigError if our own files cannot be used.
     """
     try:
         context = _context(tls)
         connection.settimeout(HANDSHAKE_S)
-        inside = context.wrap_socket(connection, server_hostname=tls.name or _host(where))
+        inside = context.wrap_socket(connection, server_hostname=tls.name or _host(address))
     except OSError as error:
         connection.close()
-        raise _explained(error, tls, where) from error
+        raise _explained(error, tls, address) from error
     except BaseException:
         connection.close()
         raise
     assert isinstance(inside, Secured)
-    inside.where = where
+    inside.address = address
     inside.settimeout(timeout_ms * 1e-3)
     return inside
 
 
-def _host(where: str) -> str:
-    return where.rpartition(":")[0]
+def _host(address: str) -> str:
+    return address.rpartition(":")[0]
 
 
 # --- our own files ------------------------------------------------------------------------------
@@ -150,44 +150,44 @@ def _unusable(key: str, path: Path, error: Exception) -> ConfigError:
 # --- what goes wrong on the way -----------------------------------------------------------------
 
 
-def _explained(error: OSError, tls: Tls, where: str) -> SourceError:
+def _explained(error: OSError, tls: Tls, address: str) -> SourceError:
     if isinstance(error, ssl.SSLCertVerificationError):
-        return _untrusted(error, tls, where)
+        return _untrusted(error, tls, address)
     if isinstance(error, ssl.SSLError) and _refuses(error):
-        return _unwanted(where)
+        return _unwanted(address)
     return LostError(
-        f"{where}: it does not speak TLS",
+        f"{address}: it does not speak TLS",
         f"is it the secure port (often {PORT}), and is the PLC awake? For a PLC "
         "that speaks plain Modbus TCP leave [driver.tls] out",
     )
 
 
-def _untrusted(error: ssl.SSLCertVerificationError, tls: Tls, where: str) -> SourceError:
-    name = tls.name or _host(where)
+def _untrusted(error: ssl.SSLCertVerificationError, tls: Tls, address: str) -> SourceError:
+    name = tls.name or _host(address)
     if error.verify_code in (_WRONG_NAME, _WRONG_ADDRESS):
         return SourceError(
-            f"{where}: its certificate is not for {name}",
+            f"{address}: its certificate is not for {name}",
             "if it is the right PLC, set name in [driver.tls] to the one in its certificate",
         )
     if error.verify_code in (_EXPIRED, _NOT_YET):
-        when = "has expired" if error.verify_code == _EXPIRED else "is not valid yet"
+        cause = "has expired" if error.verify_code == _EXPIRED else "is not valid yet"
         return SourceError(
-            f"{where}: its certificate {when}",
+            f"{address}: its certificate {cause}",
             "give the PLC a new certificate, or set its clock and ours",
         )
     return SourceError(
-        f"{where}: its certificate is not trusted ({error.verify_message})",
+        f"{address}: its certificate is not trusted ({error.verify_message})",
         f"if it is the right PLC, put its certificate, or its authority's, into {tls.trusted}",
     )
 
 
 def _refuses(error: ssl.SSLError) -> bool:
-    """Whether the other side said no, and not just anything."""
+    """Whether the PLC refused by a TLS alert, and the error is no other."""
     return "_ALERT_" in (error.reason or "")
 
 
-def _unwanted(where: str, kind: type[SourceError] = SourceError) -> SourceError:
+def _unwanted(address: str, kind: type[SourceError] = SourceError) -> SourceError:
     return kind(
-        f"{where}: it does not trust our certificate, or wants one",
+        f"{address}: it does not trust our certificate, or wants one",
         "set certificate and key in [driver.tls], and let the PLC trust them",
     )

@@ -1,8 +1,8 @@
-"""Certificates in a folder: our own with its key, those we trust, those we have refused.
+"""Certificates in a folder: our own with its key, trusted ones, rejected ones.
 
-``own/certificate.der`` and ``own/key.pem`` say who we are; whoever lies in ``trusted/``, or is
-signed by a certificate authority that does, is known, unless a list in ``revoked/`` has it. A
-certificate that was refused is kept in ``rejected/``, so that a person can look at it and move it.
+``own/certificate.der`` and ``own/key.pem`` identify us. ``trusted/`` holds the certificates that we
+trust, or those of authorities that sign them; lists in ``revoked/`` withdraw them. A rejected
+certificate is kept in ``rejected/``, so that a person can look at it and move it.
 """
 
 import socket
@@ -42,20 +42,20 @@ class Own:
 
 def make(folder: Path, name: str = "ejector-twin", days: int = DAYS) -> Own:
     """Make a certificate of our own and its key; ConfigError if there is one already."""
-    own = folder / OWN
-    if own.exists():
-        raise ConfigError(f"{own} is there already", "delete it first if it is to be replaced")
-    for part in (own.parent, *(folder / name for name in (TRUSTED, REVOKED, REJECTED))):
-        part.mkdir(parents=True, exist_ok=True)
+    path = folder / OWN
+    if path.exists():
+        raise ConfigError(f"{path} is there already", "delete it first if it is to be replaced")
+    for subfolder in (path.parent, *(folder / name for name in (TRUSTED, REVOKED, REJECTED))):
+        subfolder.mkdir(parents=True, exist_ok=True)
     key = rsa.generate_private_key(public_exponent=65537, key_size=KEY_BITS)
     _write_key(folder / KEY, key)
     certificate = signed(key, name, datetime.now(UTC) - CLOCK_SKEW, days)
-    own.write_bytes(certificate.public_bytes(serialization.Encoding.DER))
-    return Own(certificate, own, folder / KEY)
+    path.write_bytes(certificate.public_bytes(serialization.Encoding.DER))
+    return Own(certificate, path, folder / KEY)
 
 
 def _write_key(path: Path, key: rsa.RSAPrivateKey) -> None:
-    path.touch(mode=0o600)  # before anything stands in it
+    path.touch(mode=0o600)  # before it holds the key
     path.write_bytes(
         key.private_bytes(
             serialization.Encoding.PEM,
@@ -135,26 +135,26 @@ def own(folder: Path, now: datetime) -> Own:
     return Own(certificate, path, key)
 
 
-def check_time(certificate: x509.Certificate, now: datetime, who: str) -> None:
-    """SourceError if the certificate, ``who`` in words, is out of date."""
+def check_time(certificate: x509.Certificate, now: datetime, subject: str) -> None:
+    """SourceError if the certificate is out of date; ``subject`` names it in the message."""
     if not _in_time(certificate, now):
         raise SourceError(
-            f"{who} {_when(certificate, now)}",
+            f"{subject} {_when(certificate, now)}",
             "give it a new certificate, or set its clock and ours",
         )
 
 
-def untrusted(certificate: x509.Certificate, folder: Path, who: str) -> SourceError:
-    """What to say of a certificate of nobody we trust; it is kept, to be looked at."""
-    kept = _keep(certificate, folder)
+def untrusted(certificate: x509.Certificate, folder: Path, subject: str) -> SourceError:
+    """The error for an untrusted certificate, which is kept for a person to look at."""
+    path = _keep(certificate, folder)
     return SourceError(
-        f"{who} is not trusted",
-        f"if the fingerprint is the one that it shows: mv {kept} {folder / TRUSTED}/",
+        f"{subject} is not trusted",
+        f"if the fingerprint is the one that it shows: mv {path} {folder / TRUSTED}/",
     )
 
 
 def lies_in_trusted(certificate: x509.Certificate, folder: Path) -> bool:
-    """Whether it is trusted itself, not because of an authority."""
+    """Whether the certificate itself is in ``trusted/``, not only its authority."""
     return certificate in [_read(path) for path in (folder / TRUSTED).glob("*.*")]
 
 

@@ -29,7 +29,7 @@ from drivers.opcua.values import (
 from drivers.reconnect import AbsentError, Clock, LostError, unreachable
 from twin.errors import ConfigError, SourceError
 
-# It logs whatever goes wrong, tracebacks and all; what matters is raised as well.
+# The library logs each error with its traceback; what matters is raised as well.
 logging.getLogger("asyncua").setLevel(logging.CRITICAL + 1)
 
 NAMESPACES = Node("i=2255", "http://opcfoundation.org/UA/")
@@ -65,18 +65,18 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Subscribed:
-    """What a server made of a subscription that was asked for."""
+    """What a server granted of a subscription."""
 
     publishing_ms: float
     sampling_ms: float  # of the slowest node
     queue: int  # of the shortest
-    silence_s: float  # longer without a word, and the server is lost
+    silence_s: float  # after a longer silence the server counts as lost
 
 
 class OpcuaClient:
     """A connection that reads nodes and takes publications; it closes when it is broken.
 
-    The library is asynchronous; its loop runs here while something is awaited, and not between.
+    The library is asynchronous; its event loop runs only while a call waits.
     """
 
     def __init__(self, settings: OpcuaSettings, clock: Clock) -> None:
@@ -87,17 +87,17 @@ class OpcuaClient:
         self._client: Client | None = None
         self._uris: list[str] = []
         self._plans: dict[tuple[Node, ...], ua.ReadParameters] = {}
-        self._kinds: dict[tuple[Node, ...], tuple[ua.VariantType, ...]] = {}  # to be written as
+        self._kinds: dict[tuple[Node, ...], tuple[ua.VariantType, ...]] = {}  # types to write
         self._published: asyncio.Queue[ua.PublishResult] = asyncio.Queue()
-        self._known = False  # it has once served all that we want
+        self._has_served = False  # it has once served all nodes
 
     # --- connecting -------------------------------------------------------------------------------
 
     def open(self) -> None:
         """Connect, unless it is connected.
 
-        LostError if that fails; SourceError or ConfigError if the server is not to be trusted, or
-        does not want us.
+        LostError if that fails; SourceError or ConfigError if the server is not trusted, or rejects
+        us.
         """
         if self._client is not None:
             return
@@ -144,27 +144,27 @@ class OpcuaClient:
         except ConnectionError as error:
             if self._settings.security.policy == "None":
                 raise
-            # It told its endpoints just now; some hang up without a word on whom they do not know.
-            raise LostError(*self._stranger("it hung up")) from error
+            # It has just told its endpoints; some servers silently hang up on unknown clients.
+            raise LostError(*self._certificate_rejected("it hung up")) from error
 
-    def _stranger(self, how: str) -> tuple[str, str]:
-        """Text and hint where the server does not take our certificate."""
+    def _certificate_rejected(self, detail: str) -> tuple[str, str]:
+        """Text and hint if the server does not accept our certificate."""
         folder = self._settings.security.certificates or "FOLDER"
         return (
-            f"{self._settings.where}: it does not trust our certificate, or wants one ({how})",
+            f"{self._settings.where}: it does not trust our certificate, or wants one ({detail})",
             f"let the server trust {folder}/{certificates.OWN}, and set security.policy",
         )
 
     async def _protect(self, client: Client) -> None:
-        """Know the server by its certificate before anything is said to it."""
+        """Check the server's certificate before anything confidential is sent."""
         security, now = self._settings.security, self._now()
-        assert security.certificates is not None  # the settings see to it
-        own = certificates.own(security.certificates, now)
+        assert security.certificates is not None  # the settings check it
+        own_certificate = certificates.own(security.certificates, now)
         policy = POLICIES[security.policy]
         offered = await client.connect_and_get_server_endpoints()
         endpoint = self._endpoint(offered, policy.URI)
         chain: bytes = endpoint.ServerCertificate
-        der = chain[: int.from_bytes(chain[2:4], "big") + 4]  # the first of it, DER
+        der = chain[: int.from_bytes(chain[2:4], "big") + 4]  # the first certificate of the chain
         await trust.check(
             x509.load_der_x509_certificate(der),
             endpoint.Server,
@@ -174,8 +174,10 @@ class OpcuaClient:
             trust.Peer.SERVER,
             urlsplit(self._settings.url).hostname or "",
         )
-        client.application_uri = own.uri
-        await client.set_security(policy, own.path, own.key, None, der, ENCRYPTED)
+        client.application_uri = own_certificate.uri
+        await client.set_security(
+            policy, own_certificate.path, own_certificate.key, None, der, ENCRYPTED
+        )
 
     def _endpoint(
         self, offered: Sequence[ua.EndpointDescription], uri: str
@@ -211,16 +213,16 @@ class OpcuaClient:
     # --- reading ----------------------------------------------------------------------------------
 
     def read(self, nodes: tuple[Node, ...]) -> list[ua.DataValue]:
-        """Values of ``nodes``, by one request, whatever their quality.
+        """Values of ``nodes`` by one request, of any quality.
 
-        LostError if no answer comes; AbsentError if a node is not there or not to be read.
+        LostError if no answer comes; AbsentError if a node is missing or cannot be read.
         """
         values = self._do("reading", self._read(nodes))
         if len(values) != len(nodes):
             raise self._lost("reading", "it answered with another number of values")
         for node, value in zip(nodes, values, strict=True):
             self._refuse(node, code_of(value))
-        self._known = True
+        self._has_served = True
         return values
 
     async def _read(self, nodes: tuple[Node, ...]) -> list[ua.DataValue]:
@@ -238,7 +240,7 @@ class OpcuaClient:
         return ua.ReadValueId(NodeId=self._id(node), AttributeId=ua.AttributeIds.Value)
 
     def _id(self, node: Node) -> ua.NodeId:
-        """The node by the index that its namespace has now."""
+        """The node's id, with the present index of its namespace."""
         uri = node.uri or self._settings.namespace
         if uri not in self._uris:
             raise self._unfit(
@@ -252,28 +254,28 @@ class OpcuaClient:
 
     def _refuse(self, node: Node, code: int) -> None:
         """Raise if the server has no such node, or does not let us read it."""
-        where = self._settings.where
+        server = self._settings.where
         if code & CODE in UNKNOWN:
             raise self._unfit(
-                f"{where}: there is no node {node}",
+                f"{server}: there is no node {node}",
                 "compare the nodes in [driver] with the server's; any OPC UA browser shows them",
             )
         if code & CODE in FORBIDDEN:
             raise self._unfit(
-                f"{where}: {node} cannot be read ({status_name(code)})",
+                f"{server}: {node} cannot be read ({status_name(code)})",
                 "may this user read it, and is it a variable?",
             )
 
     def _unfit(self, text: str, hint: str) -> SourceError:
-        """It lacks what we want: for good, or until it has started, if it once had it."""
-        return LostError(text, hint) if self._known else AbsentError(text, hint)
+        """The error for a missing node; a server that once had it may only be starting."""
+        return LostError(text, hint) if self._has_served else AbsentError(text, hint)
 
     # --- subscribing ------------------------------------------------------------------------------
 
     def subscribe(self, nodes: tuple[Node, ...], queue: int) -> Subscribed:
         """Have every value of ``nodes`` published; errors as from ``read``.
 
-        The index of a node is its handle in what is published.
+        The index of a node is its handle in publications.
         """
         return self._do("subscribing", self._subscribe(nodes, queue))
 
@@ -287,10 +289,10 @@ class OpcuaClient:
             MaxNotificationsPerPublish=0,
             PublishingEnabled=True,
         )
-        made = await session.create_subscription(params, self._published.put_nowait)
+        subscription = await session.create_subscription(params, self._published.put_nowait)
         items = await session.create_monitored_items(
             ua.CreateMonitoredItemsParameters(
-                SubscriptionId=made.SubscriptionId,
+                SubscriptionId=subscription.SubscriptionId,
                 TimestampsToReturn=ua.TimestampsToReturn.Both,
                 ItemsToCreate=[
                     self._monitored(node, number, queue) for number, node in enumerate(nodes)
@@ -299,10 +301,12 @@ class OpcuaClient:
         )
         for node, item in zip(nodes, items, strict=True):
             self._refuse_item(node, item.StatusCode.value)
-        self._known = True
-        alive_s = made.RevisedPublishingInterval * made.RevisedMaxKeepAliveCount * 1e-3
+        self._has_served = True
+        alive_s = (
+            subscription.RevisedPublishingInterval * subscription.RevisedMaxKeepAliveCount * 1e-3
+        )
         return Subscribed(
-            made.RevisedPublishingInterval,
+            subscription.RevisedPublishingInterval,
             max(item.RevisedSamplingInterval for item in items),
             min(item.RevisedQueueSize for item in items),
             3 * alive_s + settings.timeout_ms * 1e-3,
@@ -338,7 +342,7 @@ class OpcuaClient:
     # --- writing ----------------------------------------------------------------------------------
 
     def write(self, values: Mapping[Node, float]) -> None:
-        """Write numbers, by one request, each as its node's type; Booleans as unlike 0.
+        """Write numbers by one request, each as its node's type; a Boolean is true unless 0.
 
         LostError if no answer comes; SourceError if a node cannot be written or cannot hold its
         number. Only hardware in the loop does (drivers/opcua/hil.py).
@@ -346,7 +350,7 @@ class OpcuaClient:
         nodes = tuple(values)
         if nodes not in self._kinds:
             self._kinds[nodes] = tuple(
-                self._kind(*one) for one in zip(nodes, self.read(nodes), strict=True)
+                self._kind(*pair) for pair in zip(nodes, self.read(nodes), strict=True)
             )
         variants = [
             typed(value, kind, node)
@@ -363,7 +367,7 @@ class OpcuaClient:
 
     async def _write(self, nodes: tuple[Node, ...], variants: list[ua.Variant]) -> list[int]:
         assert self._client is not None
-        written = [
+        writes = [
             ua.WriteValue(
                 NodeId=self._id(node),
                 AttributeId=ua.AttributeIds.Value,
@@ -371,7 +375,7 @@ class OpcuaClient:
             )
             for node, variant in zip(nodes, variants, strict=True)
         ]
-        params = ua.WriteParameters(NodesToWrite=written)
+        params = ua.WriteParameters(NodesToWrite=writes)
         return [int(code.value) for code in await self._client.uaclient.write(params)]
 
     def _kind(self, node: Node, value: ua.DataValue) -> ua.VariantType:
@@ -382,56 +386,58 @@ class OpcuaClient:
 
     # --- errors -----------------------------------------------------------------------------------
 
-    def _do(self, what: str, work: Coroutine[Any, Any, T]) -> T:
-        """Run ``work``; whatever the library raises becomes an error for people."""
+    def _do(self, action: str, work: Coroutine[Any, Any, T]) -> T:
+        """Run ``work``; errors of the library become errors for people."""
         if self._runner is None:
             work.close()
-            raise self._lost(what, "the connection is closed")
+            raise self._lost(action, "the connection is closed")
         try:
             return self._runner.run(work)
         except (SourceError, ConfigError):
             raise
         except ua.UaStatusCodeError as error:
-            raise self._told(what, int(error.code)) from error
+            raise self._refusal(action, int(error.code)) from error
         except OSError as error:
-            if what == "connecting":
+            if action == "connecting":
                 self._abandon()
                 raise unreachable(self._settings.where, error, "OPC UA server") from error
-            raise self._lost(what, "no answer") from error
-        except Exception as error:  # the library decodes; there is no telling what garbage raises
-            raise self._lost(what, f"a broken answer ({error or type(error).__name__})") from error
+            raise self._lost(action, "no answer") from error
+        except Exception as error:  # garbage can make the library's decoder raise anything
+            raise self._lost(
+                action, f"a broken answer ({error or type(error).__name__})"
+            ) from error
 
-    def _told(self, what: str, code: int) -> SourceError:
-        """The server said no."""
-        where, name = self._settings.where, status_name(code)
-        if what == "connecting" and code & CODE in STRANGER:
+    def _refusal(self, action: str, code: int) -> SourceError:
+        """The error for a status code by which the server refused."""
+        server, name = self._settings.where, status_name(code)
+        if action == "connecting" and code & CODE in STRANGER:
             self.close()
             return SourceError(
-                f"{where}: it does not let this user in ({name})",
+                f"{server}: it does not let this user in ({name})",
                 "check [driver.user]: the name and its password, or the certificate; without the "
                 "table we come as nobody",
             )
-        if what == "connecting" and code & CODE in UNTRUSTED:
+        if action == "connecting" and code & CODE in UNTRUSTED:
             self.close()
-            return SourceError(*self._stranger(name))
-        if what == "connecting" and code & CODE in UNPROTECTED:
+            return SourceError(*self._certificate_rejected(name))
+        if action == "connecting" and code & CODE in UNPROTECTED:
             self.close()
             return SourceError(
-                f"{where}: it wants the connection protected otherwise ({name})",
+                f"{server}: it wants the connection protected otherwise ({name})",
                 f"set security.policy in [driver], to None or one of {', '.join(POLICIES)}",
             )
-        return self._lost(what, f"it said {name}")
+        return self._lost(action, f"it said {name}")
 
-    def _lost(self, what: str, why: str) -> LostError:
-        """Close too: a late answer must not be taken for that to the next request."""
+    def _lost(self, action: str, cause: str) -> LostError:
+        """Close, and give the error: a late answer must not be taken for the next one."""
         self._abandon()
         return LostError(
-            f"{self._settings.where}: {what}: {why}",
+            f"{self._settings.where}: {action}: {cause}",
             "is the PLC on and reachable, its OPC UA server started, is the url right?",
         )
 
     def _abandon(self) -> None:
-        """Close without a word, since nobody would answer it."""
+        """Close without ending the session, since nobody would answer."""
         runner, client = self._runner, self._client
         self._runner, self._client, self._plans = None, None, {}
         if client is not None:
@@ -444,19 +450,19 @@ class OpcuaClient:
 
 
 def _usable(offered: Sequence[ua.EndpointDescription]) -> list[str]:
-    """The policies among the endpoints that we can take, as the settings name them."""
+    """Policies of the endpoints that we support, as the settings name them."""
     modes = {"None": ua.MessageSecurityMode.None_} | dict.fromkeys(POLICIES, ENCRYPTED)
-    names = [one.SecurityPolicyUri.rpartition("#")[2].replace("_", "") for one in offered]
+    names = [endpoint.SecurityPolicyUri.rpartition("#")[2].replace("_", "") for endpoint in offered]
     fit = {
         name
-        for name, one in zip(names, offered, strict=True)
-        if modes.get(name) == one.SecurityMode
+        for name, endpoint in zip(names, offered, strict=True)
+        if modes.get(name) == endpoint.SecurityMode
     }
     return sorted(fit) or ["none of ours"]
 
 
 async def _leave(client: Client, patience_s: float) -> None:
-    """End the session politely, as far as the server goes along with it."""
+    """End the session politely if the server cooperates, else close the socket."""
     try:
         await asyncio.wait_for(client.disconnect(), patience_s)
     except (OSError, TimeoutError, ua.UaError):

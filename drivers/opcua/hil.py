@@ -57,7 +57,7 @@ class HilSettings(Settings):
 
 
 class NodeOutlet:
-    """Nodes of one server."""
+    """Writes nodes of one server."""
 
     def __init__(self, link: OpcuaClient, driver: OpcuaSettings, tags: HilTags) -> None:
         self._link, self._tags = link, tags
@@ -70,7 +70,7 @@ class NodeOutlet:
         self._link.write(self.values(outputs, watchdog))
 
     def values(self, outputs: Outputs, watchdog: int) -> dict[Node, float]:
-        """What is written."""
+        """Numbers to write, by node."""
         tags, values = self._tags, dict[Node, float]()
         if tags.pressure and self._pressure:
             values[tags.pressure.node] = self._pressure.raw(outputs.pressure)
@@ -84,7 +84,7 @@ class NodeOutlet:
 
 
 def writer(driver: OpcuaSettings, document: Document) -> Writer:
-    """Whoever writes to this server, in a session of its own: the reader's waits for answers."""
+    """The writer to this server, in a session of its own: the reader's blocks while it waits."""
     settings = document.section(HilSettings, "hil")
     nodes = [tag.node for _, tag in settings.tags if tag is not None]
     if not driver.namespace and any(not node.uri for node in nodes):

@@ -1,4 +1,4 @@
-"""What an OPC UA server shows of itself, line by line: for the first hour with an unknown PLC."""
+"""Inspection of an OPC UA server, line by line: for the first hour with an unknown PLC."""
 
 import statistics
 from functools import partial
@@ -18,18 +18,18 @@ def probe(settings: OpcuaSettings, clock: Clock = REAL) -> list[Line]:
     link = OpcuaClient(settings, clock)
     try:
         connected = looked_at("connection", lambda: _connect(link, settings, clock))
-        return [connected, *_look(link, settings, clock)] if connected.good else [connected]
+        return [connected, *_inspect(link, settings, clock)] if connected.good else [connected]
     finally:
         link.close()
 
 
-def _look(link: OpcuaClient, settings: OpcuaSettings, clock: Clock) -> list[Line]:
+def _inspect(link: OpcuaClient, settings: OpcuaSettings, clock: Clock) -> list[Line]:
     lines: list[Line] = []
     for name, tag in settings.tags:
         if tag is not None:
-            lines.append(looked_at(name, partial(_show, link, tag.node)))
+            lines.append(looked_at(name, partial(_node_text, link, tag.node)))
             if lines[-1].lost:
-                return lines  # nothing else would be answered, and each question takes its time
+                return lines  # nothing else would be answered, and each request would time out
     if settings.mode == "subscribe":
         subscription = Subscription(settings, clock)
         return [*lines, looked_at("subscription", lambda: _granted(link, subscription, settings))]
@@ -49,11 +49,13 @@ def _connect(link: OpcuaClient, settings: OpcuaSettings, clock: Clock) -> str:
     return f"{settings.where}: connected in {took_ms:.0f} ms, security {settings.security.policy}"
 
 
-def _show(link: OpcuaClient, node: Node) -> str:
+def _node_text(link: OpcuaClient, node: Node) -> str:
     link.open()
     value = link.read((node,))[0]
-    held = f"{value.Value.VariantType.name} {value.Value.Value}" if readable(value) else "nothing"
-    return f"{node}: {held}, {status_name(code_of(value))}, of {value.SourceTimestamp} UTC"
+    content = (
+        f"{value.Value.VariantType.name} {value.Value.Value}" if readable(value) else "nothing"
+    )
+    return f"{node}: {content}, {status_name(code_of(value))}, of {value.SourceTimestamp} UTC"
 
 
 def _granted(link: OpcuaClient, subscription: Subscription, settings: OpcuaSettings) -> str:
@@ -94,6 +96,6 @@ def _ring(link: OpcuaClient, trace: NodeTrace) -> str:
 
 
 def _rate(link: OpcuaClient, trace: NodeTrace, clock: Clock) -> str:
-    """Scans per second by the clock here; SourceError if they are not those of the period."""
+    """Scans per second by this machine's clock; SourceError if they do not fit the period."""
     link.open()
     return watched(lambda: trace.ask(link).header, clock)

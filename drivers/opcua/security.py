@@ -1,4 +1,4 @@
-"""Who may talk to an OPC UA server of ours, and how that is kept private."""
+"""Access control and encryption of our own OPC UA server."""
 
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
@@ -25,12 +25,12 @@ POLICIES = {
     "Basic256Sha256": ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt,
     "Aes256Sha256RsaPss": ua.SecurityPolicyType.Aes256Sha256RsaPss_SignAndEncrypt,
 }
-ADDRESS: ContextVar[str] = ContextVar("address", default="")  # of whom a session is for
+ADDRESS: ContextVar[str] = ContextVar("address", default="")  # of the client that logs in
 Say = Callable[[str], None]
 
 
 class Guard(Protocol):
-    """What to keep to."""
+    """Security settings of a server."""
 
     @property
     def policies(self) -> Sequence[str]:
@@ -38,24 +38,24 @@ class Guard(Protocol):
 
     @property
     def certificates(self) -> Path | None:
-        """A folder as ``certificates.make`` makes it; needed for policies but None."""
+        """A folder as ``certificates.make`` makes it; needed for every policy but None."""
 
     @property
     def users(self) -> Path | None:
-        """A file as ``twin users`` makes it; if there is one, everybody has to be of it."""
+        """A file as ``twin users`` makes it; with one, nobody gets in anonymously."""
 
 
 @dataclass
 class Person(User):  # type: ignore[misc]  # the library's classes are untyped to us
-    """Whom a session is for: a user with a name, or whoever has a certificate, or anybody."""
+    """The identity behind a session: a user, the owner of a certificate, or anonymous."""
 
     address: str = ""
-    users: Users | None = None  # where the name stands
+    users: Users | None = None  # the file that has the name
     proof: str = ""  # what was stored of the user at the login
 
     @property
     def is_still(self) -> bool:
-        """Whether the user is there as at the login; not while that cannot be known."""
+        """Whether the user is unchanged since the login; False while that cannot be read."""
         try:
             return self.users is None or self.users.proof(self.name or "") == self.proof
         except TwinError:
@@ -63,10 +63,10 @@ class Person(User):  # type: ignore[misc]  # the library's classes are untyped t
 
 
 class Session(InternalSession):  # type: ignore[misc]
-    """A session that knows where it comes from, and is over for who is no user any more."""
+    """A session that knows its client's address, and ends once its user is removed or changed."""
 
     def activate_session(self, params: Any, peer_certificate: bytes | None) -> Any:
-        """Let somebody in; meanwhile ``ADDRESS`` is where that is."""
+        """Log a client in; meanwhile ``ADDRESS`` is its address."""
         token = ADDRESS.set(str(self.name[0]) if self.external and self.name else "")
         try:
             return super().activate_session(params, peer_certificate)
@@ -81,7 +81,7 @@ class Session(InternalSession):  # type: ignore[misc]
 
 
 class GuardedServer(InternalServer):  # type: ignore[misc]
-    """What is inside of a server whose sessions know where they come from."""
+    """The core of a server, whose sessions know their client's address."""
 
     def create_session(self, name: Any, **options: Any) -> Session:
         """Begin a session; ``name`` is the address and port of its connection."""
@@ -89,17 +89,17 @@ class GuardedServer(InternalServer):  # type: ignore[misc]
 
 
 class Door:
-    """Whom the server lets in, as the library asks for it; ``say`` is told what hinders it."""
+    """Authenticates clients for the library; ``say`` receives what prevents a login."""
 
     def __init__(self, folder: Path | None, authenticator: Authenticator | None, say: Say) -> None:
         self._authenticator, self._say = authenticator, say
-        self._said = ""  # of a trouble that lasts, once
+        self._reported = ""  # the last trouble; a lasting one is reported once
         paths = sorted((folder / certificates.USERS).glob("*.der")) if folder else []
         self._certificates = {path.read_bytes() for path in paths}
 
     @property
     def anybody(self) -> bool:
-        """Whether nobody needs to say who it is."""
+        """Whether clients may stay anonymous."""
         return self._authenticator is None and not self._certificates
 
     def get_user(
@@ -109,18 +109,18 @@ class Door:
         password: str | None = None,
         certificate: bytes | None = None,
     ) -> Person | None:
-        """A user, or None if that is nobody we know."""
+        """The identity of a client, or None if it is not let in."""
         if username:
             return self._logged_in(username, password or "")
-        right = self.anybody or certificate in self._certificates
+        admitted = self.anybody or certificate in self._certificates
         if self._authenticator is not None and certificate is not None:
-            act = Act.LOGGED_IN if right else Act.DENIED
-            who = certificates.described(x509.load_der_x509_certificate(certificate))
-            self._authenticator.audit.record(act, who, ADDRESS.get())
-        return Person(UserRole.User, None, ADDRESS.get()) if right else None
+            act = Act.LOGGED_IN if admitted else Act.DENIED
+            subject = certificates.described(x509.load_der_x509_certificate(certificate))
+            self._authenticator.audit.record(act, subject, ADDRESS.get())
+        return Person(UserRole.User, None, ADDRESS.get()) if admitted else None
 
     def _logged_in(self, name: str, password: str) -> Person | None:
-        """The user whose password that is; who guesses is refused until the wait is over."""
+        """The user with this password, or None; after wrong ones it refuses for a while."""
         if self._authenticator is None:
             return None
         users, address = self._authenticator.users, ADDRESS.get()
@@ -128,46 +128,46 @@ class Door:
             proof = users.proof(name)
             login = self._authenticator.log_in(name, password, address)
         except TwinError as error:
-            self._complain(f"nobody can log in over OPC UA: {error}: {error.hint}")
+            self._report(f"nobody can log in over OPC UA: {error}: {error.hint}")
             return None
-        self._said = ""
-        known = login.user, address, users, proof
-        return Person(UserRole.User, *known) if login.role else None
+        self._reported = ""
+        identity = login.user, address, users, proof
+        return Person(UserRole.User, *identity) if login.role else None
 
-    def _complain(self, what: str) -> None:
-        if what != self._said:
-            self._say(what)
-        self._said = what
+    def _report(self, trouble: str) -> None:
+        if trouble != self._reported:
+            self._say(trouble)
+        self._reported = trouble
 
 
 def authenticator_of(users: Path | None, say: Say) -> Authenticator | None:
-    """What lets in the users of a file; None without one, ConfigError if there is nobody in it."""
+    """The authenticator for a file of users; None without one, ConfigError if it has no users."""
     if users is None:
         return None
-    known = Users(users)
-    if not known.names:
+    registered = Users(users)
+    if not registered.names:
         raise ConfigError(
             f"{users}: no users, so nobody could come in", f"twin users add NAME --users {users}"
         )
-    return Authenticator(known, Audit(users.parent, "opcua", say))
+    return Authenticator(registered, Audit(users.parent, "opcua", say))
 
 
 async def secure(
     server: Server, settings: Guard, authenticator: Authenticator | None, say: Say
 ) -> None:
-    """Set policies, our own certificate, whose certificates are trusted, and who may come in."""
+    """Set policies, our own certificate, the check of clients' certificates, and their logins."""
     server.set_security_policy([POLICIES[policy] for policy in settings.policies])
     door = Door(settings.certificates, authenticator, say)
     server.iserver.user_manager = door
-    known = [ua.UserNameIdentityToken, ua.X509IdentityToken]
-    server.set_identity_tokens([ua.AnonymousIdentityToken] if door.anybody else known)
+    tokens = [ua.UserNameIdentityToken, ua.X509IdentityToken]
+    server.set_identity_tokens([ua.AnonymousIdentityToken] if door.anybody else tokens)
     folder = settings.certificates
     if folder is None:
         return
-    own = certificates.own(folder, datetime.now(UTC))
-    await server.load_certificate(own.path)
-    await server.load_private_key(own.key)
-    await server.set_application_uri(own.uri)
+    own_certificate = certificates.own(folder, datetime.now(UTC))
+    await server.load_certificate(own_certificate.path)
+    await server.load_private_key(own_certificate.key)
+    await server.set_application_uri(own_certificate.uri)
 
     async def check(certificate: x509.Certificate, client: ua.ApplicationDescription) -> None:
         try:

@@ -40,9 +40,9 @@ class Node:
         if match := NODE.fullmatch(str(text)):
             return cls(match["identifier"], match["uri"] or "")
         indexed = re.match(r"ns=\d+;", str(text))
-        why = "the index may be another after a restart; " if indexed else ""
+        cause = "the index may be another after a restart; " if indexed else ""
         raise ValueError(
-            f'"{text}" is no node: {why}write "s=Name" (also i=, g=, b=) and the URI of its '
+            f'"{text}" is no node: {cause}write "s=Name" (also i=, g=, b=) and the URI of its '
             'namespace as namespace = "…" in [driver], or "nsu=URI;s=Name"'
         )
 
@@ -185,14 +185,14 @@ class OpcuaSettings(Settings):
         return self
 
     def _refuse_without_effect(self) -> None:
-        """KeyedError for what is read from single nodes alone, and not from the trace."""
+        """KeyedError for a tag or setting that block mode does not use."""
         for name, bit in (COMMAND_BITS | BITS).items():
             tag = getattr(self.tags, name)
             if tag is None:
                 continue
             if tag.bit is not None or not tag.node.identifier.endswith(BIT_NODES[name]):
-                place = tag.node if tag.bit is None else f"{tag.node} bit {tag.bit}"
-                raise no_effect(name, bit, place, "subscribe")
+                address = tag.node if tag.bit is None else f"{tag.node} bit {tag.bit}"
+                raise no_effect(name, bit, address, "subscribe")
         refuse_unused(self.model_fields_set, ("gap_ms", "sampling_ms"), "subscribe")
 
     def _nodes(self) -> list[Node]:
@@ -214,7 +214,7 @@ class OpcuaSettings(Settings):
 
     @property
     def where(self) -> str:
-        """Whom messages are about."""
+        """The server as messages name it."""
         return self.url
 
 
@@ -226,10 +226,10 @@ def _below(settings: Settings, folder: Path, *names: str) -> Settings:
 
 
 def _checked_url(url: str) -> None:
-    parts = urlsplit(url)
+    split = urlsplit(url)
     try:
-        fine = parts.scheme == "opc.tcp" and bool(parts.hostname) and parts.port != 0
+        valid = split.scheme == "opc.tcp" and bool(split.hostname) and split.port != 0
     except ValueError:  # no port
-        fine = False
-    if not fine or parts.username:
+        valid = False
+    if not valid or split.username:
         raise ValueError(f'"{url}" is no address: write "opc.tcp://HOST:{PORT}"; the user apart')

@@ -21,11 +21,10 @@ def blocks(
 ) -> Generator[Samples, None, None]:
     """Samples as they come: a block at least every 0.5 s, empty while there is nothing.
 
-    Once there were rows, or the server is ``known`` to have given some, whatever it sends is at
-    worst a lost connection: it is retried for ever and shows as empty blocks and flags. Before that
-    a server that is not there or lacks its nodes is retried where there is ``away``; other errors
-    come out. ``away`` is told why there are no rows. It runs in a thread, since connecting may take
-    seconds. Closing releases all.
+    A server that has given rows, or is ``known`` to have, is retried for ever: any error counts as
+    a lost connection, and shows as empty blocks and flags. Before that, a server that is absent or
+    lacks nodes is retried only with ``away``; other errors are raised. ``away`` receives why there
+    are no rows. It runs in a thread, since connecting may take seconds. Closing releases all.
     """
     link = OpcuaClient(settings, clock)
     if settings.mode == "block":

@@ -1,8 +1,8 @@
 """Subscribe mode over OPC UA: single nodes, for servers that keep no trace.
 
-The server samples, queues and publishes as often as it likes. Each value of the pressure is a row
-at its source time; commands and supply are those that held then. Rows are numbered by the sampling
-interval that the server grants, so that a missing one is a missing number.
+The server decides how often it samples and publishes. Each value of the pressure is a row at its
+source time; commands and supply are those in force then. Rows are numbered by the sampling interval
+that the server grants, so that a missing row is a missing number.
 """
 
 import logging
@@ -30,7 +30,7 @@ from twin.errors import SourceError
 from twin.signals import MBAR, SAMPLE, UNUSABLE, Command, Quality, Samples
 
 QUEUE_MS = 2000.0  # of samples that the server is asked to keep for us
-PRESSURE = 0  # its place among the nodes, and so its handle
+PRESSURE = 0  # its index among the nodes, and so its handle
 
 Integers = npt.NDArray[np.int64]
 log = logging.getLogger(__name__)
@@ -55,7 +55,7 @@ class Column:
         del self.times[:-1], self.values[:-1], self.codes[:-1]
 
     def at(self, times: Integers) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
-        """What held at ``times``, and its quality; the first value held before it as well."""
+        """Values in force at ``times``, and their quality; the first one also before its time."""
         if not self.times:
             return np.full(len(times), np.nan), np.full(len(times), Quality.BAD, np.uint8)
         order = np.argsort(self.times, kind="stable")
@@ -70,17 +70,17 @@ class Subscription:
 
     def __init__(self, settings: OpcuaSettings, clock: Clock) -> None:
         tags = settings.tags
-        assert tags.suction is not None  # the settings see to both
+        assert tags.suction is not None  # the settings check both
         assert tags.blow_off is not None
         self._settings = settings
         self._clock = clock
         self._tags = {name: tag for name, tag in tags if tag is not None}  # the pressure first
         self._all = tuple(self._tags.values())
-        self._places = {name: place for place, name in enumerate(self._tags)}
+        self._index = {name: index for index, name in enumerate(self._tags)}
         self.nodes: tuple[Node, ...] = tuple(tag.node for tag in self._tags.values())
         self.queue = max(10, round(QUEUE_MS / settings.sampling_ms))  # values to be kept of each
         self._columns: list[Column] = []
-        self._said = ""
+        self._reported = ""
         self._period_ns = 0  # of samples, as granted
         self._published = 0  # number of the last publication with values; 0: none yet
         self._sequence = -1  # of the last row
@@ -89,44 +89,48 @@ class Subscription:
 
     def samples(self, link: OpcuaClient) -> Iterator[Samples]:
         """Blocks as they are published; ends only by an exception."""
-        for place, value in enumerate(link.read(self.nodes)):
-            self._number(place, value)  # says so if it has another type
+        for index, value in enumerate(link.read(self.nodes)):
+            self._number(index, value)  # raises if it has another type
         granted = link.subscribe(self.nodes, self.queue)
-        self._say(granted)
+        self._report(granted)
         self._period_ns = round(max(granted.sampling_ms, self._settings.sampling_ms) * 1e6)
         self._columns = [Column() for _ in self.nodes]
         self._published = 0
         while True:
             yield self._take(link.published(granted.silence_s))
 
-    def _say(self, granted: Subscribed) -> None:
-        """Report what the server made of what was asked for, once for each answer."""
+    def _report(self, granted: Subscribed) -> None:
+        """Warn if the server grants less than was asked for, once for each answer."""
         settings = self._settings
-        parts = []
+        differences = []
         if granted.sampling_ms > settings.sampling_ms:
-            parts.append(f"samples every {granted.sampling_ms:g} ms, not {settings.sampling_ms:g}")
+            differences.append(
+                f"samples every {granted.sampling_ms:g} ms, not {settings.sampling_ms:g}"
+            )
         if granted.publishing_ms > settings.interval_ms:
             publishing = f"publishes every {granted.publishing_ms:g} ms"
-            parts.append(f"{publishing}, not {settings.interval_ms:g}")
+            differences.append(f"{publishing}, not {settings.interval_ms:g}")
         if granted.queue * granted.sampling_ms < 2 * granted.publishing_ms:
-            parts.append(f"keeps only {granted.queue} values, not {self.queue}: some will be lost")
-        said = f"{settings.where}: the server {', '.join(parts)}" if parts else ""
-        if said and said != self._said:
-            log.warning(said)
-        self._said = said
+            differences.append(
+                f"keeps only {granted.queue} values, not {self.queue}: some will be lost"
+            )
+        report = f"{settings.where}: the server {', '.join(differences)}" if differences else ""
+        if report and report != self._reported:
+            log.warning(report)
+        self._reported = report
 
     def _take(self, publication: ua.PublishResult) -> Samples:
         """Rows of one publication."""
         message = publication.NotificationMessage
         changes: list[ua.MonitoredItemNotification] = []
-        for part in message.NotificationData or ():
-            if isinstance(part, ua.StatusChangeNotification):
+        for notification in message.NotificationData or ():
+            if isinstance(notification, ua.StatusChangeNotification):
                 raise LostError(
                     f"{self._settings.where}: the server ended the subscription",
                     "did it restart, or did nothing come through for too long?",
                 )
-            if isinstance(part, ua.DataChangeNotification):
-                changes += part.MonitoredItems
+            if isinstance(notification, ua.DataChangeNotification):
+                changes += notification.MonitoredItems
         if not changes:
             return EMPTY
         if self._published and message.SequenceNumber != self._published % 0xFFFF_FFFF + 1:
@@ -134,24 +138,24 @@ class Subscription:
         self._published = message.SequenceNumber
         for change in changes:
             if 0 <= change.ClientHandle < len(self.nodes):
-                self._put(change.ClientHandle, change.Value)
+                self._append(change.ClientHandle, change.Value)
         return self._rows()
 
-    def _put(self, place: int, value: ua.DataValue) -> None:
+    def _append(self, index: int, value: ua.DataValue) -> None:
         at_ns = time_ns(value)
         if at_ns is None:
             raise SourceError(
-                f"{self._settings.where}: {self.nodes[place]} comes without a time that can be",
+                f"{self._settings.where}: {self.nodes[index]} comes without a time that can be",
                 "the server must send source or server timestamps, after 1970 and before 2116",
             )
-        self._columns[place].add(at_ns, self._number(place, value), code_of(value))
+        self._columns[index].add(at_ns, self._number(index, value), code_of(value))
 
-    def _number(self, place: int, value: ua.DataValue) -> float:
+    def _number(self, index: int, value: ua.DataValue) -> float:
         """The value as a number, commands as 0 and 1; NaN where there is none."""
-        node = self.nodes[place]
+        node = self.nodes[index]
         if not readable(value):
             return float("nan")
-        tag = self._all[place]
+        tag = self._all[index]
         if isinstance(tag, NodeTag):
             return float(truth(value, node, tag.bit))
         return number(value, node)
@@ -165,7 +169,7 @@ class Subscription:
         block = np.zeros(len(pressures.times), SAMPLE)
         times = block["time_ns"] = np.array(pressures.times)
         block["host_ns"] = self._clock.wall_ns()
-        raw = {name: self._usable(name, times) for name in VALUES if name in self._places}
+        raw = {name: self._usable(name, times) for name in VALUES if name in self._index}
         fixed = self._settings.ambient_mbar * MBAR
         ambient = ambient_of(block, tags, raw, fixed)
         put_values(block, tags, raw, ambient)
@@ -173,13 +177,13 @@ class Subscription:
         block["pressure"], block["quality"] = tags.pressure.pressure(measured, ambient)
         block["quality"] |= np.array([quality(code) for code in pressures.codes], np.uint8)
         for name, command in (("suction", Command.SUCTION), ("blow_off", Command.BLOW_OFF)):
-            on, flags = self._columns[self._places[name]].at(times)
+            on, flags = self._columns[self._index[name]].at(times)
             block["commands"] |= np.where(on == 1, np.uint8(command), np.uint8(0))
             block["quality"] |= flags | np.where(np.isnan(on), Quality.BAD, 0).astype(np.uint8)
         block["supply"] = np.nan
         if tags.supply is not None:
             block["supply"] = tags.supply.gauge(self._usable("supply", times), fixed)
-        bits = {name: self._usable(name, times) for name in BITS if name in self._places}
+        bits = {name: self._usable(name, times) for name in BITS if name in self._index}
         put_bits(block, bits)
         self._count(block, np.array([lost_some(code) for code in pressures.codes]))
         self._columns[PRESSURE] = Column()
@@ -188,21 +192,21 @@ class Subscription:
         return block
 
     def _usable(self, name: str, times: Integers) -> npt.NDArray[np.float64]:
-        """What a tag held at ``times``; NaN where nothing can be made of it."""
-        values, flags = self._columns[self._places[name]].at(times)
+        """Values of a tag at ``times``; NaN where unusable."""
+        values, flags = self._columns[self._index[name]].at(times)
         values[(flags & UNUSABLE) != 0] = np.nan
         return values
 
     def _count(self, block: Samples, lost: npt.NDArray[np.bool_]) -> None:
-        """Number the rows, and mark where some are missing or time does not run on."""
+        """Number the rows, and flag gaps and times that do not run on."""
         times = block["time_ns"]
         before = self._last_ns if self._sequence >= 0 else int(times[0]) - self._period_ns
-        ran = np.diff(times, prepend=before)
-        steps = np.maximum(np.rint(ran / self._period_ns).astype(np.int64), 1)
-        missing = (steps > 1) & (ran - self._period_ns > self._settings.gap_ms * 1e6)
+        steps_ns = np.diff(times, prepend=before)
+        steps = np.maximum(np.rint(steps_ns / self._period_ns).astype(np.int64), 1)
+        missing = (steps > 1) & (steps_ns - self._period_ns > self._settings.gap_ms * 1e6)
         block["sequence"] = self._sequence + np.cumsum(steps)
         block["quality"][missing | lost] |= Quality.GAP.value
-        block["quality"][ran <= 0] |= Quality.CLOCK.value
+        block["quality"][steps_ns <= 0] |= Quality.CLOCK.value
         block["quality"][0] |= self._break
         self._break = 0
         self._sequence, self._last_ns = int(block["sequence"][-1]), int(times[-1])

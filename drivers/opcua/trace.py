@@ -1,9 +1,9 @@
-"""Block mode over OPC UA: the header, and then the ring of scans as arrays, read whole.
+"""Block mode over OPC UA: read the header, and then the whole ring of scans as arrays.
 
-The server may answer for one node of a request earlier than for another, in any order. So the
-arrays are asked for once the header is here: what it announces was complete before, whenever each
-array is read, and however the scans come. What is fresher comes with the next block. At the old end
-as much is kept clear as may have been overwritten until the arrays were here.
+The server may sample the nodes of one request at different times, in any order. So the arrays are
+requested after the header has arrived: whatever it announces was complete by then. Fresher records
+come with the next block. The oldest records are skipped, as far as the PLC may have overwritten
+them before the arrays arrived.
 """
 
 from dataclasses import dataclass, replace
@@ -47,20 +47,20 @@ Integers = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Ring:
-    """Where the ring stood, and all that was in it after that."""
+    """The header of the ring, and the whole ring read after it."""
 
     header: Header
     sequences: Integers
     statuses: Integers
     pressures: Floats  # NaN where there is none
-    single: dict[str, float]  # supply and what else is read by itself; NaN where there is none
+    single: dict[str, float]  # supply and other values outside the ring; NaN if none
     quality: int  # Quality bits that the server gives to all of it
     apart: int  # scans that may have gone by while the header was read
-    overwritten: int  # records up to this one, counted from the header's, may be
+    overwritten: int  # records up to this offset from the header's may be overwritten
 
 
 class NodeTrace(Follower[Header, OpcuaClient]):
-    """Where we are in the ring of one PLC; it outlives connections."""
+    """The reading position in the ring of one PLC; it outlives connections."""
 
     def __init__(self, settings: OpcuaSettings, clock: Clock) -> None:
         super().__init__(settings, clock)
@@ -73,31 +73,33 @@ class NodeTrace(Follower[Header, OpcuaClient]):
             for name in ("supply", *VALUES)
             if getattr(tags, name) is not None
         }
-        self._told = {name: bit for name, bit in BITS.items() if getattr(tags, name) is not None}
+        self._status_bits = {
+            name: bit for name, bit in BITS.items() if getattr(tags, name) is not None
+        }
 
     @property
     def requests(self) -> tuple[tuple[Node, ...], tuple[Node, ...]]:
-        """What is read, one after the other: the header, and all else."""
+        """Nodes of the two requests, in order: the header's, and all others."""
         return self._header_nodes, (*self._arrays, *self._single.values())
 
     def start(self, link: OpcuaClient) -> Header:
         """Begin at the newest record; SourceError if there is no ring as configured."""
-        header = self._proven(link).header
+        header = self._verified_ring(link).header
         self._begin(header)
         return header
 
-    def _proven(self, link: OpcuaClient) -> Ring:
-        """A ring that follows the last one, or holds what it announces; else SourceError.
+    def _verified_ring(self, link: OpcuaClient) -> Ring:
+        """A ring that follows the last one, or holds the announced records; else SourceError.
 
-        It may be torn: one that surprises is read again.
+        A read may be torn: an unexpected ring is read again.
         """
         last = self._header
         for attempt in range(TRIES):
-            ring = self._steady(self.ask(link))
+            ring = self._smoothed_ring(self.ask(link))
             if last is not None and ring.header.follows(last):
                 return ring
             read_again = attempt > 0 or last is None
-            if read_again and ring.header.ready and _holds_what_it_announces(ring):
+            if read_again and ring.header.ready and _holds_announced_records(ring):
                 return ring
         self.refuse_other(ring.header)
         raise SourceError(
@@ -117,58 +119,60 @@ class NodeTrace(Follower[Header, OpcuaClient]):
             )
 
     def ask(self, link: OpcuaClient) -> Ring:
-        """Read everything; LostError where the server has no values, SourceError for other ones."""
-        header, rest = self.requests
+        """Read everything; LostError if the server has no values, SourceError if they are wrong."""
+        header_nodes, other_nodes = self.requests
         asked_ns = self._clock.now_ns()
-        values = link.read(header)
+        values = link.read(header_nodes)
         header_ns = self._clock.now_ns() - asked_ns
-        values += link.read(rest)
+        values += link.read(other_nodes)
         took_ns = self._clock.now_ns() - asked_ns
-        return self._ring(dict(zip(header + rest, values, strict=True)), header_ns, took_ns)
+        return self._ring(
+            dict(zip(header_nodes + other_nodes, values, strict=True)), header_ns, took_ns
+        )
 
-    def _ring(self, given: dict[Node, Any], header_ns: int, took_ns: int) -> Ring:
-        self._refuse_bad(given)
-        arrays = self._columns(given)
-        header = self._parse(given, len(arrays[0]))
+    def _ring(self, values: dict[Node, Any], header_ns: int, took_ns: int) -> Ring:
+        self._refuse_bad(values)
+        arrays = self._columns(values)
+        header = self._parse(values, len(arrays[0]))
         period_ns = max(header.period_ns, 1)
         return Ring(
             header,
             *arrays,
-            single={name: _number_of(given, node) for name, node in self._single.items()},
-            quality=self._quality(given),
+            single={name: _number_of(values, node) for name, node in self._single.items()},
+            quality=self._quality(values),
             apart=-(-header_ns // period_ns),
             overwritten=-(-took_ns // period_ns) + 1 - header.depth,  # one is being written
         )
 
-    def _refuse_bad(self, given: dict[Node, Any]) -> None:
-        """LostError where the server itself does not stand by what must be right."""
+    def _refuse_bad(self, values: dict[Node, Any]) -> None:
+        """LostError if the server marks a value that must be right as anything but good."""
         trace = self._settings.trace
         for node in (*self._header_nodes, trace.sequences, trace.statuses):
-            code = code_of(given[node])
+            code = code_of(values[node])
             if code & SEVERITY:
                 raise LostError(
                     f"{self._settings.where}: {node} is {status_name(code)}",
                     "does the PLC's program run?",
                 )
 
-    def _parse(self, given: dict[Node, Any], depth: int) -> Header:
+    def _parse(self, values: dict[Node, Any], depth: int) -> Header:
         trace = self._settings.trace
         return Header(
-            sequence=whole(given[trace.sequence], trace.sequence) % WRAP,
-            time_ns=moment(given[trace.time], trace.time),
-            boot=whole(given[trace.boot], trace.boot),
-            period_ns=whole(given[trace.period], trace.period) * 1000,
+            sequence=whole(values[trace.sequence], trace.sequence) % WRAP,
+            time_ns=moment(values[trace.time], trace.time),
+            boot=whole(values[trace.boot], trace.boot),
+            period_ns=whole(values[trace.period], trace.period) * 1000,
             depth=depth,
         )
 
-    def _columns(self, given: dict[Node, Any]) -> tuple[Integers, Integers, Floats]:
+    def _columns(self, values: dict[Node, Any]) -> tuple[Integers, Integers, Floats]:
         """Sequences, statuses and pressures, of one length."""
         trace = self._settings.trace
-        sequences = wholes(given[trace.sequences], trace.sequences)
-        statuses = wholes(given[trace.statuses], trace.statuses)
-        if readable(given[trace.pressures]):
-            pressures = numbers(given[trace.pressures], trace.pressures)
-        else:  # the server has none to give, and says why in the quality
+        sequences = wholes(values[trace.sequences], trace.sequences)
+        statuses = wholes(values[trace.statuses], trace.statuses)
+        if readable(values[trace.pressures]):
+            pressures = numbers(values[trace.pressures], trace.pressures)
+        else:  # the server has none, and the quality says why
             pressures = np.full(len(sequences), np.nan)
         if not len(sequences) == len(statuses) == len(pressures):
             lengths = f"{len(sequences)}, {len(statuses)} and {len(pressures)}"
@@ -178,23 +182,23 @@ class NodeTrace(Follower[Header, OpcuaClient]):
             )
         return sequences, statuses, pressures
 
-    def _quality(self, given: dict[Node, Any]) -> int:
-        return quality(code_of(given[self._settings.trace.pressures]))
+    def _quality(self, values: dict[Node, Any]) -> int:
+        return quality(code_of(values[self._settings.trace.pressures]))
 
     def _read(self, link: OpcuaClient) -> Samples:
-        """Whatever is new and was announced."""
-        ring = self._proven(link)
-        self._place(ring.header)
+        """Announced records that are new."""
+        ring = self._verified_ring(link)
+        self._advance_to(ring.header)
         first, newest = self._next, self._newest
-        wanted = np.arange(first, max(first, newest + 1))
-        slots = wanted % WRAP % ring.header.depth
-        valid = ring.sequences[slots] == wanted % WRAP
-        valid &= wanted > newest + ring.overwritten
-        sequence = self._pass(first, valid)
+        expected = np.arange(first, max(first, newest + 1))
+        slots = expected % WRAP % ring.header.depth
+        valid = ring.sequences[slots] == expected % WRAP
+        valid &= expected > newest + ring.overwritten
+        sequence = self._consume(first, valid)
         return self._stamp(self._decode(ring, slots[valid]), ring.header, sequence)
 
-    def _steady(self, ring: Ring) -> Ring:
-        return replace(ring, header=self._steadied(ring.header, ring.apart))
+    def _smoothed_ring(self, ring: Ring) -> Ring:
+        return replace(ring, header=self._smoothed(ring.header, ring.apart))
 
     def _decode(self, ring: Ring, slots: Integers) -> Samples:
         tags = self._settings.tags
@@ -202,7 +206,8 @@ class NodeTrace(Follower[Header, OpcuaClient]):
         status = ring.statuses[slots]
         block["commands"] = status & COMMANDS
         put_bits(
-            block, {name: (status >> bit & 1).astype(float) for name, bit in self._told.items()}
+            block,
+            {name: (status >> bit & 1).astype(float) for name, bit in self._status_bits.items()},
         )
         raw = {name: once(value, name, len(block)) for name, value in ring.single.items()}
         fixed = self._settings.ambient_mbar * MBAR
@@ -217,14 +222,14 @@ class NodeTrace(Follower[Header, OpcuaClient]):
         return block
 
 
-def _holds_what_it_announces(ring: Ring) -> bool:
-    """Whether at least one of the newest records carries its sequence: some may be torn."""
+def _holds_announced_records(ring: Ring) -> bool:
+    """Whether one of the newest records at least carries its sequence: some may be torn."""
     newest = ring.header.sequence
     announced = np.arange(max(0, newest - 2 * RESERVE), newest + 1)
     return bool((ring.sequences[announced % ring.header.depth] == announced).any())
 
 
-def _number_of(given: dict[Node, Any], node: Node) -> float:
-    """A single value; NaN where the server does not stand by it."""
-    bad = quality(code_of(given[node])) & UNUSABLE
-    return float("nan") if bad else number(given[node], node)
+def _number_of(values: dict[Node, Any], node: Node) -> float:
+    """A single value; NaN where unusable."""
+    unusable = quality(code_of(values[node])) & UNUSABLE
+    return float("nan") if unusable else number(values[node], node)

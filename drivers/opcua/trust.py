@@ -1,8 +1,8 @@
-"""Whether the certificate of a partner over OPC UA is believed (OPC 10000-4, 6.1.3).
+"""Validation of a peer's certificate over OPC UA (OPC 10000-4, 6.1.3).
 
-Trust, revocation, key usage and ApplicationUri are the library's. It has no check of the host: a
-certificate that lies in ``trusted/`` itself is known as it is, and one that an authority there has
-signed must name the host that we speak to.
+The library checks trust, revocation, key usage and ApplicationUri, but not the host. A certificate
+that lies in ``trusted/`` itself is accepted for any host. One that an authority there has signed
+must name the host that we connect to.
 """
 
 import ipaddress
@@ -21,18 +21,18 @@ from cryptography import x509
 from drivers.opcua import certificates
 from twin.errors import SourceError
 
-# What it refuses is said by us; it would write a traceback.
+# We report what it refuses; it would log a traceback.
 logging.getLogger("asyncuagds.validate").setLevel(logging.CRITICAL)
 
 
 class Peer(Enum):
-    """What the partner is."""
+    """The role of the peer."""
 
     CLIENT = _Options.PEER_CLIENT
     SERVER = _Options.PEER_SERVER
 
 
-_WHY = {  # what is wrong, and what to do
+_FAULTS = {  # what is wrong, and what to do
     ua.StatusCodes.BadCertificateUriInvalid: (
         "does not name the application that it came from",
         "have a certificate made for the ApplicationUri that it tells",
@@ -58,36 +58,36 @@ async def check(
     application: ua.ApplicationDescription,
     folder: Path,
     now: datetime,
-    whose: str,
+    owner: str,
     peer: Peer,
     host: str = "",
 ) -> None:
-    """SourceError where the certificate of ``whose`` is not to be believed.
+    """SourceError if the certificate of ``owner`` is not to be trusted.
 
-    ``application`` is what it says of itself; ``host`` where we look for a server.
+    ``application`` is the peer's own description; ``host`` is where we look for a server.
     """
-    who = f"{whose}: its certificate ({certificates.described(certificate)})"
-    certificates.check_time(certificate, now, who)
+    subject = f"{owner}: its certificate ({certificates.described(certificate)})"
+    certificates.check_time(certificate, now, subject)
     options = _Options.TRUSTED_VALIDATION & ~_Options.TIME_RANGE | peer.value
     validator = CertificateValidator(options, await _store(folder))
     try:
         await validator.validate(certificate, application)
     except ServiceError as error:
         if error.code == ua.StatusCodes.BadCertificateUntrusted:
-            raise certificates.untrusted(certificate, folder, who) from error
-        why, hint = _WHY[error.code]
-        raise SourceError(f"{who} {why}", hint) from error
+            raise certificates.untrusted(certificate, folder, subject) from error
+        fault, hint = _FAULTS[error.code]
+        raise SourceError(f"{subject} {fault}", hint) from error
     is_pinned = certificates.lies_in_trusted(certificate, folder)
     if host and not is_pinned and not _is_for(certificate, host):
         raise SourceError(
-            f"{who} is not for {host}",
+            f"{subject} is not for {host}",
             f"have one made for that name, or put this very certificate into"
             f" {folder / certificates.TRUSTED}",
         )
 
 
 async def _store(folder: Path) -> TrustStore:
-    """What lies in the folder now; SourceError where a file there is of no use."""
+    """The folder's present content; SourceError if a file there is unusable."""
     trusted, revoked = folder / certificates.TRUSTED, folder / certificates.REVOKED
     store = TrustStore([trusted], [revoked])
     try:
@@ -108,5 +108,5 @@ def _is_for(certificate: x509.Certificate, host: str) -> bool:
     try:
         return ipaddress.ip_address(host) in names.get_values_for_type(x509.IPAddress)
     except ValueError:  # a name
-        known = {name.lower() for name in names.get_values_for_type(x509.DNSName)}
-        return host.lower() in known
+        listed = {name.lower() for name in names.get_values_for_type(x509.DNSName)}
+        return host.lower() in listed

@@ -1,4 +1,4 @@
-"""OPC UA values as numbers, times and quality; whatever a server sends, it is judged here."""
+"""OPC UA values as numbers, times and quality; whatever a server sends is checked here."""
 
 from datetime import UTC, datetime, timedelta
 from typing import Any
@@ -44,7 +44,7 @@ BEYOND = {ua.StatusCodes.UncertainEngineeringUnitsExceeded, ua.StatusCodes.BadOu
 
 
 def code_of(value: ua.DataValue) -> int:
-    """Its StatusCode; one that is not sent is good."""
+    """Its StatusCode; a missing one means good."""
     return int(value.StatusCode.value) if value.StatusCode is not None else 0
 
 
@@ -70,7 +70,7 @@ def status_name(code: int) -> str:
 
 
 def time_ns(value: ua.DataValue) -> int | None:
-    """When the source gave the value, ns since 1970; None if it gives no time that can be."""
+    """When the source gave the value, ns since 1970; None without a plausible time."""
     for stamp in (value.SourceTimestamp, value.ServerTimestamp):
         if stamp is not None and 0 < (ns := nanoseconds(stamp)) < LATEST_NS:  # 1601 means none
             return ns
@@ -78,7 +78,7 @@ def time_ns(value: ua.DataValue) -> int | None:
 
 
 def nanoseconds(stamp: datetime) -> int:
-    """Nanoseconds since 1970; OPC UA means UTC where it does not say."""
+    """Nanoseconds since 1970; OPC UA means UTC where a time has no zone."""
     aware = stamp if stamp.tzinfo is not None else stamp.replace(tzinfo=UTC)
     return (aware - EPOCH) // timedelta(microseconds=1) * 1000
 
@@ -89,7 +89,7 @@ def readable(value: ua.DataValue) -> bool:
 
 
 def _is_many(variant: ua.Variant) -> bool:
-    """Whether it is an array; a single value that claims dimensions becomes one in the library."""
+    """Whether it is an array; the library makes one of a single value that claims dimensions."""
     return bool(variant.is_array or isinstance(variant.Value, list))
 
 
@@ -112,7 +112,7 @@ def whole(value: ua.DataValue, node: Node) -> int:
 
 
 def moment(value: ua.DataValue, node: Node) -> int:
-    """A time in ns since 1970, from a whole number of them or a DateTime; 0 where it is before."""
+    """A time in ns since 1970, from a whole number of ns or a DateTime; 0 if it is earlier."""
     variant = value.Value
     if readable(value) and not _is_many(variant) and variant.VariantType == _T.DateTime:
         ns = nanoseconds(variant.Value)
@@ -142,22 +142,24 @@ def wholes(value: ua.DataValue, node: Node) -> Integers:
     return np.array(_array(value, node, fitting, "an array of whole numbers"), np.int64)
 
 
-def _array(value: ua.DataValue, node: Node, kinds: set[ua.VariantType], wanted: str) -> list[Any]:
+def _array(value: ua.DataValue, node: Node, kinds: set[ua.VariantType], expected: str) -> list[Any]:
     variant = value.Value
     fits = readable(value) and variant.is_array and variant.VariantType in kinds
     if not fits or (variant.Dimensions and not _is_flat(variant)):
-        raise wrong_type(node, variant, wanted)
-    listed: list[Any] = variant.Value
-    return listed
+        raise wrong_type(node, variant, expected)
+    elements: list[Any] = variant.Value
+    return elements
 
 
 def _is_flat(variant: ua.Variant) -> bool:
-    """Whether an array is of one dimension; the library fills up what is missing with lists."""
-    return len(variant.Dimensions) == 1 and not any(isinstance(one, list) for one in variant.Value)
+    """Whether an array has one dimension; the library pads missing elements with lists."""
+    return len(variant.Dimensions) == 1 and not any(
+        isinstance(item, list) for item in variant.Value
+    )
 
 
 def typed(number: float, kind: ua.VariantType, node: Node) -> ua.Variant:
-    """A number as a node of this type takes it; SourceError if it cannot hold it."""
+    """A number as a variant of type ``kind``; SourceError if the type cannot hold it."""
     if kind == _T.Boolean:
         return ua.Variant(bool(number), kind)
     if kind not in WHOLE:
@@ -172,14 +174,14 @@ def typed(number: float, kind: ua.VariantType, node: Node) -> ua.Variant:
     return ua.Variant(round(number), kind)
 
 
-def wrong_type(node: Node, variant: ua.Variant | None, wanted: str) -> SourceError:
-    """The error where a node holds something else, or nothing yet."""
+def wrong_type(node: Node, variant: ua.Variant | None, expected: str) -> SourceError:
+    """The error for a node of another type than ``expected``, or one that holds nothing yet."""
     error: type[SourceError] = AbsentError
-    held = "nothing"
+    content = "nothing"
     if variant is not None and variant.VariantType != _T.Null:
-        held = f"{'an array of ' if variant.is_array else ''}{variant.VariantType.name}"
+        content = f"{'an array of ' if variant.is_array else ''}{variant.VariantType.name}"
         error = SourceError
     return error(
-        f"{node} holds {held}; expected is {wanted}",
+        f"{node} holds {content}; expected is {expected}",
         "compare the nodes in [driver] with the server's; twin probe shows what they hold",
     )
