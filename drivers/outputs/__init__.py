@@ -1,1 +1,1 @@
-"""What the twin gives to others: values written to a PLC, results served over OPC UA."""
+"""Outputs of the twin: values written to a PLC, results served over OPC UA."""

@@ -1,7 +1,7 @@
 """Alarms of the twins as OPC UA conditions: events with their state, refresh, and acknowledgement.
 
-What is behind an alarm is not here: a change comes as plain data, and acknowledging one is asked of
-whoever gave the change.
+This module knows no alarm objects: a change comes as plain data, and its source is asked to
+acknowledge an alarm.
 """
 
 import asyncio
@@ -27,10 +27,10 @@ from twin.errors import TwinError
 from twin.login import Authenticator
 from twin.users import Role
 
-Acknowledge = Callable[[str, str], None]  # asks it: which alarm, and who does
+Acknowledge = Callable[[str, str], None]  # takes the alarm's name, and the person's
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 SEVERITY = {"low": 300, "medium": 600, "high": 900}
-_KNOWN = 16  # events of a condition by which it can be acknowledged
+_KEPT_EVENTS = 16  # events of a condition by which it can be acknowledged
 _T, _S, _I = ua.VariantType, ua.StatusCodes, ua.ObjectIds
 
 
@@ -40,7 +40,7 @@ CALLER: ContextVar[Person | None] = ContextVar("caller", default=None)
 
 
 class Session(security.Session):
-    """A session whose methods can know whose it is."""
+    """A session whose methods know their caller."""
 
     async def call(self, params: Any) -> Any:
         """Call methods; in them ``CALLER`` is the user of this session."""
@@ -52,7 +52,7 @@ class Session(security.Session):
 
 
 class CallerAwareServer(GuardedServer):
-    """What is inside of a server that refreshes conditions, and whose methods know who calls."""
+    """The core of a server that refreshes conditions, and whose methods know their caller."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -67,21 +67,21 @@ class CallerAwareServer(GuardedServer):
 
 
 class SubtypesToo(monitored_item_service.WhereClauseEvaluator):  # type: ignore[misc]
-    """The library takes OfType for exactly that type: a client that asks for alarms got none.
+    """Lets OfType match subtypes too: the library alone gives no alarms to a client that asks.
 
-    What is around a refresh goes to everybody, whatever they want.
+    The events around a refresh go to every client, whatever its filter.
     """
 
     def eval(self, event: Any) -> bool:
-        """Whether a client wants an event."""
+        """Whether the client's filter lets an event pass."""
         return event.EventType in _AROUND_REFRESH or bool(super().eval(event))
 
     def _eval_el(self, index: int, event: Any) -> Any:
         element = self.elements[index]
         if element.FilterOperator != ua.FilterOperator.OfType:
             return super()._eval_el(index, event)
-        wanted = self._eval_op(element.FilterOperands[0], event)
-        return wanted in _with_supertypes(self._aspace, event.EventType)
+        wanted_type = self._eval_op(element.FilterOperands[0], event)
+        return wanted_type in _with_supertypes(self._aspace, event.EventType)
 
 
 monitored_item_service.WhereClauseEvaluator = SubtypesToo
@@ -91,16 +91,16 @@ _AROUND_REFRESH = (ua.NodeId(_I.RefreshStartEventType), ua.NodeId(_I.RefreshEndE
 
 
 def _with_supertypes(space: AddressSpace, kind: ua.NodeId) -> list[ua.NodeId]:
-    found = []
+    chain = []
     while (data := space.get(kind)) is not None:
-        found.append(kind)
-        above = [
-            one.NodeId
-            for one in data.references
-            if one.ReferenceTypeId == ua.NodeId(_I.HasSubtype) and not one.IsForward
+        chain.append(kind)
+        supertypes = [
+            reference.NodeId
+            for reference in data.references
+            if reference.ReferenceTypeId == ua.NodeId(_I.HasSubtype) and not reference.IsForward
         ]
-        kind = above[0] if above else ua.NodeId()
-    return found
+        kind = supertypes[0] if supertypes else ua.NodeId()
+    return chain
 
 
 # --- conditions ---------------------------------------------------------------------------------
@@ -108,7 +108,7 @@ def _with_supertypes(space: AddressSpace, kind: ua.NodeId) -> list[ua.NodeId]:
 
 @dataclass(frozen=True)
 class Source:
-    """An ejector whose alarms these are: its node, its name, and where its values are."""
+    """The ejector that raises the alarms: its node, its name, and the nodes of its values."""
 
     node: ua.NodeId
     name: str
@@ -118,14 +118,14 @@ class Source:
 
 @dataclass
 class Condition:
-    """One alarm."""
+    """One alarm as an OPC UA condition."""
 
     name: str
     node: ua.NodeId
     source: Source
     acknowledged: bool = True
     severity: int = 0
-    events: deque[bytes] = field(default_factory=lambda: deque(maxlen=_KNOWN))
+    events: deque[bytes] = field(default_factory=lambda: deque(maxlen=_KEPT_EVENTS))
 
 
 class Conditions:
@@ -133,27 +133,27 @@ class Conditions:
 
     def __init__(self, server: Server, authenticator: Authenticator | None) -> None:
         self._server, self._authenticator = server, authenticator
-        self._known: dict[ua.NodeId, Condition] = {}
+        self._by_node: dict[ua.NodeId, Condition] = {}
         method = ua.NodeId(_I.AcknowledgeableConditionType_Acknowledge)
         server.link_method(server.get_node(method), self._acknowledge)
 
     async def tell(self, source: Source, change: Mapping[str, Any]) -> None:
-        """Send an event with the state of an alarm, and keep it for a refresh while it concerns."""
+        """Send an event with an alarm's state; a refresh repeats it while the alarm is retained."""
         name = str(change["alarm"])
         node = ua.NodeId(f"{source.name}.Alarms.{name}", source.node.NamespaceIndex)
-        condition = self._known.get(node)
+        condition = self._by_node.get(node)
         if condition is None:
-            condition = self._known[node] = Condition(name, node, source)
+            condition = self._by_node[node] = Condition(name, node, source)
             await self._add(condition, _kind(source, change))
         event = _event(condition, change)
         condition.acknowledged = bool(change["acknowledged"])
         condition.severity = event.Severity
         condition.events.append(event.EventId)
-        await self._show(condition, event)
+        await self._write_fields(condition, event)
         await self._server.iserver.subscription_service.trigger_event(event)
 
     async def _add(self, condition: Condition, kind: int) -> None:
-        """Lay out an alarm below its ejector: what its type demands."""
+        """Create the nodes of an alarm below its ejector: those that its type requires."""
         index = condition.node.NamespaceIndex
         group = self._server.get_node(ua.NodeId(f"{condition.source.name}.Alarms", index))
         names = condition.node, ua.QualifiedName(condition.name, index)
@@ -161,7 +161,7 @@ class Conditions:
         node, *_ = await instantiate(group, of_type, *names, idx=index, instantiate_optional=False)
         self._server.link_method(await node.get_child("0:Acknowledge"), self._acknowledge)
 
-    async def _show(self, condition: Condition, event: Event) -> None:
+    async def _write_fields(self, condition: Condition, event: Event) -> None:
         """Write the fields of an event into the variables of its alarm."""
         index, top = condition.node.NamespaceIndex, condition.node.Identifier
         for name, field_ in event.get_event_props_as_fields_dict().items():
@@ -172,33 +172,33 @@ class Conditions:
     async def _acknowledge(
         self, node: ua.NodeId, event: ua.Variant, comment: ua.Variant
     ) -> ua.StatusCode:
-        condition, person = self._known.get(node), CALLER.get()
+        condition, person = self._by_node.get(node), CALLER.get()
         if condition is None:
             return ua.StatusCode(_S.BadNodeIdUnknown)
         if self._authenticator is None or person is None or not person.name:
             return ua.StatusCode(_S.BadUserAccessDenied)
-        said = _text(comment.Value)
-        tell = partial(self._authenticator.audit.record, who=person.name, address=person.address)
-        about = {"unit": condition.source.name, "alarm": condition.name, "comment": said}
+        remark = _text(comment.Value)
+        record = partial(self._authenticator.audit.record, who=person.name, address=person.address)
+        details = {"unit": condition.source.name, "alarm": condition.name, "comment": remark}
         try:
             role = self._authenticator.users.role(person.name)
             if role is None or not role.covers(Role.ACKNOWLEDGE):
-                await asyncio.to_thread(tell, Act.DENIED, wanted="acknowledged", **about)
+                await asyncio.to_thread(record, Act.DENIED, wanted="acknowledged", **details)
                 return ua.StatusCode(_S.BadUserAccessDenied)
-            if (refused := _refused(condition, event.Value)) is not None:
+            if (refused := _refusal(condition, event.Value)) is not None:
                 return refused
-            who = f"{person.name} ({said})" if said else person.name
+            actor = f"{person.name} ({remark})" if remark else person.name
             assert condition.source.acknowledge is not None
-            # Both may wait: for a database, and for a disk.
-            await asyncio.to_thread(condition.source.acknowledge, condition.name, who)
-            await asyncio.to_thread(tell, "acknowledged", **about)
+            # Both may block: on a database, and on a disk.
+            await asyncio.to_thread(condition.source.acknowledge, condition.name, actor)
+            await asyncio.to_thread(record, "acknowledged", **details)
         except TwinError:
             return ua.StatusCode(_S.BadResourceUnavailable)
         return ua.StatusCode(_S.Good)
 
 
-def _refused(condition: Condition, event: Any) -> ua.StatusCode | None:
-    """Why nobody can acknowledge an alarm by an event of it now."""
+def _refusal(condition: Condition, event: Any) -> ua.StatusCode | None:
+    """The status that refuses to acknowledge the alarm by ``event``; None if it is possible."""
     if condition.source.acknowledge is None:
         return ua.StatusCode(_S.BadUserAccessDenied)
     if event not in condition.events:
@@ -221,14 +221,14 @@ def _event(condition: Condition, change: Mapping[str, Any]) -> Event:
 
 
 def _kind(source: Source, change: Mapping[str, Any]) -> int:
-    """The type of an alarm: a deviation where there is something to compare."""
+    """The type of an alarm: a deviation if its quantity has a measured and an expected value."""
     compares = str(change["quantity"]) in source.values
     return int(_I.NonExclusiveDeviationAlarmType if compares else _I.OffNormalAlarmType)
 
 
 def _fields(condition: Condition, change: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     active, acknowledged = bool(change["active"]), bool(change["acknowledged"])
-    quiet = change["state"] in ("shelved", "suppressed", "out_of_service")
+    silenced = change["state"] in ("shelved", "suppressed", "out_of_service")
     inputs = condition.source.values.get(str(change["quantity"]))
     at = EPOCH + timedelta(microseconds=int(change["host_ns"]) // 1000)
     severity = SEVERITY[change["priority"]]
@@ -251,7 +251,7 @@ def _fields(condition: Condition, change: Mapping[str, Any]) -> dict[str, tuple[
         "LastSeverity": (condition.severity or severity, _T.UInt16),
         "Comment": (ua.LocalizedText(""), _T.LocalizedText),
         "ClientUserId": (str(change["who"]), _T.String),
-        "SuppressedOrShelved": (quiet, _T.Boolean),
+        "SuppressedOrShelved": (silenced, _T.Boolean),
         **_state("EnabledState", True, "Enabled", "Disabled"),
         **_state("AckedState", acknowledged, "Acknowledged", "Unacknowledged"),
         **_state("ActiveState", active, "Active", "Inactive"),
@@ -264,7 +264,7 @@ def _fields(condition: Condition, change: Mapping[str, Any]) -> dict[str, tuple[
     return fields
 
 
-def _state(name: str, is_so: bool, so: str, not_so: str) -> dict[str, tuple[Any, Any]]:
-    """A state of two, in words and as what programs read."""
-    words = ua.LocalizedText(so if is_so else not_so)
-    return {name: (words, _T.LocalizedText), f"{name}/Id": (is_so, _T.Boolean)}
+def _state(name: str, holds: bool, true_text: str, false_text: str) -> dict[str, tuple[Any, Any]]:
+    """A two-valued state, as text and as the Boolean that programs read."""
+    text = ua.LocalizedText(true_text if holds else false_text)
+    return {name: (text, _T.LocalizedText), f"{name}/Id": (holds, _T.Boolean)}

@@ -1,4 +1,4 @@
-"""Nodes of an OPC UA server of ours: quantities with their unit and range, states with names."""
+"""Nodes of our own OPC UA server: quantities with unit and range, states with names."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ class Unit:
 
     @property
     def information(self) -> ua.EUInformation:
-        """As OPC UA has it: the code's letters are the number (OPC 10000-8)."""
+        """The unit for OPC UA: the code's bytes are its number (OPC 10000-8)."""
         return ua.EUInformation(
             NamespaceUri=UNECE if self.code else "",
             UnitId=int.from_bytes(self.code.encode(), "big") if self.code else -1,
@@ -57,7 +57,7 @@ async def add_state(server: Server, group: Node, names: Names, states: Sequence[
 
 
 async def _add(server: Server, group: Node, names: Names, kind: int) -> Node:
-    """What the type has besides, and may be left out, is."""
+    """Add a node of type ``kind``, without the optional nodes of its type."""
     node, *_ = await instantiate(
         group,
         server.get_node(kind),

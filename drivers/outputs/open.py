@@ -1,4 +1,4 @@
-"""What of a configuration is opened for others: what is written to its PLC, and its results."""
+"""Open a configuration's outputs: the writer to its PLC, and the server of its results."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 def open_writer(
     document: Document, address: str = "", lines: ConnectionPool | None = None
 ) -> Writer:
-    """Whoever writes to the PLC that ``[driver]`` names what ``[hil]`` lists.
+    """The writer of what ``[hil]`` lists, to the PLC that ``[driver]`` names.
 
-    Raises ConfigError where nothing is listed, SourceError where the PLC does not answer.
+    Raises ConfigError if nothing is listed, SourceError if the PLC does not answer.
     """
     if not document.tables.get("hil", {}).get("tags"):
         raise ConfigError(
@@ -43,33 +43,33 @@ def open_writer(
 def open_results(
     documents: Sequence[Document], figures: Mapping[str, str]
 ) -> Iterator["Callable[..., Results] | None"]:
-    """Serve the results of all configurations that want it, at one place; None if none does.
+    """Serve the results of all configurations that ask for it by one server; None if none does.
 
-    Gives ``ResultsServer.sink``, which makes a sink of an asset. ConfigError if two name different
-    places; for the others see ``ResultsServer``.
+    Gives ``ResultsServer.sink``, which makes an asset's sink. ConfigError if two configurations
+    differ in their settings; for other errors see ``ResultsServer``.
     """
-    wanted = _wanted(documents)
-    if wanted is None:
+    settings = _agreed_settings(documents)
+    if settings is None:
         yield None
         return
     from drivers.outputs.results import ResultsServer  # noqa: PLC0415 - the library takes its time
 
-    with ResultsServer(wanted, figures) as server:
+    with ResultsServer(settings, figures) as server:
         yield server.sink
 
 
-def _wanted(documents: Sequence[Document]) -> ResultsSettings | None:
-    """The settings that all agree on who serve their results."""
+def _agreed_settings(documents: Sequence[Document]) -> ResultsSettings | None:
+    """The settings that all configurations with results share; None if there are no such ones."""
     first: tuple[str, ResultsSettings] | None = None
     for document in documents:
         folder = Path(document.name).parent  # files lie there, wherever the program was started
-        one = document.section(ResultsSettings, "results").below(folder)
-        if not one.opcua:
+        settings = document.section(ResultsSettings, "results").below(folder)
+        if not settings.opcua:
             continue
-        if first is not None and first[1] != one:
+        if first is not None and first[1] != settings:
             raise ConfigError(
                 f"{first[0]} and {document.name} serve their results differently under [results]",
                 "one server stands for all ejectors of a process: write the same in both",
             )
-        first = document.name, one
+        first = document.name, settings
     return first[1] if first else None

@@ -1,8 +1,8 @@
-"""What the twin finds, served over OPC UA by a process of its own (``drivers.outputs.serve``).
+"""Results of the twins, served over OPC UA by a process of its own (``drivers.outputs.serve``).
 
-The loops leave what is newest in their ``Results`` and go on. A thread here takes it at an even
-pace and sends what has changed; it waits for each answer, so that nothing piles up. A server that
-dies or does not answer is ended and started again, with all that it showed; the loops are told.
+Each loop leaves its newest results in its ``Results`` and goes on. A thread here sends the changes
+at an even pace; it waits for each answer, so that nothing piles up. A server that dies or does not
+answer is ended and started again with all that it showed; the loops are told.
 """
 
 import logging
@@ -28,16 +28,16 @@ from twin.backoff import Backoff
 from twin.errors import SourceError, TwinError
 
 PATIENCE_S = 60.0  # for the library to build its address space on a busy machine
-SILENCE_S = 10.0  # a server that takes longer with what is new has hung
-LOOK_S = 0.05  # between looks for what the server asks, and whether to stop
+SILENCE_S = 10.0  # a server that takes longer for an update has hung
+LOOK_S = 0.05  # between checks for requests of the server, and for the end
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # before a server is started again
-SOUND_S = 60.0  # a server that ran so long and dies is told of again
+SOUND_S = 60.0  # after a longer run the death of a server is reported again
 NICE = 5  # beyond the loop's own
 
 _log = logging.getLogger(__name__)
 
-Acknowledge = Callable[[str, str], None]  # asks it: which alarm, and who does
-Tell = Callable[[str], None]  # told that the server is down, and why
+Acknowledge = Callable[[str, str], None]  # takes the alarm's name, and the person's
+Tell = Callable[[str], None]  # receives that the server is down, and why
 
 
 class DownError(Exception):
@@ -46,7 +46,7 @@ class DownError(Exception):
 
 @dataclass
 class Branch:
-    """What one ejector has to show, and what of it the server has."""
+    """The results of one ejector, and what the server already shows of them."""
 
     results: Results
     kind: str
@@ -57,15 +57,17 @@ class Branch:
     laid_out: threading.Event = field(default_factory=threading.Event)
 
     def news(self) -> tuple[str, dict[str, Reading], list[Mapping[str, Any]]]:
-        """What has changed since the last time."""
+        """Asset, changed readings and changes of alarms since the last call."""
         changes = self.changes()
         readings = self.results.readings()
-        changed = {name: one for name, one in readings.items() if one != self.shown.get(name)}
+        changed = {
+            name: reading for name, reading in readings.items() if reading != self.shown.get(name)
+        }
         self.shown = readings
         return self.results.asset, changed, changes
 
     def changes(self) -> list[Mapping[str, Any]]:
-        """How alarms have changed; those that still concern anybody are kept."""
+        """Changes of alarms since the last call; active or unacknowledged ones are kept."""
         changes = self.results.changes()
         for change in changes:
             self.standing.pop(change["alarm"], None)
@@ -75,35 +77,35 @@ class Branch:
 
 
 class Server:
-    """One process that serves; ``port`` is where. DownError where it has ended or hangs."""
+    """The process that serves. DownError once it has ended or hangs."""
 
     def __init__(self, settings: ResultsSettings, figures: Mapping[str, str]) -> None:
         if not hasattr(os, "posix_spawn"):
             raise SourceError(
                 "results are served on Linux only", "leave out opcua = true under [results]"
             )
-        ours, theirs = socket.socketpair()
+        parent_end, child_end = socket.socketpair()
         seconds = struct.pack("@ll", round(SILENCE_S), 0)  # struct timeval: s, µs
         for option in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):
-            ours.setsockopt(socket.SOL_SOCKET, option, seconds)
-        self._complaint = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
-        with theirs:
-            command = [sys.executable, "-m", "drivers.outputs.serve", str(theirs.fileno())]
+            parent_end.setsockopt(socket.SOL_SOCKET, option, seconds)
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
+        with child_end:
+            command = [sys.executable, "-m", "drivers.outputs.serve", str(child_end.fileno())]
             self._process = subprocess.Popen(  # noqa: S603  # our own program
                 command,
-                pass_fds=[theirs.fileno()],
-                stderr=self._complaint,
-                start_new_session=True,  # a Ctrl-C is the loop's to answer
+                pass_fds=[child_end.fileno()],
+                stderr=self._stderr,
+                start_new_session=True,  # Ctrl-C goes to the loop alone
             )
-        self._pipe = Connection(ours.detach())
-        with suppress(OSError):  # where that is not allowed it runs as it is
-            own = os.getpriority(os.PRIO_PROCESS, 0)
-            os.setpriority(os.PRIO_PROCESS, self._process.pid, own + NICE)
+        self._pipe = Connection(parent_end.detach())
+        with suppress(OSError):  # without the right to it, the priority stays
+            niceness = os.getpriority(os.PRIO_PROCESS, 0)
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, niceness + NICE)
         self.send((settings, dict(figures)))
 
     @property
     def pid(self) -> int:
-        """Of the process."""
+        """Id of the process."""
         return self._process.pid
 
     @property
@@ -112,49 +114,49 @@ class Server:
         return not self._pipe.closed
 
     def send(self, message: object) -> None:
-        """Send it; DownError if nobody takes it."""
+        """Send a message; DownError if the process does not take it."""
         try:
             self._pipe.send(message)
         except OSError as error:
-            raise DownError(self._why()) from error
+            raise DownError(self._cause()) from error
 
-    def heard(self, seconds: float) -> Any:
-        """The next message, or None if none comes within so long; DownError if none will come."""
+    def receive(self, seconds: float) -> Any:
+        """The next message; None if none comes in time, DownError if none can come any more."""
         try:
             return self._pipe.recv() if self._pipe.poll(seconds) else None
         except (EOFError, OSError) as error:
-            raise DownError(self._why()) from error
+            raise DownError(self._cause()) from error
 
-    def _why(self) -> str:
+    def _cause(self) -> str:
         try:
             code = self._process.wait(1.0)
         except subprocess.TimeoutExpired:
             return "it does not answer"
-        self._complaint.seek(0)
-        *_, last = [b"", *self._complaint.read().splitlines()]
-        said = last.decode(errors="replace")
-        return f"it was ended by signal {-code}" if code < 0 else said or f"exit code {code}"
+        self._stderr.seek(0)
+        *_, last = [b"", *self._stderr.read().splitlines()]
+        last_line = last.decode(errors="replace")
+        return f"it was ended by signal {-code}" if code < 0 else last_line or f"exit code {code}"
 
     def close(self) -> None:
-        """Have it end; one that does not is ended."""
+        """Ask the process to end; kill it if it does not."""
         self._pipe.close()
         try:
             self._process.wait(SILENCE_S)
         except subprocess.TimeoutExpired:
             self.kill()
-        self._complaint.close()
+        self._stderr.close()
 
     def kill(self) -> None:
-        """End it at once."""
+        """End the process at once."""
         self._process.kill()
         self._process.wait()
 
 
 class ResultsServer:
-    """A server for all twins of a process; use it in a ``with``, and before the loops begin.
+    """A server for all twins of a process; enter its ``with`` before the loops begin.
 
-    ``figures`` are the key figures of a cycle and their units. SourceError where the address
-    cannot be had, ConfigError where certificates or passwords cannot be used.
+    ``figures`` are the key figures of a cycle and their units. SourceError if the address is not
+    available, ConfigError if certificates or passwords cannot be used.
     """
 
     def __init__(self, settings: ResultsSettings, figures: Mapping[str, str]) -> None:
@@ -183,12 +185,12 @@ class ResultsServer:
 
     @property
     def url(self) -> str:
-        """Where it is reached."""
+        """The address for clients."""
         return f"opc.tcp://{self._settings.host}:{self._settings.port}"
 
     @property
     def pid(self) -> int:
-        """Of the process that serves."""
+        """Id of the process that serves."""
         return self._server.pid
 
     def sink(
@@ -198,10 +200,10 @@ class ResultsServer:
         acknowledge: Acknowledge | None = None,
         tell: Tell | None = None,
     ) -> Results:
-        """Give a sink whose rows are served as ``asset``, of the type ``kind`` of ejectors.
+        """Give a sink whose rows are served as ``asset``, an ejector of type ``kind``.
 
-        ``acknowledge`` is asked to acknowledge an alarm, in a thread; it may raise TwinError.
-        ``tell`` is told, in a thread, that the server is down; it is started again by itself.
+        ``acknowledge`` is called to acknowledge an alarm, in a thread; it may raise TwinError.
+        ``tell`` is called in a thread when the server is down; it restarts by itself.
         """
         branch = Branch(Results(asset, tuple(self._figures)), kind, acknowledge, tell)
         self._branches.append(branch)
@@ -211,51 +213,53 @@ class ResultsServer:
     # --- in its own thread ----------------------------------------------------------------------
 
     def _run(self) -> None:
-        backoff, told = Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S), False
+        backoff, reported = Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S), False
         while not self._stop.is_set():
-            begun = time.monotonic()
+            started = time.monotonic()
             try:
-                self._begin_again()
+                self._restart()
                 self._show_until_stopped()
             except (DownError, TwinError) as error:
-                if time.monotonic() - begun > SOUND_S:
+                if time.monotonic() - started > SOUND_S:
                     backoff.reset()
-                    told = False
+                    reported = False
                 self._server.close()
                 pause_s = backoff.next_s()
-                if not told:
-                    self._say(str(error), pause_s)
-                    told = True
+                if not reported:
+                    self._report_down(str(error), pause_s)
+                    reported = True
                 self._wait(pause_s)
         self._server.close()
 
-    def _say(self, why: str, pause_s: float) -> None:
-        text = f"the results server (OPC UA) is down: {why}; it is started again in {pause_s:.0f} s"
+    def _report_down(self, cause: str, pause_s: float) -> None:
+        text = (
+            f"the results server (OPC UA) is down: {cause}; it is started again in {pause_s:.0f} s"
+        )
         for branch in list(self._branches):
             if branch.tell is not None:
                 branch.tell(text)
 
     def _wait(self, seconds: float) -> None:
-        """Until the next try; what alarms do meanwhile is kept as far as it concerns."""
+        """Wait until the next attempt, and collect changes of alarms meanwhile."""
         end = time.monotonic() + seconds
         while time.monotonic() < end and not self._stop.wait(LOOK_S):
             for branch in list(self._branches):
                 branch.changes()
 
     def _begin(self) -> None:
-        """Start a server, and know its port."""
+        """Start a server, and learn its port."""
         self._server = Server(self._settings, self._figures)
         try:
-            what, told = self._answer(PATIENCE_S)
-            if what == "failed":
-                raise told
+            status, payload = self._answer(PATIENCE_S)
+            if status == "failed":
+                raise payload
         except BaseException:
             self._server.close()
             raise
-        self._settings = self._settings.model_copy(update={"port": told})
+        self._settings = self._settings.model_copy(update={"port": payload})
 
-    def _begin_again(self) -> None:
-        """Start one with all that was shown, unless the first one runs."""
+    def _restart(self) -> None:
+        """Start a server that shows everything anew, unless one is running."""
         if self._server.runs:
             return
         self._begin()
@@ -271,41 +275,41 @@ class ResultsServer:
             self._listen(self._settings.interval_ms * 1e-3)
 
     def _add(self, branch: Branch) -> None:
-        """Have its nodes laid out, and what stands shown."""
+        """Have the branch's nodes created, and show its present state."""
         asset, branch.shown = branch.results.asset, {}
         self._ask("add", asset, branch.kind, branch.acknowledge is not None)
         changes = list(branch.standing.values())
-        _, readings, new = branch.news()
-        self._ask("show", [(asset, readings, [*changes, *new])])
+        _, readings, new_changes = branch.news()
+        self._ask("show", [(asset, readings, [*changes, *new_changes])])
         branch.laid_out.set()
 
     def _ask(self, *message: Any) -> None:
-        """Have something done, and wait until it is."""
+        """Send a request, and wait until it is done."""
         self._server.send(message)
         self._answer(SILENCE_S)
 
     def _answer(self, patience_s: float) -> Any:
-        """The answer of the server; what it asks meanwhile is seen to."""
+        """The server's answer; its own requests are served meanwhile."""
         end = time.monotonic() + patience_s
         while time.monotonic() < end:
-            message = self._heard(LOOK_S)
+            message = self._receive(LOOK_S)
             if message is not None:
                 return message
         self._server.kill()
         raise DownError("it did not answer, and was ended")
 
     def _listen(self, seconds: float) -> None:
-        """See to what the server asks for so long."""
+        """Serve the server's requests for so long."""
         end = time.monotonic() + seconds
-        while (rest := end - time.monotonic()) > 0 and not self._stop.is_set():
-            self._heard(min(rest, LOOK_S))
+        while (remaining := end - time.monotonic()) > 0 and not self._stop.is_set():
+            self._receive(min(remaining, LOOK_S))
 
-    def _heard(self, seconds: float) -> Any:
-        """A message within so long, unless it asks for something; that is passed on."""
+    def _receive(self, seconds: float) -> Any:
+        """The next answer, None if none comes in time; requests are served, complaints logged."""
         with suppress(Empty):
             while True:
                 self._server.send(self._answers.get_nowait())
-        message = self._server.heard(seconds)
+        message = self._server.receive(seconds)
         if message is not None and message[0] == "complaint":
             _log.warning(message[1])
             return None
@@ -314,13 +318,13 @@ class ResultsServer:
         threading.Thread(target=self._acknowledge, args=message[1:], daemon=True).start()
         return None
 
-    def _acknowledge(self, number: int, asset: str, alarm: str, who: str) -> None:
-        """Acknowledge an alarm; it may wait for a database."""
+    def _acknowledge(self, number: int, asset: str, alarm: str, user: str) -> None:
+        """Acknowledge an alarm, and queue the answer; this may wait for a database."""
         refused = f"{asset}: no such ejector"
         for branch in self._branches:
             if branch.results.asset == asset and branch.acknowledge is not None:
                 try:
-                    branch.acknowledge(alarm, who)
+                    branch.acknowledge(alarm, user)
                     refused = ""
                 except TwinError as error:
                     refused = str(error)

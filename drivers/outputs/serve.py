@@ -1,9 +1,8 @@
-"""The process that serves over OPC UA what the twin finds (``python -m drivers.outputs.serve FD``).
+"""The process that serves the twins' results over OPC UA (``python -m drivers.outputs.serve FD``).
 
-A SCADA can read it; nobody can write. Alarms are conditions, which some users may acknowledge
-(``drivers.outputs.conditions``). What is to be shown comes over a connection from
-``drivers.outputs.results``, so that whatever a client does here, the loops do not feel it. How it
-is laid out stands in docs/opcua.md.
+A SCADA can read them; nobody can write. Alarms are conditions, which some users may acknowledge
+(``drivers.outputs.conditions``). Results come over a connection from ``drivers.outputs.results``,
+so that no client of this server can disturb the loops. docs/opcua.md shows the address space.
 """
 
 import asyncio
@@ -36,7 +35,7 @@ from twin.errors import SourceError, TwinError
 from twin.login import Authenticator
 from twin.signals import Phase
 
-# It logs clients that hang up as errors; what stops the server is raised as well.
+# The library logs clients that hang up as errors; what stops the server is raised as well.
 logging.getLogger("asyncua").setLevel(logging.CRITICAL + 1)
 
 NAMESPACE = "urn:ejector-twin:results"
@@ -72,7 +71,7 @@ PLAIN: dict[str, dict[str, ua.VariantType]] = {  # groups of values without a un
 
 @dataclass
 class Leaf:
-    """A node: what the state calls it, its type, and what it shows."""
+    """A variable: its name among the readings, its type, and its node."""
 
     name: str
     kind: ua.VariantType
@@ -89,27 +88,27 @@ class Branch:
 
 
 class Asking:
-    """Acknowledging, asked of the process that has the alarms; its answer is waited for."""
+    """Asks the process that has the alarms to acknowledge them, and waits for its answer."""
 
     def __init__(self, pipe: Connection) -> None:
         self._pipe, self._sending = pipe, threading.Lock()
         self._waiting: dict[int, Future[str]] = {}
-        self._numbers = itertools.count(os.getpid() << 32)  # no other process counts them
+        self._numbers = itertools.count(os.getpid() << 32)  # unique to this process
 
     def send(self, message: tuple[Any, ...]) -> None:
-        """Send a message, whole."""
+        """Send a message; those of other threads do not mix with it."""
         with self._sending:
             self._pipe.send(message)
 
-    def complain(self, what: str) -> None:
-        """Have a trouble said on standard error, where somebody reads it."""
-        self.send(("complaint", what))
+    def complain(self, text: str) -> None:
+        """Have a trouble logged by the process of the loops, where a person reads it."""
+        self.send(("complaint", text))
 
-    def ask(self, asset: str, alarm: str, who: str) -> None:
-        """Have an alarm acknowledged; SourceError if that is refused, or nobody answers."""
+    def ask(self, asset: str, alarm: str, user: str) -> None:
+        """Have an alarm acknowledged; SourceError if that is refused, or no answer comes."""
         number, answer = next(self._numbers), Future[str]()
         self._waiting[number] = answer
-        self.send(("acknowledge", number, asset, alarm, who))
+        self.send(("acknowledge", number, asset, alarm, user))
         try:
             refused = answer.result(ANSWER_S)
         except FutureTimeout as error:
@@ -120,7 +119,7 @@ class Asking:
             raise SourceError(refused)
 
     def answered(self, number: int, refused: str) -> None:
-        """Hand over an answer; empty where it was granted."""
+        """Pass on an answer; ``refused`` is empty if the alarm was acknowledged."""
         if number in self._waiting:
             self._waiting[number].set_result(refused)
 
@@ -135,7 +134,7 @@ class Serving:
         self._branches: dict[str, Branch] = {}
 
     async def run(self, messages: "asyncio.Queue[tuple[Any, ...] | None]") -> None:
-        """Serve until there are no more messages; SourceError where the address cannot be had."""
+        """Serve until there are no more messages; SourceError if the address is not available."""
         authenticator = authenticator_of(self._settings.users, self._asking.complain)
         server = await _prepared(self._settings, authenticator, self._asking.complain)
         self._server = server
@@ -160,12 +159,12 @@ class Serving:
         finally:
             await server.stop()
 
-    async def _take(self, what: str, *told: Any) -> None:
-        if what == "add":
-            await self._add(*told)
+    async def _take(self, kind: str, *args: Any) -> None:
+        if kind == "add":
+            await self._add(*args)
             return
-        (shown,) = told
-        for asset, readings, changes in shown:
+        (updates,) = args
+        for asset, readings, changes in updates:
             await self._show(self._branches[asset], readings, changes)
 
     async def _show(
@@ -174,7 +173,7 @@ class Serving:
         readings: Mapping[str, Reading],
         changes: Sequence[Mapping[str, Any]],
     ) -> None:
-        """Write what has changed."""
+        """Write the changes."""
         for change in changes:
             await self._conditions.tell(branch.source, change)
         for name, reading in readings.items():
@@ -184,32 +183,32 @@ class Serving:
     # --- the address space ----------------------------------------------------------------------
 
     async def _add(self, asset: str, kind: str, may_acknowledge: bool) -> None:
-        """Lay out ``GROUPS`` below one object."""
+        """Create the nodes of an ejector: ``GROUPS`` below one object."""
         top = await self._root.add_object(*self._names(asset))
         acknowledge = partial(self._asking.ask, asset) if may_acknowledge else None
         branch = Branch(Source(top.nodeid, asset, self._inputs(asset), acknowledge))
         leaves: list[Leaf] = []
-        made = {name: await top.add_object(*self._names(asset, name)) for name in GROUPS}
+        groups = {name: await top.add_object(*self._names(asset, name)) for name in GROUPS}
         for name, text in (("Id", asset), ("Type", kind)):
             names = self._names(asset, "Identification", name)
-            await made["Identification"].add_variable(*names, text, _T.String)
+            await groups["Identification"].add_variable(*names, text, _T.String)
         for group, name, unit in self._quantities():
-            leaves.append(await self._quantity(made[group], asset, group, name, unit))
+            leaves.append(await self._quantity(groups[group], asset, group, name, unit))
         for group, name, states in STATES:
             names = self._names(asset, group, name)
-            node = await add_state(self._server, made[group], names, states)
+            node = await add_state(self._server, groups[group], names, states)
             leaves.append(Leaf(name, _T.UInt32, False, node.nodeid))
         for group, kinds in PLAIN.items():
             for name, variant in kinds.items():
                 names = self._names(asset, group, name)
-                leaves.append(await _plain(made[group], names, name, variant, group))
+                leaves.append(await _plain(groups[group], names, name, variant, group))
         names = self._names(asset, "Cycle", "Number")
-        leaves.append(await _plain(made["Cycle"], names, "cycle", _T.Int64, "Cycle"))
+        leaves.append(await _plain(groups["Cycle"], names, "cycle", _T.Int64, "Cycle"))
         branch.leaves |= {leaf.name: leaf for leaf in leaves}
         self._branches[asset] = branch
 
     def _inputs(self, asset: str) -> dict[str, tuple[ua.NodeId, ua.NodeId]]:
-        """Where what alarms compare is: measured and expected, by quantity."""
+        """Nodes of the values that alarms compare: measured and expected, by quantity."""
         paths = {"pressure": (("Meas", "Pressure"), ("Model", "Expected"))}
         paths |= {
             name: (("Cycle", f"{name}_measured"), ("Cycle", f"{name}_expected"))
@@ -221,7 +220,7 @@ class Serving:
         }
 
     def _names(self, *path: str) -> Names:
-        """NodeId and browse name of what lies at ``path``."""
+        """NodeId and browse name of the node at ``path``."""
         return ua.NodeId(".".join(path), self._index), ua.QualifiedName(path[-1], self._index)
 
     def _quantities(self) -> Iterable[tuple[str, str, str]]:
@@ -256,24 +255,24 @@ class Serving:
 GROUPS = ("Identification", "Meas", "Model", "Cycle", "Health", "Events", "Alarms")
 STATES: Sequence[tuple[str, str, list[str]]] = (
     ("Model", "Phase", [phase.name.lower().replace("_", "-") for phase in Phase]),
-    ("Health", "State", [one.name.lower().replace("_", " ") for one in Standing]),
+    ("Health", "State", [standing.name.lower().replace("_", " ") for standing in Standing]),
 )
 
 
 # --- what a client may ask for -----------------------------------------------------------------
 
 MOST_CONNECTIONS = 32
-MOST_CHUNK = 65_535  # bytes; the library keeps no more than one that is not whole
-MOST_MESSAGE = 1 << 20  # bytes; the longest that is asked here has some thousands
+MOST_CHUNK = 65_535  # bytes; the library keeps at most one incomplete chunk
+MOST_MESSAGE = 1 << 20  # bytes; the longest sensible request has some thousands
 SESSION_WITHIN_S = 10.0  # of connecting
-LONGEST_SESSION_MS = 60_000.0  # without a word
-MOST_REQUESTS = 100  # of a connection that wait
+LONGEST_SESSION_MS = 60_000.0  # without a request
+MOST_REQUESTS = 100  # that wait, of one connection
 
 
 class BoundedProtocol(binary_server_asyncio.OPCUAProtocol):  # type: ignore[misc]
-    """A connection that hangs up on a chunk longer than it may be.
+    """A connection that hangs up on a chunk beyond the limit.
 
-    The library waits for all of it, whatever the head announces, and keeps what has come.
+    The library would wait for the whole chunk, whatever length its head announces, and keep it.
     """
 
     def data_received(self, data: bytes) -> None:
@@ -287,7 +286,7 @@ binary_server_asyncio.OPCUAProtocol = BoundedProtocol
 
 
 def _bounded(server: Server) -> None:
-    """Keep what strangers may take within bounds."""
+    """Limit what clients may use of the server."""
     server.limits = TransportLimits(
         max_recv_buffer=MOST_CHUNK,
         max_send_buffer=MOST_CHUNK,
@@ -315,7 +314,7 @@ async def _prepared(
 
 
 async def _plain(parent: Node, names: Names, name: str, kind: ua.VariantType, group: str) -> Leaf:
-    """A variable without a unit; events are arrays of them."""
+    """Add a variable without a unit; those of events are arrays."""
     leaf = Leaf(name, kind, group == "Events", names[0])
     empty = _variant(leaf, [] if leaf.is_array else _EMPTY[kind])
     await parent.add_variable(*names, empty, kind)
@@ -335,14 +334,14 @@ def _value(leaf: Leaf, reading: Reading) -> ua.DataValue:
 
 
 def _variant(leaf: Leaf, value: Any) -> ua.Variant:
-    """As OPC UA has it; moments come as ns since 1970."""
+    """The value for OPC UA; times come as ns since 1970."""
     if leaf.kind is _T.DateTime:
-        value = [_moment(one) for one in value] if leaf.is_array else _moment(value)
+        value = [_moment(stamp) for stamp in value] if leaf.is_array else _moment(value)
     return ua.Variant(value, leaf.kind, is_array=leaf.is_array)
 
 
 def _moment(ns: int) -> datetime:
-    """A time to the microsecond that the library keeps."""
+    """A time, to the microsecond: the library keeps no more."""
     return EPOCH + timedelta(microseconds=ns // 1000)
 
 
@@ -350,23 +349,23 @@ def _moment(ns: int) -> datetime:
 
 
 async def serve(pipe: Connection) -> None:
-    """Serve what comes over ``pipe`` until that is closed; what cannot be is said there."""
+    """Serve what comes over ``pipe`` until it is closed; a failure is reported over it."""
     (settings, figures), asking = pipe.recv(), Asking(pipe)
     messages: asyncio.Queue[tuple[Any, ...] | None] = asyncio.Queue()
     loop = asyncio.get_running_loop()
 
-    def hear() -> None:
+    def receive() -> None:
         with suppress(EOFError, OSError):
             while True:
                 message = pipe.recv()
                 if message[0] == "acknowledged":
                     asking.answered(*message[1:])
-                else:  # there is one at a time: the next one comes when it is done
+                else:  # one at a time: the next one comes when it is done
                     loop.call_soon_threadsafe(messages.put_nowait, message)
         with suppress(RuntimeError):  # the loop has ended
             loop.call_soon_threadsafe(messages.put_nowait, None)
 
-    threading.Thread(target=hear, name="messages", daemon=True).start()
+    threading.Thread(target=receive, name="messages", daemon=True).start()
     try:
         await Serving(settings, figures, asking).run(messages)
     except TwinError as error:

@@ -1,6 +1,6 @@
-"""What a twin has found, as others may read it: the newest row, the last cycle, and its health.
+"""Results of a twin for readers: the newest row, the last cycle, and the ejector's health.
 
-The loop only leaves the newest here, and never waits; whoever serves it takes what lies here.
+The loop leaves its newest results here and never waits; the server takes them from here.
 """
 
 import math
@@ -16,19 +16,19 @@ import numpy as np
 from twin.events import Event, Kind
 from twin.signals import MBAR, UNUSABLE, Phase, Quality, Samples, Ticks, deviation
 
-STALE_S = 1.0  # without a row: the newest is no longer fresh, whatever the reason
+STALE_S = 1.0  # after that time without a row the newest is stale, whatever the reason
 KEPT = 16  # events
 MEANS = tuple(f"{phase.name.lower()}_mean" for phase in Phase)  # of the deviation in a cycle, mbar
 SIDES = ("measured", "expected")
 
 
 class Standing(IntEnum):
-    """How the ejector is doing; the highest that holds."""
+    """State of the ejector; the highest that applies is shown."""
 
     STARTING = 0  # nothing has come yet
     OK = 1
     DEVIATION = 2  # measurement and model have parted
-    SIGNAL_BAD = 3  # the PLC's pressure is none
+    SIGNAL_BAD = 3  # the PLC's pressure is unusable
     PLC_STALE = 4
     STOPPED = 5  # the twin beside it has ended
 
@@ -47,7 +47,7 @@ class Status(Enum):
 
 @dataclass(frozen=True)
 class Reading:
-    """A value, of what PLC time (ns since 1970; 0 where nothing has come), and its status."""
+    """A value, its PLC time (ns since 1970; 0 before the first), and its status."""
 
     value: Any
     time_ns: int
@@ -56,7 +56,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class Health:
-    """How the ejector is doing, as its events have it."""
+    """State of the ejector according to its events."""
 
     standing: Standing = Standing.STARTING
     since_ns: int = 0
@@ -68,7 +68,7 @@ class Health:
 
 @dataclass(frozen=True)
 class Newest:
-    """The newest row, and when it came here."""
+    """The newest row, and when it arrived."""
 
     sample: np.void
     tick: np.void
@@ -77,7 +77,7 @@ class Newest:
 
 
 class Results:
-    """A sink that keeps what is newest of one ejector; ``figures`` are its names of key figures."""
+    """A sink that keeps the newest results of one ejector; ``figures`` names its key figures."""
 
     def __init__(
         self, asset: str, figures: Sequence[str], clock: Callable[[], float] = time.monotonic
@@ -85,40 +85,40 @@ class Results:
         self.asset = asset
         self._figures = figures
         self._clock = clock
-        # Each of these is replaced whole, since another thread reads them.
+        # Each of these is replaced as a whole, since another thread reads them.
         self._newest: Newest | None = None
         self._cycle: Event | None = None
         self._events: tuple[Event, ...] = ()  # newest first
         self._standing: Mapping[Standing, Health] = {}
-        self._well_since_ns = 0
+        self._healthy_since_ns = 0
         self._ended = False
         self._changes: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
 
     # --- from the loop --------------------------------------------------------------------------
 
     def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
-        """Keep the last row, and what happened."""
+        """Keep the last row, and the events."""
         for event in events:
-            self._hear(event)
+            self._handle(event)
         if len(samples):
-            parted = float(deviation(samples[-1:], ticks[-1:])[0])
+            deviation_pa = float(deviation(samples[-1:], ticks[-1:])[0])
             sample, tick = samples[-1].copy(), ticks[-1].copy()
-            self._well_since_ns = self._well_since_ns or int(samples["time_ns"][0])
-            self._newest = Newest(sample, tick, parted, self._clock())
+            self._healthy_since_ns = self._healthy_since_ns or int(samples["time_ns"][0])
+            self._newest = Newest(sample, tick, deviation_pa, self._clock())
 
     def resume(self, standing: Iterable[Mapping[str, Any]], now_ns: int) -> None:
-        """Take alarms as they are when a run begins."""
-        for plain in standing:
-            words = f"{plain['alarm']}: {plain['state'].replace('_', ' ')}"
-            self._changes.put({**plain, "host_ns": now_ns, "who": "", "text": words})
+        """Take over the alarms that stand when a run begins."""
+        for alarm in standing:
+            text = f"{alarm['alarm']}: {alarm['state'].replace('_', ' ')}"
+            self._changes.put({**alarm, "host_ns": now_ns, "who": "", "text": text})
 
     def close(self) -> None:
-        """Nothing comes any more."""
+        """End: no further rows come."""
         self._ended = True
 
-    def _hear(self, event: Event) -> None:
+    def _handle(self, event: Event) -> None:
         if event.kind in (Kind.ALARM, Kind.ALARM_CHANGED):
-            self._hear_alarm(event)
+            self._handle_alarm(event)
         self._events = (event, *self._events)[:KEPT]
         if event.kind is Kind.CYCLE:
             self._cycle = event
@@ -126,28 +126,32 @@ class Results:
             raised = _raised(RAISED[event.kind], event)
             self._standing = {**self._standing, raised.standing: raised}
         elif event.kind in CLEARED:
-            gone, self._well_since_ns = CLEARED[event.kind], event.time_ns
-            self._standing = {one: it for one, it in self._standing.items() if one is not gone}
+            cleared, self._healthy_since_ns = CLEARED[event.kind], event.time_ns
+            self._standing = {
+                standing: health
+                for standing, health in self._standing.items()
+                if standing is not cleared
+            }
         elif event.kind is Kind.DIAGNOSIS and Standing.DEVIATION in self._standing:
             explained = _explained(self._standing[Standing.DEVIATION], event)
             self._standing = {**self._standing, Standing.DEVIATION: explained}
 
-    def _hear_alarm(self, event: Event) -> None:
-        """A change of an alarm, of both where one is renamed; every one of them counts."""
-        told = {"text": event.text, "who": event.data["who"], "host_ns": event.data["host_ns"]}
-        if left := event.data.get("left"):
-            self._changes.put({**left, **told})
-        self._changes.put({**event.data, **told})
+    def _handle_alarm(self, event: Event) -> None:
+        """Queue an alarm's change; where it replaces another alarm, that one's too."""
+        details = {"text": event.text, "who": event.data["who"], "host_ns": event.data["host_ns"]}
+        if previous := event.data.get("left"):
+            self._changes.put({**previous, **details})
+        self._changes.put({**event.data, **details})
 
     # --- for whoever serves it ------------------------------------------------------------------
 
     def changes(self) -> list[Mapping[str, Any]]:
-        """How alarms have changed since the last time, in order: as they are, with the words."""
+        """Changes of alarms since the last call, in order: their new state, with text."""
         return [self._changes.get() for _ in range(self._changes.qsize())]
 
     @property
     def health(self) -> Health:
-        """The gravest of what holds."""
+        """The gravest state that applies."""
         newest, standing = self._newest, self._standing
         if self._ended:
             at_ns = int(newest.sample["time_ns"]) if newest else 0
@@ -156,7 +160,7 @@ class Results:
             return standing[max(standing)]
         if newest is None:
             return Health()
-        return Health(Standing.OK, self._well_since_ns, "measurement and model agree")
+        return Health(Standing.OK, self._healthy_since_ns, "measurement and model agree")
 
     def readings(self) -> dict[str, Reading]:
         """Everything, by the name of its node; pressures in mbar."""
@@ -170,16 +174,16 @@ class Results:
             yield "Phase", Reading(0, 0, Status.NONE_YET)
             return
         sample, tick, at_ns = newest.sample, newest.tick, int(newest.sample["time_ns"])
-        known = self._freshness(newest)
-        measured = _judged(known, int(sample["quality"]))
-        expected = known if np.isfinite(tick["expected"]) else Status.NONE_YET
-        parted = measured if expected is known else expected
-        supply = known if np.isfinite(sample["supply"]) else Status.BAD
+        freshness = self._freshness(newest)
+        measured = _measured_status(freshness, int(sample["quality"]))
+        expected = freshness if np.isfinite(tick["expected"]) else Status.NONE_YET
+        deviation_status = measured if expected is freshness else expected
+        supply = freshness if np.isfinite(sample["supply"]) else Status.BAD
         yield "Pressure", Reading(float(sample["pressure"]) / MBAR, at_ns, measured)
         yield "Supply", Reading(float(sample["supply"]) / MBAR, at_ns, supply)
         yield "Expected", Reading(float(tick["expected"]) / MBAR, at_ns, expected)
-        yield "Deviation", Reading(newest.deviation / MBAR, at_ns, parted)
-        yield "Phase", Reading(int(tick["phase"]), at_ns, known)
+        yield "Deviation", Reading(newest.deviation / MBAR, at_ns, deviation_status)
+        yield "Phase", Reading(int(tick["phase"]), at_ns, freshness)
 
     def _freshness(self, newest: Newest) -> Status:
         if self._ended:
@@ -195,13 +199,13 @@ class Results:
                 yield name, Reading(-1 if name == "cycle" else math.nan, 0, Status.NONE_YET)
                 continue
             value = cycle.data.get(name, cycle.data.get(name.removesuffix("_measured")))
-            there = isinstance(value, int | float) and math.isfinite(value)
-            status = Status.GOOD if there else Status.MISSING
-            yield name, Reading(value if there else math.nan, cycle.time_ns, status)
+            is_number = isinstance(value, int | float) and math.isfinite(value)
+            status = Status.GOOD if is_number else Status.MISSING
+            yield name, Reading(value if is_number else math.nan, cycle.time_ns, status)
 
     def _of_health(self) -> Iterator[tuple[str, Reading]]:
         health = self.health
-        told = {
+        values = {
             "State": int(health.standing),
             "Since": health.since_ns,
             "Text": health.text,
@@ -209,7 +213,7 @@ class Results:
             "Size": health.size,
             "Unit": health.unit,
         }
-        yield from ((name, Reading(value, health.since_ns)) for name, value in told.items())
+        yield from ((name, Reading(value, health.since_ns)) for name, value in values.items())
 
     def _of_events(self) -> Iterator[tuple[str, Reading]]:
         events = self._events
@@ -266,10 +270,10 @@ def _explained(health: Health, event: Event) -> Health:
     )
 
 
-def _judged(known: Status, quality: int) -> Status:
+def _measured_status(freshness: Status, quality: int) -> Status:
     """Status of a measured value with these Quality bits."""
-    if known is not Status.GOOD:
-        return known
+    if freshness is not Status.GOOD:
+        return freshness
     if quality & Quality.OVERFLOW:
         return Status.BEYOND
     if quality & Quality.STALE:

@@ -23,13 +23,13 @@ def _arguments() -> argparse.Namespace:
 
 
 def main() -> int:
-    """Run, and explain on stderr what is wrong; gives the exit code."""
-    given = _arguments()
+    """Run; explain errors on stderr; return the exit code."""
+    arguments = _arguments()
     try:
-        settings = [Document.read(one).section(PlcSettings, "plc") for one in given.configs]
-        faults = [parse_fault(text) for text in given.fault]
-        on_port = [one.on_port(given.port) for one in settings]
-        run_plc(on_port, faults, given.seed, given.duration, witness=given.witness)
+        settings = [Document.read(path).section(PlcSettings, "plc") for path in arguments.configs]
+        faults = [parse_fault(text) for text in arguments.fault]
+        on_port = [plc.on_port(arguments.port) for plc in settings]
+        run_plc(on_port, faults, arguments.seed, arguments.duration, witness=arguments.witness)
     except TwinError as error:
         print(f"{error}\n{error.hint}", file=sys.stderr)  # noqa: T201
         return error.exit_code

@@ -1,4 +1,4 @@
-"""The course of faults in time: what each does in every scan of the PLC."""
+"""The course of faults in time: how strongly each acts in every scan of the PLC."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ SCANS_PER_S = 1000
 
 @dataclass
 class Schedule:
-    """The rows of ``ROW`` for scan after scan; ``cycle_starts`` grows as suction is commanded."""
+    """Gives ``ROW`` for each scan; ``cycle_starts`` grows with each command of suction."""
 
     faults: Sequence[Fault]
     seed: int
@@ -28,8 +28,8 @@ class Schedule:
             rows[name] = self._neutral(parameter)
         scans = first + np.arange(len(cycles))
         for number, fault in enumerate(self.faults):
-            grown = self._grown(fault, scans) * self._strikes(number, fault, cycles)
-            rows[fault.column] += (fault.value - self._neutral(fault.parameter)) * grown
+            strength = self._progress(fault, scans) * self._acts(number, fault, cycles)
+            rows[fault.column] += (fault.value - self._neutral(fault.parameter)) * strength
         for name, parameter in COLUMNS.items():
             rows[name] = np.clip(rows[name], parameter.low, parameter.high) * UNITS[parameter.unit]
         return rows
@@ -37,7 +37,9 @@ class Schedule:
     def _neutral(self, parameter: Parameter) -> float:
         return self.vessel_film if parameter.neutral is None else parameter.neutral
 
-    def _grown(self, fault: Fault, scans: npt.NDArray[np.int64]) -> npt.NDArray[np.float64] | float:
+    def _progress(
+        self, fault: Fault, scans: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.float64] | float:
         """Share of the full size that the course has reached."""
         start = fault.start_s * SCANS_PER_S
         if fault.start_cycle is not None:
@@ -48,10 +50,10 @@ class Schedule:
             return np.clip((scans - start) / (fault.ramp_s * SCANS_PER_S), 0.0, 1.0)
         return (scans >= start).astype(np.float64)
 
-    def _strikes(
+    def _acts(
         self, number: int, fault: Fault, cycles: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.bool_]:
-        """Whether it acts in the cycle at all; ``share`` draws the same cycles at every run."""
+        """Whether the fault acts in each cycle; ``share`` draws the same cycles at every run."""
         if fault.share >= 1.0:
             return np.equal(cycles % fault.every, 0)
         draws = np.random.default_rng([self.seed, 3, number]).random(len(self.cycle_starts) + 1)

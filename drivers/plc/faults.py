@@ -1,7 +1,7 @@
 """What can be wrong with the rig: one table of effects, and faults as text.
 
-A fault acts through numbers that are always there; at neutral they change nothing. ``ROW`` holds
-one such number for every parameter of every fault, in SI units, for one scan of the PLC.
+A fault acts through numbers that always exist; at their neutral value they change nothing. ``ROW``
+holds one number for each parameter of each fault, in SI units, for one scan of the PLC.
 """
 
 import re
@@ -40,7 +40,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """What differs; the first parameter is its size."""
+    """One way in which the rig can differ; the first parameter is its size."""
 
     meaning: str
     parameters: tuple[Parameter, ...]
@@ -175,7 +175,7 @@ _GRAMMAR = "write NAME=VALUE[@START][/COURSE], for example leakage=1.9@10/ramp:3
 def parse_fault(text: str) -> Fault:
     """Read ``NAME[.PARAMETER]=VALUE[@SECONDS|@cCYCLE][/ramp:SECONDS|/every:N|/share:S]``.
 
-    Raises ConfigError if it does not read so, names nothing known or lies outside the bounds.
+    Raises ConfigError if the text is malformed, a name is unknown or a value is out of bounds.
     """
     match = _TEXT.fullmatch(text.strip())
     if match is None:
@@ -193,8 +193,8 @@ def _parameter(text: str, effect: str, name: str | None) -> Parameter:
     for parameter in parameters:
         if name in (None, parameter.name):
             return parameter
-    known = ", ".join(p.name for p in parameters)
-    raise ConfigError(f"fault {text!r}: {effect} has no parameter {name!r}", f"it has {known}")
+    names = ", ".join(p.name for p in parameters)
+    raise ConfigError(f"fault {text!r}: {effect} has no parameter {name!r}", f"it has {names}")
 
 
 def _number(text: str, digits: str, low: float, high: float) -> float:

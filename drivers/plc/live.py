@@ -1,4 +1,4 @@
-"""The simulated PLC in real time: its scans run with the clock, its servers stand around them."""
+"""The simulated PLC in real time: its scans follow the clock, and servers answer from them."""
 
 import asyncio
 import signal
@@ -20,11 +20,11 @@ from drivers.plc.settings import PlcSettings
 if TYPE_CHECKING:
     from drivers.plc.opcua import Serving
 
-SET_NS = 2_000_000_000  # by so much the clock is set, ahead or back
+SET_NS = 2_000_000_000  # step by which a signal sets the clock ahead or back
 WITNESSED = np.dtype(
     [("sequence", "<i8"), ("time_ns", "<i8"), ("pressure", "<f4"), ("status", "<u2")]
 )
-PERIOD_S = 0.01  # of the timer that keeps the scans up while nobody asks
+PERIOD_S = 0.01  # of the timer that computes scans while no client asks
 
 
 def run_plc(
@@ -37,17 +37,17 @@ def run_plc(
 ) -> None:
     """Run the PLC until SIGINT, SIGTERM or ``duration_s``; call it in the main thread.
 
-    Of several ejectors behind it the first says where it listens; the others differ in their unit
-    and, by OPC UA, in the prefix of their nodes. The faults are the first one's, and so is the
-    ``seed``; the next ones have those after it.
-    ``ready(host, port)`` is called once when it listens, by Modbus and, where there is a table
-    for it, by OPC UA. Raises SourceError where it cannot. Into ``witness`` goes every scan of the
-    first ejector, as ``WITNESSED``. On Linux SIGUSR1 and SIGUSR2 set its clock ahead and back by
+    With several ejectors, the first one's settings say where the PLC listens. The others differ in
+    their unit and, by OPC UA, in the prefix of their nodes. The faults and the ``seed`` are the
+    first one's; each further ejector has the next seed.
+    ``ready(host, port)`` is called once the PLC listens, by Modbus and, if there is a table for it,
+    by OPC UA. Raises SourceError if it cannot listen. Every scan of the first ejector goes into
+    ``witness``, as ``WITNESSED``. On Linux SIGUSR1 and SIGUSR2 set the clock ahead and back by
     ``SET_NS``.
     """
-    first, *others = [settings] if isinstance(settings, PlcSettings) else settings
+    first, *following = [settings] if isinstance(settings, PlcSettings) else settings
     tasks = [_task(first, faults, seed)]
-    tasks += [_task(one, (), seed + number) for number, one in enumerate(others, 1)]
+    tasks += [_task(ejector, (), seed + number) for number, ejector in enumerate(following, 1)]
     asyncio.run(_run(tasks, duration_s, ready or announce, witness))
 
 
@@ -57,7 +57,7 @@ def _task(settings: PlcSettings, faults: Sequence[Fault], seed: int) -> Task:
 
 
 def announce(host: str, port: int) -> None:
-    """Say on stdout where the PLC listens, for people and for programs that start one."""
+    """Print where the PLC listens, for people and for programs that start one."""
     print(f"listening on {host}:{port}", flush=True)  # noqa: T201 - it is the command's output
 
 
@@ -111,9 +111,9 @@ def _let_clock_be_set(memories: Sequence[Registers]) -> None:
 
 @asynccontextmanager
 async def _witnessed(task: Task, memory: Registers, path: Path | None) -> AsyncIterator[None]:
-    """Keep scans in a file, if one is wanted; no buffer, so that nothing is lost with the process.
+    """Write scans into a file if there is a ``path``; unbuffered, so that a crash loses nothing.
 
-    The last scans come as the servers end, so it closes after them.
+    The last scans come while the servers end, so it closes after them.
     """
     if path is None:
         yield
@@ -127,18 +127,18 @@ async def _witnessed(task: Task, memory: Registers, path: Path | None) -> AsyncI
             rows["time_ns"] = memory.start_ns + scans["sequence"] * PERIOD_NS
             file.write(rows.tobytes())
 
-        nobody, task.witness = task.witness, keep
+        previous, task.witness = task.witness, keep
         try:
             yield
         finally:
-            task.witness = nobody
+            task.witness = previous
 
 
 @asynccontextmanager
 async def _opcua(
     memories: Sequence[Registers], catch_up: Callable[[], None]
 ) -> AsyncIterator["Serving | None"]:
-    """Serve OPC UA too, where it is wanted."""
+    """Serve OPC UA too, if it is configured."""
     settings = memories[0].task.settings.opcua
     if settings is None:
         yield None

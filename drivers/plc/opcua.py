@@ -1,4 +1,4 @@
-"""OPC UA over the trace: the address space, filled in from the newest scans at each request."""
+"""OPC UA over the trace: an address space whose values come from the newest scans."""
 
 import logging
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
@@ -21,7 +21,7 @@ from drivers.plc.settings import OpcuaServer, PlcSettings
 from twin.errors import ConfigError, SourceError
 from twin.signals import Command
 
-# It logs clients that hang up as errors; what stops the PLC is raised as well.
+# The library logs clients that hang up as errors; what stops the PLC is raised as well.
 logging.getLogger("asyncua").setLevel(logging.CRITICAL)
 _log = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ class Memory:
         return self._task.newest
 
     def time(self, sequence: int) -> datetime:
-        """PLC time of a scan, to the microsecond that OPC UA's library keeps."""
+        """PLC time of a scan, to the microsecond: the library keeps no more."""
         return EPOCH + timedelta(
             microseconds=(self._registers.start_ns + sequence * PERIOD_NS) // 1000
         )
@@ -72,12 +72,12 @@ class Memory:
         return ua.DataValue(Value=variant, SourceTimestamp=self.time(self.newest))
 
     def command(self, bit: Command, on: bool) -> None:
-        """Command from a client, where the program leaves it to them."""
+        """Take a client's command; it counts if the program takes commands from coils."""
         coils = self._task.coils
         self._task.coils = coils | bit if on else coils & ~bit
 
     def reader(self, name: str) -> Read:
-        """How a client's read of a node is answered."""
+        """The function that answers a client's read of a node."""
 
         def read() -> ua.DataValue:
             self.catch_up()
@@ -87,7 +87,7 @@ class Memory:
 
     @property
     def header(self) -> Mapping[str, ua.Variant]:
-        """Where the trace stands."""
+        """The trace's header: newest sequence, its time, boot counter and period."""
         newest = self.newest
         return {
             "Trace.Sequence": ua.Variant(newest & 0xFFFFFFFF, Type.UInt32),
@@ -97,7 +97,7 @@ class Memory:
         }
 
     def ring(self) -> Scans:
-        """The newest scans: scan s at s mod depth; zeros where there was none yet."""
+        """The newest scans: scan s at s mod depth; zeros before the first scan."""
         newest = self.newest
         slots = np.arange(self._depth)
         return self._task.ring[(newest - (newest - slots) % self._depth) % DEPTH]
@@ -167,7 +167,7 @@ RANGES: dict[str, tuple[Unit, float, float]] = {
 
 
 def served_of(settings: PlcSettings) -> tuple[str, ...]:
-    """Names of what is served of each scan."""
+    """Names of the values that are served of each scan."""
     reports = settings.reports
     bits = tuple(REPORTS) if reports.bits else ()
     return (*MEASURED, *bits, *(VALUES if reports.values else ()))
@@ -177,12 +177,12 @@ def served_of(settings: PlcSettings) -> tuple[str, ...]:
 async def serving(
     memories: Sequence[Registers], settings: OpcuaServer, catch_up: Callable[[], None]
 ) -> AsyncIterator["Serving"]:
-    """Serve OPC UA while the context lasts. SourceError where the address cannot be had."""
-    served = [Memory(one, catch_up, settings.trace_depth) for one in memories]
+    """Serve OPC UA while the context lasts. SourceError if the address is not available."""
+    served = [Memory(registers, catch_up, settings.trace_depth) for registers in memories]
     pairs = [
         (memory, name)
-        for memory, one in zip(served, memories, strict=True)
-        for name in served_of(one.task.settings)
+        for memory, registers in zip(served, memories, strict=True)
+        for name in served_of(registers.task.settings)
     ]
     named = {f"{memory.prefix}{name}": (memory, name) for memory, name in pairs}
     if len(named) < len(pairs):
@@ -201,7 +201,7 @@ async def serving(
     await secure(server, settings, authenticator, _log.warning)
     index = await _namespace(server, settings.namespace_index)
     for memory, registers in zip(served, memories, strict=True):
-        await _Space(server, index, memory).build(registers.task.settings)
+        await _AddressSpace(server, index, memory).build(registers.task.settings)
     behaviour = Behaviour(server, settings, value, set(named), lambda: served[0].newest)
     try:
         await server.start()
@@ -225,25 +225,25 @@ class Serving:
 
     @property
     def url(self) -> str:
-        """Where it is reached."""
+        """The address for clients."""
         binary = self.server.bserver
         assert binary is not None
         return f"opc.tcp://{self.server.endpoint.hostname}:{binary.port}"
 
     def sample(self) -> None:
-        """Give subscribers what the scans since the last call have brought."""
+        """Give subscribers the values of the scans since the last call."""
         self.behaviour.sample()
 
 
 async def _namespace(server: Server, index: int) -> int:
-    """Register ours so that it gets ``index``, as a server does that serves others as well."""
+    """Register our namespace at ``index``, as in a server that has others too."""
     for number in range(len(await server.get_namespace_array()), index):
         await server.register_namespace(f"urn:ejector-twin:other-{number}")
     return int(await server.register_namespace(NAMESPACE))
 
 
-class _Space:
-    """Builds the address space: string NodeIds that read as the path."""
+class _AddressSpace:
+    """Builds the address space; its NodeIds are strings that name the path."""
 
     def __init__(self, server: Server, index: int, memory: Memory) -> None:
         self._server = server
@@ -251,27 +251,27 @@ class _Space:
         self._memory = memory
 
     async def build(self, settings: PlcSettings) -> None:
-        """Lay out ``Identification, Cmd, Meas, Param, Trace`` below one object."""
+        """Create ``Identification, Cmd, Meas, Param, Trace`` below one object."""
         objects = self._server.get_objects_node()
         root = await objects.add_object(*self._names("Ejector"))
         groups = {
             name: await root.add_object(*self._names(name))
             for name in ("Identification", "Cmd", "Meas", "Param", "Trace")
         }
-        await self._identify(groups["Identification"])
+        await self._add_identification(groups["Identification"])
         for name in (*served_of(settings), *TRACE):
-            await self._live(groups[name.partition(".")[0]], name)
-        await self._parameters(groups["Param"], settings)
+            await self._add_readable(groups[name.partition(".")[0]], name)
+        await self._add_parameters(groups["Param"], settings)
         if self._memory.partner is not None:
             group = await root.add_object(*self._names("Hil"))
             for name in WRITTEN:
-                await self._writable(group, name, self._memory.partner.written)
+                await self._add_writable(group, name, self._memory.partner.written)
         if settings.program.commands == "coils":
             for name, bit in (("Cmd.Suction", Command.SUCTION), ("Cmd.BlowOff", Command.BLOW_OFF)):
-                await self._commandable(name, bit)
+                await self._add_command(name, bit)
 
-    async def _writable(self, group: Node, name: str, written: Written) -> None:
-        """What the twin writes, where it answers the program."""
+    async def _add_writable(self, group: Node, name: str, written: Written) -> None:
+        """Add a value that the twin writes, where it answers the program."""
         field, kind = WRITTEN[name]
         value = ua.Variant(KINDS[kind](getattr(written, field)), kind)
         node = await group.add_variable(*self._names(name), value)
@@ -296,7 +296,7 @@ class _Space:
         node = ua.NodeId(f"{self._memory.prefix}{name}", self._index)
         return node, ua.QualifiedName(last, self._index)
 
-    async def _identify(self, group: Node) -> None:
+    async def _add_identification(self, group: Node) -> None:
         texts = {
             "Manufacturer": "ejector-twin",
             "Model": "simulated PLC with a compact ejector",
@@ -305,12 +305,12 @@ class _Space:
         for name, text in texts.items():
             await group.add_variable(*self._names(f"Identification.{name}"), text, Type.String)
 
-    async def _live(self, group: Node, name: str) -> None:
+    async def _add_readable(self, group: Node, name: str) -> None:
         read = self._memory.reader(name)
         example = read().Value
         assert example is not None
         if name in RANGES:
-            node = await self._analog(group, name, *RANGES[name], example)
+            node = await self._add_analog(group, name, *RANGES[name], example)
         else:
             kind = example.VariantType
             node = await group.add_variable(*self._names(name), example.Value, kind)
@@ -319,7 +319,7 @@ class _Space:
             node.nodeid, ua.AttributeIds.Value, lambda _node, _attribute: read()
         )
 
-    async def _analog(
+    async def _add_analog(
         self, group: Node, name: str, unit: Unit, low: float, high: float, value: ua.Variant
     ) -> Node:
         kind = ua.NodeId(value.VariantType.value)
@@ -327,7 +327,7 @@ class _Space:
         await node.write_value(value)
         return node
 
-    async def _parameters(self, group: Node, settings: PlcSettings) -> None:
+    async def _add_parameters(self, group: Node, settings: PlcSettings) -> None:
         program, control = settings.program, settings.control
         values = {
             "SuctionTime": (MILLISECOND, 3.6e6, program.suction_ms),
@@ -338,10 +338,10 @@ class _Space:
         }
         for name, (unit, high, number) in values.items():
             value = ua.Variant(number, Type.Double)
-            await self._analog(group, f"Param.{name}", unit, 0.0, high, value)
+            await self._add_analog(group, f"Param.{name}", unit, 0.0, high, value)
 
-    async def _commandable(self, name: str, bit: Command) -> None:
-        """Let clients command, where the program leaves it to them."""
+    async def _add_command(self, name: str, bit: Command) -> None:
+        """Let clients write a command, where the program leaves it to them."""
         node = self._server.get_node(self._names(name)[0])
         await node.set_writable()
 

@@ -1,7 +1,7 @@
-"""What real OPC UA servers do and the library's does not: sample, revise, be late, hang up.
+"""Behaviour of real OPC UA servers that the library lacks: sampling, revising, delays, hang-ups.
 
-The library reports every write and takes every interval as asked for. Here each monitored item is
-sampled from the scans at its revised interval, into a queue that overflows.
+The library reports every write and accepts every interval. Here each monitored item is sampled from
+the scans at its revised interval, into a queue that can overflow.
 """
 
 import asyncio
@@ -16,7 +16,7 @@ from asyncua.server.subscription_service import SubscriptionService
 
 from drivers.plc.settings import OpcuaServer
 
-OVERFLOW = 0x480  # info type DataValue, overflow: set on the value after those that were lost
+OVERFLOW = 0x480  # info type DataValue, overflow: set on the first value after lost ones
 Sample = Callable[[str, int], ua.DataValue]  # value of a node at a scan
 
 
@@ -31,11 +31,11 @@ class Item:
     every: int  # scans
     queue: int  # values
     always: bool  # also values that have not changed
-    after: int  # the scan that was newest when it was made, and has been queued then
+    after: int  # newest scan at its creation, which was queued then
     last: ua.Variant | None = None
 
     def put(self, value: ua.DataValue) -> None:
-        """Queue a value for the next publishing, unless it says nothing new."""
+        """Queue a value for the next publishing, unless it has not changed."""
         if not self.always and value.Value == self.last:
             return
         self.last = value.Value
@@ -58,7 +58,7 @@ def _overflown(notification: ua.MonitoredItemNotification) -> ua.MonitoredItemNo
 
 
 class Behaviour:
-    """Stands in for the library's subscriptions of one server."""
+    """Replaces the library's subscriptions of one server."""
 
     def __init__(
         self,
@@ -79,7 +79,7 @@ class Behaviour:
         server.iserver.isession.subscription_service = self.subscriptions
 
     def sample(self) -> None:
-        """Sample all items up to the newest scan, and hang up where it is time to."""
+        """Sample all items up to the newest scan, and hang up on all clients when it is due."""
         newest = self._newest()
         for item in self.subscriptions.living():
             begin = max(self._sampled, item.after) + 1
@@ -95,7 +95,7 @@ class Behaviour:
 
 
 class Subscriptions(SubscriptionService):  # type: ignore[misc]
-    """The library's, with intervals revised and items sampled."""
+    """The library's subscriptions, with revised intervals and sampled items."""
 
     def __init__(
         self, server: Server, settings: OpcuaServer, names: Set[str], newest: Callable[[], int]
@@ -107,7 +107,7 @@ class Subscriptions(SubscriptionService):  # type: ignore[misc]
         self._items: list[Item] = []
 
     def living(self) -> list[Item]:
-        """Items of subscriptions that still are; the others are forgotten."""
+        """Items of subscriptions that still exist; other items are removed."""
         self._items = [
             item
             for item in self._items
@@ -119,15 +119,15 @@ class Subscriptions(SubscriptionService):  # type: ignore[misc]
         self,
         params: ua.CreateSubscriptionParameters,
         callback: Callable[..., Any],
-        *rest: Any,
-        **named: Any,
+        *args: Any,
+        **kwargs: Any,
     ) -> ua.CreateSubscriptionResult:
-        """Create it with a publishing interval that is not below the least."""
-        wanted = params.RequestedPublishingInterval
-        params.RequestedPublishingInterval = max(wanted, self._settings.min_publishing_ms)
-        return await super().create_subscription(params, self._late(callback), *rest, **named)
+        """Create it with a publishing interval not below the configured minimum."""
+        requested_ms = params.RequestedPublishingInterval
+        params.RequestedPublishingInterval = max(requested_ms, self._settings.min_publishing_ms)
+        return await super().create_subscription(params, self._delayed(callback), *args, **kwargs)
 
-    def _late(self, callback: Callable[..., Any]) -> Callable[..., Any]:
+    def _delayed(self, callback: Callable[..., Any]) -> Callable[..., Any]:
         async def publish(*results: Any) -> None:
             await asyncio.sleep(self._settings.late_publishing_ms * 1e-3)
             await callback(*results)
@@ -137,32 +137,32 @@ class Subscriptions(SubscriptionService):  # type: ignore[misc]
     async def create_monitored_items(
         self, params: ua.CreateMonitoredItemsParameters
     ) -> list[ua.MonitoredItemCreateResult]:
-        """Create them, with sampling intervals and queues revised."""
+        """Create them, with revised sampling intervals and queues."""
         results: list[ua.MonitoredItemCreateResult] = await super().create_monitored_items(params)
         for request, result in zip(params.ItemsToCreate, results, strict=True):
             name = request.ItemToMonitor.NodeId.Identifier
             if result.StatusCode.is_good() and name in self._names:
-                self._take(self.subscriptions[params.SubscriptionId], name, request, result)
+                self._sample_item(self.subscriptions[params.SubscriptionId], name, request, result)
         return results
 
-    def _take(
+    def _sample_item(
         self,
         subscription: InternalSubscription,
         name: str,
         request: ua.MonitoredItemCreateRequest,
         result: ua.MonitoredItemCreateResult,
     ) -> None:
-        wanted = request.RequestedParameters
-        interval = wanted.SamplingInterval
+        requested = request.RequestedParameters
+        interval = requested.SamplingInterval
         if interval < 0:  # as often as is published
             interval = subscription.data.RevisedPublishingInterval
         every = max(round(interval), self._settings.min_sampling_ms)
-        queue = max(1, min(wanted.QueueSize, self._settings.max_queue))
+        queue = max(1, min(requested.QueueSize, self._settings.max_queue))
         result.RevisedSamplingInterval = float(every)
         result.RevisedQueueSize = queue
-        trigger = wanted.Filter.Trigger if wanted.Filter else ua.DataChangeTrigger.StatusValue
+        trigger = requested.Filter.Trigger if requested.Filter else ua.DataChangeTrigger.StatusValue
         always = trigger == ua.DataChangeTrigger.StatusValueTimestamp
-        number, handle = result.MonitoredItemId, wanted.ClientHandle
+        number, handle = result.MonitoredItemId, requested.ClientHandle
         self._items.append(
             Item(subscription, number, handle, name, every, queue, always, self._newest())
         )

@@ -1,7 +1,7 @@
 """The PLC as a partner of hardware in the loop: no rig behind it, the twin answers its commands.
 
-Its program waits for part present as a real one would, and supervises the twin: once the watchdog
-stands still for too long, it drops its commands and says so, until it counts again.
+Its program waits for part present as a real one would, and supervises the twin. If the watchdog
+stands still for too long, it drops its commands and reports that until the watchdog counts again.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,7 +23,7 @@ LONGEST_PICK = 5000  # scans until part present
 
 @dataclass
 class Written:
-    """What the twin writes."""
+    """Values that the twin writes."""
 
     pressure: float  # mbar, absolute
     part_present: int = 0
@@ -41,7 +41,7 @@ class PartnerTask(Task):
         self._steps = Steps(settings.program, self.written)
 
     def compute(self, n: int) -> tuple[Scans, Record]:
-        """Scans with what is written by now; there is no truth behind them."""
+        """Scans with the values written so far; no rig and no truth are behind them."""
         scans = np.zeros(n, SCAN)
         scans["sequence"] = self.newest + 1 + np.arange(n)
         scans["ambient"] = np.rint(self.settings.rig.ambient_mbar * 10)
@@ -58,8 +58,8 @@ class Steps:
 
     program: Program
     written: Written
-    _seen: int = 0  # of the watchdog
-    _still: int = PATIENCE  # scans since it counted
+    _last_watchdog: int = 0  # of the watchdog
+    _still_scans: int = PATIENCE  # scans since it counted
     _step: Iterator[int] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -69,9 +69,11 @@ class Steps:
         return self
 
     def __next__(self) -> int:
-        self._still = 0 if self.written.watchdog != self._seen else self._still + 1
-        self._seen = self.written.watchdog
-        if self._still >= PATIENCE:
+        self._still_scans = (
+            0 if self.written.watchdog != self._last_watchdog else self._still_scans + 1
+        )
+        self._last_watchdog = self.written.watchdog
+        if self._still_scans >= PATIENCE:
             self._step = self._cycles()
             return TRIPPED
         return next(self._step)

@@ -1,4 +1,4 @@
-"""The rig as numbers: its constants and its state at rest, in SI units, and what it reports."""
+"""The rig's constants, its state at rest, and the records of its readings, in SI units."""
 
 import math
 
@@ -108,7 +108,7 @@ def plant(settings: PlcSettings) -> Record:
 
 
 def refuse_stiff(p: Record, step: float) -> None:
-    """ConfigError if explicit steps of ``step`` seconds cannot follow a rig so small or so wide."""
+    """ConfigError if the rig is too fast for explicit steps of ``step`` seconds."""
     c2 = 1.4 * R_GAS * float(p["wall"][0])  # m²/s², speed of sound squared
     narrow = min(float(p["port_volume"][0]), float(p["line_volume"][0]))
     opening = float(p["opens"][0] * p["opening"][0] / p["ambient"][0]) * 46  # slope near ambient
@@ -126,14 +126,14 @@ def refuse_stiff(p: Record, step: float) -> None:
 
 
 def at_rest(p: Record, ambient: float) -> Record:
-    """State of a rig that has stood at ``ambient`` (Pa) for long, one row."""
+    """State of a rig in equilibrium with ``ambient`` (Pa), one row."""
     wall = float(p["wall"][0])
     state = {"scan": 0.0}
-    for place in ("port", "line", "vessel"):
-        volume = float(p[f"{place}_volume"][0])
-        state[f"{place}_mass"] = ambient * volume / (R_GAS * wall)
-        state[f"{place}_energy"] = ambient * volume * CV / R_GAS
-        state[f"{place}_pressure"] = ambient
+    for chamber in ("port", "line", "vessel"):
+        volume = float(p[f"{chamber}_volume"][0])
+        state[f"{chamber}_mass"] = ambient * volume / (R_GAS * wall)
+        state[f"{chamber}_energy"] = ambient * volume * CV / R_GAS
+        state[f"{chamber}_pressure"] = ambient
     state |= {"vessel_volume": float(p["vessel_volume"][0]), "added_volume": 0.0, "shrunk": 0.0}
     state |= {"near_flow": 0.0, "far_flow": 0.0}  # port to line, line to vessel
     state |= {"supply": float(p["supply"][0]), "jet": 0.0, "jet_drive": 0.0, "ice": 0.0}

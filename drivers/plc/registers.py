@@ -1,4 +1,4 @@
-"""The trace as Modbus registers: 16-bit words of the newest scans, whatever transports them.
+"""The trace as Modbus registers: 16-bit words of the newest scans.
 
 Addresses are 0-based protocol offsets. A 64-bit or 32-bit value has its high word first unless
 ``word_order`` is "little".
@@ -75,13 +75,13 @@ _REFERENCE = {"coil": 1, "input": 30001, "holding": 40001}  # how manuals count,
 
 
 def table() -> str:
-    """The register map in Markdown, with offsets as sent and references as manuals have them."""
+    """The register map in Markdown, with protocol offsets and references as in manuals."""
     lines = ["| area | offset | reference | type | what |", "| --- | --- | --- | --- | --- |"]
-    for place in MAP:
-        ends = (place.first, place.first + place.size - 1)
+    for entry in MAP:
+        ends = (entry.first, entry.first + entry.size - 1)
         offset = "–".join(str(end) for end in dict.fromkeys(ends))
-        reference = "–".join(f"{_REFERENCE[place.area] + end:05d}" for end in dict.fromkeys(ends))
-        row = (place.area, offset, reference, place.type, place.meaning)
+        reference = "–".join(f"{_REFERENCE[entry.area] + end:05d}" for end in dict.fromkeys(ends))
+        row = (entry.area, offset, reference, entry.type, entry.meaning)
         lines.append(f"| {' | '.join(row)} |")
     return "\n".join(lines)
 
@@ -90,7 +90,7 @@ def table() -> str:
 class Registers:
     """The PLC's memory as a client sees it; ``start_ns`` is the PLC time of sequence 0.
 
-    It changes where the PLC's clock is set.
+    It changes when the PLC's clock is set.
     """
 
     task: Task
@@ -98,12 +98,12 @@ class Registers:
     boot: int  # differs after every restart
 
     def coils(self) -> int:
-        """Bits of the commands: as a client asked, or as the program has them."""
-        asked = self.task.settings.program.commands == "coils"
-        return int(self.task.coils if asked else self.task.commands)
+        """Bits of the commands: a client's, or the program's."""
+        from_client = self.task.settings.program.commands == "coils"
+        return int(self.task.coils if from_client else self.task.commands)
 
     def write_coils(self, address: int, values: Sequence[int | bool]) -> bool:
-        """Command from a client; False where the program commands itself."""
+        """Take a client's commands; False if the program gives its own."""
         if self.task.settings.program.commands != "coils":
             return False
         bits = int(self.task.coils)
@@ -113,7 +113,7 @@ class Registers:
         return True
 
     def inputs(self) -> Words:
-        """Input registers 0 to 6: plain values of the newest scan; to 12 with what is besides."""
+        """Input registers of the newest scan: 0 to 6 always served, 7 to 12 optional values."""
         scan = self.task.ring[self.task.newest % DEPTH]
         tenths = int(np.clip(np.rint(float(scan["pressure"]) * 10), -32768, 32767))
         return [
@@ -129,7 +129,7 @@ class Registers:
         ]
 
     def holding(self, address: int, count: int) -> Words:
-        """``count`` holding registers, all of one part of the map, from ``address`` on."""
+        """``count`` holding registers from ``address`` on, all in one section of the map."""
         if address >= RING:
             return self.ring(address - RING, count)
         begin, words = (HEADER, self.header()) if address >= HEADER else (0, self.test())
@@ -147,7 +147,7 @@ class Registers:
         ]
 
     def header(self) -> Words:
-        """Holding registers 100 to 111: where the trace stands."""
+        """Holding registers 100 to 111: the trace's header."""
         newest = self.task.newest
         supply = int(self.task.ring["supply"][newest % DEPTH])
         return [
@@ -172,7 +172,7 @@ class Registers:
         return [*self._split(np.float32(written.pressure)), *signals]
 
     def write_hil(self, address: int, values: Sequence[int]) -> bool:
-        """Take what the twin writes; False where it has no business."""
+        """Take values that the twin writes; False for other registers, or without a partner."""
         first = address - HIL
         if self.partner is None or first < 0 or first + len(values) > HIL_SIZE:
             return False
@@ -193,8 +193,8 @@ class Registers:
         words[:, 1] = scans["status"]
         high_first = scans["pressure"].astype(">f4").view(">u2").reshape(-1, 2)
         words[:, 2:] = high_first if self._big else high_first[:, ::-1]
-        part: Words = words.ravel()[first - begin * RECORD :][:count].tolist()
-        return part
+        registers: Words = words.ravel()[first - begin * RECORD :][:count].tolist()
+        return registers
 
     @property
     def _big(self) -> bool:

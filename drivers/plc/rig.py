@@ -1,14 +1,14 @@
 """The truth behind the simulated PLC: three gas volumes, lines, an ejector, its control, sensors.
 
 It shares no code with the twin's model: gas laws, ejector, control and steps are written anew. It
-shares assumptions with it: the ideal gas and ISO 6358 with their constants, and the arrangement of
-three volumes with a line between them (all of it: CONTRIBUTING.md, Tests).
+shares assumptions: the ideal gas and ISO 6358 with their constants, and three volumes with a line
+between them. CONTRIBUTING.md (Tests) lists them all.
 
 Port (with the sensor), line and vessel each keep mass and energy; the gas in the two line halves
 has inertia, which keeps explicit steps of 50 µs stable. Everything is SI and absolute.
 
-All compiled functions stand in this one file: numba's cache does not see changes in other files
-(after a change of ``plant``'s constants, touch this one).
+All compiled functions stand in this one file, since numba's cache does not see changes in other
+files. After a change of ``plant``'s constants, touch this file.
 Their arguments p, s and row are records: ``plant.plant``, ``plant.at_rest`` and ``faults.ROW``.
 """
 
@@ -126,7 +126,7 @@ def move_lines(p: Any, s: Any, row: Any) -> None:
 
 @njit(cache=True)
 def exchange_port(p: Any, s: Any, row: Any, ambient: float) -> None:
-    """Step what enters and leaves at the port: jet, back-flow, relief and blow-off."""
+    """Step the flows at the port: jet, back-flow, relief and blow-off."""
     temperature = s.port_energy / (CV * s.port_mass)
     out = suction(p, s, row, ambient)
     out += p.relief * max(s.port_pressure - ambient, 0.0)
@@ -206,8 +206,8 @@ def drive(p: Any, s: Any, row: Any, time: float) -> None:
 def sense(p: Any, s: Any, row: Any) -> None:
     """Step both sensors."""
     quick = DT / (p.sensor_lag + DT)
-    there = s.line_pressure if p.sensor_in_line > 0.0 else s.port_pressure
-    s.sensor_first += (there - s.sensor_first) * quick
+    sensed_pressure = s.line_pressure if p.sensor_in_line > 0.0 else s.port_pressure
+    s.sensor_first += (sensed_pressure - s.sensor_first) * quick
     s.sensor_second += (s.sensor_first - s.sensor_second) * quick
     s.sensor_lagged += (
         (s.sensor_second - s.sensor_lagged) * DT / (row.sensor_lag_time_constant + DT)
@@ -218,10 +218,10 @@ def sense(p: Any, s: Any, row: Any) -> None:
 
 
 @njit(cache=True)
-def save_air(p: Any, s: Any, row: Any, asked: bool, noise: float) -> None:
+def save_air(p: Any, s: Any, row: Any, suctioning: bool, noise: float) -> None:
     """Switch the nozzle between two points of vacuum, and signal a part, on its own sensor."""
     vacuum = p.ambient + row.ambient_pressure_shift - s.own + p.own_noise * noise
-    if not asked or vacuum < p.on_again + row.threshold_drift_h2_shift:
+    if not suctioning or vacuum < p.on_again + row.threshold_drift_h2_shift:
         s.saving = 0.0
     elif p.air_saving > 0.0 and vacuum >= p.h1 + row.threshold_drift_h1_shift:
         s.saving = 1.0
@@ -229,9 +229,9 @@ def save_air(p: Any, s: Any, row: Any, asked: bool, noise: float) -> None:
 
 
 @njit(cache=True)
-def switch_valves(p: Any, s: Any, row: Any, asked: bool, blow_off: bool, noise: Any) -> None:
+def switch_valves(p: Any, s: Any, row: Any, suctioning: bool, blow_off: bool, noise: Any) -> None:
     """Give the valves their new positions, which they take after their delays."""
-    nozzle = 1.0 if asked and s.saving == 0.0 else 0.0
+    nozzle = 1.0 if suctioning and s.saving == 0.0 else 0.0
     blown = 1.0 if blow_off else 0.0
     if nozzle != s.suction_wanted:
         delay = (p.suction_on if nozzle > 0.0 else p.suction_off) + p.valve_scatter * noise[3]
@@ -244,10 +244,10 @@ def switch_valves(p: Any, s: Any, row: Any, asked: bool, blow_off: bool, noise: 
 
 
 @njit(cache=True)
-def handle_part(p: Any, s: Any, asked: bool, blow_off: bool, ambient: float) -> None:
+def handle_part(p: Any, s: Any, suctioning: bool, blow_off: bool, ambient: float) -> None:
     """Let the part leave an opening gripper, and bring the next one."""
-    s.suctioned = s.suctioned + SCAN if asked else 0.0
-    if asked:
+    s.suctioned = s.suctioned + SCAN if suctioning else 0.0
+    if suctioning:
         s.open_wanted = 0.0
     elif p.opens > 0.0 and blow_off and ambient - s.vessel_pressure < p.release:
         s.open_wanted = 1.0
@@ -271,7 +271,7 @@ def read(p: Any, s: Any, row: Any, noise: Any, reading: Any) -> None:
 
 @njit(cache=True)
 def observe(s: Any, truth: Any) -> None:
-    """Write down the truth, for tests."""
+    """Record the truth, for tests."""
     truth.port, truth.vessel = s.port_pressure, s.vessel_pressure
     truth.temperature = s.vessel_energy / (CV * s.vessel_mass)
     truth.mass = s.port_mass + s.line_mass + s.vessel_mass
@@ -291,7 +291,7 @@ def run(
     readings: Record,
     truths: Record,
 ) -> None:
-    """Run one scan per row: read, control, then let the rig go on for a millisecond.
+    """Run one scan per row: read, control, then step the rig for a millisecond.
 
     ``state`` is changed in place, ``readings`` and ``truths`` are filled; all arrays but the
     first two are as long as ``rows``, ``noise`` has ``NOISES`` normal draws in each row.
@@ -303,10 +303,10 @@ def run(
         read(p, s, row, noise[scan], readings[scan])
         observe(s, truths[scan])
         blow_off = (commands[scan] & BLOW_OFF) != 0
-        asked = (commands[scan] & SUCTION) != 0 and not blow_off  # blow-off wins
-        save_air(p, s, row, asked, noise[scan, 1])
-        switch_valves(p, s, row, asked, blow_off, noise[scan])
-        handle_part(p, s, asked, blow_off, ambient)
+        suctioning = (commands[scan] & SUCTION) != 0 and not blow_off  # blow-off wins
+        save_air(p, s, row, suctioning, noise[scan, 1])
+        switch_valves(p, s, row, suctioning, blow_off, noise[scan])
+        handle_part(p, s, suctioning, blow_off, ambient)
         for step in range(STEPS):
             drive(p, s, row, s.scan * SCAN + step * DT)
             move_lines(p, s, row)

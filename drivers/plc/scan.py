@@ -1,7 +1,7 @@
 """The PLC's 1 ms task: commands, rig and trace ring, computed up to "now" on request.
 
-Whatever the host does, a scan is computed exactly once and in order, and the samples of a seed
-are the same however the calls are chopped.
+Each scan is computed exactly once and in order, whatever the host does. A seed gives the same
+samples, however many scans a call computes.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,7 +37,7 @@ Scans = npt.NDArray[np.void]  # of SCAN
 
 
 class Cycles:
-    """The program's commands, scan for scan, with a jitter on every duration."""
+    """The program's commands, scan by scan, with jitter on every duration."""
 
     def __init__(self, program: Program, seed: int) -> None:
         self._program = program
@@ -47,27 +47,27 @@ class Cycles:
             (Command.BLOW_OFF, program.blow_off_ms),
             (Command(0), program.idle_ms),
         )
-        self._at = len(self._steps) - 1
-        self._left = round(program.start_ms)
+        self._step_index = len(self._steps) - 1
+        self._remaining = round(program.start_ms)
 
     def next(self, n: int) -> npt.NDArray[np.uint8]:
         """Commands of the next ``n`` scans."""
         commands = np.zeros(n, np.uint8)
-        done = 0
-        while done < n:
-            while self._left == 0:
+        filled = 0
+        while filled < n:
+            while self._remaining == 0:
                 self._advance()
-            part = min(n - done, self._left)
-            commands[done : done + part] = self._steps[self._at][0]
-            self._left -= part
-            done += part
+            count = min(n - filled, self._remaining)
+            commands[filled : filled + count] = self._steps[self._step_index][0]
+            self._remaining -= count
+            filled += count
         return commands
 
     def _advance(self) -> None:
-        self._at = (self._at + 1) % len(self._steps)
-        nominal = self._steps[self._at][1]
+        self._step_index = (self._step_index + 1) % len(self._steps)
+        nominal = self._steps[self._step_index][1]
         jitter = self._program.jitter_ms * self._random.standard_normal()
-        self._left = max(round(nominal + jitter), 1) if nominal else 0
+        self._remaining = max(round(nominal + jitter), 1) if nominal else 0
 
 
 class Task:
@@ -89,17 +89,19 @@ class Task:
         self._noise = np.random.default_rng([seed, 0])
         self._scatter = np.random.default_rng([seed, 2])
         self._cycle_scatter = self._scatter.standard_normal((1, 2))  # before the first cycle
-        self._reported = np.zeros(round(settings.reports.bits_delay_ms), np.uint8)  # not yet told
+        self._reported = np.zeros(
+            round(settings.reports.bits_delay_ms), np.uint8
+        )  # not yet visible
 
     def advance_to(self, n_scans: int) -> None:
-        """Compute scans until ``n_scans`` have been since the start; a stall is caught up here."""
+        """Compute scans until there are ``n_scans`` since the start; this catches up on a stall."""
         while self.newest + 1 < n_scans:
             scans, _ = self.compute(min(n_scans - self.newest - 1, 1000))
             self.ring[scans["sequence"] % DEPTH] = scans
             self.witness(scans)
 
     def compute(self, n: int) -> tuple[Scans, Record]:
-        """Compute the next ``n`` scans past the ring: what the PLC sees, and ``plant.TRUTH``."""
+        """Compute the next ``n`` scans without the ring: what the PLC sees, and ``plant.TRUTH``."""
         first = self.newest + 1
         commands = self._commands(n)
         rows = self._rows(first, commands)
@@ -114,18 +116,18 @@ class Task:
         scans["supply"] = np.rint(readings["supply"] / MBAR)
         scans["status"] = commands + OVERFLOW * readings["overflow"].astype(np.uint16)
         if self.settings.reports.bits:
-            scans["status"] |= self._late(readings["reported"]).astype(np.uint16) << REPORTED
+            scans["status"] |= self._delayed(readings["reported"]).astype(np.uint16) << REPORTED
         scans["ambient"] = np.rint(readings["ambient"] / MBAR * 10)
         scans["temperature"] = np.rint((readings["temperature"] - ZERO_C) * 10)
         scans["vessel"], scans["flow"] = readings["vessel"] / MBAR, readings["flow"] / SL_MIN
         return scans, truths
 
-    def _late(self, reported: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-        """What has been reported by now."""
-        known = np.concatenate([self._reported, reported])
-        late = round(self.settings.reports.bits_delay_ms)
-        self._reported = known[len(known) - late :]
-        return known[: len(reported)]
+    def _delayed(self, reported: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+        """The reported bits as the PLC sees them: delayed by IO-Link's cycle."""
+        pending = np.concatenate([self._reported, reported])
+        delay_scans = round(self.settings.reports.bits_delay_ms)
+        self._reported = pending[len(pending) - delay_scans :]
+        return pending[: len(reported)]
 
     def _commands(self, n: int) -> npt.NDArray[np.uint8]:
         if self.settings.program.commands == "coils":

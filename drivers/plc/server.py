@@ -1,4 +1,4 @@
-"""Modbus TCP over the trace: pymodbus answers, the registers are filled in at each request."""
+"""Modbus TCP over the trace: pymodbus serves; the registers are filled at each request."""
 
 import asyncio
 import logging
@@ -15,7 +15,7 @@ from drivers.plc import registers
 from drivers.plc.registers import Registers
 from twin.errors import ConfigError, SourceError
 
-# It logs clients that hang up as errors, frames and all; what stops the PLC is raised as well.
+# It logs clients that hang up as errors, with frames; what stops the PLC is raised as well.
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 READ_COILS, READ_HOLDING, READ_INPUTS, WRITE_COIL, WRITE_COILS = 1, 3, 4, 5, 15
@@ -29,20 +29,20 @@ async def listening(
     """Serve ``memories``, each as its own unit, while the context lasts; gives the port.
 
     ``catch_up`` is called before each answer, so that it shows the scans up to now. Raises
-    SourceError where the address cannot be had.
+    SourceError if the address is not available.
     """
-    wanted = memories[0].task.settings.server
+    address = memories[0].task.settings.server
     units = {memory.task.settings.server.unit: memory for memory in memories}
     if len(units) < len(memories):
         raise ConfigError("two ejectors have the same unit", "set unit under [plc.server] in each")
     answers = {unit: Answers(memory, catch_up) for unit, memory in units.items()}
-    devices = [*(_device(unit, answer) for unit, answer in answers.items()), _nobody()]
-    server = ModbusTcpServer(devices, address=(wanted.host, wanted.port))
+    devices = [*(_device(unit, answer) for unit, answer in answers.items()), _absent_units()]
+    server = ModbusTcpServer(devices, address=(address.host, address.port))
     try:
         await server.serve_forever(background=True)
     except RuntimeError as error:
         raise SourceError(
-            f"cannot listen on {wanted.host}:{wanted.port}",
+            f"cannot listen on {address.host}:{address.port}",
             "take another port, or 0 for any free one",
         ) from error
     try:
@@ -53,7 +53,7 @@ async def listening(
 
 @dataclass(frozen=True)
 class Answers:
-    """What pymodbus asks before it answers a request that lies inside the map."""
+    """Called by pymodbus before it answers a request inside the map."""
 
     memory: Registers
     catch_up: Callable[[], None]
@@ -74,7 +74,7 @@ class Answers:
         if function in (WRITE_REGISTER, WRITE_REGISTERS):
             if not self.memory.write_hil(address, [int(value) for value in values or ()]):
                 return ExcCodes.ILLEGAL_FUNCTION
-            function = READ_HOLDING  # as it stands there now
+            function = READ_HOLDING  # the answer shows the registers as they are now
         if function == READ_INPUTS:
             words = self.memory.inputs()[address : address + count]
         elif function == READ_HOLDING:
@@ -104,7 +104,7 @@ def _bits() -> list[SimData]:
 
 
 def _device(unit: int, answers: Answers) -> SimDevice:
-    """Lay the map out; pymodbus wants discrete inputs too, but nothing answers for them."""
+    """Create the map; pymodbus requires discrete inputs too, but nothing answers for them."""
     holding = [
         _words(0, registers.TEST_SIZE),
         _words(registers.HEADER, registers.HEADER_SIZE),
@@ -112,13 +112,13 @@ def _device(unit: int, answers: Answers) -> SimDevice:
     ]
     if answers.memory.partner:
         holding.insert(2, _words(registers.HIL, registers.HIL_SIZE))
-    more = registers.VALUES_SIZE if answers.memory.task.settings.reports.values else 0
-    inputs = [_words(0, registers.INPUT_SIZE + more)]
+    extra = registers.VALUES_SIZE if answers.memory.task.settings.reports.values else 0
+    inputs = [_words(0, registers.INPUT_SIZE + extra)]
     return SimDevice(unit, simdata=(_bits(), _bits(), holding, inputs), action=answers.answer)
 
 
-def _nobody() -> SimDevice:
-    """Say for every other unit that nobody is there."""
+def _absent_units() -> SimDevice:
+    """Answer for every other unit that it does not respond."""
 
     async def answer(*_: object) -> ExcCodes:
         return ExcCodes.GATEWAY_NO_RESPONSE

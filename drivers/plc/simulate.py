@@ -1,4 +1,4 @@
-"""The simulated PLC offline: its samples as fast as the machine goes, and the truth behind."""
+"""The simulated PLC offline: samples as fast as the machine computes, and the rig's truth."""
 
 from collections.abc import Iterator, Sequence
 
@@ -33,7 +33,7 @@ def with_truth(
     seed: int = 0,
     block: int = 1000,
 ) -> Iterator[tuple[Samples, Record]]:
-    """As ``blocks``, each with ``plant.TRUTH`` row for row, for tests that may look behind."""
+    """As ``blocks``, each with ``plant.TRUTH`` row by row, for tests that need the truth."""
     task = Task(settings, faults, seed)
     total = round(duration_s * 1000)
     for first in range(0, total, block):
@@ -44,7 +44,7 @@ def with_truth(
 def to_samples(scans: Scans, reports: Reports = NOTHING) -> Samples:
     """Turn scans into samples exactly as a client that reads the float32 registers does.
 
-    What is reported besides is there in each row, where it is served: as polled.
+    Optional signals that are served have a value in each row, as in poll mode.
     """
     samples = np.zeros(len(scans), SAMPLE)
     samples["sequence"] = scans["sequence"]
