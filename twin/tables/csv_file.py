@@ -1,8 +1,7 @@
-"""A CSV file as batches of text; every line of it is a row, a comment or empty.
+"""A CSV file as batches of text; every line is a row, a comment or empty.
 
-Lines end where they end: a quoted cell does not go on in the next line, so that one stray quotation
-mark cannot swallow rows. The header is the first row that has the name of a wanted column; what a
-program writes before it is not read.
+A quoted cell does not continue in the next line, so that one stray quotation mark cannot swallow
+rows. The header is the first row that has the name of a known column; rows before it are not read.
 """
 
 import codecs
@@ -24,11 +23,11 @@ from twin.tables.layout import wanted_names
 from twin.tables.settings import Column, Encoding, ImportSettings
 
 _PIECE = 1 << 19  # characters, about 10 000 rows
-_LOOK = 1 << 19  # bytes, by which the encoding is told
+_LOOK = 1 << 19  # bytes that decide the encoding
 _LONGEST_LINE = 1 << 20  # characters
 _UNIT = "\x1f"  # stands between cells that had quotation marks
 _UNKNOWN = "\ufffd"
-_SEPARATORS = (";", "\t", ",", " ")  # each where the header has it and those before it do not fit
+_SEPARATORS = (";", "\t", ",", " ")  # on a tie the first that the header has
 _PREAMBLE = 200  # rows that may stand before the header
 _NO_CSV = "export it from the PLC's tool as CSV, with commas, semicolons or tabs"
 _MARKS: tuple[tuple[bytes, Encoding], ...] = (
@@ -39,37 +38,39 @@ _MARKS: tuple[tuple[bytes, Encoding], ...] = (
 
 
 class CsvFile:
-    """A CSV file of which the header is read; SourceError where it is none."""
+    """A CSV file whose header has been read; SourceError if there is none."""
 
     def __init__(self, path: Path, settings: ImportSettings) -> None:
         self._path = path
         self.notes: list[str] = []
-        self._encoding = settings.encoding or self._told_encoding()
-        wanted = wanted_names(settings)
+        self._encoding = settings.encoding or self._detected_encoding()
+        known_names = wanted_names(settings)
         rows = self._rows()
-        header = _find_header(islice(rows, _PREAMBLE), wanted)
+        header = _find_header(islice(rows, _PREAMBLE), known_names)
         if header is None:
             raise SourceError(f"{path}: there is no header row", "name the columns in a first row")
         self._head, self._separator = header.line, header.separator
         self.names = _cells(header.text, self._separator)
         if header.before:
             self.notes.append(f"the header is line {self._head}; what stands before it is not read")
-        self._first = self._head + 1  # line of what may be values
+        self._first = self._head + 1  # first line that may hold values
         self._is_row = _is_row
         if scope.is_header(self.names):
             self._is_row = _is_row_of_scope
-            below = ((line, _cells(row, self._separator)) for line, row in islice(rows, _PREAMBLE))
-            self._first, self.names = scope.columns(self.names, below, self.place)
+            following = (
+                (line, _cells(row, self._separator)) for line, row in islice(rows, _PREAMBLE)
+            )
+            self._first, self.names = scope.columns(self.names, following, self.location)
             self.notes.append("it is of TwinCAT Scope: all channels have the time of the first one")
 
     @property
-    def place(self) -> str:
-        """Where the header stands."""
+    def location(self) -> str:
+        """File and line of the header."""
         return f"{self._path}:{self._head}"
 
-    def batches(self, theirs: Mapping[Column, str]) -> Iterator[Batch]:
-        """Give the rows in order, with the columns of these names in the file."""
-        index = {name: self.names.index(there) for name, there in theirs.items()}
+    def batches(self, file_names: Mapping[Column, str]) -> Iterator[Batch]:
+        """Give the rows in order, with the columns that ``file_names`` lists."""
+        index = {name: self.names.index(header) for name, header in file_names.items()}
         for first, piece in self._pieces():
             skipped = max(0, self._first - first)  # the header and what is before it
             lines = piece[skipped:]
@@ -77,8 +78,8 @@ class CsvFile:
             if rows:
                 yield self._batch(first + skipped, lines, rows, index)
 
-    def _told_encoding(self) -> Encoding:
-        """By the first bytes of the file, and by whether the first piece of it is UTF-8."""
+    def _detected_encoding(self) -> Encoding:
+        """The encoding by a byte order mark, or by whether the first piece is valid UTF-8."""
         with _opened(self._path), self._path.open("rb") as file:
             start = file.read(_LOOK)
         for mark, encoding in _MARKS:
@@ -89,10 +90,10 @@ class CsvFile:
         try:
             codecs.getincrementaldecoder("utf-8")().decode(start)
         except UnicodeDecodeError:
-            others = ", ".join(get_args(Encoding))
+            encodings = ", ".join(get_args(Encoding))
             self.notes.append(
                 "it is not UTF-8: read as cp1252 (Windows, western Europe); if names look wrong,"
-                f" say encoding under [import], one of {others}"
+                f" say encoding under [import], one of {encodings}"
             )
             return "cp1252"
         return "utf-8"
@@ -109,7 +110,7 @@ class CsvFile:
     def _batch(
         self, first: int, lines: list[str], rows: list[str], index: Mapping[Column, int]
     ) -> Batch:
-        def place(row: int) -> str:
+        def location(row: int) -> str:
             numbers = [number for number, line in enumerate(lines, first) if self._is_row(line)]
             return f"{self._path}:{numbers[row]}"
 
@@ -119,18 +120,18 @@ class CsvFile:
         broken: dict[int, str] = {}
         table = self._split(rows, [str(position) for position in index.values()], broken)
         columns = {name: table.column(str(position)) for name, position in index.items()}
-        return Batch(columns, len(rows), broken, place, cell)
+        return Batch(columns, len(rows), broken, location, cell)
 
     def _unquoted(self, rows: list[str]) -> tuple[str, str]:
         """Rows as lines with decimal points and without quotation marks, and their separator."""
         text, separator = "\n".join(rows), self._separator
         if '"' in text or separator == " ":
             cells = (_cells(row.replace(_UNIT, _UNKNOWN), separator) for row in rows)
-            # What is but a quotation mark is a row too; Arrow leaves out empty lines.
+            # A lone quotation mark is a row too, but Arrow skips empty lines.
             text, separator = "\n".join(_UNIT.join(row) or _UNKNOWN for row in cells), _UNIT
         return text if self._separator == "," else text.replace(",", "."), separator
 
-    def _split(self, rows: list[str], wanted: list[str], broken: dict[int, str]) -> pa.Table:
+    def _split(self, rows: list[str], positions: list[str], broken: dict[int, str]) -> pa.Table:
         """Columns of text; a row with another number of cells is null and goes to ``broken``."""
 
         def skip(row: arrow_csv.InvalidRow) -> str:
@@ -148,18 +149,18 @@ class CsvFile:
             ),
             arrow_csv.ParseOptions(delimiter=separator, quote_char=False, invalid_row_handler=skip),
             arrow_csv.ConvertOptions(
-                include_columns=wanted, column_types=dict.fromkeys(wanted, pa.string())
+                include_columns=positions, column_types=dict.fromkeys(positions, pa.string())
             ),
         )
         return _with_gaps(table, broken, len(rows)) if broken else table
 
     def _pieces(self) -> Iterator[tuple[int, list[str]]]:
-        """The lines of a file, many at a time, with the number of the first one."""
+        """The lines of the file in pieces, each with the number of its first line."""
         first = 1
         with _opened(self._path):
             for piece in _whole_lines(self._path, self._encoding):
-                yield first, (cut := _cut(piece))
-                first += len(cut)
+                yield first, (lines := _cut(piece))
+                first += len(lines)
 
 
 def _is_row_of_scope(line: str) -> bool:
@@ -173,11 +174,13 @@ class _Header(NamedTuple):
     before: int  # rows
 
 
-def _find_header(rows: Iterator[tuple[int, str]], wanted: set[str]) -> _Header | None:
-    """The first row that has a wanted name, else the one with the most words."""
+def _find_header(rows: Iterator[tuple[int, str]], known_names: set[str]) -> _Header | None:
+    """The first row that has a known name, else the one with the most words."""
     wordiest: tuple[int, _Header | None] = -1, None
     for before, (line, row) in enumerate(rows):
-        by_fit = {sign: len(wanted & set(_cells(row, sign))) for sign in _SEPARATORS if sign in row}
+        by_fit = {
+            sign: len(known_names & set(_cells(row, sign))) for sign in _SEPARATORS if sign in row
+        }
         separator = max(by_fit, key=by_fit.__getitem__, default=",")
         header = _Header(line, row, separator, before)
         if by_fit and by_fit[separator]:
@@ -201,7 +204,7 @@ def _cells(line: str, separator: str) -> list[str]:
 
 
 def _with_gaps(table: pa.Table, missing: Mapping[int, str], count: int) -> pa.Table:
-    """A table of ``count`` rows, those that are missing null."""
+    """A table of ``count`` rows; missing rows are null."""
     absent = np.zeros(count, bool)
     absent[list(missing)] = True
     return table.take(pa.array(np.cumsum(~absent) - 1, mask=absent))
@@ -214,7 +217,7 @@ def _is_row(line: str) -> bool:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[None]:
-    """SourceError where a file cannot be opened or read inside."""
+    """Turn OSError into SourceError for a file that cannot be opened or read."""
     try:
         yield
     except OSError as error:
@@ -223,20 +226,20 @@ def _opened(path: Path) -> Iterator[None]:
 
 
 def _cut(text: str) -> list[str]:
-    """At the ends of lines, of whatever system they are, and at nothing else."""
+    """Lines of a text, cut at the line ends of any system and nowhere else."""
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     return lines if lines[-1] else lines[:-1]
 
 
 def _whole_lines(path: Path, encoding: Encoding) -> Iterator[str]:
-    rest = ""
-    known = "utf-8-sig" if encoding == "utf-8" else encoding
-    with path.open(encoding=known, errors="replace", newline="") as file:
+    remainder = ""
+    codec = "utf-8-sig" if encoding == "utf-8" else encoding
+    with path.open(encoding=codec, errors="replace", newline="") as file:
         while piece := file.read(_PIECE):
-            head, end, rest = (rest + piece).rpartition("\n")
-            if len(rest) > _LONGEST_LINE:
+            head, end, remainder = (remainder + piece).rpartition("\n")
+            if len(remainder) > _LONGEST_LINE:
                 raise SourceError(f"{path}: there is a line of more than 1 MiB", _NO_CSV)
             if end:
                 yield head + end
-    if rest:
-        yield rest
+    if remainder:
+        yield remainder

@@ -1,7 +1,7 @@
 """Columns of dates and times as PLC tools and spreadsheets write them, to the nanosecond.
 
-Read are ISO 8601, 31.12.2026 23:59:59,999, slashes where the settings say which comes first, a
-time of day alone (counted from midnight), and Windows file times (100 ns since 1601).
+Supported are ISO 8601, 31.12.2026 23:59:59,999, dates with slashes if the settings give their
+order, a time of day alone (counted from midnight), and Windows file times (100 ns since 1601).
 """
 
 import re
@@ -41,16 +41,16 @@ _TO_ISO = (  # in order; RE2 has nine groups, so "\10" is the first one and a ze
 
 @dataclass(frozen=True)
 class Calendar:
-    """How dates and times of one file are read; ``zone`` is that of times which say none."""
+    """How to read dates and times of one file; ``zone`` applies to times without one."""
 
     zone: str | None
     date_order: Literal["day", "month"] | None
-    place: str  # for messages
+    location: str  # for messages
 
     def read(self, times: pa.Array, dates: pa.Array | None = None) -> Numbers[np.int64]:
         """Nanoseconds since 1970 UTC; with ``dates`` the times are times of day.
 
-        SourceError where times have no zone and nothing says which it is.
+        SourceError if times have no zone and the settings give none.
         """
         if pa.types.is_timestamp(times.type):
             return self._of_stamps(times)
@@ -65,7 +65,7 @@ class Calendar:
 
     @property
     def should_be(self) -> str:
-        """What a cell that cannot be read is not."""
+        """What an unreadable cell should be, for messages."""
         if self.date_order is None:
             return (
                 "a date and time that can only mean one (see date_order and time_zone of [import])"
@@ -78,8 +78,8 @@ class Calendar:
             return as_numbers(times, stamps.cast(pa.int64()), 0)
         return as_numbers(times, self._local(stamps), 0)
 
-    def _of_file_times(self, cells: pa.Array, are: pa.Array) -> Numbers[np.int64]:
-        ticks = pc.if_else(are, cells, None).cast(pa.int64())
+    def _of_file_times(self, cells: pa.Array, is_file_time: pa.Array) -> Numbers[np.int64]:
+        ticks = pc.if_else(is_file_time, cells, None).cast(pa.int64())
         return as_numbers(cells, pc.multiply(pc.subtract(ticks, _SINCE_1601), 100), 0)
 
     def _of_text(self, cells: pa.Array) -> Numbers[np.int64]:
@@ -102,23 +102,23 @@ class Calendar:
         return text
 
     def _local(self, naive: pa.Array) -> pa.Array:
-        """Times of the zone in UTC; null where its clock shows them never or twice."""
+        """Local times of the zone in UTC; null where its clock skips or repeats them."""
         if self.zone is None:
             raise SourceError(
-                f"{self.place}: the times say no time zone, and nothing else does",
+                f"{self.location}: the times say no time zone, and nothing else does",
                 'say it under [import]: time_zone = "Europe/Berlin", or --time-zone (UTC is one)',
             )
         first, last = (
-            pc.assume_timezone(naive, self.zone, ambiguous=which, nonexistent=which).cast(
+            pc.assume_timezone(naive, self.zone, ambiguous=choice, nonexistent=choice).cast(
                 pa.int64()
             )
-            for which in ("earliest", "latest")
+            for choice in ("earliest", "latest")
         )
         return pc.if_else(pc.equal(first, last), first, None)
 
 
 def _stamps(text: pa.Array, zone: str | None) -> pa.Array:
-    """Text in ISO form as instants, null where it is none."""
+    """Instants from text in ISO form; null where it is invalid."""
     kind = pa.timestamp("ns", zone)
     try:
         return text.cast(kind)

@@ -1,4 +1,4 @@
-"""Rows of a table as samples, and which of their cells hold nothing usable."""
+"""Rows of a table as samples, with masks of the unusable cells."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -16,29 +16,29 @@ from twin.tables.settings import Column
 
 _ALL_FLAGS = sum(Quality)
 
-Spoilt = dict[Column, Mask]  # where the cells of each column hold nothing usable
+Spoilt = dict[Column, Mask]  # by column: where its cells are unusable
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Some rows of a file as they stand there."""
+    """Some rows of a file, not yet converted."""
 
     columns: Mapping[Column, pa.Array]  # of ``count`` cells each, null where a row is broken
     count: int
-    broken: Mapping[int, str]  # rows whose cells cannot be told apart, and why
-    place: Callable[[int], str]  # file and line of a row, for messages
+    broken: Mapping[int, str]  # rows that cannot be split into cells, and why
+    location: Callable[[int], str]  # file and line of a row, for messages
     cell: Callable[[int, Column], str]  # as it is written in the file
 
 
 def decode(
     batch: Batch, layout: Layout, ambient: float, calendar: Calendar
 ) -> tuple[Samples, Spoilt]:
-    """Give rows of SAMPLE and, by column, where a cell is bad; ``ambient`` in Pa.
+    """Give rows of SAMPLE and, by column, a mask of bad cells; ``ambient`` in Pa.
 
-    Bad cells are NaN or 0. A column that the file does not have is NaN or 0 too.
+    Bad cells become NaN or 0, as do columns that the file lacks.
     """
     rows, bad = np.zeros(batch.count, SAMPLE), Spoilt()
-    if Column.QUALITY in batch.columns:  # the others ask what it says
+    if Column.QUALITY in batch.columns:  # other columns depend on it
         _flags(batch, rows, bad)
     if layout.time is Column.TIME:
         _date_time(batch, calendar, rows["time_ns"], bad)
@@ -49,7 +49,7 @@ def decode(
     for name in _present(batch, COMMANDS):
         _command(batch, name, rows, bad)
     rows["supply"] = np.nan
-    with np.errstate(over="ignore"):  # too large is infinite, and infinite is bad
+    with np.errstate(over="ignore"):  # an overflow gives infinity, which is bad
         _pressure(batch, layout, ambient, rows, bad)
         _supply(batch, layout, ambient, rows, bad)
         for name in _present(batch, BESIDE):
@@ -64,9 +64,9 @@ def _present(batch: Batch, names: Iterable[Column]) -> list[Column]:
 
 
 def _flags(batch: Batch, rows: Samples, bad: Spoilt) -> None:
-    told, empty, unreadable = integers(batch.columns[Column.QUALITY])
-    bad[Column.QUALITY] = empty | unreadable | (told < 0) | (told > _ALL_FLAGS)
-    rows["quality"] = np.where(bad[Column.QUALITY], 0, told)
+    quality, empty, unreadable = integers(batch.columns[Column.QUALITY])
+    bad[Column.QUALITY] = empty | unreadable | (quality < 0) | (quality > _ALL_FLAGS)
+    rows["quality"] = np.where(bad[Column.QUALITY], 0, quality)
 
 
 def _whole(batch: Batch, name: Column, out: npt.NDArray[np.int64], bad: Spoilt) -> None:
@@ -87,12 +87,12 @@ def _command(batch: Batch, name: Column, rows: Samples, bad: Spoilt) -> None:
 
 
 def _pressure(batch: Batch, layout: Layout, ambient: float, rows: Samples, bad: Spoilt) -> None:
-    """An empty cell is as it should be where the quality says that there is no pressure."""
+    """An empty cell is valid where the quality says that there is no pressure."""
     name = layout.pressure
     value, empty, unreadable = floats(batch.columns[name])
     rows["pressure"] = _single(layout.meanings[name].pascal(value, ambient, "absolute"))
-    told = empty & ((rows["quality"] & UNUSABLE) != 0)
-    bad[name] = unreadable | (np.isnan(rows["pressure"]) & ~told)
+    explained = empty & ((rows["quality"] & UNUSABLE) != 0)
+    bad[name] = unreadable | (np.isnan(rows["pressure"]) & ~explained)
 
 
 def _supply(batch: Batch, layout: Layout, ambient: float, rows: Samples, bad: Spoilt) -> None:
@@ -120,23 +120,23 @@ def _beside(
 
 
 def _reported(batch: Batch, name: Column, rows: Samples, bad: Spoilt) -> None:
-    """An empty cell means that nothing was reported; an ejector that saves air has its nozzle off.
+    """An empty cell means that nothing was reported.
 
-    That is so while it is to suck, and the nozzle is on while it does not save.
+    Under suction the nozzle is off while the ejector saves air, and on while it does not.
     """
     state, empty, unreadable = flags(batch.columns[name])
-    known = (state == 0) | (state == 1)
-    bad[name] = unreadable | (~known & ~empty)
+    is_state = (state == 0) | (state == 1)
+    bad[name] = unreadable | (~is_state & ~empty)
     on = state == 1
     if name is Column.REPORTED_AIR_SAVING:
         on = (state == 0) & (rows["commands"] == Command.SUCTION)
-    bit, whether = REPORTED[name]
-    rows["reported"] |= np.where(known, np.uint8(whether), np.uint8(0))
-    rows["reported"] |= np.where(known & on, np.uint8(bit), np.uint8(0))
+    bit, known_bit = REPORTED[name]
+    rows["reported"] |= np.where(is_state, np.uint8(known_bit), np.uint8(0))
+    rows["reported"] |= np.where(is_state & on, np.uint8(bit), np.uint8(0))
 
 
 def _single(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
-    """NaN for whatever is not finite in float32."""
+    """The values as float32; NaN where they are not finite."""
     single = values.astype(np.float32)
     single[~np.isfinite(single)] = np.nan
     return single

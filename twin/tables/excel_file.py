@@ -25,35 +25,35 @@ Cells = tuple[Any, ...]
 
 
 class ExcelFile:
-    """One sheet of an Excel file, of which the header is read; SourceError where it is none."""
+    """One sheet of an Excel file whose header has been read; SourceError if there is none."""
 
     def __init__(self, path: Path, settings: ImportSettings) -> None:
         self._path, self._settings = path, settings
         self.notes: list[str] = []
-        wanted = wanted_names(settings)
+        known_names = wanted_names(settings)
         with self._rows(self.notes) as rows:
             first = [(number, cells) for number, cells in islice(rows, _PREAMBLE) if any(cells)]
         if not first:
             raise SourceError(f"{path}: there is no header row", "name the columns in a first row")
-        fits = (row for row in first if wanted & {_text(cell) for cell in row[1]})
+        fits = (row for row in first if known_names & {_text(cell) for cell in row[1]})
         self._head, header = next(fits, max(first, key=lambda row: len(row[1])))
         self.names = [_text(cell) for cell in header]
 
     @property
-    def place(self) -> str:
-        """Where the header stands."""
+    def location(self) -> str:
+        """File and row of the header."""
         return f"{self._path}: row {self._head}"
 
-    def batches(self, theirs: Mapping[Column, str]) -> Iterator[Batch]:
-        """Give the rows in order, with the columns of these names in the sheet."""
-        index = {name: self.names.index(there) for name, there in theirs.items()}
+    def batches(self, file_names: Mapping[Column, str]) -> Iterator[Batch]:
+        """Give the rows in order, with the columns that ``file_names`` lists."""
+        index = {name: self.names.index(header) for name, header in file_names.items()}
         with self._rows([]) as rows:
             filled = ((n, cells) for n, cells in rows if n > self._head and _has_value(cells))
-            while some := list(islice(filled, _ROWS)):
-                yield self._batch(some, index)
+            while chunk := list(islice(filled, _ROWS)):
+                yield self._batch(chunk, index)
 
     def _batch(self, rows: list[tuple[int, Cells]], index: Mapping[Column, int]) -> Batch:
-        def place(row: int) -> str:
+        def location(row: int) -> str:
             return f"{self._path}: row {rows[row][0]}"
 
         def cell(row: int, name: Column) -> str:
@@ -63,37 +63,35 @@ class ExcelFile:
             name: pa.array([_text(cells[at]) if at < len(cells) else "" for _, cells in rows])
             for name, at in index.items()
         }
-        return Batch(columns, len(rows), {}, place, cell)
+        return Batch(columns, len(rows), {}, location, cell)
 
     @contextmanager
     def _rows(self, notes: list[str]) -> Iterator[Iterator[tuple[int, Cells]]]:
-        """Rows with their numbers; ``notes`` gets what is to be said of the choice of a sheet."""
-        with self._said(), self._path.open("rb") as file:
+        """Rows with their numbers; ``notes`` receives a remark on the choice of a sheet."""
+        with self._source_errors(), self._path.open("rb") as file:
             with zipfile.ZipFile(file) as archive:
                 try:
                     unzipped_within_budget(archive)
                 except ValueError as error:
                     message = f"{self._path}: {error}"
                     raise SourceError(message, "save the sheet as CSV: it has no bound") from error
-            with warnings.catch_warnings(action="ignore"):  # of styles, which nobody wants
+            with warnings.catch_warnings(action="ignore"):  # about styles, which are not needed
                 book = load_workbook(file, read_only=True, data_only=True)
             try:
                 names = book.sheetnames
-                wanted = self._settings.sheet or names[0]
-                if wanted not in names:
-                    what = f"{self._path}: no sheet is called {wanted!r}"
-                    raise SourceError(what, known_names(wanted, names))
+                sheet = self._settings.sheet or names[0]
+                if sheet not in names:
+                    text = f"{self._path}: no sheet is called {sheet!r}"
+                    raise SourceError(text, known_names(sheet, names))
                 if len(names) > 1 and not self._settings.sheet:
-                    notes.append(
-                        f"sheet {wanted!r} is read; another is chosen by sheet of [import]"
-                    )
-                yield enumerate(book[wanted].iter_rows(values_only=True), 1)
+                    notes.append(f"sheet {sheet!r} is read; another is chosen by sheet of [import]")
+                yield enumerate(book[sheet].iter_rows(values_only=True), 1)
             finally:
                 book.close()
 
     @contextmanager
-    def _said(self) -> Iterator[None]:
-        """SourceError where the file cannot be opened or is no Excel file."""
+    def _source_errors(self) -> Iterator[None]:
+        """Turn errors into SourceError if the file cannot be opened or is no Excel file."""
         try:
             yield
         except SourceError:
@@ -101,9 +99,9 @@ class ExcelFile:
         except OSError as error:
             message = f"{self._path}: cannot be read: {error.strerror or error}"
             raise SourceError(message, "check the path") from error
-        except Exception as error:  # the library lets through what zip, zlib and XML raise
-            what = str(error).partition("\n")[0] or type(error).__name__
-            message = f"{self._path}: cannot be read as an Excel file (.xlsx): {what}"
+        except Exception as error:  # the library passes on errors of zip, zlib and XML
+            detail = str(error).partition("\n")[0] or type(error).__name__
+            message = f"{self._path}: cannot be read as an Excel file (.xlsx): {detail}"
             raise SourceError(message, "save it anew as .xlsx, or as CSV") from error
 
 
@@ -112,7 +110,7 @@ def _has_value(cells: Cells) -> bool:
 
 
 def _text(cell: Any) -> str:
-    """A cell as CSV would have it; dates as ISO 8601."""
+    """A cell as text, as in CSV; dates as ISO 8601."""
     if cell is None:
         return ""
     if isinstance(cell, datetime):

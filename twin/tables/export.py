@@ -27,7 +27,7 @@ from twin.signals import (
     Ticks,
 )
 
-ROWS = 100_000  # a good size of block to export: what a reader of Parquet takes at once
+ROWS = 100_000  # a good block size for export: a Parquet reader takes that many at once
 
 Rows = Iterable[tuple[Samples, Ticks]]
 
@@ -45,22 +45,22 @@ def _commanded(bit: Command) -> _Column:
     return lambda samples, _: (samples["commands"] & bit.value) != 0
 
 
-def _given(bit: Signal) -> _Column:
+def _signalled(bit: Signal) -> _Column:
     return lambda _, ticks: (ticks["signals"] & bit.value) != 0
 
 
 def _reported(bit: Reported, known: Reported) -> _Column:
-    """0 or 1, NaN where nothing was reported."""
+    """A column of 0 or 1; NaN where nothing was reported."""
 
     def of(samples: Samples, _: Ticks) -> npt.NDArray[np.float64]:
-        said = (samples["reported"] & bit.value) != 0
-        return np.where(samples["reported"] & known.value, said, np.nan)
+        is_set = (samples["reported"] & bit.value) != 0
+        return np.where(samples["reported"] & known.value, is_set, np.nan)
 
     return of
 
 
 def _measured(column: str, unit: float, zero: float = 0.0) -> _Column:
-    """Not there, and so NaN, where it is 0."""
+    """A column in ``unit``; 0 means not measured, and becomes NaN."""
 
     def of(samples: Samples, _: Ticks) -> npt.NDArray[np.float64]:
         values = samples[column].astype(np.float64)
@@ -70,12 +70,12 @@ def _measured(column: str, unit: float, zero: float = 0.0) -> _Column:
 
 
 def _flow(samples: Samples, _: Ticks) -> npt.NDArray[np.float64]:
-    known = (samples["reported"] & Reported.FLOW_KNOWN.value) != 0
-    return np.where(known, _wide(samples["flow"], SL_MIN), np.nan)
+    is_known = (samples["reported"] & Reported.FLOW_KNOWN.value) != 0
+    return np.where(is_known, _wide(samples["flow"], SL_MIN), np.nan)
 
 
 def _wide(column: npt.NDArray[np.float32], unit: float) -> npt.NDArray[np.float64]:
-    """In ``unit``, with digits enough to come back to the bit."""
+    """The column in ``unit``, with enough digits to restore it to the bit."""
     return column.astype(np.float64) / unit
 
 
@@ -107,22 +107,22 @@ _FIELDS = {
         pa.float64(),
         lambda _, t: _wide(t["level"], MBAR),
     ),
-    "part_present": _Field("0 or 1, H2", pa.uint8(), _given(Signal.PART_PRESENT)),
-    "air_saving": _Field("0 or 1, H1", pa.uint8(), _given(Signal.AIR_SAVING)),
+    "part_present": _Field("0 or 1, H2", pa.uint8(), _signalled(Signal.PART_PRESENT)),
+    "air_saving": _Field("0 or 1, H1", pa.uint8(), _signalled(Signal.AIR_SAVING)),
     "host_ns": _Field("ns, time of receipt", pa.int64(), lambda s, _: s["host_ns"]),
 }
 
 
 def export(rows: Rows, header: LogHeader, path: Path) -> None:
-    """Write rows of a log as CSV or Parquet, by the suffix of ``path``, a block in memory.
+    """Write rows of a log as CSV or Parquet, by the suffix of ``path``, one block in memory.
 
-    The file is there once it is complete, or not at all. ConfigError for another suffix,
+    The file appears once it is complete, or not at all. ConfigError for another suffix,
     SourceError if there is a file of that name or it cannot be written.
     """
     write = _KINDS.get(path.suffix.lower())
     if write is None:
-        known = " and ".join(_KINDS)
-        raise ConfigError(f"{path}: cannot tell what to write", f"{known} files can be written")
+        suffixes = " and ".join(_KINDS)
+        raise ConfigError(f"{path}: cannot tell what to write", f"{suffixes} files can be written")
     with complete_file(path) as file:
         write(rows, header, file)
 
@@ -164,18 +164,18 @@ def _schema(header: LogHeader) -> pa.Schema:
 
 
 def _origin(header: LogHeader) -> dict[str, str]:
-    own = {
+    origin = {
         "asset_type": header.asset_type,
         "asset_id": header.asset_id,
         "config_name": header.config_name,
         "ambient_pa": repr(header.ambient),
     }
-    return header.metadata | own
+    return header.metadata | origin
 
 
 @contextmanager
 def complete_file(path: Path) -> Iterator[BinaryIO]:
-    """A file to write to, which gets its name once all is written."""
+    """A file to write to, which gets its name once it is complete."""
     if path.exists():
         message = f"{path}: there is already a file of that name"
         raise SourceError(message, "choose another name, or remove it")

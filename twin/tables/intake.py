@@ -1,4 +1,4 @@
-"""Batches of a table in, samples out: what is bad in them is refused, or kept and marked."""
+"""Turn batches of a table into samples; bad rows are refused, or kept and marked."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from twin.tables.numbers import Mask
 from twin.tables.settings import Bad, Column, ImportSettings
 
 _USUAL = 1_000_000  # ns, the period while none is known
-_LONGEST = 2**62  # ns, of a period: longer ones cannot be counted with
+_LONGEST = 2**62  # ns, of a period: longer ones would overflow
 
 _SHOULD_BE = {
     **dict.fromkeys(DIGITS, "a time"),
@@ -28,7 +28,7 @@ _SHOULD_BE = {
 
 
 class _Breaks(NamedTuple):
-    """Rows before which the stream breaks off and whose quality does not say so itself."""
+    """Rows before which the stream breaks, unless their quality already says so."""
 
     clock: Mask  # time does not go forward
     restart: Mask  # the sequence does not go forward
@@ -39,19 +39,19 @@ class _Breaks(NamedTuple):
 class _Trouble(NamedTuple):
     row: int
     column: Column
-    what: str
-    setting: str  # that lets it pass
+    text: str
+    setting: str  # that would let it pass
 
 
 @dataclass
 class Intake:
-    """The rows of one file, batch after batch; ``ambient`` in Pa."""
+    """Takes the rows of one file, batch by batch; ``ambient`` in Pa."""
 
     layout: Layout
     settings: ImportSettings
     ambient: float
     calendar: Calendar
-    _last: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # row taken
+    _last: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # the last row taken
     _period: int | None = None  # ns
 
     def __post_init__(self) -> None:
@@ -73,17 +73,17 @@ class Intake:
         self._last = rows[-1:].copy()
         return rows
 
-    # --- what cannot be NaN goes on from the row before -----------------------------------------
+    # --- values that cannot be NaN continue from the row before ---------------------------------
 
     def _replace(self, run: Samples, bad: Spoilt, batch: Batch) -> None:
         lead = len(run) - batch.count
         good = {name: np.concatenate((np.ones(lead, bool), ~mask)) for name, mask in bad.items()}
-        known = good[self.layout.time]
-        if known.any():
-            self._learn_period(run["time_ns"], known)
-            _interpolate(run["time_ns"], known, self._period or _USUAL)
+        timed = good[self.layout.time]
+        if timed.any():
+            self._learn_period(run["time_ns"], timed)
+            _interpolate(run["time_ns"], timed, self._period or _USUAL)
         elif self.settings.values is Bad.MARK:
-            message = f"{batch.place(0)}: none of {batch.count} rows from here on has a time"
+            message = f"{batch.location(0)}: none of {batch.count} rows from here on has a time"
             raise SourceError(message, "check the column of time and its unit")
         if Column.SEQUENCE in good:
             _carry_on(run["sequence"], good[Column.SEQUENCE], 1)
@@ -99,14 +99,14 @@ class Intake:
         guessed = ~good.get(Column.HOST_NS, np.arange(len(run)) < lead)
         run["host_ns"][guessed] = run["time_ns"][guessed]
 
-    def _learn_period(self, times: npt.NDArray[np.int64], known: Mask) -> None:
-        """From the first batch that has a step."""
+    def _learn_period(self, times: npt.NDArray[np.int64], timed: Mask) -> None:
+        """Take the period from the first batch that has a step."""
         if self._period is None:
-            steps = _distance(times)[known[1:] & known[:-1] & (times[1:] > times[:-1])]
+            steps = _distance(times)[timed[1:] & timed[:-1] & (times[1:] > times[:-1])]
             self._period = min(int(np.median(steps)), _LONGEST) if len(steps) else None
 
     def _count(self, run: Samples, lead: int) -> None:
-        """Number the rows, leaving out the numbers of those that are missing."""
+        """Number the rows; missing rows leave out their numbers."""
         steps = np.ones(len(run), np.int64)
         steps[1:] += self._missing(run["time_ns"])
         if lead:
@@ -119,19 +119,19 @@ class Intake:
 
     def _find_breaks(self, run: Samples) -> _Breaks:
         times, sequence = run["time_ns"], run["sequence"]
-        onward = (sequence[1:] > sequence[:-1]) | (Column.SEQUENCE not in self.layout.theirs)
+        onward = (sequence[1:] > sequence[:-1]) | (Column.SEQUENCE not in self.layout.file_names)
         missing = (_distance(sequence) - np.uint64(1)).view(np.int64)
-        told = (run["quality"][1:] & BREAK) != 0
-        first = int(len(self._last) == 0)  # nothing is before it
+        marked = (run["quality"][1:] & BREAK) != 0
+        first = int(len(self._last) == 0)  # 1 if no row comes before
         return _Breaks(
-            np.pad((times[1:] <= times[:-1]) & ~told, (first, 0)),
-            np.pad(~onward & ~told, (first, 0)),
-            np.pad(onward & (missing != 0) & ~told, (first, 0)),
+            np.pad((times[1:] <= times[:-1]) & ~marked, (first, 0)),
+            np.pad(~onward & ~marked, (first, 0)),
+            np.pad(onward & (missing != 0) & ~marked, (first, 0)),
             np.pad(missing, (first, 0)),
         )
 
     def _missing(self, times: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Samples missing before each row, from the second one, by time."""
+        """Number of samples missing before each row, from the second one on, by time."""
         period = np.uint64(self._period or _LONGEST)
         half = (period + np.uint64(1)) // np.uint64(2)
         missing = (np.maximum(_distance(times), half) - half) // period
@@ -140,42 +140,42 @@ class Intake:
     # --- refusing -------------------------------------------------------------------------------
 
     def _refuse(self, batch: Batch, bad: Spoilt, breaks: _Breaks) -> None:
-        """SourceError for the first row with something that the settings do not let pass."""
-        found: list[_Trouble] = []
+        """SourceError for the first row that the settings do not let pass."""
+        troubles: list[_Trouble] = []
         if self.settings.values is Bad.REFUSE:
-            found += _bad_cells(batch, bad, self.calendar)
+            troubles += _bad_cells(batch, bad, self.calendar)
         if self.settings.jumps is Bad.REFUSE:
-            found += self._jumps(batch, breaks)
+            troubles += self._jumps(batch, breaks)
         if self.settings.gaps is Bad.REFUSE:
-            found += self._gaps(breaks)
-        if found:
-            row, column, what, setting = min(found, key=lambda trouble: trouble.row)
-            what = batch.broken.get(row, f"column {self.layout.theirs[column]!r}: {what}")
+            troubles += self._gaps(breaks)
+        if troubles:
+            row, column, text, setting = min(troubles, key=lambda trouble: trouble.row)
+            text = batch.broken.get(row, f"column {self.layout.file_names[column]!r}: {text}")
             hint = f'mend the file, or {setting} = "mark" under [import] keeps such rows, marked'
-            raise SourceError(f"{batch.place(row)}: {what}", hint)
+            raise SourceError(f"{batch.location(row)}: {text}", hint)
 
     def _jumps(self, batch: Batch, breaks: _Breaks) -> list[_Trouble]:
-        found = []
+        troubles = []
         for name, mask in ((self.layout.time, breaks.clock), (Column.SEQUENCE, breaks.restart)):
             if mask.any():
                 row = int(mask.argmax())
-                what = f"{batch.cell(row, name)!r} does not go forward from the row before"
-                found.append(_Trouble(row, name, what, "jumps"))
-        return found
+                text = f"{batch.cell(row, name)!r} does not go forward from the row before"
+                troubles.append(_Trouble(row, name, text, "jumps"))
+        return troubles
 
     def _gaps(self, breaks: _Breaks) -> list[_Trouble]:
         if not breaks.gap.any():
             return []
         row = int(breaks.gap.argmax())
-        counted = Column.SEQUENCE in self.layout.theirs
-        what = f"{breaks.missing[row]} samples are missing before this row"
+        counted = Column.SEQUENCE in self.layout.file_names
+        text = f"{breaks.missing[row]} samples are missing before this row"
         if not counted:
-            what += f", at a period of {(self._period or 0) * 1e-6:g} ms"
-        return [_Trouble(row, Column.SEQUENCE if counted else self.layout.time, what, "gaps")]
+            text += f", at a period of {(self._period or 0) * 1e-6:g} ms"
+        return [_Trouble(row, Column.SEQUENCE if counted else self.layout.time, text, "gaps")]
 
 
 def _bad_cells(batch: Batch, bad: Spoilt, calendar: Calendar) -> list[_Trouble]:
-    found = []
+    troubles = []
     for name, mask in bad.items():
         if mask.any():
             row = int(mask.argmax())
@@ -183,28 +183,28 @@ def _bad_cells(batch: Batch, bad: Spoilt, calendar: Calendar) -> list[_Trouble]:
             should_be = _SHOULD_BE.get(name, "a finite number")
             if name is Column.TIME:
                 should_be = calendar.should_be
-            what = f"{cell!r} is not {should_be}" if cell else "the cell is empty"
-            found.append(_Trouble(row, name, what, "values"))
-    return found
+            text = f"{cell!r} is not {should_be}" if cell else "the cell is empty"
+            troubles.append(_Trouble(row, name, text, "values"))
+    return troubles
 
 
 def _carry_on(values: npt.NDArray[np.integer], good: Mask, step: int) -> None:
-    """Let values that are not good go on, in steps, from the last good one or to the first."""
-    at = np.arange(len(values))
-    known = np.maximum.accumulate(np.where(good, at, good.argmax()))
-    values[~good] = (values[known] + step * (at - known)).astype(values.dtype)[~good]
+    """Replace bad values: count on by ``step`` from the last good one, or back from the first."""
+    rows = np.arange(len(values))
+    source = np.maximum.accumulate(np.where(good, rows, good.argmax()))
+    values[~good] = (values[source] + step * (rows - source)).astype(values.dtype)[~good]
 
 
-def _interpolate(times: npt.NDArray[np.int64], known: Mask, period: int) -> None:
-    """Fill in the times between known ones evenly, before and behind them in steps of a period."""
-    at, good = np.arange(len(times)), np.flatnonzero(known)
-    since = np.interp(at, good, times[good] - times[good[0]])
-    since += period * (at - at.clip(good[0], good[-1]))
+def _interpolate(times: npt.NDArray[np.int64], timed: Mask, period: int) -> None:
+    """Fill in missing times: evenly between known ones, by the period before and after them."""
+    rows, anchors = np.arange(len(times)), np.flatnonzero(timed)
+    elapsed = np.interp(rows, anchors, times[anchors] - times[anchors[0]])
+    elapsed += period * (rows - rows.clip(anchors[0], anchors[-1]))
     with np.errstate(invalid="ignore"):  # centuries between two rows
-        times[~known] = times[good[0]] + np.rint(since).astype(np.int64)[~known]
+        times[~timed] = times[anchors[0]] + np.rint(elapsed).astype(np.int64)[~timed]
 
 
 def _distance(values: npt.NDArray[np.int64]) -> npt.NDArray[np.uint64]:
-    """From row to row, where it goes up: no difference is too large for it."""
+    """Increase from row to row; as unsigned numbers no increase overflows."""
     numbers: npt.NDArray[np.uint64] = values.view(np.uint64)
     return numbers[1:] - numbers[:-1]

@@ -1,4 +1,4 @@
-"""Which column of a file is which of the known ones."""
+"""Match the columns of a file to the known columns."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from twin.tables.settings import Column, ColumnSource, ImportSettings
 
 DIGITS = {Column.TIME_S: 9, Column.TIME_MS: 6, Column.TIME_US: 3, Column.TIME_NS: 0}  # down to ns
 TIMES = (*DIGITS, Column.TIME)
-REPORTED = {  # which bit says it, and which that it is known; an empty cell says nothing
+REPORTED = {  # the state's bit, and the bit that it is known; an empty cell leaves it unknown
     Column.REPORTED_NOZZLE: (Reported.NOZZLE, Reported.NOZZLE_KNOWN),
     Column.REPORTED_AIR_SAVING: (Reported.NOZZLE, Reported.NOZZLE_KNOWN),
     Column.REPORTED_PART_PRESENT: (Reported.PART, Reported.PART_KNOWN),
 }
-BESIDE = {  # column of SAMPLE, what one unit is in SI, and where it counts from
+BESIDE = {  # column of SAMPLE, the unit in SI, and its zero
     Column.AMBIENT_MBAR: ("ambient", MBAR, 0.0),
     Column.TEMPERATURE_C: ("temperature", 1.0, ZERO_C),
     Column.PRESSURE_2_MBAR: ("pressure_2", MBAR, 0.0),
@@ -34,9 +34,9 @@ _MEASURED = (*PRESSURES, *SUPPLIES, *BESIDE)  # whose numbers may be scaled
 
 @dataclass(frozen=True)
 class Layout:
-    """The columns that are taken; the file's other ones are ignored."""
+    """The columns that are read; the file's other ones are ignored."""
 
-    theirs: Mapping[Column, str]  # name in the file
+    file_names: Mapping[Column, str]  # name in the file
     ignored: tuple[str, ...]
     meanings: Mapping[Column, Meaning]  # of pressure and supply
     lines: Mapping[Column, tuple[float, float]]  # scale and offset of other numbers
@@ -45,65 +45,72 @@ class Layout:
     @property
     def time(self) -> Column:
         """The column of time."""
-        return next(name for name in TIMES if name in self.theirs)
+        return next(name for name in TIMES if name in self.file_names)
 
     @property
     def pressure(self) -> Column:
         """The column of pressure."""
-        return next(name for name in PRESSURES if name in self.theirs)
+        return next(name for name in PRESSURES if name in self.file_names)
 
 
 def find_layout(
-    header: Sequence[str], settings: ImportSettings, place: str, *, derive: bool = False
+    header: Sequence[str], settings: ImportSettings, location: str, *, derive: bool = False
 ) -> Layout:
-    """Find the known columns among a file's; SourceError names ``place`` and what is amiss.
+    """Find the known columns in a file's header; SourceError names ``location`` and the problem.
 
-    With ``derive`` commands may be lacking, and one must.
+    With ``derive`` commands may be lacking, and at least one must be.
     """
     sources = {name: settings.columns.get(name, ColumnSource(name=name)) for name in Column}
-    claimed = {source.name for source in settings.columns.values()}  # not by its own name as well
-    theirs = {
+    claimed = {source.name for source in settings.columns.values()}  # not under its own name too
+    file_names = {
         name: source.name
         for name, source in sources.items()
         if source.name in header and (name in settings.columns or source.name not in claimed)
     }
     for name in settings.columns:
-        if name not in theirs:
-            what = f"no column {sources[name].name!r}, which [import.columns] gives for {name}"
-            raise _missing(what, name, header, place, sources[name].name)
-    has = tuple(name for name in COMMANDS if not (settings.no_blow_off and name is Column.BLOW_OFF))
-    if settings.no_blow_off and Column.BLOW_OFF in theirs:
-        what = f"column {theirs[Column.BLOW_OFF]!r} is blow_off, and no_blow_off says there is none"
-        raise ConfigError(f"{place}: {what}", "take no_blow_off out of [import]")
-    for names in (*_REQUIRED, *([] if derive else [(name,) for name in has])):
-        _require_one(names, theirs, header, place)
-    lacking = tuple(name for name in has if name not in theirs)
+        if name not in file_names:
+            text = f"no column {sources[name].name!r}, which [import.columns] gives for {name}"
+            raise _missing(text, name, header, location, sources[name].name)
+    commands = tuple(
+        name for name in COMMANDS if not (settings.no_blow_off and name is Column.BLOW_OFF)
+    )
+    if settings.no_blow_off and Column.BLOW_OFF in file_names:
+        text = (
+            f"column {file_names[Column.BLOW_OFF]!r} is blow_off,"
+            " and no_blow_off says there is none"
+        )
+        raise ConfigError(f"{location}: {text}", "take no_blow_off out of [import]")
+    for names in (*_REQUIRED, *([] if derive else [(name,) for name in commands])):
+        _require_one(names, file_names, header, location)
+    lacking = tuple(name for name in commands if name not in file_names)
     if derive and not lacking:
         raise ConfigError(
-            f"{place}: the file has {_all_commands(has)}: none is to be derived",
+            f"{location}: the file has {_all_commands(commands)}: none is to be derived",
             "leave --derive-commands out",
         )
-    for same in ONE_OF_THEM:
-        both = [theirs[name] for name in same if name in theirs]
-        if len(both) > 1:
-            raise _too_many(f"columns {' and '.join(map(repr, both))} say the same", place)
-    for there in theirs.values():
-        if header.count(there) > 1:
-            raise _too_many(f"column {there!r} stands there {header.count(there)} times", place)
-    _refuse_scaled(sources, theirs, place)
+    for alternatives in ONE_OF_THEM:
+        duplicates = [file_names[name] for name in alternatives if name in file_names]
+        if len(duplicates) > 1:
+            raise _too_many(f"columns {' and '.join(map(repr, duplicates))} say the same", location)
+    for header_name in file_names.values():
+        if header.count(header_name) > 1:
+            raise _too_many(
+                f"column {header_name!r} stands there {header.count(header_name)} times", location
+            )
+    _refuse_scaled(sources, file_names, location)
     meanings = {
-        name: find_meaning(name, sources[name], settings, place)
+        name: find_meaning(name, sources[name], settings, location)
         for name in (*PRESSURES, *SUPPLIES)
-        if name in theirs
+        if name in file_names
     }
-    lines = {name: sources[name].line for name in BESIDE if name in theirs}
-    ignored = set(header) - set(theirs.values()) - {""}
-    left = tuple(name for name in dict.fromkeys(header) if name in ignored)
-    return Layout(theirs, left, meanings, lines, lacking)
+    lines = {name: sources[name].line for name in BESIDE if name in file_names}
+    ignored = set(header) - set(file_names.values()) - {""}
+    in_order = tuple(name for name in dict.fromkeys(header) if name in ignored)
+    return Layout(file_names, in_order, meanings, lines, lacking)
 
 
 def wanted_names(settings: ImportSettings) -> set[str]:
-    """What a header may have: the names that the settings give, and those of known columns."""
+    """Names to look for in a header: those of known columns, and those that the settings give."""
     return {*Column, *(source.name for source in settings.columns.values())}
 
 
@@ -112,45 +119,47 @@ def _all_commands(names: Sequence[Column]) -> str:
 
 
 def _refuse_scaled(
-    sources: Mapping[Column, ColumnSource], theirs: Mapping[Column, str], place: str
+    sources: Mapping[Column, ColumnSource], file_names: Mapping[Column, str], location: str
 ) -> None:
-    """ConfigError if something is said of a column that only numbers with a unit can have."""
-    for name in theirs:
+    """ConfigError if a column has settings that only numbers with a unit can have."""
+    for name in file_names:
         source = sources[name]
         of_pressure = source.unit is not None or source.reference is not None
         if (name in BESIDE and of_pressure) or not (name in _MEASURED or source.is_name_only):
-            what = "unit and reference" if name in BESIDE else "unit, reference and scale"
+            attributes = "unit and reference" if name in BESIDE else "unit, reference and scale"
             raise ConfigError(
-                f"{place}: {name} cannot have {what}",
+                f"{location}: {name} cannot have {attributes}",
                 f'write under [import.columns]: {name} = "{source.name}"',
             )
 
 
 def _require_one(
-    names: Sequence[Column], theirs: Mapping[Column, str], header: Sequence[str], place: str
+    names: Sequence[Column], file_names: Mapping[Column, str], header: Sequence[str], location: str
 ) -> None:
-    found = [theirs[name] for name in names if name in theirs]
-    if not found:
-        raise _missing(f"no column {' or '.join(names)}", names[0], header, place)
-    if len(found) > 1:
-        raise _too_many(f"only one of the columns {', '.join(map(repr, found))} can be used", place)
+    present = [file_names[name] for name in names if name in file_names]
+    if not present:
+        raise _missing(f"no column {' or '.join(names)}", names[0], header, location)
+    if len(present) > 1:
+        raise _too_many(
+            f"only one of the columns {', '.join(map(repr, present))} can be used", location
+        )
 
 
 def _missing(
-    what: str, name: Column, header: Sequence[str], place: str, asked: str = ""
+    problem: str, name: Column, header: Sequence[str], location: str, requested: str = ""
 ) -> SourceError:
-    there = ", ".join(map(repr, header))
-    shown = there if len(there) <= 300 else f"{there[:300]} ..."
+    names = ", ".join(map(repr, header))
+    listing = names if len(names) <= 300 else f"{names[:300]} ..."
     hint = f'say under [import.columns] which one it is: {name} = "NAME IN THE FILE"'
-    nearest = get_close_matches(asked, header, n=1) if asked else []
+    nearest = get_close_matches(requested, header, n=1) if requested else []
     if nearest:
         hint = f"did you mean {nearest[0]!r}? {hint}"
     if name is Column.BLOW_OFF:
         hint += "; if the ejector has none, say no_blow_off = true under [import]"
     if name in COMMANDS:
         hint += "; if nobody recorded it, twin import --derive-commands finds it from the pressure"
-    return SourceError(f"{place}: {what}; the columns are {shown}", hint)
+    return SourceError(f"{location}: {problem}; the columns are {listing}", hint)
 
 
-def _too_many(what: str, place: str) -> SourceError:
-    return SourceError(f"{place}: {what}", "take one of them out of the file, or rename it")
+def _too_many(problem: str, location: str) -> SourceError:
+    return SourceError(f"{location}: {problem}", "take one of them out of the file, or rename it")

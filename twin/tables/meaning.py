@@ -1,4 +1,4 @@
-"""What the numbers of a pressure's column mean: unit, reference, scale and offset."""
+"""Meaning of the numbers in a pressure's column: unit, reference, scale and offset."""
 
 import re
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from twin.tables.settings import Column, ColumnSource, ImportSettings
 
 Floats = npt.NDArray[np.float64]
 
-# Unit and reference of columns whose name says them; None is not said.
+# Unit and reference that a column's name implies; None: it implies none.
 PRESSURES: Mapping[Column, tuple[Unit | None, Reference]] = {
     Column.PRESSURE_MBAR: ("mbar", "absolute"),
     Column.PRESSURE_PA: ("Pa", "absolute"),
@@ -72,43 +72,43 @@ class Meaning:
 
 
 def find_meaning(
-    column: Column, source: ColumnSource, settings: ImportSettings, place: str
+    column: Column, source: ColumnSource, settings: ImportSettings, location: str
 ) -> Meaning:
-    """The meaning of a column of pressure or supply, by all that says something of it.
+    """The meaning of a column of pressure or supply, from its name, the settings and the header.
 
-    SourceError where nothing says the unit, or two things say different ones.
+    SourceError if none of them gives the unit, or two contradict each other.
     """
     named, reference = {**PRESSURES, **SUPPLIES}[column]
     if source.reference is not None:
         if reference == "vacuum" and source.reference != "vacuum":
             kind = f'pressure = {{ name = "{source.name}", reference = "{source.reference}", ... }}'
             raise ConfigError(
-                f"{place}: {column} counts from ambient, positive below", f"use {kind}"
+                f"{location}: {column} counts from ambient, positive below", f"use {kind}"
             )
         reference = source.reference
     header = _unit_of(source.name)
-    said = source.unit or (settings.pressure_unit if column in PRESSURES else None)
-    if named and said and said != named:
-        raise _other_unit(column, source, said, place)
-    unit = named or said
+    stated = source.unit or (settings.pressure_unit if column in PRESSURES else None)
+    if named and stated and stated != named:
+        raise _other_unit(column, source, stated, location)
+    unit = named or stated
     if header in _ELECTRICAL and source.signal is None and source.is_name_only:
-        raise _electrical(source, place)
+        raise _electrical(source, location)
     if unit is None and header in _UNITS:
         return Meaning(_UNITS[header], reference, *source.line, from_header=True)
     if unit is None:
         raise SourceError(
-            f"{place}: in which unit is column {source.name!r}?",
+            f"{location}: in which unit is column {source.name!r}?",
             f"say it under [import.columns]: {_generic(column)} ="
             f' {{ name = "{source.name}", unit = "mbar" }}; units are {", ".join(get_args(Unit))}',
         )
     if (
         source.is_name_only
-        and not said
+        and not stated
         and header in _UNITS
         and PASCAL[unit] != PASCAL[_UNITS[header]]
     ):
         raise SourceError(
-            f"{place}: column {source.name!r} is taken as {column}, and its name says"
+            f"{location}: column {source.name!r} is taken as {column}, and its name says"
             f" {_UNITS[header]}: in which unit is it?",
             f"if its name is right, say under [import.columns]: {_generic(column)} ="
             f' {{ name = "{source.name}", unit = "{_UNITS[header]}" }}; if not: {column} ='
@@ -118,32 +118,32 @@ def find_meaning(
 
 
 def _unit_of(name: str) -> str:
-    """The unit in brackets at the end of a column's name, in small letters; empty without one."""
-    found = _BRACKET.search(name)
-    return found[1].lower() if found else ""
+    """The unit in brackets at the end of a column's name, in lower case; empty without one."""
+    match = _BRACKET.search(name)
+    return match[1].lower() if match else ""
 
 
 def _generic(column: Column) -> str:
     return column.partition("_")[0]
 
 
-def _other_unit(column: Column, source: ColumnSource, said: Unit, place: str) -> ConfigError:
-    known = f"{_generic(column)}_{said.lower()}"
-    better = f'{known} = "{source.name}"'
-    if known not in tuple(Column):
-        better = f'{_generic(column)} = {{ name = "{source.name}", unit = "{said}" }}'
+def _other_unit(column: Column, source: ColumnSource, stated: Unit, location: str) -> ConfigError:
+    column_name = f"{_generic(column)}_{stated.lower()}"
+    line = f'{column_name} = "{source.name}"'
+    if column_name not in tuple(Column):
+        line = f'{_generic(column)} = {{ name = "{source.name}", unit = "{stated}" }}'
     key = "unit" if source.unit else "pressure_unit"
     return ConfigError(
-        f'{place}: {key} = "{said}" under [import], but column {source.name!r} is'
+        f'{location}: {key} = "{stated}" under [import], but column {source.name!r} is'
         f" taken as {column}",
-        f"say under [import.columns]: {better}, or leave {key} out",
+        f"say under [import.columns]: {line}, or leave {key} out",
     )
 
 
-def _electrical(source: ColumnSource, place: str) -> SourceError:
+def _electrical(source: ColumnSource, location: str) -> SourceError:
     unit, usual = _ELECTRICAL[_unit_of(source.name)]
     return SourceError(
-        f"{place}: column {source.name!r} is in {unit}: which pressures do its ends mean?",
+        f"{location}: column {source.name!r} is in {unit}: which pressures do its ends mean?",
         "say it under [import.columns] instead, for example: pressure ="
         f' {{ name = "{source.name}", signal = {usual}, range = [0, -1000], unit = "mbar",'
         ' reference = "gauge" }',

@@ -1,4 +1,4 @@
-"""Numbers of columns, exact, whatever they are written as; what is none is said, not raised."""
+"""Exact numbers from columns of any type; unreadable cells are flagged, not raised."""
 
 import re
 from collections.abc import Callable
@@ -22,7 +22,7 @@ N = TypeVar("N", np.float64, np.int64)
 
 
 class Numbers(NamedTuple, Generic[N]):
-    """A column of n numbers; where there is none the value is NaN or 0."""
+    """A column of n numbers; NaN or 0 where a cell is empty or unreadable."""
 
     values: npt.NDArray[N]
     empty: Mask
@@ -30,7 +30,7 @@ class Numbers(NamedTuple, Generic[N]):
 
 
 def is_readable(kind: pa.DataType) -> bool:
-    """Whether there are numbers in an Arrow array of this type, or text that may hold some."""
+    """Whether an Arrow array of this type holds numbers, or text that may be numbers."""
     inner = kind.value_type if pa.types.is_dictionary(kind) else kind
     types = (
         pa.types.is_integer,
@@ -79,7 +79,7 @@ def integers(column: pa.Array, digits: int = 0) -> Numbers[np.int64]:
 
 
 def plain(column: pa.Array) -> pa.Array:
-    """Integers, decimals, or text without blanks around; empty is null."""
+    """Integers, decimals, or text without surrounding blanks; an empty cell is null."""
     if pa.types.is_dictionary(column.type):
         column = column.dictionary_decode()
     if pa.types.is_boolean(column.type):
@@ -99,8 +99,8 @@ def _scaled(cells: pa.Array, digits: int) -> pa.Array:
     if digits:
         decimals = pc.round(decimals, digits)
     decimals = decimals.cast(pa.decimal128(_MOST_DIGITS, digits))
-    one = pa.scalar(10**digits, pa.decimal128(digits + 1, 0))
-    return pc.multiply(decimals, one).cast(pa.int64())
+    factor = pa.scalar(10**digits, pa.decimal128(digits + 1, 0))
+    return pc.multiply(decimals, factor).cast(pa.int64())
 
 
 def _one_by_one(
@@ -123,12 +123,12 @@ def _integer(text: str, digits: int) -> int | None:
         return None
     if not -(2**63) <= scaled <= 2**63 - 1:
         return None
-    whole = int(scaled.to_integral_value())
-    return whole if digits or whole == scaled else None
+    integer = int(scaled.to_integral_value())
+    return integer if digits or integer == scaled else None
 
 
 def as_numbers(cells: pa.Array, numbers: pa.Array, none: float) -> Numbers[Any]:
-    """The numbers read from cells, null where one is none; empty cells are null."""
+    """Numbers with masks, from ``numbers`` that are null where a cell is empty or unreadable."""
     empty = cells.is_null().to_numpy(zero_copy_only=False)
-    nothing = numbers.is_null().to_numpy(zero_copy_only=False)
-    return Numbers(numbers.fill_null(none).to_numpy(zero_copy_only=False), empty, nothing & ~empty)
+    missing = numbers.is_null().to_numpy(zero_copy_only=False)
+    return Numbers(numbers.fill_null(none).to_numpy(zero_copy_only=False), empty, missing & ~empty)

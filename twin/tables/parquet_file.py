@@ -19,7 +19,7 @@ _BUFFER = 1 << 20  # bytes read ahead of each column, instead of a whole row gro
 
 
 class ParquetFile:
-    """A Parquet file of which the schema is read; SourceError where it is none."""
+    """A Parquet file whose schema has been read; SourceError if there is none."""
 
     def __init__(self, path: Path, _settings: ImportSettings) -> None:
         self._path, self._is_checked = path, False
@@ -29,43 +29,43 @@ class ParquetFile:
             self.names: list[str] = self._schema.names
 
     @property
-    def place(self) -> str:
-        """Where the columns are named."""
+    def location(self) -> str:
+        """The file, for messages on its columns."""
         return str(self._path)
 
-    def batches(self, theirs: Mapping[Column, str]) -> Iterator[Batch]:
-        """Give the rows in order, with the columns of these names in the file."""
-        for name, there in theirs.items():
-            kind = self._schema.field(there).type
+    def batches(self, file_names: Mapping[Column, str]) -> Iterator[Batch]:
+        """Give the rows in order, with the columns that ``file_names`` lists."""
+        for name, header in file_names.items():
+            kind = self._schema.field(header).type
             is_instant = name is Column.TIME and pa.types.is_timestamp(kind)
             if not (is_instant or is_readable(kind)):
-                message = f"{self._path}: column {there!r} holds {kind}, which is no number"
+                message = f"{self._path}: column {header!r} holds {kind}, which is no number"
                 raise SourceError(message, "write it as integers or floating point numbers")
         first = 1
         with self._opened() as file:
-            for table in file.iter_batches(_ROWS, columns=list(dict.fromkeys(theirs.values()))):
-                table.validate(full=True)  # of text, that it is UTF-8
+            for table in file.iter_batches(_ROWS, columns=list(dict.fromkeys(file_names.values()))):
+                table.validate(full=True)  # text must be UTF-8
                 if table.num_rows:
-                    yield self._batch(first, table, theirs)
+                    yield self._batch(first, table, file_names)
                 first += table.num_rows
             if first - 1 != file.metadata.num_rows:
                 raise pa.ArrowInvalid(f"{first - 1} rows instead of {file.metadata.num_rows}")
 
-    def _batch(self, first: int, table: pa.RecordBatch, theirs: Mapping[Column, str]) -> Batch:
-        def place(row: int) -> str:
+    def _batch(self, first: int, table: pa.RecordBatch, file_names: Mapping[Column, str]) -> Batch:
+        def location(row: int) -> str:
             return f"{self._path}: row {first + row}"
 
         def cell(row: int, name: Column) -> str:
             value = columns[name][row].as_py()
             return "" if value is None else str(value)
 
-        columns = {name: table.column(there) for name, there in theirs.items()}
-        return Batch(columns, table.num_rows, {}, place, cell)
+        columns = {name: table.column(header) for name, header in file_names.items()}
+        return Batch(columns, table.num_rows, {}, location, cell)
 
     def _checked(self) -> BinaryIO:
         raw = self._path.open("rb")
         try:
-            if not self._is_checked:  # once: it takes a look at each page
+            if not self._is_checked:  # once: it reads the head of each page
                 require_small_pages(raw)
             raw.seek(0)
         except BaseException:
@@ -85,6 +85,6 @@ class ParquetFile:
             ):
                 yield file
         except (pa.ArrowException, OSError, ValueError) as error:
-            what = getattr(error, "strerror", None) or str(error).strip().splitlines()[0]
-            message = f"{self._path}: cannot be read as Parquet: {what}"
+            detail = getattr(error, "strerror", None) or str(error).strip().splitlines()[0]
+            message = f"{self._path}: cannot be read as Parquet: {detail}"
             raise SourceError(message, "check the path, or export the file anew") from error

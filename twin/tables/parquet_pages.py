@@ -1,7 +1,7 @@
-"""How large the pages of a Parquet file say they are: Arrow takes the memory before it looks.
+"""Check the sizes that the pages of a Parquet file claim: Arrow allocates before it checks.
 
-Footer and headers of pages are structs in Thrift's compact protocol, with numbered fields. They are
-read here, since Arrow tells nothing of pages, and of a damaged column ends the process.
+Footer and page headers are structs in Thrift's compact protocol, with numbered fields. They are
+read here, since Arrow tells nothing of pages, and a damaged column can end the process.
 """
 
 from collections.abc import Iterator, Sequence
@@ -10,12 +10,12 @@ from typing import BinaryIO
 from twin.files import require_within_budget
 
 MAGIC = b"PAR1"
-# Bytes of a page's header: nearly all of them, and one with long texts in its statistics.
+# Bytes of a page's header: enough for nearly all, and for one with long texts in its statistics.
 USUAL_HEADER, LONGEST_HEADER = 256, 1 << 16
-_DEEPEST = 16  # structs in each other; there are some six
-_COLUMN = (4, 1, 3)  # fields of the footer, down to what is said of each column
-_PACKED_SIZE, _FIRST_PAGE, _DICTIONARY = 7, 9, 11  # of these the fields, in bytes of the file
-_UNPACKED, _PACKED = 2, 3  # of the header of a page
+_DEEPEST = 16  # nested structs; real files have about six
+_COLUMN = (4, 1, 3)  # path of fields in the footer down to a column's metadata
+_PACKED_SIZE, _FIRST_PAGE, _DICTIONARY = 7, 9, 11  # its fields, in bytes of the file
+_UNPACKED, _PACKED = 2, 3  # fields of a page's header
 # Kinds of values; 0 ends a struct.
 _TRUE, _FALSE, _BYTE, _DOUBLE, _BINARY, _LIST, _SET, _STRUCT = 1, 2, 3, 7, 8, 9, 10, 12
 _WHOLE = (4, 5, 6)  # of 16, 32 and 64 bits
@@ -46,10 +46,10 @@ def _footer(file: BinaryIO, size: int) -> bytes:
 
 
 def _chunks(footer: bytes) -> Iterator[tuple[int, int]]:
-    """Where the pages of each column begin and end."""
-    wanted = _FIRST_PAGE, _DICTIONARY, _PACKED_SIZE
+    """Begin and end of each column's pages, in bytes of the file."""
+    fields = _FIRST_PAGE, _DICTIONARY, _PACKED_SIZE
     try:
-        for first, dictionary, size in _Compact(footer).numbers(_COLUMN, wanted):
+        for first, dictionary, size in _Compact(footer).numbers(_COLUMN, fields):
             start = min(first, dictionary) if dictionary > 0 else first
             if start < 0:
                 raise ValueError("a column begins before the file")
@@ -59,43 +59,43 @@ def _chunks(footer: bytes) -> Iterator[tuple[int, int]]:
 
 
 def _header(file: BinaryIO, at: int) -> tuple[int, int, int]:
-    """Bytes of the header there, and of its page: unpacked, and as it stands in the file."""
+    """Bytes of the header at ``at``, and of its page: unpacked, and as stored in the file."""
     for most in (USUAL_HEADER, LONGEST_HEADER):
         file.seek(at)
         header = _Compact(file.read(most))
         try:
             ((unpacked, packed),) = header.numbers((), (_UNPACKED, _PACKED))
             return header.at, unpacked, packed
-        except IndexError:  # it goes on
+        except IndexError:  # the header is longer
             continue
     raise ValueError("the header of a page has no end")
 
 
 class _Compact:
-    """Thrift's compact protocol, from the first byte on; IndexError where it has no end."""
+    """Reader of Thrift's compact protocol, from the first byte on; IndexError if data end early."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self.at = data, 0
 
-    def numbers(self, path: Sequence[int], wanted: Sequence[int]) -> Iterator[list[int]]:
-        """Whole numbers in the structs at a path of fields, −1 for one that is not there."""
-        found = dict.fromkeys(wanted, -1)
+    def numbers(self, path: Sequence[int], fields: Sequence[int]) -> Iterator[list[int]]:
+        """Whole numbers in the structs at a path of fields; −1 for a missing one."""
+        values = dict.fromkeys(fields, -1)
         for number, kind in self._fields():
             if path and number == path[0]:
                 count, inside = self._head() if kind == _LIST else (1, kind)
                 self._require(inside == _STRUCT)
                 for _ in range(count):
-                    yield from self.numbers(path[1:], wanted)
-            elif not path and number in found:
+                    yield from self.numbers(path[1:], fields)
+            elif not path and number in values:
                 self._require(kind in _WHOLE)
-                found[number] = self._signed()
+                values[number] = self._signed()
             else:
                 self._step_over(kind)
         if not path:
-            yield [*found.values()]
+            yield [*values.values()]
 
     def _fields(self) -> Iterator[tuple[int, int]]:
-        """Number and kind of each field of a struct; whoever asks takes its value."""
+        """Number and kind of each field of a struct; the caller reads its value."""
         number = 0
         while kind := self._byte():
             number = number + (kind >> 4) if kind >> 4 else self._signed()
@@ -120,7 +120,7 @@ class _Compact:
             self.at += 1 if kind == _BYTE else 8
 
     def _head(self) -> tuple[int, int]:
-        """How many there are in a list, and of which kind."""
+        """Number and kind of the elements of a list."""
         head = self._byte()
         return (head >> 4 if head >> 4 < 15 else self._number()), head & 15
 
@@ -129,7 +129,7 @@ class _Compact:
         return self._data[self.at - 1]
 
     def _number(self) -> int:
-        """Seven bits a byte, the lowest first."""
+        """A number in groups of seven bits, the lowest first."""
         number = 0
         for shift in range(0, 70, 7):
             byte = self._byte()
@@ -139,7 +139,7 @@ class _Compact:
         raise ValueError("a number has no end")
 
     def _signed(self) -> int:
-        """One whose sign is the lowest bit."""
+        """A number whose lowest bit is the sign (zigzag)."""
         number = self._number()
         return number >> 1 ^ -(number & 1)
 

@@ -1,4 +1,4 @@
-"""What a table is understood as, for a person: its columns, its first rows, and a small plot."""
+"""Preview of how a table is read: its columns, its first rows, and a small plot."""
 
 import itertools
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass
 class Preview:
-    """A table's rows as they are seen, block after block; memory does not grow with them."""
+    """Collects a table's rows, block by block; memory does not grow with their number."""
 
     table: Table
     _first: Samples | None = None
@@ -29,10 +29,10 @@ class Preview:
     _steps: list[int] = field(default_factory=list)  # ns, of the first block
     _every: int = 1  # rows in a bin
     _bins: Floats = field(default_factory=lambda: np.empty((0, 3)))  # low, high (Pa), suction
-    _rest: Floats = field(default_factory=lambda: np.empty((0, 3)))  # rows of no whole bin
+    _rest: Floats = field(default_factory=lambda: np.empty((0, 3)))  # rows of an incomplete bin
 
     def see(self, block: Samples) -> None:
-        """Take in a block of rows."""
+        """Add a block of rows."""
         if self._first is None:
             self._first = block[:FIRST].copy()
             self._steps = np.diff(block["time_ns"]).tolist()
@@ -41,13 +41,13 @@ class Preview:
         pressure = block["pressure"].astype(np.float64)
         suction = (block["commands"] & Command.SUCTION.value) != 0
         rows = np.concatenate((self._rest, np.stack((pressure, pressure, suction), axis=1)))
-        whole = len(rows) // self._every * self._every
-        self._bins = np.concatenate((self._bins, _binned(rows[:whole], self._every)))
-        self._rest = rows[whole:]
+        complete = len(rows) // self._every * self._every
+        self._bins = np.concatenate((self._bins, _binned(rows[:complete], self._every)))
+        self._rest = rows[complete:]
         while len(self._bins) > 4 * WIDTH:
             odd = len(self._bins) % 2
-            kept = self._bins[: len(self._bins) - odd]
-            self._bins = np.concatenate((_binned(kept, 2), self._bins[len(kept) :]))
+            even = self._bins[: len(self._bins) - odd]
+            self._bins = np.concatenate((_binned(even, 2), self._bins[len(even) :]))
             self._every *= 2
 
     def __str__(self) -> str:
@@ -58,19 +58,21 @@ class Preview:
 
     def _columns(self) -> Iterator[str]:
         layout, zone = self.table.layout, self.table.settings.time_zone
-        width = max(len(repr(there)) for there in layout.theirs.values())
-        for name, there in layout.theirs.items():
+        width = max(len(repr(header)) for header in layout.file_names.values())
+        for name, header in layout.file_names.items():
             meaning = layout.meanings.get(name)
-            what = str(name)
+            description = str(name)
             if meaning is not None:
-                what = f"{name.partition('_')[0]} in {meaning}"
+                description = f"{name.partition('_')[0]} in {meaning}"
             elif name is Column.TIME:
-                what = f"date and time, {f'where it says none in {zone}' if zone else 'as it says'}"
+                description = (
+                    f"date and time, {f'where it says none in {zone}' if zone else 'as it says'}"
+                )
             elif name in TIMES:
-                what = f"time in {name.rpartition('_')[2]}"
-            yield f"{there!r:{width}}  {what}"
-        for there in layout.ignored:
-            yield f"{there!r:{width}}  not taken"
+                description = f"time in {name.rpartition('_')[2]}"
+            yield f"{header!r:{width}}  {description}"
+        for header in layout.ignored:
+            yield f"{header!r:{width}}  not taken"
 
     def _table(self) -> Iterator[str]:
         if self._first is None:
@@ -90,7 +92,7 @@ class Preview:
 
     def _plot(self) -> Iterator[str]:
         bins = np.concatenate((self._bins, self._rest))
-        known = np.isfinite(bins[:, 0])
+        is_finite = np.isfinite(bins[:, 0])
         lasted = (
             (self._last_ns - int(self._first["time_ns"][0])) * NS
             if self._first is not None
@@ -98,34 +100,34 @@ class Preview:
         )
         period = f", every {np.median(self._steps) * NS / MS:g} ms" if self._steps else ""
         yield f"{self._rows} rows, {lasted:.3f} s{period}"
-        if not known.any():
+        if not is_finite.any():
             yield "no pressure in them"
             return
         low, high = np.nanmin(bins[:, 0]), np.nanmax(bins[:, 1])
         yield f"pressure from {low / MBAR:.1f} to {high / MBAR:.1f} mbar absolute"
         edges = np.linspace(0, len(bins), min(WIDTH, len(bins)) + 1).astype(int)
-        parts = [bins[first:last] for first, last in itertools.pairwise(edges)]
-        yield from _curve(parts, float(low), float(high))
-        yield f"{'suction':>8} " + "".join("█" if part[:, 2].any() else "·" for part in parts)
+        groups = [bins[first:last] for first, last in itertools.pairwise(edges)]
+        yield from _curve(groups, float(low), float(high))
+        yield f"{'suction':>8} " + "".join("█" if group[:, 2].any() else "·" for group in groups)
 
 
 def _binned(rows: Floats, every: int) -> Floats:
     """Low, high and suction of each ``every`` rows."""
-    parts = rows.reshape(-1, every, 3)
-    low = np.fmin.reduce(parts[:, :, 0], axis=1)
+    groups = rows.reshape(-1, every, 3)
+    low = np.fmin.reduce(groups[:, :, 0], axis=1)
     return np.stack(
-        (low, np.fmax.reduce(parts[:, :, 1], axis=1), parts[:, :, 2].max(axis=1)), axis=1
+        (low, np.fmax.reduce(groups[:, :, 1], axis=1), groups[:, :, 2].max(axis=1)), axis=1
     )
 
 
-def _curve(parts: list[Floats], low: float, high: float) -> Iterator[str]:
-    """Lines from the highest pressure (Pa) to the lowest, one character for each part."""
+def _curve(groups: list[Floats], low: float, high: float) -> Iterator[str]:
+    """Lines from the highest pressure (Pa) to the lowest, one character for each group."""
     step = max(high - low, 1.0) / HEIGHT
     for line in range(HEIGHT):
         bottom = high - (line + 1) * step
         marks = []
-        for part in parts:
-            least, most = np.fmin.reduce(part[:, 0]), np.fmax.reduce(part[:, 1])
+        for group in groups:
+            least, most = np.fmin.reduce(group[:, 0]), np.fmax.reduce(group[:, 1])
             top = bottom + step if line else np.inf
             inside = most >= bottom and least < top
             marks.append("█" if inside else " ")

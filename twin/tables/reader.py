@@ -28,42 +28,42 @@ READING = np.dtype([(name, SAMPLE[name]) for name in ("time_ns", "pressure", "qu
 
 class _File(Protocol):
     names: list[str]  # of its columns
-    notes: list[str]  # what is to be said of how it was read
+    notes: list[str]  # remarks on how it was read
 
     def __init__(self, path: Path, settings: ImportSettings) -> None: ...
 
     @property
-    def place(self) -> str:
-        """Where the columns are named."""
+    def location(self) -> str:
+        """File and line of the columns' names, for messages."""
 
-    def batches(self, theirs: Mapping[Column, str]) -> Iterator[Batch]:
-        """Give the rows in order, with the columns of these names in the file."""
+    def batches(self, file_names: Mapping[Column, str]) -> Iterator[Batch]:
+        """Give the rows in order, with the columns that ``file_names`` lists."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table whose columns are known; each iteration reads the file anew, a piece at a time."""
+    """A table with its columns identified; each iteration reads the file anew, piece by piece."""
 
     path: Path
     layout: Layout
     settings: ImportSettings
-    ambient: float  # Pa, from which a vacuum is counted
+    ambient: float  # Pa, the zero of a vacuum
     _file: _File
-    derived: Derived | None = None  # commands that the file lacks, once they are found
+    derived: Derived | None = None  # commands that the file lacks, once derived
 
     @property
     def ignored(self) -> tuple[str, ...]:
-        """Names of the columns in the file that are not taken."""
+        """Names of the columns in the file that are not read."""
         return self.layout.ignored
 
     @property
     def notes(self) -> Sequence[str]:
-        """What is to be said of how the file is read: its encoding, its sheet, its header."""
+        """Remarks on how the file is read: its encoding, its sheet, its header."""
         return self._file.notes
 
     @property
     def commands(self) -> str:
-        """How commands were derived, in words; empty where the file has them."""
+        """Text on how commands were derived; empty if the file has them."""
         return "" if self.derived is None else self.derived.words(self.layout.lacking)
 
     @property
@@ -72,21 +72,21 @@ class Table:
         return self.layout.meanings[self.layout.pressure].reference != "absolute"
 
     def with_commands(self) -> "Table":
-        """The same with the commands that the file lacks, found from the pressure of all its rows.
+        """The same with the commands that the file lacks, derived from all of its pressures.
 
-        SourceError where there is no cycle in it, and otherwise as from ``blocks``.
+        SourceError if it shows no cycle, and otherwise as from ``blocks``.
         """
         try:
-            # A vacuum counts from ambient; of an absolute pressure nobody knows where that is.
+            # A vacuum counts from ambient. With an absolute pressure, ambient is unknown.
             zero = self.ambient if self.counts_from_ambient else None
             return replace(self, derived=derive(self._readings(), zero))
         except SourceError as error:
             if self.path.name in str(error):
                 raise
-            raise SourceError(f"{self._file.place}: {error}", error.hint) from error
+            raise SourceError(f"{self._file.location}: {error}", error.hint) from error
 
     def _readings(self) -> Samples:
-        """Time, pressure and quality of all rows; SourceError where they are more than may be."""
+        """Time, pressure and quality of all rows; SourceError if they exceed the memory budget."""
         blocks: list[Samples] = []
         count = 0
         for block in self.blocks():
@@ -95,7 +95,7 @@ class Table:
                 require_within_budget(count * READING.itemsize, "what commands are derived from")
             except ValueError as error:
                 rows = MEMORY_BUDGET // READING.itemsize
-                message = f"{self._file.place}: {error}"
+                message = f"{self._file.location}: {error}"
                 hint = f"import it in parts of at most {rows:,} rows".replace(",", " ")
                 raise SourceError(message, hint) from error
             reading = np.empty(len(block), READING)
@@ -107,30 +107,30 @@ class Table:
     def blocks(self) -> Iterator[Samples]:
         """Every row of the file in order, about 10 000 rows of SAMPLE at a time.
 
-        SourceError names the line and column of the first bad input, once all blocks before its
-        own are given, and says where a file ends without a row, or with pressures in another unit.
+        SourceError names line and column of the first bad input, after all blocks before it have
+        been given. It is also raised for a file without rows, or with implausible pressures.
         """
         zone, order = self.settings.time_zone, self.settings.date_order
-        calendar = Calendar(zone, order, self._file.place)
+        calendar = Calendar(zone, order, self._file.location)
         intake = Intake(self.layout, self.settings, self.ambient, calendar)
         check = UnitCheck(self.layout, self.settings, self.ambient)
         block, first = None, 0
-        for batch in self._file.batches(self.layout.theirs):
+        for batch in self._file.batches(self.layout.file_names):
             block = intake.take(batch)
             if self.derived is not None:
-                found = self.derived.commands[first : first + len(block)]
-                block["commands"] |= self._lacking(found, block["commands"])
+                derived = self.derived.commands[first : first + len(block)]
+                block["commands"] |= self._lacking(derived, block["commands"])
                 first += len(block)
             check.see(block)
             yield block
-        check.refuse(self._file.place)
+        check.refuse(self._file.location)
         if block is None:
-            raise SourceError(f"{self._file.place}: no row follows", "export it with its data")
+            raise SourceError(f"{self._file.location}: no row follows", "export it with its data")
 
-    def _lacking(self, derived: Bits, there: Bits) -> Bits:
-        """Those of the derived commands that the file lacks; none while it commands something."""
+    def _lacking(self, derived: Bits, commanded: Bits) -> Bits:
+        """The derived commands that the file lacks; none where the file commands something."""
         bits = np.uint8(sum(COMMANDS[name].value for name in self.layout.lacking))
-        return np.where(there == 0, derived & bits, np.uint8(0))
+        return np.where(commanded == 0, derived & bits, np.uint8(0))
 
 
 _KINDS: dict[str, type[_File]] = {
@@ -148,14 +148,14 @@ def open_table(
     """Open a CSV, Excel or Parquet file by its suffix and find its columns; ``ambient`` in Pa.
 
     With ``derive`` the file may lack commands, to be derived.
-    ConfigError for another suffix, SourceError where the file cannot be read or lacks a column.
+    ConfigError for another suffix, SourceError if the file cannot be read or lacks a column.
     """
     kind = _KINDS.get(path.suffix.lower())
     if not path.exists():
         raise SourceError(f"{path}: cannot be read: No such file or directory", "check the path")
     if kind is None:
-        known = ", ".join(_KINDS)
-        raise ConfigError(f"{path}: cannot tell what it is", f"{known} files can be read")
+        suffixes = ", ".join(_KINDS)
+        raise ConfigError(f"{path}: cannot tell what it is", f"{suffixes} files can be read")
     file = kind(path, settings)
-    layout = find_layout(file.names, settings, file.place, derive=derive)
+    layout = find_layout(file.names, settings, file.location, derive=derive)
     return Table(path, layout, settings, ambient, file)

@@ -19,12 +19,12 @@ from twin.tables.export import complete_file
 MOST_ROWS = 1_048_575  # of a sheet, below its header
 EXACT = 2**53  # whole numbers beyond it are not kept by a spreadsheet: they become text
 TIME = "yyyy-mm-dd hh:mm:ss.000"
-# Text that begins so is a formula to programs that open CSV; an apostrophe before it makes it text.
+# Programs that open CSV take such text for a formula; an apostrophe before it keeps it text.
 _FORMULA = r"^([=+\-@\t\r])"
 
 
 def export(table: pa.Table, path: Path) -> None:
-    """Write a table as its suffix says, whole or not at all; times are UTC.
+    """Write a table in the format of the suffix, completely or not at all; times are UTC.
 
     The unit of a column is its field's metadata ``unit``. ConfigError for another suffix or too
     many rows, SourceError if there is a file of that name or it cannot be written.
@@ -56,7 +56,7 @@ def _write_parquet(table: pa.Table, file: BinaryIO) -> None:
 
 
 def _write_sheet(table: pa.Table, file: BinaryIO) -> None:
-    """One sheet, its header frozen, with the unit in it."""
+    """Write one sheet; its frozen header has the units."""
     with Workbook(file, {"constant_memory": True, "remove_timezone": True}) as book:
         sheet = book.add_worksheet()
         bold, time = book.add_format({"bold": True}), book.add_format({"num_format": TIME})
@@ -83,10 +83,10 @@ def _is_time(field: pa.Field) -> bool:
 
 
 def _rows(table: pa.Table) -> Iterator[tuple[Any, ...]]:
-    """Row by row as Python values, a batch in memory; times to the microsecond."""
+    """Rows as Python values, one batch in memory; times to the microsecond."""
     fields = [
-        pa.field(one.name, pa.timestamp("us", "UTC")) if _is_time(one) else one
-        for one in table.schema
+        pa.field(field.name, pa.timestamp("us", "UTC")) if _is_time(field) else field
+        for field in table.schema
     ]
     columns = [
         pc.cast(column, field.type, safe=False) if _is_time(field) else column
@@ -97,7 +97,7 @@ def _rows(table: pa.Table) -> Iterator[tuple[Any, ...]]:
 
 
 def _write(sheet: Worksheet, row: int, column: int, value: Any, time: Format) -> None:
-    """Each as what it is: text is never taken for a formula."""
+    """Write a value by its type: text never becomes a formula."""
     if isinstance(value, datetime):
         sheet.write_datetime(row, column, value, time)
     elif isinstance(value, str):

@@ -1,7 +1,7 @@
-"""Whether a column of pressure can be what it is taken as; if not, a person is asked what it is.
+"""Check that a column of pressure has plausible values; if not, ask a person for its unit.
 
-A pressure in bar that is read as mbar is a thousandth of what it should be, and a vacuum that is
-written as gauge pressure is negative. Nothing of this is guessed: the answer is a line to write.
+A pressure in bar that is read as mbar is a thousandth of what it should be. A vacuum that is
+written as gauge pressure is negative. Nothing is guessed: the hint lists lines to write.
 """
 
 from collections.abc import Iterator
@@ -25,12 +25,12 @@ LEAST_AMBIENT = 500.0 * MBAR  # Pa, at 5.5 km; the highest towns lie at 5.1 km
 LEAST_VACUUM = 50.0 * MBAR  # Pa, that a record with suction shows
 MOST_RELEASED = 1.5  # of ambient, that a blow-off comes to
 LONG_NS = 1_000_000_000
-MOST_ANSWERS = 4  # lines of a hint: more are not read
+MOST_ANSWERS = 4  # lines of a hint: nobody reads more
 
 
 @dataclass
 class UnitCheck:
-    """What is seen of one file's pressure, block after block; ``ambient`` in Pa."""
+    """Statistics of one file's pressure, block by block; ``ambient`` in Pa."""
 
     layout: Layout
     settings: ImportSettings
@@ -44,7 +44,7 @@ class UnitCheck:
     _run_ns: int = 0
 
     def see(self, block: Samples) -> None:
-        """Take in a block of rows."""
+        """Add a block of rows."""
         suction = (block["commands"] & Command.SUCTION.value) != 0
         steps = np.diff(block["time_ns"]).clip(0, LONG_NS)
         self._suction_ns += int(steps[suction[1:]].sum())
@@ -58,19 +58,19 @@ class UnitCheck:
         vacuum = self.ambient - pressure[suction[usable]]
         self._most_vacuum = max(self._most_vacuum, vacuum.max(initial=-np.inf))
 
-    def refuse(self, place: str) -> None:
-        """SourceError after the last block if the column is hardly what it is taken as.
+    def refuse(self, location: str) -> None:
+        """SourceError after the last block if the column's values are implausible.
 
-        It asks what the column is. Nothing is asked where ``pressure_unit`` says it.
+        Its hint asks for the unit. Nothing is checked if ``pressure_unit`` is set.
         """
         if self.settings.pressure_unit is not None or self._run_ns < LONG_NS or not self._rows:
             return
-        what = self._what_cannot_be()
-        if what:
-            name = self.layout.theirs[self.layout.pressure]
+        contradiction = self._contradiction()
+        if contradiction:
+            name = self.layout.file_names[self.layout.pressure]
             raise SourceError(
-                f"{place}: column {name!r} is taken as {self._meaning}: {what}. In which unit is"
-                " it, and what does it count from?",
+                f"{location}: column {name!r} is taken as {self._meaning}: {contradiction}."
+                " In which unit is it, and what does it count from?",
                 "\n  ".join(self._answers(name)),
             )
 
@@ -78,7 +78,7 @@ class UnitCheck:
     def _meaning(self) -> Meaning:
         return self.layout.meanings[self.layout.pressure]
 
-    def _what_cannot_be(self) -> str:
+    def _contradiction(self) -> str:
         lowest, highest = self._lowest / MBAR, self._highest / MBAR
         if self._meaning.reference == "absolute":
             if self._suction_ns >= LONG_NS and self._highest < LEAST:
@@ -95,7 +95,7 @@ class UnitCheck:
         return ""
 
     def _answers(self, name: str) -> Iterator[str]:
-        """Lines to write, first those that make the column one of an ejector."""
+        """Lines to write, first those that make the column plausible for an ejector."""
         yield "write under [import.columns] the one line that is right:"
         ends = [self._meaning.number(end, self.ambient) for end in (self._lowest, self._highest)]
         lines = _lines(name, min(ends), max(ends), self.ambient, self._meaning)
@@ -104,24 +104,27 @@ class UnitCheck:
         yield f'or, if {unit} is right, say so under [import]: pressure_unit = "{unit}"'
 
 
-def _lines(name: str, low: float, high: float, ambient: float, taken: Meaning) -> list[str]:
-    """What numbers from ``low`` to ``high`` can be, in the same unit and the deepest vacuum first.
+def _lines(name: str, low: float, high: float, ambient: float, assumed: Meaning) -> list[str]:
+    """Settings that make numbers from ``low`` to ``high`` a vacuum and its release.
 
-    That is a vacuum and its release, in another unit or from another reference than it is taken as.
+    They differ from ``assumed`` in unit or reference. The same unit comes first, then the deepest
+    vacuum.
     """
     references: tuple[Reference, ...] = ("absolute", "vacuum", "gauge")
-    found: list[tuple[bool, float, str]] = []
+    candidates: list[tuple[bool, float, str]] = []
     for unit in get_args(Unit):
         for reference in references:
-            if unit == "hPa" or (unit, reference) == (taken.unit, taken.reference):
+            if unit == "hPa" or (unit, reference) == (assumed.unit, assumed.reference):
                 continue  # hPa is mbar
             numbers = np.array([low, high]) * PASCAL[unit]
             least, most = sorted(counted_from(numbers, reference, "absolute", ambient).tolist())
             is_vacuum = LEAST_ABSOLUTE < least < ambient - LEAST_VACUUM
             if is_vacuum and LEAST_AMBIENT < most <= MOST_RELEASED * ambient:
                 means = f"   # {least / MBAR:.0f} to {most / MBAR:.0f} mbar absolute"
-                found.append((unit != taken.unit, least, _line(name, unit, reference) + means))
-    return [line for *_, line in sorted(found)]
+                candidates.append(
+                    (unit != assumed.unit, least, _line(name, unit, reference) + means)
+                )
+    return [line for *_, line in sorted(candidates)]
 
 
 def _any_line(name: str) -> list[str]:
@@ -130,7 +133,7 @@ def _any_line(name: str) -> list[str]:
 
 
 def _line(name: str, unit: Unit, reference: Reference) -> str:
-    known = {
+    column = {
         ("bar", "vacuum"): Column.VACUUM_BAR,
         ("mbar", "vacuum"): Column.VACUUM_MBAR,
         ("Pa", "vacuum"): Column.VACUUM_PA,
@@ -138,6 +141,6 @@ def _line(name: str, unit: Unit, reference: Reference) -> str:
         ("mbar", "absolute"): Column.PRESSURE_MBAR,
         ("Pa", "absolute"): Column.PRESSURE_PA,
     }.get((unit, reference))
-    if known is not None:
-        return f'{known} = "{name}"'
+    if column is not None:
+        return f'{column} = "{name}"'
     return f'pressure = {{ name = "{name}", unit = "{unit}", reference = "{reference}" }}'
