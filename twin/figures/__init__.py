@@ -1,1 +1,1 @@
-"""Key figures per cycle, as a maintenance person knows them: measured, expected, kept, trended."""
+"""Key figures of each cycle, as maintenance knows them: measured, expected, stored, trended."""

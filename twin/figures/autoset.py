@@ -8,19 +8,19 @@ from twin.errors import ConfigError
 from twin.figures.database import History
 from twin.figures.settings import LEAST_LEAKAGE, LEAST_T1_MS, permitted
 
-GOOD_CYCLES = 5  # the last ones; more tell no more of today
+GOOD_CYCLES = 5  # the last ones; earlier ones say nothing of today
 
 
 @dataclass(frozen=True)
 class Autoset:
-    """What is permitted from now on, and from how many cycles."""
+    """Permitted values from now on, and the number of cycles behind them."""
 
     permitted_t1_ms: float
     permitted_leakage_mbar_s: float
     cycles: int
 
     def toml(self) -> str:
-        """As it stands in a configuration."""
+        """The values as text for a configuration."""
         return (
             f"[figures]\npermitted_t1_ms = {self.permitted_t1_ms:.0f}\n"
             f"permitted_leakage_mbar_s = {self.permitted_leakage_mbar_s:.0f}\n"
@@ -28,10 +28,9 @@ class Autoset:
 
 
 def autoset(history: History, tolerance: float) -> Autoset:
-    """Permit the worst of the last good cycles and ``tolerance`` (a share of it) more.
+    """Permit the worst of the last good cycles, plus ``tolerance`` (a share of it).
 
-    Good is a cycle without warning and alarm that tells t1 and leakage. ConfigError if there is
-    none.
+    A good cycle has no warning or alarm, and has t1 and leakage. ConfigError if there is none.
     """
     t1, leakage = history.values["t1_measured"], history.values["leakage_measured"]
     calm = np.array([not warned for warned in history.warnings], bool) & (history.alarms == 0)

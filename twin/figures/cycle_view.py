@@ -1,7 +1,7 @@
-"""One side of a cycle, measured or expected, as key figures look at it: vacuum and nozzle.
+"""One side of a cycle, measured or expected, as input of key figures: vacuum and nozzle.
 
-Compiled, as a cycle comes once in seconds: by then what NumPy needs for its many small calls has
-left the processor's caches, and they take twice as long as one after the other.
+It is compiled. Cycles come seconds apart, and by then NumPy's code has left the processor's caches:
+its many small calls would take twice as long as in a row.
 """
 
 import math
@@ -15,27 +15,27 @@ from twin.model.compiled import compiled
 from twin.model.control import LEAK_SETTLE_S, PROTECTED_S
 from twin.signals import BAR, MBAR, NS, UNUSABLE, Phase, Samples, Ticks
 
-LEAK_WINDOW_S = 1.0  # after the settling, in which leakage is judged
+LEAK_WINDOW_S = 1.0  # after the settling, over which leakage is read
 LEAST_WINDOW_S = 0.05  # noise of 0.3 mbar then gives 3 mbar/s
-LAST_S = 0.5  # at the end of the suction, in which it may stand still
-ENDS = (0.01, 0.99)  # quantiles that stand for the lowest and the highest reading
-LONGEST_HOLE = 0.01  # s without a reading, beyond which a switching may have been missed
-MOST_STEPS = 5.0  # of the cadence, without a reading: beyond, a level may have been missed
+LAST_S = 0.5  # at the end of the suction, in which the vacuum may stand still
+ENDS = (0.01, 0.99)  # quantiles used as the lowest and the highest reading
+LONGEST_HOLE = 0.01  # s without a reading; a longer hole may hide a switching
+MOST_STEPS = 5.0  # usual steps without a reading; a longer hole may hide a level
 
 Floats = npt.NDArray[np.float64]
 Bytes = npt.NDArray[np.uint8]
 
-# As plain numbers: enumerations are slow to compare.
+# Plain numbers, since enumerations are slow to compare.
 _SUCTION, _HOLD, _BLOW_OFF = int(Phase.SUCTION), int(Phase.HOLD), int(Phase.BLOW_OFF)
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of one cycle from its suction edge on, one at least.
+    """Rows of one cycle from its suction edge on, at least one.
 
-    ``vacuum`` (mbar) is NaN where nothing usable was read; ``supply`` (bar gauge, at the nozzle)
-    where it is not measured. ``off_lag`` and ``on_lag`` (s) are from the switching of the air
-    saving to where ``phase`` has it.
+    ``vacuum`` (mbar) is NaN where no reading is usable, ``supply`` (bar gauge, at the nozzle) where
+    it is not measured. ``off_lag`` and ``on_lag`` (s) are the times from a switching of the air
+    saving until ``phase`` shows it.
     """
 
     time: Floats  # s since the suction edge
@@ -43,67 +43,67 @@ class Rows:
     supply: Floats
     phase: Bytes
     ended: bool  # the end of the suction was seen
-    blown: bool  # and that of the blow-off
+    blown: bool  # the end of the blow-off was seen too
     off_lag: float = 0.0
     on_lag: float = 0.0
 
 
 class Nozzle(NamedTuple):
-    """How the nozzle was switched while suction was commanded."""
+    """Switching of the nozzle while suction was commanded."""
 
-    on_s: float  # how long it was on
-    switchings: int  # how often it was switched on
-    quick_switchings: int  # most of the air saving, on or off, in the time valve protection has
+    on_s: float  # time that it was on
+    switchings: int  # number of times it was switched on
+    quick_switchings: int  # most by the air saving, on or off, within valve protection's time
     went_off: bool  # the air saving switched it off
-    off_s: float  # when it first did
+    off_s: float  # first time that it did
 
 
 class Vacuum(NamedTuple):
-    """What the vacuum did until suction was not commanded any more, single readings smoothed."""
+    """The vacuum until the end of the command of suction, with readings smoothed."""
 
-    seamless: bool  # readings are so close that no switching can have been missed
-    even: bool  # none is missing that tells a level, however far apart they are
-    h2_s: float  # when it came to H2
-    h1_s: float  # and to H1
+    seamless: bool  # readings are so dense that no switching can have been missed
+    even: bool  # no reading is missing, whatever their spacing: levels can be read
+    h2_s: float  # time at which it reached H2
+    h1_s: float  # and H1
     highest: float  # mbar
     last: float  # its mean at the end (mbar)
-    last_slope: float  # and how it moved there (mbar/s)
-    leakage: float  # what was lost per time in the first stretch of hold (mbar/s)
+    last_slope: float  # its slope at the end (mbar/s)
+    leakage: float  # loss per time in the first stretch of hold (mbar/s)
 
 
 class Supply(NamedTuple):
-    """What the supply read while the nozzle was on (bar)."""
+    """Readings of the supply while the nozzle was on (bar)."""
 
     mean: float
-    lowest: float  # but for one reading in a hundred
+    lowest: float  # except for one reading in a hundred
     highest: float
 
 
 class Course(NamedTuple):
-    """What is found in rows; NaN where they do not tell it."""
+    """Findings in the rows of a cycle; NaN where they do not tell."""
 
     ended: bool
     blown: bool
-    suction_s: float  # how long suction was commanded
-    blow_off_s: float  # how long blow-off was on
+    suction_s: float  # time with suction commanded
+    blow_off_s: float  # time of blow-off
     nozzle: Nozzle
     vacuum: Vacuum
     supply: Supply
 
     @property
     def is_whole(self) -> bool:
-        """Whether nothing of the suction was missed, to its end."""
+        """Whether readings are dense to the end of the suction."""
         return self.ended and self.vacuum.seamless
 
     @property
     def is_even(self) -> bool:
-        """Whether the vacuum was seen as often as ever, to the end of the suction."""
+        """Whether readings of the vacuum come without a gap to the end of the suction."""
         return self.ended and self.vacuum.even
 
 
 def course(rows: Rows, h2: float, h1: float) -> Course:
-    """Find it, with the levels of the unit (mbar)."""
-    found: Course = _course(
+    """The findings in the rows of a cycle, with the unit's levels (mbar)."""
+    result: Course = _course(
         rows.time,
         rows.vacuum,
         rows.supply,
@@ -112,15 +112,15 @@ def course(rows: Rows, h2: float, h1: float) -> Course:
         (rows.off_lag, rows.on_lag),
         (h2, h1),
     )
-    return found
+    return result
 
 
 def measured(
     samples: Samples, ticks: Ticks, ambient: float
 ) -> tuple[Floats, Floats, Floats, Bytes]:
-    """Time, vacuum below ``ambient`` (mbar), supply and phase of what was measured, for Rows."""
-    found: tuple[Floats, Floats, Floats, Bytes] = _measured(samples, ticks, ambient)
-    return found
+    """Time, vacuum below ``ambient`` (mbar), supply and phase as measured, for Rows."""
+    columns: tuple[Floats, Floats, Floats, Bytes] = _measured(samples, ticks, ambient)
+    return columns
 
 
 # --- compiled -----------------------------------------------------------------------------------
@@ -133,24 +133,24 @@ def _measured(samples, ticks, ambient):  # type: ignore[no-untyped-def]
     time, vacuum, supply = np.empty(count), np.empty(count), np.empty(count)
     phase = np.empty(count, np.uint8)
     for row in range(count):
-        one = samples[row]
-        usable = (one.quality & UNUSABLE) == 0
-        time[row] = (one.time_ns - samples[0].time_ns) * NS
-        vacuum[row] = ambient - one.pressure / MBAR if usable else math.nan
-        supply[row] = one.supply / BAR
+        sample = samples[row]
+        usable = (sample.quality & UNUSABLE) == 0
+        time[row] = (sample.time_ns - samples[0].time_ns) * NS
+        vacuum[row] = ambient - sample.pressure / MBAR if usable else math.nan
+        supply[row] = sample.supply / BAR
         phase[row] = ticks[row].phase
     return time, vacuum, supply, phase
 
 
 @compiled
-def _course(time, vacuum, supply, phase, seen, lags, levels):  # type: ignore[no-untyped-def]
-    """The course that rows took; ``seen``, ``lags`` and ``levels`` are pairs of numbers."""
+def _course(time, vacuum, supply, phase, ends_seen, lags, levels):  # type: ignore[no-untyped-def]
+    """The findings in rows; ``ends_seen``, ``lags`` and ``levels`` are pairs."""
     rows = _suction_rows(phase)
     suction_s = _at(time, rows)
     suction = phase[:rows]
     return Course(
-        seen[0],
-        seen[1],
+        ends_seen[0],
+        ends_seen[1],
         suction_s,
         _blow_off_s(time, phase),
         _nozzle(_edges(time, suction, suction_s, lags), suction),
@@ -161,7 +161,7 @@ def _course(time, vacuum, supply, phase, seen, lags, levels):  # type: ignore[no
 
 @compiled
 def _suction_rows(phase):  # type: ignore[no-untyped-def]
-    """Rows until suction is not commanded any more."""
+    """Number of rows with suction commanded, from the first on."""
     for row in range(len(phase)):
         if phase[row] != _SUCTION and phase[row] != _HOLD:
             return row
@@ -169,19 +169,19 @@ def _suction_rows(phase):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _stretch(phase, wanted, row):  # type: ignore[no-untyped-def]
-    """Where the next stretch of a phase begins and ends, from ``row`` on: the same if none does."""
-    while row < len(phase) and phase[row] != wanted:
+def _stretch(phase, value, row):  # type: ignore[no-untyped-def]
+    """Begin and end of the next stretch of a phase from ``row`` on; equal if there is none."""
+    while row < len(phase) and phase[row] != value:
         row += 1
     begin = row
-    while row < len(phase) and phase[row] == wanted:
+    while row < len(phase) and phase[row] == value:
         row += 1
     return begin, row
 
 
 @compiled
 def _at(time, row):  # type: ignore[no-untyped-def]
-    """Time of a row (s); of the one behind the last as if it came as soon as that did."""
+    """Time of a row (s); the row after the last is extrapolated by the last step."""
     if row < len(time):
         return time[row]
     return time[-1] + (time[-1] - time[-2] if row > 1 else 0.0)
@@ -189,9 +189,9 @@ def _at(time, row):  # type: ignore[no-untyped-def]
 
 @compiled
 def _edges(time, phase, end, lags):  # type: ignore[no-untyped-def]
-    """When the nozzle was switched on and off in turn (s), while suction was commanded."""
+    """Times at which the nozzle was switched on and off in turn (s) under suction."""
     edges = np.empty(len(phase) + 1)
-    count, latest = 0, 0.0  # none is before the suction's edge, which knows no lag
+    count, latest = 0, 0.0  # no edge comes before suction's, which has no lag
     begin, behind = _stretch(phase, _SUCTION, 0)
     while begin < behind:
         on = time[begin] - lags[1]
@@ -205,7 +205,7 @@ def _edges(time, phase, end, lags):  # type: ignore[no-untyped-def]
 
 @compiled
 def _nozzle(edges, phase):  # type: ignore[no-untyped-def]
-    """How it was switched, by its edges; ``phase`` is that of the same rows."""
+    """Switching of the nozzle by its edges; ``phase`` is that of the same rows."""
     on_s = 0.0
     for i in range(0, len(edges), 2):
         on_s += edges[i + 1] - edges[i]
@@ -218,10 +218,10 @@ def _nozzle(edges, phase):  # type: ignore[no-untyped-def]
 
 @compiled
 def _quick_switchings(edges, to_the_end):  # type: ignore[no-untyped-def]
-    """Most edges within the time that valve protection has.
+    """Most edges within the time of valve protection.
 
-    Those that were commanded do not count: the first one, and where the nozzle was on
-    ``to_the_end``, the last one.
+    Commanded edges do not count: the first one, and the last one if the nozzle was on
+    ``to_the_end``.
     """
     last = len(edges) - 1 if to_the_end else len(edges)
     most, behind = 0, 1
@@ -234,7 +234,7 @@ def _quick_switchings(edges, to_the_end):  # type: ignore[no-untyped-def]
 
 @compiled
 def _blow_off_s(time, phase):  # type: ignore[no-untyped-def]
-    """How long blow-off was on."""
+    """Total time of blow-off (s)."""
     total = 0.0
     begin, behind = _stretch(phase, _BLOW_OFF, 0)
     while begin < behind:
@@ -245,7 +245,7 @@ def _blow_off_s(time, phase):  # type: ignore[no-untyped-def]
 
 @compiled
 def _vacuum(time, vacuum, phase, end, levels):  # type: ignore[no-untyped-def]
-    """What it did in rows of suction, which ended at ``end`` (s)."""
+    """The vacuum in the rows of suction, which ended at ``end`` (s)."""
     times, smooth, hole = _readings(time, vacuum, end)
     seamless = len(times) > 0 and hole <= LONGEST_HOLE
     longest = LONGEST_HOLE
@@ -268,7 +268,7 @@ def _vacuum(time, vacuum, phase, end, levels):  # type: ignore[no-untyped-def]
 
 @compiled
 def _readings(time, vacuum, end):  # type: ignore[no-untyped-def]
-    """Times of what was read, smoothed; and the longest time without, from 0 to ``end`` (s)."""
+    """Times and smoothed readings, and the longest time without a reading to ``end`` (s)."""
     times, padded = np.empty(len(time)), np.empty(len(time) + 4)
     count, latest, hole = 0, 0.0, 0.0
     for row in range(len(time)):
@@ -283,9 +283,10 @@ def _readings(time, vacuum, end):  # type: ignore[no-untyped-def]
 
 @compiled
 def _smoothed(padded):  # type: ignore[no-untyped-def]
-    """The median of five neighbours: it moves no edge, and one reading alone reaches nothing.
+    """The median of five neighbours: it moves no edge, and a single spike has no effect.
 
-    Of four the least and the greatest cannot be it, so it is that of the other two and the fifth.
+    Of four values the least and the greatest cannot be the median. So it is the median of the other
+    two and the fifth.
     """
     smooth = np.empty(len(padded) - 4)
     for i in range(len(smooth)):
@@ -298,9 +299,9 @@ def _smoothed(padded):  # type: ignore[no-untyped-def]
 
 @compiled
 def _reached(time, vacuum, level, longest):  # type: ignore[no-untyped-def]
-    """Time (s) at which the vacuum comes to ``level`` (mbar); NaN if it does not.
+    """Time (s) at which the vacuum reaches ``level`` (mbar); NaN if it does not.
 
-    So it is where there was no reading for ``longest`` (s) before.
+    It is also NaN after more than ``longest`` (s) without a reading.
     """
     for row in range(len(time)):
         if vacuum[row] >= level:
@@ -316,7 +317,7 @@ def _reached(time, vacuum, level, longest):  # type: ignore[no-untyped-def]
 
 @compiled
 def _leakage(time, vacuum):  # type: ignore[no-untyped-def]
-    """Vacuum lost per time (mbar/s) in a stretch of hold; NaN where it is too short, or none."""
+    """Vacuum lost per time (mbar/s) in a stretch of hold; NaN if that is too short or empty."""
     if len(time) == 0:
         return math.nan
     _, slope, end = _line(time - time[0] - LEAK_SETTLE_S, vacuum, 0.0, LEAK_WINDOW_S)
@@ -325,9 +326,9 @@ def _leakage(time, vacuum):  # type: ignore[no-untyped-def]
 
 @compiled
 def _line(time, values, first, last):  # type: ignore[no-untyped-def]
-    """A straight line through what was read from ``first`` to ``last`` (s).
+    """A straight line through the readings from ``first`` to ``last`` (s).
 
-    Mean, slope per second, and time of the last reading: minus infinity if there is none.
+    Mean, slope per second, and time of the last reading (minus infinity if there is none).
     """
     count, middle, mean, end = 0, 0.0, 0.0, -math.inf
     for row in range(len(time)):
@@ -347,17 +348,17 @@ def _line(time, values, first, last):  # type: ignore[no-untyped-def]
 
 @compiled
 def _supply(supply, phase):  # type: ignore[no-untyped-def]
-    """What it read while the nozzle was on."""
-    there = np.empty(len(supply))
-    count, beyond = 0, 0.0  # the first one: then the mean of equal ones is just that
+    """Mean, low and high end of the supply while the nozzle was on."""
+    readings = np.empty(len(supply))
+    count, beyond = 0, 0.0  # sum over the first reading: the mean of equal readings is exact
     for row in range(len(supply)):
         if phase[row] == _SUCTION and math.isfinite(supply[row]):
-            there[count] = supply[row]
-            beyond += there[count] - there[0]
+            readings[count] = supply[row]
+            beyond += readings[count] - readings[0]
             count += 1
     if count == 0:
         return Supply(math.nan, math.nan, math.nan)
-    mean = there[0] + beyond / count
+    mean = readings[0] + beyond / count
     low, high = round(ENDS[0] * (count - 1)), round(ENDS[1] * (count - 1))
-    in_place = np.partition(there[:count], np.array([low, high]))
-    return Supply(mean, in_place[low], in_place[high])
+    partitioned = np.partition(readings[:count], np.array([low, high]))
+    return Supply(mean, partitioned[low], partitioned[high])

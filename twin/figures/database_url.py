@@ -1,4 +1,4 @@
-"""Which figure database: the one that is named, else a file beside the configuration."""
+"""The choice of the figure database: the named one, else a file beside the configuration."""
 
 from pathlib import Path
 
@@ -15,8 +15,8 @@ FILE = "figures.sqlite"
 def open_chosen(named: str, document: Document | None, *, write: bool) -> Store:
     """Open the database named on the command line, else in the configuration, else the default.
 
-    The default is a file beside the configuration, without one in the current folder. Only who
-    writes makes a file; SourceError if there is none to read.
+    The default is a file beside the configuration, or in the current folder without one. A missing
+    file is created only with ``write``; otherwise it is a SourceError.
     """
     if named:
         return open_store(named, create=write)
@@ -24,7 +24,7 @@ def open_chosen(named: str, document: Document | None, *, write: bool) -> Store:
 
 
 def place_of(document: Document | None) -> URL:
-    """The database that a configuration names, else the default."""
+    """URL of the database that a configuration names, else of the default."""
     folder = Path(document.name).parent if document else Path()
     settings = document.section(FigureSettings, "figures") if document else FigureSettings()
     return configured(settings, folder, FILE, FIGURE_DATABASE)

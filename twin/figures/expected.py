@@ -1,8 +1,8 @@
-"""What a cycle should have been: the model runs free beside the cycles, its nozzle its own.
+"""The expected cycle: the model runs free beside the cycles and switches its own nozzle.
 
-The twin's ticks cannot say it: they are set onto the measurement at each knee, so their nozzle is
-the measured one, and before H1 they end where the measurement got to. As the twin, this model
-takes over the measured level at each suction edge, and what the gas has kept of the cycle before.
+The twin's ticks cannot tell it. They are reset to the measurement at each switching event, so their
+nozzle is the measured one, and before H1 they end where the measurement ends. Like the twin, this
+model takes over the measured level at each suction edge, and the gas state of the cycle before.
 """
 
 import math
@@ -12,8 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from twin.figures.cycle_view import Bytes, Floats, Rows, course
-from twin.model import dense_solver as strides
-from twin.model import kernel
+from twin.model import dense_solver, kernel
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.model.dense_solver import DenseSolver
@@ -23,34 +22,34 @@ from twin.monitor.cycles import STALE
 from twin.monitor.rows import time_steps
 from twin.signals import BREAK, MBAR, MS, Command, Phase, Samples, Ticks
 
-LONGEST_SUCTION_S = 60.0  # in which H1 is to be reached from rest
+LONGEST_SUCTION_S = 60.0  # in which H1 must be reached from rest
 FREE_S = 1.0  # of suction with the cup open, until its vacuum is read
-SWUNG_IN = 2  # suction edges without a break, from which on the gas is as warm as it should be
+SWUNG_IN = 2  # suction edges without a break until the gas temperature has settled
 
 
 @dataclass
 class Expectation:
     """The model of one unit, running free over the rows of a stream.
 
-    It may run as they come (``go_on``), so that little is left to do when a cycle ends (``end``);
-    what it expects is the same to the last bit.
+    It may run as the rows come (``go_on``), so that little is left to do when a cycle ends
+    (``end``); its result is the same to the last bit.
     """
 
     data: DataSet
-    _strides: DenseSolver | None = None  # None until there is a level to begin at
+    _solver: DenseSolver | None = None  # None until there is a level to start from
     _control: kernel.Control = field(default_factory=kernel.Control.anew)
     _last_ns: int | None = None
     _edges: int = 0  # since it began
     _rows: int = 0  # of the cycle so far
-    _stale: bool = False  # in this cycle: nobody knows what was commanded
-    _parts: list[tuple[Floats, Bytes]] = field(default_factory=list)  # pressure (Pa) and phase
+    _stale: bool = False  # rows of this cycle are stale: the commands are unknown
+    _pieces: list[tuple[Floats, Bytes]] = field(default_factory=list)  # pressure (Pa) and phase
 
     def __post_init__(self) -> None:
         self._theta = coefficients(self.data)
         self._terms = Terms(self.data.terms, float(self._theta[c.AMBIENT]))
 
     def over(self, samples: Samples, ticks: Ticks, at_edge: bool) -> tuple[Floats, Bytes] | None:
-        """What ``end`` gives after rows that have come at once."""
+        """The result of ``end`` for rows that come all at once."""
         self.go_on(samples, ticks, at_edge)
         return self.end(at_edge)
 
@@ -63,36 +62,36 @@ class Expectation:
         self._stale |= bool((samples["quality"] & STALE).any())
         if self._stale or (first and samples["quality"][0] & BREAK):
             self.lose()
-        begin = 0 if self._strides is not None else _first_level(ticks, first and at_edge)
+        begin = 0 if self._solver is not None else _first_level(ticks, first and at_edge)
         if begin is None or self._stale:
             return
-        if self._strides is None:
-            self._strides, dt[begin], first = DenseSolver(), -1.0, True
+        if self._solver is None:
+            self._solver, dt[begin], first = DenseSolver(), -1.0, True
         rows = slice(begin, None)
         level = ticks[begin] if first else None
-        self._parts.append(self._run(self._strides, dt[rows], samples[rows], level))
+        self._pieces.append(self._run(self._solver, dt[rows], samples[rows], level))
 
     def end(self, at_edge: bool) -> tuple[Floats, Bytes] | None:
         """Expected vacuum (mbar) and phase of the rows since the last end: one cycle.
 
-        None until the model has swung in, and of rows that did not begin at a suction edge.
+        None until the model has settled, and for rows that did not begin at a suction edge.
         """
-        parts, self._parts, self._rows, self._stale = self._parts, [], 0, False
-        if self._strides is None:
+        pieces, self._pieces, self._rows, self._stale = self._pieces, [], 0, False
+        if self._solver is None:
             return None
         self._edges += at_edge
         if self._edges < SWUNG_IN or not at_edge:
             return None
-        pressure, phase = (np.concatenate(column) for column in zip(*parts, strict=True))
+        pressure, phase = (np.concatenate(column) for column in zip(*pieces, strict=True))
         return (self._theta[c.AMBIENT] - pressure) / MBAR, phase
 
     def lose(self) -> None:
-        """Begin anew: what comes does not follow what was."""
-        self._strides, self._edges = None, 0
+        """Start anew: the next rows do not follow the last ones."""
+        self._solver, self._edges = None, 0
 
     @cached_property
     def free_flow(self) -> float:
-        """Vacuum (mbar) that suction reaches with all cups open; NaN where nothing can open."""
+        """Vacuum (mbar) that suction reaches with all cups open; NaN if no cup can open."""
         if not self._theta[[c.OPENING, c.HOLE]].any():
             return float("nan")
         opened = self._theta.copy()
@@ -100,30 +99,30 @@ class Expectation:
         opened[c.LEAK] += opened[c.HOLE]
         rows = round(FREE_S * 1e3)
         commands = np.full(rows, Command.SUCTION, np.uint8)
-        _, expected = strides.simulate(opened, np.full(rows, MS), commands)
+        _, expected = dense_solver.simulate(opened, np.full(rows, MS), commands)
         return float(opened[c.AMBIENT] - expected[-1]) / MBAR
 
     def _run(
         self, model: DenseSolver, dt: Floats, samples: Samples, first: np.void | None
     ) -> tuple[Floats, Bytes]:
-        """Pressure (Pa) and phase: the ``first`` row as the twin has it, all others free."""
+        """Pressure (Pa) and phase: the ``first`` row is the twin's, all others run free."""
         phase, pressure = np.empty(len(dt), np.uint8), np.empty(len(dt))
         signals = np.empty(len(dt), np.uint8)
         free = slice(0 if first is None else 1, None)
         if first is not None:
             phase[0], level = first["phase"], np.array([first["level"]], np.float64)
-            one = pressure[:1], signals[:1]
-            strides.advance(model, self._theta, dt[:1], phase[:1], level, *one)
+            outputs = pressure[:1], signals[:1]
+            dense_solver.advance(model, self._theta, dt[:1], phase[:1], level, *outputs)
             self._control = kernel.Control.anew()
         driven = self._theta, dt[free], samples["commands"][free]
         out = phase[free], pressure[free], signals[free]
-        strides.run_on(model, self._control, *driven, out, kernel.ROUGHLY)
+        dense_solver.run_on(model, self._control, *driven, out, kernel.ROUGHLY)
         self._terms.add(phase, pressure)
         return pressure, phase
 
 
 def t1_from_rest(data: DataSet) -> float:
-    """Time (ms) from H2 to H1 that the data set expects of a suction; infinite where it stays off.
+    """Time (ms) from H2 to H1 that the data set expects; infinite if H1 is not reached.
 
     The air saving is off, so that suction goes on to H1 of the data set.
     """
@@ -140,29 +139,29 @@ def t1_from_rest(data: DataSet) -> float:
 
 
 def leakage_from_rest(data: DataSet) -> float:
-    """Leakage (mbar/s) that the data set expects of the first hold; 0 where there is none."""
+    """Leakage (mbar/s) that the data set expects of the first hold; 0 without a hold."""
     reached_ms = t1_from_rest(data)
     if not math.isfinite(reached_ms) or data.ejector.air_saving == "off":
         return 0.0
     vacuum, phase = _suction(coefficients(data), LONGEST_SUCTION_S)
     time = np.arange(len(vacuum), dtype=np.float64) * MS
     rows = Rows(time, vacuum, np.full(len(time), np.nan), phase, ended=True, blown=False)
-    found = course(rows, data.ejector.h2_mbar, data.ejector.h1_mbar).vacuum.leakage
-    return found if math.isfinite(found) else 0.0
+    leakage = course(rows, data.ejector.h2_mbar, data.ejector.h1_mbar).vacuum.leakage
+    return leakage if math.isfinite(leakage) else 0.0
 
 
 def _suction(theta: Theta, seconds: float) -> tuple[Floats, Bytes]:
     """Vacuum (mbar) and phase, each millisecond, of a suction from rest."""
     rows = round(seconds * 1e3)
     commands = np.full(rows, Command.SUCTION, np.uint8)
-    phase, pressure = strides.simulate(theta, np.full(rows, MS), commands)
+    phase, pressure = dense_solver.simulate(theta, np.full(rows, MS), commands)
     vacuum: Floats = (theta[c.AMBIENT] - pressure) / MBAR
     return vacuum, phase
 
 
 def _first_level(ticks: Ticks, at_edge: bool) -> int | None:
-    """First row on which a model can be set: an idle one, or a suction edge."""
-    good = ticks["phase"] == Phase.IDLE
-    good[0] |= at_edge
-    rows = np.flatnonzero(good & np.isfinite(ticks["level"]))
+    """First row from which a model can start: an idle one, or a suction edge."""
+    settable = ticks["phase"] == Phase.IDLE
+    settable[0] |= at_edge
+    rows = np.flatnonzero(settable & np.isfinite(ticks["level"]))
     return int(rows[0]) if len(rows) else None

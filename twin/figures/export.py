@@ -6,11 +6,11 @@ from twin.assets.unit import Unit
 from twin.figures.database import SIDES, History
 from twin.figures.table import FIGURES
 
-UNITS = {f"{one.name}_{side}": one.unit for one in FIGURES.values() for side in SIDES}
+UNITS = {f"{figure.name}_{side}": figure.unit for figure in FIGURES.values() for side in SIDES}
 
 
 def to_table(history: History, unit: Unit) -> pa.Table:
-    """The cycles as a table; what a cycle cannot tell is null."""
+    """The cycles as a table; unknown figures are null."""
     columns = {
         "asset_type": pa.array([unit.type] * len(history.host_ns), pa.string()),
         "asset_id": pa.array([unit.id] * len(history.host_ns), pa.string()),
@@ -20,7 +20,7 @@ def to_table(history: History, unit: Unit) -> pa.Table:
         "alarms": pa.array(history.alarms, pa.int64()),
         "warnings": pa.array(history.warnings, pa.string()),
     }
-    columns |= {name: pa.array(of, from_pandas=True) for name, of in history.values.items()}
+    columns |= {name: pa.array(values, from_pandas=True) for name, values in history.values.items()}
     fields = [
         pa.field(name, column.type, metadata={"unit": UNITS[name]} if name in UNITS else None)
         for name, column in columns.items()

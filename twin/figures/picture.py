@@ -1,4 +1,4 @@
-"""A picture of a trend: cycles, their medians, the line with its band, expected and limit."""
+"""A plot of a trend: cycles, their medians, the line with its band, expected value and limit."""
 
 from pathlib import Path
 from textwrap import fill
@@ -14,8 +14,8 @@ from twin.figures.table import Figure
 from twin.figures.trend import DAY_NS, Trend
 
 MOST_POINTS = 5000  # of cycles
-TITLE = 110  # characters in a line of it
-AHEAD = 0.5  # of the record, drawn after its end where nothing is reached
+TITLE = 110  # characters in a line of the title
+AHEAD = 0.5  # share of the record that is drawn after its end, if no limit is reached
 
 
 def draw(history: History, figure: Figure, trend: Trend, title: str, path: Path) -> None:
@@ -50,14 +50,14 @@ def draw(history: History, figure: Figure, trend: Trend, title: str, path: Path)
 
 
 def _axis(days: float) -> tuple[str, float]:
-    """The unit of a time axis over so many days, and how many of it are a day."""
+    """The unit of a time axis over so many days, and the number of units in a day."""
     if days >= 2.0:
         return "days", 1.0
     return ("hours", 24.0) if days * 24.0 >= 2.0 else ("minutes", 1440.0)
 
 
 def _draw_limit(axes: Axes, limit: float) -> None:
-    """The limit, if it leaves the cycles room to be seen."""
+    """Draw the limit, unless it would shrink the cycles too much."""
     low, high = axes.get_ylim()
     if low - (high - low) < limit < high + (high - low):
         axes.axhline(limit, color="tab:red", linestyle="--", label=f"limit {limit:.4g}")
@@ -67,7 +67,7 @@ def _draw_limit(axes: Axes, limit: float) -> None:
 
 
 def _draw_course(axes: Axes, trend: Trend, scale: float) -> None:
-    """The levels on either side of a step, the line with its band, and when it meets the limit."""
+    """Draw the levels of a step, the line with its band, and the time of the limit."""
     days, middle, half = trend.shape(trend.ahead(AHEAD))
     line, comes = trend.line, trend.comes
     if line is not None:

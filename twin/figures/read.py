@@ -1,4 +1,4 @@
-"""The key figures of a recorded log, as its own twin saw the rows."""
+"""The key figures of a recorded log, by the twin that recorded it."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -11,9 +11,9 @@ from twin.signals import unbroken
 
 
 def of_log(log: Log, key_figures: KeyFigures) -> Iterator[tuple[CycleFigures, Mapping[str, Any]]]:
-    """Every cycle of a log with its key figures, and as a database keeps them, alarms included."""
+    """Every cycle of a log with its key figures, and in the database's form with its alarms."""
     alarms = Alarms()
     alarms.see(log.events())
     for piece in cut(unbroken(log.blocks())):
-        if (told := key_figures.take(piece)) is not None:
-            yield told, {**told.plain(), "alarms": alarms.until(told.end_ns)}
+        if (cycle := key_figures.take(piece)) is not None:
+            yield cycle, {**cycle.plain(), "alarms": alarms.until(cycle.end_ns)}

@@ -15,12 +15,12 @@ from twin.monitor.healthy import Healthy
 from twin.monitor.monitor import MonitorSettings
 
 Positive = Annotated[float, Field(gt=0.0)]
-LEAST_T1_MS = 50.0  # over what is usual: below is scatter
+LEAST_T1_MS = 50.0  # least margin over the usual: less is scatter
 LEAST_LEAKAGE = 10.0  # mbar/s, the same
 LEAST_SUPPLY_BAR = 0.5  # the same
 LIMITED = ("t1", "leakage", "free_flow", "lowest_supply", "highest_supply")
 NOWHERE = math.inf, -math.inf
-SHORTEST_CYCLE_S = 1.0  # for which a limit is no nearer than wanted
+SHORTEST_CYCLE_S = 1.0  # cycle time for which false alarms are budgeted; longer ones give fewer
 
 
 class FigureSettings(DatabaseSettings):
@@ -45,12 +45,12 @@ class FigureSettings(DatabaseSettings):
 
 @dataclass(frozen=True)
 class Limits:
-    """What is permitted of one unit, every value known; in the figures' units.
+    """The permitted values of one unit, all known, in the figures' units.
 
-    ``configured`` are the figures whose limit the configuration sets.
+    ``configured`` names the figures whose limit the configuration sets.
     """
 
-    t1: float  # ms; infinite where no suction of the data set reaches H1
+    t1: float  # ms; infinite if no suction of the data set reaches H1
     leakage: float  # mbar/s
     free_flow: float  # mbar
     supply: tuple[float, float]  # bar gauge
@@ -62,22 +62,22 @@ class Limits:
 
 
 def permitted(usual: float, tolerance: float, least: float) -> float:
-    """The limit of a figure: a share more than usual, at least so much more that scatter is not."""
+    """The limit of a figure: ``usual`` plus a share of it, but at least ``least`` for scatter."""
     return usual + max(tolerance * usual, least)
 
 
 def healthy_range(healthy: Healthy, days: float) -> dict[str, tuple[float, float]]:
-    """How low and how high key figures come in healthy cycles, by what a commissioning saw.
+    """Lowest and highest values of key figures in healthy cycles, from the commissioning.
 
-    Beyond that one of them is once in a time that follows from ``days`` between all false alarms.
-    Figures that it did not see are not there.
+    Healthy cycles exceed them so seldom that ``days`` lie between all false alarms. Figures that
+    the commissioning did not see are left out.
     """
     cycles = cycles_between(days, LIMITS, SHORTEST_CYCLE_S)
-    found = {}
-    for name, one in healthy.key_figures.items():
-        reach = one.estimate * student_limit(cycles, len(LIMITED), one.cycles)
-        found[name] = one.mean - reach, one.mean + reach
-    return found
+    ranges = {}
+    for name, figure in healthy.key_figures.items():
+        reach = figure.estimate * student_limit(cycles, len(LIMITED), figure.cycles)
+        ranges[name] = figure.mean - reach, figure.mean + reach
+    return ranges
 
 
 def limits_of(config: Config) -> Limits:
@@ -87,9 +87,9 @@ def limits_of(config: Config) -> Limits:
 
 
 def limits(settings: FigureSettings, data: DataSet, watch: MonitorSettings) -> Limits:
-    """The limits of a unit: what is not set follows from its data set.
+    """The limits of a unit: those not set follow from its data set.
 
-    None is so near that its healthy cycles come up to it more often than ``watch`` wants.
+    They keep such a distance that healthy cycles exceed them no more often than ``watch`` permits.
     """
     reach = dict.fromkeys(LIMITED, NOWHERE) | healthy_range(watch.healthy, watch.false_alarm_days)
     t1, leakage = settings.permitted_t1_ms, settings.permitted_leakage_mbar_s

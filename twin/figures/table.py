@@ -1,7 +1,7 @@
-"""The key figures, one table: name, unit, what it is, and how it is found in one side of a cycle.
+"""The table of key figures: name, unit, description, and the function that computes each.
 
-Names and definitions are the field's, as condition monitoring of compact ejectors reports them. A
-figure that a cycle cannot tell is NaN; none is guessed.
+Names and definitions are the field's, as condition monitoring of compact ejectors reports them. An
+unknown figure is NaN; none is guessed.
 """
 
 import math
@@ -16,26 +16,26 @@ from twin.signals import BAR, MBAR
 BANDS = (67.0, 133.0, 200.0)  # mbar/s, of leakage
 WORST_LEAKAGE = 500.0  # mbar/s: quality 0
 FREE_SUCTION_S = 1.0  # at least, for a free-flow vacuum
-STEADY = 10.0  # mbar/s: at the end of it the vacuum moves by less
-LEAST_FREE_FLOW = 5.0  # mbar: below it is not told from nothing
+STEADY = 10.0  # mbar/s: a free-flow vacuum moves by less at the end of suction
+LEAST_FREE_FLOW = 5.0  # mbar: less cannot be told from zero
 UNKNOWN = math.nan
 
 
 @dataclass(frozen=True)
 class Unit:
-    """What a figure needs to know of the ejector beside its course."""
+    """Properties of the ejector that figures need besides the cycle."""
 
     data: DataSet
     energy_kwh_m3: float
 
     @property
     def h1(self) -> float:
-        """Where the air saving switches the nozzle off (mbar)."""
+        """Vacuum at which the air saving switches the nozzle off (mbar)."""
         return self.data.ejector.h1_mbar
 
     @property
     def h2(self) -> float:
-        """From where on a part is present (mbar)."""
+        """Vacuum from which a part is present (mbar)."""
         return self.data.ejector.h2_mbar
 
 
@@ -58,32 +58,32 @@ def t0(course: Course, _unit: Unit) -> float:
 
 
 def t1(course: Course, _unit: Unit) -> float:
-    """Evacuation time from H2 to H1 (ms): the switching of the air saving, where there is one."""
+    """Evacuation time from H2 to H1 (ms), or to the air saving's switching if there is one."""
     if not course.vacuum.seamless:
         return UNKNOWN
     h1 = course.nozzle.off_s if course.nozzle.went_off else course.vacuum.h1_s
     passed = h1 - course.vacuum.h2_s
-    return passed * 1e3 if passed > 0.0 else UNKNOWN  # a sensor so slow that it says nothing of it
+    return passed * 1e3 if passed > 0.0 else UNKNOWN  # the sensor is too slow to tell
 
 
 def leakage(course: Course, _unit: Unit) -> float:
-    """Vacuum lost per time (mbar/s), by a straight line through the first stretch of hold."""
+    """Vacuum lost per time (mbar/s): slope of a line through the first stretch of hold."""
     return course.vacuum.leakage
 
 
 def leakage_band(course: Course, unit: Unit) -> float:
-    """In which of the field's bands leakage is: 0 is good, 3 beyond the last."""
-    found = leakage(course, unit)
-    return UNKNOWN if math.isnan(found) else float(bisect_right(BANDS, found))
+    """Band of the leakage, as the field has them: 0 is good, 3 is beyond the last."""
+    lost = leakage(course, unit)
+    return UNKNOWN if math.isnan(lost) else float(bisect_right(BANDS, lost))
 
 
 def quality(course: Course, unit: Unit) -> float:
-    """From leakage (%): 100 without any."""
+    """Quality (%) from the leakage: 100 without any."""
     return _percent(1.0 - leakage(course, unit) / WORST_LEAKAGE)
 
 
 def free_flow(course: Course, unit: Unit) -> float:
-    """Vacuum (mbar) at which suction stands still short of H1, as with the cup open."""
+    """Vacuum (mbar) at which suction settles below H1, as with the cup open."""
     if not course.is_even or (course.is_whole and course.nozzle.went_off):
         return UNKNOWN
     if course.suction_s < FREE_SUCTION_S or abs(course.vacuum.last_slope) > STEADY:
@@ -93,7 +93,7 @@ def free_flow(course: Course, unit: Unit) -> float:
 
 
 def performance(course: Course, unit: Unit) -> float:
-    """From the free-flow vacuum (%): 100 with nothing in the way, 0 at H1."""
+    """Performance (%) from the free-flow vacuum: 100 without any restriction, 0 at H1."""
     return _percent(1.0 - free_flow(course, unit) / unit.h1)
 
 
@@ -131,12 +131,12 @@ def energy(course: Course, unit: Unit) -> float:
 
 
 def switchings(course: Course, _unit: Unit) -> float:
-    """How often the nozzle was switched on."""
+    """Number of times the nozzle was switched on."""
     return float(course.nozzle.switchings) if course.is_whole else UNKNOWN
 
 
 def quick_switchings(course: Course, _unit: Unit) -> float:
-    """Most switchings of the air saving, on or off, within the time that valve protection has."""
+    """Most switchings of the air saving, on or off, within the time of valve protection."""
     return float(course.nozzle.quick_switchings) if course.is_whole else UNKNOWN
 
 
@@ -156,15 +156,15 @@ def highest_supply(course: Course, _unit: Unit) -> float:
 
 
 def _nozzle_s(course: Course) -> float:
-    """How long the nozzle was on (s), where nothing was missed."""
+    """Time that the nozzle was on (s); unknown if a switching may have been missed."""
     return course.nozzle.on_s if course.is_whole else UNKNOWN
 
 
 def _pressed(course: Course, unit: Unit) -> float:
     """Absolute operating pressure over that of the data set: a sonic nozzle's flow follows it."""
     ambient, nominal = unit.data.ambient.pressure_mbar * MBAR / BAR, unit.data.supply.nozzle_bar
-    there = supply(course, unit)
-    return 1.0 if math.isnan(there) else (there + ambient) / (nominal + ambient)
+    measured_bar = supply(course, unit)
+    return 1.0 if math.isnan(measured_bar) else (measured_bar + ambient) / (nominal + ambient)
 
 
 def _percent(share: float) -> float:
@@ -223,12 +223,12 @@ FIGURES = {
 
 
 def figures(rows: Rows, unit: Unit) -> dict[str, float]:
-    """All key figures of one side of a cycle; NaN where it cannot tell."""
-    found = course(rows, unit.h2, unit.h1)
-    return {name: figure.of(found, unit) for name, figure in FIGURES.items()}
+    """All key figures of one side of a cycle; NaN if unknown."""
+    cycle_course = course(rows, unit.h2, unit.h1)
+    return {name: figure.of(cycle_course, unit) for name, figure in FIGURES.items()}
 
 
 def table() -> str:
     """The figures as a table for people."""
-    rows = [f"| `{one.name}` | {one.unit} | {one.what} |" for one in FIGURES.values()]
+    rows = [f"| `{figure.name}` | {figure.unit} | {figure.what} |" for figure in FIGURES.values()]
     return "\n".join(["| figure | unit | what |", "| --- | --- | --- |", *rows])

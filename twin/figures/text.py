@@ -14,14 +14,14 @@ from twin.instants import clock, instant, lasting
 from twin.language import tr
 
 SHOWN = ("t0", "t1", "leakage", "free_flow", "max_vacuum", "nozzle_share", "air", "supply")
-NO_SCATTER = 1e-6  # of the level: where all values are alike, nothing says how sure they are
+NO_SCATTER = 1e-6  # of the level: equal values give no interval
 NO_DASH = {"-": "", "0 or 1": "", "0 to 3": ""}
 
 
 def cycles_table(cycles: Sequence[Mapping[str, Any]]) -> str:
-    """One line for each cycle: measured, with what was expected in brackets."""
+    """One line for each cycle: measured values, with the expected ones in brackets."""
     head = ["cycle", *(f"{name} ({FIGURES[name].unit})" for name in SHOWN), "warnings"]
-    rows = [head, *([*_cells(one)] for one in cycles)]
+    rows = [head, *([*_cells(cycle)] for cycle in cycles)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join(
         "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
@@ -30,23 +30,26 @@ def cycles_table(cycles: Sequence[Mapping[str, Any]]) -> str:
 
 
 def curve_table(suctions: Sequence[Stretch]) -> str:
-    """One line for each suction: what is read off the curve, and why some of it is not."""
+    """One line for each suction: figures read off the curve, and why some are missing."""
     if not suctions:
         return "no suction in this record: nothing is read off its curve"
-    found = [readings(one) for one in suctions]
+    all_figures = [readings(suction) for suction in suctions]
     head = ["suction", *(f"{name} ({figure.unit})" for name, figure in CURVE.items())]
-    rows = [[str(number), *map(_reading, one.values())] for number, one in enumerate(found)]
+    rows = [
+        [str(number), *map(_reading, figures.values())]
+        for number, figures in enumerate(all_figures)
+    ]
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     lines = [
         "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
         for row in (head, *rows)
     ]
-    step = max(one.step for one in suctions) * 1e3
+    step = max(suction.step for suction in suctions) * 1e3
     title = (
         "read off the curve, without a model; vacuum counts from the record's own idle;"
         f" ± is half of a 95 % interval; a reading each {step:.3g} ms"
     )
-    return "\n".join([title, *lines, *_missing(found)])
+    return "\n".join([title, *lines, *_missing(all_figures)])
 
 
 def _reading(reading: Reading) -> str:
@@ -58,25 +61,25 @@ def _reading(reading: Reading) -> str:
     return f"{reading.value:.{decimals}f} ± {reading.half:.{decimals}f}"
 
 
-def _missing(found: Sequence[Mapping[str, Reading]]) -> list[str]:
-    """Why figures are not told, the most frequent reason of each."""
+def _missing(all_figures: Sequence[Mapping[str, Reading]]) -> list[str]:
+    """Why figures are missing: the most frequent reason of each."""
     lines = []
     for name in CURVE:
-        whys = Counter(one[name].why for one in found if one[name].why)
-        if whys:
-            (why, _), many = whys.most_common(1)[0], sum(whys.values())
-            lines.append(f"{name}: not told of {many} of {len(found)}: {why}")
+        reasons = Counter(figures[name].why for figures in all_figures if figures[name].why)
+        if reasons:
+            (reason, _), count = reasons.most_common(1)[0], sum(reasons.values())
+            lines.append(f"{name}: not told of {count} of {len(all_figures)}: {reason}")
     return lines
 
 
 def curve_plain(suctions: Sequence[Stretch]) -> list[dict[str, Any]]:
-    """The same as JSON has it: value, half of the 95 % interval, unit; or ``why`` there is none."""
+    """The same for JSON: value, half of the 95 % interval, unit; or ``why`` it is missing."""
     return [
         {
-            "begin_ns": one.begin_ns,
-            **{name: _reading_plain(name, reading) for name, reading in readings(one).items()},
+            "begin_ns": suction.begin_ns,
+            **{name: _reading_plain(name, reading) for name, reading in readings(suction).items()},
         }
-        for one in suctions
+        for suction in suctions
     ]
 
 
@@ -88,11 +91,11 @@ def _reading_plain(name: str, reading: Reading) -> dict[str, Any]:
 
 
 def _cells(cycle: Mapping[str, Any]) -> list[str]:
-    both = [
+    values = [
         f"{_number(cycle.get(f'{name}_measured'))} ({_number(cycle.get(f'{name}_expected'))})"
         for name in SHOWN
     ]
-    return [str(cycle["cycle"]), *both, ", ".join(cycle["warnings"])]
+    return [str(cycle["cycle"]), *values, ", ".join(cycle["warnings"])]
 
 
 def _number(value: float | None) -> str:
@@ -100,51 +103,51 @@ def _number(value: float | None) -> str:
 
 
 def trend_of_figure(history: History, figure: Figure, limits: Limits) -> Trend:
-    """How a figure's record runs, with its limit."""
+    """Trend of a figure's record, with its limit."""
     values = history.values[f"{figure.name}_measured"]
     return trend_of(history.host_ns, values, limit_of(figure.name, limits))
 
 
 def limit_of(name: str, limits: Limits) -> float | None:
-    """The limit of a figure, where the field has one that it may come up to."""
-    known = {"t1": limits.t1, "leakage": limits.leakage, "free_flow": limits.free_flow}
-    limit = known.get(name, math.inf)
+    """The upper limit of a figure; None if it has none."""
+    figure_limits = {"t1": limits.t1, "leakage": limits.leakage, "free_flow": limits.free_flow}
+    limit = figure_limits.get(name, math.inf)
     return limit if math.isfinite(limit) else None
 
 
 def title_of(name: str) -> str:
-    """The name of a figure as people say it."""
+    """The name of a figure for people."""
     return tr(name.replace("_", " "))
 
 
 def in_words(figure: Figure, trend: Trend, now_ns: int) -> str:
-    """How a figure runs, in a sentence that begins with its name, as commands have it."""
+    """Trend of a figure in a sentence that begins with its name, for commands."""
     return f"{figure.name}: {course_in_words(figure, trend, now_ns)}"
 
 
 def course_in_words(figure: Figure, trend: Trend, now_ns: int) -> str:
-    """How a figure runs; that it neither stepped nor drifts is said as well."""
+    """Trend of a figure in words, also if it has neither a step nor a drift."""
     unit = NO_DASH.get(figure.unit, f" {figure.unit}")
-    said = []
+    texts = []
     if trend.lacking:
         last = {"at": instant(trend.end_ns, now_ns), "count": trend.lacking}
-        said.append(tr("last measured at {at}, and not in the {count} cycles since", **last))
+        texts.append(tr("last measured at {at}, and not in the {count} cycles since", **last))
     if (step := trend.step) is not None:
-        said.append(_stepped(step, unit, now_ns))
+        texts.append(_stepped(step, unit, now_ns))
     if (line := trend.line) is not None:
         runs = _ran if trend.lacking else _runs
-        said.append(runs(line, unit, since=step is not None))
+        texts.append(runs(line, unit, since=step is not None))
     elif step is None and not trend.lacking:
         return tr("not enough to say: fewer than {count} stretches with cycles", count=FEWEST_BINS)
     if trend.limit is not None:
-        said.append(_limited(trend, tr("its limit of {value}", value=f"{trend.limit:.4g}{unit}")))
-    return "; ".join(filter(None, said))
+        texts.append(_limited(trend, tr("its limit of {value}", value=f"{trend.limit:.4g}{unit}")))
+    return "; ".join(filter(None, texts))
 
 
 def _stepped(step: Step, unit: str, now_ns: int) -> str:
     before, after = (
-        f"{one:.4g}{_give_or_take(half, one)}"
-        for one, half in ((step.before, step.before_half), (step.after, step.after_half))
+        f"{level:.4g}{_give_or_take(half, level)}"
+        for level, half in ((step.before, step.before_half), (step.after, step.after_half))
     )
     return tr(
         "stepped from {before} to {after} at {at} (95 %: {earliest} to {latest})",
@@ -157,46 +160,46 @@ def _stepped(step: Step, unit: str, now_ns: int) -> str:
 
 
 def _runs(line: Line, unit: str, *, since: bool) -> str:
-    """What a line says since a step or through all of the record."""
-    how = _changes(line, unit)
+    """The line in words, since a step or through the whole record."""
+    change = _changes(line, unit)
     if line.is_trend:
-        runs = tr("{change} since then", change=how) if since else how
+        text = tr("{change} since then", change=change) if since else change
     elif since:
-        runs = tr("no trend since then ({change})", change=how)
+        text = tr("no trend since then ({change})", change=change)
     else:
-        runs = tr("no trend ({change})", change=how)
-    return runs if since else f"{line.level:.4g}{unit}, {runs}"
+        text = tr("no trend ({change})", change=change)
+    return text if since else f"{line.level:.4g}{unit}, {text}"
 
 
 def _ran(line: Line, unit: str, *, since: bool) -> str:
-    """The same of a figure that can be measured no more: its level then, and a trend if it had one.
+    """The same for a figure that is no longer measured: its last level, and its trend if any.
 
-    That it had none would sound as if all were well.
+    Without a trend it says nothing: "no trend" would sound as if all were well.
     """
     level = "" if since else f"{line.level:.4g}{unit}"
-    how = _changes(line, unit) if line.is_trend else ""
-    if how and since:
-        how = tr("{change} after that", change=how)
-    return ", ".join(filter(None, [level, how]))
+    change = _changes(line, unit) if line.is_trend else ""
+    if change and since:
+        change = tr("{change} after that", change=change)
+    return ", ".join(filter(None, [level, change]))
 
 
 def _changes(line: Line, unit: str) -> str:
-    """By how much a line changes per day, or over a record that is shorter."""
+    """Change of a line per day, or over a shorter record."""
     span = 1.0 if line.is_rate else line.span
     change = f"{line.slope * span:+.3g}{_give_or_take(line.slope_half() * span, line.level)}"
-    known = {"change": f"{change}{unit}", "time": lasting(line.span * 86_400.0)}
+    values = {"change": f"{change}{unit}", "time": lasting(line.span * 86_400.0)}
     if line.is_rate:
-        return tr("{change} per day over {time}", **known)
-    return tr("{change} over {time}", **known)
+        return tr("{change} per day over {time}", **values)
+    return tr("{change} over {time}", **values)
 
 
 def _give_or_take(half: float, level: float) -> str:
-    """Half of an interval; nothing where the record shows no scatter to take it from."""
+    """Half of an interval in words; empty if the record shows no scatter."""
     return f" ± {half:.2g}" if half > NO_SCATTER * max(abs(level), 1.0) else ""
 
 
 def _limited(trend: Trend, limit: str) -> str:
-    """How the figure stands to its limit, where there is something to say."""
+    """The figure's relation to its limit; empty if there is nothing to say."""
     assert trend.limit is not None
     line, step = trend.line, trend.step
     level = line.level if line is not None else step.after if step is not None else 0.0
@@ -211,8 +214,8 @@ def _comes(comes: Reach | None, line: Line, limit: str) -> str:
     if comes is None:
         return tr("away from {limit}", limit=limit)
     if not math.isfinite(comes.expected):
-        far = f"{FARTHEST * line.span:.1f}"
-        return tr("{limit} is more than {days} days away", limit=limit, days=far)
+        days = f"{FARTHEST * line.span:.1f}"
+        return tr("{limit} is more than {days} days away", limit=limit, days=days)
     return tr(
         "{limit} in {days} days ({earliest} to {latest})",
         limit=limit,
@@ -223,7 +226,7 @@ def _comes(comes: Reach | None, line: Line, limit: str) -> str:
 
 
 def trend_plain(figure: Figure, trend: Trend) -> dict[str, Any]:
-    """The same as JSON has it; null where there is nothing to say."""
+    """The same for JSON; null where there is nothing to say."""
     plain: dict[str, Any] = {"figure": figure.name, "unit": figure.unit, "limit": trend.limit}
     plain |= {"step": None, "line": None, "days_to_limit": None}
     plain["ended"] = {"host_ns": trend.end_ns, "cycles": trend.lacking} if trend.lacking else None

@@ -1,12 +1,12 @@
-"""How a figure runs: its newest step, the straight line since then, and when that meets a limit.
+"""Trend of a figure: its newest step, the straight line since then, and when it meets a limit.
 
-A step is a change from one level to another between two cycles, as when a hose tears; a trend is a
-slope. Both are told apart by which of the two leaves less, and each only if it is sure.
+A step is a change of level between two cycles, as when a hose tears; a trend is a slope. The one
+with smaller residuals is chosen, and either is reported only if it is significant.
 
-Cycles are first gathered in bins of time, their medians: cycle-to-cycle scatter, and single cycles
-that went wrong, then matter little. The line is Theil and Sen's, the median of all slopes between
-two bins. How sure it is follows from what the bins scatter about it, enlarged where neighbours
-scatter alike, as with the temperature of a day: such a record tells less than its length suggests.
+Cycles are first reduced to medians of time bins, so that scatter and single bad cycles matter
+little. The line is that of Theil and Sen: the median of all slopes between two bins. Its interval
+follows from the scatter of the bins about it. It is widened where neighbours correlate, as with the
+temperature of a day: such a record tells less than its length suggests.
 """
 
 import math
@@ -21,20 +21,20 @@ from scipy.stats import theilslopes, trim_mean
 from twin.inference.levels import MAD_TO_SIGMA
 
 CONFIDENCE = 0.95  # of bands and intervals
-SURE = 0.99  # that the slope has a sign, before a trend is said to be one
+SURE = 0.99  # confidence that the slope has a sign, for a trend
 BINS = 60  # of a record
 FEWEST_BINS = 12
-FARTHEST = 3.0  # record's lengths ahead: no line is trusted beyond
-LEAST_SPAN = 1.0  # days of a record, from which on its slope is a rate per day
+FARTHEST = 3.0  # lengths of the record ahead: no line is trusted beyond
+LEAST_SPAN = 1.0  # days of a record; a shorter one gives no rate per day
 LEAST_BINS = 3  # on either side of a step
-AT_ONCE = 0.5  # of a step, within LEAST_BINS before and after it: what grows slowly is none
-# Of the cycles, the last ones in which a step is looked for; and how many sigmas of the bins it
-# must have there: what only wanders looks like a step of some sigmas in one part or another.
+AT_ONCE = 0.5  # share of a step within LEAST_BINS before and after it; a slow rise is no step
+# Shares of the last cycles in which a step is searched, and the sigmas of the bins that it must
+# have there: a record that only wanders shows a step of some sigmas in one part or another.
 PARTS = ((1.0, 0.0), (0.5, 10.0), (0.25, 10.0))
-LIKELY = 1.92  # of log-likelihood, that where a step is best may be better: 95 %
+LIKELY = 1.92  # difference of log-likelihood that bounds a step's position: 95 %
 DAY_NS = 86_400 * 10**9
-ENDED = 3  # cycles in a row without a value, at least, where a figure can be measured no more
-TRIMMED = 0.1  # of the bins on either side, before their mean is the line's level
+ENDED = 3  # fewest cycles in a row without a value for a figure that is no longer measured
+TRIMMED = 0.1  # share of the bins cut off on either side before their mean is taken
 MOST_ALIKE = 0.95  # correlation of neighbours
 
 Floats = npt.NDArray[np.float64]
@@ -49,11 +49,11 @@ class Line:
     level: float  # at day 0
     slope: float  # per day
     sigma: float  # of a bin about the line
-    alike: float  # how many times wider all intervals are for neighbours that scatter alike
+    alike: float  # factor by which correlated neighbours widen all intervals
 
     @property
     def is_rate(self) -> bool:
-        """Whether the record is long enough to give a rate per day, and when a limit comes."""
+        """Whether the record is long enough for a rate per day and the time of a limit."""
         return self.span >= LEAST_SPAN
 
     @property
@@ -66,11 +66,11 @@ class Line:
         return self._times(confidence) * self.sigma / math.sqrt(self._spread)
 
     def at(self, days: Floats) -> Floats:
-        """The line at these times."""
+        """Values of the line at these times."""
         return self.level + self.slope * days
 
     def half(self, days: Floats, confidence: float = CONFIDENCE) -> Floats:
-        """Half the width of the band within which the line runs."""
+        """Half the width of the line's confidence band."""
         away = (days - self.days.mean()) ** 2 / self._spread
         width: Floats = np.sqrt(1.0 / len(self.days) + away)
         return self._times(confidence) * self.sigma * width
@@ -85,7 +85,7 @@ class Line:
         return float(((self.days - self.days.mean()) ** 2).sum())
 
     def _times(self, confidence: float) -> float:
-        """Standard errors on either side."""
+        """Number of standard errors in half of an interval."""
         return float(student.ppf(0.5 + confidence / 2.0, len(self.days) - 2)) * self.alike
 
 
@@ -93,7 +93,7 @@ class Line:
 class Step:
     """A change from one level to another; halves are those of 95 % intervals.
 
-    It was after the cycle received at ``earliest_ns`` (UTC) and by that at ``latest_ns``, most
+    It happened after the cycle received at ``earliest_ns`` (UTC) and by that at ``latest_ns``, most
     likely between those at ``last_ns`` and ``host_ns``.
     """
 
@@ -110,9 +110,9 @@ class Step:
 
 @dataclass(frozen=True)
 class Reach:
-    """When a line comes to a limit, in days from the last cycle; ``latest`` is inf if it may not.
+    """When a line reaches a limit, in days from the last cycle; ``latest`` is inf if it may not.
 
-    ``expected`` beyond FARTHEST records ahead is nothing to rely on: it is then inf as well.
+    ``expected`` is inf too beyond FARTHEST records ahead, where it is not reliable.
     """
 
     expected: float
@@ -122,22 +122,22 @@ class Reach:
 
 @dataclass(frozen=True)
 class Trend:
-    """How a record runs: its newest step, and the line since then or through all of it.
+    """Trend of a record: its newest step, and the line since then or through all of it.
 
-    Without a step None; without a line where there are too few cycles. ``comes`` is when the line
-    comes up to the ``limit``. A figure that can be measured no more has no future.
+    ``step`` is None without one, ``line`` with too few cycles. ``comes`` is when the line reaches
+    the ``limit``; it is None for a figure that is no longer measured.
     """
 
     begin_ns: int  # of the record: first and last cycle that has a value
     end_ns: int
-    lacking: int  # cycles after its end, without a value; 0 where that is as usual
+    lacking: int  # cycles after its end, without a value; 0 if that is usual
     step: Step | None
     line: Line | None
     limit: float | None
     comes: Reach | None
 
     def ahead(self, share: float) -> float:
-        """How many days after the record's end are of interest: a share of it, or to the limit."""
+        """Days of interest after the record's end: a share of it, or until the limit."""
         if self.line is None or self.lacking:
             return 0.0
         ahead = share * self.line.span
@@ -146,9 +146,9 @@ class Trend:
         return ahead
 
     def shape(self, ahead: float) -> tuple[Floats, Floats, Floats]:
-        """The course as one draws it, to ``ahead`` days after the record's end.
+        """The trend as a curve, to ``ahead`` days after the record's end.
 
-        Days from the last cycle, the middle there, and half of its 95 % interval.
+        Days from the last cycle, value at each, and half of its 95 % interval.
         """
         pieces: list[tuple[Floats, Floats | float, Floats | float]] = []
         if (step := self.step) is not None:
@@ -161,16 +161,16 @@ class Trend:
             begin = self.begin_ns if self.step is None else self.step.host_ns
             days = np.linspace((begin - self.end_ns) / DAY_NS, ahead, 200)
             pieces.append((days, self.line.at(days), self.line.half(days)))
-        parts = [[np.broadcast_to(one, len(piece[0])) for one in piece] for piece in pieces]
-        days, middle, half = (np.concatenate(one) for one in zip(*parts, strict=True))
+        broadcast = [[np.broadcast_to(array, len(piece[0])) for array in piece] for piece in pieces]
+        days, middle, half = (np.concatenate(array) for array in zip(*broadcast, strict=True))
         return days, middle, half
 
 
 def trend_of(host_ns: npt.NDArray[np.int64], values: Floats, limit: float | None = None) -> Trend:
-    """How a record of cycles in order (received UTC, ns) runs; values may be NaN."""
-    known = np.isfinite(values)
-    lacking = _lacking(known)
-    host_ns, values = host_ns[known], values[known]
+    """Trend of a record of cycles in order of their receipt (UTC, ns); values may be NaN."""
+    has_value = np.isfinite(values)
+    lacking = _lacking(has_value)
+    host_ns, values = host_ns[has_value], values[has_value]
     newest, first = None, 0
     while (step := _newest_step(host_ns[first:], values[first:])) is not None:
         newest, first = step, first + step.first
@@ -182,26 +182,26 @@ def trend_of(host_ns: npt.NDArray[np.int64], values: Floats, limit: float | None
     return Trend(begin, end, lacking, newest, line, limit, comes)
 
 
-def _lacking(known: npt.NDArray[np.bool_]) -> int:
-    """How many of the last cycles have no value; 0 where stretches as long were seen before.
+def _lacking(has_value: npt.NDArray[np.bool_]) -> int:
+    """Number of the last cycles without a value; 0 if stretches as long are usual.
 
-    A stretch counts as usual if one in a hundred between two values was as long.
+    A stretch is usual if one in a hundred between two values was as long.
     """
-    rows = np.flatnonzero(known)
+    rows = np.flatnonzero(has_value)
     if not len(rows):
         return 0
-    lacking = len(known) - 1 - int(rows[-1])
+    lacking = len(has_value) - 1 - int(rows[-1])
     between = np.diff(rows) - 1
     usual = int(np.quantile(between, SURE, method="lower")) if len(between) else 0
     return lacking if lacking >= ENDED and lacking > usual else 0
 
 
 def line_through(host_ns: npt.NDArray[np.int64], values: Floats) -> Line | None:
-    """The line through a record of cycles in order; None where it is too short to say anything."""
-    known = np.isfinite(values)
-    if known.sum() < FEWEST_BINS:
+    """The line through a record of cycles in order; None if the record is too short."""
+    has_value = np.isfinite(values)
+    if has_value.sum() < FEWEST_BINS:
         return None
-    host_ns, values = host_ns[known], values[known]
+    host_ns, values = host_ns[has_value], values[has_value]
     days = (host_ns - host_ns[-1]) / DAY_NS
     if days[0] >= 0.0:
         return None
@@ -211,15 +211,16 @@ def line_through(host_ns: npt.NDArray[np.int64], values: Floats) -> Line | None:
     times, medians = bins
     slope = float(theilslopes(medians, times).slope)
     level = float(trim_mean(medians - slope * times, TRIMMED))
-    off = medians - level - slope * times
+    residuals = medians - level - slope * times
     sigma = max(
-        MAD_TO_SIGMA * float(np.median(np.abs(off - np.median(off)))), float(off.std()) / 2.0
+        MAD_TO_SIGMA * float(np.median(np.abs(residuals - np.median(residuals)))),
+        float(residuals.std()) / 2.0,
     )
-    return Line(times, medians, level, slope, sigma, _alike(off))
+    return Line(times, medians, level, slope, sigma, _correlation_factor(residuals))
 
 
 def reach(line: Line, limit: float) -> Reach | None:
-    """When ``line`` comes up to ``limit``; None where it does not rise for sure, or is beyond."""
+    """When ``line`` reaches ``limit``; None if it does not surely rise, or is beyond already."""
     if not line.is_trend or line.slope <= 0.0 or line.level >= limit:
         return None
     expected = (limit - line.level) / line.slope
@@ -236,16 +237,16 @@ def _first(days: Floats, reached: npt.NDArray[np.bool_]) -> float:
 
 
 def _newest_step(host_ns: npt.NDArray[np.int64], values: Floats) -> Step | None:
-    """A step of the whole, else of its last parts: one that was undone stands out only there."""
-    for part, clear in PARTS:
-        begin = round((1.0 - part) * len(values))
-        if (step := _step(host_ns[begin:], values[begin:], clear)) is not None:
+    """A step of the whole record, else of its last parts: a step undone later shows only there."""
+    for share, least_sigmas in PARTS:
+        begin = round((1.0 - share) * len(values))
+        if (step := _step(host_ns[begin:], values[begin:], least_sigmas)) is not None:
             return replace(step, first=begin + step.first)
     return None
 
 
-def _step(host_ns: npt.NDArray[np.int64], values: Floats, clear: float) -> Step | None:
-    """The step that a record has, if it is sure, so ``clear`` (sigmas), and more than a line."""
+def _step(host_ns: npt.NDArray[np.int64], values: Floats, least_sigmas: float) -> Step | None:
+    """The step of a record, if it is sure, has ``least_sigmas``, and fits better than a line."""
     if len(values) < FEWEST_BINS or host_ns[0] == host_ns[-1]:
         return None
     days = (host_ns - host_ns[-1]) / DAY_NS
@@ -254,47 +255,53 @@ def _step(host_ns: npt.NDArray[np.int64], values: Floats, clear: float) -> Step 
         return None
     times, medians = bins
     count = len(medians)
-    places = range(LEAST_BINS, count - LEAST_BINS + 1)
-    k = min(places, key=lambda at: float(np.abs(_off_levels(medians, at)).sum()))
-    off = _off_levels(medians, k)
+    positions = range(LEAST_BINS, count - LEAST_BINS + 1)
+    k = min(positions, key=lambda at: float(np.abs(_level_residuals(medians, at)).sum()))
+    residuals = _level_residuals(medians, k)
     slope = float(theilslopes(medians, times).slope)
-    off_line = medians - slope * times
-    off_line = off_line - np.median(off_line)
+    line_residuals = medians - slope * times
+    line_residuals = line_residuals - np.median(line_residuals)
     least = 1e-9 * float(np.abs(medians).max()) + 1e-300
-    left, left_by_line = (float(np.abs(one).sum()) + least for one in (off, off_line))
-    # Schwarz's criterion of the two: a step has a number more, its time.
-    better = count * math.log(left_by_line / left) - 0.5 * math.log(count)
+    misfit, line_misfit = (float(np.abs(off).sum()) + least for off in (residuals, line_residuals))
+    # Schwarz's criterion for both: a step has one more parameter, its time.
+    better = count * math.log(line_misfit / misfit) - 0.5 * math.log(count)
     if better < math.log(SURE / (1.0 - SURE)):
         return None
-    sigma = max(MAD_TO_SIGMA * float(np.median(np.abs(off))), float(off.std()) / 2.0, least)
-    error = sigma * _alike(off) / np.sqrt([k, count - k])
-    before, after = (float(trim_mean(one, TRIMMED)) for one in (medians[:k], medians[k:]))
-    chance = (1.0 - SURE) / len(places)  # as each place may look like a step by chance
+    sigma = max(
+        MAD_TO_SIGMA * float(np.median(np.abs(residuals))), float(residuals.std()) / 2.0, least
+    )
+    error = sigma * _correlation_factor(residuals) / np.sqrt([k, count - k])
+    before, after = (float(trim_mean(part, TRIMMED)) for part in (medians[:k], medians[k:]))
+    chance = (1.0 - SURE) / len(positions)  # any position may look like a step by chance
     at_once = np.median(medians[k : k + LEAST_BINS]) - np.median(medians[k - LEAST_BINS : k])
-    if abs(at_once) < max(AT_ONCE * abs(after - before), clear * sigma):
+    if abs(at_once) < max(AT_ONCE * abs(after - before), least_sigmas * sigma):
         return None
     if abs(after - before) < student.ppf(1.0 - chance / 2.0, count - 2) * math.hypot(*error):
         return None
-    first, low, high = _where(values, np.searchsorted(days, times[[k - 1, k]]), (before, after))
+    first, low, high = _locate_step(
+        values, np.searchsorted(days, times[[k - 1, k]]), (before, after)
+    )
     half = float(student.ppf(0.5 + CONFIDENCE / 2.0, count - 2)) * error
-    # By their cycles: of few bins the one with the step in it would count too much.
-    before, after = (float(trim_mean(one, TRIMMED)) for one in (values[:first], values[first:]))
-    last, new, earliest, latest = (int(host_ns[one]) for one in (first - 1, first, low - 1, high))
+    # From cycles: among few bins the one with the step in it would weigh too much.
+    before, after = (float(trim_mean(part, TRIMMED)) for part in (values[:first], values[first:]))
+    last_ns, new_ns, earliest_ns, latest_ns = (
+        int(host_ns[cycle]) for cycle in (first - 1, first, low - 1, high)
+    )
     levels = before, float(half[0]), after, float(half[1])
-    return Step(*levels, last, new, earliest, latest, first)
+    return Step(*levels, last_ns, new_ns, earliest_ns, latest_ns, first)
 
 
-def _off_levels(medians: Floats, k: int) -> Floats:
-    """What two levels leave, the second one from bin ``k`` on."""
+def _level_residuals(medians: Floats, k: int) -> Floats:
+    """Residuals of two levels, the second one from bin ``k`` on."""
     levels = np.repeat([np.median(medians[:k]), np.median(medians[k:])], [k, len(medians) - k])
-    off: Floats = medians - levels
-    return off
+    residuals: Floats = medians - levels
+    return residuals
 
 
-def _where(
+def _locate_step(
     values: Floats, near: npt.NDArray[np.int64], levels: tuple[float, float]
 ) -> tuple[int, int, int]:
-    """The first cycle of the new level, and the first and last one that it may be as well (95 %).
+    """The first cycle of the new level, and the bounds of its 95 % interval.
 
     ``near`` are cycles in the bins on either side of the step.
     """
@@ -304,7 +311,7 @@ def _where(
     cost = np.concatenate([[0.0], np.cumsum(off_before)]) + np.concatenate(
         [np.cumsum(off_after[::-1])[::-1], [0.0]]
     )
-    cost = cost[1:-1]  # one cycle at least is on either side
+    cost = cost[1:-1]  # each side has at least one cycle
     best = int(np.argmin(cost))
     scale = max(float(np.minimum(off_before, off_after).mean()), 1e-300)
     likely = np.flatnonzero(cost - cost[best] <= LIKELY * scale)
@@ -312,25 +319,26 @@ def _where(
 
 
 def _binned(days: Floats, values: Floats) -> tuple[Floats, Floats] | None:
-    """Mean time and median of each bin that holds cycles; None where there are too few."""
+    """Mean time and median of each bin that holds cycles; None if there are too few bins."""
     edges = np.searchsorted(days, np.linspace(days[0], 0.0, BINS + 1)[1:-1])
     cuts = [0, *dict.fromkeys(int(edge) for edge in edges if 0 < edge < len(days)), len(days)]
     if len(cuts) <= FEWEST_BINS:
         return None
-    parts = [slice(first, last) for first, last in pairwise(cuts)]
-    times = np.array([days[part].mean() for part in parts])
-    return times, np.array([np.median(values[part]) for part in parts])
+    bins = [slice(first, last) for first, last in pairwise(cuts)]
+    times = np.array([days[rows].mean() for rows in bins])
+    return times, np.array([np.median(values[rows]) for rows in bins])
 
 
-def _alike(off: Floats) -> float:
-    """How many times less sure a mean is than its bins' scatter says, for they are alike.
+def _correlation_factor(residuals: Floats) -> float:
+    """Factor by which correlation of neighbours widens the standard error of a mean.
 
-    For scatter whose neighbours correlate by r: √((1 + r)/(1 − r)). The line has taken from r what
-    is added to it here.
+    √((1 + r)/(1 − r)) for a correlation r. Fitting the line lowers r; here that is corrected.
     """
-    power = float(off @ off)
+    power = float(residuals @ residuals)
     if power == 0.0:
         return 1.0
-    found = float(off[1:] @ off[:-1]) / power
-    r = min(max((found + 2.0 / len(off)) / (1.0 - 4.0 / len(off)), 0.0), MOST_ALIKE)
+    correlation = float(residuals[1:] @ residuals[:-1]) / power
+    r = min(
+        max((correlation + 2.0 / len(residuals)) / (1.0 - 4.0 / len(residuals)), 0.0), MOST_ALIKE
+    )
     return math.sqrt((1.0 + r) / (1.0 - r))

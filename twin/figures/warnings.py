@@ -1,6 +1,6 @@
-"""The field's warnings: one table, each judged on the measured figures of a whole cycle.
+"""The table of the field's warnings, each evaluated on the measured figures of a whole cycle.
 
-So each is latched to the end of its cycle, and stands until the next one has been judged.
+So each is latched to the end of its cycle, and stands until the next cycle has been evaluated.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +14,7 @@ Measured = Mapping[str, float]
 
 @dataclass(frozen=True)
 class Caution:
-    """One warning: when it stands, and how it is said. Figures that are not known raise none."""
+    """One warning: its condition and its text. An unknown figure raises none."""
 
     name: str
     figure: str  # without which it cannot be judged
@@ -24,8 +24,8 @@ class Caution:
 
 
 CAUTIONS = {
-    one.name: one
-    for one in (
+    caution.name: caution
+    for caution in (
         Caution(
             "valve_protection",
             "quick_switchings",
@@ -77,28 +77,28 @@ CAUTIONS = {
 
 
 def warnings(measured: Measured, expected: Measured, limits: Limits) -> tuple[str, ...]:
-    """The names of the warnings that a cycle gives, in the order of the table.
+    """The names of the warnings of a cycle, in the order of the table.
 
-    What the data set expects of the same cycle is none, unless the configuration sets that limit:
-    a program may end suction before H1, and a small tight volume switches often.
+    A warning that the expected cycle gives too is suppressed, unless the configuration sets its
+    limit: a program may end suction before H1, and a small tight volume switches often.
     """
     return tuple(
         name
-        for name, one in CAUTIONS.items()
-        if one.stands(measured, limits)
-        and (one.figure in limits.configured or not one.stands(expected, limits))
+        for name, caution in CAUTIONS.items()
+        if caution.stands(measured, limits)
+        and (caution.figure in limits.configured or not caution.stands(expected, limits))
     )
 
 
 def in_words(names: Sequence[str], measured: Measured, limits: Limits) -> list[str]:
     """The same for people, with figure, limit, and where the limit comes from."""
     return [
-        one.words.format(**measured, limits=limits, source=limits.source(one.figure))
-        for one in map(CAUTIONS.__getitem__, names)
+        caution.words.format(**measured, limits=limits, source=limits.source(caution.figure))
+        for caution in map(CAUTIONS.__getitem__, names)
     ]
 
 
 def table() -> str:
     """The warnings as a table for people."""
-    rows = [f"| `{one.name}` | {one.when} |" for one in CAUTIONS.values()]
+    rows = [f"| `{caution.name}` | {caution.when} |" for caution in CAUTIONS.values()]
     return "\n".join(["| warning | stands while |", "| --- | --- |", *rows])

@@ -1,4 +1,4 @@
-"""Key figures into the database, from the loop or from a log; the loop never waits for it."""
+"""Write key figures to the database, from the loop or a log; the loop never waits for it."""
 
 import queue
 import threading
@@ -11,9 +11,9 @@ from twin.events import Event, Kind, Severity
 from twin.figures.database import Store
 from twin.signals import Samples, Ticks
 
-BATCH_S = 2.0  # cycles of so long are written together
+BATCH_S = 2.0  # cycles of this time are written together
 RETRY_S = 5.0  # after the database could not be written
-MOST_WAITING = 20_000  # cycles that wait for a database that is away: most of a day
+MOST_WAITING = 20_000  # cycles that wait for an unreachable database: most of a day
 
 
 class Alarms:
@@ -23,20 +23,21 @@ class Alarms:
         self._open: list[int] = []  # PLC times of those that no cycle has counted
 
     def see(self, events: Iterable[Event]) -> None:
-        """Take events; those that are alarms count."""
+        """Take events; alarms among them count."""
         self._open += [event.time_ns for event in events if event.severity is Severity.ALARM]
 
     def until(self, end_ns: int) -> int:
-        """How many there were to the end of a cycle since the cycle before."""
+        """Number of alarms up to the end of a cycle, since the cycle before."""
         later = [time_ns for time_ns in self._open if time_ns > end_ns]
-        found, self._open = len(self._open) - len(later), later
-        return found
+        count, self._open = len(self._open) - len(later), later
+        return count
 
 
 class Keeper:
-    """A sink that stores the key figures which CYCLE events carry, in a thread of its own.
+    """A sink that stores the key figures of CYCLE events, in a thread of its own.
 
-    What cannot be written is said once and kept until it can be; the loop goes on in every case.
+    A failure to write is reported once, and cycles wait until writing works again; the loop goes on
+    in every case.
     """
 
     def __init__(  # everything that makes a row whole
@@ -48,7 +49,7 @@ class Keeper:
         source: str = "live",
     ) -> None:
         self._open_store = open_store
-        self._whose = unit, data_set, source
+        self._origin = unit, data_set, source
         self._say = say
         self._alarms = Alarms()
         self._store: Store | None = None
@@ -60,7 +61,7 @@ class Keeper:
         self._thread.start()
 
     def write(self, _samples: Samples, _ticks: Ticks, events: Sequence[Event]) -> None:
-        """Take what happened."""
+        """Take the events; rows are ignored."""
         if not events:
             return
         self._alarms.see(events)
@@ -70,7 +71,7 @@ class Keeper:
                 self._cycles.put({**event.data, "alarms": alarms})
 
     def close(self) -> None:
-        """Write what is left; a database that is away is not waited for much longer."""
+        """Write the remaining cycles; it does not wait long for an unreachable database."""
         self._ending.set()
         self._thread.join()
 
@@ -81,12 +82,12 @@ class Keeper:
         while not self._ending.wait(pause):
             pause = BATCH_S if self._write_waiting() else RETRY_S
         if not self._write_waiting():
-            left = f"key figures of {len(self._waiting)} cycles could not be stored"
-            self._say(f"{left}; from a log: twin figures show LOG --keep")
-        self._let_go()
+            text = f"key figures of {len(self._waiting)} cycles could not be stored"
+            self._say(f"{text}; from a log: twin figures show LOG --keep")
+        self._close_store()
 
     def _write_waiting(self) -> bool:
-        """Write all there is; says so if it fails for the first time, or works again."""
+        """Write all waiting cycles; reports the first failure, and success after failures."""
         while not self._cycles.empty():
             self._waiting.append(self._cycles.get())
         del self._waiting[:-MOST_WAITING]
@@ -94,9 +95,9 @@ class Keeper:
             return True
         try:
             self._store = self._store or self._open_store()
-            self._store.add(*self._whose, self._waiting)
-        except Exception as error:  # whatever it is, later ones are to be stored
-            self._let_go()
+            self._store.add(*self._origin, self._waiting)
+        except Exception as error:  # whatever it is, later cycles must be stored
+            self._close_store()
             if not self._failed:
                 self._say(f"key figures wait in memory: {in_words(error)}")
             self._failed = True
@@ -106,7 +107,7 @@ class Keeper:
         self._failed, self._waiting = False, []
         return True
 
-    def _let_go(self) -> None:
+    def _close_store(self) -> None:
         if self._store is not None:
             self._store.close()
         self._store = None
