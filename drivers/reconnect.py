@@ -25,11 +25,11 @@ EMPTY: Samples = np.empty(0, SAMPLE)
 
 
 class LostError(SourceError):
-    """No connection, no answer, or a broken one: it may come back."""
+    """No connection, no answer, or a broken one: the PLC may come back."""
 
 
 class AbsentError(SourceError):
-    """An answer without what is wanted: it was never there, or the PLC is still starting."""
+    """The PLC answers, but lacks an address or node: it does not exist, or the PLC is starting."""
 
 
 def unreachable(address: str, error: OSError | UnicodeError, server: str) -> LostError:

@@ -31,7 +31,7 @@ EXCEPTIONS = {
 STATUS = Address("input", 4)  # in the register map: the bits of a record's status
 COILS = Address("coil", 0)  # and the first of the commands as coils, in the same order
 OURS = (1, 3)  # the request is wrong and stays wrong; the others may pass
-ABSENT = 2  # it may come: a PLC that starts or takes a new program does not serve it yet
+ABSENT = 2  # it may come later: a PLC that starts or takes a new program does not serve it yet
 
 
 class Tags(Settings):

@@ -1,6 +1,6 @@
 """Block mode over Modbus: the ring of scans as registers.
 
-The header is read first, then what is new. A record carries the low 16 bits of its sequence.
+The header is read first, then the new records. A record carries the low 16 bits of its sequence.
 """
 
 from dataclasses import dataclass

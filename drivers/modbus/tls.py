@@ -147,7 +147,7 @@ def _unusable(key: str, path: Path, error: Exception) -> ConfigError:
     )
 
 
-# --- what goes wrong on the way -----------------------------------------------------------------
+# --- errors of a connection ---------------------------------------------------------------------
 
 
 def _explained(error: OSError, tls: Tls, address: str) -> SourceError:

@@ -94,7 +94,7 @@ def _is_many(variant: ua.Variant) -> bool:
 
 
 def number(value: ua.DataValue, node: Node) -> float:
-    """One number; NaN where there is no value. SourceError if it is none."""
+    """One number; NaN without a value. SourceError for another type."""
     if not readable(value):
         return float("nan")
     variant = value.Value
@@ -104,7 +104,7 @@ def number(value: ua.DataValue, node: Node) -> float:
 
 
 def whole(value: ua.DataValue, node: Node) -> int:
-    """One whole number; SourceError if it is none, or none is there."""
+    """One whole number; SourceError for another type, or without a value."""
     variant = value.Value
     if not readable(value) or _is_many(variant) or variant.VariantType not in WHOLE:
         raise wrong_type(node, variant, "a whole number")
@@ -122,7 +122,7 @@ def moment(value: ua.DataValue, node: Node) -> int:
 
 
 def truth(value: ua.DataValue, node: Node, bit: int | None) -> bool:
-    """On or off: a Boolean, or one bit of a whole number; SourceError if it is neither."""
+    """On or off: a Boolean, or one bit of a whole number; SourceError for another type."""
     variant = value.Value
     if bit is not None:
         return bool(whole(value, node) >> bit & 1)
@@ -132,12 +132,12 @@ def truth(value: ua.DataValue, node: Node, bit: int | None) -> bool:
 
 
 def numbers(value: ua.DataValue, node: Node) -> Floats:
-    """An array of numbers; SourceError if it is none, or none is there."""
+    """An array of numbers; SourceError for another type, or without a value."""
     return np.array(_array(value, node, NUMBERS, "an array of numbers"), np.float64)
 
 
 def wholes(value: ua.DataValue, node: Node) -> Integers:
-    """An array of whole numbers; SourceError if it is none, or none is there."""
+    """An array of whole numbers; SourceError for another type, or without a value."""
     fitting = WHOLE - {_T.UInt64}  # the ring counts with 32 bits
     return np.array(_array(value, node, fitting, "an array of whole numbers"), np.int64)
 

@@ -63,7 +63,7 @@ class CallerAwareServer(GuardedServer):
         return Session(self, self.aspace, self.subscription_service, name, **options)
 
 
-# --- which events a client wants ----------------------------------------------------------------
+# --- clients' filters of events -----------------------------------------------------------------
 
 
 class SubtypesToo(monitored_item_service.WhereClauseEvaluator):  # type: ignore[misc]

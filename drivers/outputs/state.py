@@ -143,7 +143,7 @@ class Results:
             self._changes.put({**previous, **details})
         self._changes.put({**event.data, **details})
 
-    # --- for whoever serves it ------------------------------------------------------------------
+    # --- for the server -------------------------------------------------------------------------
 
     def changes(self) -> list[Mapping[str, Any]]:
         """Changes of alarms since the last call, in order: their new state, with text."""

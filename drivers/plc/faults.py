@@ -1,4 +1,4 @@
-"""What can be wrong with the rig: one table of effects, and faults as text.
+"""Faults of the rig: one table of effects, and faults as text.
 
 A fault acts through numbers that always exist; at their neutral value they change nothing. ``ROW``
 holds one number for each parameter of each fault, in SI units, for one scan of the PLC.

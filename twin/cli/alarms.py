@@ -1,4 +1,4 @@
-"""``twin alarms``: what stands, what was, and what people do about it, beside a run or after it."""
+"""``twin alarms``: standing alarms, their history, and actions on them, during a run or after."""
 
 import sys
 import time
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from twin.config import Config
     from twin.settings import Document
 
-ANSWER_S = 5.0  # until a run that is there has answered: it looks every second
+ANSWER_S = 5.0  # for a run to answer: it checks for requests every second
 LOOK_S = 0.1
 
 alarms_app = App("Alarms: what stands, what was; acknowledge, shelve, take out of service.")
@@ -67,16 +67,16 @@ def list_(
     now_ns = time.time_ns()
     for config in configs or (None,):
         with _open(alarms, config) as store:
-            whose = _chosen(store, config, unit)
-            shown, episodes = _standing(store, whose, config)
+            chosen = _chosen(store, config, unit)
+            shown, episodes = _standing(store, chosen, config)
         if configs and len(configs) > 1:
-            print(f"{whose.id or whose.type}:")
-        own = [_plain_alarm(alarm, episodes.get(alarm.rule.name), whose) for alarm in shown]
-        for one in own:
-            print(_alarm_in_words(one, now_ns))
-        if not own:
-            print(f"no alarm of {whose.id or whose.type}")
-        plain += own
+            print(f"{chosen.id or chosen.type}:")
+        entries = [_plain_alarm(alarm, episodes.get(alarm.rule.name), chosen) for alarm in shown]
+        for entry in entries:
+            print(_alarm_in_words(entry, now_ns))
+        if not entries:
+            print(f"no alarm of {chosen.id or chosen.type}")
+        plain += entries
     if json_file is not None:
         write_json(json_file, plain)
 
@@ -97,15 +97,19 @@ def history(
     """
     since = None if days is None else time.time_ns() - round(days * 86_400e9)
     with _open(alarms, config) as store:
-        whose = _chosen(store, config, unit)
-        episodes, comments = store.episodes(whose, since), store.comments(whose, since or 0)
+        chosen = _chosen(store, config, unit)
+        episodes, comments = store.episodes(chosen, since), store.comments(chosen, since or 0)
     plain = []
     for episode in episodes:
         print(_episode_in_words(episode, time.time_ns()))
-        of_it = [one for one in comments if one.is_of(episode)]
-        for one in of_it:
-            print(f"        {one.who}, {instant(one.written_ns, time.time_ns())}: {one.text}")
-        plain.append(_plain_episode(episode) | {"comments": [_plain_comment(one) for one in of_it]})
+        remarks = [remark for remark in comments if remark.is_of(episode)]
+        for remark in remarks:
+            print(
+                f"        {remark.who}, {instant(remark.written_ns, time.time_ns())}: {remark.text}"
+            )
+        plain.append(
+            _plain_episode(episode) | {"comments": [_plain_comment(remark) for remark in remarks]}
+        )
     if json_file is not None:
         write_json(json_file, plain)
 
@@ -132,14 +136,14 @@ def statistics(
     since_ns = now_ns - round(days * DAY_NS)
     for config in configs or (None,):
         with _open(alarms, config) as store:
-            whose = _chosen(store, config, unit)
-            episodes = store.episodes_around(whose, since_ns)
-        named += [(whose.id or whose.type, one) for one in episodes]
-    found = statistics_of(named, since_ns, now_ns)
-    for what, said in in_words(found, " ".join, now_ns):
-        print(f"{what:<32} {said}")
+            chosen = _chosen(store, config, unit)
+            episodes = store.episodes_around(chosen, since_ns)
+        named += [(chosen.id or chosen.type, episode) for episode in episodes]
+    result = statistics_of(named, since_ns, now_ns)
+    for label, value in in_words(result, " ".join, now_ns):
+        print(f"{label:<32} {value}")
     if json_file is not None:
-        write_json(json_file, plain(found))
+        write_json(json_file, plain(result))
 
 
 @alarms_app.command()
@@ -156,17 +160,21 @@ def comment(
     from twin.audit import Act
 
     with _open(alarms, config) as store:
-        whose = _chosen(store, config, unit)
-        found = [one for one in store.episodes(whose, only_going_on=True) if one.alarm == name]
-        if not found:
+        chosen = _chosen(store, config, unit)
+        standing = [
+            candidate
+            for candidate in store.episodes(chosen, only_going_on=True)
+            if candidate.alarm == name
+        ]
+        if not standing:
             hint = "twin alarms list says which ones do"
             raise ConfigError(f"{name} does not stand, so there is nothing to comment", hint)
-        who, episode = by or user_here(), found[-1]
-        said = Comment(episode.raised_ns, episode.raised_as, time.time_ns(), who, text)
-        store.comment(whose, said)
+        author, episode = by or user_here(), standing[-1]
+        remark = Comment(episode.raised_ns, episode.raised_as, time.time_ns(), author, text)
+        store.comment(chosen, remark)
     if config is not None:
-        about = {"unit": whose.id or whose.type, "alarm": name} | ({"by": by} if by else {})
-        audit_of(config.parent).record(Act.COMMENTED, user_here(), **about)
+        details = {"unit": chosen.id or chosen.type, "alarm": name} | ({"by": by} if by else {})
+        audit_of(config.parent).record(Act.COMMENTED, user_here(), **details)
     print(f"{name}: commented")
 
 
@@ -189,13 +197,13 @@ def export(
 
     since = None if days is None else time.time_ns() - round(days * 86_400e9)
     with _open(alarms, config) as store:
-        whose = _chosen(store, config, unit)
+        chosen = _chosen(store, config, unit)
         if standing:
-            shown, going_on = _standing(store, whose, config)
-            table = standing_table(shown, going_on, whose)
+            shown, going_on = _standing(store, chosen, config)
+            table = standing_table(shown, going_on, chosen)
         else:
             rules = {name: alarm.rule for name, alarm in _board(config).alarms.items()}
-            table = history_table(store.episodes(whose, since), rules, whose)
+            table = history_table(store.episodes(chosen, since), rules, chosen)
     export_table(table, output)
     print(f"{table.num_rows} alarms in {output}")
 
@@ -207,7 +215,7 @@ def acknowledge(
     """Say that somebody has seen an alarm."""
     from twin.alarms.state import Deed
 
-    _ask(names, Deed.ACKNOWLEDGED, by, _From(config, unit, alarms))
+    _ask(names, Deed.ACKNOWLEDGED, by, _Selection(config, unit, alarms))
 
 
 @alarms_app.command()
@@ -224,7 +232,7 @@ def shelve(
     """Keep an alarm quiet for a time."""
     from twin.alarms.state import Deed
 
-    _ask(names, Deed.SHELVED, by, _From(config, unit, alarms), hours * 3600.0)
+    _ask(names, Deed.SHELVED, by, _Selection(config, unit, alarms), hours * 3600.0)
 
 
 @alarms_app.command()
@@ -234,7 +242,7 @@ def unshelve(
     """Let it speak before that time is over."""
     from twin.alarms.state import Deed
 
-    _ask(names, Deed.UNSHELVED, by, _From(config, unit, alarms))
+    _ask(names, Deed.UNSHELVED, by, _Selection(config, unit, alarms))
 
 
 @alarms_app.command()
@@ -244,7 +252,7 @@ def out_of_service(
     """Keep an alarm quiet until it is taken into service again."""
     from twin.alarms.state import Deed
 
-    _ask(names, Deed.OUT_OF_SERVICE, by, _From(config, unit, alarms))
+    _ask(names, Deed.OUT_OF_SERVICE, by, _Selection(config, unit, alarms))
 
 
 @alarms_app.command()
@@ -254,7 +262,7 @@ def in_service(
     """Take an alarm into service again."""
     from twin.alarms.state import Deed
 
-    _ask(names, Deed.IN_SERVICE, by, _From(config, unit, alarms))
+    _ask(names, Deed.IN_SERVICE, by, _Selection(config, unit, alarms))
 
 
 @alarms_app.command()
@@ -271,15 +279,15 @@ def outbox(
     from twin.notifications.outbox import open_outbox
 
     with _open(alarms, config) as store:
-        whose = _chosen(store, config, unit)
-    with open_outbox(alarms or place_of(_document(config)), whose) as box:
+        chosen = _chosen(store, config, unit)
+    with open_outbox(alarms or place_of(_document(config)), chosen) as box:
         if again:
             print(f"{box.again()} that were refused wait again")
         for name in box.destinations():
             refused = box.refused(name)
             print(f"{name}: {box.count(name)} wait, {len(refused)} were refused")
-            for message, why in refused:
-                print(f"        {message.alarm}  {message.id}  {why}")
+            for message, reason in refused:
+                print(f"        {message.alarm}  {message.id}  {reason}")
         if not box.destinations():
             print("nothing waits")
 
@@ -299,35 +307,35 @@ def rules(config: ConfigFile = None) -> None:
 def alarms_of(
     settings: "Config", say: "Callable[[str], None] | None" = None
 ) -> "Callable[[], Alarms]":
-    """What begins the alarms of a configuration's unit; ConfigError names a wrong rule or key.
+    """A function that starts the alarms of a configuration's unit.
 
-    They are kept where ``[alarms]`` asks for it and there is somebody to ``say`` troubles to; a
-    replay has nobody, and no clock.
+    ConfigError names a wrong rule or key. Alarms are stored if ``[alarms]`` asks for it and ``say``
+    is there for reports of trouble; a replay has no ``say``, and no clock.
     """
     from twin.alarms.loop import Alarms
     from twin.alarms.settings import AlarmSettings, board_rules
 
     document = settings.document
-    by_cause, wanted = board_rules(document), document.section(AlarmSettings, "alarms")
+    by_cause, alarm_settings = board_rules(document), document.section(AlarmSettings, "alarms")
     if say is None:
         return lambda: Alarms(by_cause, None)
-    if not wanted.keep:
+    if not alarm_settings.keep:
         return lambda: Alarms(by_cause, time.time_ns, steady=time.monotonic_ns)
 
     from twin.alarms.database import ALARM_DATABASE
     from twin.alarms.database_url import open_chosen
-    from twin.alarms.writer import Keeper  # its SQLAlchemy is only loaded for who keeps them
+    from twin.alarms.writer import Keeper  # loads SQLAlchemy only if alarms are stored
     from twin.assets.engine import parse_url
     from twin.assets.unit import Unit
 
-    parse_url(wanted.url, ALARM_DATABASE)
-    opened = partial(open_chosen, "", document, write=True)
-    keeper = Keeper(opened, Unit(settings.asset.type, settings.asset.id), say)
+    parse_url(alarm_settings.url, ALARM_DATABASE)
+    open_database = partial(open_chosen, "", document, write=True)
+    keeper = Keeper(open_database, Unit(settings.asset.type, settings.asset.id), say)
     return lambda: Alarms(by_cause, time.time_ns, keeper.begin(), keeper, time.monotonic_ns)
 
 
 def asker_of(settings: "Config") -> "Callable[[str, str], None] | None":
-    """What asks the run to acknowledge an alarm, as the command does; None where none are kept."""
+    """A function that asks the run to acknowledge an alarm; None if alarms are not stored."""
     from twin.alarms.database_url import open_chosen
     from twin.alarms.settings import AlarmSettings
     from twin.alarms.state import Deed
@@ -337,9 +345,9 @@ def asker_of(settings: "Config") -> "Callable[[str, str], None] | None":
         return None
     unit = Unit(settings.asset.type, settings.asset.id)
 
-    def acknowledge(alarm: str, who: str) -> None:
+    def acknowledge(alarm: str, user: str) -> None:
         with open_chosen("", settings.document, write=True) as store:
-            store.ask(unit, alarm, Deed.ACKNOWLEDGED, who)
+            store.ask(unit, alarm, Deed.ACKNOWLEDGED, user)
 
     return acknowledge
 
@@ -347,8 +355,8 @@ def asker_of(settings: "Config") -> "Callable[[str, str], None] | None":
 # --- what the commands share --------------------------------------------------------------------
 
 
-class _From:
-    """Whose alarms, and from where."""
+class _Selection:
+    """The choice of a unit and its alarm database."""
 
     def __init__(self, config: Path | None, unit: str, url: str) -> None:
         self.config, self.unit, self.url = config, unit, url
@@ -376,52 +384,56 @@ def _board(config: Path | None) -> "Board":
 def _standing(
     store: "Store", unit: "Unit", config: Path | None
 ) -> "tuple[list[Alarm], dict[str, Episode]]":
-    """What a person is to look at, the most urgent first, then what is quiet; and its episodes."""
+    """Standing alarms, the most urgent first, then silenced ones; and their episodes."""
     board = _board(config)
     board.resume(store.states(unit))
     board.see(time.time_ns(), {})
-    episodes = {one.alarm: one for one in store.episodes(unit, only_going_on=True)}
+    episodes = {episode.alarm: episode for episode in store.episodes(unit, only_going_on=True)}
     return [*board.standing(), *board.quiet()], episodes
 
 
 def _chosen(store: "Store", config: Path | None, unit: str) -> "Unit":
-    """The unit that is meant: named, that of the configuration, or the only one there is."""
+    """The chosen unit: the named one, else that of the configuration, else the only one."""
     units = store.units()
     document = _document(config)
-    asked = unit or (str(document.tables.get("asset", {}).get("id", "")) if document else "")
-    found = [one for one in units if not asked or one.id == asked]
-    if len(found) != 1:
-        known = known_names(asked, (one.id or one.type for one in units))
-        what = f"{len(found)} units {asked!r}" if asked else f"{len(found)} units"
-        raise ConfigError(f"{store.name}: {what}", f"choose with --id; {known}")
-    return found[0]
+    requested = unit or (str(document.tables.get("asset", {}).get("id", "")) if document else "")
+    matches = [candidate for candidate in units if not requested or candidate.id == requested]
+    if len(matches) != 1:
+        hint = known_names(requested, (candidate.id or candidate.type for candidate in units))
+        problem = f"{len(matches)} units {requested!r}" if requested else f"{len(matches)} units"
+        raise ConfigError(f"{store.name}: {problem}", f"choose with --id; {hint}")
+    return matches[0]
 
 
-def _ask(names: list[str], deed: "Deed", by: str, of: _From, seconds: float = 0.0) -> None:
-    """Ask a run that is there, and wait a moment for what it says; ConfigError if it refuses."""
-    board = _board(of.config)
+def _ask(
+    names: list[str], deed: "Deed", by: str, selection: _Selection, seconds: float = 0.0
+) -> None:
+    """Send a request to the run, and wait briefly for its answer; ConfigError if it refuses."""
+    board = _board(selection.config)
     for name in names:
         if deed.value == "shelved":
             list(board[name].shelve(0, seconds, by))  # refuses what a run would refuse
         board[name]
-    with _open(of.url, of.config) as store:
-        whose = _chosen(store, of.config, of.unit)
-        asked = dict[int, str]()
+    with _open(selection.url, selection.config) as store:
+        chosen = _chosen(store, selection.config, selection.unit)
+        requests = dict[int, str]()
         for name in names:
-            asked[store.ask(whose, name, deed, by or user_here(), seconds)] = name
-            if of.config is not None:
-                about = {"unit": whose.id or whose.type, "alarm": name}
-                about |= {"by": by} if by else {}
-                audit_of(of.config.parent).record(deed, user_here(), **about)
+            requests[store.ask(chosen, name, deed, by or user_here(), seconds)] = name
+            if selection.config is not None:
+                details = {"unit": chosen.id or chosen.type, "alarm": name}
+                details |= {"by": by} if by else {}
+                audit_of(selection.config.parent).record(deed, user_here(), **details)
         refused = [
-            why for number, name in asked.items() if (why := _answered(store, number, name, deed))
+            refusal
+            for number, name in requests.items()
+            if (refusal := _await_answer(store, number, name, deed))
         ]
     if refused:
         raise ConfigError("\n".join(refused))
 
 
-def _answered(store: "Store", number: int, name: str, deed: "Deed") -> str:
-    """Print that it is done; or give why not."""
+def _await_answer(store: "Store", number: int, name: str, deed: "Deed") -> str:
+    """Print that the request is done; return the reason if it is refused."""
     end = time.monotonic() + ANSWER_S
     while (answer := store.answer(number)) is None:
         if time.monotonic() > end:
@@ -469,7 +481,7 @@ def _plain_comment(comment: "Comment") -> dict[str, Any]:
 
 
 def _alarm_in_words(plain: dict[str, Any], now_ns: int) -> str:
-    """An alarm on some lines: what, since when, what speaks for it, what to do."""
+    """An alarm in a few lines: state, since when, evidence, consequence and action."""
     head = f"{plain['priority']:<7} {plain['alarm']}  {plain['state'].replace('_', ' ')}"
     if plain["shelved_until_ns"] is not None:
         head += f" until {instant(plain['shelved_until_ns'], now_ns)}"

@@ -1,4 +1,4 @@
-"""What commands have in common: plain help, ``-h`` and ``--version``, and what they say."""
+"""What commands share: plain help, ``-h`` and ``--version``, and common messages."""
 
 import getpass
 import math
@@ -43,11 +43,11 @@ def _version(
 
 
 _VERSION = get_command(_only_version).params[0]
-_VERSION.expose_value = False  # it ends the program: no command takes it
+_VERSION.expose_value = False  # it ends the program, so no command has it as a parameter
 
 
 class _Common:
-    """Over one of Typer's classes: ``--version``, no option twice, and no sentence that is cut."""
+    """Mixin for Typer's classes: ``--version``, no option twice, and help that is not cut off."""
 
     help: str | None
 
@@ -55,10 +55,10 @@ class _Common:
         return [_VERSION, *super().get_params(ctx)]  # type: ignore[misc]
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """As Click does, which would take the last of two values without a word."""
-        _, _, given = self.make_parser(ctx).parse_args(args=list(args))  # type: ignore[attr-defined]
-        for option in given:
-            if given.count(option) > 1 and not _may_repeat(option):
+        """Parse as Click does, but reject repeated options: Click silently takes the last value."""
+        _, _, options = self.make_parser(ctx).parse_args(args=list(args))  # type: ignore[attr-defined]
+        for option in options:
+            if options.count(option) > 1 and not _may_repeat(option):
                 ctx.fail(f"{option.opts[0]} is given twice, and only one can be used")
         return super().parse_args(ctx, args)  # type: ignore[misc,no-any-return]
 
@@ -75,7 +75,7 @@ class _Command(_Common, TyperCommand):
 
 
 class _Group(_Common, TyperGroup):
-    order: Sequence[str] = ()  # of its commands in the help; as they were added where it is empty
+    order: Sequence[str] = ()  # of its commands in the help; empty: as they were added
 
     def list_commands(self, ctx: Any) -> list[str]:
         names = super().list_commands(ctx)
@@ -83,10 +83,10 @@ class _Group(_Common, TyperGroup):
 
 
 class App(typer.Typer):
-    """Commands whose help is text as it stands: Rich's markup would drop ``[table]`` from it.
+    """Commands whose help is plain text: Rich's markup would drop ``[table]`` from it.
 
-    ``order`` has the names of all its commands; with it the shell can complete them. ``alone`` says
-    that it does something without any of them.
+    ``order`` names all commands; with it the shell can complete them. With ``alone`` it does
+    something without a command too.
     """
 
     def __init__(
@@ -107,18 +107,18 @@ class App(typer.Typer):
         )
 
     def command(self, name: str | None = None, **options: Any) -> Callable[..., Any]:
-        """As Typer's, with what all commands have in common."""
+        """Typer's method, with what all commands share."""
         return super().command(name, cls=_Command, **options)
 
 
-def say_if_cut(recorded: "Log | Wanted", log: Path, what: str) -> None:
-    """Say that a log does not end as its writer would have ended it; ``what`` is done with it."""
+def say_if_cut(recorded: "Log | Wanted", log: Path, action: str) -> None:
+    """Report a log that does not end properly; ``action`` says what is done with it."""
     if not recorded.complete:
-        print(f"twin: {log} is not complete; what can be read is {what}", file=sys.stderr)
+        print(f"twin: {log} is not complete; what can be read is {action}", file=sys.stderr)
 
 
 def say_if_new(url: str, document: "Document | None") -> None:
-    """Say of the chosen database that what follows makes it, if it is not there."""
+    """Report that the chosen database is missing and will be created."""
     from twin.assets.database_url import chosen, is_new
     from twin.assets.engine import shown
 
@@ -127,10 +127,10 @@ def say_if_new(url: str, document: "Document | None") -> None:
 
 
 def read_config(path: Path) -> "Document":
-    """Read a configuration for a command that takes some of its tables.
+    """Read a configuration for a command that uses some of its tables.
 
-    Errors as ``Document.read``; ConfigError if it has a table that no command knows: then it is
-    another kind of file.
+    Errors as from ``Document.read``. ConfigError if it has a table that no command knows: then it
+    is another kind of file.
     """
     from twin.config import TABLES
     from twin.settings import Document
@@ -141,19 +141,19 @@ def read_config(path: Path) -> "Document":
 
 
 def not_negative(value: float | None) -> float | None:
-    """For an option with a number: usage error unless it is finite and not below zero."""
+    """Callback of a numeric option: usage error unless the number is finite and not negative."""
     if value is not None and not (math.isfinite(value) and value >= 0.0):
         raise typer.BadParameter(f"{value:g} is not a finite number from 0 on")
     return value
 
 
 def audit_of(folder: Path) -> Audit:
-    """The trail of what is done by commands."""
-    return Audit(folder, "command", lambda what: print(f"twin: {what}", file=sys.stderr))
+    """The audit trail for actions of commands."""
+    return Audit(folder, "command", lambda text: print(f"twin: {text}", file=sys.stderr))
 
 
 def user_here() -> str:
-    """Who runs this program on this machine: a name, or a number where there is none."""
+    """Name of the user who runs this program, or the user's number without a name."""
     try:
         return getpass.getuser()
     except (KeyError, OSError):  # as in a container

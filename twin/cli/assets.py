@@ -1,4 +1,4 @@
-"""``twin assets``: look into the asset database, add to it, carry it elsewhere."""
+"""``twin assets``: show the asset database, add to it, export and import it."""
 
 import json
 import sys
@@ -61,18 +61,18 @@ def show(
     from twin.assets.file import parse_time
 
     now = parse_time(at) if at else time.time_ns()
-    known = parse_time(as_of) if as_of else None
+    as_of_ns = parse_time(as_of) if as_of else None
     with _open(assets, config, write=False) as database:
-        records = database.records(name=name, as_of_ns=known)
+        records = database.records(name=name, as_of_ns=as_of_ns)
         _require(records, name, database)
     recorded = _recorded_in(database)
     if history:
         print("\n".join(_line_of_history(record, recorded) for record in records))
         return
-    shown = _holding_each(records, now)
-    if not shown:
+    holding = _holding_each(records, now)
+    if not holding:
         raise ConfigError(f"no data set of {name!r} holds at that time", "see --history")
-    print("\n".join(_in_full(record, recorded) for record in shown), end="")
+    print("\n".join(_in_full(record, recorded) for record in holding), end="")
 
 
 @assets_app.command()
@@ -94,17 +94,17 @@ def add(
 
     document = Document.read(file)
     provenance = {"file": file.name, "code": f"ejector-twin {version('ejector-twin')}"}
-    given, dated = read_asset(document, provenance)
-    record = checked(given)
+    unchecked, dated = read_asset(document, provenance)
+    record = checked(unchecked)
     with _to_store(assets, config) as database:
         check_asset(document, record, database)  # before a new one is made
     with _open(assets, config, write=True) as database:
         before = database.records(record.kind, record.name)
         if before and not dated:
             record = replace(record, valid_from_ns=time.time_ns())
-        same = holding(before, record.valid_from_ns)
-        if same and (same.hash, same.type) == (record.hash, record.type):
-            print(f"{same.name}: unchanged, {same.hash} already holds")
+        present = holding(before, record.valid_from_ns)
+        if present and (present.hash, present.type) == (record.hash, record.type):
+            print(f"{present.name}: unchanged, {present.hash} already holds")
             return
         added = database.add(record)
         since = show_time(added.valid_from_ns)
@@ -130,8 +130,8 @@ def import_(
     with _to_store(assets, config, shipped=False) as database:
         database.refuse(document)  # before a new one is made
     with _open(assets, config, write=True, shipped=False) as database:
-        new = database.import_(document)
-        print(f"{new} new of {len(document['records'])} records, in {database.name}")
+        count = database.import_(document)
+        print(f"{count} new of {len(document['records'])} records, in {database.name}")
     if fmu is not None:
         write_whole(fmu, model)
         print(f"the FMU in {fmu}")
@@ -182,7 +182,7 @@ def export(
 
 
 def _to_store(url: str, config: Path | None, *, shipped: bool = True) -> "Assets":
-    """The database in which something is to be stored, to look into first; it may be new."""
+    """The database in which something will be stored, opened for reading; it may be new."""
     from twin.assets.database_url import open_chosen
 
     document = read_config(config) if config else None
@@ -201,15 +201,15 @@ def _open(url: str, config: Path | None, *, write: bool, shipped: bool = True) -
 
 
 def _holding_each(records: "Iterable[Record]", now: int) -> "list[Record]":
-    """Of every type, then of every unit, the record that holds."""
+    """The valid record of every type, then of every unit."""
     from twin.assets.record import holding
 
     assets: dict[tuple[str, str], list[Record]] = {}
     for record in records:
         assets.setdefault((record.kind, record.name), []).append(record)
     in_order = sorted(assets, key=lambda asset: (asset[0] == "instance", asset[1]))
-    held = (holding(assets[asset], now) for asset in in_order)
-    return [record for record in held if record is not None]
+    valid = (holding(assets[asset], now) for asset in in_order)
+    return [record for record in valid if record is not None]
 
 
 def _require(records: "list[Record]", name: str, database: "Assets") -> None:
@@ -218,12 +218,12 @@ def _require(records: "list[Record]", name: str, database: "Assets") -> None:
             raise ConfigError(
                 f"{database.name}: nothing was known of {name!r} at that time", "see --history"
             )
-        known = known_names(name, (record.name for record in database.records()))
-        raise ConfigError(f"{database.name}: no type or unit is called {name!r}", known)
+        hint = known_names(name, (record.name for record in database.records()))
+        raise ConfigError(f"{database.name}: no type or unit is called {name!r}", hint)
 
 
 def _recorded_in(database: "Assets") -> "Callable[[Record], str]":
-    """When a record came to a database; what is shipped and in no database never did."""
+    """A function for the time at which a record was stored; shipped records never were."""
     from twin.assets.file import show_time
 
     if database.in_memory:
@@ -267,7 +267,7 @@ def _in_full(record: "Record", recorded: "Callable[[Record], str]") -> str:
 
 
 def _read_json(file: Path) -> dict[str, Any]:
-    """The document in a file; whether it is an export is for the database to say."""
+    """The document in a JSON file; the database checks whether it is an export."""
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
@@ -287,7 +287,7 @@ def _read_json(file: Path) -> dict[str, Any]:
 def _require_options(
     output: Path | None, aasx: Path | None, unit: str, fmu: Path | None, logs: str
 ) -> None:
-    """ConfigError for options that mean nothing together."""
+    """ConfigError for options that do not fit together."""
     if aasx is not None and output is not None:
         raise ConfigError("-o and --aasx exclude each other", "export twice")
     if aasx is not None and aasx.suffix.lower() != AASX:
@@ -299,10 +299,10 @@ def _require_options(
 
 
 def _of_unit(database: "Assets", unit: str) -> "list[Record]":
-    """The records of a unit and of its type, in the order of recording."""
-    own = database.records("instance", unit)
-    _require(own, unit, database)
-    types = {record.type for record in own}
+    """The records of a unit and of its type, in order of recording."""
+    of_unit = database.records("instance", unit)
+    _require(of_unit, unit, database)
+    types = {record.type for record in of_unit}
     return [
         record
         for record in database.records()
@@ -312,13 +312,13 @@ def _of_unit(database: "Assets", unit: str) -> "list[Record]":
 
 def _only_fmu(file: Path, fmus: Mapping[str, bytes]) -> bytes:
     if len(fmus) != 1:
-        there = ", ".join(sorted(fmus)) or "none"
-        raise ConfigError(f"{file}: --fmu writes one FMU, and in it are: {there}", "leave it out")
+        names = ", ".join(sorted(fmus)) or "none"
+        raise ConfigError(f"{file}: --fmu writes one FMU, and in it are: {names}", "leave it out")
     return next(iter(fmus.values()))
 
 
 def _shells() -> "ModuleType":
-    """What reads and writes shells; ConfigError says what to install where it is missing."""
+    """The module for Asset Administration Shells; ConfigError if its library is not installed."""
     try:
         from twin.exchange import aas
     except ImportError as error:
@@ -335,5 +335,5 @@ def _read_fmu(path: Path) -> "Fmu":
 
 
 def _not_installed(error: ImportError) -> ConfigError:
-    what = f"shells need the Eclipse BaSyx SDK, which is not installed: {error}"
-    return ConfigError(what, install_hint("aas"))
+    text = f"shells need the Eclipse BaSyx SDK, which is not installed: {error}"
+    return ConfigError(text, install_hint("aas"))

@@ -44,9 +44,9 @@ def calibrate(
     with status() as say:
         calibration = fit_unit(settings, (rows for rows, _ in recorded.blocks()), say)
     say_if_new(assets, settings.document)
-    record, where = store(calibration, settings, assets, log)
+    record, location = store(calibration, settings, assets, log)
     print(in_words(calibration))
-    print(f"stored as {settings.asset.id} in {where}, record {record.id[:8]}")
+    print(f"stored as {settings.asset.id} in {location}, record {record.id[:8]}")
     if json_file is not None:
         write_json(json_file, as_json(calibration, record))
 
@@ -99,17 +99,17 @@ def commission(
             if recorded is not None
             else _recorded_cycles(document, cycles, say)
         )
-        found = fit_unit(settings, blocks, say)
-    print(commissioned_in_words(found))
+        commissioned = fit_unit(settings, blocks, say)
+    print(commissioned_in_words(commissioned))
     record = None
-    if found.verdict.word != "refused":
+    if commissioned.verdict.word != "refused":
         say_if_new(assets, settings.document)
-        record, where = store_first(found.calibration, settings, assets, source)
-        print(f"stored as {settings.asset.id} in {where}, record {record.id[:8]}")
+        record, location = store_first(commissioned.calibration, settings, assets, source)
+        print(f"stored as {settings.asset.id} in {location}, record {record.id[:8]}")
     if json_file is not None:
-        write_json(json_file, commissioned_as_json(found, settings.asset, record))
+        write_json(json_file, commissioned_as_json(commissioned, settings.asset, record))
     if report is not None:
-        write_page(found, settings.asset, report)
+        write_page(commissioned, settings.asset, report)
     if record is None:
         raise typer.Exit(2)
 
@@ -117,7 +117,7 @@ def commission(
 def _recorded_cycles(
     document: "Document", cycles: int, say: "Callable[[str], None]"
 ) -> "Iterator[Samples]":
-    """Blocks from the PLC until so many cycles have ended after the first, which may be cut."""
+    """Blocks from the PLC until so many cycles have ended after the first, which may be partial."""
     from drivers.sources import open_source
     from twin.signals import Command
 

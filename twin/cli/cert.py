@@ -1,4 +1,4 @@
-"""``twin cert``: a certificate of our own, for OPC UA servers that want to know who we are."""
+"""``twin cert``: a certificate of our own, for OPC UA servers that ask for one."""
 
 from pathlib import Path
 from typing import Annotated
@@ -16,10 +16,10 @@ def cert(
     from drivers.opcua import certificates
 
     with said_plainly(folder):
-        own = certificates.make(folder, name)
-    print(f"made {own.path}")
-    print(f"     {certificates.described(own.certificate)}")
-    print(f"     valid until {own.certificate.not_valid_after_utc:%Y-%m-%d}; the key stays here")
-    print(f"then let the server trust {own.path},")
+        made = certificates.make(folder, name)
+    print(f"made {made.path}")
+    print(f"     {certificates.described(made.certificate)}")
+    print(f"     valid until {made.certificate.not_valid_after_utc:%Y-%m-%d}; the key stays here")
+    print(f"then let the server trust {made.path},")
     print(f"put the server's certificate into {folder / certificates.TRUSTED}/")
     print(f'and say so in [driver.security]: certificates = "{folder}"')

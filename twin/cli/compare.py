@@ -28,28 +28,28 @@ def compare(
     ] = None,
 ) -> None:
     """Say what differs between two logs: key figures and courses, from the suction edge on."""
-    from twin.compare.compare import compare as beside
+    from twin.compare.compare import compare as compare_sides
     from twin.compare.text import in_words, plain, remarks
 
     _refuse_before_work(json_file, picture, rrd)
-    found = beside(_read(a), _read(b))
-    for remark in remarks(found):
+    comparison = compare_sides(_read(a), _read(b))
+    for remark in remarks(comparison):
         print(f"twin: {remark}", file=sys.stderr)
-    print(in_words(found))
+    print(in_words(comparison))
     if json_file is not None:
-        write_json(json_file, plain(found))
+        write_json(json_file, plain(comparison))
     if picture is not None:
         from twin.compare.picture import draw
 
-        draw(found, picture)
+        draw(comparison, picture)
     if rrd is not None:
         from twin.compare.recording import record
 
-        record(found, rrd)
+        record(comparison, rrd)
 
 
 def _read(path: Path) -> "Side":
-    """All cycles of a log, as its own twin saw them."""
+    """All cycles of a log, by the twin that recorded it."""
     from twin.compare.side import side_of
     from twin.config import Config
     from twin.figures.cycle import compiled
@@ -63,7 +63,7 @@ def _read(path: Path) -> "Side":
 
 
 def _refuse_before_work(json_file: Path | None, picture: Path | None, rrd: Path | None) -> None:
-    """Say what cannot be written before two logs have been read."""
+    """Reject outputs that cannot be written, before the logs are read."""
     from twin.compare.picture import FORMATS
 
     if picture is not None and picture.suffix not in FORMATS:

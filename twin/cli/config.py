@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 config_app = App("Check a configuration, and help editors to write one.")
 _SCHEMA = "https://json-schema.org/draft/2020-12/schema"
-_PLACE = re.compile(r":(\d+): ")
+_LINE_NUMBER = re.compile(r":(\d+): ")
 
 
 @config_app.command()
@@ -31,12 +31,12 @@ def check(
     from twin.settings import Document
 
     document = Document.read(file)
-    found = mistakes(document)
-    for mistake in found:
+    messages = mistakes(document)
+    for mistake in messages:
         print(mistake)
-    if found:
-        many = "1 mistake" if len(found) == 1 else f"{len(found)} mistakes"
-        print(f"twin: {file}: {many}", file=sys.stderr)
+    if messages:
+        count = "1 mistake" if len(messages) == 1 else f"{len(messages)} mistakes"
+        print(f"twin: {file}: {count}", file=sys.stderr)
         raise typer.Exit(2)
     print(f"{file}: no mistake in {', '.join(f'[{name}]' for name in document.tables)}")
 
@@ -86,30 +86,30 @@ def sections() -> "dict[str, dict[str, type[Settings]]]":
 
 
 def mistakes(document: "Document") -> list[str]:
-    """All that is wrong in a configuration, a line for each, with what to do about it."""
+    """All mistakes of a configuration, one line each, with what to do about it."""
     return sorted(dict.fromkeys(_mistakes(document)), key=_line)
 
 
 def _mistakes(document: "Document") -> Iterator[str]:
-    """The same as they are found, some more than once."""
+    """The same in the order of the checks; some come more than once."""
     for problem in _checks(document):
         try:
             problem()
-        except (ConfigError, SourceError) as error:  # a file or database that it names
+        except (ConfigError, SourceError) as error:  # of a file or database that it names
             lines = str(error).splitlines()
             yield from lines[:-1]
             yield lines[-1] + _advice(error)
 
 
 def _advice(error: ConfigError | SourceError) -> str:
-    """What to do, where the mistake itself does not say it."""
+    """The hint of an error, unless its message has it already."""
     from twin.settings import ALL_MISTAKES
 
     return "" if error.hint in ("", ALL_MISTAKES) else f"; {error.hint}".replace("\n", ";")
 
 
 def _checks(document: "Document") -> Iterator[Callable[[], Any]]:
-    """What may raise ConfigError: each table by itself, then what only several tables show."""
+    """Checks that may raise ConfigError: of each table, then of several tables together."""
     from drivers.sources import settings_of
     from twin.alarms.settings import chosen_rules
     from twin.config import TABLES, Config
@@ -126,7 +126,7 @@ def _checks(document: "Document") -> Iterator[Callable[[], Any]]:
     if driver is not None:
         yield partial(settings_of, document)
     yield partial(Config.of, document, to_store=True)
-    if "data" in document.tables:  # where what is wrong with [asset] hides it
+    if "data" in document.tables:  # a mistake in [asset] would hide those of [data]
         nobody = {name: document.tables[name] for name in TABLES & set(document.tables) - {"asset"}}
         yield partial(Config.of, replace(document, tables=nobody), to_store=True)
     yield partial(chosen_rules, document)
@@ -135,8 +135,8 @@ def _checks(document: "Document") -> Iterator[Callable[[], Any]]:
 
 
 def _line(mistake: str) -> int:
-    found = _PLACE.search(mistake)
-    return int(found[1]) if found else 0
+    match = _LINE_NUMBER.search(mistake)
+    return int(match[1]) if match else 0
 
 
 # --- schema -------------------------------------------------------------------------------------
@@ -145,51 +145,54 @@ def _line(mistake: str) -> int:
 def json_schema() -> dict[str, Any]:
     """The JSON Schema (2020-12) of a configuration, made from the settings' classes.
 
-    What depends on several keys at once is not in it; ``twin config check`` knows that as well.
+    It does not have rules on several keys at once; ``twin config check`` checks those too.
     """
     from pydantic.json_schema import models_json_schema
 
     from twin.keys import comments_of, defaults_of, tables_below
 
     kinds = sections()
-    every = {
-        one: None for by in kinds.values() for kind in by.values() for _, one in tables_below(kind)
+    all_kinds = {
+        table: None
+        for by_kind in kinds.values()
+        for kind in by_kind.values()
+        for _, table in tables_below(kind)
     }
     names, schema = models_json_schema(
-        [(kind, "validation") for kind in every], ref_template="#/$defs/{model}"
+        [(kind, "validation") for kind in all_kinds], ref_template="#/$defs/{model}"
     )
     definitions = schema["$defs"]
-    for kind in every:
+    for kind in all_kinds:
         name = names[(kind, "validation")]["$ref"].rpartition("/")[2]
         _describe(definitions[name], comments_of(kind), defaults_of(kind))
     tables = {}
     for name, by_kind in kinds.items():
         refs = [names[(kind, "validation")] for kind in by_kind.values()]
         tables[name] = refs[0] if len(refs) == 1 else {"anyOf": refs}
-    used = _named_by(tables, definitions)
+    reachable = _referenced(tables, definitions)
     return {
         "$schema": _SCHEMA,
         "title": "Configuration of ejector-twin",
         "type": "object",
         "properties": tables,
         "additionalProperties": False,
-        "$defs": {name: table for name, table in definitions.items() if name in used},
+        "$defs": {name: table for name, table in definitions.items() if name in reachable},
     }
 
 
-def _named_by(schema: Any, definitions: dict[str, Any]) -> set[str]:
-    """The definitions that a schema names, and those that these name."""
-    found: set[str] = set()
-    here = [schema]
-    while here:
-        named = set(re.findall(r'#/\$defs/(\w+)"', json.dumps(here))) - found
-        found |= named
-        here = [definitions[name] for name in named]
-    return found
+def _referenced(schema: Any, definitions: dict[str, Any]) -> set[str]:
+    """Names of the definitions that a schema refers to, directly or indirectly."""
+    names: set[str] = set()
+    pending = [schema]
+    while pending:
+        new_names = set(re.findall(r'#/\$defs/(\w+)"', json.dumps(pending))) - names
+        names |= new_names
+        pending = [definitions[name] for name in new_names]
+    return names
 
 
 def _describe(table: dict[str, Any], comments: dict[str, str], defaults: dict[str, Any]) -> None:
-    """Put into a table's schema what is said of its keys, and defaults as a file has them."""
+    """Add descriptions of the keys to a table's schema, and defaults in the file's form."""
     for key in UNWRITTEN & set(table["properties"]):
         del table["properties"][key]
     for key, schema in table["properties"].items():

@@ -1,4 +1,4 @@
-"""What a command says while it runs: events to stdout, what it has to say of its work to stderr."""
+"""Output of a running command: events to stdout, remarks on its work to stderr."""
 
 import os
 import sys
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 
 class Console:
-    """A sink that prints what happens, one line each, with whose loop says it.
+    """A sink that prints events, one line each, with the loop's name.
 
-    ``say`` prints lines in one piece, since others may be printing too.
+    ``say`` prints several lines in one piece, since other loops may be printing too.
     """
 
     def __init__(self, name: str = "", say: Callable[[str], None] | None = None) -> None:
@@ -26,12 +26,12 @@ class Console:
         self._say = say or _print
 
     def write(self, _samples: "Samples", _ticks: "Ticks", events: Sequence[Event]) -> None:
-        """Print what happened; an alarm does not say again what it is made of."""
-        told, lines = {event.text for event in events}, ""
+        """Print the events; an alarm does not repeat the text of its evidence."""
+        texts, lines = {event.text for event in events}, ""
         for event in events:
             self.alarmed |= event.severity is Severity.ALARM
-            what = f"{event.severity:<7}  {event.kind:<17}  {_short(event, told)}"
-            lines += f"{stamp(event.time_ns)}  {self._name}{what}\n"
+            line = f"{event.severity:<7}  {event.kind:<17}  {_short(event, texts)}"
+            lines += f"{stamp(event.time_ns)}  {self._name}{line}\n"
         if lines:
             self._say(lines)
 
@@ -39,20 +39,20 @@ class Console:
         """Nothing to finish."""
 
 
-def _short(event: Event, told: Collection[str]) -> str:
-    """The text of an event; of an alarm without its evidence, where that has been ``told``."""
-    words = event.data.get("evidence", {}).get("words")
-    return event.text.replace(f": {words}", "", 1) if words in told else event.text
+def _short(event: Event, texts: Collection[str]) -> str:
+    """The text of an event; for an alarm without its evidence if that is among ``texts``."""
+    evidence = event.data.get("evidence", {}).get("words")
+    return event.text.replace(f": {evidence}", "", 1) if evidence in texts else event.text
 
 
-class Kept:
-    """A sink that keeps what happens, as JSON has it."""
+class EventRecorder:
+    """A sink that keeps events in the form of JSON."""
 
     def __init__(self) -> None:
         self.events: list[dict[str, object]] = []
 
     def write(self, _samples: "Samples", _ticks: "Ticks", events: Sequence[Event]) -> None:
-        """Keep what happened."""
+        """Keep the events."""
         self.events += map(_plain, events)
 
     def close(self) -> None:
@@ -71,13 +71,13 @@ def _plain(event: Event) -> dict[str, object]:
 
 @contextmanager
 def printers() -> Iterator[tuple[Printer, Callable[[str], None]]]:
-    """Give what prints to stdout, and what complains on stderr, without waiting for who reads."""
+    """Give a printer to stdout and a function that complains on stderr; neither waits."""
     printer, talk = Printer(sys.stdout), Printer(sys.stderr)
     try:
-        yield printer, lambda what: talk.say(f"twin: {what}\n")
+        yield printer, lambda text: talk.say(f"twin: {text}\n")
     finally:
-        if left := printer.close():
-            talk.say(f"twin: nobody took what was said last, in {left} parts\n")
+        if unread := printer.close():
+            talk.say(f"twin: nobody took what was said last, in {unread} parts\n")
         talk.close()
 
 
@@ -88,23 +88,23 @@ def _print(text: str) -> None:
         _mute(sys.stdout)
 
 
-def complain(what: str) -> None:
-    """In one piece, since others may be printing too."""
+def complain(text: str) -> None:
+    """Print a complaint in one piece, since other loops may be printing too."""
     try:
-        print(f"twin: {what}\n", end="", file=sys.stderr, flush=True)
+        print(f"twin: {text}\n", end="", file=sys.stderr, flush=True)
     except OSError:
         _mute(sys.stderr)
 
 
 def _mute(stream: TextIO) -> None:
-    """Have nothing more written to where nobody reads: each write would be an error."""
+    """Send further output of a stream without a reader to nowhere: each write would fail."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, stream.fileno())
     os.close(nowhere)
 
 
-def progress(source: "Iterable[Samples]", what: str) -> "Iterator[Samples]":
-    """Count samples on a terminal, say nothing in a pipe."""
+def progress(source: "Iterable[Samples]", label: str) -> "Iterator[Samples]":
+    """Show a count of samples on a terminal, nothing in a pipe."""
     if not sys.stderr.isatty():
         yield from source
         return
@@ -113,7 +113,7 @@ def progress(source: "Iterable[Samples]", what: str) -> "Iterator[Samples]":
 
     columns = (SpinnerColumn(), TextColumn("{task.description}"), MofNCompleteColumn())
     with Progress(*columns, console=Terminal(stderr=True), transient=True) as progress:
-        task = progress.add_task(f"{what} (samples)", total=None)
+        task = progress.add_task(f"{label} (samples)", total=None)
         for block in source:
             progress.advance(task, len(block))
             yield block
@@ -121,9 +121,9 @@ def progress(source: "Iterable[Samples]", what: str) -> "Iterator[Samples]":
 
 @contextmanager
 def status() -> Iterator[Callable[[str], None]]:
-    """Give a function that says what is being done: on a terminal, and nothing in a pipe."""
+    """Give a function that shows what is being done on a terminal, and nothing in a pipe."""
     if not sys.stderr.isatty():
-        with unsaid() as say:
+        with no_status() as say:
             yield say
         return
     from rich.console import Console as Terminal
@@ -133,6 +133,6 @@ def status() -> Iterator[Callable[[str], None]]:
 
 
 @contextmanager
-def unsaid() -> Iterator[Callable[[str], None]]:
-    """As ``status`` where several would say it at once."""
-    yield lambda _what: None
+def no_status() -> Iterator[Callable[[str], None]]:
+    """As ``status``, but silent: for loops that would show it at the same time."""
+    yield lambda _text: None

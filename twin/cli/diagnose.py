@@ -50,10 +50,10 @@ def diagnose(
     require_writable(json_file, report, propose)
     recorded = open_log(log)
     say_if_cut(recorded, log, "diagnosed")
-    other = open_log(judge_on) if judge_on else None
-    if other is not None and judge_on is not None:
-        other.header.require_commands(str(judge_on))
-        say_if_cut(other, judge_on, "judged on")
+    other_log = open_log(judge_on) if judge_on else None
+    if other_log is not None and judge_on is not None:
+        other_log.header.require_commands(str(judge_on))
+        say_if_cut(other_log, judge_on, "judged on")
     store = bool(save_as)
     settings = settings_of(recorded.header, log, config, assets, unit, as_of, to_store=store)
     if not unit:
@@ -61,12 +61,12 @@ def diagnose(
     with status() as say:
         blocks = (rows for rows, _ in recorded.blocks())
         diagnosis = find_cause(settings, blocks, str(log), say, derived=recorded.header.derived)
-        if other is not None:
+        if other_log is not None:
             say(f"judging on {judge_on}")
-            blocks = (rows for rows, _ in other.blocks())
+            blocks = (rows for rows, _ in other_log.blocks())
             diagnosis.json["judged_on"] = judged_on(diagnosis, settings, str(judge_on), blocks)
     print(in_words(diagnosis))
-    if other is not None:
+    if other_log is not None:
         print(on_another_log(diagnosis.json, nothing(diagnosis)))
     if json_file is not None:
         write_json(json_file, diagnosis.json)
@@ -79,23 +79,23 @@ def diagnose(
 
 
 def _save(diagnosis: "Diagnosis", settings: "Config", unit: str, assets: str, log: Path) -> None:
-    """Keep the extended model, or say why there is none."""
+    """Store the extended model, or print why there is none."""
     from twin.diagnosis.extend import extended, nothing, remarks, store
 
     print()
     for line in remarks(diagnosis):
         print(line)
-    known = extended(diagnosis, settings)
-    if known is None:
+    extended_config = extended(diagnosis, settings)
+    if extended_config is None:
         print(f"nothing is stored as {unit}: {nothing(diagnosis)}")
         return
     say_if_new(assets, settings.document)
-    record, where = store(known, diagnosis, settings, unit, assets, log)
-    print(f"stored as {unit} in {where}, record {record.id[:8]}; use it: --id {unit}")
+    record, location = store(extended_config, diagnosis, settings, unit, assets, log)
+    print(f"stored as {unit} in {location}, record {record.id[:8]}; use it: --id {unit}")
 
 
 def _propose(diagnosis: "Diagnosis", settings: "Config", log: Path, file: Path) -> None:
-    """Write what acts that nobody listed as an effect to be taken in, or say why there is none."""
+    """Write an unlisted mechanism as a proposed effect, or print why there is none."""
     from twin.diagnosis.propose import proposed
 
     text = proposed(diagnosis, settings, log, file)

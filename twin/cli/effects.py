@@ -1,4 +1,4 @@
-"""``twin effects``: how a real ejector can differ from its data set, and what more was found."""
+"""``twin effects``: list the effects, and add found ones to a catalogue."""
 
 import sys
 from pathlib import Path
@@ -29,9 +29,9 @@ def list_(context: typer.Context) -> None:
     from twin.model.effects import table
     from twin.model.mechanism import places_table, whens_table
 
-    both = (one.replace("<br>", "; ") for one in (places_table(), whens_table()))
-    beside = "Where and when something can act that is none of these:"
-    print(table("; "), courses(), beside, *both, sep="\n\n")
+    tables = (text.replace("<br>", "; ") for text in (places_table(), whens_table()))
+    heading = "Where and when something can act that is none of these:"
+    print(table("; "), courses(), heading, *tables, sep="\n\n")
 
 
 @effects_app.command()
@@ -89,17 +89,17 @@ def add(
 def _targets(
     database: "Assets", proposal: "Proposal", unit: str, kind: str, site: bool
 ) -> "list[Record]":
-    """The records that it is taken into."""
+    """The records that take the effect into their catalogue."""
     from twin.assets.catalogue import target_of
 
     if site:
         types = sorted({record.name for record in database.records("type")})
-        return [target_of(database, one, "") for one in types]
+        return [target_of(database, type_name, "") for type_name in types]
     return [target_of(database, kind or proposal.type, unit)]
 
 
 def _test(proposal: "Proposal", file: Path, log: Path | None, assets: str) -> None:
-    """ConfigError if a diagnosis of its log does not name it, or the log is another one."""
+    """ConfigError if a diagnosis of the effect's log does not name it, or the log differs."""
     from twin.assets.provenance import of_log
     from twin.config import Config
     from twin.diagnosis.propose import named_on
@@ -112,13 +112,15 @@ def _test(proposal: "Proposal", file: Path, log: Path | None, assets: str) -> No
     if of_log(path)["log_sha256"] != proposal.test.log_sha256:
         raise ConfigError(f"{path}: not the log that the effect was found in", skip)
     recorded = open_log(path)
-    known = Config.of_recorded(recorded.header, str(path))
-    if known.data.hash != proposal.effect.found_in.get("data_set"):  # it was found beside another
-        known = Config.of_recorded(recorded.header, str(path), assets=assets, unit=proposal.unit)
+    settings = Config.of_recorded(recorded.header, str(path))
+    if settings.data.hash != proposal.effect.found_in.get(
+        "data_set"
+    ):  # it was found beside another
+        settings = Config.of_recorded(recorded.header, str(path), assets=assets, unit=proposal.unit)
     print(f"testing on {path}", file=sys.stderr)
-    if said := named_on(proposal, known, recorded, str(path)):
+    if reason := named_on(proposal, settings, recorded, str(path)):
         raise ConfigError(
-            f"{file}: with it in the catalogue, a diagnosis of {path} does not name it: {said}",
+            f"{file}: with it in the catalogue, a diagnosis of {path} does not name it: {reason}",
             "widen low and high of its parameters, or take it without its test: --untested",
         )
     print(f"{proposal.name} is named on {path}")

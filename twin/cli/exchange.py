@@ -19,7 +19,7 @@ PACKAGES = (".fmu", ".ssp")
 
 
 class Vessel(StrEnum):
-    """Whose the vessel is."""
+    """Where the vessel is simulated."""
 
     INSIDE = "inside"
     OUTSIDE = "outside"
@@ -65,30 +65,30 @@ def export_fmu(
     from twin.exchange.ssp import make_ssp
     from twin.exchange.variables import Component
 
-    document, asked = _document(config, unit, assets)
-    known = Config.of(document, assets, asked)
-    name = known.asset.id or known.asset.type
+    document, requested = _document(config, unit, assets)
+    settings = Config.of(document, assets, requested)
+    name = settings.asset.id or settings.asset.type
     program = f"ejector-twin {version('ejector-twin')}"
-    component = Component.of(known.data, vessel.value)
+    component = Component.of(settings.data, vessel.value)
     fmu = make_fmu(
-        component, name, known.origin, program, int(fmi.value), compiled=not sources_only
+        component, name, settings.origin, program, int(fmi.value), compiled=not sources_only
     )
     target = output or Path(fmu.name)
     if target.suffix not in PACKAGES:
         raise ConfigError(f"{target}: neither an FMU nor an SSP", "call it *.fmu or *.ssp")
     content = fmu.content
     if target.suffix == ".ssp":
-        kind = Config.of(document, assets, asked, calibrated=False)
+        kind = Config.of(document, assets, requested, calibrated=False)
         content = make_ssp(fmu, name, component, Component.of(kind.data, vessel.value))
     write_whole(target, content)
-    _remark(known, binary=fmu.binary, wanted=not sources_only)
-    print(f"{name} in {target}: FMI {fmi.value}.0, {known.origin}")
+    _remark(settings, binary=fmu.binary, is_compiled=not sources_only)
+    print(f"{name} in {target}: FMI {fmi.value}.0, {settings.origin}")
 
 
 def _document(config: Path | None, name: str, assets: str) -> "tuple[Document, str]":
-    """The configuration, and the unit in place of its own.
+    """The configuration, and the unit that replaces its own.
 
-    Without a configuration it is one that names a unit or type that the database knows.
+    Without a configuration it is one that names a unit or type of the database.
     """
     from twin.assets.database_url import open_chosen
     from twin.settings import Document
@@ -104,23 +104,23 @@ def _document(config: Path | None, name: str, assets: str) -> "tuple[Document, s
     with open_chosen(assets, None, write=False) as database:
         records = database.records(name=name)
         if not records:
-            known = known_names(name, (record.name for record in database.records()))
-            raise ConfigError(f"{database.name}: no type or unit is called {name!r}", known)
+            hint = known_names(name, (record.name for record in database.records()))
+            raise ConfigError(f"{database.name}: no type or unit is called {name!r}", hint)
     newest = max(records, key=lambda record: record.recorded_ns)
     asset = {"type": newest.type, "id": name if newest.kind == "instance" else ""}
     return Document("", "", {"asset": asset}), ""
 
 
-def _remark(known: "Config", *, binary: str, wanted: bool) -> None:
-    """Say what else is to be known of the FMU."""
-    if known.instead:
-        print(known.instead, file=sys.stderr)
-    if known.data.terms:
+def _remark(settings: "Config", *, binary: str, is_compiled: bool) -> None:
+    """Print remarks on the FMU."""
+    if settings.instead:
+        print(settings.instead, file=sys.stderr)
+    if settings.data.terms:
         print(
             "the data set's terms are left out: what data gave and no physics explains is not in"
             " the FMU",
             file=sys.stderr,
         )
-    if wanted:
-        said = f"compiled: {binary}" if binary else "no C compiler for this platform: sources alone"
-        print(said, file=sys.stderr)
+    if is_compiled:
+        text = f"compiled: {binary}" if binary else "no C compiler for this platform: sources alone"
+        print(text, file=sys.stderr)

@@ -1,4 +1,4 @@
-"""``twin figures``: key figures of a log, and of what the database has kept."""
+"""``twin figures``: key figures of a log, and of the database."""
 
 import sys
 import time
@@ -71,9 +71,9 @@ def show(
     recorded = open_log(log)
     say_if_cut(recorded, log, "used")
     settings = _of_log(recorded, log, config)
-    plain = [kept for _, kept in of_log(recorded, key_figures_of(settings))]
-    if recorded.header.derived:  # nobody knows what to expect when
-        plain = [{k: v for k, v in one.items() if not k.endswith("_expected")} for one in plain]
+    plain = [cycle for _, cycle in of_log(recorded, key_figures_of(settings))]
+    if recorded.header.derived:  # timings of derived commands are unknown, and so are expectations
+        plain = [{k: v for k, v in cycle.items() if not k.endswith("_expected")} for cycle in plain]
     suctions = list(stretches((rows for rows, _ in recorded.blocks()), volume_of(settings)))
     if recorded.header.derived:
         print(f"twin: {recorded.header.derived}", file=sys.stderr)
@@ -90,8 +90,8 @@ def show(
             export_table(to_table(store.history(unit), unit), output)
     if keep:
         with _open(figures, config, write=True) as store:
-            new = store.add(unit, data_set, log.name, plain)
-            print(f"{new} new of {len(plain)} cycles, in {store.name}")
+            count = store.add(unit, data_set, log.name, plain)
+            print(f"{count} new of {len(plain)} cycles, in {store.name}")
 
 
 @figures_app.command()
@@ -112,21 +112,21 @@ def trend(
     from twin.figures.database import SIDES
     from twin.figures.text import in_words, trend_of_figure, trend_plain
 
-    wanted = _wanted(names, picture)
+    chosen_figures = _chosen_figures(names, picture)
     limits = _limits(config)
     with _open(figures, config, write=False) as store:
-        columns = [f"{figure.name}_{side}" for figure in wanted for side in SIDES]
+        columns = [f"{figure.name}_{side}" for figure in chosen_figures for side in SIDES]
         history = _history(store, _chosen(store, config, unit), days, columns)
     plain = []
-    for figure in wanted:
-        found = trend_of_figure(history, figure, limits)
-        said = in_words(figure, found, time.time_ns())
-        print(said)
-        plain.append(trend_plain(figure, found))
+    for figure in chosen_figures:
+        course = trend_of_figure(history, figure, limits)
+        text = in_words(figure, course, time.time_ns())
+        print(text)
+        plain.append(trend_plain(figure, course))
         if picture is not None:
             from twin.figures.picture import draw
 
-            draw(history, figure, found, said, picture)
+            draw(history, figure, course, text, picture)
     if json_file is not None:
         write_json(json_file, plain)
 
@@ -142,12 +142,12 @@ def counters(
 ) -> None:
     """Suction cycles, valve switchings and alarms: in all, and since they were erased."""
     with _open(figures, config, write=erase) as store:
-        whose = _chosen(store, config, unit)
+        chosen = _chosen(store, config, unit)
         if erase:
-            store.erase(whose)
-        total, erasable = store.counters(whose), store.counters(whose, erasable=True)
+            store.erase(chosen)
+        total, erasable = store.counters(chosen), store.counters(chosen, erasable=True)
     print(f"{'':18}{'in all':>12}{'erasable':>12}")
-    for name, label in _COUNTED.items():
+    for name, label in _COUNTER_LABELS.items():
         print(f"{label:18}{getattr(total, name):12}{getattr(erasable, name):12}")
 
 
@@ -166,12 +166,12 @@ def autoset(
     """Permitted t1 and leakage from the last good cycles, to put into the configuration."""
     from twin.figures.autoset import autoset as teach
 
-    over = _settings(config).autoset_tolerance if tolerance is None else tolerance
+    share = _settings(config).autoset_tolerance if tolerance is None else tolerance
     with _open(figures, config, write=False) as store:
-        whose = _chosen(store, config, unit)
-        taught = teach(store.history(whose), over)
-    print(f"# from the last {taught.cycles} good cycles of {whose.id or whose.type}")
-    print(taught.toml(), end="")
+        chosen = _chosen(store, config, unit)
+        permitted = teach(store.history(chosen), share)
+    print(f"# from the last {permitted.cycles} good cycles of {chosen.id or chosen.type}")
+    print(permitted.toml(), end="")
 
 
 @figures_app.command()
@@ -187,8 +187,8 @@ def export(
     from twin.tables.sheet import export as export_table
 
     with _open(figures, config, write=False) as store:
-        whose = _chosen(store, config, unit)
-        table = to_table(_history(store, whose, days), whose)
+        chosen = _chosen(store, config, unit)
+        table = to_table(_history(store, chosen, days), chosen)
     export_table(table, output)
     print(f"{table.num_rows} cycles in {output}")
 
@@ -204,9 +204,9 @@ def key_figures_of(settings: "Config") -> "KeyFigures":
 
 
 def keeper_of(settings: "Config", say: "Callable[[str], None]") -> "Callable[[], Keeper] | None":
-    """What opens the sink that keeps key figures, where ``[figures]`` asks for it; or None.
+    """A function that opens the sink of key figures; None unless ``[figures]`` asks for it.
 
-    ConfigError for a URL of an unknown kind; a database that is away is said, and waited for.
+    ConfigError for a URL of an unknown kind. The sink reports an unreachable database, and retries.
     """
     from twin.assets.engine import parse_url
     from twin.assets.unit import Unit
@@ -215,18 +215,18 @@ def keeper_of(settings: "Config", say: "Callable[[str], None]") -> "Callable[[],
     from twin.figures.settings import FigureSettings
     from twin.figures.writer import Keeper
 
-    wanted = settings.document.section(FigureSettings, "figures")
-    if not wanted.keep:
+    figure_settings = settings.document.section(FigureSettings, "figures")
+    if not figure_settings.keep:
         return None
-    parse_url(wanted.url, FIGURE_DATABASE)
+    parse_url(figure_settings.url, FIGURE_DATABASE)
     unit = Unit(settings.asset.type, settings.asset.id)
-    opened = partial(open_chosen, "", settings.document, write=True)
-    return lambda: Keeper(opened, unit, settings.data.hash, say)
+    open_database = partial(open_chosen, "", settings.document, write=True)
+    return lambda: Keeper(open_database, unit, settings.data.hash, say)
 
 
 # --- what the commands share --------------------------------------------------------------------
 
-_COUNTED = {"cycles": "suction cycles", "switchings": "valve switchings", "alarms": "alarms"}
+_COUNTER_LABELS = {"cycles": "suction cycles", "switchings": "valve switchings", "alarms": "alarms"}
 
 
 def _document(config: Path | None) -> "Document | None":
@@ -249,7 +249,7 @@ def _settings(config: Path | None) -> "FigureSettings":
 
 
 def _limits(config: Path | None) -> "Limits":
-    """The limits of a configuration's unit; without one the field's defaults."""
+    """The limits of a configuration's unit; without a configuration the field's defaults."""
     from twin.config import Config
     from twin.figures.settings import FigureSettings, limits, limits_of
     from twin.model.dataset import DataSet
@@ -262,7 +262,7 @@ def _limits(config: Path | None) -> "Limits":
 
 
 def _of_log(recorded: "Log", log: Path, instead: Path | None) -> "Config":
-    """The configuration of a log, with the data set it was recorded beside; or another one."""
+    """The configuration of a log with the data set of its recording, or another configuration."""
     from twin.config import Config
     from twin.settings import Document
 
@@ -271,17 +271,17 @@ def _of_log(recorded: "Log", log: Path, instead: Path | None) -> "Config":
 
 
 def _chosen(store: "Store", config: Path | None, unit: str) -> "Unit":
-    """The unit that is meant: named, that of the configuration, or the only one there is."""
+    """The chosen unit: the named one, else that of the configuration, else the only one."""
     units = store.units()
-    asked = unit
-    if not asked and (document := _document(config)) is not None:
-        asked = str(document.tables.get("asset", {}).get("id", ""))
-    found = [one for one in units if not asked or one.id == asked]
-    if len(found) != 1:
-        known = known_names(asked, (one.id or one.type for one in units))
-        what = f"{len(found)} units {asked!r}" if asked else f"{len(found)} units"
-        raise ConfigError(f"{store.name}: {what}", f"choose with --id; {known}")
-    return found[0]
+    requested = unit
+    if not requested and (document := _document(config)) is not None:
+        requested = str(document.tables.get("asset", {}).get("id", ""))
+    matches = [candidate for candidate in units if not requested or candidate.id == requested]
+    if len(matches) != 1:
+        hint = known_names(requested, (candidate.id or candidate.type for candidate in units))
+        problem = f"{len(matches)} units {requested!r}" if requested else f"{len(matches)} units"
+        raise ConfigError(f"{store.name}: {problem}", f"choose with --id; {hint}")
+    return matches[0]
 
 
 def _history(
@@ -294,7 +294,7 @@ def _history(
     return history
 
 
-def _wanted(names: list[str] | None, picture: Path | None) -> "list[Figure]":
+def _chosen_figures(names: list[str] | None, picture: Path | None) -> "list[Figure]":
     from twin.figures.table import FIGURES
 
     unknown = [name for name in names or [] if name not in FIGURES]

@@ -1,4 +1,4 @@
-"""``twin fleet``: thousands of logs, each worked on once, and compared."""
+"""``twin fleet``: thousands of logs, each processed once, and compared."""
 
 import sys
 import time
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 fleet_app = App("Many logs: work on each once, and compare.")
 
 
-One = TypeVar("One")
+Item = TypeVar("Item")
 
 
 class EngineName(StrEnum):
-    """Who does the work."""
+    """The engine that does the work."""
 
     LOCAL = "local"
     DASK = "dask"
@@ -57,8 +57,9 @@ Page = Annotated[
     Path | None, typer.Option("--html", metavar="F.html", help="Write a page with a picture.")
 ]
 
-_DONE = {"calibrate": "used", "diagnose": "diagnosed", "replay": "replayed"}  # with a log
-_WHAT = {
+# What a kind of work does with a log.
+_ACTIONS = {"calibrate": "used", "diagnose": "diagnosed", "replay": "replayed"}
+_DESCRIPTIONS = {
     "calibrate": "Fit every unit to its log of healthy cycles, and store its data set.",
     "diagnose": "Say of every log what the simulation gets wrong, and why.",
     "replay": "Run the twin over every log: mean key figures, and how much of every effect.",
@@ -80,15 +81,15 @@ def _command(work: str) -> Callable[..., None]:
         require_writable(json_file)
         files, workers_of = _files(logs), _Engine(engine, scheduler, workers)  # before a database
         fleet = _Fleet.of(config, assets)
-        told = _done(work, files, fleet, workers_of)
+        outcomes = _done(work, files, fleet, workers_of)
         if json_file is not None:
-            write_json(json_file, {"work": work, "logs": _plain(told, fleet)})
-        _leave(told)
+            write_json(json_file, {"work": work, "logs": _plain(outcomes, fleet)})
+        _leave(outcomes)
 
     return command
 
 
-for _name, _help in _WHAT.items():
+for _name, _help in _DESCRIPTIONS.items():
     fleet_app.command(_name, help=_help)(_command(_name))
 
 
@@ -113,35 +114,35 @@ def report(
     require_writable(json_file, page)
     files, workers_of = _files(logs or []), _Engine(engine, scheduler, workers)
     fleet = _Fleet.of(config, assets, to_store=bool(files))
-    told = _done("replay", files, fleet, workers_of) if files else []
+    outcomes = _done("replay", files, fleet, workers_of) if files else []
     with open_store(fleet.assets) as store, open_assets(fleet.assets) as database:
         results, records = store.newest(), database.records()
     if logs:
-        named = {one.key.log_sha256 for one in told if one.key}
-        results = [one for one in results if one.key.log_sha256 in named]
+        hashes = {outcome.key.log_sha256 for outcome in outcomes if outcome.key}
+        results = [result for result in results if result.key.log_sha256 in hashes]
     if not results:
         raise SourceError(f"{fleet.name}: no log was worked on", "name logs, or folders of them")
-    refused = [Refused(str(one.log), one.error) for one in told if one.error]
-    found = put_together(results, records, time.time_ns(), refused)
-    print(in_words(found))
+    refused = [Refused(str(outcome.log), outcome.error) for outcome in outcomes if outcome.error]
+    fleet_report = put_together(results, records, time.time_ns(), refused)
+    print(in_words(fleet_report))
     if json_file is not None:
-        write_json(json_file, found.plain())
+        write_json(json_file, fleet_report.plain())
     if page is not None:
-        write_page(found, page)
+        write_page(fleet_report, page)
         print(f"drawn in {page}")
-    _leave(told)
+    _leave(outcomes)
 
 
 @dataclass(frozen=True)
 class _Engine:
-    """Who is to do the work, as the command line has it."""
+    """The engine that the command line asks for."""
 
     name: EngineName
     scheduler: str
     workers: int | None
 
     def __post_init__(self) -> None:
-        """ConfigError where options do not go together."""
+        """ConfigError for options that do not fit together."""
         if self.name is EngineName.LOCAL:
             if self.scheduler:
                 raise ConfigError("a scheduler is Dask's", "add --engine dask")
@@ -153,7 +154,7 @@ class _Engine:
 
     @contextmanager
     def open(self) -> "Iterator[Submit]":
-        """The one that was asked for."""
+        """Open the engine while the context lasts; gives the function that submits jobs."""
         from twin.fleet.engines import cores, dask, local
 
         if self.name is EngineName.LOCAL:
@@ -166,7 +167,7 @@ class _Engine:
 
 @dataclass(frozen=True)
 class _Fleet:
-    """What judges every log, and where answers go."""
+    """The configuration for every log, and the database for answers."""
 
     document: "Document | None"
     assets: "URL"
@@ -174,7 +175,7 @@ class _Fleet:
 
     @classmethod
     def of(cls, config: Path | None, assets: str, *, to_store: bool = True) -> "_Fleet":
-        """The database is made where it is missing, if answers are ``to_store`` in it."""
+        """Open it; a missing database is created if answers are ``to_store`` in it."""
         from twin.assets.database_url import chosen, is_new, open_chosen
         from twin.assets.engine import shown
 
@@ -189,7 +190,7 @@ class _Fleet:
             return cls(document, chosen(assets, document), database.name)
 
     def config_of(self, log: "Log", work: str) -> "Config":
-        """What is known now of the unit of a log, or of its type."""
+        """The configuration with the present data set of a log's unit, or of its type."""
         from twin.config import Config, document_in
 
         header = log.header
@@ -204,76 +205,77 @@ class _Fleet:
 
 
 def _done(work: str, files: Sequence[Path], fleet: _Fleet, engine: _Engine) -> "list[Told]":
-    """Do what is missing; say what became of each log, and of all; gives them as they are named."""
+    """Process logs that are not yet done; print failures and a summary; outcomes in order."""
     from twin.fleet.results_database import open_store
     from twin.fleet.runner import Told, ask, go
 
-    asking = ask(work, files, lambda log: fleet.config_of(log, work))
-    asked = list(_progress(asking, len(files), "reading logs"))
-    wanted = [one for one in asked if not isinstance(one, Told)]
-    told = [one for one in asked if isinstance(one, Told)]
-    for one in told:
-        print(f"twin: {one.error}", file=sys.stderr)
-    for job in wanted:
-        say_if_cut(job, job.job.log, _DONE[work])
+    pending = ask(work, files, lambda log: fleet.config_of(log, work))
+    requests = list(_progress(pending, len(files), "reading logs"))
+    jobs = [job for job in requests if not isinstance(job, Told)]
+    outcomes = [outcome for outcome in requests if isinstance(outcome, Told)]
+    for outcome in outcomes:
+        print(f"twin: {outcome.error}", file=sys.stderr)
+    for job in jobs:
+        say_if_cut(job, job.job.log, _ACTIONS[work])
     with open_store(fleet.assets) as store, engine.open() as submit:
-        for one in _progress(go(wanted, submit, store, fleet.assets), len(wanted), work):
-            told.append(one)
-            if one.error:
-                print(f"twin: {one.error}", file=sys.stderr)
+        for outcome in _progress(go(jobs, submit, store, fleet.assets), len(jobs), work):
+            outcomes.append(outcome)
+            if outcome.error:
+                print(f"twin: {outcome.error}", file=sys.stderr)
     count = {
-        state: sum(one.state == state for one in told) for state in ("done", "known", "failed")
+        state: sum(outcome.state == state for outcome in outcomes)
+        for state in ("done", "known", "failed")
     }
-    cut = sum(not one.complete for one in told)
+    cut = sum(not outcome.complete for outcome in outcomes)
     print(
-        f"{work}: {count['done']} of {len(told)} logs done, {count['known']} were known,"
+        f"{work}: {count['done']} of {len(outcomes)} logs done, {count['known']} were known,"
         f" {count['failed']} could not be{f', {cut} cut off' if cut else ''}; in {fleet.name}"
     )
-    place = {log: number for number, log in enumerate(files)}
-    return sorted(told, key=lambda one: place[one.log])
+    position = {log: number for number, log in enumerate(files)}
+    return sorted(outcomes, key=lambda outcome: position[outcome.log])
 
 
-def _leave(told: "Iterable[Told]") -> None:
-    """Exit as for a log that could not be read, if there was any; the others are done."""
-    if any(one.error for one in told):
+def _leave(outcomes: "Iterable[Told]") -> None:
+    """Exit as for an unreadable log if any log failed; all others are done."""
+    if any(outcome.error for outcome in outcomes):
         raise typer.Exit(SourceError.exit_code)
 
 
 def _files(logs: Sequence[Path]) -> list[Path]:
-    """The logs that are named, and all in the folders that are."""
+    """The named logs, and all logs in the named folders."""
     from twin.log.part import first_parts
 
-    found: list[Path] = []
+    paths: list[Path] = []
     for path in logs:
-        found += first_parts(path) if path.is_dir() else [path]
-    if logs and not found:
+        paths += first_parts(path) if path.is_dir() else [path]
+    if logs and not paths:
         raise SourceError(f"{logs[0]}: no log in it", "name logs, or folders with *.mcap")
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(paths))
 
 
-def _progress(over: "Iterable[One]", total: int, what: str) -> "Iterator[One]":
-    """Show how far it is and how long it will take, where somebody looks."""
+def _progress(items: "Iterable[Item]", total: int, label: str) -> "Iterator[Item]":
+    """Show progress and remaining time on a terminal."""
     from rich.console import Console
     from rich.progress import track
 
     console = Console(stderr=True)
     yield from track(
-        over, what, total, console=console, transient=True, disable=not console.is_terminal
+        items, label, total, console=console, transient=True, disable=not console.is_terminal
     )
 
 
-def _plain(told: "Iterable[Told]", fleet: _Fleet) -> list[dict[str, object]]:
-    """As JSON: what became of every log, with its answer."""
+def _plain(outcomes: "Iterable[Told]", fleet: _Fleet) -> list[dict[str, object]]:
+    """The outcome of every log for JSON, with its answer."""
     from twin.fleet.results_database import open_store
 
     with open_store(fleet.assets) as store:
         return [
             {
-                "log": str(one.log),
-                "state": one.state,
-                "error": one.error or None,
-                "log_complete": one.complete if one.key else None,
-                "answer": store.answer(one.key) if one.key else None,
+                "log": str(outcome.log),
+                "state": outcome.state,
+                "error": outcome.error or None,
+                "log_complete": outcome.complete if outcome.key else None,
+                "answer": store.answer(outcome.key) if outcome.key else None,
             }
-            for one in told
+            for outcome in outcomes
         ]

@@ -1,4 +1,4 @@
-"""``twin init``: a commented configuration to begin with, from flags and a few questions."""
+"""``twin init``: write a first, commented configuration from flags and a few questions."""
 
 import json
 import re
@@ -20,13 +20,13 @@ UNKNOWN = "unknown"
 NO_PLC = "none"
 FILE_ONLY, PLACEHOLDER = "none: there are only files", "192.168.0.10:502"
 OPC_UA = "opc.tcp://"
-LAYOUTS = {  # where the simulated PLC and docs/connect-your-plc.md have pressure and commands
+LAYOUTS = {  # pressure and commands in the simulated PLC and in docs/connect-your-plc.md
     ("modbus", True): ("30002", "30005/0", "30005/1"),
     ("modbus", False): ("40001", "00001", "00002"),
     ("opcua", True): ("s=Meas.Pressure", "s=Cmd.Suction", "s=Cmd.BlowOff"),
     ("opcua", False): ("s=Meas.Pressure", "s=Cmd.Suction", "s=Cmd.BlowOff"),
 }
-_TAGS = {  # what to look up, by OPC UA and by ring
+_TAGS = {  # remark on the tags, by OPC UA and by ring
     (False, True): "in block mode the ring's values are read instead",
     (False, False): 'addresses as in manuals, or counted from 0: "holding:0"',
     (True, True): "in block mode the values of [driver.trace] are read instead",
@@ -35,7 +35,7 @@ _TAGS = {  # what to look up, by OPC UA and by ring
 GUESSED = {"hose_mm": 1000.0, "diameter_mm": 6.0, "cups": 50.0, "vessel": 750.0}  # mid-market
 
 
-# What few have, as the same PLC has it: comments in the file, each ready to be taken in.
+# Optional signals of the same PLC, as comments in the file that are ready for use.
 OFFERED = """\
 # Each of these that is there narrows what is open: docs/reported-signals.md. Of nozzle
 # (1: it is on) and air saving (1: it is off) take one. A second pressure is at the other end.
@@ -79,7 +79,7 @@ BESIDE_COLUMNS = """\
 
 
 class Unit(StrEnum):
-    """Of the pressure, as it arrives."""
+    """Unit of the pressure as it arrives."""
 
     MBAR = "mbar"
     HPA = "hPa"
@@ -117,7 +117,7 @@ class End(StrEnum):
 
 
 class Place(StrEnum):
-    """Where the sensor is that the PLC reads."""
+    """Place of the sensor that the PLC reads."""
 
     EJECTOR = "ejector"
     END = "end"
@@ -125,7 +125,7 @@ class Place(StrEnum):
 
 
 class Answer(StrEnum):
-    """To a question that a person may not be able to answer."""
+    """Answer to a question that a person may not be able to answer."""
 
     YES = "yes"
     NO = "no"
@@ -133,7 +133,7 @@ class Answer(StrEnum):
 
 
 def _positive(text: str) -> float | None:
-    """For an option with a size: usage error unless it is above zero; None for ``unknown``."""
+    """Parse a size: usage error unless it is above zero; None for ``unknown``."""
     if text == UNKNOWN:
         return None
     try:
@@ -146,7 +146,7 @@ def _positive(text: str) -> float | None:
 
 
 def _address(text: str) -> str:
-    """For the PLC's address: usage error unless it is one of the three forms."""
+    """Parse the PLC's address: usage error unless it has one of the three forms."""
     host, _, port = text.removeprefix(OPC_UA).rpartition(":")
     if text != NO_PLC and not (host and port.isdecimal() and 0 < int(port) <= 0xFFFF):
         raise typer.BadParameter(
@@ -156,7 +156,7 @@ def _address(text: str) -> str:
 
 
 def _range(text: str) -> tuple[float, float] | None:
-    """For the sensor's range: usage error unless LOW,HIGH; None for ``unknown``."""
+    """Parse the sensor's range: usage error unless LOW,HIGH; None for ``unknown``."""
     if text == UNKNOWN:
         return None
     try:
@@ -170,7 +170,7 @@ def _range(text: str) -> tuple[float, float] | None:
 
 @dataclass(frozen=True)
 class Connection:
-    """Where pressure and commands come from."""
+    """Source of pressure and commands."""
 
     address: str
     is_ring: bool
@@ -184,7 +184,7 @@ class Connection:
 
 @dataclass(frozen=True)
 class Sensor:
-    """What the pressure means."""
+    """Meaning of the pressure."""
 
     unit: Unit
     reference: Reference
@@ -193,7 +193,7 @@ class Sensor:
 
 @dataclass(frozen=True)
 class System:
-    """What hangs on the ejector; None is not known."""
+    """What hangs on the ejector; None means unknown."""
 
     hose_mm: float | None
     diameter_mm: float | None
@@ -208,18 +208,22 @@ T = TypeVar("T")
 
 
 class Questions:
-    """Flags, and what people answer where there is none; ``guessed`` is what nobody said."""
+    """Values of flags, or people's answers without a flag; ``guessed`` lists the defaults used."""
 
     def __init__(self) -> None:
         self.guessed: list[str] = []
 
-    def ask(self, flag: str, given: Any, words: str, default: str, parse: Callable[[str], T]) -> T:
+    def ask(
+        self, flag: str, value: Any, question: str, default: str, parse: Callable[[str], T]
+    ) -> T:
         """A flag's value, else a person's answer, else the default."""
         text = default
-        if given is not None:
-            text = str(given)
+        if value is not None:
+            text = str(value)
         elif sys.stdin.isatty():
-            text = typer.prompt(words, default=default, value_proc=partial(_kept, parse), err=True)
+            text = typer.prompt(
+                question, default=default, value_proc=partial(_valid_answer, parse), err=True
+            )
         elif default != UNKNOWN:
             self.guessed.append(flag)
         if text == UNKNOWN:
@@ -227,17 +231,17 @@ class Questions:
         return parse(text)
 
 
-def _kept(parse: Callable[[str], Any], text: str) -> str:
-    """What a person typed, if it is an answer; usage error else, and it is asked again."""
+def _valid_answer(parse: Callable[[str], Any], text: str) -> str:
+    """The text that a person typed, if it is valid; else a usage error, and it is asked again."""
     try:
         parse(text.strip())
-    except ValueError as error:  # of a choice
+    except ValueError as error:  # no choice of an enumeration
         raise typer.BadParameter(f"{text!r} is none of these") from error
     return text.strip()
 
 
-def _size(flag: str, what: str) -> Any:
-    return typer.Option(flag, metavar="X|unknown", help=what)
+def _size(flag: str, help_text: str) -> Any:
+    return typer.Option(flag, metavar="X|unknown", help=help_text)
 
 
 def init(
@@ -300,36 +304,40 @@ def init(
     if file.exists():
         message = f"{file}: there is already a file of that name"
         raise SourceError(message, "choose another name, or remove it")
-    asked = Questions()
-    ask = asked.ask
+    questions = Questions()
+    ask = questions.ask
     named = ask("--id", unit, "Name of this unit", file.stem, str)
     typed = ask("--type", kind, "Type on the nameplate", UNKNOWN, str)
-    where = ask("--address", address, f"Where the PLC is ({FILE_ONLY})", PLACEHOLDER, _address)
+    plc_address = ask(
+        "--address", address, f"Where the PLC is ({FILE_ONLY})", PLACEHOLDER, _address
+    )
     connection = None
-    if where != NO_PLC:
+    if plc_address != NO_PLC:
         tags = pressure, suction, blow_off
-        connection = _connection(asked, where, ring, namespace, tags, coded, scale)
-    meant = Sensor(
+        connection = _connection(questions, plc_address, ring, namespace, tags, coded, scale)
+    pressure_meaning = Sensor(
         ask("--unit", pressure_unit, f"Unit of the pressure ({_of(Unit)})", Unit.MBAR, Unit),
         ask("--reference", reference, f"Counted from ({_of(Reference)})", "absolute", Reference),
         ask("--range", sensor_range, "Range of the sensor, LOW,HIGH", UNKNOWN, _range),
     )
-    what = ask("--end", end, f"What is evacuated ({_of(End)})", End.CUPS, End)
-    volume_of = "Volume of all cups, or of the vessel, ml"
-    lets_go = f"Does blow-off let the part go ({_of(Answer)})"
+    end_kind = ask("--end", end, f"What is evacuated ({_of(End)})", End.CUPS, End)
+    volume_question = "Volume of all cups, or of the vessel, ml"
+    released_question = f"Does blow-off let the part go ({_of(Answer)})"
     system = System(
         ask("--hose-mm", hose, "Length of the hose, mm", UNKNOWN, _positive),
         ask("--diameter-mm", diameter, "Its inner diameter, mm", UNKNOWN, _positive),
-        what,
-        ask("--volume-ml", volume, volume_of, UNKNOWN, _positive),
+        end_kind,
+        ask("--volume-ml", volume, volume_question, UNKNOWN, _positive),
         ask("--sensor", sensor, f"Where the sensor is ({_of(Place)})", UNKNOWN, Place),
-        ask("--released", released, lets_go, UNKNOWN, Answer),
+        ask("--released", released, released_question, UNKNOWN, Answer),
         ask("--supply-bar", supply, "Supply at the regulator, bar gauge", UNKNOWN, _positive),
     )
-    text = configuration(file, (named, typed), connection, meant, system, asked.guessed)
+    text = configuration(
+        file, (named, typed), connection, pressure_meaning, system, questions.guessed
+    )
     _check(text, file)
-    with said_plainly(file), file.open("x", encoding="utf-8") as new:
-        new.write(text)
+    with said_plainly(file), file.open("x", encoding="utf-8") as stream:
+        stream.write(text)
     print(f"written: {file}; look through it, then:")
     for line in next_commands(file, connection):
         print(f"  {line}")
@@ -340,34 +348,34 @@ def _of(choices: type[StrEnum]) -> str:
 
 
 def _connection(
-    asked: Questions,
-    where: str,
+    questions: Questions,
+    address: str,
     ring: bool | None,
     namespace: str,
     tags: tuple[str | None, ...],
     coded: Number | None,
     scale: float,
 ) -> Connection:
-    kind = "opcua" if where.startswith(OPC_UA) else "modbus"
-    words = "Does the PLC keep a ring of scans, as docs/connect-your-plc.md has it (yes, no)"
-    told = None if ring is None else Answer.YES if ring else Answer.NO
-    is_ring = asked.ask("--ring", told, words, Answer.YES, Answer) is Answer.YES
-    usual, number = LAYOUTS[kind, is_ring], coded or Number.FLOAT32
-    if is_ring:  # which has its own layout
-        at, on, off = (given or own for given, own in zip(tags, usual, strict=True))
-        return Connection(where, is_ring, namespace, at, number, scale, on, off)
-    at = asked.ask("--pressure", tags[0], "Address of the pressure", usual[0], str)
+    kind = "opcua" if address.startswith(OPC_UA) else "modbus"
+    question = "Does the PLC keep a ring of scans, as docs/connect-your-plc.md has it (yes, no)"
+    answer = None if ring is None else Answer.YES if ring else Answer.NO
+    is_ring = questions.ask("--ring", answer, question, Answer.YES, Answer) is Answer.YES
+    layout, number = LAYOUTS[kind, is_ring], coded or Number.FLOAT32
+    if is_ring:  # a ring has its own layout
+        at, on, off = (tag or layout_tag for tag, layout_tag in zip(tags, layout, strict=True))
+        return Connection(address, is_ring, namespace, at, number, scale, on, off)
+    at = questions.ask("--pressure", tags[0], "Address of the pressure", layout[0], str)
     if kind == "modbus":
-        words = f"Its type ({_of(Number)})"
-        number = asked.ask("--pressure-type", coded, words, Number.INT16, Number)
-    words = "Address of the suction command, with /BIT in a word"
-    on = asked.ask("--suction", tags[1], words, usual[1], str)
-    off = asked.ask("--blow-off", tags[2], "Address of the blow-off command", usual[2], str)
-    return Connection(where, is_ring, namespace, at, number, scale, on, off)
+        question = f"Its type ({_of(Number)})"
+        number = questions.ask("--pressure-type", coded, question, Number.INT16, Number)
+    question = "Address of the suction command, with /BIT in a word"
+    on = questions.ask("--suction", tags[1], question, layout[1], str)
+    off = questions.ask("--blow-off", tags[2], "Address of the blow-off command", layout[2], str)
+    return Connection(address, is_ring, namespace, at, number, scale, on, off)
 
 
 def _check(text: str, file: Path) -> None:
-    """ConfigError if what was answered makes no configuration: then nothing is written."""
+    """ConfigError if the answers make no valid configuration: then nothing is written."""
     from drivers.sources import settings_of
     from twin.config import Config
     from twin.settings import Document
@@ -381,7 +389,7 @@ def _check(text: str, file: Path) -> None:
 
 
 def next_commands(file: Path, connection: Connection | None) -> tuple[str, str]:
-    """The two that follow."""
+    """The two commands to run next."""
     if connection is None:
         return (
             f"twin import TRACE.csv --config {file} -o healthy.mcap",
@@ -401,7 +409,7 @@ def configuration(
     system: System,
     guessed: Sequence[str],
 ) -> str:
-    """The text for an asset (its ID and type); what is ``guessed`` says so."""
+    """Text of a configuration for ``asset`` (ID and type); it lists what is ``guessed``."""
     unit, kind = asset
     is_known = kind not in ("", UNKNOWN)
     name = kind if is_known else f"type-of-{unit}"
@@ -451,13 +459,15 @@ def _driver(connection: Connection, sensor: Sensor) -> list[str]:
     else:
         polled, key = "poll", "address"
         host, _, port = connection.address.rpartition(":")
-        asked = "not said: put the PLC's address here" if connection.address == PLACEHOLDER else ""
-        lines += ['kind = "modbus"', _line(f"host = {_quoted(host)}", asked), f"port = {port}"]
+        remark = "not said: put the PLC's address here" if connection.address == PLACEHOLDER else ""
+        lines += ['kind = "modbus"', _line(f"host = {_quoted(host)}", remark), f"port = {port}"]
         lines += ["unit = 1", _line('word_order = "big"', "twin probe tells which")]
     mode = "block" if connection.is_ring else polled
-    why = f'a ring of scans; without one "{polled}"' if connection.is_ring else "no ring of scans"
+    mode_remark = (
+        f'a ring of scans; without one "{polled}"' if connection.is_ring else "no ring of scans"
+    )
     lines += [
-        _line(f'mode = "{mode}"', why),
+        _line(f'mode = "{mode}"', mode_remark),
         "",
         _line("[driver.tags]", _TAGS[is_opcua, connection.is_ring]),
     ]
@@ -465,16 +475,20 @@ def _driver(connection: Connection, sensor: Sensor) -> list[str]:
     scale = "" if connection.scale == 1.0 else f"scale = {connection.scale:g}, "
     pressure = f"{key} = {_quoted(connection.pressure)}, {number}{scale}{_meaning(sensor)}"
     lines += [f"pressure = {{ {pressure} }}"]
-    for name, place in (("suction", connection.suction), ("blow_off", connection.blow_off)):
-        bit = re.fullmatch(r"(.+)/(\d+)", place)
-        at = f"{key} = {_quoted(bit[1])}, bit = {bit[2]}" if bit else f"{key} = {_quoted(place)}"
+    for name, tag_address in (("suction", connection.suction), ("blow_off", connection.blow_off)):
+        bit = re.fullmatch(r"(.+)/(\d+)", tag_address)
+        at = (
+            f"{key} = {_quoted(bit[1])}, bit = {bit[2]}"
+            if bit
+            else f"{key} = {_quoted(tag_address)}"
+        )
         lines += [f"{name} = {{ {at} }}"]
     registers = BESIDE_RING if connection.is_ring else BESIDE_POLLED
     return [*lines, *(OFFERED + (BESIDE_NODES if is_opcua else registers)).splitlines()]
 
 
 def _no_driver(sensor: Sensor) -> list[str]:
-    """A unit of which there are only files."""
+    """Lines for a unit that has only files."""
     pressure = f'{{ name = "Pressure", unit = "{sensor.unit}", reference = "{sensor.reference}" }}'
     return [
         "# --- files of another program: docs/csv.md --------------------------------------",
@@ -502,7 +516,7 @@ def _system(system: System) -> list[str]:
         system.released is Answer.UNKNOWN and system.end is End.CUPS
     )
     kind = "cups" if is_released else "vessel"
-    behind = {
+    cups_remark = {
         Answer.YES: "open to ambient once the part is gone",
         Answer.NO: "closed: nothing is released",
         Answer.UNKNOWN: "not known whether the part is released: guessed",
@@ -511,10 +525,9 @@ def _system(system: System) -> list[str]:
         "length_mm": (system.hose_mm, GUESSED["hose_mm"]),
         "diameter_mm": (system.diameter_mm, GUESSED["diameter_mm"]),
     }
-    guessed = [name for name, (known, _) in sizes.items() if known is None]
+    guessed = [name for name, (size, _) in sizes.items() if size is None]
     values = ", ".join(
-        f"{name} = {known if known is not None else guess}"
-        for name, (known, guess) in sizes.items()
+        f"{name} = {size if size is not None else guess}" for name, (size, guess) in sizes.items()
     )
     hose = _line(
         f'    {{ kind = "tube", {values} }},',
@@ -522,17 +535,19 @@ def _system(system: System) -> list[str]:
     )
     volume = system.volume_ml if system.volume_ml is not None else GUESSED[system.end]
     size = "" if system.volume_ml is not None else "; volume_ml not known: guessed"
-    place = "not known: guessed" if system.sensor is Place.UNKNOWN else f"at the {system.sensor}"
-    sensor = _line('    { kind = "sensor" },', place)
+    sensor_remark = (
+        "not known: guessed" if system.sensor is Place.UNKNOWN else f"at the {system.sensor}"
+    )
+    sensor = _line('    { kind = "sensor" },', sensor_remark)
     parts = [hose, sensor] if system.sensor is Place.END else [sensor, hose]
-    last = _line(f'    {{ kind = "{kind}", volume_ml = {volume} }},', behind + size)
+    last = _line(f'    {{ kind = "{kind}", volume_ml = {volume} }},', cups_remark + size)
     return ["[data.system]", "parts = [", *parts, last, "]"]
 
 
-def _supply(known: float | None) -> list[str]:
-    value = "# pressure_bar = 5.0" if known is None else f"pressure_bar = {known}"
-    what = "gauge, at the regulator" + ("; not known" if known is None else "")
-    return ["[data.supply]", _line(value, what)]
+def _supply(pressure_bar: float | None) -> list[str]:
+    value = "# pressure_bar = 5.0" if pressure_bar is None else f"pressure_bar = {pressure_bar}"
+    remark = "gauge, at the regulator" + ("; not known" if pressure_bar is None else "")
+    return ["[data.supply]", _line(value, remark)]
 
 
 def _line(text: str, comment: str) -> str:

@@ -1,7 +1,7 @@
 """The command line: the only place where the twin meets the drivers.
 
-Imports of what a command does stand inside it so that ``twin --help`` is quick. What a command
-finds goes to stdout, what it has to say about its work to stderr.
+A command imports its modules when it runs, so that ``twin --help`` is quick. Results of a command
+go to stdout, remarks on its work to stderr.
 """
 
 import atexit
@@ -34,9 +34,9 @@ from twin.cli.tables import export, import_
 from twin.cli.users import users_app
 from twin.errors import TwinError
 
-GARBAGE = 20_000  # objects made and not let go of, after which Python looks for garbage
+GARBAGE = 20_000  # allocations beyond releases after which Python collects garbage
 
-# As the days go: begin, run, ask why, look after what is kept, tools.
+# In the order of use: set up, run, find causes, look after stored data, tools.
 ORDER = (
     *("init", "config", "probe", "import", "commission", "calibrate"),
     *("run", "serve", "replay", "diagnose", "compare", "figures", "alarms"),
@@ -45,7 +45,7 @@ ORDER = (
 )
 
 app = App("A live digital twin of pneumatic vacuum ejectors.", ORDER)
-for name, some in {
+for name, sub_app in {
     "assets": assets_app,
     "figures": figures_app,
     "alarms": alarms_app,
@@ -55,21 +55,21 @@ for name, some in {
     "effects": effects_app,
     "log": log_app,
 }.items():
-    app.add_typer(some, name=name)
-for one in (
+    app.add_typer(sub_app, name=name)
+for command in (
     *(init, probe, commission, calibrate, run, serve, replay, diagnose, compare, cert),
     *(export, export_fmu, paper, plc),
 ):
-    app.command()(one)
+    app.command()(command)
 app.command("import")(import_)
 
 
 def main() -> None:
     """Run the command line; errors become one message with a hint, and the exit code."""
-    # Matrices are small here: more threads only wait for each other, on cores that others need.
+    # Matrices are small: more threads only wait for each other, on cores that others need.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when a command imports NumPy
-    gc.set_threshold(GARBAGE)  # of what is imported nothing is: looking is a tenth of the start
-    atexit.register(gc.freeze)  # what is left ends with the process: no 0.2 s for its garbage
+    gc.set_threshold(GARBAGE)  # imports make no garbage; collecting takes a tenth of the start
+    atexit.register(gc.freeze)  # the process ends: no 0.2 s for a last collection
     try:
         app(prog_name="twin")
     except KeyboardInterrupt:

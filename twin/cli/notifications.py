@@ -1,4 +1,4 @@
-"""Where the alarms of ``twin run`` go, as its configurations have it."""
+"""Destinations for the alarms of ``twin run``, from its configurations."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from twin.notifications.uploader import Uploader
 
 Say = Callable[[str], None]
-Standing = Sequence[Mapping[str, Any]]  # alarms as they are
+Standing = Sequence[Mapping[str, Any]]  # standing alarms as plain data
 Begin = Callable[[Standing], "Outlets"]
 
 
 def outlets_of(settings: "Config", say: Say) -> Begin | None:
-    """What begins the outlets of a configuration, with its alarms as they are; None without any.
+    """A function that starts a configuration's outlets with its standing alarms.
 
-    ConfigError names a wrong key, or a secret or certificate that cannot be used.
+    None without outlets. ConfigError names a wrong key, or an unusable secret or certificate.
     """
     from twin.alarms.database_url import place_of
     from twin.alarms.settings import AlarmSettings
@@ -81,7 +81,7 @@ def outlets_of(settings: "Config", say: Say) -> Begin | None:
 
 
 def _uploader_of(settings: "Config", say: Say) -> "Uploader | None":
-    """What uploads logs when asked, where ``[outlets.upload]`` is there."""
+    """The uploader of logs on request; None without ``[outlets.upload]``."""
     import threading
 
     from twin.alarms.database_url import place_of as database_of
@@ -109,7 +109,7 @@ def _uploader_of(settings: "Config", say: Say) -> "Uploader | None":
 
 
 def _tellers_of(settings: "Config", mqtt: "MqttSettings") -> "list[Teller]":
-    """What goes to the broker beside alarms."""
+    """Sources of other data for the broker: key figures and values."""
     from twin.assets.unit import Unit
     from twin.notifications.data import Cycles, Values
     from twin.notifications.message import asset_of
@@ -124,11 +124,11 @@ def _tellers_of(settings: "Config", mqtt: "MqttSettings") -> "list[Teller]":
 
 
 def _lanes_of(mqtt: "MqttSettings") -> "list[Lane]":
-    """How that waits: also what an earlier run has left of what is not told any more."""
+    """Lanes in which that data waits; also for data of an earlier run that is no longer sent."""
     from twin.notifications.data import CYCLE, VALUES
     from twin.notifications.sender import Lane
     from twin.notifications.uploader import UPLOAD
 
     answers = Lane(UPLOAD, "answers about uploads", mqtt.keep_hours, most=1000)
-    what = {CYCLE: "key figures", VALUES: "values"}
-    return [answers, *(Lane(topic, words, mqtt.keep_hours) for topic, words in what.items())]
+    labels = {CYCLE: "key figures", VALUES: "values"}
+    return [answers, *(Lane(topic, label, mqtt.keep_hours) for topic, label in labels.items())]

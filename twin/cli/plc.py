@@ -1,4 +1,4 @@
-"""``twin plc`` and ``twin probe``: the simulated PLC, and what a real one answers."""
+"""``twin plc`` and ``twin probe``: the simulated PLC, and the inspection of a real one."""
 
 from typing import Annotated
 
@@ -33,14 +33,14 @@ def plc(
     from drivers.plc.live import run_plc
     from drivers.plc.settings import PlcSettings
 
-    documents = [read_config(one) for one in configs]
+    documents = [read_config(path) for path in configs]
     for document in documents:
         if "plc" not in document.tables:
             raise ConfigError(
                 f"{document.name}: there is no [plc] table",
                 "say what is simulated, as configs/test_rig.toml does",
             )
-    settings = [one.section(PlcSettings, "plc").on_port(port) for one in documents]
+    settings = [document.section(PlcSettings, "plc").on_port(port) for document in documents]
     run_plc(settings, [parse_fault(text) for text in fault or []], seed, duration)
 
 

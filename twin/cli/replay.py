@@ -11,7 +11,7 @@ import typer
 
 from twin.cli.alarms import alarms_of
 from twin.cli.app import say_if_cut
-from twin.cli.console import Console, Kept, progress
+from twin.cli.console import Console, EventRecorder, progress
 from twin.cli.options import (
     AsOf,
     AssetsUrl,
@@ -46,7 +46,7 @@ def replay(
     fail_on_alarm: FailOnAlarm = False,
 ) -> None:
     """Run the same loop over a recorded log, as fast as it goes."""
-    with _unwatched():
+    with _gc_paused():
         from twin.live import REPLAYED
         from twin.live import run as run_loop
         from twin.log.part import refuse_other_suffix
@@ -62,30 +62,30 @@ def replay(
         twin, monitor = pair_of(settings, judges=not recorded.header.derived)
         alarms = alarms_of(settings)()
     with views_of({"": settings}, view, rrd) as view_of, stop_on_signal(None) as stopped:
-        console, kept = Console(), Kept() if json_file else None
+        console, recorder = Console(), EventRecorder() if json_file else None
         header = settings.log_header(recorded.header.unmeasured)
         sinks = open_sinks(
             {
                 "log": partial(Recorder, output, header) if output else None,
                 "view": view_of(""),
                 "console": lambda: console,
-                "events": (lambda: kept) if kept else None,
+                "events": (lambda: recorder) if recorder else None,
             }
         )
         blocks = progress((samples for samples, _ in recorded.blocks(REPLAYED)), "replaying")
         run_loop(until(stopped, blocks), twin, monitor, [*sinks.values()], advisers=[alarms])
-    if json_file is not None and kept is not None:
-        write_json(json_file, {"log": str(log), "events": kept.events})
+    if json_file is not None and recorder is not None:
+        write_json(json_file, {"log": str(log), "events": recorder.events})
     alarmed = fail_on_alarm and console.alarmed
     leave(alarmed, interrupted=stopped() == "interrupted")
 
 
 @contextmanager
-def _unwatched() -> "Iterator[None]":
-    """Keep the garbage collector off while a command gets ready: nothing made then is garbage."""
+def _gc_paused() -> "Iterator[None]":
+    """Pause the garbage collector while a command starts: nothing allocated then is garbage."""
     gc.disable()
     try:
         yield
     finally:
-        gc.freeze()  # or it would go through all of it now
+        gc.freeze()  # else it would scan all of it now
         gc.enable()

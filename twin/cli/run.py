@@ -14,7 +14,7 @@ import typer
 
 from twin.cli.alarms import alarms_of, asker_of
 from twin.cli.app import not_negative
-from twin.cli.console import Console, printers, status, unsaid
+from twin.cli.console import Console, no_status, printers, status
 from twin.cli.figures import keeper_of
 from twin.cli.notifications import outlets_of
 from twin.cli.options import Address, AssetsUrl, ConfigFiles, FailOnAlarm, RrdFile, UnitId, ViewFlag
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from twin.monitor.staleness import Notices
     from twin.signals import Samples
 
-WAITS = "it is tried until it answers"  # a PLC that is off
+WAITS = "it is tried until it answers"  # said of a PLC that is off
 
 
 def run(
@@ -84,37 +84,39 @@ def run(
     alone = len(configs) == 1
     if not alone:
         _refuse_one_id(unit, len(configs))
-    _require_places(log, rrd)  # the PLC may answer much later
-    ejectors = _named([configured(Document.read(one), assets, unit) for one in configs])
-    pairs = {name: pair_of(one) for name, one in ejectors.items()}  # compiled before time counts
+    _require_writable_targets(log, rrd)  # the PLC may answer much later
+    ejectors = _by_asset([configured(Document.read(path), assets, unit) for path in configs])
+    pairs = {
+        name: pair_of(settings) for name, settings in ejectors.items()
+    }  # compiled before time counts
     width = 0 if alone else max(map(len, ejectors))
     lines = ConnectionPool()
 
-    def beside(name: str, settings: "Config") -> None:
+    def run_one(name: str, settings: "Config") -> None:
         label = "" if alone else name
         twin, monitor = pairs[name]
         alarms, outlets = alarms_of(settings, complain), outlets_of(settings, complain)
-        at = settings.document, address, lines if hil or not alone else None
-        plc = _Plc(partial(open_source, *at), label, complain, once=once)
-        shown = (
+        source_arguments = settings.document, address, lines if hil or not alone else None
+        plc = _Plc(partial(open_source, *source_arguments), label, complain, once=once)
+        results = (
             show(name, settings.asset.type, asker_of(settings), plc.results_down) if show else None
         )
         with (
             service.loop(name, stop) as stopped,
-            closed(shown),
+            closed(results),
             _locked(settings, log, complain),
             ExitStack() as closing,
         ):
-            if not plc.answers(stopped):  # said before a log is begun
+            if not plc.answers(stopped):  # reported before a log begins
                 return
-            # So is what is wrong with [hil].
-            writer = closing.enter_context(open_writer(*at)) if hil else None
+            # A mistake in [hil] is reported before a log begins, too.
+            writer = closing.enter_context(open_writer(*source_arguments)) if hil else None
             file = _file_of(log, label, name)
-            # The log comes last: what people are told does not wait for the disk.
+            # The log comes last: messages to people do not wait for the disk.
             opened = open_sinks(
                 {
                     "console": lambda: consoles[name],
-                    "OPC UA results": (lambda: shown) if shown else None,
+                    "OPC UA results": (lambda: results) if results else None,
                     "key figures": keeper_of(settings, complain),
                     "live page": live_rows_of(settings, complain),
                     "view": view_of(name),
@@ -125,13 +127,16 @@ def run(
                 _retained(settings, opened.get("log"), plc.listening.notices, complain)
             )
             adviser = _diagnosing(settings, file, stopped, alone=alone)
-            # What is not measured has no faults. Alarms come last: they hear the diagnosis.
-            advised: dict[str, EventEnricher] = (
+            # With --hil nothing is measured, so nothing is diagnosed. Alarms come last: they use
+            # the diagnosis.
+            enrichers: dict[str, EventEnricher] = (
                 {} if hil else {"diagnosis": adviser, "alarms": (board := alarms())}
             )
-            told = {} if hil else _told(board.standing(), shown, outlets)
-            sinks, advisers = _supervised({**told, **opened}, advised, plc.listening.notices)
-            # It begins with the newest row: what came while all this was opened is not judged.
+            outlet_sinks = {} if hil else _outlet_sinks(board.standing(), results, outlets)
+            sinks, advisers = _supervised(
+                {**outlet_sinks, **opened}, enrichers, plc.listening.notices
+            )
+            # It begins with the newest row: rows that came during the start are not evaluated.
             source = _answering(plc.blocks(), settings, writer) if writer else plc.blocks()
             with closed(source):
                 run_loop(until(stopped, source), twin, monitor, sinks, plc.listening, advisers)
@@ -139,10 +144,10 @@ def run(
     failed: list[str] = []
     units = {figure.name: figure.unit for figure in FIGURES.values()}
     with (
-        open_results([one.document for one in ejectors.values()], units) as show,
+        open_results([settings.document for settings in ejectors.values()], units) as show,
         views_of(ejectors, view, rrd) as view_of,
         stop_on_signal(duration) as stop,
-        _spared(),
+        _gc_frozen(),
         Service(os.environ) as service,
         printers() as (printer, complain),
     ):
@@ -150,10 +155,10 @@ def run(
             name: Console("" if alone else name.ljust(width), printer.print) for name in ejectors
         }
         if alone:
-            beside(*next(iter(ejectors.items())))
+            run_one(*next(iter(ejectors.items())))
         else:
-            loops = {name: partial(beside, name, one) for name, one in ejectors.items()}
-            failed = run_together(loops, lambda name, why: complain(f"{name}: {why}"))
+            loops = {name: partial(run_one, name, settings) for name, settings in ejectors.items()}
+            failed = run_together(loops, lambda name, cause: complain(f"{name}: {cause}"))
         if failed:
             raise SourceError(f"{len(failed)} of {len(loops)} ejectors failed: {', '.join(failed)}")
         alarmed = any(console.alarmed for console in consoles.values())
@@ -161,7 +166,7 @@ def run(
 
 
 class _Plc:
-    """The PLC of one ejector: tried until it answers, unless it is to answer at ``once``."""
+    """The PLC of one ejector: retried until it answers, unless it must answer at ``once``."""
 
     def __init__(
         self,
@@ -175,9 +180,9 @@ class _Plc:
 
         self.listening = Listening()
         self._opened, self._complain, self._once = opened, complain, once
-        self._said = f"{name}: " if name else ""
+        self._prefix = f"{name}: " if name else ""
         self._waits = False  # it did not answer at first
-        self._known = False  # it has given a row: whatever it sends from now on may pass
+        self._known = False  # it has given a row: from now on any error may pass
 
     def blocks(self) -> "Iterator[Samples]":
         """Its samples from now on; errors as from ``drivers.sources.open_source``."""
@@ -195,12 +200,12 @@ class _Plc:
                 if stopped(begun=False):
                     return False
         if self._waits:
-            self._complain(f"{self._said}the PLC answers")
+            self._complain(f"{self._prefix}the PLC answers")
         return True
 
-    def results_down(self, why: str) -> None:
-        """Have it said with the events of this ejector."""
-        self.listening.notices.tell(Kind.RESULTS_DOWN, why)
+    def results_down(self, cause: str) -> None:
+        """Report among the events of this ejector that the results server is down."""
+        self.listening.notices.tell(Kind.RESULTS_DOWN, cause)
 
     def _away(self, error: TwinError) -> None:
         if self._known:
@@ -208,11 +213,11 @@ class _Plc:
             return
         waits = "" if self._waits else f"\n  {WAITS}; with --once the run ends instead"
         self._waits = True
-        self._complain(f"{self._said}{error}\n  {error.hint}{waits}")
+        self._complain(f"{self._prefix}{error}\n  {error.hint}{waits}")
 
 
-def _named(ejectors: "Sequence[Config]") -> "dict[str, Config]":
-    """The configurations by asset; ConfigError where two are of the same."""
+def _by_asset(ejectors: "Sequence[Config]") -> "dict[str, Config]":
+    """The configurations by asset; ConfigError if two are of the same asset."""
     named: dict[str, Config] = {}
     for settings in ejectors:
         name = re.sub(r"[^\w.-]", "_", settings.asset.id) or Path(settings.document.name).stem
@@ -226,7 +231,7 @@ def _named(ejectors: "Sequence[Config]") -> "dict[str, Config]":
 
 
 def _refuse_one_id(unit: str, ejectors: int) -> None:
-    """ConfigError if several are to be the one unit."""
+    """ConfigError if ``--id`` is given for several ejectors."""
     if unit:
         raise ConfigError(
             f"--id is for one ejector, and here are {ejectors}",
@@ -234,8 +239,8 @@ def _refuse_one_id(unit: str, ejectors: int) -> None:
         )
 
 
-def _require_places(log: Path | None, rrd: Path | None) -> None:
-    """SourceError if no log or no view can be written there."""
+def _require_writable_targets(log: Path | None, rrd: Path | None) -> None:
+    """SourceError if log or view cannot be written."""
     require_writable(rrd)
     if log is None or not log.is_dir():
         require_writable(log)
@@ -244,7 +249,7 @@ def _require_places(log: Path | None, rrd: Path | None) -> None:
 
 
 def _file_of(path: Path | None, label: str, name: str) -> Path | None:
-    """Where one of several writes: run.mcap becomes run.rig-01.mcap; in a folder a new file."""
+    """Log file of one ejector: run.mcap becomes run.rig-01.mcap; in a folder it is a new file."""
     if path is not None and path.is_dir():
         return path / time.strftime(f"{name}.%Y%m%dT%H%M%SZ.mcap", time.gmtime())
     return path.with_name(f"{path.stem}.{label}{path.suffix}") if path and label else path
@@ -254,42 +259,42 @@ def _file_of(path: Path | None, label: str, name: str) -> Path | None:
 def _locked(
     settings: "Config", log: Path | None, complain: Callable[[str], None]
 ) -> Iterator[None]:
-    """Be the only run of the unit that writes where this one does; SourceError says who else is."""
+    """Lock the folders of this run for its unit; SourceError names another run that has them."""
     unit = " ".join(part for part in (settings.asset.type, settings.asset.id) if part)
     with ExitStack() as locks:
-        for folder in sorted(_written_by(settings, log)):
+        for folder in sorted(_written_folders(settings, log)):
             locks.enter_context(only_run(folder, unit, time.time_ns(), complain))
         yield
 
 
-def _written_by(settings: "Config", log: Path | None) -> set[Path]:
-    """The folders in which a second run of the unit would write the same once more."""
+def _written_folders(settings: "Config", log: Path | None) -> set[Path]:
+    """The folders in which a second run of the unit would write the same data again."""
     from twin.alarms.database_url import place_of as alarms_in
     from twin.alarms.settings import AlarmSettings
     from twin.assets.engine import sqlite_file
     from twin.figures.database_url import place_of as figures_in
     from twin.figures.settings import FigureSettings
 
-    document, places = settings.document, list["URL"]()
+    document, urls = settings.document, list["URL"]()
     if document.section(AlarmSettings, "alarms").keep:
-        places.append(alarms_in(document))
+        urls.append(alarms_in(document))
     if document.section(FigureSettings, "figures").keep:
-        places.append(figures_in(document))
-    files = (sqlite_file(place) or Path(document.name) for place in places)  # or a server
+        urls.append(figures_in(document))
+    files = (sqlite_file(url) or Path(document.name) for url in urls)  # or a server
     logs = [] if log is None else [log if log.is_dir() else log.parent]
     return {folder.resolve() for folder in [*logs, *(Path(file).parent for file in files)]}
 
 
 def _recorder(file: Path, settings: "Config", *, hil: bool) -> "Sink":
-    """The log of a live run."""
+    """The recorder of a live run's log."""
     from twin.log.header import HIL, RECORDED
     from twin.log.recorder import Recorder
 
     rotate = round(settings.log.rotate_mb * 1e6)
-    own = {RECORDED: "twin run"}
+    metadata = {RECORDED: "twin run"}
     if hil:
-        own[HIL] = "the pressure is the model's own, as it was written to the PLC"
-    return Recorder(file, settings.log_header(own), rotate_bytes=rotate)
+        metadata[HIL] = "the pressure is the model's own, as it was written to the PLC"
+    return Recorder(file, settings.log_header(metadata), rotate_bytes=rotate)
 
 
 def _retained(
@@ -298,14 +303,18 @@ def _retained(
     notices: "Notices",
     complain: Callable[[str], None],
 ) -> "AbstractContextManager[object]":
-    """What keeps the logs of a live run within the bounds of [log]."""
+    """Keeps the logs of a live run within the bounds of [log]."""
     from twin.log.recorder import Recorder
     from twin.log.retention import GB, Bounds, Retention
 
     if not isinstance(log, Recorder):
         return nullcontext()
-    kept, unit = settings.log, (settings.asset.type, settings.asset.id)
-    bounds = Bounds(kept.keep_days, kept.keep_gb and kept.keep_gb * GB, kept.disk_pct / 100)
+    log_settings, unit = settings.log, (settings.asset.type, settings.asset.id)
+    bounds = Bounds(
+        log_settings.keep_days,
+        log_settings.keep_gb and log_settings.keep_gb * GB,
+        log_settings.disk_pct / 100,
+    )
     tell = partial(notices.tell, Kind.LOG_DELETED)
     return Retention(log.under_way.parent, unit, bounds, lambda: log.under_way, tell, complain)
 
@@ -313,14 +322,14 @@ def _retained(
 def _diagnosing(
     settings: "Config", log: Path | None, stopped: Callable[[], str], *, alone: bool
 ) -> "EventEnricher":
-    """Who has the alarms of a live run diagnosed."""
+    """The enricher that has alarms of a live run diagnosed."""
     from twin.diagnosis.process import LiveDiagnosis
 
     return LiveDiagnosis(
         settings,
         str(log or "live"),
         lambda: stopped() == "interrupted",
-        status if alone else unsaid,
+        status if alone else no_status,
         reports=reports_of(settings),
     )
 
@@ -328,7 +337,7 @@ def _diagnosing(
 def _answering(
     source: "Iterator[Samples]", settings: "Config", writer: "Writer"
 ) -> "Iterator[Samples]":
-    """The blocks with the model as the plant, which answers what the PLC commands."""
+    """The blocks with the model as the plant: it answers the PLC's commands."""
     from drivers.outputs.writer import Outputs
     from twin.hil import Plant, in_place
     from twin.model.dataset import coefficients
@@ -340,7 +349,7 @@ def _answering(
 def _supervised(
     sinks: "Mapping[str, Sink]", advisers: "Mapping[str, EventEnricher]", notices: "Notices"
 ) -> "tuple[list[Sink], list[EventEnricher]]":
-    """The same; one that fails does not end the run."""
+    """The same with supervision: a failure of one does not end the run."""
     from twin.log.recorder import Recorder
     from twin.supervised import Outages, SupervisedEnricher, SupervisedSink
 
@@ -353,23 +362,23 @@ def _supervised(
         return SupervisedSink(name, sink, lambda: sink, outages, rows=rows)
 
     return (
-        [supervised(*one) for one in sinks.items()],
-        [SupervisedEnricher(name, one, outages) for name, one in advisers.items()],
+        [supervised(*item) for item in sinks.items()],
+        [SupervisedEnricher(name, enricher, outages) for name, enricher in advisers.items()],
     )
 
 
-def _told(
-    standing: "Standing", shown: "Results | None", outlets: "Begin | None"
+def _outlet_sinks(
+    standing: "Standing", results: "Results | None", outlets: "Begin | None"
 ) -> "dict[str, Sink]":
-    """Tell of the alarms that stand when a run begins; gives the sinks that tell of the others."""
-    if shown is not None:
-        shown.resume(standing, time.time_ns())
+    """Report the alarms that stand when a run begins; gives the sinks for further alarms."""
+    if results is not None:
+        results.resume(standing, time.time_ns())
     return {} if outlets is None else {"MQTT and webhook": outlets(standing)}
 
 
 @contextmanager
-def _spared() -> "Iterator[None]":
-    """Keep the garbage collector from all there is: going through it holds a block up by 0.2 s."""
+def _gc_frozen() -> "Iterator[None]":
+    """Exclude present objects from garbage collection: scanning them delays a block by 0.2 s."""
     gc.collect()
     gc.freeze()
     try:

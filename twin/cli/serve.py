@@ -77,16 +77,16 @@ def serve(
         raise ConfigError("no ejector to show", hint)
     if (certificate is None) != (key is None):
         raise ConfigError("--certificate and --key belong together", "give both, as PEM files")
-    place, known = Place(host, port, certificate, key), Users(users or first.parent / FILE)
-    _require_users(place, known)
-    settings = [Config.of(Document.read(one), assets) for one in configs or []]
-    with _heard_of(broker) as hall:
-        _serve(place, settings, known, names or [], hall)
+    endpoint, registered = Place(host, port, certificate, key), Users(users or first.parent / FILE)
+    _require_users(endpoint, registered)
+    settings = [Config.of(Document.read(path), assets) for path in configs or []]
+    with _plant_overview_of(broker) as plant_overview:
+        _serve(endpoint, settings, registered, names or [], plant_overview)
 
 
 @contextmanager
-def _heard_of(broker: Path | None) -> "Iterator[PlantOverview | None]":
-    """What all ejectors publish, while it is listened to; None without a broker."""
+def _plant_overview_of(broker: Path | None) -> "Iterator[PlantOverview | None]":
+    """The overview of all ejectors of a broker while its messages are read; None without one."""
     if broker is None:
         yield None
         return
@@ -95,21 +95,21 @@ def _heard_of(broker: Path | None) -> "Iterator[PlantOverview | None]":
     from twin.page.plant_overview import PlantOverview
     from twin.page.plant_overview_client import listening
 
-    document, hall = read_config(broker), PlantOverview()
+    document, plant_overview = read_config(broker), PlantOverview()
     document.refuse_unknown_tables(TABLES)
     mqtt, _ = chosen(document)
     if not mqtt.host:
         raise ConfigError(f"{broker}: no [mqtt] in it", 'say where the broker is: host = "..."')
-    with listening(mqtt, broker.parent, hall, complain):
-        yield hall
+    with listening(mqtt, broker.parent, plant_overview, complain):
+        yield plant_overview
 
 
 def _serve(
-    place: "Place",
+    endpoint: "Place",
     settings: "list[Config]",
     users: "Users",
     names: list[str],
-    hall: "PlantOverview | None",
+    plant_overview: "PlantOverview | None",
 ) -> None:
     import socket
 
@@ -120,19 +120,19 @@ def _serve(
     from twin.page.server import address, listen, make_server
     from twin.page.sessions import Sessions
 
-    ours = {one.lower() for one in (*names, place.host, socket.gethostname()) if one}
-    access = Access(frozenset(ours), place.scheme == "https", place.is_loopback)
+    host_names = {name.lower() for name in (*names, endpoint.host, socket.gethostname()) if name}
+    access = Access(frozenset(host_names), endpoint.scheme == "https", endpoint.is_loopback)
     authenticator = Authenticator(users, Audit(users.path.parent, "page", complain))
-    ejectors = [Ejector(one) for one in settings]
-    page = Page(ejectors, authenticator, Sessions(users), access, hall)
-    server = make_server(page.app(), place)
-    with listen(place) as listening:
-        print(f"the page is at {address(place, listening)}", flush=True)
+    ejectors = [Ejector(config) for config in settings]
+    page = Page(ejectors, authenticator, Sessions(users), access, plant_overview)
+    server = make_server(page.app(), endpoint)
+    with listen(endpoint) as listening:
+        print(f"the page is at {address(endpoint, listening)}", flush=True)
         server.run(sockets=[listening])
 
 
 def _require_extra() -> None:
-    """ConfigError where the page's libraries are not installed."""
+    """ConfigError if the page's libraries are not installed."""
     try:
         import babel  # noqa: F401
         import starlette  # noqa: F401
@@ -142,16 +142,16 @@ def _require_extra() -> None:
         raise ConfigError(f"twin serve needs {error.name}", install_hint("serve")) from error
 
 
-def _require_users(place: "Place", users: "Users") -> None:
-    """ConfigError where the network would reach a page without users."""
-    if place.is_loopback:
+def _require_users(endpoint: "Place", users: "Users") -> None:
+    """ConfigError if a page without users would be reachable from the network."""
+    if endpoint.is_loopback:
         return
     if not users.names:
         raise ConfigError(
-            f"{place.host}: others would reach the page, and it has no users",
+            f"{endpoint.host}: others would reach the page, and it has no users",
             "make one first: twin users add NAME --config CONFIG",
         )
-    if place.certificate is None:
+    if endpoint.certificate is None:
         complain("without --certificate others on the network can read passwords on their way")
 
 
@@ -161,7 +161,7 @@ def _require_users(place: "Place", users: "Users") -> None:
 def live_rows_of(
     settings: "Config", say: "Callable[[str], None]"
 ) -> "Callable[[], LiveRows] | None":
-    """What opens the sink that leaves live rows, where ``[page]`` asks for it; or None."""
+    """A function that opens the sink of live rows; None unless ``[page]`` asks for it."""
     from twin.page.ring import LiveRows
     from twin.page.settings import RING, PageSettings, folder_of
     from twin.signals import MBAR
@@ -174,7 +174,7 @@ def live_rows_of(
 
 
 def reports_of(settings: "Config") -> Path | None:
-    """The folder for reports of live diagnoses, where ``[page]`` asks for them; or None."""
+    """The folder for reports of live diagnoses; None unless ``[page]`` asks for them."""
     from twin.page.settings import REPORTS, PageSettings, folder_of
 
     if not settings.document.section(PageSettings, "page").keep:

@@ -1,4 +1,4 @@
-"""What a command begins with: the configuration of an ejector, its twin and its monitor."""
+"""Set-up of a command: the configuration of an ejector, its twin and its monitor."""
 
 import sys
 from pathlib import Path
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def configured(document: "Document", assets: str, unit: str) -> "Config":
-    """The configuration with what is known of its unit; says so if one that is named is unknown."""
+    """The configuration with its unit's data; prints a remark if the named unit is unknown."""
     from twin.config import Config
 
     settings = Config.of(document, assets, unit)
@@ -34,31 +34,31 @@ def settings_of(
     *,
     to_store: bool = False,
 ) -> "Config":
-    """The configuration a log carries, with the data set it was made with; or another one.
+    """The configuration of a log with the data set of its recording, or another configuration.
 
-    ``to_store`` something in the asset database: it may be new.
+    With ``to_store`` something will be stored in the asset database, which may be new.
     """
     from twin.assets.file import parse_time
     from twin.config import Config
     from twin.settings import Document
 
     document = Document.read(instead) if instead is not None else None
-    known = parse_time(as_of) if as_of else None
+    as_of_ns = parse_time(as_of) if as_of else None
     settings = Config.of_recorded(
-        header, str(log), document, assets, unit, known, to_store=to_store
+        header, str(log), document, assets, unit, as_of_ns, to_store=to_store
     )
     _say_instead(settings, unit)
     return settings
 
 
 def _say_instead(settings: "Config", unit: str) -> None:
-    """Say so if a unit that is named is unknown."""
+    """Print a remark if the named unit is unknown."""
     if unit and settings.instead:
         print(f"twin: {settings.instead}", file=sys.stderr)
 
 
 def pair_of(settings: "Config", *, judges: bool = True) -> tuple["Twin", "Monitor"]:
-    """The twin of a configuration and its monitor, which may be one that ``judges`` no cycle."""
+    """The twin of a configuration and its monitor; with ``judges`` it evaluates cycles."""
     from twin.live import compiled
     from twin.monitor.isolation import Isolation
     from twin.monitor.monitor import Monitor
@@ -76,5 +76,5 @@ def pair_of(settings: "Config", *, judges: bool = True) -> tuple["Twin", "Monito
     monitor = Monitor(watch, twin.theta, teller=teller, isolation=isolation, judges=judges)
     monitor.reports = ReportWatch(twin.theta, twin.knees) if judges else None
     if settings.document.tables.get("driver", {}).get("mode") == "poll":
-        monitor.clocks = None  # then time is that of the poll here
+        monitor.clocks = None  # then times are this machine's
     return twin, monitor

@@ -1,4 +1,4 @@
-"""Where rows go: sinks opened together, and the Rerun view."""
+"""Sinks of rows: opened together, and the Rerun view."""
 
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def open_sinks(makers: "Mapping[str, Callable[[], Sink] | None]") -> "dict[str, Sink]":
-    """The sinks that are wanted; if one cannot be opened, those before it are closed."""
+    """Open the sinks; if one cannot be opened, those before it are closed."""
     sinks: dict[str, Sink] = {}
     try:
         for name, make in makers.items():
@@ -34,17 +34,17 @@ def open_sinks(makers: "Mapping[str, Callable[[], Sink] | None]") -> "dict[str, 
 def views_of(
     ejectors: "dict[str, Config]", view: bool, rrd: Path | None
 ) -> "Iterator[Callable[[str], Callable[[], Sink] | None]]":
-    """Give what opens the Rerun view of an ejector, by its name: all in one window or one file."""
+    """Give a function that returns the opener of an ejector's view; all share a window or file."""
     if view and rrd is not None:
         raise ConfigError("--view and --rrd exclude each other", "open the file: rerun FILE.rrd")
     one_at_a_time, alone = Lock(), len(ejectors) == 1
     with ExitStack() as closing:
 
         @cache
-        def screen() -> "Screen":  # opened by the first that has something to show
+        def screen() -> "Screen":  # opened by the first ejector that shows something
             from twin.view import Screen
 
-            titles = [f"{one.asset.type} {one.asset.id}" for one in ejectors.values()]
+            titles = [f"{config.asset.type} {config.asset.id}" for config in ejectors.values()]
             opened = Screen(", ".join(titles), rrd, ("",) if alone else tuple(ejectors))
             closing.callback(opened.close)
             if opened.url:

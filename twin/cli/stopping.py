@@ -1,4 +1,4 @@
-"""How a command ends: by a signal, after a time, with an exit code, and nothing left open."""
+"""The end of a command: by a signal or after a time, with an exit code, and everything closed."""
 
 import signal
 import time
@@ -18,11 +18,11 @@ ALARMED = 1
 
 @contextmanager
 def stop_on_signal(duration: float | None) -> Iterator[Callable[..., str]]:
-    """Give a function that says why to stop: "" (go on), "duration" or "interrupted".
+    """Give a function that returns why to stop: "" (go on), "duration" or "interrupted".
 
     The first Ctrl-C lets the loop finish its block and close the log; the second one is Python's.
     """
-    end: float | None = None  # from the first question on: what comes before takes its time
+    end: float | None = None  # counts from the first call: the start takes its time
     reason = ""
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
@@ -31,7 +31,7 @@ def stop_on_signal(duration: float | None) -> Iterator[Callable[..., str]]:
             raise KeyboardInterrupt
         reason = "interrupted"
 
-    def why(*, begun: bool = True) -> str:
+    def stop_reason(*, begun: bool = True) -> str:
         nonlocal reason, end
         if begun and end is None and duration is not None:
             end = time.monotonic() + duration
@@ -39,14 +39,14 @@ def stop_on_signal(duration: float | None) -> Iterator[Callable[..., str]]:
             reason = "duration"
         return reason
 
-    wanted = {signal.SIGINT, signal.SIGTERM}
+    signals = {signal.SIGINT, signal.SIGTERM}
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup
-        wanted.add(signal.SIGHUP)  # the terminal was closed
-    before = {number: signal.signal(number, interrupt) for number in wanted}
+        signals.add(signal.SIGHUP)  # the terminal was closed
+    previous = {number: signal.signal(number, interrupt) for number in signals}
     try:
-        yield why
+        yield stop_reason
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)
 
 
@@ -63,7 +63,7 @@ def until(stopped: Callable[[], str], source: "Iterable[Samples]") -> "Iterator[
 
 @contextmanager
 def heeded() -> Iterator[None]:
-    """Have a Ctrl-C end what is done here: a compiler's callbacks swallow Python's exception."""
+    """Let Ctrl-C end this block: a compiler's callbacks swallow Python's exception."""
     interrupted = False
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
@@ -71,18 +71,18 @@ def heeded() -> Iterator[None]:
         interrupted = True
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGINT, interrupt)
+    previous = signal.signal(signal.SIGINT, interrupt)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, previous)
     if interrupted:
         raise KeyboardInterrupt
 
 
 @contextmanager
 def closed(source: object) -> Iterator[None]:
-    """Close it at the end, begun or not: drivers have threads and connections."""
+    """Close ``source`` at the end, started or not: drivers have threads and connections."""
     try:
         yield
     finally:
@@ -91,7 +91,7 @@ def closed(source: object) -> Iterator[None]:
 
 
 def leave(alarmed: bool = False, *, interrupted: bool) -> None:
-    """Exit as the contract of the command line has it."""
+    """Exit with the code that the command line documents."""
     if interrupted:
         raise typer.Exit(INTERRUPTED)
     if alarmed:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def _known_zone(name: str) -> str:
-    """For ``--time-zone``: usage error unless there is such a zone."""
+    """Callback of ``--time-zone``: usage error unless the zone exists."""
     from twin.tables.settings import known_zone
 
     try:
@@ -72,11 +72,11 @@ def import_(
     elif not dry_run:
         raise typer.BadParameter("say with -o LOG.mcap where the log goes, or look with --dry-run")
     settings = configured(Document.read(config), assets, unit)
-    wanted = settings.document.section(ImportSettings, "import")
+    import_settings = settings.document.section(ImportSettings, "import")
     if time_zone:
-        wanted = wanted.model_copy(update={"time_zone": time_zone})
+        import_settings = import_settings.model_copy(update={"time_zone": time_zone})
     ambient = settings.data.ambient.pressure_mbar * MBAR
-    table = open_table(file, wanted, ambient, derive=derive_commands)
+    table = open_table(file, import_settings, ambient, derive=derive_commands)
     settings = replace(settings, gauge=table.counts_from_ambient)
     for note in table.notes:
         print(f"twin: {file}: {note}", file=sys.stderr)
@@ -89,20 +89,20 @@ def import_(
         table = table.with_commands()
         unmeasured[DERIVED] = table.commands
         print(f"twin: {table.commands}", file=sys.stderr)
-    else:  # a whole look first: nothing is said of rows that are then refused
+    else:  # read the whole table first, so that no events come of rows that are then refused
         for _ in progress(table.blocks(), "reading"):
             pass
     twin, monitor = pair_of(settings, judges=not table.commands)
-    with _whole(output) as part, stop_on_signal(None) as stopped:
+    with _complete_file(output) as draft, stop_on_signal(None) as stopped:
         header = settings.log_header(unmeasured)
-        sinks = open_sinks({"log": partial(Recorder, part, header), "console": Console})
+        sinks = open_sinks({"log": partial(Recorder, draft, header), "console": Console})
         blocks = until(stopped, progress(table.blocks(), "importing"))
         run_loop(blocks, twin, monitor, [*sinks.values()])
     return leave(interrupted=stopped() == "interrupted")
 
 
 def _show(table: "Table", *, derive: bool) -> None:
-    """Print how a table is understood, also where it is then refused."""
+    """Print how a table is read, even if it is then refused."""
     from twin.tables.preview import Preview
 
     preview = Preview(table)
@@ -116,20 +116,20 @@ def _show(table: "Table", *, derive: bool) -> None:
 
 
 @contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """Give a name to write under; ``path`` is there only once all went well, and never replaced."""
+def _complete_file(path: Path) -> Iterator[Path]:
+    """Give a draft to write to; ``path`` appears only on success, and is never overwritten."""
     if path.exists():
         message = f"{path}: there is already a file of that name"
         raise SourceError(message, "choose another name, or remove it")
-    part = path.with_name(f"{path.name}.part")
+    draft = path.with_name(f"{path.name}.part")
     with suppress(OSError):
-        part.unlink()  # left by one that was killed
+        draft.unlink()  # left by a killed command
     try:
-        yield part
-        part.rename(path)
+        yield draft
+        draft.rename(path)
     finally:
         with suppress(OSError):
-            part.unlink()
+            draft.unlink()
 
 
 def export(

@@ -34,11 +34,11 @@ ROLES = "look, acknowledge (alarms, and shelve them), configure (take them out o
 @users_app.command("list")
 def list_(config: ConfigFile = None, users: UsersFile = None) -> None:
     """Print every user with the role."""
-    known = _users(config, users)
-    for name in known.names:
-        print(f"{known.role(name):<11}  {name}")
-    if not known.names:
-        print(f"{known.path}: no users", file=sys.stderr)
+    registry = _users(config, users)
+    for name in registry.names:
+        print(f"{registry.role(name):<11}  {name}")
+    if not registry.names:
+        print(f"{registry.path}: no users", file=sys.stderr)
 
 
 @users_app.command()
@@ -51,10 +51,10 @@ def add(
     """Ask for a password, and keep its hash; the file is for its owner only."""
     from twin.users import role_of
 
-    known, wanted = _users(config, users), role_of(role)
-    known.add(name, _password(name), wanted)
-    _record(known, Act.USER_ADDED, name, role=wanted)
-    print(f"{name} has the role {wanted}")
+    registry, new_role = _users(config, users), role_of(role)
+    registry.add(name, _password(name), new_role)
+    _record(registry, Act.USER_ADDED, name, role=new_role)
+    print(f"{name} has the role {new_role}")
 
 
 @users_app.command()
@@ -67,27 +67,27 @@ def role(
     """Give a user another role; it holds at once."""
     from twin.users import role_of
 
-    known, wanted = _users(config, users), role_of(role)
-    known.set_role(name, wanted)
-    _record(known, Act.ROLE_CHANGED, name, role=wanted)
-    print(f"{name} has the role {wanted}")
+    registry, new_role = _users(config, users), role_of(role)
+    registry.set_role(name, new_role)
+    _record(registry, Act.ROLE_CHANGED, name, role=new_role)
+    print(f"{name} has the role {new_role}")
 
 
 @users_app.command()
 def password(name: Name, config: ConfigFile = None, users: UsersFile = None) -> None:
     """Give a user a new password; the page's sessions with the old one end."""
-    known = _users(config, users)
-    known.set_password(name, _password(name))
-    _record(known, Act.PASSWORD_CHANGED, name)
+    registry = _users(config, users)
+    registry.set_password(name, _password(name))
+    _record(registry, Act.PASSWORD_CHANGED, name)
     print(f"{name} has a new password")
 
 
 @users_app.command()
 def remove(name: Name, config: ConfigFile = None, users: UsersFile = None) -> None:
     """Take a user away; it holds at once."""
-    known = _users(config, users)
-    known.remove(name)
-    _record(known, Act.USER_REMOVED, name)
+    registry = _users(config, users)
+    registry.remove(name)
+    _record(registry, Act.USER_REMOVED, name)
     print(f"{name} is no user any more")
 
 
@@ -99,15 +99,15 @@ def audit(config: ConfigFile = None, users: UsersFile = None, json_file: JsonFil
     """
     folder = _users(config, users).path.parent
     try:
-        found, broken = records(folder)
+        acts, broken = records(folder)
     except OSError as error:
         raise SourceError(f"the audit trail in {folder} cannot be read: {error}") from error
-    for one in found:
-        print(in_words(one))
+    for act in acts:
+        print(in_words(act))
     if broken:
         print(f"twin: {broken} lines of the audit trail cannot be read", file=sys.stderr)
     if json_file is not None:
-        write_json(json_file, found)
+        write_json(json_file, acts)
 
 
 def _users(config: Path | None, users: Path | None) -> "Users":
@@ -117,12 +117,12 @@ def _users(config: Path | None, users: Path | None) -> "Users":
     return Users(users or folder / FILE)
 
 
-def _record(users: "Users", what: Act, whom: str, **details: str) -> None:
-    audit_of(users.path.parent).record(what, user_here(), user=whom, **details)
+def _record(users: "Users", act: Act, name: str, **details: str) -> None:
+    audit_of(users.path.parent).record(act, user_here(), user=name, **details)
 
 
 def _password(name: str) -> str:
-    """Asked for twice on a terminal; from a pipe its first line."""
+    """A password: asked for twice on a terminal, the first line from a pipe."""
     if not sys.stdin.isatty():
         return sys.stdin.readline().rstrip("\r\n")
     password = getpass.getpass(f"password of {name}: ")

@@ -50,7 +50,7 @@ CYCLE = Table(
     Column("asset_id", Text, primary_key=True),
     Column("host_ns", BigInteger, primary_key=True, autoincrement=False),
     Column("begin_ns", BigInteger, primary_key=True, autoincrement=False),
-    Column("data_set", Text, primary_key=True),  # content hash of what the twin knew
+    Column("data_set", Text, primary_key=True),  # content hash of the twin's data
     Column("cycle", BigInteger, nullable=False),  # its number in that stream
     Column("source", Text, nullable=False),  # a log, or "live"
     Column("stored_ns", BigInteger, nullable=False),

@@ -1,4 +1,4 @@
-"""The names a table's columns go by, and how it is taken in."""
+"""Names of a table's columns, and settings of its import."""
 
 from collections.abc import Mapping
 from enum import StrEnum
@@ -88,7 +88,7 @@ class ColumnSource(Settings):
 
     @property
     def is_name_only(self) -> bool:
-        """Whether nothing but the name is said."""
+        """Whether only the name is given."""
         return self == ColumnSource(name=self.name)
 
 

@@ -23,7 +23,7 @@ LEAST_ABSOLUTE = -20.0 * MBAR  # Pa; a sensor's zero may be off by less
 MOST_AMBIENT = 1100.0 * MBAR  # Pa; the highest air pressure measured at sea level is 1085 mbar
 LEAST_AMBIENT = 500.0 * MBAR  # Pa, at 5.5 km; the highest towns lie at 5.1 km
 LEAST_VACUUM = 50.0 * MBAR  # Pa, that a record with suction shows
-MOST_RELEASED = 1.5  # of ambient, that a blow-off comes to
+MOST_RELEASED = 1.5  # of ambient, the highest pressure of a blow-off
 LONG_NS = 1_000_000_000
 MOST_ANSWERS = 4  # lines of a hint: nobody reads more
 
