@@ -17,8 +17,9 @@ from twin.inference.covariance import Floats
 
 MISMATCH = 0.08  # of what an effect explains, that its waveform is off
 # How probable things are beforehand, beside a single listed effect. Chosen: something that is not
-# in the table is a tenth as probable, beside a listed effect a fifth; of two listed ones at once
-# each is a third as probable. UNLISTED halved or doubled moves 0.96 to 0.98 or 0.93.
+# in the table is a tenth as probable; of two listed ones at once each is a third as probable.
+# UNLISTED halved or doubled moves 0.96 to 0.98 or 0.93. Beside a listed effect something unlisted
+# has 0.15: of 85 causes where more was left, 53 act (tools.reliability), 0.15 to 0.1 says 0.6.
 UNLISTED, BESIDE, FURTHER = 0.1, 0.15, 0.3
 SHARES = np.geomspace(0.003, 1.0, 9)  # of what was explained, that may be left of it
 _EDGES = np.concatenate([[0.0], np.sqrt(SHARES[1:] * SHARES[:-1]), [1.0]])
