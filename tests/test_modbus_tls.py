@@ -117,7 +117,7 @@ def test_one_that_does_not_answer_in_time_is_lost(
 
 def test_one_that_hangs_up_at_once_may_not_want_us(linked: Callable[..., ModbusClient]) -> None:
     link = linked(lambda client: client.close())
-    with pytest.raises(LostError, match="it does not trust our certificate, or wants one"):
+    with pytest.raises(LostError, match="it does not trust our certificate, or requires one"):
         link.read(FOUR.address, 4)
 
 
@@ -187,7 +187,7 @@ def test_a_plc_that_wants_a_certificate_takes_the_one_it_knows(tmp_path: Path, k
         if known:
             assert _opened_and_read(link) == [1, 515, 1029, 1543]
             return
-        with pytest.raises(SourceError, match="it does not trust our certificate, or wants one"):
+        with pytest.raises(SourceError, match="it does not trust our certificate, or requires one"):
             _opened_and_read(link)
 
 

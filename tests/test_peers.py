@@ -418,7 +418,7 @@ def test_tls_to_a_plc_that_wants_another_certificate(folder: Path, ours: str | N
         own = {"certificate": pem(folder / ours), "key": folder / ours / certificates.KEY}
     with libmodbus_in_tls(folder, clients=pem(folder / "theirs")) as server:
         error = refused(by_modbus(server.port, **in_tls(folder, **own)))
-    assert str(error).endswith("it does not trust our certificate, or wants one")
+    assert str(error).endswith("it does not trust our certificate, or requires one")
 
 
 @pytest.mark.needs(*STUNNEL)
@@ -449,7 +449,7 @@ def test_node_opcua_does_not_know_us(folder: Path, node: int, tmp_path: Path) ->
     certificates.make(tmp_path / "ours")
     opcua_plc.trust(tmp_path / "ours", folder / "theirs")
     error = refused(by_opcua(node, **secured(tmp_path, "Basic256Sha256")))
-    assert "it does not trust our certificate, or wants one" in str(error)
+    assert "it does not trust our certificate, or requires one" in str(error)
 
 
 def test_node_opcua_is_not_known_to_us(node: int, tmp_path: Path) -> None:

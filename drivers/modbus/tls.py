@@ -27,7 +27,7 @@ class Tls(Settings):
 
     trusted: Path  # PEM: the PLC's certificate, or the authority's that signed it
     name: str = ""  # in the PLC's certificate; "" means the host
-    certificate: Path | None = None  # PEM, our own, where the PLC wants one
+    certificate: Path | None = None  # PEM, our own, where the PLC requires one
     key: Path | None = None  # PEM, of our own certificate
 
     @model_validator(mode="after")
@@ -188,6 +188,6 @@ def _refuses(error: ssl.SSLError) -> bool:
 
 def _unwanted(address: str, kind: type[SourceError] = SourceError) -> SourceError:
     return kind(
-        f"{address}: it does not trust our certificate, or wants one",
+        f"{address}: it does not trust our certificate, or requires one",
         "set certificate and key in [driver.tls], and let the PLC trust them",
     )

@@ -17,7 +17,7 @@ class Tls(Settings):
     """How a connection is protected. ``{}`` trusts whom this machine trusts."""
 
     trusted: Path | None = None  # PEM: the server's certificate, or the authority's
-    certificate: Path | None = None  # PEM, our own, where the server wants one
+    certificate: Path | None = None  # PEM, our own, where the server requires one
     key: Path | None = None  # PEM, of our own certificate
 
     @model_validator(mode="after")

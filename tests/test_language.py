@@ -1,0 +1,147 @@
+"""What people read is plain: no riddles that once stood here, and sentences that read easily.
+
+Reading ease is Flesch's: 206.835 less 1.015 times the words of a sentence and 84.6 times the
+syllables of a word (Flesch, "A new readability yardstick", 1948). From 60 on a text is plain
+English. A page of short, odd sentences scores well too: hence the phrases.
+"""
+
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pyphen
+import pytest
+import typer
+from babel.messages.pofile import read_po
+
+from twin.cli.main import app
+
+ROOT = Path(__file__).parents[1]
+EASIEST = 60.0  # Flesch's limit of plain English
+LONGEST = 45  # words of a sentence, lists in it included
+FEWEST = 80  # words, below which a text has no reading ease
+# Riddles, and word orders of another language. Each stood in a text here, and a reader stopped.
+BANNED = {
+    r"\bnothing to tell\b": "say what is missing: incomplete, not evaluated",
+    r"\bhas it from\b": "name its source",
+    r"\bwants (one|to be)\b": "requires",
+    r"\bis said once\b": "is reported once",
+    r"\band that is said\b": "with a warning",
+    r"\bwhat cannot be is\b": "invalid values are",
+    r"\bwhat else goes\b": "other data",
+    r"\bhow they go together\b": "how they fit together",
+    r"\bgoes as one before\b": "is like an earlier one",
+    r"\bwhat speaks for it\b": "evidence",
+    r"\bnothing waits\b": "the queue is empty",
+    r"\bas wide as needed\b": "say how wide, and why",
+    r"\bso many of them\b": "say how many",
+    r"\bthe less of what\b": "two quantities and how one follows the other",
+}
+WORDS = re.compile(r"[A-Za-z][A-Za-z'’-]*")
+
+
+def pages() -> list[Path]:
+    """Every page that somebody wrote, and not a program."""
+    made = {"commands.md", "configuration.md"}
+    docs = [page for page in (ROOT / "docs").rglob("*.md") if page.name not in made]
+    return sorted([*docs, ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md"])
+
+
+def prose(markdown: str) -> str:
+    """Paragraphs and list items without code, tables, headings, comments and link targets."""
+    text = re.sub(r"^ *```.*?^ *```", "", markdown, flags=re.S | re.M)
+    text = re.sub(r"<!--.*?-->", "", text, flags=re.S)
+    text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)
+    lines = [
+        ""
+        if re.match(r"\s*(#|\||>|:|\+--|=+$)", line)
+        else re.sub(r"^\s*([-*]|\d+\.) ", "\n", line)
+        for line in text.splitlines()
+    ]
+    return "\n".join(lines)
+
+
+def sentences(text: str) -> Iterator[str]:
+    """Sentences; a paragraph or list item ends one. Code in backticks counts as one word."""
+    plain = re.sub(r"`[^`]*`", "code", text).replace("**", "")
+    for paragraph in re.split(r"\n\s*\n", plain):
+        for sentence in re.split(r"(?<=[.!?:;])\s+", " ".join(paragraph.split())):
+            if WORDS.search(sentence):
+                yield sentence
+
+
+@cache
+def syllables(word: str) -> int:
+    """Syllables of an English word, by where it may be divided."""
+    return str(pyphen.Pyphen(lang="en_US").inserted(word.lower())).count("-") + 1
+
+
+def reading_ease(text: str) -> float:
+    """Flesch's reading ease."""
+    counted = [WORDS.findall(sentence) for sentence in sentences(text)]
+    words = [word for some in counted for word in some]
+    each = sum(syllables(word) for word in words) / len(words)
+    return 206.835 - 1.015 * len(words) / len(counted) - 84.6 * each
+
+
+def helps() -> Iterator[tuple[str, str]]:
+    """Name and help text of every command, and of its options."""
+
+    def below(command: Any, name: str) -> Iterator[tuple[str, str]]:
+        options = [str(getattr(option, "help", "") or "") for option in command.params]
+        yield name, " ".join([command.help or "", *options])
+        for child, subcommand in getattr(command, "commands", {}).items():
+            yield from below(subcommand, f"{name} {child}")
+
+    yield from below(typer.main.get_command(app), "twin")
+
+
+def messages() -> Iterator[str]:
+    """Texts of page, alarms and advice, as their catalogue has them."""
+    with (ROOT / "twin" / "locale" / "de.po").open("rb") as file:
+        for message in read_po(file):
+            yield str(message.id)
+
+
+def banned(text: str) -> list[str]:
+    """What a text says that nobody understands at once, with what to write."""
+    plain = " ".join(text.split())
+    return [
+        f"{found[0]!r}: {instead}"
+        for phrase, instead in BANNED.items()
+        for found in [re.search(phrase, plain, flags=re.I)]
+        if found
+    ]
+
+
+@pytest.mark.parametrize("page", pages(), ids=lambda page: str(page.relative_to(ROOT)))
+def test_a_page_reads_easily(page: Path) -> None:
+    text = prose(page.read_text(encoding="utf-8"))
+    assert not banned(text)
+    longest = max(sentences(text), key=lambda sentence: len(WORDS.findall(sentence)))
+    assert len(WORDS.findall(longest)) <= LONGEST, longest
+    if len(WORDS.findall(text)) >= FEWEST:
+        assert reading_ease(text) >= EASIEST
+
+
+@pytest.mark.parametrize(("name", "text"), list(helps()), ids=lambda text: text[:30])
+def test_a_help_text_has_no_riddle(name: str, text: str) -> None:
+    assert not banned(text), name
+
+
+def test_no_message_is_a_riddle() -> None:
+    assert not [found for message in messages() for found in banned(message)]
+
+
+def test_the_check_finds_what_it_is_for() -> None:
+    assert banned("Where it\nhas it from is told.") == ["'has it from': name its source"]
+    easy, hard = "The tank leaks. Close the valve. ", "Instrumentation heterogeneity necessitates. "
+    assert reading_ease(50 * easy) > 90.0
+    assert reading_ease(50 * hard) < 0.0
+    assert list(sentences("One is here. `a.b.c` is two:\n\n- three")) == [
+        "One is here.",
+        "code is two:",
+        "- three",
+    ]
