@@ -58,7 +58,7 @@ class Report:
         return "\n".join([*lines, *(f"unreadable: {damage}" for damage in self.damage)])
 
     def _missing(self) -> str:
-        """How many rows are missing: over a restart the PLC counts anew, so nobody knows."""
+        """How many rows are missing; unknown over a restart, since the PLC counts anew."""
         if not self.restarts:
             return f"{self.missing} rows missing"
         if self.restarts == self.gaps:
@@ -71,8 +71,8 @@ class Report:
     def _unseen(self) -> str:
         """How long the gaps are, and how many of them are restarts."""
         seconds = f", {self.unseen_s:.1f} s not seen" if self.gaps else ""
-        what = "a restart" if self.restarts == 1 else "restarts"
-        return seconds + (f", {self.restarts} of them {what} of the PLC" if self.restarts else "")
+        noun = "a restart" if self.restarts == 1 else "restarts"
+        return seconds + (f", {self.restarts} of them {noun} of the PLC" if self.restarts else "")
 
     def _state(self) -> str:
         if any(not damage.torn for damage in self.damage):
@@ -81,8 +81,8 @@ class Report:
         return end if self.checked else f"{end}; its head is unchecked: it has no checksum"
 
 
-class _Tally:
-    """Adds up the rows of a stream, however it is cut."""
+class _StreamStatistics:
+    """Counts the rows of a stream. How the stream is cut into blocks does not matter."""
 
     def __init__(self) -> None:
         self.samples = self.events = self.gaps = self.missing = 0
@@ -95,11 +95,11 @@ class _Tally:
         rows = np.concatenate((self._last, samples))
         self._last = rows[-1:]
         skipped = np.diff(rows["sequence"]) - 1
-        anew = ((rows["quality"][1:] & Quality.RESTART) != 0) | (skipped < 0)
-        gaps = (skipped > 0) | anew
+        restarts = ((rows["quality"][1:] & Quality.RESTART) != 0) | (skipped < 0)
+        gaps = (skipped > 0) | restarts
         self.gaps += int(gaps.sum())
-        self.restarts += int(anew.sum())
-        self.missing += int(skipped[gaps & ~anew].sum())
+        self.restarts += int(restarts.sum())
+        self.missing += int(skipped[gaps & ~restarts].sum())
         self.unseen_s += float(unseen_ns(rows[:-1][gaps], rows[1:][gaps]).sum() * NS)
         steps = np.diff(rows["time_ns"])
         self.time_back += int((steps <= 0).sum())
@@ -108,50 +108,50 @@ class _Tally:
 
 
 def check(path: Path) -> Report:
-    """Read all of a log and say what is in it; SourceError if it is none."""
-    return _go_through(open_log(path), lambda *_: None)
+    """Read a whole log and report what it holds; SourceError if the file is no log."""
+    return _scan(open_log(path), lambda *_: None)
 
 
 def recover(path: Path, out: Path) -> Report:
-    """Write what can be read of a log to a complete new one; the report is of the old one.
+    """Copy the readable part of a log to a complete new log; the report is about the old one.
 
-    SourceError if it is no log, or if ``out`` exists or cannot be written.
+    SourceError if the file is no log, or if ``out`` exists or cannot be written.
     """
     log = open_log(path)
     origin = log.header.metadata | {RECOVERED: path.name}
     with Recorder(out, replace(log.header, metadata=origin)) as recorder:
-        return _go_through(log, recorder.write)
+        return _scan(log, recorder.write)
 
 
-def _go_through(log: Log, take: Callable[[Samples, Ticks, Sequence[Event]], None]) -> Report:
+def _scan(log: Log, write: Callable[[Samples, Ticks, Sequence[Event]], None]) -> Report:
     damage: list[Damage] = []
-    tally = _Tally()
+    statistics = _StreamStatistics()
     for samples, ticks, events in _pieces(log, damage):
-        tally.add(samples)
-        tally.events += len(events)
-        take(samples, ticks, events)
+        statistics.add(samples)
+        statistics.events += len(events)
+        write(samples, ticks, events)
     size = sum(part.stat().st_size for part in log.parts)
     return Report(
         path=log.path,
         parts=len(log.parts),
         complete=log.complete,
         damage=tuple(damage),
-        samples=tally.samples,
-        events=tally.events,
-        duration_s=tally.duration_s,
-        gaps=tally.gaps,
-        missing=tally.missing,
-        unseen_s=tally.unseen_s,
-        restarts=tally.restarts,
-        time_back=tally.time_back,
-        bytes_per_sample=size / max(tally.samples, 1),
+        samples=statistics.samples,
+        events=statistics.events,
+        duration_s=statistics.duration_s,
+        gaps=statistics.gaps,
+        missing=statistics.missing,
+        unseen_s=statistics.unseen_s,
+        restarts=statistics.restarts,
+        time_back=statistics.time_back,
+        bytes_per_sample=size / max(statistics.samples, 1),
         checked=log.checked,
         derived=log.header.derived,
     )
 
 
 def _pieces(log: Log, damage: list[Damage]) -> Iterator[Piece]:
-    """Each message of rows with the events after it: those that happened in it."""
+    """Each message of rows with the events written after it, which happened during these rows."""
     samples, ticks = RowBuffer(0).take()
     events: list[Event] = []
     for part in log.parts:

@@ -1,8 +1,9 @@
 """Rows to packed columns and back, lossless to the bit.
 
-Neighbouring rows are alike: as differences of the bits (floats too: those of like numbers are
-near), laid out byte plane by byte plane, most bytes are zero or repeat, and the chunk's
-compression takes them away. The coding is written down in twin.log.schema.
+Neighbouring rows differ little, so the coding stores the differences of their bits. Floats of
+similar size have similar bits too. The differences are laid out byte plane by byte plane. Most of
+these bytes are zero or repeat, and the chunk's compression removes them. twin.log.schema specifies
+the coding.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,92 +16,92 @@ from twin.log.schema import ADDED, COLUMNS, SAMPLES
 from twin.model.compiled import compiled, per_row
 from twin.signals import EXTRA, SAMPLE, TICK, Samples, Ticks
 
-_Places = npt.NDArray[np.int64]
+_Layout = npt.NDArray[np.int64]
 
-_FIRST = 8  # bytes of the first row's bits
-_MOST = 8  # byte planes
-_TILE = 512  # rows that are unpacked at a time: with all their columns they stay in the cache
+_FIRST_ROW_BYTES = 8  # bytes of the first row's bits
+_MAX_PLANES = 8  # byte planes
+_TILE = 512  # rows unpacked at a time: with all their columns they fit into the cache
 _ONE = np.uint64(1)
 _FIELDS = SAMPLES.message.DESCRIPTOR.fields_by_name
 _NUMBERS = np.array([_FIELDS[name].number for name in COLUMNS])
-_HIGHEST = int(_NUMBERS.max())
-_ADDED = np.array([name in ADDED for name in COLUMNS])
-_VARINT, _BYTES = 0, 2  # how protobuf says what comes
+_MAX_NUMBER = int(_NUMBERS.max())
+_IS_OPTIONAL = np.array([name in ADDED for name in COLUMNS])
+_VARINT, _BYTES = 0, 2  # protobuf's wire types
 
 
-def _places(rows: np.dtype[np.void]) -> _Places:
-    """Offset and width of each field; in bytes."""
+def _layout(rows: np.dtype[np.void]) -> _Layout:
+    """Offset and width of each field, in bytes."""
     fields = (rows.fields or {}).values()
     return np.array([(offset, field.itemsize) for field, offset, *_ in fields])
 
 
-_SAMPLE_PLACES, _TICK_PLACES = _places(SAMPLE), _places(TICK)
-_EXTRA_FROM = int(_SAMPLE_PLACES[-len(EXTRA), 0])  # they stand last in a row
+_SAMPLE_LAYOUT, _TICK_LAYOUT = _layout(SAMPLE), _layout(TICK)
+_EXTRA_FROM = int(_SAMPLE_LAYOUT[-len(EXTRA), 0])  # these fields come last in a row
 
 
 def encode(samples: Samples, ticks: Ticks) -> bytes:
     """Pack n > 0 row-aligned rows into a serialised ``ejector_twin.Samples``."""
     message = SAMPLES.message(count=len(samples))
-    space = np.empty(_FIRST + _MOST * len(samples), np.uint8)
+    buffer = np.empty(_FIRST_ROW_BYTES + _MAX_PLANES * len(samples), np.uint8)
     columns = iter(COLUMNS)
-    for rows, places in ((samples, _SAMPLE_PLACES), (ticks, _TICK_PLACES)):
+    for rows, layout in ((samples, _SAMPLE_LAYOUT), (ticks, _TICK_LAYOUT)):
         raw = np.ascontiguousarray(rows).view(np.uint8)
-        raw.flags.writeable = False  # as rows of a file are: one type to compile for
-        blank = rows is samples and _ends_in_zeros(raw, rows.itemsize, _EXTRA_FROM)
-        for offset, width in places.tolist():
+        raw.flags.writeable = False  # like rows of a file, so that numba compiles for one type
+        extra_is_zero = rows is samples and _ends_in_zeros(raw, rows.itemsize, _EXTRA_FROM)
+        for offset, width in layout.tolist():
             name = next(columns)
-            if name in EXTRA and (blank or _is_zero(raw, rows.itemsize, offset, width)):
+            if name in EXTRA and (extra_is_zero or _is_zero(raw, rows.itemsize, offset, width)):
                 continue
-            used = _pack(raw, rows.itemsize, offset, width, space)
-            setattr(message, name, space[:used].tobytes())
+            length = _pack(raw, rows.itemsize, offset, width, buffer)
+            setattr(message, name, buffer[:length].tobytes())
     packed: bytes = message.SerializeToString()
     return packed
 
 
 def decode(packed: bytes | memoryview) -> tuple[Samples, Ticks]:
-    """Reverse ``encode``; ValueError if it is something else.
+    """Reverse ``encode``; ValueError if the bytes are no such message.
 
-    Protobuf's own classes would copy each column twice.
+    Protobuf's own classes would copy each column twice, so they are not used.
     """
     raw = np.frombuffer(packed, np.uint8)
-    spans = np.zeros((_HIGHEST + 1, 2), np.int64)
-    count = _find(raw, spans)
+    spans = np.zeros((_MAX_NUMBER + 1, 2), np.int64)
+    count = _parse_fields(raw, spans)
     if count < 1:
         raise ValueError("it is no message of rows")
     require_within_budget(count * (SAMPLE.itemsize + TICK.itemsize), f"a message of {count} rows")
     spans = spans[_NUMBERS]
-    if (wrong := _misfit(spans, count, _ADDED)) >= 0:
-        raise ValueError(f"{COLUMNS[wrong]} is not packed for {count} rows")
+    if (invalid := _first_invalid_column(spans, count, _IS_OPTIONAL)) >= 0:
+        raise ValueError(f"{COLUMNS[invalid]} is not packed for {count} rows")
     samples, ticks = np.zeros(count, SAMPLE), np.zeros(count, TICK)
-    of_samples, of_ticks = spans[: len(_SAMPLE_PLACES)], spans[len(_SAMPLE_PLACES) :]
-    _unpack(raw, of_samples, _SAMPLE_PLACES, count, samples.view(np.uint8))
-    _unpack(raw, of_ticks, _TICK_PLACES, count, ticks.view(np.uint8))
+    sample_spans, tick_spans = spans[: len(_SAMPLE_LAYOUT)], spans[len(_SAMPLE_LAYOUT) :]
+    _unpack(raw, sample_spans, _SAMPLE_LAYOUT, count, samples.view(np.uint8))
+    _unpack(raw, tick_spans, _TICK_LAYOUT, count, ticks.view(np.uint8))
     return samples, ticks
 
 
-# Compiled. Places in a row are counted in unsigned integers: then what is done byte by byte below
-# becomes one instruction for the whole field.
+# Compiled. Positions are unsigned integers: then the compiler turns the loops over bytes into one
+# instruction for the whole field.
 
 
 @per_row
-def _read(raw, at, width):  # type: ignore[no-untyped-def]
-    """Little-endian bytes, not extended."""
+def _read(raw, position, width):  # type: ignore[no-untyped-def]
+    """Bits of ``width`` little-endian bytes, without sign extension."""
     bits = np.uint64(0)
     for j in range(width):
-        bits |= np.uint64(raw[at + np.uint64(j)]) << np.uint64(8 * j)
+        bits |= np.uint64(raw[position + np.uint64(j)]) << np.uint64(8 * j)
     return bits
 
 
 @compiled
 def _ends_in_zeros(rows, size, offset):  # type: ignore[no-untyped-def]
-    """Whether all fields from ``offset`` on are zero in all rows, to the bit: quick to see."""
+    """Whether all fields from ``offset`` on are zero in all rows, to the bit. It is a fast test."""
     any_bits = np.uint64(0)
     words = (size - offset) // 8
     for begin in range(0, len(rows), size):
         for word in range(words):
             any_bits |= _read(rows, np.uint64(begin + offset + 8 * word), 8)
-        for at in range(begin + offset + 8 * words, begin + size):
-            any_bits |= np.uint64(rows[at])
+        for position in range(begin + offset + 8 * words, begin + size):
+            any_bits |= np.uint64(rows[position])
     return any_bits == 0
 
 
@@ -108,105 +109,108 @@ def _ends_in_zeros(rows, size, offset):  # type: ignore[no-untyped-def]
 def _is_zero(rows, size, offset, width):  # type: ignore[no-untyped-def]
     """Whether a field is zero in all rows, to the bit."""
     any_bits = np.uint64(0)
-    for at in range(offset, len(rows), size):
-        any_bits |= _read(rows, np.uint64(at), width)
+    for position in range(offset, len(rows), size):
+        any_bits |= _read(rows, np.uint64(position), width)
     return any_bits == 0
 
 
 @compiled
 def _pack(rows, size, offset, width, packed):  # type: ignore[no-untyped-def]
-    """Pack one field of all rows into the first bytes of ``packed``; gives how many."""
+    """Pack one field of all rows into the first bytes of ``packed``; returns their number."""
     n = len(rows) // size
     zigzag = np.empty(n, np.uint64)
-    at = np.uint64(offset)
-    before = any_bits = np.uint64(0)
+    position = np.uint64(offset)
+    previous = any_bits = np.uint64(0)
     for i in range(n):
         if width == 8:
-            bits = _read(rows, at, 8)
+            bits = _read(rows, position, 8)
         elif width == 4:
-            bits = np.uint64(np.int32(_read(rows, at, 4)))
+            bits = np.uint64(np.int32(_read(rows, position, 4)))
         else:
-            bits = np.uint64(np.int8(rows[at]))
-        at += np.uint64(size)
+            bits = np.uint64(np.int8(rows[position]))
+        position += np.uint64(size)
         if i == 0:
-            before = bits
-            for j in range(_FIRST):
+            previous = bits
+            for j in range(_FIRST_ROW_BYTES):
                 packed[j] = bits >> np.uint64(8 * j)
-        step = bits - before  # wraps, and wraps back
+        step = bits - previous  # wraps, and wraps back
         zigzag[i] = (step << _ONE) ^ (np.uint64(0) - (step >> np.uint64(63)))
         any_bits |= zigzag[i]
-        before = bits
-    kept = 0
-    while kept < _MOST and any_bits >> np.uint64(8 * kept):
-        plane = packed[_FIRST + kept * n :]
+        previous = bits
+    planes = 0
+    while planes < _MAX_PLANES and any_bits >> np.uint64(8 * planes):
+        plane = packed[_FIRST_ROW_BYTES + planes * n :]
         for i in range(n):
-            plane[i] = zigzag[i] >> np.uint64(8 * kept)
-        kept += 1
-    return _FIRST + kept * n
+            plane[i] = zigzag[i] >> np.uint64(8 * planes)
+        planes += 1
+    return _FIRST_ROW_BYTES + planes * n
 
 
 @per_row
-def _varint(packed, at):  # type: ignore[no-untyped-def]
-    """A number of protobuf and where it ends: past the end where it is broken off."""
+def _varint(packed, position):  # type: ignore[no-untyped-def]
+    """A varint of protobuf and the position after it; past the end if the varint is cut off."""
     number = np.int64(0)
     for j in range(10):
-        if at >= len(packed):
+        if position >= len(packed):
             break
-        byte = np.int64(packed[at])
-        at += 1
+        byte = np.int64(packed[position])
+        position += 1
         number |= (byte & 0x7F) << (7 * j)
         if byte < 0x80:
-            return number, at
+            return number, position
     return number, len(packed) + 1
 
 
 @compiled
-def _find(packed, spans):  # type: ignore[no-untyped-def]
-    """Begin and end of each field by its number; gives the count, or -1 if it is no ``Samples``."""
-    count = at = 0
-    while at < len(packed):
-        tag, at = _varint(packed, at)
-        number, at = _varint(packed, at)
+def _parse_fields(packed, spans):  # type: ignore[no-untyped-def]
+    """Fill ``spans`` with begin and end of each field by its number.
+
+    Returns the count of rows, or -1 if the message is no ``Samples``.
+    """
+    count = position = 0
+    while position < len(packed):
+        tag, position = _varint(packed, position)
+        number, position = _varint(packed, position)
         if tag & 7 == _VARINT:
             count = number if tag >> 3 == 1 else count
-        elif tag & 7 == _BYTES and 0 <= number <= len(packed) - at:
+        elif tag & 7 == _BYTES and 0 <= number <= len(packed) - position:
             if 0 <= tag >> 3 < len(spans):
-                spans[tag >> 3] = at, at + number
-            at += number
+                spans[tag >> 3] = position, position + number
+            position += number
         else:
             return -1
-    return count if at == len(packed) else -1
+    return count if position == len(packed) else -1
 
 
 @compiled
-def _misfit(spans, count, added):  # type: ignore[no-untyped-def]
-    """The first column whose length is not that of whole planes, -1 if there is none."""
+def _first_invalid_column(spans, count, is_optional):  # type: ignore[no-untyped-def]
+    """The first column whose length does not fit whole planes; -1 if all columns fit."""
     for column in range(len(spans)):
         length = spans[column, 1] - spans[column, 0]
-        planes = length - _FIRST
-        fits = 0 <= planes <= _MOST * count and planes % count == 0
-        if not fits and not (added[column] and length == 0):
+        planes = length - _FIRST_ROW_BYTES
+        fits = 0 <= planes <= _MAX_PLANES * count and planes % count == 0
+        if not fits and not (is_optional[column] and length == 0):
             return column
     return -1
 
 
 @compiled
-def _steps(packed, at, n, kept, steps):  # type: ignore[no-untyped-def]
-    """Differences of some rows; ``at`` is where the first one stands in planes of ``n`` bytes.
+def _decode_steps(packed, position, n, planes, steps):  # type: ignore[no-untyped-def]
+    """Differences of some rows, the first at ``position`` in planes of ``n`` bytes.
 
-    For one to four planes, that is nearly always: several rows in one instruction.
+    Works for one to four planes, which is nearly always. One instruction decodes several rows.
     """
     m = len(steps)
-    a = packed[at : at + m]
-    if kept == 1:
+    a = packed[position : position + m]
+    if planes == 1:
         for i in range(m):
             z = np.uint32(a[i])
             steps[i] = np.int32((z >> np.uint32(1)) ^ (np.uint32(0) - (z & np.uint32(1))))
         return
-    none = np.zeros(m, np.uint8)
-    b = packed[at + n : at + n + m] if kept > 1 else none
-    c = packed[at + 2 * n : at + 2 * n + m] if kept > 2 else none
-    d = packed[at + 3 * n : at + 3 * n + m] if kept > 3 else none
+    zeros = np.zeros(m, np.uint8)
+    b = packed[position + n : position + n + m] if planes > 1 else zeros
+    c = packed[position + 2 * n : position + 2 * n + m] if planes > 2 else zeros
+    d = packed[position + 3 * n : position + 3 * n + m] if planes > 3 else zeros
     for i in range(m):
         low = np.uint32(a[i]) | np.uint32(b[i]) << np.uint32(8)
         high = np.uint32(c[i]) | np.uint32(d[i]) << np.uint32(8)
@@ -215,87 +219,96 @@ def _steps(packed, at, n, kept, steps):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _long_steps(packed, at, n, kept, steps):  # type: ignore[no-untyped-def]
-    """As ``_steps``, for any number of planes."""
+def _decode_wide_steps(packed, position, n, planes, steps):  # type: ignore[no-untyped-def]
+    """As ``_decode_steps``, for any number of planes."""
     for i in range(len(steps)):
         z = np.uint64(0)
-        for j in range(kept):
-            z |= np.uint64(packed[at + j * n + i]) << np.uint64(8 * j)
+        for j in range(planes):
+            z |= np.uint64(packed[position + j * n + i]) << np.uint64(8 * j)
         steps[i] = np.int64((z >> _ONE) ^ (np.uint64(0) - (z & _ONE)))
 
 
 @per_row
-def _write(bits, rows, at, width):  # type: ignore[no-untyped-def]
+def _write(bits, rows, position, width):  # type: ignore[no-untyped-def]
     for j in range(width):
-        rows[at + np.uint64(j)] = np.uint8(bits >> np.uint64(8 * j))
+        rows[position + np.uint64(j)] = np.uint8(bits >> np.uint64(8 * j))
 
 
 @compiled
-def _sum(bits, steps, rows, size, at, width):  # type: ignore[no-untyped-def]
-    """Write a field of some rows from its bits before them, the first at ``at``; gives the last."""
-    at = np.uint64(at)
+def _write_column(bits, steps, rows, size, position, width):  # type: ignore[no-untyped-def]
+    """Write one field of some rows, the first at ``position``, by adding up its differences.
+
+    ``bits`` are those of the row before; returns those of the last row.
+    """
+    position = np.uint64(position)
     if width == 8:
         for step in steps:
             bits += np.uint64(step)
-            _write(bits, rows, at, 8)
-            at += np.uint64(size)
+            _write(bits, rows, position, 8)
+            position += np.uint64(size)
     elif width == 4:
         for step in steps:
             bits += np.uint64(step)
-            _write(bits, rows, at, 4)
-            at += np.uint64(size)
+            _write(bits, rows, position, 4)
+            position += np.uint64(size)
     else:
         for step in steps:
             bits += np.uint64(step)
-            rows[at] = np.uint8(bits)
-            at += np.uint64(size)
+            rows[position] = np.uint8(bits)
+            position += np.uint64(size)
     return bits
 
 
 @compiled
-def _unpack(packed, spans, places, n, rows):  # type: ignore[no-untyped-def]
-    """Fill ``n`` rows, each field from its packed column; one that is not there stays zero."""
+def _unpack(packed, spans, layout, n, rows):  # type: ignore[no-untyped-def]
+    """Fill ``n`` rows, each field from its packed column; a missing field stays zero."""
     size = len(rows) // n
-    bits = np.zeros(len(places), np.uint64)
-    for column in range(len(places)):
+    bits = np.zeros(len(layout), np.uint64)
+    for column in range(len(layout)):
         if spans[column, 1] > spans[column, 0]:
             bits[column] = _read(packed, np.uint64(spans[column, 0]), 8)
-    short, long = np.empty(_TILE, np.int32), np.empty(_TILE, np.int64)
+    narrow_steps, wide_steps = np.empty(_TILE, np.int32), np.empty(_TILE, np.int64)
     for row in range(0, n, _TILE):
-        m = min(_TILE, n - row)
-        for column in range(len(places)):
+        count = min(_TILE, n - row)
+        for column in range(len(layout)):
             start, end = spans[column]
             if end == start:
                 continue
-            offset, width = places[column]
-            kept = max(end - start - _FIRST, 0) // n
-            first, at = start + _FIRST + row, row * size + offset
-            if kept > 4:
-                _long_steps(packed, first, n, kept, long[:m])
-                bits[column] = _sum(bits[column], long[:m], rows, size, at, width)
+            offset, width = layout[column]
+            planes = max(end - start - _FIRST_ROW_BYTES, 0) // n
+            source, position = start + _FIRST_ROW_BYTES + row, row * size + offset
+            if planes > 4:
+                _decode_wide_steps(packed, source, n, planes, wide_steps[:count])
+                bits[column] = _write_column(
+                    bits[column], wide_steps[:count], rows, size, position, width
+                )
                 continue
-            if kept > 0:
-                _steps(packed, first, n, kept, short[:m])
+            if planes > 0:
+                _decode_steps(packed, source, n, planes, narrow_steps[:count])
             else:
-                for i in range(m):  # numba compiles seconds' worth of what a slice may not fit
-                    short[i] = 0
-            bits[column] = _sum(bits[column], short[:m], rows, size, at, width)
+                for i in range(
+                    count
+                ):  # a slice would cost seconds: numba compiles its length check
+                    narrow_steps[i] = 0
+            bits[column] = _write_column(
+                bits[column], narrow_steps[:count], rows, size, position, width
+            )
 
 
 def joined(blocks: Sequence[tuple[Samples, Ticks]]) -> tuple[Samples, Ticks]:
-    """The rows of n > 0 blocks in one."""
+    """The rows of n > 0 blocks in one block."""
     if len(blocks) == 1:
         return blocks[0]
     # As raw bytes: NumPy copies structured rows field by field, 20 times slower.
-    rows, beside = (
-        np.concatenate([one.view((np.void, one.itemsize)) for one in column])
+    rows, tick_rows = (
+        np.concatenate([block.view((np.void, block.itemsize)) for block in column])
         for column in zip(*blocks, strict=True)
     )
-    return rows.view(SAMPLE), beside.view(TICK)
+    return rows.view(SAMPLE), tick_rows.view(TICK)
 
 
 class RowBuffer:
-    """Collects rows from blocks of any size into full blocks of ``size`` rows."""
+    """Collects rows of blocks of any size into full blocks of ``size`` rows."""
 
     def __init__(self, size: int) -> None:
         self._size = size
@@ -308,8 +321,8 @@ class RowBuffer:
         self._filled = 0
 
     def add(self, samples: Samples, ticks: Ticks) -> Iterator[tuple[Samples, Ticks]]:
-        """Take rows in; hand out each block as it fills up, what is one already as it is."""
-        rows, beside = samples.view(self._samples.dtype), ticks.view(self._ticks.dtype)
+        """Add rows and yield each full block; rows that are a full block already pass uncopied."""
+        rows, tick_rows = samples.view(self._samples.dtype), ticks.view(self._ticks.dtype)
         start = 0
         while start < len(rows):
             stop = min(start + self._size - self._filled, len(rows))
@@ -318,14 +331,14 @@ class RowBuffer:
             else:
                 end = self._filled + stop - start
                 self._samples[self._filled : end] = rows[start:stop]
-                self._ticks[self._filled : end] = beside[start:stop]
+                self._ticks[self._filled : end] = tick_rows[start:stop]
                 self._filled = end
             start = stop
             if self._filled == self._size:
                 yield self.take()
 
     def take(self) -> tuple[Samples, Ticks]:
-        """Hand out what is in it, maybe nothing; it is empty afterwards."""
+        """Return the collected rows, maybe none; the buffer is empty afterwards."""
         samples, ticks = self._samples[: self._filled], self._ticks[: self._filled]
         self._begin()
         return samples.view(SAMPLE), ticks.view(TICK)

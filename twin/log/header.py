@@ -1,4 +1,4 @@
-"""What a log says about itself, so that it replays alone."""
+"""The head of a log. It holds all that a replay needs."""
 
 import hashlib
 import json
@@ -9,8 +9,8 @@ from twin.errors import ConfigError
 FORMAT = "ejector-twin-log/2"
 UNCHECKED = "ejector-twin-log/1"  # the same without a checksum of the head
 CHECKSUM = "sha256"
-HIL, DERIVED = "hil", "derived_commands"  # what of the rows was not measured, in free metadata
-RECORDED, RECOVERED = "recorded_by", "recovered_from"  # where the rows come from, there too
+HIL, DERIVED = "hil", "derived_commands"  # free metadata: parts of the rows that nobody measured
+RECORDED, RECOVERED = "recorded_by", "recovered_from"  # free metadata: origin of the rows
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class LogHeader:
 
     @property
     def is_recorded(self) -> bool:
-        """Whether ``twin run`` wrote it beside a PLC; a copy that was recovered is no such log."""
+        """Whether ``twin run`` wrote it beside a PLC; a recovered copy does not count."""
         return RECORDED in self.metadata and RECOVERED not in self.metadata
 
     def require_commands(self, log: str) -> None:
-        """ConfigError where nobody recorded the commands: no twin can be fitted to such a log."""
+        """ConfigError if nobody recorded the commands: no twin can be fitted to such a log."""
         if self.derived:
             raise ConfigError(
                 f"{log}: {self.derived}. A twin needs to know when valves were told",
@@ -45,7 +45,7 @@ class LogHeader:
 
     @property
     def unmeasured(self) -> dict[str, str]:
-        """What of the rows was not measured, and goes with them into another log."""
+        """Metadata about unmeasured parts of the rows; copies of the rows keep it."""
         return {name: self.metadata[name] for name in (HIL, DERIVED) if name in self.metadata}
 
 
@@ -58,11 +58,11 @@ class Identity:
 
 
 def to_metadata(header: LogHeader, identity: Identity) -> dict[str, str]:
-    """All but the configuration's text and the free metadata, as MCAP stores it.
+    """The header as MCAP metadata, without the configuration's text and the free metadata.
 
-    The checksum is over all three: MCAP has none for metadata.
+    The checksum covers all three, since MCAP has no checksum for metadata.
     """
-    own = {
+    fields = {
         "format": FORMAT,
         "series": identity.series,
         "part": str(identity.part),
@@ -71,22 +71,22 @@ def to_metadata(header: LogHeader, identity: Identity) -> dict[str, str]:
         "config_name": header.config_name,
         "ambient_pa": repr(header.ambient),
     }
-    return own | {CHECKSUM: _checksum(own, header.config_text, header.metadata)}
+    return fields | {CHECKSUM: _checksum(fields, header.config_text, header.metadata)}
 
 
 def from_metadata(
     stored: dict[str, str], config_text: str, metadata: dict[str, str]
 ) -> tuple[LogHeader, Identity, bool]:
-    """Reverse ``to_metadata``; whether there was a checksum stands last.
+    """Reverse ``to_metadata``; the last element says whether there was a checksum.
 
-    KeyError or ValueError where it was not written by it, or is no longer as it was written.
+    KeyError or ValueError if ``to_metadata`` did not write it, or if it has changed since.
     """
     if stored["format"] not in (FORMAT, UNCHECKED):
         raise ValueError(f"its format is {stored['format']!r}, not {FORMAT!r}")
     is_checked = stored["format"] == FORMAT or CHECKSUM in stored
     if is_checked:
-        own = {key: value for key, value in stored.items() if key != CHECKSUM}
-        if stored[CHECKSUM] != _checksum(own, config_text, metadata):
+        fields = {key: value for key, value in stored.items() if key != CHECKSUM}
+        if stored[CHECKSUM] != _checksum(fields, config_text, metadata):
             raise ValueError("its checksum is wrong: not all in it is as it was written")
     header = LogHeader(
         asset_type=stored["asset_type"],
@@ -99,6 +99,6 @@ def from_metadata(
     return header, Identity(stored["series"], int(stored["part"])), is_checked
 
 
-def _checksum(own: dict[str, str], config_text: str, metadata: dict[str, str]) -> str:
-    head = json.dumps([own, metadata, config_text], sort_keys=True)
-    return hashlib.sha256(head.encode()).hexdigest()
+def _checksum(fields: dict[str, str], config_text: str, metadata: dict[str, str]) -> str:
+    content = json.dumps([fields, metadata, config_text], sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()

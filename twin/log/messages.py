@@ -1,4 +1,4 @@
-"""Rows and events as the small messages that other tools draw, and events back."""
+"""Rows and events as small messages that other tools can draw; and events decoded again."""
 
 import json
 from typing import Any
@@ -16,12 +16,12 @@ SCALAR_NS = 20_000_000  # 50 Hz
 _SECOND = 1_000_000_000  # ns
 _LEVEL = {Severity.INFO: 2, Severity.WARNING: 3, Severity.ALARM: 4}  # as foxglove.Log has them
 
-# Every field of a message of /scalars is written, zeros too, and in a fixed length: then messages
-# are rows of an array. By name: how protobuf says what comes, and as what it comes.
+# Every field of a message of /scalars is written in a fixed length, zeros too. So messages are rows
+# of an array. Maps a name to protobuf's wire type and the field's type in the array.
 _VARINT, _FIXED64, _BYTES = 0, 1, 2
-_SECONDS, _NANOS, _PHASE = 10, 5, 2  # bytes; before 1970 all of the seconds' are needed
+_SECONDS, _NANOS, _PHASE = 10, 5, 2  # bytes; times before 1970 need all bytes of the seconds
 _FORMS: dict[str, tuple[int, Any]] = {
-    "timestamp": (_BYTES, "u1"),  # its length; it consists of the two that follow
+    "timestamp": (_BYTES, "u1"),  # the length of the two fields that follow, which form it
     "seconds": (_VARINT, ("u1", _SECONDS)),
     "nanos": (_VARINT, ("u1", _NANOS)),
     "vacuum_mbar": (_FIXED64, "<f8"),
@@ -39,7 +39,7 @@ def _stamp(message: Any, time_ns: int) -> None:
 
 
 def _blank() -> npt.NDArray[np.void]:
-    """``ejector_twin.Scalars`` as protobuf lays it out, keys filled in, in one element."""
+    """One array element laid out as protobuf's ``ejector_twin.Scalars``, with keys filled in."""
     message = SCALARS.message.DESCRIPTOR.fields_by_name
     fields = {**message, **message["timestamp"].message_type.fields_by_name}
     pairs = [((f"{name} key", "u1"), (name, form)) for name, (_, form) in _FORMS.items()]
@@ -51,9 +51,9 @@ def _blank() -> npt.NDArray[np.void]:
 
 
 def _varint(numbers: npt.NDArray[np.integer], length: int) -> npt.NDArray[np.uint8]:
-    """Protobuf's numbers in ``length`` bytes each, as many as the longest needs: (n, length).
+    """Varints of ``length`` bytes each, shape (n, length); the longest number must fit.
 
-    Seven bits a byte, the lowest first; longer than need be is allowed.
+    Each byte holds seven bits, the lowest first. Protobuf allows longer varints than needed.
     """
     bits = numbers.astype(np.int64).view(np.uint64)[:, np.newaxis]
     digits = (bits >> (7 * np.arange(length, dtype=np.uint64)) & 0x7F).astype(np.uint8)
@@ -65,18 +65,18 @@ _BLANK = _blank()
 
 
 class Scalars:
-    """Picks rows from the stream and makes messages of them, however the stream is cut."""
+    """Picks rows of the stream and makes messages of them. How the stream is cut has no effect."""
 
     def __init__(self, ambient: float) -> None:
         self._ambient = ambient  # Pa
         self._before = [-1, -1, -1]  # time slot, commands and phase of the row before
 
     def pick(self, samples: Samples, ticks: Ticks) -> npt.NDArray[np.bool_]:
-        """True for one row in 20 ms, and where a command or the phase changes, of n > 0 rows."""
+        """A mask of n > 0 rows: one row in 20 ms, and each change of a command or the phase."""
         columns = samples["time_ns"] // SCALAR_NS, samples["commands"], ticks["phase"]
         picked = np.zeros(len(samples), np.bool_)
-        for column, before in zip(columns, self._before, strict=True):
-            picked[0] |= int(column[0]) != before
+        for column, previous in zip(columns, self._before, strict=True):
+            picked[0] |= int(column[0]) != previous
             picked[1:] |= column[1:] != column[:-1]
         self._before = [int(column[-1]) for column in columns]
         return picked
@@ -86,7 +86,7 @@ class Scalars:
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.void]]:
         """Receipt and PLC time in ns, and the message, of each row picked from n > 0 rows."""
         rows = np.flatnonzero(self.pick(samples, ticks))
-        # NumPy goes through rows field by field to index them, and to fill an array with one.
+        # ``take`` and ``repeat`` are fast; indexing and filling go through rows field by field.
         samples, ticks = samples.take(rows), ticks.take(rows)
         messages = np.repeat(_BLANK, len(rows))
         seconds, nanos = np.divmod(samples["time_ns"], _SECOND)
@@ -105,7 +105,7 @@ class Scalars:
 
 
 def encode_event(event: Event) -> bytes:
-    """Serialise as ``ejector_twin.Event``; what JSON cannot hold is said to be so, in its place."""
+    """Serialise as ``ejector_twin.Event``; a note replaces each value that JSON cannot hold."""
     message = EVENTS.message(
         kind=event.kind.value,
         severity=event.severity.value,
@@ -118,7 +118,7 @@ def encode_event(event: Event) -> bytes:
 
 
 def decode_event(packed: bytes | memoryview) -> Event:
-    """Reverse ``encode_event``; ValueError for a kind that is not known here."""
+    """Reverse ``encode_event``; ValueError for an unknown kind."""
     message = EVENTS.message.FromString(packed)
     time_ns = message.timestamp.seconds * _SECOND + message.timestamp.nanos
     return Event(time_ns, Kind(message.kind), message.text, json.loads(message.data_json))

@@ -8,35 +8,34 @@ from pathlib import Path
 
 
 class Output:
-    """A new file without a buffer; OSError where the disk is full or fails.
+    """A new unbuffered file; OSError if the disk is full or fails.
 
-    What is written survives the process, and what could not be written is not tried again at
-    close.
+    Written bytes survive the process. A failed write is not tried again at close.
     """
 
     def __init__(self, path: Path) -> None:
-        # The disk may take its time, hundreds of milliseconds on flash; the live loop has none.
+        # A sync may take hundreds of milliseconds on flash; the live loop must not wait for it.
         self._thread = ThreadPoolExecutor(1, "log-sync")
         self._syncing: Future[None] | None = None
-        self._raw = path.open("xb", buffering=0)  # last: what fails leaves no empty file
+        self._raw = path.open("xb", buffering=0)  # last: an earlier failure leaves no empty file
 
     def write(self, data: bytes) -> None:
-        """Write all of it."""
-        left = memoryview(data)
-        while left:
-            left = left[self._raw.write(left) :]
+        """Write all of ``data``."""
+        remaining = memoryview(data)
+        while remaining:
+            remaining = remaining[self._raw.write(remaining) :]
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Do nothing: there is no buffer."""
 
     def tell(self) -> int:
         """Bytes written."""
         return self._raw.tell()
 
     def sync(self) -> None:
-        """Start bringing everything to the disk, unless that is still under way.
+        """Start a sync to the disk, unless one is still under way.
 
-        OSError where that went wrong before, or somebody has deleted the file.
+        OSError if the last sync failed or somebody has deleted the file.
         """
         if os.fstat(self._raw.fileno()).st_nlink == 0:
             raise FileNotFoundError(errno.ENOENT, "somebody has deleted it")
@@ -47,7 +46,7 @@ class Output:
         self._syncing = self._thread.submit(os.fdatasync, self._raw.fileno())
 
     def finish(self) -> None:
-        """Bring everything to the disk, wait for it and close."""
+        """Sync everything to the disk, wait for it and close the file."""
         self._thread.shutdown()
         if self._syncing is not None:
             self._syncing.result()
@@ -55,7 +54,7 @@ class Output:
         self._raw.close()
 
     def abandon(self) -> None:
-        """Close as it stands, after an error that was told; another one adds nothing."""
+        """Close the file after a reported error; further errors are ignored."""
         self._thread.shutdown()
         with suppress(OSError):
             self._raw.close()

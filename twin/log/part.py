@@ -1,4 +1,4 @@
-"""The files of one log: their names, and what stands at the head of each."""
+"""The files of one log: their names, and the head of each."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from twin.log.writer import Writer
 OWN_METADATA = "ejector-twin"
 FREE_METADATA = "run"
 SUFFIX = ".mcap"
-CLOCK_METADATA = "clock"  # at the end: the PLC's clock against the one here
+CLOCK_METADATA = "clock"  # at the end of a file: the PLC's clock against the host's
 
 
 def part_path(path: Path, number: int) -> Path:
@@ -20,7 +20,7 @@ def part_path(path: Path, number: int) -> Path:
 
 
 def refuse_other_suffix(path: Path) -> None:
-    """ConfigError for a new log with a name that says it is something else."""
+    """ConfigError for a new log whose name has another suffix than a log's."""
     if path.suffix != SUFFIX:
         raise ConfigError(
             f"{path}: a log is an MCAP file, and its name ends in {SUFFIX}",
@@ -38,22 +38,22 @@ def place_of(path: Path) -> tuple[Path, int]:
 
 
 def first_parts(folder: Path) -> list[Path]:
-    """The logs of a folder by their first files, in the order of their names.
+    """The first file of each log in a folder, sorted by name.
 
-    What came before may have been deleted: a log begins with the first part that is there.
+    Earlier parts may have been deleted: a log begins with its first existing part.
     """
     files = sorted(folder.glob(f"*{SUFFIX}"))
     return [path for path in files if not follows(path)]
 
 
 def follows(path: Path) -> bool:
-    """Whether it is a later part of a log of which the part before is there."""
+    """Whether the file is a later part of a log and the part before it exists."""
     first, number = place_of(path)
     return number > 0 and part_path(first, number - 1).exists()
 
 
 def write_head(output: Output, header: LogHeader, identity: Identity) -> Writer:
-    """Begin a file that says all about itself before its first chunk."""
+    """Begin a file with its whole head before the first chunk."""
     writer = Writer(output, LIBRARY)
     writer.add_metadata(OWN_METADATA, to_metadata(header, identity))
     writer.add_metadata(FREE_METADATA, header.metadata)

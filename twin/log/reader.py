@@ -1,4 +1,4 @@
-"""A log from disk: its header, and its rows as the blocks they were."""
+"""Reads a log from disk: its header, its rows in blocks, and its events."""
 
 import struct
 from collections.abc import Iterator
@@ -26,8 +26,8 @@ _UNDECODABLE = (ValueError, struct.error, DecodeError, RecursionError)  # the la
 class Log:
     """A log with all its parts; each iteration reads the files anew, a chunk at a time.
 
-    Iterating raises SourceError where a file is damaged. What a killed writer left unfinished at
-    the end is no damage: it ends there, and ``complete`` is False.
+    Iterating raises SourceError where a file is damaged. An unfinished end that a killed writer
+    left is no damage: iteration ends there, and ``complete`` is False.
     """
 
     path: Path
@@ -37,17 +37,17 @@ class Log:
     checked: bool = True  # every head by its checksum; logs of older programs have none
 
     def blocks(self, size: int = 10_000) -> Iterator[tuple[Samples, Ticks]]:
-        """Rows of SAMPLE and TICK in written order, ``size`` at a time and the rest at the end."""
-        tray = RowBuffer(size)
+        """Rows of SAMPLE and TICK in written order, in blocks of ``size``; the last is shorter."""
+        buffer = RowBuffer(size)
         for part in self.parts:
             for _, packed in messages(part, (SAMPLES.topic,), _refuse):
-                yield from tray.add(*decode_rows(part, packed))
-        samples, ticks = tray.take()
+                yield from buffer.add(*decode_rows(part, packed))
+        samples, ticks = buffer.take()
         if len(samples):
             yield samples, ticks
 
     def events(self) -> Iterator[Event]:
-        """What happened, in written order."""
+        """Events in written order."""
         for part in self.parts:
             for _, packed in messages(part, (EVENTS.topic,), _refuse):
                 yield decode_happening(part, packed)
@@ -81,9 +81,9 @@ def _other_version(part: Path, error: Exception) -> SourceError:
 
 
 def open_log(path: Path) -> Log:
-    """Open a log at its first part, or one part of it; SourceError if it is none.
+    """Open a log at its first part, or one part of it; SourceError if the file is no log.
 
-    Where parts before were deleted the first one that is left begins the log.
+    If earlier parts were deleted, the first existing part begins the log.
     """
     header, identity, checked = _head(path)
     parts = [path]
@@ -92,20 +92,20 @@ def open_log(path: Path) -> Log:
     alone = number != identity.part or (number > 0 and follows(path))
     while not alone and (following := part_path(first, number + len(parts))).exists():
         try:
-            _, other, is_checked = _head(following)
-        except SourceError:  # its writer was stopped before it could say anything
+            _, next_identity, next_checked = _head(following)
+        except SourceError:  # its writer was stopped before the head was complete
             complete = False
             break
-        if other != Identity(identity.series, number + len(parts)):
+        if next_identity != Identity(identity.series, number + len(parts)):
             break  # left from another log of that name
         parts.append(following)
         complete &= is_complete(following)
-        checked &= is_checked
+        checked &= next_checked
     return Log(path, header, tuple(parts), complete, checked)
 
 
 def read_header(path: Path) -> LogHeader:
-    """What one file says about itself; SourceError if it is no log."""
+    """The header of one file; SourceError if it is no log."""
     header, _, _ = _head(path)
     return header
 
@@ -131,7 +131,7 @@ def _check_magic(path: Path) -> None:
 
 
 def _read_head(path: Path) -> tuple[LogHeader, Identity, bool]:
-    """From the records before the first chunk; only other tools put them behind."""
+    """Read the head's records; this program writes them before the first chunk."""
     stored: dict[str, dict[str, str]] = {}
     config: bytes | None = None
     damage: list[Damage] = []
@@ -144,17 +144,17 @@ def _read_head(path: Path) -> tuple[LogHeader, Identity, bool]:
             try:
                 return from_metadata(stored[OWN_METADATA], config.decode(), stored[FREE_METADATA])
             except (ValueError, KeyError) as error:
-                raise _head_lost(path, f"damaged: {error}") from error
+                raise _head_error(path, f"damaged: {error}") from error
     if damage:
-        raise _head_lost(path, f"damaged: {damage[0].what}")
+        raise _head_error(path, f"damaged: {damage[0].what}")
     if OWN_METADATA in stored or not is_complete(path):
-        raise _head_lost(path, "missing")
+        raise _head_error(path, "missing")
     raise SourceError(
         f"{path}: an MCAP file of another program: it has no {SAMPLES.topic} of an ejector",
         "take a log of 'twin run', 'twin replay' or 'twin import'",
     )
 
 
-def _head_lost(path: Path, how: str) -> SourceError:
+def _head_error(path: Path, how: str) -> SourceError:
     hint = "there is no way to read it without; take another log or a copy"
     return SourceError(f"{path}: the head of the log is {how}", hint)

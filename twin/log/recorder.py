@@ -1,4 +1,4 @@
-"""The log as one more sink of the loop."""
+"""The log as a sink of the live loop."""
 
 import errno
 import os
@@ -22,10 +22,10 @@ from twin.log.part import CLOCK_METADATA, part_path, write_head
 from twin.log.schema import CHANNELS
 from twin.signals import SAMPLE, TICK, Samples, Ticks
 
-FLUSH_S = 0.25  # after this much a chunk is completed; a killed process loses no more than it
-SYNC_S = 1.0  # after this much the disk is asked to keep it
-BATCH = 10_000  # rows in a message where they come fast
-ROOM = 16 << 20  # bytes that a disk must have free for another part: some minutes of rows
+FLUSH_S = 0.25  # interval at which chunks are completed: a killed process loses at most this
+SYNC_S = 1.0  # interval of syncs to the disk
+BATCH = 10_000  # rows in a message where they arrive fast
+ROOM = 16 << 20  # free bytes that another part needs: a few minutes of rows
 
 _SAMPLES, _SCALARS, _EVENTS, _LOG = CHANNELS
 
@@ -33,12 +33,12 @@ Block: TypeAlias = tuple[Samples, Ticks]
 
 
 class Recorder:
-    """Writes a new log, in parts where ``rotate_bytes`` is given.
+    """Writes a new log, in parts if ``rotate_bytes`` is given.
 
     A part is closed once it is that long, so it may be longer by a chunk (1 MiB). Every method
-    raises SourceError where the file cannot be written; what was written until then can be read.
-    Rows that ``write`` was given are then held, and ``again`` goes on with them in another part.
-    After any other error of ``write`` its rows have not been taken.
+    raises SourceError if the file cannot be written; what was written before can be read. Rows
+    given to ``write`` are then held, and ``again`` writes them to another part. After any other
+    error ``write`` has not taken its rows.
     """
 
     def __init__(
@@ -54,24 +54,24 @@ class Recorder:
         self._clock = clock
         self._flushed = self._synced = clock()
         self._scalars = Scalars(header.ambient)
-        # Rows and events (with ns of receipt) come in here, are laid out as messages, and are
-        # forgotten once a whole chunk with them is in the file.
+        # Rows and events (with ns of receipt) arrive here and are laid out as messages. They are
+        # dropped once a whole chunk with them is in the file.
         self._blocks: list[Block] = []
         self._events: list[tuple[int, Event]] = []
         self._laid_blocks: list[Block] = []
         self._laid_events: list[tuple[int, Event]] = []
-        self._saved = 0, 0  # messages of rows and of events in this part, forgotten here
+        self._saved = 0, 0  # messages of rows and of events in this part, already dropped
         self._host_ns: int | None = None  # of the last row
-        self._clocks: dict[str, str] = {}  # as last told of
+        self._clocks: dict[str, str] = {}  # of the latest CLOCK event
         self._failure: SourceError | None = None
         self._closed = False
         self._series = uuid.uuid4().hex
         self._number = 0
-        encode(np.zeros(1, SAMPLE), np.zeros(1, TICK))  # compiled, not to fall into a block
+        encode(np.zeros(1, SAMPLE), np.zeros(1, TICK))  # compile now, not during a block
         self._begin(0)
 
     def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event] = ()) -> None:
-        """Take row-aligned SAMPLE and TICK rows, maybe none, and what happened with them."""
+        """Take row-aligned SAMPLE and TICK rows, maybe none, and the events that go with them."""
         if len(samples) != len(ticks):
             raise ValueError(f"{len(samples)} samples but {len(ticks)} ticks")
         if self._failure:
@@ -83,7 +83,7 @@ class Recorder:
             raise self._fail(error) from error
 
     def close(self) -> None:
-        """Write what is held back and the summary; further calls do nothing."""
+        """Write the held rows and events and the summary; further calls do nothing."""
         if self._closed or self._failure:
             return
         try:
@@ -104,9 +104,9 @@ class Recorder:
         return sum(len(rows) for rows, _ in [*self._laid_blocks, *self._blocks])
 
     def again(self) -> Self:
-        """After a failure go on in the next part, with what had not reached the file.
+        """After a failure, go on in the next part with all that had not reached the file.
 
-        SourceError where that cannot be written either; then it can be asked again.
+        SourceError if that part cannot be written either; the call can then be repeated.
         """
         if self._failure is None:
             return self
@@ -143,8 +143,8 @@ class Recorder:
         clocks = self._clocks
         for event in events:
             if event.kind is Kind.CLOCK:
-                at = {"time_ns": str(event.time_ns)}
-                clocks = at | {name: str(value) for name, value in event.data.items()}
+                entry = {"time_ns": str(event.time_ns)}
+                clocks = entry | {name: str(value) for name, value in event.data.items()}
         blocks = [(samples.copy(), ticks.copy())] if len(samples) else []
         self._blocks, self._events, self._host_ns, self._clocks = (
             self._blocks + blocks,
@@ -154,11 +154,11 @@ class Recorder:
         )
 
     def _write_on(self, idle: bool) -> None:
-        """Lay out what fills a message, and complete the chunk if it is time to."""
+        """Lay out full messages, and complete the chunk when it is due."""
         while sum(len(rows) for rows, _ in self._blocks) >= BATCH:
             self._lay_out_rows()
         now = self._clock()
-        # An empty block says that nothing comes just now: nothing to wait for.
+        # An empty block means that no rows are arriving: there is nothing to wait for.
         if now - self._flushed >= FLUSH_S or idle:
             self._flush(now)
 
@@ -172,7 +172,7 @@ class Recorder:
             self._synced = now
 
     def _lay_out(self) -> None:
-        """Lay out all there is."""
+        """Lay out all rows and events."""
         while self._blocks:
             self._lay_out_rows()
         events = self._events
@@ -196,7 +196,7 @@ class Recorder:
             self._begin(self._number + 1)
 
     def _forget_saved(self) -> None:
-        """Hold no longer what whole chunks in the file have."""
+        """Drop what whole chunks in the file contain."""
         rows, events = self._writer.saved(_SAMPLES), self._writer.saved(_EVENTS)
         rows_before, events_before = self._saved
         self._laid_blocks, self._laid_events, self._saved = (
@@ -206,11 +206,11 @@ class Recorder:
         )
 
     def _received(self, events: Sequence[Event], samples: Samples, last: int | None) -> list[int]:
-        """When the rows were received with which they happened: in a long block not the last."""
+        """Receipt time of each event's row, in ns; in a long block this is not the last row."""
         times = np.array([event.time_ns for event in events], np.int64)
         host = times if last is None else np.full(len(times), last)
         if len(samples):
-            # The PLC's clock may jump back: of the rows that are not later, the last one.
+            # The PLC's clock may jump back: take the last row that is not later than the event.
             earliest = np.minimum.accumulate(samples["time_ns"][::-1])[::-1]
             rows = np.searchsorted(earliest, times, "right") - 1
             host = np.where(rows >= 0, samples["host_ns"][rows], host)
@@ -236,7 +236,7 @@ class Recorder:
         self._output, self._writer, self._number, self._saved = output, writer, number, (0, 0)
 
     def _finish(self) -> None:
-        """Complete the part; what was laid out is in it."""
+        """Complete the part with all that was laid out."""
         if self._clocks:
             self._writer.add_metadata(CLOCK_METADATA, self._clocks)
         self._writer.finish()
@@ -244,7 +244,7 @@ class Recorder:
         self._forget_saved()
 
     def _fail(self, error: Exception) -> SourceError:
-        """Let go of the file, and hold what whole chunks in it do not have."""
+        """Close the file, and hold what its whole chunks do not contain."""
         self._output.abandon()
         self._forget_saved()
         self._blocks, self._laid_blocks = self._laid_blocks + self._blocks, []

@@ -1,7 +1,7 @@
-"""The records of an MCAP file from front to back, through what a crash leaves.
+"""The records of an MCAP file from front to back, also of a file that a crash has damaged.
 
-The library parses and unpacks them. Its StreamReader does not do to walk over them: it passes over
-whatever a wrong length takes along, does not say where it is and ends at the first broken record.
+The library parses and unpacks them. Its StreamReader cannot walk over them: it skips whatever a
+wrong length covers, does not tell its position, and ends at the first broken record.
 """
 
 import os
@@ -45,14 +45,14 @@ _CHUNK_MARK = re.compile(rb"\x06.{36}(\x04\x00\x00\x00zstd|\x03\x00\x00\x00lz4)"
 _CHUNK_MARK_LENGTH = 45  # at most
 _PIECE = 1 << 20
 _OPCODES = frozenset(Opcode)
-_KINDS: dict[int, type[Any]] = {
+_RECORD_TYPES: dict[int, type[Any]] = {
     Opcode.ATTACHMENT: Attachment,
     Opcode.CHUNK: Chunk,
     Opcode.HEADER: Header,
     Opcode.METADATA: Metadata,
     Opcode.STATISTICS: Statistics,
 }
-_BROKEN = (
+_DECODE_ERRORS = (
     zstandard.ZstdError,
     McapError,
     ValueError,
@@ -77,15 +77,15 @@ class Damage:
         return f"{self.path}: byte {self.position}: {self.what} ({self.length} bytes)"
 
 
-class _Space:
-    """Memory to unpack one chunk after another into: new memory costs as much as unpacking."""
+class _DecompressionBuffer:
+    """Memory reused for each unpacked chunk: allocating it anew costs as much as unpacking."""
 
     def __init__(self) -> None:
         self._memory = memoryview(b"")
         self._zstd = zstandard.ZstdDecompressor()
 
     def unpack(self, chunk: Chunk) -> memoryview:
-        """Contents of a chunk, until the next one; one of ``_BROKEN`` if it is damaged."""
+        """Contents of a chunk, valid until the next call; ``_DECODE_ERRORS`` if it is damaged."""
         require_within_budget(chunk.uncompressed_size, "unpacked it")
         if chunk.compression == "zstd":
             contents = self._unpack_zstd(chunk)
@@ -118,11 +118,11 @@ def _unpack_lz4(chunk: Chunk) -> memoryview:
     return contents
 
 
-Damaged = Callable[[Damage], None]  # told of each damage; may raise
+Damaged = Callable[[Damage], None]  # is called with each damage; may raise
 
 
 def is_complete(path: Path) -> bool:
-    """Whether the writer came to the end: there is a footer."""
+    """Whether the file ends with a footer, so that its writer has finished it."""
     footer = _HEAD.pack(Opcode.FOOTER, 20)
     with path.open("rb") as file:
         file.seek(0, os.SEEK_END)
@@ -132,24 +132,24 @@ def is_complete(path: Path) -> bool:
 
 
 def records(path: Path, damaged: Damaged) -> Iterator[McapRecord | memoryview]:
-    """Each of ``_KINDS`` in written order, one in memory; of a chunk, what is packed in it,
-    in memory that the next chunk takes.
+    """Each record of ``_RECORD_TYPES`` in written order, one in memory at a time.
 
-    Behind something broken it goes on at the next chunk: its length may be what is broken.
+    A chunk is yielded as its contents; the next chunk overwrites them. After a broken record,
+    reading goes on at the next chunk, because the record's length may be wrong.
     """
     complete = is_complete(path)
-    chunks = 0  # met, broken ones too
-    space = _Space()
+    chunks = 0  # so far, with broken ones
+    buffer = _DecompressionBuffer()
     with path.open("rb") as file:
         size = file.seek(0, os.SEEK_END)
         position = file.seek(len(MAGIC))
         while position < size - len(MAGIC) * complete:
             try:
-                record = _record(file, space)
+                record = _record(file, buffer)
                 chunks += isinstance(record, memoryview)
                 if isinstance(record, Statistics) and record.chunk_count > chunks:
                     raise ValueError(f"{record.chunk_count - chunks} chunks are missing")
-            except _BROKEN as error:
+            except _DECODE_ERRORS as error:
                 chunks += 1
                 end = file.seek(_next_chunk(file, position + 1) or size)
                 torn = end >= size and not complete
@@ -163,32 +163,34 @@ def records(path: Path, damaged: Damaged) -> Iterator[McapRecord | memoryview]:
 def _reason(error: Exception, torn: bool) -> str:
     if torn:
         return "the last record is unfinished"
-    return str(error) if type(error) is ValueError else "not a record"  # others talk of bytes
+    return (
+        str(error) if type(error) is ValueError else "not a record"
+    )  # the library's messages are technical
 
 
-def _record(file: BinaryIO, space: _Space) -> McapRecord | memoryview | None:
-    """The record that stands here, None if it is of no use; one of ``_BROKEN`` if it is none."""
+def _record(file: BinaryIO, buffer: _DecompressionBuffer) -> McapRecord | memoryview | None:
+    """The record at the file's position, None if it is not needed; else ``_DECODE_ERRORS``."""
     opcode, length = _HEAD.unpack(file.read(_HEAD.size))
     body = file.read(min(length, MEMORY_BUDGET))
     if opcode not in _OPCODES or len(body) < length:
         raise ValueError("not a record")
     if opcode == Opcode.MESSAGE_INDEX and length != _INDEX.size + _INDEX.unpack_from(body)[1]:
-        raise ValueError("not a record")  # of no use here, but its length may take chunks along
-    if opcode not in _KINDS:
+        raise ValueError("not a record")  # not needed, but its length may skip chunks
+    if opcode not in _RECORD_TYPES:
         return None
     stream = ReadDataStream(BytesIO(body))
-    record = _KINDS[opcode].read(stream)
+    record = _RECORD_TYPES[opcode].read(stream)
     if stream.count < length:
         raise ValueError("a record's lengths disagree")
     if isinstance(record, Attachment) and zlib.crc32(body[:-4]).to_bytes(4, "little") != body[-4:]:
         raise ValueError("the attachment's checksum is wrong")
-    return _contents(record, space) if isinstance(record, Chunk) else record
+    return _contents(record, buffer) if isinstance(record, Chunk) else record
 
 
-def _contents(chunk: Chunk, space: _Space) -> memoryview:
+def _contents(chunk: Chunk, buffer: _DecompressionBuffer) -> memoryview:
     try:
-        contents = space.unpack(chunk)
-    except _BROKEN as error:
+        contents = buffer.unpack(chunk)
+    except _DECODE_ERRORS as error:
         raise ValueError(f"a chunk is damaged: {error}") from error
     if not _is_whole(np.frombuffer(contents, np.uint8)):
         raise ValueError("a chunk is damaged: its records do not fill it")
@@ -209,9 +211,9 @@ def _next_chunk(file: BinaryIO, start: int) -> int | None:
 def messages(
     path: Path, topics: Collection[str], damaged: Damaged
 ) -> Iterator[tuple[str, memoryview]]:
-    """Topic and data of each message of ``topics``, in written order, one chunk in memory.
+    """Topic and data of each message of ``topics``, in written order, with one chunk in memory.
 
-    Data is there until the next message is asked for.
+    The data is valid until the next message is requested.
     """
     names: dict[int, str] = {}
     for record in records(path, damaged):
@@ -224,12 +226,12 @@ def messages(
 def _chunk_messages(
     contents: memoryview, names: dict[int, str], topics: Collection[str]
 ) -> Iterator[tuple[str, memoryview]]:
-    """Only records that are wanted come to Python: an hour has 200 000."""
+    """Topic and data of each wanted message; compiled code skips others: an hour has 200 000."""
     records = np.frombuffer(contents, np.uint8)
     wanted = _wanted(names, topics)
     end = 0
     while end < len(records):
-        opcode, number, start, end = _seek(records, end, wanted)
+        opcode, number, start, end = _next_record(records, end, wanted)
         if opcode == Opcode.CHANNEL:
             channel = Channel.read(ReadDataStream(BytesIO(contents[start:end])))
             names[channel.id] = channel.topic
@@ -256,7 +258,7 @@ def _span(records, position):  # type: ignore[no-untyped-def]
 
 @compiled
 def _is_whole(records):  # type: ignore[no-untyped-def]
-    """Whether one record follows another to the very end."""
+    """Whether the records follow one another up to the end."""
     end = 0
     while end + _HEAD_SIZE <= len(records):
         opcode = records[end]
@@ -268,10 +270,10 @@ def _is_whole(records):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _seek(records, position, wanted):  # type: ignore[no-untyped-def]
-    """Opcode, channel id, begin and end of the next channel or message of a ``wanted`` channel.
+def _next_record(records, position, wanted):  # type: ignore[no-untyped-def]
+    """Opcode, channel id, begin and end of the next channel record or ``wanted`` message.
 
-    Where there is none, the last record's.
+    If there is none, those of the last record.
     """
     opcode, number, start, end = 0, 0, position, position
     while end < len(records):

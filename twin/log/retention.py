@@ -1,7 +1,7 @@
-"""Old logs make room for new ones: the oldest finished files of a unit are deleted, and told.
+"""Deletes the oldest finished log files of a unit to make room, and reports each deletion.
 
-Only what ``twin run`` recorded of this unit in the one folder is deleted, file by file. A file that
-was made read-only stays, and so does what was imported, replayed or recovered.
+Only files that ``twin run`` recorded of this unit in the one folder are deleted. Read-only files
+stay, and so do imported, replayed and recovered logs.
 """
 
 import shutil
@@ -21,10 +21,10 @@ from twin.log.part import SUFFIX
 from twin.log.reader import read_header
 from twin.log.records import is_complete
 
-LOOK_S = 60.0  # between looks at the folder
-MOST_AT_ONCE = 50  # files that go in one look, each with an event
-ABANDONED_S = 86_400.0  # an unfinished file that nobody has written to for so long is over
-LEAST_SHARE = 0.1  # of the disk, which logs may keep whatever others fill
+LOOK_S = 60.0  # interval at which the folder is checked
+MOST_AT_ONCE = 50  # files deleted in one check, each with an event
+ABANDONED_S = 86_400.0  # an unfinished file counts as finished after so long without a write
+LEAST_SHARE = 0.1  # of the disk, which logs may keep however much others use
 GB = 1e9  # bytes
 DAY_S = 86_400.0
 
@@ -33,7 +33,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Bounds:
-    """How much is kept; None is no bound."""
+    """How much is kept; None means no bound."""
 
     days: float | None = None
     bytes: float | None = None  # of all logs of the unit in the folder
@@ -42,16 +42,16 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Disk:
-    """Bytes of a disk, as a user without privileges has them."""
+    """Bytes of a disk that a user without privileges can have."""
 
     total: int
     free: int
 
     @classmethod
     def of(cls, folder: Path) -> "Disk":
-        """The disk that a folder is on; OSError where there is none."""
-        found = shutil.disk_usage(folder)
-        return cls(found.used + found.free, found.free)
+        """The disk that a folder is on; OSError if the folder does not exist."""
+        usage = shutil.disk_usage(folder)
+        return cls(usage.used + usage.free, usage.free)
 
 
 @dataclass(frozen=True)
@@ -66,32 +66,32 @@ class File:
 def outdated(
     files: Sequence[File], bounds: Bounds, disk: Disk, now_s: float
 ) -> list[tuple[File, str]]:
-    """Which of ``files``, the oldest first, are to go, with the reason."""
+    """Those of ``files`` (the oldest first) to delete, each with the reason."""
     total = sum(file.size for file in files)
     least = LEAST_SHARE * disk.total
     most_used = bounds.disk_share * disk.total
-    gone: list[tuple[File, str]] = []
-    for file, until in zip(files, accumulate(file.size for file in files), strict=True):
-        left = total - (until - file.size)  # with this one, without those before
-        used = disk.total - disk.free - (until - file.size)
+    deletions: list[tuple[File, str]] = []
+    for file, cumulative in zip(files, accumulate(file.size for file in files), strict=True):
+        remaining = total - (cumulative - file.size)  # with this one, without those before
+        used = disk.total - disk.free - (cumulative - file.size)
         if bounds.days is not None and now_s - file.ended_s > bounds.days * DAY_S:
-            why = f"logs are kept for {bounds.days:g} days"
-        elif bounds.bytes is not None and left > bounds.bytes:
-            why = f"logs of this unit may take {bounds.bytes / GB:g} GB"
-        elif used > most_used and left > least:
-            why = f"the disk is more than {bounds.disk_share:.0%} full"
+            reason = f"logs are kept for {bounds.days:g} days"
+        elif bounds.bytes is not None and remaining > bounds.bytes:
+            reason = f"logs of this unit may take {bounds.bytes / GB:g} GB"
+        elif used > most_used and remaining > least:
+            reason = f"the disk is more than {bounds.disk_share:.0%} full"
         else:
             break
-        gone.append((file, why))
-    return gone
+        deletions.append((file, reason))
+    return deletions
 
 
 @dataclass
 class Retention:
-    """Keeps the logs of a unit in a folder within bounds; in a ``with``, from a thread of its own.
+    """Keeps the logs of a unit in a folder within bounds; a ``with`` block runs it in a thread.
 
-    The file that ``written`` names stays in every case. ``tell`` is told of each file that is
-    deleted, ``complain`` once of what goes wrong.
+    The file that ``written`` names always stays. ``tell`` reports each deleted file; ``complain``
+    reports a failure once.
     """
 
     folder: Path
@@ -116,14 +116,14 @@ class Retention:
         self._thread.join()
 
     def look(self) -> None:
-        """Delete what is outdated now; OSError where that is not allowed."""
+        """Delete files that are outdated now; OSError if that is not allowed."""
         files = self._finished()
-        gone = outdated(files, self.bounds, self.disk(self.folder), self.clock())
-        for file, why in gone[:MOST_AT_ONCE]:
+        deletions = outdated(files, self.bounds, self.disk(self.folder), self.clock())
+        for file, reason in deletions[:MOST_AT_ONCE]:
             file.path.unlink(missing_ok=True)
             until = dated(round(file.ended_s * 1e9))
             self.tell(
-                f"{file.path.name} is deleted ({file.size / 1e6:.0f} MB, until {until}): {why}"
+                f"{file.path.name} is deleted ({file.size / 1e6:.0f} MB, until {until}): {reason}"
             )
 
     def _work(self) -> None:
@@ -139,15 +139,15 @@ class Retention:
                 return
 
     def _finished(self) -> list[File]:
-        """The files that may go, the oldest first."""
-        written = self.written().name  # before looking: what is finished meanwhile stays
+        """The files that may be deleted, the oldest first."""
+        written = self.written().name  # before the listing: a file finished meanwhile stays
         files = []
         for path in self.folder.glob(f"*{SUFFIX}"):
             with suppress(OSError):  # somebody else has moved or deleted it
-                found = path.lstat()
-                may_go = stat.S_ISREG(found.st_mode) and found.st_mode & stat.S_IWUSR
-                if may_go and path.name != written and self._is_over(path, found.st_mtime):
-                    files.append(File(path, found.st_size, found.st_mtime))
+                status = path.lstat()
+                may_go = stat.S_ISREG(status.st_mode) and status.st_mode & stat.S_IWUSR
+                if may_go and path.name != written and self._is_over(path, status.st_mtime):
+                    files.append(File(path, status.st_size, status.st_mtime))
         ours = [file for file in files if self._is_ours(file.path)]
         return sorted(ours, key=lambda file: (file.ended_s, file.path))
 

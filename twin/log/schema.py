@@ -12,7 +12,7 @@ _Type: TypeAlias = _Field.Type.ValueType | str  # a string names a message or an
 _Fields = dict[int, tuple[str, _Type]]  # by number: name and type
 
 COLUMNS = (*(SAMPLE.names or ()), *(TICK.names or ()))  # in the order of twin.log.columns
-ADDED = {"signals", *EXTRA}  # columns that a log need not have; there they are all zero
+ADDED = {"signals", *EXTRA}  # optional columns of a log; all zero where they are missing
 
 _SAMPLES = """Rows of the measurement and the model at full rate, column by column, lossless.
 Each column: 8 bytes with the first row's bits, then k byte planes of `count` bytes each.
@@ -71,7 +71,7 @@ _TWIN: dict[str, tuple[str, _Fields]] = {
     ),
 }
 
-# As Foxglove defines it; its log panel goes by the name and the numbers.
+# As Foxglove defines it; its log panel relies on the name and the field numbers.
 _FOXGLOVE: dict[str, tuple[str, _Fields]] = {
     "Log": (
         "A log message",
@@ -129,9 +129,9 @@ def _foxglove() -> descriptor_pb2.FileDescriptorProto:
 _TIMESTAMP = descriptor_pb2.FileDescriptorProto.FromString(timestamp_pb2.DESCRIPTOR.serialized_pb)
 _FILES = {"foxglove": _foxglove(), "ejector_twin": _file("ejector_twin", _TWIN)}
 
-_POOL = descriptor_pool.DescriptorPool()  # an own one: others may bring their foxglove.Log
-for _each in (_TIMESTAMP, *_FILES.values()):
-    _POOL.Add(_each)
+_POOL = descriptor_pool.DescriptorPool()  # not the default pool: others may register foxglove.Log
+for _file_descriptor in (_TIMESTAMP, *_FILES.values()):
+    _POOL.Add(_file_descriptor)
 
 
 class Channel(NamedTuple):
@@ -144,8 +144,8 @@ class Channel(NamedTuple):
 
 
 def _channel(topic: str, schema: str) -> Channel:
-    own = _FILES[schema.partition(".")[0]]
-    files = descriptor_pb2.FileDescriptorSet(file=[_TIMESTAMP, own]).SerializeToString()
+    descriptor = _FILES[schema.partition(".")[0]]
+    files = descriptor_pb2.FileDescriptorSet(file=[_TIMESTAMP, descriptor]).SerializeToString()
     kind = message_factory.GetMessageClass(_POOL.FindMessageTypeByName(schema))
     return Channel(topic, schema, files, kind)
 
@@ -155,7 +155,7 @@ SCALARS = _channel("/scalars", "ejector_twin.Scalars")
 EVENTS = _channel("/events", "ejector_twin.Event")
 LOG = _channel("/log", "foxglove.Log")
 
-# Channel ids count from 1 in this order where a file's header names LIBRARY, so that it is readable
-# without its first chunk, the only one that names them.
+# Where a file's header names LIBRARY, channel ids count from 1 in this order. Only the first chunk
+# names the channels; with fixed ids a file is readable without it.
 CHANNELS = {1: SAMPLES, 2: SCALARS, 3: EVENTS, 4: LOG}
 LIBRARY = "ejector-twin"

@@ -1,7 +1,7 @@
-"""An MCAP file, written as the library's Writer does but many messages at once.
+"""Writes an MCAP file as the library's Writer does, but many messages at once.
 
-The records are the library's; only messages and their indexes, of which an hour has 185 000, are
-laid out here as arrays. Its Writer takes one message at a time and has no other way in.
+The library encodes the records. Only messages and their indexes are laid out here as arrays: an
+hour has 185 000 of them, and the library's Writer takes only one message at a time.
 """
 
 import struct
@@ -34,7 +34,7 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from twin.log.output import Output
 
-CHUNK = 1 << 20  # bytes; one that has become longer is completed
+CHUNK = 1 << 20  # bytes; a chunk that has grown longer is completed
 
 _HEAD = np.dtype(
     [
@@ -54,10 +54,10 @@ _FOOTER = struct.Struct("<BQQQ")  # opcode, length and the two offsets, all that
 Times: TypeAlias = npt.NDArray[np.int64]  # ns since 1970; those before are written as 0
 
 
-class _Open:
-    """The chunk under way: its bytes, and for each channel the entries of its index.
+class _OpenChunk:
+    """The chunk under way: its bytes, and the index entries of each channel.
 
-    Messages are laid out where they stay: each copy of all of them is a tenth of packing them.
+    Messages are laid out in place: copying all of them costs a tenth of packing them.
     """
 
     def __init__(self) -> None:
@@ -65,17 +65,17 @@ class _Open:
         self.clear()
 
     def clear(self) -> None:
-        """Begin another one in the same memory."""
+        """Begin another chunk in the same memory."""
         self.size = 0
         self.entries: dict[int, list[npt.NDArray[np.void]]] = {}
 
     @property
     def contents(self) -> memoryview:
-        """All that is in it."""
+        """All bytes of the chunk so far."""
         return self._memory[: self.size].data
 
     def room(self, length: int) -> npt.NDArray[np.uint8]:
-        """The next bytes, to be filled and then counted: half a record would spoil the chunk."""
+        """The next ``length`` bytes. Fill them before counting: half a record spoils a chunk."""
         end = self.size + length
         if end > len(self._memory):
             self._memory = np.resize(self._memory, 2 * end)
@@ -83,19 +83,19 @@ class _Open:
 
 
 class Writer:
-    """Writes to ``output`` from its beginning; in memory are a chunk and the index of all."""
+    """Writes to ``output`` from its beginning; memory holds one chunk and the index of all."""
 
     def __init__(self, output: Output, library: str) -> None:
         self._output = output
         self._compressor = zstandard.ZstdCompressor()
-        self._open = _Open()
+        self._open = _OpenChunk()
         self._schemas: list[McapRecord] = []
         self._channels: list[McapRecord] = []
         self._chunks: list[McapRecord] = []
         self._attachments: list[McapRecord] = []
         self._metadata: list[McapRecord] = []
         self._counts: dict[int, int] = {}  # messages by channel
-        self._saved: dict[int, int] = {}  # of them in chunks that are whole in the file
+        self._saved: dict[int, int] = {}  # messages by channel in whole chunks of the file
         self._first = self._last = 0  # log times
         output.write(MAGIC)
         output.write(_bytes(Header("", library)))
@@ -107,7 +107,7 @@ class Writer:
         self._output.write(raw)
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
-        """Write a file into the file; it has no times."""
+        """Write an attachment without times."""
         offset = self._output.tell()
         raw = _bytes(Attachment(0, 0, name, media_type, data))
         index = AttachmentIndex(offset, len(raw), 0, 0, len(data), name, media_type)
@@ -115,13 +115,13 @@ class Writer:
         self._output.write(raw)
 
     def register_channel(self, topic: str, schema: str, files: bytes) -> int:
-        """Give a topic a number, from 1, and protobuf messages; ``files`` define them."""
+        """Register a topic of protobuf messages that ``files`` define; returns its id, from 1."""
         number = len(self._channels) + 1
         self._schemas.append(Schema(number, files, "protobuf", schema))
         self._channels.append(Channel(number, topic, "protobuf", {}, number))
-        both = _bytes(self._schemas[-1]) + _bytes(self._channels[-1])
-        self._open.room(len(both))[:] = np.frombuffer(both, np.uint8)
-        self._open.size += len(both)
+        record_bytes = _bytes(self._schemas[-1]) + _bytes(self._channels[-1])
+        self._open.room(len(record_bytes))[:] = np.frombuffer(record_bytes, np.uint8)
+        self._open.size += len(record_bytes)
         return number
 
     def add_message(self, channel: int, log_ns: int, publish_ns: int, message: bytes) -> None:
@@ -136,12 +136,12 @@ class Writer:
     def add_messages(
         self, channel: int, log_ns: Times, publish_ns: Times, messages: npt.NDArray[np.void]
     ) -> None:
-        """Write n messages of one length; each element of ``messages`` is one as it is."""
+        """Write n messages of one length; each element of ``messages`` is one encoded message."""
         n = len(messages)
         if not n:
             return
-        whole = np.dtype((np.void, messages.itemsize))
-        record = np.dtype([("head", _HEAD), ("message", whole)])
+        message_type = np.dtype((np.void, messages.itemsize))
+        record = np.dtype([("head", _HEAD), ("message", message_type)])
         records = self._open.room(n * record.itemsize).view(record)
         head = records["head"]
         head["opcode"] = Opcode.MESSAGE
@@ -150,11 +150,11 @@ class Writer:
         head["sequence"] = 0
         head["log_time"] = np.maximum(log_ns, 0)
         head["publish_time"] = np.maximum(publish_ns, 0)
-        records["message"] = messages.view(whole)
+        records["message"] = messages.view(message_type)
         self._count(channel, head["log_time"], record.itemsize)
 
     def _count(self, channel: int, times: npt.NDArray[np.uint64], length: int) -> None:
-        """Take in records of one ``length`` (bytes) that have been laid out."""
+        """Count records of one ``length`` (bytes) that have been laid out."""
         entries = np.empty(len(times), _ENTRY)
         entries["log_time"] = times
         entries["offset"] = self._open.size + length * np.arange(len(times))
@@ -164,11 +164,11 @@ class Writer:
             self.flush()
 
     def saved(self, channel: int) -> int:
-        """How many messages of a channel are in the file, whatever fails from now on."""
+        """How many messages of a channel are safely in the file, even if a later write fails."""
         return self._saved.get(channel, 0)
 
     def flush(self) -> None:
-        """Complete the chunk under way, if it has messages: then it is in the file."""
+        """Write the chunk under way to the file, if it has messages."""
         if not self._open.entries:
             return
         contents, indexes = self._open.contents, self._open.entries
@@ -206,7 +206,7 @@ class Writer:
         )
 
     def finish(self) -> None:
-        """Write what is under way and the summary; ``output`` stays open."""
+        """Write the chunk under way and the summary; ``output`` stays open."""
         self.flush()
         self._output.write(_bytes(DataEnd(0)))
         start = self._output.tell()
@@ -259,7 +259,7 @@ def _bytes(record: McapRecord) -> bytes:
 
 
 def _index(channel: int, entries: npt.NDArray[np.void]) -> bytes:
-    """A message index; the library's takes one entry at a time."""
+    """A message index; the library's own takes one entry at a time."""
     length = entries.nbytes
     head = _INDEX.pack(Opcode.MESSAGE_INDEX, length + 6, channel, length)
     return head + entries.tobytes()
