@@ -1,1 +1,1 @@
-"""Where alarms go: an outbox that outlives the program, and who takes from it to the outside."""
+"""Notifications: an outbox that outlives the program, and the senders that deliver from it."""

@@ -1,4 +1,4 @@
-"""A sink that puts what is told into the outbox for all destinations; never waited for."""
+"""A sink that puts messages for all destinations into the outbox. The loop never waits for it."""
 
 import queue
 import threading
@@ -21,14 +21,15 @@ MOST_IN_MEMORY = 10_000  # messages, while the database is away
 MOST_AT_ONCE = 1000
 RETRY_S = 5.0
 CLOSE_S = 15.0  # for all threads to end; they die with the program
-Letter = tuple[str, Message]  # to whom, and what
+Letter = tuple[str, Message]  # destination and message
 
 
 class Outlets:
-    """Where the alarms of a unit go (``twin.live.Sink``), and what is told beside them.
+    """Sends the alarms of a unit and further data to destinations (``twin.live.Sink``).
 
-    A thread writes into the outbox, and one for each destination delivers. ``restating`` are the
-    destinations that are to know every alarm as it is; ``tellers`` say what else goes to each.
+    One thread writes into the outbox, and one for each destination delivers. ``restating`` names
+    the destinations that get every alarm's state at the start. ``tellers`` make the further data of
+    each destination.
     """
 
     def __init__(
@@ -45,23 +46,23 @@ class Outlets:
         self._unit, self._open_outbox, self._senders = unit, open_outbox, senders
         self._say, self._restating, self._uploader = say, restating, uploader
         self._tellers = [
-            (box_of(name, one.topic), one)
-            for name, those in (tellers or {}).items()
-            for one in those
+            (box_of(name, teller.topic), teller)
+            for name, group in (tellers or {}).items()
+            for teller in group
         ]
         self._outbox: Outbox | None = None
         self._failed = False
-        self._lost = 0  # that there was no room for
+        self._lost = 0  # messages for which there was no room
         self._waiting: list[Letter] = []
         self._letters: queue.Queue[Letter] = queue.Queue(MOST_IN_MEMORY)
         self._ending, self._news = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._work, name="outbox", daemon=True)
 
     def begin(self, standing: Sequence[Mapping[str, Any]]) -> None:
-        """Start; ``standing`` are the alarms as they are (``twin.alarms.text.plain``)."""
+        """Start; ``standing`` are the alarms' present states (``twin.alarms.text.plain``)."""
         now_ns = time.time_ns()
-        for plain in standing:
-            message = restated(self._unit, plain, now_ns)
+        for alarm in standing:
+            message = restated(self._unit, alarm, now_ns)
             for name in self._restating:
                 self._put(name, message)
         self._thread.start()
@@ -71,7 +72,7 @@ class Outlets:
             sender.start()
 
     def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
-        """Take what happened."""
+        """Take rows and events."""
         for event in events:
             for message in of_event(self._unit, event):
                 for sender in self._senders:
@@ -81,9 +82,9 @@ class Outlets:
                 self.tell(box, message)
 
     def tell(self, box: str, message: Message) -> None:
-        """Put what is told beside alarms into the outbox; from any thread.
+        """Put a message that is no alarm into the outbox; from any thread.
 
-        It leaves room for alarms where the database is away.
+        It leaves room for alarms while the database cannot be reached.
         """
         if self._letters.qsize() < MOST_IN_MEMORY // 2:
             self._put(box, message)
@@ -91,9 +92,9 @@ class Outlets:
             self._lost += 1
 
     def close(self) -> None:
-        """Write and deliver what can be at once; the rest waits for the next run.
+        """Write and deliver what is possible at once; the rest waits for the next run.
 
-        Whoever still waits for an answer then is left behind, and that is said.
+        A thread that still waits for an answer then is abandoned, with a message.
         """
         end = time.monotonic() + CLOSE_S
         if self._uploader is not None:
@@ -131,9 +132,9 @@ class Outlets:
                 self._ending.wait(RETRY_S)
                 self._news.set()
         self._write_all()
-        left = len(self._waiting) + self._letters.qsize() + self._lost
-        if left:
-            self._say(f"{left} messages could not be put into the outbox")
+        unsaved = len(self._waiting) + self._letters.qsize() + self._lost
+        if unsaved:
+            self._say(f"{unsaved} messages could not be put into the outbox")
         self._let_go()
 
     def _write_all(self) -> bool:
@@ -143,17 +144,17 @@ class Outlets:
         return True
 
     def _write(self) -> bool:
-        """Put what there is into the outbox; says so if that begins to fail."""
+        """Put the waiting messages into the outbox; reports when this begins to fail."""
         while len(self._waiting) < MOST_AT_ONCE and not self._letters.empty():
             self._waiting.append(self._letters.get())
         try:
             self._outbox = self._outbox or self._open_outbox()
             self._outbox.put(self._waiting)
-        except Exception as error:  # whatever it is, later ones are to be told
+        except Exception as error:  # later messages must still go out, whatever the error
             self._let_go()
             if not self._failed:
-                why = in_words(error)
-                self._say(f"changes of alarms wait in memory, not in the outbox: {why}")
+                cause = in_words(error)
+                self._say(f"changes of alarms wait in memory, not in the outbox: {cause}")
             self._failed = True
             return False
         if self._failed:

@@ -1,6 +1,6 @@
-"""Which files a request means: finished parts of the unit's own logs in the one folder of logs.
+"""Finds the files of an upload request: finished parts of the unit's logs in the logs folder.
 
-Nothing that was asked becomes part of a path: a name is looked up among those that are there.
+No text of a request becomes part of a path: a name is looked up among the existing files.
 """
 
 from collections.abc import Iterator
@@ -22,14 +22,14 @@ MOST_PARTS = 1000  # of one request
 
 @dataclass(frozen=True)
 class Found:
-    """Finished files, and the names of others that are still written, or whose writer died."""
+    """Finished files, and names of unfinished ones: still being written, or their writer died."""
 
     parts: tuple[Path, ...]
     unfinished: tuple[str, ...]
 
 
 def find(folder: Path, unit: Unit, request: UploadRequest) -> Found:
-    """What a request means in a folder of logs; RefusedError where that is nothing."""
+    """The files that a request asks for in a folder of logs; RefusedError if there are none."""
     parts, unfinished = list[Path](), list[str]()
     for log in _named(folder, unit, request.log) if request.log else _all(folder, unit):
         for part in log.parts:
@@ -40,19 +40,19 @@ def find(folder: Path, unit: Unit, request: UploadRequest) -> Found:
             elif _is_within(part, request):
                 parts.append(part)
     if not parts:
-        why = "no finished file of a log is like that"
-        still = f"; not finished: {', '.join(unfinished[:5])}" if unfinished else ""
-        raise RefusedError(f"{why}{still}")
+        reason = "no finished file of a log is like that"
+        note = f"; not finished: {', '.join(unfinished[:5])}" if unfinished else ""
+        raise RefusedError(f"{reason}{note}")
     if len(parts) > MOST_PARTS:
         raise RefusedError(f"that is {len(parts)} files, more than {MOST_PARTS}: ask for less")
     return Found(tuple(parts), tuple(unfinished))
 
 
 def _named(folder: Path, unit: Unit, name: str) -> list[Log]:
-    there = {path.name: path for path in first_parts(folder) if _is_own(path)}
-    if name not in there:
+    path_by_name = {path.name: path for path in first_parts(folder) if _is_own(path)}
+    if name not in path_by_name:
         raise RefusedError("there is no log of that name")
-    log = _opened(there[name])
+    log = _opened(path_by_name[name])
     if log is None:
         raise RefusedError("the file of that name cannot be read as a log")
     if _unit_of(log) != unit:
@@ -78,12 +78,12 @@ def _unit_of(log: Log) -> Unit:
 
 
 def _is_own(path: Path) -> bool:
-    """A link may lead anywhere."""
+    """Whether it is a regular file: a link may lead anywhere."""
     return path.is_file() and not path.is_symlink()
 
 
 def _is_within(part: Path, request: UploadRequest) -> bool:
-    """Whether anything in it was received in the range of time."""
+    """Whether any message of the part was received in the requested range of time."""
     if request.begin is None or request.end is None:
         return True
     try:
@@ -93,6 +93,6 @@ def _is_within(part: Path, request: UploadRequest) -> bool:
         return False
     if summary is None or summary.statistics is None or not summary.statistics.message_count:
         return False
-    said = summary.statistics
-    begin, end = (round(at.timestamp() * 1e9) for at in (request.begin, request.end))
-    return said.message_start_time < end and said.message_end_time >= begin
+    statistics = summary.statistics
+    begin, end = (round(time.timestamp() * 1e9) for time in (request.begin, request.end))
+    return statistics.message_start_time < end and statistics.message_end_time >= begin

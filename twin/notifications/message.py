@@ -1,4 +1,4 @@
-"""What is told: one JSON document for each change of an alarm, the same wherever it goes."""
+"""Messages: one JSON document for each change of an alarm, the same for every destination."""
 
 import json
 import uuid
@@ -19,15 +19,15 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A change of one alarm on its way; the ID stays the same however often it is sent."""
+    """A change of one alarm to be sent; the ID stays the same however often it is sent."""
 
     id: str
-    alarm: str  # empty of what is told beside alarms
+    alarm: str  # empty for other data
     body: str  # JSON
 
 
 def of_event(unit: Unit, event: Event) -> Iterator[Message]:
-    """What an event says of alarms: of one that is renamed, that the other is no more as well."""
+    """The messages of an alarm's event; a renamed alarm also ends under its old name."""
     if event.kind not in (Kind.ALARM, Kind.ALARM_CHANGED):
         return
     data = event.data
@@ -38,53 +38,53 @@ def of_event(unit: Unit, event: Event) -> Iterator[Message]:
         "announced": event.kind is Kind.ALARM,
         "text": event.text,
     }
-    if left := data.get("left"):
-        yield _message(unit, left, change | {"renamed_to": data["alarm"], "announced": False})
-    was = {"renamed_from": data["was"]} if "was" in data else {}
-    yield _message(unit, data, change | was)
+    if old_alarm := data.get("left"):
+        yield _message(unit, old_alarm, change | {"renamed_to": data["alarm"], "announced": False})
+    former = {"renamed_from": data["was"]} if "was" in data else {}
+    yield _message(unit, data, change | former)
 
 
 def restated(unit: Unit, plain: Mapping[str, Any], now_ns: int) -> Message:
-    """An alarm as it is, without anything having happened to it."""
+    """The present state of an alarm, without any change to it."""
     change = {"time": moment(now_ns), "deed": "restated", "who": "", "announced": False}
     return _message(unit, plain, change)
 
 
 def again(message: Message, now_ns: int) -> Message:
-    """The state that a message told, told once more under an ID of its own."""
+    """The state of an earlier message, restated under a new ID."""
     number = new_id()
-    later = {"id": number, "time": moment(now_ns), "deed": "restated", "announced": False}
-    return Message(number, message.alarm, json_text({**json.loads(message.body), **later}))
+    changes = {"id": number, "time": moment(now_ns), "deed": "restated", "announced": False}
+    return Message(number, message.alarm, json_text({**json.loads(message.body), **changes}))
 
 
 def of_status(asset: Asset, status: str, since_ns: int | None, program: str) -> str:
-    """Whether the twin is there, since when; who dies cannot say when."""
+    """The twin's status and since when; a last will has no time, since it is written before."""
     since = None if since_ns is None else moment(since_ns)
-    told = {"asset": asset, "status": status, "since": since, "program": program}
-    return json_text({"format": STATUS_FORMAT, **told})
+    content = {"asset": asset, "status": status, "since": since, "program": program}
+    return json_text({"format": STATUS_FORMAT, **content})
 
 
-def beside(form: str, asset: Asset, time_ns: int, told: Mapping[str, Any]) -> Message:
-    """What is told beside alarms; ``time_ns`` is by the clock here."""
+def beside(form: str, asset: Asset, time_ns: int, content: Mapping[str, Any]) -> Message:
+    """A message with other data than alarms; ``time_ns`` is host time."""
     number = new_id()
     head = {"format": form, "id": number, "asset": asset}
-    at = {"time": moment(time_ns), "time_ns": time_ns}
-    return Message(number, "", json_text({**head, **at, **told}))
+    times = {"time": moment(time_ns), "time_ns": time_ns}
+    return Message(number, "", json_text({**head, **times, **content}))
 
 
 def asset_of(unit: Unit, batch: str) -> Asset:
-    """Whose it is, as messages beside alarms have it; the batch where it is known."""
+    """The unit, as messages that are no alarms name it; with its batch if known."""
     return unit._asdict() | ({"batch": batch} if batch else {})
 
 
 def moment(ns: int) -> str:
-    """A time as ISO 8601 has it, in UTC, to the microsecond."""
-    at = EPOCH + timedelta(microseconds=ns // 1000)
-    return at.isoformat(timespec="microseconds").replace("+00:00", "Z")
+    """A time in ISO 8601, in UTC, to the microsecond."""
+    instant = EPOCH + timedelta(microseconds=ns // 1000)
+    return instant.isoformat(timespec="microseconds").replace("+00:00", "Z")
 
 
 def new_id() -> str:
-    """An ID that nothing else has."""
+    """A new unique ID."""
     return str(uuid.uuid4())
 
 
@@ -108,17 +108,15 @@ def _message(unit: Unit, plain: Mapping[str, Any], change: Mapping[str, Any]) ->
 
 
 def _state(plain: Mapping[str, Any]) -> str:
-    """Its state; that an alarm with nothing to say is suppressed concerns nobody, and is not told
-    when it ends either.
-    """
-    quiet = plain["state"] == "suppressed" and plain["acknowledged"] and not plain["active"]
-    if not quiet:
+    """Its state; suppression of an alarm that is inactive and acknowledged is not reported."""
+    is_silent = plain["state"] == "suppressed" and plain["acknowledged"] and not plain["active"]
+    if not is_silent:
         return str(plain["state"])
     return "normal" if plain["shelved_until_ns"] is None else "shelved"
 
 
 def _episode(plain: Mapping[str, Any]) -> str | None:
-    """What tells one time of being active from others, also after it is renamed."""
+    """An ID of the episode, which stays the same after the alarm is renamed."""
     raised_ns = plain["raised_ns"]
     return None if raised_ns is None else f"{raised_ns}.{plain['raised_as']}"
 

@@ -1,7 +1,7 @@
-"""To an MQTT 5 broker: a retained topic for each alarm, whether the twin is there, and more.
+"""Publishes to an MQTT 5 broker: a retained topic for each alarm, the twin's status, and more.
 
-The library's network loop runs in the sender's thread, between messages. Every connection has a
-client of its own, which knows nothing of before: what the broker has not taken is in the outbox.
+The library's network loop runs in the sender's thread, between messages. Every connection has a new
+client without earlier state: the outbox holds all that the broker has not taken.
 """
 
 import re
@@ -28,18 +28,18 @@ from twin.notifications.sender import ALARM, BATCH, LostError, Sent
 from twin.notifications.settings import MqttSettings
 from twin.secret import Say
 
-CONNECT_S = 5.0  # to connect, and then to be let in
-ANSWER_S = 20.0  # to take a batch
-LISTEN_S = 0.1  # to the network, before looking for something to send
-REQUEST = "request"  # the topic on which the twin of a unit is asked
-SESSION_S = 86_400  # for which the broker knows us: whether it has lost everything meanwhile
+CONNECT_S = 5.0  # limit for connecting, and then for the broker's acceptance
+ANSWER_S = 20.0  # limit for the broker to take a batch
+LISTEN_S = 0.1  # time on the network loop before the next look for messages to send
+REQUEST = "request"  # the topic for requests to the twin of a unit
+SESSION_S = 86_400  # lifetime of the session, which shows whether the broker has lost its state
 
 
 class Mqtt:
-    """A channel (``twin.notifications.sender.Channel``) for what is told of one unit.
+    """A channel (``twin.notifications.sender.Channel``) for the messages of one unit.
 
-    ``folder`` is where relative paths are from. ConfigError where a secret or certificate cannot
-    be used. What ``hear_request`` does not raise on is taken from the broker for good.
+    Paths are relative to ``folder``. ConfigError if a secret or certificate cannot be used. A
+    request is acknowledged to the broker unless ``hear_request`` raises.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Mqtt:
         self._at_once = BATCH
 
     def open(self) -> bool:
-        """Connect, with the last will, and say that the twin is there."""
+        """Connect with the last will, and publish that the twin is online."""
         if self._client is not None:
             return False
         client = self._client = self._new_client()
@@ -91,7 +91,7 @@ class Mqtt:
             )
         except (OSError, ValueError) as error:
             raise self._lost(str(error)) from error
-        with suppress(LostError):  # whoever is not let in is told so, and then hung up on
+        with suppress(LostError):  # a broker that rejects us answers first, then disconnects
             self._listen_until(lambda: self._let_in is not None, CONNECT_S)
         forgotten = self._settle()
         if self._hear_request is not None:
@@ -101,7 +101,7 @@ class Mqtt:
         return forgotten and not was_first
 
     def send(self, messages: Sequence[Message], topic: str = ALARM) -> Sent:
-        """Publish, retained, and wait until the broker has taken each."""
+        """Publish retained messages, and wait until the broker has taken each."""
         sent = Sent()
         try:
             for begin in range(0, len(messages), self._at_once):
@@ -116,7 +116,7 @@ class Mqtt:
             self._listen(LISTEN_S)
 
     def hang_up(self) -> None:
-        """Let go without a word; the broker tells the last will."""
+        """Drop the connection without notice; the broker publishes the last will."""
         if self._client is not None:
             sock = self._client.socket()
             if sock is not None:
@@ -124,7 +124,7 @@ class Mqtt:
         self._client = None
 
     def close(self) -> None:
-        """Say that the twin has stopped, and leave."""
+        """Publish that the twin is offline, and disconnect."""
         if self._client is None:
             return
         self._say_status("offline")
@@ -132,9 +132,9 @@ class Mqtt:
         self.hang_up()
 
     def topic(self, *path: str) -> str:
-        """A topic of this unit; what would be a wildcard or a level in a name is escaped."""
-        names = (_SPECIAL.sub(_escaped, one) or "-" for one in (*self._unit, *path))
-        return "/".join((self._settings.prefix, *names))
+        """A topic of this unit; wildcards and level separators in names are escaped."""
+        levels = (_SPECIAL.sub(_escaped, name) or "-" for name in (*self._unit, *path))
+        return "/".join((self._settings.prefix, *levels))
 
     # --- connecting -----------------------------------------------------------------------------
 
@@ -154,7 +154,7 @@ class Mqtt:
         return client
 
     def _settle(self) -> bool:
-        """Take what the broker says to our coming; whether it has forgotten us."""
+        """Take the broker's CONNACK; returns whether it has no session of ours."""
         if self._let_in is None:
             raise self._lost("it does not answer as an MQTT 5 broker", "is it the right port?")
         flags, reason, properties = self._let_in
@@ -172,8 +172,8 @@ class Mqtt:
         reason: ReasonCode,
         properties: Properties | None,
     ) -> None:
-        none = Properties(PacketTypes.CONNACK)  # type: ignore[no-untyped-call]
-        self._let_in = flags, reason, properties or none
+        no_properties = Properties(PacketTypes.CONNACK)  # type: ignore[no-untyped-call]
+        self._let_in = flags, reason, properties or no_properties
 
     def _on_publish(
         self, _client: Client, _userdata: Any, packet: int, reason: ReasonCode, _properties: Any
@@ -183,9 +183,9 @@ class Mqtt:
             self._answers[packet] = reason
 
     def _ask_for_requests(self, client: Client) -> None:
-        """Hear what is asked of this unit, also what was asked while it was away for a day.
+        """Subscribe to requests; the broker keeps those of up to a day's absence.
 
-        A retained request is none: it would be asked again and again.
+        Retained requests are ignored: they would arrive with every connection.
         """
         answers: list[ReasonCode] = []
         client.on_subscribe = lambda _c, _u, _packet, reasons, _p: answers.extend(reasons)
@@ -198,7 +198,7 @@ class Mqtt:
         self._is_deaf = answers[0].is_failure
 
     def _on_message(self, _client: Client, _userdata: Any, message: MQTTMessage) -> None:
-        """An error goes through the library's loop, before the broker is told that it arrived."""
+        """Handle a request; an error leaves the library's loop before the acknowledgement."""
         if self._hear_request is not None and not message.retain:
             self._hear_request(bytes(message.payload))
 
@@ -215,25 +215,25 @@ class Mqtt:
     def _send(self, messages: Sequence[Message], topic: str, sent: Sent) -> None:
         packets: dict[int, Message] = {}
         try:
-            for one in messages:
-                where = self.topic(topic, one.alarm) if one.alarm else self.topic(topic)
-                if why := self._too_large(where, one):
-                    sent.refused[one.id] = why
+            for message in messages:
+                address = self.topic(topic, message.alarm) if message.alarm else self.topic(topic)
+                if problem := self._too_large(address, message):
+                    sent.refused[message.id] = problem
                 else:
-                    packets[self._publish(where, one.body)] = one
+                    packets[self._publish(address, message.body)] = message
             self._listen_until(lambda: packets.keys() <= self._answers.keys(), ANSWER_S)
         finally:
-            for packet, one in packets.items():
+            for packet, message in packets.items():
                 if (reason := self._answers.pop(packet, None)) is None:
                     continue
                 if reason.is_failure:
-                    sent.refused[one.id] = f"{self._where}: {reason}"
+                    sent.refused[message.id] = f"{self._where}: {reason}"
                 else:
-                    sent.delivered.append(one)
+                    sent.delivered.append(message)
 
     def _too_large(self, topic: str, message: Message) -> str:
-        """Why the broker would hang up on it; empty if it would not."""
-        size = len(message.body.encode()) + len(topic.encode()) + 16  # more than its header has
+        """Why the broker would drop the connection over this message; empty if it would not."""
+        size = len(message.body.encode()) + len(topic.encode()) + 16  # more than the header takes
         if not self._largest or size <= self._largest:
             return ""
         return f"{self._where}: {size} bytes are more than the {self._largest} that it takes"
@@ -247,7 +247,7 @@ class Mqtt:
         return int(info.mid)
 
     def _listen_until(self, is_done: Callable[[], bool], patience_s: float) -> None:
-        """Listen until something has come; LostError if it does not in time."""
+        """Listen until ``is_done``; LostError if that takes longer than ``patience_s``."""
         end = time.monotonic() + patience_s
         while not is_done():
             if time.monotonic() > end:
@@ -260,12 +260,14 @@ class Mqtt:
         if result != MQTTErrorCode.MQTT_ERR_SUCCESS:
             raise self._lost(f"the connection is lost ({result.name})")
 
-    def _lost(self, why: str, hint: str = "") -> LostError:
-        return LostError(f"MQTT broker {self._where}: {why}", hint or "is it there, and reachable?")
+    def _lost(self, cause: str, hint: str = "") -> LostError:
+        return LostError(
+            f"MQTT broker {self._where}: {cause}", hint or "is it there, and reachable?"
+        )
 
 
 class _Closed(ssl.SSLSocket):
-    """Closed where the handshake fails, which the library does not do."""
+    """A socket that closes if the handshake fails; the library would leave it open."""
 
     def do_handshake(self, block: bool = False) -> None:
         try:
@@ -278,8 +280,8 @@ class _Closed(ssl.SSLSocket):
 _SPECIAL = re.compile(r"[/+#%\x00-\x1f\x7f]")  # in a level of a topic
 
 
-def _escaped(found: re.Match[str]) -> str:
-    return quote(found[0], safe="")
+def _escaped(match: re.Match[str]) -> str:
+    return quote(match[0], safe="")
 
 
 def _program() -> str:

@@ -1,7 +1,8 @@
-"""What is to be told, until it is: a table beside the alarms, in order, under IDs that stay.
+"""The outbox: a table in the alarm database with messages to deliver, in order, under fixed IDs.
 
-A row is a message to one destination. It is there before it is sent, and goes when the destination
-has taken it; so each is delivered at least once, through restarts and lost networks.
+A row is a message to one destination. It is stored before it is sent, and deleted when the
+destination has taken it. So each message is delivered at least once, through restarts and lost
+networks.
 """
 
 import time
@@ -45,12 +46,12 @@ OUTBOX = Table(
     Column("alarm", Text, nullable=False),
     Column("body", Text, nullable=False),  # JSON
     Column("made_ns", BigInteger, nullable=False),
-    Column("refused", Text),  # why the destination will not have it; then it is not sent again
+    Column("refused", Text),  # why the destination refused it; then it is not sent again
     sqlite_autoincrement=True,
 )
 ORDER = Index(
     "alarm_outbox_order",
-    *(OUTBOX.c[one] for one in ("destination", "asset_type", "asset_id", "number")),
+    *(OUTBOX.c[name] for name in ("destination", "asset_type", "asset_id", "number")),
 )
 
 
@@ -63,7 +64,7 @@ def open_outbox(
 ) -> "Outbox":
     """Open the outbox of a unit in the alarm database at a URL or in an SQLite file.
 
-    ConfigError for a URL of an unknown kind, SourceError if it cannot be reached or written.
+    ConfigError for a URL of an unknown kind, SourceError if the database cannot be used.
     """
     outbox = Outbox(where, unit, busy_s, clock)
     with outbox.closed_on_error():
@@ -72,7 +73,7 @@ def open_outbox(
 
 
 class Outbox(Database):
-    """An open outbox. Several threads may use one each; what is written is written whole."""
+    """An open outbox. Each thread uses its own; every write is one transaction."""
 
     def __init__(
         self, where: str | Path | URL, unit: Unit, busy_s: float, clock: Callable[[], int]
@@ -81,127 +82,137 @@ class Outbox(Database):
         self._unit = unit
 
     def prepare(self) -> None:
-        """Make the table if it is not there, and its index."""
+        """Create the table and its index if they are missing."""
         with self._reading() as connection:
-            there = inspect(connection)
-            whole = there.has_table(OUTBOX.name) and there.has_index(OUTBOX.name, str(ORDER.name))
-        if not whole:
+            inspector = inspect(connection)
+            is_complete = inspector.has_table(OUTBOX.name) and inspector.has_index(
+                OUTBOX.name, str(ORDER.name)
+            )
+        if not is_complete:
             with self._writing() as connection:
                 metadata.create_all(connection)
                 ORDER.create(connection, checkfirst=True)
 
-    def put(self, letters: Iterable[tuple[str, Message]]) -> None:
-        """Take messages, each for the destination it is with."""
-        own: dict[str, Any] = {"asset_type": self._unit.type, "asset_id": self._unit.id}
-        own["made_ns"] = self._clock()
+    def put(self, messages: Iterable[tuple[str, Message]]) -> None:
+        """Store messages, each with its destination."""
+        common: dict[str, Any] = {"asset_type": self._unit.type, "asset_id": self._unit.id}
+        common["made_ns"] = self._clock()
         rows = [
-            {**own, "destination": to, "id": one.id, "alarm": one.alarm, "body": one.body}
-            for to, one in letters
+            {
+                **common,
+                "destination": destination,
+                "id": message.id,
+                "alarm": message.alarm,
+                "body": message.body,
+            }
+            for destination, message in messages
         ]
         with self._writing() as connection:
             connection.execute(OUTBOX.insert(), rows)
 
     def next(self, destination: str, most: int) -> list[Message]:
-        """The oldest messages that wait, in their order."""
+        """The oldest waiting messages, in order, ``most`` of them."""
         with self._reading() as connection:
             return _messages(connection, self._waiting(destination), most)
 
     def count(self, destination: str) -> int:
-        """How many wait."""
-        wanted = select(func.count()).select_from(OUTBOX).where(*self._waiting(destination))
+        """The number of waiting messages."""
+        statement = select(func.count()).select_from(OUTBOX).where(*self._waiting(destination))
         with self._reading() as connection:
-            return int(connection.execute(wanted).scalar_one())
+            return int(connection.execute(statement).scalar_one())
 
     def delivered(self, destination: str, numbers: Collection[str]) -> None:
-        """The destination has these, by their IDs."""
+        """Delete messages that the destination has taken, by their IDs."""
         with self._writing() as connection:
             connection.execute(OUTBOX.delete().where(*self._named(destination, numbers)))
 
     def refuse(self, destination: str, number: str, why: str) -> None:
-        """Set one aside that the destination will not have."""
+        """Set a message aside that the destination refused."""
         with self._writing() as connection:
             named = OUTBOX.update().where(*self._named(destination, [number]))
             connection.execute(named.values(refused=why))
 
     def refused(self, destination: str) -> list[tuple[Message, str]]:
-        """What was set aside, with why."""
-        whose = (*self._own(destination), OUTBOX.c.refused.is_not(None))
+        """The refused messages, each with the reason."""
+        condition = (*self._of_destination(destination), OUTBOX.c.refused.is_not(None))
         with self._reading() as connection:
-            rows = connection.execute(select(OUTBOX).where(*whose).order_by(OUTBOX.c.number))
+            rows = connection.execute(select(OUTBOX).where(*condition).order_by(OUTBOX.c.number))
             return [(_message(row), str(row.refused)) for row in rows]
 
     def again(self) -> int:
-        """Let everything that was refused wait once more, in its old order; gives how many."""
-        mine = *self._whose(), OUTBOX.c.refused.is_not(None)
+        """Let all refused messages wait again, in their old order; returns how many."""
+        condition = *self._of_unit(), OUTBOX.c.refused.is_not(None)
         with self._writing() as connection:
-            return connection.execute(OUTBOX.update().where(*mine).values(refused=None)).rowcount
+            return connection.execute(
+                OUTBOX.update().where(*condition).values(refused=None)
+            ).rowcount
 
     def destinations(self) -> list[str]:
-        """For whom there is anything."""
-        wanted = select(OUTBOX.c.destination).where(*self._whose()).distinct()
+        """The destinations of all stored messages."""
+        statement = select(OUTBOX.c.destination).where(*self._of_unit()).distinct()
         with self._reading() as connection:
-            return sorted(connection.execute(wanted).scalars())
+            return sorted(connection.execute(statement).scalars())
 
     def give_up(self, destination: str, most: int, since_ns: int) -> list[Message]:
-        """Let go of what waits beyond the newest ``most`` or from before a time; gives it.
+        """Delete waiting messages beyond the newest ``most`` or from before a time; returns them.
 
-        What was refused goes after that time as well; it has been told.
+        Refused messages from before that time are deleted too; they were reported already.
         """
         waiting, number = self._waiting(destination), OUTBOX.c.number
         with self._reading() as connection:
             newest = select(number).where(*waiting).order_by(number.desc()).offset(most).limit(1)
             limit = connection.execute(newest).scalar()
-            gone = OUTBOX.c.made_ns < since_ns
+            outdated = OUTBOX.c.made_ns < since_ns
             if limit is not None:
-                gone |= number <= limit
-            lost = _messages(connection, (*waiting, gone))
-            old = (*self._own(destination), OUTBOX.c.made_ns < since_ns)
+                outdated |= number <= limit
+            lost = _messages(connection, (*waiting, outdated))
+            old = (*self._of_destination(destination), OUTBOX.c.made_ns < since_ns)
             is_old = connection.execute(select(number).where(*old).limit(1)).first()
         if lost or is_old:
             with self._writing() as connection:
-                for which in ((*waiting, gone), old):
-                    connection.execute(OUTBOX.delete().where(*which))
+                for condition in ((*waiting, outdated), old):
+                    connection.execute(OUTBOX.delete().where(*condition))
         return lost
 
     def forget(self, destination: str, most: int, since_ns: int) -> int:
-        """Let go of all beyond the newest ``most`` or from before a time.
+        """Delete all messages beyond the newest ``most`` or from before a time.
 
-        Gives how many of them waited.
+        Returns how many of them were waiting.
         """
-        own, number = self._own(destination), OUTBOX.c.number
-        newest = select(number).where(*own).order_by(number.desc()).offset(most).limit(1)
-        oldest = select(OUTBOX.c.made_ns).where(*own).order_by(number).limit(1)
+        condition, number = self._of_destination(destination), OUTBOX.c.number
+        newest = select(number).where(*condition).order_by(number.desc()).offset(most).limit(1)
+        oldest = select(OUTBOX.c.made_ns).where(*condition).order_by(number).limit(1)
         with self._reading() as connection:
             limit = connection.execute(newest).scalar()
             first_ns = connection.execute(oldest).scalar()
         if limit is None and (first_ns is None or first_ns >= since_ns):
             return 0
-        gone = or_(OUTBOX.c.made_ns < since_ns, number <= (-1 if limit is None else limit))
-        waited = select(func.count()).select_from(OUTBOX)
-        waited = waited.where(*self._waiting(destination), gone)
+        outdated = or_(OUTBOX.c.made_ns < since_ns, number <= (-1 if limit is None else limit))
+        statement = select(func.count()).select_from(OUTBOX)
+        statement = statement.where(*self._waiting(destination), outdated)
         with self._writing() as connection:
-            count = int(connection.execute(waited).scalar_one())
-            connection.execute(OUTBOX.delete().where(*own, gone))
+            count = int(connection.execute(statement).scalar_one())
+            connection.execute(OUTBOX.delete().where(*condition, outdated))
         return count
 
-    def _own(self, destination: str) -> tuple[ColumnElement[bool], ...]:
-        return OUTBOX.c.destination == destination, *self._whose()
+    def _of_destination(self, destination: str) -> tuple[ColumnElement[bool], ...]:
+        return OUTBOX.c.destination == destination, *self._of_unit()
 
-    def _whose(self) -> tuple[ColumnElement[bool], ...]:
+    def _of_unit(self) -> tuple[ColumnElement[bool], ...]:
         return of_unit(OUTBOX, self._unit)
 
     def _waiting(self, destination: str) -> tuple[ColumnElement[bool], ...]:
-        return *self._own(destination), OUTBOX.c.refused.is_(None)
+        return *self._of_destination(destination), OUTBOX.c.refused.is_(None)
 
     def _named(self, destination: str, numbers: Collection[str]) -> tuple[ColumnElement[bool], ...]:
-        return *self._own(destination), OUTBOX.c.id.in_(numbers)
+        return *self._of_destination(destination), OUTBOX.c.id.in_(numbers)
 
 
 def _messages(
-    connection: Connection, which: Sequence[ColumnElement[bool]], most: int | None = None
+    connection: Connection, condition: Sequence[ColumnElement[bool]], most: int | None = None
 ) -> list[Message]:
-    wanted = select(OUTBOX).where(*which).order_by(OUTBOX.c.number).limit(most)
-    return [_message(row) for row in connection.execute(wanted)]
+    statement = select(OUTBOX).where(*condition).order_by(OUTBOX.c.number).limit(most)
+    return [_message(row) for row in connection.execute(statement)]
 
 
 def _message(row: Row[Any]) -> Message:

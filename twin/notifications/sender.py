@@ -1,4 +1,4 @@
-"""Delivers what waits in the outbox for one destination, in a thread of its own."""
+"""Delivers the outbox's messages to one destination, in a thread of its own."""
 
 import threading
 import time
@@ -13,69 +13,69 @@ from twin.notifications.message import Message, again
 from twin.notifications.outbox import Outbox
 from twin.notifications.settings import Outlet
 
-BATCH = 20  # messages on their way at once: what MQTT brokers take
-FIRST_PAUSE_S = 1.0  # after a failure; the next ones are twice as long each
+BATCH = 20  # messages in flight at once: what MQTT brokers accept
+FIRST_PAUSE_S = 1.0  # after a failure; each further pause is twice as long
 LONGEST_PAUSE_S = 60.0
-BOUND_NS = 10 * 1_000_000_000  # between looks whether more waits than is to
-LOOK_S = 30.0  # into the outbox, where nobody has said that there is something
-GRACE_S = 3.0  # to deliver what is left when the program ends
+BOUND_NS = 10 * 1_000_000_000  # interval at which the bounds on waiting messages are checked
+LOOK_S = 30.0  # interval at which the outbox is read without a wake-up
+GRACE_S = 3.0  # for deliveries when the program ends
 ALARM = "alarm"  # the topic of alarms
 HOUR_NS = 3600 * 1_000_000_000
 DAY_NS = 86_400 * 1_000_000_000
 
 
 class LostError(SourceError):
-    """The destination cannot be reached now, or does not answer; it may come back."""
+    """The destination cannot be reached or does not answer; it may come back."""
 
 
 @dataclass
 class Sent:
-    """What has become of messages; what is in neither is to be sent again."""
+    """The outcome of sending; a message in neither collection must be sent again."""
 
     delivered: list[Message] = field(default_factory=list)
-    refused: dict[str, str] = field(default_factory=dict)  # by ID, why; for good
+    refused: dict[str, str] = field(default_factory=dict)  # reason by ID; final
     lost: LostError | None = None
 
 
 @dataclass(frozen=True)
 class Lane:
-    """What goes to a destination beside alarms: after them, in an order of its own."""
+    """Other data for a destination; it is sent after alarms, in an order of its own."""
 
     topic: str
     what: str  # in words
-    hours: float  # for which it waits
-    most: int = 1_000_000  # messages that wait
+    hours: float  # longest wait
+    most: int = 1_000_000  # waiting messages
 
 
 class Channel(Protocol):
-    """A way to a destination; one thread alone uses it."""
+    """A connection to a destination; only one thread uses it."""
 
     def open(self) -> bool:
-        """Be connected. True if the other side has forgotten what it was told; LostError if not."""
+        """Connect if needed; True if the other side has lost its state. LostError if that fails."""
 
     def send(self, messages: Sequence[Message], topic: str = ALARM) -> Sent:
-        """Deliver in this order, waiting until they are taken."""
+        """Deliver messages in this order, and wait until they are taken."""
 
     def idle(self, wake: threading.Event) -> None:
         """Keep the connection for a moment, or until ``wake``; LostError if it is lost."""
 
     def hang_up(self) -> None:
-        """Let go of a connection that failed."""
+        """Drop a connection that failed."""
 
     def close(self) -> None:
-        """Say good-bye; nothing comes after it."""
+        """Close the connection in order; it is the last call."""
 
 
 def box_of(destination: str, topic: str) -> str:
-    """Under what name a lane's messages wait in the outbox."""
+    """The name under which a lane's messages wait in the outbox."""
     return f"{destination} {topic}"
 
 
 class Sender:
     """Delivers the messages of a unit to one destination, each at least once and in order.
 
-    ``lanes`` are what goes there beside alarms. What goes wrong is said once, until it goes well
-    again.
+    ``lanes`` describe the other data for this destination. A failure is reported once, and its end
+    too.
     """
 
     def __init__(
@@ -89,13 +89,15 @@ class Sender:
         lanes: Sequence[Lane] = (),
     ) -> None:
         self.name = name
-        self._lanes = {box_of(name, one.topic): one for one in lanes}
+        self._lanes = {box_of(name, lane.topic): lane for lane in lanes}
         self._bounded_ns = 0
-        self._gone: Counter[str] = Counter()  # by lane: what was given up and is not yet said
+        self._unreported: Counter[str] = (
+            Counter()
+        )  # by lane: messages given up and not yet reported
         self._channel, self._open_outbox = channel, open_outbox
         self._limits, self._say, self._clock = limits, say, clock
         self._outbox: Outbox | None = None
-        self._told: dict[str, Message] = {}  # by alarm: the newest that was delivered
+        self._newest: dict[str, Message] = {}  # by alarm: the newest that was delivered
         self._to_restate = False
         self._complaint = ""
         self._refusal = ""
@@ -104,20 +106,20 @@ class Sender:
         self._thread = threading.Thread(target=self._work, name=f"to {name}", daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread.start()
 
     def wake(self) -> None:
-        """There is something in the outbox."""
+        """Signal that the outbox has new messages."""
         self._wake.set()
 
     def end(self) -> None:
-        """Deliver what can be delivered at once, then stop."""
+        """Deliver what is possible at once, then stop."""
         self._ending.set()
         self._wake.set()
 
     def join(self, patience_s: float | None = None) -> bool:
-        """Wait until it has stopped; whether it has."""
+        """Wait until the thread has stopped; returns whether it has."""
         self._thread.join(patience_s)
         return not self._thread.is_alive()
 
@@ -127,13 +129,13 @@ class Sender:
         while not self._ending.is_set():
             self._go_on_or_wait()
         self._finish()
-        self._let_go()
+        self._disconnect()
 
     def _go_on_or_wait(self) -> None:
         try:
             if not self._go_on():
                 self._rest()
-        except Exception as error:  # whatever it is, later ones are to be delivered
+        except Exception as error:  # later messages must still be delivered, whatever the error
             self._fail(error)
 
     def _go_on(self) -> bool:
@@ -148,7 +150,7 @@ class Sender:
         return is_more
 
     def _deliver_next(self, outbox: Outbox) -> bool:
-        """Alarms first, then what is beside them; False if there is nothing."""
+        """Deliver alarms first, then other data; False if there is nothing."""
         if messages := outbox.next(self.name, BATCH):
             self._deliver(outbox, messages)
             return True
@@ -168,23 +170,23 @@ class Sender:
 
     def _deliver(self, outbox: Outbox, messages: Sequence[Message]) -> None:
         sent = self._channel.send(messages)
-        self._told |= {one.alarm: one for one in sent.delivered}
+        self._newest |= {message.alarm: message for message in sent.delivered}
         self._settle(outbox, self.name, "alarms", sent)
 
-    def _settle(self, outbox: Outbox, box: str, what: str, sent: Sent) -> None:
-        """Note what has become of messages; LostError if the connection is lost."""
-        outbox.delivered(box, [one.id for one in sent.delivered])
-        for number, why in sent.refused.items():
-            outbox.refuse(box, number, why)
-            if why != self._refusal:
-                self._say(f"{self.name} refuses {what}, which are set aside: {why}")
-            self._refusal = why
+    def _settle(self, outbox: Outbox, box: str, content: str, sent: Sent) -> None:
+        """Record the outcome of sending; LostError if the connection is lost."""
+        outbox.delivered(box, [message.id for message in sent.delivered])
+        for number, reason in sent.refused.items():
+            outbox.refuse(box, number, reason)
+            if reason != self._refusal:
+                self._say(f"{self.name} refuses {content}, which are set aside: {reason}")
+            self._refusal = reason
         if sent.lost is not None:
             raise sent.lost
 
     def _restate(self) -> None:
-        """Tell every alarm as it was told last, so that whoever has lost everything is right."""
-        messages = [again(one, self._clock()) for one in self._told.values()]
+        """Send every alarm's last state again, for a destination that has lost its own."""
+        messages = [again(message, self._clock()) for message in self._newest.values()]
         for begin in range(0, len(messages), BATCH):
             sent = self._channel.send(messages[begin : begin + BATCH])
             if sent.lost is not None:
@@ -192,11 +194,11 @@ class Sender:
         self._to_restate = False
 
     def _give_up(self, outbox: Outbox) -> None:
-        """Let go of what waits beyond the bounds, and say so; the newest state is still told."""
+        """Delete alarms that wait beyond the bounds, and report it; their newest state is sent."""
         since_ns = self._clock() - round(self._limits.longest_days * DAY_NS)
         lost = outbox.give_up(self.name, self._limits.most_waiting, since_ns)
         if lost:
-            self._told |= {one.alarm: one for one in lost}
+            self._newest |= {message.alarm: message for message in lost}
             self._to_restate = True
             self._say(
                 f"{len(lost)} changes of alarms were never delivered to {self.name} and are given"
@@ -205,33 +207,33 @@ class Sender:
             )
 
     def _bound(self, outbox: Outbox) -> None:
-        """Hold what waits beside alarms within its bounds, also while nobody takes it."""
+        """Keep waiting other data within its bounds, also while the destination is away."""
         now = self._clock()
         if abs(now - self._bounded_ns) < BOUND_NS:
             return
         self._bounded_ns = now
         for box, lane in self._lanes.items():
-            gone = outbox.forget(box, lane.most, now - round(lane.hours * HOUR_NS))
-            if gone and not self._gone[box]:
+            count = outbox.forget(box, lane.most, now - round(lane.hours * HOUR_NS))
+            if count and not self._unreported[box]:
                 self._say(
                     f"{lane.what} wait for {self.name} for longer than {lane.hours:g} hours:"
                     " the oldest are given up"
                 )
-            self._gone[box] += gone
+            self._unreported[box] += count
 
-    def _say_gone(self) -> None:
+    def _report_given_up(self) -> None:
         for box, lane in self._lanes.items():
-            if gone := self._gone.pop(box, 0):
+            if count := self._unreported.pop(box, 0):
                 self._say(
-                    f"{gone} messages with {lane.what} were never delivered to {self.name}"
+                    f"{count} messages with {lane.what} were never delivered to {self.name}"
                     " and are given up"
                 )
 
-    # --- when it goes wrong, and well again -----------------------------------------------------
+    # --- failure and recovery -------------------------------------------------------------------
 
     def _fail(self, error: Exception) -> None:
-        """Say so if that is new, and wait; longer each time."""
-        self._let_go()
+        """Report a new failure, and wait; each pause is longer than the last."""
+        self._disconnect()
         if not self._complaint:
             self._say(f"alarms wait in the outbox: {self.name}: {in_words(error)}")
         self._complaint = in_words(error)
@@ -240,18 +242,18 @@ class Sender:
     def _succeed(self) -> None:
         if self._complaint:
             self._say(f"alarms go to {self.name} again")
-        self._say_gone()
+        self._report_given_up()
         self._complaint = ""
         self._backoff.reset()
 
-    def _let_go(self) -> None:
+    def _disconnect(self) -> None:
         self._channel.hang_up()
         if self._outbox is not None:
             self._outbox.close()
         self._outbox = None
 
     def _finish(self) -> None:
-        """Deliver what is left while that goes well and is soon done."""
+        """Deliver what is left, until a failure or the end of the grace time."""
         end = time.monotonic() + GRACE_S
         try:
             while self._go_on() and time.monotonic() < end:
@@ -259,11 +261,11 @@ class Sender:
             self._channel.close()
         except Exception as error:
             self._complaint = in_words(error)
-        with_why = f": {self._complaint}" if self._complaint else ""
+        cause = f": {self._complaint}" if self._complaint else ""
         try:
             self._outbox = self._outbox or self._open_outbox()
-            self._say_gone()
-            if left := sum(self._outbox.count(box) for box in (self.name, *self._lanes)):
-                self._say(f"{left} messages to {self.name} wait for the next run{with_why}")
+            self._report_given_up()
+            if waiting := sum(self._outbox.count(box) for box in (self.name, *self._lanes)):
+                self._say(f"{waiting} messages to {self.name} wait for the next run{cause}")
         except Exception as error:
             self._say(f"what waits for {self.name} is not known: {in_words(error)}")

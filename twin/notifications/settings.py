@@ -27,14 +27,16 @@ class Tls(Settings):
         return self
 
     def context(self, table: str, folder: Path) -> ssl.SSLContext:
-        """What a connection takes; ConfigError where a file cannot be used."""
+        """The context of a connection; ConfigError if a file cannot be used."""
         try:
             trusted = folder / self.trusted if self.trusted else None
             context = ssl.create_default_context(cafile=trusted)
-            context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN  # the server's own is enough
+            context.verify_flags |= (
+                ssl.VERIFY_X509_PARTIAL_CHAIN
+            )  # the server's own certificate is enough
             if self.certificate and self.key:
-                own = folder / self.certificate, folder / self.key
-                context.load_cert_chain(*own, password=lambda: "")
+                pair = folder / self.certificate, folder / self.key
+                context.load_cert_chain(*pair, password=lambda: "")
         except (OSError, ValueError) as error:
             raise ConfigError(
                 f"[{table}.tls]: cannot be used: {error}",
@@ -103,15 +105,15 @@ class HttpSettings(Settings):
         return self
 
     def address(self, table: str, folder: Path, say: Say) -> str:
-        """The address, from wherever it stands; ConfigError if it is none."""
+        """The address, read from its secret if need be; ConfigError if it is no address."""
         if isinstance(self.url, str):
             return self.url
-        found = self.url.read(f"[{table}] url", folder, say)
+        url = self.url.read(f"[{table}] url", folder, say)
         try:
-            self._check(found)
+            self._check(url)
         except ValueError as error:
             raise ConfigError(f"[{table}] {error}", "put an address there") from error
-        return found
+        return url
 
     def _check(self, url: str) -> None:
         _check_url(url, has_secrets=bool(self.headers) and not self.unprotected)
@@ -147,11 +149,11 @@ class OutletsSettings(Settings):
 
 
 def chosen(document: Document) -> tuple[MqttSettings, WebhookSettings]:
-    """What a configuration asks for; ConfigError names file, line and key."""
+    """The settings of a configuration; ConfigError names file, line and key."""
     mqtt = document.section(MqttSettings, "mqtt")
     webhook = document.section(WebhookSettings, "webhook")
-    for table, wanted in (("mqtt", mqtt.host), ("webhook", webhook.url)):
-        if table in document.tables and not wanted:
+    for table, target in (("mqtt", mqtt.host), ("webhook", webhook.url)):
+        if table in document.tables and not target:
             key = "host" if table == "mqtt" else "url"
             raise ConfigError(
                 f"{document.name}: [{table}] has no {key}", "write where, or leave the table out"
@@ -160,7 +162,7 @@ def chosen(document: Document) -> tuple[MqttSettings, WebhookSettings]:
 
 
 def chosen_upload(document: Document) -> UploadSettings | None:
-    """Whether logs are uploaded when asked; ConfigError names file, line and key."""
+    """The upload settings, None without uploads; ConfigError names file, line and key."""
     upload = document.section(OutletsSettings, "outlets").upload
     if upload is not None and "mqtt" not in document.tables:
         raise ConfigError(
@@ -171,13 +173,13 @@ def chosen_upload(document: Document) -> UploadSettings | None:
 
 
 def _check_url(url: str, *, has_secrets: bool) -> None:
-    """ValueError for what is no address, or would show secrets."""
-    where = urlsplit(url)
-    if where.scheme not in ("http", "https") or not where.hostname:
+    """ValueError if the URL is no address, or would show secrets."""
+    parts = urlsplit(url)
+    if parts.scheme not in ("http", "https") or not parts.hostname:
         raise ValueError("url is no address: https://HOST/PATH")
-    if has_secrets and where.scheme == "http" and not _is_loopback(where.hostname):
+    if has_secrets and parts.scheme == "http" and not _is_loopback(parts.hostname):
         raise ValueError(
-            f'"{where.hostname}" is beyond this machine, and headers are secrets: take https,'
+            f'"{parts.hostname}" is beyond this machine, and headers are secrets: take https,'
             " or say unprotected = true"
         )
 

@@ -1,4 +1,4 @@
-"""Where logs are uploaded to: an address that takes PUT, or a folder, which may be a share."""
+"""Destinations of log uploads: an address that takes PUT, or a folder, which may be a share."""
 
 import base64
 import hashlib
@@ -28,14 +28,14 @@ class StoppedError(Exception):
 
 
 class Place(Protocol):
-    """Takes files. LostError if it is to be tried again, RefusedError if never."""
+    """Takes files. LostError if a retry makes sense, RefusedError if not."""
 
     def put(self, path: Path, file: File) -> None:
-        """Have a file there, whole."""
+        """Store a whole file there."""
 
 
 class Source:
-    """A file to be read, until the program ends."""
+    """An open file; reading stops when the program ends."""
 
     def __init__(self, file: BinaryIO, ending: threading.Event) -> None:
         self._file, self._ending = file, ending
@@ -47,14 +47,14 @@ class Source:
         return self._file.read(size)
 
     def __iter__(self) -> Iterator[bytes]:
-        """All of it, in pieces."""
+        """The whole file in pieces."""
         while piece := self.read():
             yield piece
 
 
 @contextmanager
 def opened(path: Path, ending: threading.Event) -> Iterator[Source]:
-    """A file of ours, no link to another; RefusedError if it cannot be read any more."""
+    """Open a file, but no link; RefusedError if it can no longer be read."""
     try:
         file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW), "rb")
     except OSError as error:
@@ -65,20 +65,20 @@ def opened(path: Path, ending: threading.Event) -> Iterator[Source]:
 
 def described(path: Path, ending: threading.Event) -> File:
     """A file with its size and hash."""
-    found, size = hashlib.sha256(), 0
+    digest, size = hashlib.sha256(), 0
     with opened(path, ending) as source:
         for piece in source:
-            found.update(piece)
+            digest.update(piece)
             size += len(piece)
-    return File(path.name, size, found.hexdigest())
+    return File(path.name, size, digest.hexdigest())
 
 
 def place_of(
     settings: UploadSettings, unit: Unit, folder: Path, ending: threading.Event, say: Say
 ) -> Place:
-    """What a configuration names; relative paths are from ``folder``.
+    """The destination that a configuration names; paths are relative to ``folder``.
 
-    ConfigError where a secret or certificate cannot be used.
+    ConfigError if a secret or certificate cannot be used.
     """
     if settings.folder is not None:
         return Share(folder / settings.folder, unit, ending)
@@ -86,27 +86,27 @@ def place_of(
 
 
 class Share:
-    """A folder, with one in it for each type and unit. It must be there: it may be a mount."""
+    """A folder with a subfolder for each type and unit. It must exist: it may be a mount."""
 
     def __init__(self, folder: Path, unit: Unit, ending: threading.Event) -> None:
         self._folder, self._ending = folder, ending
-        self._own = folder.joinpath(*_levels(unit))
+        self._unit_folder = folder.joinpath(*_levels(unit))
 
     def put(self, path: Path, file: File) -> None:
-        """Copy it, under its name only once it is whole; nothing that is there is replaced."""
+        """Copy a file; it gets its name when it is whole. Existing files are never replaced."""
         if not self._folder.is_dir():
             raise LostError(f"{self._folder}: no such folder", "is the share mounted?")
-        target = self._own / file.name
+        target = self._unit_folder / file.name
         try:
-            self._own.mkdir(parents=True, exist_ok=True)
+            self._unit_folder.mkdir(parents=True, exist_ok=True)
             if target.exists():
-                self._refuse_another(target, file)
+                self._check_same(target, file)
                 return
             self._copy(path, target)
         except OSError as error:
             raise LostError(f"{target}: cannot be written: {error.strerror}") from error
 
-    def _refuse_another(self, target: Path, file: File) -> None:
+    def _check_same(self, target: Path, file: File) -> None:
         if described(target, self._ending) != file:
             raise RefusedError(f"another file called {file.name} is already there")
 
@@ -121,7 +121,7 @@ class Share:
 
 
 class Address:
-    """What takes files by PUT below its URL, with a level for each type and unit."""
+    """A server that takes files by PUT below its URL, with a level for each type and unit."""
 
     def __init__(
         self,
@@ -133,23 +133,23 @@ class Address:
     ) -> None:
         url = settings.address("outlets.upload", folder, say)
         self._url = "/".join((url.rstrip("/"), *_levels(unit)))
-        where = urlsplit(url)
-        self._where = f"{where.scheme}://{where.netloc}"  # what follows may be a secret
+        parts = urlsplit(url)
+        self._where = f"{parts.scheme}://{parts.netloc}"  # what follows may be a secret
         self._ending = ending
         self._headers = {
             name: sendable(f"[outlets.upload] headers.{name}", secret, folder, say)
             for name, secret in settings.headers.items()
         }
-        secured = where.scheme == "https"
+        is_secure = parts.scheme == "https"
         self._pool = urllib3.PoolManager(
             1,
             retries=False,  # nor redirects
             timeout=urllib3.Timeout(connect=CONNECT_S, read=settings.timeout_s),
-            ssl_context=settings.tls.context("outlets.upload", folder) if secured else None,
+            ssl_context=settings.tls.context("outlets.upload", folder) if is_secure else None,
         )
 
     def put(self, path: Path, file: File) -> None:
-        """Put it, with its hash (RFC 9530)."""
+        """Upload a file with its hash (RFC 9530)."""
         digest = base64.b64encode(bytes.fromhex(file.sha256)).decode()
         headers = {
             **self._headers,
@@ -176,4 +176,4 @@ class Address:
 
 def _levels(unit: Unit) -> list[str]:
     """Type and unit as names of folders; a dot alone would be another folder."""
-    return [quote(one, safe="").replace(".", "%2E") or "-" for one in unit]
+    return [quote(name, safe="").replace(".", "%2E") or "-" for name in unit]

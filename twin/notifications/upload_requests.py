@@ -1,4 +1,4 @@
-"""What is asked of a unit over the broker: logs to be uploaded, kept until that is done."""
+"""Requests over the broker to upload a unit's logs; they are stored until they are done."""
 
 import json
 import time
@@ -29,13 +29,13 @@ from twin.settings import Settings
 
 REQUEST_FORMAT = "ejector-twin-upload-request/1"
 LONGEST = 4096  # bytes of a request
-KEPT = 1000  # requests that are remembered, so that none is done twice
+KEPT = 1000  # requests remembered, so that none is done twice
 ACCEPTED, RUNNING, DONE, REFUSED = "accepted", "running", "done", "refused"
 OPEN = (ACCEPTED, RUNNING)
 
 
 class RefusedError(TwinError):
-    """What is asked for is not done, and why."""
+    """A request that is refused, with the reason."""
 
 
 class UploadRequest(Settings):
@@ -59,17 +59,17 @@ class UploadRequest(Settings):
 
 
 def parse(payload: bytes) -> UploadRequest:
-    """A request as it came; RefusedError says what is wrong with it."""
+    """Parse a received request; RefusedError says what is wrong with it."""
     if len(payload) > LONGEST:
         raise RefusedError(f"a request has {LONGEST} bytes at most")
     try:
         return UploadRequest.model_validate_json(payload)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False, include_context=False)[0]
-        where = ".".join(map(str, first["loc"]))
+        location = ".".join(map(str, first["loc"]))
         unknown = first["type"] == "extra_forbidden"
-        what = "unknown key" if unknown else first["msg"].removeprefix("Value error, ")
-        raise RefusedError(f"{where[:80]}: {what}" if where else what) from error
+        problem = "unknown key" if unknown else first["msg"].removeprefix("Value error, ")
+        raise RefusedError(f"{location[:80]}: {problem}" if location else problem) from error
 
 
 @dataclass(frozen=True)
@@ -83,13 +83,13 @@ class File:
 
 @dataclass(frozen=True)
 class Asked:
-    """A request and what has become of it."""
+    """A request and its state."""
 
     number: int
     request: UploadRequest
     state: str
-    why: str = ""  # it is refused
-    files: tuple[File, ...] = ()  # that have arrived
+    why: str = ""  # reason of a refusal
+    files: tuple[File, ...] = ()  # files that have arrived
 
 
 metadata = MetaData()
@@ -117,9 +117,9 @@ def open_uploads(
     busy_s: float = 5.0,
     clock: Callable[[], int] = time.time_ns,
 ) -> "Uploads":
-    """Open what is asked of a unit in the alarm database at a URL or in an SQLite file.
+    """Open the upload requests of a unit in the alarm database at a URL or in an SQLite file.
 
-    ConfigError for a URL of an unknown kind, SourceError if it cannot be reached or written.
+    ConfigError for a URL of an unknown kind, SourceError if the database cannot be used.
     """
     uploads = Uploads(where, unit, busy_s, clock)
     with uploads.closed_on_error():
@@ -128,7 +128,7 @@ def open_uploads(
 
 
 class Uploads(Database):
-    """What is asked of a unit. Several threads may open one each."""
+    """The upload requests of a unit. Each thread opens its own."""
 
     def __init__(
         self, where: str | Path | URL, unit: Unit, busy_s: float, clock: Callable[[], int]
@@ -137,45 +137,45 @@ class Uploads(Database):
         self._unit = unit
 
     def prepare(self) -> None:
-        """Make the table if it is not there."""
+        """Create the table if it is missing."""
         self._make_missing(metadata)
 
     def find(self, number: str) -> Asked | None:
-        """What was asked under an ID, as far as that is remembered."""
-        wanted = select(UPLOADS).where(*of_unit(UPLOADS, self._unit), UPLOADS.c.id == number)
+        """The request with an ID, if it is still remembered."""
+        statement = select(UPLOADS).where(*of_unit(UPLOADS, self._unit), UPLOADS.c.id == number)
         with self._reading() as connection:
-            row = connection.execute(wanted).first()
+            row = connection.execute(statement).first()
         return _asked(row) if row else None
 
     def add(self, request: UploadRequest) -> None:
-        """Keep a request that is accepted; the oldest that are done are forgotten."""
-        own: dict[str, Any] = {"asset_type": self._unit.type, "asset_id": self._unit.id}
-        own |= {"id": request.id, "request": request.model_dump_json(by_alias=True)}
-        own |= {"asked_ns": self._clock(), "state": ACCEPTED, "why": "", "files": "[]"}
-        mine = of_unit(UPLOADS, self._unit)
+        """Store an accepted request, and delete the oldest finished ones beyond ``KEPT``."""
+        row: dict[str, Any] = {"asset_type": self._unit.type, "asset_id": self._unit.id}
+        row |= {"id": request.id, "request": request.model_dump_json(by_alias=True)}
+        row |= {"asked_ns": self._clock(), "state": ACCEPTED, "why": "", "files": "[]"}
+        of_this_unit = of_unit(UPLOADS, self._unit)
         with self._writing() as connection:
-            connection.execute(UPLOADS.insert(), own)
-            newest = select(func.max(UPLOADS.c.number)).where(*mine)
+            connection.execute(UPLOADS.insert(), row)
+            newest = select(func.max(UPLOADS.c.number)).where(*of_this_unit)
             limit = int(connection.execute(newest).scalar_one()) - KEPT
             old = UPLOADS.c.number <= limit, UPLOADS.c.state.not_in(OPEN)
-            connection.execute(UPLOADS.delete().where(*mine, *old))
+            connection.execute(UPLOADS.delete().where(*of_this_unit, *old))
 
     def waiting(self) -> list[Asked]:
-        """What is not done yet, in order."""
-        mine = *of_unit(UPLOADS, self._unit), UPLOADS.c.state.in_(OPEN)
+        """The requests that are not done yet, in order."""
+        condition = *of_unit(UPLOADS, self._unit), UPLOADS.c.state.in_(OPEN)
         with self._reading() as connection:
-            rows = connection.execute(select(UPLOADS).where(*mine).order_by(UPLOADS.c.number))
+            rows = connection.execute(select(UPLOADS).where(*condition).order_by(UPLOADS.c.number))
             return [_asked(row) for row in rows]
 
     def note(self, number: int, state: str, files: Sequence[File], why: str = "") -> None:
-        """What has become of one."""
-        told = json.dumps([vars(one) for one in files])
-        values = {"state": state, "files": told, "why": why}
+        """Store the state of a request."""
+        files_json = json.dumps([vars(file) for file in files])
+        values = {"state": state, "files": files_json, "why": why}
         with self._writing() as connection:
             connection.execute(UPLOADS.update().where(UPLOADS.c.number == number).values(values))
 
 
 def _asked(row: Row[Any]) -> Asked:
     request = UploadRequest.model_validate_json(row.request)
-    files = tuple(File(**one) for one in json.loads(row.files))
+    files = tuple(File(**file) for file in json.loads(row.files))
     return Asked(row.number, request, row.state, row.why, files)

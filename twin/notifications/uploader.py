@@ -1,7 +1,7 @@
-"""Uploads finished logs when asked over the broker, one request after the other, in a thread.
+"""Uploads finished logs on request over the broker, one request at a time, in a thread.
 
-A request is in the database before the broker is told that it arrived, and stays there until it is
-done. So it outlives the program and lost networks.
+A request is stored in the database before the broker gets its acknowledgement, and stays there
+until it is done. So it outlives the program and lost networks.
 """
 
 import threading
@@ -30,18 +30,18 @@ from twin.secret import Say
 
 ANSWER_FORMAT = "ejector-twin-upload/1"
 UPLOAD = "upload"  # the topic of answers, below the unit's
-MOST_OPEN = 20  # requests that wait
-FIRST_PAUSE_S = 2.0  # after a failure; the next ones are twice as long each
+MOST_OPEN = 20  # waiting requests
+FIRST_PAUSE_S = 2.0  # after a failure; each further pause is twice as long
 LONGEST_PAUSE_S = 300.0
 
 Tell = Callable[[Message], None]
 
 
 class Uploader:
-    """Takes requests and does them. ``ending`` is set by ``end``, for all who read files for it.
+    """Takes requests and carries them out. ``end`` sets ``ending``, which stops reading files.
 
-    ``find`` gives the files that a request means, or raises RefusedError. What goes wrong is said
-    once, until it goes well again.
+    ``find`` returns the files that a request asks for, or raises RefusedError. A failure is
+    reported once, and its end too.
     """
 
     def __init__(
@@ -62,45 +62,50 @@ class Uploader:
         self._thread = threading.Thread(target=self._work, name="uploads", daemon=True)
 
     def start(self, tell: Tell) -> None:
-        """Begin, with what an earlier run has left; answers go to ``tell``."""
+        """Start with the requests that an earlier run left; answers go to ``tell``."""
         self._tell = tell
         self._wake.set()
         self._thread.start()
 
     def end(self) -> None:
-        """Stop in the middle of a file; the next run sends it again."""
+        """Stop, even in the middle of a file; the next run sends that file again."""
         self._ending.set()
         self._wake.set()
 
     def join(self, patience_s: float | None = None) -> bool:
-        """Wait until it has stopped; whether it has."""
+        """Wait until the thread has stopped; returns whether it has."""
         self._thread.join(patience_s)
         return not self._thread.is_alive()
 
     def hear(self, payload: bytes) -> None:
-        """Take a request and answer it; SourceError if it cannot be kept: it is to come again."""
+        """Take a request and answer it; SourceError if it cannot be stored and must come again."""
         try:
             request = parse(payload)
         except RefusedError as error:
             self._answer(None, REFUSED, why=str(error))
             return
         with self._open_uploads() as uploads:
-            if known := uploads.find(request.id):
-                self._answer(request.id, known.state, known.files, why=known.why)
+            if earlier := uploads.find(request.id):
+                self._answer(request.id, earlier.state, earlier.files, why=earlier.why)
                 return
             if len(uploads.waiting()) >= MOST_OPEN:
-                why = f"{MOST_OPEN} requests wait already: ask again later"
-                self._answer(request.id, REFUSED, why=why)
+                reason = f"{MOST_OPEN} requests wait already: ask again later"
+                self._answer(request.id, REFUSED, why=reason)
                 return
             uploads.add(request)
         self._answer(request.id, ACCEPTED)
         self._wake.set()
 
     def _answer(
-        self, number: str | None, state: str, files: Sequence[File] = (), **more: Any
+        self, number: str | None, state: str, files: Sequence[File] = (), **details: Any
     ) -> None:
-        told = {"request": number, "state": state, "files": [vars(one) for one in files], **more}
-        self._tell(beside(ANSWER_FORMAT, self._asset, time.time_ns(), told))
+        content = {
+            "request": number,
+            "state": state,
+            "files": [vars(file) for file in files],
+            **details,
+        }
+        self._tell(beside(ANSWER_FORMAT, self._asset, time.time_ns(), content))
 
     # --- the thread -----------------------------------------------------------------------------
 
@@ -124,28 +129,28 @@ class Uploader:
                 self._failed = False
                 self._backoff.reset()
 
-    def _do(self, uploads: Uploads, asked: Asked) -> None:
-        """Upload what is still to be; LostError if it is to be tried again."""
-        number, files = asked.request.id, list(asked.files)
+    def _do(self, uploads: Uploads, job: Asked) -> None:
+        """Upload the remaining files of a request; LostError if it must be tried again."""
+        number, files = job.request.id, list(job.files)
         try:
-            found = self._find(asked.request)
-            more: dict[str, Any] = {"unfinished": list(found.unfinished)}
-            if asked.state == ACCEPTED:
-                uploads.note(asked.number, RUNNING, files)
-                self._answer(number, RUNNING, **more)
-            for path in found.parts:
-                if path.name in {one.name for one in files}:
+            selection = self._find(job.request)
+            details: dict[str, Any] = {"unfinished": list(selection.unfinished)}
+            if job.state == ACCEPTED:
+                uploads.note(job.number, RUNNING, files)
+                self._answer(number, RUNNING, **details)
+            for path in selection.parts:
+                if path.name in {sent.name for sent in files}:
                     continue
                 file = described(path, self._ending)
                 self._place.put(path, file)
                 files.append(file)
-                uploads.note(asked.number, RUNNING, files)
+                uploads.note(job.number, RUNNING, files)
         except RefusedError as error:
-            uploads.note(asked.number, REFUSED, files, str(error))
+            uploads.note(job.number, REFUSED, files, str(error))
             self._answer(number, REFUSED, files, why=str(error))
             return
-        uploads.note(asked.number, DONE, files)
-        self._answer(number, DONE, files, **more)
+        uploads.note(job.number, DONE, files)
+        self._answer(number, DONE, files, **details)
 
     def _fail(self, error: TwinError) -> None:
         if not self._failed:

@@ -1,4 +1,4 @@
-"""Alarms to an address that takes JSON by POST, one after the other."""
+"""Posts alarms as JSON to an address, one after the other."""
 
 import socket
 import threading
@@ -17,15 +17,14 @@ from twin.notifications.sender import ALARM, LostError, Sent
 from twin.notifications.settings import WebhookSettings
 from twin.secret import Say, Secret
 
-LATER = (408, 425, 429)  # of the client's errors those that say: not now
+LATER = (408, 425, 429)  # client errors that mean: try again later
 IDLE_S = 0.2
 
 
 class Webhook:
     """A channel (``twin.notifications.sender.Channel``).
 
-    ``folder`` is where relative paths are from. ConfigError where a secret or certificate cannot
-    be used.
+    Paths are relative to ``folder``. ConfigError if a secret or certificate cannot be used.
     """
 
     def __init__(self, settings: WebhookSettings, folder: Path, say: Say) -> None:
@@ -35,50 +34,50 @@ class Webhook:
             for name, secret in settings.headers.items()
         }
         self._url = settings.address("webhook", folder, say)
-        where = urlsplit(self._url)
-        self._where = f"{where.scheme}://{where.netloc}"  # what follows may be a secret
-        secured = where.scheme == "https"
+        parts = urlsplit(self._url)
+        self._where = f"{parts.scheme}://{parts.netloc}"  # what follows may be a secret
+        is_secure = parts.scheme == "https"
         self._pool = urllib3.PoolManager(
             1,
             retries=False,  # nor redirects
             timeout=urllib3.Timeout(total=settings.timeout_s),
-            ssl_context=settings.tls.context("webhook", folder) if secured else None,
+            ssl_context=settings.tls.context("webhook", folder) if is_secure else None,
         )
         self._pool.pool_classes_by_scheme = {"http": _Plain, "https": _Secured}
 
     def open(self) -> bool:
-        """There is a connection for each request, if need be."""
+        """Do nothing: each request connects if need be."""
         return False
 
     def send(self, messages: Sequence[Message], _topic: str = ALARM) -> Sent:
-        """Post each, until one does not come through."""
+        """Post each message, until the destination cannot be reached."""
         sent = Sent()
         for message in messages:
             try:
-                refused = self._post(message)
+                refusal = self._post(message)
             except LostError as error:
                 sent.lost = error
                 break
-            if refused:
-                sent.refused[message.id] = refused
+            if refusal:
+                sent.refused[message.id] = refusal
             else:
                 sent.delivered.append(message)
         return sent
 
     def idle(self, wake: threading.Event) -> None:
-        """Nothing is to be kept."""
+        """Wait: there is no connection to keep."""
         wake.wait(IDLE_S)
 
     def hang_up(self) -> None:
-        """Let go of connections."""
+        """Close all connections."""
         self._pool.clear()
 
     def close(self) -> None:
-        """Let go of connections."""
+        """Close all connections."""
         self._pool.clear()
 
     def _post(self, message: Message) -> str:
-        """Why it is refused, for good; empty if it is taken. LostError if it is to come again."""
+        """Why a message is refused for good; empty if it is taken. LostError if a retry helps."""
         headers = {**self._headers, "Idempotency-Key": message.id}
         try:
             answer = self._pool.request(
@@ -91,9 +90,9 @@ class Webhook:
             answer.close()
         except urllib3.exceptions.HTTPError as error:
             raise LostError(f"webhook {self._where}: {error}", "is it there?") from error
-        except ValueError as error:  # whose words may have a secret in them
-            why = f"the request cannot be made ({type(error).__name__})"
-            raise LostError(f"webhook {self._where}: {why}", "check [webhook]") from None
+        except ValueError as error:  # its text may contain a secret
+            cause = f"the request cannot be made ({type(error).__name__})"
+            raise LostError(f"webhook {self._where}: {cause}", "check [webhook]") from None
         if answer.status in LATER or answer.status >= 500:
             raise LostError(f"webhook {self._where}: status {answer.status} {answer.reason or ''}")
         if answer.status >= 300:
@@ -102,24 +101,24 @@ class Webhook:
 
 
 class _InTime(HTTPConnection):
-    """Its timeout is for a whole answer; the library's is for each piece of it."""
+    """A connection whose timeout limits the whole answer; the library's limits each piece."""
 
     def getresponse(self) -> HTTPResponse:  # type: ignore[override]  # as the library has it
-        sock, late = self.sock, threading.Event()
+        sock, timed_out = self.sock, threading.Event()
 
-        def cut() -> None:
-            late.set()
+        def shut_down() -> None:
+            timed_out.set()
             with suppress(OSError):  # it is closed already
                 sock.shutdown(socket.SHUT_RDWR)
 
-        timer = threading.Timer(self.timeout or 0.0, cut)
+        timer = threading.Timer(self.timeout or 0.0, shut_down)
         timer.start()
         try:
             return super().getresponse()
         finally:
             timer.cancel()
             timer.join()
-            if late.is_set():  # what was cut may look whole
+            if timed_out.is_set():  # a truncated answer may look whole
                 raise TimeoutError("timed out")
 
 
@@ -136,13 +135,13 @@ class _Secured(urllib3.HTTPSConnectionPool):
 
 
 def sendable(key: str, secret: Secret, folder: Path, say: Say) -> str:
-    """The secret of a header, if a header can have it; ConfigError if not."""
-    found = secret.read(key, folder, say)
+    """The secret of a header; ConfigError if a header cannot contain it."""
+    text = secret.read(key, folder, say)
     try:
-        found.encode("latin-1")
+        text.encode("latin-1")
     except UnicodeEncodeError:
         raise ConfigError(
             f"{key}: the secret has a character that no header can have",
             "only Latin letters, digits and signs; was it copied whole and right?",
         ) from None
-    return found
+    return text
