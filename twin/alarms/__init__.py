@@ -1,1 +1,1 @@
-"""Alarms as ISA-18.2 has them: rules, states, episodes; beside the loop, and in a database."""
+"""Alarms after ISA-18.2: rules, states and episodes, in the live loop and in a database."""

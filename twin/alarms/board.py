@@ -1,4 +1,4 @@
-"""All alarms of one ejector together: values in, changes out; and episodes made of changes."""
+"""All alarms of one ejector: takes values, returns changes; and builds episodes from changes."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -9,48 +9,51 @@ from twin.alarms.rules import Priority, Rule
 from twin.alarms.state import SECOND_NS, Alarm, Change, Deed, Kept, State
 from twin.errors import ConfigError
 
-SUPPRESSION = "suppression"  # stands for who acknowledges what nobody was told of
+SUPPRESSION = "suppression"  # who acknowledged an alarm that was never announced
 _ORDER = tuple(reversed(Priority))  # the most urgent first
 
 
 class Board:
-    """The alarms of one ejector by their rules."""
+    """The alarms of one ejector, one for each rule."""
 
     def __init__(self, rules: Sequence[Rule]) -> None:
         self.alarms = {rule.name: Alarm(rule) for rule in rules}
-        self._suppressible = [one for one in self.alarms.values() if one.rule.suppressed_by]
-        self._suppressing = {name for one in self._suppressible for name in one.rule.suppressed_by}
+        self._suppressible = [alarm for alarm in self.alarms.values() if alarm.rule.suppressed_by]
+        self._suppressing = {
+            name for alarm in self._suppressible for name in alarm.rule.suppressed_by
+        }
 
     def see(self, now: int, values: Mapping[str, float]) -> list[Change]:
-        """Take what is new, by name; of what is not in it only time goes on."""
+        """Take new values by name; for alarms without a new value only time passes."""
         changes: list[Change] = []
         for alarm in self.alarms.values():
             if alarm.rule.value in values or not alarm.rests:
                 changes += alarm.see(now, values.get(alarm.rule.value, math.nan))
-        designed = list(self._designed(now))
-        suppressed = {change.alarm for change in designed if change.deed is Deed.SUPPRESSED}
-        # What suppresses another alarm does so from the moment on in which both are raised.
+        suppressions = list(self._apply_suppression(now))
+        suppressed = {change.alarm for change in suppressions if change.deed is Deed.SUPPRESSED}
+        # An alarm suppresses another one even when both are raised at the same moment.
         changes = [
-            replace(one, announced=False) if one.alarm in suppressed else one for one in changes
+            replace(change, announced=False) if change.alarm in suppressed else change
+            for change in changes
         ]
-        return [*changes, *designed]
+        return [*changes, *suppressions]
 
     def resume(self, states: Mapping[str, Kept]) -> None:
-        """Go on where another run ended; alarms that the rules do not know any more are left."""
-        for name, kept in states.items():
+        """Restore the states of an earlier run; alarms without a rule are ignored."""
+        for name, stored in states.items():
             if name in self.alarms:
-                self.alarms[name].resume(kept)
+                self.alarms[name].resume(stored)
 
     def watching(self, value: str) -> list[Alarm]:
-        """The alarms of a value, in the order of the rules."""
+        """The alarms that watch a value, in the order of the rules."""
         return [alarm for alarm in self.alarms.values() if alarm.rule.value == value]
 
-    def rename(self, now: int, value: str, other: str) -> list[Change]:
-        """What was taken for one cause is another one: its alarms go on as those of the other."""
+    def rename(self, now: int, value: str, new_value: str) -> list[Change]:
+        """Move the alarms of a value to another one, since the deviation has another cause."""
         changes: list[Change] = []
-        for old, new in zip(self.watching(value), self.watching(other), strict=True):
+        for old, new in zip(self.watching(value), self.watching(new_value), strict=True):
             changes += old.become(now, new)
-        return [*changes, *self._designed(now)]
+        return [*changes, *self._apply_suppression(now)]
 
     def __getitem__(self, name: str) -> Alarm:
         if name not in self.alarms:
@@ -58,16 +61,18 @@ class Board:
         return self.alarms[name]
 
     def standing(self) -> list[Alarm]:
-        """What a person is to look at: the most urgent first, of these the unacknowledged."""
-        shown = [
+        """Alarms for a person to handle: the most urgent first, unacknowledged before others."""
+        standing = [
             alarm
             for alarm in self.alarms.values()
             if alarm.state in (State.UNACKNOWLEDGED, State.ACKNOWLEDGED, State.RETURNED)
         ]
-        return sorted(shown, key=lambda one: (_ORDER.index(one.rule.priority), one.acknowledged))
+        return sorted(
+            standing, key=lambda alarm: (_ORDER.index(alarm.rule.priority), alarm.acknowledged)
+        )
 
     def quiet(self) -> list[Alarm]:
-        """What is shelved or out of service, or has something to say but is suppressed."""
+        """Alarms that are shelved or out of service, or suppressed although they concern people."""
         return [
             alarm
             for alarm in self.alarms.values()
@@ -75,8 +80,8 @@ class Board:
             or (alarm.state is State.SUPPRESSED and alarm.concerns)
         ]
 
-    def _designed(self, now: int) -> Iterator[Change]:
-        """Suppress what is quiet by design while another alarm is active."""
+    def _apply_suppression(self, now: int) -> Iterator[Change]:
+        """Suppress alarms by design while another alarm is active, and end that afterwards."""
         active = {name for name in self._suppressing if self.alarms[name].active}
         for alarm in self._suppressible:
             yield from alarm.suppress(now, bool(active & set(alarm.rule.suppressed_by)))
@@ -84,9 +89,10 @@ class Board:
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """One time that an alarm was active; None for what has not happened yet.
+    """One period in which an alarm was active; None for a time that has not come yet.
 
-    ``raised_as`` is the name it was raised under; with the time it tells an episode from others.
+    ``raised_as`` is the name under which it was raised. With ``raised_ns`` it identifies the
+    episode.
     """
 
     alarm: str
@@ -99,18 +105,18 @@ class Episode:
 
     @property
     def is_over(self) -> bool:
-        """Whether it is cleared and acknowledged."""
+        """Whether the episode is cleared and acknowledged."""
         return self.cleared_ns is not None and self.acknowledged_ns is not None
 
     @property
     def seconds(self) -> float | None:
-        """How long it was active."""
+        """How long the alarm was active; None while it is."""
         return None if self.cleared_ns is None else (self.cleared_ns - self.raised_ns) / SECOND_NS
 
 
 @dataclass(frozen=True, slots=True)
 class Comment:
-    """What somebody wrote to an episode, which its first name and time tell from others."""
+    """A person's comment on an episode, which ``raised_ns`` and ``raised_as`` identify."""
 
     raised_ns: int
     raised_as: str
@@ -119,12 +125,12 @@ class Comment:
     text: str
 
     def is_of(self, episode: "Episode") -> bool:
-        """Whether it was written to that one."""
+        """Whether it was written to this episode."""
         return (self.raised_ns, self.raised_as) == (episode.raised_ns, episode.raised_as)
 
 
 class Diary:
-    """The episodes that changes in their order make; of those that are over it knows nothing."""
+    """Builds episodes from changes in their order; it forgets episodes that are over."""
 
     def __init__(self, going_on: Iterable[Episode] = ()) -> None:
         self._going_on: dict[str, list[Episode]] = {}  # by alarm
@@ -132,25 +138,25 @@ class Diary:
             self._going_on.setdefault(episode.alarm, []).append(episode)
 
     def take(self, change: Change) -> list[Episode]:
-        """The episodes that a change begins or alters, as they are then."""
+        """The new state of each episode that a change begins or alters."""
         before = self._going_on.pop(change.alarm, [])
         if change.deed is Deed.RAISED:
             new = Episode(change.alarm, change.time_ns, raised_as=change.alarm)
             self._going_on[change.alarm] = [*before, new]
             return [new]
-        after = [_gone_on(one, change) for one in before]
-        for one in after:
-            if not one.is_over:
-                self._going_on.setdefault(one.alarm, []).append(one)
+        after = [_after_change(episode, change) for episode in before]
+        for episode in after:
+            if not episode.is_over:
+                self._going_on.setdefault(episode.alarm, []).append(episode)
         return [new for old, new in zip(before, after, strict=True) if new is not old]
 
     def newest(self, alarm: str) -> Episode | None:
-        """The newest episode of an alarm, of those that go on."""
+        """The newest episode of an alarm that is not over; None without one."""
         episodes = self._going_on.get(alarm)
         return episodes[-1] if episodes else None
 
     def note(self, alarm: str, evidence: Mapping[str, Any]) -> list[Episode]:
-        """The episode of an alarm that is active, with more to speak for it."""
+        """Add evidence to the episode of an active alarm; returns that episode, or nothing."""
         episodes = self._going_on.get(alarm, [])
         if not episodes or episodes[-1].cleared_ns is not None:
             return []
@@ -158,19 +164,19 @@ class Diary:
         return episodes[-1:]
 
 
-def joined(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
-    """What is known later over what was; the first cycle and the first guess stay."""
-    stays = {key: before[key] for key in ("first_cycle", "guess") if key in before}
-    return {**before, **after, **stays}
+def joined(earlier: Mapping[str, Any], later: Mapping[str, Any]) -> dict[str, Any]:
+    """Evidence updated by later evidence; the first cycle and the first guess stay."""
+    first_values = {key: earlier[key] for key in ("first_cycle", "guess") if key in earlier}
+    return {**earlier, **later, **first_values}
 
 
-def _gone_on(episode: Episode, change: Change) -> Episode:
-    """The episode after a change to its alarm; who acknowledges has seen all of its episodes."""
+def _after_change(episode: Episode, change: Change) -> Episode:
+    """The episode after a change of its alarm; an acknowledgement covers all its episodes."""
     if change.deed is Deed.CLEARED and episode.cleared_ns is None:
-        over = replace(episode, cleared_ns=change.time_ns)
+        cleared = replace(episode, cleared_ns=change.time_ns)
         if change.untold:
-            over = replace(over, acknowledged_ns=change.time_ns, acknowledged_by=SUPPRESSION)
-        return over
+            cleared = replace(cleared, acknowledged_ns=change.time_ns, acknowledged_by=SUPPRESSION)
+        return cleared
     if change.deed is Deed.ACKNOWLEDGED:
         return replace(episode, acknowledged_ns=change.time_ns, acknowledged_by=change.who)
     if change.deed is Deed.RENAMED:

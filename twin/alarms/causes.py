@@ -1,4 +1,4 @@
-"""The causes that a deviation can have: each has an alarm of its own."""
+"""The causes that a deviation can have; each has its own alarm."""
 
 from twin.model.effects import EFFECTS, UNKNOWN, find_effect
 
@@ -13,19 +13,21 @@ def value_of(cause: str) -> str:
 
 
 def cause_of(value: str) -> str:
-    """The cause that a value stands for; empty for a value that is none of the deviation."""
+    """The cause that a value stands for; empty if the value is not one of the deviation."""
     cause = value.removeprefix(f"{DEVIATION}.")
     return cause if cause != value and cause in CAUSES else ""
 
 
 def known(effect: str) -> str:
-    """The cause that an effect's name stands for; UNLISTED for one that is none."""
+    """The cause with an effect's name; UNLISTED if there is none."""
     return effect if effect in CAUSES else UNLISTED
 
 
 def catalogue_words(effect: str) -> dict[str, dict[str, str]]:
-    """Words for an effect of a catalogue, which has no alarm of its own, beside other evidence."""
-    found = None if effect in CAUSES else find_effect(effect)
-    if found is None:
+    """Evidence that describes a catalogue's effect, which has no alarm of its own; else empty."""
+    catalogued = None if effect in CAUSES else find_effect(effect)
+    if catalogued is None:
         return {}
-    return {"taken_in": {"name": effect, "sentence": found.sentence, "look_at": found.look_at}}
+    return {
+        "taken_in": {"name": effect, "sentence": catalogued.sentence, "look_at": catalogued.look_at}
+    }

@@ -1,4 +1,4 @@
-"""Where alarms are kept: states as they are, episodes as they were, and what people ask for."""
+"""The alarm database: present states, episodes, and people's requests and comments."""
 
 import json
 import time
@@ -35,14 +35,14 @@ ALARM_DATABASE = Purpose("alarm database", "--alarms", "alarms")
 metadata = MetaData()
 
 
-def _whose() -> tuple[Column[Any], Column[Any]]:
+def _unit_columns() -> tuple[Column[Any], Column[Any]]:
     return Column("asset_type", Text, primary_key=True), Column("asset_id", Text, primary_key=True)
 
 
 STATE = Table(
     "alarm_state",
     metadata,
-    *_whose(),
+    *_unit_columns(),
     Column("alarm", Text, primary_key=True),
     Column("active", Boolean, nullable=False),
     Column("acknowledged", Boolean, nullable=False),
@@ -54,7 +54,7 @@ STATE = Table(
 EPISODE = Table(
     "alarm_episode",
     metadata,
-    *_whose(),
+    *_unit_columns(),
     Column("raised_ns", BigInteger, primary_key=True, autoincrement=False),
     Column("raised_as", Text, primary_key=True),  # its name then
     Column("alarm", Text, nullable=False),
@@ -86,15 +86,15 @@ COMMENT = Table(
     Column("id", Integer, primary_key=True),
     Column("asset_type", Text, nullable=False),
     Column("asset_id", Text, nullable=False),
-    Column("raised_ns", BigInteger, nullable=False),  # with the next one: which episode
+    Column("raised_ns", BigInteger, nullable=False),  # identifies the episode, with raised_as
     Column("raised_as", Text, nullable=False),
     Column("written_ns", BigInteger, nullable=False),
     Column("who", Text, nullable=False),
     Column("text", Text, nullable=False),
 )
 
-# What a run has once kept is a unit that can be asked for, whether or not an alarm was ever raised.
-UNIT = Table("alarm_unit", metadata, *_whose())
+# All units of which a run has kept alarms. They can be queried even if no alarm was ever raised.
+UNIT = Table("alarm_unit", metadata, *_unit_columns())
 
 
 def open_store(
@@ -106,104 +106,106 @@ def open_store(
 ) -> "Store":
     """Open the alarm database at a URL or in an SQLite file; close it, or use it as a context.
 
-    ``create=False`` refuses an SQLite file that is not there. ConfigError for a URL of an unknown
-    kind, SourceError if it cannot be reached, read or written.
+    ``create=False`` rejects a missing SQLite file. ConfigError for a URL of an unknown kind,
+    SourceError if the database cannot be reached, read or written.
     """
-    absent = "" if create else "check --alarms; twin run makes one where [alarms] keep = true"
-    store = Store(where, ALARM_DATABASE, busy_s, clock, absent)
+    absent_hint = "" if create else "check --alarms; twin run makes one where [alarms] keep = true"
+    store = Store(where, ALARM_DATABASE, busy_s, clock, absent_hint)
     with store.closed_on_error():
         store.prepare()
     return store
 
 
 class Store(Database):
-    """An open alarm database. What is written is written whole or not at all."""
+    """An open alarm database. Every write is one transaction."""
 
     def prepare(self) -> None:
-        """Make the tables that are not there."""
+        """Create missing tables."""
         self._make_missing(metadata)
 
     # --- a run ----------------------------------------------------------------------------------
 
     def before(self, unit: Unit) -> Before:
-        """What was when the last run of a unit ended; the unit can be asked for from now on."""
-        own = {"asset_type": unit.type, "asset_id": unit.id}
+        """The alarms at the end of a unit's last run; it also registers the unit."""
+        unit_key = {"asset_type": unit.type, "asset_id": unit.id}
         with self._writing() as connection:
-            _replace(connection, UNIT, own)
+            _replace(connection, UNIT, unit_key)
         return Before(self.states(unit), self.episodes(unit, only_going_on=True))
 
     def save(self, unit: Unit, news: News) -> None:
-        """Write what has changed."""
-        own = {"asset_type": unit.type, "asset_id": unit.id}
+        """Write all changes."""
+        unit_key = {"asset_type": unit.type, "asset_id": unit.id}
         with self._writing() as connection:
-            _replace(connection, UNIT, own)
-            for name, kept in news.states.items():
+            _replace(connection, UNIT, unit_key)
+            for name, state in news.states.items():
                 stored = {"alarm": name, "stored_ns": self._clock()}
-                _replace(connection, STATE, {**own, **stored, **_plain_state(kept)})
+                _replace(connection, STATE, {**unit_key, **stored, **_plain_state(state)})
             for episode in news.episodes.values():
-                _replace(connection, EPISODE, {**own, **_plain_episode(episode)})
+                _replace(connection, EPISODE, {**unit_key, **_plain_episode(episode)})
             for number, answer in news.answers.items():
                 answered = {"answered_ns": self._clock(), "answer": answer}
                 connection.execute(REQUEST.update().where(REQUEST.c.id == number).values(answered))
 
     def requests(self, unit: Unit) -> list[Request]:
-        """What is asked of a unit's alarms, and not answered, in the order it was asked."""
-        wanted = select(REQUEST).where(*of_unit(REQUEST, unit), REQUEST.c.answered_ns.is_(None))
+        """The unanswered requests to a unit's alarms, in order."""
+        statement = select(REQUEST).where(*of_unit(REQUEST, unit), REQUEST.c.answered_ns.is_(None))
         with self._reading() as connection:
-            return [_request(row) for row in connection.execute(wanted.order_by(REQUEST.c.id))]
+            return [_request(row) for row in connection.execute(statement.order_by(REQUEST.c.id))]
 
     # --- people ---------------------------------------------------------------------------------
 
     def ask(self, unit: Unit, alarm: str, deed: Deed, who: str, seconds: float = 0.0) -> int:
-        """Ask something of a unit's alarm; gives the number by which to look for the answer."""
+        """Store a request to a unit's alarm; returns its number, by which to get the answer."""
         values: dict[str, Any] = {"asset_type": unit.type, "asset_id": unit.id, "alarm": alarm}
         values |= {"deed": deed.value, "who": who, "asked_ns": self._clock(), "seconds": seconds}
         with self._writing() as connection:
-            done = connection.execute(REQUEST.insert().values(values).returning(REQUEST.c.id))
-            return int(done.scalar_one())
+            result = connection.execute(REQUEST.insert().values(values).returning(REQUEST.c.id))
+            return int(result.scalar_one())
 
     def answer(self, number: int) -> str | None:
-        """Why a request was refused, empty if it was done; None while nobody has answered."""
-        wanted = select(REQUEST.c.answered_ns, REQUEST.c.answer).where(REQUEST.c.id == number)
+        """Why a request was refused, empty if it was done; None while it is unanswered."""
+        statement = select(REQUEST.c.answered_ns, REQUEST.c.answer).where(REQUEST.c.id == number)
         with self._reading() as connection:
-            answered_ns, answer = connection.execute(wanted).one()
+            answered_ns, answer = connection.execute(statement).one()
         return None if answered_ns is None else str(answer)
 
     def episodes_around(self, unit: Unit, since_ns: int) -> list[Episode]:
-        """The episodes of a unit that were raised since then, and those from before that go on."""
-        before = [
-            one for one in self.episodes(unit, only_going_on=True) if one.raised_ns < since_ns
+        """Episodes of a unit raised since ``since_ns``, after earlier ones that are not over."""
+        earlier = [
+            episode
+            for episode in self.episodes(unit, only_going_on=True)
+            if episode.raised_ns < since_ns
         ]
-        return [*before, *self.episodes(unit, since_ns)]
+        return [*earlier, *self.episodes(unit, since_ns)]
 
     def comment(self, unit: Unit, comment: Comment) -> None:
-        """Keep a comment; ConfigError where its episode is none of the unit's."""
-        own = {"asset_type": unit.type, "asset_id": unit.id}
-        which = {"raised_ns": comment.raised_ns, "raised_as": comment.raised_as}
-        there = [EPISODE.c[name] == value for name, value in (own | which).items()]
-        values = own | which | {"written_ns": comment.written_ns}
+        """Store a comment; ConfigError if the unit has no such episode."""
+        unit_key = {"asset_type": unit.type, "asset_id": unit.id}
+        episode_key = {"raised_ns": comment.raised_ns, "raised_as": comment.raised_as}
+        condition = [EPISODE.c[name] == value for name, value in (unit_key | episode_key).items()]
+        values = unit_key | episode_key | {"written_ns": comment.written_ns}
         values |= {"who": comment.who, "text": comment.text}
         with self._writing() as connection:
-            if connection.execute(select(EPISODE.c.alarm).where(*there)).first() is None:
+            if connection.execute(select(EPISODE.c.alarm).where(*condition)).first() is None:
                 raise ConfigError(f"no alarm {comment.raised_as} was raised then")
             connection.execute(COMMENT.insert().values(values))
 
     def comments(self, unit: Unit, since_ns: int = 0) -> list[Comment]:
-        """The comments to episodes of a unit (raised since then), in the order of writing."""
-        wanted = select(COMMENT).where(*of_unit(COMMENT, unit), COMMENT.c.raised_ns >= since_ns)
+        """Comments on a unit's episodes raised since ``since_ns``, in the order of writing."""
+        statement = select(COMMENT).where(*of_unit(COMMENT, unit), COMMENT.c.raised_ns >= since_ns)
         with self._reading() as connection:
-            rows = connection.execute(wanted.order_by(COMMENT.c.id)).all()
+            rows = connection.execute(statement.order_by(COMMENT.c.id)).all()
         return [
             Comment(row.raised_ns, row.raised_as, row.written_ns, row.who, row.text) for row in rows
         ]
 
     def units(self) -> list[Unit]:
-        """All units of which a run has kept alarms."""
+        """All units of which a run has stored alarms."""
         with self._reading() as connection:
             return sorted(Unit(*row) for row in connection.execute(select(UNIT)))
 
     def states(self, unit: Unit) -> dict[str, Kept]:
-        """The alarms of a unit that were ever anything else than normal."""
+        """The states of a unit's alarms that have ever left the normal state."""
         with self._reading() as connection:
             rows = connection.execute(select(STATE).where(*of_unit(STATE, unit))).all()
         return {
@@ -214,30 +216,30 @@ class Store(Database):
     def episodes(
         self, unit: Unit, since_ns: int | None = None, *, only_going_on: bool = False
     ) -> list[Episode]:
-        """The episodes of a unit (raised since then), in the order they were raised."""
-        wanted = select(EPISODE).where(*of_unit(EPISODE, unit))
+        """The episodes of a unit (raised since ``since_ns``), in the order they were raised."""
+        statement = select(EPISODE).where(*of_unit(EPISODE, unit))
         if since_ns is not None:
-            wanted = wanted.where(EPISODE.c.raised_ns >= since_ns)
+            statement = statement.where(EPISODE.c.raised_ns >= since_ns)
         if only_going_on:
             cleared, seen = EPISODE.c.cleared_ns, EPISODE.c.acknowledged_ns
-            wanted = wanted.where(cleared.is_(None) | seen.is_(None))
+            statement = statement.where(cleared.is_(None) | seen.is_(None))
         with self._reading() as connection:
-            return [_episode(row) for row in connection.execute(wanted.order_by("raised_ns"))]
+            return [_episode(row) for row in connection.execute(statement.order_by("raised_ns"))]
 
 
 def _replace(connection: Connection, table: Table, row: Mapping[str, Any]) -> None:
-    """Put a row in place of the one with its key."""
+    """Replace the row with the same key."""
     key = [column == row[column.name] for column in table.primary_key]
     connection.execute(table.delete().where(*key))
     connection.execute(table.insert().values(row))
 
 
-def _plain_state(kept: Kept) -> dict[str, Any]:
+def _plain_state(state: Kept) -> dict[str, Any]:
     return {
-        "active": kept.active,
-        "acknowledged": kept.acknowledged,
-        "shelved_until_ns": kept.shelved_until,
-        "out_of_service": kept.out_of_service,
+        "active": state.active,
+        "acknowledged": state.acknowledged,
+        "shelved_until_ns": state.shelved_until,
+        "out_of_service": state.out_of_service,
     }
 
 

@@ -1,4 +1,4 @@
-"""Which alarm database: the one that is named, else a file beside the configuration."""
+"""Chooses the alarm database: the named one, else a file beside the configuration."""
 
 from pathlib import Path
 
@@ -15,8 +15,8 @@ FILE = "alarms.sqlite"
 def open_chosen(named: str, document: Document | None, *, write: bool) -> Store:
     """Open the database named on the command line, else in the configuration, else the default.
 
-    The default is a file beside the configuration, without one in the current folder. Only a run
-    makes a file; SourceError if there is none to read.
+    The default is a file beside the configuration; without a configuration, in the current folder.
+    Only a run creates the file; SourceError if there is none to read.
     """
     return open_store(named or place_of(document), create=write)
 

@@ -1,4 +1,4 @@
-"""What people ask of an alarm, from another program or page; and how a board does it."""
+"""People's requests to an alarm, from another program or page; and how a board grants them."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ ASKABLE = (
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One wish, with who has it; ``seconds`` is for how long to shelve, from when it was asked."""
+    """One person's request; ``seconds`` is the time to shelve for, from ``asked_ns`` on."""
 
     id: int
     alarm: str
@@ -28,7 +28,7 @@ class Request:
 
 
 def grant(board: Board, request: Request, now: int) -> list[Change]:
-    """Do what is asked; ConfigError where that cannot be."""
+    """Carry out a request; ConfigError if that is not possible."""
     alarm, who = board[request.alarm], request.who
     match request.deed:
         case Deed.ACKNOWLEDGED:

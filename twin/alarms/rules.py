@@ -52,18 +52,18 @@ class Rule(Settings):
 
     @property
     def alarms(self) -> tuple[str, ...]:
-        """The names of its alarms: one for each cause of the deviation, else its own."""
+        """The names of its alarms: one for each cause of a deviation, else only its own name."""
         if self.value != DEVIATION:
             return (self.name,)
         return tuple(f"{self.name}_{cause}" for cause in CAUSES)
 
-    def is_beyond(self, value: float, before: bool) -> bool:
-        """Whether a value is beyond the limit; back within it only by the dead band."""
-        back = self.dead_band if before else 0.0
+    def is_beyond(self, value: float, was_beyond: bool) -> bool:
+        """Whether a value is beyond the limit; it returns only past the dead band."""
+        margin = self.dead_band if was_beyond else 0.0
         if self.above is not None:
-            return value > self.above - back
+            return value > self.above - margin
         assert self.below is not None
-        return value < self.below + back
+        return value < self.below + margin
 
 
 class RuleFile(Settings):
@@ -74,11 +74,11 @@ class RuleFile(Settings):
     @model_validator(mode="after")
     def _names_fit(self) -> Self:
         names = [rule.name for rule in self.alarm]
-        if twice := {name for name in names if names.count(name) > 1}:
-            raise ValueError(f"several alarms are called {', '.join(sorted(twice))}")
-        known = {*names, *(alarm for rule in self.alarm for alarm in rule.alarms)}
+        if duplicates := {name for name in names if names.count(name) > 1}:
+            raise ValueError(f"several alarms are called {', '.join(sorted(duplicates))}")
+        valid_names = {*names, *(alarm for rule in self.alarm for alarm in rule.alarms)}
         for rule in self.alarm:
-            if unknown := set(rule.suppressed_by) - known:
+            if unknown := set(rule.suppressed_by) - valid_names:
                 raise ValueError(
                     f"{rule.name} is suppressed by {', '.join(sorted(unknown))}: no such alarm"
                 )
@@ -103,18 +103,20 @@ def default_rules() -> tuple[Rule, ...]:
 
 
 def write_rules(rules: Sequence[Rule]) -> str:
-    """The file that would give these rules again."""
+    """The rules as the text of a rule file."""
     tables = [rule.model_dump(mode="json", exclude_defaults=True) for rule in rules]
     return tomli_w.dumps({"alarm": tables})
 
 
 def by_cause(rules: Sequence[Rule]) -> tuple[Rule, ...]:
-    """The rules as a board takes them, one for each alarm; a rule stands for all of its alarms."""
+    """The rules for a board, one for each alarm; ``suppressed_by`` names alarms, not rules."""
     of_name = {rule.name: rule.alarms for rule in rules}
     return tuple(
-        one.model_copy(update={"suppressed_by": tuple(_alarms(one.suppressed_by, of_name))})
+        alarm_rule.model_copy(
+            update={"suppressed_by": tuple(_alarms(alarm_rule.suppressed_by, of_name))}
+        )
         for rule in rules
-        for one in _of_causes(rule)
+        for alarm_rule in _of_causes(rule)
     )
 
 

@@ -17,11 +17,11 @@ class AlarmSettings(DatabaseSettings):
 
 
 def chosen_rules(document: Document | None) -> tuple[Rule, ...]:
-    """The rules that a configuration names, else the program's; ConfigError names the place."""
-    wanted = document.section(AlarmSettings, "alarms").rules if document else ""
-    if not wanted or document is None:
+    """The rules that a configuration names, else the program's; ConfigError names the file."""
+    file_name = document.section(AlarmSettings, "alarms").rules if document else ""
+    if not file_name or document is None:
         return default_rules()
-    path = Path(document.name).parent / wanted
+    path = Path(document.name).parent / file_name
     rules = read_rules(Document.read(path))
     for rule in rules:
         if rule.value not in NAMES:
@@ -33,5 +33,5 @@ def chosen_rules(document: Document | None) -> tuple[Rule, ...]:
 
 
 def board_rules(document: Document | None) -> tuple[Rule, ...]:
-    """The same with a rule for each cause."""
+    """The rules of ``chosen_rules``, with one for each cause."""
     return by_cause(chosen_rules(document))

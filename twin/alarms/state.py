@@ -1,8 +1,8 @@
-"""One alarm: whether it is active, whether somebody has seen it, and what keeps it quiet.
+"""One alarm: whether it is active, acknowledged, and kept from being announced.
 
-The states of ISA-18.2: active and acknowledged are two things. Shelving (by a person, for a time),
-suppression (by design, while another alarm stands) and out of service (by a person, until told
-otherwise) keep an alarm from being announced; underneath it goes on.
+The states are those of ISA-18.2. Active and acknowledged are independent. Three states keep an
+alarm from being announced: shelved (by a person, for a time), suppressed (by design, while another
+alarm stands) and out of service (by a person, until put back). Meanwhile it follows its value.
 """
 
 import math
@@ -28,16 +28,16 @@ class Deed(StrEnum):
     UNSUPPRESSED = "unsuppressed"
     OUT_OF_SERVICE = "out_of_service"
     IN_SERVICE = "in_service"
-    RENAMED = "renamed"  # it has another cause than was thought
+    RENAMED = "renamed"  # it has another cause than assumed
 
 
 class State(StrEnum):
-    """What it is, as ISA-18.2 names it."""
+    """The state of an alarm, with the names of ISA-18.2."""
 
     NORMAL = "normal"
     UNACKNOWLEDGED = "unacknowledged"  # active
     ACKNOWLEDGED = "acknowledged"  # active
-    RETURNED = "returned"  # not active any more, and nobody has acknowledged it
+    RETURNED = "returned"  # no longer active, not acknowledged
     SHELVED = "shelved"
     SUPPRESSED = "suppressed"
     OUT_OF_SERVICE = "out_of_service"
@@ -45,10 +45,10 @@ class State(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One thing that happened to one alarm; ``who`` is empty where the program did it.
+    """One change of one alarm; ``who`` is empty if the program made it.
 
-    ``announced`` says that people are to be told of the alarm now; one that is renamed goes on as
-    ``to``. One that was cleared ``untold`` has nothing to acknowledge.
+    ``announced`` says that people must be notified now. A renamed alarm goes on as ``to``. An alarm
+    that was cleared ``untold`` needs no acknowledgement.
     """
 
     time_ns: int
@@ -62,7 +62,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """What outlives the program of one alarm; suppression follows from the others."""
+    """The part of an alarm's state that outlives the program; suppression follows from others."""
 
     active: bool = False
     acknowledged: bool = True
@@ -70,12 +70,12 @@ class Kept:
     out_of_service: bool = False
 
 
-_SPEAKS = (Deed.RAISED, Deed.UNSHELVED, Deed.UNSUPPRESSED, Deed.IN_SERVICE)
+_ANNOUNCING = (Deed.RAISED, Deed.UNSHELVED, Deed.UNSUPPRESSED, Deed.IN_SERVICE)
 
 
 @dataclass
 class Alarm:
-    """One alarm over time; every method gives what it changes. Times are ns of one clock."""
+    """One alarm over time; every method returns its changes. Times are ns of one clock."""
 
     rule: Rule
     active: bool = False
@@ -83,14 +83,14 @@ class Alarm:
     shelved_until: int | None = None
     suppressed: bool = False
     out_of_service: bool = False
-    _beyond: bool = False  # the value is, by the dead band
-    _since: int | None = None  # when the value came to where the alarm is not yet
-    _turned: int | None = None  # when it became active, or not any more
+    _beyond: bool = False  # the value is beyond the limit, with the dead band
+    _since: int | None = None  # when the value crossed the limit, while the delay runs
+    _turned: int | None = None  # when it last became active or inactive
     _untold: bool = False  # it became active while suppressed
 
     @property
     def state(self) -> State:
-        """What a person sees first."""
+        """The one state to show to a person."""
         if self.out_of_service:
             return State.OUT_OF_SERVICE
         if self.suppressed:
@@ -103,23 +103,25 @@ class Alarm:
 
     @property
     def concerns(self) -> bool:
-        """Whether it is active, or was and nobody has seen it; however quiet it is kept."""
+        """Whether it is active or unacknowledged, even if it is shelved or suppressed."""
         return self.active or not self.acknowledged
 
     @property
     def is_coming(self) -> bool:
-        """Whether its value is beyond the limit, but not yet for long enough."""
+        """Whether its value is beyond the limit, and its delay still runs."""
         return self._beyond and not self.active
 
     @property
     def rests(self) -> bool:
-        """Whether nothing comes of it while only time goes on."""
+        """Whether passing time alone cannot change it."""
         return self._since is None and self._beyond == self.active and self.shelved_until is None
 
     def see(self, now: int, value: float = math.nan) -> Iterator[Change]:
-        """Take the newest value; NaN where there is none, then only time goes on."""
+        """Take the newest value; with NaN only time passes."""
         if self.shelved_until is not None:
-            latest = now + self._longest_shelving()  # a clock set back lengthens nothing
+            latest = (
+                now + self._longest_shelving()
+            )  # setting the clock back must not extend shelving
             self.shelved_until = min(self.shelved_until, latest)
             if now >= self.shelved_until:
                 yield from self.unshelve(now)
@@ -134,91 +136,96 @@ class Alarm:
             yield from self._turn(now)
 
     def shift(self, by_ns: int) -> None:
-        """The clock was set: what waits for its delay waits no longer and no less."""
+        """Shift a running delay after the clock was set, so that it keeps its length."""
         if self._since is not None:
             self._since += by_ns
 
     def acknowledge(self, now: int, who: str) -> Iterator[Change]:
-        """Somebody has seen it; a latching one may go now."""
+        """Acknowledge it; a latching alarm may clear from now on."""
         if self.acknowledged:
             return
         self.acknowledged, self._untold = True, False
-        yield self._done(now, Deed.ACKNOWLEDGED, who)
+        yield self._change(now, Deed.ACKNOWLEDGED, who)
         if self.rule.latching:
             yield from self.see(now)
 
     def shelve(self, now: int, seconds: float, who: str) -> Iterator[Change]:
-        """Keep it quiet for a time; ConfigError for longer than its rule lets anybody."""
+        """Shelve it for a time; ConfigError for longer than its rule allows."""
         if not 0.0 < seconds <= self.rule.longest_shelving_s:
             raise ConfigError(
                 f"{self.rule.name} cannot be shelved for {seconds:g} s",
                 f"up to {self.rule.longest_shelving_s:g} s; longer: take it out of service",
             )
         self.shelved_until = now + round(seconds * SECOND_NS)
-        yield self._done(now, Deed.SHELVED, who)
+        yield self._change(now, Deed.SHELVED, who)
 
     def unshelve(self, now: int, who: str = "") -> Iterator[Change]:
-        """Let it speak again."""
+        """End shelving."""
         if self.shelved_until is not None:
             self.shelved_until = None
-            yield self._done(now, Deed.UNSHELVED, who)
+            yield self._change(now, Deed.UNSHELVED, who)
 
-    def suppress(self, now: int, wanted: bool) -> Iterator[Change]:
-        """Keep it quiet by design, or let it speak again, unless its value is back already."""
-        if wanted == self.suppressed:
+    def suppress(self, now: int, suppressed: bool) -> Iterator[Change]:
+        """Begin or end suppression; at the end it clears if its value is back in limits."""
+        if suppressed == self.suppressed:
             return
-        if wanted:
-            self._untold |= self.active and self._turned == now  # by one that came with it
+        if suppressed:
+            self._untold |= (
+                self.active and self._turned == now
+            )  # raised at the same moment as the other alarm
         elif self.active and not self._beyond:
             yield from self._turn(now)
-        self.suppressed = wanted
-        self._untold &= wanted
-        yield self._done(now, Deed.SUPPRESSED if wanted else Deed.UNSUPPRESSED)
+        self.suppressed = suppressed
+        self._untold &= suppressed
+        yield self._change(now, Deed.SUPPRESSED if suppressed else Deed.UNSUPPRESSED)
 
-    def serve(self, now: int, wanted: bool, who: str) -> Iterator[Change]:
-        """Take it out of service, or back."""
-        if wanted == self.out_of_service:
-            self.out_of_service = not wanted
-            yield self._done(now, Deed.IN_SERVICE if wanted else Deed.OUT_OF_SERVICE, who)
+    def serve(self, now: int, in_service: bool, who: str) -> Iterator[Change]:
+        """Put it into service, or take it out."""
+        if in_service == self.out_of_service:
+            self.out_of_service = not in_service
+            yield self._change(now, Deed.IN_SERVICE if in_service else Deed.OUT_OF_SERVICE, who)
 
-    def become(self, now: int, other: "Alarm") -> Iterator[Change]:
-        """Go on as another alarm, which has been the one all along; what keeps each quiet stays."""
+    def become(self, now: int, successor: "Alarm") -> Iterator[Change]:
+        """Hand its state to another alarm, the true one; shelving and the like stay with each."""
         if not (self._beyond or self.concerns):
             return
-        other.acknowledged = self.acknowledged and other.acknowledged
-        other.active, other._beyond = self.active or other.active, self._beyond or other._beyond
-        other._since = self._since
+        successor.acknowledged = self.acknowledged and successor.acknowledged
+        successor.active, successor._beyond = (
+            self.active or successor.active,
+            self._beyond or successor._beyond,
+        )
+        successor._since = self._since
         self.active, self.acknowledged, self._beyond, self._since = False, True, False, None
-        speaks = other.state is State.UNACKNOWLEDGED
-        yield Change(now, self.rule.name, Deed.RENAMED, "", speaks, other.rule.name)
+        announced = successor.state is State.UNACKNOWLEDGED
+        yield Change(now, self.rule.name, Deed.RENAMED, "", announced, successor.rule.name)
 
     def keep(self) -> "Kept":
-        """What is to outlive the program."""
+        """The state that outlives the program."""
         return Kept(self.active, self.acknowledged, self.shelved_until, self.out_of_service)
 
     def resume(self, kept: "Kept") -> None:
-        """Go on where another run ended."""
+        """Restore the state of an earlier run."""
         self.active = self._beyond = kept.active
         self.acknowledged, self.shelved_until = kept.acknowledged, kept.shelved_until
         self.out_of_service = kept.out_of_service
 
     def _turn(self, now: int) -> Iterator[Change]:
-        """Become what the value has been for long enough."""
+        """Become active or inactive after the delay."""
         if self.active and self.rule.latching and not self.acknowledged:
             return
         self.active, self._since, self._turned = not self.active, None, now
         if self.active:
             self._untold = self.suppressed and self.acknowledged
             self.acknowledged = False
-            yield self._done(now, Deed.RAISED)
+            yield self._change(now, Deed.RAISED)
             return
         untold, self._untold = self._untold, False
         self.acknowledged |= untold
-        yield replace(self._done(now, Deed.CLEARED), untold=untold)
+        yield replace(self._change(now, Deed.CLEARED), untold=untold)
 
-    def _done(self, now: int, deed: Deed, who: str = "") -> Change:
-        """What happened; an alarm that may speak again announces what it kept to itself."""
-        announced = deed in _SPEAKS and self.state is State.UNACKNOWLEDGED
+    def _change(self, now: int, deed: Deed, who: str = "") -> Change:
+        """A change of this alarm; it announces an alarm that shelving or the like ends on."""
+        announced = deed in _ANNOUNCING and self.state is State.UNACKNOWLEDGED
         return Change(now, self.rule.name, deed, who, announced)
 
     def _longest_shelving(self) -> int:

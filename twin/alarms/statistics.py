@@ -1,6 +1,6 @@
-"""How many alarms people get, after EEMUA 191 and ISA-18.2: rate, floods, standing, chattering.
+"""Alarm load after EEMUA 191 and ISA-18.2: rate, floods, standing and chattering alarms.
 
-The figures are those of one operator, so they are of all ejectors that one person looks after.
+The figures are for one operator, so they cover all ejectors that one person looks after.
 """
 
 from collections import Counter
@@ -16,13 +16,13 @@ from twin.instants import SECOND_NS, instant
 from twin.language import tr
 
 DAY_NS = 86_400 * SECOND_NS
-# Limits as ISA-18.2 (2016) recommends them, which EEMUA 191 (edition 3) has alike.
-WINDOW_NS = 600 * SECOND_NS  # the ten minutes that rates are given for
-MANAGEABLE = 2.0  # alarms in ten minutes on the average: the most that a person can manage
+# Limits that ISA-18.2 (2016) recommends; those of EEMUA 191 (edition 3) are the same.
+WINDOW_NS = 600 * SECOND_NS  # rates are per ten minutes
+MANAGEABLE = 2.0  # average alarms in ten minutes that a person can manage at most
 FLOOD = 10  # more alarms in ten minutes are a flood
-STANDING_NS = DAY_NS  # active for longer: it stands, and nobody looks at it any more
-CHATTERING, CHATTER_NS = 3, 60 * SECOND_NS  # so many times within a minute
-MOST = 10  # of the most frequent
+STANDING_NS = DAY_NS  # an alarm active for longer counts as standing
+CHATTERING, CHATTER_NS = 3, 60 * SECOND_NS  # raised so often within a minute
+MOST = 10  # most frequent alarms to list
 
 Known = tuple[str, str]  # ejector and alarm
 Named = tuple[str, Episode]  # an episode with the name of its ejector
@@ -30,7 +30,7 @@ Named = tuple[str, Episode]  # an episode with the name of its ejector
 
 @dataclass(frozen=True)
 class Statistics:
-    """The figures of some time; an ``average`` and ``peak`` are alarms in ten minutes."""
+    """The figures of a period; ``average`` and ``peak`` are alarms in ten minutes."""
 
     days: float
     count: int
@@ -43,32 +43,36 @@ class Statistics:
 
 
 def statistics(episodes: Sequence[Named], since_ns: int, now_ns: int) -> Statistics:
-    """The figures from ``since_ns`` to ``now_ns``; episodes from before count where they stand yet.
+    """The figures from ``since_ns`` to ``now_ns``; earlier episodes count if they still stand.
 
-    What was suppressed by design was announced to nobody, and is left out.
+    Alarms suppressed by design are left out, since nobody was notified.
     """
-    told = [one for one in episodes if one[1].acknowledged_by != SUPPRESSION]
-    raised = [one for one in told if since_ns <= one[1].raised_ns <= now_ns]
-    times = np.sort(np.array([one.raised_ns for _, one in raised], dtype=np.int64))
+    announced = [entry for entry in episodes if entry[1].acknowledged_by != SUPPRESSION]
+    raised = [entry for entry in announced if since_ns <= entry[1].raised_ns <= now_ns]
+    times = np.sort(np.array([entry.raised_ns for _, entry in raised], dtype=np.int64))
     span = now_ns - since_ns
     by_alarm: dict[Known, list[int]] = {}
     for name, episode in raised:
         by_alarm.setdefault((name, episode.alarm), []).append(episode.raised_ns)
-    often = {known: _most_within(np.sort(at), CHATTER_NS) for known, at in by_alarm.items()}
+    most_in_a_minute = {
+        alarm: _most_within(np.sort(times_ns), CHATTER_NS) for alarm, times_ns in by_alarm.items()
+    }
     return Statistics(
         days=span / DAY_NS,
         count=len(raised),
         average=len(raised) * WINDOW_NS / span,
         peak=_most_within(times, WINDOW_NS),
         flood_share=_flood_share(times, since_ns, now_ns),
-        standing=sorted(_standing(told, now_ns), key=lambda one: one[1]),
-        chattering=_by_number({known: n for known, n in often.items() if n >= CHATTERING}),
-        top=_by_number({known: len(at) for known, at in by_alarm.items()})[:MOST],
+        standing=sorted(_standing(announced, now_ns), key=lambda entry: entry[1]),
+        chattering=_by_number(
+            {alarm: count for alarm, count in most_in_a_minute.items() if count >= CHATTERING}
+        ),
+        top=_by_number({alarm: len(times_ns) for alarm, times_ns in by_alarm.items()})[:MOST],
     )
 
 
 def _most_within(times: npt.NDArray[np.int64], span_ns: int) -> int:
-    """The most of some times (ascending, ns) that lie within a span."""
+    """The largest number of ``times`` (ascending, ns) within any span of ``span_ns``."""
     if not len(times):
         return 0
     ends = np.searchsorted(times, times + span_ns, side="left")
@@ -81,60 +85,66 @@ def _flood_share(times: npt.NDArray[np.int64], since_ns: int, now_ns: int) -> fl
     return sum(count > FLOOD for count in counts.values()) / windows
 
 
-def _standing(told: Sequence[Named], now_ns: int) -> Iterator[tuple[Known, int]]:
-    for name, episode in told:
+def _standing(announced: Sequence[Named], now_ns: int) -> Iterator[tuple[Known, int]]:
+    for name, episode in announced:
         if episode.cleared_ns is None and now_ns - episode.raised_ns > STANDING_NS:
             yield (name, episode.alarm), episode.raised_ns
 
 
 def _by_number(counts: dict[Known, int]) -> list[tuple[Known, int]]:
-    return sorted(counts.items(), key=lambda one: (-one[1], one[0]))
+    return sorted(counts.items(), key=lambda item: (-item[1], item[0]))
 
 
 def in_words(
-    found: Statistics, title: Callable[[Known], str], now_ns: int
+    figures: Statistics, title: Callable[[Known], str], now_ns: int
 ) -> list[tuple[str, str]]:
-    """What each figure is, and its value with what is good; ``title`` names an alarm."""
+    """Label and text of each figure, with what is good; ``title`` names an alarm."""
     average = tr(
         "{average} in 10 min ({count} in {days} days); up to {limit} can be managed",
-        average=f"{found.average:.2g}",
-        count=found.count,
-        days=f"{found.days:.3g}",
+        average=f"{figures.average:.2g}",
+        count=figures.count,
+        days=f"{figures.days:.3g}",
         limit=f"{MANAGEABLE:g}",
     )
-    peak = tr("{peak} in 10 min; more than {limit} are a flood", peak=found.peak, limit=FLOOD)
-    flood = tr("{share} % of the time; below 1 % is good", share=f"{100 * found.flood_share:.2g}")
+    peak = tr("{peak} in 10 min; more than {limit} are a flood", peak=figures.peak, limit=FLOOD)
+    flood = tr("{share} % of the time; below 1 % is good", share=f"{100 * figures.flood_share:.2g}")
     lists = (
         (
             tr("standing for over 24 h"),
-            [f"{title(one)} ({instant(at, now_ns)})" for one, at in found.standing],
+            [
+                f"{title(alarm)} ({instant(raised_ns, now_ns)})"
+                for alarm, raised_ns in figures.standing
+            ],
         ),
         (
             tr("chattering: 3 times in a minute"),
-            [f"{title(one)} ({count})" for one, count in found.chattering],
+            [f"{title(alarm)} ({count})" for alarm, count in figures.chattering],
         ),
         (
             tr("most frequent"),
-            [f"{title(one)} ({100 * count / found.count:.0f} %)" for one, count in found.top],
+            [
+                f"{title(alarm)} ({100 * count / figures.count:.0f} %)"
+                for alarm, count in figures.top
+            ],
         ),
     )
-    figures = [(tr("alarm rate"), average), (tr("highest rate"), peak), (tr("in a flood"), flood)]
-    return [*figures, *((what, "; ".join(said) or tr("none")) for what, said in lists)]
+    rates = [(tr("alarm rate"), average), (tr("highest rate"), peak), (tr("in a flood"), flood)]
+    return [*rates, *((label, "; ".join(entries) or tr("none")) for label, entries in lists)]
 
 
-def plain(found: Statistics) -> dict[str, Any]:
-    """The same as JSON has it."""
+def plain(figures: Statistics) -> dict[str, Any]:
+    """The figures as a JSON document."""
 
-    def each(listed: Sequence[tuple[Known, int]], what: str) -> list[dict[str, Any]]:
-        return [{"unit": unit, "alarm": alarm, what: value} for (unit, alarm), value in listed]
+    def as_rows(alarms: Sequence[tuple[Known, int]], key: str) -> list[dict[str, Any]]:
+        return [{"unit": unit, "alarm": alarm, key: value} for (unit, alarm), value in alarms]
 
     return {
-        "days": found.days,
-        "alarms": found.count,
-        "per_10_min": found.average,
-        "most_in_10_min": found.peak,
-        "flood_pct": 100.0 * found.flood_share,
-        "standing": each(found.standing, "raised_ns"),
-        "chattering": each(found.chattering, "in_a_minute"),
-        "most_frequent": each(found.top, "times"),
+        "days": figures.days,
+        "alarms": figures.count,
+        "per_10_min": figures.average,
+        "most_in_10_min": figures.peak,
+        "flood_pct": 100.0 * figures.flood_share,
+        "standing": as_rows(figures.standing, "raised_ns"),
+        "chattering": as_rows(figures.chattering, "in_a_minute"),
+        "most_frequent": as_rows(figures.top, "times"),
     }

@@ -1,4 +1,4 @@
-"""Changes of alarms as events, in plain words."""
+"""Changes of alarms as events with a text."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -23,7 +23,7 @@ STATES = {
     State.OUT_OF_SERVICE: "a person keeps it quiet until it is taken into service again",
 }
 SUPPRESSIONS = (Deed.SUPPRESSED, Deed.UNSUPPRESSED)
-_SAID = {
+_DEED_WORDS = {
     Deed.RAISED: "raised",
     Deed.CLEARED: "cleared",
     Deed.ACKNOWLEDGED: "acknowledged",
@@ -38,29 +38,29 @@ _SAID = {
 
 def table() -> str:
     """The states as a table for people."""
-    rows = [f"| `{state}` | {what} |" for state, what in STATES.items()]
+    rows = [f"| `{state}` | {meaning} |" for state, meaning in STATES.items()]
     return "\n".join(["| state | what it means |", "| --- | --- |", *rows])
 
 
 def worth_saying(change: Change, alarm: Alarm) -> bool:
-    """Suppression of an alarm that has nothing to say is nobody's concern."""
+    """Whether to report a change; suppression of an alarm that concerns nobody is not reported."""
     return change.announced or alarm.concerns or change.deed not in SUPPRESSIONS
 
 
 def action_of(rule: Rule, evidence: Evidence) -> str:
-    """What to do, first where to look; no diagnosis helps where no unit was ever commissioned."""
+    """What to do, beginning with where to look; a unit must be commissioned before all else."""
     if evidence.get("commissioned") is False:
         return tr(COMMISSION)
-    cause, known = cause_of(rule.value), evidence.get("taken_in")
-    if cause not in EFFECTS and not known:
+    cause, catalogued = cause_of(rule.value), evidence.get("taken_in")
+    if cause not in EFFECTS and not catalogued:
         return tr(rule.action)
-    where = known["look_at"] if known else tr(EFFECTS[cause].look_at)
-    first = tr("Look at {where}.", where=where)
-    return f"{first} {tr(rule.action)}".rstrip()
+    location = catalogued["look_at"] if catalogued else tr(EFFECTS[cause].look_at)
+    look = tr("Look at {where}.", where=location)
+    return f"{look} {tr(rule.action)}".rstrip()
 
 
 def plain(alarm: Alarm, evidence: Evidence, episode: Episode | None) -> dict[str, Any]:
-    """An alarm as it is with its newest episode, in what JSON can hold."""
+    """The state of an alarm with its newest episode, as a JSON document."""
     rule = alarm.rule
     return {
         "alarm": rule.name,
@@ -79,7 +79,7 @@ def plain(alarm: Alarm, evidence: Evidence, episode: Episode | None) -> dict[str
 
 
 def event_of(change: Change, now: Mapping[str, Any], alarm: Alarm, time_ns: int) -> Event:
-    """A change as an event at a PLC time; ``now`` is ``plain`` of the alarm, by its new name."""
+    """A change as an event at a PLC time; ``now`` is ``plain`` of the alarm with its new name."""
     data = {**now, "deed": change.deed.value, "host_ns": change.time_ns, "who": change.who}
     if change.deed is Deed.RENAMED:
         data["was"] = change.alarm
@@ -88,34 +88,34 @@ def event_of(change: Change, now: Mapping[str, Any], alarm: Alarm, time_ns: int)
 
 
 def _text(change: Change, alarm: Alarm, evidence: Evidence) -> str:
-    said = _deed(change, alarm)
+    sentence = _deed(change, alarm)
     if not change.announced:
-        return said
+        return sentence
     rule = alarm.rule
-    why = f": {evidence['words']}" if "words" in evidence else ""
+    reason = f": {evidence['words']}" if "words" in evidence else ""
     consequence = "" if change.deed is Deed.RENAMED else rule.consequence  # the same as before
     advice = " ".join(filter(None, (consequence, action_of(rule, evidence))))
-    return f"{said} ({rule.priority} priority){why}. {advice}".rstrip()
+    return f"{sentence} ({rule.priority} priority){reason}. {advice}".rstrip()
 
 
 def _deed(change: Change, alarm: Alarm) -> str:
-    """What happened, in a few words."""
+    """A short sentence about the change."""
     if change.deed is Deed.RENAMED:
         return f"{change.alarm} is now {change.to}"
     by = f" by {change.who}" if change.who else ""
-    said = f"{change.alarm} {_SAID[change.deed]}{by}"
+    sentence = f"{change.alarm} {_DEED_WORDS[change.deed]}{by}"
     if change.deed is Deed.SHELVED and alarm.shelved_until is not None:
-        return f"{said} for {(alarm.shelved_until - change.time_ns) / SECOND_NS / 60:.3g} min"
+        return f"{sentence} for {(alarm.shelved_until - change.time_ns) / SECOND_NS / 60:.3g} min"
     if change.deed is Deed.RAISED and not change.announced:
-        return f"{said}, and kept quiet: {str(alarm.state).replace('_', ' ')}"
-    return said
+        return f"{sentence}, and kept quiet: {str(alarm.state).replace('_', ' ')}"
+    return sentence
 
 
 def rules_table() -> str:
     """The rules that come with the program as a table for people."""
-    rows = [f"| `{one.name}` | {_in_columns(one)} |" for one in default_rules()]
-    head = "| alarm | priority | delays | if nobody acts | what to do |"
-    return "\n".join([head, "| --- | --- | --- | --- | --- |", *rows])
+    rows = [f"| `{rule.name}` | {_in_columns(rule)} |" for rule in default_rules()]
+    header = "| alarm | priority | delays | if nobody acts | what to do |"
+    return "\n".join([header, "| --- | --- | --- | --- | --- |", *rows])
 
 
 def _in_columns(rule: Rule) -> str:

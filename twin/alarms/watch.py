@@ -1,4 +1,4 @@
-"""What alarms watch: values, and what speaks for them, made of what the loop says happened."""
+"""The values that alarms watch, and their evidence, made from the loop's events."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,7 +10,7 @@ from twin.figures.text import NO_DASH
 from twin.figures.warnings import CAUTIONS
 from twin.model.effects import UNKNOWN
 
-Evidence = Mapping[str, Any]  # what JSON can hold; "words" for people
+Evidence = Mapping[str, Any]  # a JSON document; "words" is for people
 
 _SWITCHED = {  # events that begin and end something
     Kind.PLC_STALE: ("plc_stale", 1.0),
@@ -22,19 +22,19 @@ _SWITCHED = {  # events that begin and end something
     Kind.OUTPUT_DOWN: ("output_down", 1.0),
     Kind.OUTPUT_BACK: ("output_down", 0.0),
 }
-STREAM = frozenset(name for name, _ in _SWITCHED.values())  # nothing is wrong until it is said
+STREAM = frozenset(name for name, _ in _SWITCHED.values())  # 0 until an event says otherwise
 NAMES = STREAM | {DEVIATION} | set(CAUTIONS)
 _MEASURE = ("figure", "phase", "excess_mbar", "sigma", "size", "unit", "also", "commissioned")
 
 
 def values(event: Event) -> dict[str, float]:
-    """The values that an event changes, 1 or 0 each: by the names of NAMES, deviation by cause.
+    """The values that an event sets to 1 or 0, by the names of NAMES; deviation by cause.
 
-    A warning that a cycle could not judge keeps the value it had.
+    A warning that a cycle could not judge keeps its value.
     """
     if event.kind in _SWITCHED:
         name, value = _SWITCHED[event.kind]
-        return {name: 1.0 if event.data.get("standing") else value}  # others may stand still
+        return {name: 1.0 if event.data.get("standing") else value}  # another fault may still stand
     if event.kind is Kind.DEVIATION:
         return deviating(known(str(event.data.get("effect"))))
     if event.kind is Kind.DEVIATION_CLEARED:
@@ -55,23 +55,29 @@ def deviating(*causes: str) -> dict[str, float]:
 
 
 def quantity(value: str) -> str | None:
-    """What a value compares with what is expected: the pressure, a key figure, or nothing."""
+    """The quantity that a value compares with its expectation: pressure, a key figure or None."""
     if value == DEVIATION or value.startswith(f"{DEVIATION}."):
         return "pressure"
     return CAUTIONS[value].figure if value in CAUTIONS else None
 
 
 def evidence(event: Event) -> dict[str, Evidence]:
-    """What an event says for the alarms, by the value that it speaks for."""
+    """The evidence in an event, by the value that it supports."""
     if event.kind in _SWITCHED and _SWITCHED[event.kind][1]:
         return {_SWITCHED[event.kind][0]: {"words": event.text}}
     if event.kind is Kind.DEVIATION:
         effect = str(event.data.get("effect"))
         cause = known(effect)
         measured = {key: event.data[key] for key in _MEASURE if key in event.data}
-        guess = {} if cause == UNKNOWN else {"guess": cause}
-        told = {"words": event.text, **guess, **measured, **catalogue_words(effect), **_in(event)}
-        return {value_of(cause): told}
+        first_guess = {} if cause == UNKNOWN else {"guess": cause}
+        entry = {
+            "words": event.text,
+            **first_guess,
+            **measured,
+            **catalogue_words(effect),
+            **_in(event),
+        }
+        return {value_of(cause): entry}
     if event.kind is Kind.CYCLE:
         standing = event.data.get("warnings", ())
         return {name: _figure(name, event) for name in standing}
@@ -79,7 +85,7 @@ def evidence(event: Event) -> dict[str, Evidence]:
 
 
 def _figure(warning: str, event: Event) -> Evidence:
-    """What a cycle's figure was, and should have been; the words are those of its warning."""
+    """Measured and expected value of a cycle's figure, with the text of its warning."""
     name = CAUTIONS[warning].figure
     measured, expected = (event.data.get(f"{name}_{side}") for side in ("measured", "expected"))
     unit, words = FIGURES[name].unit, str(event.data.get("warned", {}).get(warning, warning))
@@ -90,6 +96,6 @@ def _figure(warning: str, event: Event) -> Evidence:
 
 
 def _in(event: Event) -> Evidence:
-    """In which cycle."""
+    """The event's cycle as the first and last one; empty if it has none."""
     number = event.data.get("cycle")
     return {} if number is None else {"first_cycle": int(number), "last_cycle": int(number)}

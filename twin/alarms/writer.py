@@ -1,4 +1,4 @@
-"""Alarms into the database and what people ask for out of it; the loop never waits for it."""
+"""Writes alarms to the database and reads people's requests. The loop never waits for it."""
 
 import queue
 import threading
@@ -10,14 +10,15 @@ from twin.alarms.requests import Request
 from twin.assets.unit import Unit
 from twin.errors import TwinError, in_words
 
-POLL_S = 1.0  # between looks at what is asked; what has changed is written with it
+POLL_S = 1.0  # interval at which changes are written and requests are read
 RETRY_S = 5.0  # after the database could not be reached
 
 
 class Keeper:
-    """Keeps the alarms of a unit, in a thread of its own (``twin.alarms.loop.Office``).
+    """Stores the alarms of a unit, in a thread of its own (``twin.alarms.loop.Office``).
 
-    What cannot be written is said once and kept until it can be; the loop goes on in every case.
+    A failure is reported once, and the changes are held until they can be written. The loop always
+    goes on.
     """
 
     def __init__(
@@ -29,12 +30,12 @@ class Keeper:
         self._failed = False
         self._news: queue.SimpleQueue[News] = queue.SimpleQueue()
         self._requests: queue.SimpleQueue[Request] = queue.SimpleQueue()
-        self._passed_on = 0  # the newest request that was
+        self._passed_on = 0  # ID of the newest request handed to the loop
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._work, name="alarms", daemon=True)
 
     def begin(self) -> Before:
-        """Give what another run left, and begin; without a database nothing is known of before."""
+        """Start; returns the state of an earlier run, or an empty one without a database."""
         before = Before()
         try:
             self._store = self._open_store()
@@ -47,15 +48,15 @@ class Keeper:
         return before
 
     def take(self, news: News) -> None:
-        """Keep it."""
+        """Take changes to store."""
         self._news.put(news)
 
     def asked(self) -> list[Request]:
-        """What people have asked for since the last time."""
+        """People's requests since the last call."""
         return [self._requests.get() for _ in range(self._requests.qsize())]
 
     def close(self) -> None:
-        """Write what is left; a database that is away is not waited for much longer."""
+        """Write what is left; if the database cannot be reached, only one more attempt is made."""
         self._ending.set()
         self._thread.join()
 
@@ -70,7 +71,7 @@ class Keeper:
         self._let_go()
 
     def _exchange(self) -> bool:
-        """Write what has changed and look at what is asked; says so if that begins to fail."""
+        """Write changes and read requests; reports when this begins to fail."""
         while not self._news.empty():
             self._waiting.add(self._news.get())
         try:
@@ -79,7 +80,7 @@ class Keeper:
                 self._store.save(self._unit, self._waiting)
             self._waiting = News()
             self._pass_on(self._store.requests(self._unit))
-        except Exception as error:  # whatever it is, later ones are to be stored
+        except Exception as error:  # later changes must still be stored, whatever the error
             self._let_go()
             if not self._failed:
                 self._say(f"alarms wait in memory: {in_words(error)}")
@@ -91,7 +92,7 @@ class Keeper:
         return True
 
     def _pass_on(self, requests: list[Request]) -> None:
-        """Hand over each request once; it stays in the database until it is answered."""
+        """Hand over each request once; it stays in the database until it has its answer."""
         for request in requests:
             if request.id > self._passed_on:
                 self._passed_on = request.id
