@@ -1,4 +1,4 @@
-"""A database as a configuration names it."""
+"""The settings of a database in a configuration."""
 
 from typing import Self
 from urllib.parse import urlsplit

@@ -1,7 +1,7 @@
-"""The database: records are added and never changed; which one holds is a question of two times.
+"""The asset database. Records are added and never changed; two times decide which one holds.
 
-Valid time says from when on a data set describes its asset, recorded time when we came to know it.
-So a replay of last month's log can ask for what held then, as it was known then (``as_of``).
+Valid time says from when a data set describes its asset; recorded time says when it was stored. So
+a replay of last month's log can get the data set of that time, as known at that time (``as_of``).
 """
 
 import json
@@ -46,47 +46,47 @@ def open_assets(
 ) -> "Assets":
     """Open the database at a URL or in an SQLite file; close it, or use it as a context.
 
-    A new one gets its tables, and every one the records this program ships that it never had;
-    ``shipped=False`` leaves these to the next opening, for an import that brings its own.
-    ``create=False`` refuses an SQLite file that is not there. ``busy_s`` is how long to wait for
-    other writers, ``clock`` gives UTC in ns.
+    A new database gets its tables. Every database gets the shipped records that it never had;
+    ``shipped=False`` leaves them to the next opening, for an import that brings its own.
+    ``create=False`` rejects a missing SQLite file. ``busy_s`` is how long to wait for other
+    writers; ``clock`` returns UTC in ns.
 
     ConfigError for a URL of an unknown kind, a newer schema and another program's file; SourceError
-    if it cannot be reached, read or written, or stays locked.
+    if the database cannot be reached, read or written, or stays locked.
     """
-    absent = (
+    absent_hint = (
         "" if create else "check --assets; twin calibrate, or twin assets add or import, makes one"
     )
-    assets = Assets(where, ASSETS, busy_s, clock, absent)
+    assets = Assets(where, ASSETS, busy_s, clock, absent_hint)
     with assets.closed_on_error():
         assets.prepare(shipped=shipped)
     return assets
 
 
 class Assets(Database):
-    """An open asset database. What is written is written whole or not at all."""
+    """An open asset database. Every write is one transaction."""
 
     def prepare(self, *, shipped: bool) -> None:
-        """Make the tables and add the shipped records, each where it is missing."""
-        wanted = shipped_records() if shipped else ()
+        """Create missing tables and add missing shipped records."""
+        required = shipped_records() if shipped else ()
         with self._reading() as connection:
-            if is_made(connection, self.name) and not _missing(connection, wanted):
+            if is_made(connection, self.name) and not _missing(connection, required):
                 return
         with self._writing() as connection:
             if not is_made(connection, self.name):
                 make(connection, self.name)
-            for record in _missing(connection, wanted):
+            for record in _missing(connection, required):
                 self._append(connection, record)
 
     def add(self, record: Record) -> Record:
-        """Append a record; gives it back with its id, recorded time and hash.
+        """Append a record; returns it with its id, recorded time and hash.
 
-        ConfigError for a unit whose type is not there, and for what cannot be kept.
+        ConfigError for a unit of an unknown type, and for content that cannot be stored.
         """
         record = checked(record)
         with self._writing() as connection:
             if record.kind == "instance":
-                _require_type(record, _known(connection, "type"))
+                _require_type(record, _names(connection, "type"))
             return self._append(connection, replace(record, id=uuid.uuid4().hex))
 
     def get(
@@ -99,25 +99,25 @@ class Assets(Database):
     ) -> Found:
         """The data set that holds for a unit at a time (default: now), else that of its type.
 
-        ``as_of_ns`` takes only what was recorded until then. Of several the one with the newest
-        valid time holds, among these the one recorded last. UnknownAssetError if there is none,
-        ConfigError if the unit is of another type.
+        ``as_of_ns`` ignores records stored later. The record with the newest valid time holds;
+        among equals the one recorded last. UnknownAssetError if there is none, ConfigError if the
+        unit is of another type.
         """
         if not type:
             raise ConfigError(f"asset {id!r} has no type", "say [asset] type in the configuration")
-        at = self._clock() if at_ns is None else at_ns
-        base = holding(self.records("type", type, as_of_ns=as_of_ns), at)
-        if id and (record := holding(self.records("instance", id, as_of_ns=as_of_ns), at)):
-            return Found(_of_type(record, type), base)
-        if base:
-            return Found(base)
+        time_ns = self._clock() if at_ns is None else at_ns
+        type_record = holding(self.records("type", type, as_of_ns=as_of_ns), time_ns)
+        if id and (record := holding(self.records("instance", id, as_of_ns=as_of_ns), time_ns)):
+            return Found(_of_type(record, type), type_record)
+        if type_record:
+            return Found(type_record)
         with self._reading() as connection:
-            raise _nothing(self.name, type, id, _known(connection, "type"))
+            raise _unknown_asset(self.name, type, id, _names(connection, "type"))
 
     def records(
         self, kind: Kind | None = None, name: str | None = None, *, as_of_ns: int | None = None
     ) -> list[Record]:
-        """All records (of a kind, of a name, recorded until then), in the order of recording."""
+        """All records (of a kind, of a name, recorded by a time), in the order of recording."""
         conditions: list[ColumnElement[bool]] = []
         if kind is not None:
             conditions.append(RECORD.c.kind == kind)
@@ -129,30 +129,30 @@ class Assets(Database):
             return _read(connection, conditions)
 
     def export(self) -> dict[str, Any]:
-        """Everything, as one JSON document that ``import_`` takes without loss."""
+        """All records as one JSON document that ``import_`` reads without loss."""
         return to_export(self.records())
 
     def import_(self, document: Mapping[str, Any]) -> int:
-        """Append the records of an export that are not here yet; gives their number.
+        """Append the new records of an export; returns their number.
 
-        They keep their id and their recorded time. ConfigError, and nothing is appended, if one is
-        damaged, differs from the record of the same id here, or is a unit without a type.
+        They keep their id and their recorded time. ConfigError if a record is damaged, differs from
+        the stored record of the same id, or is a unit without a type; then nothing is appended.
         """
-        given = parse_export(document)
+        imported = parse_export(document)
         with self._writing() as connection:
-            new = _new(connection, given)
+            new = _new_records(connection, imported)
             for record in new:
                 _insert(connection, record)
         return len(new)
 
     def refuse(self, document: Mapping[str, Any]) -> None:
-        """ConfigError where ``import_`` would raise one; nothing is written."""
-        given = parse_export(document)
+        """Raise the ConfigError that ``import_`` would raise; nothing is written."""
+        imported = parse_export(document)
         with self._reading() as connection:
-            _new(connection, given)
+            _new_records(connection, imported)
 
     def _append(self, connection: Connection, record: Record) -> Record:
-        """Insert as the last one: recorded later than all before, whatever the clocks say."""
+        """Insert a record with a later recorded time than all others, whatever the clock says."""
         last = connection.scalar(select(func.max(RECORD.c.recorded_ns)))
         now = self._clock() if last is None else max(self._clock(), last + 1)
         record = replace(record, recorded_ns=now)
@@ -183,25 +183,27 @@ def _insert(connection: Connection, record: Record) -> None:
 
 def _read(connection: Connection, conditions: Conditions) -> list[Record]:
     """Records with their arrays, in the order of recording."""
-    wanted = select(RECORD).where(*conditions).order_by(RECORD.c.recorded_ns, RECORD.c.id)
-    found = connection.execute(wanted).all()
+    statement = select(RECORD).where(*conditions).order_by(RECORD.c.recorded_ns, RECORD.c.id)
+    rows = connection.execute(statement).all()
     arrays: defaultdict[str, dict[str, Array]] = defaultdict(dict)
     for row in connection.execute(select(ARRAY).join(RECORD).where(*conditions)):
         arrays[row.record][row.name] = _array(row)
-    return [_record(row, arrays[row.id]) for row in found]
+    return [_record(row, arrays[row.id]) for row in rows]
 
 
-def _new(connection: Connection, given: Sequence[Record]) -> list[Record]:
-    """Those of the records that are not here yet; ConfigError for one that cannot be added."""
-    here = {record.id: record for record in _read(connection, ())}
-    types = _known(connection, "type") | {r.name for r in given if r.kind == "type"}
+def _new_records(connection: Connection, imported: Sequence[Record]) -> list[Record]:
+    """The records that are not stored yet; ConfigError for one that cannot be added."""
+    by_id = {record.id: record for record in _read(connection, ())}
+    types = _names(connection, "type") | {
+        imported_record.name for imported_record in imported if imported_record.kind == "type"
+    }
     new: list[Record] = []
-    for record in given:
-        if _is_here(record, here):
+    for record in imported:
+        if _is_stored(record, by_id):
             continue
         if record.kind == "instance":
             _require_type(record, types)
-        here[record.id] = record
+        by_id[record.id] = record
         new.append(record)
     return new
 
@@ -212,7 +214,7 @@ def _array(row: Row[Any]) -> Array:
 
 
 def _record(row: Row[Any], arrays: Mapping[str, Array]) -> Record:
-    """SourceError if the content is no longer what was written."""
+    """The record of a row; SourceError if its content has changed since it was written."""
     values: dict[str, Any] = dict(row._mapping)
     for table in ("data", "healthy", "provenance"):
         values[table] = json.loads(values[table])
@@ -225,16 +227,16 @@ def _record(row: Row[Any], arrays: Mapping[str, Array]) -> Record:
     return record
 
 
-def _known(connection: Connection, kind: Kind) -> set[str]:
+def _names(connection: Connection, kind: Kind) -> set[str]:
     """The names of all types, or of all units."""
     return set(connection.scalars(select(RECORD.c.name).where(RECORD.c.kind == kind)))
 
 
-def _missing(connection: Connection, wanted: Sequence[Record]) -> list[Record]:
-    """Those never recorded here: an older program does not put its own back on top."""
-    ids = [record.id for record in wanted]
-    here = set(connection.scalars(select(RECORD.c.id).where(RECORD.c.id.in_(ids))))
-    return [record for record in wanted if record.id not in here]
+def _missing(connection: Connection, records: Sequence[Record]) -> list[Record]:
+    """The records never stored here: an older program must not put its own back on top."""
+    ids = [record.id for record in records]
+    stored = set(connection.scalars(select(RECORD.c.id).where(RECORD.c.id.in_(ids))))
+    return [record for record in records if record.id not in stored]
 
 
 # --- what is refused ----------------------------------------------------------------------------
@@ -248,35 +250,38 @@ def _require_type(record: Record, types: Iterable[str]) -> None:
         )
 
 
-def _of_type(record: Record, wanted: str) -> Record:
-    if record.type != wanted:
+def _of_type(record: Record, type_name: str) -> Record:
+    if record.type != type_name:
         raise ConfigError(
-            f"{record.name!r} is of type {record.type!r} in the database, not {wanted!r}",
+            f"{record.name!r} is of type {record.type!r} in the database, not {type_name!r}",
             "change [asset] type, or add a data set of the unit with the right type",
         )
     return record
 
 
-def _nothing(where: str, type_name: str, unit: str, types: Iterable[str]) -> UnknownAssetError:
+def _unknown_asset(
+    database: str, type_name: str, unit: str, types: Iterable[str]
+) -> UnknownAssetError:
     asset = f"{unit!r} or its type {type_name!r}" if unit else f"type {type_name!r}"
-    known = ", ".join(sorted(types)) or "none"
+    type_list = ", ".join(sorted(types)) or "none"
     return UnknownAssetError(
-        f"{where}: no data set of {asset} at that time", f"known types: {known}; twin assets add"
+        f"{database}: no data set of {asset} at that time",
+        f"known types: {type_list}; twin assets add",
     )
 
 
-def _is_here(record: Record, here: Mapping[str, Record]) -> bool:
-    """Whether this record is known; ConfigError if its id stands for another one.
+def _is_stored(record: Record, by_id: Mapping[str, Record]) -> bool:
+    """Whether this record is stored; ConfigError if its id belongs to another record.
 
-    A shipped type has the same id everywhere, and in each database its own recorded time.
+    A shipped type has the same id everywhere, but its own recorded time in each database.
     """
-    same = here.get(record.id)
-    if same is not None and _identity(same) != _identity(record):
+    stored = by_id.get(record.id)
+    if stored is not None and _identity(stored) != _identity(record):
         raise ConfigError(
             f"record {record.id} of {record.name!r} differs from the one in the database",
             "an exported record was changed; add it as a new one instead",
         )
-    return same is not None
+    return stored is not None
 
 
 def _identity(record: Record) -> tuple[str, str, str, int, str]:

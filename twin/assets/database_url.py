@@ -1,4 +1,4 @@
-"""Which database: the one that is named, else a file beside the configuration."""
+"""Chooses the asset database: the named one, else a file beside the configuration."""
 
 from pathlib import Path
 
@@ -27,10 +27,10 @@ def open_chosen(
 ) -> Assets:
     """Open the database named on the command line, else in the configuration, else the default.
 
-    The default is a file beside the configuration, without one in the current folder. Only who
-    writes makes a file, named or default. To read where the default is not there, the shipped
-    data sets are enough; and where a named one is not there, if what is read for is ``to_store``
-    something in it. SourceError otherwise. ``shipped`` as in ``open_assets``.
+    The default is a file beside the configuration; without a configuration, in the current folder.
+    Only ``write`` creates a file. A reader gets the shipped data sets in memory if the default file
+    is missing, or if a named file is missing and the reader will store results there later
+    (``to_store``). SourceError otherwise. ``shipped`` as in ``open_assets``.
     """
     where = chosen(named, document)
     is_named = bool(named or (document and document.section(AssetsSettings, "assets").url))
@@ -40,7 +40,7 @@ def open_chosen(
 
 
 def is_new(named: str | URL, document: Document | None) -> bool:
-    """Whether that database is a file that is not there yet."""
+    """Whether that database is a file that does not exist yet."""
     file = sqlite_file(chosen(named, document))
     return file is not None and not file.exists()
 

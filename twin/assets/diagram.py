@@ -44,7 +44,7 @@ class Diagram(Settings):
     @classmethod
     def _fits_and_falls(cls, rows: list[list[float]], info: ValidationInfo) -> list[list[float]]:
         vacuum, supply = info.data.get("vacuum_mbar"), info.data.get("supply_bar")
-        if vacuum is None or supply is None:  # what is wrong with the axes is said already
+        if vacuum is None or supply is None:  # the axes have reported their own errors
             return rows
         if len(rows) != len(supply):
             raise ValueError(f"has {len(rows)} rows for {len(supply)} supply pressures")
@@ -61,14 +61,16 @@ class Diagram(Settings):
         }
 
 
-def _check_row(what: str, row: list[float], vacuum: list[float]) -> None:
+def _check_row(label: str, row: list[float], vacuum: list[float]) -> None:
     if len(row) != len(vacuum):
-        raise ValueError(f"{what} has {len(row)} values for {len(vacuum)} vacuums")
+        raise ValueError(f"{label} has {len(row)} values for {len(vacuum)} vacuums")
     if row[0] <= 0.0:
-        raise ValueError(f"{what} must be positive at vacuum 0")
-    for at, (here, further) in zip(vacuum[1:], pairwise(row), strict=True):
-        if further > here:
-            raise ValueError(f"{what} must not rise, but does at {at:g} mbar: {here} to {further}")
+        raise ValueError(f"{label} must be positive at vacuum 0")
+    for vacuum_mbar, (flow, next_flow) in zip(vacuum[1:], pairwise(row), strict=True):
+        if next_flow > flow:
+            raise ValueError(
+                f"{label} must not rise, but does at {vacuum_mbar:g} mbar: {flow} to {next_flow}"
+            )
 
 
 def diagram_of(arrays: Mapping[str, npt.NDArray[np.float64]]) -> Diagram | None:
@@ -84,10 +86,12 @@ def diagram_of(arrays: Mapping[str, npt.NDArray[np.float64]]) -> Diagram | None:
 
 
 def check_diagram(name: str, arrays: Mapping[str, npt.NDArray[np.float64]]) -> None:
-    """ConfigError if the asset's arrays hold a diagram that cannot be one."""
+    """ConfigError if the asset's arrays hold an invalid diagram."""
     try:
         diagram_of(arrays)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        where = ".".join(map(str, first["loc"]))
-        raise ConfigError(f"{name!r}: characteristic diagram: {where}: {first['msg']}") from error
+        location = ".".join(map(str, first["loc"]))
+        raise ConfigError(
+            f"{name!r}: characteristic diagram: {location}: {first['msg']}"
+        ) from error

@@ -1,7 +1,7 @@
-"""From a URL to a connection: what SQLite and PostgreSQL need, and their errors for people.
+"""Opens SQLite and PostgreSQL databases from a URL, and turns their errors into messages.
 
-SQLite keeps its rollback journal. The faster write-ahead log needs memory shared by all who have
-the file open, which network folders do not give, and two more files that a copy easily forgets.
+SQLite keeps its rollback journal. The faster write-ahead log needs shared memory, which network
+folders do not provide, and two more files that are easily forgotten when copying.
 """
 
 import math
@@ -35,7 +35,7 @@ from twin.secret import refuse_password
 
 @dataclass(frozen=True)
 class Purpose:
-    """What a database is for, as messages name it, and the option that chooses another one."""
+    """The name of a database in messages, and the option that chooses another one."""
 
     name: str
     option: str
@@ -44,7 +44,7 @@ class Purpose:
 
 ASSETS = Purpose("asset database", "--assets", "assets")
 POSTGRES = {"postgresql", "postgres", "postgresql+psycopg"}
-_WRITERS_LOCK = 0x656A6563  # any number that no other program takes in the same database
+_WRITERS_LOCK = 0x656A6563  # any number that no other program uses as a lock in the same database
 
 _TRY_AGAIN = "another program holds it; try again, or end the program that keeps it open"
 _HINTS = {  # by SQLite's error name, or PostgreSQL's SQLSTATE
@@ -66,7 +66,7 @@ _ELSE = {
 def parse_url(where: str | Path | URL, purpose: Purpose) -> URL:
     """The URL of a database: a URL, or the path of an SQLite file.
 
-    ConfigError for other kinds, and for a text with a password in it.
+    ConfigError for other kinds, and for a text that contains a password.
     """
     if isinstance(where, URL):
         return where
@@ -101,11 +101,10 @@ def configured(settings: DatabaseSettings, folder: Path, default: str, purpose: 
 
 
 class Database:
-    """An open database. What is written is written whole or not at all; close it, or use ``with``.
+    """An open database. Every write is one transaction; close the database, or use ``with``.
 
-    ``busy_s`` is how long to wait for other writers, ``clock`` gives UTC in ns. ConfigError for a
-    URL of an unknown kind; with ``absent``, what to do then, SourceError for an SQLite file that is
-    not there.
+    ``busy_s`` is how long to wait for other writers; ``clock`` returns UTC in ns. ConfigError for a
+    URL of an unknown kind. With ``absent``, a hint, a missing SQLite file raises SourceError.
     """
 
     def __init__(
@@ -130,7 +129,7 @@ class Database:
         self.close()
 
     def close(self) -> None:
-        """Give all connections back."""
+        """Close all connections."""
         self._engine.dispose()
 
     @property
@@ -140,12 +139,12 @@ class Database:
 
     @property
     def in_memory(self) -> bool:
-        """Whether it is made anew each time it is opened, and gone when it is closed."""
+        """Whether the database exists only while it is open."""
         return is_in_memory(self._url)
 
     @contextmanager
     def closed_on_error(self) -> Iterator[None]:
-        """Make its tables inside: where that fails, it is closed."""
+        """Close the database if the block fails, for creating tables."""
         try:
             yield
         except BaseException:
@@ -153,10 +152,10 @@ class Database:
             raise
 
     def _make_missing(self, tables: MetaData) -> None:
-        """Make the tables that are not there; where all are, nothing is written."""
+        """Create missing tables; nothing is written if all exist."""
         with self._reading() as connection:
-            there = set(inspect(connection).get_table_names())
-        if not there >= set(tables.tables):
+            existing = set(inspect(connection).get_table_names())
+        if not existing >= set(tables.tables):
             with self._writing() as connection:
                 tables.create_all(connection)
 
@@ -177,7 +176,7 @@ def _unknown_kind(message: str) -> ConfigError:
 
 
 def is_in_memory(url: URL) -> bool:
-    """Whether it is an SQLite database without a file."""
+    """Whether the URL is an SQLite database without a file."""
     return url.get_backend_name() == "sqlite" and sqlite_file(url) is None
 
 
@@ -189,24 +188,24 @@ def sqlite_file(url: URL) -> Path | None:
 
 
 def make_engine(url: URL, busy_s: float) -> Engine:
-    """An engine whose transactions are serial where they write; waits ``busy_s`` for its turn."""
-    options = {"busy_ms": max(1, round(busy_s * 1e3))}  # to PostgreSQL 0 is for ever
+    """An engine whose writing transactions are serial; each waits ``busy_s`` for its turn."""
+    options = {"busy_ms": max(1, round(busy_s * 1e3))}  # for PostgreSQL 0 means no limit
     if url.get_backend_name() == "sqlite":
-        pool = NullPool if sqlite_file(url) else StaticPool  # in memory: the one there is
+        pool = NullPool if sqlite_file(url) else StaticPool  # in memory: one shared connection
         engine = create_engine(
             url, poolclass=pool, connect_args={"timeout": busy_s}, execution_options=options
         )
         event.listen(engine, "connect", _prepare_sqlite)
     else:
-        patience = {"connect_timeout": str(max(2, math.ceil(busy_s)))}  # 2 s is libpq's least
-        url = url.update_query_dict({**patience, **url.query})
+        query = {"connect_timeout": str(max(2, math.ceil(busy_s)))}  # libpq's minimum is 2 s
+        url = url.update_query_dict({**query, **url.query})
         engine = create_engine(url, pool_pre_ping=True, execution_options=options)
     event.listen(engine, "begin", _begin)
     return engine
 
 
 def _prepare_sqlite(connection: DBAPIConnection, _entry: ConnectionPoolEntry) -> None:
-    """Leave transactions to us, and be durable through a loss of power."""
+    """Turn off automatic transactions, and make writes durable through a loss of power."""
     assert isinstance(connection, sqlite3.Connection)
     connection.isolation_level = None
     connection.execute("PRAGMA foreign_keys = ON")
@@ -214,7 +213,7 @@ def _prepare_sqlite(connection: DBAPIConnection, _entry: ConnectionPoolEntry) ->
 
 
 def _begin(connection: Connection) -> None:
-    """Writers take their turn at once: nobody who has read must wait in order to write."""
+    """Writers take the lock at the start, so that none waits for it after reading."""
     options = connection.get_execution_options()
     writing = options.get("writing", False)
     if connection.dialect.name == "sqlite":
@@ -229,9 +228,7 @@ def _begin(connection: Connection) -> None:
 
 
 def _take_turn(connection: Connection, busy_ms: int) -> None:
-    """Begin to write, looking often: SQLite itself looks every 100 ms, and a busy writer starves
-    all others.
-    """
+    """Begin a write, polling often: SQLite polls every 100 ms, so a busy writer starves others."""
     end = time.monotonic() + busy_ms * 1e-3
     connection.exec_driver_sql("PRAGMA busy_timeout = 0")
     while True:
@@ -248,7 +245,7 @@ def _take_turn(connection: Connection, busy_ms: int) -> None:
 
 @contextmanager
 def plain_errors(url: URL, purpose: Purpose) -> Iterator[None]:
-    """Turn the database's errors into a SourceError that says where and what to do."""
+    """Turn the database's errors into a SourceError with the place and a hint."""
     try:
         yield
     except DBAPIError as error:
@@ -268,7 +265,7 @@ def _code(error: BaseException | None) -> str:
 
 
 def shown(url: URL) -> str:
-    """How messages name the database: the file, or the URL without its password."""
+    """The database's name in messages: the file, or the URL without its password."""
     if url.get_backend_name() == "sqlite":
         return str(sqlite_file(url) or "the shipped data sets")
     return url.set(drivername=url.get_backend_name(), query={}).render_as_string()

@@ -1,4 +1,4 @@
-"""The database as one JSON document that others can read: every number as it is, lossless."""
+"""The database as one lossless JSON document for other programs."""
 
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
@@ -50,7 +50,7 @@ class ExportForm(Settings):
 
 
 def to_plain(record: Record) -> dict[str, Any]:
-    """A record as JSON has it."""
+    """A record as a JSON document."""
     arrays = {
         name: {"shape": list(array.shape), "values": array.ravel().tolist()}
         for name, array in record.arrays.items()
@@ -59,29 +59,29 @@ def to_plain(record: Record) -> dict[str, Any]:
 
 
 def to_export(records: Sequence[Record]) -> dict[str, Any]:
-    """The document with these records."""
-    plain = [to_plain(record) for record in records]
-    return {"format": FORMAT, "program": version("ejector-twin"), "records": plain}
+    """The export document with these records."""
+    documents = [to_plain(record) for record in records]
+    return {"format": FORMAT, "program": version("ejector-twin"), "records": documents}
 
 
 def parse_export(document: Mapping[str, Any]) -> list[Record]:
-    """The records of a document; ConfigError if it is none, or one is not what was exported."""
+    """The records of an export; ConfigError if it is none, or a record was changed since."""
     try:
         form = ExportForm.model_validate(document)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        where = ".".join(map(str, first["loc"])) or "document"
+        location = ".".join(map(str, first["loc"])) or "document"
         raise ConfigError(
-            f"not an export of an asset database: {where}: {first['msg']}",
+            f"not an export of an asset database: {location}: {first['msg']}",
             "twin assets export makes one; a newer format needs a newer ejector-twin",
         ) from error
-    return [_record(given) for given in form.records]
+    return [_record(record_form) for record_form in form.records]
 
 
 def _record(form: RecordForm) -> Record:
     fields = {name: getattr(form, name) for name in RecordForm.model_fields}
     try:
-        fields["arrays"] = {name: given.array() for name, given in form.arrays.items()}
+        fields["arrays"] = {name: array_form.array() for name, array_form in form.arrays.items()}
     except ValueError as error:
         raise ConfigError(f"record {form.id} of {form.name!r}: arrays: {error}") from error
     record = checked(Record(**fields))

@@ -1,4 +1,4 @@
-"""An asset as a person writes it: one TOML file for a type or a unit."""
+"""An asset's TOML file, which a person writes: one file for a type or a unit."""
 
 from collections.abc import Mapping
 from datetime import UTC, date, datetime, timedelta
@@ -31,31 +31,31 @@ class AssetFile(Settings):
 
 
 def read_asset(document: Document, provenance: Mapping[str, Any]) -> tuple[Record, bool]:
-    """The record in a file, and whether it says from when it is valid (if not: always).
+    """The record in a file, and whether the file has a valid time (without: always valid).
 
     ConfigError with file, line and key.
     """
-    given = document.section(AssetFile)
-    if given.kind == "instance" and not given.type:
+    asset = document.section(AssetFile)
+    if asset.kind == "instance" and not asset.type:
         raise ConfigError(
-            f"{document.name}:1: type: instance {given.name!r} has no type",
+            f"{document.name}:1: type: instance {asset.name!r} has no type",
             'say which type of ejector it is: type = "..."',
         )
     record = Record(
-        given.kind,
-        given.name,
-        given.type or given.name,
-        given.data,
-        given.healthy,
-        given.diagram.arrays() if given.diagram else {},
-        {**provenance, "note": given.note} if given.note else provenance,
-        valid_from_ns=0 if given.valid_from is None else to_ns(given.valid_from),
+        asset.kind,
+        asset.name,
+        asset.type or asset.name,
+        asset.data,
+        asset.healthy,
+        asset.diagram.arrays() if asset.diagram else {},
+        {**provenance, "note": asset.note} if asset.note else provenance,
+        valid_from_ns=0 if asset.valid_from is None else to_ns(asset.valid_from),
     )
-    return record, given.valid_from is not None
+    return record, asset.valid_from is not None
 
 
 def write_asset(record: Record) -> str:
-    """The file that would give this content again; arrays other than the diagram are not in it."""
+    """The file with this record's content; it contains no arrays other than the diagram."""
     diagram = diagram_of(record.arrays)
     tables = {
         "kind": record.kind,
@@ -68,28 +68,30 @@ def write_asset(record: Record) -> str:
     }
     if not record.valid_from_ns:
         del tables["valid_from"]
-    return tomli_w.dumps({key: _set(value) for key, value in tables.items() if value != {}})
+    return tomli_w.dumps(
+        {key: _without_null(value) for key, value in tables.items() if value != {}}
+    )
 
 
-def _set(value: Any) -> Any:
-    """Without what is null: TOML has no word for it, and leaves it out."""
+def _without_null(value: Any) -> Any:
+    """A value without null entries, since TOML cannot express them."""
     if isinstance(value, Mapping):
-        return {key: _set(inner) for key, inner in value.items() if inner is not None}
+        return {key: _without_null(inner) for key, inner in value.items() if inner is not None}
     if isinstance(value, list):
-        return [_set(inner) for inner in value if inner is not None]
+        return [_without_null(inner) for inner in value if inner is not None]
     return value
 
 
-def to_ns(when: date) -> int:
-    """UTC in ns since 1970; a day is its first moment, a time without a zone is UTC."""
-    if not isinstance(when, datetime):
-        when = datetime(when.year, when.month, when.day)
-    since = (when if when.tzinfo else when.replace(tzinfo=UTC)) - _EPOCH
+def to_ns(moment: date) -> int:
+    """UTC in ns since 1970; a date means its first moment, a time without a zone is UTC."""
+    if not isinstance(moment, datetime):
+        moment = datetime(moment.year, moment.month, moment.day)
+    since = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - _EPOCH
     return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
 
 
 def parse_time(text: str) -> int:
-    """A time as people give it on the command line, in ns; ConfigError if it is none."""
+    """The time in ns of a command-line argument; ConfigError if it is no time."""
     try:
         return to_ns(datetime.fromisoformat(text))
     except ValueError as error:
@@ -99,7 +101,7 @@ def parse_time(text: str) -> int:
 
 
 def show_time(ns: int) -> str:
-    """To the second, UTC; 0 is how records say always."""
+    """A time in UTC to the second; 0 means always."""
     if ns == 0:
         return "always"
     return (_EPOCH + timedelta(seconds=ns // 10**9)).strftime("%Y-%m-%dT%H:%M:%SZ")

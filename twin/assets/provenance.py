@@ -1,4 +1,4 @@
-"""Where a record is from, if it was made of a log, and since when it holds."""
+"""Provenance of a record that was made from a log, and its valid time."""
 
 import hashlib
 import time
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def of_log(log: Path) -> dict[str, str]:
-    """The log by name and content, and the program, as ``Record.provenance`` keeps them."""
+    """The log's name and hash, and the program, for ``Record.provenance``."""
     with log.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     return {
@@ -18,5 +18,5 @@ def of_log(log: Path) -> dict[str, str]:
 
 
 def valid_from(received_ns: int) -> int:
-    """When a record holds from: since its rows were received, whatever clock stamped them."""
+    """The valid time of a record: when its rows were received, but between 1970 and now."""
     return min(max(received_ns, 0), time.time_ns())

@@ -1,4 +1,4 @@
-"""One entry of the asset database: what was known of a type or of one unit, and from where."""
+"""One record of the asset database: the data of a type or of one unit, with provenance."""
 
 import hashlib
 import json
@@ -40,14 +40,14 @@ class Record:
 
 @dataclass(frozen=True)
 class Found:
-    """What the database has of an asset: the unit's own data set, or its type's."""
+    """The database's entry for an asset: the unit's own data set, or its type's."""
 
     record: Record
     base: Record | None = None  # of a unit: what holds of its type
 
     @property
     def used(self) -> Kind:
-        """Whether it is the unit's own or its type's."""
+        """The kind of the record: of the unit itself or of its type."""
         return self.record.kind
 
 
@@ -59,7 +59,7 @@ def content_hash(record: Record) -> str:
     """16 hex digits over data set, healthy scatter and arrays: same hash, same content."""
     shapes = {name: array.shape for name, array in record.arrays.items()}
     content = {"data": record.data, "healthy": record.healthy, "arrays": shapes}
-    # Sorted: in which order a file has its keys says nothing about the ejector.
+    # Sorted, because the order of keys in a file must not matter.
     digest = hashlib.sha256(to_json(content, sort_keys=True).encode())
     for _, array in sorted(record.arrays.items()):
         digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
@@ -67,21 +67,21 @@ def content_hash(record: Record) -> str:
 
 
 def holding(records: Iterable[Record], at_ns: int) -> Record | None:
-    """Which of an asset's records holds at a time: the newest valid one, of these the last."""
+    """The record that holds at a time: that with the newest valid time, then the last recorded."""
     valid = (record for record in records if record.valid_from_ns <= at_ns)
     return max(valid, key=lambda r: (r.valid_from_ns, r.recorded_ns, r.id), default=None)
 
 
 def to_json(value: object, *, sort_keys: bool = False) -> str:
-    """JSON as the database keeps it; ValueError or TypeError where JSON has no word for it."""
+    """JSON for the database; ValueError or TypeError for a value that JSON cannot express."""
     return json.dumps(value, sort_keys=sort_keys, separators=(",", ":"), allow_nan=False)
 
 
 def checked(record: Record) -> Record:
-    """The record as the database would give it back, hash included; ConfigError if it cannot be."""
+    """The record as the database would return it, with hash; ConfigError if it is invalid."""
     _check_names(record)
     _check_times(record)
-    kept = replace(
+    record_to_store = replace(
         record,
         data=_plain(record, "data", record.data),
         healthy=_plain(record, "healthy", record.healthy),
@@ -90,8 +90,8 @@ def checked(record: Record) -> Record:
             name: np.array(array, dtype=np.float64) for name, array in sorted(record.arrays.items())
         },
     )
-    _check_arrays(kept)
-    return replace(kept, hash=content_hash(kept))
+    _check_arrays(record_to_store)
+    return replace(record_to_store, hash=content_hash(record_to_store))
 
 
 def _check_names(record: Record) -> None:
@@ -110,21 +110,23 @@ def _check_names(record: Record) -> None:
 
 
 def _check_times(record: Record) -> None:
-    for what in ("valid_from_ns", "recorded_ns"):
-        if getattr(record, what) not in _INT64:
-            raise ConfigError(f"{record.name!r}: {what} is not a time: {getattr(record, what)!r}")
+    for field_name in ("valid_from_ns", "recorded_ns"):
+        if getattr(record, field_name) not in _INT64:
+            raise ConfigError(
+                f"{record.name!r}: {field_name} is not a time: {getattr(record, field_name)!r}"
+            )
 
 
-def _plain(record: Record, what: str, table: Mapping[str, Any]) -> dict[str, Any]:
-    """The table as JSON keeps it."""
+def _plain(record: Record, field_name: str, table: Mapping[str, Any]) -> dict[str, Any]:
+    """The table after a round trip through JSON."""
     try:
-        plain: dict[str, Any] = json.loads(to_json(table))
+        content: dict[str, Any] = json.loads(to_json(table))
     except (TypeError, ValueError, RecursionError) as error:
         raise ConfigError(
-            f"{record.name!r}: its {what} cannot be kept: {error}",
+            f"{record.name!r}: its {field_name} cannot be kept: {error}",
             "tables, lists, texts, finite numbers, true and false can be",
         ) from error
-    return plain
+    return content
 
 
 def _check_arrays(record: Record) -> None:

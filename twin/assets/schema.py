@@ -1,4 +1,4 @@
-"""The tables, which the database itself keeps append-only, and their version."""
+"""The tables and their version. The database itself enforces that they are append-only."""
 
 from importlib.metadata import version
 
@@ -26,7 +26,7 @@ VERSION = 1
 
 metadata = MetaData()
 
-# This table stays as it is in every version: it is how an older program knows a newer schema.
+# This table never changes: an older program recognises a newer schema by it.
 SCHEMA = Table(
     "asset_schema",
     metadata,
@@ -34,7 +34,7 @@ SCHEMA = Table(
     Column("program", Text, nullable=False),  # the program version that made it
 )
 
-# Without a rowid there is no second key by which INSERT OR REPLACE could remove a row.
+# Without a rowid, INSERT OR REPLACE has no second key by which it could remove a row.
 RECORD = Table(
     "asset_record",
     metadata,
@@ -74,25 +74,25 @@ _SQLITE_TRIGGER = """
 CREATE TRIGGER {table}_no_{deed} BEFORE {deed} ON {table} {when}
 BEGIN SELECT RAISE(ABORT, 'the asset database is append-only'); END
 """
-# INSERT OR REPLACE would delete without asking the trigger on DELETE.
-_TAKEN = {
+# INSERT OR REPLACE deletes rows without firing the trigger on DELETE.
+_KEY_EXISTS = {
     RECORD: "WHEN EXISTS (SELECT 1 FROM asset_record WHERE id = NEW.id)",
     ARRAY: "WHEN EXISTS (SELECT 1 FROM asset_array WHERE record = NEW.record AND name = NEW.name)",
 }
 
 
-def _only(dialect: str, statement: str) -> ExecutableDDLElement:
+def _for_dialect(dialect: str, statement: str) -> ExecutableDDLElement:
     ddl: ExecutableDDLElement = DDL(statement).execute_if(dialect=dialect)  # type: ignore[no-untyped-call]
     return ddl
 
 
 def _guard(table: Table) -> None:
-    """Have the database refuse every change of ``table`` but a new row."""
-    for deed, when in (("update", ""), ("delete", ""), ("insert", _TAKEN[table])):
-        trigger = _SQLITE_TRIGGER.format(table=table.name, deed=deed, when=when)
-        event.listen(table, "after_create", _only("sqlite", trigger))
+    """Make the database reject every change of ``table`` except new rows."""
+    for operation, condition in (("update", ""), ("delete", ""), ("insert", _KEY_EXISTS[table])):
+        trigger = _SQLITE_TRIGGER.format(table=table.name, deed=operation, when=condition)
+        event.listen(table, "after_create", _for_dialect("sqlite", trigger))
     for statement in (_POSTGRES_FUNCTION, _POSTGRES_TRIGGERS.format(table=table.name)):
-        event.listen(table, "after_create", _only("postgresql", statement))
+        event.listen(table, "after_create", _for_dialect("postgresql", statement))
 
 
 _guard(RECORD)
@@ -100,14 +100,14 @@ _guard(ARRAY)
 
 
 def is_made(connection: Connection, where: str) -> bool:
-    """Whether the tables are there; ConfigError if they are of a newer program."""
+    """Whether the tables exist; ConfigError if a newer program made them."""
     if not inspect(connection).has_table(SCHEMA.name):
         return False
     newest = select(SCHEMA).order_by(SCHEMA.c.version.desc()).limit(1)
-    found, program = connection.execute(newest).one()
-    if found > VERSION:
+    schema_version, program = connection.execute(newest).one()
+    if schema_version > VERSION:
         raise ConfigError(
-            f"{where}: an asset database of ejector-twin {program} (schema {found}); "
+            f"{where}: an asset database of ejector-twin {program} (schema {schema_version}); "
             f"this is ejector-twin {version('ejector-twin')} (schema {VERSION})",
             f"update ejector-twin to {program} or newer, or choose another database with --assets",
         )
@@ -115,7 +115,7 @@ def is_made(connection: Connection, where: str) -> bool:
 
 
 def make(connection: Connection, where: str) -> None:
-    """Make the tables in an empty database; ConfigError if a file is another program's."""
+    """Create the tables in an empty database; ConfigError if the file is another program's."""
     if connection.dialect.name == "sqlite" and inspect(connection).get_table_names():
         raise ConfigError(
             f"{where}: a database of another program", "choose another file with --assets"

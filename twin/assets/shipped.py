@@ -15,10 +15,10 @@ FOLDERS = ("types", "units")  # in this order: a unit is of a type
 
 @cache
 def shipped_records() -> tuple[Record, ...]:
-    """All of them, checked, types first, each in the order of their file names, with their ids."""
+    """All shipped records with ids, checked; types first, then by file name."""
     provenance = {"source": f"shipped with ejector-twin {version('ejector-twin')}"}
-    given = (read_asset(document, provenance)[0] for document in _documents())
-    return tuple(_named(checked(record)) for record in given)
+    records = (read_asset(document, provenance)[0] for document in _documents())
+    return tuple(_named(checked(record)) for record in records)
 
 
 def _documents() -> list[Document]:
@@ -31,5 +31,5 @@ def _documents() -> list[Document]:
 
 
 def _named(record: Record) -> Record:
-    """With an id that is the same in every database, so that none gets it twice."""
+    """The record with an id that is the same in every database, so that none gets it twice."""
     return replace(record, id=uuid5(NAMESPACE_URL, f"{record.name}/{record.hash}").hex)

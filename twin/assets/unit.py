@@ -1,4 +1,4 @@
-"""Whose rows: what is kept of a unit stands in tables beside that of others."""
+"""The unit as a key: tables hold the rows of several units."""
 
 from typing import NamedTuple
 
