@@ -1,1 +1,1 @@
-"""Thousands of logs: each judged once, what was found kept, and all compared."""
+"""Fleets: thousands of logs, each analysed once; results are stored and units compared."""

@@ -1,7 +1,7 @@
-"""Who does the jobs: processes on this machine, or the workers of a Dask cluster.
+"""Engines that run the jobs: processes on this machine, or the workers of a Dask cluster.
 
-Either takes a function with its argument and gives a future. A process that dies costs the job it
-was at: Pebble tells it from the others, Dask gives it to another worker first.
+An engine takes a function with its argument and returns a future. If a process dies, its job fails:
+Pebble reports that job alone; Dask first tries it on another worker.
 """
 
 import os
@@ -25,13 +25,13 @@ _MISSING = f"{install_hint('dask')}, or take --engine local"
 
 
 def cores() -> int:
-    """How many this process may use."""
+    """The number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
 def local(workers: int) -> Iterator[Submit]:
-    """Processes of this machine; those that run are ended where the block is left by an error."""
+    """Processes of this machine; an error in the block stops the running ones."""
     pool = ProcessPool(max_workers=workers, context=get_context("spawn"))
     try:
         yield lambda function, job: pool.schedule(function, args=(job,))
@@ -45,13 +45,13 @@ def local(workers: int) -> Iterator[Submit]:
 
 @contextmanager
 def dask(scheduler: str) -> Iterator[Submit]:
-    """The workers of the scheduler at an address; ConfigError where Dask is not installed."""
+    """The workers of the scheduler at an address; ConfigError if Dask is not installed."""
     try:
         from distributed import Client  # noqa: PLC0415  # an extra
     except ImportError as error:
         raise ConfigError(f"a Dask cluster needs Dask, not installed: {error}", _MISSING) from error
     address = urlsplit(scheduler)
-    try:  # first, as a client that does not come about leaves a thread behind
+    try:  # test the address first: a client that fails to connect leaves a thread behind
         socket.create_connection((address.hostname or "", address.port or PORT), CONNECT_S).close()
         client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
@@ -62,5 +62,5 @@ def dask(scheduler: str) -> Iterator[Submit]:
 
 
 def died(error: BaseException) -> bool:
-    """Whether this is how an engine says that the process of a job is gone."""
+    """Whether an engine's error means that the process of a job has died."""
     return isinstance(error, ProcessExpired) or type(error).__name__ == "KilledWorker"

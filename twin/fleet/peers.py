@@ -1,9 +1,9 @@
-"""Units beside others like them: who is far from the rest, in what, and who is moving.
+"""Compares units with others of their type: which are far from the rest, in what, and which drift.
 
-Every unit differs from its type a little. What stands out is what is far outside of how the others
-of the type scatter, by median and median deviation: a few bad ones among them hide nothing. A unit
-with earlier logs is compared with what it was itself, and that change with the changes of others,
-which the weather and the years have made as well.
+Every unit differs a little from its type. A unit stands out if it is far outside the scatter of the
+others of its type. Median and median absolute deviation measure that scatter, so a few bad units
+hide nothing. A unit with earlier logs is compared with its own past. That change is compared with
+the changes of the others, since weather and age act on them too.
 """
 
 import math
@@ -21,25 +21,26 @@ from twin.fleet.results_database import Result
 from twin.fleet.watch import name_of
 from twin.monitor.model_bank import SUSPECTS
 
-FEWEST_PEERS = 8  # of a type, by which the others are judged
-FEWEST_LOGS = 6  # of a unit, in which a drift can be seen
+FEWEST_PEERS = 8  # units of a type that a comparison needs
+FEWEST_LOGS = 6  # logs of a unit that a drift needs
 DAY_NS = 86_400e9
-LEAST_SCATTER = 0.3  # sigmas a cycle: no fleet is more alike than that
-SIGMA = 0.683  # of all, within one sigma
-DRIFTS = 4.0  # sigmas, from which on a unit is said to drift
-STEPS = 8.0  # and to have stepped: that may be in any effect and between any two logs
+LEAST_SCATTER = 0.3  # sigmas a cycle: the lower bound of a fleet's scatter
+SIGMA = 0.683  # probability within one sigma
+DRIFTS = 4.0  # threshold of a drift, in sigmas
+STEPS = 8.0  # of a step: higher, as it may be in any effect and between any two logs
 
-_MOST = {  # the largest size that it can have
-    name_of(one): max(abs(one.parameter.low), abs(one.parameter.high)) for one in SUSPECTS
+_MAX_SIZE = {  # the largest size that it can have
+    name_of(suspect): max(abs(suspect.parameter.low), abs(suspect.parameter.high))
+    for suspect in SUSPECTS
 }
-_ONE_WAY = {name_of(one) for one in SUSPECTS if not one.both_ways}
+_ONE_SIDED = {name_of(suspect) for suspect in SUSPECTS if not suspect.both_ways}
 
 Unit = tuple[str, str]  # type, ID
 
 
 @dataclass(frozen=True)
 class Standing:
-    """How far one unit is from those like it, in the effect in which it is furthest."""
+    """How far one unit is from its peers, in the effect in which it is furthest."""
 
     type: str
     id: str
@@ -57,7 +58,7 @@ class Standing:
 class Drift:
     """One effect that grows or shrinks from log to log, or stepped between two of them.
 
-    A step has no rate: ``per_day`` is None, ``step`` how much it is, and ``step_ns`` when the first
+    A step has no rate: ``per_day`` is None, ``step`` is its size, and ``step_ns`` is when the first
     log with it began (UTC).
     """
 
@@ -71,128 +72,147 @@ class Drift:
 
 
 def standings(watched: Sequence[Result]) -> list[Standing]:
-    """Every unit with logs that were watched (in the order of time), the furthest out first."""
+    """Every unit with results of watched logs (ordered by time), the furthest out first."""
     logs: dict[Unit, list[Result]] = defaultdict(list)
-    for one in watched:
-        if one.answer["effects"]:
-            logs[one.type, one.id].append(one)
-    says = {unit: _says(mine) for unit, mine in logs.items()}
+    for result in watched:
+        if result.answer["effects"]:
+            logs[result.type, result.id].append(result)
+    effects = {unit: _effect_changes(results) for unit, results in logs.items()}
     peers: dict[tuple[str, bool], list[Values]] = defaultdict(list)
-    for unit, mine in logs.items():
-        peers[unit[0], len(mine) > 1].append(says[unit])
-    usual = {group: _Usual.of(every) for group, every in peers.items()}
-    found = [
-        _standing(mine, says[unit], usual[unit[0], len(mine) > 1]) for unit, mine in logs.items()
+    for unit, results in logs.items():
+        peers[unit[0], len(results) > 1].append(effects[unit])
+    statistics = {
+        group: _GroupStatistics.of(group_effects) for group, group_effects in peers.items()
+    }
+    unsorted = [
+        _standing(results, effects[unit], statistics[unit[0], len(results) > 1])
+        for unit, results in logs.items()
     ]
-    return sorted(found, key=lambda one: -one.beyond)
+    return sorted(unsorted, key=lambda standing: -standing.beyond)
 
 
 @dataclass(frozen=True)
-class _Value:
-    """One effect in one unit: sigmas a cycle, by how much they are uncertain, and the size."""
+class _Effect:
+    """One effect in one unit: sigmas a cycle, their uncertainty, and the size."""
 
     sigmas: float
-    known: float
+    uncertainty: float
     size: float
 
 
-Values = Mapping[str, _Value]
+Values = Mapping[str, _Effect]
 
 
-def _says(mine: Sequence[Result]) -> Values:
-    """What a unit's newest log says of every effect, less what its earlier ones did."""
-    *earlier, newest = ({n: _value(one) for n, one in r.answer["effects"].items()} for r in mine)
+def _effect_changes(results: Sequence[Result]) -> Values:
+    """Every effect in a unit's newest log, less the median of its earlier logs."""
+    *earlier, newest = (
+        {name: _effect_of(effect) for name, effect in result.answer["effects"].items()}
+        for result in results
+    )
     return {
-        name: _less(one, [e[name] for e in earlier if name in e]) for name, one in newest.items()
+        name: _minus_median(effect, [log[name] for log in earlier if name in log])
+        for name, effect in newest.items()
     }
 
 
-def _value(one: Mapping[str, Any]) -> _Value:
-    scatter = 1.0 if one["scatter"] is None else one["scatter"]
-    return _Value(one["sigmas"], scatter / math.sqrt(one["cycles"]), one["size"])
+def _effect_of(effect: Mapping[str, Any]) -> _Effect:
+    scatter = 1.0 if effect["scatter"] is None else effect["scatter"]
+    return _Effect(effect["sigmas"], scatter / math.sqrt(effect["cycles"]), effect["size"])
 
 
-def _less(one: _Value, earlier: Sequence[_Value]) -> _Value:
+def _minus_median(latest: _Effect, earlier: Sequence[_Effect]) -> _Effect:
     if not earlier:
-        return one
-    sigmas, known, size = np.median([(e.sigmas, e.known, e.size) for e in earlier], axis=0).tolist()
-    return _Value(one.sigmas - sigmas, math.hypot(one.known, known), one.size - size)
+        return latest
+    sigmas, uncertainty, size = np.median(
+        [(effect.sigmas, effect.uncertainty, effect.size) for effect in earlier], axis=0
+    ).tolist()
+    return _Effect(
+        latest.sigmas - sigmas, math.hypot(latest.uncertainty, uncertainty), latest.size - size
+    )
 
 
 @dataclass(frozen=True)
-class _Usual:
-    """Of units like each other: how many, and of every effect the middle and the scatter."""
+class _GroupStatistics:
+    """Statistics of peers: their number, and the median and scatter of every effect."""
 
     peers: int
     middle: Mapping[str, tuple[float, float]]  # sigmas a cycle, and size
     scatter: Mapping[str, float]  # sigmas a cycle
 
     @classmethod
-    def of(cls, units: Sequence[Values]) -> "_Usual":
-        """Of few units nothing is usual but the calibrated twin."""
-        names = {name for one in units for name in one}
+    def of(cls, units: Sequence[Values]) -> "_GroupStatistics":
+        """Statistics of some units; with too few of them, those of the calibrated twin."""
+        names = {name for unit in units for name in unit}
         if len(units) < FEWEST_PEERS:
             return cls(len(units), dict.fromkeys(names, (0.0, 0.0)), dict.fromkeys(names, 1.0))
-        said = {n: [(u[n].sigmas, u[n].size) for u in units if n in u] for n in names}
-        middle = {n: tuple(np.median(some, axis=0).tolist()) for n, some in said.items()}
-        scatter = {
-            n: median_abs_deviation(np.array(x)[:, 0], scale="normal") for n, x in said.items()
+        pairs = {
+            name: [(unit[name].sigmas, unit[name].size) for unit in units if name in unit]
+            for name in names
         }
-        return cls(
-            len(units), middle, {n: max(float(one), LEAST_SCATTER) for n, one in scatter.items()}
-        )
+        middle = {name: tuple(np.median(values, axis=0).tolist()) for name, values in pairs.items()}
+        scatter = {
+            name: median_abs_deviation(np.array(values)[:, 0], scale="normal")
+            for name, values in pairs.items()
+        }
+        bounded = {name: max(float(spread), LEAST_SCATTER) for name, spread in scatter.items()}
+        return cls(len(units), middle, bounded)
 
-    def beyond(self, name: str, one: _Value) -> float:
-        """Sigmas of the others' scatter, and of what its logs do not know, from their middle."""
-        far = (one.sigmas - self.middle[name][0]) / math.hypot(self.scatter[name], one.known)
-        return far if name in _ONE_WAY else abs(far)
+    def beyond(self, name: str, effect: _Effect) -> float:
+        """Distance from the peers' median, in sigmas of their scatter and its own uncertainty."""
+        sigmas = (effect.sigmas - self.middle[name][0]) / math.hypot(
+            self.scatter[name], effect.uncertainty
+        )
+        return sigmas if name in _ONE_SIDED else abs(sigmas)
 
 
 def _reported(name: str, size: float) -> float | None:
-    """A size as it is told; None where it has left what the effect can be."""
-    return size if abs(size) < _MOST[name] else None
+    """The size to report; None if it exceeds the effect's bounds."""
+    return size if abs(size) < _MAX_SIZE[name] else None
 
 
-def _standing(mine: Sequence[Result], says: Values, usual: _Usual) -> Standing:
-    last, beyond = mine[-1], {name: usual.beyond(name, one) for name, one in says.items()}
-    first = max(beyond, key=lambda name: beyond[name])
+def _standing(results: Sequence[Result], effects: Values, statistics: _GroupStatistics) -> Standing:
+    last, beyond = (
+        results[-1],
+        {name: statistics.beyond(name, effect) for name, effect in effects.items()},
+    )
+    furthest = max(beyond, key=lambda name: beyond[name])
     return Standing(
         last.type,
         last.id,
         last.batch,
-        beyond[first],
-        first,
-        _reported(first, says[first].size - usual.middle[first][1]),
-        last.answer["effects"][first]["unit"],
-        usual.peers,
-        _drifts(mine),
+        beyond[furthest],
+        furthest,
+        _reported(furthest, effects[furthest].size - statistics.middle[furthest][1]),
+        last.answer["effects"][furthest]["unit"],
+        statistics.peers,
+        _drifts(results),
         last.log,
     )
 
 
-def _drifts(mine: Sequence[Result]) -> tuple[Drift, ...]:
-    """What moves from log to log, by the median of the slopes between any two of them."""
-    if len(mine) < FEWEST_LOGS:
+def _drifts(results: Sequence[Result]) -> tuple[Drift, ...]:
+    """The effects that move from log to log, by the median slope between any two logs."""
+    if len(results) < FEWEST_LOGS:
         return ()
-    day = (np.array([one.begin_ns for one in mine]) - mine[0].begin_ns) / DAY_NS
+    day = (np.array([result.begin_ns for result in results]) - results[0].begin_ns) / DAY_NS
     if day[-1] < LEAST_SPAN:
         return ()
-    found = [_drift(name, day, mine) for name in mine[-1].answer["effects"]]
-    drifting = [one for one in found if one is not None]
-    return tuple(sorted(drifting, key=lambda one: -one.sigmas))
+    candidates = [_drift(name, day, results) for name in results[-1].answer["effects"]]
+    drifting = [drift for drift in candidates if drift is not None]
+    return tuple(sorted(drifting, key=lambda drift: -drift.sigmas))
 
 
-def _drift(name: str, day: npt.NDArray[np.float64], mine: Sequence[Result]) -> Drift | None:
-    effects = [one.answer["effects"].get(name) for one in mine]
-    shown = np.array([one is not None for one in effects])
+def _drift(name: str, day: npt.NDArray[np.float64], results: Sequence[Result]) -> Drift | None:
+    effects = [result.answer["effects"].get(name) for result in results]
+    shown = np.array([entry is not None for entry in effects])
     if shown.sum() < FEWEST_LOGS:
         return None
-    sizes = np.array([one["size"] for one in effects if one is not None])
+    sizes = np.array([entry["size"] for entry in effects if entry is not None])
     line = theilslopes(sizes, day[shown], alpha=SIGMA)
     sigma = max(0.5 * float(line.high_slope - line.low_slope), 1e-12)
-    unit = mine[-1].answer["effects"][name]["unit"]
+    unit = results[-1].answer["effects"][name]["unit"]
     drift = Drift(name, float(line.slope), unit, abs(float(line.slope)) / sigma, float(day[-1]))
-    step = trend_of(np.array([one.begin_ns for one in mine])[shown], sizes).step
+    step = trend_of(np.array([result.begin_ns for result in results])[shown], sizes).step
     if step is None:
         return drift if drift.sigmas >= DRIFTS else None
     size = step.after - step.before

@@ -1,7 +1,7 @@
-"""What a fleet's answers come to: who needs attention first, what is wrong with them, and why.
+"""The report of a fleet: which units need attention first, and what is wrong with them.
 
-Worst first: units are ranked by how far they stand from those like them; those whose logs were
-diagnosed and not watched, by what the diagnosis found.
+Units are ranked by their distance from their peers, the worst first. Units whose logs were
+diagnosed but not watched are ranked by their diagnosis.
 """
 
 from collections import Counter, defaultdict
@@ -21,50 +21,50 @@ DIAGNOSED = {"unlisted": 2, "explained": 2, "insufficient": 1, "consistent": 0}
 
 
 class State(StrEnum):
-    """What is known of a unit."""
+    """The judgement of a unit."""
 
-    STANDS_OUT = "stands_out"  # somebody should look at it
-    DOES_NOT = "does_not"  # it was judged, and nothing is found
-    NOT_JUDGED = "not_judged"  # nobody knows
+    STANDS_OUT = "stands_out"  # a person should look at it
+    DOES_NOT = "does_not"  # it was judged as normal
+    NOT_JUDGED = "not_judged"  # there is no judgement
 
 
 @dataclass(frozen=True)
 class Row:
-    """One unit. ``reason`` says why it could not be judged, and is empty where it was."""
+    """One unit. ``reason`` says why it could not be judged; it is empty if it was."""
 
     type: str
     id: str
     batch: str
     log: str  # the newest
-    log_complete: bool  # otherwise it was cut off, and the unit is judged by what is there
+    log_complete: bool  # otherwise it was cut off, and the unit is judged by the rest
     logs: int
     state: State
     reason: str
     standing: Standing | None
-    verdict: str  # of the newest diagnosis; empty where there is none
+    verdict: str  # of the newest diagnosis; empty without one
     causes: tuple[Mapping[str, Any], ...]
-    leftover: float  # mbar rms that the twin is off in the newest diagnosis; 0 where there is none
+    leftover: float  # mbar rms of the twin's error in the newest diagnosis; 0 without one
 
     @property
     def stands_out(self) -> bool:
-        """Whether somebody should look at it."""
+        """Whether a person should look at it."""
         return self.state is State.STANDS_OUT
 
     @property
     def compared(self) -> Standing | None:
-        """How far it is from the others, where there are enough of them to compare it with."""
+        """Its distance from its peers; None if there are too few of them."""
         enough = self.standing is not None and self.standing.peers >= FEWEST_PEERS
         return self.standing if enough else None
 
     @property
     def drifts(self) -> tuple[Drift, ...]:
-        """What moves from log to log."""
+        """Its drifts from log to log."""
         return self.standing.drifts if self.standing else ()
 
 
 @dataclass(frozen=True)
 class Refused:
-    """A log that nothing could be done with, and why."""
+    """A log that could not be used, and why."""
 
     log: str
     why: str
@@ -72,7 +72,7 @@ class Refused:
 
 @dataclass(frozen=True)
 class Report:
-    """All of a fleet, worst first, and the logs that are missing in it."""
+    """All units of a fleet, the worst first, and the logs that could not be used."""
 
     rows: Sequence[Row]
     kinds: Mapping[str, Sequence[Estimate]]
@@ -87,7 +87,7 @@ class Report:
         return [row for row in self.rows if not row.log_complete]
 
     def groups(self) -> list[dict[str, Any]]:
-        """By type and batch: how many units there are, in each state and cut off, and causes."""
+        """Counts by type and batch: units, units in each state, cut-off logs, and causes."""
         members: dict[tuple[str, str], list[Row]] = defaultdict(list)
         for row in self.rows:
             members[row.type, row.batch].append(row)
@@ -106,13 +106,15 @@ class Report:
         ]
 
     def plain(self) -> dict[str, Any]:
-        """As JSON."""
+        """The report as a JSON document."""
         return {
             "format": FORMAT,
             "units": [_plain(rank, row) for rank, row in enumerate(self.rows, 1)],
             "groups": self.groups(),
-            "refused": [asdict(one) for one in self.refused],
-            "types": {kind: [asdict(one) for one in every] for kind, every in self.kinds.items()},
+            "refused": [asdict(item) for item in self.refused],
+            "types": {
+                kind: [asdict(item) for item in estimates] for kind, estimates in self.kinds.items()
+            },
         }
 
 
@@ -122,17 +124,20 @@ def report(
     at_ns: int,
     refused: Sequence[Refused] = (),
 ) -> Report:
-    """Put together what is known of a fleet at a time (UTC, ns)."""
-    watched = {(s.type, s.id): s for s in standings([r for r in results if r.key.work == "replay"])}
-    every: dict[tuple[str, str], list[Result]] = defaultdict(list)
-    for one in results:
-        every[one.type, one.id].append(one)
-    rows = [_row(mine, watched.get(unit)) for unit, mine in every.items()]
-    return Report(sorted(rows, key=_first, reverse=True), estimates(records, at_ns), refused)
+    """The report of a fleet at a time (UTC, ns)."""
+    watched = {
+        (standing.type, standing.id): standing
+        for standing in standings([result for result in results if result.key.work == "replay"])
+    }
+    by_unit: dict[tuple[str, str], list[Result]] = defaultdict(list)
+    for result in results:
+        by_unit[result.type, result.id].append(result)
+    rows = [_row(unit_results, watched.get(unit)) for unit, unit_results in by_unit.items()]
+    return Report(sorted(rows, key=_sort_key, reverse=True), estimates(records, at_ns), refused)
 
 
 def cause_of(row: Row) -> str:
-    """What is wrong: what the diagnosis names, else what it is most like."""
+    """The cause: the diagnosed one, else the effect in which the unit is furthest."""
     if row.causes:
         return str(row.causes[0]["effect"])
     if row.verdict == "unlisted":
@@ -140,11 +145,11 @@ def cause_of(row: Row) -> str:
     return row.standing.effect if row.standing else ""
 
 
-def _row(mine: Sequence[Result], standing: Standing | None) -> Row:
-    answers = [one for one in mine if one.key.work == "diagnose"]
+def _row(results: Sequence[Result], standing: Standing | None) -> Row:
+    answers = [result for result in results if result.key.work == "diagnose"]
     newest = answers[-1] if answers else None
     answer: Mapping[str, Any] = newest.answer if newest else {}
-    last = mine[-1]
+    last = results[-1]
     state, reason = _judged(standing, newest, last)
     return Row(
         last.type,
@@ -152,7 +157,7 @@ def _row(mine: Sequence[Result], standing: Standing | None) -> Row:
         last.batch,
         last.log,
         last.complete,
-        len({one.key.log_sha256 for one in mine}),
+        len({result.key.log_sha256 for result in results}),
         state,
         reason,
         standing,
@@ -163,26 +168,26 @@ def _row(mine: Sequence[Result], standing: Standing | None) -> Row:
 
 
 def _judged(standing: Standing | None, newest: Result | None, last: Result) -> tuple[State, str]:
-    """A unit's state by those like it, else by its newest diagnosis; or why it has none.
+    """A unit's state by its peers, else by its newest diagnosis; or why it has none.
 
-    What was well in an older log says nothing of the last one.
+    A good result of an older log says nothing about the last one.
     """
     if standing is not None and standing.drifts:
         return State.STANDS_OUT, ""
     current = standing is not None and standing.log == last.log
     if standing is not None and current and standing.peers >= FEWEST_PEERS:
         return (State.STANDS_OUT if standing.beyond >= STANDS_OUT else State.DOES_NOT), ""
-    if newest is not None and (found := _diagnosed(newest, last)) is not None:
-        return found
+    if newest is not None and (judgement := _diagnosed(newest, last)) is not None:
+        return judgement
     if standing is None or not current:
         return State.NOT_JUDGED, "no cycle of its newest log can be compared"
     units = "1 unit" if standing.peers == 1 else f"{standing.peers} units"
-    few = f"{units} to compare, {FEWEST_PEERS} are needed"
-    return State.NOT_JUDGED, f"{few}; its newest log is not diagnosed yet"
+    needed = f"{units} to compare, {FEWEST_PEERS} are needed"
+    return State.NOT_JUDGED, f"{needed}; its newest log is not diagnosed yet"
 
 
 def _diagnosed(newest: Result, last: Result) -> tuple[State, str] | None:
-    """The same by the newest diagnosis; None where it says nothing of the last log."""
+    """A unit's state by its newest diagnosis; None if that says nothing about the last log."""
     verdict = newest.answer["verdict"]
     if DIAGNOSED[verdict] == 2:
         return State.STANDS_OUT, ""
@@ -193,12 +198,12 @@ def _diagnosed(newest: Result, last: Result) -> tuple[State, str] | None:
     return State.NOT_JUDGED, f"no diagnosis: {newest.answer['next_experiment']}"
 
 
-def _first(row: Row) -> tuple[float, ...]:
-    """The greater, the earlier it is listed."""
+def _sort_key(row: Row) -> tuple[float, ...]:
+    """The sort key of a row; greater keys are listed first."""
     beyond = row.standing.beyond if row.standing else 0.0
-    drift = max((one.sigmas for one in row.drifts), default=0.0)
+    drift_sigmas = max((drift.sigmas for drift in row.drifts), default=0.0)
     rank = (State.DOES_NOT, State.NOT_JUDGED, State.STANDS_OUT).index(row.state)
-    return float(rank), max(beyond, drift), DIAGNOSED.get(row.verdict, 0), row.leftover
+    return float(rank), max(beyond, drift_sigmas), DIAGNOSED.get(row.verdict, 0), row.leftover
 
 
 def _plain(rank: int, row: Row) -> dict[str, Any]:
@@ -219,7 +224,7 @@ def _plain(rank: int, row: Row) -> dict[str, Any]:
         "effect": standing.effect if standing else None,
         "size": standing.size if standing else None,
         "unit": standing.unit if standing else None,
-        "drifts": [asdict(one) for one in row.drifts],
+        "drifts": [asdict(item) for item in row.drifts],
         "verdict": row.verdict or None,
-        "causes": [dict(one) for one in row.causes],
+        "causes": [dict(item) for item in row.causes],
     }

@@ -1,7 +1,7 @@
-"""Where answers about logs are kept: in the asset database, each once.
+"""Stores answers about logs in the asset database, each once.
 
-An answer is known by the work, the content of the log, the program's own content and the
-configuration that it was judged with. So a run that is asked for again does only what is missing.
+The key of an answer is the work, the content of the log, the program's sources and the
+configuration. So a repeated run does only the missing work.
 """
 
 import hashlib
@@ -44,7 +44,7 @@ RESULT = Table(
     Column("asset_type", Text, nullable=False),
     Column("asset_id", Text, nullable=False),
     Column("batch", Text, nullable=False),
-    Column("log", Text, nullable=False),  # where it was
+    Column("log", Text, nullable=False),  # its path then
     Column("begin_ns", BigInteger, nullable=False),  # when it was recorded, UTC
     Column("stored_ns", BigInteger, nullable=False),
     Column("answer", Text, nullable=False),  # JSON
@@ -62,7 +62,7 @@ LOG = Table(
 
 @dataclass(frozen=True)
 class Key:
-    """By what an answer is known again."""
+    """The key of an answer."""
 
     work: str
     log_sha256: str
@@ -82,26 +82,26 @@ class Result:
     begin_ns: int
     stored_ns: int
     answer: Mapping[str, Any]
-    complete: bool = True  # the log; otherwise it was cut off, and this is of what is there
+    complete: bool = True  # the log; otherwise it was cut off, and the answer is about the rest
 
 
 def key_of(work: str, log: Log, config: Config) -> Key:
-    """Of a log with all its parts, and what it is judged with."""
+    """The key for a log with all its parts and a configuration."""
     content = hashlib.sha256()
     for part in log.parts:
         with part.open("rb") as file:
             while piece := file.read(PIECE):
                 content.update(piece)
-    judged_with = [config.document.text, config.data.hash, config.monitor.model_dump_json()]
-    judged_with += [config.asset.type, config.asset.id, config.asset.batch]
-    basis = hashlib.sha256(json.dumps(judged_with).encode()).hexdigest()[:16]
+    inputs = [config.document.text, config.data.hash, config.monitor.model_dump_json()]
+    inputs += [config.asset.type, config.asset.id, config.asset.batch]
+    basis = hashlib.sha256(json.dumps(inputs).encode()).hexdigest()[:16]
     return Key(work, content.hexdigest(), code(), basis)
 
 
 def open_store(
     where: str | Path | URL, busy_s: float = 30.0, clock: Callable[[], int] = time.time_ns
 ) -> "Store":
-    """Open the answers in an asset database that is there."""
+    """Open the answers in an existing asset database."""
     store = Store(where, ASSETS, busy_s, clock)
     with store.closed_on_error():
         store.prepare()
@@ -109,25 +109,27 @@ def open_store(
 
 
 class Store(Database):
-    """Open answers. What is added is added whole or not at all."""
+    """An open database of answers. Every write is one transaction."""
 
     def prepare(self) -> None:
-        """Make the table where it is missing."""
+        """Create missing tables."""
         self._make_missing(metadata)
 
     def known(self, keys: Iterable[Key]) -> set[Key]:
-        """Of some answers, those that are there."""
+        """Those of the keys that have an answer."""
         with self._reading() as connection:
             rows = connection.execute(select(*RESULT.primary_key.columns)).all()
         return {Key(*row) for row in rows} & set(keys)
 
     def answer(self, key: Key) -> Any:
-        """One answer that is there."""
+        """The answer of a stored key."""
         with self._reading() as connection:
-            return json.loads(connection.scalars(select(RESULT.c.answer).where(*_is(key))).one())
+            return json.loads(
+                connection.scalars(select(RESULT.c.answer).where(*_matches(key))).one()
+            )
 
     def add(self, key: Key, config: Config, log: Path, begin_ns: int, answer: object) -> None:
-        """Keep an answer; one that another run has added meanwhile stays."""
+        """Store an answer; one that another run has added meanwhile stays."""
         asset = config.asset
         values = {
             **vars(key),
@@ -140,28 +142,30 @@ class Store(Database):
             "answer": json.dumps(answer),
         }
         with self._writing() as connection:
-            if connection.execute(select(RESULT.c.work).where(*_is(key))).first() is None:
+            if connection.execute(select(RESULT.c.work).where(*_matches(key))).first() is None:
                 connection.execute(RESULT.insert().values(values))
 
     def note(self, complete: Mapping[str, bool]) -> None:
-        """Keep which logs, by their SHA-256, are complete."""
+        """Store which logs, by their SHA-256, are complete."""
         with self._writing() as connection:
-            there = set(connection.scalars(select(LOG.c.log_sha256)))
-            for sha, is_complete in complete.items():
-                if sha not in there:
-                    connection.execute(LOG.insert().values(log_sha256=sha, complete=is_complete))
+            stored = set(connection.scalars(select(LOG.c.log_sha256)))
+            for digest, is_complete in complete.items():
+                if digest not in stored:
+                    connection.execute(LOG.insert().values(log_sha256=digest, complete=is_complete))
 
     def newest(self) -> list[Result]:
-        """Of every work and log the answer that was added last, in the order of recording."""
+        """The last added answer for every work and log, in the order of recording."""
         with self._reading() as connection:
             rows = connection.execute(select(RESULT).order_by(RESULT.c.stored_ns)).all()
-            cut = set(connection.scalars(select(LOG.c.log_sha256).where(~LOG.c.complete)))
-        last = {(row.work, row.log_sha256, row.asset_type, row.asset_id): row for row in rows}
-        results = (_result(row, row.log_sha256 not in cut) for row in last.values())
-        return sorted(results, key=lambda one: one.begin_ns)
+            incomplete = set(connection.scalars(select(LOG.c.log_sha256).where(~LOG.c.complete)))
+        newest_rows = {
+            (row.work, row.log_sha256, row.asset_type, row.asset_id): row for row in rows
+        }
+        results = (_result(row, row.log_sha256 not in incomplete) for row in newest_rows.values())
+        return sorted(results, key=lambda result: result.begin_ns)
 
 
-def _is(key: Key) -> list[ColumnElement[bool]]:
+def _matches(key: Key) -> list[ColumnElement[bool]]:
     return [column == getattr(key, column.name) for column in RESULT.primary_key.columns]
 
 

@@ -1,4 +1,4 @@
-"""A fleet's logs, one job each: what is known already is left out, what is done is kept at once."""
+"""Runs one job for each log of a fleet; skips stored answers, and stores new ones at once."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, as_completed
@@ -21,7 +21,7 @@ Configure = Callable[[Log], Config]
 
 @dataclass(frozen=True)
 class Wanted:
-    """A job that is to be done, and by what its answer will be known."""
+    """A job to run, and the key of its answer."""
 
     job: Job
     key: Key
@@ -31,17 +31,17 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Told:
-    """What became of a log."""
+    """The outcome for a log."""
 
     log: Path
     state: str  # done, known, failed
-    key: Key | None = None  # of the answer, where there is one
+    key: Key | None = None  # of the answer, if there is one
     error: str = ""
     complete: bool = True  # the log, as far as it could be read
 
 
 def ask(work: str, logs: Iterable[Path], configure: Configure) -> Iterator[Wanted | Told]:
-    """Open every log; give its job, or why there is none."""
+    """Open every log; yields its job, or why there is none."""
     for path in logs:
         try:
             log = open_log(path)
@@ -57,45 +57,47 @@ def ask(work: str, logs: Iterable[Path], configure: Configure) -> Iterator[Wante
 def go(
     wanted: Sequence[Wanted], submit: Submit, store: Store, assets: str | Path | URL
 ) -> Iterator[Told]:
-    """Have jobs done; tell of each as it is done, and kept."""
-    store.note({one.key.log_sha256: one.complete for one in wanted})
-    known = store.known([one.key for one in wanted])
+    """Run jobs; yields each outcome once it is stored."""
+    store.note({item.key.log_sha256: item.complete for item in wanted})
+    stored = store.known([item.key for item in wanted])
     futures: dict[Future[Done], Wanted] = {}
-    asked = set(known)
-    for one in wanted:
-        if one.key in asked:
-            yield Told(one.job.log, "known", one.key, complete=one.complete)
+    seen = set(stored)
+    for item in wanted:
+        if item.key in seen:
+            yield Told(item.job.log, "known", item.key, complete=item.complete)
         else:
-            asked.add(one.key)
-            futures[submit(run, one.job)] = one
+            seen.add(item.key)
+            futures[submit(run, item.job)] = item
     for future in as_completed(futures):
-        yield _keep(future, futures.pop(future), store, assets)
+        yield _store_outcome(future, futures.pop(future), store, assets)
 
 
-def _keep(future: Future[Done], one: Wanted, store: Store, assets: str | Path | URL) -> Told:
-    log = one.job.log
+def _store_outcome(
+    future: Future[Done], item: Wanted, store: Store, assets: str | Path | URL
+) -> Told:
+    log = item.job.log
     try:
-        done = future.result()
+        outcome = future.result()
     except Exception as error:
         if not died(error):
             raise
         return _failed(log, f"the process that worked on it was killed: {error}")
-    if done.answer is None:
-        return _failed(log, done.error)
-    if done.record is not None:
+    if outcome.answer is None:
+        return _failed(log, outcome.error)
+    if outcome.record is not None:
         with open_assets(assets) as database:
-            add_calibrated(database, done.record)
-    store.add(one.key, one.job.config, log, one.begin_ns, done.answer)
-    return Told(log, "done", one.key, complete=one.complete)
+            add_calibrated(database, outcome.record)
+    store.add(item.key, item.job.config, log, item.begin_ns, outcome.answer)
+    return Told(log, "done", item.key, complete=item.complete)
 
 
-def _failed(log: Path, why: str) -> Told:
-    """Of which log it is said, where that is not said yet."""
-    return Told(log, "failed", error=why if str(log) in why else f"{log}: {why}")
+def _failed(log: Path, reason: str) -> Told:
+    """The outcome of a failed log; its text names the log."""
+    return Told(log, "failed", error=reason if str(log) in reason else f"{log}: {reason}")
 
 
 def _begin_ns(log: Log) -> int:
-    """When it was recorded: its first row's receipt."""
+    """When the log was recorded: the receipt time of its first row, in ns."""
     for samples, _ in log.blocks(1):
         return int(samples["host_ns"][0])
     return 0

@@ -1,7 +1,7 @@
-"""What is done with one log of a fleet, in a worker that knows nothing of the others.
+"""The tasks for one log of a fleet; a worker runs them independently of other logs.
 
-A worker reads its log and computes; what it finds goes back to who asked, who alone writes to the
-database. So a worker that dies costs its log and nothing else.
+A worker reads its log, computes and returns the answer. Only the caller writes to the database. So
+a worker that dies costs only its log.
 """
 
 import hashlib
@@ -31,12 +31,12 @@ class Job:
     work: str  # of WORKS
     log: Path
     config: Config
-    code: str  # of who asks
+    code: str  # of the caller
 
 
 @dataclass(frozen=True)
 class Done:
-    """What became of a job: an answer, or why there is none."""
+    """The outcome of a job: an answer, or why there is none."""
 
     answer: Mapping[str, Any] | None
     error: str = ""
@@ -45,7 +45,7 @@ class Done:
 
 @cache
 def code() -> str:
-    """16 hex digits over the sources that answer: other ones may answer otherwise."""
+    """16 hex digits of a hash over the sources: other sources may give another answer."""
     sources, root = hashlib.sha256(), Path(__file__).parents[1]
     for path in sorted(root.rglob("*.py")):
         sources.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
@@ -53,9 +53,9 @@ def code() -> str:
 
 
 def run(job: Job) -> Done:
-    """Do a job on one core; whatever goes wrong is said of this log and stops no other one."""
+    """Run a job on one core; any error concerns this log only and stops no other one."""
     if job.code != code():
-        return Done(None, f"{job.log}: {_OTHER}")
+        return Done(None, f"{job.log}: {_OTHER_VERSION}")
     CORES.set(1)
     try:
         answer, record = WORKS[job.work](job)
@@ -67,20 +67,22 @@ def run(job: Job) -> Done:
 
 
 def _calibrate(job: Job) -> tuple[dict[str, Any], Record | None]:
-    calibration = fit_unit(job.config, _samples(job), _unsaid)
+    calibration = fit_unit(job.config, _samples(job), _no_progress)
     record = record_of(calibration, job.config, job.log)
     return calibration_report.as_json(calibration, record), record
 
 
 def _diagnose(job: Job) -> tuple[dict[str, Any], Record | None]:
-    return find_cause(job.config, _samples(job), str(job.log), _unsaid).json, None
+    return find_cause(job.config, _samples(job), str(job.log), _no_progress).json, None
 
 
 def _replay(job: Job) -> tuple[dict[str, Any], Record | None]:
     return watched(job.config, _samples(job)), None
 
 
-_OTHER = "the worker has another version of ejector-twin; install the same one there as here"
+_OTHER_VERSION = (
+    "the worker has another version of ejector-twin; install the same one there as here"
+)
 
 WORKS: Mapping[str, Callable[[Job], tuple[dict[str, Any], Record | None]]] = {
     "calibrate": _calibrate,
@@ -90,11 +92,11 @@ WORKS: Mapping[str, Callable[[Job], tuple[dict[str, Any], Record | None]]] = {
 
 
 def _samples(job: Job) -> Iterator[Samples]:
-    """What was measured, in blocks; ConfigError where nobody recorded the commands."""
+    """The log's rows in blocks; ConfigError if nobody recorded the commands."""
     log = open_log(job.log)
     log.header.require_commands(str(job.log))
     return (samples for samples, _ in log.blocks())
 
 
-def _unsaid(_what: str) -> None:
-    """Nobody watches one of many."""
+def _no_progress(_what: str) -> None:
+    """Report no progress, since nobody watches one log of many."""

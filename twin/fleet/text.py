@@ -22,7 +22,7 @@ NOT_JUDGED = ("unit", "batch", "why")
 REFUSED = ("log", "why")
 CUT = ("unit", "batch", "log", "judged by what is there")
 GROUPS = ("type", "batch", "units", "stand out", "do not", "not judged", "log cut off", "causes")
-SAID = {
+STATE_WORDS = {
     State.STANDS_OUT: "stands out",
     State.DOES_NOT: "does not stand out",
     State.NOT_JUDGED: "could not be judged",
@@ -30,12 +30,14 @@ SAID = {
 
 
 def in_words(report: Report) -> str:
-    """Worst units first, then what is not known, types and batches, and what units say of types."""
+    """The worst units first, then unjudged units, types and batches, and the types' values."""
     lines = [headline(report)]
-    out = [(str(n), *_cells(row)) for n, row in enumerate(report.of(State.STANDS_OUT), 1)]
-    lines += _listed("", ("", *HEAD), out)
+    outliers = [
+        (str(rank), *_cells(row)) for rank, row in enumerate(report.of(State.STANDS_OUT), 1)
+    ]
+    lines += _listed("", ("", *HEAD), outliers)
     if any(not row.verdict for row in report.of(State.STANDS_OUT)):
-        lines += ["", _DIAGNOSE]
+        lines += ["", _DIAGNOSE_ADVICE]
     lines += _listed("could not be judged", NOT_JUDGED, _reasons(report))
     if advice := _advice(report):
         lines += ["", advice]
@@ -48,41 +50,51 @@ def in_words(report: Report) -> str:
 
 
 def headline(report: Report) -> str:
-    """The whole in one sentence: the only count there is."""
-    out, fine, unknown = (len(report.of(state)) for state in State)
-    said = [f"{out or 'none'} {'stands' if out < 2 else 'stand'} out"]
-    said += [f"{fine} {'does' if fine == 1 else 'do'} not"] if fine and (out or unknown) else []
-    said += [f"{unknown} could not be judged"] if unknown else []
+    """The whole report in one sentence with all counts."""
+    outliers, normal, unknown = (len(report.of(state)) for state in State)
+    phrases = [f"{outliers or 'none'} {'stands' if outliers < 2 else 'stand'} out"]
+    phrases += (
+        [f"{normal} {'does' if normal == 1 else 'do'} not"]
+        if normal and (outliers or unknown)
+        else []
+    )
+    phrases += [f"{unknown} could not be judged"] if unknown else []
     counted = (
         (len(report.cut()), "cut off: judged by what is there"),
         (len(report.refused), "could not be used"),
     )
-    logs = [f"{count} {_some('log', count)} {what}" for count, what in counted if count]
-    units = f"{len(report.rows)} {_some('unit', len(report.rows))}"
-    return f"{units}: {'; '.join([', '.join(said), *logs])}"
+    logs = [f"{count} {_plural('log', count)} {problem}" for count, problem in counted if count]
+    units = f"{len(report.rows)} {_plural('unit', len(report.rows))}"
+    return f"{units}: {'; '.join([', '.join(phrases), *logs])}"
 
 
 def write_page(report: Report, path: Path) -> None:
     """Write the report as one HTML file; SourceError if it cannot be written."""
-    out = report.of(State.STANDS_OUT)
+    outliers = report.of(State.STANDS_OUT)
     parts = []
-    if out:
-        rows = [(str(rank), *_cells(row)) for rank, row in enumerate(out, 1)]
+    if outliers:
+        rows = [(str(rank), *_cells(row)) for rank, row in enumerate(outliers, 1)]
         parts.append(section("Worst first", table("Units to look at", ("", *HEAD), rows, (0,))))
-    if unknown := _reasons(report):
+    if unjudged := _reasons(report):
         advice = paragraph(_advice(report)) if _advice(report) else ""
-        parts.append(section("Could not be judged", table("", NOT_JUDGED, unknown) + advice))
-    if cut := _cut(report):
-        parts.append(section("Log cut off", table("", CUT, cut)))
-    if lost := _refused(report):
-        cards = "\n".join(card(log, why, ()) for log, why in lost)
+        parts.append(section("Could not be judged", table("", NOT_JUDGED, unjudged) + advice))
+    if cut_off := _cut(report):
+        parts.append(section("Log cut off", table("", CUT, cut_off)))
+    if unusable := _refused(report):
+        cards = "\n".join(card(log, reason, ()) for log, reason in unusable)
         parts.append(section("Logs that could not be used", cards))
-    parts += _drawn(report)
+    parts += _distance_picture(report)
     parts.append(section("By type and batch", table("", GROUPS, _groups(report), range(2, 7))))
     for kind, (top, *values) in _kinds(report):
         body = table("", top, values, range(1, 6))
-        parts.append(section(f"{kind}, by its calibrated units", body + paragraph(_MEAN)))
-    colour, mark = (BAD, "▲") if out else (UNKNOWN, "?") if unknown or cut or lost else (GOOD, "✓")
+        parts.append(section(f"{kind}, by its calibrated units", body + paragraph(_MEAN_CAPTION)))
+    colour, mark = (
+        (BAD, "▲")
+        if outliers
+        else (UNKNOWN, "?")
+        if unjudged or cut_off or unusable
+        else (GOOD, "✓")
+    )
     page = PAGE.substitute(
         title="Fleet",
         colour=colour,
@@ -98,19 +110,19 @@ def write_page(report: Report, path: Path) -> None:
     write_text(path, page)
 
 
-_DIAGNOSE = "What stands out says little of the cause: twin fleet diagnose LOGS names it."
-_FEW = (
+_DIAGNOSE_ADVICE = "What stands out says little of the cause: twin fleet diagnose LOGS names it."
+_TOO_FEW = (
     f"Fewer than {FEWEST_PEERS} units of a type cannot be compared. Their diagnoses judge them:"
     " run twin fleet diagnose LOGS, then this report again."
 )
-_MEAN = (
+_MEAN_CAPTION = (
     "Mean of the units, each counting by how well its log determines the value; the spread is from "
     "unit to unit. Values that too few logs determine are left out."
 )
 
 
-def _some(what: str, count: int) -> str:
-    return what if count == 1 else f"{what}s"
+def _plural(noun: str, count: int) -> str:
+    return noun if count == 1 else f"{noun}s"
 
 
 def _name(row: Row) -> str:
@@ -118,45 +130,47 @@ def _name(row: Row) -> str:
 
 
 def _reasons(report: Report) -> list[tuple[str, ...]]:
-    """The units that could not be judged, each with why."""
+    """The units that could not be judged, each with the reason."""
     return [(_name(row), row.batch, row.reason) for row in report.of(State.NOT_JUDGED)]
 
 
 def _advice(report: Report) -> str:
-    """What judges units that nobody has judged yet; empty where there is none."""
-    few = (row.standing and not row.compared for row in report.of(State.NOT_JUDGED))
-    return _FEW if any(few) else ""
+    """How to judge units that have too few peers; empty if there are none."""
+    uncompared = (row.standing and not row.compared for row in report.of(State.NOT_JUDGED))
+    return _TOO_FEW if any(uncompared) else ""
 
 
 def _cut(report: Report) -> list[tuple[str, ...]]:
-    """The units whose newest log was cut off, and how they are judged all the same."""
+    """The units whose newest log was cut off, with their judgement."""
     rows = report.cut()
-    return [(_name(row), row.batch, Path(row.log).name, SAID[row.state]) for row in rows]
+    return [(_name(row), row.batch, Path(row.log).name, STATE_WORDS[row.state]) for row in rows]
 
 
 def _refused(report: Report) -> list[tuple[str, str]]:
-    """The logs that nothing could be done with, each with why."""
-    return [(one.log, one.why.removeprefix(f"{one.log}: ")) for one in report.refused]
+    """The logs that could not be used, each with the reason."""
+    return [
+        (refusal.log, refusal.why.removeprefix(f"{refusal.log}: ")) for refusal in report.refused
+    ]
 
 
-def _listed(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """A part of the text, as many rows as one reads; nothing where there are none."""
+def _listed(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """A section of the text with the first ``MOST_LISTED`` rows; empty without rows."""
     if not rows:
         return []
-    left = len(rows) - MOST_LISTED
-    more = [f"and {left} more; --json and --html have all"] if left > 0 else []
-    return ["", *([title] if title else []), *_columns([head, *rows[:MOST_LISTED]]), *more]
+    omitted = len(rows) - MOST_LISTED
+    remark = [f"and {omitted} more; --json and --html have all"] if omitted > 0 else []
+    return ["", *([title] if title else []), *_columns([header, *rows[:MOST_LISTED]]), *remark]
 
 
 def _cells(row: Row) -> tuple[str, ...]:
     standing, drift = row.compared, row.drifts[0] if row.drifts else None
     beyond = f"{standing.beyond:.1f} sigma" if standing else ""
-    what = spoken(standing.effect) if standing else ""
+    most_like = spoken(standing.effect) if standing else ""
     if standing and standing.size is not None:
-        what += f" {standing.size:+.3g} {standing.unit}"
-    moves = _moves(drift) if drift else ""
-    causes = ", ".join(spoken(str(one["effect"])) for one in row.causes) or row.verdict
-    return _name(row), row.batch, beyond, what, moves, causes or "not yet"
+        most_like += f" {standing.size:+.3g} {standing.unit}"
+    movement = _moves(drift) if drift else ""
+    causes = ", ".join(spoken(str(cause["effect"])) for cause in row.causes) or row.verdict
+    return _name(row), row.batch, beyond, most_like, movement, causes or "not yet"
 
 
 def _moves(drift: Drift) -> str:
@@ -183,31 +197,35 @@ def _groups(report: Report) -> list[tuple[str, ...]]:
 
 
 def _kinds(report: Report) -> list[tuple[str, list[tuple[str, ...]]]]:
-    head: tuple[str, ...] = ("value", "units", "mean", "± 1 sigma", "spread", "type has", "unit")
-    return [(kind, [head, *map(_value, every)]) for kind, every in report.kinds.items() if every]
+    header: tuple[str, ...] = ("value", "units", "mean", "± 1 sigma", "spread", "type has", "unit")
+    return [
+        (kind, [header, *map(_value, estimates)])
+        for kind, estimates in report.kinds.items()
+        if estimates
+    ]
 
 
-def _value(one: Estimate) -> tuple[str, ...]:
-    has = "" if one.type_has is None else f"{one.type_has:.4g}"
-    known = f"{one.mean:.4g}", f"{one.sigma:.2g}", f"{one.spread:.2g}"
-    return one.parameter, str(one.units), *known, has, one.unit
+def _value(estimate: Estimate) -> tuple[str, ...]:
+    type_value = "" if estimate.type_has is None else f"{estimate.type_has:.4g}"
+    numbers = f"{estimate.mean:.4g}", f"{estimate.sigma:.2g}", f"{estimate.spread:.2g}"
+    return estimate.parameter, str(estimate.units), *numbers, type_value, estimate.unit
 
 
-def _drawn(report: Report) -> list[str]:
-    """How far units are from the others of their type, where there are enough to compare."""
-    far = [(row, standing.beyond) for row in report.rows if (standing := row.compared)]
-    if not far:
+def _distance_picture(report: Report) -> list[str]:
+    """The picture of the units' distances from their peers; empty if none has enough peers."""
+    compared = [(row, standing.beyond) for row in report.rows if (standing := row.compared)]
+    if not compared:
         return []
-    far.sort(key=lambda one: -one[1])
-    title = f"Furthest from the others: {_name(far[0][0])}, by {far[0][1]:.1f} sigma"
+    compared.sort(key=lambda pair: -pair[1])
+    title = f"Furthest from the others: {_name(compared[0][0])}, by {compared[0][1]:.1f} sigma"
     with empty("fleet", 3.6) as figure:
         axes = figure.subplots()
-        for colour, label, wanted in (
+        for colour, label, is_outlier in (
             (BEFORE, "stands out", True),
             (AFTER, "does not", False),
         ):
-            ranks = [n for n, (row, _) in enumerate(far) if row.stands_out is wanted]
-            beyond = [max(far[n][1], 0.0) for n in ranks]
+            ranks = [n for n, (row, _) in enumerate(compared) if row.stands_out is is_outlier]
+            beyond = [max(compared[n][1], 0.0) for n in ranks]
             axes.plot([n + 1 for n in ranks], beyond, ".", color=colour, label=label)
         axes.axhline(STANDS_OUT, color=QUIET, lw=0.8, ls="--")
         logarithmic(axes)
@@ -226,10 +244,10 @@ def _drawn(report: Report) -> list[str]:
 
 
 def _columns(rows: Iterable[Sequence[str]]) -> list[str]:
-    """Lines with their cells below each other."""
-    every = list(rows)
-    wide = [max(len(cell) for cell in column) for column in zip(*every, strict=True)]
+    """Lines with aligned cells."""
+    lines = list(rows)
+    widths = [max(len(cell) for cell in column) for column in zip(*lines, strict=True)]
     return [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, wide, strict=True)).rstrip()
-        for row in every
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in lines
     ]

@@ -1,8 +1,8 @@
-"""A type's data anew, from its calibrated units: the mean of each value, and how units differ.
+"""Estimates a type's data from its calibrated units: mean and spread of each value.
 
 The founding paper takes the mean of ten ejectors for the object-specific data of a type. Here a
-unit counts by how well its log determines the value: between units that differ by a scatter τ and
-are each known to within s, the weights are 1 / (τ² + s²), with τ² by DerSimonian and Laird (1986).
+unit counts by how well its log determines the value. With the scatter τ between units and the
+uncertainty s of each, the weights are 1 / (τ² + s²). τ² is after DerSimonian and Laird (1986).
 """
 
 from collections import defaultdict
@@ -33,32 +33,36 @@ class Estimate:
 
 
 def estimates(records: Sequence[Record], at_ns: int) -> dict[str, list[Estimate]]:
-    """For each type with calibrated units, the values that enough of them determine."""
+    """Estimates for each type with calibrated units, of values that enough units determine."""
     units: dict[str, list[Record]] = defaultdict(list)
-    for name in dict.fromkeys(one.name for one in records if one.kind == "instance"):
-        mine = [one for one in records if one.kind == "instance" and one.name == name]
-        here = holding(mine, at_ns)
-        if here is not None and "covariance" in here.arrays:
-            units[here.type].append(here)
-    found = {}
-    for kind, mine in units.items():
-        base = holding([r for r in records if r.kind == "type" and r.name == kind], at_ns)
-        every = [_estimate(free, mine, base) for free in FREE]
-        found[kind] = [one for one in every if one is not None]
-    return found
+    for name in dict.fromkeys(record.name for record in records if record.kind == "instance"):
+        unit_records = [
+            record for record in records if record.kind == "instance" and record.name == name
+        ]
+        current = holding(unit_records, at_ns)
+        if current is not None and "covariance" in current.arrays:
+            units[current.type].append(current)
+    by_type = {}
+    for kind, unit_records in units.items():
+        base = holding(
+            [record for record in records if record.kind == "type" and record.name == kind], at_ns
+        )
+        all_estimates = [_estimate(free, unit_records, base) for free in FREE]
+        by_type[kind] = [record for record in all_estimates if record is not None]
+    return by_type
 
 
 def _estimate(free: Free, units: Sequence[Record], base: Record | None) -> Estimate | None:
-    known = [_known(free, unit) for unit in units]
-    values = np.array([one for one in known if one is not None])
+    pairs = [_determined_value(free, unit) for unit in units]
+    values = np.array([pair for pair in pairs if pair is not None])
     if len(values) < FEWEST_UNITS:
         return None
     mean, sigma, spread = _pooled(*values.T)
-    has = None if base is None else base.data.get(free.table, {}).get(free.key)
-    return Estimate(free.name, free.unit, len(values), mean, sigma, spread, has)
+    type_value = None if base is None else base.data.get(free.table, {}).get(free.key)
+    return Estimate(free.name, free.unit, len(values), mean, sigma, spread, type_value)
 
 
-def _known(free: Free, unit: Record) -> tuple[float, float] | None:
+def _determined_value(free: Free, unit: Record) -> tuple[float, float] | None:
     """A unit's value and its sigma, if its log determines it."""
     names: Sequence[str] = unit.provenance.get("parameters", ())
     if free.name not in unit.provenance.get("determined", ()) or free.name not in names:
@@ -70,10 +74,12 @@ def _known(free: Free, unit: Record) -> tuple[float, float] | None:
 
 def _pooled(values: Floats, sigmas: Floats) -> tuple[float, float, float]:
     """Mean, its sigma, and the scatter between units."""
-    own = 1.0 / np.maximum(sigmas, 1e-12) ** 2
-    fixed = float(np.average(values, weights=own))
-    excess = float(np.sum(own * (values - fixed) ** 2)) - (len(values) - 1)
-    between = max(excess / float(own.sum() - np.sum(own**2) / own.sum()), 0.0)
+    fixed_weights = 1.0 / np.maximum(sigmas, 1e-12) ** 2
+    fixed = float(np.average(values, weights=fixed_weights))
+    excess = float(np.sum(fixed_weights * (values - fixed) ** 2)) - (len(values) - 1)
+    between = max(
+        excess / float(fixed_weights.sum() - np.sum(fixed_weights**2) / fixed_weights.sum()), 0.0
+    )
     weights = 1.0 / (between + sigmas**2)
     mean = float(np.average(values, weights=weights))
     return mean, float(1.0 / np.sqrt(weights.sum())), float(np.sqrt(between))

@@ -1,4 +1,4 @@
-"""What one log says of its ejector: mean key figures, and how much of every effect there may be."""
+"""Summarises one log of an ejector: mean key figures, and the likely size of every effect."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -18,67 +18,69 @@ FORMAT = "ejector-twin-watched/1"
 
 
 def watched(config: Config, blocks: Iterable[Samples]) -> dict[str, Any]:
-    """Run twin and hypotheses over a log; give what its cycles say on average."""
-    listener, cutter = ScoreExtractor.of(config.data, config.monitor.healthy), CycleCutter()
-    bank = ModelBank(listener.theta, listener.suspects)
-    teller = compiled(config)
-    told: list[CycleFigures] = []
-    heard: list[CycleResidual] = []
+    """Run twin and hypotheses over a log; returns the averages over its cycles."""
+    extractor, cutter = ScoreExtractor.of(config.data, config.monitor.healthy), CycleCutter()
+    bank = ModelBank(extractor.theta, extractor.suspects)
+    key_figures = compiled(config)
+    figures_of_cycles: list[CycleFigures] = []
+    residuals: list[CycleResidual] = []
     for rows, ticks in Twin.of(config.data).over(bridged(blocks)):
         for cycle in cutter.push(rows, ticks):
-            drawn = bank.take(cycle)
-            if (one := teller.take(cycle)) is not None:
-                told.append(one)
+            predictions = bank.take(cycle)
+            if (cycle_figures := key_figures.take(cycle)) is not None:
+                figures_of_cycles.append(cycle_figures)
             if cycle.complete and cycle.settled:
-                said = listener.hear(cycle, *drawn, figures(cycle, listener.theta))
-                heard += [] if said is None else [said]
+                residual = extractor.hear(cycle, *predictions, figures(cycle, extractor.theta))
+                residuals += [] if residual is None else [residual]
     return {
         "format": FORMAT,
         "asset": {"type": config.asset.type, "id": config.asset.id, "batch": config.asset.batch},
         "data_set": config.data.hash,
-        "cycles": len(heard),
-        "begin_ns": told[0].host_ns if told else None,
-        "figures": _figures(told),
-        "effects": _effects(heard),
+        "cycles": len(residuals),
+        "begin_ns": figures_of_cycles[0].host_ns if figures_of_cycles else None,
+        "figures": _figures(figures_of_cycles),
+        "effects": _effects(residuals),
     }
 
 
 def name_of(suspect: Suspect) -> str:
-    """As answers have it: an effect with several parameters has one for each."""
-    alone = sum(one.effect == suspect.effect for one in SUSPECTS) == 1
-    return suspect.effect if alone else f"{suspect.effect}.{suspect.parameter.name}"
+    """The name in answers; an effect with several parameters has a name for each."""
+    is_only_parameter = sum(candidate.effect == suspect.effect for candidate in SUSPECTS) == 1
+    return suspect.effect if is_only_parameter else f"{suspect.effect}.{suspect.parameter.name}"
 
 
-def _figures(told: Sequence[CycleFigures]) -> dict[str, dict[str, float]]:
-    """Mean of every key figure over the cycles that tell it, of both sides where both are told."""
+def _figures(cycles: Sequence[CycleFigures]) -> dict[str, dict[str, float]]:
+    """Mean of every key figure over cycles where it is both measured and expected."""
     means = {}
     for name in FIGURES:
-        both = np.array([(one.measured[name], one.expected[name]) for one in told]).reshape(-1, 2)
-        known = both[np.all(np.isfinite(both), axis=1)]
-        if len(known):
+        pairs = np.array(
+            [(cycle.measured[name], cycle.expected[name]) for cycle in cycles]
+        ).reshape(-1, 2)
+        finite = pairs[np.all(np.isfinite(pairs), axis=1)]
+        if len(finite):
             means[name] = dict(
-                zip(("measured", "expected"), known.mean(axis=0).tolist(), strict=True)
+                zip(("measured", "expected"), finite.mean(axis=0).tolist(), strict=True)
             )
     return means
 
 
-def _effects(heard: Sequence[CycleResidual]) -> dict[str, dict[str, Any]]:
-    """Of every effect on its own: sigmas a cycle, how they scatter, the size that fits best."""
-    if not heard:
+def _effects(residuals: Sequence[CycleResidual]) -> dict[str, dict[str, Any]]:
+    """For every effect alone: sigmas a cycle, their scatter, and the best-fitting size."""
+    if not residuals:
         return {}
-    scores = np.array([said.scores() for said in heard])
-    sizes = np.array([said.sizes() for said in heard])
-    found = {}
+    scores = np.array([residual.scores() for residual in residuals])
+    sizes = np.array([residual.sizes() for residual in residuals])
+    effects = {}
     for number, suspect in enumerate(SUSPECTS):
-        shown = np.isfinite(scores[:, number])
-        if not shown.any():
+        is_finite = np.isfinite(scores[:, number])
+        if not is_finite.any():
             continue
-        mean = scores[shown, number]
-        found[name_of(suspect)] = {
-            "sigmas": float(mean.mean()),
-            "scatter": float(mean.std(ddof=1)) if len(mean) > 1 else None,
-            "cycles": len(mean),
-            "size": float(sizes[shown, number].mean()) * suspect.step,
+        values = scores[is_finite, number]
+        effects[name_of(suspect)] = {
+            "sigmas": float(values.mean()),
+            "scatter": float(values.std(ddof=1)) if len(values) > 1 else None,
+            "cycles": len(values),
+            "size": float(sizes[is_finite, number].mean()) * suspect.step,
             "unit": suspect.parameter.unit,
         }
-    return found
+    return effects
