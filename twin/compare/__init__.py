@@ -1,1 +1,1 @@
-"""Two logs beside each other: what differs, by how much, and how sure that is."""
+"""Comparison of two logs: what differs, by how much, and how certain that is."""

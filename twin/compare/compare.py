@@ -1,9 +1,9 @@
-"""What differs between two logs: each figure's mean, spread and difference, and how sure that is.
+"""Compares two logs: mean, spread and difference of each figure, and how certain that is.
 
-The 95 % intervals come from resampling whole cycles, widened as a t distribution is where cycles
-are few (Hesterberg's expanded percentile interval). Which figures are said to differ is decided
-for all of them together (Welch's test with Holm's correction), so that two logs of the same kind
-are called different once in twenty comparisons and not in nearly every one.
+The 95 % intervals come from resampling whole cycles. For few cycles they are widened like a t
+distribution (Hesterberg's expanded percentile interval). Welch's test with Holm's correction
+decides which figures differ, for all of them together. So two logs of the same kind are called
+different once in twenty comparisons, and not in nearly every one.
 """
 
 import math
@@ -24,20 +24,20 @@ Floats = npt.NDArray[np.float64]
 
 FEWEST = 5  # cycles on each side, for an interval
 RESAMPLED = 10_000
-AT_ONCE = 1_000_000  # numbers that are drawn at a time
-WRONGLY = 0.05  # how often, of comparisons of the same with the same, any figure may be marked
+AT_ONCE = 1_000_000  # numbers drawn at a time
+WRONGLY = 0.05  # family-wise error rate: how often a comparison of equals may mark any figure
 UNKNOWN = math.nan
 _PHASES = {Phase.SUCTION: "suction", Phase.HOLD: "hold", Phase.BLOW_OFF: "blow-off"}
 
 
 @dataclass(frozen=True)
 class Values:
-    """A figure over the cycles of one side that tell it."""
+    """A figure over those cycles of one side that have it."""
 
     count: int
-    mean: float  # NaN where no cycle tells it
-    spread: float  # standard deviation; NaN of fewer than two
-    expected: float  # mean of what the twin expected; NaN where it has no say
+    mean: float  # NaN if no cycle has it
+    spread: float  # standard deviation; NaN for fewer than two cycles
+    expected: float  # mean of the twin's expectation; NaN without one
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,10 @@ class Quantity:
     a: Values
     b: Values
     difference: float  # of the means, B less A
-    low: float  # 95 %; NaN where cycles are too few
+    low: float  # 95 %; NaN for too few cycles
     high: float
-    chance: float  # of a difference as big in two logs of the same; NaN where nobody can tell
-    differs: bool = False  # beyond chance, all figures considered
+    chance: float  # p value of the difference; NaN for too few cycles
+    differs: bool = False  # significant, with all figures considered
 
 
 @dataclass(frozen=True)
@@ -67,25 +67,25 @@ class Comparison:
 
     @property
     def different(self) -> list[Quantity]:
-        """What differs, the clearest first."""
-        found = [one for one in (*self.figures, *self.deviations) if one.differs]
-        return sorted(found, key=lambda one: -clearness(one))
+        """The quantities that differ, the clearest first."""
+        differing = [quantity for quantity in (*self.figures, *self.deviations) if quantity.differs]
+        return sorted(differing, key=lambda quantity: -clearness(quantity))
 
 
 def clearness(quantity: Quantity) -> float:
-    """How big a difference is, in spreads of a cycle; of counts that never vary, in tenths."""
+    """Size of a difference in spreads of a cycle; for counts that never vary, in tenths."""
     spread = math.hypot(quantity.a.spread, quantity.b.spread) / math.sqrt(2.0)
     return abs(quantity.difference) / (spread or 0.1 * abs(quantity.a.mean + quantity.b.mean))
 
 
 def compare(a: Side, b: Side, seed: int = 1) -> Comparison:
-    """Compare all that the cycles of two logs say; ``seed`` is of the resampling."""
+    """Compare all figures of two logs' cycles; ``seed`` is for the resampling."""
     rng = np.random.default_rng(seed)
-    if a.derived or b.derived:  # what hangs on commands and the twin beside them tells nothing
-        return Comparison(a, b, _judged(list(_off_the_curve(a, b, rng))), [])
-    every = [*_figures(a, b, rng), *_deviations(a, b, rng)]
-    judged = _judged(every)
-    split = sum(one.name in FIGURES for one in judged)
+    if a.derived or b.derived:  # derived commands make figures of commands and twin meaningless
+        return Comparison(a, b, _mark_differences(list(_curve_figures(a, b, rng))), [])
+    quantities = [*_figures(a, b, rng), *_deviations(a, b, rng)]
+    judged = _mark_differences(quantities)
+    split = sum(quantity.name in FIGURES for quantity in judged)
     return Comparison(a, b, judged[:split], judged[split:])
 
 
@@ -99,7 +99,7 @@ def _figures(a: Side, b: Side, rng: np.random.Generator) -> Iterator[Quantity]:
             yield _quantity(figure.name, figure.unit, figure.what, sides, rng)
 
 
-def _off_the_curve(a: Side, b: Side, rng: np.random.Generator) -> Iterator[Quantity]:
+def _curve_figures(a: Side, b: Side, rng: np.random.Generator) -> Iterator[Quantity]:
     for figure in CURVE.values():
         sides = [(_column(side.curve, figure.name), np.empty(0)) for side in (a, b)]
         if any(len(measured) for measured, _ in sides):
@@ -107,20 +107,20 @@ def _off_the_curve(a: Side, b: Side, rng: np.random.Generator) -> Iterator[Quant
 
 
 def _deviations(a: Side, b: Side, rng: np.random.Generator) -> Iterator[Quantity]:
-    for phase, words in _PHASES.items():
+    for phase, phase_name in _PHASES.items():
         for kind in ("mean", "rms"):
             name = f"{phase.name.lower()}_{kind}"
             sides = [(_column(side.deviation, name), np.empty(0)) for side in (a, b)]
             if any(len(measured) for measured, _ in sides):
-                what = f"{kind} of measured less expected pressure in {words}"
+                what = f"{kind} of measured less expected pressure in {phase_name}"
                 yield _quantity(name, "mbar", what, sides, rng)
 
 
 def _column(cycles: Iterable[dict[str, float]], name: str) -> Floats:
-    """One number of the cycles that tell it."""
+    """One figure of all cycles that have it."""
     values = np.array([cycle.get(name, UNKNOWN) for cycle in cycles], np.float64)
-    told: Floats = values[np.isfinite(values)]
-    return told
+    finite: Floats = values[np.isfinite(values)]
+    return finite
 
 
 def _quantity(
@@ -131,9 +131,11 @@ def _quantity(
     rng: np.random.Generator,
 ) -> Quantity:
     (a, _), (b, _) = sides
-    of_a, of_b = (_values(*side) for side in sides)
+    values_a, values_b = (_values(*side) for side in sides)
     low, high = interval(a, b, rng)
-    return Quantity(name, unit, what, of_a, of_b, of_b.mean - of_a.mean, low, high, chance(a, b))
+    return Quantity(
+        name, unit, what, values_a, values_b, values_b.mean - values_a.mean, low, high, chance(a, b)
+    )
 
 
 def _values(measured: Floats, expected: Floats) -> Values:
@@ -146,12 +148,12 @@ def _values(measured: Floats, expected: Floats) -> Values:
 
 
 def interval(a: Floats, b: Floats, rng: np.random.Generator) -> tuple[float, float]:
-    """The 95 % interval of mean(b) − mean(a), by resampling; NaN where values are too few."""
-    few = min(len(a), len(b))
-    if few < FEWEST:
+    """The 95 % interval of mean(b) − mean(a), by resampling; NaN for too few values."""
+    smaller = min(len(a), len(b))
+    if smaller < FEWEST:
         return UNKNOWN, UNKNOWN
-    wide = math.sqrt(few / (few - 1)) * stats.t.ppf(UPPER_95, few - 1)
-    tail = float(stats.norm.sf(wide))
+    quantile = math.sqrt(smaller / (smaller - 1)) * stats.t.ppf(UPPER_95, smaller - 1)
+    tail = float(stats.norm.sf(quantile))
     differences = _means(b, rng) - _means(a, rng)
     low, high = np.quantile(differences, [tail, 1.0 - tail])
     return float(low), float(high)
@@ -159,33 +161,36 @@ def interval(a: Floats, b: Floats, rng: np.random.Generator) -> tuple[float, flo
 
 def _means(values: Floats, rng: np.random.Generator) -> Floats:
     """Means of resampled values."""
-    at_once = max(AT_ONCE // len(values), 1)
-    sizes = [min(at_once, RESAMPLED - first) for first in range(0, RESAMPLED, at_once)]
-    drawn = (values[rng.integers(len(values), size=(size, len(values)))] for size in sizes)
-    return np.concatenate([some.mean(axis=1) for some in drawn])
+    batch = max(AT_ONCE // len(values), 1)
+    sizes = [min(batch, RESAMPLED - start) for start in range(0, RESAMPLED, batch)]
+    samples = (values[rng.integers(len(values), size=(size, len(values)))] for size in sizes)
+    return np.concatenate([sample.mean(axis=1) for sample in samples])
 
 
 def chance(a: Floats, b: Floats) -> float:
-    """How probable means as far apart are where nothing differs; NaN where values are too few.
+    """The p value of the difference of two means; NaN for too few values.
 
-    Welch's test; without any spread, how many ways there are to deal the cycles to two sides.
+    Welch's test; without any spread, from the number of ways to deal the cycles to two sides.
     """
     if min(len(a), len(b)) < FEWEST:
         return UNKNOWN
     if np.ptp(a) == 0.0 and np.ptp(b) == 0.0:  # no spread to compare with: counts, for example
         return 1.0 if a[0] == b[0] else 2.0 / math.comb(len(a) + len(b), len(a))
-    told = stats.ttest_ind_from_stats(
+    test = stats.ttest_ind_from_stats(
         a.mean(), a.std(ddof=1), len(a), b.mean(), b.std(ddof=1), len(b), equal_var=False
     )
-    return float(told.pvalue)
+    return float(test.pvalue)
 
 
-def _judged(every: Sequence[Quantity]) -> list[Quantity]:
-    """Mark what differs: from the least probable on, each against those that are left (Holm)."""
-    testable = sorted((one for one in every if math.isfinite(one.chance)), key=lambda q: q.chance)
+def _mark_differences(quantities: Sequence[Quantity]) -> list[Quantity]:
+    """Mark quantities that differ: from the smallest p value on, by Holm's correction."""
+    testable = sorted(
+        (quantity for quantity in quantities if math.isfinite(quantity.chance)),
+        key=lambda quantity: quantity.chance,
+    )
     marked: set[str] = set()
-    for left, one in zip(range(len(testable), 0, -1), testable, strict=True):
-        if one.chance > WRONGLY / left:
+    for remaining, quantity in zip(range(len(testable), 0, -1), testable, strict=True):
+        if quantity.chance > WRONGLY / remaining:
             break
-        marked.add(one.name)
-    return [replace(one, differs=one.name in marked) for one in every]
+        marked.add(quantity.name)
+    return [replace(quantity, differs=quantity.name in marked) for quantity in quantities]

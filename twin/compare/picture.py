@@ -24,18 +24,18 @@ def draw(comparison: Comparison, path: Path) -> None:
     """Write the picture, SVG or PNG as ``path`` ends; SourceError if it cannot be written."""
     with mpl.rc_context({**STYLE, "svg.hashsalt": "compare"}):
         figure = Figure(figsize=(10.0, 8.0), layout="constrained")
-        vacuum, difference, off = figure.subplots(
+        vacuum, difference, deviation = figure.subplots(
             3, 1, sharex=True, gridspec_kw={"height_ratios": [2.2, 1.2, 1.2]}
         )
         for label, side in (("A", comparison.a), ("B", comparison.b)):
             _draw_vacuum(vacuum, label, side)
-            _band(off, side.off, COLOURS[label], f"{label}: measured − expected")
+            _band(deviation, side.off, COLOURS[label], f"{label}: measured − expected")
         _draw_difference(difference, comparison)
         _name(vacuum, "vacuum (mbar)")
         _name(difference, "difference (mbar)")
-        _name(off, "deviation (mbar)")
-        off.set_xlabel("time since the suction edge (s)")
-        off.set_xlim(0.0, _end(comparison))
+        _name(deviation, "deviation (mbar)")
+        deviation.set_xlabel("time since the suction edge (s)")
+        deviation.set_xlim(0.0, _end(comparison))
         figure.suptitle(fill(conclusion(comparison), TITLE), x=0.01, ha="left", fontsize=10.5)
         with said_plainly(path):
             figure.savefig(path, metadata=FORMATS[path.suffix], dpi=110)
@@ -55,7 +55,7 @@ def _draw_vacuum(axes: Axes, label: str, side: Side) -> None:
 
 
 def _draw_difference(axes: Axes, comparison: Comparison) -> None:
-    """B less A, measured with how sure the means are, and expected."""
+    """Draw B less A: measured with the 95 % band of the means, and expected."""
     measured = [side.measured_vacuum for side in (comparison.a, comparison.b)]
     time, mean, half = difference(*measured)
     counts = [len(side.cycles) for side in (comparison.a, comparison.b)]
@@ -67,22 +67,22 @@ def _draw_difference(axes: Axes, comparison: Comparison) -> None:
 
 
 def difference(a: Curve, b: Curve) -> tuple[Floats, Floats, Floats]:
-    """Time (s), difference of the means B − A (mbar) and half its 95 % band, where both are."""
-    both = np.isfinite(a.mean) & np.isfinite(b.mean)
+    """Time (s), difference of the means B − A (mbar) and half its 95 % band, where both exist."""
+    is_finite = np.isfinite(a.mean) & np.isfinite(b.mean)
     error = np.hypot(a.error, b.error)
-    return bins()[both], (b.mean - a.mean)[both], SIGMAS_95 * error[both]
+    return bins()[is_finite], (b.mean - a.mean)[is_finite], SIGMAS_95 * error[is_finite]
 
 
 def _band(axes: Axes, curve: Curve, colour: str, label: str) -> None:
-    """Mean, and a spread of a cycle on both sides."""
+    """Draw the mean with a band of one spread on both sides."""
     time, mean, spread = _shown(curve)
     axes.fill_between(time, mean - spread, mean + spread, color=colour, alpha=0.25, lw=0)
     axes.plot(time, mean, color=colour, lw=1.5, label=label)
 
 
 def _shown(curve: Curve) -> tuple[Floats, Floats, Floats]:
-    there = np.isfinite(curve.mean)
-    return bins()[there], curve.mean[there], curve.spread[there]
+    is_finite = np.isfinite(curve.mean)
+    return bins()[is_finite], curve.mean[is_finite], curve.spread[is_finite]
 
 
 def _end(comparison: Comparison) -> float:

@@ -44,8 +44,8 @@ def record(comparison: Comparison, path: Path) -> None:
 
 
 def _send_curve(rr: Any, stream: Any, path: str, name: str, curve: Curve) -> None:
-    there = np.isfinite(curve.mean)
-    _send(rr, stream, path, name, (bins()[there], curve.mean[there]))
+    is_finite = np.isfinite(curve.mean)
+    _send(rr, stream, path, name, (bins()[is_finite], curve.mean[is_finite]))
 
 
 def _send(rr: Any, stream: Any, path: str, name: str, line: Sequence[Floats]) -> None:
@@ -54,8 +54,8 @@ def _send(rr: Any, stream: Any, path: str, name: str, line: Sequence[Floats]) ->
     width = 1.0 if path.endswith("expected") else 2.0
     style = rr.SeriesLines(names=name, colors=colour, widths=width)
     stream.log(path, style, static=True, strict=True)
-    since = np.round(time / NS).astype("timedelta64[ns]")
-    columns = [rr.TimeColumn(TIMELINE, duration=since)]
+    durations = np.round(time / NS).astype("timedelta64[ns]")
+    columns = [rr.TimeColumn(TIMELINE, duration=durations)]
     stream.send_columns(path, columns, rr.Scalars.columns(scalars=values), strict=True)
 
 

@@ -1,4 +1,4 @@
-"""One side of a comparison: what every cycle of a log says, and its mean course over time."""
+"""One side of a comparison: the figures of every cycle of a log, and its mean curve over time."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -22,9 +22,9 @@ from twin.signals import BREAK, MBAR, MS, NS, UNUSABLE, Phase, Samples, Ticks, d
 Floats = npt.NDArray[np.float64]
 
 BIN_S = 2.0 * MS
-LONGEST_S = 10.0  # of a cycle, whose course is kept
-FEWEST_SHARE = 0.5  # of the cycles, that must reach a time for their mean to be shown
-_OVER = (Phase.IDLE, Phase.BLOW_OFF)
+LONGEST_S = 10.0  # length of a cycle's curve
+FEWEST_SHARE = 0.5  # share of the cycles that must reach a time for a mean there
+_END_PHASES = (Phase.IDLE, Phase.BLOW_OFF)
 
 
 @dataclass
@@ -34,19 +34,19 @@ class Curve:
     _sums: Floats = field(default_factory=lambda: np.zeros((3, round(LONGEST_S / BIN_S))))
 
     def add(self, since: Floats, values: Floats) -> None:
-        """Take the rows of one cycle: s since its suction edge, and values (mbar or NaN)."""
-        places = np.floor(since / BIN_S + 1e-6).astype(np.int64)
-        good = np.isfinite(values) & (places >= 0) & (places < self._sums.shape[1])
-        places, values = places[good], values[good]
-        count = np.bincount(places, minlength=self._sums.shape[1])
+        """Add the rows of one cycle: s since its suction edge, and values (mbar or NaN)."""
+        bins = np.floor(since / BIN_S + 1e-6).astype(np.int64)
+        is_valid = np.isfinite(values) & (bins >= 0) & (bins < self._sums.shape[1])
+        bins, values = bins[is_valid], values[is_valid]
+        count = np.bincount(bins, minlength=self._sums.shape[1])
         with np.errstate(invalid="ignore"):
-            mean = np.bincount(places, values, len(count)) / count
-        seen = count > 0  # a cycle counts once in a bin, however many rows it has there
-        self._sums[:, seen] += np.stack([np.ones(len(mean)), mean, mean**2])[:, seen]
+            mean = np.bincount(bins, values, len(count)) / count
+        is_filled = count > 0  # a cycle counts once in a bin, however many rows it has there
+        self._sums[:, is_filled] += np.stack([np.ones(len(mean)), mean, mean**2])[:, is_filled]
 
     @property
     def mean(self) -> Floats:
-        """Mean of the cycles in each bin; NaN where too few of them come."""
+        """Mean of the cycles in each bin; NaN where too few cycles reach it."""
         count, total, _ = self._sums
         enough = count >= max(FEWEST_SHARE * count.max(), 1.0)
         return np.where(enough, total / np.maximum(count, 1.0), np.nan)
@@ -55,8 +55,8 @@ class Curve:
     def spread(self) -> Floats:
         """Standard deviation of the cycles in each bin; NaN where the mean is."""
         count, total, squares = self._sums
-        left = squares - total**2 / np.maximum(count, 1.0)
-        spread = np.sqrt(np.maximum(left, 0.0) / np.maximum(count - 1.0, 1.0))
+        residual = squares - total**2 / np.maximum(count, 1.0)
+        spread = np.sqrt(np.maximum(residual, 0.0) / np.maximum(count - 1.0, 1.0))
         return np.where(np.isfinite(self.mean), spread, np.nan)
 
     @property
@@ -72,12 +72,14 @@ class Side:
 
     name: str
     header: LogHeader
-    data_set: str  # hash of the one its twin had
+    data_set: str  # hash of its twin's data set
     cycles: list[int] = field(default_factory=list)
     measured: list[dict[str, float]] = field(default_factory=list)  # a row for each cycle
     expected: list[dict[str, float]] = field(default_factory=list)
     deviation: list[dict[str, float]] = field(default_factory=list)
-    curve: list[dict[str, float]] = field(default_factory=list)  # read off it, without a model
+    curve: list[dict[str, float]] = field(
+        default_factory=list
+    )  # figures read off the curve, without a model
     measured_vacuum: Curve = field(default_factory=Curve)
     expected_vacuum: Curve = field(default_factory=Curve)
     off: Curve = field(default_factory=Curve)  # measured less expected pressure
@@ -92,12 +94,12 @@ class Side:
         """Whether nobody recorded its commands."""
         return bool(self.header.derived)
 
-    def add(self, cycle: Cycle, told: CycleFigures, theta: Theta) -> None:
-        """Take a whole cycle; ``theta`` are the coefficients of the twin beside it."""
+    def add(self, cycle: Cycle, figures: CycleFigures, theta: Theta) -> None:
+        """Add a whole cycle; ``theta`` holds the coefficients of the log's twin."""
         ambient = float(theta[c.AMBIENT])
         self.cycles.append(cycle.index)
-        self.measured.append(dict(told.measured))
-        self.expected.append(dict(told.expected))
+        self.measured.append(dict(figures.measured))
+        self.expected.append(dict(figures.expected))
         self.deviation.append(judged(cycle, theta))
         since = (cycle.samples["time_ns"] - cycle.samples["time_ns"][0]) * NS
         usable = (cycle.samples["quality"] & UNUSABLE) == 0
@@ -108,23 +110,25 @@ class Side:
 
 
 def side_of(log: Log, settings: Config, key_figures: KeyFigures) -> Side:
-    """Read all of a log; SourceError if no cycle of it can be compared.
+    """Read a whole log; SourceError if no cycle of it can be compared.
 
     The first cycle after the start or a break is left out: its gas, and the model's, is not yet as
-    warm as in all others.
+    warm as in the others.
     """
     theta = coefficients(settings.data)
     side = Side(log.path.name, log.header, settings.data.hash)
     blocks = (rows for rows, _ in log.blocks())
-    suctions = _settled(one for one in stretches(blocks, volume_of(settings)) if one.ended)
-    side.curve = [_told(one) for one in suctions]
+    suctions = _settled(
+        stretch for stretch in stretches(blocks, volume_of(settings)) if stretch.ended
+    )
+    side.curve = [_reading_values(stretch) for stretch in suctions]
     if side.derived:
         _add_suctions(side, suctions)
         return side
     for cycle in whole(unbroken(log.blocks())):
-        told = key_figures.take(cycle)
-        if told is not None and told.complete and cycle.complete and cycle.settled:
-            side.add(cycle, told, theta)
+        figures = key_figures.take(cycle)
+        if figures is not None and figures.complete and cycle.complete and cycle.settled:
+            side.add(cycle, figures, theta)
     if not side.cycles:
         raise SourceError(
             f"{log.path}: no cycle to compare: none is whole, and follows on another",
@@ -134,52 +138,52 @@ def side_of(log: Log, settings: Config, key_figures: KeyFigures) -> Side:
 
 
 def _settled(suctions: Iterable[Stretch]) -> list[Stretch]:
-    """All but the first of several, whose gas is not yet as warm as in the others."""
-    every = list(suctions)
-    return every[1:] if len(every) > 1 and every[0].begun else every
+    """All suctions without the first of several: its gas is not yet as warm as in the others."""
+    all_suctions = list(suctions)
+    return all_suctions[1:] if len(all_suctions) > 1 and all_suctions[0].begun else all_suctions
 
 
-def _told(suction: Stretch) -> dict[str, float]:
-    return {name: one.value for name, one in readings(suction).items() if not one.why}
+def _reading_values(suction: Stretch) -> dict[str, float]:
+    return {name: reading.value for name, reading in readings(suction).items() if not reading.why}
 
 
 def _add_suctions(side: Side, suctions: list[Stretch]) -> None:
-    """Take those of derived commands; SourceError if none ends in the record."""
+    """Add the suctions of derived commands; SourceError if none ends in the record."""
     if not suctions:
         raise SourceError(
             f"{side.name}: no suction to compare: none ends in the record",
             "record at least one suction with its release",
         )
     side.cycles = list(range(len(suctions)))
-    for one in suctions:
-        side.measured_vacuum.add(one.time - one.origin, one.vacuum)
+    for suction in suctions:
+        side.measured_vacuum.add(suction.time - suction.origin, suction.vacuum)
 
 
 def whole(blocks: Iterable[tuple[Samples, Ticks]]) -> Iterator[Cycle]:
-    """Cut rows into cycles, in one piece up to some minutes; and what belongs to none."""
+    """Cut rows into cycles, joined up to some minutes; also yields rows that belong to none."""
     pieces: list[Cycle] = []
-    before = -1  # index of what was given last
+    previous = -1  # index of the last yielded cycle
     for piece in cut(blocks):
         if pieces and (piece.index > pieces[0].index or piece.samples["quality"][0] & BREAK):
-            yield _joined(pieces, before)
-            before, pieces = pieces[0].index, []
+            yield _join(pieces, previous)
+            previous, pieces = pieces[0].index, []
         pieces.append(piece)
-        if piece.ticks["phase"][-1] in _OVER or len(pieces) == MOST_PIECES:
-            yield _joined(pieces, before)
-            before, pieces = pieces[0].index, []
+        if piece.ticks["phase"][-1] in _END_PHASES or len(pieces) == MOST_PIECES:
+            yield _join(pieces, previous)
+            previous, pieces = pieces[0].index, []
     if pieces:
-        yield _joined(pieces, before)
+        yield _join(pieces, previous)
 
 
-def _joined(pieces: list[Cycle], before: int) -> Cycle:
+def _join(pieces: list[Cycle], previous: int) -> Cycle:
     first, last = pieces[0], pieces[-1]
     if first is last:
         return first
-    at_edge, over = first.index > before, last.ticks["phase"][-1] in _OVER
+    at_suction_edge, is_over = first.index > previous, last.ticks["phase"][-1] in _END_PHASES
     return replace(
         first,
         samples=np.concatenate([piece.samples for piece in pieces]),
         ticks=np.concatenate([piece.ticks for piece in pieces]),
-        complete=bool(at_edge and over),
+        complete=bool(at_suction_edge and is_over),
         cut_short=last.cut_short,
     )

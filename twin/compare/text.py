@@ -1,4 +1,4 @@
-"""A comparison for people, in a table and a conclusion; and as JSON."""
+"""A comparison as text, with tables and a conclusion; and as JSON."""
 
 import math
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from twin.compare.side import Side
 
 FORMAT = "ejector-twin-compare/1"
 NAMED = 3  # in the conclusion
-FOLLOWS = (  # from other figures: said after them
+FOLLOWS = (  # figures that follow from others; they come after them
     "leakage_band",
     "quality",
     "performance",
@@ -23,21 +23,24 @@ NO_DASH = {"-": "", "0 or 1": "", "0 to 3": ""}
 
 
 def in_words(comparison: Comparison) -> str:
-    """All of it: the sides, the tables, and what to conclude."""
+    """The whole comparison: the sides, the tables and the conclusion."""
     sides = [
         f"{label}  {side.name}: {side.asset or 'no asset named'}, {_cycles(len(side.cycles))}"
         for label, side in (("A", comparison.a), ("B", comparison.b))
     ]
-    head = ("figure", "unit", "A (expected)", "B (expected)", "B − A", "95 %", "")
-    rows = [head, *map(_row, comparison.figures)]
-    off = [("deviation", "unit", "A", "B", "B − A", "95 %", ""), *map(_row, comparison.deviations)]
-    tables = [_table(rows), *([_table(off)] if comparison.deviations else [])]
+    header = ("figure", "unit", "A (expected)", "B (expected)", "B − A", "95 %", "")
+    rows = [header, *map(_row, comparison.figures)]
+    deviations = [
+        ("deviation", "unit", "A", "B", "B − A", "95 %", ""),
+        *map(_row, comparison.deviations),
+    ]
+    tables = [_table(rows), *([_table(deviations)] if comparison.deviations else [])]
     legend = "mean ± spread of a cycle; * differs beyond chance, all figures considered"
     return "\n\n".join(["\n".join(sides), *tables, legend, conclusion(comparison)])
 
 
 def conclusion(comparison: Comparison) -> str:
-    """What to conclude, in a sentence or two."""
+    """The conclusion in a sentence or two."""
     counts = [len(side.cycles) for side in (comparison.a, comparison.b)]
     if min(counts) < FEWEST:
         return (
@@ -45,57 +48,61 @@ def conclusion(comparison: Comparison) -> str:
             f" {FEWEST} on each side are needed."
         )
     different = comparison.different
-    figures = [one for one in different if one in comparison.figures]
-    figures.sort(key=lambda one: one.name in FOLLOWS)
-    off = [one for one in different if one in comparison.deviations and "rms" in one.name]
+    figures = [quantity for quantity in different if quantity in comparison.figures]
+    figures.sort(key=lambda quantity: quantity.name in FOLLOWS)
+    deviations = [
+        quantity
+        for quantity in different
+        if quantity in comparison.deviations and "rms" in quantity.name
+    ]
     if not different:
-        looked = len(comparison.figures) + len(comparison.deviations)
-        return f"B does not differ from A beyond chance: {looked} figures over {_both(counts)}."
-    told = [", ".join(map(_change, figures[:NAMED])) + _more(len(figures) - NAMED)]
+        compared = len(comparison.figures) + len(comparison.deviations)
+        return f"B does not differ from A beyond chance: {compared} figures over {_both(counts)}."
+    parts = [", ".join(map(_change, figures[:NAMED])) + _more(len(figures) - NAMED)]
     if not figures:
-        told = ["no key figure differs beyond chance"]
-    if off:
-        told.append(f"deviation from the twin: {', '.join(map(_change, off[:1]))}")
-    return f"B against A: {'; '.join(told)}."
+        parts = ["no key figure differs beyond chance"]
+    if deviations:
+        parts.append(f"deviation from the twin: {', '.join(map(_change, deviations[:1]))}")
+    return f"B against A: {'; '.join(parts)}."
 
 
 def remarks(comparison: Comparison) -> list[str]:
-    """What a person should know before taking differences for those of the ejector."""
+    """Reasons other than the ejector for a difference, which a person should know."""
     a, b = comparison.a, comparison.b
-    said = []
+    sentences = []
     if a.header.asset_type != b.header.asset_type:
-        said.append(
+        sentences.append(
             f"different types of asset, {a.header.asset_type or 'none named'} and"
             f" {b.header.asset_type or 'none named'}: figures differ by that alone"
         )
     elif a.header.asset_id != b.header.asset_id:
-        said.append(
+        sentences.append(
             f"different units, {a.header.asset_id or 'none'} and {b.header.asset_id or 'none'}"
         )
     for label, side in (("A", a), ("B", b)):
         if side.derived:
-            said.append(f"{label}: {side.header.derived}")
+            sentences.append(f"{label}: {side.header.derived}")
     if a.derived != b.derived:
-        said.append(
+        sentences.append(
             "the commands of one log were recorded and of the other derived: compare no times with"
             " them, for a recorded command comes before the pressure moves"
         )
     if a.data_set != b.data_set:
-        said.append(
+        sentences.append(
             "the logs were made beside different data sets: what is expected, and deviations,"
             " differ by that too"
         )
-    return said
+    return sentences
 
 
 def plain(comparison: Comparison) -> dict[str, Any]:
-    """As JSON has it; what is not known is null."""
+    """The comparison as a JSON document; unknown values are null."""
     return {
         "format": FORMAT,
         "a": _side(comparison.a),
         "b": _side(comparison.b),
-        "figures": [_plain(one) for one in comparison.figures],
-        "deviations": [_plain(one) for one in comparison.deviations],
+        "figures": [_plain(quantity) for quantity in comparison.figures],
+        "deviations": [_plain(quantity) for quantity in comparison.deviations],
         "remarks": remarks(comparison),
         "conclusion": conclusion(comparison),
     }
@@ -106,40 +113,42 @@ def _side(side: Side) -> dict[str, Any]:
     return {"log": side.name, "asset": asset, "data_set": side.data_set, "cycles": side.cycles}
 
 
-def _plain(one: Quantity) -> dict[str, Any]:
+def _plain(quantity: Quantity) -> dict[str, Any]:
     return {
-        "name": one.name,
-        "unit": one.unit,
-        "what": one.what,
-        "a": _values(one.a),
-        "b": _values(one.b),
-        "difference": _known(one.difference),
-        "low95": _known(one.low),
-        "high95": _known(one.high),
-        "differs": one.differs,
+        "name": quantity.name,
+        "unit": quantity.unit,
+        "what": quantity.what,
+        "a": _values(quantity.a),
+        "b": _values(quantity.b),
+        "difference": _rounded(quantity.difference),
+        "low95": _rounded(quantity.low),
+        "high95": _rounded(quantity.high),
+        "differs": quantity.differs,
     }
 
 
 def _values(values: Values) -> dict[str, Any]:
-    known = {name: _known(getattr(values, name)) for name in ("mean", "spread", "expected")}
-    return {"cycles": values.count, **known}
+    rounded = {name: _rounded(getattr(values, name)) for name in ("mean", "spread", "expected")}
+    return {"cycles": values.count, **rounded}
 
 
-def _known(value: float) -> float | None:
+def _rounded(value: float) -> float | None:
     return round(value, 6) if math.isfinite(value) else None
 
 
-def _row(one: Quantity) -> Sequence[str]:
-    finest = _finest(one)
-    known = math.isfinite(one.low)
+def _row(quantity: Quantity) -> Sequence[str]:
+    finest = _finest(quantity)
+    has_interval = math.isfinite(quantity.low)
     return (
-        one.name,
-        one.unit,
-        _cell(one.a, finest),
-        _cell(one.b, finest),
-        _number(one.difference, finest, "+"),
-        f"{_number(one.low, finest, '+')} to {_number(one.high, finest, '+')}" if known else "-",
-        "*" if one.differs else "",
+        quantity.name,
+        quantity.unit,
+        _cell(quantity.a, finest),
+        _cell(quantity.b, finest),
+        _number(quantity.difference, finest, "+"),
+        f"{_number(quantity.low, finest, '+')} to {_number(quantity.high, finest, '+')}"
+        if has_interval
+        else "-",
+        "*" if quantity.differs else "",
     )
 
 
@@ -147,14 +156,14 @@ def _cell(values: Values, finest: float) -> str:
     if not values.count:
         return "-"
     spread = f" ± {_number(values.spread, finest)}" if math.isfinite(values.spread) else ""
-    beside = f" ({_number(values.expected, finest)})" if math.isfinite(values.expected) else ""
-    return f"{_number(values.mean, finest)}{spread}{beside}"
+    expectation = f" ({_number(values.expected, finest)})" if math.isfinite(values.expected) else ""
+    return f"{_number(values.mean, finest)}{spread}{expectation}"
 
 
-def _finest(one: Quantity) -> float:
-    """The smallest spread there is: what is written has two digits of it."""
-    spreads = [side.spread for side in (one.a, one.b) if side.spread > 0.0]
-    means = [abs(side.mean) for side in (one.a, one.b) if side.mean % 1.0]
+def _finest(quantity: Quantity) -> float:
+    """The smallest spread; numbers are written with two digits of it."""
+    spreads = [side.spread for side in (quantity.a, quantity.b) if side.spread > 0.0]
+    means = [abs(side.mean) for side in (quantity.a, quantity.b) if side.mean % 1.0]
     return min(spreads or [0.01 * mean for mean in means] or [10.0])
 
 
@@ -169,18 +178,18 @@ def _table(rows: Sequence[Sequence[str]]) -> str:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join(
         "  ".join(
-            cell.ljust(width) if place < 2 else cell.rjust(width)
-            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
+            cell.ljust(width) if column_index < 2 else cell.rjust(width)
+            for column_index, (cell, width) in enumerate(zip(row, widths, strict=True))
         ).rstrip()
         for row in rows
     )
 
 
-def _change(one: Quantity) -> str:
-    unit = NO_DASH.get(one.unit, f" {one.unit}")
+def _change(figure: Quantity) -> str:
+    unit = NO_DASH.get(figure.unit, f" {figure.unit}")
     return (
-        f"{one.name.replace('_', ' ')} {_short(one.a.mean)} → {_short(one.b.mean)}{unit}"
-        f" ({_short(one.low, '+')} to {_short(one.high, '+')} at 95 %)"
+        f"{figure.name.replace('_', ' ')} {_short(figure.a.mean)} → {_short(figure.b.mean)}{unit}"
+        f" ({_short(figure.low, '+')} to {_short(figure.high, '+')} at 95 %)"
     )
 
 
