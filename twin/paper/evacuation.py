@@ -1,8 +1,8 @@
 """The paper's two systems, its two equations, and its model as a data set for the twin's kernel.
 
-The paper's model is an adiabatic vessel on a suction mass flow that falls linearly from nominal
-suction at ambient pressure to zero at end pressure, at once and without leak. With wall heat or a
-bulge it is this twin's.
+The paper's model is an adiabatic vessel with a suction mass flow. The flow falls linearly from
+nominal suction at ambient pressure to zero at end pressure, without delay and without leak. With
+wall heat or a bulge it becomes this twin's model.
 """
 
 import math
@@ -27,7 +27,7 @@ END_MBAR: float = _MEAN_OF_TEN["end_pressure_mbar"]  # absolute
 SAFETY = 1.2  # usual factor on equation (2)
 HOSE = Tube(kind="tube", length_mm=2000.0, diameter_mm=4.0)  # of the application
 
-# Inner walls, which the paper does not need.
+# Areas of inner walls, which the paper's model does not use.
 TANK_CM2, TUBES_CM2 = 470.0, 31.0  # of the rig, tubes of 165 mm × 6 mm in all
 CUPS_CM2, HOSE_CM2 = 200.0, area(HOSE) * 1e4
 
@@ -50,17 +50,17 @@ class Setup:
     temperature_c: float
     target_mbar: float
     measured_ms: float
-    parts: tuple[Part, ...]  # that make up volume and wall
+    parts: tuple[Part, ...]  # of that volume and wall
 
     @property
     def slowest_ms(self) -> float:
-        """No curve of interest takes longer to the target."""
+        """An upper bound (ms) of the time to the target, for all curves of interest."""
         return 2.0 * equation_1(self)
 
 
 @dataclass(frozen=True)
 class Unit:
-    """What is assumed of the ejector and of the walls around the gas."""
+    """Assumptions about the ejector and the walls around the gas."""
 
     suction_sl_min: float = INSTANCE_SL_MIN
     film: float = 0.0  # W/(m² K)
@@ -68,14 +68,14 @@ class Unit:
 
 
 def one_vessel(volume_ml: float, wall_cm2: float) -> tuple[Part, ...]:
-    """Parts that store ``volume_ml`` together with the ejector's port, and hardly resist."""
+    """Parts with ``volume_ml`` including the ejector's port, and almost without resistance."""
     rest = volume_ml - PORT_ML - volume(SHORT) / ML
     wall = wall_cm2 - area(SHORT) * 1e4
     return SHORT, Vessel(kind="vessel", volume_ml=rest, wall_area_cm2=wall)
 
 
 def with_hose(setup: Setup, *, sensor_in_cups: bool) -> Setup:
-    """The application with its hose as a line that resists, and with a place for the sensor."""
+    """The application with its hose as a line with resistance, and a place for the sensor."""
     sensor, rest = Sensor(kind="sensor"), setup.volume_ml - PORT_ML - volume(HOSE) / ML
     cups = Vessel(kind="vessel", volume_ml=rest, wall_area_cm2=CUPS_CM2)
     parts = (HOSE, sensor, cups) if sensor_in_cups else (sensor, HOSE, cups)
@@ -83,7 +83,7 @@ def with_hose(setup: Setup, *, sensor_in_cups: bool) -> Setup:
 
 
 def of_volume(setup: Setup, volume_ml: float) -> Setup:
-    """The same with another volume, and a wall that grows as walls of the same shape do."""
+    """The setup with another volume; its wall grows as for the same shape."""
     wall = setup.wall_cm2 * (volume_ml / setup.volume_ml) ** (2.0 / 3.0)
     parts = one_vessel(volume_ml, wall)
     return replace(setup, volume_ml=volume_ml, wall_cm2=wall, parts=parts)
@@ -112,13 +112,13 @@ APPLICATION = Setup(
 
 
 def time_constant(setup: Setup, suction_sl_min: float = INSTANCE_SL_MIN) -> float:
-    """V / S_N in ms, with S_N as volume at the system's ambient pressure and temperature."""
+    """V / S_N in ms, with S_N as volume flow at the system's ambient pressure and temperature."""
     density = setup.ambient_mbar * MBAR / (R * (setup.temperature_c + ZERO_CELSIUS))
     return setup.volume_ml * ML / (suction_sl_min * SL_MIN / density) / MS
 
 
 def equation_1(setup: Setup) -> float:
-    """Evacuation time (ms) by the paper's equation (1): isothermal, suction volume falls."""
+    """Evacuation time (ms) by the paper's equation (1): isothermal, falling suction volume flow."""
     begin, end = setup.ambient_mbar - END_MBAR, setup.target_mbar - END_MBAR
     return time_constant(setup) * math.log(begin / end)
 
@@ -134,7 +134,7 @@ def isothermal(setup: Setup) -> float:
 
 
 def data_set(setup: Setup, unit: Unit) -> DataSet:
-    """The paper's model of a unit on a system, as this twin's; walls and bulge come on top."""
+    """The paper's model of a unit on a system as this twin's data set, with walls and bulge."""
     return DataSet(
         ambient=Ambient(pressure_mbar=setup.ambient_mbar, temperature_c=setup.temperature_c),
         ejector=Ejector(
@@ -156,8 +156,8 @@ def data_set(setup: Setup, unit: Unit) -> DataSet:
 def pressures(setup: Setup, unit: Unit, suction_ms: int, hold_ms: int = 0) -> Floats:
     """Pressure (Pa) at each ms from 0: the nozzle on from the beginning, later off.
 
-    The jet stands at full strength and the sensor reads at once, so that no phase is mixed in
-    that the paper's model does not have.
+    The jet has full strength from the start and the sensor has no lag, since the paper's model has
+    no such effects.
     """
     theta = coefficients(data_set(setup, unit))
     theta[c.SENSOR_LAG] = AT_ONCE
@@ -174,8 +174,11 @@ def pressures(setup: Setup, unit: Unit, suction_ms: int, hold_ms: int = 0) -> Fl
 
 def evacuation_ms(setup: Setup, unit: Unit) -> float:
     """Time (ms) in which the twin's kernel reaches the target."""
-    p = pressures(setup, unit, math.ceil(setup.slowest_ms)) / MBAR
-    after = int(np.argmax(p <= setup.target_mbar))
+    pressures_mbar = pressures(setup, unit, math.ceil(setup.slowest_ms)) / MBAR
+    after = int(np.argmax(pressures_mbar <= setup.target_mbar))
     assert after > 0, "the target is reached long before the end"
     before = after - 1
-    return before + float((p[before] - setup.target_mbar) / (p[before] - p[after]))
+    return before + float(
+        (pressures_mbar[before] - setup.target_mbar)
+        / (pressures_mbar[before] - pressures_mbar[after])
+    )

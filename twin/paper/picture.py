@@ -1,4 +1,4 @@
-"""The picture of ``twin paper``: curves like the paper's Fig. 7, and pairs that part later."""
+"""The picture of ``twin paper``: curves like the paper's Fig. 7, and pairs that separate later."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -50,12 +50,12 @@ def draw(rows: Sequence[Row], separation: Separation, path: Path) -> None:
 
 
 def _draw_tables(axes: Axes, rows: Sequence[Row], separation: Separation) -> None:
-    """Like Fig. 7: vacuum over time on the rig."""
+    """Draw vacuum over time on the rig, like Fig. 7."""
     seconds = np.linspace(0.0, LONGEST_MS * 1e-3, LONGEST_MS + 1)
     textbook = zip(TEXTBOOK, _textbook(seconds), strict=True)
-    for (label, colour, dots), curve in textbook:
-        axes.plot(seconds, curve, color=colour, lw=1.8, ls=(0, dots), label=label)
-    (extended,) = (one.unit for one in separation.pairs if one.unit.film == separation.film)
+    for (label, colour, dashes), curve in textbook:
+        axes.plot(seconds, curve, color=colour, lw=1.8, ls=(0, dashes), label=label)
+    (extended,) = (pair.unit for pair in separation.pairs if pair.unit.film == separation.film)
     for label, colour, style, unit in (
         ("the paper's model, object-specific", "#c8500a", "--", Unit(OBJECT_SL_MIN)),
         ("the paper's model, instance-specific", "#e0a100", "--", Unit(INSTANCE_SL_MIN)),
@@ -64,10 +64,10 @@ def _draw_tables(axes: Axes, rows: Sequence[Row], separation: Separation) -> Non
         curve = _vacuum(pressures(RIG, unit, LONGEST_MS))
         axes.plot(seconds, curve, style, color=colour, lw=1.8, label=label)
     _mark(axes)
-    off = [percent_more(row.twin_ms, RIG.measured_ms) for row in rows if row.setup is RIG]
+    over = [percent_more(row.twin_ms, RIG.measured_ms) for row in rows if row.setup is RIG]
     axes.set_title(
-        f"Test rig to 600 mbar,rel: the equations take {min(off[:2]):.0f} to {max(off[:2]):.0f} %"
-        f" too long,\nthe paper's model {off[3]:.0f} to {off[2]:.0f} %",
+        f"Test rig to 600 mbar,rel: the equations take {min(over[:2]):.0f} to {max(over[:2]):.0f} %"
+        f" too long,\nthe paper's model {over[3]:.0f} to {over[2]:.0f} %",
         fontsize=10.5,
     )
     axes.set(xlim=(0.0, LONGEST_MS * 1e-3), ylim=(0.0, 880.0))
@@ -75,14 +75,14 @@ def _draw_tables(axes: Axes, rows: Sequence[Row], separation: Separation) -> Non
 
 
 def _draw_pairs(axes: Axes, separation: Separation) -> None:
-    """Pairs of film coefficient and bulge that meet the measured time, with the hold after it."""
-    off = round(RIG.measured_ms)
-    seconds = np.linspace(0.0, (off + HOLD_MS) * 1e-3, off + HOLD_MS + 1)
+    """Draw pairs of film coefficient and bulge that meet the measured time, and their hold."""
+    switch_off_ms = round(RIG.measured_ms)
+    seconds = np.linspace(0.0, (switch_off_ms + HOLD_MS) * 1e-3, switch_off_ms + HOLD_MS + 1)
     shown = [pair.unit for pair in separation.pairs if pair.unit.film in SHOWN]
     for unit, colour in zip(shown, COLOURS, strict=True):
         label = f"film {unit.film:g} W/(m² K), bulge {unit.bulge:.2f}"
         width = 2.4 if unit.film == separation.film else 1.6
-        curve = _vacuum(pressures(RIG, unit, off, HOLD_MS))
+        curve = _vacuum(pressures(RIG, unit, switch_off_ms, HOLD_MS))
         axes.plot(seconds, curve, color=colour, lw=width, label=label)
     _mark(axes)
     axes.set_title(
@@ -103,8 +103,8 @@ def _textbook(seconds: Floats) -> tuple[Floats, Floats]:
     return first, np.minimum(second, ambient - END_MBAR)
 
 
-def _vacuum(p: Floats) -> Floats:
-    return RIG.ambient_mbar - p / MBAR
+def _vacuum(pressures: Floats) -> Floats:
+    return RIG.ambient_mbar - pressures / MBAR
 
 
 def _mark(axes: Axes) -> None:

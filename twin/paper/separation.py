@@ -1,7 +1,7 @@
-"""Wall heat and a bulging characteristic: what evacuation times can tell of them, and what not.
+"""Wall heat and a bulging characteristic: which evacuation times can separate them.
 
-Both are fitted to the rig's measured time: for each film coefficient there is a bulge that meets
-it. What such pairs say of everything else shows what would tell them apart.
+Both are fitted to the rig's measured time: for each film coefficient a bulge meets it. What such
+pairs predict for other experiments shows which of these would separate them.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from twin.paper.evacuation import (
 from twin.signals import MBAR
 
 FILMS = (0.0, 2.0, 5.0, 10.0, 20.0, 40.0)  # W/(m² K); still gas at a wall has 5 to 20
-FILM = 10.0  # of the one pair looked at more closely
+FILM = 10.0  # of the pair that is examined in detail
 BIG = of_volume(RIG, 5000.0)
 AT_EJECTOR = with_hose(APPLICATION, sensor_in_cups=False)
 IN_CUPS = with_hose(APPLICATION, sensor_in_cups=True)
@@ -36,7 +36,7 @@ MOST_SUCTION = 60.0  # sl/min
 
 @dataclass(frozen=True)
 class Pair:
-    """A film coefficient and the bulge that goes with it, and what they say of other things."""
+    """A film coefficient with its bulge, and what they predict."""
 
     unit: Unit
     rig_ms: float
@@ -50,7 +50,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Alone:
-    """What one change makes of the evacuation times of rig and application."""
+    """The evacuation times of rig and application after one change."""
 
     what: str
     rig_ms: float
@@ -59,27 +59,27 @@ class Alone:
 
 @dataclass(frozen=True)
 class Separation:
-    """All that is computed on what can be told apart."""
+    """All results on what can be separated."""
 
     alone: Sequence[Alone]
     pairs: Sequence[Pair]
-    film: float  # W/(m² K), of the pair looked at more closely
+    film: float  # W/(m² K), of the pair that is examined in detail
     delay_ms: float  # by which the printed rig is later than the recomputed one
     delayed_ms: float  # application, if the ejector responds that much later
     object_ms: float  # application, if its ejector is a mean one of the type
 
 
 def separate(delay_ms: float) -> Separation:
-    """Compute everything; ``delay_ms`` is a response delay that might be there."""
-    looked_at = fitted(FILM)
-    late = fitted(FILM, delay_ms)
-    mean = Unit(OBJECT_SL_MIN, looked_at.film, looked_at.bulge)
+    """Compute everything; ``delay_ms`` is a possible response delay."""
+    reference = fitted(FILM)
+    delayed = fitted(FILM, delay_ms)
+    mean = Unit(OBJECT_SL_MIN, reference.film, reference.bulge)
     return Separation(
-        alone=_alone(looked_at),
+        alone=_single_changes(reference),
         pairs=[_pair(fitted(film)) for film in FILMS],
         film=FILM,
         delay_ms=delay_ms,
-        delayed_ms=evacuation_ms(APPLICATION, late) + delay_ms,
+        delayed_ms=evacuation_ms(APPLICATION, delayed) + delay_ms,
         object_ms=evacuation_ms(APPLICATION, mean),
     )
 
@@ -87,19 +87,19 @@ def separate(delay_ms: float) -> Separation:
 def fitted(film: float, delay_ms: float = 0.0) -> Unit:
     """The unit whose bulge meets the rig's measured time at a ``film`` coefficient."""
 
-    def late(bulge: float) -> float:
+    def excess_ms(bulge: float) -> float:
         unit = Unit(INSTANCE_SL_MIN, film, bulge)
         return evacuation_ms(RIG, unit) + delay_ms - RIG.measured_ms
 
-    return Unit(INSTANCE_SL_MIN, film, float(brentq(late, 0.0, MOST_BULGE, xtol=1e-5)))
+    return Unit(INSTANCE_SL_MIN, film, float(brentq(excess_ms, 0.0, MOST_BULGE, xtol=1e-5)))
 
 
 def lost_in_hold(setup: Setup, unit: Unit) -> tuple[float, ...]:
     """Vacuum (mbar) lost at ``HOLDS_MS`` after the nozzle went off at the target."""
-    off = round(evacuation_ms(setup, unit))
-    p = pressures(setup, unit, off, HOLDS_MS[-1] + 100)
-    lowest = int(np.argmin(p))
-    return tuple(float(p[lowest + ms] - p[lowest]) / MBAR for ms in HOLDS_MS)
+    switch_off_ms = round(evacuation_ms(setup, unit))
+    pressures_pa = pressures(setup, unit, switch_off_ms, HOLDS_MS[-1] + 100)
+    lowest = int(np.argmin(pressures_pa))
+    return tuple(float(pressures_pa[lowest + ms] - pressures_pa[lowest]) / MBAR for ms in HOLDS_MS)
 
 
 def _pair(unit: Unit) -> Pair:
@@ -111,19 +111,19 @@ def _pair(unit: Unit) -> Pair:
         in_cups_ms=evacuation_ms(IN_CUPS, unit),
         big_ms=evacuation_ms(BIG, unit),
         lost_mbar=lost_in_hold(RIG, unit),
-        needed_sl_min=_needed(unit),
+        needed_sl_min=_needed_suction(unit),
     )
 
 
-def _needed(unit: Unit) -> float:
-    def late(suction: float) -> float:
-        other = Unit(suction, unit.film, unit.bulge)
-        return evacuation_ms(APPLICATION, other) - APPLICATION.measured_ms
+def _needed_suction(unit: Unit) -> float:
+    def excess_ms(suction: float) -> float:
+        variant = Unit(suction, unit.film, unit.bulge)
+        return evacuation_ms(APPLICATION, variant) - APPLICATION.measured_ms
 
-    return float(brentq(late, INSTANCE_SL_MIN, MOST_SUCTION, xtol=1e-3))
+    return float(brentq(excess_ms, INSTANCE_SL_MIN, MOST_SUCTION, xtol=1e-3))
 
 
-def _alone(unit: Unit) -> list[Alone]:
+def _single_changes(unit: Unit) -> list[Alone]:
     changes = (
         ("the paper's model", Unit()),
         (f"wall heat alone, {unit.film:g} W/(m² K)", Unit(film=unit.film)),
@@ -131,6 +131,6 @@ def _alone(unit: Unit) -> list[Alone]:
         ("both", unit),
     )
     return [
-        Alone(what, evacuation_ms(RIG, one), evacuation_ms(APPLICATION, one))
-        for what, one in changes
+        Alone(label, evacuation_ms(RIG, variant), evacuation_ms(APPLICATION, variant))
+        for label, variant in changes
     ]

@@ -36,12 +36,12 @@ class Row:
 
     @property
     def off_paper(self) -> float:
-        """Recomputed over printed, in % more."""
+        """Excess of the recomputed time over the printed one, in %."""
         return percent_more(self.twin_ms, self.paper_ms)
 
     @property
     def json(self) -> dict[str, object]:
-        """The row as it is written to a file."""
+        """The row as a JSON document."""
         return {
             "system": self.setup.name,
             "quantity": self.quantity,
@@ -51,7 +51,7 @@ class Row:
 
 
 def percent_more(this: float, than: float) -> float:
-    """How much more, in %."""
+    """Excess of ``this`` over ``than``, in %."""
     return 100.0 * (this / than - 1.0)
 
 
@@ -65,7 +65,7 @@ def recomputed() -> list[Row]:
 
 
 def late_by(rows: Sequence[Row]) -> float:
-    """By how many ms the rig's model, with the unit's data, is printed later than recomputed."""
+    """Delay (ms) of the printed over the recomputed rig model, with the unit's data."""
     (row,) = (row for row in rows if row.setup is RIG and row.quantity == QUANTITIES[-1])
     return row.paper_ms - row.twin_ms
 

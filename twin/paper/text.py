@@ -1,4 +1,4 @@
-"""What ``twin paper`` prints: plain text tables, 80 columns wide, and what they rest on."""
+"""The text of ``twin paper``: tables of 80 columns, with their assumptions and conclusions."""
 
 import textwrap
 from collections.abc import Iterable, Sequence
@@ -65,9 +65,11 @@ def _table(title: str, rows: Sequence[Row]) -> list[str]:
 
 
 def _row(row: Row) -> str:
-    printed, found = (percent_more(ms, row.setup.measured_ms) for ms in (row.paper_ms, row.twin_ms))
+    printed, recomputed = (
+        percent_more(ms, row.setup.measured_ms) for ms in (row.paper_ms, row.twin_ms)
+    )
     figures = f"{row.paper_ms:8.0f}{row.twin_ms:10.1f}{row.off_paper:+12.1f}"
-    return f"{row.quantity:26}{figures}{printed:+14.1f}{found:+10.1f}"
+    return f"{row.quantity:26}{figures}{printed:+14.1f}{recomputed:+10.1f}"
 
 
 def _assumptions(separation: Separation) -> list[str]:
@@ -100,12 +102,12 @@ def _alone(separation: Separation) -> list[str]:
         f"{'':36}{'ms':>10}{'change, %':>11}{'ms':>11}{'change, %':>11}",
     ]
     base = separation.alone[0]
-    for one in separation.alone:
-        rig = percent_more(one.rig_ms, base.rig_ms)
-        application = percent_more(one.application_ms, base.application_ms)
+    for change in separation.alone:
+        rig = percent_more(change.rig_ms, base.rig_ms)
+        application = percent_more(change.application_ms, base.application_ms)
         lines.append(
-            f"{one.what:36}{one.rig_ms:10.1f}{rig:+11.1f}"
-            f"{one.application_ms:11.1f}{application:+11.1f}"
+            f"{change.what:36}{change.rig_ms:10.1f}{rig:+11.1f}"
+            f"{change.application_ms:11.1f}{application:+11.1f}"
         )
     measured = f"{RIG.measured_ms:10.1f}{'':11}{APPLICATION.measured_ms:11.1f}"
     return [*lines, f"{'measured':36}{measured}"]
@@ -132,26 +134,32 @@ def _pair(pair: Pair) -> str:
 
 def _conclusions(separation: Separation) -> list[str]:
     pairs = separation.pairs
-    lumped, big = [pair.application_ms for pair in pairs], [pair.big_ms for pair in pairs]
-    needed, late = [pair.needed_sl_min for pair in pairs], [pair.lost_mbar[-1] for pair in pairs]
-    one = next(pair for pair in pairs if pair.unit.film == separation.film)
-    other_unit = separation.object_ms - one.application_ms
-    delayed = separation.delayed_ms - one.application_ms
+    vessel_ms, tank = (
+        [pair.application_ms for pair in pairs],
+        [pair.big_ms for pair in pairs],
+    )
+    suctions, losses = (
+        [pair.needed_sl_min for pair in pairs],
+        [pair.lost_mbar[-1] for pair in pairs],
+    )
+    reference = next(pair for pair in pairs if pair.unit.film == separation.film)
+    other_unit = separation.object_ms - reference.application_ms
+    delayed = separation.delayed_ms - reference.application_ms
     return [
         "They speak against the equations, and with a straight characteristic they demand an energy"
         f" balance: from an isothermal vessel the same flow takes {isothermal(RIG):.0f} and"
-        f" {isothermal(APPLICATION):.0f} ms, {_late(RIG):.0f} and {_late(APPLICATION):.0f} % too"
-        " long. With a bulge they demand no more: an almost isothermal gas"
+        f" {isothermal(APPLICATION):.0f} ms, {_excess(RIG):.0f} and {_excess(APPLICATION):.0f} %"
+        " too long. With a bulge they demand no more: an almost isothermal gas"
         f" ({pairs[-1].unit.film:g} W/(m² K)) meets the rig's time with a bulge of"
         f" {pairs[-1].unit.bulge:.2f}.",
         "The rig's time alone fixes a combination: to every film coefficient belongs a bulge.",
         "The application as one vessel only says it again: all pairs come to"
-        f" {_span(lumped, '.1f')} ms. Wall times time over volume is {_exposure(RIG):.0f} s/m on"
+        f" {_span(vessel_ms, '.1f')} ms. Wall times time over volume is {_exposure(RIG):.0f} s/m on"
         f" the rig and {_exposure(APPLICATION):.0f} s/m there, so heat and bulge weigh alike."
         f" A mean ejector of the type instead of this unit moves it by {other_unit:+.1f} ms, a"
         f" response delay of {separation.delay_ms:.0f} ms in both by {delayed:+.1f} ms.",
         f"No pair meets the {APPLICATION.measured_ms:.0f} ms so. It would take"
-        f" {_span(needed, '.1f')} sl/min, and the paper does not say that the ejector measured"
+        f" {_span(suctions, '.1f')} sl/min, and the paper does not say that the ejector measured"
         f" there was the one of {INSTANCE_SL_MIN} sl/min.",
         "With the hose as a line everything depends on where the pressure was read, which is not"
         f" said either: {_span([pair.at_ejector_ms for pair in pairs], '.0f')} ms at the ejector,"
@@ -160,11 +168,11 @@ def _conclusions(separation: Separation) -> list[str]:
         "So two times, from two systems and perhaps two ejectors, cannot tell heat, bulge, suction"
         " capacity, delay and hose apart.",
         "The hold phase can: after the nozzle goes off, a tight tank loses"
-        f" {_span(late, '.0f')} mbar of vacuum in 4 s, only because its gas warms up. How fast it"
+        f" {_span(losses, '.0f')} mbar of vacuum in 4 s, only because its gas warms up. How fast it"
         " levels off gives the film coefficient; a leak goes on instead.",
         "A second volume on the same unit can as well, if its size differs:"
-        f" {BIG.volume_ml / 1e3:g} l take {_span(big, '.0f')} ms. But the smallest and the largest"
-        f" film coefficient differ there by {abs(percent_more(big[0], big[-1])):.1f} % only, so"
+        f" {BIG.volume_ml / 1e3:g} l take {_span(tank, '.0f')} ms. But the smallest and the largest"
+        f" film coefficient differ there by {abs(percent_more(tank[0], tank[-1])):.1f} % only, so"
         " the hold is the surer way.",
         "Whole cycles, blow-off and idle included, tell wall heat and bulge apart on one volume:"
         " docs/founding-model.md takes the paper's model as the nominal one and lets a fit find"
@@ -172,19 +180,19 @@ def _conclusions(separation: Separation) -> list[str]:
     ]
 
 
-def _late(setup: Setup) -> float:
-    """By how many % an isothermal vessel misses the measured time."""
+def _excess(setup: Setup) -> float:
+    """Excess of an isothermal vessel over the measured time, in %."""
     return percent_more(isothermal(setup), setup.measured_ms)
 
 
 def _exposure(setup: Setup) -> float:
-    """Wall times measured time over volume, in s/m: how much heat counts."""
+    """Wall area × measured time / volume, in s/m: a measure of the influence of heat."""
     return setup.wall_cm2 * 1e-4 * setup.measured_ms * 1e-3 / (setup.volume_ml * 1e-6)
 
 
-def _span(values: Iterable[float], form: str) -> str:
+def _span(values: Iterable[float], number_format: str) -> str:
     ordered = sorted(values)
-    return f"{ordered[0]:{form}} to {ordered[-1]:{form}}"
+    return f"{ordered[0]:{number_format}} to {ordered[-1]:{number_format}}"
 
 
 def _paragraph(text: str) -> list[str]:
