@@ -1,1 +1,1 @@
-"""The model and its data in the forms other tools take."""
+"""The model and its data in the formats of other tools."""

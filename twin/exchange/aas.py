@@ -1,7 +1,7 @@
 """The asset database as Asset Administration Shells, in one AASX package, and back.
 
-A type has a shell, and so has each unit, derived from its type's. What a shell shows is the data
-set that holds; the submodel ``DataSets`` has all records of its asset as a file, so that nothing is
+Each type has a shell, and each unit has one that is derived from its type's. A shell shows the data
+set that holds. The submodel ``DataSets`` has all records of its asset as a file, so that nothing is
 lost.
 """
 
@@ -41,7 +41,7 @@ Store = model.DictIdentifiableStore[model.Identifiable]
 
 @dataclass(frozen=True)
 class Package:
-    """What a package brings: an export of a database, and FMUs by their places in the package."""
+    """Contents of a package: an export of a database, and FMUs by their paths in the package."""
 
     document: dict[str, Any]
     fmus: dict[str, bytes]
@@ -56,27 +56,27 @@ class _Asset:
 
     @property
     def shown(self) -> Record:
-        """What holds; of one that is yet to hold, what was recorded last."""
+        """The record that holds; the last recorded one if none holds yet."""
         return holding(self.records, self.now_ns) or self.records[-1]
 
-    def id(self, what: str) -> str:
-        """The same whenever this asset is exported: it hangs on its first record."""
-        return uuid5(UUID(hex=self.records[0].id), what).urn
+    def id(self, part: str) -> str:
+        """The id of a part, the same in every export: it depends on the asset's first record."""
+        return uuid5(UUID(hex=self.records[0].id), part).urn
 
     def place(self, file: str) -> str:
-        """Where a file of it stands in the package."""
+        """The path of one of its files in the package."""
         return f"/aasx/files/{UUID(self.id('shell')).hex}/{file}"
 
 
 def write_package(
     records: Iterable[Record], now_ns: int, fmus: Mapping[str, Fmu], logs: str
 ) -> bytes:
-    """The records as an AASX package, each asset showing what holds at a time (UTC).
+    """The records as an AASX package; each asset shows the data set that holds at a time (UTC).
 
-    ``fmus`` are simulation models by the name of their unit; ``logs`` is the address under which
-    logs are kept, or empty. ConfigError where a shell cannot hold a name.
+    ``fmus`` holds simulation models by the name of their unit. ``logs`` is the address of the
+    stored logs, or empty. ConfigError if a shell cannot hold a name.
     """
-    store, files = _nothing()
+    store, files = _empty_containers()
     assets = _by_asset(records, now_ns)
     try:
         shells = [_shell(asset, assets, fmus, logs, store, files) for asset in assets.values()]
@@ -85,21 +85,21 @@ def write_package(
             f"a shell cannot hold what the asset database has: {error}",
             "export it as JSON: twin assets export",
         ) from error
-    written = BytesIO()
-    with AASXWriter(written, failsafe=False) as writer:
+    package = BytesIO()
+    with AASXWriter(package, failsafe=False) as writer:
         writer.write_aas([shell.id for shell in shells], store, files, write_json=True)
-    return written.getvalue()
+    return package.getvalue()
 
 
-def _nothing() -> tuple[Store, DictSupplementaryFileContainer]:
+def _empty_containers() -> tuple[Store, DictSupplementaryFileContainer]:
     return model.DictIdentifiableStore(), DictSupplementaryFileContainer()  # type: ignore[no-untyped-call]
 
 
 def _by_asset(records: Iterable[Record], now_ns: int) -> dict[tuple[Kind, str], _Asset]:
-    found: dict[tuple[Kind, str], list[Record]] = {}
+    groups: dict[tuple[Kind, str], list[Record]] = {}
     for record in records:
-        found.setdefault((record.kind, record.name), []).append(record)
-    return {key: _Asset(of, now_ns) for key, of in found.items()}
+        groups.setdefault((record.kind, record.name), []).append(record)
+    return {key: _Asset(group, now_ns) for key, group in groups.items()}
 
 
 def _shell(
@@ -110,24 +110,24 @@ def _shell(
     store: Store,
     files: DictSupplementaryFileContainer,
 ) -> model.AssetAdministrationShell:
-    """The shell of an asset; it and its submodels go to ``store``, their files to ``files``."""
+    """The shell of an asset; adds it and its submodels to ``store``, their files to ``files``."""
     record = asset.shown
     submodels = [
         nameplate(asset.id("Nameplate"), asset.id("asset"), record),
         technical_data(asset.id("TechnicalData"), record),
         _data_sets(asset, files),
     ]
-    if of_logs := [one for one in asset.records if "log_sha256" in one.provenance]:
+    if of_logs := [item for item in asset.records if "log_sha256" in item.provenance]:
         submodels.append(time_series(asset.id("TimeSeries"), of_logs, logs))
     if record.kind == "instance" and (fmu := fmus.get(record.name)):
-        place = asset.place(f"{short(Path(fmu.name).stem)}.fmu")
-        files.add_file(place, BytesIO(fmu.content), MEDIA_TYPE)
-        submodels.append(simulation_models(asset.id("SimulationModels"), fmu, place))
+        fmu_path = asset.place(f"{short(Path(fmu.name).stem)}.fmu")
+        files.add_file(fmu_path, BytesIO(fmu.content), MEDIA_TYPE)
+        submodels.append(simulation_models(asset.id("SimulationModels"), fmu, fmu_path))
     shell = model.AssetAdministrationShell(
         _information(asset, assets),
         asset.id("shell"),
         short(record.name),
-        submodel={model.ModelReference.from_referable(one) for one in submodels},
+        submodel={model.ModelReference.from_referable(item) for item in submodels},
         derived_from=_derived_from(record, assets),
     )
     store.update([shell, *submodels])
@@ -161,41 +161,41 @@ def _derived_from(
 
 
 def _data_sets(asset: _Asset, files: DictSupplementaryFileContainer) -> model.Submodel:
-    """All records of an asset, as ``twin assets export`` has them."""
+    """A submodel with all records of an asset, in the format of ``twin assets export``."""
     content = json.dumps(to_export(asset.records), indent=1).encode()
-    place = files.add_file(asset.place("records.json"), BytesIO(content), JSON)
-    elements = [text("Format", FORMAT, FORMAT), link("Records", place, JSON, FORMAT)]
+    path = files.add_file(asset.place("records.json"), BytesIO(content), JSON)
+    elements = [text("Format", FORMAT, FORMAT), link("Records", path, JSON, FORMAT)]
     return submodel(asset.id("DataSets"), "DataSets", elements, FORMAT)
 
 
-# --- and back -----------------------------------------------------------------------------------
+# --- reading ------------------------------------------------------------------------------------
 
 
 def read_package(path: Path) -> Package:
-    """What an AASX package of ``write_package`` brings.
+    """The contents of an AASX package of ``write_package``.
 
-    SourceError where it cannot be read, ConfigError where it is none, is damaged, or was changed.
+    SourceError if it cannot be read; ConfigError if it is none, is damaged or was changed.
     """
-    store, files = _opened(path)
+    store, files = _open_package(path)
     exports, fmus = [], {}
-    for one in store:
-        if not isinstance(one, model.Submodel):
+    for item in store:
+        if not isinstance(item, model.Submodel):
             continue
-        if one.semantic_id == meaning(FORMAT):
-            exports.append(_export(path, one, files))
-        for place in _places(one, MEDIA_TYPE):
-            fmus[place] = _file(path, place, files)
+        if item.semantic_id == meaning(FORMAT):
+            exports.append(_export(path, item, files))
+        for fmu_path in _file_paths(item, MEDIA_TYPE):
+            fmus[fmu_path] = _file(path, fmu_path, files)
     if not exports:
         raise ConfigError(f"{path}: no shell in it has data sets of this program", HINT)
     records = [record for export in exports for record in export["records"]]
-    records.sort(key=lambda one: (one["recorded_ns"], one["id"]))
+    records.sort(key=lambda item: (item["recorded_ns"], item["id"]))
     document = {**exports[0], "records": records}
-    _refuse_changed(path, parse_export(document), store)
+    _check_unchanged(path, parse_export(document), store)
     return Package(document, fmus)
 
 
-def _opened(path: Path) -> tuple[Store, DictSupplementaryFileContainer]:
-    store, files = _nothing()
+def _open_package(path: Path) -> tuple[Store, DictSupplementaryFileContainer]:
+    store, files = _empty_containers()
     try:
         content = BytesIO(path.read_bytes())
     except OSError as error:
@@ -208,56 +208,56 @@ def _opened(path: Path) -> tuple[Store, DictSupplementaryFileContainer]:
             unzipped_within_budget(archive)
         with AASXReader(content, failsafe=False) as reader:
             reader.read_into(store, files)
-    except Exception as error:  # whatever the parsers of ZIP, OPC, XML and JSON have to say
-        what = f"{type(error).__name__}: {error}"
-        raise ConfigError(f"{path}: not a whole AASX package: {what}", HINT) from error
+    except Exception as error:  # the parsers of ZIP, OPC, XML and JSON raise many kinds
+        cause = f"{type(error).__name__}: {error}"
+        raise ConfigError(f"{path}: not a whole AASX package: {cause}", HINT) from error
     return store, files
 
 
 def _export(
     path: Path, data_sets: model.Submodel, files: DictSupplementaryFileContainer
 ) -> dict[str, Any]:
-    """The records of one asset; whether they are what was exported is for the database to say."""
-    for place in _places(data_sets, JSON):
+    """The records of one asset; the database checks later whether they were changed."""
+    for file_path in _file_paths(data_sets, JSON):
         try:
-            document = json.loads(_file(path, place, files))
+            document = json.loads(_file(path, file_path, files))
             parse_export(document)
         except (ValueError, RecursionError) as error:
-            raise ConfigError(f"{path}: {place}: not valid JSON: {error}", HINT) from error
+            raise ConfigError(f"{path}: {file_path}: not valid JSON: {error}", HINT) from error
         return dict(document)
     raise ConfigError(f"{path}: the data sets of {data_sets.id} are missing", HINT)
 
 
-def _places(one: model.Submodel, content: str) -> list[str]:
-    """Where the files of a kind stand that a submodel names."""
-    pending: list[Any] = list(one.submodel_element)
-    found = []
+def _file_paths(data_submodel: model.Submodel, content: str) -> list[str]:
+    """The paths of a submodel's files of one content type."""
+    pending: list[Any] = list(data_submodel.submodel_element)
+    paths = []
     while pending:
         element = pending.pop()
         if isinstance(element, model.File) and element.content_type == content and element.value:
-            found.append(element.value)
+            paths.append(element.value)
         elif isinstance(element, model.SubmodelElementCollection):
             pending += element.value
-    return found
+    return paths
 
 
-def _file(path: Path, place: str, files: DictSupplementaryFileContainer) -> bytes:
+def _file(path: Path, file_path: str, files: DictSupplementaryFileContainer) -> bytes:
     content = BytesIO()
     try:
-        files.write_file(place, content)
+        files.write_file(file_path, content)
     except KeyError as error:
-        raise ConfigError(f"{path}: {place} is not in the package", HINT) from error
+        raise ConfigError(f"{path}: {file_path} is not in the package", HINT) from error
     return content.getvalue()
 
 
-def _refuse_changed(path: Path, records: Sequence[Record], store: Store) -> None:
-    """ConfigError where technical data are not those of any record: their change would be lost."""
+def _check_unchanged(path: Path, records: Sequence[Record], store: Store) -> None:
+    """ConfigError if technical data match no record: their change would be lost."""
     for (_, name), asset in _by_asset(records, 0).items():
-        shown = store.get(asset.id("TechnicalData"))
-        if not isinstance(shown, model.Submodel):
+        stored = store.get(asset.id("TechnicalData"))
+        if not isinstance(stored, model.Submodel):
             continue
-        given = {_plain(one) for one in shown.submodel_element if one.id_short == _AREAS}
-        if given and not given & {_plain(technical_areas(one)) for one in asset.records}:
+        areas = {_plain(entry) for entry in stored.submodel_element if entry.id_short == _AREAS}
+        if areas and not areas & {_plain(technical_areas(entry)) for entry in asset.records}:
             raise ConfigError(
                 f"{path}: the technical data of {name!r} were changed, and are not those of any of"
                 " its data sets",

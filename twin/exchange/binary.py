@@ -1,4 +1,4 @@
-"""The binary of an FMU, where a C compiler is at hand."""
+"""Compiles the binary of an FMU, if a C compiler is available."""
 
 import platform
 import shutil
@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from twin.errors import TwinError
 
-COMPILERS = ("cc", "gcc", "clang")  # the first one that is there
+COMPILERS = ("cc", "gcc", "clang")  # the first available one is used
 FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden")
 
 
@@ -24,31 +24,31 @@ class Binary(NamedTuple):
 def binary(sources: Mapping[str, str], main: str, identifier: str, version: int) -> Binary | None:
     """Compile ``main`` of the sources for this machine; None without a compiler.
 
-    TwinError with the compiler's first complaint if it does not take them.
+    TwinError with the compiler's first error if it rejects them.
     """
     compiler = next(filter(None, map(shutil.which, COMPILERS)), None)
-    place = _place(version)
-    if compiler is None or place is None:
+    platform_folder = _platform_folder(version)
+    if compiler is None or platform_folder is None:
         return None
     with tempfile.TemporaryDirectory() as folder:
         for name, text in sources.items():
             (Path(folder) / name).write_text(text, encoding="utf-8")
         output = Path(folder) / f"{identifier}.so"
         command = [compiler, *FLAGS, "-o", str(output), main, "-lm"]
-        done = subprocess.run(  # noqa: S603 - found on the path, our own sources
+        result = subprocess.run(  # noqa: S603 - found on the path, our own sources
             command, cwd=folder, capture_output=True, text=True, check=False
         )
-        if done.returncode != 0:
-            said = (done.stderr.strip().splitlines() or ["no reason given"])[0]
+        if result.returncode != 0:
+            complaint = (result.stderr.strip().splitlines() or ["no reason given"])[0]
             raise TwinError(
-                f"{compiler} does not compile the FMU: {said}",
+                f"{compiler} does not compile the FMU: {complaint}",
                 "leave the binary out with --sources-only; the importing tool may compile it",
             )
-        return Binary(f"binaries/{place}/{output.name}", output.read_bytes())
+        return Binary(f"binaries/{platform_folder}/{output.name}", output.read_bytes())
 
 
-def _place(version: int) -> str | None:
-    """The folder of this platform: FMI 3.0 has names for more of them than FMI 2.0."""
+def _platform_folder(version: int) -> str | None:
+    """The folder of this platform in an FMU; FMI 3.0 names more platforms than FMI 2.0."""
     machine = platform.machine().lower()
     if platform.system() != "Linux":
         return None

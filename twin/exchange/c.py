@@ -1,4 +1,4 @@
-"""What C is made of here: kinds of values, expressions, declarations."""
+"""Building blocks of the generated C: kinds of values, expressions and declarations."""
 
 import math
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ _NAMED_BY_C = {"nan": "NAN", "inf": "INFINITY"}
 
 
 class Untranslatable(Exception):  # noqa: N818 - says what the source has, not that something broke
-    """A passage of the source that has no translation, with its place."""
+    """A passage of the source without a translation, with its file and line."""
 
 
 class Value(NamedTuple):
@@ -28,24 +28,24 @@ class Value(NamedTuple):
     binds: int = ATOM
 
     def inside(self, binds: int) -> str:
-        """The text as an operand of an operator that binds so tightly."""
+        """The text as an operand of an operator with that precedence."""
         return self.text if self.binds >= binds else f"({self.text})"
 
 
 @dataclass
 class Declarations:
-    """Constants and structures, each once and before it is used."""
+    """Constants and structures; each is declared once, before its first use."""
 
     _numbers: dict[str, float] = field(default_factory=dict)
     _structs: dict[str, str] = field(default_factory=dict)
 
     def constant(self, module: str, name: str, value: float) -> Value:
-        """A number that has a name in a module."""
+        """A named number of a module."""
         if name in _NAMED_BY_C:
             return Value(_NAMED_BY_C[name], NUMBER)
-        known = named(module, name).upper()
-        self._numbers[known] = value
-        return Value(known, WHOLE if isinstance(value, int) else NUMBER)
+        c_name = named(module, name).upper()
+        self._numbers[c_name] = value
+        return Value(c_name, WHOLE if isinstance(value, int) else NUMBER)
 
     def type_of(self, kind: Kind) -> str:
         """The type in C of a kind; structures are declared at their first use."""
@@ -54,38 +54,41 @@ class Declarations:
         if kind in (ROWS, LANE, TABLES):
             return "double *"
         if isinstance(kind, tuple):
-            words = [one if isinstance(one, str) else one.__name__ for one in kind]
+            words = [part if isinstance(part, str) else part.__name__ for part in kind]
             name, fields = "_".join(words), [f"a{n}" for n in range(len(kind))]
-            types = [self.type_of(one) for one in kind]
+            types = [self.type_of(part) for part in kind]
         else:
             name, fields = kind.__name__, kind._fields
             types = [NUMBER] * len(fields)
-        lines = [f"    {declared(of, one)};" for of, one in zip(types, fields, strict=True)]
+        lines = [
+            f"    {declared(type_name, part)};"
+            for type_name, part in zip(types, fields, strict=True)
+        ]
         self._structs[name] = "\n".join([f"struct {name} {{", *lines, "};"])
         return f"struct {name}"
 
     def text(self) -> str:
-        """All of them in C."""
-        whole = [f"    {name} = {value}," for name, value in self._of(int)]
+        """All declarations in C."""
+        integers = [f"    {name} = {value}," for name, value in self._of(int)]
         numbers = [
             f"static const double {name} = {literal(value)};" for name, value in self._of(float)
         ]
         return "\n\n".join(
-            ["\n".join(["enum {", *whole, "};"]), "\n".join(numbers), *self._structs.values()]
+            ["\n".join(["enum {", *integers, "};"]), "\n".join(numbers), *self._structs.values()]
         )
 
     def _of(self, kind: type) -> list[tuple[str, float]]:
-        return sorted(one for one in self._numbers.items() if isinstance(one[1], kind))
+        return sorted(item for item in self._numbers.items() if isinstance(item[1], kind))
 
 
 def named(module: str, name: str) -> str:
-    """The name in C of what a module of ours has."""
+    """The C name of an object in one of the model's modules."""
     return f"{module.rsplit('.', 1)[-1]}_{name.strip('_')}"
 
 
-def declared(of: str, name: str) -> str:
-    """A declaration."""
-    return f"{of}{name}" if of.endswith("*") else f"{of} {name}"
+def declared(type_name: str, name: str) -> str:
+    """A declaration in C."""
+    return f"{type_name}{name}" if type_name.endswith("*") else f"{type_name} {name}"
 
 
 def literal(value: float) -> str:
@@ -95,12 +98,12 @@ def literal(value: float) -> str:
     return repr(value)
 
 
-def joined(one: Kind, two: Kind) -> Kind:
+def joined(first: Kind, second: Kind) -> Kind:
     """The kind that holds both."""
-    if one is None or one == two:
-        return two
-    if isinstance(one, tuple) and isinstance(two, tuple) and len(one) == len(two):
-        return tuple(joined(a, b) for a, b in zip(one, two, strict=True))
-    if {one, two} == {NUMBER, WHOLE}:
+    if first is None or first == second:
+        return second
+    if isinstance(first, tuple) and isinstance(second, tuple) and len(first) == len(second):
+        return tuple(joined(a, b) for a, b in zip(first, second, strict=True))
+    if {first, second} == {NUMBER, WHOLE}:
         return NUMBER
-    raise Untranslatable(f"{one} and {two} have no kind in common")
+    raise Untranslatable(f"{first} and {second} have no kind in common")

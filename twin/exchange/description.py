@@ -1,4 +1,4 @@
-"""What an FMU says of itself: modelDescription.xml for FMI 3.0 and 2.0, buildDescription.xml."""
+"""The description of an FMU: modelDescription.xml for FMI 3.0 and 2.0, buildDescription.xml."""
 
 import math
 from collections.abc import Sequence
@@ -15,35 +15,35 @@ LICENSE = "Apache-2.0"
 
 @dataclass(frozen=True)
 class Identity:
-    """Of which asset an FMU is, by which program, and what ties its parts together."""
+    """The asset and program of an FMU, and the token that ties its parts together."""
 
-    name: str  # as people call it
-    identifier: str  # the same as C and file systems take it
+    name: str  # for people
+    identifier: str  # the name in a form valid for C and file systems
     origin: str  # where the data set is from, in words
     program: str
     token: str
 
 
 def model_description(
-    component: Component, who: Identity, version: int, files: Sequence[str]
+    component: Component, identity: Identity, version: int, files: Sequence[str]
 ) -> bytes:
     """modelDescription.xml; ``files`` are the sources to compile."""
-    return as_xml(_fmi3(component, who) if version == 3 else _fmi2(component, who, files))
+    return as_xml(_fmi3(component, identity) if version == 3 else _fmi2(component, identity, files))
 
 
-def build_description(who: Identity, files: Sequence[str]) -> bytes:
+def build_description(identity: Identity, files: Sequence[str]) -> bytes:
     """sources/buildDescription.xml of FMI 3.0."""
     root = Element("fmiBuildDescription", fmiVersion="3.0")
-    build = SubElement(root, "BuildConfiguration", modelIdentifier=who.identifier)
-    together = SubElement(build, "SourceFileSet", language="C99")
+    build = SubElement(root, "BuildConfiguration", modelIdentifier=identity.identifier)
+    file_set = SubElement(build, "SourceFileSet", language="C99")
     for file in files:
-        SubElement(together, "SourceFile", name=file)
+        SubElement(file_set, "SourceFile", name=file)
     SubElement(build, "Library", name="m", external="true", description="mathematics")
     return as_xml(root)
 
 
 def as_xml(root: Element) -> bytes:
-    """A document, for people to read as well."""
+    """An XML document, indented for people."""
     indent(root)
     text: bytes = tostring(root, encoding="UTF-8", xml_declaration=True)
     return text + b"\n"
@@ -55,8 +55,8 @@ def units(names: Sequence[str], parent: Element, tag: str = "", *, shown: bool =
         unit = SubElement(parent, f"{tag}Unit", name=name)
         base = {kind: str(exponent) for kind, exponent in UNITS[name].base.items()}
         SubElement(unit, f"{tag}BaseUnit", base | _factor(UNITS[name].factor))
-        for other, factor in UNITS[name].shown.items() if shown else ():
-            SubElement(unit, "DisplayUnit", {"name": other} | _factor(factor))
+        for display_name, factor in UNITS[name].shown.items() if shown else ():
+            SubElement(unit, "DisplayUnit", {"name": display_name} | _factor(factor))
 
 
 def number(value: float) -> str:
@@ -68,13 +68,15 @@ def _factor(factor: float) -> dict[str, str]:
     return {} if factor == 1.0 else {"factor": number(factor)}
 
 
-def _common(component: Component, who: Identity) -> dict[str, str]:
-    where = "with the vessel inside" if component.where == "inside" else "with a port for a vessel"
+def _common(component: Component, identity: Identity) -> dict[str, str]:
+    boundary = (
+        "with the vessel inside" if component.where == "inside" else "with a port for a vessel"
+    )
     return {
-        "modelName": who.name,
-        "description": f"{WORDS}; {where}; data: {who.origin}",
+        "modelName": identity.name,
+        "description": f"{WORDS}; {boundary}; data: {identity.origin}",
         "license": LICENSE,
-        "generationTool": who.program,
+        "generationTool": identity.program,
         "variableNamingConvention": "structured",
     }
 
@@ -87,94 +89,105 @@ def _experiment(root: Element) -> None:
     SubElement(root, "DefaultExperiment", startTime="0.0", stopTime="10.0", stepSize=number(MS))
 
 
-def _bounds(one: Variable) -> dict[str, str]:
-    """Bounds of what may be set; what is read is as it is."""
-    if one.is_output or one.truth:
+def _bounds(variable: Variable) -> dict[str, str]:
+    """Bounds of a variable that may be set; outputs have none."""
+    if variable.is_output or variable.truth:
         return {}
-    form = (lambda value: str(int(value))) if one.choices else number
-    known = {"min": one.low, "max": one.high}
-    return {key: form(value) for key, value in known.items() if math.isfinite(value)}
+    to_text = (lambda value: str(int(value))) if variable.choices else number
+    bounds = {"min": variable.low, "max": variable.high}
+    return {key: to_text(value) for key, value in bounds.items() if math.isfinite(value)}
 
 
-def _start(one: Variable) -> str:
-    if one.truth:
-        return "true" if one.start else "false"
-    return str(int(one.start)) if one.choices else number(one.start)
+def _start(variable: Variable) -> str:
+    if variable.truth:
+        return "true" if variable.start else "false"
+    return str(int(variable.start)) if variable.choices else number(variable.start)
 
 
-def _measure(one: Variable) -> dict[str, str]:
-    return ({"unit": one.unit} if one.unit else {}) | (
-        {"displayUnit": one.shown} if one.shown else {}
+def _measure(variable: Variable) -> dict[str, str]:
+    return ({"unit": variable.unit} if variable.unit else {}) | (
+        {"displayUnit": variable.shown} if variable.shown else {}
     )
 
 
-def _head(one: Variable, reference: int) -> dict[str, str]:
-    causality, variability = one.role.value
-    head = {"name": one.name, "valueReference": str(reference), "description": one.words}
-    head |= {"causality": causality, "variability": variability}
-    return head | ({"initial": "calculated"} if one.is_output else {})
+def _head(variable: Variable, reference: int) -> dict[str, str]:
+    causality, variability = variable.role.value
+    attributes = {
+        "name": variable.name,
+        "valueReference": str(reference),
+        "description": variable.words,
+    }
+    attributes |= {"causality": causality, "variability": variability}
+    return attributes | ({"initial": "calculated"} if variable.is_output else {})
 
 
 # --- FMI 3.0 ------------------------------------------------------------------------------------
 
 
-def _fmi3(component: Component, who: Identity) -> Element:
-    head = {"fmiVersion": "3.0", "instantiationToken": who.token} | _common(component, who)
-    root = Element("fmiModelDescription", head)
+def _fmi3(component: Component, identity: Identity) -> Element:
+    attributes = {"fmiVersion": "3.0", "instantiationToken": identity.token} | _common(
+        component, identity
+    )
+    root = Element("fmiModelDescription", attributes)
     SubElement(
         root,
         "CoSimulation",
-        modelIdentifier=who.identifier,
+        modelIdentifier=identity.identifier,
         canGetAndSetFMUState="true",
         canSerializeFMUState="true",
         canHandleVariableCommunicationStepSize="true",
         fixedInternalStepSize=number(MS),
     )
-    units([*(one.unit for one in component.variables), "s"], SubElement(root, "UnitDefinitions"))
+    units(
+        [*(variable.unit for variable in component.variables), "s"],
+        SubElement(root, "UnitDefinitions"),
+    )
     types = SubElement(root, "TypeDefinitions")
-    for one in component.variables:
-        if one.choices:
-            kind = SubElement(types, "EnumerationType", name=one.type_name)
-            for name, value in one.choices.items():
+    for variable in component.variables:
+        if variable.choices:
+            kind = SubElement(types, "EnumerationType", name=variable.type_name)
+            for name, value in variable.choices.items():
                 SubElement(kind, "Item", name=name, value=str(value))
     _experiment(root)
     variables = SubElement(root, "ModelVariables")
-    for reference, one in enumerate(component.variables):
-        _variable3(variables, one, reference)
+    for reference, variable in enumerate(component.variables):
+        _variable3(variables, variable, reference)
     time = {"name": "time", "valueReference": str(len(component.variables))}
     time |= {"causality": "independent", "variability": "continuous", "unit": "s"}
     SubElement(variables, "Float64", time)
     structure = SubElement(root, "ModelStructure")
-    outputs = [str(n) for n, one in enumerate(component.variables) if one.is_output]
-    for output in outputs:  # nothing passes through at once
+    outputs = [str(n) for n, variable in enumerate(component.variables) if variable.is_output]
+    for output in outputs:  # no output depends directly on an input
         SubElement(structure, "Output", valueReference=output, dependencies="")
     for output in outputs:
         SubElement(structure, "InitialUnknown", valueReference=output)
     return root
 
 
-def _variable3(variables: Element, one: Variable, reference: int) -> None:
-    head = _head(one, reference)
-    start = {} if one.is_output else {"start": _start(one)}
-    if one.truth:
-        SubElement(variables, "Boolean", head | start)
-    elif one.choices:
-        kind = {"declaredType": one.type_name}
-        SubElement(variables, "Enumeration", head | kind | _bounds(one) | start)
+def _variable3(variables: Element, variable: Variable, reference: int) -> None:
+    attributes = _head(variable, reference)
+    start = {} if variable.is_output else {"start": _start(variable)}
+    if variable.truth:
+        SubElement(variables, "Boolean", attributes | start)
+    elif variable.choices:
+        kind = {"declaredType": variable.type_name}
+        SubElement(variables, "Enumeration", attributes | kind | _bounds(variable) | start)
     else:
-        SubElement(variables, "Float64", head | _measure(one) | _bounds(one) | start)
+        SubElement(
+            variables, "Float64", attributes | _measure(variable) | _bounds(variable) | start
+        )
 
 
 # --- FMI 2.0 ------------------------------------------------------------------------------------
 
 
-def _fmi2(component: Component, who: Identity, files: Sequence[str]) -> Element:
-    head = {"fmiVersion": "2.0", "guid": who.token} | _common(component, who)
-    root = Element("fmiModelDescription", head)
+def _fmi2(component: Component, identity: Identity, files: Sequence[str]) -> Element:
+    attributes = {"fmiVersion": "2.0", "guid": identity.token} | _common(component, identity)
+    root = Element("fmiModelDescription", attributes)
     simulation = SubElement(
         root,
         "CoSimulation",
-        modelIdentifier=who.identifier,
+        modelIdentifier=identity.identifier,
         canHandleVariableCommunicationStepSize="true",
         canNotUseMemoryManagementFunctions="true",
         canGetAndSetFMUstate="true",
@@ -183,19 +196,21 @@ def _fmi2(component: Component, who: Identity, files: Sequence[str]) -> Element:
     listed = SubElement(simulation, "SourceFiles")
     for file in files:
         SubElement(listed, "File", name=file)
-    units([one.unit for one in component.variables], SubElement(root, "UnitDefinitions"))
+    units([variable.unit for variable in component.variables], SubElement(root, "UnitDefinitions"))
     types = SubElement(root, "TypeDefinitions")
-    for one in component.variables:
-        if one.choices:
-            kind = SubElement(SubElement(types, "SimpleType", name=one.type_name), "Enumeration")
-            for name, value in one.choices.items():
+    for variable in component.variables:
+        if variable.choices:
+            kind = SubElement(
+                SubElement(types, "SimpleType", name=variable.type_name), "Enumeration"
+            )
+            for name, value in variable.choices.items():
                 SubElement(kind, "Item", name=name, value=str(value))
     _experiment(root)
     variables = SubElement(root, "ModelVariables")
-    for reference, one in enumerate(component.variables):
-        _variable2(SubElement(variables, "ScalarVariable", _head(one, reference)), one)
+    for reference, variable in enumerate(component.variables):
+        _variable2(SubElement(variables, "ScalarVariable", _head(variable, reference)), variable)
     structure = SubElement(root, "ModelStructure")
-    outputs = [str(n) for n, one in enumerate(component.variables, 1) if one.is_output]
+    outputs = [str(n) for n, variable in enumerate(component.variables, 1) if variable.is_output]
     listed = SubElement(structure, "Outputs")
     for index in outputs:
         SubElement(listed, "Unknown", index=index, dependencies="")
@@ -205,12 +220,12 @@ def _fmi2(component: Component, who: Identity, files: Sequence[str]) -> Element:
     return root
 
 
-def _variable2(variable: Element, one: Variable) -> None:
-    start = {} if one.is_output else {"start": _start(one)}
-    if one.truth:
-        SubElement(variable, "Boolean", start)
-    elif one.choices:
-        kind = {"declaredType": one.type_name}
-        SubElement(variable, "Enumeration", kind | _bounds(one) | start)
+def _variable2(parent: Element, variable: Variable) -> None:
+    start = {} if variable.is_output else {"start": _start(variable)}
+    if variable.truth:
+        SubElement(parent, "Boolean", start)
+    elif variable.choices:
+        kind = {"declaredType": variable.type_name}
+        SubElement(parent, "Enumeration", kind | _bounds(variable) | start)
     else:
-        SubElement(variable, "Real", _measure(one) | _bounds(one) | start)
+        SubElement(parent, "Real", _measure(variable) | _bounds(variable) | start)

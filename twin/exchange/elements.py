@@ -1,4 +1,4 @@
-"""Submodels and their elements in few words; what they mean is said by a ``semanticId``."""
+"""Short constructors of submodels and their elements; a ``semanticId`` gives each a meaning."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -9,7 +9,9 @@ from basyx.aas.model import datatypes
 
 Element = model.SubmodelElement
 
-ARBITRARY = "https://admin-shell.io/SMT/General/Arbitrary"  # what no dictionary has a word for
+ARBITRARY = (
+    "https://admin-shell.io/SMT/General/Arbitrary"  # for elements that no dictionary defines
+)
 MOST_TEXT, MOST_NAME = 1000, 128  # characters, of a text in a language and of an idShort
 
 _NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9_]")
@@ -17,7 +19,7 @@ _NOT_IN_TEXTS = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010fff
 
 
 def meaning(identifier: str) -> model.ExternalReference:
-    """A reference to what something means."""
+    """A reference to a meaning."""
     return model.ExternalReference((model.Key(model.KeyTypes.GLOBAL_REFERENCE, identifier),))
 
 
@@ -41,64 +43,68 @@ def listed(name: str, groups: Iterable[Element], semantic: str) -> Element:
 
 
 def typed(name: str, kind: Any, value: object, semantic: str) -> Element:
-    """A value of a type of XML Schema; None where it is not known."""
-    given = None if value is None else kind(value)
-    return model.Property(name, kind, given, semantic_id=meaning(semantic))
+    """A value of a type of XML Schema; None if it is unknown."""
+    converted = None if value is None else kind(value)
+    return model.Property(name, kind, converted, semantic_id=meaning(semantic))
 
 
 def text(name: str, value: str | None, semantic: str) -> Element:
-    """A text; None where it is not known."""
+    """A text; None if it is unknown."""
     return typed(name, datatypes.String, value, semantic)
 
 
 def words(name: str, value: str | None, semantic: str) -> Element:
-    """A text in a language, here English; None where it is not known."""
-    said = model.MultiLanguageTextType({"en": _shown(value)[:MOST_TEXT]}) if value else None
-    return model.MultiLanguageProperty(name, said, semantic_id=meaning(semantic))
+    """A text in a language, here English; None if it is unknown."""
+    translations = model.MultiLanguageTextType({"en": _shown(value)[:MOST_TEXT]}) if value else None
+    return model.MultiLanguageProperty(name, translations, semantic_id=meaning(semantic))
 
 
-def link(name: str, where: str, content: str, semantic: str) -> Element:
+def link(name: str, path: str, content: str, semantic: str) -> Element:
     """A file, in the package or elsewhere; ``content`` is its media type."""
-    return model.File(name, content, where, semantic_id=meaning(semantic))
+    return model.File(name, content, path, semantic_id=meaning(semantic))
 
 
 def numbers(name: str, values: Iterable[float]) -> Element:
     """A list of numbers."""
     kind = datatypes.Double
-    each = (model.Property(None, kind, float(one)) for one in values)
+    properties = (model.Property(None, kind, float(number)) for number in values)
     return model.SubmodelElementList(
-        name, model.Property, each, value_type_list_element=kind, semantic_id=meaning(ARBITRARY)
+        name,
+        model.Property,
+        properties,
+        value_type_list_element=kind,
+        semantic_id=meaning(ARBITRARY),
     )
 
 
 def tree(table: Mapping[str, Any]) -> list[Element]:
-    """Nested tables as nested collections; what is null or empty is left out."""
+    """Nested tables as nested collections, without null and empty values."""
     named: dict[str, Any] = {}
     for key, value in table.items():
         name = short(key)
         while name in named:
             name = short(f"{name}_")
         named[name] = _branch(name, value)
-    return [one for one in named.values() if one is not None]
+    return [element for element in named.values() if element is not None]
 
 
 def short(name: str) -> str:
-    """A name as an idShort can be: letters, digits and underscores, a letter first."""
+    """A name as a valid idShort: letters, digits and underscores, a letter first."""
     plain = _NOT_IN_NAMES.sub("_", name)
     return (plain if re.match("[A-Za-z]", plain) else f"x_{plain}")[:MOST_NAME]
 
 
 def _branch(name: str, value: Any) -> Element | None:
-    if isinstance(value, list) and value and all(_is_number(one) for one in value):
+    if isinstance(value, list) and value and all(_is_number(item) for item in value):
         return numbers(name, value)
     if isinstance(value, list):
-        value = {f"{name}_{place}": one for place, one in enumerate(value)}
+        value = {f"{name}_{index}": item for index, item in enumerate(value)}
     if isinstance(value, Mapping):
         inner = tree(value)
         return group(name, inner, ARBITRARY) if inner else None
     if isinstance(value, str):
         return text(name, _shown(value), ARBITRARY)
-    kind = next((one for one in (bool, int, float) if isinstance(value, one)), None)
+    kind = next((item for item in (bool, int, float) if isinstance(value, item)), None)
     return None if kind is None else typed(name, kind, value, ARBITRARY)  # True is an int as well
 
 
@@ -106,6 +112,6 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _shown(said: str) -> str:
-    """Without the characters that shells cannot hold."""
-    return _NOT_IN_TEXTS.sub("\ufffd", said)
+def _shown(value: str) -> str:
+    """The text without characters that shells cannot hold."""
+    return _NOT_IN_TEXTS.sub("\ufffd", value)

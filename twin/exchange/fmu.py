@@ -12,13 +12,13 @@ from twin.exchange.page import page
 from twin.exchange.sources import main_source, sources
 from twin.exchange.variables import Component
 
-BEGINNING = (1980, 1, 1, 0, 0, 0)  # the time of every file inside: same content, same FMU
+BEGINNING = (1980, 1, 1, 0, 0, 0)  # fixed time of every file inside: same content, same FMU
 VERSIONS = (3, 2)
 
 
 @dataclass(frozen=True)
 class Fmu:
-    """A whole FMU, its file name, and where its binary is, if it has one."""
+    """A whole FMU, its file name, and the path of its binary, if it has one."""
 
     name: str
     content: bytes
@@ -30,26 +30,26 @@ def make_fmu(
 ) -> Fmu:
     """The FMU of a component called ``name``, for FMI 3.0 or 2.0.
 
-    Where there is no compiler, or ``compiled`` is not asked for, it has sources alone.
+    Without a compiler, or without ``compiled``, it contains only sources.
     """
     texts, token = sources(component, version)
-    who = Identity(name, identifier(name), origin, program, token)
+    identity = Identity(name, identifier(name), origin, program, token)
     main = main_source(version)
-    built = binary(texts, main, who.identifier, version) if compiled else None
+    built = binary(texts, main, identity.identifier, version) if compiled else None
     parts = {
-        "modelDescription.xml": model_description(component, who, version, [main]),
-        "documentation/index.html": page(component, who).encode(),
+        "modelDescription.xml": model_description(component, identity, version, [main]),
+        "documentation/index.html": page(component, identity).encode(),
         **{f"sources/{file}": text.encode() for file, text in texts.items()},
     }
     if version == 3:
-        parts["sources/buildDescription.xml"] = build_description(who, [main])
+        parts["sources/buildDescription.xml"] = build_description(identity, [main])
     if built is not None:
         parts[built.path] = built.content
-    return Fmu(f"{who.identifier}.fmu", packed(parts), built.path if built else "")
+    return Fmu(f"{identity.identifier}.fmu", packed(parts), built.path if built else "")
 
 
 def identifier(name: str) -> str:
-    """A name as C and file systems take it."""
+    """A name in a form valid for C and file systems."""
     plain = re.sub(r"[^A-Za-z0-9_]", "_", name)
     return plain if plain[:1].isalpha() else f"ejector_{plain}"
 

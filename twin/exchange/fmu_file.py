@@ -1,4 +1,4 @@
-"""A simulation model as an FMU, as far as a shell says what it is."""
+"""Reads from an FMU what a shell says about it."""
 
 import zipfile
 from dataclasses import dataclass
@@ -12,33 +12,33 @@ from twin.files import unzipped_within_budget
 
 DESCRIPTION = "modelDescription.xml"
 MEDIA_TYPE = "application/x-fmu-sharedlibrary"
-_WAYS = {"CoSimulation": "Co-Simulation", "ModelExchange": "Model Exchange"}
+_MODES = {"CoSimulation": "Co-Simulation", "ModelExchange": "Model Exchange"}
 
 
 @dataclass(frozen=True)
 class Fmu:
-    """An FMU and what it says of itself."""
+    """An FMU and facts from its description."""
 
     name: str  # of its file
     content: bytes
-    version: str  # of the model, empty where it does not say
+    version: str  # of the model, empty if not given
     fmi: str  # version of the standard
-    ways: tuple[str, ...]  # in which it can be run
+    ways: tuple[str, ...]  # modes in which it can run
 
     @property
     def kind(self) -> str:
-        """As the template has it: FMI 2.0, Co-Simulation."""
+        """The kind in the template's form: FMI 2.0, Co-Simulation."""
         return ", ".join([f"FMI {self.fmi}", *self.ways])
 
 
 def read_fmu(path: Path) -> Fmu:
-    """An FMU from a file; SourceError where it cannot be read, ConfigError where it is none."""
+    """An FMU from a file; SourceError if it cannot be read, ConfigError if it is no FMU."""
     try:
         content = path.read_bytes()
     except OSError as error:
         message = f"{path}: cannot be read: {error.strerror}"
         raise SourceError(message, "check the path") from error
-    # Whatever stands in the file, no entity of it is resolved.
+    # The file may come from anywhere, so no entity in it is resolved.
     parser = etree.XMLParser(resolve_entities=False, no_network=True)
     try:
         with zipfile.ZipFile(BytesIO(content)) as archive:
@@ -48,5 +48,5 @@ def read_fmu(path: Path) -> Fmu:
     except (zipfile.BadZipFile, KeyError, etree.XMLSyntaxError, OSError, ValueError) as error:
         hint = "take what twin export-fmu, or another program that exports FMUs, has written"
         raise ConfigError(f"{path}: not an FMU: {error}", hint) from error
-    ways = tuple(words for tag, words in _WAYS.items() if root.find(tag) is not None)
-    return Fmu(path.name, content, root.get("version", ""), fmi, ways)
+    modes = tuple(mode for tag, mode in _MODES.items() if root.find(tag) is not None)
+    return Fmu(path.name, content, root.get("version", ""), fmi, modes)

@@ -1,4 +1,4 @@
-"""The page on an FMU that is inside it: what it is, how to use it, every variable."""
+"""The documentation page inside an FMU: what it is, how to use it, every variable."""
 
 import html
 import math
@@ -54,47 +54,58 @@ _TITLES: Mapping[str, tuple[Role, ...]] = {
 }
 
 
-def page(component: Component, who: Identity) -> str:
+def page(component: Component, identity: Identity) -> str:
     """documentation/index.html."""
     tables = [
         f"<h2>{title}</h2>\n{_table(one for one in component.variables if one.role in roles)}"
         for title, roles in _TITLES.items()
     ]
     return _PAGE.format(
-        title=html.escape(who.name),
+        title=html.escape(identity.name),
         vessel=_VESSEL[component.where],
-        origin=html.escape(who.origin),
-        program=html.escape(who.program),
+        origin=html.escape(identity.origin),
+        program=html.escape(identity.program),
         port=_PORT[component.where],
         tables="\n".join(tables),
     )
 
 
 def _table(variables: Iterable[Variable]) -> str:
-    heads = ("name", "unit", "start", "bounds", "what it is")
+    headings = ("name", "unit", "start", "bounds", "what it is")
     rows = [
-        (f"<code>{one.name}</code>", one.unit, _start(one), _bounds(one), html.escape(one.words))
-        for one in variables
+        (
+            f"<code>{variable.name}</code>",
+            variable.unit,
+            _start(variable),
+            _bounds(variable),
+            html.escape(variable.words),
+        )
+        for variable in variables
     ]
     lines = ["".join(f"<td>{cell}</td>" for cell in row) for row in rows]
-    head = "".join(f"<th>{cell}</th>" for cell in heads)
+    heading_row = "".join(f"<th>{cell}</th>" for cell in headings)
     return "\n".join(
-        ["<table>", f"<tr>{head}</tr>", *(f"<tr>{one}</tr>" for one in lines), "</table>"]
+        [
+            "<table>",
+            f"<tr>{heading_row}</tr>",
+            *(f"<tr>{variable}</tr>" for variable in lines),
+            "</table>",
+        ]
     )
 
 
-def _start(one: Variable) -> str:
-    if one.is_output:
+def _start(variable: Variable) -> str:
+    if variable.is_output:
         return ""
-    if one.choices:
-        return next(name for name, value in one.choices.items() if value == one.start)
-    return "false" if one.truth else f"{one.start:.6g}"
+    if variable.choices:
+        return next(name for name, value in variable.choices.items() if value == variable.start)
+    return "false" if variable.truth else f"{variable.start:.6g}"
 
 
-def _bounds(one: Variable) -> str:
-    if one.choices:
-        return ", ".join(one.choices)
-    if one.is_output or one.truth:
+def _bounds(variable: Variable) -> str:
+    if variable.choices:
+        return ", ".join(variable.choices)
+    if variable.is_output or variable.truth:
         return ""
-    known = [f"{value:g}" for value in (one.low, one.high) if math.isfinite(value)]
-    return " to ".join(known) if len(known) == 2 else ""
+    limits = [f"{value:g}" for value in (variable.low, variable.high) if math.isfinite(value)]
+    return " to ".join(limits) if len(limits) == 2 else ""

@@ -43,12 +43,12 @@ _SETTABLE = {Role.DATA: "BEFORE", Role.OUTPUT: "NEVER", Role.SIGNAL: "NEVER"}
 def sources(component: Component, version: int) -> tuple[Mapping[str, str], str]:
     """The files in ``sources/`` by name, and the token that ties binary and description together.
 
-    The token follows from the content: the same component and model give the same FMU.
+    The token depends only on the content: the same component and model give the same FMU.
     """
     model, templates = _model(component), files("twin.exchange") / "templates"
     token = str(uuid5(NAMESPACE_URL, f"ejector-twin FMI {version}\n{model}"))
-    ties = f'#define TOKEN "{token}"\n#define STAMP {int(token[:8], 16)}.0\n'
-    texts = {"model.h": f"{HEAD}\n{ties}{model}"}
+    defines = f'#define TOKEN "{token}"\n#define STAMP {int(token[:8], 16)}.0\n'
+    texts = {"model.h": f"{HEAD}\n{defines}{model}"}
     for name in ("component.h", "export.h", f"fmi{version}.h", main_source(version)):
         texts[name] = (templates / name).read_text(encoding="utf-8")
     return texts, token
@@ -61,9 +61,9 @@ def main_source(version: int) -> str:
 
 def _model(component: Component) -> str:
     program = Program()
-    for called, *kinds in _CALLED:
-        program.function(called, *kinds)
-    acting = [
+    for source, *kinds in _CALLED:
+        program.function(source, *kinds)
+    effect_functions = [
         (program.function(effect.act, ROWS, *[NUMBER] * len(effect.parameters)).name, effect)
         for effect in component.effects
     ]
@@ -72,12 +72,15 @@ def _model(component: Component) -> str:
             program.declarations.constant(module.__name__, name, getattr(module, name))
     for number, name in enumerate(c.COEFFICIENTS):
         program.declarations.constant(c.__name__, name, number)
-    given = [f"    theta[THETA_{name}] = {component.sources[name]};" for name in c.COEFFICIENTS]
-    for function, effect in acting:
+    assignments = [
+        f"    theta[THETA_{name}] = {component.sources[name]};" for name in c.COEFFICIENTS
+    ]
+    for function, effect in effect_functions:
         values = [
-            f"v[{reference(f'effect.{effect.name}.{one.name}')}]" for one in effect.parameters
+            f"v[{reference(f'effect.{effect.name}.{parameter.name}')}]"
+            for parameter in effect.parameters
         ]
-        given.append(f"    {function}({', '.join(['theta', *values])});")
+        assignments.append(f"    {function}({', '.join(['theta', *values])});")
     return "\n".join(
         [
             f"#define VESSEL_OUTSIDE {int(component.where == 'outside')}",
@@ -90,7 +93,7 @@ def _model(component: Component) -> str:
             "",
             "/* Coefficients from values; effects act on them as they do in the twin. */",
             "static void coefficients(const double *v, double *theta) {",
-            *given,
+            *assignments,
             "}",
             "",
         ]
@@ -98,14 +101,14 @@ def _model(component: Component) -> str:
 
 
 def _at_rest() -> str:
-    values = ", ".join(literal(float(one)) for one in nothing_done())
+    values = ", ".join(literal(float(value)) for value in nothing_done())
     return f"static const double NOTHING_DONE[] = {{{values}}};"
 
 
 def _variables(component: Component) -> str:
     """References by name and the table of variables; time comes last."""
-    names = [one.reference for one in component.variables]
-    rows = [_row(one) for one in component.variables]
+    names = [variable.reference for variable in component.variables]
+    rows = [_row(variable) for variable in component.variables]
     return "\n".join(
         [
             "enum { REAL, TRUTH, CHOICE };",
@@ -129,7 +132,11 @@ def _variables(component: Component) -> str:
     )
 
 
-def _row(one: Variable) -> str:
-    kind = "TRUTH" if one.truth else "CHOICE" if one.choices else "REAL"
-    numbers = ", ".join(literal(float(value)) for value in (one.low, one.high, one.start))
-    return f'    {{"{one.name}", {kind}, {_SETTABLE.get(one.role, "ALWAYS")}, {numbers}}},'
+def _row(variable: Variable) -> str:
+    kind = "TRUTH" if variable.truth else "CHOICE" if variable.choices else "REAL"
+    numbers = ", ".join(
+        literal(float(value)) for value in (variable.low, variable.high, variable.start)
+    )
+    return (
+        f'    {{"{variable.name}", {kind}, {_SETTABLE.get(variable.role, "ALWAYS")}, {numbers}}},'
+    )

@@ -1,6 +1,6 @@
-"""A system structure with the FMU in it, and parameter sets: the type's, and over it the unit's.
+"""An SSP package: a system structure with the FMU, and parameter sets of the type and the unit.
 
-SSP 1.0: of several parameter bindings of a component the later one holds.
+In SSP 1.0 the later one of several parameter bindings of a component holds.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ ELEMENT = "ejector"
 
 
 def make_ssp(fmu: Fmu, name: str, unit: Component, kind: Component) -> bytes:
-    """The package: ``unit`` is the component of the FMU, ``kind`` the same as its type has it."""
+    """The package: ``unit`` is the component of the FMU, ``kind`` that of its type."""
     resource = f"resources/{fmu.name}"
     return packed(
         {
@@ -35,33 +35,37 @@ def make_ssp(fmu: Fmu, name: str, unit: Component, kind: Component) -> bytes:
 
 def overlay(unit: Component, kind: Component) -> Sequence[Variable]:
     """The parameters in which a unit differs from its type."""
-    below = {one.name: one.start for one in kind.parameters}
-    return [one for one in unit.parameters if one.start != below[one.name]]
+    type_start = {parameter.name: parameter.start for parameter in kind.parameters}
+    return [
+        parameter for parameter in unit.parameters if parameter.start != type_start[parameter.name]
+    ]
 
 
 def parameter_set(name: str, parameters: Sequence[Variable]) -> bytes:
     """A parameter set (``.ssv``)."""
     root = Element("ssv:ParameterSet", _spaces("ssv", "ssc") | {"version": "1.0", "name": name})
     listed = SubElement(root, "ssv:Parameters")
-    for one in parameters:
-        parameter = SubElement(listed, "ssv:Parameter", name=one.name)
-        if one.choices:
-            chosen = next(word for word, value in one.choices.items() if value == one.start)
-            kind = {"value": chosen, "name": one.type_name}
+    for variable in parameters:
+        parameter = SubElement(listed, "ssv:Parameter", name=variable.name)
+        if variable.choices:
+            choice = next(
+                label for label, value in variable.choices.items() if value == variable.start
+            )
+            kind = {"value": choice, "name": variable.type_name}
             SubElement(parameter, "ssv:Enumeration", kind)
         else:
-            measure = {"unit": one.unit} if one.unit else {}
-            SubElement(parameter, "ssv:Real", {"value": number(one.start)} | measure)
+            measure = {"unit": variable.unit} if variable.unit else {}
+            SubElement(parameter, "ssv:Real", {"value": number(variable.start)} | measure)
     _enumerations(root, "ssv:", parameters)
     _units(root, "ssv:", parameters)
     return as_xml(root)
 
 
 def _structure(name: str, resource: str, component: Component) -> bytes:
-    head = _spaces("ssd", "ssc") | {"version": "1.0", "name": name}
-    root = Element("ssd:SystemStructureDescription", head)
+    attributes = _spaces("ssd", "ssc") | {"version": "1.0", "name": name}
+    root = Element("ssd:SystemStructureDescription", attributes)
     system = SubElement(root, "ssd:System", name="system")
-    ports = [one for one in component.variables if not one.is_parameter]
+    ports = [port for port in component.variables if not port.is_parameter]
     _connectors(system, ports)
     elements = SubElement(system, "ssd:Elements")
     element = SubElement(
@@ -74,14 +78,14 @@ def _structure(name: str, resource: str, component: Component) -> bytes:
     )
     _connectors(element, ports)
     bindings = SubElement(element, "ssd:ParameterBindings")
-    for source in (TYPE, UNIT):  # the later one holds
+    for source in (TYPE, UNIT):  # the later binding holds
         kind = "application/x-ssp-parameter-set"
         SubElement(bindings, "ssd:ParameterBinding", type=kind, source=source)
     connections = SubElement(system, "ssd:Connections")
-    for one in ports:
-        inner = {"Element": ELEMENT, "Connector": one.name}
-        outer = {"Connector": one.name}
-        start, end = (inner, outer) if one.is_output else (outer, inner)
+    for port in ports:
+        inner = {"Element": ELEMENT, "Connector": port.name}
+        outer = {"Connector": port.name}
+        start, end = (inner, outer) if port.is_output else (outer, inner)
         ends = {f"start{key}": value for key, value in start.items()}
         ends |= {f"end{key}": value for key, value in end.items()}
         SubElement(connections, "ssd:Connection", ends)
@@ -93,28 +97,28 @@ def _structure(name: str, resource: str, component: Component) -> bytes:
 
 def _connectors(parent: Element, ports: Sequence[Variable]) -> None:
     listed = SubElement(parent, "ssd:Connectors")
-    for one in ports:
-        kind = "output" if one.is_output else "input"
-        connector = SubElement(listed, "ssd:Connector", name=one.name, kind=kind)
-        if one.truth:
+    for port in ports:
+        kind = "output" if port.is_output else "input"
+        connector = SubElement(listed, "ssd:Connector", name=port.name, kind=kind)
+        if port.truth:
             SubElement(connector, "ssc:Boolean")
-        elif one.choices:
-            SubElement(connector, "ssc:Enumeration", name=one.type_name)
+        elif port.choices:
+            SubElement(connector, "ssc:Enumeration", name=port.type_name)
         else:
-            SubElement(connector, "ssc:Real", unit=one.unit)
+            SubElement(connector, "ssc:Real", unit=port.unit)
 
 
 def _enumerations(root: Element, tag: str, variables: Sequence[Variable]) -> None:
-    chosen = [one for one in variables if one.choices]
-    listed = SubElement(root, f"{tag}Enumerations") if chosen else root
-    for one in chosen:
-        kind = SubElement(listed, "ssc:Enumeration", name=one.type_name)
-        for word, value in (one.choices or {}).items():
-            SubElement(kind, "ssc:Item", name=word, value=str(value))
+    enumerations = [variable for variable in variables if variable.choices]
+    listed = SubElement(root, f"{tag}Enumerations") if enumerations else root
+    for variable in enumerations:
+        kind = SubElement(listed, "ssc:Enumeration", name=variable.type_name)
+        for label, value in (variable.choices or {}).items():
+            SubElement(kind, "ssc:Item", name=label, value=str(value))
 
 
 def _units(root: Element, tag: str, variables: Sequence[Variable]) -> None:
-    names = [one.unit for one in variables if one.unit]
+    names = [variable.unit for variable in variables if variable.unit]
     if names:
         units(names, SubElement(root, f"{tag}Units"), "ssc:", shown=False)
 

@@ -1,7 +1,7 @@
-"""What a shell says of an asset, after the submodel templates of the IDTA.
+"""The submodels of a shell, after the submodel templates of the IDTA.
 
 Digital Nameplate 3.0 (02006), Technical Data 2.0 (02003), Provision of Simulation Models 1.0
-(02005) and Time Series Data 1.1 (02008). What the asset database does not know is there without a
+(02005) and Time Series Data 1.1 (02008). Properties that the asset database does not know have no
 value.
 """
 
@@ -41,7 +41,7 @@ _ADDRESS = "https://admin-shell.io/zvei/nameplate/1/0/ContactInformations/Addres
 _SIMULATION = "https://admin-shell.io/idta/SimulationModels/"
 _SERIES = "https://admin-shell.io/idta/TimeSeries/"
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-# What a message of /scalars in a log has, beside its time.
+# The fields of a message of /scalars in a log, without its time.
 _SCALARS = {
     "vacuum_mbar": datatypes.Double,
     "expected_vacuum_mbar": datatypes.Double,
@@ -97,12 +97,12 @@ def technical_data(identifier: str, record: Record) -> model.Submodel:
 def _statement(record: Record) -> str:
     since, recorded = show_time(record.valid_from_ns), show_time(record.recorded_ns)
     note = str(record.provenance.get("note", ""))
-    said = f"Data set {record.hash}, valid from: {since}, recorded {recorded}"
-    return f"{said}; {note}" if note else said
+    statement = f"Data set {record.hash}, valid from: {since}, recorded {recorded}"
+    return f"{statement}; {note}" if note else statement
 
 
 def technical_areas(record: Record) -> Element:
-    """The tables of a data set, and beside them the characteristic diagram, if there is one."""
+    """The tables of a data set, and its characteristic diagram if there is one."""
     tables = tree({"data": record.data, "healthy": record.healthy})
     elements = [*tables, *_diagram(record)]
     semantic = f"{_DICTIONARY}ABL358#002/0173-1#01-AHX773#002"
@@ -130,12 +130,12 @@ def _diagram(record: Record) -> Iterator[Element]:
     yield group("characteristic_diagram", [axis, *curves], ARBITRARY)
 
 
-def simulation_models(identifier: str, fmu: Fmu, where: str) -> model.Submodel:
-    """An FMU, which stands at ``where`` in the package."""
+def simulation_models(identifier: str, fmu: Fmu, path: str) -> model.Submodel:
+    """The submodel of an FMU at ``path`` in the package."""
     s = _SIMULATION
     version = [
         text("ModelVersionId", fmu.version or None, f"{s}ModelVersionId/1/0"),
-        link("DigitalFile", where, MEDIA_TYPE, f"{s}DigitalFile/1/0"),
+        link("DigitalFile", path, MEDIA_TYPE, f"{s}DigitalFile/1/0"),
     ]
     files = [
         text("ModelFileType", fmu.kind, f"{s}ModelFileType/1/0"),
@@ -155,22 +155,22 @@ def simulation_models(identifier: str, fmu: Fmu, where: str) -> model.Submodel:
         text("ParamMethod", "parameters of the FMU, set to this asset's", f"{s}ParamMethod/1/0"),
         text("InitStateMethod", "at ambient pressure, not commanded", f"{s}InitStateMethod/1/0"),
     ]
-    one = group("SimulationModel", described, f"{s}SimulationModel/1/0")
-    return submodel(identifier, "SimulationModels", [one], f"{s}SimulationModels/1/0")
+    simulation_model = group("SimulationModel", described, f"{s}SimulationModel/1/0")
+    return submodel(identifier, "SimulationModels", [simulation_model], f"{s}SimulationModels/1/0")
 
 
 def time_series(identifier: str, records: Iterable[Record], logs: str) -> model.Submodel:
-    """The logs that records were made of; ``logs`` says where they are kept, or nothing."""
+    """The logs from which records were made; ``logs`` is their address, or empty."""
     s = _SERIES
     columns = [typed(name, kind, None, ARBITRARY) for name, kind in _SCALARS.items()]
     columns.insert(0, typed("Time", datatypes.Long, None, f"{s}RelativePointInTime/1/1"))
-    about = "MCAP files; a message of /scalars has these values, PLC time in ns"
+    description = "MCAP files; a message of /scalars has these values, PLC time in ns"
     metadata = [
         words("Name", "Logs of the ejector", f"{s}Metadata/Name/1/1"),
-        words("Description", about, f"{s}Metadata/Description/1/1"),
+        words("Description", description, f"{s}Metadata/Description/1/1"),
         group("Record", columns, f"{s}Record/1/1"),
     ]
-    by_log = {str(one.provenance["log_sha256"]): one for one in records}
+    by_log = {str(record.provenance["log_sha256"]): record for record in records}
     segments = [
         _segment(f"ExternalSegment{number:02d}", record, logs)
         for number, record in enumerate(by_log.values(), 1)
@@ -183,13 +183,13 @@ def time_series(identifier: str, records: Iterable[Record], logs: str) -> model.
 
 
 def _segment(name: str, record: Record, logs: str) -> Element:
-    """The log that a record was made of, which stands outside of the package."""
+    """The log from which a record was made; it is outside the package."""
     log, digest = str(record.provenance["log"]), str(record.provenance["log_sha256"])
     since, s = show_time(record.valid_from_ns), f"{_SERIES}Segment/"
-    about = f"Data set {record.hash} was made of it; SHA-256 {digest}"
+    description = f"Data set {record.hash} was made of it; SHA-256 {digest}"
     elements = [
         words("Name", log, f"{s}Name/1/1"),
-        words("Description", about, f"{s}Description/1/1"),
+        words("Description", description, f"{s}Description/1/1"),
         text("StartTime", since, f"{s}StartTime/1/1"),
         text("State", "completed", f"{s}State/1/1"),
         link("File", place_of(log, digest, logs), MCAP, f"{_SERIES}File/1/1"),
@@ -198,7 +198,7 @@ def _segment(name: str, record: Record, logs: str) -> Element:
 
 
 def place_of(log: str, digest: str, logs: str) -> str:
-    """The address of a log where it is kept; else its name by content (RFC 6920)."""
+    """The address of a stored log; without one, its name by content (RFC 6920)."""
     if logs:
         return f"{logs.rstrip('/')}/{quote(log)}"
     return f"ni:///sha-256;{base64.urlsafe_b64encode(bytes.fromhex(digest)).decode().rstrip('=')}"

@@ -1,10 +1,9 @@
-"""Compiled functions of the model as C: the same source, so the physics exists once.
+"""Translates compiled functions of the model into C, so that the physics has one source.
 
-What is translated is the part of Python that the model is written in: numbers, rows of numbers,
-named tuples, tuples, ``if``, and loops over ranges and over what is written out. One hypothesis is
-left: loops over hypotheses are done once and the index of a hypothesis falls away. Functions are
-specialised by the kinds of their arguments, as the compiler for Python does it. Anything else is
-refused with file and line.
+The translated part of Python is what the model uses: numbers, rows of numbers, named tuples,
+tuples, ``if``, and loops over ranges and literal tuples. The C code has one hypothesis: loops over
+hypotheses run once, and the index of a hypothesis is dropped. Functions are specialised by the
+kinds of their arguments, as Numba does. Anything else is rejected with file and line.
 """
 
 import ast
@@ -37,14 +36,14 @@ from twin.exchange.c import (
     named,
 )
 
-# What every translated program needs: Python's min and max, and whole numbers that do not overflow.
+# Needed by every translated program: Python's min and max, and conversion without overflow.
 PRELUDE = """\
 static double lesser(double a, double b) { return b < a ? b : a; }
 static double greater(double a, double b) { return b > a ? b : a; }
 static int whole(double x) { return x > -1e9 ? (x < 1e9 ? (int)x : 1000000000) : -1000000000; }
 """
 
-# What is called of Python and of NumPy, on one value.
+# Functions of Python and NumPy that take one value.
 _CALLED: Mapping[object, tuple[str, Kind]] = {
     math.sqrt: ("sqrt({})", NUMBER),
     math.sin: ("sin({})", NUMBER),
@@ -84,22 +83,22 @@ class Function:
 
 @dataclass
 class Program:
-    """Functions with what they need, each before it is used."""
+    """Functions with their declarations, each before its first use."""
 
     declarations: Declarations = field(default_factory=Declarations)
     _texts: list[str] = field(default_factory=list)
     _functions: dict[tuple[object, tuple[Kind, ...]], Function] = field(default_factory=dict)
 
     def function(self, source: Callable[..., Any], *kinds: Kind) -> Function:
-        """The function for arguments of these kinds, translated where it is not yet."""
-        plain = getattr(source, "py_func", source)
-        if (plain, kinds) not in self._functions:
-            name, taken = named(plain.__module__, plain.__name__), self._functions.values()
-            while any(one.name == name for one in taken):
+        """The function for arguments of these kinds; translated at the first call."""
+        original = getattr(source, "py_func", source)
+        if (original, kinds) not in self._functions:
+            name, existing = named(original.__module__, original.__name__), self._functions.values()
+            while any(function.name == name for function in existing):
                 name += "_again"
-            self._functions[plain, kinds] = made = Function(name)
-            self._texts.append(_Body(self, plain, kinds, made).text())
-        return self._functions[plain, kinds]
+            self._functions[original, kinds] = made = Function(name)
+            self._texts.append(_Body(self, original, kinds, made).text())
+        return self._functions[original, kinds]
 
     def text(self) -> str:
         """The whole program."""
@@ -107,13 +106,13 @@ class Program:
 
 
 class _Body:
-    """One function on its way to C."""
+    """The translation of one function to C."""
 
     def __init__(
         self, program: Program, source: Callable[..., Any], kinds: tuple[Kind, ...], made: Function
     ) -> None:
-        self._program, self._source, self._made = program, source, made
-        self._known = program.declarations
+        self._program, self._source, self._function = program, source, made
+        self._declarations = program.declarations
         lines, self._line = inspect.getsourcelines(source)
         tree = ast.parse(textwrap.dedent("".join(lines))).body[0]
         assert isinstance(tree, ast.FunctionDef)
@@ -124,50 +123,53 @@ class _Body:
         self._count = 0
 
     def text(self) -> str:
-        """The function in C; gone through until the kinds of all its variables are known."""
-        told = ast.get_docstring(self._tree)
-        statements = self._tree.body[1:] if told else self._tree.body
+        """The function in C; passes repeat until the kinds of all its variables are known."""
+        docstring = ast.get_docstring(self._tree)
+        statements = self._tree.body[1:] if docstring else self._tree.body
         while True:
-            before, self._count = (dict(self._locals), self._made.returns), 0
+            previous, self._count = (dict(self._locals), self._function.returns), 0
             body = self._block(statements)
-            if before == (self._locals, self._made.returns):
+            if previous == (self._locals, self._function.returns):
                 break
-        given = [
-            declared(self._known.type_of(kind), name)
+        parameters = [
+            declared(self._declarations.type_of(kind), name)
             for name, kind in self._parameters.items()
             if kind != INDEX
         ]
-        returned = self._known.type_of(self._made.returns) if self._made.returns else "void"
-        head = f"static {declared(returned, self._made.name)}({', '.join(given)}) {{"
-        known = [
-            f"    {declared(self._known.type_of(kind), name)};"
+        returned = (
+            self._declarations.type_of(self._function.returns) if self._function.returns else "void"
+        )
+        header = f"static {declared(returned, self._function.name)}({', '.join(parameters)}) {{"
+        local_declarations = [
+            f"    {declared(self._declarations.type_of(kind), name)};"
             for name, kind in self._locals.items()
         ]
-        comment = [f"/* {textwrap.indent(told, '   ').strip()} */"] if told else []
-        return "\n".join([*comment, head, *known, *body, "}"])
+        comment = [f"/* {textwrap.indent(docstring, '   ').strip()} */"] if docstring else []
+        return "\n".join([*comment, header, *local_declarations, *body, "}"])
 
     # --- statements -----------------------------------------------------------------------------
 
     def _block(self, statements: list[ast.stmt]) -> list[str]:
-        return [f"    {line}" for one in statements for line in self._statement(one)]
+        return [f"    {line}" for statement in statements for line in self._statement(statement)]
 
     def _statement(self, node: ast.stmt) -> list[str]:  # noqa: PLR0911 - a table of statements
         match node:
             case ast.Assign(targets=[ast.Tuple(elts=targets)], value=value):
                 return self._unpacked(targets, value)
             case ast.Assign(targets=targets, value=value):
-                given = self._value(value)
+                result = self._value(value)
                 return [
-                    " = ".join([*(self._target(one, given) for one in targets), given.text]) + ";"
+                    " = ".join([*(self._target(item, result) for item in targets), result.text])
+                    + ";"
                 ]
             case ast.AnnAssign(target=target, value=ast.expr() as value):
-                given = self._value(value)
-                return [f"{self._target(target, given)} = {given.text};"]
+                result = self._value(value)
+                return [f"{self._target(target, result)} = {result.text};"]
             case ast.AugAssign():
                 return self._changed(node)
-            case ast.If(test=test, body=body, orelse=other):
+            case ast.If(test=test, body=body, orelse=orelse):
                 lines = [f"if ({self._truth(test)}) {{", *self._block(body), "}"]
-                return [*lines[:-1], "} else {", *self._block(other), "}"] if other else lines
+                return [*lines[:-1], "} else {", *self._block(orelse), "}"] if orelse else lines
             case ast.For():
                 return self._loop(node)
             case ast.Return(value=ast.expr() as value):
@@ -179,22 +181,22 @@ class _Body:
         raise self._refused(node)
 
     def _unpacked(self, targets: list[ast.expr], value: ast.expr) -> list[str]:
-        """Several targets at once; values that read what is assigned are held meanwhile."""
+        """Assign to several targets at once; values that read a target are held meanwhile."""
         if isinstance(value, ast.Tuple):
-            parts = [self._value(one) for one in value.elts]
-            written = {one.id for target in targets for one in _names(target)}
-            if not written & {one.id for one in _names(value)}:
-                held, lines = parts, []
+            parts = [self._value(item) for item in value.elts]
+            written = {item.id for target in targets for item in _names(target)}
+            if not written & {item.id for item in _names(value)}:
+                values, lines = parts, []
             else:
-                held = [Value(self._held(part.kind), part.kind) for part in parts]
-                pairs = zip(held, parts, strict=True)
+                values = [Value(self._held(part.kind), part.kind) for part in parts]
+                pairs = zip(values, parts, strict=True)
                 lines = [f"{name.text} = {part.text};" for name, part in pairs]
         else:
-            whole = self._value(value)
-            name = self._held(whole.kind)
-            held = [Value(f"{name}.a{n}", kind) for n, kind in enumerate(whole.kind)]
-            lines = [f"{name} = {whole.text};"]
-        for target, part in zip(targets, held, strict=True):
+            result = self._value(value)
+            name = self._held(result.kind)
+            values = [Value(f"{name}.a{n}", kind) for n, kind in enumerate(result.kind)]
+            lines = [f"{name} = {result.text};"]
+        for target, part in zip(targets, values, strict=True):
             if not (isinstance(target, ast.Name) and target.id == "_"):
                 lines.append(f"{self._target(target, part)} = {part.text};")
         return lines
@@ -203,49 +205,56 @@ class _Body:
         """``x += v`` and the like; several rows at once get the same ``v``."""
         if type(node.op) not in _BINARY:
             raise self._refused(node)
-        given, (sign, _) = self._value(node.value), _BINARY[type(node.op)]
+        operand, (sign, _) = self._value(node.value), _BINARY[type(node.op)]
         if isinstance(node.op, ast.Div):
-            given = Value(given.text, NUMBER)  # and so becomes what is divided
+            operand = Value(operand.text, NUMBER)  # so that the target becomes a number as well
         match node.target:
-            case ast.Subscript(value=of, slice=ast.List(elts=rows)):
-                name = self._held(given.kind)
-                places = [f"{self._value(of).text}[{self._value(row).text}]" for row in rows]
-                return [f"{name} = {given.text};", *(f"{one} {sign}= {name};" for one in places)]
-        return [f"{self._target(node.target, given)} {sign}= {given.text};"]
+            case ast.Subscript(value=array, slice=ast.List(elts=rows)):
+                name = self._held(operand.kind)
+                places = [f"{self._value(array).text}[{self._value(row).text}]" for row in rows]
+                return [
+                    f"{name} = {operand.text};",
+                    *(f"{place} {sign}= {name};" for place in places),
+                ]
+        return [f"{self._target(node.target, operand)} {sign}= {operand.text};"]
 
     def _loop(self, node: ast.For) -> list[str]:
         match node.iter, node.target:
             case ast.Call(func=ast.Name(id="range"), args=[ast.Subscript()]), ast.Name(id=name):
-                self._parameters[name] = INDEX  # over hypotheses, of which there is one
+                self._parameters[name] = INDEX  # a loop over hypotheses, of which there is one
                 return ["do {", *self._block(node.body), "} while (0);"]
             case ast.Call(func=ast.Name(id="range"), args=[_] | [_, _] as bounds), ast.Name(
                 id=name
             ):
-                values = [self._value(one).text for one in bounds]
+                values = [self._value(part).text for part in bounds]
                 start, end = ["0", *values][-2:]
                 counter = f"n{self._next()}" if name == "_" else name
                 self._local(counter, WHOLE)
-                head = f"for ({counter} = {start}; {counter} < {end}; {counter}++) {{"
-                return [head, *self._block(node.body), "}"]
+                header = f"for ({counter} = {start}; {counter} < {end}; {counter}++) {{"
+                return [header, *self._block(node.body), "}"]
             case ast.Tuple(elts=items), target if not _continues(node.body):
                 lines = []
-                for item in items:  # written out one after the other
-                    given: list[ast.stmt] = [ast.Assign([target], item, lineno=node.lineno)]
-                    lines += [line for one in given + node.body for line in self._statement(one)]
+                for item in items:  # unrolled
+                    assignment: list[ast.stmt] = [ast.Assign([target], item, lineno=node.lineno)]
+                    lines += [
+                        line for part in assignment + node.body for line in self._statement(part)
+                    ]
                 return lines
         raise self._refused(node)
 
     def _returned(self, node: ast.expr) -> str:
         if isinstance(node, ast.Tuple):
-            given = self._tuple([self._value(one) for one in node.elts], self._made.returns)
+            result = self._tuple(
+                [self._value(element) for element in node.elts], self._function.returns
+            )
         else:
-            given = self._value(node)
-        self._made.returns = joined(self._made.returns, given.kind)
-        return given.text
+            result = self._value(node)
+        self._function.returns = joined(self._function.returns, result.kind)
+        return result.text
 
-    def _target(self, node: ast.expr, given: Value) -> str:
+    def _target(self, node: ast.expr, assigned: Value) -> str:
         if isinstance(node, ast.Name):
-            self._local(node.id, given.kind)
+            self._local(node.id, assigned.kind)
             return node.id
         return self._value(node).text
 
@@ -253,7 +262,7 @@ class _Body:
         if name not in self._parameters:
             self._locals[name] = joined(self._locals.get(name), kind)
         elif joined(self._parameters[name], kind) != self._parameters[name]:
-            raise Untranslatable(f"{self._made.name}: {name} changes its kind")
+            raise Untranslatable(f"{self._function.name}: {name} changes its kind")
 
     def _held(self, kind: Kind) -> str:
         name = f"held{self._next()}"
@@ -278,69 +287,69 @@ class _Body:
                 return Value(name, self._locals[name])
             case ast.Name() | ast.Attribute() if (static := self._static(node)) is not None:
                 return self._constant(node, static)
-            case ast.Attribute(value=of, attr=name):
-                return Value(f"{self._value(of).text}.{name}", NUMBER)
+            case ast.Attribute(value=container, attr=name):
+                return Value(f"{self._value(container).text}.{name}", NUMBER)
             case ast.Subscript():
                 return self._part(node)
             case ast.BinOp():
                 return self._binary(node)
             case ast.UnaryOp(op=ast.USub(), operand=operand):
-                given = self._value(operand)
-                return Value(f"-{given.inside(5)}", given.kind, 4)
+                negated = self._value(operand)
+                return Value(f"-{negated.inside(5)}", negated.kind, 4)
             case ast.UnaryOp(op=ast.Not(), operand=operand):
                 return Value(f"!({self._truth(operand)})", WHOLE)
             case ast.BoolOp(op=op, values=values):
                 sign = " && " if isinstance(op, ast.And) else " || "
-                return Value(sign.join(f"({self._truth(one)})" for one in values), WHOLE, 0)
+                return Value(sign.join(f"({self._truth(part)})" for part in values), WHOLE, 0)
             case ast.Compare(left=left, ops=[op], comparators=[right]) if type(op) in _COMPARED:
                 pair = self._value(left).inside(2), self._value(right).inside(2)
                 return Value(f"{pair[0]} {_COMPARED[type(op)]} {pair[1]}", WHOLE, 1)
-            case ast.IfExp(test=test, body=body, orelse=other):
-                return self._choice(test, body, other)
+            case ast.IfExp(test=test, body=body, orelse=orelse):
+                return self._choice(test, body, orelse)
             case ast.Tuple(elts=parts):
-                return self._tuple([self._value(one) for one in parts])
+                return self._tuple([self._value(part) for part in parts])
             case ast.Call(keywords=[]):
                 return self._call(node)
         raise self._refused(node)
 
-    def _tuple(self, parts: list[Value], wanted: Kind = None) -> Value:
-        kind = joined(wanted, tuple(part.kind for part in parts))
+    def _tuple(self, parts: list[Value], expected: Kind = None) -> Value:
+        kind = joined(expected, tuple(part.kind for part in parts))
         text = ", ".join(part.text for part in parts)
-        return Value(f"({self._known.type_of(kind)}){{{text}}}", kind)
+        return Value(f"({self._declarations.type_of(kind)}){{{text}}}", kind)
 
     def _truth(self, node: ast.expr) -> str:
-        given = self._value(node)
-        return given.text if given.kind == WHOLE else f"{given.inside(2)} != 0.0"
+        condition = self._value(node)
+        return condition.text if condition.kind == WHOLE else f"{condition.inside(2)} != 0.0"
 
-    def _choice(self, test: ast.expr, body: ast.expr, other: ast.expr) -> Value:
-        one, two = self._value(body), self._value(other)
-        text = f"({self._truth(test)}) ? {one.inside(1)} : {two.inside(1)}"
-        return Value(text, joined(one.kind, two.kind), 0)
+    def _choice(self, test: ast.expr, body: ast.expr, orelse: ast.expr) -> Value:
+        first, second = self._value(body), self._value(orelse)
+        text = f"({self._truth(test)}) ? {first.inside(1)} : {second.inside(1)}"
+        return Value(text, joined(first.kind, second.kind), 0)
 
     def _constant(self, node: ast.expr, static: object) -> Value:
-        """A number of a module, under the name it has in the module that was asked."""
+        """A number of a module, under the name in the module that the source refers to."""
         if not isinstance(static, int | float):
             raise self._refused(node)
         if isinstance(node, ast.Attribute):
             module = self._static(node.value)
             assert isinstance(module, ModuleType)
-            return self._known.constant(module.__name__, node.attr, static)
+            return self._declarations.constant(module.__name__, node.attr, static)
         assert isinstance(node, ast.Name)
-        return self._known.constant(self._source.__module__, node.id, static)
+        return self._declarations.constant(self._source.__module__, node.id, static)
 
     def _part(self, node: ast.Subscript) -> Value:
-        """A row of rows; what is one per hypothesis is itself."""
-        of, at = self._value(node.value), node.slice
-        if of.kind == ROWS:
-            row = at.elts[0] if isinstance(at, ast.Tuple) else at
-            return Value(f"{of.text}[{self._value(row).text}]", NUMBER)
-        if isinstance(of.kind, tuple) and isinstance(at, ast.Constant):
-            assert isinstance(at.value, int)
-            return Value(f"{of.text}.a{at.value}", of.kind[at.value])
-        if self._value(at).kind != INDEX:
+        """An element: a row of rows; a value per hypothesis stands for itself."""
+        container, index = self._value(node.value), node.slice
+        if container.kind == ROWS:
+            row = index.elts[0] if isinstance(index, ast.Tuple) else index
+            return Value(f"{container.text}[{self._value(row).text}]", NUMBER)
+        if isinstance(container.kind, tuple) and isinstance(index, ast.Constant):
+            assert isinstance(index.value, int)
+            return Value(f"{container.text}.a{index.value}", container.kind[index.value])
+        if self._value(index).kind != INDEX:
             raise self._refused(node)
-        known = {LANE: Value(f"{of.text}[0]", NUMBER), TABLES: Value(of.text, ROWS)}
-        return known.get(of.kind, of)
+        by_kind = {LANE: Value(f"{container.text}[0]", NUMBER), TABLES: Value(container.text, ROWS)}
+        return by_kind.get(container.kind, container)
 
     def _binary(self, node: ast.BinOp) -> Value:
         left, right = self._value(node.left), self._value(node.right)
@@ -354,47 +363,49 @@ class _Body:
         if binds == 0:
             return Value(f"{left.inside(ATOM)} {sign} {right.inside(ATOM)}", WHOLE, 0)
         kind = NUMBER if sign == "/" else joined(left.kind, right.kind)
-        first = (
+        numerator = (
             f"(double){left.inside(4)}"
             if sign == "/" and left.kind == WHOLE
             else left.inside(binds)
         )
-        return Value(f"{first} {sign} {right.inside(binds + 1)}", kind, binds)
+        return Value(f"{numerator} {sign} {right.inside(binds + 1)}", kind, binds)
 
     def _call(self, node: ast.Call) -> Value:
         match node.func:
-            case ast.Attribute(value=of, attr="copy" | "any") if self._static(of) is None:
-                return self._value(of)  # of one value: itself
+            case ast.Attribute(value=container, attr="copy" | "any") if (
+                self._static(container) is None
+            ):
+                return self._value(container)  # of one value: the value itself
         static = self._static(node.func)
         if static is np.where:
             return self._choice(*node.args)
-        values = [self._value(one) for one in node.args]
+        values = [self._value(argument) for argument in node.args]
         if static is min or static is max:
             return self._extreme("lesser" if static is min else "greater", values)
         if static in _CALLED:
             form, kind = _CALLED[static]
             return Value(form.format(values[0].text), kind)
         if isinstance(static, type) and hasattr(static, "_fields"):
-            text = ", ".join(one.text for one in values)
-            return Value(f"({self._known.type_of(static)}){{{text}}}", static)
+            text = ", ".join(argument.text for argument in values)
+            return Value(f"({self._declarations.type_of(static)}){{{text}}}", static)
         if not inspect.isfunction(getattr(static, "py_func", static)):
             raise self._refused(node)
-        called = self._program.function(static, *(one.kind for one in values))
-        kept = [one.text for one in values if one.kind != INDEX]
-        return Value(f"{called.name}({', '.join(kept)})", called.returns)
+        callee = self._program.function(static, *(argument.kind for argument in values))
+        passed = [argument.text for argument in values if argument.kind != INDEX]
+        return Value(f"{callee.name}({', '.join(passed)})", callee.returns)
 
     def _extreme(self, name: str, values: list[Value]) -> Value:
-        """The least or greatest of several, from the left as in Python."""
+        """The least or greatest of several values, from the left as in Python."""
         text, kind = values[0].text, values[0].kind
-        for one in values[1:]:
-            text, kind = f"{name}({text}, {one.text})", joined(kind, one.kind)
+        for value in values[1:]:
+            text, kind = f"{name}({text}, {value.text})", joined(kind, value.kind)
         return Value(f"(int){text}" if kind == WHOLE else text, kind)
 
     def _static(self, node: ast.expr) -> Any:
-        """What a name stands for outside the function; None where it is the function's own."""
+        """The object of a name outside the function; None for a name of the function itself."""
         if isinstance(node, ast.Attribute):
-            of = self._static(node.value)
-            return getattr(of, node.attr, None) if isinstance(of, ModuleType) else None
+            module = self._static(node.value)
+            return getattr(module, node.attr, None) if isinstance(module, ModuleType) else None
         if not isinstance(node, ast.Name) or node.id in {**self._parameters, **self._locals}:
             return None
         return self._source.__globals__.get(node.id, getattr(builtins, node.id, None))
@@ -408,8 +419,8 @@ class _Body:
 
 
 def _continues(body: list[ast.stmt]) -> bool:
-    return any(isinstance(one, ast.Continue) for line in body for one in ast.walk(line))
+    return any(isinstance(node, ast.Continue) for line in body for node in ast.walk(line))
 
 
 def _names(node: ast.AST) -> list[ast.Name]:
-    return [one for one in ast.walk(node) if isinstance(one, ast.Name)]
+    return [child for child in ast.walk(node) if isinstance(child, ast.Name)]

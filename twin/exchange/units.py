@@ -13,11 +13,11 @@ _PLAIN = str.maketrans({"²": "2", "³": "3", "·": ".", " ": "."})
 
 @dataclass(frozen=True)
 class Unit:
-    """One unit: ``value`` in it times ``factor`` is SI. ``shown`` are others to show it in."""
+    """One unit: a value times ``factor`` is SI. ``shown`` lists display units."""
 
     base: Mapping[str, int]
     factor: float = 1.0
-    shown: Mapping[str, float] = field(default_factory=dict)  # so many of them in one
+    shown: Mapping[str, float] = field(default_factory=dict)  # display units per unit
 
 
 _PRESSURE, _FLOW, _VOLUME = {"kg": 1, "m": -1, "s": -2}, {"kg": 1, "s": -1}, {"m": 3}

@@ -1,6 +1,6 @@
 """The variables of an FMU: ports, settings, effects, and the coefficients of the data set.
 
-One table, from which the description, the C sources, the page and the parameter sets are made.
+The description, the C sources, the page and the parameter sets are made from this one table.
 Effects and coefficients come from the model's own tables.
 """
 
@@ -26,7 +26,7 @@ from twin.signals import Phase
 Where = Literal["inside", "outside"]  # the vessel: part of the FMU, or somebody else's
 
 PHASES = {phase.name.lower(): int(phase) for phase in Phase}
-# What acts on the vessel alone, and goes with it.
+# Effects that act on the vessel alone; an FMU without the vessel does not have them.
 OF_THE_VESSEL = ("added_volume", "cup_compliance", "heat_exchange")
 # Coefficients that are ports and settings, in C over the values ``v``.
 _PORTS = {
@@ -47,7 +47,7 @@ _VESSEL: Mapping[Where, Mapping[str, str]] = {
         "INFLOW": "v[V_VESSEL_INFLOW]",
         "RELEASE": "v[V_CUPS_RELEASE] > -9e5 ? v[V_CUPS_RELEASE] : NAN",
     },
-    # A vessel so large that its pressure stays what the port says for a millisecond.
+    # A vessel so large that its pressure stays at the port's value for a millisecond.
     "outside": {
         "VOLUME": "1e3",
         "COMPLIANCE": "0.0",
@@ -68,7 +68,7 @@ def reference(name: str) -> str:
 
 
 class Role(Enum):
-    """What a variable is to the importing tool: causality, variability, when it may be set."""
+    """The role of a variable for the importing tool: causality and variability."""
 
     INPUT = ("input", "continuous")
     COMMAND = ("input", "discrete")
@@ -105,7 +105,7 @@ class Variable:
 
     @property
     def is_output(self) -> bool:
-        """Whether the FMU works it out."""
+        """Whether the FMU computes it."""
         return self.role in (Role.OUTPUT, Role.SIGNAL)
 
     @property
@@ -116,7 +116,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class Component:
-    """What an FMU is made from: its variables, and where each coefficient comes from in C."""
+    """The source of an FMU: its variables, and the C expression of each coefficient."""
 
     where: Where
     variables: tuple[Variable, ...]
@@ -125,50 +125,58 @@ class Component:
 
     @classmethod
     def of(cls, data: DataSet, where: Where) -> "Component":
-        """The component of a data set; what it has of effects is where the effects start.
+        """The component of a data set; effects start at the sizes in the data set.
 
-        A mechanism beside the table is a part of it: its coefficients hold it.
+        A mechanism that is not in the table of effects is part of the coefficients.
         """
-        given = {name: sizes for name, sizes in data.effects.items() if name in EFFECTS}
-        beside = {name: sizes for name, sizes in data.effects.items() if name not in EFFECTS}
-        theta = coefficients(data.model_copy(update={"effects": beside}))
-        names = [*given, *(name for name in EFFECTS if name not in given)]
-        kept = [name for name in names if where == "inside" or name not in OF_THE_VESSEL]
-        acting = _acting(theta, data.effects, kept)
+        listed = {name: sizes for name, sizes in data.effects.items() if name in EFFECTS}
+        unlisted = {name: sizes for name, sizes in data.effects.items() if name not in EFFECTS}
+        theta = coefficients(data.model_copy(update={"effects": unlisted}))
+        names = [*listed, *(name for name in EFFECTS if name not in listed)]
+        available = [name for name in names if where == "inside" or name not in OF_THE_VESSEL]
+        effect_variables = _effect_variables(theta, data.effects, available)
         sources = {**_PORTS, **_VESSEL[where]}
-        for variable, number in acting:
-            if number is not None:  # it stands for a coefficient
+        for variable, number in effect_variables:
+            if number is not None:  # it replaces a coefficient
                 sources.setdefault(list(COEFFICIENTS)[number], f"v[{variable.reference}]")
-        held = [_held(name, float(theta[n])) for n, name in enumerate(COEFFICIENTS)]
-        rest = {
-            name: one for name, one in zip(COEFFICIENTS, held, strict=True) if name not in sources
+        data_variables = [
+            _data_variable(name, float(theta[n])) for n, name in enumerate(COEFFICIENTS)
+        ]
+        remaining = {
+            name: variable
+            for name, variable in zip(COEFFICIENTS, data_variables, strict=True)
+            if name not in sources
         }
-        sources |= {name: f"v[{one.reference}]" for name, one in rest.items()}
-        variables = (*_ports(theta, where), *(one for one, _ in acting), *rest.values())
-        return cls(where, variables, sources, tuple(EFFECTS[name] for name in kept))
+        sources |= {name: f"v[{variable.reference}]" for name, variable in remaining.items()}
+        variables = (
+            *_ports(theta, where),
+            *(variable for variable, _ in effect_variables),
+            *remaining.values(),
+        )
+        return cls(where, variables, sources, tuple(EFFECTS[name] for name in available))
 
     @property
     def parameters(self) -> tuple[Variable, ...]:
-        """What a parameter set holds."""
-        return tuple(one for one in self.variables if one.is_parameter)
+        """The variables of a parameter set."""
+        return tuple(variable for variable in self.variables if variable.is_parameter)
 
 
-def _acting(
-    theta: Theta, given: Mapping[str, Mapping[str, float]], names: Sequence[str]
+def _effect_variables(
+    theta: Theta, start_values: Mapping[str, Mapping[str, float]], names: Sequence[str]
 ) -> list[tuple[Variable, int | None]]:
-    """The parameters of effects, in the order of their table, and what coefficient they are."""
-    acting = []
+    """The parameters of effects in the table's order, each with the coefficient it replaces."""
+    variables = []
     for effect in (effect for effect in EFFECTS.values() if effect.name in names):
-        for one in effect.parameters:
-            start = given.get(effect.name, {}).get(one.name, one.neutral(theta))
-            name, unit = f"effect.{effect.name}.{one.name}", plain(one.unit)
-            bounds = min(one.low, start), max(one.high, start)
+        for parameter in effect.parameters:
+            start = start_values.get(effect.name, {}).get(parameter.name, parameter.neutral(theta))
+            name, unit = f"effect.{effect.name}.{parameter.name}", plain(parameter.unit)
+            bounds = min(parameter.low, start), max(parameter.high, start)
             variable = Variable(name, effect.sentence, Role.SETTING, unit, start, *bounds)
-            acting.append((variable, one.coefficient))
-    return acting
+            variables.append((variable, parameter.coefficient))
+    return variables
 
 
-def _held(name: str, value: float) -> Variable:
+def _data_variable(name: str, value: float) -> Variable:
     unit, words = COEFFICIENTS[name]
     return Variable(f"coefficient.{name.lower()}", words, Role.DATA, plain(unit), value)
 
