@@ -195,7 +195,7 @@ def test_errors_are_plain_pages_and_plain_json(site: Site) -> None:
     assert page.status_code == 404
     assert "<h1>Not Found</h1>" in page.text
     assert site.client.get("/api/ejectors/9/history").json() == {"error": "no such ejector"}
-    told = site.page._said(
+    told = site.page._error_response(
         Request({"type": "http", "path": "/", "headers": [], "language": "en"}), 400, "<b>"
     )
     assert b"<b>" not in told.body

@@ -141,7 +141,7 @@ def test_while_plc_time_stands_still_no_more_than_a_bound_is_held(path: Path) ->
     rows: list[np.float32] = []
     for _ in range(200):
         held = np.concatenate([held[0], samples]), np.concatenate([held[1], ticks])
-        made, held = ring._binned(*held)
+        made, held = ring._bin_rows(*held)
         rows.extend(made["measured_low"])
         assert len(held[0]) == len(held[1]) < ring.MOST_HELD
     assert rows == [np.float32(1e5)] * (200 * PER_ROW // ring.MOST_HELD)

@@ -1,1 +1,1 @@
-"""The technician's page: traffic light, alarms, live pressure, trends; a process of its own."""
+"""The technician's page: status, alarms, live pressure and trends, in a process of its own."""

@@ -1,7 +1,7 @@
-"""The page over HTTP: who may see and do what, and what the browser is told.
+"""The page over HTTP: access rights, and the answers to the browser.
 
-Nothing from outside becomes part of a path: what is served stands in tables that are made at the
-start, and a report is known by the name that the run gave it.
+Nothing from outside becomes part of a path. Served files are in tables that are built at the start,
+and a report is found by the name that the run gave it.
 """
 
 import asyncio
@@ -45,25 +45,25 @@ from twin.page.sessions import SESSION_S, Session, Sessions
 from twin.users import Role
 
 COOKIE = "ejector-twin"
-LANGUAGE = "ejector-twin-language"  # the cookie of who has chosen one
+LANGUAGE = "ejector-twin-language"  # the cookie with a chosen language
 LANGUAGE_S = 365 * 86_400
-MARKED = re.compile(r"\{\{(.+?)\}\}")  # a text of a page, to be said in each language
+MARKED = re.compile(r"\{\{(.+?)\}\}")  # a text of a page to be translated
 TOKEN = "x-csrf-token"  # noqa: S105  # a header's name
 LONGEST_COMMENT = 500  # letters
-MOST_BODY = 4096  # bytes that anybody may send
+MOST_BODY = 4096  # bytes of a request's body
 MOST_DAYS = 400.0
-ROWS_S = 0.03  # between batches of live rows: a block of the loop, about 20 batches a second
-STATE_S = 1.0  # between looks at alarms
-MOST_DIGITS = 18  # of a number, which then is one to a database too
-# What reading a body raises that has something else in it; also one nested without end.
+ROWS_S = 0.03  # interval of batches of live rows: a block of the loop, about 20 batches a second
+STATE_S = 1.0  # interval at which alarms are read
+MOST_DIGITS = 18  # of a number, so that it fits into a database
+# What reading an invalid body raises, also for endless nesting.
 NO_REQUEST = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
-SLOWEST_S = 20.0  # for a browser to take one message, or to send a request's body
-NEEDED: dict[str, Role] = {  # role for what is asked of an alarm
+SLOWEST_S = 20.0  # limit for a browser to take one message, or to send a request's body
+NEEDED: dict[str, Role] = {  # role that a request to an alarm needs
     Deed.ACKNOWLEDGED: Role.ACKNOWLEDGE,
     Deed.SHELVED: Role.ACKNOWLEDGE,
     Deed.UNSHELVED: Role.ACKNOWLEDGE,
     Act.COMMENTED: Role.ACKNOWLEDGE,
-    Deed.OUT_OF_SERVICE: Role.CONFIGURE,  # without an end, and for every shift
+    Deed.OUT_OF_SERVICE: Role.CONFIGURE,  # without a time limit, and for every shift
     Deed.IN_SERVICE: Role.CONFIGURE,
 }
 
@@ -79,7 +79,7 @@ CSP = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self';"
     " frame-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
-# A report brings its style with it. Nothing in it is run.
+# A report contains its style. Nothing in it is executed.
 REPORT_CSP = (
     "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none';"
     " frame-ancestors 'self'; sandbox allow-popups"
@@ -98,14 +98,14 @@ HEADERS = {
 
 @dataclass(frozen=True)
 class Access:
-    """How the page is reached, and what that asks for."""
+    """How the page is reached, and the access rules that follow."""
 
-    names: frozenset[str] = frozenset()  # of this machine, beside its addresses and localhost
+    names: frozenset[str] = frozenset()  # of this machine, besides its addresses and localhost
     secure: bool = False  # over TLS
-    open_to_see: bool = True  # only loopback: to see needs no login, to act does
+    open_to_see: bool = True  # on loopback only: reading needs no login, acting does
 
     def is_ours(self, host: str) -> bool:
-        """Whether a Host header is of this machine: a foreign name was led here by its DNS."""
+        """Whether a Host header names this machine: a foreign name may point here by its DNS."""
         try:
             name = (urlsplit(f"//{host}").hostname or "").lower()
         except ValueError:
@@ -119,13 +119,13 @@ class Access:
         return True
 
     def is_own_origin(self, headers: Headers) -> bool:
-        """Whether a request comes from a page of ours."""
+        """Whether a request comes from this program's own page."""
         scheme = "https" if self.secure else "http"
         return headers.get("origin") == f"{scheme}://{headers.get('host', '')}"
 
 
 class Page:
-    """All that the page does."""
+    """The routes of the page and their handlers."""
 
     def __init__(
         self,
@@ -133,17 +133,18 @@ class Page:
         authenticator: Authenticator,
         sessions: Sessions,
         access: Access,
-        hall: PlantOverview | None = None,
+        plant: PlantOverview | None = None,
     ) -> None:
-        self.hall = hall
+        self.plant = plant
         self.ejectors, self.sessions, self.access = ejectors, sessions, access
         self._authenticator, self.users = authenticator, authenticator.users
         self._catalogues = Catalogues()
         self._states = [
-            {code: _Remembered(one.state) for code in self._catalogues.texts} for one in ejectors
+            {code: _CachedState(ejector.state) for code in self._catalogues.texts}
+            for ejector in ejectors
         ]
-        self._one_login = asyncio.Lock()  # at a time: its hash takes memory and time
-        self._one_trend = asyncio.Lock()
+        self._login_lock = asyncio.Lock()  # one at a time: its hash takes memory and time
+        self._trend_lock = asyncio.Lock()
         files = resources.files("twin.page").joinpath("static")
         self._static = {name: files.joinpath(name).read_bytes() for name in STATIC}
         self._pages = {
@@ -152,8 +153,8 @@ class Page:
         }
 
     def app(self) -> ASGIApp:
-        """As uvicorn takes it."""
-        one = "/api/ejectors/{number}"
+        """The ASGI application for uvicorn."""
+        ejector_path = "/api/ejectors/{number}"
         routes: list[BaseRoute] = [
             Route("/", self.index),
             Route("/login", self.login_page),
@@ -164,16 +165,16 @@ class Page:
             Route("/language/{code}", self.choose_language),
             Route("/api/me", self.me),
             Route("/api/statistics", self.statistics),
-            Route(f"{one}/history", self.history),
-            Route(f"{one}/trends/{{name}}", self.trend),
-            Route(f"{one}/requests", self.ask, methods=["POST"]),
-            Route(f"{one}/comments", self.comment, methods=["POST"]),
-            Route(f"{one}/requests/{{request_number}}", self.answer),
+            Route(f"{ejector_path}/history", self.history),
+            Route(f"{ejector_path}/trends/{{name}}", self.trend),
+            Route(f"{ejector_path}/requests", self.ask, methods=["POST"]),
+            Route(f"{ejector_path}/comments", self.comment, methods=["POST"]),
+            Route(f"{ejector_path}/requests/{{request_number}}", self.answer),
             Route("/reports/{number}/{name}", self.report),
             WebSocketRoute("/live", self.live),
         ]
-        if self.hall is not None:
-            routes += AllEjectors(self.hall, self._require_sight).routes()
+        if self.plant is not None:
+            routes += AllEjectors(self.plant, self._require_sight).routes()
             routes.append(Route(ALL, self.all_page))
         handlers: dict[Any, Any] = {HTTPException: self.refused, TwinError: self.trouble}
 
@@ -183,25 +184,25 @@ class Page:
     # --- languages ------------------------------------------------------------------------------
 
     def _page(self, connection: HTTPConnection, name: str, **values: str) -> str:
-        """A page in the language of who reads it; ``values`` are HTML already."""
-        said = MARKED.sub(lambda found: html.escape(tr(found[1])), self._pages[name])
-        return Template(said).substitute(values, language=connection.scope["language"])
+        """A page in the reader's language; ``values`` are HTML already."""
+        markup = MARKED.sub(lambda match: html.escape(tr(match[1])), self._pages[name])
+        return Template(markup).substitute(values, language=connection.scope["language"])
 
     async def texts(self, request: Request) -> Response:
-        """What scripts say, in the language of who reads it."""
+        """The texts of scripts in the reader's language."""
         code = request.scope["language"]
         texts = json.dumps(dict(self._catalogues.texts[code]), ensure_ascii=False)
         script = f"const LANGUAGE = {json.dumps(code)};\nconst TEXTS = {texts};\n"
         return Response(script, media_type="text/javascript")
 
     async def choose_language(self, request: Request) -> Response:
-        """Keep what somebody chose, and lead back to where it was chosen."""
+        """Store a chosen language in a cookie, and redirect to the previous page."""
         code = request.path_params["code"]
         if code not in self._catalogues.texts:
             raise HTTPException(HTTPStatus.NOT_FOUND)
-        before = urlsplit(request.headers.get("referer", "")).path
-        back = before if before in (ALL, "/login") else "/"
-        answer = RedirectResponse(back, HTTPStatus.SEE_OTHER)
+        previous = urlsplit(request.headers.get("referer", "")).path
+        target = previous if previous in (ALL, "/login") else "/"
+        answer = RedirectResponse(target, HTTPStatus.SEE_OTHER)
         answer.set_cookie(
             LANGUAGE,
             code,
@@ -212,7 +213,7 @@ class Page:
         )
         return answer
 
-    # --- who it is ------------------------------------------------------------------------------
+    # --- authentication -------------------------------------------------------------------------
 
     def _session(self, connection: HTTPConnection) -> Session | None:
         return self.sessions.get(connection.cookies.get(COOKIE))
@@ -225,7 +226,7 @@ class Page:
             raise HTTPException(HTTPStatus.UNAUTHORIZED, tr("log in first"))
 
     def _require_session(self, request: Request) -> Session:
-        """Who asks for a change: logged in, from a page of ours, with its token."""
+        """The session of a request for a change: own origin, logged in, with the CSRF token."""
         if not self.access.is_own_origin(request.headers):
             raise HTTPException(HTTPStatus.FORBIDDEN, tr("this was not asked from the page itself"))
         session = self._session(request)
@@ -237,7 +238,7 @@ class Page:
         return session
 
     async def _require_role(self, request: Request, session: Session, deed: str) -> None:
-        """As the file of users has it now, not as it was at the login."""
+        """Require the role for a request, by the users' present roles, not those at the login."""
         role, needed = self.users.role(session.user), NEEDED.get(deed, Role.CONFIGURE)
         if role is None or not role.covers(needed):
             await self._record(request, Act.DENIED, session.user, wanted=deed)
@@ -251,41 +252,42 @@ class Page:
                 ),
             )
 
-    async def _record(self, request: Request, what: str, who: str, **details: str) -> None:
+    async def _record(self, request: Request, act: str, user: str, **details: str) -> None:
         record = partial(self._authenticator.audit.record, **details)
-        await run_sync(record, what, who, _address(request))
+        await run_sync(record, act, user, _address(request))
 
     async def login_page(self, request: Request) -> Response:
-        """The form."""
+        """The login form."""
         return self._login_form(request)
 
-    def _login_form(self, request: Request, said: str = "", status: int = 200) -> Response:
-        if not said and not self.users.names:
-            said = tr("There are no users yet. On the machine of the page: twin users add NAME")
-        role = ' role="alert"' if said else ""
+    def _login_form(self, request: Request, message: str = "", status: int = 200) -> Response:
+        if not message and not self.users.names:
+            message = tr("There are no users yet. On the machine of the page: twin users add NAME")
+        role = ' role="alert"' if message else ""
         languages = " ".join(
-            f'<a href="/language/{one["code"]}" lang="{one["code"]}">{html.escape(one["name"])}</a>'
-            for one in self._catalogues.names
+            f'<a href="/language/{language["code"]}" lang="{language["code"]}">'
+            f"{html.escape(language['name'])}</a>"
+            for language in self._catalogues.names
         )
-        shown = {"said": html.escape(said), "role": role, "languages": languages}
-        return HTMLResponse(self._page(request, "login.html", **shown), status)
+        values = {"said": html.escape(message), "role": role, "languages": languages}
+        return HTMLResponse(self._page(request, "login.html", **values), status)
 
     async def login(self, request: Request) -> Response:
-        """Take name and password; slower after wrong ones."""
+        """Log in with name and password; after wrong ones there is a wait."""
         if not self.access.is_own_origin(request.headers):
             raise HTTPException(HTTPStatus.FORBIDDEN, tr("this was not asked from the page itself"))
         form = parse_qs((await _body(request)).decode(errors="replace"), max_num_fields=5)
         name, password = (form.get(key, [""])[0] for key in ("name", "password"))
-        async with self._one_login:
+        async with self._login_lock:
             log_in = self._authenticator.log_in
             login = await run_sync(log_in, name, password, _address(request))
         if login.role is None:
-            said, status = tr("Name or password is wrong."), HTTPStatus.UNAUTHORIZED
+            message, status = tr("Name or password is wrong."), HTTPStatus.UNAUTHORIZED
             if login.wait_s > 0.0:
                 wait = f"{login.wait_s:.0f}"
-                said = tr("Too many wrong passwords. Try again in {wait} s.", wait=wait)
+                message = tr("Too many wrong passwords. Try again in {wait} s.", wait=wait)
                 status = HTTPStatus.TOO_MANY_REQUESTS
-            return self._login_form(request, said, status)
+            return self._login_form(request, message, status)
         self.sessions.end(request.cookies.get(COOKIE))
         answer = RedirectResponse("/", HTTPStatus.SEE_OTHER)
         answer.set_cookie(
@@ -308,24 +310,26 @@ class Page:
         return answer
 
     async def me(self, request: Request) -> Response:
-        """Who is logged in, the token for what he asks, and what there is to see."""
+        """The logged-in user with the CSRF token, and the ejectors and figures to show."""
         self._require_sight(request)
         session = self._session(request)
-        own: dict[str, Any] = {"user": "", "may": []}
+        user: dict[str, Any] = {"user": "", "may": []}
         if session is not None:
             role = self.users.role(session.user)
             may = [deed for deed, needed in NEEDED.items() if role and role.covers(needed)]
-            own = {"user": session.user, "csrf": session.csrf, "may": may}
-        ejectors = [{"name": one.name, "type": one.config.asset.type} for one in self.ejectors]
+            user = {"user": session.user, "csrf": session.csrf, "may": may}
+        ejectors = [
+            {"name": ejector.name, "type": ejector.config.asset.type} for ejector in self.ejectors
+        ]
         figures = self.ejectors[0].figures() if self.ejectors else []
-        known = {"ejectors": ejectors, "figures": figures, "all": self.hall is not None}
-        known["languages"] = self._catalogues.names
-        return JSONResponse({**own, **known})
+        common = {"ejectors": ejectors, "figures": figures, "all": self.plant is not None}
+        common["languages"] = self._catalogues.names
+        return JSONResponse({**user, **common})
 
     # --- pages ----------------------------------------------------------------------------------
 
     async def index(self, request: Request) -> Response:
-        """The page itself; the rest it asks for."""
+        """The page itself; it requests the rest."""
         if not self._may_see(request):
             return RedirectResponse("/login", HTTPStatus.SEE_OTHER)
         if not self.ejectors:
@@ -339,7 +343,7 @@ class Page:
         return HTMLResponse(self._page(request, "all.html"))
 
     async def static(self, request: Request) -> Response:
-        """What the page is made of."""
+        """A static file of the page."""
         name = request.path_params["name"]
         if name not in self._static:
             raise HTTPException(HTTPStatus.NOT_FOUND)
@@ -347,14 +351,14 @@ class Page:
         return Response(self._static[name], headers=headers, media_type=STATIC[name])
 
     async def report(self, request: Request) -> Response:
-        """The page of a diagnosis."""
+        """The HTML report of a diagnosis."""
         self._require_sight(request)
-        found = await run_sync(self._ejector(request).report, request.path_params["name"])
-        if found is None:
+        content = await run_sync(self._ejector(request).report, request.path_params["name"])
+        if content is None:
             raise HTTPException(HTTPStatus.NOT_FOUND, tr("this report is not kept any more"))
-        return HTMLResponse(found, headers=REPORT_HEADERS)
+        return HTMLResponse(content, headers=REPORT_HEADERS)
 
-    # --- what there is to know ------------------------------------------------------------------
+    # --- data -----------------------------------------------------------------------------------
 
     def _ejector(self, request: Request) -> Ejector:
         number = _number(request, "number")
@@ -363,42 +367,42 @@ class Page:
         return self.ejectors[number]
 
     async def history(self, request: Request) -> Response:
-        """Every time an alarm was active."""
+        """The episodes of all alarms."""
         self._require_sight(request)
         return JSONResponse(await run_sync(self._ejector(request).history, _days(request)))
 
     async def statistics(self, request: Request) -> Response:
-        """How many alarms people get, of all ejectors of the page together."""
+        """The alarm load of all ejectors of the page together."""
         self._require_sight(request)
         now_ns = time.time_ns()
         since_ns = now_ns - round(_days(request) * DAY_NS)
         return JSONResponse(await run_sync(self._statistics, since_ns, now_ns))
 
     def _statistics(self, since_ns: int, now_ns: int) -> list[tuple[str, str]]:
-        episodes = [found for one in self.ejectors for found in one.episodes(since_ns)]
-        of_name = {one.name: one for one in self.ejectors}
+        episodes = [episode for ejector in self.ejectors for episode in ejector.episodes(since_ns)]
+        of_name = {ejector.name: ejector for ejector in self.ejectors}
 
-        def title(known: tuple[str, str]) -> str:
-            name, alarm = known
+        def title(key: tuple[str, str]) -> str:
+            name, alarm = key
             return f"{name}: {of_name[name].title(alarm)}"
 
         return in_words(statistics(episodes, since_ns, now_ns), title, now_ns)
 
     async def trend(self, request: Request) -> Response:
-        """How a figure runs over days; one at a time."""
+        """The trend of a figure over days; one request at a time."""
         self._require_sight(request)
         ejector, name = self._ejector(request), request.path_params["name"]
-        async with self._one_trend:
+        async with self._trend_lock:
             return JSONResponse(await run_sync(ejector.trend, name, _days(request)))
 
     async def ask(self, request: Request) -> Response:
-        """Ask the run something of an alarm; gives the number to look for the answer by."""
+        """Send a request about an alarm to the run; returns the number to get its answer by."""
         session = self._require_session(request)
         ejector = self._ejector(request)
         try:
-            asked = json.loads(await _body(request))
-            alarm, deed = str(asked["alarm"]), str(asked["deed"])
-            seconds = float(asked.get("seconds", 0.0))
+            body = json.loads(await _body(request))
+            alarm, deed = str(body["alarm"]), str(body["deed"])
+            seconds = float(body.get("seconds", 0.0))
         except NO_REQUEST as error:
             raise HTTPException(HTTPStatus.BAD_REQUEST, "not a request") from error
         await self._require_role(request, session, deed)
@@ -407,25 +411,25 @@ class Page:
         return JSONResponse({"request": number}, HTTPStatus.ACCEPTED)
 
     async def comment(self, request: Request) -> Response:
-        """Keep what somebody writes to an alarm."""
+        """Store a comment on an alarm."""
         session = self._require_session(request)
         ejector = self._ejector(request)
         try:
-            written = json.loads(await _body(request))
-            (name, raised), text = written["episode"], str(written["text"]).strip()
+            body = json.loads(await _body(request))
+            (name, raised), text = body["episode"], str(body["text"]).strip()
             alarm, raised_ns = str(name), _instant(str(raised))
         except NO_REQUEST as error:
             raise HTTPException(HTTPStatus.BAD_REQUEST, "not a comment") from error
         if not 0 < len(text) <= LONGEST_COMMENT:
-            wanted = tr("a comment has 1 to {most} letters", most=LONGEST_COMMENT)
-            raise HTTPException(HTTPStatus.BAD_REQUEST, wanted)
+            hint = tr("a comment has 1 to {most} letters", most=LONGEST_COMMENT)
+            raise HTTPException(HTTPStatus.BAD_REQUEST, hint)
         await self._require_role(request, session, Act.COMMENTED)
         await run_sync(ejector.comment, alarm, raised_ns, session.user, text)
         await self._record(request, Act.COMMENTED, session.user, unit=ejector.name, alarm=alarm)
         return JSONResponse({}, HTTPStatus.CREATED)
 
     async def answer(self, request: Request) -> Response:
-        """What has become of it: null while nobody has answered, empty if it was done."""
+        """The answer to a request: null while there is none, empty if it was done."""
         self._require_sight(request)
         number = _number(request, "request_number")
         return JSONResponse({"answer": await run_sync(self._ejector(request).answer, number)})
@@ -433,9 +437,9 @@ class Page:
     # --- live -----------------------------------------------------------------------------------
 
     async def live(self, socket: WebSocket) -> None:
-        """States of all ejectors every second, rows of the one that the browser watches.
+        """Send all ejectors' states every second, and rows of the one that the browser watches.
 
-        A browser that is slow gets what is newest then; nothing waits for it here.
+        A slow browser gets only the newest data; nothing waits for it.
         """
         allowed = self.access.is_own_origin(socket.headers) and self._may_see(socket)
         if not (allowed and self.ejectors):
@@ -443,19 +447,19 @@ class Page:
             return
         await socket.accept()
         watched = _Watched()
-        telling = asyncio.create_task(self._tell(socket, watched))
+        updates = asyncio.create_task(self._send_updates(socket, watched))
         try:
             while True:
                 watched.take(await socket.receive_text(), len(self.ejectors))
         except (WebSocketDisconnect, ValueError):
             pass
         finally:
-            telling.cancel()
+            updates.cancel()
             with suppress(asyncio.CancelledError, WebSocketDisconnect, TimeoutError):
-                await telling
+                await updates
 
-    async def _tell(self, socket: WebSocket, watched: "_Watched") -> None:
-        """Until the browser is gone, too slow, or its session over."""
+    async def _send_updates(self, socket: WebSocket, watched: "_Watched") -> None:
+        """Send updates until the browser is gone or too slow, or its session has ended."""
         loop = asyncio.get_running_loop()
         next_state = 0.0
         try:
@@ -463,16 +467,18 @@ class Page:
                 if loop.time() >= next_state:
                     next_state = loop.time() + STATE_S
                     code = socket.scope["language"]
-                    states = [await one[code].get() for one in self._states]
+                    states = [
+                        await states_by_language[code].get() for states_by_language in self._states
+                    ]
                     await _send(socket, {"states": states})
-                await self._tell_rows(socket, watched)
+                await self._send_rows(socket, watched)
                 await asyncio.sleep(ROWS_S)
         finally:
             with suppress(RuntimeError, WebSocketDisconnect):  # it is closed already
                 await socket.close(1008)
 
-    async def _tell_rows(self, socket: WebSocket, watched: "_Watched") -> None:
-        """What is new of the ejector that is watched."""
+    async def _send_rows(self, socket: WebSocket, watched: "_Watched") -> None:
+        """Send new rows of the watched ejector."""
         number, since = watched.number, watched.since
         rows = await run_sync(self.ejectors[number].rows, since)
         if rows is None or (number, since) != (watched.number, watched.since):
@@ -480,50 +486,53 @@ class Page:
         watched.since = rows["next"]
         await _send(socket, {"rows": rows, "of": number})
 
-    # --- troubles -------------------------------------------------------------------------------
+    # --- errors ---------------------------------------------------------------------------------
 
     async def refused(self, request: Request, error: HTTPException) -> Response:
-        """What cannot be had, as a plain page or as JSON."""
-        return self._said(request, error.status_code, error.detail)
+        """A refused request, as a plain page or as JSON."""
+        return self._error_response(request, error.status_code, error.detail)
 
     async def trouble(self, request: Request, error: TwinError) -> Response:
-        """What a person can put right."""
+        """An error that a person can correct."""
         status = HTTPStatus.BAD_REQUEST if error.exit_code == 2 else HTTPStatus.SERVICE_UNAVAILABLE
-        return self._said(request, status, str(error))
+        return self._error_response(request, status, str(error))
 
-    def _said(self, request: Request, status: int, what: str) -> Response:
+    def _error_response(self, request: Request, status: int, message: str) -> Response:
         if request.url.path.startswith("/api/"):
-            return JSONResponse({"error": what}, status)
-        title, what = tr(HTTPStatus(status).phrase), tr(what)  # a refusal may have no other words
-        shown = {"title": html.escape(title), "what": html.escape(what)}
-        return HTMLResponse(self._page(request, "error.html", **shown), status)
+            return JSONResponse({"error": message}, status)
+        title, message = (
+            tr(HTTPStatus(status).phrase),
+            tr(message),
+        )  # a refusal may have only its status phrase
+        values = {"title": html.escape(title), "what": html.escape(message)}
+        return HTMLResponse(self._page(request, "error.html", **values), status)
 
 
-class _Remembered:
-    """A state that several browsers ask for, looked at once a second at most."""
+class _CachedState:
+    """A state that several browsers request; it is read at most once a second."""
 
-    def __init__(self, look: Callable[[], dict[str, Any]]) -> None:
-        self._look = look
+    def __init__(self, read_state: Callable[[], dict[str, Any]]) -> None:
+        self._read_state = read_state
         self._lock = asyncio.Lock()
-        self._then = float("-inf")
+        self._read_s = float("-inf")
         self._state: dict[str, Any] = {}
 
     async def get(self) -> dict[str, Any]:
         loop = asyncio.get_running_loop()
         async with self._lock:
-            if loop.time() >= self._then + 0.9 * STATE_S:
-                self._state, self._then = await run_sync(self._look), loop.time()
+            if loop.time() >= self._read_s + 0.9 * STATE_S:
+                self._state, self._read_s = await run_sync(self._read_state), loop.time()
             return self._state
 
 
 class _Watched:
-    """Which ejector a browser shows, and from which row on it wants more."""
+    """The ejector that a browser shows, and the next row to send."""
 
     def __init__(self) -> None:
         self.number = self.since = 0
 
     def take(self, text: str, ejectors: int) -> None:
-        """Take what it says; ValueError for anything else than a number that there is."""
+        """Take the browser's choice; ValueError unless it is the number of an ejector."""
         number = int(text)
         if not 0 <= number < ejectors:
             raise ValueError
@@ -531,9 +540,9 @@ class _Watched:
 
 
 class _Guard:
-    """Before everything: hosts that are ours, and the language of who asks.
+    """Checks the host and sets the reader's language before each request.
 
-    After everything: the headers of every answer.
+    It adds the common headers to every answer.
     """
 
     def __init__(self, app: ASGIApp, access: Access, catalogues: Catalogues) -> None:
@@ -547,27 +556,27 @@ class _Guard:
             if scope["type"] == "websocket":
                 await send({"type": "websocket.close", "code": 1008})
                 return
-            refused = Response("This page has another name.\n", HTTPStatus.BAD_REQUEST)
-            await refused(scope, receive, _headed(send))
+            refusal = Response("This page has another name.\n", HTTPStatus.BAD_REQUEST)
+            await refusal(scope, receive, _with_headers(send))
             return
-        asked = HTTPConnection(scope)
-        accepted = asked.headers.get("accept-language", "")
-        code = self._catalogues.choose(asked.cookies.get(LANGUAGE, ""), accepted)
+        connection = HTTPConnection(scope)
+        accepted = connection.headers.get("accept-language", "")
+        code = self._catalogues.choose(connection.cookies.get(LANGUAGE, ""), accepted)
         scope["language"] = code
         with speaking(self._catalogues.texts[code]):
-            await self._app(scope, receive, _headed(send))
+            await self._app(scope, receive, _with_headers(send))
 
 
-def _headed(send: Send) -> Send:
+def _with_headers(send: Send) -> Send:
     async def with_headers(message: Message) -> None:
         if message["type"] == "http.response.start":
-            there = {name for name, _ in message["headers"]}
+            existing = {name for name, _ in message["headers"]}
             message["headers"] = [
                 *message["headers"],
                 *(
                     (name.encode(), value.encode())
                     for name, value in HEADERS.items()
-                    if name.encode() not in there
+                    if name.encode() not in existing
                 ),
             ]
         await send(message)
@@ -575,13 +584,13 @@ def _headed(send: Send) -> Send:
     return with_headers
 
 
-async def _send(socket: WebSocket, what: Any) -> None:
+async def _send(socket: WebSocket, document: Any) -> None:
     async with asyncio.timeout(SLOWEST_S):
-        await socket.send_text(json.dumps(what, ensure_ascii=False, allow_nan=False))
+        await socket.send_text(json.dumps(document, ensure_ascii=False, allow_nan=False))
 
 
 async def _body(request: Request) -> bytes:
-    """What was sent, up to MOST_BODY."""
+    """The body of a request, up to MOST_BODY bytes."""
     body = b""
     try:
         async with asyncio.timeout(SLOWEST_S):
@@ -599,7 +608,7 @@ def _address(request: Request) -> str:
 
 
 def _number(request: Request, name: str) -> int:
-    """A number in the path; NOT_FOUND for anything else, and for one that nothing can have."""
+    """A number in the path; NOT_FOUND for anything else, and for a number that is too long."""
     text = str(request.path_params[name])
     if not (text.isascii() and text.isdigit() and len(text) <= MOST_DIGITS):
         raise HTTPException(HTTPStatus.NOT_FOUND)
@@ -607,7 +616,7 @@ def _number(request: Request, name: str) -> int:
 
 
 def _instant(digits: str) -> int:
-    """Nanoseconds as a database can have them; ValueError for anything else."""
+    """Nanoseconds that fit into a database; ValueError for anything else."""
     if not (digits.isascii() and digits.isdigit() and len(digits) <= MOST_DIGITS + 1):
         raise ValueError
     return min(int(digits), 2**63 - 1)
@@ -623,5 +632,5 @@ def _days(request: Request) -> float:
     return days
 
 
-def _same(given: str, known: str) -> bool:
-    return hmac.compare_digest(given.encode(), known.encode())
+def _same(first: str, second: str) -> bool:
+    return hmac.compare_digest(first.encode(), second.encode())

@@ -1,4 +1,4 @@
-"""The languages of the page: gettext catalogues, and which of them a browser asks for."""
+"""The languages of the page: gettext catalogues, and the choice by a browser's preferences."""
 
 from collections.abc import Mapping, Sequence
 from importlib import resources
@@ -9,7 +9,7 @@ from babel.messages.pofile import read_po
 from twin.language import Texts
 
 ENGLISH = "en"
-MOST_ASKED = 20  # languages of a browser that are looked at
+MOST_ASKED = 20  # languages of a browser that are considered
 
 
 class Catalogues:
@@ -24,23 +24,25 @@ class Catalogues:
 
     @property
     def names(self) -> list[dict[str, str]]:
-        """Each language as it calls itself."""
+        """Each language's code and its own name."""
         return [{"code": code, "name": _own_name(code)} for code in self.texts]
 
     def choose(self, chosen: str, accepted: str) -> str:
         """The code of a language: the ``chosen`` one, else the best that a browser accepts."""
-        known = {code.lower(): code for code in self.texts}
+        codes = {code.lower(): code for code in self.texts}
         for language in (chosen, *_preferred(accepted)):
-            whole = language.lower()
-            if found := known.get(whole) or known.get(whole.partition("-")[0]):
-                return found
+            lower_case = language.lower()
+            if match := codes.get(lower_case) or codes.get(lower_case.partition("-")[0]):
+                return match
         return ENGLISH
 
 
 def _read(file: bytes) -> Texts:
     messages = read_po(file.splitlines(keepends=True))
     return {
-        str(one.id): str(one.string) for one in messages if one.id and one.string and not one.fuzzy
+        str(message.id): str(message.string)
+        for message in messages
+        if message.id and message.string and not message.fuzzy
     }
 
 
@@ -51,8 +53,8 @@ def _own_name(code: str) -> str:
 
 
 def _preferred(accepted: str) -> Sequence[str]:
-    """The languages of an Accept-Language header (RFC 9110), the most wanted first."""
-    wanted = []
+    """The languages of an Accept-Language header (RFC 9110), in order of preference."""
+    languages = []
     for part in accepted.split(",")[:MOST_ASKED]:
         language, _, weight = part.partition(";")
         try:
@@ -60,5 +62,5 @@ def _preferred(accepted: str) -> Sequence[str]:
         except ValueError:
             continue
         if language.strip() and quality > 0.0:
-            wanted.append((quality, language.strip()))
-    return [language for _, language in sorted(wanted, key=lambda one: -one[0])]
+            languages.append((quality, language.strip()))
+    return [language for _, language in sorted(languages, key=lambda item: -item[0])]

@@ -1,6 +1,6 @@
-"""One ejector as the page sees it: what its run and its databases have left, read anew each time.
+"""One ejector for the page: reads what its run and its databases have stored, anew each time.
 
-Everything here may wait for a disk or a database; the page calls it in a thread.
+All methods may wait for a disk or a database, so the page calls them in a thread.
 """
 
 import math
@@ -44,20 +44,20 @@ from twin.signals import BREAK, MBAR
 SHOWN_S = 10.0  # of live rows, at first
 MOST_EPISODES = 500
 MOST_POINTS = 600  # of a trend's cycles
-AHEAD = 0.25  # of the record, drawn after its end where nothing is reached
+AHEAD = 0.25  # share of the record to extrapolate where no limit is reached
 REPORT = re.compile(r"[0-9a-f]{32}")
 
 
 class Ejector:
-    """What is known of one ejector, for its page; ConfigError where a run keeps nothing for it."""
+    """The data of one ejector for its page; ConfigError if a run stores nothing for it."""
 
     def __init__(self, config: Config, clock: Callable[[], int] = time.time_ns) -> None:
         document = config.document
-        kept = {
+        settings = {
             "alarms": document.section(AlarmSettings, "alarms").keep,
             "page": document.section(PageSettings, "page").keep,
         }
-        for name, is_kept in kept.items():
+        for name, is_kept in settings.items():
             if not is_kept:
                 raise ConfigError(
                     f"{document.name}: twin run keeps nothing for its page under [{name}]",
@@ -69,37 +69,37 @@ class Ejector:
         self._limits = limits_of(config)
         self._folder = folder_of(document, config.asset)
         self._unit = Unit(config.asset.type, config.asset.id)
-        self._asked: set[int] = set()  # through this page
+        self._asked: set[int] = set()  # numbers of requests made through this page
 
-    # --- what stands ----------------------------------------------------------------------------
+    # --- status ---------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
-        """Traffic light, alarms and how the run is; a database that is away is said in it."""
+        """Status, alarms and state of the run; it also reports an unreachable database."""
         now = self._clock()
         live = ring.read(self._folder / RING, since=2**62)
         running = live is not None and live.is_running(now)
-        own = {"name": self.name, "type": self.config.asset.type, "now": now / S_NS}
-        own |= {"running": running, "last": live and live.last_ns / S_NS, "trouble": ""}
-        own |= {"ended": bool(live and live.ended_ns), "zone": zone(now)}
-        own |= {"last_seen": said(None if live is None else live.last_ns, now)}
+        document = {"name": self.name, "type": self.config.asset.type, "now": now / S_NS}
+        document |= {"running": running, "last": live and live.last_ns / S_NS, "trouble": ""}
+        document |= {"ended": bool(live and live.ended_ns), "zone": zone(now)}
+        document |= {"last_seen": said(None if live is None else live.last_ns, now)}
         try:
             with self._alarms() as store:
                 board = self._board(store, now)
                 episodes = store.episodes(self._unit, only_going_on=True)
                 waiting = store.requests(self._unit)
-                first = min((one.raised_ns for one in episodes), default=now)
+                first = min((episode.raised_ns for episode in episodes), default=now)
                 comments = store.comments(self._unit, first)
         except TwinError as error:
             grey = {"light": Light.GREY.value, "words": tr(WORDS[Light.GREY]), "alarms": []}
             if live is None:  # before the first run there is none
-                return own | grey
-            return own | grey | {"words": tr("Alarms unknown"), "trouble": _with_hint(error)}
+                return document | grey
+            return document | grey | {"words": tr("Alarms unknown"), "trouble": _with_hint(error)}
         light = light_of(board, running=running)
-        found = {"light": light.value, "words": tr(WORDS[light])}
-        return own | found | {"alarms": listed(board, episodes, waiting, now, comments)}
+        shown = {"light": light.value, "words": tr(WORDS[light])}
+        return document | shown | {"alarms": listed(board, episodes, waiting, now, comments)}
 
     def history(self, days: float) -> list[dict[str, Any]]:
-        """Every time an alarm was active, the newest first."""
+        """Episodes of the last days, the newest first."""
         values = {rule.name: rule.value for rule in self._rules}
         priorities = {rule.name: rule.priority.value for rule in self._rules}
         now = self._clock()
@@ -111,59 +111,59 @@ class Ejector:
             )
         return [
             {
-                "alarm": one.alarm,
-                "priority": priorities.get(one.alarm, ""),
-                "priority_words": priority_words(priorities.get(one.alarm, "")),
-                **told(one, values.get(one.alarm, ""), now, comments),
+                "alarm": episode.alarm,
+                "priority": priorities.get(episode.alarm, ""),
+                "priority_words": priority_words(priorities.get(episode.alarm, "")),
+                **told(episode, values.get(episode.alarm, ""), now, comments),
             }
-            for one in reversed(episodes[-MOST_EPISODES:])
+            for episode in reversed(episodes[-MOST_EPISODES:])
         ]
 
     def episodes(self, since_ns: int) -> list[tuple[str, Episode]]:
-        """Every time an alarm was active since then, and what stood before and goes on."""
+        """Episodes since a time, and earlier ones that are not over."""
         with self._alarms() as store:
-            return [(self.name, one) for one in store.episodes_around(self._unit, since_ns)]
+            return [(self.name, episode) for episode in store.episodes_around(self._unit, since_ns)]
 
     def title(self, alarm: str) -> str:
-        """An alarm as people say it."""
+        """The title of an alarm for people."""
         values = {rule.name: rule.value for rule in self._rules}
         return str(named(alarm, values.get(alarm, ""))["what"])
 
-    # --- what people ask ------------------------------------------------------------------------
+    # --- requests -------------------------------------------------------------------------------
 
     def ask(self, alarm: str, deed: str, who: str, seconds: float) -> int:
-        """Ask the run something of an alarm, as ``twin alarms`` does; gives the request's number.
+        """Send a request about an alarm to the run, like ``twin alarms``; returns its number.
 
-        ConfigError for what no run would grant.
+        ConfigError for a request that no run would grant.
         """
-        if deed not in {one.value for one in ASKABLE}:
+        if deed not in {deed_kind.value for deed_kind in ASKABLE}:
             raise ConfigError(f"{deed!r} is nothing that can be asked of an alarm")
-        wanted = Board(self._rules)[alarm]
+        alarm_to_ask = Board(self._rules)[alarm]
         if deed == Deed.SHELVED:
-            list(wanted.shelve(0, seconds, who))  # refuses what a run would refuse
+            list(alarm_to_ask.shelve(0, seconds, who))  # raises where a run would refuse
         with self._alarms() as store:
             number = store.ask(self._unit, alarm, Deed(deed), who, seconds)
         self._asked.add(number)
         return number
 
     def answer(self, number: int) -> str | None:
-        """Why a request was refused, empty if it was done; None while no run has answered."""
+        """Why a request was refused, empty if it was done; None while it is unanswered."""
         if number not in self._asked:
             raise ConfigError(f"nothing was asked here with the number {number}")
         with self._alarms() as store:
             return store.answer(number)
 
     def comment(self, raised_as: str, raised_ns: int, who: str, text: str) -> None:
-        """Keep what somebody writes to an alarm; no run is needed for it."""
+        """Store a comment on an alarm; this needs no run."""
         with self._alarms() as store:
             store.comment(self._unit, Comment(raised_ns, raised_as, self._clock(), who, text))
 
     # --- live -----------------------------------------------------------------------------------
 
     def rows(self, since: int) -> dict[str, Any] | None:
-        """What is new since a row's number, vacuum in mbar; None where nothing is.
+        """New rows since a row's number, vacuum in mbar; None if there are none.
 
-        Who is far behind gets the last SHOWN_S and no more.
+        A browser that is far behind gets only the last SHOWN_S.
         """
         live = ring.read(self._folder / RING, since)
         if live is None or live.next == since:
@@ -179,7 +179,7 @@ class Ejector:
         return {
             "next": live.next,
             "time": (rows["time_ns"] / S_NS).round(3).tolist(),
-            "host": (rows["host_ns"] / S_NS).round(3).tolist(),  # as the alarms have it
+            "host": (rows["host_ns"] / S_NS).round(3).tolist(),  # the time base of alarms
             "phase": rows["phase"].tolist(),
             "commands": rows["commands"].tolist(),
             "broken": broken.astype(int).tolist(),
@@ -189,11 +189,11 @@ class Ejector:
     # --- trends ---------------------------------------------------------------------------------
 
     def figures(self) -> list[dict[str, str]]:
-        """What there are trends of."""
-        return [figure_words(one) for one in FIGURES.values()]
+        """The figures that have trends."""
+        return [figure_words(figure) for figure in FIGURES.values()]
 
     def trend(self, name: str, days: float) -> dict[str, Any]:
-        """How a figure runs over days: cycles, line, band, limit, and when it comes to it."""
+        """The trend of a figure over days: cycles, line, band, limit, and when it is reached."""
         if name not in FIGURES:
             raise ConfigError(f"no figure is called {name!r}")
         figure = FIGURES[name]
@@ -201,24 +201,24 @@ class Ejector:
         since = self._clock() - round(days * DAY_NS)
         with open_figures("", self.config.document, write=False) as store:
             history = store.history(self._unit, since, columns)
-        found: dict[str, Any] = {
+        document: dict[str, Any] = {
             **figure_words(figure),
             "cycles": len(history.cycle),
         }
         if not len(history.cycle):
-            return found | {"words": tr("no cycles in that time")}
+            return document | {"words": tr("no cycles in that time")}
         trend = trend_of_figure(history, figure, self._limits)
-        every = max(1, math.ceil(len(history.cycle) / MOST_POINTS))
+        stride = max(1, math.ceil(len(history.cycle) / MOST_POINTS))
         words = f"{title_of(name)}: {course_in_words(figure, trend, self._clock())}"
-        found |= {"words": words, "limit": trend.limit, "every": every}
-        found |= {"time": (history.host_ns[::every] / S_NS).tolist()}
-        found |= {side: _plain(history.values[f"{name}_{side}"][::every]) for side in SIDES}
-        return found | _drawn(trend)
+        document |= {"words": words, "limit": trend.limit, "every": stride}
+        document |= {"time": (history.host_ns[::stride] / S_NS).tolist()}
+        document |= {side: _plain(history.values[f"{name}_{side}"][::stride]) for side in SIDES}
+        return document | _trend_curve(trend)
 
     # --- reports --------------------------------------------------------------------------------
 
     def report(self, name: str) -> bytes | None:
-        """The page of a diagnosis; None where there is none of that name."""
+        """The HTML report of a diagnosis; None if there is none of that name."""
         if not REPORT.fullmatch(name):
             return None
         try:
@@ -229,7 +229,7 @@ class Ejector:
     # --- the database ---------------------------------------------------------------------------
 
     def _alarms(self) -> AlarmStore:
-        """The alarm database, opened anew each time: one that was taken away is none any more."""
+        """The alarm database, opened anew each time, since it may have been removed."""
         return open_alarms("", self.config.document, write=False)
 
     def _board(self, store: AlarmStore, now: int) -> Board:
@@ -240,9 +240,9 @@ class Ejector:
 
 
 def figure_words(figure: Figure) -> dict[str, str]:
-    """A key figure as people read it."""
-    unit, what = figure.unit, tr(figure.what)
-    return {"name": figure.name, "title": title_of(figure.name), "unit": unit, "what": what}
+    """Name, title, unit and meaning of a key figure for people."""
+    unit, meaning = figure.unit, tr(figure.what)
+    return {"name": figure.name, "title": title_of(figure.name), "unit": unit, "what": meaning}
 
 
 def _with_hint(error: TwinError) -> str:
@@ -250,16 +250,16 @@ def _with_hint(error: TwinError) -> str:
 
 
 def _plain(values: Any) -> list[float | None]:
-    """Numbers as JSON has them, to five digits; null where there is none."""
-    return [float(f"{one:.5g}") if math.isfinite(one) else None for one in values.tolist()]
+    """Numbers for JSON, to five digits; null if not finite."""
+    return [float(f"{value:.5g}") if math.isfinite(value) else None for value in values.tolist()]
 
 
-def _drawn(trend: Trend) -> dict[str, Any]:
-    """The course with its band as one draws it, as far ahead as it may come to its limit."""
+def _trend_curve(trend: Trend) -> dict[str, Any]:
+    """The trend with its band for drawing, extrapolated to where it may reach its limit."""
     if trend.step is None and trend.line is None:
         return {}
     days, middle, half = trend.shape(trend.ahead(AHEAD))
-    at = trend.end_ns / S_NS + days * 86_400.0
+    time = trend.end_ns / S_NS + days * 86_400.0
     step = trend.step and {
         "at": trend.step.host_ns / S_NS,
         "from": trend.step.earliest_ns / S_NS,
@@ -268,7 +268,7 @@ def _drawn(trend: Trend) -> dict[str, Any]:
     return {
         "step": step,
         "line": {
-            "time": at.tolist(),
+            "time": time.tolist(),
             "middle": _plain(middle),
             "low": _plain(middle - half),
             "high": _plain(middle + half),

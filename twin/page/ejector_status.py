@@ -1,6 +1,6 @@
-"""The traffic light of an ejector, and its alarms as a technician reads them.
+"""The status of an ejector, and its alarms for a technician.
 
-Plain dictionaries, as they go to the browser: times are Unix seconds by the clock here.
+The functions return plain dictionaries for the browser; times are Unix seconds of host time.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,8 +27,8 @@ WITHOUT = {  # causes that are no effect
     UNLISTED: "Something that no listed cause explains",
     UNKNOWN: "Something has changed; its cause is not known yet",
 }
-_SPELT = {"plc": "PLC", "h1": "H1", "h2": "H2"}
-_URGENT = (Priority.HIGH, Priority.MEDIUM)
+_UPPER_CASE = {"plc": "PLC", "h1": "H1", "h2": "H2"}
+_URGENT_PRIORITIES = (Priority.HIGH, Priority.MEDIUM)
 STATES = {  # as ISA-18.2 names them
     State.NORMAL: "normal",
     State.UNACKNOWLEDGED: "unacknowledged",
@@ -46,12 +46,12 @@ PRIORITIES = {
 
 
 class Light(StrEnum):
-    """What a person sees from afar."""
+    """The status at a glance, as a traffic light."""
 
-    RED = "red"  # somebody is to act, and nobody has said that he does
-    YELLOW = "yellow"  # something stands, or is kept quiet
-    GREEN = "green"  # it runs, and nothing stands
-    GREY = "grey"  # nothing is known of it now
+    RED = "red"  # an urgent alarm is unacknowledged
+    YELLOW = "yellow"  # an alarm stands, is shelved or is out of service
+    GREEN = "green"  # it runs without alarms
+    GREY = "grey"  # its state is unknown now
 
 
 WORDS = {
@@ -66,20 +66,23 @@ WORST_FIRST = (Light.RED, Light.GREY, Light.YELLOW, Light.GREEN)
 
 
 def rank(state: str, priority: str) -> tuple[int, int]:
-    """Where an alarm stands in a list, the worst first: active and unacknowledged, most urgent."""
-    first = _STANDING.index(State(state)) if state in _STANDING else len(_STANDING)
-    known = priority in _PRIORITIES
-    return first, _PRIORITIES.index(Priority(priority)) if known else len(_PRIORITIES)
+    """The sort key of an alarm: active and unacknowledged ones first, then the most urgent."""
+    position = _STANDING.index(State(state)) if state in _STANDING else len(_STANDING)
+    is_known = priority in _PRIORITIES
+    return position, _PRIORITIES.index(Priority(priority)) if is_known else len(_PRIORITIES)
 
 
 def light_of(board: Board, *, running: bool) -> Light:
-    """The traffic light: never green while an alarm is active, however quiet it is kept."""
+    """The status: never green while an alarm is active, even if it is shelved or suppressed."""
     if not running:
         return Light.GREY
     alarms = board.alarms.values()
-    if any(one.state is State.UNACKNOWLEDGED and one.rule.priority in _URGENT for one in alarms):
+    if any(
+        alarm.state is State.UNACKNOWLEDGED and alarm.rule.priority in _URGENT_PRIORITIES
+        for alarm in alarms
+    ):
         return Light.RED
-    if any(one.concerns or one.state is State.OUT_OF_SERVICE for one in alarms):
+    if any(alarm.concerns or alarm.state is State.OUT_OF_SERVICE for alarm in alarms):
         return Light.YELLOW
     return Light.GREEN
 
@@ -91,21 +94,21 @@ def listed(
     now_ns: int,
     comments: Sequence[Comment] = (),
 ) -> list[dict[str, Any]]:
-    """What a person is to look at, what is active and the most urgent first; then what is quiet."""
-    by_name = {one.alarm: one for one in episodes}
-    shown = [*board.standing(), *board.quiet()]
-    shown.sort(key=lambda one: rank(one.state, one.rule.priority))
+    """Alarms for a person to handle, active and most urgent ones first; then the quiet ones."""
+    by_name = {entry.alarm: entry for entry in episodes}
+    alarms = [*board.standing(), *board.quiet()]
+    alarms.sort(key=lambda entry: rank(entry.state, entry.rule.priority))
     return [
-        _alarm(one, waiting, now_ns)
-        | _episode(by_name.get(one.rule.name), one.rule, now_ns, comments)
-        for one in shown
+        _alarm(entry, waiting, now_ns)
+        | _episode(by_name.get(entry.rule.name), entry.rule, now_ns, comments)
+        for entry in alarms
     ]
 
 
 def _episode(
     episode: Episode | None, rule: Rule, now_ns: int, comments: Sequence[Comment]
 ) -> dict[str, Any]:
-    """What is known of the time that an alarm is active; its name where it is not."""
+    """The facts of an alarm's episode; only its name if it has none."""
     action = {"action": action_of(rule, episode.evidence if episode else {})}
     if episode is None:
         return action | named(rule.name, rule.value) | {"comments": [], "facts": []}
@@ -128,35 +131,35 @@ def _alarm(alarm: Alarm, waiting: Sequence[Request], now_ns: int) -> dict[str, A
         "shelved_until": until and until / S_NS,
         "quiet_until": said(until, now_ns),
         "consequence": tr(rule.consequence),
-        "asked": [_asked(one) for one in waiting if one.alarm == rule.name],
+        "asked": [_request(request) for request in waiting if request.alarm == rule.name],
     }
 
 
 def state_words(state: str) -> str:
-    """A state for people; one that another program has made up stays as it is."""
+    """A state for people; one that is unknown here stays as it is."""
     return tr(STATES[State(state)]) if state in STATES else state
 
 
 def priority_words(priority: str) -> str:
-    """A priority for people; one that another program has made up stays as it is."""
+    """A priority for people; one that is unknown here stays as it is."""
     return tr(PRIORITIES[Priority(priority)]) if priority in PRIORITIES else priority
 
 
-def _asked(request: Request) -> dict[str, Any]:
+def _request(request: Request) -> dict[str, Any]:
     return {"deed": request.deed.value, "who": request.who, "at": request.asked_ns / S_NS}
 
 
 def said(ns: int | None, now_ns: int) -> str:
-    """An instant in words; empty for what has not happened."""
+    """An instant in words; empty for None."""
     return "" if ns is None else instant(ns, now_ns)
 
 
 def told(
     episode: Episode, value: str, now_ns: int, comments: Sequence[Comment] = ()
 ) -> dict[str, Any]:
-    """One time that an alarm was active: what, since when, what speaks for it and how sure.
+    """One episode of an alarm: title, times, evidence and certainty.
 
-    ``times`` has its instants in words, as they are now.
+    ``times`` has its instants in words, relative to ``now_ns``.
     """
     raised, cleared, seen = episode.raised_ns, episode.cleared_ns, episode.acknowledged_ns
     return {
@@ -173,20 +176,26 @@ def told(
         "seen_by": episode.acknowledged_by,
         "facts": [[name, text] for name, text in facts(episode.evidence)],
         "report": episode.evidence.get("report", ""),
-        "episode": [episode.raised_as, str(raised)],  # a browser's numbers are too short for ns
+        "episode": [
+            episode.raised_as,
+            str(raised),
+        ],  # as text: JavaScript's numbers are too short for ns
         "comments": [
-            {"who": one.who, "when": said(one.written_ns, now_ns), "text": one.text}
-            for one in comments
-            if one.is_of(episode)
+            {"who": comment.who, "when": said(comment.written_ns, now_ns), "text": comment.text}
+            for comment in comments
+            if comment.is_of(episode)
         ],
     }
 
 
-def named(alarm: str, value: str, known: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """What it is, and where to look, as people say it; ``known`` says it of an effect taken in."""
-    if known:
-        what, where = _title(spoken(known["name"])), known["look_at"].partition(":")[0]
-        return {"what": what, "sentence": f"{known['sentence']}.", "where": where}
+def named(alarm: str, value: str, catalogued: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """Title, sentence and place of an alarm; ``catalogued`` describes a catalogue's effect."""
+    if catalogued:
+        heading, location = (
+            _title(spoken(catalogued["name"])),
+            catalogued["look_at"].partition(":")[0],
+        )
+        return {"what": heading, "sentence": f"{catalogued['sentence']}.", "where": location}
     cause = cause_of(value)
     if cause in EFFECTS:
         return {
@@ -199,8 +208,8 @@ def named(alarm: str, value: str, known: Mapping[str, str] | None = None) -> dic
 
 
 def spelt(alarm: str) -> str:
-    """The name of an alarm that has no cause, in words."""
-    return " ".join(_SPELT.get(word, word) for word in spoken(alarm).split())
+    """The name in words of an alarm without a cause."""
+    return " ".join(_UPPER_CASE.get(word, word) for word in spoken(alarm).split())
 
 
 def _title(words: str) -> str:
@@ -208,10 +217,10 @@ def _title(words: str) -> str:
 
 
 def facts(evidence: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
-    """What speaks for it, a name and a text each."""
+    """The evidence as pairs of name and text."""
     sizes = evidence.get("parameters", {}).values()
     if sizes:
-        yield tr("size"), "; ".join(_size(one) for one in sizes)
+        yield tr("size"), "; ".join(_size(parameter) for parameter in sizes)
     yield from ((tr("how sure"), text) for text in _sureness(evidence))
     if measured := _measured(evidence):
         yield tr("measured"), measured
@@ -224,7 +233,7 @@ def facts(evidence: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
 
 
 def _measured(evidence: Mapping[str, Any]) -> str:
-    """What was measured and what was expected of it; empty where nobody kept numbers."""
+    """Measured and expected value in words; empty if the evidence has no numbers."""
     if "excess_mbar" in evidence:
         phase = str(evidence.get("phase", "")).replace("_", "-")
         excess = f"{evidence['excess_mbar']:+.1f}"
@@ -243,16 +252,20 @@ def _size(parameter: Mapping[str, Any]) -> str:
 
 
 def _sureness(evidence: Mapping[str, Any]) -> Iterable[str]:
-    """How sure the cause is: by the diagnosis, or else by the first guess."""
+    """The certainty of the cause: from the diagnosis, else from the first guess."""
     if evidence.get("commissioned") is False:
         yield tr(NOT_COMMISSIONED)
     elif "probability" in evidence:
         yield tr("diagnosed: {certainty}", certainty=certainty(evidence))
     elif "guess" in evidence:
-        also = [tr(spoken(one)) for one in str(evidence.get("also", "")).split(",") if one]
-        if also:
-            alike = ", ".join(also)
-            yield tr("a first guess, or {alike}; the diagnosis needs some more cycles", alike=alike)
+        names = [
+            tr(spoken(effect)) for effect in str(evidence.get("also", "")).split(",") if effect
+        ]
+        if names:
+            others = ", ".join(names)
+            yield tr(
+                "a first guess, or {alike}; the diagnosis needs some more cycles", alike=others
+            )
         else:
             yield tr("a first guess; the diagnosis needs some more cycles")
     elif "measured" in evidence:

@@ -1,7 +1,7 @@
-"""All ejectors that publish to one broker, as far as it has told: in memory, and bounded.
+"""All ejectors that publish to one broker: their last messages, in bounded memory.
 
-What comes from a broker may be anything. A message that is not understood is counted and left; one
-ejector is what stands on its own topics, whatever its messages say of themselves.
+A broker may deliver anything. Invalid messages are counted and ignored. An ejector is identified by
+its topics, whatever its messages contain.
 """
 
 import json
@@ -29,7 +29,7 @@ MOST_ALARMS = 200  # of an ejector
 MOST_CYCLES = 1000  # of an ejector, the newest
 MOST_ROWS = 600  # of values, the newest
 MOST_BYTES = 65_536  # of a message
-MOST_IDS = 100  # by which one that comes again is known
+MOST_IDS = 100  # of messages, to recognise repeated ones
 COLUMNS = [f"{name}_{side}" for name in FIGURES for side in SIDES]
 NOT_UNDERSTOOD = (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
 
@@ -49,14 +49,14 @@ class Row:
 
 @dataclass
 class Heard:
-    """What one ejector has told. Times are Unix seconds."""
+    """The last messages of one ejector. Times are Unix seconds."""
 
     unit: Unit
-    status: str = ""  # online, offline, or nothing yet
-    since: float | None = None  # None: it died, and nobody knows when
-    seen: float = 0.0  # when anything was last heard of it
-    told: float = 0.0  # when values last came
-    every_s: float = 0.0  # between messages with values
+    status: str = ""  # online, offline, or empty before the first message
+    since: float | None = None  # None: it died at an unknown time
+    seen: float = 0.0  # time of its last message
+    told: float = 0.0  # time of its last message with values
+    every_s: float = 0.0  # interval of messages with values
     batch: str = ""
     program: str = ""
     alarms: dict[str, Document] = field(default_factory=dict)
@@ -67,7 +67,7 @@ class Heard:
     _ids: deque[str] = field(default_factory=lambda: deque(maxlen=MOST_IDS))
 
     def is_new(self, document: Document) -> bool:
-        """Whether a message has not come before: each comes at least once."""
+        """Whether a message is new: MQTT delivers each at least once."""
         number = str(document["id"])
         if number in self._ids:
             return False
@@ -76,34 +76,33 @@ class Heard:
 
 
 class PlantOverview:
-    """What the broker has told of all ejectors; one thread tells, others look. ``clock`` is Unix
-    seconds.
+    """The last messages of all ejectors; one thread writes, others read.
+
+    ``clock`` returns Unix seconds.
     """
 
     def __init__(self, clock: Callable[[], float] = time.time) -> None:
         self.clock = clock
         self._lock = threading.Lock()
-        self._heard: dict[Unit, Heard] = {}
-        self._trouble, self._since = "not connected yet", clock()
+        self._ejectors: dict[Unit, Heard] = {}
+        self._failure, self._since = "not connected yet", clock()
         self.not_understood = 0  # messages
 
-    # --- who tells ------------------------------------------------------------------------------
+    # --- writing --------------------------------------------------------------------------------
 
     def connected(self) -> None:
-        """The broker is there."""
+        """The broker is connected."""
         with self._lock:
-            self._trouble, self._since = "", self.clock()
+            self._failure, self._since = "", self.clock()
 
     def lost(self, why: str) -> None:
-        """The broker is not there: nothing is known of now."""
+        """The broker is not connected: the present state is unknown."""
         with self._lock:
-            self._since = self._since if self._trouble else self.clock()
-            self._trouble = why
+            self._since = self._since if self._failure else self.clock()
+            self._failure = why
 
     def take(self, levels: list[str], payload: bytes, *, kept: bool) -> None:
-        """Take a message by the levels of its topic below the prefix; ``kept`` by the broker is
-        one from before.
-        """
+        """Take a message by its topic's levels below the prefix; ``kept`` marks a retained one."""
         with self._lock:
             try:
                 self._take(levels, payload, kept)
@@ -118,101 +117,101 @@ class PlantOverview:
         if len(payload) > MOST_BYTES:
             raise ValueError
         document = json.loads(payload)
-        json.dumps(document, ensure_ascii=False).encode()  # half a character ends here
-        taken = {STATUS: _status, ALARM: _alarm, CYCLE: _cycle, VALUES: _values}[topic]
-        heard = self._heard.get(unit) or Heard(unit)
-        at = taken(heard, document)
+        json.dumps(document, ensure_ascii=False).encode()  # raises for half a character
+        handler = {STATUS: _status, ALARM: _alarm, CYCLE: _cycle, VALUES: _values}[topic]
+        ejector = self._ejectors.get(unit) or Heard(unit)
+        time = handler(ejector, document)
         now = self.clock()
-        heard.seen = max(heard.seen, min(at, now)) if kept else now
+        ejector.seen = max(ejector.seen, min(time, now)) if kept else now
         if topic == VALUES:
-            heard.told = heard.seen
-        if unit in self._heard or len(self._heard) < MOST:
-            self._heard[unit] = heard
+            ejector.told = ejector.seen
+        if unit in self._ejectors or len(self._ejectors) < MOST:
+            self._ejectors[unit] = ejector
 
     def _forget(self, unit: Unit, levels: list[str]) -> None:
-        """The broker was told to keep nothing on a topic any more."""
+        """Delete the data of a topic whose retained message was cleared."""
         if levels == [STATUS]:
-            self._heard.pop(unit, None)
-        elif levels[0] == ALARM and unit in self._heard:
-            self._heard[unit].alarms.pop(_name(levels[1]), None)
+            self._ejectors.pop(unit, None)
+        elif levels[0] == ALARM and unit in self._ejectors:
+            self._ejectors[unit].alarms.pop(_name(levels[1]), None)
 
-    # --- who looks ------------------------------------------------------------------------------
+    # --- reading --------------------------------------------------------------------------------
 
     def look(self, show: Callable[[list[Heard], str, float], Any]) -> Any:
-        """What ``show`` makes of all that was heard, what is wrong with the broker, since when."""
+        """The result of ``show`` for all ejectors, the broker's failure and since when."""
         with self._lock:
-            return show(list(self._heard.values()), self._trouble, self._since)
+            return show(list(self._ejectors.values()), self._failure, self._since)
 
 
-# --- what is understood: each gives when it was told --------------------------------------------
+# --- message handlers: each returns the time of its message -------------------------------------
 
 
-def _status(heard: Heard, document: Document) -> float:
+def _status(ejector: Heard, document: Document) -> float:
     _require(document, STATUS_FORMAT)
     status = document["status"]
     if status not in ("online", "offline"):
         raise ValueError
     since = None if document["since"] is None else _time(document["since"])
-    heard.status, heard.since = status, since
-    heard.program = str(document["program"])
-    _batch(heard, document)
+    ejector.status, ejector.since = status, since
+    ejector.program = str(document["program"])
+    _batch(ejector, document)
     return since or 0.0
 
 
-def _alarm(heard: Heard, document: Document) -> float:
+def _alarm(ejector: Heard, document: Document) -> float:
     _require(document, ALARM_FORMAT)
-    name, at = str(document["alarm"]), _time(document["time"])
-    kept: dict[str, Any] = {key: bool(document[key]) for key in ("active", "acknowledged")}
-    kept |= {key: str(document[key]) for key in ("state", "priority")}
+    name, time = str(document["alarm"]), _time(document["time"])
+    fields: dict[str, Any] = {key: bool(document[key]) for key in ("active", "acknowledged")}
+    fields |= {key: str(document[key]) for key in ("state", "priority")}
     since = None if document["since"] is None else _time(document["since"])
     texts = {key: str(document[key]) for key in ("consequence", "action")}
     evidence = document["evidence"]
     if not isinstance(evidence, Mapping):
         raise TypeError
-    if name in heard.alarms or len(heard.alarms) < MOST_ALARMS:
-        whole = {"alarm": name, "since": since, **kept, **texts, "evidence": evidence}
-        heard.alarms[name] = whole
-    return at
+    if name in ejector.alarms or len(ejector.alarms) < MOST_ALARMS:
+        alarm = {"alarm": name, "since": since, **fields, **texts, "evidence": evidence}
+        ejector.alarms[name] = alarm
+    return time
 
 
-def _cycle(heard: Heard, document: Document) -> float:
+def _cycle(ejector: Heard, document: Document) -> float:
     _require(document, CYCLE_FORMAT)
-    at = int(document["time_ns"]) / 1e9
+    time = int(document["time_ns"]) / 1e9
     values = array("f", (_or_nan(document.get(name)) for name in COLUMNS))
     number = int(document["cycle"])
-    if heard.is_new(document):
-        heard.cycles.append((at, number, values))
-    _batch(heard, document)
-    return at
+    if ejector.is_new(document):
+        ejector.cycles.append((time, number, values))
+    _batch(ejector, document)
+    return time
 
 
-def _values(heard: Heard, document: Document) -> float:
+def _values(ejector: Heard, document: Document) -> float:
     _require(document, VALUES_FORMAT)
-    rows = [_row(one) for one in document["rows"]]
-    heard.every_s = float(document["period_s"]) * len(rows)
-    if heard.is_new(document):
-        heard.rows.extend(rows)
-    _batch(heard, document)
+    rows = [_row(row) for row in document["rows"]]
+    ejector.every_s = float(document["period_s"]) * len(rows)
+    if ejector.is_new(document):
+        ejector.rows.extend(rows)
+    _batch(ejector, document)
     return int(document["time_ns"]) / 1e9
 
 
-def _row(told: Mapping[str, Any]) -> Row:
-    measured, expected = told["measured_mbar"], told["expected_mbar"]
+def _row(values: Mapping[str, Any]) -> Row:
+    measured, expected = values["measured_mbar"], values["expected_mbar"]
     low, mean, high = (_number(measured[name]) for name in ("low", "mean", "high"))
-    return Row(int(told["time_ns"]) / 1e9, low, mean, high, _number(expected["mean"]))
+    return Row(int(values["time_ns"]) / 1e9, low, mean, high, _number(expected["mean"]))
 
 
-def _require(document: Document, form: str) -> None:
-    if document["format"] != form:
+def _require(document: Document, expected: str) -> None:
+    if document["format"] != expected:
         raise ValueError
 
 
-def _batch(heard: Heard, document: Document) -> None:
-    heard.batch = str(document["asset"].get("batch", ""))
+def _batch(ejector: Heard, document: Document) -> None:
+    ejector.batch = str(document["asset"].get("batch", ""))
 
 
 def _name(level: str) -> str:
-    """As it was before it became a level of a topic."""
+    """The name that a level of a topic encodes."""
     return "" if level == "-" else unquote(level)
 
 

@@ -1,4 +1,4 @@
-"""The page over all ejectors of a broker, over HTTP; who may see it, the technician's page says."""
+"""The page over all ejectors of a broker, over HTTP; the technician's page decides on access."""
 
 from collections.abc import Callable
 from http import HTTPStatus
@@ -17,33 +17,35 @@ ALL = "/all"
 
 
 class AllEjectors:
-    """What there is of it to ask for."""
+    """The routes of that page."""
 
-    def __init__(self, hall: PlantOverview, require_sight: Callable[[Request], None]) -> None:
-        self._hall, self._require_sight = hall, require_sight
+    def __init__(self, plant: PlantOverview, require_sight: Callable[[Request], None]) -> None:
+        self._plant, self._require_sight = plant, require_sight
 
     def routes(self) -> list[Route]:
-        """Beside those of the technician's page."""
+        """The routes to add to those of the technician's page."""
         return [Route("/api/all", self.all), Route("/api/all/one", self.one)]
 
     async def all(self, request: Request) -> Response:
-        """A line for each, the worst first."""
+        """A line for each ejector, the worst first."""
         self._require_sight(request)
-        now = self._hall.clock()
-        told = self._hall.look(lambda heard, trouble, since: overview(heard, trouble, since, now))
-        counts = {"counts": counted(told["ejectors"])}
-        return JSONResponse(told | counts | {"not_understood": self._hall.not_understood})
+        now = self._plant.clock()
+        document = self._plant.look(
+            lambda ejectors, failure, since: overview(ejectors, failure, since, now)
+        )
+        counts = {"counts": counted(document["ejectors"])}
+        return JSONResponse(document | counts | {"not_understood": self._plant.not_understood})
 
     async def one(self, request: Request) -> Response:
-        """All that is known of one."""
+        """All that is known of one ejector."""
         self._require_sight(request)
-        asked = request.query_params
-        unit, now = Unit(asked.get("type", ""), asked.get("id", "")), self._hall.clock()
-        told = self._hall.look(
-            lambda heard, trouble, _since: (
-                details(found, trouble, now) if (found := of_one(heard, unit)) else None
+        query = request.query_params
+        unit, now = Unit(query.get("type", ""), query.get("id", "")), self._plant.clock()
+        document = self._plant.look(
+            lambda ejectors, failure, _since: (
+                details(ejector, failure, now) if (ejector := of_one(ejectors, unit)) else None
             )
         )
-        if told is None:
+        if document is None:
             raise HTTPException(HTTPStatus.NOT_FOUND, tr("the broker knows no such ejector"))
-        return JSONResponse(told | {"now": now})
+        return JSONResponse(document | {"now": now})

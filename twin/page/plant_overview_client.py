@@ -1,4 +1,4 @@
-"""The line from a broker to what is known of all ejectors: it only listens."""
+"""The MQTT client of the plant overview; it only subscribes."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,17 +15,18 @@ from twin.notifications.settings import MqttSettings
 from twin.page.plant_overview import STATUS, PlantOverview
 
 CONNECT_S = 5.0
-LONGEST_PAUSE_S = 30  # between tries to connect
+LONGEST_PAUSE_S = 30  # between attempts to connect
 TOPICS = (STATUS, f"{ALARM}/+", CYCLE, VALUES)  # below a unit's
 
 
 @contextmanager
 def listening(
-    settings: MqttSettings, folder: Path, hall: PlantOverview, say: Callable[[str], None]
+    settings: MqttSettings, folder: Path, plant: PlantOverview, say: Callable[[str], None]
 ) -> Iterator[None]:
-    """Hear what all ejectors of a broker publish, in a thread of the library's; it comes back by
-    itself. ``folder`` is where relative paths are from; ConfigError where a secret or certificate
-    cannot be used.
+    """Receive what all ejectors of a broker publish, in a thread of the library.
+
+    The library reconnects by itself. Paths are relative to ``folder``; ConfigError if a secret or
+    certificate cannot be used.
     """
     client = Client(CallbackAPIVersion.VERSION2, protocol=MQTTv5)
     client.connect_timeout = CONNECT_S
@@ -36,29 +37,29 @@ def listening(
         client.username_pw_set(settings.user, password)
     if settings.tls is not None:
         client.tls_set_context(settings.tls.context("mqtt", folder))
-    where = f"MQTT broker {settings.host}"
+    broker = f"MQTT broker {settings.host}"
     prefix = settings.prefix.split("/")
 
-    def come(_c: Client, _u: Any, _flags: Any, reason: ReasonCode, _p: Any) -> None:
+    def on_connect(_c: Client, _u: Any, _flags: Any, reason: ReasonCode, _p: Any) -> None:
         if reason.is_failure:
-            hall.lost(f"{where} does not let us in: {reason}")
+            plant.lost(f"{broker} does not let us in: {reason}")
             return
-        client.subscribe([(f"{settings.prefix}/+/+/{one}", 1) for one in TOPICS])
+        client.subscribe([(f"{settings.prefix}/+/+/{item}", 1) for item in TOPICS])
 
-    def heard(_c: Client, _u: Any, _packet: int, reasons: list[ReasonCode], _p: Any) -> None:
-        refused = [one for one in reasons if one.is_failure]
+    def on_subscribe(_c: Client, _u: Any, _packet: int, reasons: list[ReasonCode], _p: Any) -> None:
+        refused = [item for item in reasons if item.is_failure]
         if refused:
-            hall.lost(f"{where} does not let us listen: {refused[0]}")
+            plant.lost(f"{broker} does not let us listen: {refused[0]}")
         else:
-            hall.connected()
+            plant.connected()
 
-    def take(_c: Client, _u: Any, message: MQTTMessage) -> None:
+    def on_message(_c: Client, _u: Any, message: MQTTMessage) -> None:
         levels = message.topic.split("/")[len(prefix) :]
-        hall.take(levels, bytes(message.payload), kept=message.retain)
+        plant.take(levels, bytes(message.payload), kept=message.retain)
 
-    client.on_connect, client.on_subscribe, client.on_message = come, heard, take
-    client.on_connect_fail = lambda *_: hall.lost(f"{where} cannot be reached")
-    client.on_disconnect = lambda *_: hall.lost(f"{where}: the connection is lost")
+    client.on_connect, client.on_subscribe, client.on_message = on_connect, on_subscribe, on_message
+    client.on_connect_fail = lambda *_: plant.lost(f"{broker} cannot be reached")
+    client.on_disconnect = lambda *_: plant.lost(f"{broker}: the connection is lost")
     port = settings.port or (8883 if settings.tls is not None else 1883)
     client.connect_async(settings.host, port, settings.keepalive_s)
     client.loop_start()

@@ -1,6 +1,6 @@
-"""All ejectors as people read them: the traffic light of each, the worst first, and one by itself.
+"""All ejectors for people: the status of each, the worst first, and the details of one.
 
-Plain dictionaries, as they go to the browser: times are Unix seconds by the clock here.
+The functions return plain dictionaries for the browser; times are Unix seconds of host time.
 """
 
 import math
@@ -29,11 +29,11 @@ from twin.page.ejector_status import (
 )
 from twin.page.plant_overview import COLUMNS, NOT_UNDERSTOOD, Document, Heard, Row
 
-KEY_FIGURES = ("t0", "leakage", "air")  # that stand in the table
+KEY_FIGURES = ("t0", "leakage", "air")  # of the table
 SPARK_POINTS = 60
 SPARK_ROWS = 300
-SILENT_S = 15.0  # longer than three messages with values take
-BEHIND_S = 60.0  # values that come late are said to
+SILENT_S = 15.0  # longer than the interval of three messages with values
+BEHIND_S = 60.0  # a delay of values that is reported
 WORDS = {
     Light.RED: "Alarm",
     Light.YELLOW: "Look after it",
@@ -44,89 +44,89 @@ _RULES = {rule.name: rule for rule in by_cause(default_rules())}
 SILENT, NOT_KNOWN = "Silent", "Not known"
 
 
-def overview(heard: Sequence[Heard], trouble: str, since: float, now: float) -> dict[str, Any]:
-    """Every ejector in a line, the worst first; without a broker nothing is known of any."""
-    lines = [_line(one, now, trouble) for one in heard]
+def overview(ejectors: Sequence[Heard], failure: str, since: float, now: float) -> dict[str, Any]:
+    """A line for every ejector, the worst first; without a broker all are unknown."""
+    lines = [_line(line, now, failure) for line in ejectors]
     order = [light.value for light in WORST_FIRST]
-    lines.sort(key=lambda one: (order.index(one["light"]), one["since"] or 0.0, one["name"]))
-    told = {"now": now, "zone": zone(_ns(now)), "trouble": trouble, "ejectors": lines}
-    return told | {"trouble_since": _said(since, now) if trouble else ""}
+    lines.sort(key=lambda line: (order.index(line["light"]), line["since"] or 0.0, line["name"]))
+    document = {"now": now, "zone": zone(_ns(now)), "trouble": failure, "ejectors": lines}
+    return document | {"trouble_since": _said(since, now) if failure else ""}
 
 
-def details(heard: Heard, trouble: str, now: float) -> dict[str, Any]:
-    """All that is known of one."""
+def details(ejector: Heard, failure: str, now: float) -> dict[str, Any]:
+    """All that is known of one ejector."""
     return {
-        **_line(heard, now, trouble),
-        "program": heard.program,
-        "status": heard.status,
-        "alarms": [_card(one, now) for one in _standing(heard)],
-        "rows": _columns(heard.rows),
-        "trends": _trends(heard),
+        **_line(ejector, now, failure),
+        "program": ejector.program,
+        "status": ejector.status,
+        "alarms": [_card(alarm, now) for alarm in _standing(ejector)],
+        "rows": _columns(ejector.rows),
+        "trends": _trends(ejector),
     }
 
 
-def _line(heard: Heard, now: float, trouble: str) -> dict[str, Any]:
-    light, words, since = _light(heard, now, trouble)
-    standing = _standing(heard)
+def _line(ejector: Heard, now: float, failure: str) -> dict[str, Any]:
+    light, words, since = _light(ejector, now, failure)
+    standing = _standing(ejector)
     worst = standing[0] if standing else None
-    newest = heard.rows[-1].time if heard.rows else None
-    late = newest is not None and heard.status == "online" and now - newest
+    newest = ejector.rows[-1].time if ejector.rows else None
+    delay_s = newest is not None and ejector.status == "online" and now - newest
     return {
-        "type": heard.unit.type,
-        "id": heard.unit.id,
-        "batch": heard.batch,
-        "name": heard.unit.id or heard.unit.type,
+        "type": ejector.unit.type,
+        "id": ejector.unit.id,
+        "batch": ejector.batch,
+        "name": ejector.unit.id or ejector.unit.type,
         "light": light.value,
         "words": tr(words),
         "since": since,
         "times": {
             "since": _said(since, now),
-            "seen": _said(heard.seen or None, now),
-            "behind": lasting(late) if late and late > max(BEHIND_S, _patience(heard)) else "",
+            "seen": _said(ejector.seen or None, now),
+            "behind": lasting(delay_s)
+            if delay_s and delay_s > max(BEHIND_S, _patience(ejector))
+            else "",
         },
-        "what": _title(str(worst["alarm"]))["what"] if worst else _without_alarm(heard, words),
+        "what": _title(str(worst["alarm"]))["what"] if worst else _without_alarm(ejector, words),
         "alarms_count": len(standing),
-        "seen": heard.seen or None,
-        "behind": late if late and late > max(BEHIND_S, _patience(heard)) else None,
-        "figures": _newest(heard),
-        "spark": _spark(list(heard.rows)[-SPARK_ROWS:]),
+        "seen": ejector.seen or None,
+        "behind": delay_s if delay_s and delay_s > max(BEHIND_S, _patience(ejector)) else None,
+        "figures": _newest(ejector),
+        "spark": _spark(list(ejector.rows)[-SPARK_ROWS:]),
     }
 
 
 # --- the light ----------------------------------------------------------------------------------
 
 
-def _light(heard: Heard, now: float, trouble: str) -> tuple[Light, str, float | None]:
-    """Light, words and since when; as on the technician's page, never green while anything is
-    unknown.
-    """
-    standing = _standing(heard)
-    if trouble:
+def _light(ejector: Heard, now: float, failure: str) -> tuple[Light, str, float | None]:
+    """Status, its text and since when; as on the technician's page, unknown is never green."""
+    standing = _standing(ejector)
+    if failure:
         return Light.GREY, NOT_KNOWN, None
-    if heard.status != "online":
-        return Light.GREY, WORDS[Light.GREY], heard.since or heard.seen
-    urgent = [one for one in standing if _is_urgent(one)]
+    if ejector.status != "online":
+        return Light.GREY, WORDS[Light.GREY], ejector.since or ejector.seen
+    urgent = [alarm for alarm in standing if _is_urgent(alarm)]
     if urgent:
         return Light.RED, WORDS[Light.RED], urgent[0]["since"]
-    if heard.told and now - heard.told > _patience(heard):
-        return Light.GREY, SILENT, heard.told
+    if ejector.told and now - ejector.told > _patience(ejector):
+        return Light.GREY, SILENT, ejector.told
     if standing:
         return Light.YELLOW, WORDS[Light.YELLOW], standing[0]["since"]
-    return Light.GREEN, WORDS[Light.GREEN], heard.since
+    return Light.GREEN, WORDS[Light.GREEN], ejector.since
 
 
-def _without_alarm(heard: Heard, words: str) -> str:
-    """What there is to say where no alarm stands."""
+def _without_alarm(ejector: Heard, words: str) -> str:
+    """The text for an ejector without a standing alarm."""
     if words == WORDS[Light.GREY]:
-        died = heard.status == "offline" and heard.since is None
-        gone = tr("stopped") if heard.status else tr("never came")
-        return tr("gone without a word") if died else gone
+        died = ejector.status == "offline" and ejector.since is None
+        reason = tr("stopped") if ejector.status else tr("never came")
+        return tr("gone without a word") if died else reason
     return tr("no values come") if words == SILENT else "" if words == NOT_KNOWN else tr("no alarm")
 
 
-def _patience(heard: Heard) -> float:
-    """How long values may keep one waiting."""
-    return SILENT_S + 3.0 * heard.every_s
+def _patience(ejector: Heard) -> float:
+    """How long (s) values may be missing before the ejector counts as silent."""
+    return SILENT_S + 3.0 * ejector.every_s
 
 
 def _is_urgent(alarm: Document) -> bool:
@@ -134,10 +134,14 @@ def _is_urgent(alarm: Document) -> bool:
     return urgent and alarm["state"] == State.UNACKNOWLEDGED
 
 
-def _standing(heard: Heard) -> list[Document]:
-    """Alarms that are more than normal: not acknowledged and urgent ones first, then the oldest."""
-    there = [one for one in heard.alarms.values() if one["active"] or one["state"] != State.NORMAL]
-    return sorted(there, key=_rank)
+def _standing(ejector: Heard) -> list[Document]:
+    """Alarms beyond normal: unacknowledged and urgent ones first, then the oldest."""
+    alarms = [
+        alarm
+        for alarm in ejector.alarms.values()
+        if alarm["active"] or alarm["state"] != State.NORMAL
+    ]
+    return sorted(alarms, key=_rank)
 
 
 def _rank(alarm: Document) -> tuple[int, int, float]:
@@ -148,32 +152,32 @@ def _rank(alarm: Document) -> tuple[int, int, float]:
 
 
 def _card(alarm: Document, now: float) -> dict[str, Any]:
-    """An alarm as a technician reads it."""
+    """An alarm for a technician."""
     try:
-        known = [[name, text] for name, text in facts(alarm["evidence"])]
+        evidence = [[name, text] for name, text in facts(alarm["evidence"])]
     except NOT_UNDERSTOOD:  # another program's
-        known = []
-    kept = {key: alarm[key] for key in alarm if key != "evidence"}
-    kept |= {"state_words": state_words(str(alarm["state"]))}
-    kept |= {"priority_words": priority_words(str(alarm["priority"]))}
-    kept |= _advice(alarm)
+        evidence = []
+    shown = {key: alarm[key] for key in alarm if key != "evidence"}
+    shown |= {"state_words": state_words(str(alarm["state"]))}
+    shown |= {"priority_words": priority_words(str(alarm["priority"]))}
+    shown |= _advice(alarm)
     times = {"times": {"since": _said(alarm["since"], now)}}
-    return kept | _title(str(alarm["alarm"])) | {"facts": known} | times
+    return shown | _title(str(alarm["alarm"])) | {"facts": evidence} | times
 
 
 def _advice(alarm: Document) -> dict[str, Any]:
-    """What follows and what to do, in the language of who reads it where the rule is ours."""
+    """Consequence and action; in the reader's language if the rule is the program's own."""
     rule = _RULES.get(str(alarm["alarm"]))
-    said = {key: alarm.get(key, "") for key in ("consequence", "action")}
+    advice = {key: alarm.get(key, "") for key in ("consequence", "action")}
     with speaking({}):
         published = {"consequence": rule.consequence, "action": action_of(rule, {})} if rule else {}
-    if rule is None or said != published:
-        return said
+    if rule is None or advice != published:
+        return advice
     return {"consequence": tr(rule.consequence), "action": action_of(rule, {})}
 
 
 def _said(seconds: float | None, now: float) -> str:
-    """An instant in words; empty where nobody knows it."""
+    """An instant in words; empty if unknown."""
     return "" if seconds is None else instant(_ns(seconds), _ns(now))
 
 
@@ -189,63 +193,65 @@ def _title(alarm: str) -> dict[str, Any]:
 # --- numbers ------------------------------------------------------------------------------------
 
 
-def _newest(heard: Heard) -> list[dict[str, Any]]:
-    """The key figures of the table, as the newest cycle that knows each has them."""
-    found = []
+def _newest(ejector: Heard) -> list[dict[str, Any]]:
+    """The table's key figures, each from the newest cycle that has it."""
+    figures = []
     for name in KEY_FIGURES:
-        for _, _, values in reversed(heard.cycles):
+        for _, _, values in reversed(ejector.cycles):
             measured, expected = (values[COLUMNS.index(f"{name}_{side}")] for side in SIDES)
             if math.isfinite(measured):
                 sides = {"measured": _plain(measured), "expected": _plain(expected)}
-                known = {"name": name, "title": title_of(name), "unit": FIGURES[name].unit}
-                found.append(known | sides)
+                labels = {"name": name, "title": title_of(name), "unit": FIGURES[name].unit}
+                figures.append(labels | sides)
                 break
-    return found
+    return figures
 
 
-def _trends(heard: Heard) -> list[dict[str, Any]]:
-    """Every figure that any cycle knows."""
-    made = []
-    times = [at for at, _, _ in heard.cycles]
+def _trends(ejector: Heard) -> list[dict[str, Any]]:
+    """Every figure that any cycle has, over time."""
+    trends = []
+    times = [time for time, _, _ in ejector.cycles]
     for name, figure in FIGURES.items():
         sides = {
-            side: [_plain(values[COLUMNS.index(f"{name}_{side}")]) for _, _, values in heard.cycles]
+            side: [
+                _plain(values[COLUMNS.index(f"{name}_{side}")]) for _, _, values in ejector.cycles
+            ]
             for side in SIDES
         }
-        if any(one is not None for one in sides["measured"]):
-            made.append({**figure_words(figure), "time": times, **sides})
-    return made
+        if any(value is not None for value in sides["measured"]):
+            trends.append({**figure_words(figure), "time": times, **sides})
+    return trends
 
 
 def _columns(rows: Iterable[Row]) -> dict[str, list[float | None]]:
-    there = list(rows)
-    return {name: [getattr(one, name) for one in there] for name in Row.__slots__}
+    listed = list(rows)
+    return {name: [getattr(row, name) for row in listed] for name in Row.__slots__}
 
 
 def _spark(rows: Sequence[Row]) -> dict[str, list[float | None]]:
     """Lowest and highest vacuum of a few points in whole mbar."""
-    each = max(1, math.ceil(len(rows) / SPARK_POINTS))
-    groups = [rows[at : at + each] for at in range(0, len(rows), each)]
+    stride = max(1, math.ceil(len(rows) / SPARK_POINTS))
+    groups = [rows[start : start + stride] for start in range(0, len(rows), stride)]
     return {
-        "low": [_end(min, (one.low for one in group)) for group in groups],
-        "high": [_end(max, (one.high for one in group)) for group in groups],
+        "low": [_end(min, (row.low for row in group)) for group in groups],
+        "high": [_end(max, (row.high for row in group)) for group in groups],
     }
 
 
-def _end(which: Any, values: Iterable[float | None]) -> float | None:
-    there = [one for one in values if one is not None]
-    return round(which(there)) if there else None
+def _end(extreme: Any, values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return round(extreme(known)) if known else None
 
 
 def _plain(value: float) -> float | None:
     return float(f"{value:.5g}") if math.isfinite(value) else None
 
 
-def of_one(heard: Sequence[Heard], unit: Unit) -> Heard | None:
-    """One of those that were heard."""
-    return next((one for one in heard if one.unit == unit), None)
+def of_one(ejectors: Sequence[Heard], unit: Unit) -> Heard | None:
+    """The ejector of a unit; None if it is unknown."""
+    return next((ejector for ejector in ejectors if ejector.unit == unit), None)
 
 
 def counted(lines: Sequence[Mapping[str, Any]]) -> dict[str, int]:
-    """How many have each light."""
-    return {light.value: sum(one["light"] == light for one in lines) for light in WORST_FIRST}
+    """The number of ejectors with each status."""
+    return {light.value: sum(line["light"] == light for line in lines) for light in WORST_FIRST}

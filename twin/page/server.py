@@ -1,4 +1,4 @@
-"""The web server under the page: where it listens, and how much it lets anybody do."""
+"""The web server of the page: its address, and limits for clients."""
 
 import asyncio
 import ipaddress
@@ -15,13 +15,13 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from twin.errors import ConfigError, SourceError
 
 MOST_AT_ONCE = 200  # connections
-HEAD_S = 10.0  # a request whose head has not come by then will not come
-QUIET_S = 20.0  # a browser that does not answer for so long is gone
+HEAD_S = 10.0  # limit for the head of a request to arrive
+QUIET_S = 20.0  # a browser counts as gone after so long without an answer
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where the page is; ``certificate`` and ``key`` (PEM) where it is over TLS."""
+    """The address of the page; with ``certificate`` and ``key`` (PEM) over TLS."""
 
     host: str
     port: int
@@ -30,7 +30,7 @@ class Place:
 
     @property
     def is_loopback(self) -> bool:
-        """Whether nobody else on the network reaches it."""
+        """Whether only this machine reaches it."""
         try:
             return ipaddress.ip_address(self.host).is_loopback
         except ValueError:
@@ -38,12 +38,12 @@ class Place:
 
     @property
     def scheme(self) -> str:
-        """As its address begins."""
+        """The scheme of its URL."""
         return "https" if self.certificate else "http"
 
 
 def listen(place: Place) -> socket.socket:
-    """Take the port; SourceError where it is not to be had."""
+    """Listen on the port; SourceError if that is not possible."""
     family = socket.AF_INET6 if ":" in place.host else socket.AF_INET
     try:
         return socket.create_server((place.host, place.port), family=family, backlog=64)
@@ -55,24 +55,24 @@ def listen(place: Place) -> socket.socket:
 
 
 def address(place: Place, listening: socket.socket) -> str:
-    """What to open in a browser."""
+    """The URL to open in a browser."""
     host, port = listening.getsockname()[:2]
     shown = f"[{host}]" if ":" in host else host
     return f"{place.scheme}://{shown}:{port}/"
 
 
 class _TimelyProtocol(H11Protocol):
-    """Lets go of who opens a connection and does not ask: uvicorn waits for the head for ever."""
+    """Closes connections without a request; uvicorn would wait for the head for ever."""
 
     _late: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to wait for a request."""
+        """Start the timer for a request."""
         super().connection_made(transport)
         self._late = self.loop.call_later(HEAD_S, transport.close)
 
     def data_received(self, data: bytes) -> None:
-        """A whole head ends the wait; the beginning of another one begins it."""
+        """Stop the timer after a whole head; start it with the beginning of another one."""
         super().data_received(data)
         if self.conn.their_state is not h11.IDLE:
             self._forget()
@@ -80,7 +80,7 @@ class _TimelyProtocol(H11Protocol):
             self._late = self.loop.call_later(HEAD_S, self.transport.close)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Nothing comes any more."""
+        """Stop the timer."""
         self._forget()
         super().connection_lost(exc)
 
@@ -91,7 +91,7 @@ class _TimelyProtocol(H11Protocol):
 
 
 def make_server(app: ASGIApp, place: Place) -> uvicorn.Server:
-    """What serves until Ctrl-C or SIGTERM; ConfigError where certificate or key are of no use."""
+    """A server that runs until Ctrl-C or SIGTERM; ConfigError for a bad certificate or key."""
     config = uvicorn.Config(
         app,
         http=_TimelyProtocol,

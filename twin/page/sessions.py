@@ -1,4 +1,4 @@
-"""Who is logged in."""
+"""The sessions of logged-in users."""
 
 import secrets
 import time
@@ -13,23 +13,23 @@ MOST = 1000  # sessions
 
 @dataclass(frozen=True)
 class Session:
-    """One browser that somebody has logged in with."""
+    """One browser with a logged-in user."""
 
     user: str
-    proof: str  # what was stored of the user then
+    proof: str  # the user's stored password hash at the login
     ends: float
     csrf: str = field(default_factory=lambda: secrets.token_urlsafe(32))
 
 
 class Sessions:
-    """The sessions there are, in memory: a restart ends them all. ``clock`` gives seconds."""
+    """All sessions, in memory: a restart ends them. ``clock`` returns seconds."""
 
     def __init__(self, users: Users, clock: Callable[[], float] = time.monotonic) -> None:
         self._users, self._clock = users, clock
         self._by_token: dict[str, Session] = {}
 
     def begin(self, user: str) -> str:
-        """Begin one; gives the token that its cookie carries."""
+        """Begin a session; returns the token for its cookie."""
         self._forget()
         token = secrets.token_urlsafe(32)
         ends = self._clock() + SESSION_S
@@ -47,11 +47,11 @@ class Sessions:
         return None
 
     def end(self, token: str | None) -> None:
-        """Log out."""
+        """End the session of a token."""
         self._by_token.pop(token or "", None)
 
     def _forget(self) -> None:
-        """Those that are over, and the oldest where there are too many."""
+        """Delete ended sessions, and the oldest if there are too many."""
         now = self._clock()
-        left = {token: one for token, one in self._by_token.items() if now < one.ends}
-        self._by_token = dict(list(left.items())[-(MOST - 1) :])
+        active = {token: session for token, session in self._by_token.items() if now < session.ends}
+        self._by_token = dict(list(active.items())[-(MOST - 1) :])

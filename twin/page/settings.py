@@ -1,4 +1,4 @@
-"""The table ``[page]``: what a run leaves for the page, and where."""
+"""The table ``[page]``: what a run stores for the page, and where."""
 
 import re
 from pathlib import Path
@@ -18,7 +18,7 @@ class PageSettings(Settings):
 
 
 def folder_of(document: Document, asset: Asset) -> Path:
-    """Where the run of an ejector leaves what its page shows."""
-    wanted = document.section(PageSettings, "page").folder
+    """The folder in which the run of an ejector stores the data for its page."""
+    folder = document.section(PageSettings, "page").folder
     name = ".".join(re.sub(r"[^\w-]+", "_", part) for part in (asset.type, asset.id) if part)
-    return Path(document.name).parent / wanted / name
+    return Path(document.name).parent / folder / name
