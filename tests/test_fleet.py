@@ -221,13 +221,13 @@ def test_a_cluster_gives_the_same_though_a_worker_is_killed(
     asked = ("fleet", "replay", logs, "--assets")
     assert twin(monkeypatch, *asked, tmp_path / "1.sqlite", "--workers", "1", "--json", here) == 0
     with cluster(2) as started:
-        keep = going._keep
+        keep = going._store_outcome
 
         def killing(future: "Future[Done]", *rest: Any) -> going.Told:
             started.workers[0].kill()  # with what it is at, and what it has done
             return keep(future, *rest)
 
-        monkeypatch.setattr(going, "_keep", killing)
+        monkeypatch.setattr(going, "_store_outcome", killing)
         on = ("--engine", "dask", "--scheduler", started.address, "--json", there)
         assert twin(monkeypatch, *asked, tmp_path / "2.sqlite", *on) == 0
         assert started.workers[0].wait(10) == -signal.SIGKILL
