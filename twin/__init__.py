@@ -1,7 +1,7 @@
 """A live digital twin of pneumatic vacuum ejectors.
 
-For notebooks: ``open`` a log, ``simulate``, ``calibrate``, ``diagnose``. They come with their first
-use, so that ``import twin`` costs nothing.
+For notebooks: ``open`` a log, ``simulate``, ``calibrate``, ``diagnose``. They are loaded at their
+first use, so ``import twin`` costs nothing.
 """
 
 from typing import TYPE_CHECKING, Any

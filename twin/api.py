@@ -1,9 +1,8 @@
 """What an analyst needs in a notebook: a log as columns, simulation, calibration, diagnosis.
 
-``import twin`` has all of it. ``calibrate`` and ``diagnose`` are the commands of the same name
-without their files, and give the same answers. Columns are in SI units, which end their names; what
-the field has names for (key figures, sizes of causes, values of a data set) comes in the field's
-units, as everywhere.
+``import twin`` provides all of it. ``calibrate`` and ``diagnose`` give the same answers as the
+commands of the same name, without their files. Columns are in SI units, with which their names end.
+Key figures, sizes of causes and values of a data set are in the field's units, as everywhere.
 """
 
 import warnings
@@ -64,19 +63,19 @@ _SIGNALS = {"part_present": Signal.PART_PRESENT, "air_saving": Signal.AIR_SAVING
 
 
 def _quiet(_what: str) -> None:
-    """Say nothing of what is being done."""
+    """Report no progress."""
 
 
 @dataclass(frozen=True)
 class Log:
-    """A recorded log, or a table of another program, beside its twin; ``open`` makes one.
+    """A recorded log, or a table of another program, with its twin; ``open`` returns one.
 
-    ``config`` is the configuration it is read with, the data set of its unit included.
+    ``config`` is the configuration for reading it, including the data set of its unit.
     """
 
     path: Path
     config: Config
-    assets: str = ""  # the asset database that was named
+    assets: str = ""  # the asset database, if one was named
     _source: Source = field(kw_only=True)
 
     def __repr__(self) -> str:
@@ -84,30 +83,30 @@ class Log:
         return f"<Log {self.path} of {asset}>"
 
     def columns(self) -> Columns:
-        """All rows, one array for each column: what was measured and what the twin says to it.
+        """All rows, one array for each column: the measurement and the twin's expectation.
 
-        Of a log they are as they were recorded; beside a table the twin runs now.
+        A log's rows are as recorded; for a table the twin runs now.
         """
         rows = list(self._rows())
-        samples = joined(np.empty(0, SAMPLE), *(one for one, _ in rows))
-        ticks = joined(np.empty(0, TICK), *(one for _, one in rows))
-        since = samples["time_ns"] - samples["time_ns"][:1]
+        samples = joined(np.empty(0, SAMPLE), *(block for block, _ in rows))
+        ticks = joined(np.empty(0, TICK), *(block for _, block in rows))
+        elapsed_ns = samples["time_ns"] - samples["time_ns"][:1]
         return {
-            "time_s": since * NS,
+            "time_s": elapsed_ns * NS,
             "time_ns": samples["time_ns"],
             "sequence": samples["sequence"],
-            **_bits(samples["commands"], _COMMANDS),
+            **_bit_columns(samples["commands"], _COMMANDS),
             "pressure_pa": samples["pressure"].astype(np.float64),
             "supply_pa": samples["supply"].astype(np.float64),
             "quality": samples["quality"],
             "expected_pa": ticks["expected"].astype(np.float64),
             "deviation_pa": deviation(samples, ticks),
             "phase": ticks["phase"],
-            **_bits(ticks["signals"], _SIGNALS),
+            **_bit_columns(ticks["signals"], _SIGNALS),
         }
 
     def frame(self) -> Any:
-        """The columns as a ``pandas.DataFrame``; ConfigError where pandas is not installed."""
+        """The columns as a ``pandas.DataFrame``; ConfigError if pandas is not installed."""
         try:
             from pandas import DataFrame  # noqa: PLC0415  (an extra)
         except ImportError as error:
@@ -120,28 +119,28 @@ class Log:
     def cycles(self) -> list[dict[str, Any]]:
         """Key figures of every cycle, measured and expected, in the field's units.
 
-        What a cycle cannot tell is left out of it.
+        Figures that a cycle cannot give are left out of it.
         """
-        teller = key_figures(self.config)
-        told = (teller.take(cycle) for cycle in cut(unbroken(self._rows())))
-        return [one.plain() for one in told if one is not None]
+        reader = key_figures(self.config)
+        figures = (reader.take(cycle) for cycle in cut(unbroken(self._rows())))
+        return [cycle_figures.plain() for cycle_figures in figures if cycle_figures is not None]
 
     @property
     def _header(self) -> LogHeader:
-        """What the log says of itself, or would say as one."""
+        """The header of the log; for a table, the header that its log would have."""
         if not isinstance(self._source, Table):
             return self._source.header
         derived = self._source.commands
         return self.config.log_header({DERIVED: derived} if derived else None)
 
     def _samples(self) -> Iterator[Samples]:
-        """What was measured, in blocks."""
+        """The measured rows in blocks."""
         if isinstance(self._source, Table):
             return self._source.blocks()
         return (samples for samples, _ in self._source.blocks())
 
     def _rows(self) -> Iterator[tuple[Samples, Ticks]]:
-        """The same with what the twin says to it."""
+        """The measured rows with the twin's ticks, in blocks."""
         if isinstance(self._source, Table):
             return Twin.of(self.config.data).over(self._source.blocks())
         return self._source.blocks()
@@ -149,9 +148,9 @@ class Log:
 
 @dataclass(frozen=True)
 class Calibrated:
-    """What healthy cycles say of one unit; ``str`` has it as a table.
+    """The data set fitted to one unit's healthy cycles; ``str`` gives it as a table.
 
-    ``config`` is the configuration with the data set that was fitted: open other logs with it.
+    ``config`` is the configuration with the fitted data set: open other logs with it.
     """
 
     config: Config
@@ -163,13 +162,13 @@ class Calibrated:
 
     @property
     def values(self) -> dict[str, dict[str, Any]]:
-        """By name each value with its unit, its 95 % interval and whether the log determines it."""
+        """Each value by name, with unit, 95 % interval and whether the log determines it."""
         return calibration_report.parameters(self._calibration)
 
     def save(self) -> Record:
-        """Keep it in the asset database as the unit's data set, as ``twin calibrate`` does.
+        """Store it in the asset database as the unit's data set, like ``twin calibrate``.
 
-        ConfigError where no unit is named.
+        ConfigError if no unit is named.
         """
         if not self.config.asset.id:
             hint = "open the log with unit=ID, or say [asset] id in the configuration"
@@ -180,7 +179,7 @@ class Calibrated:
 
 @dataclass(frozen=True)
 class Answer:
-    """What the simulation gets wrong on a log, and why; ``str`` has it in words.
+    """What the simulation gets wrong on a log, and why; ``str`` gives it in words.
 
     ``json`` is what ``twin diagnose --json`` writes.
     """
@@ -202,7 +201,7 @@ class Answer:
 
     @property
     def causes(self) -> list[dict[str, Any]]:
-        """Each with its effect, course, sizes and a sentence that says why; none if nothing is."""
+        """Each cause with its effect, course, sizes and a sentence that says why; maybe none."""
         return list(self.json["causes"])
 
     def report(self, path: Place) -> None:
@@ -220,17 +219,17 @@ def open(  # noqa: A001  (as a module's open is called)
 ) -> Log:
     """Open a log (MCAP), or a table (CSV, Excel, Parquet) of a PLC's trace.
 
-    A log carries its configuration and the data set it was recorded beside; ``config``, a file or
-    that of another log or calibration, takes its place. A table needs one. ``unit`` and ``assets``
-    are the unit and the asset database in place of the configured ones. ``derive_commands`` finds
-    the commands that a table lacks from its pressure, and warns of what cannot be told then.
+    A log contains its configuration and the data set of its recording. ``config`` replaces both: a
+    file, or the configuration of another log or calibration. A table needs ``config``. ``unit`` and
+    ``assets`` replace the configured unit and asset database. ``derive_commands`` derives a table's
+    missing commands from its pressure, and warns about what cannot be known then.
 
-    SourceError where a file cannot be read, ConfigError where a configuration cannot be used or is
-    that of another ejector.
+    SourceError if a file cannot be read, ConfigError if a configuration cannot be used or is that
+    of another ejector.
     """
     path = Path(path)
     source: Source
-    notes: Sequence[str] = ()  # as of an encoding that had to be guessed
+    notes: Sequence[str] = ()  # for example about a guessed encoding
     if path.suffix.lower() == MCAP:
         source = open_log(path)
         settings = _of_log(source, config, assets, unit)
@@ -244,9 +243,9 @@ def open(  # noqa: A001  (as a module's open is called)
         settings, notes = replace(settings, gauge=source.counts_from_ambient), source.notes
         remark = f"columns not taken: {', '.join(source.ignored)}" if source.ignored else ""
     log = Log(path, settings, assets, _source=source)
-    instead = settings.instead if unit else ""
-    for what in filter(None, (*notes, remark, log._header.derived, instead)):
-        warnings.warn(what, stacklevel=2)
+    substitution = settings.instead if unit else ""
+    for warning in filter(None, (*notes, remark, log._header.derived, substitution)):
+        warnings.warn(warning, stacklevel=2)
     return log
 
 
@@ -257,41 +256,41 @@ def simulate(
     blow_off: npt.ArrayLike,
     effects: Mapping[str, Mapping[str, float]] | None = None,
 ) -> Columns:
-    """Run the model alone, as it answers commands: what a sensor would read.
+    """Run the model alone with some commands; returns what a sensor would read.
 
-    ``time_s`` (n) goes forward, ``suction`` and ``blow_off`` (n) are 0 or 1; it begins at ambient.
-    ``effects`` says what is to be wrong, in the field's units:
-    ``{"leakage": {"sonic_flow": 2.0}}``. Gives ``time_s``, the commands, ``pressure_pa``
-    (absolute), ``part_present`` and ``air_saving``. ConfigError for columns that do not fit.
+    ``time_s`` (n) rises; ``suction`` and ``blow_off`` (n) are 0 or 1; the start is at ambient.
+    ``effects`` are faults to simulate, in the field's units: ``{"leakage": {"sonic_flow": 2.0}}``.
+    Returns ``time_s``, the commands, ``pressure_pa`` (absolute), ``part_present`` and
+    ``air_saving``. ConfigError for columns that do not fit.
     """
     settings = _configured(config)
-    samples = _commanded(time_s, {"suction": suction, "blow_off": blow_off})
+    samples = _command_rows(time_s, {"suction": suction, "blow_off": blow_off})
     theta = coefficients(settings.data)
     for name, values in (effects or {}).items():
         theta = apply(theta, name, values)
     pressure, signals = Plant(theta, settings.data.terms).run(samples)
     return {
         "time_s": np.asarray(time_s, np.float64),
-        **_bits(samples["commands"], _COMMANDS),
+        **_bit_columns(samples["commands"], _COMMANDS),
         "pressure_pa": pressure,
-        **_bits(signals, _SIGNALS),
+        **_bit_columns(signals, _SIGNALS),
     }
 
 
 def calibrate(log: Log, progress: Progress = _quiet) -> Calibrated:
     """Fit the data set of one unit to the healthy cycles of a log, beginning with its type's.
 
-    ``progress`` is told what is being done: ``print``, for example. ConfigError where the log does
-    not suffice, or is not that of a healthy unit.
+    ``progress`` is called with a text about each step: ``print``, for example. ConfigError if the
+    log does not suffice, or is not that of a healthy unit.
     """
     log._header.require_commands(str(log.path))
     document, unit = log.config.document, log.config.asset.id
-    known = Config.of(document, log.assets, unit, calibrated=False)
-    settings = replace(known, gauge=log.config.gauge)
-    found = fit_unit(settings, log._samples(), progress)
-    monitor = settings.monitor.model_copy(update={"healthy": found.healthy})
-    fitted = replace(settings, data=found.fitted.data, monitor=monitor, origin=f"{log.path}")
-    return Calibrated(fitted, found, log)
+    unit_config = Config.of(document, log.assets, unit, calibrated=False)
+    settings = replace(unit_config, gauge=log.config.gauge)
+    result = fit_unit(settings, log._samples(), progress)
+    monitor = settings.monitor.model_copy(update={"healthy": result.healthy})
+    fitted = replace(settings, data=result.fitted.data, monitor=monitor, origin=f"{log.path}")
+    return Calibrated(fitted, result, log)
 
 
 def diagnose(log: Log, progress: Progress = _quiet) -> Answer:
@@ -303,18 +302,18 @@ def diagnose(log: Log, progress: Progress = _quiet) -> Answer:
     return Answer(find_cause(log.config, samples, str(log.path), progress, derived=derived))
 
 
-# --- what these share ---------------------------------------------------------------------------
+# --- shared helpers -----------------------------------------------------------------------------
 
 
 def _configured(config: Place | Config, assets: str = "", unit: str = "", own: str = "") -> Config:
-    """The configuration with what is known of its unit; one that is at hand as it is."""
+    """The configuration with the data set of its unit; a ``Config`` stays as it is."""
     if not isinstance(config, Config):
         return Config.of(Document.read(Path(config)), assets, unit, own=own)
     return Config.of(config.document, assets, unit, own=own) if assets or unit else config
 
 
 def _of_log(recorded: Recorded, config: Place | Config | None, assets: str, unit: str) -> Config:
-    """A log's own configuration or another one, not that of another ejector."""
+    """The configuration for a log: its own or another one, but not that of another ejector."""
     name = str(recorded.path)
     if config is None:
         return Config.of_recorded(recorded.header, name, assets=assets, unit=unit)
@@ -325,20 +324,20 @@ def _of_log(recorded: Recorded, config: Place | Config | None, assets: str, unit
 
 
 def _table(path: Path, settings: Config, derive: bool) -> Table:
-    """A table whose columns are as the configuration says, maybe with derived commands."""
-    wanted = settings.document.section(ImportSettings, "import")
+    """A table with the configured columns, maybe with derived commands."""
+    import_settings = settings.document.section(ImportSettings, "import")
     ambient = settings.data.ambient.pressure_mbar * MBAR
-    table = open_table(path, wanted, ambient, derive=derive)
+    table = open_table(path, import_settings, ambient, derive=derive)
     return table.with_commands() if derive else table
 
 
-def _bits(flags: npt.NDArray[np.uint8], bits: Mapping[str, int]) -> Columns:
-    """A column of true and false for each bit."""
+def _bit_columns(flags: npt.NDArray[np.uint8], bits: Mapping[str, int]) -> Columns:
+    """A Boolean column for each bit."""
     return {name: (flags & np.uint8(bit)) != 0 for name, bit in bits.items()}
 
 
-def _commanded(time_s: npt.ArrayLike, commands: Mapping[str, npt.ArrayLike]) -> Samples:
-    """Rows of a PLC that commands this; ConfigError where the columns do not fit."""
+def _command_rows(time_s: npt.ArrayLike, commands: Mapping[str, npt.ArrayLike]) -> Samples:
+    """Rows of a PLC with these commands; ConfigError if the columns do not fit."""
     time = np.atleast_1d(np.asarray(time_s, np.float64))
     if not np.isfinite(time).all() or (np.diff(time) < NS).any():
         raise ConfigError("time_s does not go forward from row to row", "sort it, in seconds")
@@ -346,7 +345,7 @@ def _commanded(time_s: npt.ArrayLike, commands: Mapping[str, npt.ArrayLike]) -> 
     samples["time_ns"] = np.rint(time / NS)
     for name, column in commands.items():
         if np.shape(column) != time.shape:
-            what = f"{name} has the shape {np.shape(column)}, time_s {time.shape}"
-            raise ConfigError(what, "give each of them one value for each time")
+            mismatch = f"{name} has the shape {np.shape(column)}, time_s {time.shape}"
+            raise ConfigError(mismatch, "give each of them one value for each time")
         samples["commands"] |= np.where(np.asarray(column, bool), _COMMANDS[name], 0).astype("u1")
     return samples

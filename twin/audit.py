@@ -1,7 +1,7 @@
 """The audit trail: who did what, from where and when, one JSON object a line beside the users.
 
-What was refused has a file of its own: whoever guesses passwords must not push out what users did.
-Each file is moved aside when it is large, and the oldest goes.
+Refused actions have a file of their own, so that guessing passwords cannot push out what users did.
+Each file is rotated when it is large, and the oldest one is deleted.
 """
 
 import errno
@@ -24,7 +24,7 @@ SECOND_NS = 1_000_000_000
 
 
 class Act(StrEnum):
-    """What is told beside the deeds of alarms."""
+    """Recorded actions, in addition to those on alarms."""
 
     LOGGED_IN = "logged_in"
     LOGGED_OUT = "logged_out"
@@ -33,7 +33,7 @@ class Act(StrEnum):
     ROLE_CHANGED = "role_changed"
     PASSWORD_CHANGED = "password_changed"  # noqa: S105  # what happened
     WRONG_PASSWORD = "wrong_password"  # noqa: S105
-    THROTTLED = "throttled"  # tried again before the time was over; the first such try is told
+    THROTTLED = "throttled"  # tried again during the wait; only the first such try is recorded
     COMMENTED = "commented"  # an alarm
     DENIED = "denied"  # the role does not allow it
 
@@ -42,9 +42,10 @@ _REFUSALS = {Act.WRONG_PASSWORD, Act.THROTTLED, Act.DENIED}
 
 
 class Audit:
-    """Appends records in ``folder``; a disk that fails is complained of once and holds up nobody.
+    """Appends records in ``folder``; a failing disk is reported once and blocks nobody.
 
-    ``through`` is which way people come: page, opcua or command. ``clock`` gives ns since 1970.
+    ``through`` is the interface that people use: page, opcua or command. ``clock`` returns ns since
+    1970.
     """
 
     def __init__(
@@ -56,55 +57,57 @@ class Audit:
     ) -> None:
         self._folder, self._through = folder, through
         self._complain, self._clock = complain, clock
-        self._fails = False
+        self._is_failing = False
 
-    def record(self, what: str, who: str, address: str = "", **details: str) -> None:
-        """Keep that ``who`` did ``what``; it is on the disk when this returns."""
+    def record(self, act: str, who: str, address: str = "", **details: str) -> None:
+        """Record that ``who`` did ``act``; the record is on the disk when this returns."""
         seconds, rest_ns = divmod(self._clock(), SECOND_NS)
         moment = f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest_ns // 1000:06d}Z"
-        told = {"time": moment, "what": str(what), "who": who[:LONGEST]}
-        told |= {"through": self._through, "from": address}
-        told |= {name: text[:LONGEST] for name, text in details.items() if text}
-        line = json.dumps(told, ensure_ascii=False).encode(errors="replace") + b"\n"
-        path = self._folder / (REFUSED if what in _REFUSALS else DONE)
+        entry = {"time": moment, "what": str(act), "who": who[:LONGEST]}
+        entry |= {"through": self._through, "from": address}
+        entry |= {name: text[:LONGEST] for name, text in details.items() if text}
+        line = json.dumps(entry, ensure_ascii=False).encode(errors="replace") + b"\n"
+        path = self._folder / (REFUSED if act in _REFUSALS else DONE)
         try:
             with _locked(self._folder) as is_alone:
                 if is_alone and _size(path) + len(line) > LARGEST:
-                    _move_aside(path)
+                    _rotate(path)
                 _append(path, line)
-            self._fails = False
+            self._is_failing = False
         except OSError as error:
-            if not self._fails:
+            if not self._is_failing:
                 self._complain(
                     f"{path}: the audit trail cannot be written: {error.strerror or error};"
                     " logins go on without it"
                 )
-            self._fails = True
+            self._is_failing = True
 
 
 def records(folder: Path) -> tuple[list[dict[str, Any]], int]:
-    """All records, the oldest first, and how many lines cannot be read; OSError as open."""
-    found, broken = [], 0
+    """All records, the oldest first, and the number of unreadable lines; OSError as in open."""
+    entries, broken = [], 0
     for name in (DONE, REFUSED):
         for path in _files(folder / name):
             for line in path.read_bytes().splitlines():
                 try:
-                    told = json.loads(line)
-                    moment = str(told["time"])
+                    entry = json.loads(line)
+                    moment = str(entry["time"])
                 except (ValueError, KeyError, TypeError):
                     broken += bool(line)
                 else:
-                    found.append((moment, told))
-    return [told for _, told in sorted(found, key=lambda one: one[0])], broken
+                    entries.append((moment, entry))
+    return [entry for _, entry in sorted(entries, key=lambda pair: pair[0])], broken
 
 
-def in_words(told: dict[str, Any]) -> str:
-    """A record on one line. Names are a stranger's: what a terminal would act on is left out."""
-    what = str(told.get("what", "")).replace("_", " ")
-    place = f"{told.get('through', '')} {told.get('from', '')}".strip()
-    known = ("time", "what", "who", "through", "from")
-    details = [f"{name}={text}" for name, text in told.items() if name not in known]
-    line = "  ".join([str(told["time"]), f"{what:<16}", str(told.get("who", "")), place, *details])
+def in_words(entry: dict[str, Any]) -> str:
+    """A record on one line; control characters are replaced, since names come from strangers."""
+    act = str(entry.get("what", "")).replace("_", " ")
+    origin = f"{entry.get('through', '')} {entry.get('from', '')}".strip()
+    fixed_keys = ("time", "what", "who", "through", "from")
+    details = [f"{name}={text}" for name, text in entry.items() if name not in fixed_keys]
+    line = "  ".join(
+        [str(entry["time"]), f"{act:<16}", str(entry.get("who", "")), origin, *details]
+    )
     return "".join(letter if letter.isprintable() else "�" for letter in line)
 
 
@@ -112,20 +115,20 @@ def in_words(told: dict[str, Any]) -> str:
 
 
 def _files(path: Path) -> list[Path]:
-    """Those of a kind that are there, the oldest first."""
-    aside = [_aside(path, number) for number in range(KEPT - 1, 0, -1)]
-    return [one for one in (*aside, path) if one.exists()]
+    """The existing files of a kind, the oldest first."""
+    rotated = [_rotated_path(path, number) for number in range(KEPT - 1, 0, -1)]
+    return [file for file in (*rotated, path) if file.exists()]
 
 
-def _aside(path: Path, number: int) -> Path:
+def _rotated_path(path: Path, number: int) -> Path:
     return path.with_name(f"{path.stem}.{number}{path.suffix}")
 
 
-def _move_aside(path: Path) -> None:
+def _rotate(path: Path) -> None:
     for number in range(KEPT - 1, 1, -1):
-        if (younger := _aside(path, number - 1)).exists():
-            younger.replace(_aside(path, number))
-    path.replace(_aside(path, 1))
+        if (younger := _rotated_path(path, number - 1)).exists():
+            younger.replace(_rotated_path(path, number))
+    path.replace(_rotated_path(path, 1))
 
 
 def _size(path: Path) -> int:
@@ -136,7 +139,7 @@ def _size(path: Path) -> int:
 
 
 def _append(path: Path, line: bytes) -> None:
-    """Whole and on the disk; after what a crash has left of a line, on a new one."""
+    """Append a line and sync it; after an unfinished line of a crash, begin a new one."""
     handle = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o600)
     try:
         size = os.fstat(handle).st_size
@@ -151,7 +154,7 @@ def _append(path: Path, line: bytes) -> None:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[bool]:
-    """Whether no other process writes in a folder; where one hangs it is not waited for long."""
+    """Lock a folder against other writers; yields whether that worked within LOCK_S."""
     try:
         import fcntl  # noqa: PLC0415 - other systems have none
     except ImportError:

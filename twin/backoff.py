@@ -1,4 +1,4 @@
-"""How long to wait before something that failed is tried again."""
+"""The pauses before retries after failures."""
 
 
 class Backoff:
@@ -14,5 +14,5 @@ class Backoff:
         return pause_s
 
     def reset(self) -> None:
-        """It worked: the next failure begins anew."""
+        """Start again with the first pause, after a success."""
         self._pause_s = self._first_s

@@ -1,8 +1,8 @@
-"""The twin's own part of a configuration: which asset, what is known of it, when to raise an alarm.
+"""The twin's own part of a configuration: the asset, its data set, and the settings of alarms.
 
-What is known lies in layers, each over the one before: the defaults; the object-specific data set
+The data set has layers; each overrides the one before: the defaults; the object-specific data set
 of the type in the asset database; ``[data]``; the instance-specific data set of the unit in the
-asset database. Where they came from is kept.
+asset database. Their origin is kept.
 """
 
 import json
@@ -29,7 +29,7 @@ from twin.settings import Document, Settings
 from twin.signals import MBAR
 from twin.validation import findings, path_in_words, without_tags
 
-if TYPE_CHECKING:  # a log brings its own data set, and need not wait for its SQLAlchemy
+if TYPE_CHECKING:  # SQLAlchemy loads slowly, and a log that has its own data set does not need it
     from sqlalchemy import URL
 
     from twin.assets.database import Assets
@@ -55,13 +55,13 @@ TABLES = {
 NO_TYPE = "unknown"
 FROM_AMBIENT = ("gauge", "vacuum")  # references of a tag
 COUNTED_FROM, AMBIENT = "counted_from", "ambient"  # in a log's metadata, of its pressure
-IN_A_LOG = {"asset", "data", "driver", "figures", "import", "log", "monitor"}  # heeded in one
-PLACES = {"url", "password", "keep"}  # keys of them that are not
+IN_A_LOG = {"asset", "data", "driver", "figures", "import", "log", "monitor"}  # used from a log
+PLACES = {"url", "password", "keep"}  # keys that are ignored in a log
 SHIPPED = "sqlite://"  # the data sets that come with the program
 HAND_WRITTEN = "[data] of the configuration"
 _WORDS = {"type": "object-specific data", "instance": "instance-specific data"}
 
-Tables = Mapping[str, Any]  # as [data] has them
+Tables = Mapping[str, Any]  # nested like [data]
 
 
 class Asset(Settings):
@@ -99,9 +99,9 @@ class Config:
     data: DataSet
     monitor: MonitorSettings
     log: LogSettings
-    origin: str = HAND_WRITTEN  # where the data set is from, in words
-    instead: str = ""  # of the unit's own data set, which nobody has: what is used, in words
-    gauge: bool = False  # whether the pressure sensor counts from ambient, as far as is known
+    origin: str = HAND_WRITTEN  # origin of the data set, in words
+    instead: str = ""  # what replaces the unit's missing data set, in words
+    gauge: bool = False  # whether the pressure sensor is known to count from ambient
 
     @classmethod
     def of(
@@ -117,42 +117,43 @@ class Config:
     ) -> "Config":
         """Check all of the twin's tables; ConfigError names file, line and key, or the record.
 
-        ``assets`` names the database in place of the configuration's, ``unit`` the ID in place of
-        its own: ConfigError if the database does not know it and it is not ``own``, that of a log.
-        Not ``calibrated`` is the unit as its type has it, whatever is known of itself: it may be
-        new. ``as_of_ns`` (UTC) takes what the database knew then. ``to_store`` allows a database
-        that is not there yet.
+        ``assets`` and ``unit`` replace the configured database and ID. ConfigError if the database
+        does not know ``unit`` and it is not ``own``, the unit of a log. Without ``calibrated`` the
+        unit gets its type's data set even if it has its own; it may be new. ``as_of_ns`` (UTC)
+        ignores what was stored later. ``to_store`` allows a missing database.
         """
         from twin.assets.database_url import open_chosen
 
         document.refuse_unknown_tables(TABLES)
         _refuse_calibrated(document)
         asset = _asset(document, unit)
-        to_store = to_store or not calibrated  # what is not, is read to be calibrated and stored
+        to_store = to_store or not calibrated  # otherwise it will be calibrated and stored
         with open_chosen(assets, document, write=False, to_store=to_store) as database:
             if unit and calibrated and unit not in (own, document.section(Asset, "asset").id):
                 _require_unit(database, unit, {own, document.section(Asset, "asset").id} - {""})
-            found = _find(database, document, asset.type, asset.id if calibrated else "", as_of_ns)
-            where = database.name
-        known = _layered(document, found, where)
-        config = cls._checked(document, asset, known, _origin(found, known))
-        if calibrated and not (found and found.used == "instance"):
-            config = replace(config, instead=_instead(asset, found, where))
+            record = _find_record(
+                database, document, asset.type, asset.id if calibrated else "", as_of_ns
+            )
+            database_name = database.name
+        layers = _layers(document, record, database_name)
+        config = cls._checked(document, asset, layers, _origin(record, layers))
+        if calibrated and not (record and record.used == "instance"):
+            config = replace(config, instead=_instead(asset, record, database_name))
         return config
 
     @classmethod
     def of_log(cls, document: Document, metadata: Mapping[str, str], log: str) -> "Config":
-        """The configuration of a log, with the data set it was recorded beside.
+        """The configuration of a log, with the data set of its recording.
 
-        SourceError names ``log`` and the key where this program cannot take either of them.
+        SourceError names ``log`` and the key if this program cannot use either of them.
         """
         if "data" not in metadata:
             return cls.of(document, SHIPPED)
-        known = _of_log(metadata, log)
-        with _in_log(metadata, log):
+        stored = _stored_in_log(metadata, log)
+        with _log_errors(metadata, log):
             document.refuse_unknown_tables(TABLES)
             asset = document.section(Asset, "asset")
-            return cls._checked(document, asset, known, metadata.get("origin", "the log"))
+            return cls._checked(document, asset, stored, metadata.get("origin", "the log"))
 
     @classmethod
     def of_recorded(
@@ -166,35 +167,35 @@ class Config:
         *,
         to_store: bool = False,
     ) -> "Config":
-        """The configuration a log carries, with the data set it was made with; or ``instead``.
+        """The configuration in a log, with the data set of its recording; or ``instead``.
 
-        Where a database, a unit or a time is named the data set is looked up anew, as in ``of``.
-        A database that is to be made knows nothing to look up.
+        If a database, a unit or a time is named, the data set is looked up anew, as in ``of``. A
+        database that does not exist yet is not searched.
         """
         from twin.assets.database_url import is_new
 
-        with _in_log(header.metadata, log):
+        with _log_errors(header.metadata, log):
             document = instead or document_in(header)
-        known = bool(assets) and not (to_store and is_new(assets, document))
-        if instead is not None or known or unit or as_of_ns is not None:
+        is_lookup = bool(assets) and not (to_store and is_new(assets, document))
+        if instead is not None or is_lookup or unit or as_of_ns is not None:
             own = header.asset_id
             config = cls.of(document, assets, unit, as_of_ns=as_of_ns, own=own, to_store=to_store)
         else:
             config = cls.of_log(document, header.metadata, log)
             # --id may have named another unit than the configuration does.
-            named = {"type": header.asset_type, "id": header.asset_id}
-            config = replace(config, asset=config.asset.model_copy(update=named))
+            names = {"type": header.asset_type, "id": header.asset_id}
+            config = replace(config, asset=config.asset.model_copy(update=names))
         return config.of_rows(header)
 
     def of_rows(self, header: LogHeader) -> "Config":
-        """The same for the rows of a log: they say what their pressure counts from."""
+        """The configuration for the rows of a log, which say what their pressure counts from."""
         gauge = self.gauge or header.metadata.get(COUNTED_FROM) == AMBIENT
         return self if gauge == self.gauge else replace(self, gauge=gauge)
 
     def log_header(self, unmeasured: Mapping[str, str] | None = None) -> LogHeader:
-        """What a log of this unit must carry to be replayed alone.
+        """The header with which a log of this unit can be replayed alone.
 
-        ``unmeasured`` says what of its rows was not measured (``LogHeader.unmeasured``).
+        ``unmeasured`` names unmeasured parts of its rows (``LogHeader.unmeasured``).
         """
         metadata = {
             "program": version("ejector-twin"),
@@ -217,42 +218,44 @@ class Config:
     def refuse_another(self, header: LogHeader, log: str) -> None:
         """ConfigError if this is the configuration of another asset than the log's."""
         recorded = header.asset_type, header.asset_id
-        asked = self.asset.type, self.asset.id
-        if all((*recorded, *asked)) and recorded != asked:
+        own = self.asset.type, self.asset.id
+        if all((*recorded, *own)) and recorded != own:
             raise ConfigError(
                 f"{log} is a log of {' '.join(recorded)}, {self.document.name} is for"
-                f" {' '.join(asked)}",
+                f" {' '.join(own)}",
                 "take the log's own configuration (no --config), or say with --id which unit to"
                 " compare it with",
             )
 
     @classmethod
-    def _checked(cls, document: Document, asset: Asset, known: Known, origin: str) -> "Config":
-        effects_in(known.data.catalogue)  # known by name from here on, in words as in alarms
+    def _checked(cls, document: Document, asset: Asset, stored: Known, origin: str) -> "Config":
+        effects_in(
+            stored.data.catalogue
+        )  # registers the catalogue's effects by name, for texts and alarms
         monitor = document.section(MonitorSettings, "monitor")
-        monitor = monitor.model_copy(update={"healthy": known.healthy})
+        monitor = monitor.model_copy(update={"healthy": stored.healthy})
         log = document.section(LogSettings, "log")
         gauge = _counts_from_ambient(document.tables)
-        return cls(document, asset, known.data, monitor, log, origin, gauge=gauge)
+        return cls(document, asset, stored.data, monitor, log, origin, gauge=gauge)
 
 
 def _counts_from_ambient(tables: Tables) -> bool:
-    """Whether the tag, or the column, of the pressure is said to count from ambient."""
+    """Whether the pressure's tag or column is configured to count from ambient."""
     with suppress(KeyError, TypeError):
         return bool(tables["driver"]["tags"]["pressure"]["reference"] in FROM_AMBIENT)
     with suppress(KeyError, TypeError):
         columns = tables["import"]["columns"]
-        said = columns.get("pressure")
-        gauge = isinstance(said, Mapping) and said.get("reference") in FROM_AMBIENT
+        settings = columns.get("pressure")
+        gauge = isinstance(settings, Mapping) and settings.get("reference") in FROM_AMBIENT
         return gauge or any(str(name).startswith("vacuum") for name in columns)
     return False
 
 
 def document_in(header: LogHeader) -> Document:
-    """The configuration that a log carries; ConfigError if it is not TOML.
+    """The configuration in a log; ConfigError if it is not TOML.
 
-    A log may be anybody's. So what names places to open is left out: databases, files, services.
-    Older ones have what a calibration found, which stands in the log itself as well.
+    A log may come from anybody. So keys that name databases, files or services are left out. Older
+    logs contain the result of a calibration here, which is in the log's metadata as well.
     """
     document = Document.parse(header.config_text, Path(header.config_name).name)
     document.refuse_unknown_tables(TABLES)
@@ -272,20 +275,22 @@ def _without(table: Any, keys: set[str]) -> Any:
 
 
 def check_asset(document: Document, record: Record, database: "Assets") -> None:
-    """ConfigError with file, line and key if a record read from a file would be of no use.
+    """ConfigError with file, line and key if a record read from a file cannot be used.
 
-    A unit is checked over what the database has of its type.
+    A unit is checked together with its type's data set in the database.
     """
-    below: Tables = {}
+    type_tables: Tables = {}
     if record.kind == "instance":
-        kind = database.get(record.type).record
-        below = _laid(kind, {}, partial(_in_record, kind, database.name))
-    _laid(record, below, partial(_in_file, document))
+        type_record = database.get(record.type).record
+        type_tables = _overlay_record(
+            type_record, {}, partial(_checked_record, type_record, database.name)
+        )
+    _overlay_record(record, type_tables, partial(_checked_file, document))
     replace(document, tables={"healthy": record.healthy}).section(Known)
 
 
 def _refuse_calibrated(document: Document) -> None:
-    """ConfigError if a person's file has what only a calibration can know."""
+    """ConfigError if a person's file contains results of a calibration."""
     monitor = document.tables.get("monitor", {})
     if isinstance(monitor, Mapping) and "healthy" in monitor:
         raise ConfigError(
@@ -309,14 +314,14 @@ def _asset(document: Document, unit: str) -> Asset:
     return asset
 
 
-def _require_unit(database: "Assets", unit: str, others: set[str]) -> None:
-    """ConfigError if nothing was ever known of ``unit``: its name is taken for a mistyped one.
+def _require_unit(database: "Assets", unit: str, alternatives: set[str]) -> None:
+    """ConfigError if the database does not know ``unit``: the name is probably mistyped.
 
-    ``others`` may be meant too: the unit of the log and that of the configuration.
+    The hint also suggests ``alternatives``: the units of the log and of the configuration.
     """
     if not database.records("instance", unit):
         stored = {record.name for record in database.records("instance")}
-        units = known_names(unit, stored | others)
+        units = known_names(unit, stored | alternatives)
         raise ConfigError(
             f"{database.name}: no unit is called {unit!r}",
             f"{units}\n  a new unit is named by [asset] id in the configuration; twin calibrate"
@@ -324,10 +329,10 @@ def _require_unit(database: "Assets", unit: str, others: set[str]) -> None:
         )
 
 
-def _find(
+def _find_record(
     database: "Assets", document: Document, type_name: str, unit: str, as_of_ns: int | None
 ) -> Found | None:
-    """What the database has; None where it knows neither unit nor type, but [data] does."""
+    """The database's entry; None if it knows neither unit nor type, but there is a [data]."""
     try:
         return database.get(type_name, unit, as_of_ns=as_of_ns)
     except UnknownAssetError:
@@ -341,135 +346,139 @@ def _find(
         return None
 
 
-def _origin(found: Found | None, known: Known) -> str:
-    """Where the data set is from, in words."""
-    if found is None:
+def _origin(record: Found | None, stored: Known) -> str:
+    """The origin of the data set, in words."""
+    if record is None:
         return HAND_WRITTEN
-    words = _named(found.record)
-    if found.base and any(_left_out(known.data.model_dump(), found.record.data)):
-        words += f", over {_named(found.base)}"
+    words = _record_name(record.record)
+    if record.base and any(_missing_keys(stored.data.model_dump(), record.record.data)):
+        words += f", over {_record_name(record.base)}"
     return words
 
 
-def _named(record: Record) -> str:
+def _record_name(record: Record) -> str:
     return f"{_WORDS[record.kind]} of {record.name}, record {record.id[:8]}"
 
 
-def _instead(asset: Asset, found: Found | None, where: str) -> str:
+def _instead(asset: Asset, record: Found | None, database_name: str) -> str:
     if not asset.id:
         return ""
-    if found is None:
-        nobody = f"no data set of {asset.id!r} or its type {asset.type!r} in {where}"
-        return f"{nobody}; using {HAND_WRITTEN}"
-    nobody = f"no instance-specific data set of {asset.id!r} in {where}"
-    return f"{nobody}; using the type's {asset.type!r}"
+    if record is None:
+        missing = f"no data set of {asset.id!r} or its type {asset.type!r} in {database_name}"
+        return f"{missing}; using {HAND_WRITTEN}"
+    missing = f"no instance-specific data set of {asset.id!r} in {database_name}"
+    return f"{missing}; using the type's {asset.type!r}"
 
 
 # --- layers -------------------------------------------------------------------------------------
 
 
-def _layered(document: Document, found: Found | None, where: str) -> Known:
-    """What is known of an asset; every layer is checked by itself, so that the right one is named.
+def _layers(document: Document, record: Found | None, database_name: str) -> Known:
+    """The layered data set; each layer is checked by itself, so that errors name the right one.
 
-    ConfigError too if the unit was calibrated on another system than the configuration has.
+    ConfigError also if the unit was calibrated on another system than the configured one.
     """
-    kind = found.base or found.record if found else None
-    below = _laid(kind, {}, partial(_in_record, kind, where)) if kind else {}
-    tables = _merged(below, document.tables.get("data", {}))
-    known = _in_file(document, tables)
-    if found is None or found.used == "type":
-        return known
-    unit = found.record
-    check = partial(_in_record, unit, where)
-    own = check(_laid(unit, tables, check))
+    type_record = record.base or record.record if record else None
+    type_tables = (
+        _overlay_record(type_record, {}, partial(_checked_record, type_record, database_name))
+        if type_record
+        else {}
+    )
+    tables = _merged(type_tables, document.tables.get("data", {}))
+    type_layer = _checked_file(document, tables)
+    if record is None or record.used == "type":
+        return type_layer
+    unit = record.record
+    check = partial(_checked_record, unit, database_name)
+    unit_layer = check(_overlay_record(unit, tables, check))
     configured = "parts" in document.tables.get("data", {}).get("system", {})
-    if configured and own.data.system.parts != known.data.system.parts:
+    if configured and unit_layer.data.system.parts != type_layer.data.system.parts:
         raise ConfigError(
             f"{document.name}: {unit.name} was calibrated on another system than"
             " [data.system.parts] has",
             "calibrate it again on this one (twin calibrate), or give it another id",
         )
-    return own
+    return unit_layer
 
 
-def _laid(record: Record, below: Tables, check: Callable[[Tables], object]) -> Tables:
-    """A record over what lies ``below``; what it says outright holds over what its diagram says."""
-    tables: Tables = _merged(below, record.data)
+def _overlay_record(record: Record, base: Tables, check: Callable[[Tables], object]) -> Tables:
+    """A record laid over ``base``; its explicit values override those from its diagram."""
+    tables: Tables = _merged(base, record.data)
     check(tables)
     if VACUUM not in record.arrays:
         return tables
     try:
-        diagram = _reduced(record, DataSet.model_validate(tables))
-        tables = _merged(_merged(below, diagram), record.data)
+        diagram = _tables_of_diagram(record, DataSet.model_validate(tables))
+        tables = _merged(_merged(base, diagram), record.data)
         DataSet.model_validate(tables)
     except (ConfigError, ValidationError) as error:
-        why = _in_words(error, DataSet) if isinstance(error, ValidationError) else str(error)
+        cause = _in_words(error, DataSet) if isinstance(error, ValidationError) else str(error)
         raise ConfigError(
             f"{record.kind} {record.name!r}: the model cannot follow its characteristic diagram:"
-            f" {why}",
+            f" {cause}",
             "check its rows: one peak over operating pressure, and capacity that falls with vacuum",
         ) from error
     return tables
 
 
-def _reduced(record: Record, data: DataSet) -> Tables:
-    """What a record's characteristic diagram says."""
+def _tables_of_diagram(record: Record, data: DataSet) -> Tables:
+    """The values that follow from a record's characteristic diagram."""
     axes = record.arrays[VACUUM], record.arrays[SUPPLY]
     nominal, ambient = data.supply.nozzle_bar, data.ambient.pressure_mbar
     return reduce(*axes, record.arrays[FLOW], nominal, ambient).tables
 
 
-def _merged(base: Any, over: Any) -> Any:
-    """``over`` laid over ``base``, table by table."""
-    if not (isinstance(base, Mapping) and isinstance(over, Mapping)):
-        return over
-    return {**base, **{key: _merged(base.get(key), value) for key, value in over.items()}}
+def _merged(base: Any, overlay: Any) -> Any:
+    """``overlay`` merged into ``base``, table by table."""
+    if not (isinstance(base, Mapping) and isinstance(overlay, Mapping)):
+        return overlay
+    return {**base, **{key: _merged(base.get(key), value) for key, value in overlay.items()}}
 
 
-# --- checks, each naming where a wrong key stands -----------------------------------------------
+# --- checks; each error names the place of the wrong key ----------------------------------------
 
 
-def _in_file(document: Document, tables: Tables) -> Known:
+def _checked_file(document: Document, tables: Tables) -> Known:
     merged = replace(document, tables={**document.tables, "data": tables})
     return Known(data=merged.section(DataSet, "data"))
 
 
-def _in_record(record: Record, where: str, tables: Tables) -> Known:
+def _checked_record(record: Record, database_name: str, tables: Tables) -> Known:
     try:
         return Known.model_validate({"data": tables, "healthy": record.healthy})
     except ValidationError as error:
-        unfit = f"record {record.id[:8]} of {record.kind} {record.name!r} cannot be used"
+        problem = f"record {record.id[:8]} of {record.kind} {record.name!r} cannot be used"
         raise ConfigError(
-            f"{where}: {unfit}: {_in_words(error)}",
+            f"{database_name}: {problem}: {_in_words(error)}",
             f"twin assets show {record.name} prints it; add one that is right: twin assets add",
         ) from error
 
 
 @contextmanager
-def _in_log(metadata: Mapping[str, str], log: str) -> Iterator[None]:
-    """Say of a configuration's faults that it stands in a log: there is no file to mend."""
+def _log_errors(metadata: Mapping[str, str], log: str) -> Iterator[None]:
+    """Turn errors of a log's configuration into SourceErrors, since no file can be corrected."""
     try:
         yield
     except ConfigError as error:
         message = f"{log}: the configuration in it cannot be used: {error}"
-        raise SourceError(message, _instead_of_its_own(metadata)) from error
+        raise SourceError(message, _log_hint(metadata)) from error
 
 
-def _instead_of_its_own(metadata: Mapping[str, str]) -> str:
+def _log_hint(metadata: Mapping[str, str]) -> str:
     return (
         "give another one with --config CONFIG, or use the ejector-twin that made the log"
         f" ({metadata.get('program', 'of unknown version')})"
     )
 
 
-def _of_log(metadata: Mapping[str, str], log: str) -> Known:
-    """All that a log says of the data set; nothing is made up where it leaves something out."""
+def _stored_in_log(metadata: Mapping[str, str], log: str) -> Known:
+    """The data set in a log; SourceError if it is incomplete, since defaults would be wrong."""
     try:
         stored = {key: json.loads(metadata[key]) for key in ("data", "healthy") if key in metadata}
-        known = Known.model_validate(stored)
-        missing = list(_left_out(known.data.model_dump(mode="json"), stored["data"], "data"))
+        content = Known.model_validate(stored)
+        missing = list(_missing_keys(content.data.model_dump(mode="json"), stored["data"], "data"))
         problem = f"{', '.join(missing)}: missing" if missing else ""
-        if not problem and metadata.get("data_set", known.data.hash) != known.data.hash:
+        if not problem and metadata.get("data_set", content.data.hash) != content.data.hash:
             problem = "it is not as it was written: its hash is another one"
     except ValidationError as error:
         problem = _in_words(error)
@@ -477,30 +486,30 @@ def _of_log(metadata: Mapping[str, str], log: str) -> Known:
         problem = str(error)
     if problem:
         message = f"{log}: its data set cannot be used: {problem}"
-        raise SourceError(message, _instead_of_its_own(metadata))
-    return known
+        raise SourceError(message, _log_hint(metadata))
+    return content
 
 
 def _in_words(error: ValidationError, kind: type[Settings] = Known) -> str:
-    """What is wrong with stored tables: key, what, and what stands there."""
+    """The errors of stored tables in words: key, problem and value."""
     return "; ".join(
-        f"{path_in_words(without_tags(kind, problem['loc']))}: {what}"
-        for problem, what in findings(error, kind)
+        f"{path_in_words(without_tags(kind, problem['loc']))}: {finding}"
+        for problem, finding in findings(error, kind)
     )
 
 
-def _left_out(whole: Any, given: Any, at: str = "") -> Iterator[str]:
-    """The keys of ``whole`` that are not in ``given``, where both have tables or lists.
+def _missing_keys(whole: Any, given: Any, prefix: str = "") -> Iterator[str]:
+    """The keys of ``whole`` that are missing in ``given``, through nested tables and lists.
 
-    An empty catalogue of effects may be left out: it says nothing of the pressure.
+    An empty catalogue of effects may be missing: it does not affect the pressure.
     """
     if isinstance(whole, Mapping) and isinstance(given, Mapping):
         for key, value in whole.items():
-            here = f"{at}.{key}".removeprefix(".")
+            path = f"{prefix}.{key}".removeprefix(".")
             if key in given:
-                yield from _left_out(value, given[key], here)
+                yield from _missing_keys(value, given[key], path)
             elif value or key != "catalogue":
-                yield here
+                yield path
     elif isinstance(whole, list | tuple) and isinstance(given, list | tuple):
-        for number, (one, other) in enumerate(zip(whole, given, strict=True)):
-            yield from _left_out(one, other, f"{at}.{number}")
+        for number, (item, given_item) in enumerate(zip(whole, given, strict=True)):
+            yield from _missing_keys(item, given_item, f"{prefix}.{number}")

@@ -1,7 +1,7 @@
-"""What numba compiles for: it has to be said before whoever comes first compiles anything.
+"""Sets the processor features that numba compiles for; import it before anything is compiled.
 
-Where a processor has vectors of 512 bits, LLVM leaves a loop over hypotheses scalar, and each takes
-three times as long; four at a time it runs everywhere.
+For processors with vectors of 512 bits, LLVM leaves a loop over hypotheses scalar, which takes
+three times as long. With vectors of four it works on all processors.
 """
 
 import numba

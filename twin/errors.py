@@ -1,16 +1,16 @@
 """Errors for people: what is wrong, where, and what to do about it.
 
-The command line maps each kind to its exit code; nothing below it catches them to go on quietly.
+The command line maps each kind to its exit code. No code below it suppresses these errors.
 """
 
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-_MOST_NAMES = 20  # that a hint lists: more are not read
+_MOST_NAMES = 20  # in a hint: nobody reads more
 
 
 class TwinError(Exception):
-    """Something a person can put right; ``hint`` says how."""
+    """An error that a person can correct; ``hint`` says how."""
 
     exit_code = 1
 
@@ -32,15 +32,15 @@ class SourceError(TwinError):
 
 
 def in_words(error: Exception) -> str:
-    """What went wrong: a TwinError says it, of others the kind belongs to it."""
+    """The text of an error; with its class, unless it is a TwinError."""
     return str(error) if isinstance(error, TwinError) else f"{type(error).__name__}: {error}"
 
 
 def known_names(asked: str, names: Iterable[str]) -> str:
-    """A hint where nothing is called ``asked``: the name that is nearest, and those there are."""
-    there = sorted(set(names))
-    shown = ", ".join(there[:_MOST_NAMES]) or "none"
-    more = f" and {len(there) - _MOST_NAMES} more" if len(there) > _MOST_NAMES else ""
-    nearest = get_close_matches(asked, there, n=1)
+    """A hint for an unknown name ``asked``: the nearest name, and the known names."""
+    sorted_names = sorted(set(names))
+    shown = ", ".join(sorted_names[:_MOST_NAMES]) or "none"
+    more = f" and {len(sorted_names) - _MOST_NAMES} more" if len(sorted_names) > _MOST_NAMES else ""
+    nearest = get_close_matches(asked, sorted_names, n=1)
     did_you_mean = f"did you mean {nearest[0]!r}? " if nearest else ""
     return f"{did_you_mean}known: {shown}{more}"

@@ -1,4 +1,4 @@
-"""Everything the twin says happens: one record, and one table of kinds."""
+"""The twin's events: one record type, and one table of kinds."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -7,7 +7,7 @@ from typing import Any
 
 
 class Severity(StrEnum):
-    """How much it concerns a person."""
+    """How much an event matters to a person."""
 
     INFO = "info"
     WARNING = "warning"
@@ -15,7 +15,7 @@ class Severity(StrEnum):
 
 
 class Kind(StrEnum):
-    """What can happen. The value is the name in logs; SEVERITY says how much it matters."""
+    """The kinds of events. The value is the name in logs; SEVERITY says how much each matters."""
 
     GAP = "gap"
     PLC_RESTARTED = "plc_restarted"
@@ -46,7 +46,7 @@ SEVERITY: dict[Kind, Severity] = {
     Kind.PLC_RESTARTED: Severity.WARNING,
     Kind.CLOCK_JUMPED: Severity.WARNING,
     Kind.CLOCK: Severity.INFO,
-    Kind.PLC_LOST: Severity.WARNING,  # why there are no rows; how long that may last, PLC_STALE
+    Kind.PLC_LOST: Severity.WARNING,  # why there are no rows; PLC_STALE follows if that lasts
     Kind.PLC_STALE: Severity.ALARM,
     Kind.PLC_BACK: Severity.INFO,
     Kind.TWIN_LATE: Severity.WARNING,
@@ -56,22 +56,22 @@ SEVERITY: dict[Kind, Severity] = {
     Kind.LOG_DELETED: Severity.INFO,  # to make room, as [log] says
     Kind.SIGNAL_BAD: Severity.WARNING,
     Kind.SIGNAL_GOOD: Severity.INFO,
-    Kind.SIGNAL_CONTRADICTS: Severity.WARNING,  # what is reported, and the pressure
+    Kind.SIGNAL_CONTRADICTS: Severity.WARNING,  # a reported signal contradicts the pressure
     Kind.SIGNAL_AGREES: Severity.INFO,
     Kind.CYCLE: Severity.INFO,
     Kind.DEVIATION: Severity.ALARM,
     Kind.DEVIATION_CLEARED: Severity.INFO,
     Kind.DIAGNOSIS: Severity.WARNING,  # the alarm has been raised already; this says why
-    Kind.ALARM: Severity.WARNING,  # people are to be told; what raised it has its own severity
+    Kind.ALARM: Severity.WARNING,  # notifies people; its trigger has its own severity
     Kind.ALARM_CHANGED: Severity.INFO,  # cleared, acknowledged, shelved and so on
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One thing that happened, in PLC time, with its numbers in the field's units.
+    """One event, in PLC time, with its numbers in the field's units.
 
-    ``data`` is what JSON can hold: numbers and texts, and of a diagnosis the whole answer.
+    ``data`` is valid JSON: numbers and texts, and for a diagnosis the whole answer.
     """
 
     time_ns: int
@@ -81,5 +81,5 @@ class Event:
 
     @property
     def severity(self) -> Severity:
-        """As the table of kinds has it."""
+        """The severity of its kind."""
         return SEVERITY[self.kind]

@@ -1,4 +1,4 @@
-"""How to install what an option needs: one line that works for this installation."""
+"""The command that installs an optional extra, for this installation."""
 
 import shlex
 import sys
@@ -11,15 +11,17 @@ _ROOT = Path(__file__).resolve().parents[1]
 def install_hint(extra: str, root: Path = _ROOT) -> str:
     """The command that installs an extra, for this Python.
 
-    From a checkout (``root`` has the project file) the project itself is installed with the extra.
-    From a wheel its packages are named: nobody knows from where the wheel came.
+    In a checkout (``root`` has the project file) it installs the project with the extra. For a
+    wheel it names the packages, since the wheel's origin is unknown.
     """
     if (root / "pyproject.toml").is_file():
-        wanted = ["-e", f"{root}[{extra}]"]
+        packages = ["-e", f"{root}[{extra}]"]
     else:
-        wanted = [
+        packages = [
             package.strip()
-            for package, _, marker in (one.partition(";") for one in requires("ejector-twin") or ())
+            for package, _, marker in (
+                requirement.partition(";") for requirement in requires("ejector-twin") or ()
+            )
             if marker.replace('"', "'").strip() == f"extra == '{extra}'"
         ]
-    return shlex.join([sys.executable, "-m", "pip", "install", *wanted])
+    return shlex.join([sys.executable, "-m", "pip", "install", *packages])

@@ -1,6 +1,6 @@
-"""Files that answers are written to: refused before the work, whole or not at all after it.
+"""Writes files of answers: checked before the work, and written atomically where needed.
 
-And folders that nobody else may write to, and how much a file may make us hold in memory.
+It also provides private folders, and a limit of the memory that a file may claim.
 """
 
 import errno
@@ -17,31 +17,33 @@ from zipfile import ZipFile
 
 from twin.errors import SourceError
 
-MOST_DEEP = 20  # levels of what is written as JSON; an answer of a diagnosis has eight
-LONGEST_BITS = 64  # of an integer there; Python refuses to print very long ones
-MEMORY_BUDGET = 64 << 20  # bytes; no record, batch of rows or package of ours is ever near it
+MOST_DEEP = 20  # levels of a JSON document; an answer of a diagnosis has eight
+LONGEST_BITS = 64  # of an integer in JSON; Python refuses to print very long ones
+MEMORY_BUDGET = 64 << 20  # bytes; no valid record, batch of rows or package comes near it
 
 
-def require_within_budget(size: int, what: str) -> None:
-    """ValueError if what a file declares is too much to be held; ask before it is allocated."""
+def require_within_budget(size: int, subject: str) -> None:
+    """ValueError if a file declares more bytes than fit; call it before allocating."""
     if size > MEMORY_BUDGET:
         mib = MEMORY_BUDGET >> 20
-        raise ValueError(f"{what} claims {size / 2**20:.0f} MiB; more than {mib} MiB are not read")
+        raise ValueError(
+            f"{subject} claims {size / 2**20:.0f} MiB; more than {mib} MiB are not read"
+        )
 
 
 def unzipped_within_budget(archive: ZipFile) -> None:
-    """ValueError if all of an archive is too much to be held unpacked."""
-    require_within_budget(sum(one.file_size for one in archive.infolist()), "unpacked it")
+    """ValueError if an archive is too large when unpacked."""
+    require_within_budget(sum(entry.file_size for entry in archive.infolist()), "unpacked it")
 
 
 def require_writable(*paths: Path | None) -> None:
-    """SourceError before the work is done, if its answer could not be written."""
+    """SourceError if an answer could not be written; call it before the work."""
     for path in paths:
         if path is None:
             continue
         if path.is_dir():
             raise _unwritable(path, "it is a folder")
-        if path.exists():  # it is written over, whatever its folder allows: /dev/stdout
+        if path.exists():  # overwriting needs no right to the folder: /dev/stdout
             if not os.access(path, os.W_OK):
                 raise _unwritable(path, os.strerror(errno.EACCES))
         elif not os.access(path.parent, os.W_OK):
@@ -50,7 +52,7 @@ def require_writable(*paths: Path | None) -> None:
 
 @contextmanager
 def said_plainly(path: Path) -> Iterator[None]:
-    """SourceError where what is written inside cannot be written."""
+    """Turn an OSError of the block into a SourceError."""
     try:
         yield
     except OSError as error:
@@ -58,47 +60,47 @@ def said_plainly(path: Path) -> Iterator[None]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file that may be there already; SourceError if that cannot be done."""
+    """Write or overwrite a file; SourceError if that fails."""
     with said_plainly(path):
         path.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, document: object) -> None:
-    """Write an answer for programs."""
+    """Write a JSON document for programs."""
     write_text(path, json_text(document, indent=1) + "\n")
 
 
 def json_text(document: Any, indent: int | None = None) -> str:
-    """JSON that every reader takes; it never fails: what has no form there is said to have none."""
+    """Valid JSON for every reader; it never fails: a note replaces what JSON cannot hold."""
     return json.dumps(finite(document), indent=indent, ensure_ascii=False, allow_nan=False)
 
 
-def finite(value: Any, deep: int = MOST_DEEP) -> Any:
-    """What JSON can hold: null for a number that is not finite, plain numbers for NumPy's.
+def finite(value: Any, depth: int = MOST_DEEP) -> Any:
+    """A value that JSON can hold: null for numbers that are not finite, plain numbers for NumPy's.
 
-    Text for what it cannot hold, and for what nests deeper than ``deep``; half a character, which
-    UTF-8 cannot hold, as its number.
+    A text replaces what JSON cannot hold, and what nests deeper than ``depth``. A number replaces
+    half a character, which UTF-8 cannot hold.
     """
-    if isinstance(value, Mapping) and deep:
-        return {utf8(str(key)): finite(one, deep - 1) for key, one in value.items()}
-    if isinstance(value, list | tuple | set | frozenset) and deep:
-        return [finite(one, deep - 1) for one in value]
-    if hasattr(value, "tolist") and deep:  # NumPy's, which costs too much to import here
-        return finite(value.tolist(), deep - 1)
-    return _single(value)
+    if isinstance(value, Mapping) and depth:
+        return {utf8(str(key)): finite(item, depth - 1) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset) and depth:
+        return [finite(item, depth - 1) for item in value]
+    if hasattr(value, "tolist") and depth:  # NumPy's, which costs too much to import here
+        return finite(value.tolist(), depth - 1)
+    return _scalar(value)
 
 
-def _single(value: Any) -> Any:
+def _scalar(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if value is None or (isinstance(value, int) and value.bit_length() <= LONGEST_BITS):
         return value
     if isinstance(value, str):
         return utf8(value)
-    return f"not JSON ({type(value).__name__}){_shown(value)}"
+    return f"not JSON ({type(value).__name__}){_excerpt(value)}"
 
 
-def _shown(value: Any) -> str:
+def _excerpt(value: Any) -> str:
     try:
         return f": {reprlib.repr(value)}"
     except ValueError:  # Python prints no integer of thousands of digits
@@ -106,12 +108,12 @@ def _shown(value: Any) -> str:
 
 
 def utf8(text: str) -> str:
-    """A text that UTF-8 can hold: half a character is its number."""
+    """A text that UTF-8 can hold; a number replaces half a character."""
     return text.encode(errors="backslashreplace").decode()
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """The file is there complete, or as it was before; SourceError if it cannot be written."""
+    """Write a file atomically; SourceError if it cannot be written."""
     part = path.with_name(path.name + ".part")
     try:
         with said_plainly(path):
@@ -123,7 +125,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def user_cache() -> Path:
-    """Where what can be made again is kept for this user, as the XDG specification has it.
+    """The cache folder of this user, after the XDG specification.
 
     SourceError for a user without a home.
     """
@@ -137,10 +139,10 @@ def user_cache() -> Path:
 
 
 def private_folder(folder: Path) -> Path:
-    """Make a folder for this user only, if it is not there; SourceError if it is not private.
+    """Create a folder for this user only; SourceError if an existing one is not private.
 
-    Who may write into the folder above could exchange it: that one, too, is this user's. A group
-    may, as many systems give each user one of his own.
+    The parent folder must be this user's too: whoever may write there could exchange the folder.
+    Its group may write, since many systems give each user a group of his own.
     """
     with said_plainly(folder):
         folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -153,20 +155,20 @@ def private_folder(folder: Path) -> Path:
 
 
 def _require_own(folder: Path, forbidden: int) -> None:
-    """SourceError where a folder is another user's, or others have a right of ``forbidden``."""
-    found = folder.lstat()
-    if not stat.S_ISDIR(found.st_mode):
+    """SourceError if a folder is another user's, or others have a right of ``forbidden``."""
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode):
         raise _unwritable(folder, "it is a link: somebody else may have put it there")
-    if found.st_uid != os.geteuid():
+    if status.st_uid != os.geteuid():
         raise SourceError(
             f"{folder} belongs to another user and is not trusted", "have it removed, or given back"
         )
-    if found.st_mode & forbidden:
+    if status.st_mode & forbidden:
         raise SourceError(
             f"{folder}: others may use it, so it is not trusted", f"chmod 700 {folder}"
         )
 
 
-def _unwritable(path: Path, why: str) -> SourceError:
+def _unwritable(path: Path, cause: str) -> SourceError:
     hint = "check that the folder exists, may be written to and has space"
-    return SourceError(f"{path}: cannot be written: {why}", hint)
+    return SourceError(f"{path}: cannot be written: {cause}", hint)

@@ -1,6 +1,6 @@
-"""Instants as people read them: clock time and age, worded once for terminal, page, report and log.
+"""Instants for people: clock time and age, in the same words on terminal, page, report and log.
 
-Clock times are those of this computer's zone: what hangs on the wall beside it.
+Clock times are in this computer's time zone.
 """
 
 import time
@@ -8,7 +8,7 @@ import time
 from twin.language import tr
 
 SECOND_NS = 1_000_000_000
-CALENDAR_NS = 946_684_800 * SECOND_NS  # year 2000: a clock that reads less was never set
+CALENDAR_NS = 946_684_800 * SECOND_NS  # year 2000: an earlier clock was never set
 
 
 def instant(ns: int, now_ns: int) -> str:
@@ -17,18 +17,20 @@ def instant(ns: int, now_ns: int) -> str:
 
 
 def clock(ns: int, now_ns: int) -> str:
-    """Its clock time to the second; with the date where that is another day than today's."""
-    there, here = time.localtime(ns // SECOND_NS), time.localtime(now_ns // SECOND_NS)
-    return time.strftime("%H:%M:%S" if there[:3] == here[:3] else "%Y-%m-%d %H:%M:%S", there)
+    """Clock time to the second; with the date unless it is today."""
+    instant_time, now_time = time.localtime(ns // SECOND_NS), time.localtime(now_ns // SECOND_NS)
+    return time.strftime(
+        "%H:%M:%S" if instant_time[:3] == now_time[:3] else "%Y-%m-%d %H:%M:%S", instant_time
+    )
 
 
 def dated(ns: int) -> str:
-    """Its clock time with the date, for what is kept."""
+    """Clock time with the date, for stored texts."""
     return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(ns // SECOND_NS))
 
 
 def age(ns: int, now_ns: int) -> str:
-    """How long ago it was, or how soon it comes."""
+    """How long ago an instant was, or how soon it comes."""
     seconds = (now_ns - ns) / SECOND_NS
     if seconds >= 0.0:
         return tr("{time} ago", time=lasting(seconds))
@@ -36,7 +38,7 @@ def age(ns: int, now_ns: int) -> str:
 
 
 def lasting(seconds: float) -> str:
-    """A time in the largest unit that tells it well enough."""
+    """A duration in a unit that is precise enough."""
     if seconds < 119.5:
         return f"{seconds:.0f} s"
     if seconds < 7170.0:
@@ -47,11 +49,11 @@ def lasting(seconds: float) -> str:
 
 
 def zone(ns: int) -> int:
-    """Seconds that this computer's zone is ahead of UTC then."""
+    """The offset (s) of this computer's zone from UTC at an instant."""
     return time.localtime(ns // SECOND_NS).tm_gmtoff
 
 
 def stamp(ns: int) -> str:
-    """The time of day to the millisecond, before a line that says what happened then."""
-    there = time.strftime("%H:%M:%S", time.localtime(ns // SECOND_NS))
-    return f"{there}.{ns // 1_000_000 % 1000:03d}"
+    """The time of day to the millisecond, as the beginning of a line about an event."""
+    clock_time = time.strftime("%H:%M:%S", time.localtime(ns // SECOND_NS))
+    return f"{clock_time}.{ns // 1_000_000 % 1000:03d}"

@@ -1,7 +1,7 @@
-"""The language in which texts for people are said: English, unless somebody chose another one.
+"""The language of texts for people: English, unless another one was chosen.
 
-A text is its own key, as in gettext. Each task and thread has its own choice, and begins with the
-one of whoever started it.
+A text is its own key, as in gettext. Each task and thread has its own choice, and inherits the one
+of its creator.
 """
 
 from collections.abc import Iterator, Mapping
@@ -15,17 +15,17 @@ _chosen: ContextVar[Texts] = ContextVar("texts", default=_ENGLISH)
 
 
 def tr(text: str, **values: object) -> str:
-    """A text in the chosen language, or in English where the catalogue lacks it.
+    """A text in the chosen language, or in English if the catalogue lacks it.
 
-    ``values`` replace their names in braces; without any the text is taken as it is.
+    ``values`` replace their names in braces; without values the text stays as it is.
     """
-    said = _chosen.get().get(text, text)
-    return said.format(**values) if values else said
+    translated = _chosen.get().get(text, text)
+    return translated.format(**values) if values else translated
 
 
 @contextmanager
 def speaking(texts: Texts) -> Iterator[None]:
-    """Choose a language for what is said inside."""
+    """Choose the language of texts inside the block."""
     token = _chosen.set(texts)
     try:
         yield
@@ -34,5 +34,5 @@ def speaking(texts: Texts) -> Iterator[None]:
 
 
 def is_english() -> bool:
-    """Whether nothing else was chosen."""
+    """Whether the language is English."""
     return not _chosen.get()

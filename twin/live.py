@@ -1,4 +1,4 @@
-"""The loop: blocks in, twin, monitor, sinks out. All of the path is on this page."""
+"""The live loop: blocks pass through twin and monitor to the sinks. This module has all of it."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
@@ -23,49 +23,49 @@ from twin.monitor.staleness import Listening
 from twin.monitor.surroundings import are_told, following, stretches
 from twin.signals import SAMPLE, TICK, Phase, Samples, Ticks
 
-REPLAYED = 60_000  # rows that a replay takes at once: what is done to many cycles stays in caches
+REPLAYED = 60_000  # rows that a replay takes at once: work on many cycles uses the caches well
 
 
 class Sink(Protocol):
-    """Whatever takes the result: a log, a view, an alarm output."""
+    """A consumer of the results: a log, a view, an alarm output."""
 
     def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
-        """Take rows, their ticks, and what happened."""
+        """Take rows, their ticks, and events."""
 
     def close(self) -> None:
-        """Finish; nothing comes after it."""
+        """Finish; it is the last call."""
 
 
 class EventEnricher(Protocol):
-    """Whoever has more to say to what happens, once it has found out."""
+    """A source of further events, such as a diagnosis, which may come later."""
 
     def follow(self, samples: Samples, events: Sequence[Event]) -> list[Event]:
-        """Take rows and what happened, without delay; give what has been found out by now.
+        """Take rows and events without delay; returns the new events by now.
 
-        What it raised at may come once more.
+        After an exception the same rows may come again.
         """
 
     def finish(self) -> list[Event]:
-        """Give what is still to be said when the rows have ended; this may take a while."""
+        """Return the remaining events after the last row; this may take a while."""
 
     def close(self) -> None:
-        """Let go of everything; called in every case."""
+        """Release all resources; always called."""
 
 
 @dataclass
 class Twin:
-    """The model beside the rig: what the sensor should read, a little behind the measurement."""
+    """The model that runs beside the rig; it expects the sensor's reading with a short delay."""
 
     theta: Theta
     knees: Knees
     terms: Sequence[Term] = ()
-    _strides: DenseSolver = field(default_factory=DenseSolver)
+    _solver: DenseSolver = field(default_factory=DenseSolver)
     _last_ns: int | None = None
     _phase: int = Phase.IDLE  # of the newest row
 
     def __post_init__(self) -> None:
         self._finder = PhaseFinder(self.knees)
-        self._around = self.theta  # with the surroundings as they are told
+        self._surrounded_theta = self.theta  # coefficients with the measured surroundings
         self._terms = Terms(self.terms, float(self.theta[c.AMBIENT]))
 
     @classmethod
@@ -74,11 +74,11 @@ class Twin:
         return cls(coefficients(data), knees_of(data), data.terms)
 
     def advance(self, block: Samples) -> tuple[Samples, Ticks]:
-        """Take a block; give the rows that are settled with what the twin says to them."""
+        """Take a block; returns the settled rows with their ticks."""
         return self._expect(self._finder.push(block))
 
     def flush(self) -> tuple[Samples, Ticks]:
-        """Give the rows still held back at the end of the stream."""
+        """Return the rows still held back at the end of the stream."""
         return self._expect(self._finder.flush())
 
     def over(self, blocks: Iterable[Samples]) -> Iterator[tuple[Samples, Ticks]]:
@@ -90,17 +90,17 @@ class Twin:
         samples, ticks = self.flush()
         yield gaps.on(samples), ticks
 
-    def _expect(self, found: Found) -> tuple[Samples, Ticks]:
-        samples, phase, level = found
+    def _expect(self, phases: Found) -> tuple[Samples, Ticks]:
+        samples, phase, level = phases
         ticks = np.empty(len(samples), TICK)
         ticks["phase"], ticks["level"] = phase, level
         expected = np.empty(len(samples))
         dt = time_steps(samples, self._last_ns)
         level, signals = ticks["level"].astype("f8"), np.empty(len(samples), "u1")
-        for rows, telling in self._surrounded(samples, ticks):
-            self._around = following(self._around, telling)
-            driven, out = (dt[rows], phase[rows], level[rows]), (expected[rows], signals[rows])
-            strides.advance(self._strides, self._around, *driven, *out)
+        for rows, surroundings in self._surrounded(samples, ticks):
+            self._surrounded_theta = following(self._surrounded_theta, surroundings)
+            inputs, outputs = (dt[rows], phase[rows], level[rows]), (expected[rows], signals[rows])
+            strides.advance(self._solver, self._surrounded_theta, *inputs, *outputs)
         self._terms.add(phase, expected)
         ticks["expected"], ticks["signals"] = expected, signals
         if len(samples):
@@ -108,14 +108,14 @@ class Twin:
         return samples, ticks
 
     def _surrounded(self, samples: Samples, ticks: Ticks) -> Iterable[tuple[slice, Samples]]:
-        """Rows in one stretch of surroundings; nearly always nobody tells any."""
+        """Slices of rows with constant surroundings; nearly always none are measured."""
         if are_told(samples):
             return stretches(samples, ticks, self._phase)
         return [(slice(None), samples[:0])]
 
 
 def compiled(data: DataSet) -> Twin:
-    """A twin whose path is compiled: seconds where nothing is cached, not to fall into a block."""
+    """A twin with compiled code; without a cache that takes seconds, which no block must wait."""
     twin = Twin.of(data)
     twin.advance(np.zeros(3 * twin.knees.lag, SAMPLE))
     return Twin(twin.theta, twin.knees, twin.terms)
@@ -131,44 +131,46 @@ def run(
 ) -> None:
     """Take every block of ``source`` through twin and monitor to the sinks; close them at the end.
 
-    A live source is timed by ``listening``. What ``advisers`` say goes to the sinks with what it
-    follows.
+    ``listening`` times a live source. Events of ``advisers`` go to the sinks with the rows that
+    they follow.
     """
-    timed = listening.over(source, monitor) if listening else ((block, []) for block in source)
+    stream = listening.over(source, monitor) if listening else ((block, []) for block in source)
     with ExitStack() as closing:
         for close in [sink.close for sink in sinks] + [adviser.close for adviser in advisers]:
             closing.callback(close)
-        for samples, ticks, events in _watched(timed, twin, monitor):
-            hand_out(sinks, samples, ticks, _advised(advisers, samples, events))
-        none = np.empty(0, SAMPLE), np.empty(0, TICK)
-        if last_words := _last_words(advisers, none[0]):
-            hand_out(sinks, *none, last_words)
+        for samples, ticks, events in _monitored(stream, twin, monitor):
+            hand_out(sinks, samples, ticks, _enriched(advisers, samples, events))
+        no_rows = np.empty(0, SAMPLE), np.empty(0, TICK)
+        if final_events := _final_events(advisers, no_rows[0]):
+            hand_out(sinks, *no_rows, final_events)
 
 
-def _watched(
-    timed: Iterable[tuple[Samples, Sequence[Event]]], twin: Twin, monitor: Monitor
+def _monitored(
+    stream: Iterable[tuple[Samples, Sequence[Event]]], twin: Twin, monitor: Monitor
 ) -> Iterator[tuple[Samples, Ticks, list[Event]]]:
-    """All rows with what they make happen, in the order of time within each PLC time."""
+    """All rows with their events, ordered by time within each PLC time."""
     gaps = ShortGaps()
-    for block, happened in timed:
-        yield from _marked(gaps, monitor.over(*twin.advance(gaps.off(block)), happened))
-    *parts, (samples, ticks, events) = _marked(gaps, monitor.over(*twin.flush()))
+    for block, source_events in stream:
+        yield from _with_gap_marks(
+            gaps, monitor.over(*twin.advance(gaps.off(block)), source_events)
+        )
+    *parts, (samples, ticks, events) = _with_gap_marks(gaps, monitor.over(*twin.flush()))
     yield from parts
     yield samples, ticks, in_order([*events, *monitor.close()])
 
 
-def _marked(
+def _with_gap_marks(
     gaps: ShortGaps, parts: Iterable[tuple[Samples, Ticks, list[Event]]]
 ) -> Iterator[tuple[Samples, Ticks, list[Event]]]:
-    """Rows with the marks of short gaps again, and with what there is to say of these."""
+    """Rows with the marks of short gaps restored, and with events about these gaps."""
     for samples, ticks, events in parts:
         yield gaps.on(samples), ticks, in_order([*events, *gaps.told()])
 
 
-def _advised(
+def _enriched(
     advisers: Sequence[EventEnricher], samples: Samples, events: list[Event]
 ) -> list[Event]:
-    """What happened with what advisers say to it, in the order of time; each hears those before it.
+    """Events with those of the advisers, ordered by time; each adviser gets those before it.
 
     Rows and events are of one PLC time.
     """
@@ -177,17 +179,17 @@ def _advised(
     return events
 
 
-def _last_words(advisers: Sequence[EventEnricher], none: Samples) -> list[Event]:
-    """The same when the rows have ended."""
-    said: list[Event] = []
+def _final_events(advisers: Sequence[EventEnricher], no_rows: Samples) -> list[Event]:
+    """The advisers' events after the last row."""
+    events: list[Event] = []
     for adviser in advisers:
-        said += (adviser.follow(none, said) if said else []) + adviser.finish()
-    return said
+        events += (adviser.follow(no_rows, events) if events else []) + adviser.finish()
+    return events
 
 
 def hand_out(
     sinks: Sequence[Sink], samples: Samples, ticks: Ticks, events: Sequence[Event]
 ) -> None:
-    """Give every sink the same."""
+    """Write rows and events to every sink."""
     for sink in sinks:
         sink.write(samples, ticks, events)

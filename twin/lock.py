@@ -1,4 +1,4 @@
-"""One run at a time for a unit: a lock on a file beside what it writes, until the process ends."""
+"""Allows one run at a time for a unit, by a lock on a file in its output folder."""
 
 import errno
 import os
@@ -11,12 +11,12 @@ from pathlib import Path
 from twin.errors import SourceError
 from twin.instants import dated
 
-LOOK_S = 1.0  # between looks whether the file is still there; a log finds as fast that it is not
-_TAKEN = (errno.EAGAIN, errno.EACCES)  # what flock says of one that another process holds
+LOOK_S = 1.0  # interval of checks that the file still exists; a log notices that as fast
+_TAKEN = (errno.EAGAIN, errno.EACCES)  # flock's errors for a lock of another process
 
 
 def lock_file(folder: Path, unit: str) -> Path:
-    """Where the lock of a unit in a folder is; it stays there when a run has ended."""
+    """The lock file of a unit in a folder; it remains after a run."""
     name = re.sub(r"[^\w.-]+", "_", unit)
     return folder / f".{name}.lock"
 
@@ -25,10 +25,11 @@ def lock_file(folder: Path, unit: str) -> Path:
 def only_run(
     folder: Path, unit: str, now_ns: int, complain: Callable[[str], None]
 ) -> Iterator[None]:
-    """Be the only run of ``unit`` that writes into ``folder``; SourceError says who else is.
+    """Be the only run of ``unit`` that writes into ``folder``; SourceError names another one.
 
-    ``now_ns`` (UTC) is kept for others to read. Where nothing can be locked it is complained of.
-    Somebody may delete the file, with its folder maybe: once the folder is there again, so is it.
+    The file contains ``now_ns`` (UTC) for others to read. ``complain`` reports that locking is
+    impossible. If somebody deletes the file or its folder, the lock is taken again once the folder
+    exists.
     """
     lock = _Lock(lock_file(folder, unit), unit, now_ns)
     try:
@@ -49,33 +50,33 @@ def only_run(
 
 
 def _watch(lock: "_Lock", ended: threading.Event, complain: Callable[[str], None]) -> None:
-    """Hold the lock wherever its file is deleted; what hinders that is said once."""
-    said = ""
+    """Take the lock again after its file was deleted; each failure is reported once."""
+    last_text = ""
     while not ended.wait(LOOK_S):
         try:
             lock.hold()
-            said = ""
+            last_text = ""
         except FileNotFoundError:  # its folder is gone: nobody can write into it now
             continue
         except (SourceError, OSError) as error:
             text = str(error) if isinstance(error, SourceError) else lock.refused(error)
-            if said != text:
+            if last_text != text:
                 complain(f"{text}; this run goes on")
-            said = text
+            last_text = text
 
 
 class _Lock:
-    """A lock on a file, which others may delete."""
+    """A lock on a file that others may delete."""
 
     def __init__(self, path: Path, unit: str, now_ns: int) -> None:
         self._path, self._unit = path, unit
-        self._told = f"process {os.getpid()} since {dated(now_ns)}\n".encode()
+        self._content = f"process {os.getpid()} since {dated(now_ns)}\n".encode()
         self._handle: int | None = None
 
     def hold(self) -> None:
-        """Take it, or take it again if the file there is not the one that is locked.
+        """Take the lock, or take it again if the locked file is no longer at its path.
 
-        SourceError if somebody else has it, OSError or ImportError if it cannot be locked.
+        SourceError if another process holds it, OSError or ImportError if it cannot be locked.
         """
         if self._handle is not None and _is_at(self._path, self._handle):
             return
@@ -89,16 +90,16 @@ class _Lock:
         self._handle = handle
         with suppress(OSError):  # a full disk is no reason not to run
             os.ftruncate(handle, 0)
-            os.pwrite(handle, self._told, 0)
+            os.pwrite(handle, self._content, 0)
 
     def let_go(self) -> None:
-        """Others may have it."""
+        """Release the lock."""
         if self._handle is not None:
             os.close(self._handle)
         self._handle = None
 
     def refused(self, error: Exception) -> str:
-        """What is wrong, in words."""
+        """The text of a failure to lock."""
         return f"{self._path} cannot be locked ({error})"
 
     def _lock(self, handle: int) -> None:
@@ -118,7 +119,7 @@ class _Lock:
 
 
 def _is_at(path: Path, handle: int) -> bool:
-    """Whether that is the open file of ``handle``."""
+    """Whether ``path`` is the open file of ``handle``."""
     try:
         return os.path.samestat(path.stat(), os.fstat(handle))
     except OSError:

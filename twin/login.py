@@ -1,4 +1,4 @@
-"""How people log in, on the page and over OPC UA: one store of users, one throttle, one trail."""
+"""Login on the page and over OPC UA: one store of users, one throttle, one audit trail."""
 
 from dataclasses import dataclass
 
@@ -6,23 +6,23 @@ from twin.audit import Act, Audit
 from twin.throttle import FILE, LoginThrottle
 from twin.users import Role, Users, normal
 
-LONGEST_NAME = 100  # letters that are looked at
+LONGEST_NAME = 100  # letters of a name that count
 ADDRESS_S, NAME_S = 60.0, 10.0  # longest wait after wrong passwords, of an address and of a name
 
 
 @dataclass(frozen=True)
 class Login:
-    """What came of a try to log in."""
+    """The result of an attempt to log in."""
 
     user: str
     role: Role | None  # None: refused
-    wait_s: float = 0.0  # until another try is taken, after too many wrong ones
+    wait_s: float = 0.0  # until the next attempt is accepted, after too many wrong ones
 
 
 class Authenticator:
-    """Lets users in; who guesses has to wait, by name and by address. One call at a time.
+    """Checks passwords and slows down guessing, by name and by address. One call at a time.
 
-    Tries are counted beside the users, for all processes that have them.
+    Attempts are counted in a file beside the users, for all processes.
     """
 
     def __init__(self, users: Users, audit: Audit) -> None:
@@ -31,7 +31,7 @@ class Authenticator:
         self._throttle = LoginThrottle(users.path.with_name(FILE), longest_s)
 
     def log_in(self, name: str, password: str, address: str) -> Login:
-        """Try a password; TwinError where the users cannot be read. A hash takes its time."""
+        """Try a password; TwinError if the users cannot be read. Hashing takes time."""
         name = normal(name.strip()[:LONGEST_NAME])
         who = {"address": address, "name": name}
         wait = self._throttle.take(who)

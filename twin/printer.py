@@ -1,7 +1,7 @@
-"""Lines to a stream from a thread of its own: the loop never waits for who reads them.
+"""Prints lines to a stream from a thread of its own, so that the loop never waits for a reader.
 
-A pager is paused, a terminal is stopped, a disk is full. Who writes into a pipe waits then, and a
-stream cannot be asked not to: whatever else has it open would be asked with it.
+A pager may be paused, a terminal stopped, a disk full. Then a write to a pipe blocks. The stream
+cannot be made non-blocking, since that would affect all who have it open.
 """
 
 import errno
@@ -13,14 +13,14 @@ from typing import TextIO
 
 from twin.errors import SourceError
 
-MOST_WAITING = 1000  # texts that wait to be written
-RETRY_S = 1.0  # after a disk was full
-PATIENCE_S = 3.0  # at the end, with a reader that takes nothing
-NOBODY = {errno.EPIPE, errno.EIO, errno.EBADF}  # a reader that has gone, a closed terminal
+MOST_WAITING = 1000  # waiting texts
+RETRY_S = 1.0  # after a full disk
+PATIENCE_S = 3.0  # at the end, for a reader that takes nothing
+NOBODY = {errno.EPIPE, errno.EIO, errno.EBADF}  # the reader has gone, or the terminal is closed
 
 
 class Printer:
-    """Prints to a stream in order. Once nobody is there to read, nothing is printed any more."""
+    """Prints to a stream in order. Once the reader has gone, it prints nothing more."""
 
     def __init__(self, stream: TextIO) -> None:
         stream.flush()
@@ -30,8 +30,8 @@ class Printer:
         except UnsupportedOperation:  # a stream in memory
             self._handle = None
         self._texts: deque[str] = deque()
-        self._rest = b""  # of the first of them
-        self._missing = 0  # lines that found no room
+        self._rest = b""  # unwritten bytes of the first text
+        self._missing = 0  # lines that were dropped
         self._why = "nobody takes what it says"
         self._taken = 0
         self._is_read, self._ending = True, False
@@ -40,7 +40,7 @@ class Printer:
         self._thread.start()
 
     def print(self, text: str) -> None:
-        """Have lines printed; SourceError where too many wait, and then it has none of these."""
+        """Queue lines for printing; SourceError if too many wait, and then none are queued."""
         with self._changed:
             if not self._is_read:
                 return
@@ -51,7 +51,7 @@ class Printer:
             self._changed.notify_all()
 
     def say(self, text: str) -> None:
-        """The same with a line that may be left out; how many were is said with the next one."""
+        """Print a line that may be dropped; the next line says how many were."""
         try:
             missing = f"twin: {self._missing} lines are missing here\n" if self._missing else ""
             self.print(missing + text)
@@ -60,7 +60,7 @@ class Printer:
             self._missing += 1
 
     def close(self) -> int:
-        """Print what waits, while somebody takes it; gives how many texts are left over."""
+        """Print waiting texts while the reader takes them; returns the number of the others."""
         with self._changed:
             self._ending = True
             self._changed.notify_all()
@@ -68,12 +68,12 @@ class Printer:
             while self._texts and self._is_read and taken != self._taken:
                 taken = self._taken
                 self._changed.wait(PATIENCE_S)
-            left = len(self._texts) if self._is_read else 0
+            unprinted = len(self._texts) if self._is_read else 0
             self._is_read = False
             self._changed.notify_all()
-        if not left:
+        if not unprinted:
             self._thread.join()
-        return left
+        return unprinted
 
     # --- the thread -----------------------------------------------------------------------------
 
@@ -85,7 +85,7 @@ class Printer:
                 self._fail(error)
 
     def _wait_for_text(self) -> bool:
-        """Take the next one; False if there is none to come."""
+        """Wait for the next text; False if there will be none."""
         with self._changed:
             while self._is_read and not self._texts and not self._ending:
                 self._changed.wait()
@@ -109,7 +109,7 @@ class Printer:
             self._changed.notify_all()
 
     def _fail(self, error: OSError) -> None:
-        """Print nothing any more, or wait a while before it is tried again."""
+        """Stop printing if the reader has gone, else wait before the next attempt."""
         with self._changed:
             self._is_read &= error.errno not in NOBODY
             self._why = f"it cannot be written: {error.strerror}"

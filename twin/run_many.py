@@ -1,4 +1,4 @@
-"""Several loops in one process, a thread each: one that ends in an error leaves the others alone.
+"""Runs several loops in one process, a thread each; an error in one does not affect the others.
 
 The kernel runs without the interpreter's lock, and the rest of a loop is a few per cent of a core.
 """
@@ -9,13 +9,13 @@ from collections.abc import Callable, Mapping
 
 from twin.errors import TwinError
 
-Told = Callable[[str, str], None]  # whose loop, and what it says
+Told = Callable[[str, str], None]  # takes the loop's name and a text
 
 
-def run_together(loops: Mapping[str, Callable[[], None]], told: Told) -> list[str]:
-    """Run every loop to its end, by its name; gives the names of those that failed.
+def run_together(loops: Mapping[str, Callable[[], None]], report: Told) -> list[str]:
+    """Run every named loop to its end; returns the names of those that failed.
 
-    Why one failed goes to ``told`` at once, from the thread it ran in.
+    ``report`` gets the reason of a failure at once, in the loop's thread.
     """
     failed: list[str] = []
 
@@ -24,10 +24,10 @@ def run_together(loops: Mapping[str, Callable[[], None]], told: Told) -> list[st
             loop()
         except TwinError as error:
             failed.append(name)
-            told(name, f"{error}\n  {error.hint}" if error.hint else str(error))
-        except Exception:  # a mistake of ours in one loop is no reason to end the others
+            report(name, f"{error}\n  {error.hint}" if error.hint else str(error))
+        except Exception:  # a programming error in one loop must not end the others
             failed.append(name)
-            told(name, traceback.format_exc())
+            report(name, traceback.format_exc())
 
     threads = [
         threading.Thread(target=guarded, args=(name, loop), name=f"loop of {name}")

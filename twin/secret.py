@@ -1,7 +1,7 @@
-"""Passwords and tokens: where a configuration names one, and where none may stand.
+"""Passwords and tokens: how a configuration names them, and where none may be written.
 
-A configuration is copied into every log, shown on pages and quoted in messages. So a secret stands
-in a file or an environment variable, and the configuration says which.
+A configuration is copied into every log, shown on pages and quoted in messages. So a secret is in a
+file or an environment variable, and the configuration names that.
 """
 
 import logging
@@ -21,11 +21,11 @@ from twin.settings import Settings
 Say = Callable[[str], None]
 
 INSTEAD = '{ file = "FILE" } or { env = "NAME" }'
-_TOKEN = re.compile(r"(?=[^/]*\d)(?=[^/]*[A-Za-z])[\w-]{20,}")  # a part of a path, as services have
+_TOKEN = re.compile(
+    r"(?=[^/]*\d)(?=[^/]*[A-Za-z])[\w-]{20,}"
+)  # a part of a path that looks like a service's token
 _log = logging.getLogger(__name__)
-_told = set[
-    Path
-]()  # of these files it was said that others may read them: each connection reads one
+_reported = set[Path]()  # files reported as readable by others: each connection reads them again
 
 
 class Secret(Settings):
@@ -50,31 +50,31 @@ class Secret(Settings):
         return self
 
     def below(self, folder: Path) -> "Secret":
-        """Give the same with its file looked for in ``folder``, unless its path is absolute."""
+        """The secret with its file in ``folder``, unless its path is absolute."""
         return self if self.file is None else Secret(file=folder / self.file)
 
     def read(self, key: str, folder: Path, say: Say = _log.warning) -> str:
-        """The secret of ``key``, one line; ConfigError where there is none.
+        """The secret of ``key``, one line; ConfigError if there is none.
 
-        A file that others may read is said.
+        A file that others may read is reported once.
         """
         if self.file is None:
-            found, where = os.environ.get(self.env, ""), f"environment variable {self.env}"
+            text, place = os.environ.get(self.env, ""), f"environment variable {self.env}"
         else:
-            found, where = _read(key, folder / self.file, say), str(folder / self.file)
-        found = found.strip("\r\n")  # as echo and editors leave them
-        if not found:
-            raise ConfigError(f"{key}: {where} is empty or not set", "put the secret there")
-        if not found.isprintable():
+            text, place = _read(key, folder / self.file, say), str(folder / self.file)
+        text = text.strip("\r\n")  # as echo and editors leave them
+        if not text:
+            raise ConfigError(f"{key}: {place} is empty or not set", "put the secret there")
+        if not text.isprintable():
             raise ConfigError(
-                f"{key}: {where} has a line break, or another character that cannot be seen, in it",
+                f"{key}: {place} has a line break, or another character that cannot be seen, in it",
                 "put the secret there alone, on one line of plain text",
             )
-        return found
+        return text
 
 
 def refuse_password(url: str, instead: str) -> None:
-    """ValueError where the URL of a database has a password in it; ``instead`` is what to do."""
+    """ValueError if the URL of a database contains a password; ``instead`` is the advice."""
     try:
         parts = urlsplit(url)
         password = parts.password
@@ -88,7 +88,7 @@ def refuse_password(url: str, instead: str) -> None:
 
 
 def refuse_secrets(url: str) -> None:
-    """ValueError where the address of a service has in it what looks like a secret."""
+    """ValueError if the address of a service contains something that looks like a secret."""
     parts = urlsplit(url)
     has_token = any(_TOKEN.fullmatch(part) for part in parts.path.split("/"))
     if parts.username is not None or parts.query or parts.fragment or has_token:
@@ -101,13 +101,13 @@ def refuse_secrets(url: str) -> None:
 def _read(key: str, path: Path, say: Say) -> str:
     try:
         mode = path.stat().st_mode
-        found = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(
             f"{key} {path}: cannot be read: {error}", "a text file with the secret alone"
         ) from error
     is_open = os.name == "posix" and mode & (stat.S_IRWXG | stat.S_IRWXO)
-    if is_open and path not in _told:
-        _told.add(path)
+    if is_open and path not in _reported:
+        _reported.add(path)
         say(f"{key}: others may read {path}; keep it to yourself: chmod 600 {path}")
-    return found
+    return text

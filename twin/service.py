@@ -1,7 +1,7 @@
-"""What a service manager is told (sd_notify(3)): ready, stopping, and that every loop goes on.
+"""Notifies a service manager (sd_notify(3)): ready, stopping, and the watchdog of all loops.
 
-A datagram to the socket that ``NOTIFY_SOCKET`` names; without one nobody is told, and nothing is
-different. A loop that hangs keeps the watchdog unfed, and systemd starts the process anew.
+It sends datagrams to the socket that ``NOTIFY_SOCKET`` names; without one it does nothing. If a
+loop hangs, the watchdog is not fed, and systemd restarts the process.
 """
 
 import os
@@ -14,13 +14,13 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-FEEDS = 4  # within the time after which systemd would act; it advises at least two
+FEEDS = 4  # within systemd's watchdog time; systemd advises at least two
 
 
 class Service:
-    """The manager of this process; it feeds its watchdog as long as all loops ask whether to stop.
+    """The manager of this process; feeds its watchdog while all loops ask whether to stop.
 
-    ``environ`` loses what the manager put there for this process: children do not speak for it.
+    The manager's variables are removed from ``environ``, so that children do not inherit them.
     """
 
     def __init__(
@@ -33,7 +33,7 @@ class Service:
         self._limit_s = int(limit_us) * 1e-6 if is_meant else 0.0  # 0: there is no watchdog
         self._clock = clock
         self._fed_s = -self._limit_s
-        self._heard_s: dict[str, float] = {}  # when each loop was heard of last
+        self._last_beat_s: dict[str, float] = {}  # last sign of life of each loop
         self._lock = threading.Lock()
 
     def __enter__(self) -> "Service":
@@ -45,23 +45,23 @@ class Service:
 
     @contextmanager
     def loop(self, name: str, stopped: Callable[..., T]) -> Iterator[Callable[..., T]]:
-        """Give the question ``stopped`` back; that a loop asks it says that the loop goes on."""
+        """Wrap the query ``stopped``; each call of it is a sign of life of the loop."""
 
-        def asked(*arguments: object, **options: object) -> T:
-            self._hear(name)
+        def query_and_beat(*arguments: object, **options: object) -> T:
+            self._beat(name)
             return stopped(*arguments, **options)
 
-        self._hear(name)
+        self._beat(name)
         try:
-            yield asked
+            yield query_and_beat
         finally:
             with self._lock:
-                del self._heard_s[name]
+                del self._last_beat_s[name]
 
-    def _hear(self, name: str) -> None:
+    def _beat(self, name: str) -> None:
         with self._lock:
-            now = self._heard_s[name] = self._clock()
-            all_go_on = now - min(self._heard_s.values()) < self._limit_s
+            now = self._last_beat_s[name] = self._clock()
+            all_go_on = now - min(self._last_beat_s.values()) < self._limit_s
             if all_go_on and now - self._fed_s >= self._limit_s / FEEDS:
                 self._fed_s = now
                 self._tell("WATCHDOG=1")
@@ -70,5 +70,5 @@ class Service:
         if not self._address:
             return
         with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as to_manager:
-            to_manager.setblocking(False)  # a manager that hangs is not waited for
+            to_manager.setblocking(False)  # do not wait for a hanging manager
             to_manager.sendto(state.encode(), self._address)

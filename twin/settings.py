@@ -1,7 +1,7 @@
-"""TOML documents and checked, frozen settings; an unknown key is refused with its place.
+"""TOML documents and checked, frozen settings; errors name the place of an unknown key.
 
-Each part of the program declares the settings it takes as a ``Settings`` class in the field's
-units, with bounds; a ``Document`` hands each part its table, checked.
+Each part of the program declares its settings as a ``Settings`` class in the field's units, with
+bounds. A ``Document`` gives each part its checked table.
 """
 
 import re
@@ -30,11 +30,11 @@ class Settings(BaseModel):
 
 
 class KeyedError(ValueError):
-    """What is wrong with one key of a table, where only the whole table shows it."""
+    """An error of one key that only a check of the whole table finds."""
 
-    def __init__(self, what: str, *keys: str) -> None:
-        super().__init__(what)
-        self.keys = keys  # from the table's own on
+    def __init__(self, message: str, *keys: str) -> None:
+        super().__init__(message)
+        self.keys = keys  # path below the table
 
 
 S = TypeVar("S", bound=Settings)
@@ -62,19 +62,19 @@ class Document:
 
     @classmethod
     def parse(cls, text: str, name: str) -> "Document":
-        """Take TOML text that stands elsewhere, for example in a log."""
+        """Parse TOML text from elsewhere, for example from a log."""
         try:
             return cls(name, text, tomllib.loads(text))
         except (tomllib.TOMLDecodeError, RecursionError) as error:
             raise ConfigError(f"{name}: not valid TOML: {error}") from error
 
-    def refuse_unknown_tables(self, known: set[str]) -> None:
-        """ConfigError if a top-level table is none of ``known``."""
+    def refuse_unknown_tables(self, names: set[str]) -> None:
+        """ConfigError if a top-level table is none of ``names``."""
         for key in self.tables:
-            if key not in known:
+            if key not in names:
                 raise ConfigError(
                     f"{self.name}:{self._line((key,))}: unknown table [{key}]",
-                    known_names(key, known),
+                    known_names(key, names),
                 )
 
     def section(self, kind: type[S], *path: str) -> S:
@@ -89,35 +89,35 @@ class Document:
 
     def _explain(self, path: tuple[str, ...], kind: type[S], error: ValidationError) -> str:
         lines = []
-        for problem, what in findings(error, kind):
+        for problem, text in findings(error, kind):
             cause = problem.get("ctx", {}).get("error")
-            below = cause.keys if isinstance(cause, KeyedError) else ()
-            keys = self._written((*path, *problem["loc"], *below))
+            inner_keys = cause.keys if isinstance(cause, KeyedError) else ()
+            keys = self._written((*path, *problem["loc"], *inner_keys))
             line = self._line(tuple(map(str, keys)))
-            lines.append(f"{self.name}:{line}: {path_in_words(keys)}: {what}")
+            lines.append(f"{self.name}:{line}: {path_in_words(keys)}: {text}")
         return "\n".join(lines)
 
     def _written(self, path: tuple[str | int, ...]) -> tuple[str | int, ...]:
-        """Keys as they stand in the text: without the kind that tells a list's tables apart."""
+        """Keys as written in the text: without the kind that distinguishes a list's tables."""
         keys: list[str | int] = []
-        here: Any = self.tables
+        table: Any = self.tables
         for step in path:
-            if isinstance(here, Mapping) and step == here.get("kind") and step not in here:
+            if isinstance(table, Mapping) and step == table.get("kind") and step not in table:
                 continue
-            if step == "[key]":  # of a name that is none of those a table can have
+            if step == "[key]":  # Pydantic's step for an invalid key of a dictionary
                 continue
             keys.append(step)
             try:
-                here = here[step]
+                table = table[step]
             except (KeyError, IndexError, TypeError):
-                here = None
+                table = None
         return tuple(keys)
 
     def _line(self, keys: tuple[str, ...]) -> int:
-        """Line of the deepest of ``keys`` that can be found; TOML parsers do not keep it."""
+        """Line of the deepest of ``keys`` that can be found; TOML parsers keep no lines."""
         table: tuple[str, ...] = ()
         seen: Counter[str] = Counter()  # how often a table of a list has begun
-        items: tuple[str, ...] = ()  # the list whose inline tables stand in lines of their own
+        items: tuple[str, ...] = ()  # the list whose inline tables have lines of their own
         best, depth = 1, 0
         for number, line in enumerate(self.text.splitlines(), 1):
             if header := re.match(r"\s*\[+\s*([^\]]+?)\s*\]", line):
@@ -125,17 +125,17 @@ class Document:
                 if line.lstrip().startswith("[["):
                     table = (*table, str(seen[header[1]]))
                     seen[header[1]] += 1
-                here = table
+                path = table
             elif key := re.match(r"""\s*(["'\w.-]+)\s*=\s*(\[\s*(#.*)?$)?""", line):
-                here = (*table, *_path(key[1]))
-                items = here if key[2] else ()
+                path = (*table, *_path(key[1]))
+                items = path if key[2] else ()
             elif items and line.lstrip().startswith("{"):
-                here = (*items, str(seen[".".join(items)]))
+                path = (*items, str(seen[".".join(items)]))
                 seen[".".join(items)] += 1
             else:
                 continue
-            if depth < len(here) and here == keys[: len(here)]:
-                best, depth = number, len(here)
+            if depth < len(path) and path == keys[: len(path)]:
+                best, depth = number, len(path)
         return best
 
 

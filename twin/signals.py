@@ -1,7 +1,7 @@
-"""The vocabulary of the path: samples in, ticks beside them, and units at the edges.
+"""The data types of the loop: samples, ticks, and units at the edges.
 
-Everything flows in blocks: structured arrays of ``SAMPLE`` (what was measured) with, row for row,
-``TICK`` (what the twin says to it). A live block has 10 to 100 rows, a replayed one thousands.
+Data flows in blocks: structured arrays of ``SAMPLE`` (the measurement) with row-aligned ``TICK``
+(the twin's results). A live block has 10 to 100 rows, a replayed one thousands.
 """
 
 from collections.abc import Iterable, Iterator
@@ -42,7 +42,7 @@ def counted_from(
     onto: Reference,
     ambient: float | npt.NDArray[np.float64],
 ) -> npt.NDArray[np.float64]:
-    """Pressures counted from ``reference`` as counted from ``onto``; ambient cancels exactly."""
+    """Convert pressures from one reference to another; ambient cancels exactly."""
     zero: dict[Reference, float | npt.NDArray[np.float64]]
     zero = {"absolute": 0.0, "gauge": ambient, "vacuum": ambient}
     sign = {"absolute": 1.0, "gauge": 1.0, "vacuum": -1.0}
@@ -52,14 +52,14 @@ def counted_from(
 SAMPLE = np.dtype(
     [
         ("sequence", "<i8"),  # the PLC's scan counter; a missing number is a missing sample
-        ("time_ns", "<i8"),  # PLC time; where the PLC has none, the time of the poll here
-        ("host_ns", "<i8"),  # when it was received here
-        ("pressure", "<f4"),  # Pa, absolute, as read; NaN where nothing readable came
-        ("supply", "<f4"),  # Pa, gauge, as read; NaN where it is not measured
+        ("time_ns", "<i8"),  # PLC time; if the PLC has none, host time of the poll
+        ("host_ns", "<i8"),  # host time of receipt
+        ("pressure", "<f4"),  # Pa, absolute, as read; NaN if unreadable
+        ("supply", "<f4"),  # Pa, gauge, as read; NaN if not measured
         ("commands", "u1"),  # Command bits
         ("quality", "u1"),  # Quality bits
-        # What an ejector or its surroundings may tell besides; all zero where nothing does. No
-        # pressure and no temperature is 0 in these; a flow is measured where Reported says so.
+        # Optional measurements of the ejector and its surroundings; all zero without them. No real
+        # pressure or temperature here is 0; a flow is measured if Reported says so.
         ("reported", "u1"),  # Reported bits
         ("ambient", "<f4"),  # Pa, absolute, of a barometer
         ("temperature", "<f4"),  # K, of the gas or the surroundings
@@ -67,14 +67,14 @@ SAMPLE = np.dtype(
         ("flow", "<f4"),  # kg/s, suction flow
     ]
 )
-EXTRA = ("reported", "ambient", "temperature", "pressure_2", "flow")  # of these, what few have
+EXTRA = ("reported", "ambient", "temperature", "pressure_2", "flow")  # optional fields of these
 
 TICK = np.dtype(
     [
         ("expected", "<f4"),  # Pa, absolute, what the sensor should read; NaN before the first sync
-        ("level", "<f4"),  # Pa, what the model was synchronised on at this row; NaN for most
+        ("level", "<f4"),  # Pa, the pressure that synchronised the model at this row; mostly NaN
         ("phase", "u1"),  # Phase
-        ("signals", "u1"),  # Signal bits: what the model hands out to other components
+        ("signals", "u1"),  # Signal bits of the model
     ]
 )
 
@@ -83,34 +83,36 @@ Ticks = npt.NDArray[np.void]  # of TICK
 
 
 def joined(*blocks: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
-    """All rows in one array, as ``np.concatenate`` gives it from arrays of one dtype.
+    """All rows in one array, like ``np.concatenate`` of arrays of one dtype.
 
-    One block is given as it is. Rows are copied whole: NumPy alone goes through them field by
-    field, ten times as slow.
+    A single block is returned uncopied. Rows are copied whole; NumPy copies them field by field,
+    which takes ten times as long.
     """
     if len(blocks) == 1:
         return blocks[0]
     dtype = blocks[0].dtype
-    whole = np.dtype((np.void, dtype.itemsize))
-    return np.concatenate([np.ascontiguousarray(block).view(whole) for block in blocks]).view(dtype)
+    row_type = np.dtype((np.void, dtype.itemsize))
+    return np.concatenate([np.ascontiguousarray(block).view(row_type) for block in blocks]).view(
+        dtype
+    )
 
 
 class Command(IntFlag):
-    """What the PLC commands."""
+    """The PLC's commands."""
 
     SUCTION = 1
     BLOW_OFF = 2
 
 
 class Signal(IntFlag):
-    """The switching signals a compact ejector gives; the model hands them out as well."""
+    """The switching signals of a compact ejector; the model has them too."""
 
     PART_PRESENT = 1  # H2
     AIR_SAVING = 2  # H1
 
 
 class Reported(IntFlag):
-    """What an ejector says of itself, and what of it is known in a row."""
+    """States that an ejector reports, and which of them a row has."""
 
     NOZZLE_KNOWN = 1
     NOZZLE = 2  # it is on
@@ -120,7 +122,7 @@ class Reported(IntFlag):
 
 
 class Quality(IntFlag):
-    """What is wrong with a sample, or with the stream just before it; 0 is good."""
+    """Faults of a sample, or of the stream just before it; 0 is good."""
 
     GAP = 1  # samples are missing before this one
     RESTART = 2  # the PLC restarted before this one
@@ -128,21 +130,21 @@ class Quality(IntFlag):
     OUT_OF_RANGE = 8  # outside the range the tag declares
     OVERFLOW = 16  # the input is beyond what it can measure: not a pressure
     STALE = 32  # the PLC answers, but its value is no longer fresh
-    BAD = 64  # the PLC or the server says itself that the value is bad
-    OURS = 128  # the pause before its receipt is the twin's: it was late, or its clock was set
+    BAD = 64  # the PLC or the server marks the value as bad
+    OURS = 128  # the twin caused the pause before its receipt: it was late, or its clock was set
 
 
-# Plain numbers: with an IntFlag NumPy makes 64 bits of every byte.
+# Plain numbers: with an IntFlag NumPy would convert every byte to 64 bits.
 UNUSABLE = int(Quality.OVERFLOW | Quality.STALE | Quality.BAD)  # no pressure to compare with
 BREAK = int(Quality.GAP | Quality.RESTART | Quality.CLOCK)  # time does not run on from before
-MOST_BRIDGED = 3  # rows missing one after the other, over which the model steps
+MOST_BRIDGED = 3  # consecutive missing rows that the model steps over
 NEW_TIME = int(Quality.RESTART | Quality.CLOCK)  # another PLC time begins, earlier or later
 
 
 def unseen_ns(before: Samples | np.void, after: Samples | np.void) -> npt.NDArray[np.int64]:
     """Time (ns) that passed unseen between rows before and after a gap.
 
-    By PLC time where it runs on; after a restart or a jump of it, by the times of receipt.
+    PLC time counts if it runs on; after a restart or a clock jump, the times of receipt count.
     """
     runs_on = (after["quality"] & NEW_TIME) == 0
     by_plc, by_receipt = (after[name] - before[name] for name in ("time_ns", "host_ns"))
@@ -152,47 +154,47 @@ def unseen_ns(before: Samples | np.void, after: Samples | np.void) -> npt.NDArra
 
 @dataclass
 class Bridge:
-    """Takes blocks in, gives them out without the mark of gaps of a few rows: the model steps over.
+    """Removes the marks of gaps of a few rows from blocks: the model steps over them.
 
-    A command that changes in one is taken to change at its end. Longer gaps stay, as what happened
-    in them is not known; so do those of which the numbers do not say how long they are.
+    A command that changes in such a gap counts as changing at its end. Longer gaps keep their mark,
+    since nobody knows what happened; so do gaps whose length the sequence numbers do not tell.
     """
 
     _before: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # the row before
 
     def over(self, block: Samples) -> Samples:
-        """The block as it came, or a copy without these marks."""
-        before, self._before = self._before, block[-1:].copy() if len(block) else self._before
+        """The block unchanged, or a copy without these marks."""
+        previous, self._before = self._before, block[-1:].copy() if len(block) else self._before
         if not (block["quality"] & np.uint8(Quality.GAP)).any():
             return block
-        rows = np.concatenate([before, block])
+        rows = np.concatenate([previous, block])
         missing = np.diff(rows["sequence"]) - 1
         short = (missing > 0) & (missing <= MOST_BRIDGED) & (rows["quality"][1:] & NEW_TIME == 0)
         rows["quality"][1:][short] &= np.uint8(~np.uint8(Quality.GAP))
-        return rows[len(before) :]
+        return rows[len(previous) :]
 
 
 def sampling_ms(samples: Samples) -> float:
-    """The usual time between rows in whole milliseconds; at least one, as models run so."""
+    """The median time between rows in whole milliseconds; at least one, as for the model."""
     if len(samples) < 2:
         return 1.0
     return max(round(float(np.median(np.diff(samples["time_ns"]))) * NS / MS), 1.0)
 
 
 def bridged(blocks: Iterable[Samples]) -> Iterator[Samples]:
-    """All blocks of a stream as ``Bridge`` gives them."""
+    """All blocks of a stream, passed through a ``Bridge``."""
     bridge = Bridge()
     return (bridge.over(block) for block in blocks)
 
 
 def unbroken(blocks: Iterable[tuple[Samples, Ticks]]) -> Iterator[tuple[Samples, Ticks]]:
-    """The same of blocks with what the twin says to them."""
+    """All blocks with their ticks, passed through a ``Bridge``."""
     bridge = Bridge()
     return ((bridge.over(samples), ticks) for samples, ticks in blocks)
 
 
 class Phase(IntEnum):
-    """Where in its cycle the ejector is, whatever commanded it."""
+    """The phase of the ejector's cycle."""
 
     IDLE = 0  # no command
     SUCTION = 1  # commanded, nozzle on
@@ -201,7 +203,7 @@ class Phase(IntEnum):
 
 
 def deviation(samples: Samples, ticks: Ticks) -> npt.NDArray[np.float64]:
-    """Measured minus expected pressure in Pa, row by row; NaN where either cannot be used."""
+    """Measured minus expected pressure in Pa, row by row; NaN if either is unusable."""
     difference: npt.NDArray[np.float64] = samples["pressure"] - ticks["expected"].astype(np.float64)
     difference[(samples["quality"] & UNUSABLE) != 0] = np.nan
     return difference

@@ -1,7 +1,7 @@
-"""Outputs of a run that may fail: one that does is set aside and tried again; the loop goes on.
+"""Supervises the outputs of a run: a failed one is set aside and retried; the loop goes on.
 
-A full disk, a reader that has gone or a mistake of ours in one output is no reason to end
-monitoring. What happens to an output is told among the events of the run, once.
+A full disk, a reader that has gone or a programming error in one output must not end monitoring.
+Loss and recovery of an output are each reported once, as events of the run.
 """
 
 import time
@@ -18,32 +18,32 @@ from twin.live import EventEnricher, Sink
 from twin.monitor.staleness import Notices
 from twin.signals import TICK, Quality, Samples, Ticks
 
-KEPT_ROWS = 60_000  # that wait for an output: a minute of them each millisecond, some 5 MB
-KEPT_EVENTS = 10_000  # of rows that were lost
-KEPT_BLOCKS = 10_000  # of an output that takes no rows, or while none come
+KEPT_ROWS = 60_000  # rows that wait for an output: one minute at 1 kHz, about 5 MB
+KEPT_EVENTS = 10_000  # events of lost rows
+KEPT_BLOCKS = 10_000  # blocks of an output that takes no rows, or while none arrive
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # before an output is tried again
-SOUND_S = 60.0  # an adviser that worked so long begins with the first pause again
+SOUND_S = 60.0  # after working so long, an adviser starts with the first pause again
 
 Block = tuple[Samples, Ticks, Sequence[Event]]
 
 
 @dataclass
 class Outages:
-    """Which outputs of one run are down."""
+    """The failed outputs of one run."""
 
     notices: Notices
     _down: dict[str, float] = field(default_factory=dict)  # since when
 
-    def begin(self, name: str, why: Exception, now_s: float) -> None:
-        """Tell that an output has failed, unless that has been told."""
+    def begin(self, name: str, cause: Exception, now_s: float) -> None:
+        """Report that an output has failed, unless that was reported."""
         if name in self._down:
             return
         self._down[name] = now_s
-        text = f"{name}: {in_words(why)}; monitoring goes on, and it is tried again"
+        text = f"{name}: {in_words(cause)}; monitoring goes on, and it is tried again"
         self.notices.tell(Kind.OUTPUT_DOWN, text, {"output": name})
 
     def end(self, name: str, now_s: float, rows: int = 0, events: int = 0) -> None:
-        """Tell that an output works again; so many rows and events did not wait for it."""
+        """Report that an output works again, with the numbers of lost rows and events."""
         seconds = now_s - self._down.pop(name)
         missing = f"; {lost(rows, events)}" if rows or events else ""
         text = f"{name}: works again after {seconds:.0f} s{missing}"
@@ -52,30 +52,30 @@ class Outages:
 
 
 def lost(rows: int, events: int) -> str:
-    """What is missing in an output, in words."""
+    """A text about rows and events that are missing in an output."""
     counts = [f"{rows} rows"] * bool(rows or not events) + [f"{events} events"] * bool(events)
     return f"{' and '.join(counts)} are missing in it"
 
 
 class Backlog:
-    """Blocks that wait for an output: bounded, and what found no room is counted.
+    """Blocks that wait for an output, in bounded memory; lost rows and events are counted.
 
-    The first rows after some that were lost are marked as after a gap.
+    The first row after lost ones gets the mark of a gap.
     """
 
     def __init__(self) -> None:
         self.blocks: deque[Block] = deque()
-        self.rows = 0  # that wait
+        self.rows = 0  # waiting
         self.rows_lost = self.events_lost = 0
-        self._gap = False  # rows were lost, and none are there to mark yet
+        self._gap = False  # rows were lost, and no later row is there to mark yet
 
     @property
     def events(self) -> int:
-        """How many wait."""
+        """The number of waiting events."""
         return sum(len(events) for *_, events in self.blocks)
 
     def keep(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
-        """Have a block wait, unless it is empty; the oldest rows make room."""
+        """Add a block, unless it is empty; the oldest rows are dropped to make room."""
         if len(samples) or events:
             self.blocks.append((samples.copy(), ticks.copy(), list(events)))
             self.rows += len(samples)
@@ -84,41 +84,41 @@ class Backlog:
             self._lose_oldest()
 
     def forget_oldest(self) -> None:
-        """It has arrived."""
+        """Remove the oldest block after its delivery."""
         self.rows -= len(self.blocks.popleft()[0])
 
     def clear(self) -> None:
-        """All of it has arrived, and what did not was told."""
+        """Remove all blocks and counts after delivery and report."""
         self.blocks.clear()
         self.rows = self.rows_lost = self.events_lost = 0
         self._gap = False
 
     def _lose_oldest(self) -> None:
-        """Let its rows go; its events wait on."""
-        oldest, _, before = self.blocks.popleft()
+        """Drop the oldest block's rows; its events go on waiting."""
+        oldest, _, older_events = self.blocks.popleft()
         samples, ticks, events = self.blocks.popleft()
-        together = [*before, *events]
-        self.blocks.appendleft((samples, ticks, together[-KEPT_EVENTS:]))
+        all_events = [*older_events, *events]
+        self.blocks.appendleft((samples, ticks, all_events[-KEPT_EVENTS:]))
         self.rows -= len(oldest)
         self.rows_lost += len(oldest)
-        self.events_lost += max(0, len(together) - KEPT_EVENTS)
+        self.events_lost += max(0, len(all_events) - KEPT_EVENTS)
         self._gap |= len(oldest) > 0
         self._mark()
 
     def _mark(self) -> None:
-        later = next((rows for rows, *_ in self.blocks if len(rows)), None)
-        if self._gap and later is not None:
-            later["quality"][0] |= np.uint8(Quality.GAP)
+        first_rows = next((rows for rows, *_ in self.blocks if len(rows)), None)
+        if self._gap and first_rows is not None:
+            first_rows["quality"][0] |= np.uint8(Quality.GAP)
             self._gap = False
 
 
 class SupervisedSink:
-    """A sink (``twin.live.Sink``) that raises nothing while it is written to.
+    """A sink (``twin.live.Sink``) whose ``write`` raises nothing.
 
-    After a failure rows and events wait, up to KEPT_ROWS, and ``again`` is asked for a sink that
-    works, with a pause that doubles. A sink that says how many rows it has ``held`` is not given
-    those again with which it raised SourceError, and is tried once more where it fails at its end.
-    One without ``rows`` is of events alone. ``close`` raises what a sink says at its end.
+    After a failure rows and events wait, up to KEPT_ROWS. ``again`` is called for a working sink,
+    with pauses that double. A sink with ``held`` keeps the rows with which it raised SourceError,
+    so it does not get them again; it is retried once if it fails at its end. Without ``rows`` the
+    sink gets only events. ``close`` raises the sink's error at its end.
     """
 
     def __init__(
@@ -140,7 +140,7 @@ class SupervisedSink:
         self._waiting = Backlog()
 
     def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
-        """Take rows, their ticks, and what happened."""
+        """Take rows, their ticks, and events."""
         if self._failure is None:
             try:
                 self._sink.write(samples, ticks, events)
@@ -154,7 +154,7 @@ class SupervisedSink:
             self._try_again()
 
     def close(self) -> None:
-        """Finish; SourceError where something is missing in it."""
+        """Finish; SourceError if rows or events are missing in the output."""
         if self._failure is None and self._held is not None:
             try:
                 self._sink.close()
@@ -173,7 +173,7 @@ class SupervisedSink:
         self._sink.close()
 
     def _is_held(self, error: Exception) -> bool:
-        """Whether a sink that failed has the rows, to write them when it is tried again."""
+        """Whether the failed sink holds the rows itself, and writes them when retried."""
         return self._held is not None and isinstance(error, SourceError)
 
     def _keep(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
@@ -211,12 +211,12 @@ class SupervisedSink:
 
 
 class SupervisedEnricher:
-    """An adviser (``twin.live.EventEnricher``) that raises nothing while rows come.
+    """An adviser (``twin.live.EventEnricher``) whose ``follow`` raises nothing.
 
-    After a failure rows and events wait for it, up to KEPT_ROWS. With a pause that doubles it is
-    given all of them again, in order. Once it takes any of them, those that it still fails at are
-    left out and counted; as long as it takes none, they wait on. The pause begins anew after it
-    has worked for SOUND_S. ``close`` raises SourceError where it has failed to the end.
+    After a failure rows and events wait for it, up to KEPT_ROWS. It gets all of them again in
+    order, with pauses that double. Once it takes any of them, those that still fail are dropped and
+    counted; as long as it takes none, they go on waiting. After SOUND_S of work the pauses start
+    anew. ``close`` raises SourceError if it has failed to the end.
     """
 
     def __init__(
@@ -230,11 +230,11 @@ class SupervisedEnricher:
         self._clock = clock
         self._failure: Exception | None = None
         self._next_s, self._backoff = 0.0, Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S)
-        self._back_s = 0.0  # when it worked again
+        self._back_s = 0.0  # when it recovered
         self._waiting = Backlog()
 
     def follow(self, samples: Samples, events: Sequence[Event]) -> list[Event]:
-        """Take rows and what happened; give what has been found out by now."""
+        """Take rows and events; returns the new events by now."""
         if self._failure is None:
             try:
                 return self._adviser.follow(samples, events)
@@ -246,17 +246,17 @@ class SupervisedEnricher:
         return []
 
     def finish(self) -> list[Event]:
-        """Give what is still to be said when the rows have ended."""
-        said = self._try_again() if self._failure is not None else []
+        """Return the remaining events after the last row."""
+        events = self._try_again() if self._failure is not None else []
         if self._failure is None:
             try:
-                said += self._adviser.finish()
+                events += self._adviser.finish()
             except Exception as error:
                 self._set_aside(error)
-        return said
+        return events
 
     def close(self) -> None:
-        """Let go of everything; SourceError where it has not heard all that happened."""
+        """Release all resources; SourceError if the adviser has missed rows or events."""
         self._adviser.close()
         if self._failure is not None:
             waiting = self._waiting
@@ -267,27 +267,27 @@ class SupervisedEnricher:
             ) from self._failure
 
     def _try_again(self, *newest: Block) -> list[Event]:
-        """Give it all that waits; what it says."""
+        """Pass all waiting blocks to the adviser; returns its events."""
         waiting = self._waiting
         for block in newest:
             waiting.keep(*block)
-        said: list[Event] = []
+        events: list[Event] = []
         blocks = [*waiting.blocks] or [*newest]
         failures = list[tuple[Exception, Block]]()
         for block in blocks:
             try:
-                said += self._adviser.follow(block[0], block[2])
+                events += self._adviser.follow(block[0], block[2])
             except Exception as error:
                 failures.append((error, block))
         if blocks and len(failures) == len(blocks):
             self._set_aside(failures[0][0])
             return []
-        rows = waiting.rows_lost + sum(len(block[0]) for _, block in failures)
-        events = waiting.events_lost + sum(len(block[2]) for _, block in failures)
-        self._outages.end(self._name, self._clock(), rows, events)
+        lost_rows = waiting.rows_lost + sum(len(block[0]) for _, block in failures)
+        lost_events = waiting.events_lost + sum(len(block[2]) for _, block in failures)
+        self._outages.end(self._name, self._clock(), lost_rows, lost_events)
         self._failure, self._back_s = None, self._clock()
         waiting.clear()
-        return said
+        return events
 
     def _set_aside(self, error: Exception) -> None:
         now_s = self._clock()

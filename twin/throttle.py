@@ -1,4 +1,4 @@
-"""How often one may try a password, counted once for all processes that take them."""
+"""Limits attempts to log in, counted together for all processes."""
 
 import os
 import sqlite3
@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-FILE = "logins.sqlite"  # beside the users; without it counting begins anew
-MOST = 1000  # who are remembered of a kind
+FILE = "logins.sqlite"  # beside the users; without it counting starts anew
+MOST = 1000  # remembered names and addresses, each
 FREE_TRIES = 5
 BUSY_S = 0.2  # longest wait for another process that counts
 
@@ -24,17 +24,18 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Wait:
-    """How long somebody has to wait (s), and whether that has not been told yet."""
+    """How long somebody has to wait (s), and whether that was not recorded yet."""
 
     seconds: float = 0.0
     is_news: bool = False
 
 
 class LoginThrottle:
-    """Slows down who guesses: after some wrong ones each takes twice as long as the one before.
+    """Slows down guessing: after some wrong attempts each wait is twice as long as the last.
 
-    ``longest_s`` has the longest wait of each kind of ``who``, as address and name are. ``clock``
-    is one for all processes of a machine. Where the file cannot be written each counts for itself.
+    ``longest_s`` is the longest wait for each kind of ``who``, such as address and name. ``clock``
+    must be common to all processes of a machine. If the file cannot be written, each process counts
+    for itself.
     """
 
     def __init__(
@@ -47,32 +48,32 @@ class LoginThrottle:
         self._own: sqlite3.Connection | None = None
 
     def take(self, who: Mapping[str, str]) -> Wait:
-        """Begin a try, by kind who makes it; it counts as wrong until it was ``right``."""
-        return self._counted(lambda connection: self._take(connection, who))
+        """Begin an attempt of ``who``, by kind; it counts as wrong until ``right`` is called."""
+        return self._transact(lambda connection: self._take(connection, who))
 
     def right(self, who: Mapping[str, str]) -> None:
-        """It was right: nothing is held against him."""
+        """Forget wrong attempts after a right one."""
         forget = "DELETE FROM wrong WHERE kind = ? AND who = ?"
-        self._counted(lambda connection: connection.executemany(forget, who.items()))
+        self._transact(lambda connection: connection.executemany(forget, who.items()))
 
     def _take(self, connection: sqlite3.Connection, who: Mapping[str, str]) -> Wait:
         now = self._clock()
-        # The clock begins anew with the machine.
+        # The clock starts anew with the machine.
         connection.execute("UPDATE wrong SET last = ? WHERE last > ?", (now, now))
-        find = "SELECT count, last, told FROM wrong WHERE kind = ? AND who = ?"
-        there = {one: connection.execute(find, one).fetchone() for one in who.items()}
+        query = "SELECT count, last, told FROM wrong WHERE kind = ? AND who = ?"
+        rows = {key: connection.execute(query, key).fetchone() for key in who.items()}
         waits = {
-            one: self._pause_s(one[0], row[0]) - (now - row[1]) for one, row in there.items() if row
+            key: self._pause_s(key[0], row[0]) - (now - row[1]) for key, row in rows.items() if row
         }
-        waiting = [one for one, wait_s in waits.items() if wait_s > 0.0]
+        waiting = [key for key, wait_s in waits.items() if wait_s > 0.0]
         if waiting:
-            tell = "UPDATE wrong SET told = 1 WHERE kind = ? AND who = ?"
-            connection.executemany(tell, waiting)
-            return Wait(max(waits.values()), any(not there[one][2] for one in waiting))
+            update = "UPDATE wrong SET told = 1 WHERE kind = ? AND who = ?"
+            connection.executemany(update, waiting)
+            return Wait(max(waits.values()), any(not rows[key][2] for key in waiting))
         for kind, name in who.items():
-            row = there[kind, name]
-            counted = kind, name, (row[0] if row else 0) + 1, now
-            connection.execute("REPLACE INTO wrong VALUES (?, ?, ?, ?, 0)", counted)
+            row = rows[kind, name]
+            new_row = kind, name, (row[0] if row else 0) + 1, now
+            connection.execute("REPLACE INTO wrong VALUES (?, ?, ?, ?, 0)", new_row)
             connection.execute(_FORGET, (kind, kind, MOST))
         return Wait()
 
@@ -81,18 +82,18 @@ class LoginThrottle:
             return 0.0
         return min(2.0 ** min(count - FREE_TRIES, 20), self._longest_s[kind])
 
-    # --- where it is counted --------------------------------------------------------------------
+    # --- storage --------------------------------------------------------------------------------
 
-    def _counted(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
-        """Work that no other process comes between, in the file; where that fails, in memory."""
+    def _transact(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
+        """Run ``work`` in an exclusive transaction, in the file; in memory if that fails."""
         with suppress(sqlite3.Error, OSError):
             os.close(os.open(self._path, os.O_RDWR | os.O_CREAT, 0o600))  # for its owner alone
-            with closing(self._opened(str(self._path))) as connection:
-                return self._done(connection, work)
-        self._own = self._own or self._opened(":memory:")
-        return self._done(self._own, work)
+            with closing(self._open_database(str(self._path))) as connection:
+                return self._run(connection, work)
+        self._own = self._own or self._open_database(":memory:")
+        return self._run(self._own, work)
 
-    def _done(
+    def _run(
         self, connection: sqlite3.Connection, work: Callable[[sqlite3.Connection], Result]
     ) -> Result:
         connection.execute("BEGIN IMMEDIATE")
@@ -101,12 +102,12 @@ class LoginThrottle:
         connection.execute("COMMIT")
         return result
 
-    def _opened(self, path: str) -> sqlite3.Connection:
+    def _open_database(self, path: str) -> sqlite3.Connection:
         connection = sqlite3.connect(
             path, timeout=BUSY_S, isolation_level=None, check_same_thread=False
         )
         try:
-            connection.execute("PRAGMA synchronous = OFF")  # after a crash it may begin anew
+            connection.execute("PRAGMA synchronous = OFF")  # counting may start anew after a crash
             connection.execute("PRAGMA journal_mode = MEMORY")
         except sqlite3.Error:
             connection.close()

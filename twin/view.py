@@ -1,9 +1,9 @@
 """The view: measured beside expected in Rerun, live on this machine or as a ``.rrd`` file.
 
-Rerun is the optional extra ``[view]``; it is imported when a view is opened, not before.
-The viewer is started here instead of by Rerun's own ``spawn`` and ``serve_*`` calls: those listen
-on all interfaces, and this one is bound to loopback. Its usage statistics are switched off for
-that process alone; the user's own Rerun settings are neither read nor changed.
+Rerun is the optional extra ``[view]``; it is imported only when a view is opened. This module
+starts the viewer itself and binds it to loopback, since Rerun's own ``spawn`` and ``serve_*`` calls
+listen on all interfaces. It switches usage statistics off for that process alone; the user's own
+Rerun settings are neither read nor changed.
 """
 
 import colorsys
@@ -42,15 +42,15 @@ from twin.signals import (
     deviation,
 )
 
-TIMELINE = "PLC time of the sample"  # as long as a time: the event list's column is as wide
-# PLC time that goes to Rerun at once: a row costs 8 µs in batches of 100 and 2 µs in those of 1000.
+TIMELINE = "PLC time of the sample"  # as long as a time: it sets the width of the list's column
+# PLC time sent to Rerun at once: a row costs 8 µs in batches of 100 and 2 µs in those of 1000.
 LIVE_BATCH_NS = 100_000_000
 FILE_BATCH_NS = 1_000_000_000
-WINDOW_S = 20.0  # what a live plot shows
-MEMORY = "1GB"  # the viewer then forgets the oldest: hours of 1 kHz
-START_S = 20.0  # a cold viewer on a busy machine takes some seconds
-PATIENCE_S = 0.05  # longest wait for the viewer in one write: well below what a PLC buffers
-MISSES = 60  # writes in a row it may leave unread before it counts as hung
+WINDOW_S = 20.0  # time span of a live plot
+MEMORY = "1GB"  # beyond it the viewer drops the oldest data: hours at 1 kHz
+START_S = 20.0  # limit for a start: a cold viewer on a busy machine takes a few seconds
+PATIENCE_S = 0.05  # longest wait for the viewer in one write: well below a PLC's buffer
+MISSES = 60  # consecutive unread writes after which the viewer counts as hung
 
 # Entity, name in the legend, colour, line width, how it runs from sample to sample. The expected
 # line is wide: where the two agree, it shows as the measured line's rim.
@@ -75,16 +75,16 @@ _log = logging.getLogger(__name__)
 
 
 class Screen:
-    """One recording, in a file or in a viewer on this machine: what all views are drawn on.
+    """One recording, in a file or in a viewer on this machine, on which all views draw.
 
-    Views may draw from threads of their own. ``url`` is the page to open where there is no window.
+    Views may draw from threads of their own. ``url`` is the page to open if there is no window.
     """
 
     def __init__(self, title: str, target: Path | None, ejectors: Sequence[str] = ("",)) -> None:
-        """Write to the file ``target``, or start a viewer where it is None.
+        """Write to the file ``target``, or start a viewer if it is None.
 
-        Of several ``ejectors`` each has a page named after it, and one shows all. ConfigError if
-        Rerun is not installed; SourceError if the file cannot be written or no viewer starts.
+        With several ``ejectors`` each has a page with its name, and one page shows all. ConfigError
+        if Rerun is not installed; SourceError if the file cannot be written or no viewer starts.
         """
         self.rr = import_rerun()
         self._misses = 0
@@ -97,23 +97,23 @@ class Screen:
         self._stream.send_recording_name(title)
 
     def style(self, path: str, archetype: Any) -> None:
-        """Say once how an entity is drawn."""
+        """Set the style of an entity."""
         if stream := self._stream:
             stream.log(path, archetype, static=True, strict=True)
 
     def send(self, path: str, time_ns: npt.NDArray[np.int64], values: Any) -> None:
-        """Draw columns of an entity at PLC times; nothing once the screen is gone."""
+        """Draw columns of an entity at PLC times; does nothing once the screen has ended."""
         if stream := self._stream:
             column = self.rr.TimeColumn(TIMELINE, timestamp=time_ns.astype("datetime64[ns]"))
             stream.send_columns(path, [column], values, strict=True)
 
     def follow(self) -> None:
-        """Ask whether the viewer still reads, which bounds what can pile up in memory for it.
+        """Check whether the viewer still reads, which bounds the data that wait for it.
 
-        One that is closed, or hangs for some seconds, ends the screen and nothing else.
+        If the viewer was closed, or hangs for some seconds, only the screen ends.
         """
         if self._viewer is None or not self._asking.acquire(blocking=False):
-            return  # somebody else is waiting for it: once is enough
+            return  # another thread checks already
         try:
             if self._stream and not self._follows(self._viewer):
                 _log.warning("the Rerun viewer was closed or hangs: going on without it")
@@ -131,7 +131,7 @@ class Screen:
         if stream is None:
             return
         if self._viewer and not self._delivered(stream):
-            self._viewer.close()  # while it hangs, disconnecting would wait for it for ever
+            self._viewer.close()  # disconnecting would wait for a hanging viewer for ever
         stream.disconnect()
         if self._viewer:
             self._viewer.close()
@@ -169,7 +169,7 @@ class View:
         self._screen = screen
         self._rr = screen.rr
         self._ambient_pa = ambient_pa
-        self._at = f"{name}/" if name else ""
+        self._prefix = f"{name}/" if name else ""
         self._waiting: list[tuple[Samples, Ticks]] = []
         self._phase = -1
         self._last_ns: int | None = None
@@ -177,7 +177,7 @@ class View:
         self._style()
 
     def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
-        """Take row-aligned blocks of SAMPLE and TICK and what happened in them."""
+        """Take row-aligned blocks of SAMPLE and TICK and their events."""
         for event in events:
             self._send_event(event)
         if len(samples):
@@ -187,20 +187,20 @@ class View:
             self._screen.follow()
 
     def close(self) -> None:
-        """Send the rest; the screen stays."""
+        """Send the waiting rows; the screen stays open."""
         if self._waiting:
             self._send_waiting()
 
     def _style(self) -> None:
-        """Say once how each entity is drawn."""
+        """Set the style of each entity."""
         for path, name, colour, width, mode in _SERIES:
             style = self._rr.SeriesLines(
                 names=name, colors=colour, widths=width, interpolation_mode=mode
             )
-            self._screen.style(self._at + path, style)
+            self._screen.style(self._prefix + path, style)
         labels, colours = zip(*_PHASES.values(), strict=True)
         phases = self._rr.StateConfiguration(values=labels, colors=np.array(colours, np.uint32))
-        self._screen.style(f"{self._at}phase", phases)
+        self._screen.style(f"{self._prefix}phase", phases)
 
     def _span_ns(self) -> int:
         first, last = self._waiting[0][0]["time_ns"][0], self._waiting[-1][0]["time_ns"][-1]
@@ -217,16 +217,16 @@ class View:
         self._last_ns = int(samples["time_ns"][-1])
 
     def _lift_pen(self, samples: Samples) -> None:
-        """Blank all lines right after the row before a break: nothing was measured in between."""
+        """Interrupt all lines at a break, since nothing was measured in between."""
         breaks = np.flatnonzero(samples["quality"] & BREAK)
         if self._last_ns is None:
             breaks = breaks[breaks > 0]  # before the very first row nothing is drawn
         if len(breaks):
-            before = np.concatenate(([self._last_ns or 0], samples["time_ns"]))[breaks]
-            after, blanks = before + 1, len(breaks)
+            previous_ns = np.concatenate(([self._last_ns or 0], samples["time_ns"]))[breaks]
+            blank_ns, count = previous_ns + 1, len(breaks)
             for path, *_ in _SERIES:
-                self._send(path, after, self._rr.Scalars.columns(scalars=[np.nan] * blanks))
-            self._send("phase", after, self._rr.StateChange.columns(state=[""] * blanks))
+                self._send(path, blank_ns, self._rr.Scalars.columns(scalars=[np.nan] * count))
+            self._send("phase", blank_ns, self._rr.StateChange.columns(state=[""] * count))
 
     def _series(self, samples: Samples, ticks: Ticks) -> Mapping[str, npt.NDArray[np.float64]]:
         usable = (samples["quality"] & UNUSABLE) == 0
@@ -240,7 +240,7 @@ class View:
         }
 
     def _send_phases(self, samples: Samples, ticks: Ticks) -> None:
-        """Send only where the phase changes, or is known again after a break."""
+        """Send the phase only where it changes, and after a break."""
         phases = ticks["phase"].astype(np.int64)
         changed = np.diff(phases, prepend=self._phase) != 0
         rows = np.flatnonzero(changed | (samples["quality"] & BREAK != 0))
@@ -251,33 +251,33 @@ class View:
             self._send("phase", times, self._rr.StateChange.columns(state=names))
 
     def _send_event(self, event: Event) -> None:
-        place = "alarms" if event.kind in _ALARMS else "events"
+        folder = "alarms" if event.kind in _ALARMS else "events"
         text = self._rr.TextLog.columns(text=[event.text], level=[_LEVELS[event.severity]])
-        self._send(f"{place}/{event.kind}", np.array([event.time_ns]), text)
+        self._send(f"{folder}/{event.kind}", np.array([event.time_ns]), text)
         if event.kind is Kind.CYCLE and "probabilities" in event.data:
             self._send_probabilities(event.time_ns, event.data["probabilities"])
 
-    def _send_probabilities(self, time_ns: int, likely: Mapping[str, float]) -> None:
-        """Send those of a cycle; what was likely before and is not among them has come to 0."""
-        for cause in likely.keys() - self._causes:
+    def _send_probabilities(self, time_ns: int, probabilities: Mapping[str, float]) -> None:
+        """Send the probabilities of a cycle; earlier causes that are missing get 0."""
+        for cause in probabilities.keys() - self._causes:
             style = self._rr.SeriesLines(
                 names=CAUSES.get(cause, cause),
                 colors=_colour_of(cause),
                 widths=2.0,
                 interpolation_mode="StepAfter",
             )
-            self._screen.style(f"{self._at}probabilities/{cause}", style)
-        self._causes |= likely.keys()
+            self._screen.style(f"{self._prefix}probabilities/{cause}", style)
+        self._causes |= probabilities.keys()
         for cause in sorted(self._causes):
-            value = self._rr.Scalars.columns(scalars=[likely.get(cause, 0.0)])
+            value = self._rr.Scalars.columns(scalars=[probabilities.get(cause, 0.0)])
             self._send(f"probabilities/{cause}", np.array([time_ns]), value)
 
     def _send(self, path: str, time_ns: npt.NDArray[np.int64], values: Any) -> None:
-        self._screen.send(self._at + path, time_ns, values)
+        self._screen.send(self._prefix + path, time_ns, values)
 
 
 def _colour_of(cause: str) -> tuple[int, int, int]:
-    """The same for an effect wherever it is drawn; neighbours in the table are far apart."""
+    """The fixed colour of a cause; neighbours in the table get distant colours."""
     if cause == "none":
         return 230, 230, 230
     if cause == UNKNOWN:
@@ -289,7 +289,7 @@ def _colour_of(cause: str) -> tuple[int, int, int]:
 
 
 class _Viewer:
-    """A viewer process on loopback: a window, or a page for the browser where there is none."""
+    """A viewer process on loopback: a window, or a page for the browser without a display."""
 
     def __init__(self) -> None:
         port, page = _free_port(), _free_port()
@@ -301,19 +301,19 @@ class _Viewer:
             command += ["--serve-web", "--web-viewer-port", str(page)]
             command += ["--server-memory-limit", MEMORY]
             self.url = f"http://127.0.0.1:{page}?url={quote(self.address, safe='')}"
-        # Where CI is set Rerun sends no usage statistics; a session of its own keeps Ctrl-C here.
-        quiet = {**os.environ, "CI": "1", "RUST_LOG": "error"}
-        self._process = subprocess.Popen(command, env=quiet, start_new_session=True)  # noqa: S603
+        # With CI set Rerun sends no usage statistics; Ctrl-C does not reach its own session.
+        environment = {**os.environ, "CI": "1", "RUST_LOG": "error"}
+        self._process = subprocess.Popen(command, env=environment, start_new_session=True)  # noqa: S603
         self._wait_for(port)
         if self.url:
             self._wait_for(page)
 
     def running(self) -> bool:
-        """Say whether the process lives; the user may have closed its window."""
+        """Whether the process is alive; the user may have closed its window."""
         return self._process.poll() is None
 
     def close(self) -> None:
-        """End the process at once: it keeps nothing, and while it hangs it would not listen."""
+        """Kill the process: it has nothing to save, and would not react while it hangs."""
         self._process.kill()
         self._process.wait()
 
@@ -331,7 +331,7 @@ class _Viewer:
 
 
 def import_rerun() -> Any:
-    """The optional package; ConfigError says what to install where it is missing."""
+    """The optional package; if it is missing, ConfigError says what to install."""
     try:
         return importlib.import_module("rerun")
     except ImportError as error:
@@ -342,12 +342,12 @@ def import_rerun() -> Any:
 
 
 def _executable() -> str:
-    """Path of the viewer itself: the ``rerun`` script would leave it behind when terminated."""
+    """Path of the viewer itself: a terminated ``rerun`` script would leave the viewer running."""
     folder = Path(str(importlib.import_module("rerun_cli").__file__)).parent
-    found = shutil.which("rerun", path=folder)
-    if not found:
+    path = shutil.which("rerun", path=folder)
+    if not path:
         raise ConfigError(f"no Rerun viewer in {folder}", install_hint("view"))
-    return found
+    return path
 
 
 def _has_display() -> bool:
@@ -361,9 +361,9 @@ def _free_port() -> int:
 
 
 def _blueprint(rr: Any, ejectors: Sequence[str], *, live: bool) -> Any:
-    """Lay out one ejector, or several as pages behind one that shows all; live follows the newest.
+    """The layout of one ejector, or of several as pages after an overview; live follows time.
 
-    Rerun has no linked time axis that also moves on, so the live ones are not linked.
+    Rerun has no linked time axis that also moves on, so live axes are not linked.
     """
     plan = rr.blueprint
     axis = plan.archetypes.TimeAxis(
@@ -381,7 +381,7 @@ def _blueprint(rr: Any, ejectors: Sequence[str], *, live: bool) -> Any:
 
 
 def _page(plan: Any, axis: Any, name: str) -> Any:
-    """All of one ejector: its views one under the other."""
+    """The page of one ejector: its views one below the other."""
     legend = {"axis_x": axis, "plot_legend": plan.PlotLegend(plan.Corner2D.LeftTop)}
     views = (
         _vacuum(plan, axis, name, "Vacuum, mbar below ambient"),
@@ -391,7 +391,7 @@ def _page(plan: Any, axis: Any, name: str) -> Any:
             name="Commands: suction (blue), blow-off (violet)",
             axis_x=axis,
             axis_y=plan.ScalarAxis(range=(-0.15, 1.15), zoom_lock=True),
-            plot_legend=plan.PlotLegend(visible=False),  # it would hide the steps
+            plot_legend=plan.PlotLegend(visible=False),  # a legend would hide the steps
         ),
         plan.StateTimelineView(origin=f"{name}/phase", name="Phase", time_view=axis),
         _probabilities(plan, axis, name),
@@ -431,14 +431,14 @@ def _probabilities(plan: Any, axis: Any, name: str) -> Any:
     )
 
 
-def _texts(plan: Any, title: str, places: Sequence[str]) -> Any:
-    shown = ["entitypath"] if len(places) > 1 else []
+def _texts(plan: Any, title: str, paths: Sequence[str]) -> Any:
+    path_column = ["entitypath"] if len(paths) > 1 else []
     return plan.TextLogView(
         origin="/",
-        contents=[f"+ /{place.lstrip('/')}/**" for place in places],
+        contents=[f"+ /{place.lstrip('/')}/**" for place in paths],
         name=title,
         columns=plan.TextLogColumns(
-            timeline_columns=[TIMELINE], text_log_columns=[*shown, "loglevel", "body"]
+            timeline_columns=[TIMELINE], text_log_columns=[*path_column, "loglevel", "body"]
         ),
     )
 

@@ -57,7 +57,7 @@ _TITLES: Mapping[str, tuple[Role, ...]] = {
 def page(component: Component, identity: Identity) -> str:
     """documentation/index.html."""
     tables = [
-        f"<h2>{title}</h2>\n{_table(one for one in component.variables if one.role in roles)}"
+        f"<h2>{title}</h2>\n{_table(item for item in component.variables if item.role in roles)}"
         for title, roles in _TITLES.items()
     ]
     return _PAGE.format(

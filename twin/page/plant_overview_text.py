@@ -239,8 +239,8 @@ def _spark(rows: Sequence[Row]) -> dict[str, list[float | None]]:
 
 
 def _end(extreme: Any, values: Iterable[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return round(extreme(known)) if known else None
+    present = [value for value in values if value is not None]
+    return round(extreme(present)) if present else None
 
 
 def _plain(value: float) -> float | None:
