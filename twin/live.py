@@ -115,7 +115,7 @@ class Twin:
 
 
 def compiled(data: DataSet) -> Twin:
-    """A twin with compiled code; without a cache that takes seconds, which no block must wait."""
+    """A twin with compiled code: without a cache compiling takes seconds, so it is done first."""
     twin = Twin.of(data)
     twin.advance(np.zeros(3 * twin.knees.lag, SAMPLE))
     return Twin(twin.theta, twin.knees, twin.terms)

@@ -154,7 +154,7 @@ class Alarms:
         self._now, self._plc_ns = (int(samples[name][-1]) for name in ("host_ns", "time_ns"))
         return self._now
 
-    # --- what happened --------------------------------------------------------------------------
+    # --- events ---------------------------------------------------------------------------------
 
     def _first_rows(self, samples: Samples, events: Sequence[Event], now: int) -> list[Event]:
         """With the first fresh rows, faults of the stream from before a restart are over."""
@@ -258,7 +258,7 @@ class Alarms:
         changes = self.board.see(now, deviating(*causes) if is_active else {})
         return events + self._events_of(changes, event.time_ns)
 
-    # --- what follows ---------------------------------------------------------------------------
+    # --- changes --------------------------------------------------------------------------------
 
     def _grant(self, request: Request, now: int) -> list[Event]:
         try:

@@ -224,7 +224,7 @@ class Alarm:
         yield replace(self._change(now, Deed.CLEARED), untold=untold)
 
     def _change(self, now: int, deed: Deed, who: str = "") -> Change:
-        """A change of this alarm; it announces an alarm that shelving or the like ends on."""
+        """A change of this alarm; it is announced if people must be notified of the alarm now."""
         announced = deed in _ANNOUNCING and self.state is State.UNACKNOWLEDGED
         return Change(now, self.rule.name, deed, who, announced)
 

@@ -239,7 +239,7 @@ def _missing(connection: Connection, records: Sequence[Record]) -> list[Record]:
     return [record for record in records if record.id not in stored]
 
 
-# --- what is refused ----------------------------------------------------------------------------
+# --- checks -------------------------------------------------------------------------------------
 
 
 def _require_type(record: Record, types: Iterable[str]) -> None:

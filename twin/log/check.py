@@ -1,4 +1,4 @@
-"""What is in a log, what is wrong with it, and saving what can be read."""
+"""Checks a log: its contents and its damage; and recovers the readable part."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -20,23 +20,23 @@ Piece = tuple[Samples, Ticks, list[Event]]
 
 @dataclass(frozen=True)
 class Report:
-    """What a log holds; counts are of what can be read."""
+    """The contents of a log; counts are of its readable part."""
 
     path: Path
     parts: int
-    complete: bool  # its writer came to the end
-    damage: tuple[Damage, ...]  # each place that cannot be read
+    complete: bool  # its writer finished it
+    damage: tuple[Damage, ...]  # all unreadable places
     samples: int
     events: int
     duration_s: float  # PLC time, without jumps of the clock and restarts
     gaps: int  # places where samples are missing: sequence numbers, or all of a restart
-    missing: int  # samples missing there, without those of restarts: they are not known
-    unseen_s: float  # how long the gaps are together
-    restarts: int  # gaps after which the sequence begins anew
+    missing: int  # samples missing there, without those over restarts: their number is unknown
+    unseen_s: float  # total length of the gaps
+    restarts: int  # gaps after which the sequence starts again
     time_back: int  # places where PLC time does not go forward
     bytes_per_sample: float  # of the files
-    checked: bool = True  # its head, by a checksum
-    derived: str = ""  # how its commands were, where nobody recorded them
+    checked: bool = True  # its head has a checksum
+    derived: str = ""  # how commands were derived, if nobody recorded them
 
     @property
     def sound(self) -> bool:

@@ -169,7 +169,7 @@ def _reason(error: Exception, torn: bool) -> str:
 
 
 def _record(file: BinaryIO, buffer: _DecompressionBuffer) -> McapRecord | memoryview | None:
-    """The record at the file's position, None if it is not needed; else ``_DECODE_ERRORS``."""
+    """The record at the file's position, None if unused; ``_DECODE_ERRORS`` if it is damaged."""
     opcode, length = _HEAD.unpack(file.read(_HEAD.size))
     body = file.read(min(length, MEMORY_BUDGET))
     if opcode not in _OPCODES or len(body) < length:

@@ -111,7 +111,7 @@ class Outbox(Database):
             connection.execute(OUTBOX.insert(), rows)
 
     def next(self, destination: str, most: int) -> list[Message]:
-        """The oldest waiting messages, in order, ``most`` of them."""
+        """The oldest waiting messages, in order, at most ``most`` of them."""
         with self._reading() as connection:
             return _messages(connection, self._waiting(destination), most)
 

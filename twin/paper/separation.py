@@ -1,4 +1,4 @@
-"""Wall heat and a bulging characteristic: which evacuation times can separate them.
+"""Wall heat and a bulging characteristic: what evacuation times can tell about them.
 
 Both are fitted to the rig's measured time: for each film coefficient a bulge meets it. What such
 pairs predict for other experiments shows which of these would separate them.
