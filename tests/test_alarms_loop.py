@@ -63,7 +63,7 @@ def diagnosis(seconds: float, of_s: float, *causes: str, verdict: str = "explain
 
 
 class Desk:
-    """An office that keeps everything at hand."""
+    """A storage in memory."""
 
     def __init__(self) -> None:
         self.news, self.wishes = News(), list[Request]()

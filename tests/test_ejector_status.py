@@ -7,7 +7,7 @@ from twin.alarms.rules import Priority, Rule
 from twin.alarms.state import Kept
 from twin.alarms.text import action_of
 from twin.instants import instant
-from twin.page.ejector_status import S_NS, Light, light_of, listed, told
+from twin.page.ejector_status import S_NS, Light, alarm_cards, episode_details, light_of
 
 STATES = {
     "normal": (Kept(), Light.GREEN, Light.GREEN),
@@ -52,13 +52,18 @@ def test_what_is_active_and_unseen_is_listed_first() -> None:
             "quiet": Kept(True, False, 9),
         }
     )
-    assert [alarm["alarm"] for alarm in listed(one, [], [], 0)] == ["low", "seen", "gone", "quiet"]
+    assert [alarm["alarm"] for alarm in alarm_cards(one, [], [], 0)] == [
+        "low",
+        "seen",
+        "gone",
+        "quiet",
+    ]
 
 
 def test_an_effect_that_was_taken_in_is_told_in_the_words_of_who_did() -> None:
     words = {"name": "lifting_lip", "sentence": "A lip lifts off", "look_at": "the lips: worn"}
     episode = Episode("deviation_unlisted", 10, None, None, "", evidence={"taken_in": words})
-    said = told(episode, "deviation.unlisted", 20)
+    said = episode_details(episode, "deviation.unlisted", 20)
     assert (said["what"], said["sentence"]) == ("Lifting lip", "A lip lifts off.")
     assert said["where"] == "the lips"
     rule = Rule(name="deviation_unlisted", value="deviation.unlisted", above=0.5)
@@ -69,14 +74,14 @@ def test_instants_are_worded_as_everywhere() -> None:
     begin = 1_790_000_000 * S_NS  # 2026-09-21 14:13:20 UTC
     now = begin + 480 * S_NS
     episode = Episode("plc_stale", begin, begin + 60 * S_NS, begin + 120 * S_NS, "ann")
-    assert told(episode, "plc_stale", now)["times"] == {
+    assert episode_details(episode, "plc_stale", now)["times"] == {
         "raised": "14:13:20, 8 min ago",
         "cleared": "14:14:20, 7 min ago",
         "seen": "14:15:20, 6 min ago",
         "lasted": "60 s",
     }
-    assert told(episode, "plc_stale", now)["times"]["raised"] == instant(begin, now)
+    assert episode_details(episode, "plc_stale", now)["times"]["raised"] == instant(begin, now)
     one = board(quiet=Priority.HIGH)
     one.resume({"quiet": Kept(True, False, now + 1200 * S_NS)})
-    (alarm,) = listed(one, [], [], now)
+    (alarm,) = alarm_cards(one, [], [], now)
     assert alarm["quiet_until"] == "14:41:20, in 20 min"

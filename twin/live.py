@@ -139,10 +139,10 @@ def run(
         for close in [sink.close for sink in sinks] + [adviser.close for adviser in advisers]:
             closing.callback(close)
         for samples, ticks, events in _monitored(stream, twin, monitor):
-            hand_out(sinks, samples, ticks, _enriched(advisers, samples, events))
+            dispatch(sinks, samples, ticks, _enriched(advisers, samples, events))
         no_rows = np.empty(0, SAMPLE), np.empty(0, TICK)
         if final_events := _final_events(advisers, no_rows[0]):
-            hand_out(sinks, *no_rows, final_events)
+            dispatch(sinks, *no_rows, final_events)
 
 
 def _monitored(
@@ -187,7 +187,7 @@ def _final_events(advisers: Sequence[EventEnricher], no_rows: Samples) -> list[E
     return events
 
 
-def hand_out(
+def dispatch(
     sinks: Sequence[Sink], samples: Samples, ticks: Ticks, events: Sequence[Event]
 ) -> None:
     """Write rows and events to every sink."""

@@ -160,11 +160,13 @@ class Diary:
         episodes = self._going_on.get(alarm, [])
         if not episodes or episodes[-1].cleared_ns is not None:
             return []
-        episodes[-1] = replace(episodes[-1], evidence=joined(episodes[-1].evidence, evidence))
+        episodes[-1] = replace(
+            episodes[-1], evidence=merge_evidence(episodes[-1].evidence, evidence)
+        )
         return episodes[-1:]
 
 
-def joined(earlier: Mapping[str, Any], later: Mapping[str, Any]) -> dict[str, Any]:
+def merge_evidence(earlier: Mapping[str, Any], later: Mapping[str, Any]) -> dict[str, Any]:
     """Evidence updated by later evidence; the first cycle and the first guess stay."""
     first_values = {key: earlier[key] for key in ("first_cycle", "guess") if key in earlier}
     return {**earlier, **later, **first_values}

@@ -18,12 +18,12 @@ def cause_of(value: str) -> str:
     return cause if cause != value and cause in CAUSES else ""
 
 
-def known(effect: str) -> str:
+def cause_or_unlisted(effect: str) -> str:
     """The cause with an effect's name; UNLISTED if there is none."""
     return effect if effect in CAUSES else UNLISTED
 
 
-def catalogue_words(effect: str) -> dict[str, dict[str, str]]:
+def catalogue_evidence(effect: str) -> dict[str, dict[str, str]]:
     """Evidence that describes a catalogue's effect, which has no alarm of its own; else empty."""
     catalogued = None if effect in CAUSES else find_effect(effect)
     if catalogued is None:

@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from twin.alarms.board import Board, Diary, Episode, joined
-from twin.alarms.causes import CAUSES, UNLISTED, catalogue_words, known, value_of
+from twin.alarms.board import Board, Diary, Episode, merge_evidence
+from twin.alarms.causes import CAUSES, UNLISTED, catalogue_evidence, cause_or_unlisted, value_of
 from twin.alarms.requests import Request, grant
 from twin.alarms.rules import Rule
 from twin.alarms.state import Alarm, Change, Deed, Kept
-from twin.alarms.text import SUPPRESSIONS, event_of, plain, worth_saying
+from twin.alarms.text import SUPPRESSIONS, event_of, is_reportable, plain
 from twin.alarms.watch import STREAM, deviating, evidence, values
 from twin.errors import TwinError
 from twin.events import Event, Kind
@@ -53,7 +53,7 @@ class News:
         self.answers |= later.answers
 
 
-class Office(Protocol):
+class AlarmStorage(Protocol):
     """Stores changes and delivers people's requests. The loop never waits for it."""
 
     def take(self, news: News) -> None:
@@ -78,7 +78,7 @@ class Alarms:
         rules: Sequence[Rule],
         clock: Callable[[], int] | None,
         before: Before | None = None,
-        office: Office | None = None,
+        office: AlarmStorage | None = None,
         steady: Callable[[], int] | None = None,
     ) -> None:
         before = before or Before()
@@ -195,7 +195,7 @@ class Alarms:
         if self._deviation_cause == UNKNOWN:
             causes |= set(standing)
         elif UNKNOWN in standing or self._is_coming(value_of(UNKNOWN)):
-            entry = joined(self._evidence.get(value_of(UNKNOWN), {}), entry)
+            entry = merge_evidence(self._evidence.get(value_of(UNKNOWN), {}), entry)
             changes = self.board.rename(now, value_of(UNKNOWN), value_of(self._deviation_cause))
         self._note(value_of(self._deviation_cause), entry)
         events = self._events_of(changes, event.time_ns)
@@ -215,7 +215,7 @@ class Alarms:
 
     def _cause_of(self, event: Event) -> str:
         """The cause of a deviation: a standing cause that it resembles, else its own."""
-        own_cause = known(str(event.data.get("effect")))
+        own_cause = cause_or_unlisted(str(event.data.get("effect")))
         similar = {own_cause, *str(event.data.get("also", "")).split(",")}
         standing = self._deviating()
         self._resumed &= bool(standing) and own_cause == UNKNOWN
@@ -238,9 +238,9 @@ class Alarms:
             return []
         if answer.get("verdict") not in ("explained", "unlisted"):
             return []
-        causes = {known(details["effect"]): details for details in answer["causes"]} or {
-            UNLISTED: {}
-        }
+        causes = {
+            cause_or_unlisted(details["effect"]): details for details in answer["causes"]
+        } or {UNLISTED: {}}
         former = self._deviation_cause
         main_cause = former if former in causes else next(iter(causes))
         for cause, details in causes.items():
@@ -273,9 +273,9 @@ class Alarms:
         """Store evidence for a value's alarms, and write it into their episodes."""
         if not any(alarm.active for alarm in self.board.watching(value)):
             pending = self._evidence.get(value, {}) if self._is_coming(value) else {}
-            self._evidence[value] = joined(pending, entry)
+            self._evidence[value] = merge_evidence(pending, entry)
             return
-        self._evidence[value] = joined(self._evidence.get(value, {}), entry)
+        self._evidence[value] = merge_evidence(self._evidence.get(value, {}), entry)
         for alarm in self.board.watching(value):
             self._record(self._diary.note(alarm.rule.name, entry))
 
@@ -297,7 +297,7 @@ class Alarms:
                 self._store_state(self.board[change.alarm])
             if change.deed not in SUPPRESSIONS:  # suppression follows from the other states
                 self._store_state(alarm)
-            if worth_saying(change, alarm):
+            if is_reportable(change, alarm):
                 events.append(event_of(change, self._plain(change, episodes), alarm, time_ns))
         return events
 
@@ -333,6 +333,6 @@ def _received(samples: Samples, time_ns: int, else_ns: int) -> int:
 def _cause_evidence(cause: Mapping[str, Any]) -> dict[str, Any]:
     """The evidence that a diagnosis gives for one cause."""
     keys = ("effect", "course", "parameters", "probability", "not_separable_from")
-    return {key: cause[key] for key in keys if key in cause} | catalogue_words(
+    return {key: cause[key] for key in keys if key in cause} | catalogue_evidence(
         cause.get("effect", "")
     )

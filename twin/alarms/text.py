@@ -42,7 +42,7 @@ def table() -> str:
     return "\n".join(["| state | what it means |", "| --- | --- |", *rows])
 
 
-def worth_saying(change: Change, alarm: Alarm) -> bool:
+def is_reportable(change: Change, alarm: Alarm) -> bool:
     """Whether to report a change; suppression of an alarm that concerns nobody is not reported."""
     return change.announced or alarm.concerns or change.deed not in SUPPRESSIONS
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from twin.alarms.causes import CAUSES, DEVIATION, catalogue_words, known, value_of
+from twin.alarms.causes import CAUSES, DEVIATION, catalogue_evidence, cause_or_unlisted, value_of
 from twin.events import Event, Kind
 from twin.figures.table import FIGURES
 from twin.figures.text import NO_DASH
@@ -36,7 +36,7 @@ def values(event: Event) -> dict[str, float]:
         name, value = _SWITCHED[event.kind]
         return {name: 1.0 if event.data.get("standing") else value}  # another fault may still stand
     if event.kind is Kind.DEVIATION:
-        return deviating(known(str(event.data.get("effect"))))
+        return deviating(cause_or_unlisted(str(event.data.get("effect"))))
     if event.kind is Kind.DEVIATION_CLEARED:
         return deviating()
     if event.kind is not Kind.CYCLE or "warnings" not in event.data:
@@ -67,14 +67,14 @@ def evidence(event: Event) -> dict[str, Evidence]:
         return {_SWITCHED[event.kind][0]: {"words": event.text}}
     if event.kind is Kind.DEVIATION:
         effect = str(event.data.get("effect"))
-        cause = known(effect)
+        cause = cause_or_unlisted(effect)
         measured = {key: event.data[key] for key in _MEASURE if key in event.data}
         first_guess = {} if cause == UNKNOWN else {"guess": cause}
         entry = {
             "words": event.text,
             **first_guess,
             **measured,
-            **catalogue_words(effect),
+            **catalogue_evidence(effect),
             **_in(event),
         }
         return {value_of(cause): entry}

@@ -15,7 +15,7 @@ RETRY_S = 5.0  # after the database could not be reached
 
 
 class Keeper:
-    """Stores the alarms of a unit, in a thread of its own (``twin.alarms.loop.Office``).
+    """Stores the alarms of a unit, in a thread of its own (``twin.alarms.loop.AlarmStorage``).
 
     A failure is reported once, and the changes are held until they can be written. The loop always
     goes on.

@@ -9,7 +9,7 @@ import numpy as np
 from twin.events import Event
 from twin.log.columns import RowBuffer
 from twin.log.header import RECOVERED
-from twin.log.reader import Log, decode_happening, decode_rows, open_log
+from twin.log.reader import Log, decode_event_message, decode_rows, open_log
 from twin.log.recorder import Recorder
 from twin.log.records import Damage, messages
 from twin.log.schema import EVENTS, SAMPLES
@@ -157,7 +157,7 @@ def _pieces(log: Log, damage: list[Damage]) -> Iterator[Piece]:
     for part in log.parts:
         for topic, packed in messages(part, (SAMPLES.topic, EVENTS.topic), damage.append):
             if topic == EVENTS.topic:
-                events.append(decode_happening(part, packed))
+                events.append(decode_event_message(part, packed))
                 continue
             yield samples, ticks, events
             (samples, ticks), events = decode_rows(part, packed), []

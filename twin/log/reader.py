@@ -50,7 +50,7 @@ class Log:
         """Events in written order."""
         for part in self.parts:
             for _, packed in messages(part, (EVENTS.topic,), _refuse):
-                yield decode_happening(part, packed)
+                yield decode_event_message(part, packed)
 
 
 def _refuse(damage: Damage) -> None:
@@ -67,7 +67,7 @@ def decode_rows(part: Path, packed: memoryview) -> tuple[Samples, Ticks]:
         raise _other_version(part, error) from error
 
 
-def decode_happening(part: Path, packed: memoryview) -> Event:
+def decode_event_message(part: Path, packed: memoryview) -> Event:
     """Event of a message of /events; SourceError if it is not of this format."""
     try:
         return decode_event(packed)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.events import Event, Kind
-from twin.notifications.message import Asset, Message, beside, moment
+from twin.notifications.message import Asset, Message, beside, iso_time
 from twin.signals import MBAR, UNUSABLE, Phase, Samples, Ticks, joined
 
 CYCLE_FORMAT = "ejector-twin-cycle/1"
@@ -53,7 +53,7 @@ class Cycles:
 
     def _message_of(self, event: Event) -> Message:
         figures = {name: value for name, value in event.data.items() if name != "answer"}
-        plc_time = {"plc_time": moment(event.time_ns), "plc_time_ns": event.time_ns}
+        plc_time = {"plc_time": iso_time(event.time_ns), "plc_time_ns": event.time_ns}
         received_ns = int(figures.pop("host_ns", self._clock()))
         return beside(CYCLE_FORMAT, self._asset, received_ns, plc_time | figures)
 

@@ -21,7 +21,7 @@ MOST_IN_MEMORY = 10_000  # messages, while the database is away
 MOST_AT_ONCE = 1000
 RETRY_S = 5.0
 CLOSE_S = 15.0  # for all threads to end; they die with the program
-Letter = tuple[str, Message]  # destination and message
+AddressedMessage = tuple[str, Message]  # destination and message
 
 
 class Outlets:
@@ -53,8 +53,8 @@ class Outlets:
         self._outbox: Outbox | None = None
         self._failed = False
         self._lost = 0  # messages for which there was no room
-        self._waiting: list[Letter] = []
-        self._letters: queue.Queue[Letter] = queue.Queue(MOST_IN_MEMORY)
+        self._waiting: list[AddressedMessage] = []
+        self._queue: queue.Queue[AddressedMessage] = queue.Queue(MOST_IN_MEMORY)
         self._ending, self._news = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._work, name="outbox", daemon=True)
 
@@ -86,7 +86,7 @@ class Outlets:
 
         It leaves room for alarms while the database cannot be reached.
         """
-        if self._letters.qsize() < MOST_IN_MEMORY // 2:
+        if self._queue.qsize() < MOST_IN_MEMORY // 2:
             self._put(box, message)
         else:
             self._lost += 1
@@ -117,7 +117,7 @@ class Outlets:
 
     def _put(self, name: str, message: Message) -> None:
         try:
-            self._letters.put_nowait((name, message))
+            self._queue.put_nowait((name, message))
         except queue.Full:
             self._lost += 1
         self._news.set()
@@ -132,21 +132,21 @@ class Outlets:
                 self._ending.wait(RETRY_S)
                 self._news.set()
         self._write_all()
-        unsaved = len(self._waiting) + self._letters.qsize() + self._lost
+        unsaved = len(self._waiting) + self._queue.qsize() + self._lost
         if unsaved:
             self._say(f"{unsaved} messages could not be put into the outbox")
         self._let_go()
 
     def _write_all(self) -> bool:
-        while self._waiting or not self._letters.empty():
+        while self._waiting or not self._queue.empty():
             if not self._write():
                 return False
         return True
 
     def _write(self) -> bool:
         """Put the waiting messages into the outbox; reports when this begins to fail."""
-        while len(self._waiting) < MOST_AT_ONCE and not self._letters.empty():
-            self._waiting.append(self._letters.get())
+        while len(self._waiting) < MOST_AT_ONCE and not self._queue.empty():
+            self._waiting.append(self._queue.get())
         try:
             self._outbox = self._outbox or self._open_outbox()
             self._outbox.put(self._waiting)

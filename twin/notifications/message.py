@@ -32,7 +32,7 @@ def of_event(unit: Unit, event: Event) -> Iterator[Message]:
         return
     data = event.data
     change = {
-        "time": moment(data["host_ns"]),
+        "time": iso_time(data["host_ns"]),
         "deed": data["deed"],
         "who": data["who"],
         "announced": event.kind is Kind.ALARM,
@@ -46,20 +46,20 @@ def of_event(unit: Unit, event: Event) -> Iterator[Message]:
 
 def restated(unit: Unit, plain: Mapping[str, Any], now_ns: int) -> Message:
     """The present state of an alarm, without any change to it."""
-    change = {"time": moment(now_ns), "deed": "restated", "who": "", "announced": False}
+    change = {"time": iso_time(now_ns), "deed": "restated", "who": "", "announced": False}
     return _message(unit, plain, change)
 
 
 def again(message: Message, now_ns: int) -> Message:
     """The state of an earlier message, restated under a new ID."""
     number = new_id()
-    changes = {"id": number, "time": moment(now_ns), "deed": "restated", "announced": False}
+    changes = {"id": number, "time": iso_time(now_ns), "deed": "restated", "announced": False}
     return Message(number, message.alarm, json_text({**json.loads(message.body), **changes}))
 
 
 def of_status(asset: Asset, status: str, since_ns: int | None, program: str) -> str:
     """The twin's status and since when; a last will has no time, since it is written before."""
-    since = None if since_ns is None else moment(since_ns)
+    since = None if since_ns is None else iso_time(since_ns)
     content = {"asset": asset, "status": status, "since": since, "program": program}
     return json_text({"format": STATUS_FORMAT, **content})
 
@@ -68,7 +68,7 @@ def beside(form: str, asset: Asset, time_ns: int, content: Mapping[str, Any]) ->
     """A message with other data than alarms; ``time_ns`` is host time."""
     number = new_id()
     head = {"format": form, "id": number, "asset": asset}
-    times = {"time": moment(time_ns), "time_ns": time_ns}
+    times = {"time": iso_time(time_ns), "time_ns": time_ns}
     return Message(number, "", json_text({**head, **times, **content}))
 
 
@@ -77,7 +77,7 @@ def asset_of(unit: Unit, batch: str) -> Asset:
     return unit._asdict() | ({"batch": batch} if batch else {})
 
 
-def moment(ns: int) -> str:
+def iso_time(ns: int) -> str:
     """A time in ISO 8601, in UTC, to the microsecond."""
     instant = EPOCH + timedelta(microseconds=ns // 1000)
     return instant.isoformat(timespec="microseconds").replace("+00:00", "Z")
@@ -122,4 +122,4 @@ def _episode(plain: Mapping[str, Any]) -> str | None:
 
 
 def _moment(ns: int | None) -> str | None:
-    return None if ns is None else moment(ns)
+    return None if ns is None else iso_time(ns)

@@ -16,7 +16,7 @@ from twin.assets.unit import Unit
 from twin.notifications.sender import LostError
 from twin.notifications.settings import UploadSettings
 from twin.notifications.upload_requests import File, RefusedError
-from twin.notifications.webhook import LATER, sendable
+from twin.notifications.webhook import LATER, header_secret
 from twin.secret import Say
 
 PIECE = 1 << 20  # bytes read at once
@@ -27,7 +27,7 @@ class StoppedError(Exception):
     """The program ends; the next one goes on."""
 
 
-class Place(Protocol):
+class UploadDestination(Protocol):
     """Takes files. LostError if a retry makes sense, RefusedError if not."""
 
     def put(self, path: Path, file: File) -> None:
@@ -53,7 +53,7 @@ class Source:
 
 
 @contextmanager
-def opened(path: Path, ending: threading.Event) -> Iterator[Source]:
+def open_source(path: Path, ending: threading.Event) -> Iterator[Source]:
     """Open a file, but no link; RefusedError if it can no longer be read."""
     try:
         file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW), "rb")
@@ -66,7 +66,7 @@ def opened(path: Path, ending: threading.Event) -> Iterator[Source]:
 def described(path: Path, ending: threading.Event) -> File:
     """A file with its size and hash."""
     digest, size = hashlib.sha256(), 0
-    with opened(path, ending) as source:
+    with open_source(path, ending) as source:
         for piece in source:
             digest.update(piece)
             size += len(piece)
@@ -75,7 +75,7 @@ def described(path: Path, ending: threading.Event) -> File:
 
 def place_of(
     settings: UploadSettings, unit: Unit, folder: Path, ending: threading.Event, say: Say
-) -> Place:
+) -> UploadDestination:
     """The destination that a configuration names; paths are relative to ``folder``.
 
     ConfigError if a secret or certificate cannot be used.
@@ -112,7 +112,7 @@ class Share:
 
     def _copy(self, path: Path, target: Path) -> None:
         part = target.with_name(f"{target.name}.part")
-        with opened(path, self._ending) as source, part.open("wb") as copy:
+        with open_source(path, self._ending) as source, part.open("wb") as copy:
             for piece in source:
                 copy.write(piece)
             copy.flush()
@@ -137,7 +137,7 @@ class Address:
         self._where = f"{parts.scheme}://{parts.netloc}"  # what follows may be a secret
         self._ending = ending
         self._headers = {
-            name: sendable(f"[outlets.upload] headers.{name}", secret, folder, say)
+            name: header_secret(f"[outlets.upload] headers.{name}", secret, folder, say)
             for name, secret in settings.headers.items()
         }
         is_secure = parts.scheme == "https"
@@ -158,7 +158,7 @@ class Address:
             "Content-Digest": f"sha-256=:{digest}:",
         }
         try:
-            with opened(path, self._ending) as source:
+            with open_source(path, self._ending) as source:
                 url = f"{self._url}/{quote(file.name, safe='')}"
                 answer = self._pool.request(
                     "PUT", url, body=source, headers=headers, preload_content=False

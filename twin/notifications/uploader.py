@@ -13,7 +13,7 @@ from twin.backoff import Backoff
 from twin.errors import TwinError
 from twin.notifications.logs import Found
 from twin.notifications.message import Asset, Message, beside
-from twin.notifications.upload_destinations import Place, StoppedError, described
+from twin.notifications.upload_destinations import StoppedError, UploadDestination, described
 from twin.notifications.upload_requests import (
     ACCEPTED,
     DONE,
@@ -49,12 +49,12 @@ class Uploader:
         asset: Asset,
         open_uploads: Callable[[], Uploads],
         find: Callable[[UploadRequest], Found],
-        place: Place,
+        place: UploadDestination,
         ending: threading.Event,
         say: Say,
     ) -> None:
         self._asset, self._open_uploads = asset, open_uploads
-        self._find, self._place, self._say = find, place, say
+        self._find, self._destination, self._say = find, place, say
         self._tell: Tell = lambda _message: None
         self._failed = False
         self._backoff = Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S)
@@ -142,7 +142,7 @@ class Uploader:
                 if path.name in {sent.name for sent in files}:
                     continue
                 file = described(path, self._ending)
-                self._place.put(path, file)
+                self._destination.put(path, file)
                 files.append(file)
                 uploads.note(job.number, RUNNING, files)
         except RefusedError as error:

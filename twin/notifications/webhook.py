@@ -30,7 +30,7 @@ class Webhook:
     def __init__(self, settings: WebhookSettings, folder: Path, say: Say) -> None:
         self._settings = settings
         self._headers = {"Content-Type": "application/json"} | {
-            name: sendable(f"[webhook] headers.{name}", secret, folder, say)
+            name: header_secret(f"[webhook] headers.{name}", secret, folder, say)
             for name, secret in settings.headers.items()
         }
         self._url = settings.address("webhook", folder, say)
@@ -134,7 +134,7 @@ class _Secured(urllib3.HTTPSConnectionPool):
     ConnectionCls = _InTimeTls
 
 
-def sendable(key: str, secret: Secret, folder: Path, say: Say) -> str:
+def header_secret(key: str, secret: Secret, folder: Path, say: Say) -> str:
     """The secret of a header; ConfigError if a header cannot contain it."""
     text = secret.read(key, folder, say)
     try:

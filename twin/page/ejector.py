@@ -31,12 +31,12 @@ from twin.page.ejector_status import (
     S_NS,
     WORDS,
     Light,
+    alarm_cards,
+    describe_alarm,
+    episode_details,
+    instant_or_empty,
     light_of,
-    listed,
-    named,
     priority_words,
-    said,
-    told,
 )
 from twin.page.settings import REPORTS, RING, PageSettings, folder_of
 from twin.signals import BREAK, MBAR
@@ -81,7 +81,7 @@ class Ejector:
         document = {"name": self.name, "type": self.config.asset.type, "now": now / S_NS}
         document |= {"running": running, "last": live and live.last_ns / S_NS, "trouble": ""}
         document |= {"ended": bool(live and live.ended_ns), "zone": zone(now)}
-        document |= {"last_seen": said(None if live is None else live.last_ns, now)}
+        document |= {"last_seen": instant_or_empty(None if live is None else live.last_ns, now)}
         try:
             with self._alarms() as store:
                 board = self._board(store, now)
@@ -96,7 +96,7 @@ class Ejector:
             return document | grey | {"words": tr("Alarms unknown"), "trouble": _with_hint(error)}
         light = light_of(board, running=running)
         shown = {"light": light.value, "words": tr(WORDS[light])}
-        return document | shown | {"alarms": listed(board, episodes, waiting, now, comments)}
+        return document | shown | {"alarms": alarm_cards(board, episodes, waiting, now, comments)}
 
     def history(self, days: float) -> list[dict[str, Any]]:
         """Episodes of the last days, the newest first."""
@@ -114,7 +114,7 @@ class Ejector:
                 "alarm": episode.alarm,
                 "priority": priorities.get(episode.alarm, ""),
                 "priority_words": priority_words(priorities.get(episode.alarm, "")),
-                **told(episode, values.get(episode.alarm, ""), now, comments),
+                **episode_details(episode, values.get(episode.alarm, ""), now, comments),
             }
             for episode in reversed(episodes[-MOST_EPISODES:])
         ]
@@ -127,7 +127,7 @@ class Ejector:
     def title(self, alarm: str) -> str:
         """The title of an alarm for people."""
         values = {rule.name: rule.value for rule in self._rules}
-        return str(named(alarm, values.get(alarm, ""))["what"])
+        return str(describe_alarm(alarm, values.get(alarm, ""))["what"])
 
     # --- requests -------------------------------------------------------------------------------
 
@@ -190,7 +190,7 @@ class Ejector:
 
     def figures(self) -> list[dict[str, str]]:
         """The figures that have trends."""
-        return [figure_words(figure) for figure in FIGURES.values()]
+        return [figure_labels(figure) for figure in FIGURES.values()]
 
     def trend(self, name: str, days: float) -> dict[str, Any]:
         """The trend of a figure over days: cycles, line, band, limit, and when it is reached."""
@@ -202,7 +202,7 @@ class Ejector:
         with open_figures("", self.config.document, write=False) as store:
             history = store.history(self._unit, since, columns)
         document: dict[str, Any] = {
-            **figure_words(figure),
+            **figure_labels(figure),
             "cycles": len(history.cycle),
         }
         if not len(history.cycle):
@@ -239,7 +239,7 @@ class Ejector:
         return board
 
 
-def figure_words(figure: Figure) -> dict[str, str]:
+def figure_labels(figure: Figure) -> dict[str, str]:
     """Name, title, unit and meaning of a key figure for people."""
     unit, meaning = figure.unit, tr(figure.what)
     return {"name": figure.name, "title": title_of(figure.name), "unit": unit, "what": meaning}

@@ -87,7 +87,7 @@ def light_of(board: Board, *, running: bool) -> Light:
     return Light.GREEN
 
 
-def listed(
+def alarm_cards(
     board: Board,
     episodes: Iterable[Episode],
     waiting: Sequence[Request],
@@ -111,8 +111,8 @@ def _episode(
     """The facts of an alarm's episode; only its name if it has none."""
     action = {"action": action_of(rule, episode.evidence if episode else {})}
     if episode is None:
-        return action | named(rule.name, rule.value) | {"comments": [], "facts": []}
-    return action | told(episode, rule.value, now_ns, comments)
+        return action | describe_alarm(rule.name, rule.value) | {"comments": [], "facts": []}
+    return action | episode_details(episode, rule.value, now_ns, comments)
 
 
 def _alarm(alarm: Alarm, waiting: Sequence[Request], now_ns: int) -> dict[str, Any]:
@@ -129,7 +129,7 @@ def _alarm(alarm: Alarm, waiting: Sequence[Request], now_ns: int) -> dict[str, A
         "priority_words": priority_words(rule.priority),
         "longest_shelving_s": rule.longest_shelving_s,
         "shelved_until": until and until / S_NS,
-        "quiet_until": said(until, now_ns),
+        "quiet_until": instant_or_empty(until, now_ns),
         "consequence": tr(rule.consequence),
         "asked": [_request(request) for request in waiting if request.alarm == rule.name],
     }
@@ -149,12 +149,12 @@ def _request(request: Request) -> dict[str, Any]:
     return {"deed": request.deed.value, "who": request.who, "at": request.asked_ns / S_NS}
 
 
-def said(ns: int | None, now_ns: int) -> str:
+def instant_or_empty(ns: int | None, now_ns: int) -> str:
     """An instant in words; empty for None."""
     return "" if ns is None else instant(ns, now_ns)
 
 
-def told(
+def episode_details(
     episode: Episode, value: str, now_ns: int, comments: Sequence[Comment] = ()
 ) -> dict[str, Any]:
     """One episode of an alarm: title, times, evidence and certainty.
@@ -163,14 +163,14 @@ def told(
     """
     raised, cleared, seen = episode.raised_ns, episode.cleared_ns, episode.acknowledged_ns
     return {
-        **named(episode.alarm, value, episode.evidence.get("taken_in")),
+        **describe_alarm(episode.alarm, value, episode.evidence.get("taken_in")),
         "raised": raised / S_NS,
         "cleared": cleared and cleared / S_NS,
         "seen": seen and seen / S_NS,
         "times": {
-            "raised": said(raised, now_ns),
-            "cleared": said(cleared, now_ns),
-            "seen": said(seen, now_ns),
+            "raised": instant_or_empty(raised, now_ns),
+            "cleared": instant_or_empty(cleared, now_ns),
+            "seen": instant_or_empty(seen, now_ns),
             "lasted": "" if cleared is None else lasting((cleared - raised) / S_NS),
         },
         "seen_by": episode.acknowledged_by,
@@ -181,14 +181,20 @@ def told(
             str(raised),
         ],  # as text: JavaScript's numbers are too short for ns
         "comments": [
-            {"who": comment.who, "when": said(comment.written_ns, now_ns), "text": comment.text}
+            {
+                "who": comment.who,
+                "when": instant_or_empty(comment.written_ns, now_ns),
+                "text": comment.text,
+            }
             for comment in comments
             if comment.is_of(episode)
         ],
     }
 
 
-def named(alarm: str, value: str, catalogued: Mapping[str, str] | None = None) -> dict[str, Any]:
+def describe_alarm(
+    alarm: str, value: str, catalogued: Mapping[str, str] | None = None
+) -> dict[str, Any]:
     """Title, sentence and place of an alarm; ``catalogued`` describes a catalogue's effect."""
     if catalogued:
         heading, location = (

@@ -17,12 +17,12 @@ from twin.figures.table import FIGURES
 from twin.figures.text import title_of
 from twin.instants import SECOND_NS, instant, lasting, zone
 from twin.language import speaking, tr
-from twin.page.ejector import figure_words
+from twin.page.ejector import figure_labels
 from twin.page.ejector_status import (
     WORST_FIRST,
     Light,
+    describe_alarm,
     facts,
-    named,
     priority_words,
     rank,
     state_words,
@@ -187,7 +187,7 @@ def _ns(seconds: float) -> int:
 
 def _title(alarm: str) -> dict[str, Any]:
     cause = alarm.removeprefix(f"{DEVIATION}_")
-    return named(alarm, value_of(cause) if cause in CAUSES else "")
+    return describe_alarm(alarm, value_of(cause) if cause in CAUSES else "")
 
 
 # --- numbers ------------------------------------------------------------------------------------
@@ -219,7 +219,7 @@ def _trends(ejector: Heard) -> list[dict[str, Any]]:
             for side in SIDES
         }
         if any(value is not None for value in sides["measured"]):
-            trends.append({**figure_words(figure), "time": times, **sides})
+            trends.append({**figure_labels(figure), "time": times, **sides})
     return trends
 
 
