@@ -229,9 +229,7 @@ class Config:
 
     @classmethod
     def _checked(cls, document: Document, asset: Asset, stored: Known, origin: str) -> "Config":
-        effects_in(
-            stored.data.catalogue
-        )  # registers the catalogue's effects by name, for texts and alarms
+        effects_in(stored.data.catalogue)  # registers its effects by name, for texts and alarms
         monitor = document.section(MonitorSettings, "monitor")
         monitor = monitor.model_copy(update={"healthy": stored.healthy})
         log = document.section(LogSettings, "log")

@@ -21,9 +21,8 @@ from twin.settings import Settings
 Say = Callable[[str], None]
 
 INSTEAD = '{ file = "FILE" } or { env = "NAME" }'
-_TOKEN = re.compile(
-    r"(?=[^/]*\d)(?=[^/]*[A-Za-z])[\w-]{20,}"
-)  # a part of a path that looks like a service's token
+# A part of a path that looks like a service's token.
+_TOKEN = re.compile(r"(?=[^/]*\d)(?=[^/]*[A-Za-z])[\w-]{20,}")
 _log = logging.getLogger(__name__)
 _reported = set[Path]()  # files reported as readable by others: each connection reads them again
 
@@ -59,15 +58,15 @@ class Secret(Settings):
         A file that others may read is reported once.
         """
         if self.file is None:
-            text, place = os.environ.get(self.env, ""), f"environment variable {self.env}"
+            text, origin = os.environ.get(self.env, ""), f"environment variable {self.env}"
         else:
-            text, place = _read(key, folder / self.file, say), str(folder / self.file)
+            text, origin = _read(key, folder / self.file, say), str(folder / self.file)
         text = text.strip("\r\n")  # as echo and editors leave them
         if not text:
-            raise ConfigError(f"{key}: {place} is empty or not set", "put the secret there")
+            raise ConfigError(f"{key}: {origin} is empty or not set", "put the secret there")
         if not text.isprintable():
             raise ConfigError(
-                f"{key}: {place} has a line break, or another character that cannot be seen, in it",
+                f"{key}: {origin} has a line break, or another character that cannot be seen, in it",
                 "put the secret there alone, on one line of plain text",
             )
         return text

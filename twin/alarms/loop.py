@@ -78,7 +78,7 @@ class Alarms:
         rules: Sequence[Rule],
         clock: Callable[[], int] | None,
         before: Before | None = None,
-        office: AlarmStorage | None = None,
+        storage: AlarmStorage | None = None,
         steady: Callable[[], int] | None = None,
     ) -> None:
         before = before or Before()
@@ -86,7 +86,7 @@ class Alarms:
         self.board.resume(before.states)
         self._stored_names = [name for name in before.states if name in self.board.alarms]
         self._diary = Diary(before.going_on)
-        self._clock, self._office, self._steady = clock, office, steady
+        self._clock, self._storage, self._steady = clock, storage, steady
         self._clock_offset: int | None = None  # host clock less the monotonic one, in ns
         self._evidence: dict[str, dict[str, Any]] = {  # by value
             self.board[episode.alarm].rule.value: dict(episode.evidence)
@@ -96,9 +96,7 @@ class Alarms:
         self._deviation_cause = ""  # the cause of the deviation that was raised last
         self._deviation_ns = -1  # when that was, in PLC time
         self._cycles_to_agree = AGREEING if self._deviating() else 0
-        self._resumed = bool(
-            self._cycles_to_agree
-        )  # alarms from before the restart have no new cause yet
+        self._resumed = bool(self._cycles_to_agree)  # standing alarms have no new cause yet
         self._has_rows = False  # fresh rows of the PLC have arrived
         self._now = self._plc_ns = 0  # of the last row
         self._news = News()
@@ -114,7 +112,7 @@ class Alarms:
         for event in events:
             self._pending_events += self._take(event, _received(samples, event.time_ns, now))
         self._pending_events += self._events_of(self.board.see(now, {}), self._plc_ns)
-        for request in self._office.asked() if self._office else ():
+        for request in self._storage.asked() if self._storage else ():
             self._pending_events += self._grant(request, now)
         self._hand_over()
         events_out, self._pending_events = self._pending_events, []
@@ -135,8 +133,8 @@ class Alarms:
 
     def close(self) -> None:
         """Close the database."""
-        if self._office is not None:
-            self._office.close()
+        if self._storage is not None:
+            self._storage.close()
 
     def _follow_clock(self) -> None:
         """Shift pending delays when the host's clock was set, so that they keep their length."""
@@ -319,8 +317,8 @@ class Alarms:
         self._news.states[alarm.rule.name] = alarm.keep()
 
     def _hand_over(self) -> None:
-        if self._office is not None and self._news:
-            self._office.take(self._news)
+        if self._storage is not None and self._news:
+            self._storage.take(self._news)
         self._news = News()
 
 

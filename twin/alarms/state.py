@@ -119,9 +119,8 @@ class Alarm:
     def see(self, now: int, value: float = math.nan) -> Iterator[Change]:
         """Take the newest value; with NaN only time passes."""
         if self.shelved_until is not None:
-            latest = (
-                now + self._longest_shelving()
-            )  # setting the clock back must not extend shelving
+            # Setting the clock back must not extend shelving.
+            latest = now + self._longest_shelving()
             self.shelved_until = min(self.shelved_until, latest)
             if now >= self.shelved_until:
                 yield from self.unshelve(now)
@@ -170,9 +169,8 @@ class Alarm:
         if suppressed == self.suppressed:
             return
         if suppressed:
-            self._untold |= (
-                self.active and self._turned == now
-            )  # raised at the same moment as the other alarm
+            # It was raised at the same moment as the other alarm.
+            self._untold |= self.active and self._turned == now
         elif self.active and not self._beyond:
             yield from self._turn(now)
         self.suppressed = suppressed

@@ -77,9 +77,7 @@ class Side:
     measured: list[dict[str, float]] = field(default_factory=list)  # a row for each cycle
     expected: list[dict[str, float]] = field(default_factory=list)
     deviation: list[dict[str, float]] = field(default_factory=list)
-    curve: list[dict[str, float]] = field(
-        default_factory=list
-    )  # figures read off the curve, without a model
+    curve: list[dict[str, float]] = field(default_factory=list)  # read off it, without a model
     measured_vacuum: Curve = field(default_factory=Curve)
     expected_vacuum: Curve = field(default_factory=Curve)
     off: Curve = field(default_factory=Curve)  # measured less expected pressure

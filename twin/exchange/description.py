@@ -69,12 +69,10 @@ def _factor(factor: float) -> dict[str, str]:
 
 
 def _common(component: Component, identity: Identity) -> dict[str, str]:
-    boundary = (
-        "with the vessel inside" if component.where == "inside" else "with a port for a vessel"
-    )
+    scope = "with the vessel inside" if component.where == "inside" else "with a port for a vessel"
     return {
         "modelName": identity.name,
-        "description": f"{WORDS}; {boundary}; data: {identity.origin}",
+        "description": f"{WORDS}; {scope}; data: {identity.origin}",
         "license": LICENSE,
         "generationTool": identity.program,
         "variableNamingConvention": "structured",

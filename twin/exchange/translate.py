@@ -136,9 +136,8 @@ class _Body:
             for name, kind in self._parameters.items()
             if kind != INDEX
         ]
-        returned = (
-            self._declarations.type_of(self._function.returns) if self._function.returns else "void"
-        )
+        returns = self._function.returns
+        returned = self._declarations.type_of(returns) if returns else "void"
         header = f"static {declared(returned, self._function.name)}({', '.join(parameters)}) {{"
         local_declarations = [
             f"    {declared(self._declarations.type_of(kind), name)};"

@@ -163,9 +163,8 @@ def records(path: Path, damaged: Damaged) -> Iterator[McapRecord | memoryview]:
 def _reason(error: Exception, torn: bool) -> str:
     if torn:
         return "the last record is unfinished"
-    return (
-        str(error) if type(error) is ValueError else "not a record"
-    )  # the library's messages are technical
+    # Other errors are the library's, whose messages are technical.
+    return str(error) if type(error) is ValueError else "not a record"
 
 
 def _record(file: BinaryIO, buffer: _DecompressionBuffer) -> McapRecord | memoryview | None:

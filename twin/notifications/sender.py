@@ -91,9 +91,7 @@ class Sender:
         self.name = name
         self._lanes = {box_of(name, lane.topic): lane for lane in lanes}
         self._bounded_ns = 0
-        self._unreported: Counter[str] = (
-            Counter()
-        )  # by lane: messages given up and not yet reported
+        self._unreported: Counter[str] = Counter()  # by lane: messages given up, not yet reported
         self._channel, self._open_outbox = channel, open_outbox
         self._limits, self._say, self._clock = limits, say, clock
         self._outbox: Outbox | None = None

@@ -31,9 +31,8 @@ class Tls(Settings):
         try:
             trusted = folder / self.trusted if self.trusted else None
             context = ssl.create_default_context(cafile=trusted)
-            context.verify_flags |= (
-                ssl.VERIFY_X509_PARTIAL_CHAIN
-            )  # the server's own certificate is enough
+            # The server's own certificate is enough.
+            context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
             if self.certificate and self.key:
                 pair = folder / self.certificate, folder / self.key
                 context.load_cert_chain(*pair, password=lambda: "")

@@ -500,10 +500,7 @@ class Page:
     def _error_response(self, request: Request, status: int, message: str) -> Response:
         if request.url.path.startswith("/api/"):
             return JSONResponse({"error": message}, status)
-        title, message = (
-            tr(HTTPStatus(status).phrase),
-            tr(message),
-        )  # a refusal may have only its status phrase
+        title, message = tr(HTTPStatus(status).phrase), tr(message)  # maybe both the status phrase
         values = {"title": html.escape(title), "what": html.escape(message)}
         return HTMLResponse(self._page(request, "error.html", **values), status)
 

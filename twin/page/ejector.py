@@ -34,7 +34,7 @@ from twin.page.ejector_status import (
     alarm_cards,
     describe_alarm,
     episode_details,
-    instant_or_empty,
+    instant_text,
     light_of,
     priority_words,
 )
@@ -81,7 +81,7 @@ class Ejector:
         document = {"name": self.name, "type": self.config.asset.type, "now": now / S_NS}
         document |= {"running": running, "last": live and live.last_ns / S_NS, "trouble": ""}
         document |= {"ended": bool(live and live.ended_ns), "zone": zone(now)}
-        document |= {"last_seen": instant_or_empty(None if live is None else live.last_ns, now)}
+        document |= {"last_seen": instant_text(None if live is None else live.last_ns, now)}
         try:
             with self._alarms() as store:
                 board = self._board(store, now)

@@ -129,7 +129,7 @@ def _alarm(alarm: Alarm, waiting: Sequence[Request], now_ns: int) -> dict[str, A
         "priority_words": priority_words(rule.priority),
         "longest_shelving_s": rule.longest_shelving_s,
         "shelved_until": until and until / S_NS,
-        "quiet_until": instant_or_empty(until, now_ns),
+        "quiet_until": instant_text(until, now_ns),
         "consequence": tr(rule.consequence),
         "asked": [_request(request) for request in waiting if request.alarm == rule.name],
     }
@@ -149,7 +149,7 @@ def _request(request: Request) -> dict[str, Any]:
     return {"deed": request.deed.value, "who": request.who, "at": request.asked_ns / S_NS}
 
 
-def instant_or_empty(ns: int | None, now_ns: int) -> str:
+def instant_text(ns: int | None, now_ns: int) -> str:
     """An instant in words; empty for None."""
     return "" if ns is None else instant(ns, now_ns)
 
@@ -168,22 +168,19 @@ def episode_details(
         "cleared": cleared and cleared / S_NS,
         "seen": seen and seen / S_NS,
         "times": {
-            "raised": instant_or_empty(raised, now_ns),
-            "cleared": instant_or_empty(cleared, now_ns),
-            "seen": instant_or_empty(seen, now_ns),
+            "raised": instant_text(raised, now_ns),
+            "cleared": instant_text(cleared, now_ns),
+            "seen": instant_text(seen, now_ns),
             "lasted": "" if cleared is None else lasting((cleared - raised) / S_NS),
         },
         "seen_by": episode.acknowledged_by,
         "facts": [[name, text] for name, text in facts(episode.evidence)],
         "report": episode.evidence.get("report", ""),
-        "episode": [
-            episode.raised_as,
-            str(raised),
-        ],  # as text: JavaScript's numbers are too short for ns
+        "episode": [episode.raised_as, str(raised)],  # JavaScript's numbers are too short for ns
         "comments": [
             {
                 "who": comment.who,
-                "when": instant_or_empty(comment.written_ns, now_ns),
+                "when": instant_text(comment.written_ns, now_ns),
                 "text": comment.text,
             }
             for comment in comments
@@ -193,15 +190,12 @@ def episode_details(
 
 
 def describe_alarm(
-    alarm: str, value: str, catalogued: Mapping[str, str] | None = None
+    alarm: str, value: str, entry: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
-    """Title, sentence and place of an alarm; ``catalogued`` describes a catalogue's effect."""
-    if catalogued:
-        heading, location = (
-            _title(spoken(catalogued["name"])),
-            catalogued["look_at"].partition(":")[0],
-        )
-        return {"what": heading, "sentence": f"{catalogued['sentence']}.", "where": location}
+    """Title, sentence and place of an alarm; ``entry`` describes a catalogue's effect."""
+    if entry:
+        heading, location = _title(spoken(entry["name"])), entry["look_at"].partition(":")[0]
+        return {"what": heading, "sentence": f"{entry['sentence']}.", "where": location}
     cause = cause_of(value)
     if cause in EFFECTS:
         return {
@@ -264,14 +258,11 @@ def _sureness(evidence: Mapping[str, Any]) -> Iterable[str]:
     elif "probability" in evidence:
         yield tr("diagnosed: {certainty}", certainty=certainty(evidence))
     elif "guess" in evidence:
-        names = [
-            tr(spoken(effect)) for effect in str(evidence.get("also", "")).split(",") if effect
-        ]
+        effects = str(evidence.get("also", "")).split(",")
+        names = [tr(spoken(effect)) for effect in effects if effect]
         if names:
-            others = ", ".join(names)
-            yield tr(
-                "a first guess, or {alike}; the diagnosis needs some more cycles", alike=others
-            )
+            rest = ", ".join(names)
+            yield tr("a first guess, or {alike}; the diagnosis needs some more cycles", alike=rest)
         else:
             yield tr("a first guess; the diagnosis needs some more cycles")
     elif "measured" in evidence:
