@@ -66,7 +66,8 @@ class Secret(Settings):
             raise ConfigError(f"{key}: {origin} is empty or not set", "put the secret there")
         if not text.isprintable():
             raise ConfigError(
-                f"{key}: {origin} has a line break, or another character that cannot be seen, in it",
+                f"{key}: {origin} has a line break, or another character that cannot be seen,"
+                " in it",
                 "put the secret there alone, on one line of plain text",
             )
         return text
