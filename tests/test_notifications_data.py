@@ -238,7 +238,7 @@ def test_data_leaves_room_for_alarms_where_the_database_is_away(
     monkeypatch.setattr(dispatch, "MOST_IN_MEMORY", 10)
     outlets = Outlets(UNIT, pytest.fail, [], pytest.fail, tellers={"mqtt": [Cycles(ASSET)]})  # type: ignore[arg-type]
     outlets.write(NONE, NO_TICKS, [cycle(n) for n in range(9)])
-    assert outlets._letters.qsize() == 5
+    assert outlets._queue.qsize() == 5
     assert outlets._lost == 4
 
 
