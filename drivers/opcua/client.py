@@ -151,7 +151,8 @@ class OpcuaClient:
         """Text and hint if the server does not accept our certificate."""
         folder = self._settings.security.certificates or "FOLDER"
         return (
-            f"{self._settings.where}: it does not trust our certificate, or requires one ({detail})",
+            f"{self._settings.where}: it does not trust our certificate, or requires one"
+            f" ({detail})",
             f"let the server trust {folder}/{certificates.OWN}, and set security.policy",
         )
 
