@@ -72,19 +72,21 @@ class Verdict:
 
     def unnamed(self) -> "Verdict":
         """The same without names: what differs is one unknown cause."""
-        share = sum(one.share for one in self.causes)
+        share = sum(cause.share for cause in self.causes)
         return replace(self, causes=[Likeness(UNKNOWN, None, "", share)] if self.causes else ())
 
     def where_changed(self) -> "Verdict":
         """The same where it is known that something differs."""
-        total = sum(one.share for one in self.causes) or 1.0
+        total = sum(cause.share for cause in self.causes) or 1.0
         return replace(
-            self, none=0.0, causes=[replace(one, share=one.share / total) for one in self.causes]
+            self,
+            none=0.0,
+            causes=[replace(cause, share=cause.share / total) for cause in self.causes],
         )
 
     def plain(self) -> dict[str, float]:
         """The probabilities, of what has at least one in a hundred."""
-        shown = {one.effect: round(one.share, 3) for one in self.causes}
+        shown = {cause.effect: round(cause.share, 3) for cause in self.causes}
         likely = {effect: share for effect, share in shown.items() if share >= 0.01}
         return {"none": round(self.none, 3), **likely}
 
@@ -96,14 +98,14 @@ class _Usual:
     count: Floats = field(default_factory=lambda: np.zeros(len(KINDS) << 16))  # by place
     mean: Floats = field(default_factory=lambda: np.zeros(len(KINDS) << 16))
 
-    def add(self, said: CycleResidual) -> None:
-        at = said.place  # levels, which are below zero, at the end
+    def add(self, residual: CycleResidual) -> None:
+        at = residual.place  # levels, which are below zero, at the end
         self.count[at] += 1.0
-        self.mean[at] += (said.off - self.mean[at]) / self.count[at]
+        self.mean[at] += (residual.off - self.mean[at]) / self.count[at]
 
-    def of(self, said: CycleResidual) -> tuple[Floats, Floats]:
+    def of(self, residual: CycleResidual) -> tuple[Floats, Floats]:
         """Mean (mbar) at the places of a cycle, and in how many cycles they were seen."""
-        return self.mean[said.place], self.count[said.place]
+        return self.mean[residual.place], self.count[residual.place]
 
 
 class Isolation:
@@ -130,8 +132,8 @@ class Isolation:
         self._since = 0  # cycles since it began, while raised
         self._back = 0.0  # logarithm of the odds that it is as before
         self._alike = np.zeros((count, count))  # cosines, as far as known
-        ends = [one.parameter.range(listener.theta) for one in self._suspects]
-        steps = np.array([one.step for one in self._suspects])
+        ends = [suspect.parameter.range(listener.theta) for suspect in self._suspects]
+        steps = np.array([suspect.step for suspect in self._suspects])
         self._bounds = np.array(ends) / steps[:, None]
 
     @property
@@ -142,7 +144,9 @@ class Isolation:
     @property
     def known(self) -> list[Effect]:
         """The effects beside the table that are looked for."""
-        names = dict.fromkeys(one.effect for one in self._suspects if one.effect not in EFFECTS)
+        names = dict.fromkeys(
+            suspect.effect for suspect in self._suspects if suspect.effect not in EFFECTS
+        )
         return [effect_of(name) for name in names]
 
     @property
@@ -165,18 +169,18 @@ class Isolation:
         averaged(np.zeros(2, np.uint8), np.zeros(2), drawn, expected)
         return cls(ModelBank(listener.theta, listener.suspects), listener, days)
 
-    def hear(self, looks: Sequence[CycleView]) -> list[Heard | None]:
+    def hear(self, views: Sequence[CycleView]) -> list[Heard | None]:
         """Take cycles and pieces, in order, and what the monitor has of them; say what they say."""
-        drawn = [self._bank.take(look.cycle) for look in looks]
-        said = [
-            self._listener.hear(look.cycle, *rows, look.figures)
-            if look.fit and look.cycle.complete
+        drawn = [self._bank.take(view.cycle) for view in views]
+        residuals = [
+            self._listener.hear(view.cycle, *rows, view.figures)
+            if view.fit and view.cycle.complete
             else None
-            for look, rows in zip(looks, drawn, strict=True)
+            for view, rows in zip(views, drawn, strict=True)
         ]
         return [
-            Heard(one, one.scores(), look.cycle.seconds) if one else None
-            for look, one in zip(looks, said, strict=True)
+            Heard(residual, residual.scores(), view.cycle.seconds) if residual else None
+            for view, residual in zip(views, residuals, strict=True)
         ]
 
     def judge(self, heard: Heard, far: float = 0.0, *, begins: bool = False) -> Verdict | None:
@@ -185,32 +189,32 @@ class Isolation:
         ``far`` are the sigmas by which it alone is out, if it is: from such a one nothing is
         learned. Where something else ``begins`` with it, the cause is sought from it on.
         """
-        said, scores, seconds = heard
+        residual, scores, seconds = heard
         self._cycles += 1
         self._seconds += seconds
         step = self._normalizer.take(self._reference.standard(scores))
         normal = step.normal
-        self._kept.append(said)
+        self._kept.append(residual)
         self._scored.append(normal)
         verdict = self._conclude(self._changes, normal, far, begins) if self._changes else None
         if self.stands:
             self._guard.forget()
         elif self._changes is None and not far:
-            self._learn(said, scores, step)
+            self._learn(residual, scores, step)
         elif not far and (verdict is None or not verdict.causes):
-            for one in self._guard.take((said, scores, step), normal):
-                self._learn(*one)
+            for learned in self._guard.take((residual, scores, step), normal):
+                self._learn(*learned)
         return verdict
 
-    def _learn(self, said: CycleResidual, scores: Floats, step: NormalScores) -> None:
+    def _learn(self, residual: CycleResidual, scores: Floats, step: NormalScores) -> None:
         """Take a cycle as usual; what is shown for the first time is looked for from now on."""
         new = np.isfinite(scores) & (self._reference.count == 0.0)
         self._reference.add(scores)
         self._normalizer.learn(step)
-        self._usual.add(said)
+        self._usual.add(residual)
         self._learned += 1
         if new.any():
-            alike = said.alike()
+            alike = residual.alike()
             self._alike = np.where(alike != 0.0, alike, self._alike)
         if self._learned == LEARNED:
             self._changes = looked_for(self._suspects)
@@ -310,50 +314,57 @@ class Isolation:
         if not _explains(suits, mean.off, effect):
             return [Likeness(UNKNOWN, None, "", changed)]
         listed = changed * listed_share(suits, mean.off, effect, mean.kind, mean.time)
-        found = self._by_effect(share * (listed / share.sum()), sizes)
-        if found[0].share < LEAST_SURE * changed:
+        causes = self._by_effect(share * (listed / share.sum()), sizes)
+        if causes[0].share < LEAST_SURE * changed:
             return [Likeness(UNKNOWN, None, "", changed)]
-        return [*found, Likeness(UNKNOWN, None, "", changed - listed)]
+        return [*causes, Likeness(UNKNOWN, None, "", changed - listed)]
 
     def _mean(self, since: int) -> tuple[CycleResidual, Floats]:
         """The mean of the last cycles, less what was usual; and its covariance."""
         last = self._kept[-1]
-        some = list(self._kept)[-since:]
-        often = np.mean([np.isin(last.place, said.place) for said in some], axis=0) > 0.5
+        residuals = list(self._kept)[-since:]
+        often = (
+            np.mean([np.isin(last.place, residual.place) for residual in residuals], axis=0) > 0.5
+        )
         last = last.at(often)
         columns = np.column_stack([last.off, last.signatures, last.larger]) * 0.0
         counts = np.zeros(len(last.place))
-        for said in some:
-            _, mine, theirs = np.intersect1d(last.place, said.place, True, True)
-            columns[mine] += np.column_stack([said.off, said.signatures, said.larger])[theirs]
-            counts[mine] += 1.0
+        for residual in residuals:
+            _, at, there = np.intersect1d(last.place, residual.place, True, True)
+            values = np.column_stack([residual.off, residual.signatures, residual.larger])
+            columns[at] += values[there]
+            counts[at] += 1.0
         columns /= counts[:, None]
         usual, seen = self._usual.of(last)
         off = columns[:, 0] - usual
         signatures, larger = np.split(columns[:, 1:], [len(self._suspects)], axis=1)
         own = np.hypot(last.common / np.sqrt(1.0 + seen), MISMATCH * off)
         usually = 1.0 / np.sqrt(1.0 + seen)
-        scatter = last.alone / len(some) + last.alone * np.outer(usually, usually)
+        scatter = last.alone / len(residuals) + last.alone * np.outer(usually, usually)
         covariance = scatter + fading(own, last.time, last.kind)
         return replace(last, off=off, signatures=signatures, larger=larger), covariance
 
     def _by_effect(self, share: Floats, sizes: Floats) -> list[Likeness]:
         """Parameters of one effect belong together; the most probable one gives the size."""
-        found: dict[str, Likeness] = {}
+        causes: dict[str, Likeness] = {}
         for number in np.argsort(-share).tolist():
-            one, mine = self._suspects[number], float(share[number])
-            if first := found.get(one.effect):
-                found[one.effect] = replace(first, share=first.share + mine)
+            suspect, probability = self._suspects[number], float(share[number])
+            if first := causes.get(suspect.effect):
+                causes[suspect.effect] = replace(first, share=first.share + probability)
                 continue
-            size = one.parameter.reported(float(sizes[number]) * one.step, self._listener.theta)
-            found[one.effect] = Likeness(one.effect, size, one.parameter.unit, mine)
-        return sorted(found.values(), key=lambda likeness: -likeness.share)
+            size = suspect.parameter.reported(
+                float(sizes[number]) * suspect.step, self._listener.theta
+            )
+            causes[suspect.effect] = Likeness(
+                suspect.effect, size, suspect.parameter.unit, probability
+            )
+        return sorted(causes.values(), key=lambda likeness: -likeness.share)
 
 
 def looked_for(suspects: Sequence[Suspect] = SUSPECTS) -> ChangeDetector:
     """Sums for all suspects, with nothing seen yet."""
-    both_ways = np.array([one.both_ways for one in suspects])
-    return ChangeDetector(both_ways, np.array([one.often for one in suspects]))
+    both_ways = np.array([suspect.both_ways for suspect in suspects])
+    return ChangeDetector(both_ways, np.array([suspect.often for suspect in suspects]))
 
 
 def _fitted(off: Floats, signatures: Floats, bounds: Floats) -> tuple[Floats, Floats]:
@@ -382,8 +393,8 @@ def _effect(number: int, size: float, signatures: Floats, larger: Floats) -> Flo
 
 def _grows(number: int, signatures: Floats, larger: Floats) -> Floats:
     """What a delay does at each of DELAYS_AT, (places, sizes)."""
-    some = np.split(larger, len(DELAYS), axis=1)[DELAYS.index(number)]
-    return np.column_stack([np.zeros(len(some)), signatures[:, number], some])
+    columns = np.split(larger, len(DELAYS), axis=1)[DELAYS.index(number)]
+    return np.column_stack([np.zeros(len(columns)), signatures[:, number], columns])
 
 
 def _fitted_along(off: Floats, grows: Floats, most: float) -> tuple[float, float]:

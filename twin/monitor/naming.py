@@ -61,7 +61,7 @@ def likenesses(
     known = Covariance.of(covariance)
     fits = _Fits.of(known, cycle.off, bounds, np.ones(len(effects)), cycle.slopes)
     fits.search(expect)
-    low = next(number for number, one in enumerate(effects) if one.name == SUPPLY)
+    low = next(number for number, effect in enumerate(effects) if effect.name == SUPPLY)
     wider = fits.widen(low, expect, covariance)
     best = int(np.argmin(fits.left))
     rest = cycle.squares(cycle.off - fits.does[:, best])
@@ -73,14 +73,14 @@ def likenesses(
     shares *= listed / shares.sum()
     if shares[best] < LEAST_SURE:
         return []
-    found = [
-        Likeness(one.name, first.reported(size, theta), first.unit, share)
-        for one, first, size, share in zip(
+    causes = [
+        Likeness(effect.name, first.reported(size, theta), first.unit, share)
+        for effect, first, size, share in zip(
             effects, firsts, (fits.size * typical).tolist(), shares.tolist(), strict=True
         )
     ]
-    found.sort(key=lambda likeness: -likeness.share)
-    return [*found, Likeness(UNKNOWN, None, "", 1.0 - listed)]
+    causes.sort(key=lambda likeness: -likeness.share)
+    return [*causes, Likeness(UNKNOWN, None, "", 1.0 - listed)]
 
 
 def compiled_for(cycle: Cycle) -> None:
@@ -97,8 +97,8 @@ def listed_share(known: Covariance, off: Floats, effect: Floats, kind: Ints, tim
     for neither: a steep edge that comes a row later leaves much beside every effect.
     """
     courses = [np.zeros((len(kind), 0))]
-    for one in np.unique(kind[kind >= 0]):
-        here = kind == one
+    for number in np.unique(kind[kind >= 0]):
+        here = kind == number
         courses.append(hats(time, knots_over(time[here])) * (here * effect)[:, None])
     white = known.white(np.column_stack([off - effect, *courses]))
     return Odds.of(log_likelihoods_in_place(white[:, 1:], white[:, 0])[None]).of_cause(1, 0.0)
@@ -131,7 +131,10 @@ class _Cycle:
         """Covariance (mbar²): healthy cycles scatter, and waveforms are a little wrong."""
         common, alone = model_error(healthy.error, self.kind, self.time)
         scatter = np.array(
-            [healthy.scatter.get(one.name, SCATTER.get(one.name, ("", 0.0))[1]) for one in effects]
+            [
+                healthy.scatter.get(effect.name, SCATTER.get(effect.name, ("", 0.0))[1])
+                for effect in effects
+            ]
         )
         moves = self.slopes * (scatter / typical)
         goes_on = lasting(self.bins, self.first, alone)
@@ -174,8 +177,8 @@ class _Expected:
     def _with(self, sizes: Floats) -> Floats:
         """Coefficients with so many typical sizes of each effect, (effects, n)."""
         changes = [
-            (one.name, {p.name: p.typical for p in one.parameters if not p.shapes})
-            for one in self.effects
+            (effect.name, {p.name: p.typical for p in effect.parameters if not p.shapes})
+            for effect in self.effects
         ]
         return coefficients_at(self.theta, changes, sizes)
 
