@@ -1,1 +1,1 @@
-"""What all inference is made of: sensitivities, covariances and how sure is sure enough."""
+"""The parts of all inference: sensitivities, covariances and confidence levels."""

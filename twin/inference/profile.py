@@ -1,9 +1,9 @@
-"""Intervals by profile likelihood: how far a size may go until the misfit has grown too much.
+"""Intervals by profile likelihood: how far a size can move until the misfit has grown too much.
 
-A normal approximation takes its width from the curvature at the best point and is as wide on both
-sides. Here the misfit is asked on either side, the other sizes moving along (Venzon and Moolgavkar,
-"A method for computing profile-likelihood-based confidence intervals", 1988), so an interval may be
-lopsided and ends at a bound where the data allow that.
+A normal approximation takes its width from the curvature at the best point, so it is symmetric.
+Here the misfit is evaluated on either side, and the other sizes move along (Venzon and Moolgavkar,
+"A method for computing profile-likelihood-based confidence intervals", 1988). So an interval may
+be asymmetric, and ends at a bound if the data allow that.
 """
 
 import math
@@ -16,8 +16,8 @@ Floats = npt.NDArray[np.float64]
 Misfit = Callable[[Floats], Floats]  # chi-square of points (n, sizes)
 
 ROUNDS = 5
-NEAR = 0.05  # of the rise that is looked for
-LEAST_TIMES, MOST_TIMES = 0.3, 3.0  # as far as before, in one round
+NEAR = 0.05  # relative error of the wanted rise at which a search ends
+LEAST_TIMES, MOST_TIMES = 0.3, 3.0  # bounds of the factor by which one round changes a distance
 
 
 def profile_interval(
@@ -25,40 +25,44 @@ def profile_interval(
 ) -> tuple[Floats, Floats]:
     """Lower and upper end of each size in ``x``, where the misfit has grown by ``rise``.
 
-    The other sizes go along as ``covariance`` (of the sizes) says: what one takes away another
-    adds. Ends are within ``bounds``, low and high.
+    The other sizes move along as their ``covariance`` says. Ends are within ``bounds``, low and
+    high.
     """
     count = len(x)
     sigmas = np.sqrt(np.diag(covariance))
-    ways = np.concatenate([-covariance / sigmas, covariance / sigmas], axis=1).T  # (2 sizes, sizes)
-    own = np.tile(np.arange(count), 2)
+    directions = np.concatenate(
+        [-covariance / sigmas, covariance / sigmas], axis=1
+    ).T  # (2 sizes, sizes)
+    size_index = np.tile(np.arange(count), 2)
     reach = np.full(2 * count, math.sqrt(rise))
-    room = _room(x, ways, own, bounds)
-    least = float(misfit(x[None])[0])
-    going = np.ones(2 * count, np.bool_)
+    room = _room(x, directions, size_index, bounds)
+    best_misfit = float(misfit(x[None])[0])
+    searching = np.ones(2 * count, np.bool_)
     for _ in range(ROUNDS):
         at_bound = reach >= room
         reach = np.minimum(reach, room)
-        points = np.clip(x + reach[going, None] * ways[going], *bounds)
-        grown = np.maximum(misfit(points) - least, 1e-12)
-        times = np.clip(np.sqrt(rise / grown), LEAST_TIMES, MOST_TIMES)
-        here = np.flatnonzero(going)
-        done = (np.abs(grown / rise - 1.0) < NEAR) | (at_bound[here] & (grown <= rise))
-        reach[here[~done]] *= times[~done]
-        going[here[done]] = False
-        if not going.any():
+        points = np.clip(x + reach[searching, None] * directions[searching], *bounds)
+        rise_reached = np.maximum(misfit(points) - best_misfit, 1e-12)
+        factor = np.clip(np.sqrt(rise / rise_reached), LEAST_TIMES, MOST_TIMES)
+        active = np.flatnonzero(searching)
+        done = (np.abs(rise_reached / rise - 1.0) < NEAR) | (
+            at_bound[active] & (rise_reached <= rise)
+        )
+        reach[active[~done]] *= factor[~done]
+        searching[active[done]] = False
+        if not searching.any():
             break
     reach = np.minimum(reach, room)
-    ends = x[own] + reach * ways[np.arange(2 * count), own]
+    ends = x[size_index] + reach * directions[np.arange(2 * count), size_index]
     return ends[:count], ends[count:]
 
 
 def _room(
-    x: Floats, ways: Floats, own: npt.NDArray[np.int64], bounds: tuple[Floats, Floats]
+    x: Floats, directions: Floats, size_index: npt.NDArray[np.int64], bounds: tuple[Floats, Floats]
 ) -> Floats:
-    """How far each size itself can go on its way until a bound, in sigmas."""
-    step = ways[np.arange(len(own)), own]
+    """Distance to each size's own bound along its direction, in sigmas."""
+    step = directions[np.arange(len(size_index)), size_index]
     low, high = bounds
-    room = np.where(step > 0.0, high[own] - x[own], low[own] - x[own])
+    room = np.where(step > 0.0, high[size_index] - x[size_index], low[size_index] - x[size_index])
     reach: Floats = np.maximum(room / np.where(step == 0.0, 1.0, step), 0.0)
     return reach

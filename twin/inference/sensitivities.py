@@ -1,6 +1,6 @@
-"""How predictions change with parameters: finite differences, all of them in one run.
+"""Derivatives of predictions by parameters: finite differences, all of them in one run.
 
-Coordinates are multiples of a parameter's size: of a change worth an alarm, or of one sigma.
+A coordinate counts in multiples of a parameter's size: a change worth an alarm, or one sigma.
 """
 
 import math
@@ -16,18 +16,18 @@ Floats = npt.NDArray[np.float64]
 Predict = Callable[[Floats], Floats]  # points (parameters, n) to predictions (rows, n)
 Change = tuple[str, Mapping[str, float]]  # of an effect: its parameters' changes from neutral
 
-# Of a size, for a derivative. On a gripper it is within 3 % of what tiny steps give, and 13 % where
-# something acts later; twice as large, it is twice as far off.
+# Step of a derivative, as a share of a size. On a gripper the derivative is within 3 % of that of
+# tiny steps, and within 13 % if a cause acts later. A step twice as large doubles the error.
 STEP = 0.05
 
 
 def inside(x: Floats, high: Floats, step: float = STEP) -> Floats:
-    """One step for each parameter: backwards where forwards would pass ``high``."""
+    """One step for each parameter: backwards if forwards would pass ``high``."""
     return np.where(x + step <= high, step, -step)
 
 
 def points(x: Floats, steps: Floats) -> Floats:
-    """``x``, then with one parameter after the other moved, (parameters, 1 + parameters)."""
+    """``x``, then ``x`` with each parameter moved in turn, (parameters, 1 + parameters)."""
     return np.column_stack([x, x[:, None] + np.diag(steps)])
 
 
@@ -37,9 +37,9 @@ def derivatives(values: Floats, steps: Floats | float = 1.0) -> tuple[Floats, Fl
 
 
 def central(plus: Floats, minus: Floats) -> tuple[Floats, Floats]:
-    """What one sigma of a normal variable moves, and what its square does.
+    """First- and second-order changes of predictions by one sigma of normal variables.
 
-    From the changes of predictions with each variable one sigma up, and down.
+    ``plus`` and ``minus`` are the changes with each variable one sigma up and down.
     """
     return (plus - minus) / 2.0, (plus + minus) / math.sqrt(2.0)
 
@@ -50,16 +50,16 @@ def sensitivities(predict: Predict, x: Floats, steps: Floats) -> tuple[Floats, F
 
 
 def coefficients_at(theta: Theta, changes: Sequence[Change], at: Floats) -> Floats:
-    """Coefficients (coefficients, n) with so many times each change, ``at`` is (changes, n).
+    """Coefficients (coefficients, n) with ``at`` (changes, n) multiples of each change.
 
-    Raises ConfigError where that is out of an effect's bounds.
+    Raises ConfigError if one is outside an effect's bounds.
     """
     columns = []
     for point in at.T.tolist():
-        here = theta
+        changed = theta
         for (name, sizes), times in zip(changes, point, strict=True):
-            here = _changed(here, name, sizes, times) if times else here
-        columns.append(here)
+            changed = _changed(changed, name, sizes, times) if times else changed
+        columns.append(changed)
     return np.stack(columns, axis=1)
 
 
