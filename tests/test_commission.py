@@ -47,7 +47,7 @@ from twin.calibration.parameters import (
 from twin.calibration.readings import Readings, deep, read, turns
 from twin.calibration.report import commissioned_as_json, commissioned_in_words, headline
 from twin.calibration.save import store_first
-from twin.calibration.verdict import Residual, Verdict, _left, judge
+from twin.calibration.verdict import Residual, Verdict, _rms_and_floor, judge
 from twin.config import Asset
 from twin.diagnosis.answer import diagnose
 from twin.errors import ConfigError
@@ -562,8 +562,8 @@ def test_what_few_cycles_show_counts_neither_as_left_nor_as_floor() -> None:
     off = np.array([1.0, 2.0, 3.0, 4.0, 2.0, 3.0]) * MBAR
     place, cycle = np.array([0, 1, 0, 1, 0, 1]), np.array([1, 1, 2, 2, 3, 3])
     longer = np.append(off, 50.0 * MBAR), np.append(place, 2), np.append(cycle, 3)
-    known = _left(off, place, cycle, np.ones(6), 0.0)
-    assert _left(*longer, np.ones(7), 0.0) == pytest.approx(known)
+    known = _rms_and_floor(off, place, cycle, np.ones(6), 0.0)
+    assert _rms_and_floor(*longer, np.ones(7), 0.0) == pytest.approx(known)
     assert known[1] == pytest.approx(MBAR)
 
 

@@ -28,30 +28,30 @@ from twin.monitor.surroundings import taken_in
 from twin.signals import BREAK, MBAR, SAMPLE, UNUSABLE, Command, Phase, Samples, bridged
 
 FEWEST = 5  # complete cycles
-MOST_FITTED = 12  # cycles that are fitted; what more there are tell the scatter
+MOST_FITTED = 12  # cycles that are fitted; the others only show the scatter
 MOST_SPOILT = 0.02  # share of samples that are saturated, stale or bad
-MOST_LEFT = 15.0  # mbar rms, above which no ejector of this kind is behind the log
+MOST_LEFT = 15.0  # mbar rms: a larger residual means that the log is not of such an ejector
 LEAST_SCATTER = 0.05  # of a figure, in its unit
 NOTHING: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What healthy cycles say about one unit."""
+    """Result of a calibration: the fit of one unit, and its healthy scatter."""
 
     fitted: Fitted
     healthy: Healthy
     cycles: int
-    first_ns: int  # when the log was recorded, by the clock here
+    first_ns: int  # host time of the log's first and last row
     last_ns: int
 
 
 def calibrate(
     config: Config, blocks: Iterable[Samples], progress: Callable[[str], None]
 ) -> Calibration:
-    """Calibrate the unit of ``config`` on a log; its data set says what the type leaves open.
+    """Calibrate the unit of ``config`` on a log, starting from its data set.
 
-    ConfigError where the log does not suffice or is not that of a healthy unit.
+    Raises ConfigError if the log does not suffice or is not that of a healthy unit.
     """
     progress("reading the log")
     samples = np.concatenate([np.empty(0, SAMPLE), *bridged(blocks)])
@@ -73,7 +73,7 @@ def calibrate(
 
 
 def complete(data: DataSet, samples: Samples) -> list[Cycle]:
-    """Complete cycles beside the twin of ``data``, but for the first, in which it swings in."""
+    """Complete cycles with the twin of ``data``, without the first, in which it settles."""
     return [cycle for cycle in whole(Twin.of(data).over([samples])) if cycle.settled]
 
 
@@ -101,20 +101,20 @@ def refuse_insufficient(samples: Samples, cycles: Sequence[Cycle]) -> None:
 
 
 def refuse_contradicting(cycles: Sequence[Cycle], data: DataSet) -> None:
-    """ConfigError if the ejector says something else of its nozzle than the pressure does."""
-    for one in contradictions(cycles, data):
-        if one.signal == "nozzle":
-            raise ConfigError(one.what, f"{one.action}; or leave the tag out")
+    """ConfigError if the reported nozzle contradicts the pressure."""
+    for contradiction in contradictions(cycles, data):
+        if contradiction.signal == "nozzle":
+            raise ConfigError(contradiction.what, f"{contradiction.action}; or leave the tag out")
 
 
 def contradictions(cycles: Sequence[Cycle], data: DataSet) -> list[Contradiction]:
-    """The signals in a record that its pressure contradicts."""
+    """Signals of a record that its pressure contradicts."""
     twin = Twin.of(data)
     return standing(cycles, twin.theta, twin.knees)
 
 
 def refuse_rounded(data: DataSet, samples: Samples) -> None:
-    """ConfigError if a twin of ``data`` would not see in each cycle that the nozzle goes off."""
+    """ConfigError if a twin of ``data`` would not see the nozzle go off in each cycle."""
     knees = Twin.of(data).knees
     if as_wide_as_needed(knees, [samples]) != knees:
         raise ConfigError(
@@ -126,7 +126,7 @@ def refuse_rounded(data: DataSet, samples: Samples) -> None:
 
 
 def refuse_unlike(fitted: Fitted, data: DataSet) -> None:
-    """ConfigError if what was fitted is no healthy unit of its type."""
+    """ConfigError if the fit is no healthy unit of its type."""
     if fitted.left > MOST_LEFT * MBAR:
         raise ConfigError(
             f"the model cannot follow this log: {fitted.left / MBAR:.0f} mbar rms are left",
@@ -148,23 +148,27 @@ def refuse_unlike(fitted: Fitted, data: DataSet) -> None:
 def refuse_unalike(data: DataSet, samples: Samples, cycles: Sequence[Cycle]) -> None:
     """ConfigError if something came or went while the log was recorded."""
     theta = coefficients(data)
-    found = [figures(cycle, theta) for cycle in cycles]
-    refuse_changing(Cycles.as_live(samples, data), theta, data.sensor.noise_mbar * MBAR, found)
+    cycle_figures = [figures(cycle, theta) for cycle in cycles]
+    refuse_changing(
+        Cycles.as_live(samples, data), theta, data.sensor.noise_mbar * MBAR, cycle_figures
+    )
 
 
 def scatter(data: DataSet, cycles: Sequence[Cycle]) -> dict[str, Scatter]:
     """Mean and scatter of every figure of healthy cycles.
 
-    A few cycles show their scatter only roughly; what is given is not exceeded with SURE.
+    A few cycles show their scatter only roughly: each sigma is an upper bound that holds with SURE.
     """
     theta = coefficients(data)
-    found = [figures(cycle, theta) for cycle in cycles]
+    cycle_figures = [figures(cycle, theta) for cycle in cycles]
     names = [f"{phase.name.lower()}_{kind}" for phase in Phase for kind in ("mean", "rms")]
-    shown = {
-        name: np.array([one[name] for one in found if name in one])
+    by_name = {
+        name: np.array(
+            [values_of_cycle[name] for values_of_cycle in cycle_figures if name in values_of_cycle]
+        )
         for name in [*names, "h1_level", "h1_low_level"]
     }
-    return {name: _scatter(values) for name, values in shown.items() if len(values) >= FEWEST}
+    return {name: _scatter(values) for name, values in by_name.items() if len(values) >= FEWEST}
 
 
 def _scatter(values: npt.NDArray[np.float64]) -> Scatter:
@@ -173,9 +177,9 @@ def _scatter(values: npt.NDArray[np.float64]) -> Scatter:
 
 
 def uncertain(fitted: Fitted, untold: Mapping[str, float]) -> dict[str, tuple[float, ...]]:
-    """Ways in which the log leaves the data set open, as ``Healthy`` has them.
+    """Factor of the covariance that the log leaves to the data set, as ``Healthy`` has it.
 
-    ``untold`` are values that no log shows and nobody told, with their sigmas.
+    ``untold`` has sigmas of values that no log shows and nobody configured.
     """
     factor = block_diag(np.linalg.cholesky(fitted.left_open), np.diag([*untold.values()]))
     names = [*(free.name for free in fitted.free), *untold]
@@ -192,17 +196,17 @@ def like_these(
     samples: Samples,
     untold: Mapping[str, float] = NOTHING,
 ) -> Healthy:
-    """What healthy cycles are like beside the calibrated twin; ``untold`` as in ``uncertain``."""
-    known = Healthy(figures=figures, uncertain=uncertain(fitted, untold))
-    monitor = config.monitor.model_copy(update={"healthy": known})
+    """Healthy deviations from the calibrated twin; ``untold`` as in ``uncertain``."""
+    model_scatter = Healthy(figures=figures, uncertain=uncertain(fitted, untold))
+    monitor = config.monitor.model_copy(update={"healthy": model_scatter})
     healthy = learned(collect(replace(config, data=fitted.data, monitor=monitor), [samples]))
     return healthy.model_copy(update={"key_figures": limited(fitted.data, samples)})
 
 
 def limited(data: DataSet, samples: Samples) -> dict[str, Scatter]:
-    """Those key figures of a healthy record that have limits, as far as enough cycles show them."""
-    teller = KeyFigures(data)
-    told = [*filter(None, map(teller.take, whole(Twin.of(data).over([samples]))))]
-    shown = {name: np.array([one.measured[name] for one in told]) for name in LIMITED}
-    shown = {name: values[np.isfinite(values)] for name, values in shown.items()}
-    return {name: _scatter(values) for name, values in shown.items() if len(values) >= FEWEST}
+    """Scatter of a healthy record's limited key figures that at least FEWEST cycles have."""
+    key_figures = KeyFigures(data)
+    told_cycles = [*filter(None, map(key_figures.take, whole(Twin.of(data).over([samples]))))]
+    by_name = {name: np.array([cycle.measured[name] for cycle in told_cycles]) for name in LIMITED}
+    by_name = {name: values[np.isfinite(values)] for name, values in by_name.items()}
+    return {name: _scatter(values) for name, values in by_name.items() if len(values) >= FEWEST}

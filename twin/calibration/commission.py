@@ -1,7 +1,7 @@
-"""Commissioning: a unit that nobody has seen before, from a record and what a person can read off.
+"""Commissioning: fit a unit of unknown type, from a record and what a person can read off.
 
-The record says what the configuration need not: noise, thresholds, ambient pressure where the
-system is opened, rough flows and delays. From there the fit goes wherever the market may be.
+The record itself shows noise, thresholds, ambient pressure if the system is opened, rough flows
+and delays. The fit starts from these and searches the range of all ejectors on the market.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -48,46 +48,46 @@ from twin.signals import (
     bridged,
 )
 
-SLOWEST = 10.5 * MS  # s between rows; what switches faster than a few rows is not seen
-COARSE = 2.05 * MS  # s between rows, above which it is said what they do not show
+SLOWEST = 10.5 * MS  # s between rows; switching within a few rows would not be seen
+COARSE = 2.05 * MS  # s between rows, above which the answer states what they cannot show
 MOST_MISSING = 0.2  # share of rows
 ROOM_TEMPERATURE = 293.15  # K, for a first guess
-# Where a fit starts: of the line, between sensor and port, and of all gas, in the port.
+# Where fits start: the sensor's place along the line, and the share of all gas that is in the port.
 PLACES, PORT_SHARES = (0.05, 0.95), (0.01, 0.1)
-NEARLY = 0.95  # of the deepest pressure of a suction that nothing ends but its command
-# How cups give way: the share of their volume that goes, softness, and stiff_mbar (System).
+NEARLY = 0.95  # first guess of the end pressure, over the deepest pressure without air saving
+# How cups give way: the share of their volume that is lost, softness, and stiff_mbar (System).
 RIGID, LIPS, BELLOWS = (0.0, 5.0, 30.0), (0.03, 5.0, 30.0), (0.4, 10.0, 300.0)
-# s in which suction grows, for the jet to be tried as the cause; the soonest that it comes.
+# Growth time of suction (s) for which the jet is tried as the cause; its shortest response (ms).
 SLOW_JET, SOONEST_MS = (12.0 * MS, 100.0 * MS), 2.0
 _JET = ("ramp_up_ms", "ramp_down_ms", "response_ms", "response_off_ms")
-SAGS = {"droop_bar": 0.1, "lag_ms": 50.0}  # a supply, before anything is known of it
-CLEARLY = 15.0  # mbar by which a threshold must differ to be told; overshoot is part of a turn
-# Of the line, by which a sensor is at another place than told, and sigmas.
+SAGS = {"droop_bar": 0.1, "lag_ms": 50.0}  # first guess of the supply
+CLEARLY = 15.0  # mbar: a threshold is reported if it differs by more; a turn includes overshoot
+# A sensor is reported as misplaced beyond this share of the line, and beyond so many sigmas.
 ELSEWHERE, SURELY = 0.6, 4.0
-# Above ambient (mbar), from where on a record that goes so high has met a relief valve. It opens at
-# about half of that.
+# A record that rises so far above ambient (mbar) has met a relief valve, which opens at about half
+# of that.
 RELIEVED, RELIEVES = 60.0, 0.5
-CREEPS = 0.3  # share of what cups give way by, that comes later, before anything is known of them
-DRAINS = 0.2  # of the rate at which blow-off fills, by which it drains a reservoir of its own
-COMES = 40.0  # ms after suction, at which cups meet a part where the record does not show it
+CREEPS = 0.3  # first guess of the share of the cups' yielding that comes later
+DRAINS = 0.2  # rate at which blow-off drains its reservoir, over the rate at which it fills
+COMES = 40.0  # ms after suction at which cups meet a part, if the record does not show it
 LITTLE_VACUUM = 200.0  # mbar; flow ejectors on leaking parts make more
-AMBIENT_CLEARLY = 3.0  # mbar, the same for ambient pressure
-# Share by which the evacuated volume must differ from what is told: nearly twice what a flow meter
-# is off by on rigs whose truth is known.
+AMBIENT_CLEARLY = 3.0  # mbar: ambient pressure is reported if it differs by more
+# Relative difference from the configured volume above which that of the flow meter is used: nearly
+# twice a flow meter's error on rigs whose truth is known.
 VOLUME_CLEARLY = 0.15
-LEAST_LEFT = 0.1  # of what is not a tube, that a flow meter must leave of it
-# One sigma, of its value, where nobody told it. Suction then rises or falls by 6 % a bar about a
-# supply of 5 bar; momentum theory of ejectors on the market has up to 12 %.
+LEAST_LEFT = 0.1  # least factor for the volume of all but tubes; below it the tubes are wrong
+# Relative sigma of the optimum pressure if it is not configured. Suction then rises or falls by
+# 6 % a bar about a supply of 5 bar; momentum theory of ejectors on the market has up to 12 %.
 OPTIMUM_UNTOLD = 0.2
-# mbar, one sigma of the hysteresis where no cycle shows it and nobody told it: ejectors on the
+# mbar, one sigma of the hysteresis if no cycle shows it and it is not configured: ejectors on the
 # market have 10 to 300.
 HYSTERESIS_UNTOLD = 75.0
-LEAST_OFFSET = 1.0  # mbar, of the sensor beside a barometer, to be taken for one
+LEAST_OFFSET = 1.0  # mbar: a smaller difference from the barometer is no offset of the sensor
 
 
 @dataclass(frozen=True)
 class Remark:
-    """Something that the record says and the configuration does not, with the line to change."""
+    """A contradiction of record and configuration, with the line to change."""
 
     text: str
     line: str
@@ -95,25 +95,25 @@ class Remark:
 
 @dataclass(frozen=True)
 class Commissioned:
-    """A unit's calibration, how well it follows the record, and what the record corrected."""
+    """A unit's calibration, its verdict, and the corrections that the record made."""
 
     calibration: Calibration
     readings: Readings
     verdict: Verdict
     remarks: tuple[Remark, ...]
-    contradictions: tuple[Contradiction, ...]  # of what is reported and the pressure
-    samples: Samples  # that the twin was judged on
+    contradictions: tuple[Contradiction, ...]  # between reported signals and the pressure
+    samples: Samples  # on which the twin was judged
 
     @property
     def assumed(self) -> list[str]:
-        """Values that the record does not show; they stay what the guess said, and as wide."""
+        """Names of values that the record does not determine: they keep guess and width."""
         fitted = self.calibration.fitted
-        known = zip(fitted.free, fitted.determined, strict=True)
-        return [one.name for one, sure in known if not sure]
+        determined = zip(fitted.free, fitted.determined, strict=True)
+        return [free.name for free, is_determined in determined if not is_determined]
 
     @property
     def unseen(self) -> str:
-        """What the cadence of the record cannot show, in a sentence; empty where it shows all."""
+        """One sentence on what the record's cadence cannot show; empty if it shows all."""
         if self.readings.period <= COARSE:
             return ""
         apart = f"{self.readings.period / MS:.0f} ms"
@@ -126,10 +126,10 @@ class Commissioned:
 def commission(
     config: Config, blocks: Iterable[Samples], progress: Callable[[str], None]
 ) -> Commissioned:
-    """Fit a unit from its record; ``config`` says what hangs on the ejector, roughly.
+    """Fit a unit from its record; ``config`` describes roughly what hangs on the ejector.
 
-    ConfigError with the reason where the record cannot answer. How well the twin follows a record
-    that can is the ``verdict``; who stores it must look at it.
+    Raises ConfigError with the reason if the record does not suffice. The ``verdict`` says how
+    well the twin follows the record; a caller must check it before storing the result.
     """
     progress("reading the record")
     samples = np.concatenate([np.empty(0, SAMPLE), *bridged(blocks)])
@@ -143,20 +143,22 @@ def commission(
     guess, remarks = guessed(config.data, readings)
     before = complete(guess, samples)
     refuse_insufficient(samples, before)
-    looked = switching(guess, samples)
-    against = contradictions(before if looked is guess else complete(looked, samples), looked)
-    wrong = {one.signal for one in against}
-    if "nozzle" in wrong:
+    switching_data = switching(guess, samples)
+    contradictory = contradictions(
+        before if switching_data is guess else complete(switching_data, samples), switching_data
+    )
+    wrong_signals = {contradiction.signal for contradiction in contradictory}
+    if "nozzle" in wrong_signals:
         progress("the nozzle is not as reported: reading the pressure alone")
         samples = unreported(samples)
         readings = read(samples)
-    if "pressure_2" in wrong:
+    if "pressure_2" in wrong_signals:
         samples = samples.copy()
-        samples["pressure_2"] = 0.0  # the fit follows one
+        samples["pressure_2"] = 0.0  # so that the fit does not follow it
     metered, by_flow = config.data, list[Remark]()
-    if "flow" not in wrong:
+    if "flow" not in wrong_signals:
         metered, by_flow = as_metered(config.data, readings)
-    if "nozzle" in wrong or by_flow:
+    if "nozzle" in wrong_signals or by_flow:
         guess, remarks = guessed(metered, readings)
         remarks = by_flow + remarks
         before = complete(guess, samples)
@@ -165,33 +167,35 @@ def commission(
     refuse_parted(Cycles.found(samples, guess))
     free = free_of(config, readings)
     fitted = _fit(used, starts(guess, readings.meets, readings.grows), free, progress)
-    if fitted.data.ambient != guess.ambient:  # thresholds are below ambient pressure
+    if fitted.data.ambient != guess.ambient:  # thresholds count from ambient pressure
         remarks = by_flow + guessed(within(metered, fitted.data.ambient), readings)[1]
     progress("judging the fit")
     verdict = judge(Cycles.found(samples, fitted.data), fitted.data, readings.noise)
-    if verdict.word != "refused":  # a fit that does not follow says nothing of places
+    if verdict.word != "refused":  # the places of a bad fit mean nothing
         remarks += [*misplaced(config.data, fitted), *another_ambient(config.data, fitted)]
     cycles = complete(fitted.data, samples)
-    known = replace(config, data=fitted.data)
+    fitted_config = replace(config, data=fitted.data)
     sigma = OPTIMUM_UNTOLD * fitted.data.supply.optimum_bar
     untold = {} if optimum_is_told else {"supply.optimum_bar": sigma}
-    healthy = like_these(known, fitted, scatter(fitted.data, cycles), samples, untold)
+    healthy = like_these(fitted_config, fitted, scatter(fitted.data, cycles), samples, untold)
     healthy = healthy.model_copy(update={"unseen_level_mbar": unseen_level})
     times = samples["host_ns"]
     calibration = Calibration(fitted, healthy, len(cycles), int(times[0]), int(times[-1]))
-    return Commissioned(calibration, readings, verdict, tuple(remarks), tuple(against), samples)
+    return Commissioned(
+        calibration, readings, verdict, tuple(remarks), tuple(contradictory), samples
+    )
 
 
-def _unseen_level(told: DataSet, readings: Readings) -> float:
-    """One sigma (mbar) of where the nozzle goes on again, should a later record show it."""
-    is_told = "h1_hysteresis_mbar" in told.ejector.model_fields_set
+def _unseen_level(data: DataSet, readings: Readings) -> float:
+    """One sigma (mbar) of the vacuum at which the nozzle goes on again, for later records."""
+    is_told = "h1_hysteresis_mbar" in data.ejector.model_fields_set
     return UNSEEN_LEVEL_MBAR if is_told or np.isfinite(readings.on) else HYSTERESIS_UNTOLD
 
 
 def switching(data: DataSet, samples: Samples) -> DataSet:
-    """``data`` so that switchings are looked for where the nozzle is reported, whatever that says.
+    """``data`` with air saving on if the nozzle is reported, so that switchings are searched.
 
-    A report that it never goes off is what the pressure may contradict.
+    The pressure may contradict a report that the nozzle never goes off.
     """
     if not (samples["reported"] & np.uint8(Reported.NOZZLE_KNOWN)).any():
         return data
@@ -200,20 +204,20 @@ def switching(data: DataSet, samples: Samples) -> DataSet:
 
 
 def unreported(samples: Samples) -> Samples:
-    """The same as if nobody had reported the nozzle."""
+    """A copy without the reported nozzle."""
     samples = samples.copy()
     samples["reported"] &= ~np.uint8(Reported.NOZZLE_KNOWN | Reported.NOZZLE)
     return samples
 
 
 def refuse_empty(samples: Samples) -> None:
-    """ConfigError if there is no suction to look at."""
+    """ConfigError if there is no suction."""
     if not (samples["commands"] == Command.SUCTION).any():
         raise ConfigError("the record has no suction", "check which tag or column is suction")
 
 
 def refuse_unreadable(readings: Readings) -> None:
-    """ConfigError where the sampling cannot show what an ejector does."""
+    """ConfigError if rows are too far apart, or too many are missing."""
     if readings.period > SLOWEST:
         raise ConfigError(
             f"the record has a row each {readings.period / MS:.0f} ms: the nozzle's switching and"
@@ -245,48 +249,48 @@ def _fit(
 
 
 def as_metered(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:
-    """``data`` with the volume that a flow meter tells, where it is clearly another than told.
+    """``data`` with the volume by the flow meter, if it clearly differs from the configured one.
 
-    Tubes stay as long and wide as told. Volumes of all else behind the port are multiplied alike,
-    so that the sum is what the meter tells. Where hardly anything is left for them, the tubes are
-    what is wrong, and nobody knows how: all stays as it is.
+    Tubes keep their length and diameter. All other volumes behind the port get one common factor,
+    so that the sum is that of the meter. If that factor is very small, the tubes must be wrong in
+    an unknown way, and nothing is changed.
     """
-    found = readings.evacuated(data.ambient.temperature_c + ZERO_C)
+    metered = readings.evacuated(data.ambient.temperature_c + ZERO_C)
     parts = data.system.parts
-    told = sum(volume(part) for part in parts)
+    configured = sum(volume(part) for part in parts)
     tubes = sum(volume(part) for part in parts if isinstance(part, Tube | Sensor))
-    times = (found - tubes) / (told - tubes)
-    if not abs(found / told - 1.0) > VOLUME_CLEARLY or times < LEAST_LEFT:
+    times = (metered - tubes) / (configured - tubes)
+    if not abs(metered / configured - 1.0) > VOLUME_CLEARLY or times < LEAST_LEFT:
         return data, []
     scaled = tuple(_scaled(part, times) for part in parts)
-    said = (
+    lines = (
         f'kind = "{part.kind}", volume_ml = {_rough(part.volume_ml)}'
         for part in scaled
         if not isinstance(part, Tube | Sensor) and part.volume_ml > 0.0
     )
     text = (
-        f"by the flow meter {_rough(found / ML)} ml are evacuated; the configuration says"
-        f" {_rough(told / ML)}"
+        f"by the flow meter {_rough(metered / ML)} ml are evacuated; the configuration says"
+        f" {_rough(configured / ML)}"
     )
-    line = f"[[data.system.parts]] {' and '.join(said)}"
+    line = f"[[data.system.parts]] {' and '.join(lines)}"
     system = data.system.model_copy(update={"parts": scaled})
     return data.model_copy(update={"system": system}), [Remark(text, line)]
 
 
-def _scaled(part: Part, times: float) -> Part:
-    """A part with so many times its volume; tubes have theirs from length and diameter."""
+def _scaled(part: Part, factor: float) -> Part:
+    """A part with its volume times ``factor``; tubes keep theirs, from length and diameter."""
     if isinstance(part, Tube | Sensor):
         return part
-    return part.model_copy(update={"volume_ml": times * part.volume_ml})
+    return part.model_copy(update={"volume_ml": factor * part.volume_ml})
 
 
 def _rough(volume_ml: float) -> str:
-    """A volume as precise as a flow meter tells it."""
+    """A volume as text, as precise as a flow meter is."""
     return f"{round(volume_ml, 0 if volume_ml >= 100.0 else 1):g}"
 
 
 def guessed(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:
-    """``data`` with what the record shows in its place, and remarks where that differs."""
+    """``data`` with the values that the record shows, and remarks on those that differ."""
     tables = data.model_dump()
     ambient, remarks = _ambient(tables, readings)
     tables["sensor"]["noise_mbar"] = max(readings.noise / MBAR, 0.05)
@@ -299,40 +303,43 @@ def guessed(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:
 
 
 def _ambient(tables: dict[str, dict[str, Any]], readings: Readings) -> tuple[float, list[Remark]]:
-    """Set ambient pressure where it shows, and the sensor's offset; what vacuum is read from."""
-    told = float(tables["ambient"]["pressure_mbar"])
+    """Set ambient pressure and the sensor's offset if they show.
+
+    Returns the reading (mbar) at zero vacuum, and remarks.
+    """
+    configured = float(tables["ambient"]["pressure_mbar"])
     if not readings.opened:
-        return told, []
+        return configured, []
     offset = (readings.idle - readings.barometer) / MBAR
-    if abs(offset) <= APART / MBAR:  # so much the sensor may read off
+    if abs(offset) <= APART / MBAR:  # within the error of a sensor
         tables["ambient"]["pressure_mbar"] = round(readings.barometer / MBAR, 1)
         if abs(offset) > LEAST_OFFSET:
             tables["effects"]["sensor_offset"] = {"offset": round(offset, 1)}
         return readings.idle / MBAR, []
-    found = round(readings.idle / MBAR, 1)
-    tables["ambient"]["pressure_mbar"] = found
-    if abs(found - told) <= AMBIENT_CLEARLY:
-        return found, []
-    text = f"the opened system stands at {found:g} mbar; the configuration says {told:g}"
-    return found, [Remark(text, f"[data.ambient] pressure_mbar = {found:g}")]
+    measured = round(readings.idle / MBAR, 1)
+    tables["ambient"]["pressure_mbar"] = measured
+    if abs(measured - configured) <= AMBIENT_CLEARLY:
+        return measured, []
+    text = f"the opened system stands at {measured:g} mbar; the configuration says {configured:g}"
+    return measured, [Remark(text, f"[data.ambient] pressure_mbar = {measured:g}")]
 
 
 def _air_saving(ejector: dict[str, Any], readings: Readings, ambient: float) -> list[Remark]:
-    """Set whether air is saved, and at which pressures; ``ambient`` in mbar."""
-    told = ejector["air_saving"]
+    """Set air saving and its thresholds; ``ambient`` in mbar."""
+    configured = ejector["air_saving"]
     if readings.saves_air:
-        ejector["air_saving"] = "on" if told == "off" else told
+        ejector["air_saving"] = "on" if configured == "off" else configured
         return _thresholds(ejector, readings, ambient)
     ejector["air_saving"] = "off"
     remarks = []
-    if told != "off":
+    if configured != "off":
         text = "in no suction the nozzle goes off by itself; the configuration has air saving on"
         remarks.append(Remark(text, '[data.ejector] air_saving = "off"'))
     return [*remarks, *_part_present(ejector, readings, ambient)]
 
 
 def _questions(readings: Readings) -> Iterator[Remark]:
-    """What is strange in the record, but may be so."""
+    """Remarks on what is unusual in the record, but possible."""
     if not readings.tells_blow_off:
         text = "no row of the record has blow-off; where the unit has one, its command is missing"
         yield Remark(text, "[driver.tags.blow_off], or the column blow_off")
@@ -342,9 +349,9 @@ def _questions(readings: Readings) -> Iterator[Remark]:
 
 
 def _flows(ejector: dict[str, Any], readings: Readings, evacuated: float, ambient: float) -> None:
-    """Set first guesses of flows, by how fast ``evacuated`` (m³) empties and fills."""
+    """Set first guesses of flows, from how fast ``evacuated`` (m³) empties and fills."""
     ejector["jet_depth"] = 0.5
-    if not readings.saves_air:  # so suction goes on to where hardly anything flows
+    if not readings.saves_air:  # so suction goes on nearly to its end pressure
         ejector["end_pressure_mbar"] = float(np.clip(NEARLY * readings.deepest / MBAR, 10.0, 690.0))
     ejector["cracking_pressure_mbar"] = 5.0
     capacity = readings.capacity(evacuated, ambient, ROOM_TEMPERATURE) / SL_MIN
@@ -365,46 +372,50 @@ def _flows(ejector: dict[str, Any], readings: Readings, evacuated: float, ambien
 
 
 def starts(data: DataSet, meets: float, grows: float = np.nan) -> list[DataSet]:
-    """``data``, and what may differ from it so much that no fit leads there.
+    """Starts of a fit: ``data`` in variants that no fit reaches from each other.
 
-    Where along the line the sensor sits, what gas is at the port, how a part leaves, whether cups
-    spread or fold, and whether they meet the next part after suction is commanded, ``meets``
-    seconds (NaN: the record does not show it), or are on it by then. Where the fall ``grows``
-    slowly (s), that may be the jet as well as the sensor.
+    They differ in the sensor's place along the line, the gas at the port, how a part leaves, and
+    whether cups spread or fold. Cups may be on the next part when suction is commanded, or meet it
+    ``meets`` seconds later (NaN: not shown by the record). If the fall ``grows`` slowly (s), the
+    jet may be the reason, or the sensor.
     """
     cups = sum(volume(part) for part in data.system.parts if isinstance(part, Cups)) / ML
     leaves = ("in_blow_off", "after_blow_off") if cups else (data.system.part_leaves,)
     comes = meets / MS if np.isfinite(meets) else COMES
     waits = (0.0, comes) if cups else (0.0,)
     tables = data.model_dump()
-    place = sensor_place(data)
-    everything = _volume(data) / ML
-    usual = LIPS if cups else RIGID
+    configured_place = sensor_place(data)
+    total_volume = _volume(data) / ML
+    usual_wall = LIPS if cups else RIGID
     softer = (BELLOWS,) if cups else (LIPS, BELLOWS)  # a vessel may be cups on a part that stays
     quick = {key: tables["ejector"][key] for key in _JET}
     slow = _slow(quick, grows / MS) if SLOW_JET[0] < grows < SLOW_JET[1] else quick
     inside = [
-        (PORT_SHARES[0], usual, slow),
-        (PORT_SHARES[1], usual, slow),
+        (PORT_SHARES[0], usual_wall, slow),
+        (PORT_SHARES[1], usual_wall, slow),
         *((PORT_SHARES[0], wall, slow) for wall in softer),
     ]
     if slow is not quick:
-        inside.append((PORT_SHARES[0], usual, quick))
-    found = []
-    for wait, way, at, (share, wall, jet) in product(waits, leaves, PLACES, inside):
+        inside.append((PORT_SHARES[0], usual_wall, quick))
+    guesses = []
+    for wait, leaving, place, (share, wall, jet) in product(waits, leaves, PLACES, inside):
         shrinks, softness, stiff = wall
-        port = share * everything
-        tables["system"].update(part_leaves=way, rim="turbulent", sensor_shift=at - place)
-        tables["system"].update(part_meets_ms=wait, shrinks_ml=shrinks * (cups or everything))
+        port = share * total_volume
+        tables["system"].update(
+            part_leaves=leaving, rim="turbulent", sensor_shift=place - configured_place
+        )
+        tables["system"].update(part_meets_ms=wait, shrinks_ml=shrinks * (cups or total_volume))
         tables["system"].update(softness=softness, stiff_mbar=stiff)
         tables["ejector"].update(jet, port_volume_ml=port)
-        found.append(DataSet.model_validate(tables))
-    return found
+        guesses.append(DataSet.model_validate(tables))
+    return guesses
 
 
 def _slow(jet: Mapping[str, float], ramp_ms: float) -> dict[str, float]:
-    """A jet that takes so long to come and to go, and is half there when ``jet`` is."""
-    sooner_up, sooner_down = (0.5 * (ramp_ms - jet[f"ramp_{way}_ms"]) for way in ("up", "down"))
+    """A jet with ramps of ``ramp_ms`` that reaches half its strength when ``jet`` does."""
+    sooner_up, sooner_down = (
+        0.5 * (ramp_ms - jet[f"ramp_{direction}_ms"]) for direction in ("up", "down")
+    )
     return {
         "ramp_up_ms": ramp_ms,
         "ramp_down_ms": ramp_ms,
@@ -414,46 +425,53 @@ def _slow(jet: Mapping[str, float], ramp_ms: float) -> dict[str, float]:
 
 
 def within(data: DataSet, ambient: Ambient) -> DataSet:
-    """``data`` in other surroundings."""
+    """``data`` with another ambient."""
     return data.model_copy(update={"ambient": ambient})
 
 
 def free_of(config: Config, readings: Readings) -> tuple[Free, ...]:
-    """What a fit may move: ambient pressure too, where nothing but the fit can tell it."""
+    """Free parameters of a fit: with ambient pressure if only the fit can determine it."""
     if readings.opened or config.gauge or np.isfinite(readings.barometer):
         return FREE_IN_MARKET
-    told = config.data.ambient.pressure_mbar != Ambient().pressure_mbar
-    return (*FREE_IN_MARKET, AMBIENT_TOLD if told else AMBIENT)
+    is_configured = config.data.ambient.pressure_mbar != Ambient().pressure_mbar
+    return (*FREE_IN_MARKET, AMBIENT_TOLD if is_configured else AMBIENT)
 
 
-def another_ambient(told: DataSet, fitted: Fitted) -> Iterator[Remark]:
-    """A remark where ambient pressure was fitted and is clearly another than ``told``."""
-    keys = [one.name for one in fitted.free]
+def another_ambient(configured: DataSet, fitted: Fitted) -> Iterator[Remark]:
+    """A remark if ambient pressure was fitted and clearly differs from the configured one."""
+    keys = [free.name for free in fitted.free]
     if AMBIENT.name not in keys:
         return
-    was, found = told.ambient.pressure_mbar, fitted.data.ambient.pressure_mbar
-    unsure = float(fitted.spread[keys.index(AMBIENT.name)])
-    if abs(found - was) > max(AMBIENT_CLEARLY, SURELY * unsure):
-        text = (
-            f"the closed system follows an ambient pressure of {found:.0f} mbar; the configuration"
+    was, now = configured.ambient.pressure_mbar, fitted.data.ambient.pressure_mbar
+    sigma = float(fitted.spread[keys.index(AMBIENT.name)])
+    if abs(now - was) > max(AMBIENT_CLEARLY, SURELY * sigma):
+        text = f"the closed system follows an ambient pressure of {now:.0f} mbar; the configuration"
+        yield Remark(f"{text} says {was:g}", f"[data.ambient] pressure_mbar = {now:.0f}")
+
+
+def misplaced(configured: DataSet, fitted: Fitted) -> Iterator[Remark]:
+    """A remark if the sensor is clearly at another place than configured."""
+    configured_place, fitted_place = sensor_place(configured), sensor_place(fitted.data)
+    sigma = float(fitted.spread[[free.key for free in fitted.free].index("sensor_shift")])
+    if (
+        abs(fitted_place - configured_place) > ELSEWHERE
+        and abs(fitted_place - configured_place) > SURELY * sigma
+    ):
+        nearer, farther = (
+            ("the vessel", "the port")
+            if fitted_place > configured_place
+            else ("the port", "the vessel")
         )
-        yield Remark(f"{text} says {was:g}", f"[data.ambient] pressure_mbar = {found:.0f}")
-
-
-def misplaced(told: DataSet, fitted: Fitted) -> Iterator[Remark]:
-    """A remark where the pressure is clearly read at another place than ``told``."""
-    was, found = sensor_place(told), sensor_place(fitted.data)
-    unsure = float(fitted.spread[[one.key for one in fitted.free].index("sensor_shift")])
-    if abs(found - was) > ELSEWHERE and abs(found - was) > SURELY * unsure:
-        here, there = ("the vessel", "the port") if found > was else ("the port", "the vessel")
-        text = f"the pressure is read nearer to {here}; the configuration has the sensor nearer to"
-        order = "after" if found > was else "before"
+        text = (
+            f"the pressure is read nearer to {nearer}; the configuration has the sensor nearer to"
+        )
+        order = "after" if fitted_place > configured_place else "before"
         line = f'[[data.system.parts]] kind = "sensor", {order} the tubes'
-        yield Remark(f"{text} {there}", line)
+        yield Remark(f"{text} {farther}", line)
 
 
 def _thresholds(ejector: dict[str, Any], readings: Readings, ambient: float) -> list[Remark]:
-    """Set H1 and its hysteresis from the turns; H2 stays below them."""
+    """Set H1 and its hysteresis from the turning points; keep H2 below them."""
     h1, remarks = round(ambient - readings.off / MBAR), []
     if abs(h1 - ejector["h1_mbar"]) > CLEARLY:
         text = f"the nozzle goes off at {h1:g} mbar; the configuration says {ejector['h1_mbar']:g}"
@@ -477,7 +495,7 @@ def _thresholds(ejector: dict[str, Any], readings: Readings, ambient: float) -> 
 
 
 def _part_present(ejector: dict[str, float], readings: Readings, ambient: float) -> list[Remark]:
-    """Set H2 to where the ejector itself says that the part is there, if it says so."""
+    """Set H2 to the vacuum at which the ejector reports a part, if it reports one."""
     if not np.isfinite(readings.part):
         return []
     h2, before = round(ambient - readings.part / MBAR), ejector["h2_mbar"]
@@ -489,5 +507,5 @@ def _part_present(ejector: dict[str, float], readings: Readings, ambient: float)
 
 
 def _volume(data: DataSet) -> float:
-    """All that is evacuated (m³)."""
+    """The whole evacuated volume (m³)."""
     return sum(volume(part) for part in data.system.parts) + data.ejector.port_volume_ml * ML

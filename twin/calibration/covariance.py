@@ -1,8 +1,8 @@
-"""What a residual weighs: the covariance of noise, cycle-to-cycle scatter and the model's error.
+"""Covariance of residuals: noise, cycle-to-cycle scatter and the model's own error.
 
-Scatter differs from cycle to cycle and averages out. The model's own error is the same in all of
-them and does not: the fit may not believe in more than it would from the mean cycle. So the error
-counts in each of n cycles with n times its variance, which is the same.
+Scatter differs from cycle to cycle and averages out. The model's error is the same in all cycles
+and does not: the fit must be no surer than with the mean cycle alone. So each of n cycles counts
+the error with n times its variance, which is equivalent.
 """
 
 from collections.abc import Sequence
@@ -21,53 +21,55 @@ from twin.signals import MBAR, ML, MS
 
 FIRST_ERROR = 3.0 * MBAR  # Pa, of a model that has not been fitted
 LEAST_ERROR = 0.15 * MBAR  # Pa
-VOLUME = 0.01  # of what is evacuated, to which its parts are known
-LATE = 0.5 * MS  # s, by which what the model has at an edge may be early or late
-HIDDEN = 1.5  # the error over what is left of it once a fit has done its best
-NEAR = 4  # places before and behind, over which the error's size is taken
+VOLUME = 0.01  # relative sigma of the evacuated volume
+LATE = 0.5 * MS  # s, sigma of the time of an edge in the model
+HIDDEN = 1.5  # model error before a fit, over the residual that the fit leaves of it
+NEAR = 4  # neighbouring bins on either side over which the error's variance is averaged
 
 
 @dataclass(frozen=True)
 class Weights:
     """Whitens residuals cycle by cycle."""
 
-    parts: Sequence[tuple[Ints, Covariance]]  # bins of a cycle, and what they have in common
+    parts: Sequence[tuple[Ints, Covariance]]  # bins of a cycle, and their covariance
 
     def white(self, off: Floats) -> list[Floats]:
-        """Residuals (bins, n) in sigmas for each cycle; what belongs to none is left out."""
-        return [covariance.white(off[here]) for here, covariance in self.parts]
+        """Whitened residuals (bins, n) of each cycle; bins without a cycle are left out."""
+        return [covariance.white(off[rows]) for rows, covariance in self.parts]
 
     def followed_by(self, other: "Weights", bins: int) -> "Weights":
-        """Those of one pressure with ``bins``, then those of another."""
-        return Weights([*self.parts, *((here + bins, one) for here, one in other.parts)])
+        """These weights, for a pressure with ``bins``, then those of a second pressure."""
+        return Weights(
+            [*self.parts, *((rows + bins, covariance) for rows, covariance in other.parts)]
+        )
 
 
 def plain(cycles: Cycles, noise: float, error: float, late: float) -> Weights:
-    """Weights where nobody knows yet what scatters: each bin by noise and the model's own error.
+    """Weights before the scatter is known: each bin by noise and the model's own error.
 
-    That is ``error`` (Pa), and what the pressure moves by in ``late`` (s).
+    That is ``error`` (Pa), and the change of pressure within ``late`` (s).
     """
     bins = cycles.bins
     errors = np.hypot(error, late * _slope(cycles))
     parts = []
-    numbers = np.unique(bins.cycle[bins.cycle >= 1])  # the model swings in in the first
-    for one in numbers:
-        here = np.flatnonzero(bins.cycle == one)
-        covariance = low_rank(cycles.unsure[here]) * len(numbers)
-        add_independent(covariance, errors[here] ** 2 + noise**2 / bins.count[here])
-        parts.append((here, Covariance.of(covariance)))
+    numbers = np.unique(bins.cycle[bins.cycle >= 1])  # the model settles in the first
+    for number in numbers:
+        rows = np.flatnonzero(bins.cycle == number)
+        covariance = low_rank(cycles.unsure[rows]) * len(numbers)
+        add_independent(covariance, errors[rows] ** 2 + noise**2 / bins.count[rows])
+        parts.append((rows, Covariance.of(covariance)))
     return Weights(parts)
 
 
 def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> Weights:
-    """Weights for residuals about ``theta``, by what it leaves if it is ``fitted``.
+    """Weights for residuals about ``theta``; their errors come from its residuals if ``fitted``.
 
     ``noise`` (Pa) is the sensor's.
     """
     bins = cycles.bins
-    bigger = ("added_volume", {"volume": VOLUME * theta[c.VOLUME] / ML})
-    scattering = [(name, {key: size}) for name, (key, size) in SCATTER.items()]
-    sigmas = [bigger, *scattering]
+    volume_change = ("added_volume", {"volume": VOLUME * theta[c.VOLUME] / ML})
+    scatter_changes = [(name, {key: size}) for name, (key, size) in SCATTER.items()]
+    sigmas = [volume_change, *scatter_changes]
     off, moves = sensitivities(
         lambda at: cycles.off(coefficients_at(theta, sigmas, at)),
         np.zeros(len(sigmas)),
@@ -75,26 +77,26 @@ def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> Wei
     )
     errors, cycle_error = np.full(len(off), FIRST_ERROR), np.zeros(len(off))
     if fitted:
-        errors, cycle_error = _errors(_beside(off, cycles.unsure), bins, noise)
+        errors, cycle_error = _errors(_without_sensor_error(off, cycles.unsure), bins, noise)
     errors = np.hypot(errors, LATE * _slope(cycles))
     numbers = np.unique(bins.cycle[bins.cycle >= 0])
     always, scatter = np.column_stack([moves[:, :1], cycles.unsure]), moves[:, 1:]
     parts = []
-    for one in numbers:
-        here = np.flatnonzero(bins.cycle == one)
-        time = bins.time[here]
-        covariance = fading(errors[here], time, bins.kind[here]) + low_rank(always[here])
+    for number in numbers:
+        rows = np.flatnonzero(bins.cycle == number)
+        time = bins.time[rows]
+        covariance = fading(errors[rows], time, bins.kind[rows]) + low_rank(always[rows])
         covariance *= len(numbers)
-        covariance += fading(cycle_error[here], time, bins.stretch[here]) + low_rank(scatter[here])
-        add_independent(covariance, noise**2 / bins.count[here])
-        parts.append((here, Covariance.of(covariance)))
+        covariance += fading(cycle_error[rows], time, bins.stretch[rows]) + low_rank(scatter[rows])
+        add_independent(covariance, noise**2 / bins.count[rows])
+        parts.append((rows, Covariance.of(covariance)))
     return Weights(parts)
 
 
-def _beside(off: Floats, unsure: Floats) -> Floats:
-    """What is left (Pa) once the ways that a sensor may be off in are taken from it."""
-    taken: Floats = off - unsure @ np.linalg.lstsq(unsure, off)[0]
-    return taken
+def _without_sensor_error(off: Floats, unsure: Floats) -> Floats:
+    """Residuals (Pa) without the part that errors of the sensor explain."""
+    remainder: Floats = off - unsure @ np.linalg.lstsq(unsure, off)[0]
+    return remainder
 
 
 def _slope(cycles: Cycles) -> Floats:
@@ -104,23 +106,28 @@ def _slope(cycles: Cycles) -> Floats:
 
 
 def _errors(off: Floats, bins: Bins, noise: float) -> tuple[Floats, Floats]:
-    """How far the model is off in each bin (Pa): in all cycles alike, and in each differently."""
-    places, place, many = np.unique(bins.place, return_inverse=True, return_counts=True)
-    mean = np.bincount(place, off) / many
-    noisy = np.bincount(place, noise**2 / bins.count) / many
-    within = np.bincount(place, (off - mean[place]) ** 2) / np.maximum(many - 1, 1) - noisy
-    kind = places >> 16
-    common = np.maximum(_near(mean**2 - noisy / many, kind), LEAST_ERROR**2)
-    alone = np.maximum(_near(within, kind), 0.0)
-    return HIDDEN * np.sqrt(common)[place], np.sqrt(alone)[place]
+    """The model's error in each bin (Pa): common to all cycles, and differing between them."""
+    bin_places, place_number, counts = np.unique(
+        bins.place, return_inverse=True, return_counts=True
+    )
+    mean = np.bincount(place_number, off) / counts
+    noise_variance = np.bincount(place_number, noise**2 / bins.count) / counts
+    scatter_variance = (
+        np.bincount(place_number, (off - mean[place_number]) ** 2) / np.maximum(counts - 1, 1)
+        - noise_variance
+    )
+    kinds = bin_places >> 16
+    common = np.maximum(_neighbour_mean(mean**2 - noise_variance / counts, kinds), LEAST_ERROR**2)
+    per_cycle = np.maximum(_neighbour_mean(scatter_variance, kinds), 0.0)
+    return HIDDEN * np.sqrt(common)[place_number], np.sqrt(per_cycle)[place_number]
 
 
-def _near(values: Floats, kind: Ints) -> Floats:
-    """Mean over NEAR places of the same kind on either side."""
+def _neighbour_mean(values: Floats, kind: Ints) -> Floats:
+    """Mean over NEAR bins of the same kind on either side."""
     smooth = np.empty_like(values)
-    for one in np.unique(kind):
-        here = np.flatnonzero(kind == one)
+    for stretch_kind in np.unique(kind):
+        rows = np.flatnonzero(kind == stretch_kind)
         window = np.ones(2 * NEAR + 1)
-        sums = np.convolve(values[here], window)[NEAR:-NEAR]
-        smooth[here] = sums / np.convolve(np.ones(len(here)), window)[NEAR:-NEAR]
+        sums = np.convolve(values[rows], window)[NEAR:-NEAR]
+        smooth[rows] = sums / np.convolve(np.ones(len(rows)), window)[NEAR:-NEAR]
     return smooth

@@ -1,4 +1,4 @@
-"""Healthy cycles as the fit sees them: rows in one stretch, averaged over bins."""
+"""Healthy cycles for a fit: rows in one stretch, averaged over bins."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,8 +21,8 @@ from twin.signals import MBAR, MS, UNUSABLE, Phase, Samples
 
 BINS = 6  # in each unit of warped time
 MOST_EARLY = 15.0 * MS  # s (a row at least), by which the nozzle may be seen early or late
-# What a second sensor may be off the first by: 1 % of a vacuum sensor's bar, of its span as well,
-# and what is left of its lag, which is looked for among some.
+# Sigmas of a second sensor beside the first: offset of 1 % of a vacuum sensor's bar, error of its
+# span, and the error of its lag, which is one of LAGS.
 ZERO, SPAN, LAG = 10.0 * MBAR, 0.01, 1.0 * MS  # Pa, 1, s
 LAGS = np.array([0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0]) * MS
 Bytes = npt.NDArray[np.uint8]
@@ -38,16 +38,16 @@ class Cycles:
     level: Floats
     bins: Bins
     measured: Floats  # mean pressure (Pa) of each bin
-    drawn: Ints  # rows that suffice to draw what is expected
+    drawn: Ints  # subsampled rows at which the model is evaluated
     tolerance: float  # Pa, of a step of the model
-    end: Literal["", "port", "vessel"] = ""  # of the line, where another sensor than the PLC's sits
-    lag: float = np.nan  # s, of that one
-    # (bins, n): how the same in all cycles it may be off (Pa), one standard deviation each.
+    end: Literal["", "port", "vessel"] = ""  # end of the line with a second sensor, if it is that
+    lag: float = np.nan  # s, of the second sensor
+    # (bins, n): errors (Pa) of the sensor that are the same in all cycles, one sigma each.
     unsure: Floats = field(default_factory=lambda: np.empty((0, 0)))
 
     @classmethod
     def as_live(cls, samples: Samples, data: DataSet) -> "Cycles":
-        """Find the phases as the live twin of ``data`` does, which is synchronised at each knee."""
+        """Find the phases as the live twin of ``data`` does, synchronised at each breakpoint."""
         theta = coefficients(data)
         finder = PhaseFinder(as_wide_as_needed(knees_of(data), [samples]))
         early, late = finder.push(samples), finder.flush()
@@ -57,31 +57,33 @@ class Cycles:
 
     @classmethod
     def found(cls, samples: Samples, data: DataSet) -> "Cycles":
-        """Find the phases, and where the nozzle switched whatever hangs on it.
+        """Find the phases and the nozzle's switchings without a model.
 
-        It switches where the pressure shows it, and the model runs on through that. An ejector that
-        saves no air never switches it by itself.
+        The nozzle switches where the pressure shows it; the model is not synchronised there. An
+        ejector without air saving never switches the nozzle by itself.
         """
         theta = coefficients(data)
         blow_off = float(theta[c.BLOW_OFF_MODE]), float(theta[c.BLOW_OFF_TIME])
-        rows, told, level = commanded(samples, blow_off)
+        rows, commanded_phase, level = commanded(samples, blow_off)
         level = level.astype(np.float32).astype(np.float64)
         saves_air = theta[c.AIR_SAVING] != c.OFF
-        found = switchings(rows, told, noise_of(rows, told)) if saves_air else []
-        phase = _switched(told, found)
+        nozzle_switchings = (
+            switchings(rows, commanded_phase, noise_of(rows, commanded_phase)) if saves_air else []
+        )
+        phase = _switched(commanded_phase, nozzle_switchings)
         return cls._of(rows, phase, level, theta, quickly=True)
 
     @classmethod
     def _of(
         cls, rows: Samples, phase: Bytes, level: Floats, theta: Floats, *, quickly: bool
     ) -> "Cycles":
-        """Those of ``phase`` and ``level``, as far as the model of ``theta`` has a say in them."""
+        """Cycles with ``phase`` and ``level``; bins only where the model of ``theta`` is finite."""
         dt = time_steps(rows, None)
         expected = _expected(theta.reshape(-1, 1), dt, phase, level)[:, 0]
         usable = ((rows["quality"] & UNUSABLE) == 0) & np.isfinite(rows["pressure"])
         bins = binned(phase, usable & np.isfinite(expected), _edges(phase), BINS)
         measured = bins.mean(rows["pressure"].astype(np.float64))
-        # A fit from afar takes what is quick: it has a long way to go, and is off by more.
+        # A fit from afar takes the quick way: it needs many runs, and its error is larger anyway.
         drawn = _drawn(dt, phase, level) if quickly else np.arange(len(dt))
         tolerance = kernel.ROUGHLY if quickly else kernel.TOLERANCE
         unsure = np.empty((len(measured), 0))
@@ -89,11 +91,11 @@ class Cycles:
 
     @property
     def most_early(self) -> int:
-        """Rows by which the nozzle may be seen to switch early or late, the same in all cycles."""
+        """Rows by which a switching may be seen early or late, the same in all cycles."""
         return max(round(MOST_EARLY / float(np.median(self.dt))), 1)
 
     def of_second(self, end: Literal["port", "vessel"]) -> "Cycles":
-        """The same of the second pressure, which is measured at an ``end`` of the line."""
+        """These cycles with the second pressure, measured at an ``end`` of the line."""
         pressure = self.samples["pressure_2"].astype(np.float64)
         usable = (self.bins.number >= 0) & (pressure > 0.0)
         rows = np.arange(len(pressure))
@@ -101,20 +103,20 @@ class Cycles:
         bins = binned(self.phase, usable, _edges(self.phase), BINS)
         measured = bins.mean(pressure)
         slope = bins.mean(np.gradient(pressure) / float(np.median(self.dt)))
-        ways = np.full(len(measured), ZERO), SPAN * (measured.max() - measured), LAG * slope
-        return replace(self, bins=bins, measured=measured, end=end, unsure=np.stack(ways, axis=1))
+        errors = np.full(len(measured), ZERO), SPAN * (measured.max() - measured), LAG * slope
+        return replace(self, bins=bins, measured=measured, end=end, unsure=np.stack(errors, axis=1))
 
     def as_slow(self, theta: Theta) -> "Cycles":
-        """The same with the lag of LAGS with which the model of ``theta`` is nearest."""
+        """These cycles with the lag of LAGS for which the model of ``theta`` fits best."""
         slow = [replace(self, lag=float(lag))._sensed(theta) for lag in LAGS]
         off = self.off(np.stack(slow, axis=1))
-        left = np.abs(off - self.unsure @ np.linalg.lstsq(self.unsure, off)[0])
-        return replace(self, lag=float(LAGS[np.average(left, axis=0).argmin()]))
+        residual = np.abs(off - self.unsure @ np.linalg.lstsq(self.unsure, off)[0])
+        return replace(self, lag=float(LAGS[np.average(residual, axis=0).argmin()]))
 
     def off(self, theta: Floats, early: Sequence[int] = ()) -> Floats:
         """Measured minus expected pressure (Pa) in each bin for hypotheses, (coefficients, n).
 
-        ``early`` says for each by how many rows the nozzle switches before it is seen to.
+        ``early``: for each hypothesis, rows by which the nozzle switches before it is seen to.
         """
         theta = self._sensed(theta)
         moved = any(early)
@@ -136,7 +138,7 @@ class Cycles:
             return np.concatenate(list(pool.map(run, parts)), axis=1)
 
     def _sensed(self, theta: Floats) -> Floats:
-        """Coefficients with the sensor that is looked at in place of the PLC's."""
+        """Coefficients with this pressure's sensor in place of the PLC's."""
         if not self.end:
             return theta
         theta = theta.copy()
@@ -158,7 +160,7 @@ class Cycles:
 
 @dataclass(frozen=True)
 class Both:
-    """Two pressures of the same cycles: what is said of the second follows what is of the first."""
+    """Two pressures of the same cycles: residuals of the first, then of the second."""
 
     first: Cycles
     second: Cycles
@@ -174,18 +176,18 @@ class Both:
         return self.first.most_early
 
     def off(self, theta: Floats, early: Sequence[int] = ()) -> Floats:
-        """As of ``Cycles``."""
+        """As in ``Cycles``."""
         return np.concatenate([self.first.off(theta, early), self.second.off(theta, early)])
 
 
-def _switched(told: Bytes, found: Sequence[Switching]) -> Bytes:
-    """Phases as commanded, with the nozzle going on and off as was found."""
-    phase = told.copy()
-    ends = [*(np.flatnonzero(np.diff(told)) + 1).tolist(), len(told)]
-    for one in found:
-        end = ends[int(np.searchsorted(ends, one.row, "right"))]
-        if told[one.row] == Phase.SUCTION:
-            phase[one.row : end] = Phase.SUCTION if one.on else Phase.HOLD
+def _switched(commanded_phase: Bytes, nozzle_switchings: Sequence[Switching]) -> Bytes:
+    """Commanded phases, with suction split into suction and hold by the switchings."""
+    phase = commanded_phase.copy()
+    ends = [*(np.flatnonzero(np.diff(commanded_phase)) + 1).tolist(), len(commanded_phase)]
+    for switching in nozzle_switchings:
+        end = ends[int(np.searchsorted(ends, switching.row, "right"))]
+        if commanded_phase[switching.row] == Phase.SUCTION:
+            phase[switching.row : end] = Phase.SUCTION if switching.on else Phase.HOLD
     return phase
 
 
@@ -198,13 +200,13 @@ def _switches(phase: Bytes) -> Ints:
 
 
 def _edges(phase: Bytes) -> Ints:
-    """Rows at which a cycle begins: suction that does not go on from a hold."""
+    """Rows at which a cycle begins: suction after idle or blow-off, not after hold."""
     begins = (phase[1:] == Phase.SUCTION) & np.isin(phase[:-1], (Phase.IDLE, Phase.BLOW_OFF))
     return np.flatnonzero(begins) + 1
 
 
 def _drawn(dt: Floats, phase: Bytes, level: Floats) -> Ints:
-    """Rows that suffice to draw a course: where phases change, rows are missing, a level is set."""
+    """Subsampled rows for linear interpolation, denser after phase changes and set levels."""
     begins = np.isfinite(level)
     begins[0] = True
     begins[1:] |= np.diff(phase) != 0

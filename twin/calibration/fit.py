@@ -1,8 +1,8 @@
 """The fit: the data set whose model follows healthy cycles best, and how well they determine it.
 
-Maximum a posteriori by generalised least squares: the type says where a value is to be expected and
-how far units differ, the cycles say the rest, each residual weighing what noise, scatter and the
-model's own error leave of it. All derivatives come from one run of the bank of hypotheses.
+Maximum a posteriori by generalised least squares. The type gives the prior: expected values and
+how far units differ. Residuals are whitened by noise, scatter and the model's own error. All
+derivatives come from one run of the bank of hypotheses.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,27 +25,28 @@ from twin.model.dataset import RIPPLE, DataSet, coefficients, sensor_place
 from twin.model.system import Tube
 from twin.signals import MBAR, MS, NS, UNUSABLE, Samples
 
-# Tolerances of the rounds. Knees are found and residuals weighed with what the round before found.
+# Tolerances of the rounds. Each round uses breakpoints and weights by the fit of the round before.
 ROUNDS = (1e-2, 1e-2, 1e-3)
 MOST_STEPS = 8  # in a round
-FIRST_SHARE = 0.4  # of the log, for the first round: it has the longest way to go
-DETERMINED = 0.5  # of what the type leaves open: what is known better comes from the log
-SWITCHING = 0.4  # of the most that the nozzle may be seen early or late, one standard deviation
-# s, one standard deviation of when a valve acts from stroke to stroke: edges are known no better.
+FIRST_SHARE = 0.4  # of the log, for the first round, which takes the most steps
+DETERMINED = 0.5  # of the prior sigma: a parameter with a smaller one is determined by the log
+SWITCHING = 0.4  # sigma of the nozzle's time, over the most that it may be seen early or late
+# s, sigma of a valve's delay from stroke to stroke: it limits how well edges are known.
 JITTER = 0.3 * MS
-INSIDE = 0.1  # sigmas from a bound, where a search begins at most: on it, it would not move
-RISING = 40  # steps over the characteristic, in which suction is looked at
+INSIDE = 0.1  # sigmas: least distance of a search's start from a bound; on it, it would not move
+RISING = 40  # steps over the characteristic in which a rise is penalised
 END_PRESSURE = "ejector.end_pressure_mbar"
-NEARLY_NOTHING = 0.02  # of the suction capacity, at the deepest pressure of a record
+NEARLY_NOTHING = 0.02  # of the suction capacity: a record with less flow reaches the end pressure
 BEST_END = 50.0 * MBAR  # Pa, absolute; single-stage ejectors end at 70 and more
-DEEPEST = 0.001  # quantile of a record's rows: no single reading
+DEEPEST = 0.001  # quantile of a record's pressures that counts as its deepest
 SPEED_OF_SOUND = 343.0  # m/s
-# s through a line whose waves would be late by as much. Chosen on a rig with 2.4 m of hose, told as
-# 2.9: there 0.9 ms. With none, what the waves left drew the suction's course off by 14 mbar.
+# s, travel time in a line at which waves are late by as much. Chosen on a rig with 2.4 m of hose,
+# configured as 2.9 m: 0.9 ms there. Without it, the waves' residuals shifted the suction's course
+# by 14 mbar.
 CARRIED = 27e-3
-MOST_WORSE = 1.1  # times the cost of the first pressure alone, with a second one
-MOST_ROWS = 0.5  # of the usable ones, above which a second pressure is followed
-MOST_FACTOR = 10.0  # of the logarithm
+MOST_WORSE = 1.1  # factor by which following a second pressure may raise the cost of the first
+MOST_ROWS = 0.5  # share of usable rows above which a second pressure is followed
+MOST_FACTOR = 10.0  # of the logarithm: the widest half interval
 BENDS = ("bulge", "skew", "bend_2", "bend_3")
 
 Floats = npt.NDArray[np.float64]
@@ -53,17 +54,17 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Round:
-    """A round of a fit from afar: how many of the starts go through, on which cycles, how long."""
+    """A round of a fit from afar: number of starts, share of the record, limits of the search."""
 
     starts: int
     share: float  # of the record
-    error: float  # Pa, what the model may be off by
+    error: float  # Pa, sigma of the model's error
     steps: int
-    tolerance: float  # of the cost, below which it is done
+    tolerance: float  # relative change of the cost that ends a search
 
 
-# All starts are tried on a few cycles, and half of what is left falls behind in each round; what
-# they are off by is narrowed with those that remain.
+# All starts are tried on a few cycles, and about half of them drop out in each round. The model's
+# error is narrowed for those that remain.
 NARROWING = (
     Round(100, 0.3, 5.0 * MBAR, 4, 1e-2),
     Round(6, 0.3, 5.0 * MBAR, 8, 1e-2),
@@ -72,7 +73,7 @@ NARROWING = (
     Round(2, 0.3, 0.6 * MBAR, 20, 1e-3),
     Round(1, 1.0, 0.6 * MBAR, 40, 1e-4),
 )
-# Sigmas, beyond which a residual pulls less than its square; below, it is what a fit gets wrong.
+# Sigmas beyond which the robust loss grows more slowly than the square of a residual.
 ROBUST = 8.0
 
 
@@ -85,17 +86,20 @@ class Problem:
     weights: Weights
 
     def residual(self, x: Floats) -> Floats:
-        """Residuals of all bins, and how far ``x`` is from what is expected.
+        """Residuals of all bins, and distances of ``x`` from the prior.
 
-        The nozzle switches at a row: between two, what is expected is between theirs.
+        The nozzle switches at a row: between two rows, residuals are interpolated.
         """
-        n, whole = len(self.space.free), self._whole(x)
+        n, whole_rows = len(self.space.free), self._whole(x)
         if n == len(x):
             return self._predict(x[:, None])[:, 0]
-        after = whole + np.append(np.zeros(n), 1.0 / self._rows)
-        share = self._rows * (x[n] - whole[n])
-        both: Floats = self._predict(np.stack([whole, after], axis=1)) @ [1.0 - share, share]
-        return both
+        next_rows = whole_rows + np.append(np.zeros(n), 1.0 / self._rows)
+        share = self._rows * (x[n] - whole_rows[n])
+        interpolated: Floats = self._predict(np.stack([whole_rows, next_rows], axis=1)) @ [
+            1.0 - share,
+            share,
+        ]
+        return interpolated
 
     def jacobian(self, x: Floats) -> Floats:
         """Derivatives of ``residual``."""
@@ -106,25 +110,25 @@ class Problem:
 
     @property
     def bounds(self) -> tuple[Floats, Floats]:
-        """Of the coordinates and of when the nozzle switches."""
+        """Lower and upper bounds of the coordinates, the nozzle's time last."""
         most = self.cycles.most_early / self._rows
         return np.append(self.space.low, -most), np.append(self.space.high, most)
 
     @property
     def _rows(self) -> float:
-        """Rows by which the nozzle switches sooner or later, one standard deviation."""
+        """One sigma of the time at which the nozzle switches, in rows."""
         return SWITCHING * self.cycles.most_early
 
     def _whole(self, x: Floats) -> Floats:
         """``x`` with the nozzle switching at the row before."""
-        n, whole = len(self.space.free), x.copy()
-        whole[n:] = np.floor(x[n:] * self._rows) / self._rows
-        return whole
+        n, rounded = len(self.space.free), x.copy()
+        rounded[n:] = np.floor(x[n:] * self._rows) / self._rows
+        return rounded
 
     def _predict(self, points: Floats) -> Floats:
         """Residuals at points, (coordinates, n) to (residuals, n)."""
         n = len(self.space.free)
-        moved = [self.space.at(one) for one in points[:n].T]
+        moved = [self.space.at(point) for point in points[:n].T]
         early = np.rint(points[n:] * self._rows).astype(int).ravel().tolist()
         off = self.cycles.off(np.stack([coefficients(data) for data in moved], axis=1), early)
         white = np.concatenate([*self.weights.white(off), points])
@@ -136,16 +140,16 @@ class Problem:
 def _rising(data: DataSet) -> Floats:
     """Penalty (sigmas) where suction would rise with vacuum: no ejector's does.
 
-    It is felt a little before: at a wall that comes without warning, a fit stops.
+    It sets in gradually: a fit would stop at a hard wall.
     """
     steps = np.diff(data.ejector.share(np.linspace(0.0, 1.0, RISING + 1)))
     return (np.hypot(steps, RIPPLE) - steps) / (0.6 * RIPPLE)
 
 
 def falling(data: DataSet) -> DataSet:
-    """``data`` with its characteristic bent no further than suction falls with vacuum.
+    """``data`` with bends reduced until suction falls with vacuum everywhere.
 
-    The penalty keeps a fit nearly there; a data set must be there.
+    The penalty only keeps a fit close to that; a data set must fulfil it.
     """
     x = np.linspace(0.0, 1.0, 101)
     unbent = data.ejector.model_copy(update=dict.fromkeys(BENDS, 0.0))
@@ -163,15 +167,15 @@ class Fitted:
     data: DataSet
     free: tuple[Free, ...]
     covariance: Floats  # of the free parameters, in their units
-    left_open: Floats  # the same without what the model leaves out: what other logs may show
-    prior: Floats  # one standard deviation of each before the log, in its unit
-    left: float  # Pa rms that the model is off in the fitted cycles
-    scaled: npt.NDArray[np.bool_]  # of which parameters the logarithm is normally distributed
-    deepest: float = np.nan  # Pa, to which the record goes; NaN where the type knows what is below
+    left_open: Floats  # the covariance without the model's discrepancy: other logs may narrow it
+    prior: Floats  # sigma of each before the log, in its unit
+    left: float  # Pa rms of the residual in the fitted cycles
+    scaled: npt.NDArray[np.bool_]  # parameters whose logarithm is normally distributed
+    deepest: float = np.nan  # Pa, lowest pressure of the record; NaN if the type is known
 
     @property
     def reaches_end(self) -> bool:
-        """Whether the record goes down to where the ejector moves nearly nothing any more."""
+        """Whether the record goes down to where the ejector has nearly no suction."""
         ejector, ambient = self.data.ejector, self.data.ambient.pressure_mbar
         end = ejector.end_pressure_mbar
         beyond = max(self.deepest / MBAR - end, 0.0) / (ambient - end)
@@ -186,16 +190,16 @@ class Fitted:
     @property
     def determined(self) -> npt.NDArray[np.bool_]:
         """Which parameters the log determines; the others come from the type."""
-        known: npt.NDArray[np.bool_] = self.spread < DETERMINED * self.prior
-        known[self._number(END_PRESSURE)] &= self.reaches_end
-        return known
+        is_determined: npt.NDArray[np.bool_] = self.spread < DETERMINED * self.prior
+        is_determined[self._number(END_PRESSURE)] &= self.reaches_end
+        return is_determined
 
     def interval(self, name: str) -> tuple[float, float]:
         """95 % interval of a parameter (``table.key``), in its unit.
 
-        What the log does not determine may be nothing, where that can be: a leak. An end pressure
-        that the record does not come near is known to be below its deepest: how the characteristic
-        goes on from there is nobody's knowledge.
+        A parameter that the log does not determine may be zero if its bounds allow that, as a leak
+        may. If the record does not come near the end pressure, that is only known to lie below the
+        deepest pressure: the record does not show how the characteristic continues.
         """
         if name == END_PRESSURE and not self.reaches_end:
             return min(BEST_END, self.deepest) / MBAR, self.deepest / MBAR
@@ -217,11 +221,11 @@ class Fitted:
 def fit(samples: Samples, space: Space, progress: Callable[[str], None]) -> Fitted:
     """Fit the free parameters to healthy cycles of a unit of known type, starting from its data."""
     x, best, noise = np.zeros(len(space.free)), space.data, space.data.sensor.noise_mbar * MBAR
-    for turn, tolerance in enumerate(ROUNDS):
-        progress(f"fitting, round {turn + 1} of {len(ROUNDS)}")
-        rows = round(len(samples) * (FIRST_SHARE if turn == 0 else 1.0))
+    for round_number, tolerance in enumerate(ROUNDS):
+        progress(f"fitting, round {round_number + 1} of {len(ROUNDS)}")
+        rows = round(len(samples) * (FIRST_SHARE if round_number == 0 else 1.0))
         cycles = Cycles.as_live(samples[:rows], best)
-        weights = weighted(cycles, coefficients(best), noise, fitted=turn > 0)
+        weights = weighted(cycles, coefficients(best), noise, fitted=round_number > 0)
         problem = Problem(space, cycles, weights)
         x = _solved(problem, x, MOST_STEPS, tolerance)
         best = space.at(x)
@@ -230,7 +234,7 @@ def fit(samples: Samples, space: Space, progress: Callable[[str], None]) -> Fitt
 
 @dataclass(frozen=True)
 class _Start:
-    """Where a fit from afar has come to from one of its starts."""
+    """State of a fit from afar from one of its starts."""
 
     space: Space
     x: Floats
@@ -247,32 +251,32 @@ def fit_from_afar(
     progress: Callable[[str], None],
     free: tuple[Free, ...] = FREE_IN_MARKET,
 ) -> Fitted:
-    """Fit a unit that nobody has seen before, however far from the ``guesses`` it may be.
+    """Fit a unit of unknown type, however far from the ``guesses`` it may be.
 
-    Each guess is a start, as a curve has more than one explanation near which a fit can end. What
-    the model may be off by begins wide and is narrowed, so that the fit follows the large features
-    first; residuals beyond it pull less than their square (a robust loss). No bin's error is taken
-    to be another's: what a fit may call scatter from cycle to cycle hides what it gets wrong.
+    Each guess is a start, as a curve has several local explanations at which a fit can end. The
+    model's error begins wide and is narrowed, so that the fit follows the large features first;
+    residuals beyond it have a robust loss. Errors of bins are independent: a fit could otherwise
+    hide its errors as scatter from cycle to cycle.
 
-    A second pressure, where most rows have one, is followed from there on: from a guess, two lead
-    astray more often than one. It is not where the first is followed less well for it.
+    A second pressure is followed afterwards, if most rows have one: from a guess, two pressures
+    mislead a fit more often than one. It is left out if the first is then followed less well.
     """
     noises = [guesses[0].sensor.noise_mbar * MBAR]
     spaces = [Space.of_market(guess, free) for guess in guesses]
     starts = [_Start(space, np.zeros(len(space.free))) for space in spaces]
-    for number, one in enumerate(NARROWING, 1):
-        starts = starts[: one.starts]
+    for number, fit_round in enumerate(NARROWING, 1):
+        starts = starts[: fit_round.starts]
         progress(f"fitting, round {number} of {len(NARROWING)}: {len(starts)} starts")
-        rows = samples[: round(len(samples) * one.share)]
+        rows = samples[: round(len(samples) * fit_round.share)]
         starts = sorted(
-            (_followed(rows, start, one, noises) for start in starts), key=attrgetter("cost")
+            (_followed(rows, start, fit_round, noises) for start in starts), key=attrgetter("cost")
         )
-    best, two = starts[0], noises + second_noise(samples)
-    if len(two) > 1:
+    best, both_noises = starts[0], noises + second_noise(samples)
+    if len(both_noises) > 1:
         progress("following the second pressure as well")
-        both = _followed(samples, best, NARROWING[-1], two)
-        if _alone(samples, both, noises) < MOST_WORSE * _alone(samples, best, noises):
-            best, noises = both, two
+        with_second = _followed(samples, best, NARROWING[-1], both_noises)
+        if _alone(samples, with_second, noises) < MOST_WORSE * _alone(samples, best, noises):
+            best, noises = with_second, both_noises
         else:
             progress("the second pressure is left out: the first would be followed less well")
     theta = coefficients(best.data)
@@ -285,17 +289,17 @@ def fit_from_afar(
 
 
 def second_noise(samples: Samples) -> list[float]:
-    """Noise (Pa) of a second pressure; empty where too few rows have one to follow it."""
+    """Noise (Pa) of a second pressure; empty if too few rows have one."""
     usable = (samples["quality"] & UNUSABLE) == 0
-    there = usable & (samples["pressure_2"] > 0.0)
-    if np.count_nonzero(there) <= MOST_ROWS * np.count_nonzero(usable):
+    has_second = usable & (samples["pressure_2"] > 0.0)
+    if np.count_nonzero(has_second) <= MOST_ROWS * np.count_nonzero(usable):
         return []
     period = float(np.median(np.diff(samples["time_ns"]))) * NS
-    return [noise_of(samples["pressure_2"][there].astype(np.float64), period)]
+    return [noise_of(samples["pressure_2"][has_second].astype(np.float64), period)]
 
 
 def _alone(samples: Samples, start: _Start, noises: Sequence[float]) -> float:
-    """What is left of the first pressure alone, as a cost."""
+    """Cost of the residuals of the first pressure alone."""
     error = NARROWING[-1].error
     problem = _problem(
         samples, start, noises, lambda cycles, noise: plain(cycles, noise, error, _late(start.data))
@@ -304,7 +308,7 @@ def _alone(samples: Samples, start: _Start, noises: Sequence[float]) -> float:
 
 
 def _cost(residual: Floats) -> float:
-    """Of residuals in sigmas; what is far off costs little more than what is off."""
+    """Robust cost of residuals in sigmas: large ones grow it by their logarithm only."""
     return float(np.sum(np.log1p(residual**2)))
 
 
@@ -319,7 +323,7 @@ def _problem(
     noises: Sequence[float],
     weigh: Callable[[Cycles, float], Weights],
 ) -> Problem:
-    """To follow the pressure from a start, and a second one where there are two ``noises`` (Pa)."""
+    """The problem of following the pressure from a start; two ``noises`` (Pa): both pressures."""
     cycles = Cycles.found(samples, start.data)
     weights = weigh(cycles, noises[0])
     if len(noises) == 1:
@@ -330,27 +334,26 @@ def _problem(
 
 
 def _late(data: DataSet) -> float:
-    """By how much (s) edges may be early or late: by strokes of valves, and by waves in the line.
+    """One sigma (s) of the time of an edge: by strokes of valves, and by waves in the line.
 
-    Few nodes carry those.
-    A wave that is not much longer than what is between two nodes is late by a share of its way that
-    grows with the square of it.
+    The model has few nodes along the line. A wave that is not much longer than their distance is
+    late. Its delay over the travel time grows with the square of that.
     """
     length = sum(part.length_mm for part in data.system.parts if isinstance(part, Tube))
-    through = 1e-3 * length / SPEED_OF_SOUND
-    return float(np.hypot(JITTER, through * (through / CARRIED) ** 2))
+    passage = 1e-3 * length / SPEED_OF_SOUND
+    return float(np.hypot(JITTER, passage * (passage / CARRIED) ** 2))
 
 
-def _followed(samples: Samples, start: _Start, one: Round, noises: Sequence[float]) -> _Start:
-    """Where a round leads from a start."""
+def _followed(samples: Samples, start: _Start, fit_round: Round, noises: Sequence[float]) -> _Start:
+    """The result of one round from a start."""
     problem = _problem(
         samples,
         start,
         noises,
-        lambda cycles, noise: plain(cycles, noise, one.error, _late(start.data)),
+        lambda cycles, noise: plain(cycles, noise, fit_round.error, _late(start.data)),
     )
-    # The last coordinate is how much sooner the nozzle switches than it was seen to.
-    x = _solved(problem, np.append(start.x, 0.0), one.steps, one.tolerance, "soft_l1")
+    # The last coordinate is the time by which the nozzle switches before it is seen to.
+    x = _solved(problem, np.append(start.x, 0.0), fit_round.steps, fit_round.tolerance, "soft_l1")
     return _Start(start.space, x[:-1], _cost(problem.residual(x)))
 
 
@@ -362,7 +365,7 @@ def _solved(
     loss: Literal["linear", "soft_l1"] = "linear",
 ) -> Floats:
     low, high = (bound[: len(x)] for bound in problem.bounds)
-    found = least_squares(
+    result = least_squares(
         problem.residual,
         np.clip(x, low + INSIDE, high - INSIDE),
         problem.jacobian,
@@ -373,32 +376,32 @@ def _solved(
         loss=loss,
         f_scale=ROBUST,
     )
-    best: Floats = found.x
+    best: Floats = result.x
     return best
 
 
 def _fitted(problem: Problem, x: Floats) -> Fitted:
-    """What the fit found at ``x``, and how sure it is."""
+    """The data set at ``x`` with its covariance."""
     problem = replace(problem, space=problem.space.on_the_line)
     space, cycles = problem.space, problem.cycles
     x = np.clip(x, space.low, space.high)
     best = DataSet.model_validate(falling(space.at(x)).model_dump())
-    ways = space.slopes(x)
+    slopes = space.slopes(x)
     off = cycles.off(np.stack(with_left_out(best), axis=1))
     jacobian = problem.jacobian(x)
     plain = np.asarray(np.linalg.inv(jacobian.T @ jacobian), np.float64)
-    covariance = ways @ _with_left_out(plain, jacobian, problem.weights.white(off)) @ ways.T
-    prior = np.sqrt(np.diag(ways @ ways.T))
-    first = off[: len(cycles.bins.count), 0]
-    left = float(np.sqrt(np.average(first**2, weights=cycles.bins.count)))
-    left_open = ways @ plain @ ways.T
-    return Fitted(best, space.free, covariance, left_open, prior, left, space.scaled)
+    covariance = slopes @ _with_left_out(plain, jacobian, problem.weights.white(off)) @ slopes.T
+    prior = np.sqrt(np.diag(slopes @ slopes.T))
+    first_residual = off[: len(cycles.bins.count), 0]
+    rms = float(np.sqrt(np.average(first_residual**2, weights=cycles.bins.count)))
+    left_open = slopes @ plain @ slopes.T
+    return Fitted(best, space.free, covariance, left_open, prior, rms, space.scaled)
 
 
 def _with_left_out(covariance: Floats, jacobian: Floats, white: Sequence[Floats]) -> Floats:
-    """Covariance of ``x``: of what residuals scatter, and where what is left out moves it.
+    """Covariance of ``x``: by the scatter of residuals, and by the model's discrepancy.
 
-    ``white`` are residuals (bins, n) in sigmas: of the fit, then with what the model leaves out.
+    ``white`` are residuals (bins, n) in sigmas: of the fit, then with each omitted effect.
     """
     all_white = np.concatenate(white)
     _, changes = derivatives(all_white)

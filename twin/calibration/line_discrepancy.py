@@ -1,7 +1,7 @@
-"""What the model leaves out of a line, as coefficients that have it in.
+"""Discrepancy of the model of a line: coefficients with the effects that it omits.
 
-A calibration cannot tell it from what it fits. Where that moves the parameters is no error of the
-log, so no number of cycles makes it smaller; it belongs into the intervals all the same.
+A calibration confuses these effects with its parameters. That shift of the parameters is a bias:
+more cycles do not reduce it. So the intervals must include it.
 """
 
 from twin.model import theta as c
@@ -11,11 +11,11 @@ from twin.model.theta import Theta
 
 
 def with_left_out(data: DataSet) -> list[Theta]:
-    """Coefficients of ``data`` and then, one by one, with what the model leaves out.
+    """Coefficients of ``data``, then the same with each omitted effect in turn.
 
-    The gas in a line too short to swing still has inertia, which pushes while a jet or a blow-off
-    sets in. And the wall at the far end of a tube is taken for the vessel's, film and all, as far
-    out as half of what is not half-way along.
+    The gas in a line too short to oscillate still has inertia, which pushes while a jet or a
+    blow-off sets in. And the model counts the wall of a tube's far end as the vessel's, film
+    included.
     """
     theta = coefficients(data)
     total = lumped(data.system.parts, theta[c.SUCTION], theta[c.AMBIENT], theta[c.TEMPERATURE])

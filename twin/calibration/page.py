@@ -1,4 +1,4 @@
-"""The page of a commissioning: verdict, what to change, measured against fitted, what was found."""
+"""The page of a commissioning: verdict, what to change, measured against fitted, values."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,85 +21,90 @@ MARKS = {"good": ("●", "#2e7d4f"), "usable": ("▲", "#b36b00"), "refused": ("
 HEIGHT = 5.0  # inches
 
 
-def write_page(found: Commissioned, asset: Asset, path: Path) -> None:
+def write_page(commissioned: Commissioned, asset: Asset, path: Path) -> None:
     """Write the page, one HTML file that needs no network."""
-    mark, colour = MARKS[found.verdict.word]
+    mark, colour = MARKS[commissioned.verdict.word]
     parts = [
-        page.section("What to change", "\n".join(_remarks(found))),
-        _picture(found),
-        page.section("How close", _residuals(found)),
-        page.section("What was found", _parameters(found)),
+        page.section("What to change", "\n".join(_remarks(commissioned))),
+        _picture(commissioned),
+        page.section("How close", _residuals(commissioned)),
+        page.section("What was found", _parameters(commissioned)),
     ]
     text = page.PAGE.substitute(
         title=f"Commissioning of {asset.id}",
         colour=colour,
         mark=mark,
-        verdict=found.verdict.word,
-        headline=f"{asset.type} {asset.id}: {headline(found.verdict)}",
+        verdict=commissioned.verdict.word,
+        headline=f"{asset.type} {asset.id}: {headline(commissioned.verdict)}",
         body="\n".join(parts),
-        footer=f"{found.calibration.cycles} cycles; pressures in mbar, intervals of 95 %",
+        footer=f"{commissioned.calibration.cycles} cycles; pressures in mbar, intervals of 95 %",
     )
     write_text(path, text)
 
 
-def _remarks(found: Commissioned) -> Iterator[str]:
-    for remark in found.remarks:
+def _remarks(commissioned: Commissioned) -> Iterator[str]:
+    for remark in commissioned.remarks:
         yield page.box(remark.text, f"The record's value is used. Write: {remark.line}")
-    for one in found.contradictions:
-        yield page.box(one.what, f"{one.action[0].upper()}{one.action[1:]}.")
-    if not found.remarks and not found.contradictions:
+    for contradiction in commissioned.contradictions:
+        yield page.box(
+            contradiction.what, f"{contradiction.action[0].upper()}{contradiction.action[1:]}."
+        )
+    if not commissioned.remarks and not commissioned.contradictions:
         yield page.paragraph("Nothing: the record does not contradict the configuration.")
-    if found.unseen:
-        yield page.paragraph(found.unseen)
+    if commissioned.unseen:
+        yield page.paragraph(commissioned.unseen)
 
 
-def _residuals(found: Commissioned) -> str:
+def _residuals(commissioned: Commissioned) -> str:
     head = ("phase", "rms left, mbar", "floor, mbar", "times the floor")
     rows = (
         (
             phase.name.lower().replace("_", "-"),
-            *(f"{value:.2f}" for value in (one.left / MBAR, one.floor / MBAR, one.times)),
+            *(
+                f"{value:.2f}"
+                for value in (residual.left / MBAR, residual.floor / MBAR, residual.times)
+            ),
         )
-        for phase, one in found.verdict.residuals.items()
+        for phase, residual in commissioned.verdict.residuals.items()
     )
     caption = "The floor is what cycles of this record differ by, noise included"
     return page.table(caption, head, rows, numbers=(1, 2, 3))
 
 
-def _parameters(found: Commissioned) -> str:
+def _parameters(commissioned: Commissioned) -> str:
     head = ("value", "found", "from", "to", "unit", "known from")
     rows = (
         (
             name,
-            *(f"{one[key]:.4g}" for key in ("value", "low95", "high95")),
-            one["unit"],
-            "record" if one["determined"] else "assumed",
+            *(f"{parameter[key]:.4g}" for key in ("value", "low95", "high95")),
+            parameter["unit"],
+            "record" if parameter["determined"] else "assumed",
         )
-        for name, one in parameters(found.calibration).items()
+        for name, parameter in parameters(commissioned.calibration).items()
     )
     return page.table("Values of the data set, with intervals of 95 %", head, rows, (1, 2, 3))
 
 
-def _picture(found: Commissioned) -> str:
-    title = f"Measured against fitted: {_worst(found)}"
+def _picture(commissioned: Commissioned) -> str:
+    title = f"Measured against fitted: {_worst(commissioned)}"
     alt = "Vacuum of one cycle, measured and fitted, and the deviation below it"
     with empty("commissioning", HEIGHT) as figure:
-        _draw(figure, _typical(found.calibration.fitted.data, found.samples))
+        _draw(figure, _typical(commissioned.calibration.fitted.data, commissioned.samples))
         svg = as_svg(figure, alt)
     return page.picture(title, svg, "The cycle whose deviation is the median of all.")
 
 
-def _worst(found: Commissioned) -> str:
-    if not found.verdict.weak:
+def _worst(commissioned: Commissioned) -> str:
+    if not commissioned.verdict.weak:
         return "the twin follows every phase"
-    names = [phase.name.lower().replace("_", "-") for phase in found.verdict.weak]
+    names = [phase.name.lower().replace("_", "-") for phase in commissioned.verdict.weak]
     return f"the twin is off in {' and '.join(names)}"
 
 
 def _typical(data: DataSet, samples: Samples) -> Cycle:
     """The cycle with the median deviation."""
-    cycles = [one for one in whole(Twin.of(data).over([samples])) if one.settled]
-    cycles.sort(key=lambda one: float(np.nanmean(one.off**2)))
+    cycles = [cycle for cycle in whole(Twin.of(data).over([samples])) if cycle.settled]
+    cycles.sort(key=lambda cycle: float(np.nanmean(cycle.off**2)))
     return cycles[len(cycles) // 2]
 
 

@@ -1,4 +1,4 @@
-"""What a calibration may move: one table, each with what the type leaves open."""
+"""Table of a calibration's free parameters, each with its prior; and the space of a search."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,15 +14,14 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Free:
-    """One value of a data set: where it stands, its unit and bounds, how far units differ.
+    """One free value of a data set: table and key, unit, bounds, and how far units differ.
 
-    ``spread`` is one standard deviation from unit to unit and from what is configured: a share of
-    the value where ``relative``, else in its unit. ``healthy`` is how many of them below and above
-    the type's value a unit is still taken for healthy; None where the value only shapes the curve.
-    ``market`` is the spread where nobody knows the type: of the logarithm where the value is
-    ``scaled``, else in its unit. It is wide enough for any rig that is on the market.
-    ``model_form`` is one sigma of the logarithm by which a rig of other equations has it elsewhere
-    though the curves agree: it widens the interval that is told, and nothing else.
+    ``spread`` is one sigma from unit to unit and from the configuration: a share of the value if
+    ``relative``, else in its unit. ``healthy`` limits a healthy unit, in sigmas below and above the
+    type's value; None if the value only shapes the curve. ``market`` is one sigma if the type is
+    unknown: of the logarithm if the value is ``scaled``, else in its unit. It is wide enough for
+    any rig on the market. ``model_form`` is one sigma of the logarithm between rigs of other
+    equations whose curves agree: it only widens the reported interval.
     """
 
     table: str
@@ -39,7 +38,7 @@ class Free:
 
     @property
     def name(self) -> str:
-        """As a configuration has it."""
+        """Table and key as in a configuration."""
         return f"{self.table}.{self.key}"
 
     def of(self, data: DataSet) -> float:
@@ -47,7 +46,7 @@ class Free:
         return float(getattr(getattr(data, self.table), self.key))
 
     def sigma(self, data: DataSet) -> float:
-        """How far it may be from its value in ``data``, one standard deviation, in its unit."""
+        """One sigma about its value in ``data``, in its unit."""
         return self.spread * abs(self.of(data)) if self.relative else self.spread
 
 
@@ -55,9 +54,9 @@ _E = "ejector"
 _ANY = (4.0, 4.0)
 FREE = (
     # A worn nozzle moves less air; a unit that moves more than its type is only a good one.
-    # It is suction at ambient pressure, where the jet still grows and gas at the port makes up for
-    # it: on seven commissioned rigs of the tests' second world (seeds from 101000) it was off by
-    # 26 % rms, while the curves agreed to a millibar.
+    # This is suction at ambient pressure, where the jet still grows and gas at the port hides that.
+    # On seven commissioned rigs of the tests' second world (seeds from 101000) its error was 26 %
+    # rms, while the curves agreed to a millibar.
     Free(
         _E,
         "suction_capacity_sl_min",
@@ -94,8 +93,8 @@ FREE = (
 )
 _NUMBER = {free.key: number for number, free in enumerate(FREE)}
 _BENDS = [_NUMBER[key] for key in ("bulge", "skew", "bend_2", "bend_3")]
-# Legendre polynomials over the characteristic, in powers of x. A real characteristic is smooth: in
-# these the finer ones are small, and none can be traded against another, as powers could.
+# Legendre polynomials over the characteristic, in powers of x. A real characteristic is smooth, so
+# the finer ones are small. They are orthogonal; powers of x would be nearly collinear.
 _SMOOTH = np.array(
     [
         [1.0, -1.0, 1.0, -1.0],
@@ -105,9 +104,8 @@ _SMOOTH = np.array(
     ]
 )
 
-# A characteristic may also be said by how much it rises in each of five parts, as the coefficients
-# of Bernstein's polynomials do, and with such rises above zero it rises everywhere: bends from
-# them, (bends, parts).
+# A characteristic can also be given by its rises in five parts, as with the coefficients of
+# Bernstein polynomials; with rises above zero it is monotonic. Bends from rises, (bends, parts).
 _FROM_RISES = np.array(
     [
         [4.0, -1.0, -1.0, -1.0, -1.0],
@@ -117,28 +115,28 @@ _FROM_RISES = np.array(
     ]
 )
 _PARTS = _FROM_RISES.shape[1]
-# Courses of the logarithm of the rises over the parts, the finer ones last, (parts, bends).
+# Legendre polynomials that tilt the logarithms of the rises, the finer ones last, (parts, bends).
 _TILTS = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, _PARTS), len(_BENDS))[:, 1:]
-LEAST_RISE = 1e-3  # of all, in a part of a characteristic from which a fit begins
+LEAST_RISE = 1e-3  # least share of the whole rise in a part, where a fit begins
 
 
 def _rises(bends: Floats) -> Floats:
-    """The rises of a characteristic, which add up to 1, from its bends."""
-    both = np.vstack([_FROM_RISES, np.ones(_PARTS)])
-    found = np.maximum(np.linalg.solve(both, np.append(bends, 1.0)), LEAST_RISE)
-    shares: Floats = found / found.sum()
+    """Rises of a characteristic from its bends; they add up to 1."""
+    equations = np.vstack([_FROM_RISES, np.ones(_PARTS)])
+    rises = np.maximum(np.linalg.solve(equations, np.append(bends, 1.0)), LEAST_RISE)
+    shares: Floats = rises / rises.sum()
     return shares
 
 
 def _tilted(rises: Floats, tilts: Floats) -> Floats:
-    """Rises whose logarithms are tilted."""
+    """Rises with tilted logarithms; they add up to 1."""
     logarithms = _TILTS @ tilts
-    found = rises * np.exp(logarithms - logarithms.max())
-    shares: Floats = found / found.sum()
+    tilted = rises * np.exp(logarithms - logarithms.max())
+    shares: Floats = tilted / tilted.sum()
     return shares
 
 
-# What is free beside these where nobody knows the type.
+# Free parameters if the type is unknown.
 FREE_IN_MARKET = (
     *FREE,
     Free(_E, "port_volume_ml", "ml", 0.2, 0.1, 1000.0, True, market=1.0),
@@ -168,66 +166,71 @@ FREE_IN_MARKET = (
     Free("system", "part_meets_ms", "ms", 5.0, 0.0, 5000.0, market=0.6),
     Free("system", "release_shift_mbar", "mbar", 5.0, -60.0, 200.0, market=15.0, scaled=False),
 )
-# What is free beside these where an absolute sensor reads a system that is never open to ambient:
-# nothing else tells ambient pressure. Told, it is known to some mbar; else places differ by height.
+# Also free if an absolute sensor reads a system that is never open: nothing else shows ambient
+# pressure. If configured, it is known to some mbar; otherwise it depends on the site's height.
 AMBIENT = Free("ambient", "pressure_mbar", "mbar", 3.0, 500.0, 1100.0, market=40.0, scaled=False)
 AMBIENT_TOLD = replace(AMBIENT, market=3.0)
-SMALLEST = 0.02  # in its unit, a value of the type from which a scale can lead away
-FARTHEST = 5.0  # of the logarithm, from the guess
-# Sigmas of the market, for a derivative. With five times as much a fit of 46 values stopped far
-# from the best: what the step made of the strong directions hid what the weak ones are.
+SMALLEST = 0.02  # in its unit: least centre of a scaled value, as a factor cannot leave zero
+FARTHEST = 5.0  # largest change of the logarithm from the guess
+# Step of a derivative, in market sigmas. With five times as much, a fit of 46 values stopped far
+# from the best: errors along the strong directions hid the weak ones.
 MARKET_STEP = 0.01
 
 
 def values(data: DataSet, free: Sequence[Free] = FREE) -> Floats:
     """Values of free parameters, in their units."""
-    return np.array([one.of(data) for one in free])
+    return np.array([parameter.of(data) for parameter in free])
 
 
 def directions(data: DataSet) -> Floats:
-    """(parameters, n): independent ways to differ from ``data``, one standard deviation each."""
-    ways = np.diag([free.sigma(data) for free in FREE])
-    ways[np.ix_(_BENDS, _BENDS)] = _SMOOTH * np.diag(ways)[_BENDS]
-    # The exhaust that blow-off leaves through is as wide as the blow-off needs it.
+    """(parameters, n): independent directions away from ``data``, one sigma each."""
+    columns = np.diag([free.sigma(data) for free in FREE])
+    columns[np.ix_(_BENDS, _BENDS)] = _SMOOTH * np.diag(columns)[_BENDS]
+    # The exhaust is sized for the blow-off, so it varies with it.
     flow, relief = FREE[_NUMBER["blow_off_sl_min"]], _NUMBER["relief_sl_min"]
-    ways[relief, _NUMBER["blow_off_sl_min"]] = flow.spread * FREE[relief].of(data)
-    return ways
+    columns[relief, _NUMBER["blow_off_sl_min"]] = flow.spread * FREE[relief].of(data)
+    return columns
 
 
 def with_values(data: DataSet, numbers: Floats, free: Sequence[Free] = FREE) -> DataSet:
-    """``data`` with other values, unchecked: a search passes through what is no ejector.
+    """``data`` with other values, unchecked: a search may pass through impossible ejectors.
 
-    The nozzle goes off and on at pressures: with another ambient pressure that is another vacuum.
+    The nozzle switches at absolute pressures: another ambient pressure changes the vacuum of its
+    thresholds.
     """
     changed: dict[str, dict[str, float]] = {}
-    for one, number in zip(free, numbers, strict=True):
-        changed.setdefault(one.table, {})[one.key] = float(number)
+    for parameter, number in zip(free, numbers, strict=True):
+        changed.setdefault(parameter.table, {})[parameter.key] = float(number)
     if "ambient" in changed:
-        higher = changed["ambient"][AMBIENT.key] - data.ambient.pressure_mbar
+        rise = changed["ambient"][AMBIENT.key] - data.ambient.pressure_mbar
         for key in ("h1_mbar", "h2_mbar"):
-            changed.setdefault("ejector", {})[key] = getattr(data.ejector, key) + higher
+            changed.setdefault("ejector", {})[key] = getattr(data.ejector, key) + rise
     tables = {name: getattr(data, name).model_copy(update=new) for name, new in changed.items()}
     return data.model_copy(update=tables)
 
 
-def _reach(one: Free, data: DataSet) -> tuple[float, float]:
-    """Coordinates in a market about ``data`` at which a value is at its bounds."""
-    value = one.of(data)
-    if not one.scaled:
-        return (one.low - value) / one.market, (one.high - value) / one.market
-    centre, farthest = max(value, one.low, SMALLEST), np.exp(FARTHEST)
-    low, high = max(one.low, centre / farthest), min(one.high, centre * farthest)
-    return float(np.log(low / centre)) / one.market, float(np.log(high / centre)) / one.market
+def _reach(parameter: Free, data: DataSet) -> tuple[float, float]:
+    """Market coordinates about ``data`` at which a value reaches its bounds."""
+    value = parameter.of(data)
+    if not parameter.scaled:
+        return (parameter.low - value) / parameter.market, (
+            parameter.high - value
+        ) / parameter.market
+    centre, farthest = max(value, parameter.low, SMALLEST), np.exp(FARTHEST)
+    low, high = max(parameter.low, centre / farthest), min(parameter.high, centre * farthest)
+    return float(np.log(low / centre)) / parameter.market, float(
+        np.log(high / centre)
+    ) / parameter.market
 
 
 @dataclass(frozen=True)
 class Space:
-    """Where a fit may go: coordinates in standard deviations about a data set, 0 at the data set.
+    """Space of a fit: coordinates in sigmas about a data set, which is at 0.
 
-    ``ways`` are (parameters, n). A parameter that is ``scaled`` is multiplied by the exponential of
-    its coordinate, any other is added to. A search stays between ``low`` and ``high``: outside,
-    where nothing moves, it would find no way back. Where nobody knows the type, the coordinates of
-    the bends tilt the characteristic so that it rises ``everywhere``.
+    ``ways`` are directions, (parameters, n). A ``scaled`` parameter is multiplied by the
+    exponential of its coordinate; to any other the coordinate is added. A search stays between
+    ``low`` and ``high``: outside the derivatives are zero. If the type is unknown, the coordinates
+    of the bends tilt the characteristic so that it rises ``everywhere``.
     """
 
     data: DataSet
@@ -247,33 +250,35 @@ class Space:
 
     @classmethod
     def of_market(cls, data: DataSet, free: tuple[Free, ...] = FREE_IN_MARKET) -> "Space":
-        """Any ejector on the market and what may hang on it; ``data`` is a guess."""
-        ways = np.diag([one.market for one in free])
-        scaled = np.array([one.scaled for one in free])
-        low, high = np.array([_reach(one, data) for one in free]).T
+        """Any ejector on the market with any system; ``data`` is a guess."""
+        directions = np.diag([parameter.market for parameter in free])
+        scaled = np.array([parameter.scaled for parameter in free])
+        low, high = np.array([_reach(parameter, data) for parameter in free]).T
         low[_BENDS], high[_BENDS] = -np.inf, np.inf  # each coordinate moves several of them
-        return cls(data, free, ways, scaled, low, high, MARKET_STEP, everywhere=True)
+        return cls(data, free, directions, scaled, low, high, MARKET_STEP, everywhere=True)
 
     @property
     def on_the_line(self) -> "Space":
-        """The same, with the sensor no farther than an end of the line.
+        """The same space with the sensor bound to the line.
 
-        A search may pass an end, so that it does not stop there. But beyond it nothing moves: a
-        record would seem to leave open where the sensor is.
+        A search may pass an end of the line, so that it does not stop there. But derivatives are
+        zero beyond it: the record would seem not to determine the sensor's place.
         """
         system = self.data.system.model_copy(update={"sensor_shift": 0.0})
-        told = sensor_place(self.data.model_copy(update={"system": system}))
-        number = [one.key for one in self.free].index("sensor_shift")
-        one = replace(self.free[number], low=-told, high=1.0 - told)
-        ends = np.array([one.low, one.high]) - one.of(self.data)
+        configured_place = sensor_place(self.data.model_copy(update={"system": system}))
+        number = [parameter.key for parameter in self.free].index("sensor_shift")
+        parameter = replace(self.free[number], low=-configured_place, high=1.0 - configured_place)
+        ends = np.array([parameter.low, parameter.high]) - parameter.of(self.data)
         low, high = self.low.copy(), self.high.copy()
         low[number], high[number] = ends / self.ways[number, number]
-        free = (*self.free[:number], one, *self.free[number + 1 :])
+        free = (*self.free[:number], parameter, *self.free[number + 1 :])
         return replace(self, free=free, low=low, high=high)
 
     def values(self, x: Floats) -> Floats:
         """Values of the free parameters at ``x``, kept within their bounds."""
-        low, high = ([getattr(one, end) for one in self.free] for end in ("low", "high"))
+        low, high = (
+            [getattr(parameter, end) for parameter in self.free] for end in ("low", "high")
+        )
         return np.clip(self._unbound(x), low, high)
 
     def at(self, x: Floats) -> DataSet:
@@ -296,6 +301,6 @@ class Space:
         if self.everywhere:
             rises = _tilted(_rises(centre[_BENDS]), moved[_BENDS])
             moved[_BENDS] = _FROM_RISES @ rises - centre[_BENDS]
-        least = np.array([max(one.low, SMALLEST) for one in self.free])
+        least = np.array([max(parameter.low, SMALLEST) for parameter in self.free])
         scale = np.exp(np.clip(moved, -FARTHEST, FARTHEST))
         return np.where(self.scaled, np.maximum(centre, least) * scale, centre + moved)

@@ -1,7 +1,7 @@
-"""What a record shows by itself, before any model: noise, steps, cadence, switching, flows.
+"""Readings of a record without a model: noise, steps, cadence, switching, flows.
 
-A commissioning starts from these readings. They are rough, to some per cent, and need
-nothing but commands and pressure; the fit refines them.
+A commissioning starts from these readings. They need only commands and pressure, and are accurate
+to some per cent; the fit refines them.
 """
 
 from collections.abc import Iterator
@@ -21,29 +21,29 @@ from twin.signals import MBAR, MS, NS, UNUSABLE, Command, Reported, Samples
 
 Floats = npt.NDArray[np.float64]
 
-# Noise is what is left beside a parabola over two periods of the mains, so that hum counts. Edges
-# are in few of such windows, so a low quantile of them is noise.
+# Noise is the residual of a parabola over two periods of the mains, so that hum counts. Few such
+# windows contain edges, so a low quantile of their variances is noise.
 WINDOW_MS, FEWEST_ROWS = 40.0, 16
 QUIET = 0.3
-SMOOTH_MS = 20.0  # a period of the mains; over it turning points are looked for
-CLEAR = 6.0  # sigmas of the smoothed pressure that make a turn
+SMOOTH_MS = 20.0  # a period of the mains: width of the mean before turning points are searched
+CLEAR = 6.0  # sigmas of the smoothed pressure: the least height of a turn
 LEAST_TURN = 1.5 * MBAR  # Pa
-EDGE_MS = 30.0  # after a command, in which a turn is still the valve's delay
-DEEP = 0.3  # of the way down, from the lowest, in which the nozzle may go off
-AGAIN = 0.5  # of a rise, by which the pressure falls after it where the nozzle is on again
-STEEP_MS, BACK_MS = 10.0, 200.0  # what flows back without a check valve does so at once
+EDGE_MS = 30.0  # after a command: turns in it are due to the valve's delay
+DEEP = 0.3  # share of the fall, above the lowest pressure, in which the nozzle may go off
+AGAIN = 0.5  # least fall after a rise, over the rise, if the nozzle went on again
+STEEP_MS, BACK_MS = 10.0, 200.0  # width of the slope, and the time in which gas flows back
 LEAST_VACUUM = 20.0 * MBAR  # Pa
-MOST_SUCTIONS = 0.5  # of all suctions must turn for an ejector that saves air
-# Open cups draw some mbar before they meet a part: shares of the way down.
+MOST_SUCTIONS = 0.5  # share of suctions that must turn for an ejector that saves air
+# Shares of the fall: open cups draw some mbar before they meet a part; then the fall proper.
 FIRST_FALL, DRAWN = 0.005, (0.15, 0.35)
 LEAST_WAIT_MS = 15.0  # between them; ramp and sensor take less
-# Shares of the way down. Where suction grows evenly the fall grows with the square of time: it is
-# at the second twice as long after it began as at the first. Between the last two it is steepest.
+# Shares of the fall. If suction grows evenly, the fall grows with the square of time: it takes
+# twice as long to the second as to the first. Between the last two it is steepest.
 GROWING, STEEP = (0.01, 0.04), (0.1, 0.25)
-LEAST_GROWN = 0.05  # of the way, in the time between the first two at that slope: else it is short
+LEAST_GROWN = 0.05  # least share of the fall between the first two times at the full slope
 OPENED_MS = 40.0  # of an idle, over which its pressure is averaged
-OPENED_FROM, OPENED_TO = 0.6, 0.85  # of an idle, in which an opened system stands at ambient
-STILL = 3.0  # sigmas by which the pressure of an opened system may still move in that time
+OPENED_FROM, OPENED_TO = 0.6, 0.85  # part of an idle in which an opened system is at ambient
+STILL = 3.0  # sigmas by which the pressure of an opened system may move in that time
 
 
 @dataclass(frozen=True)
@@ -57,35 +57,35 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Readings:
-    """What a record shows without a model. Pressures in Pa, absolute; NaN where it shows none."""
+    """Readings of a record. Pressures in Pa, absolute; NaN if the record does not show one."""
 
-    period: float  # s, the usual time between rows
-    missing: float  # share of rows that are not there
+    period: float  # s, median time between rows
+    missing: float  # share of missing rows
     noise: float  # Pa, one standard deviation, steps of the converter included
     step: float  # Pa, the smallest difference between two readings
-    idle: float  # Pa, the reading late in an idle: ambient, where the system is opened
-    opened: bool  # idles stand still at one pressure
+    idle: float  # Pa, the reading late in an idle: ambient if the system is opened
+    opened: bool  # all idles settle at one pressure
     suctions: int
     off: float  # Pa, at which the nozzle goes off (median of the turns)
     on: float  # Pa, at which it goes on again
-    switches: int  # how many suctions show the nozzle go off
+    switches: int  # suctions in which the nozzle goes off
     deepest: float  # Pa, the lowest pressure
     highest: float  # Pa
     rises_in_suction: bool  # and falls in blow-off: commands or sign are swapped
-    tells_blow_off: bool  # in any row
+    tells_blow_off: bool  # any row has blow-off commanded
     fill_rate: float  # 1/s, dp/dt over ambient as blow-off begins
     draw_rate: float  # 1/s, −dp/dt over pressure as suction begins
     meets: float  # s after suction is commanded, when open cups meet a part; NaN if they have one
-    back_rate: float  # 1/s, dp/dt over ambient at its steepest after suction, nothing commanded
-    grows: float  # s, in which suction grows to its full strength; NaN where that does not show
+    back_rate: float  # 1/s, steepest dp/dt over ambient after suction, nothing commanded
+    grows: float  # s, in which suction grows to its full strength; NaN if that does not show
     barometer: float = np.nan  # Pa, its median
     part: float = np.nan  # Pa, at which the ejector itself reports a part
-    part_unsure: float = np.nan  # Pa, as that may be late
-    stored: float = np.nan  # kg/Pa, gas that is evacuated, by a flow meter
+    part_unsure: float = np.nan  # Pa, error of it as the report may be late
+    stored: float = np.nan  # kg/Pa, evacuated gas by a flow meter
 
     @property
     def least_vacuum(self) -> float:
-        """Vacuum (Pa) that an ejector makes if it makes any."""
+        """Least vacuum (Pa) that counts as made by an ejector."""
         return max(LEAST_VACUUM, 10.0 * self.noise)
 
     @property
@@ -94,7 +94,7 @@ class Readings:
         return self.switches > MOST_SUCTIONS * self.suctions
 
     def evacuated(self, temperature: float) -> float:
-        """Volume (m³) that is evacuated, by a flow meter; NaN where none tells it."""
+        """Evacuated volume (m³) by a flow meter; NaN without one."""
         return self.stored * R * temperature
 
     def capacity(self, volume: float, ambient: float, temperature: float) -> float:
@@ -106,44 +106,48 @@ class Readings:
         return flow_behind(self.fill_rate, volume, ambient, temperature)
 
     def back_flow(self, volume: float, ambient: float, temperature: float) -> float:
-        """Flow (kg/s) that fills ``volume`` (m³) as fast as it fills once suction has ended."""
+        """Flow (kg/s) that fills ``volume`` (m³) as fast as the record shows after suction."""
         return flow_behind(self.back_rate, volume, ambient, temperature)
 
 
 def read(samples: Samples) -> Readings:
-    """Read ``samples``, at least one suction among them."""
+    """Read ``samples``, which must have at least one suction."""
     usable = ((samples["quality"] & UNUSABLE) == 0) & np.isfinite(samples["pressure"])
     rows = samples[usable]
     pressure = rows["pressure"].astype(np.float64)
-    apart = np.diff(rows["time_ns"]) * NS
-    period = float(np.median(apart))
+    intervals = np.diff(rows["time_ns"]) * NS
+    period = float(np.median(intervals))
     numbers = samples["sequence"]
     span = max(int(numbers[-1] - numbers[0]) + 1, 1)
     noise, step = noise_of(pressure, period), _step(pressure)
     noise = max(noise, step / np.sqrt(12.0))
-    found = list(stretches(rows["commands"]))
+    command_stretches = list(stretches(rows["commands"]))
     width = max(round(SMOOTH_MS * MS / period), 3)
     edge = max(round(EDGE_MS * MS / period), 1)
     turn = max(CLEAR * noise / np.sqrt(width), LEAST_TURN)
-    suctions = [one for one in found if one.command == Command.SUCTION]
+    suctions = [stretch for stretch in command_stretches if stretch.command == Command.SUCTION]
     offs, ons, switches = [], [], 0
     reported = reports_nozzle(rows["reported"][rows["commands"] == Command.SUCTION])
     nozzle = (rows["reported"] & np.uint8(Reported.NOZZLE)) != 0
-    for one in suctions:
-        smooth = _smoothed(pressure[one.first : one.last], width)[edge:]
+    for stretch in suctions:
+        smooth = _smoothed(pressure[stretch.first : stretch.last], width)[edge:]
         lows, highs = deep(smooth, *turns(smooth, turn))
         offs += list(smooth[lows])
         ons += list(smooth[highs])
-        edges = [one.first + row for row in told_edges(nozzle[one.first : one.last])]
+        edges = [stretch.first + row for row in told_edges(nozzle[stretch.first : stretch.last])]
         switches += len(edges if reported else lows) > 0
-        if reported and not lows:  # it holds so well that the pressure does not turn
+        if reported and not lows:  # the system is so tight that the pressure does not turn
             offs += list(pressure[edges[:1]])
     parts = [
-        at
-        for one in suctions
-        if (at := part_at(rows[one.first : one.last], pressure[one.first : one.last]))
+        part
+        for stretch in suctions
+        if (
+            part := part_at(
+                rows[stretch.first : stretch.last], pressure[stretch.first : stretch.last]
+            )
+        )
     ]
-    idle, opened = _idle(pressure, found, round(OPENED_MS * MS / period), noise)
+    idle, opened = _idle(pressure, command_stretches, round(OPENED_MS * MS / period), noise)
     return Readings(
         period=period,
         missing=1.0 - len(rows) / span,
@@ -157,13 +161,13 @@ def read(samples: Samples) -> Readings:
         switches=switches,
         deepest=float(pressure.min()),
         highest=float(pressure.max()),
-        rises_in_suction=_rises(pressure, found, Command.SUCTION)
-        and not _rises(pressure, found, Command.BLOW_OFF),
-        tells_blow_off=any(one.command == Command.BLOW_OFF for one in found),
-        fill_rate=_fill_rate(pressure, found, period, idle),
+        rises_in_suction=_rises(pressure, command_stretches, Command.SUCTION)
+        and not _rises(pressure, command_stretches, Command.BLOW_OFF),
+        tells_blow_off=any(stretch.command == Command.BLOW_OFF for stretch in command_stretches),
+        fill_rate=_fill_rate(pressure, command_stretches, period, idle),
         draw_rate=_draw_rate(pressure, suctions, period),
         meets=_meets(pressure, suctions, period, noise),
-        back_rate=_back_rate(pressure, found, period, idle),
+        back_rate=_back_rate(pressure, command_stretches, period, idle),
         grows=_grows(pressure, suctions, period, noise),
         barometer=told(samples).get("ambient", np.nan),
         part=_median([pascal for pascal, _ in parts]),
@@ -173,53 +177,55 @@ def read(samples: Samples) -> Readings:
 
 
 def _metered(rows: Samples, suctions: list[Stretch]) -> Iterator[Suction]:
-    """Rows of each suction in which the flow is measured."""
-    for one in suctions:
-        here = rows[one.first : one.last]
-        here = here[(here["reported"] & np.uint8(Reported.FLOW_KNOWN)) != 0]
-        columns = here["time_ns"] * NS, here["pressure"], here["flow"]
+    """Rows of each suction with a measured flow."""
+    for stretch in suctions:
+        metered = rows[stretch.first : stretch.last]
+        metered = metered[(metered["reported"] & np.uint8(Reported.FLOW_KNOWN)) != 0]
+        columns = metered["time_ns"] * NS, metered["pressure"], metered["flow"]
         seconds, pressure, flow = (column.astype(np.float64) for column in columns)
         yield seconds, pressure, flow
 
 
 def stretches(commands: npt.NDArray[np.uint8]) -> Iterator[Stretch]:
     """Stretches of one command, in order; blow-off wins over suction."""
-    told = np.where(commands & Command.BLOW_OFF, int(Command.BLOW_OFF), commands & Command.SUCTION)
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(told)) + 1, [len(told)]])
+    command = np.where(
+        commands & Command.BLOW_OFF, int(Command.BLOW_OFF), commands & Command.SUCTION
+    )
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(command)) + 1, [len(command)]])
     for first, last in pairwise(edges.tolist()):
-        yield Stretch(int(told[first]), first, last)
+        yield Stretch(int(command[first]), first, last)
 
 
 def noise_of(pressure: Floats, period: float) -> float:
-    """Noise of readings (Pa), hum and steps of the converter included."""
+    """One sigma (Pa) of the readings' noise, with hum and steps of the converter."""
     rows = max(round(WINDOW_MS * MS / period), FEWEST_ROWS)
     windows = pressure[: len(pressure) // rows * rows].reshape(-1, rows)
     if not len(windows):
         return float("nan")
     smooth = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, rows), 3))[0]
-    left = windows - (windows @ smooth) @ smooth.T
-    variance = np.sum(left**2, axis=1) / (rows - 3)
+    residual = windows - (windows @ smooth) @ smooth.T
+    variance = np.sum(residual**2, axis=1) / (rows - 3)
     return float(np.sqrt(np.quantile(variance, QUIET)))
 
 
 def turns(smooth: Floats, least: float) -> tuple[list[int], list[int]]:
     """Rows of the lows and the highs between which ``smooth`` moves by at least ``least``.
 
-    It begins by falling. A last low or high that nothing follows is none.
+    ``smooth`` begins by falling. A last low or high that nothing follows does not count.
     """
-    found: tuple[list[int], list[int]] = ([], [])
-    falling, best = True, 0
+    rows: tuple[list[int], list[int]] = ([], [])
+    is_falling, best = True, 0
     for row, value in enumerate(smooth.tolist()):
-        if (value < smooth[best]) if falling else (value > smooth[best]):
+        if (value < smooth[best]) if is_falling else (value > smooth[best]):
             best = row
         elif abs(value - smooth[best]) >= least:
-            found[0 if falling else 1].append(best)
-            falling, best = not falling, row
-    return found
+            rows[0 if is_falling else 1].append(best)
+            is_falling, best = not is_falling, row
+    return rows
 
 
 def deep(smooth: Floats, lows: list[int], highs: list[int]) -> tuple[list[int], list[int]]:
-    """Those of the turns that are down where air is saved; a line that is set off rings above."""
+    """The turns deep enough for air saving; oscillations of the line are above."""
     if not lows:
         return [], []
     lowest = smooth.min()
@@ -228,136 +234,151 @@ def deep(smooth: Floats, lows: list[int], highs: list[int]) -> tuple[list[int], 
 
 
 def drawn_again(smooth: Floats, lows: list[int], highs: list[int]) -> tuple[list[int], list[int]]:
-    """Without the turns of a rise that goes on: waves in the line, and walls that warm the gas.
+    """Lows and highs without turns within a longer rise, by waves or by walls that warm the gas.
 
-    Where the nozzle goes on again, it draws down to where it went off.
+    A nozzle that goes on again draws down to where it went off.
     """
-    kept, on = lows[:1], list[int]()
+    kept_lows, kept_highs = lows[:1], list[int]()
     for high in highs:
-        after = next((row for row in lows if row > high), high + int(np.argmin(smooth[high:])))
-        risen, fallen = smooth[high] - smooth[[kept[-1], after]]
+        next_low = next((row for row in lows if row > high), high + int(np.argmin(smooth[high:])))
+        risen, fallen = smooth[high] - smooth[[kept_lows[-1], next_low]]
         if fallen > AGAIN * risen:
-            on.append(high)
-            kept += [after] if after in lows else []
-    return kept, on
+            kept_highs.append(high)
+            kept_lows += [next_low] if next_low in lows else []
+    return kept_lows, kept_highs
 
 
 def _smoothed(pressure: Floats, width: int) -> Floats:
-    """Mean over ``width`` rows about each; fewer at the ends."""
+    """Moving mean over ``width`` rows; fewer at the ends."""
     sums = np.convolve(pressure, np.ones(width), "same")
     return sums / np.convolve(np.ones(len(pressure)), np.ones(width), "same")
 
 
 def _step(pressure: Floats) -> float:
-    """The smallest difference (Pa) between readings that many show: a step of the converter."""
+    """The smallest frequent difference (Pa) between readings: a step of the converter."""
     levels = np.unique(np.round(pressure, 1))
     return float(np.quantile(np.diff(levels), 0.1)) if len(levels) > 2 else 0.0
 
 
-def _idle(pressure: Floats, found: list[Stretch], rows: int, noise: float) -> tuple[float, bool]:
-    """What idles stand at, and whether each stands still, all at one pressure.
+def _idle(
+    pressure: Floats, command_stretches: list[Stretch], rows: int, noise: float
+) -> tuple[float, bool]:
+    """Pressure of the idles (Pa), and whether all of them settle at it.
 
-    A closed system that settles slowly moves too little in some milliseconds to be told from one
-    that is open. Before the next suction begins a cup may touch its part already.
+    A closed system that settles slowly moves little in some milliseconds, like an open one, so
+    longer parts are compared. The end of an idle does not count, as a cup may touch its part then.
     """
     half = max(rows // 2, 1)
-    idles = [one for one in found[1:] if one.command == 0 and one.last - one.first >= 2 * rows]
+    idles = [
+        idle
+        for idle in command_stretches[1:]
+        if idle.command == 0 and idle.last - idle.first >= 2 * rows
+    ]
     if not idles:
         return float("nan"), False
     moves, levels = [], np.empty(len(idles))
-    for number, one in enumerate(idles):
+    for number, idle in enumerate(idles):
         first, last = (
-            one.first + round(share * (one.last - one.first)) for share in (OPENED_FROM, OPENED_TO)
+            idle.first + round(share * (idle.last - idle.first))
+            for share in (OPENED_FROM, OPENED_TO)
         )
         moves.append(abs(pressure[last - half : last].mean() - pressure[first:][:half].mean()))
         levels[number] = pressure[last - rows : last].mean()
-    still = STILL * noise * np.sqrt(2.0 / half) + 0.1 * MBAR
-    opened = bool(np.median(moves) < still and np.ptp(levels) < 2.0 * MBAR + 4.0 * noise)
+    most_move = STILL * noise * np.sqrt(2.0 / half) + 0.1 * MBAR
+    opened = bool(np.median(moves) < most_move and np.ptp(levels) < 2.0 * MBAR + 4.0 * noise)
     return float(np.median(levels)), opened
 
 
-def _rises(pressure: Floats, found: list[Stretch], command: int) -> bool:
-    """Whether the pressure ends higher than it began in most stretches of a command."""
+def _rises(pressure: Floats, command_stretches: list[Stretch], command: int) -> bool:
+    """Whether the pressure rises in most stretches of a command."""
     moves = [
-        pressure[one.last - 1] - pressure[one.first] for one in found if one.command == command
+        pressure[stretch.last - 1] - pressure[stretch.first]
+        for stretch in command_stretches
+        if stretch.command == command
     ]
     return bool(moves) and float(np.median(moves)) > 0.0
 
 
 def _draw_rate(pressure: Floats, suctions: list[Stretch], period: float) -> float:
-    """−dp/dt over p (1/s) at its steepest between a tenth and a third of the way down."""
+    """−dp/dt over p (1/s) between a tenth and a third of the fall, median of the suctions."""
     rates = []
-    for one in suctions:
-        part = pressure[one.first : one.last]
-        way = part[0] - part.min()
-        begun, ended = (np.flatnonzero(part < part[0] - share * way) for share in (0.1, 0.33))
-        if len(ended) and ended[0] > begun[0] and part[ended[0]] > 0.0:
+    for suction in suctions:
+        curve = pressure[suction.first : suction.last]
+        depth = curve[0] - curve.min()
+        begun, ended = (np.flatnonzero(curve < curve[0] - share * depth) for share in (0.1, 0.33))
+        if len(ended) and ended[0] > begun[0] and curve[ended[0]] > 0.0:
             first, last = begun[0], ended[0]
-            rates.append(np.log(part[first] / part[last]) / ((last - first) * period))
+            rates.append(np.log(curve[first] / curve[last]) / ((last - first) * period))
     return _median(rates)
 
 
 def _meets(pressure: Floats, suctions: list[Stretch], period: float, noise: float) -> float:
-    """When the fall proper begins (s), where in most suctions a small one comes well before it.
+    """Time (s) at which the fall proper begins, if most suctions have a small fall before it.
 
-    The fall proper is drawn back from between two shares of the way.
+    The begin is extrapolated from the times of two shares of the fall.
     """
     times = []
-    for one in suctions:
-        part = pressure[one.first : one.last]
-        part = part[: int(part.argmin()) + 1]
-        way = part[0] - part[-1]
-        levels = (max(FIRST_FALL * way, CLEAR * noise), DRAWN[0] * way, DRAWN[1] * way)
+    for suction in suctions:
+        curve = pressure[suction.first : suction.last]
+        curve = curve[: int(curve.argmin()) + 1]
+        depth = curve[0] - curve[-1]
+        levels = (max(FIRST_FALL * depth, CLEAR * noise), DRAWN[0] * depth, DRAWN[1] * depth)
         if levels[0] < levels[1]:
-            first, early, late = (int(np.argmax(part <= part[0] - level)) for level in levels)
+            first, early, late = (int(np.argmax(curve <= curve[0] - level)) for level in levels)
             begins = early - DRAWN[0] / (DRAWN[1] - DRAWN[0]) * (late - early)
-            known = (begins - first) * period > LEAST_WAIT_MS * MS
-            times.append(begins * period if known else np.nan)
-    met = np.isfinite(times)
-    return _median(np.array(times)[met].tolist()) if met.sum() > 0.5 * len(suctions) else np.nan
+            is_met = (begins - first) * period > LEAST_WAIT_MS * MS
+            times.append(begins * period if is_met else np.nan)
+    shown = np.isfinite(times)
+    return _median(np.array(times)[shown].tolist()) if shown.sum() > 0.5 * len(suctions) else np.nan
 
 
 def _grows(pressure: Floats, suctions: list[Stretch], period: float, noise: float) -> float:
-    """In what time (s) the fall grows to its full slope, where in most suctions it grows slowly."""
+    """Time (s) in which the fall reaches its full slope; NaN if most suctions reach it at once."""
     times = []
-    for one in suctions:
-        part = pressure[one.first : one.last]
-        part = part[: int(part.argmin()) + 1]
-        way = part[0] - part[-1]
-        if GROWING[0] * way < CLEAR * noise:
+    for suction in suctions:
+        curve = pressure[suction.first : suction.last]
+        curve = curve[: int(curve.argmin()) + 1]
+        depth = curve[0] - curve[-1]
+        if GROWING[0] * depth < CLEAR * noise:
             continue
-        rows = [int(np.argmax(part <= part[0] - share * way)) for share in (*GROWING, *STEEP)]
+        rows = [int(np.argmax(curve <= curve[0] - share * depth)) for share in (*GROWING, *STEEP)]
         first, second, third, fourth = (row * period for row in rows)
         share = (second - first) * (STEEP[1] - STEEP[0]) / max(fourth - third, period)
         grows = (second - first) * share / (2.0 * GROWING[0])
         times.append(grows if share > LEAST_GROWN else np.nan)
-    slow = np.isfinite(times)
-    return _median(np.array(times)[slow].tolist()) if slow.sum() > 0.5 * len(suctions) else np.nan
+    shown = np.isfinite(times)
+    return _median(np.array(times)[shown].tolist()) if shown.sum() > 0.5 * len(suctions) else np.nan
 
 
-def _fill_rate(pressure: Floats, found: list[Stretch], period: float, ambient: float) -> float:
-    """dp/dt over ambient (1/s) between a third and two thirds of the way up."""
+def _fill_rate(
+    pressure: Floats, command_stretches: list[Stretch], period: float, ambient: float
+) -> float:
+    """dp/dt over ambient (1/s) between a third and two thirds of the rise in blow-off."""
     rates = []
-    for one in found:
-        if one.command == Command.BLOW_OFF:
-            part = pressure[one.first : one.last]
-            top = min(part.max(), ambient) if np.isfinite(ambient) else part.max()
-            way = top - part[0]
-            begun, ended = (np.flatnonzero(part > part[0] + share * way) for share in (0.33, 0.67))
+    for stretch in command_stretches:
+        if stretch.command == Command.BLOW_OFF:
+            curve = pressure[stretch.first : stretch.last]
+            top = min(curve.max(), ambient) if np.isfinite(ambient) else curve.max()
+            rise_to_top = top - curve[0]
+            begun, ended = (
+                np.flatnonzero(curve > curve[0] + share * rise_to_top) for share in (0.33, 0.67)
+            )
             if len(ended) and ended[0] > begun[0]:
-                rise = part[ended[0]] - part[begun[0]]
+                rise = curve[ended[0]] - curve[begun[0]]
                 rates.append(rise / ((ended[0] - begun[0]) * period) / top)
     return _median(rates)
 
 
-def _back_rate(pressure: Floats, found: list[Stretch], period: float, ambient: float) -> float:
-    """dp/dt over ambient (1/s), over STEEP_MS at its steepest soon after suction."""
+def _back_rate(
+    pressure: Floats, command_stretches: list[Stretch], period: float, ambient: float
+) -> float:
+    """Steepest dp/dt over ambient (1/s) within BACK_MS after suction, over STEEP_MS."""
     width, rows = max(round(STEEP_MS * MS / period), 2), round(BACK_MS * MS / period)
     rates = []
-    for before, one in pairwise(found):
-        part = pressure[one.first : min(one.last, one.first + rows)]
-        if before.command == Command.SUCTION and one.command == 0 and len(part) > width:
-            rise = float(np.max(part[width:] - part[:-width]))
+    for previous, stretch in pairwise(command_stretches):
+        curve = pressure[stretch.first : min(stretch.last, stretch.first + rows)]
+        if previous.command == Command.SUCTION and stretch.command == 0 and len(curve) > width:
+            rise = float(np.max(curve[width:] - curve[:-width]))
             rates.append(rise / (width * period) / ambient)
     return _median(rates)
 

@@ -1,4 +1,4 @@
-"""What a calibration found, for people and for programs."""
+"""Results of a calibration, for people and for programs."""
 
 from typing import Any
 
@@ -11,16 +11,16 @@ from twin.signals import MBAR, MS, Phase
 
 
 def in_words(calibration: Calibration) -> str:
-    """A table of the parameters: value, 95 % interval, and where each comes from."""
+    """A table of the parameters: value, 95 % interval and source."""
     fitted = calibration.fitted
     lines = [
         f"{calibration.cycles} healthy cycles; the model is {fitted.left / MBAR:.2f} mbar rms off",
         "",
         f"{'parameter':<34}{'value':>9}   {'95 % interval':<19}{'unit':<11}from",
     ]
-    for free, known in zip(fitted.free, fitted.determined, strict=True):
+    for free, is_determined in zip(fitted.free, fitted.determined, strict=True):
         low, high = (f"{bound:.4g}" for bound in fitted.interval(free.name))
-        source = "log" if known else "type"
+        source = "log" if is_determined else "type"
         lines.append(
             f"{free.name:<34}{free.of(fitted.data):>9.4g}   {low + ' to ' + high:<19}"
             f"{free.unit:<11}{source}"
@@ -40,7 +40,7 @@ def _scatter(calibration: Calibration) -> list[str]:
 
 
 def as_json(calibration: Calibration, record: Record) -> dict[str, Any]:
-    """The same for programs, with the data set as it was stored."""
+    """The calibration for programs, with the stored data set."""
     return {
         "format": "ejector-twin-calibration/1",
         "asset": {"type": record.type, "id": record.name},
@@ -56,38 +56,41 @@ def as_json(calibration: Calibration, record: Record) -> dict[str, Any]:
 def parameters(calibration: Calibration) -> dict[str, dict[str, Any]]:
     """Each parameter's value with its unit, 95 % interval, and whether the log determines it."""
     fitted = calibration.fitted
-    found = {}
-    for free, known in zip(fitted.free, fitted.determined, strict=True):
+    by_name = {}
+    for free, is_determined in zip(fitted.free, fitted.determined, strict=True):
         low, high = fitted.interval(free.name)
-        found[free.name] = {
+        by_name[free.name] = {
             "value": free.of(fitted.data),
             "unit": free.unit,
             "low95": low,
             "high95": high,
-            "determined": bool(known),
+            "determined": bool(is_determined),
         }
-    return found
+    return by_name
 
 
-def commissioned_in_words(found: Commissioned) -> str:
-    """The verdict, what the record corrects, what was found and what was assumed."""
-    lines = [headline(found.verdict), ""]
+def commissioned_in_words(commissioned: Commissioned) -> str:
+    """The verdict, the record's corrections, the parameters and the assumed values."""
+    lines = [headline(commissioned.verdict), ""]
     lines += [
-        f"{phase.name.lower().replace('_', '-'):<10}{one.left / MBAR:>7.2f} mbar rms off;"
-        f" this record cannot be followed nearer than {one.floor / MBAR:.2f}"
-        for phase, one in found.verdict.residuals.items()
+        f"{phase.name.lower().replace('_', '-'):<10}{residual.left / MBAR:>7.2f} mbar rms off;"
+        f" this record cannot be followed nearer than {residual.floor / MBAR:.2f}"
+        for phase, residual in commissioned.verdict.residuals.items()
     ]
-    for remark in found.remarks:
+    for remark in commissioned.remarks:
         lines += ["", f"the record contradicts the configuration: {remark.text}"]
         lines += [f"  the record's value is used; write: {remark.line}"]
-    for one in found.contradictions:
-        lines += ["", f"a signal contradicts the pressure ({one.signal}): {one.what}"]
-        lines += [f"  {one.action}"]
-    lines += ["", in_words(found.calibration)]
-    if found.unseen:
-        lines += ["", found.unseen]
-    if found.assumed:
-        lines += ["", f"not shown by this record, assumed: {', '.join(found.assumed)}"]
+    for contradiction in commissioned.contradictions:
+        lines += [
+            "",
+            f"a signal contradicts the pressure ({contradiction.signal}): {contradiction.what}",
+        ]
+        lines += [f"  {contradiction.action}"]
+    lines += ["", in_words(commissioned.calibration)]
+    if commissioned.unseen:
+        lines += ["", commissioned.unseen]
+    if commissioned.assumed:
+        lines += ["", f"not shown by this record, assumed: {', '.join(commissioned.assumed)}"]
     return "\n".join(lines)
 
 
@@ -107,44 +110,46 @@ def headline(verdict: Verdict) -> str:
     )
 
 
-def _weak(phase: Phase, one: Residual) -> str:
-    """What is left in a phase, where most, and which causes that concerns."""
-    side = "above" if one.most > 0.0 else "below"
+def _weak(phase: Phase, off: Residual) -> str:
+    """The residual of a phase, its largest value, and the causes that it concerns."""
+    side = "above" if off.most > 0.0 else "below"
     return (
-        f"{one.times:.1f} times in {phase.name.lower().replace('_', '-')}, at most"
-        f" {abs(one.most) / MBAR:.1f} mbar measured {side} expected, {one.at / MS:.0f} ms after it"
+        f"{off.times:.1f} times in {phase.name.lower().replace('_', '-')}, at most"
+        f" {abs(off.most) / MBAR:.1f} mbar measured {side} expected, {off.at / MS:.0f} ms after it"
         f" begins ({WEAKENS[phase]})"
     )
 
 
 def commissioned_as_json(
-    found: Commissioned, asset: Asset, record: Record | None
+    commissioned: Commissioned, asset: Asset, record: Record | None
 ) -> dict[str, Any]:
-    """The same for programs; ``data`` is there even where it is refused."""
-    fitted = found.calibration.fitted
+    """The commissioning for programs; ``data`` is included even if it is refused."""
+    fitted = commissioned.calibration.fitted
     return {
         "format": "ejector-twin-commissioning/1",
         "asset": {"type": asset.type, "id": asset.id},
         "record": record.id if record else None,
-        "verdict": found.verdict.word,
+        "verdict": commissioned.verdict.word,
         "residual": {
             phase.name.lower(): {
-                "left_mbar": one.left / MBAR,
-                "floor_mbar": one.floor / MBAR,
-                "times": one.times,
-                "most_mbar": one.most / MBAR,
-                "at_ms": one.at / MS,
+                "left_mbar": residual.left / MBAR,
+                "floor_mbar": residual.floor / MBAR,
+                "times": residual.times,
+                "most_mbar": residual.most / MBAR,
+                "at_ms": residual.at / MS,
             }
-            for phase, one in found.verdict.residuals.items()
+            for phase, residual in commissioned.verdict.residuals.items()
         },
-        "contradicts": [{"what": one.text, "line": one.line} for one in found.remarks],
-        "signals": [
-            {"signal": one.signal, "what": one.what, "do": one.action}
-            for one in found.contradictions
+        "contradicts": [
+            {"what": remark.text, "line": remark.line} for remark in commissioned.remarks
         ],
-        "assumed": found.assumed,
-        "unseen": found.unseen,
-        "cycles": found.calibration.cycles,
-        "parameters": parameters(found.calibration),
+        "signals": [
+            {"signal": contradiction.signal, "what": contradiction.what, "do": contradiction.action}
+            for contradiction in commissioned.contradictions
+        ],
+        "assumed": commissioned.assumed,
+        "unseen": commissioned.unseen,
+        "cycles": commissioned.calibration.cycles,
+        "parameters": parameters(commissioned.calibration),
         "data": fitted.data.model_dump(),
     }

@@ -1,4 +1,4 @@
-"""A calibration becomes a record of the asset database, with where it came from."""
+"""Store a calibration as a record of the asset database, with its provenance."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from twin.calibration.calibrate import Calibration
 from twin.config import Config
 from twin.signals import MBAR
 
-OF_TYPE = ("supply", "ejector")  # tables of a data set that say what a type is
+OF_TYPE = ("supply", "ejector")  # tables of a data set that belong to the type
 
 
 def store(calibration: Calibration, config: Config, assets: str, log: Path) -> tuple[Record, str]:
@@ -24,25 +24,27 @@ def store(calibration: Calibration, config: Config, assets: str, log: Path) -> t
 def store_first(
     calibration: Calibration, config: Config, assets: str, log: Path
 ) -> tuple[Record, str]:
-    """The same for a unit whose type may be unknown: its first unit then says what the type is."""
+    """Store the data set of a unit; add its type with the unit's values if that is unknown."""
     with open_chosen(assets, config.document, write=True) as database:
         unit = record_of(calibration, config, log)
         if not database.records("type", unit.type):
-            own = {table: unit.data[table] for table in OF_TYPE}
+            type_data = {table: unit.data[table] for table in OF_TYPE}
             note = {"note": f"begun with the commissioning of {unit.name}"}
-            provenance_ = dict(unit.provenance) | note
-            kind = Record("type", unit.type, unit.type, own, provenance=provenance_)
-            database.add(kind)
+            type_provenance = dict(unit.provenance) | note
+            type_record = Record(
+                "type", unit.type, unit.type, type_data, provenance=type_provenance
+            )
+            database.add(type_record)
         return add(database, unit), database.name
 
 
 def add(database: Assets, unit: Record) -> Record:
-    """Add a calibrated unit's record; what was taken in for this unit alone stays with it."""
+    """Add a calibrated unit's record; mechanisms stored for this unit stay in its catalogue."""
     return database.add(replace(unit, data=carried_on(database, unit.name, unit.data)))
 
 
 def record_of(calibration: Calibration, config: Config, log: Path) -> Record:
-    """The unit's data set as it is stored; it holds from the time the log was recorded on."""
+    """The record of the unit's data set; it is valid from the time of the log on."""
     fitted = calibration.fitted
     return Record(
         kind="instance",
@@ -58,8 +60,8 @@ def record_of(calibration: Calibration, config: Config, log: Path) -> Record:
             "parameters": [free.name for free in fitted.free],
             "determined": [
                 free.name
-                for free, known in zip(fitted.free, fitted.determined, strict=True)
-                if known
+                for free, is_determined in zip(fitted.free, fitted.determined, strict=True)
+                if is_determined
             ],
             "left_mbar": round(fitted.left / MBAR, 3),
         },

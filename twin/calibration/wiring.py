@@ -1,4 +1,4 @@
-"""What the curves say about how pressure and commands are connected, before anything is fitted."""
+"""Check from the curves how pressure and commands are connected, before any fit."""
 
 from collections.abc import Iterator
 from typing import NoReturn
@@ -9,18 +9,18 @@ from twin.calibration.readings import Floats, Readings, stretches
 from twin.errors import ConfigError
 from twin.signals import MBAR, UNUSABLE, Samples
 
-NEVER_OPENED = 0.2  # of ambient pressure: what never comes above it was never at ambient
-TWICE = 1.5  # of ambient pressure: what idles above it counts ambient pressure twice
-BELOW_NOTHING = -20.0 * MBAR  # Pa, absolute: less than an ambient pressure a little wrong explains
-# What holds and then rises is not a leak: one is a tenth of the way up after at most an eighth of
-# the time that nine tenths take, where it is choked all the way.
+NEVER_OPENED = 0.2  # of ambient pressure: a record below it was never at ambient
+TWICE = 1.5  # of ambient pressure: an idle above it counts ambient pressure twice
+BELOW_NOTHING = -20.0 * MBAR  # Pa, absolute: lower than a slightly wrong ambient explains
+# A pressure that holds and then rises is not a leak: a leak, choked all the way, makes a tenth of
+# its rise within an eighth of the time that nine tenths take.
 HELD = 0.25
-RISEN = 0.5  # of the vacuum: less is no blow-off
+RISEN = 0.5  # of the vacuum: a smaller rise is no blow-off
 TAG = "[driver.tags.pressure], or of the column"
 
 
 def refuse_miswired(samples: Samples, readings: Readings, ambient: float) -> None:
-    """ConfigError where the curves show another wiring; ``ambient`` (Pa) as configured."""
+    """ConfigError if the curves show another wiring; ``ambient`` (Pa) as configured."""
     if readings.rises_in_suction:
         _refuse_rising(readings, ambient)
     if readings.deepest < BELOW_NOTHING:
@@ -48,11 +48,11 @@ def refuse_miswired(samples: Samples, readings: Readings, ambient: float) -> Non
             f"check the unit and the range of {TAG}",
         )
     if not readings.tells_blow_off:
-        _refuse_untold_blow_off(samples)
+        _refuse_missing_blow_off(samples)
 
 
 def _refuse_rising(readings: Readings, ambient: float) -> NoReturn:
-    """Say why the pressure rises in suction: another reference, its sign, or the commands."""
+    """ConfigError with the reason for a rise in suction: reference, sign or commands."""
     highest = f"{readings.highest / MBAR:.0f} mbar absolute"
     if readings.deepest < NEVER_OPENED * ambient and readings.highest < ambient:
         raise ConfigError(
@@ -72,11 +72,11 @@ def _refuse_rising(readings: Readings, ambient: float) -> NoReturn:
     )
 
 
-def _refuse_untold_blow_off(samples: Samples) -> None:
-    """ConfigError where the pressure rises as only blow-off makes it rise."""
+def _refuse_missing_blow_off(samples: Samples) -> None:
+    """ConfigError if the pressure rises as only blow-off makes it rise."""
     idles = list(_idles(samples))
-    rises = [one[-1] - one[0] for one in idles]
-    if idles and np.median([_held(one) for one in idles]) > HELD:
+    rises = [idle[-1] - idle[0] for idle in idles]
+    if idles and np.median([_delay_ratio(idle) for idle in idles]) > HELD:
         raise ConfigError(
             f"after suction the pressure holds, then rises by {np.median(rises) / MBAR:.0f} mbar at"
             " once, and no row has blow-off commanded: something lets air in that is not told",
@@ -85,20 +85,20 @@ def _refuse_untold_blow_off(samples: Samples) -> None:
 
 
 def _idles(samples: Samples) -> Iterator[Floats]:
-    """Pressures (Pa) of each idle in which most of the vacuum goes."""
+    """Pressures (Pa) of each idle that loses most of the vacuum."""
     pressure = samples["pressure"].astype(np.float64)
     usable = ((samples["quality"] & UNUSABLE) == 0) & np.isfinite(pressure)
     ambient = float(np.quantile(pressure[usable], 0.99)) if usable.any() else 0.0
-    for one in list(stretches(samples["commands"]))[1:]:
-        if one.command == 0:
-            rows = np.flatnonzero(usable[one.first : one.last]) + one.first
+    for stretch in list(stretches(samples["commands"]))[1:]:
+        if stretch.command == 0:
+            rows = np.flatnonzero(usable[stretch.first : stretch.last]) + stretch.first
             idle = pressure[rows]
             if len(idle) > 1 and idle.max() - idle[0] > RISEN * (ambient - idle[0]):
                 yield idle
 
 
-def _held(idle: Floats) -> float:
-    """How long a tenth of the rise takes, over how long nine tenths take."""
-    way = (idle - idle[0]) / (idle.max() - idle[0])
-    tenth, most = (int(np.argmax(way > share)) for share in (0.1, 0.9))
-    return tenth / max(most, 1)
+def _delay_ratio(idle: Floats) -> float:
+    """Time of a tenth of the rise over the time of nine tenths."""
+    risen = (idle - idle[0]) / (idle.max() - idle[0])
+    tenth, nine_tenths = (int(np.argmax(risen > share)) for share in (0.1, 0.9))
+    return tenth / max(nine_tenths, 1)
