@@ -1,7 +1,7 @@
-"""Knees of one kind, moved to where each fits the mean course of all of them best.
+"""Align the breakpoints of one kind: move each to where it fits their mean course best.
 
-The valve's stroke, the line and the sensor round a knee, and in one record they do so alike. What
-is alike is found from all knees together; what noise leaves of each is then only when it was.
+The valve's stroke, the line and the sensor round all breakpoints of a record in the same way. All
+of them together give that common shape; then noise only affects the time of each.
 """
 
 from collections.abc import Sequence
@@ -13,156 +13,169 @@ import numpy.typing as npt
 from twin.monitor.breakpoints import OF_A_ROW, WANTED, Course, Floats, fits, vertex
 from twin.signals import MS
 
-FEWEST = 3  # knees that have a mean course
+FEWEST = 3  # breakpoints, for a mean course
 ROUNDS, NARROWS = 4, 0.7
-OF_NOISE = 40.0  # as in breaks, with all that is alike known
-LEAST, LEAST_ROWS = 80.0 * MS, 12  # on either side
-ROOM = 0.8  # of what most knees have on either side
+OF_NOISE = 40.0  # variance factor of the time, as in ``breakpoints``, with the common shape known
+LEAST, LEAST_ROWS = 80.0 * MS, 12  # shortest window on either side
+ROOM = 0.8  # of the room that three quarters of the breakpoints have on either side
 POINTS, PLACES = 60, 61
-FARTHEST, ROWS, SHARE = 30.0 * MS, 2.0, 0.4  # that a knee is moved in a round; share of the window
+FARTHEST, ROWS, SHARE = 30.0 * MS, 2.0, 0.4  # largest shift in a round; share of the window
 ROUNDED = (-0.2, -0.1, -0.05, 0.05, 0.1, 0.2)  # of the window: where the mean course may bend
 OWN, ALIKE = (
     [0, 1, 4],
     [2, 3, *range(5, 7 + len(ROUNDED))],
-)  # columns: level and slopes are a knee's own
+)  # columns: level and slopes are each breakpoint's own
 
 
 @dataclass
 class Knee:
-    """The nozzle's switching as it shows in the pressure."""
+    """A breakpoint: the nozzle's switching as it shows in the pressure."""
 
     on: bool
     time: float  # s
     level: float  # Pa
-    rows: tuple[int, int]  # from the knee or command before it to that after it
-    jump: float  # Pa/s, by which the slope breaks
-    scale: float  # s, over which the course beside it may be taken for a parabola
+    rows: tuple[int, int]  # from the breakpoint or command before it to that after it
+    jump: float  # Pa/s, change of the slope
+    scale: float  # s, over which the course is approximately a parabola
     stepped: bool = False
-    held: float = np.nan  # Pa, as suction ends, if the nozzle is off until then
+    held: float = np.nan  # Pa, at the end of suction, if the nozzle is off until then
 
 
 def align(course: Course, knees: Sequence[Knee]) -> None:
-    """Move ``knees``, all of one kind, in place. Those with a step are where it is."""
+    """Move ``knees``, all of one kind, in place. Those with a step stay where it is."""
     if len(knees) < FEWEST or np.mean([knee.stepped for knee in knees]) > 0.5:
         return
     half = _window(course, knees)
-    many = max(1, round(half / course.period / POINTS))
-    grid = many * course.period
+    rows_per_point = max(1, round(half / course.period / POINTS))
+    grid = rows_per_point * course.period
     count = round(half / grid)
     reach = min(FARTHEST + ROWS * course.period, SHARE * half)
-    wide = count + int(np.ceil(reach / grid))
-    about = np.arange(-float(wide), wide + 1.0) * grid
-    around = _Around(course, many, half, about, count)
+    reach_count = count + int(np.ceil(reach / grid))
+    offsets = np.arange(-float(reach_count), reach_count + 1.0) * grid
+    courses = _CourseAtKnees(course, rows_per_point, half, offsets, count)
     times = np.array([knee.time for knee in knees])
     ends = course.time[np.array([[knee.rows[0], knee.rows[1] - 1] for knee in knees])]
     for _ in range(ROUNDS):
-        mean = around.alike(times, ends)
-        moved = np.array(
-            [around.moved(*each, mean, reach) for each in zip(times, ends, strict=True)]
+        mean_course = courses.mean_course(times, ends)
+        shifts = np.array(
+            [
+                courses.shift_of(*knee_and_ends, mean_course, reach)
+                for knee_and_ends in zip(times, ends, strict=True)
+            ]
         )
-        times = times + moved - np.median(moved)
+        times = times + shifts - np.median(shifts)
         reach = max(NARROWS * reach, 2.0 * course.period)
-    times = times + around.middle(times, ends, -1.0 if knees[0].on else 1.0)
+    times = times + courses.break_offset(times, ends, -1.0 if knees[0].on else 1.0)
     for knee, time, (low, high) in zip(knees, times.tolist(), ends.tolist(), strict=True):
         knee.time = min(max(time, low + course.period), high - course.period)
 
 
 def _window(course: Course, knees: Sequence[Knee]) -> float:
-    """Time (s) on either side that places a knee well, and that most of them have."""
+    """Window (s) on either side that gives precise times, and that most breakpoints have."""
     period, noise = course.period, course.noise
     jump, scale = (
-        float(np.median(one)) for one in zip(*((k.jump, k.scale) for k in knees), strict=True)
+        float(np.median(values)) for values in zip(*((k.jump, k.scale) for k in knees), strict=True)
     )
-    wanted = max(WANTED, OF_A_ROW * period)
-    wide = max(OF_NOISE * noise.at(jump) / (jump * wanted) ** 2, LEAST_ROWS * period, LEAST)
+    wanted_sigma = max(WANTED, OF_A_ROW * period)
+    wanted_window = max(
+        OF_NOISE * noise.at(jump) / (jump * wanted_sigma) ** 2, LEAST_ROWS * period, LEAST
+    )
     room = [
         min(knee.time - course.time[knee.rows[0]], course.time[knee.rows[1] - 1] - knee.time)
         for knee in knees
     ]
-    least = 6.0 * period
-    most = max(ROOM * float(np.quantile(room, 0.25)), least), max(scale, least)
-    return min(max(wide, noise.window), *most)
+    shortest = 6.0 * period
+    limits = max(ROOM * float(np.quantile(room, 0.25)), shortest), max(scale, shortest)
+    return min(max(wanted_window, noise.window), *limits)
 
 
 @dataclass(frozen=True)
-class _Around:
-    """The course about knees, at the same times before and after each."""
+class _CourseAtKnees:
+    """The course about breakpoints, at the same times before and after each."""
 
     course: Course
-    many: int  # rows of which each value is the mean
+    rows_per_point: int  # rows of which each value is the mean
     half: float  # s
-    wide: Floats  # s, times about a knee, further than it is moved
-    count: int  # of them, on either side, that are compared
+    wide: Floats  # s, times about a breakpoint, farther than it is moved
+    count: int  # values compared on either side
 
     @property
     def narrow(self) -> Floats:
-        """Times (s) about a knee that are compared."""
+        """Times (s) about a breakpoint that are compared."""
         beyond = len(self.wide) // 2 - self.count
         return self.wide[beyond : len(self.wide) - beyond]
 
     def at(self, times: Floats) -> Floats:
         """Pressure (Pa) about ``times``."""
-        within = (np.arange(self.many) - 0.5 * (self.many - 1)) * self.course.period
-        fine = np.interp((times[:, None] + within).ravel(), self.course.time, self.course.pressure)
-        mean: Floats = fine.reshape(-1, self.many).mean(axis=1)
-        return mean
+        row_offsets = (
+            np.arange(self.rows_per_point) - 0.5 * (self.rows_per_point - 1)
+        ) * self.course.period
+        readings = np.interp(
+            (times[:, None] + row_offsets).ravel(), self.course.time, self.course.pressure
+        )
+        means: Floats = readings.reshape(-1, self.rows_per_point).mean(axis=1)
+        return means
 
-    def alike(self, times: Floats, ends: Floats) -> Floats:
-        """What the courses about all knees have in common beside their own level and slopes."""
-        columns = _bent(self.wide / self.half)
-        rest, left = list[Floats](), list[Floats]()
+    def mean_course(self, times: Floats, ends: Floats) -> Floats:
+        """Common course (Pa) about all breakpoints, without their own level and slopes."""
+        columns = _knee_columns(self.wide / self.half)
+        shape_columns, residuals = list[Floats](), list[Floats]()
         for time, (low, high) in zip(times, ends, strict=True):
-            here = (time + self.wide >= low) & (time + self.wide <= high)
-            if np.count_nonzero(here) < self.count:
+            inside = (time + self.wide >= low) & (time + self.wide <= high)
+            if np.count_nonzero(inside) < self.count:
                 continue
-            own = np.linalg.qr(columns[here][:, OWN])[0]
-            for values, of in (
-                (columns[here][:, ALIKE], rest),
-                (self.at(time + self.wide[here]), left),
+            own_basis = np.linalg.qr(columns[inside][:, OWN])[0]
+            for values, parts in (
+                (columns[inside][:, ALIKE], shape_columns),
+                (self.at(time + self.wide[inside]), residuals),
             ):
-                of.append(values - own @ (own.T @ values))
-        if not rest:
+                parts.append(values - own_basis @ (own_basis.T @ values))
+        if not shape_columns:
             return np.zeros(len(self.wide))
-        common = np.linalg.lstsq(np.concatenate(rest), np.concatenate(left), rcond=1e-6)[0]
+        common = np.linalg.lstsq(
+            np.concatenate(shape_columns), np.concatenate(residuals), rcond=1e-6
+        )[0]
         mean: Floats = columns[:, ALIKE] @ common
         return mean
 
-    def moved(self, time: float, ends: Floats, mean: Floats, reach: float) -> float:
-        """By how much (s) a knee must be moved for ``mean`` to fit best."""
+    def shift_of(self, time: float, ends: Floats, mean: Floats, reach: float) -> float:
+        """Shift (s) of a breakpoint for which ``mean`` fits best."""
         narrow = self.narrow
-        here = (time + narrow >= ends[0]) & (time + narrow <= ends[1])
-        if np.count_nonzero(here) < max(8, self.count):
+        inside = (time + narrow >= ends[0]) & (time + narrow <= ends[1])
+        if np.count_nonzero(inside) < max(8, self.count):
             return 0.0
-        places = np.linspace(-reach, reach, PLACES)
-        z = narrow[here] - places[:, None]
-        left = self.at(time + narrow[here]) - np.interp(z, self.wide, mean)
-        own = np.stack([np.ones_like(z), z / self.half, np.maximum(z, 0.0) / self.half], axis=2)
-        basis = np.linalg.qr(own)[0]
-        along = np.einsum("mnk,mn->mk", basis, left)
-        rss = np.sum(left**2, axis=1) - np.sum(along**2, axis=1)
-        least = int(rss.argmin())
-        return float(places[least]) + vertex(rss, least) * float(places[1] - places[0])
+        shifts = np.linspace(-reach, reach, PLACES)
+        z = narrow[inside] - shifts[:, None]
+        residual = self.at(time + narrow[inside]) - np.interp(z, self.wide, mean)
+        own_columns = np.stack(
+            [np.ones_like(z), z / self.half, np.maximum(z, 0.0) / self.half], axis=2
+        )
+        basis = np.linalg.qr(own_columns)[0]
+        projections = np.einsum("mnk,mn->mk", basis, residual)
+        rss = np.sum(residual**2, axis=1) - np.sum(projections**2, axis=1)
+        best = int(rss.argmin())
+        return float(shifts[best]) + vertex(rss, best) * float(shifts[1] - shifts[0])
 
-    def middle(self, times: Floats, ends: Floats, sign: float) -> float:
-        """Where (s) the mean course breaks."""
+    def break_offset(self, times: Floats, ends: Floats, sign: float) -> float:
+        """Time (s) at which the mean course breaks."""
         narrow = self.narrow
-        whole = [
+        curves = [
             self.at(time + narrow)
             for time, (low, high) in zip(times, ends, strict=True)
             if time + narrow[0] >= low and time + narrow[-1] <= high
         ]
-        if not whole:
+        if not curves:
             return 0.0
-        mean = np.mean([one - one.mean() for one in whole], axis=0)
-        places = np.linspace(-0.5, 0.5, PLACES)
-        rss, bent = fits(narrow / self.half, mean, places, step=False)
-        rss = np.where(sign * bent[:, 3] > 0.0, rss, np.inf)
-        least = int(rss.argmin())
-        return self.half * float(places[least]) if np.isfinite(rss[least]) else 0.0
+        mean = np.mean([curve - curve.mean() for curve in curves], axis=0)
+        offsets = np.linspace(-0.5, 0.5, PLACES)
+        rss, coefficients = fits(narrow / self.half, mean, offsets, step=False)
+        rss = np.where(sign * coefficients[:, 3] > 0.0, rss, np.inf)
+        best = int(rss.argmin())
+        return self.half * float(offsets[best]) if np.isfinite(rss[best]) else 0.0
 
 
-def _bent(u: Floats) -> npt.NDArray[np.float64]:
-    """Columns of a course with a rounded knee at 0: cubics either side, and bends about it."""
+def _knee_columns(u: Floats) -> npt.NDArray[np.float64]:
+    """Columns of a course with a rounded break at 0: cubics on either side, and bends about it."""
     after = np.maximum(u, 0.0)
     columns = [u**0, u, u * u, u**3, after, after**2, after**3]
-    return np.stack(columns + [np.maximum(u - one, 0.0) for one in ROUNDED], axis=1)
+    return np.stack(columns + [np.maximum(u - offset, 0.0) for offset in ROUNDED], axis=1)

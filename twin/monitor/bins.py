@@ -1,7 +1,7 @@
-"""Rows averaged into bins that suit how a model errs.
+"""Rows averaged into bins that suit the errors of a model.
 
-What a model gets wrong after a switching goes on for about as long as the switching is past. So
-bins, correlations and all else run in warped time: logarithmic from an edge on, then uniform.
+An error of the model after a switching lasts about as long as the time since the switching. So bins
+and correlations use warped time: logarithmic after an edge, then uniform.
 """
 
 import math
@@ -16,10 +16,10 @@ from twin.model.kernel import LONGEST_BRIDGE
 from twin.model.term import AGAIN
 from twin.signals import MS, Phase
 
-EARLIEST_S, LATEST_S = 5e-3, 0.3  # how long an error goes on, at an edge and long after it
+EARLIEST_S, LATEST_S = 5e-3, 0.3  # correlation time of an error, at an edge and long after it
 PER_UNIT = 4  # bins in each unit of warped time
-SPARSE, FARTHEST = 20, 10  # rows kept: one in as many as a SPARSEth of those past, at most FARTHEST
-ROWS = 10_000  # of a stretch; where bins begin in so many is looked up
+SPARSE, FARTHEST = 20, 10  # spacing of kept rows: a SPARSEth of the rows past, at most FARTHEST
+ROWS = 10_000  # of a stretch: the table of bins' first rows grows by so many
 Bytes = npt.NDArray[np.uint8]
 Bools = npt.NDArray[np.bool_]
 Floats = npt.NDArray[np.float64]
@@ -29,36 +29,36 @@ _SUCTION, _HOLD = int(Phase.SUCTION), int(Phase.HOLD)  # plain: enumerations are
 
 @dataclass(frozen=True)
 class Bins:
-    """What each bin is, in order of time; no bin crosses a phase change."""
+    """Bins in order of time; no bin crosses a phase change."""
 
-    number: Ints  # of the bin of each row; -1 where nothing can be compared
+    number: Ints  # of the bin of each row; -1 if the row cannot be compared
     count: Ints  # rows
     cycle: Ints
     stretch: Ints  # of one phase, counted over all rows
     kind: Ints  # of stretch, index into KINDS
     since: Ints  # rows since the stretch began
-    step: Ints  # in warped time, counted in it
+    step: Ints  # of warped time, counted since the stretch began
 
     @cached_property
     def time(self) -> Floats:
-        """Warped, since the stretch began."""
+        """Warped time since the stretch began."""
         return warped(self.since * np.float64(MS))
 
     @property
     def place(self) -> Ints:
-        """The same number for what is alike from cycle to cycle: kind and time."""
+        """Identity of each bin that is the same from cycle to cycle: kind and time."""
         return (self.kind << 16) + self.step
 
     @property
     def place_by_turn(self) -> Ints:
-        """The same, where the second hold of a cycle is another place than the first."""
+        """Identity of each bin as in ``place``, but different for the second hold of a cycle."""
         stretches, first, number = np.unique(self.stretch, return_index=True, return_inverse=True)
         cycle, kind = self.cycle[first], self.kind[first]
         turn = np.zeros(len(stretches), np.int64)
-        for one in np.unique(kind):
-            here = np.flatnonzero(kind == one)
-            begins = np.searchsorted(cycle[here], cycle[here])  # stretches go by time
-            turn[here] = np.arange(len(here)) - begins
+        for stretch_kind in np.unique(kind):
+            of_kind = np.flatnonzero(kind == stretch_kind)
+            begins = np.searchsorted(cycle[of_kind], cycle[of_kind])  # stretches go by time
+            turn[of_kind] = np.arange(len(of_kind)) - begins
         return (turn[number] << 24) + self.place
 
     def mean(self, values: Floats) -> Floats:
@@ -71,9 +71,9 @@ class Bins:
         return sums / self.count.reshape(-1, *[1] * (values.ndim - 1))
 
     def through(self, kept: Ints, values: Floats) -> Floats:
-        """The mean over each bin of straight lines through ``values`` at the rows ``kept``.
+        """Mean over each bin of straight lines through ``values`` at the rows ``kept``.
 
-        From (kept, n) to (bins, n); what is in a bin lies between the first and the last kept row.
+        From (kept, n) to (bins, n). All rows with a bin lie between the first and the last kept.
         """
         sums = np.zeros((len(self.count), values.shape[1]))
         _add_lines(self.number, kept, values, sums)
@@ -81,14 +81,14 @@ class Bins:
 
 
 def warped(seconds: Floats) -> Floats:
-    """Warped time: it passes by 1 while an error goes on being about the same."""
+    """Warped time: errors stay correlated for about 1 of it."""
     early = np.minimum(seconds, LATEST_S - EARLIEST_S)
     late: Floats = (seconds - early) / LATEST_S
     return np.log1p(early / EARLIEST_S) + late
 
 
 def unwarped(time: Floats) -> Floats:
-    """Seconds after which warped time is ``time``."""
+    """Seconds of a warped time."""
     turn = np.log1p((LATEST_S - EARLIEST_S) / EARLIEST_S)
     early = EARLIEST_S * np.expm1(np.minimum(time, turn))
     seconds: Floats = early + np.maximum(time - turn, 0.0) * LATEST_S
@@ -98,7 +98,7 @@ def unwarped(time: Floats) -> Floats:
 def binned(phase: Bytes, usable: Bools, starts: Ints, per_unit: int = PER_UNIT) -> Bins:
     """Bins of rows whose phases are given; ``starts`` are the first rows of cycles.
 
-    What comes before the first of them belongs to cycle -1.
+    Rows before the first of them belong to cycle -1.
     """
     number = np.empty(len(phase), np.int64)
     begins = _begins(len(phase) // ROWS + 1, per_unit)
@@ -108,92 +108,92 @@ def binned(phase: Bytes, usable: Bools, starts: Ints, per_unit: int = PER_UNIT) 
 def averaged(
     phase: Bytes, off: Floats, drawn: Ints, expected: Floats, per_unit: int = PER_UNIT
 ) -> tuple[Bins, Floats, Floats]:
-    """Bins of the rows of one cycle, and over each the means of ``off`` and of what is expected.
+    """Bins of the rows of one cycle, and the means of ``off`` and ``expected`` over each.
 
-    The latter goes straight between rows that are ``drawn``: from (drawn, n) to (bins, n). What is
-    not known, or lies beside drawn rows at which something is not, is in no bin.
+    ``expected`` is interpolated between the rows ``drawn``: from (drawn, n) to (bins, n). A row is
+    in no bin if ``off`` is unknown there, or ``expected`` at a drawn row beside it.
     """
     number = np.empty(len(phase), np.int64)
     begins = _begins(len(phase) // ROWS + 1, per_unit)
-    found, *means = _averaged(np.array(phase), off, drawn, expected, begins, number)
-    return Bins(number, *found.T), *means
+    columns, *means = _averaged(np.array(phase), off, drawn, expected, begins, number)
+    return Bins(number, *columns.T), *means
 
 
 @lru_cache(maxsize=16)
 def _begins(times: int, per_unit: int) -> Ints:
-    """Rows of a stretch before each step of warped time, up to so many ``times`` ROWS or more."""
+    """Rows of a stretch before each step of warped time, for at least ``times`` ROWS."""
     steps = np.arange(int(warped(np.array(times * ROWS * MS)) * per_unit) + 2)
     return np.ceil(unwarped(steps / per_unit) / MS).astype(np.int64)
 
 
 @compiled
 def _averaged(phase, off, drawn, expected, begins, number):  # type: ignore[no-untyped-def]
-    """What each bin is, and the means of what is off and of what is expected in it."""
+    """Columns of the bins, and the means of deviation and expected values over each."""
     usable = _between(drawn, expected, off)
-    found = _number(phase, usable, np.zeros(1, np.int64), begins, number)
-    mean, through = np.zeros(len(found)), np.zeros((len(found), expected.shape[1]))
+    columns = _number(phase, usable, np.zeros(1, np.int64), begins, number)
+    mean, through = np.zeros(len(columns)), np.zeros((len(columns), expected.shape[1]))
     for row in range(len(number)):
         if number[row] >= 0:
             mean[number[row]] += off[row]
     _add_lines(number, drawn, expected, through)
-    for one in range(len(found)):
-        mean[one] /= found[one, 0]
+    for index in range(len(columns)):
+        mean[index] /= columns[index, 0]
         for i in range(expected.shape[1]):
-            through[one, i] /= found[one, 0]
-    return found, mean, through
+            through[index, i] /= columns[index, 0]
+    return columns, mean, through
 
 
 @compiled
 def _between(drawn, expected, off):  # type: ignore[no-untyped-def]
-    """Where there is a deviation and all is known at the drawn rows on either side."""
+    """Rows with a deviation and with known values at the drawn rows on either side."""
     usable = np.zeros(len(off), np.bool_)
-    before, first = False, len(off)
+    was_known, first = False, len(off)
     for i in range(len(drawn)):
         unknown = 0
-        for j in range(expected.shape[1]):  # so written, several at a time
+        for j in range(expected.shape[1]):  # written so that the compiler vectorises it
             unknown += 0 if expected[i, j] - expected[i, j] == 0.0 else 1
-        last, known = drawn[i], unknown == 0
-        for row in range(first, last if before and known else first):
+        last, is_known = drawn[i], unknown == 0
+        for row in range(first, last if was_known and is_known else first):
             usable[row] = math.isfinite(off[row])
-        usable[last] = known and math.isfinite(off[last])
-        before, first = known, last + 1
+        usable[last] = is_known and math.isfinite(off[last])
+        was_known, first = is_known, last + 1
     return usable
 
 
 @compiled
 def _add_lines(number, drawn, values, sums):  # type: ignore[no-untyped-def]
-    """Add what lines through ``values`` are at each row to the sum of its bin."""
+    """Add the values of lines through ``values`` at each row to the sum of its bin."""
     for after in range(len(drawn)):
         before = max(after - 1, 0)
         first, last = drawn[before], drawn[after]
         row = first + 1
         while row < last:
-            here, rows, share = number[row], 0, 0.0
-            while row < last and number[row] == here:  # of one bin they are summed together
+            bin_number, rows, share = number[row], 0, 0.0
+            while row < last and number[row] == bin_number:  # rows of one bin are summed together
                 rows, share, row = rows + 1, share + (last - row) / (last - first), row + 1
-            if here >= 0:
-                _add(sums[here], share, values[before])
-                _add(sums[here], rows - share, values[after])
-        if number[last] >= 0:  # whatever is beside it
+            if bin_number >= 0:
+                _add(sums[bin_number], share, values[before])
+                _add(sums[bin_number], rows - share, values[after])
+        if number[last] >= 0:
             _add(sums[number[last]], 1.0, values[after])
 
 
 @per_row
 def _add(total, times, values):  # type: ignore[no-untyped-def]
-    """Add so many times the values."""
+    """Add ``times`` the values."""
     for i in range(len(total)):
         total[i] += times * values[i]
 
 
 @compiled
 def _number(phase, usable, starts, begins, number):  # type: ignore[no-untyped-def]
-    """Number the bin of each row, and tell of each bin, (bins, 6).
+    """Number the bin of each row, and give the columns of each bin, (bins, 6).
 
     Rows, cycle, stretch, its kind, rows since it began, and steps in warped time.
     """
-    found = np.empty((len(phase), 6), np.int64)
+    columns = np.empty((len(phase), 6), np.int64)
     bins, cycle, stretch, first, again = 0, -1, -1, 0, False
-    step, used = 0, -1  # the last that has a bin
+    step, used = 0, -1  # of warped time; the last with a bin
     for row in range(len(phase)):
         begun = row == 0 or phase[row] != phase[row - 1]
         while cycle + 1 < len(starts) and starts[cycle + 1] <= row:
@@ -207,21 +207,21 @@ def _number(phase, usable, starts, begins, number):  # type: ignore[no-untyped-d
         if usable[row]:
             if step != used:
                 kind = AGAIN if again else phase[row]
-                found[bins] = 0, cycle, stretch, kind, row - first, step
+                columns[bins] = 0, cycle, stretch, kind, row - first, step
                 bins, used = bins + 1, step
-            found[bins - 1, 0] += 1
+            columns[bins - 1, 0] += 1
             number[row] = bins - 1
-    return found[:bins].copy()
+    return columns[:bins].copy()
 
 
 def drawn(dt: Floats, begins: npt.NDArray[np.bool_]) -> Ints:
-    """Rows, ``dt`` seconds apart, that suffice to draw a course whose bends begin at some of them.
+    """Subsampled rows for linear interpolation; ``begins`` marks breakpoints, ``dt`` is in seconds.
 
-    Those about a missing row are among them, as lines are drawn by rows. Where rows are so far
-    apart that the model would not step over those left out, all are.
+    Rows beside a missing row are kept, as interpolation counts rows. All rows are kept if they are
+    so far apart that the model could not step over the others.
     """
-    apart = dt[dt > 0.0]
-    period = float(np.median(apart)) if len(apart) else MS
+    intervals = dt[dt > 0.0]
+    period = float(np.median(intervals)) if len(intervals) else MS
     if 1.5 * period * FARTHEST > LONGEST_BRIDGE:
         return np.arange(len(dt))
     odd = np.flatnonzero((dt < 0.5 * period) | (dt > 1.5 * period))
@@ -229,9 +229,9 @@ def drawn(dt: Floats, begins: npt.NDArray[np.bool_]) -> Ints:
 
 
 def sparse(begins: npt.NDArray[np.bool_], since: int = -1) -> Ints:
-    """Rows that suffice to draw a curve whose bends begin at some rows: fewer, the later after.
+    """Subsampled rows for linear interpolation; spacing grows with the rows since a breakpoint.
 
-    Before the first row the last bend began ``since`` rows ago.
+    The last breakpoint before the first row was ``since`` rows ago.
     """
     kept: Ints = sparse_rows(np.ascontiguousarray(begins), since)
     return kept
@@ -239,11 +239,11 @@ def sparse(begins: npt.NDArray[np.bool_], since: int = -1) -> Ints:
 
 @compiled
 def sparse_rows(begins, since):  # type: ignore[no-untyped-def]
-    """The same, compiled."""
+    """``sparse``, compiled."""
     kept = np.empty(len(begins), np.int64)
-    count, due = 0, 0  # rows after a bend
+    count, due = 0, 0  # kept rows; rows after a breakpoint at which the next one is due
     while due <= since:
-        due += _apart(due)
+        due += _spacing(due)
     for row in range(len(begins)):
         since += 1
         if begins[row]:
@@ -252,11 +252,11 @@ def sparse_rows(begins, since):  # type: ignore[no-untyped-def]
             kept[count] = row
             count += 1
         if since == due:
-            due += _apart(due)
+            due += _spacing(due)
     return kept[:count].copy()
 
 
 @per_row
-def _apart(since):  # type: ignore[no-untyped-def]
-    """Rows from one that is kept so many rows after a bend to the next."""
+def _spacing(since):  # type: ignore[no-untyped-def]
+    """Spacing of kept rows, ``since`` rows after a breakpoint."""
     return min(max(since // SPARSE, 1), FARTHEST)

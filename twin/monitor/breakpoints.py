@@ -1,7 +1,7 @@
-"""Where the slope of a noisy course breaks: local polynomials, free on either side of it.
+"""Breakpoints of the slope of a noisy course: local polynomials, free on either side.
 
-Nothing is known of the system. How far to look follows from the noise, the sampling and how steep
-the course is; all lengths are times, however often there is a row.
+No model of the system is used. Windows follow from the noise, the sampling and the slope of the
+course; all lengths are times, whatever the sampling.
 """
 
 from collections.abc import Sequence
@@ -17,33 +17,33 @@ from twin.signals import MBAR, MS
 Floats = npt.NDArray[np.float64]
 Rows = tuple[int, int]  # first, and last exclusive
 
-# Noise is what is left beside a parabola over two periods of the mains, so that hum counts. Edges
-# are in few of such windows, so a low quantile of them is noise; over the short ones hum does not
-# show, and of their few rows that quantile is less than the mean.
+# Noise is the residual of a parabola over two periods of the mains, so that hum counts. Few such
+# windows contain edges, so a low quantile of their variances is noise. Short windows do not show
+# hum; with their few rows that quantile is less than the mean.
 MAINS, SHORT, FEWEST, FEWEST_SHORT = 20.0 * MS, 8.0 * MS, 16, 8
 QUIET, SHORT_QUIET = 0.3, 0.77
-ENOUGH = 10  # windows of a part that shows its noise
-HUM = 0.02  # of hum's variance over a period is left by windows that are longer
-HUMS = 1.5  # times as much over the long windows as over the short ones
-WIDTHS = (1, 3, 5, 9, 15, 21)  # rows over which readings are smoothed, until that is quiet:
-CALM = 0.00125  # of the record's range
-SHARE_OF_STEP = 12.0**-0.5  # a step of the converter adds as much noise
+ENOUGH = 10  # windows that a part needs to show its noise
+HUM = 0.02  # share of the variance of hum over a period that remains in longer windows
+HUMS = 1.5  # noise of long windows over that of short ones, above which there is hum
+WIDTHS = (1, 3, 5, 9, 15, 21)  # rows over which readings are smoothed, until the noise is below
+CALM = 0.00125  # this share of the record's range
+SHARE_OF_STEP = 12.0**-0.5  # sigma of quantisation noise, over a step of the converter
 
-WANTED = 1.5 * MS  # one sigma of when a break is, where noise lets it be known so well
-OF_A_ROW = 0.3  # the same in rows, where they are far apart
+WANTED = 1.5 * MS  # wanted sigma of the time of a break
+OF_A_ROW = 0.3  # the same in rows, if they are far apart
 OF_NOISE = 18.0  # variance of a break between two free parabolas, 4.2² (W·Δ²/density)⁻¹
 LEAST, LEAST_ROWS = 30.0 * MS, 12  # window
 OUTER = 1e-9  # keeps the normal equations solvable
-AT_ONCE = 16  # bins that a window is thinned to where it is only looked through
-POINTS, PLACES = 192, 61  # a window is thinned to so many; a break is looked for at so many
+AT_ONCE = 16  # bins per window in a search
+POINTS, PLACES = 192, 61  # points of a thinned window; times at which a break is tried
 STEP_POINTS = 80
-CLEAR, FIRST = 8.0, 0.6  # sigmas of a break; one as clear as this share of it but earlier is it
+CLEAR, FIRST = 8.0, 0.6  # least sigmas of a break; an earlier one with this share of them wins
 RINGS, AWAY, COMES_BACK, FOOT = 60.0 * MS, 5.0, 1.5, 0.2  # s; sigmas; times as far away; share
-STEP_CLEAR, STEP_GAIN = 10.0, 20.0  # sigmas of one with a step; χ² by which the step must be better
+STEP_CLEAR, STEP_GAIN = 10.0, 20.0  # least sigmas of a break with a step; least χ² it must gain
 
 
 def smoothed(pressure: Floats, width: int) -> Floats:
-    """Mean over ``width`` rows about each, fewer at the ends."""
+    """Moving mean over ``width`` rows, fewer at the ends."""
     sums = np.cumsum(np.concatenate([[0.0], pressure - pressure[0]]))
     at = np.arange(len(pressure))
     half = np.minimum(width // 2, np.minimum(at, len(at) - 1 - at))
@@ -52,55 +52,55 @@ def smoothed(pressure: Floats, width: int) -> Floats:
 
 
 def beside_parabolas(pressure: Floats, rows: int) -> float:
-    """What most windows of so many rows leave beside a parabola (Pa rms); 0 if there is none."""
+    """Noise (Pa rms): QUIET quantile of windows' residuals from parabolas; 0 without windows."""
     windows = pressure[: len(pressure) // rows * rows].reshape(-1, rows)
     if not len(windows):
         return 0.0
     smooth = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, rows), 3))[0]
-    left = windows - (windows @ smooth) @ smooth.T
-    return float(np.sqrt(np.quantile(np.sum(left**2, axis=1) / (rows - 3), QUIET)))
+    residual = windows - (windows @ smooth) @ smooth.T
+    return float(np.sqrt(np.quantile(np.sum(residual**2, axis=1) / (rows - 3), QUIET)))
 
 
-def _least(parts: Sequence[Floats], rows: int, width: int) -> float:
-    """The least noise (Pa) of any part that has some, smoothed over ``width`` rows."""
-    found = [beside_parabolas(smoothed(part, width), rows) for part in parts]
-    return min((one for one in found if one > 0.0), default=0.0)
+def _least_noise(parts: Sequence[Floats], rows: int, width: int) -> float:
+    """The least noise (Pa) above zero of any part, smoothed over ``width`` rows."""
+    noises = [beside_parabolas(smoothed(part, width), rows) for part in parts]
+    return min((noise for noise in noises if noise > 0.0), default=0.0)
 
 
 @dataclass(frozen=True)
 class Noise:
-    """How readings scatter, and over which times."""
+    """Noise of readings, and its correlation time."""
 
-    period: float  # s, the usual time between readings
+    period: float  # s, median time between readings
     single: float  # Pa, of single readings, with hum
-    width: int  # rows; means over them are quiet enough for turns of the pressure to be seen
+    width: int  # rows; a mean over them is quiet enough to show turns of the pressure
     quiet: float  # Pa, noise of such means
-    density: float  # Pa²·s: divided by a time it is the variance of a mean over it
-    steps: float  # Pa³; divided by the slope it is that density for the converter's steps
-    correlated: float  # s, over which noise is alike: shorter windows say nothing
+    density: float  # Pa²·s; divided by a time it is the variance of a mean over that time
+    steps: float  # Pa³; divided by the slope it is the density for the converter's steps
+    correlated: float  # s, correlation time of the noise: shorter windows say nothing
     hum: bool
 
     @classmethod
     def of(cls, pressure: Floats, idle: Floats, period: float, falls: Floats) -> "Noise":
-        """Read it off a record.
+        """Estimate it from a record.
 
-        ``idle`` are its readings while nothing is commanded: a small vessel is never quiet else.
-        ``falls`` is the change (Pa) from row to row where the pressure is steep.
+        ``idle`` are the readings while nothing is commanded: a small vessel is quiet only then.
+        ``falls`` are changes (Pa) from row to row where the pressure is steep.
         """
         rows = max(round(2.0 * MAINS / period), FEWEST)
-        both = [one for one in (pressure, idle) if len(one) >= ENOUGH * rows]
-        single = _least(both, rows, 1)
-        short = _least(both, max(FEWEST_SHORT, round(SHORT / period)), 1) / SHORT_QUIET
+        parts = [candidate for candidate in (pressure, idle) if len(candidate) >= ENOUGH * rows]
+        single = _least_noise(parts, rows, 1)
+        short = _least_noise(parts, max(FEWEST_SHORT, round(SHORT / period)), 1) / SHORT_QUIET
         span = CALM * float(np.ptp(pressure))
         mains = int(MAINS / period) | 1
         width, quiet = 1, single
-        for width in sorted({*(one for one in WIDTHS if one < mains), mains}):
-            quiet = _least(both, rows, width)
+        for width in sorted({*(candidate for candidate in WIDTHS if candidate < mains), mains}):
+            quiet = _least_noise(parts, rows, width)
             if quiet < span:
                 break
         levels = np.unique(np.round(pressure, 1))
         step = float(np.quantile(np.diff(levels), 0.1)) if len(levels) > 2 else 0.0
-        held = 1.0 / max(float(np.mean(falls != 0.0)), 0.05) if len(falls) > 9 else 1.0
+        rows_per_reading = 1.0 / max(float(np.mean(falls != 0.0)), 0.05) if len(falls) > 9 else 1.0
         hum = single > HUMS * short
         of_a_row = max(short, step * SHARE_OF_STEP)
         return cls(
@@ -108,14 +108,14 @@ class Noise:
             single=single,
             width=width,
             quiet=quiet,
-            density=of_a_row**2 * period * held + hum * HUM * MAINS * single**2,
+            density=of_a_row**2 * period * rows_per_reading + hum * HUM * MAINS * single**2,
             steps=step**3 / 12.0,
-            correlated=held * period,
+            correlated=rows_per_reading * period,
             hum=hum,
         )
 
     def at(self, slope: float) -> float:
-        """Density (Pa²·s) where the pressure moves by ``slope`` (Pa/s); never 0."""
+        """Density (Pa²·s) at a slope (Pa/s) of the pressure; never 0."""
         return self.density + self.steps / slope + (1e-4 * MBAR) ** 2 * MS
 
     @property
@@ -130,7 +130,7 @@ class Noise:
 
 
 class Course(NamedTuple):
-    """Readings that can be used, in order of time."""
+    """Usable readings, in order of time."""
 
     time: Floats  # s
     pressure: Floats  # Pa
@@ -138,19 +138,20 @@ class Course(NamedTuple):
 
     @property
     def period(self) -> float:
-        """The usual time (s) between them."""
+        """Median time (s) between readings."""
         return self.noise.period
 
     def thinned(self, rows: Rows, points: int) -> tuple[Floats, Floats, float]:
-        """Time and pressure, averaged to about ``points``, and what each of these lasts (s)."""
+        """Time and pressure, averaged to about ``points``, and the time between these (s)."""
         first, last = rows
-        many = max(1, (last - first) // points)
-        count = (last - first) // many
-        part = slice(first, first + count * many)
+        rows_per_point = max(1, (last - first) // points)
+        count = (last - first) // rows_per_point
+        part = slice(first, first + count * rows_per_point)
         time, pressure = (
-            one[part].reshape(count, many).mean(axis=1) for one in (self.time, self.pressure)
+            column[part].reshape(count, rows_per_point).mean(axis=1)
+            for column in (self.time, self.pressure)
         )
-        return time, pressure, many * self.period
+        return time, pressure, rows_per_point * self.period
 
     def row(self, time: float, rows: Rows) -> int:
         """The first row from ``time`` on, well within ``rows``."""
@@ -161,46 +162,56 @@ class Break(NamedTuple):
     """A break of the slope."""
 
     time: float  # s
-    level: float  # Pa, where the course before it leads
-    jump: float  # Pa/s, by which the slope changes
-    clear: float  # sigmas
+    level: float  # Pa, to which the course before it leads
+    jump: float  # Pa/s, change of the slope
+    clear: float  # significance in sigmas
     stepped: bool  # the pressure jumps as well
 
 
 @lru_cache(maxsize=512)
 def hinge(left: int, right: int) -> Floats:
-    """Filter that gives by how much the slope breaks, beside a cubic; over so many bins."""
-    at = np.arange(-left, right + 1.0)
-    cubic = np.linalg.qr(np.stack([(at / left) ** k for k in range(4)], axis=1))[0]
-    bent = np.maximum(at, 0.0)
-    bent -= cubic @ (cubic.T @ bent)
-    filter_: Floats = bent / (bent @ bent)
+    """Filter over bins that gives the change of the slope, insensitive to a cubic."""
+    offsets = np.arange(-left, right + 1.0)
+    cubic = np.linalg.qr(np.stack([(offsets / left) ** k for k in range(4)], axis=1))[0]
+    ramp = np.maximum(offsets, 0.0)
+    ramp -= cubic @ (cubic.T @ ramp)
+    filter_: Floats = ramp / (ramp @ ramp)
     return filter_
 
 
 def closer(course: Course, rows: Rows, row: int, window: int, jump: float) -> tuple[int, int]:
     """Follow a break to shorter windows while it stays clear: its row, and the last window (rows).
 
-    Where a line rings, each of its swings breaks the slope: the first is the break. ``jump`` is
-    negative where the slope becomes less.
+    If a line rings, each swing breaks the slope: the first one is the break. ``jump`` is negative
+    if the slope decreases.
     """
     density = course.noise.at(abs(jump))
     while (half := window // 2) >= 6 and half * course.period >= course.noise.window:
-        many = max(1, half // AT_ONCE)
-        bins = max(half // many, 4)
-        first = max(rows[0], row - half - bins * many - many)
-        last = min(rows[1], row + half + bins * many + many)
-        count = (last - first) // many
+        rows_per_bin = max(1, half // AT_ONCE)
+        bins = max(half // rows_per_bin, 4)
+        first = max(rows[0], row - half - bins * rows_per_bin - rows_per_bin)
+        last = min(rows[1], row + half + bins * rows_per_bin + rows_per_bin)
+        count = (last - first) // rows_per_bin
         if count < 2 * bins + 3:
             break
-        means = course.pressure[first : first + count * many].reshape(count, many).mean(axis=1)
-        sigma = np.sqrt(density / (many * course.period)) * np.linalg.norm(hinge(bins, bins))
-        clear = np.sign(jump) * np.correlate(means, hinge(bins, bins), "valid") / sigma
-        if clear.max() < CLEAR:
+        means = (
+            course.pressure[first : first + count * rows_per_bin]
+            .reshape(count, rows_per_bin)
+            .mean(axis=1)
+        )
+        sigma = np.sqrt(density / (rows_per_bin * course.period)) * np.linalg.norm(
+            hinge(bins, bins)
+        )
+        significance = np.sign(jump) * np.correlate(means, hinge(bins, bins), "valid") / sigma
+        if significance.max() < CLEAR:
             break
-        beside = np.concatenate([[-np.inf], clear, [-np.inf]])
-        peaks = (clear >= beside[:-2]) & (clear >= beside[2:]) & (clear >= FIRST * clear.max())
-        row = first + (int(peaks.argmax()) + bins) * many + many // 2
+        padded = np.concatenate([[-np.inf], significance, [-np.inf]])
+        peaks = (
+            (significance >= padded[:-2])
+            & (significance >= padded[2:])
+            & (significance >= FIRST * significance.max())
+        )
+        row = first + (int(peaks.argmax()) + bins) * rows_per_bin + rows_per_bin // 2
         window = half
     return row, window
 
@@ -210,126 +221,134 @@ def placed(
 ) -> Break | None:
     """The break within ``reach`` of ``row``, in a window of at most ``most`` rows on either side.
 
-    It is as wide as it must be for the time to be known. None where there is no room.
+    The window is as wide as the wanted precision of the time requires. None if there is no room.
     """
     period = course.period
     wanted = max(WANTED, OF_A_ROW * period)
     density = course.noise.at(abs(jump))
-    least = max(LEAST_ROWS * period, LEAST, course.noise.window)
-    wide = max(OF_NOISE * density / (jump * wanted) ** 2, least) / period
-    half = int(np.clip(round(wide), 8, max(most, 8)))
-    found = None
+    shortest = max(LEAST_ROWS * period, LEAST, course.noise.window)
+    wanted_rows = max(OF_NOISE * density / (jump * wanted) ** 2, shortest) / period
+    half = int(np.clip(round(wanted_rows), 8, max(most, 8)))
+    best_break = None
     for _ in range(2):
         window = max(rows[0], row - half), min(rows[1], row + half + 1)
-        found = _best(course, window, float(course.time[row]), reach, (POINTS, 0.0), jump)
-        if found is None:
+        best_break = _best_break(
+            course, window, float(course.time[row]), reach, (POINTS, 0.0), jump
+        )
+        if best_break is None:
             return None
-        row = course.row(found.time, rows)
+        row = course.row(best_break.time, rows)
         reach = max(reach // 8, 2)
-    return found
+    return best_break
 
 
 def stepped(course: Course, rows: Rows, row: int, window: int, jump: float) -> Break | None:
-    """The break about ``row`` if the pressure jumps there as well; found as closely as it shows."""
-    found, reach = None, window
+    """The break about ``row`` if the pressure also jumps there, in the shortest clear window."""
+    closest, reach = None, window
     while True:
         part = max(rows[0], row - window - reach // 2), min(rows[1], row + window + reach // 2 + 1)
-        near = _best(course, part, float(course.time[row]), reach, (STEP_POINTS, STEP_GAIN), jump)
-        if near is None or near.clear < STEP_CLEAR or not near.stepped:
-            return found
-        found, row = near, course.row(near.time, rows)
+        candidate = _best_break(
+            course, part, float(course.time[row]), reach, (STEP_POINTS, STEP_GAIN), jump
+        )
+        if candidate is None or candidate.clear < STEP_CLEAR or not candidate.stepped:
+            return closest
+        closest, row = candidate, course.row(candidate.time, rows)
         if window <= 8:
-            return found
+            return closest
         window = max(window // 2, 8)
         reach = max(window // 2, 2)
 
 
 def rung(course: Course, rows: Rows, time: float, scale: float) -> Break | None:
-    """Where the pressure first left its course, if by ``time`` it has been away and come back.
+    """The point where the pressure first left its course, if it came back to it before ``time``.
 
-    A line that rings does so: a later swing may break the slope more than the first. ``scale`` (s)
-    of the course before it may be taken for a parabola.
+    A ringing line does that: a later swing may break the slope more than the first. The course
+    before it is approximately a parabola over ``scale`` (s).
     """
     period, noise = course.period, course.noise
     row = course.row(time, rows)
-    back = min(RINGS, 0.5 * scale)
+    ringing_time = min(RINGS, 0.5 * scale)
     span = max(scale, LEAST_ROWS * period)
-    begin = max(course.row(time - back - span, rows), rows[0])
-    ends = course.row(time - back, rows)
+    begin = max(course.row(time - ringing_time - span, rows), rows[0])
+    ends = course.row(time - ringing_time, rows)
     if ends - begin < LEAST_ROWS or row - ends < 3:
         return None
     x = (course.time[begin:row] - course.time[ends]) / span
     fit = np.linalg.lstsq(np.vander(x[: ends - begin], 3), course.pressure[begin:ends], rcond=None)[
         0
     ]
-    led = np.vander(x, 3) @ fit
+    extrapolated = np.vander(x, 3) @ fit
     width = max(round(noise.correlated / period), 1) | 1
-    off = smoothed(course.pressure[begin:row] - led, width)[ends - begin :]
-    least = AWAY * max(
-        noise.single, float(np.std(course.pressure[begin:ends] - led[: ends - begin]))
+    deviation = smoothed(course.pressure[begin:row] - extrapolated, width)[ends - begin :]
+    threshold = AWAY * max(
+        noise.single, float(np.std(course.pressure[begin:ends] - extrapolated[: ends - begin]))
     )
-    highest = float(off.max())
-    if highest < least + COMES_BACK * max(float(off[-1]), 0.0):
+    highest = float(deviation.max())
+    if highest < threshold + COMES_BACK * max(float(deviation[-1]), 0.0):
         return None
-    peak = int(off.argmax())
-    below = np.flatnonzero(off[:peak] < FOOT * highest)
-    at = int(below[-1]) + 1 if len(below) else 0
-    return Break(float(course.time[ends + at]), float(led[ends - begin + at]), 0.0, np.inf, True)
+    peak = int(deviation.argmax())
+    below = np.flatnonzero(deviation[:peak] < FOOT * highest)
+    foot = int(below[-1]) + 1 if len(below) else 0
+    return Break(
+        float(course.time[ends + foot]), float(extrapolated[ends - begin + foot]), 0.0, np.inf, True
+    )
 
 
-def _best(
-    course: Course, rows: Rows, at: float, reach: int, how: tuple[int, float], jump: float
+def _best_break(
+    course: Course, rows: Rows, centre: float, reach: int, criteria: tuple[int, float], jump: float
 ) -> Break | None:
-    """The best break within ``reach`` rows of the time ``at``.
+    """The best break within ``reach`` rows of the time ``centre``.
 
-    ``how``: points that the window is thinned to, χ² by which one with a step must be better; 0: it
-    must leave half as much.
+    ``criteria``: points of the thinned window, and the χ² that a step must gain; with 0 the step
+    must halve the residual.
     """
-    points, gain = how
+    points, gain = criteria
     if rows[1] - rows[0] < 8:
         return None
-    time, pressure, lasts = course.thinned(rows, points)
-    time = time - at
-    middle, scale = float(pressure.mean()), float(np.abs(time[[0, -1]]).max())
-    low = max(-reach * course.period, time[0] + 2.5 * lasts)
-    high = min(reach * course.period, time[-1] - 2.5 * lasts)
+    time, pressure, point_time = course.thinned(rows, points)
+    time = time - centre
+    mean, scale = float(pressure.mean()), float(np.abs(time[[0, -1]]).max())
+    low = max(-reach * course.period, time[0] + 2.5 * point_time)
+    high = min(reach * course.period, time[-1] - 2.5 * point_time)
     if high <= low:
         return None
-    places = np.linspace(low, high, PLACES)
-    y, sign = pressure - middle, np.sign(jump)
-    variance = course.noise.at(abs(jump)) / lasts
-    smooth, bent = fits(time / scale, y, places / scale, step=False)
-    rss = np.where(sign * bent[:, 3] > 0.0, smooth, np.inf)
+    times = np.linspace(low, high, PLACES)
+    y, sign = pressure - mean, np.sign(jump)
+    variance = course.noise.at(abs(jump)) / point_time
+    smooth, coefficients = fits(time / scale, y, times / scale, step=False)
+    rss = np.where(sign * coefficients[:, 3] > 0.0, smooth, np.inf)
     with_step = False
-    least = int(rss.argmin())
-    other, jumped = fits(time / scale, y, places / scale, step=True)
-    left = float(other.min())
-    spare = max(len(y) - 7, 1)
+    best = int(rss.argmin())
+    stepped_rss, stepped_coefficients = fits(time / scale, y, times / scale, step=True)
+    least_stepped_rss = float(stepped_rss.min())
+    freedom = max(len(y) - 7, 1)
     if gain:
-        with_step = bool(rss[least] - left > gain * max(variance, left / spare))
+        with_step = bool(
+            rss[best] - least_stepped_rss > gain * max(variance, least_stepped_rss / freedom)
+        )
     else:
-        with_step = bool(left < 0.5 * rss[least] - variance * len(y))
+        with_step = bool(least_stepped_rss < 0.5 * rss[best] - variance * len(y))
     if with_step:
-        rss, bent, least = other, jumped, int(other.argmin())
-    if not np.isfinite(rss[least]):
+        rss, coefficients, best = stepped_rss, stepped_coefficients, int(stepped_rss.argmin())
+    if not np.isfinite(rss[best]):
         return None
     cubic = np.linalg.qr(np.vander(time / scale, 4))[0]
-    unbent = float(np.sum((y - cubic @ (cubic.T @ y)) ** 2))
-    sigma = np.sqrt(max(variance, 0.25 * float(rss[least]) / spare))
+    cubic_rss = float(np.sum((y - cubic @ (cubic.T @ y)) ** 2))
+    sigma = np.sqrt(max(variance, 0.25 * float(rss[best]) / freedom))
     return Break(
-        time=at + float(places[least]) + vertex(rss, least) * float(places[1] - places[0]),
-        level=float(bent[least, 0]) + middle,
-        jump=max(abs(float(bent[least, 3])) / scale, 1e-3),
-        clear=float(np.sqrt(max(unbent - float(rss[least]), 0.0)) / sigma),
+        time=centre + float(times[best]) + vertex(rss, best) * float(times[1] - times[0]),
+        level=float(coefficients[best, 0]) + mean,
+        jump=max(abs(float(coefficients[best, 3])) / scale, 1e-3),
+        clear=float(np.sqrt(max(cubic_rss - float(rss[best]), 0.0)) / sigma),
         stepped=with_step,
     )
 
 
 def fits(x: Floats, y: Floats, places: Floats, *, step: bool) -> tuple[Floats, Floats]:
-    """Sum of squares beside two parabolas that meet at each of ``places``, and coefficients.
+    """Residual sum of squares of two parabolas that meet at each of ``places``, and coefficients.
 
-    These are level, slope and half the curvature before, and what is added to slope and curvature
-    after, (places, 5); with ``step`` also the step between the parabolas.
+    These are level, slope and half the curvature before, and the changes of slope and half the
+    curvature after, (places, 5); with ``step`` also the step between the parabolas.
     """
     z = x - places[:, None]
     after = np.maximum(z, 0.0)
@@ -337,18 +356,22 @@ def fits(x: Floats, y: Floats, places: Floats, *, step: bool) -> tuple[Floats, F
     if step:
         columns.append((z > 0.0).astype(float))
     basis = np.stack(columns, axis=2)
-    turned = basis.transpose(0, 2, 1)
-    normal, right = turned @ basis, turned @ y
+    transposed = basis.transpose(0, 2, 1)
+    normal, moments = transposed @ basis, transposed @ y
     normal += OUTER * np.eye(len(columns))
-    coefficients: Floats = np.linalg.solve(normal, right[..., None])[..., 0]
-    rss: Floats = y @ y - np.sum(coefficients * right, axis=1)
+    coefficients: Floats = np.linalg.solve(normal, moments[..., None])[..., 0]
+    rss: Floats = y @ y - np.sum(coefficients * moments, axis=1)
     return rss, coefficients
 
 
 def vertex(values: Floats, least: int) -> float:
-    """Where the parabola through the least of equally spaced values and its neighbours is least."""
+    """Offset of the vertex of the parabola through the least value and its neighbours, in steps."""
     if not 0 < least < len(values) - 1:
         return 0.0
-    before, here, after = values[least - 1 : least + 2]
-    bend = before - 2.0 * here + after
-    return float(0.5 * (before - after) / bend) if np.isfinite(bend) and bend > 0.0 else 0.0
+    before, middle, after = values[least - 1 : least + 2]
+    curvature = before - 2.0 * middle + after
+    return (
+        float(0.5 * (before - after) / curvature)
+        if np.isfinite(curvature) and curvature > 0.0
+        else 0.0
+    )

@@ -1,9 +1,9 @@
-"""The PLC's clock against the one here: how far apart, how fast they part, and when one was set.
+"""The PLC's clock against the host's: offset, drift, and steps when one of them was set.
 
-A sample is received later than it was taken, sometimes much later, and never earlier: the fastest
-of many receipts tells the clocks' distance, but for the shortest way a sample can take. A line
-through the fastest of each window tells how fast they part. Where the PLC counts its scans, a clock
-that was set shows against the count, whatever the way does meanwhile.
+A sample is received later than it was taken, sometimes much later, and never earlier. So the
+fastest of many receipts gives the offset, apart from the shortest transport. A line through the
+fastest receipt of each window gives the drift. If the PLC counts its scans, a step of its clock
+shows against the count, whatever the transport does.
 """
 
 from collections.abc import Iterator
@@ -23,14 +23,14 @@ WINDOW_NS = 5_000_000_000  # of PLC time; the fastest receipt of each counts
 KEPT = 120  # windows: ten minutes, over which the drift of a quartz is steady
 EVERY = 12  # windows from one report to the next
 FEWEST = 3  # windows for a report
-FULL = 20  # receipts, of which one came by the shortest way: for a window that was cut off
+FULL = 20  # receipts that a window needs if it was cut off: one has the shortest transport
 LEAD = 64  # rows from which the scans' period is taken
-SET_NS = 3_000_000  # a clock that was set by less cannot be told from the PLC's jitter
-CONFIRMED = 3  # receipts that must agree that it was set
-OLDEST = 0.1  # of the windows may have come since the line was drawn that says what is far off it
-FARTHEST = 1000  # scans between two receipts; beyond, the period is not known that well
-UNSTEADY = 2.0  # times what the middle receipt came after the fastest: the fastest may be late too
-SHORTER, LONGER = 2, 12  # windows after which a way that is shorter, or longer, is a clock's doing
+SET_NS = 3_000_000  # a smaller step of a clock cannot be told from the PLC's jitter
+CONFIRMED = 3  # receipts that must agree on a step
+OLDEST = 0.1  # the line is fitted anew after this share of its windows, before it judges outliers
+FARTHEST = 1000  # scans between two receipts; beyond, the period is not precise enough
+UNSTEADY = 2.0  # limit of an offset over the median delay behind the fastest: that may be late too
+SHORTER, LONGER = 2, 12  # windows after which a shorter, or longer, transport counts as a step
 
 Integers = npt.NDArray[np.int64]
 Floats = npt.NDArray[np.float64]
@@ -39,15 +39,15 @@ Number = TypeVar("Number", float, Floats)
 
 @dataclass(frozen=True)
 class Estimate:
-    """The PLC's clock less the one here, transport included; ± half of a 95 % interval.
+    """The PLC's clock less the host's, transport included; ± half of a 95 % interval.
 
-    A sample is received after it was taken. The shortest transport therefore makes the offset that
-    much smaller than the clocks' own: only an offset above zero is surely one of the clocks.
+    A sample is received after it was taken. So the shortest transport reduces the offset of the
+    clocks: only an offset above zero is certainly one of the clocks.
     """
 
     offset_ms: float
     offset_pm_ms: float
-    drift_ppm: float  # above zero the PLC's clock is the faster one
+    drift_ppm: float  # above zero: the PLC's clock is faster
     drift_pm_ppm: float
 
     def __str__(self) -> str:
@@ -68,14 +68,14 @@ def _long(ms: float) -> str:
 
 
 def line(x: Floats, y: Floats) -> tuple[float, float]:
-    """Slope, and value at the last ``x``, of a line of which a third of the points may be off.
+    """Slope, and value at the last ``x``, of a robust line: a third of the points may be outliers.
 
-    Theil and Sen's line, as SciPy has it, whose import alone would take longer than a block may.
+    The line of Theil and Sen as in SciPy, whose import would take longer than a block may.
     """
     slopes = _slopes(x, y)
-    middle = [(len(slopes) - 1) // 2, len(slopes) // 2]
-    slopes.partition(middle)  # of thousands only these need be in their places
-    slope = float(slopes[middle].sum()) / 2
+    middles = [(len(slopes) - 1) // 2, len(slopes) // 2]
+    slopes.partition(middles)  # only these of thousands need to be in order
+    slope = float(slopes[middles].sum()) / 2
     return slope, median((y - slope * (x - x[-1])).tolist())
 
 
@@ -91,7 +91,7 @@ def slope_pm(x: Floats, y: Floats) -> float:
 
 @compiled
 def _slopes(x, y):  # type: ignore[no-untyped-def]
-    """Slopes of the lines through any two points."""
+    """Slopes of the lines through all pairs of points."""
     slopes, first = np.empty(len(x) * (len(x) - 1) // 2), 0
     for i in range(len(x) - 1):
         to = slopes[first : first + len(x) - 1 - i]
@@ -103,31 +103,31 @@ def _slopes(x, y):  # type: ignore[no-untyped-def]
 
 @compiled
 def _receipts(before, samples):  # type: ignore[no-untyped-def]
-    """The newest row of each receipt that another one follows: PLC time, receipt and sequence.
+    """The newest row of each receipt that another follows: PLC time, host time and sequence.
 
-    ``before`` is the row before these, or none. Where it was received at PLC time itself, there is
-    one clock only, and nothing to tell.
+    ``before`` is the row before these, or empty. Rows whose host time is their PLC time are left
+    out: there is only one clock.
     """
-    found, count = np.empty((len(samples), 3), np.int64), 0
+    receipts, count = np.empty((len(samples), 3), np.int64), 0
     for row in range(1 - len(before), len(samples)):
         newest = samples[row - 1] if row else before[0]
         if newest.host_ns != samples[row].host_ns and newest.host_ns != newest.time_ns:
-            found[count] = newest.time_ns, newest.host_ns, newest.sequence
+            receipts[count] = newest.time_ns, newest.host_ns, newest.sequence
             count += 1
-    return found[:count].copy()
+    return receipts[:count].copy()
 
 
 @compiled
 def _first_plain(receipts, last, zero_ns, window, period, far):  # type: ignore[no-untyped-def]
-    """How many of the first receipts lie in a window, with no clock set by ``far`` (ns) or more.
+    """Number of the first receipts that lie in a window and have no step of ``far`` (ns) or more.
 
-    ``last`` is the receipt before, PLC time and sequence.
+    ``last`` is the receipt before: PLC time and sequence.
     """
     time_ns, sequence = last
     for i in range(len(receipts)):
         scans = receipts[i, 2] - sequence
-        apart = receipts[i, 0] - time_ns - scans * period
-        was_set = period > 0.0 and 0 < scans <= FARTHEST and abs(apart) >= far
+        clock_step = receipts[i, 0] - time_ns - scans * period
+        was_set = period > 0.0 and 0 < scans <= FARTHEST and abs(clock_step) >= far
         time_ns, sequence = receipts[i, 0], receipts[i, 2]
         if was_set or (time_ns - zero_ns) // WINDOW_NS != window:
             return i
@@ -136,33 +136,33 @@ def _first_plain(receipts, last, zero_ns, window, period, far):  # type: ignore[
 
 @dataclass
 class ClockWatch:
-    """Takes rows in, gives what they tell of the clocks; all of it in PLC time."""
+    """Turns rows into events of the clocks; all in PLC time."""
 
     _receipt: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # its newest row
     _lead: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))
     _period: float = 0.0  # ns a scan; 0 until it is known
-    _zero: tuple[int, int] | None = None  # PLC time, and host less PLC time, counted from here
+    _zero: tuple[int, int] | None = None  # origin of PLC time, and of host less PLC time
     _last: tuple[int, int] = (0, 0)  # PLC time and sequence of the receipt before
-    _apart: float = 0.0  # ns, PLC time from where the count of the scans says it is
-    _aside: list[float] = field(default_factory=list)  # the same of receipts where that is far
+    _clock_step: float = 0.0  # ns, PLC time less that by the count of the scans
+    _suspected_steps: list[float] = field(default_factory=list)  # large steps of the last receipts
     _window: int = 0
-    _fastest: tuple[int, int] | None = None  # of the window: time and way, ns
-    _ways: list[int] = field(default_factory=list)  # of the window's receipts, ns
-    # Of the windows before: their fastest, and how long after it their middle receipt came, ns.
+    _fastest: tuple[int, int] | None = None  # receipt of the window: time and transport, ns
+    _transports: list[int] = field(default_factory=list)  # transports of the window's receipts, ns
+    # Windows before: time and transport of the fastest, and the median delay behind it, ns.
     _points: Floats = field(default_factory=lambda: np.empty((3, 0)))
     _since: int = 0  # windows since the last report
-    _off: int = 0  # windows in a row that are off the line, below zero where they are too early
-    _line: tuple[float, float, float] = (0.0, 0.0, 0.0)  # its slope, value and time (ns) at its end
-    _undrawn: int = 0  # windows since it was drawn
+    _off_windows: int = 0  # windows in a row off the line; below zero if they are early
+    _line: tuple[float, float, float] = (0.0, 0.0, 0.0)  # slope, value and time (ns) at its end
+    _windows_since_fit: int = 0  # windows since the line was fitted
 
     def __post_init__(self) -> None:
-        """Have what is compiled at hand, not to fall into a block."""
+        """Compile now, so that no block has to wait for it."""
         _slopes(np.zeros(2), np.zeros(2))
         row = np.zeros(1, SAMPLE)
         _first_plain(_receipts(row, row), self._last, 0, 0, 0.0, 0.0)
 
     def push(self, samples: Samples) -> list[Event]:
-        """Take rows without a break, but maybe before the first one."""
+        """Take rows; only the first may have a break before it."""
         if not len(samples):
             return []
         events = []
@@ -171,9 +171,9 @@ class ClockWatch:
             self._begin()
         receipts = _receipts(self._receipt, samples)
         self._receipt = samples[-1:].copy()
-        self._learn(samples)
+        self._learn_period(samples)
         while len(receipts):
-            if plain := self._plain(receipts):
+            if plain := self._plain_count(receipts):
                 self._take_plain(receipts[:plain])
             else:
                 events += self._take(*receipts[0].tolist())
@@ -181,19 +181,19 @@ class ClockWatch:
         return events
 
     def close(self) -> list[Event]:
-        """Give what the rows since the last report tell, if it is enough."""
+        """Report the rows since the last report, if they suffice."""
         if not len(self._receipt):
             return []
-        if len(self._ways) >= FULL:
-            self._finish_window()
+        if len(self._transports) >= FULL:
+            self._close_window()
         return list(self._report(int(self._receipt["time_ns"][0])))
 
     def _begin(self) -> None:
         fresh = ClockWatch()
         self.__dict__.update(fresh.__dict__)
 
-    def _learn(self, samples: Samples) -> None:
-        """The period of the scans, from the first rows, however they are cut into blocks."""
+    def _learn_period(self, samples: Samples) -> None:
+        """Learn the period of the scans from the first LEAD rows."""
         if self._period:
             return
         self._lead = np.concatenate([self._lead, samples[: LEAD - len(self._lead)]])
@@ -202,75 +202,75 @@ class ClockWatch:
             us = np.median(np.diff(self._lead["time_ns"]) / scans) / 1e3
             self._period = max(float(np.rint(us)), 1.0) * 1e3
 
-    def _plain(self, receipts: Integers) -> int:
-        """How many of the first receipts only say how fast they were: nearly always all.
+    def _plain_count(self, receipts: Integers) -> int:
+        """Number of the first receipts that only add a transport: nearly always all.
 
-        In the window under way, and no clock was set, as ``_was_set`` would find one by one.
+        They lie in the current window, and ``_was_set`` would find no step in any of them.
         """
-        if self._zero is None or self._apart or self._aside:
+        if self._zero is None or self._clock_step or self._suspected_steps:
             return 0
         zero_ns, period = self._zero[0], self._period
-        plain = _first_plain(receipts, self._last, zero_ns, self._window, period, self._far)
+        plain = _first_plain(receipts, self._last, zero_ns, self._window, period, self._least_step)
         return int(plain)
 
     def _take_plain(self, receipts: Integers) -> None:
-        """The same as ``_take`` of each, where it is only how fast they were."""
+        """Take receipts that only add a transport; equivalent to ``_take`` of each."""
         assert self._zero is not None
         time_ns, host_ns, sequence = receipts.T
         since = time_ns - self._zero[0]
-        ways = host_ns - sum(self._zero) - since
-        first = int(np.argmin(ways))
-        if self._fastest is None or ways[first] < self._fastest[1]:
-            self._fastest = int(since[first]), int(ways[first])
-        self._ways += ways.tolist()
+        transports = host_ns - sum(self._zero) - since
+        first = int(np.argmin(transports))
+        if self._fastest is None or transports[first] < self._fastest[1]:
+            self._fastest = int(since[first]), int(transports[first])
+        self._transports += transports.tolist()
         self._last = int(time_ns[-1]), int(sequence[-1])
 
     def _take(self, time_ns: int, host_ns: int, sequence: int) -> Iterator[Event]:
-        way = host_ns - time_ns
+        transport = host_ns - time_ns
         if self._zero is None:
-            self._zero = time_ns, way
+            self._zero = time_ns, transport
         elif (moved := self._was_set(time_ns, sequence)) is not None:
-            yield from self._moved(time_ns, moved, "PLC time was set by {:+.1f} ms")
-            self._zero = time_ns, way
+            yield from self._report_step(time_ns, moved, "PLC time was set by {:+.1f} ms")
+            self._zero = time_ns, transport
         self._last = time_ns, sequence
-        at = time_ns - self._zero[0], way - self._zero[1]
-        if at[0] // WINDOW_NS != self._window:
+        point = time_ns - self._zero[0], transport - self._zero[1]
+        if point[0] // WINDOW_NS != self._window:
             yield from self._next_window(time_ns)
             if self._zero is None:  # it begins anew
-                self._zero, at = (time_ns, way), (0, 0)
-            self._window = at[0] // WINDOW_NS
-        self._ways.append(at[1])
-        if self._fastest is None or at[1] < self._fastest[1]:
-            self._fastest = at
+                self._zero, point = (time_ns, transport), (0, 0)
+            self._window = point[0] // WINDOW_NS
+        self._transports.append(point[1])
+        if self._fastest is None or point[1] < self._fastest[1]:
+            self._fastest = point
 
     # --- a clock that was set -------------------------------------------------------------------
 
     @property
-    def _far(self) -> float:
-        """From how much (ns) on PLC time may have been set."""
+    def _least_step(self) -> float:
+        """Least step (ns) of PLC time that counts."""
         return max(float(SET_NS), 2.0 * self._period)
 
     def _was_set(self, time_ns: int, sequence: int) -> float | None:
-        """By how much (ns) PLC time moved against the count some receipts ago, if it stayed so."""
+        """Step (ns) of PLC time against the count some receipts ago, if it lasted."""
         scans = sequence - self._last[1]
         if not self._period or not 0 < scans <= FARTHEST:
-            self._apart = 0.0
-            self._aside.clear()
+            self._clock_step = 0.0
+            self._suspected_steps.clear()
             return None
-        self._apart += time_ns - self._last[0] - scans * self._period
-        if abs(self._apart) < self._far:
-            self._apart = 0.0  # the count's own clock may run a little differently
-            self._aside.clear()
+        self._clock_step += time_ns - self._last[0] - scans * self._period
+        if abs(self._clock_step) < self._least_step:
+            self._clock_step = 0.0  # the count's own clock may run a little differently
+            self._suspected_steps.clear()
             return None
-        self._aside.append(self._apart)
-        if len(self._aside) <= CONFIRMED:
+        self._suspected_steps.append(self._clock_step)
+        if len(self._suspected_steps) <= CONFIRMED:
             return None
-        least, most = min(self._aside), max(self._aside)
-        return median(self._aside) if least * most > 0 else None
+        least, most = min(self._suspected_steps), max(self._suspected_steps)
+        return median(self._suspected_steps) if least * most > 0 else None
 
-    def _moved(self, time_ns: int, by_ns: float, text: str) -> Iterator[Event]:
-        """A clock was set: what was known is told, and the estimate begins anew."""
-        self._fastest, self._ways = None, []  # before it was set, or after: who knows
+    def _report_step(self, time_ns: int, by_ns: float, text: str) -> Iterator[Event]:
+        """Report the estimate so far and the step, and begin the estimate anew."""
+        self._fastest, self._transports = None, []  # these may be from before the step or after it
         yield from self._report(time_ns)
         data = {"jump_s": by_ns * 1e-9}
         yield Event(time_ns, Kind.CLOCK_JUMPED, text.format(by_ns * 1e-6), data)
@@ -281,51 +281,55 @@ class ClockWatch:
     # --- the fastest of each window -------------------------------------------------------------
 
     def _next_window(self, time_ns: int) -> Iterator[Event]:
-        off = self._finish_window()
-        if -self._off >= SHORTER or self._off >= LONGER:
+        off = self._close_window()
+        if -self._off_windows >= SHORTER or self._off_windows >= LONGER:
             text = "the clocks were moved by {:+.1f} ms against each other"
-            text += ", or the samples' way is longer now" if self._off > 0 else ""
-            yield from self._moved(time_ns, -off, text)
+            text += ", or the samples' way is longer now" if self._off_windows > 0 else ""
+            yield from self._report_step(time_ns, -off, text)
         elif self._since >= EVERY:
             yield from self._report(time_ns)
 
-    def _finish_window(self) -> float:
-        """Take the window's fastest; how far it is off the line (ns), where that is far."""
+    def _close_window(self) -> float:
+        """Close the window; its offset (ns) from the line if it is an outlier, else 0."""
         if self._fastest is None:
             return 0.0
-        off = self._beyond(self._fastest)
-        self._off = 0 if not off else int(np.sign(off)) + (self._off if off * self._off > 0 else 0)
-        late = median(self._ways) - self._fastest[1]
+        off = self._outlier_offset(self._fastest)
+        self._off_windows = (
+            0
+            if not off
+            else int(np.sign(off)) + (self._off_windows if off * self._off_windows > 0 else 0)
+        )
+        late = median(self._transports) - self._fastest[1]
         self._points = np.column_stack([self._points[:, -KEPT + 1 :], [*self._fastest, late]])
-        self._since, self._undrawn = self._since + 1, self._undrawn + 1
-        self._fastest, self._ways = None, []
+        self._since, self._windows_since_fit = self._since + 1, self._windows_since_fit + 1
+        self._fastest, self._transports = None, []
         return off
 
-    def _beyond(self, point: tuple[int, int]) -> float:
-        """How far (ns) a window's fastest is off the line of those before, where that is far."""
-        x, y, late = self._sure
+    def _outlier_offset(self, point: tuple[int, int]) -> float:
+        """Offset (ns) of a window's fastest from the line of those before if large, else 0."""
+        x, y, late = self._settled_points
         if len(x) < FEWEST:
             return 0.0
-        if self._undrawn > OLDEST * len(x):
-            self._draw()
+        if self._windows_since_fit > OLDEST * len(x):
+            self._fit_line()
         if abs(self._off_line(*point)) <= SET_NS:  # nearly always
             return 0.0
-        self._draw()
+        self._fit_line()
         off = self._off_line(*point)
         scatter = MAD_TO_SIGMA * median(np.abs(self._off_line(x, y)).tolist())
         unsteady = UNSTEADY * median(late.tolist())
         return off if abs(off) > max(float(SET_NS), 8.0 * scatter, unsteady) else 0.0
 
-    def _draw(self) -> None:
-        x, y, _ = self._sure
-        self._line, self._undrawn = (*line(x, y), float(x[-1])), 0
+    def _fit_line(self) -> None:
+        x, y, _ = self._settled_points
+        self._line, self._windows_since_fit = (*line(x, y), float(x[-1])), 0
 
     def _off_line(self, x: Number, y: Number) -> Number:
         slope, at_end, end = self._line
         return y - at_end - slope * (x - end)
 
     def _report(self, time_ns: int) -> Iterator[Event]:
-        if self._sure.shape[1] < FEWEST or not self._since or self._zero is None:
+        if self._settled_points.shape[1] < FEWEST or not self._since or self._zero is None:
             return
         self._since = 0
         estimate = self._estimate(time_ns - self._zero[0], self._zero[1])
@@ -334,17 +338,17 @@ class ClockWatch:
         yield Event(time_ns, Kind.CLOCK, str(estimate), data)
 
     def _estimate(self, now: int, zero: int) -> Estimate:
-        """At ``now``, which the line is drawn out to."""
-        x, y, _ = self._sure
-        self._draw()
+        """The estimate, with the line extrapolated to ``now``."""
+        x, y, _ = self._settled_points
+        self._fit_line()
         slope, at_end, _ = self._line
         drift_pm = slope_pm(x, y)
         scatter = MAD_TO_SIGMA * median(np.abs(self._off_line(x, y)).tolist())
         offset_pm = SIGMAS_95 * scatter + drift_pm * float(x[-1] - x[0]) / 2
-        here = at_end + slope * (now - x[-1])
-        return Estimate(-(zero + here) * 1e-6, offset_pm * 1e-6, -slope * 1e6, drift_pm * 1e6)
+        offset_ns = at_end + slope * (now - x[-1])
+        return Estimate(-(zero + offset_ns) * 1e-6, offset_pm * 1e-6, -slope * 1e6, drift_pm * 1e6)
 
     @property
-    def _sure(self) -> Floats:
-        """Windows without the last ones, if these are off the line: it may be another one."""
-        return self._points[:, : self._points.shape[1] - abs(self._off)]
+    def _settled_points(self) -> Floats:
+        """Windows without the last ones that are off the line: a new line may begin there."""
+        return self._points[:, : self._points.shape[1] - abs(self._off_windows)]

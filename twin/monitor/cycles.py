@@ -1,4 +1,4 @@
-"""Cycles cut out of the stream, and the figures each one gives."""
+"""Cycles cut out of the stream, and the figures of each."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -27,20 +27,20 @@ from twin.signals import (
 
 LONGEST_PIECE = 10_000  # rows; a longer cycle is judged in pieces so that alarms do not wait
 FEWEST_ROWS = 20  # of a phase, to judge it
-STALE = int(Quality.STALE)  # plain: NumPy makes masks of bytes with these, and compares them
+STALE = int(Quality.STALE)  # plain integers: NumPy compares bytes with them
 SUCTION, BLOW_OFF, IDLE = int(Phase.SUCTION), int(Phase.BLOW_OFF), int(Phase.IDLE)
 HOLD = int(Phase.HOLD)
 _NAMES = tuple((int(phase), phase.name.lower()) for phase in Phase)
-MEASURED = ("max_vacuum", "t0_measured")  # of ``figures``, what needs no model
-PAPER_VACUUM = 600.0 * MBAR  # Pa below ambient: what the founding paper times evacuation to
+MEASURED = ("max_vacuum", "t0_measured")  # the ``figures`` that need no model
+PAPER_VACUUM = 600.0 * MBAR  # Pa below ambient, to which the founding paper times evacuation
 
 
 @dataclass(frozen=True)
 class Cycle:
     """One pick: from the suction edge to the next one, or a piece of a long one.
 
-    ``complete`` is a whole cycle that began with a suction edge and was seen to its idle end;
-    ``cut_short`` one whose last phase may have gone on, as far as anybody knows.
+    ``complete``: the cycle began with a suction edge and was seen to its idle end. ``cut_short``:
+    its last phase may have continued unseen.
     """
 
     index: int
@@ -48,11 +48,11 @@ class Cycle:
     ticks: Ticks
     complete: bool
     cut_short: bool = False
-    settled: bool = True  # a whole cycle came before without a break: the model has swung in
+    settled: bool = True  # a whole cycle came before without a break: the model has settled
 
     @property
     def coverage(self) -> float:
-        """Share of its samples that are there."""
+        """Share of its samples that were received."""
         sequence = self.samples["sequence"]
         return len(sequence) / max(int(sequence[-1] - sequence[0]) + 1, 1)
 
@@ -68,26 +68,26 @@ class Cycle:
 
     @cached_property
     def off(self) -> npt.NDArray[np.float64]:
-        """Measured less expected pressure (mbar), row by row; NaN where either cannot be used."""
+        """Measured less expected pressure (mbar), row by row; NaN if either is unusable."""
         return deviation(self.samples, self.ticks) / MBAR
 
     @cached_property
     def stale(self) -> bool:
-        """Whether nobody knows what was commanded during some of it: the model may be anywhere."""
+        """Whether commands were unknown for a part of it: the model's state is then unknown."""
         return bool((self.samples["quality"] & STALE).any())
 
 
 class CycleView(NamedTuple):
-    """What is seen of a cycle before anything is judged."""
+    """A cycle with its figures, before it is judged."""
 
     cycle: Cycle
     before: Cycle | None
     figures: Mapping[str, float]
-    fit: bool  # to be judged
+    fit: bool  # it can be judged
 
 
 class Told(Protocol):
-    """What can be told of a whole cycle."""
+    """Key figures of a whole cycle."""
 
     @property
     def end_ns(self) -> int:
@@ -95,28 +95,28 @@ class Told(Protocol):
 
     @property
     def words(self) -> str:
-        """For people, in a line."""
+        """One line for people."""
 
     def plain(self) -> dict[str, Any]:
-        """Its numbers, as JSON has them."""
+        """Its numbers for JSON."""
 
 
 class Teller(Protocol):
-    """Whoever tells more of cycles than ``figures`` does: the key figures."""
+    """A source of key figures."""
 
     def ahead(self, parts: Sequence[tuple[Samples, Ticks]], at_edge: bool) -> None:
-        """See the rows so far of the next piece, to have less to do when it comes.
+        """Process the rows so far of the next piece, to spread the work.
 
-        ``at_edge`` says that they begin with a suction edge.
+        ``at_edge``: they begin with a suction edge.
         """
 
     def take(self, piece: Cycle) -> Told | None:
-        """Take what a CycleCutter gives, in order; tell of the cycle that is over with it."""
+        """Take pieces of a CycleCutter in order; give the key figures of a cycle that has ended."""
 
 
 @dataclass
 class CycleCutter:
-    """Takes rows in, gives cycles out as soon as they have ended.
+    """Cuts rows into cycles, and gives each as soon as it has ended.
 
     Cycles with more rows than ``longest`` come in pieces.
     """
@@ -124,9 +124,9 @@ class CycleCutter:
     longest: float = LONGEST_PIECE
     _parts: list[tuple[Samples, Ticks]] = field(default_factory=list)
     _count: int = 0  # rows in them
-    _phase: int = Phase.SUCTION  # of the newest row; before the first one none can begin
-    _index: int = -1  # of the cycle that is being collected; −1 before the first suction edge
-    _at_edge: bool = False  # what is collected begins with a suction edge
+    _phase: int = Phase.SUCTION  # of the newest row; the first row cannot begin a cycle
+    _index: int = -1  # of the collected cycle; −1 before the first suction edge
+    _at_edge: bool = False  # the collected rows begin with a suction edge
     _edges_on_end: int = 0  # suction edges since the start or the last break
 
     def push(self, samples: Samples, ticks: Ticks) -> Iterator[Cycle]:
@@ -152,7 +152,7 @@ class CycleCutter:
         return self._parts, self._at_edge
 
     def flush(self) -> Iterator[Cycle]:
-        """Give what is left; it is complete if it had come to idle."""
+        """Give the remaining rows as a cycle; it is complete if it had come to idle."""
         if self._count:
             yield self._cut()
         self._phase = Phase.SUCTION
@@ -171,7 +171,7 @@ class CycleCutter:
             self._count += len(samples)
 
     def _cut(self, at_edge: bool = False, at_break: bool = False) -> Cycle:
-        """The rows so far, and what the one after them begins."""
+        """The collected rows as a cycle; the next row is at an edge, at a break, or neither."""
         begins, self._at_edge = self._at_edge, at_edge and not at_break
         self._edges_on_end += begins
         settled = self._edges_on_end >= 2
@@ -186,7 +186,7 @@ class CycleCutter:
 
 
 def cut(blocks: Iterable[tuple[Samples, Ticks]], longest: float = LONGEST_PIECE) -> Iterator[Cycle]:
-    """All that a CycleCutter gives of rows from their beginning to their end."""
+    """All cycles of rows by a CycleCutter, flushed at the end."""
     cutter = CycleCutter(longest)
     for samples, ticks in blocks:
         yield from cutter.push(samples, ticks)
@@ -194,7 +194,7 @@ def cut(blocks: Iterable[tuple[Samples, Ticks]], longest: float = LONGEST_PIECE)
 
 
 def whole(blocks: Iterable[tuple[Samples, Ticks]]) -> list[Cycle]:
-    """The complete cycles of rows, none in pieces however long a part is held."""
+    """The complete cycles of rows; long ones are not cut into pieces."""
     return [cycle for cycle in cut(blocks, math.inf) if cycle.complete]
 
 
@@ -210,11 +210,11 @@ def time_to_vacuum(
 
 
 def figures(cycle: Cycle, theta: Theta) -> dict[str, float]:
-    """Return what a cycle says in one number each, pressures in mbar and times in ms.
+    """Figures of a cycle, pressures in mbar and times in ms; unknown ones are left out.
 
     Deviation per phase as mean and rms; the vacuum at which the air saving switched; evacuation
-    times to H2 measured and expected; the highest vacuum. What a cycle cannot say is left out.
-    Ambient pressure and H2 are those of ``theta``.
+    times to H2, measured and expected; the highest vacuum. Ambient pressure and H2 are those of
+    ``theta``.
     """
     ambient, h2 = float(theta[c.AMBIENT]), float(theta[c.H2])
     result: dict[str, float] = {}
@@ -222,13 +222,13 @@ def figures(cycle: Cycle, theta: Theta) -> dict[str, float]:
     by_phase = _by_phase(cycle.off, cycle.ticks, ambient)[:, : len(Phase)]
     rows, sums, squares, knees, levels = by_phase.tolist()
     for phase, name in _NAMES:
-        # Of the last one of a cycle cut short the beginning is no measure of all of it.
+        # The beginning of a phase that was cut short does not represent it.
         if phase != broken_off and rows[phase] >= FEWEST_ROWS:
             result[f"{name}_mean"] = sums[phase] / rows[phase]
             result[f"{name}_rms"] = math.sqrt(squares[phase] / rows[phase])
-    for name, into in (("h1_level", HOLD), ("h1_low_level", SUCTION)):
-        if knees[into]:
-            result[name] = levels[into] / knees[into]
+    for name, entered in (("h1_level", HOLD), ("h1_low_level", SUCTION)):
+        if knees[entered]:
+            result[name] = levels[entered] / knees[entered]
     if cycle.complete:
         usable = (cycle.samples["quality"] & UNUSABLE) == 0
         measured = np.where(usable, cycle.samples["pressure"], np.nan).astype(np.float64)
@@ -242,10 +242,10 @@ def figures(cycle: Cycle, theta: Theta) -> dict[str, float]:
 
 @compiled
 def _by_phase(off, ticks, ambient):  # type: ignore[no-untyped-def]
-    """Sums by phase, (5, all that a byte is).
+    """Sums by phase, (5, 256).
 
-    Rows with a deviation, it and its square; rows with a level, and its vacuum, both of what it is
-    set on for.
+    Rows with a deviation, its sum and that of its squares; rows with a level, and the sum of their
+    vacua, by the phase that begins there.
     """
     sums = np.zeros((5, 256))
     for row in range(len(off)):

@@ -1,4 +1,4 @@
-"""How the knees of a system will look: how wide a window they need, how late they are seen."""
+"""Window of the phase detector: how wide a system's breakpoints need it, and how late they show."""
 
 import math
 from collections.abc import Sequence
@@ -15,34 +15,34 @@ from twin.monitor.phase_detector import SHORTEST_WINDOW, SIGNIFICANT, Knees, Pha
 from twin.monitor.simulated_switching import seen
 from twin.signals import MBAR, MS, Phase, Samples
 
-SHARP, ROUNDED = 2.5, 2.0  # times SIGNIFICANT, which is to show of a knee; lags round it
-ROUNDS = 8  # until the window's rows are known
+SHARP, ROUNDED = 2.5, 2.0  # wanted significance over SIGNIFICANT: of a sharp break, a rounded one
+ROUNDS = 8  # iterations of the window's rows
 LONGEST_WINDOW = 240  # rows
-NEVER = 2**31  # rows into a suction: no knee is looked for
-SETTLED = 20e-3  # s after the valve's response before a knee can be one
-AGAIN = 30e-3  # s after a knee, in which lines ring, before the next can be one
-AT_ONCE = 2  # rows: so few would follow the lag that calibration finds, and that lag them
+NEVER = 2**31  # rows into a suction: no breakpoint is searched
+SETTLED = 20e-3  # s after the valve's response before the first breakpoint
+AGAIN = 30e-3  # s after a breakpoint before the next one: lines ring in that time
+AT_ONCE = 2  # rows: smaller shifts are ignored; calibrated lag and shift would chase each other
 HELD = 2.0  # s for which the nozzle is off in the free run
 LONGEST_RUN = 60_000  # rows of it
-TOLD_LATE = 20e-3  # s, that what an ejector reports may be late: a slow IO-Link cycle and a PLC's
-RINGS = 1.5  # times as high as in the free run a line may ring
+TOLD_LATE = 20e-3  # s, longest delay of an ejector's report: a slow IO-Link cycle and a PLC's
+RINGS = 1.5  # highest ringing of a line over that of the free run
 MOST_APART = 2.0 / 3.0  # of H1's hysteresis: thresholds drift
 
 
 def knees_of(data: DataSet, sampling_ms: float | None = None) -> Knees:
-    """How knees will look in rows of a data set's unit, or in those of a record."""
+    """Properties of breakpoints for a data set's unit, at its sampling or at that of a record."""
     period = (sampling_ms or data.sensor.sampling_ms) * MS
     return expected_knees(coefficients(data), data.sensor.noise_mbar * MBAR, period)
 
 
 def expected_knees(theta: Theta, noise: float, period: float = MS) -> Knees:
-    """Derive the knees' window from how sharply the slope breaks at H1 in this system.
+    """Derive the window of breakpoints from the change of the slope at H1 in this system.
 
     ``noise`` in Pa; rows come each ``period`` (s).
-    The slope of a straight line over n rows of noise s has the deviation s √(12/n³); the window is
+    The slope of a straight line over n rows of noise s has the deviation s √(12/n³). The window is
     chosen so that the break is SIGNIFICANT against the difference of two such slopes. A lag of the
-    sensor leaves 1 / (1 + lag / n) of that difference. Where no air is saved there are no knees
-    but those that the ejector reports.
+    sensor leaves 1 / (1 + lag / n) of that difference. Without air saving there are only the
+    breakpoints that the ejector reports.
     """
     h1 = theta[c.AMBIENT] - theta[c.H1]
     suction = suction_at(theta, h1) * R * theta[c.TEMPERATURE]
@@ -54,7 +54,7 @@ def expected_knees(theta: Theta, noise: float, period: float = MS) -> Knees:
     for _ in range(ROUNDS):
         rows = max(sharp, sharp * (ROUNDED / SHARP * (1.0 + lag / rows)) ** (2.0 / 3.0))
     window = int(min(max(math.ceil(rows), SHORTEST_WINDOW), LONGEST_WINDOW))
-    to_the_end = (h1 - theta[c.END_RATIO] * theta[c.AMBIENT]) / bend  # if it went on like this
+    to_the_end = (h1 - theta[c.END_RATIO] * theta[c.AMBIENT]) / bend  # at this slope
     at_once = Knees(
         window=window,
         longest=int(min(max(to_the_end, window), LONGEST_WINDOW)),
@@ -70,29 +70,31 @@ def expected_knees(theta: Theta, noise: float, period: float = MS) -> Knees:
         acts=(round(theta[c.RESPONSE_OFF] / period), round(theta[c.RESPONSE] / period)),
         period=period,
     )
-    return _as_seen(at_once, theta, GAMMA * theta[c.H1] / bend)
+    return _as_in_free_run(at_once, theta, GAMMA * theta[c.H1] / bend)
 
 
-def _as_seen(knees: Knees, theta: Theta, most: float) -> Knees:
-    """The same, seen as in a free run, which reaches H1 by ``most`` rows: as late, as far apart.
+def _as_in_free_run(knees: Knees, theta: Theta, rows_to_h1: float) -> Knees:
+    """``knees`` with delays and distance as in a free run, which reaches H1 by ``rows_to_h1``.
 
-    Jet and sensor delay a knee; the step at the port pulls it forward. As that step swings in the
-    line, the slope breaks as at a knee, but near the last one's level. Where the free run does not
-    show how high, the window is as long as the swing, over which it is level, or as it may last. A
-    flow back into another run lets the pressure come down to where the nozzle goes on.
+    Jet and sensor delay a breakpoint; the step at the port advances it. While that step oscillates
+    in the line, the slope breaks again, but near the level of the last breakpoint. If the free run
+    does not show how high, the window covers the oscillation, over which it averages out. A second
+    run has a flow back, so that the vacuum falls to where the nozzle goes on.
     """
     gas = (theta[c.VOLUME] + theta[c.PORT_VOLUME]) / (R * theta[c.TEMPERATURE])
     leaky = theta.copy()
     leaky[c.BACK_FLOW] += gas * (theta[c.H1] - theta[c.H1_LOW]) / HELD
     leaky[c.AIR_SAVING] = c.WITHOUT_CONTINUOUS
-    rows = min(int(most + HELD / knees.period) + 2 * LONGEST_WINDOW, LONGEST_RUN)
+    rows = min(int(rows_to_h1 + HELD / knees.period) + 2 * LONGEST_WINDOW, LONGEST_RUN)
     tight, leaking = seen([theta, leaky], rows, replace(knees, on_shift=0))
-    swings = round(swing(theta, float(theta[c.NEAR_INERTANCE] + theta[c.INERTANCE])) / knees.period)
-    wide = min(swings, knees.again)
-    if tight.rings == 0.0 and knees.settled != NEVER and wide > knees.window:
-        knees = replace(knees, window=wide, longest=max(knees.longest, wide))
+    swing_period_rows = round(
+        swing(theta, float(theta[c.NEAR_INERTANCE] + theta[c.INERTANCE])) / knees.period
+    )
+    swing_rows = min(swing_period_rows, knees.again)
+    if tight.rings == 0.0 and knees.settled != NEVER and swing_rows > knees.window:
+        knees = replace(knees, window=swing_rows, longest=max(knees.longest, swing_rows))
         tight, leaking = seen([theta, leaky], rows, replace(knees, on_shift=0))
-    most_rows = knees.on_shift + knees.window  # more: it is another knee
+    most_rows = knees.on_shift + knees.window  # a later one is another breakpoint
     if AT_ONCE < tight.off_rows <= most_rows:
         knees = replace(knees, off_shift=tight.off_rows)
     if 0 < leaking.on_rows <= most_rows:
@@ -103,25 +105,25 @@ def _as_seen(knees: Knees, theta: Theta, most: float) -> Knees:
 
 
 def as_wide_as_needed(knees: Knees, blocks: Sequence[Samples]) -> Knees:
-    """The same with the window in which most suctions of a whole record show the nozzle go off.
+    """``knees`` with the window in which most suctions of a record show the nozzle go off.
 
-    The narrowest of these: a wider one finds out more where a sensor, slower than anybody knew, has
-    rounded the knees, but is further behind and needs longer stretches.
+    The narrowest such window. A wider one finds breakpoints that an unexpectedly slow sensor has
+    rounded, but it lags more and needs longer stretches.
     """
     if knees.settled == NEVER:
         return knees
-    best, (most, suctions) = knees, _nozzle_off(knees, blocks)
+    best, (best_count, suctions) = knees, _count_nozzle_off(knees, blocks)
     window = knees.window
-    while most < suctions and window < knees.longest:
+    while best_count < suctions and window < knees.longest:
         window = min(2 * window, knees.longest)
         wider = replace(knees, window=window)
-        if (found := _nozzle_off(wider, blocks)[0]) > most:
-            best, most = wider, found
+        if (count := _count_nozzle_off(wider, blocks)[0]) > best_count:
+            best, best_count = wider, count
     return best
 
 
-def _nozzle_off(knees: Knees, blocks: Sequence[Samples]) -> tuple[int, int]:
-    """In how many suctions the nozzle is seen to go off, and of how many."""
+def _count_nozzle_off(knees: Knees, blocks: Sequence[Samples]) -> tuple[int, int]:
+    """Number of suctions in which the nozzle is seen to go off, and of all suctions."""
     finder = PhaseFinder(knees)
     phase = np.concatenate([*(finder.push(block)[1] for block in blocks), finder.flush()[1]])
     inside = np.isin(phase, (Phase.SUCTION, Phase.HOLD))

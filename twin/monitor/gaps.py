@@ -1,4 +1,4 @@
-"""Missing rows: what is said of them, and how short gaps go through twin and monitor unmarked."""
+"""Missing rows: their events, and how short gaps pass through twin and monitor unmarked."""
 
 from dataclasses import dataclass, field
 
@@ -11,7 +11,7 @@ APART_NS = 1_000_000_000  # between events of short gaps: a stream may have doze
 
 
 def gap_event(before: np.void, row: np.void) -> Event:
-    """That rows are missing between two."""
+    """The event of missing rows between two."""
     missing = int(row["sequence"]) - int(before["sequence"]) - 1
     seconds = float(unseen_ns(before, row)) * NS
     text = f"{missing} samples are missing ({seconds:.3f} s)"
@@ -24,20 +24,20 @@ def gap_event(before: np.void, row: np.void) -> Event:
 
 @dataclass
 class ShortGaps:
-    """Keeps the marks of short gaps aside while rows go through what steps over them.
+    """Removes the marks of short gaps before twin and monitor, and restores them afterwards.
 
-    Rows come back in the order in which they went in, however they are cut. A short gap is told of
-    at once; those within a second after it are told with the next.
+    Rows must come back in the order in which they went in; blocks may be cut anew. A short gap is
+    reported at once; those within a second after it are reported with the next.
     """
 
     _bridge: Bridge = field(default_factory=Bridge)
-    _marks: list[int] = field(default_factory=list)  # rows with one that have not come back
+    _marks: list[int] = field(default_factory=list)  # marked rows that have not come back
     _in: int = 0  # rows so far
     _out: int = 0
     _last: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # row that came back
     _events: list[Event] = field(default_factory=list)
-    _told_ns: int | None = None
-    _gaps: int = 0  # not told of yet, and rows missing in them
+    _reported_ns: int | None = None
+    _gaps: int = 0  # not yet reported, and rows missing in them
     _missing: int = 0
 
     def off(self, block: Samples) -> Samples:
@@ -50,33 +50,33 @@ class ShortGaps:
         return rows
 
     def on(self, samples: Samples) -> Samples:
-        """The next of these rows, as they were."""
+        """The next of these rows, with their marks."""
         begin, self._out = self._out, self._out + len(samples)
-        here = [row - begin for row in self._marks if row < self._out]
-        if here:
-            self._marks = self._marks[len(here) :]
+        marked_rows = [row - begin for row in self._marks if row < self._out]
+        if marked_rows:
+            self._marks = self._marks[len(marked_rows) :]
             samples = samples.copy()
-            samples["quality"][here] |= np.uint8(Quality.GAP)
-            for row in here:
-                self._tell(samples[row - 1] if row else self._last[0], samples[row])
+            samples["quality"][marked_rows] |= np.uint8(Quality.GAP)
+            for row in marked_rows:
+                self._report(samples[row - 1] if row else self._last[0], samples[row])
         self._last = samples[-1:].copy() if len(samples) else self._last
         return samples
 
     def told(self) -> list[Event]:
-        """What there is to say of the rows that came back since the last call."""
+        """Events of the rows that came back since the last call."""
         events, self._events = self._events, []
         return events
 
-    def _tell(self, before: np.void, row: np.void) -> None:
-        """Say it, or keep it for the next that is said."""
+    def _report(self, before: np.void, row: np.void) -> None:
+        """Report a gap, or count it for the next report."""
         self._gaps += 1
         self._missing += int(row["sequence"]) - int(before["sequence"]) - 1
         now_ns = int(row["time_ns"])
-        if self._told_ns is not None and 0 <= now_ns - self._told_ns < APART_NS:
+        if self._reported_ns is not None and 0 <= now_ns - self._reported_ns < APART_NS:
             return
         event = gap_event(before, row)
         if self._gaps > 1:
-            since = (now_ns - self._told_ns) * NS if self._told_ns is not None else 0.0
+            since = (now_ns - self._reported_ns) * NS if self._reported_ns is not None else 0.0
             text = (
                 f"{self._missing} samples are missing in {self._gaps} gaps of at most"
                 f" {MOST_BRIDGED} within {since:.1f} s: the model steps over them"
@@ -84,4 +84,4 @@ class ShortGaps:
             data = {"missing": self._missing, "seconds": since, "gaps": self._gaps}
             event = Event(now_ns, Kind.GAP, text, data)
         self._events.append(event)
-        self._told_ns, self._gaps, self._missing = now_ns, 0, 0
+        self._reported_ns, self._gaps, self._missing = now_ns, 0, 0

@@ -1,4 +1,4 @@
-"""An effect as a possible cause of what differs."""
+"""An effect as a possible cause of a deviation."""
 
 from dataclasses import dataclass
 
@@ -9,23 +9,23 @@ UNNAMED = "its cause is sought in the first whole cycle"
 
 @dataclass(frozen=True)
 class Likeness:
-    """One effect beside a deviation: its size, and how probable it is."""
+    """An effect that may explain a deviation: its size and probability."""
 
     effect: str
-    size: float | None  # in the unit of the effect's first parameter; None where it is not known
+    size: float | None  # in the unit of the effect's first parameter; None if unknown
     unit: str
     share: float  # probability
 
     @property
     def is_small(self) -> bool:
-        """Whether what it does is about in proportion to its size: typical ones are the limit."""
+        """Whether the response is nearly linear in the size: up to the typical size."""
         effect = find_effect(self.effect)
         typical = effect.parameters[0].typical if effect else 0.0
         return self.size is not None and abs(self.size) <= typical
 
     @property
     def words(self) -> str:
-        """The effect and its size, or why none is told."""
+        """The effect and its size for people, or why there is none."""
         if self.effect == UNKNOWN:
             return UNNAMED
         if self.size is None:
@@ -33,6 +33,6 @@ class Likeness:
         return f"fits {self.effect} {self.size:.3g} {self.unit}"
 
     def plain(self) -> dict[str, float | int | str]:
-        """The same as JSON has it; without a size where none is known."""
-        told: dict[str, float | int | str] = {"effect": self.effect, "share": self.share}
-        return told if self.size is None else {**told, "size": self.size, "unit": self.unit}
+        """The effect for JSON; without a size if that is unknown."""
+        values: dict[str, float | int | str] = {"effect": self.effect, "share": self.share}
+        return values if self.size is None else {**values, "size": self.size, "unit": self.unit}

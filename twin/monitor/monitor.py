@@ -1,8 +1,8 @@
-"""The monitor: what happens in the stream, and when measurement and model part.
+"""The monitor: events of the stream, and alarms when measurement and model differ.
 
-Each cycle is boiled down to its figures; a figure is judged in sigmas of what healthy cycles
-scatter. An alarm is raised when one figure is far out, or when the isolation says that cycles
-differ where no single one does. It is cleared, with hysteresis, when all are back for some cycles.
+Each cycle is reduced to its figures; a figure is judged in sigmas of the scatter of healthy cycles.
+An alarm is raised if one figure is far out, or if the isolation finds that cycles differ although
+no single one does. It is cleared, with hysteresis, when all figures are back for some cycles.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -50,21 +50,21 @@ if TYPE_CHECKING:  # its SciPy would be imported with every configuration
     from twin.monitor.isolation import Heard, Isolation, Verdict
 
 _UNFIT = int(Quality.OUT_OF_RANGE | Quality.OVERFLOW | Quality.STALE | Quality.BAD)
-# Of a cycle's samples, to judge it: commands seen late look like a deviation. Usual records lack up
-# to a twentieth of their rows.
+# Share of a cycle's samples needed to judge it: commands seen late look like a deviation. Usual
+# records lack up to a twentieth of their rows.
 FEWEST_SHARE = 0.9
-RIVAL = 0.05  # probability from which on another cause is named as well, or a standing name holds
-# Probability of something unlisted, from which on a cause found by its signature does not suit, and
-# is sought in the size that it has. Where one suits, that is 0.01 to 0.05; else up to a third.
+RIVAL = 0.05  # least probability to name another cause as well, or to keep a standing name
+# Probability of something unlisted above which a cause found by its signature does not suit: the
+# cause is then searched with its full size. If one suits, it is 0.01 to 0.05; else up to a third.
 UNSUITED = 0.1
-ALIKE = 0.2  # of how far out a cycle is: by so much its figures may move before the cause is sought
+ALIKE = 0.2  # largest change of figures, over the excess, without a new search for the cause
 RENAMED = 3  # cycles in a row that must agree on another name before a standing alarm gets it
-LONGEST_RING_NS = 120_000_000_000  # of rows that a PLC keeps while nobody reads them
-CLEARS = 3.5  # sigmas of a figure, below which a cycle is as healthy ones
-LARGE = 6.0  # sigmas: from less nothing else is told to begin
-SHORTEST_S = 0.1  # that a cycle takes
-GREW = 2.0  # times as far out as any cycle before: something else has begun
-PHASES = {"h1": "suction", "h1_low": "hold"}  # which a level of the air saving ends
+LONGEST_RING_NS = 120_000_000_000  # longest time of rows that a PLC keeps while nobody reads them
+CLEARS = 3.5  # sigmas of a figure, below which a cycle counts as healthy
+LARGE = 6.0  # sigmas: a cycle must exceed GREW times this for a second cause to begin
+SHORTEST_S = 0.1  # shortest duration of a cycle
+GREW = 2.0  # factor over the farthest cycle so far from which something else has begun
+PHASES = {"h1": "suction", "h1_low": "hold"}  # phases that end at a level of the air saving
 
 
 class MonitorSettings(Settings):
@@ -84,21 +84,21 @@ class Outlier(NamedTuple):
     figure: str
     excess: float  # mbar
     sigmas: float
-    normal: float  # the standard normal value that is as improbable
+    normal: float  # the equally improbable standard normal value
 
     @property
     def place(self) -> str:
-        """Where in the cycle it is, a phase or a level."""
+        """Place in the cycle: a phase or a level."""
         return self.figure.rsplit("_", 1)[0].replace("_", "-")
 
     @property
     def phase(self) -> str:
         """The phase it is measured in, for people."""
-        where = self.figure.rsplit("_", 1)[0]
-        return PHASES.get(where, where).replace("_", "-")
+        place = self.figure.rsplit("_", 1)[0]
+        return PHASES.get(place, place).replace("_", "-")
 
     def plain(self) -> dict[str, float | int | str]:
-        """As JSON has it."""
+        """The outlier for JSON."""
         phase = self.phase.replace("-", "_")
         return {
             "figure": self.figure,
@@ -110,33 +110,35 @@ class Outlier(NamedTuple):
 
 @dataclass
 class Monitor:
-    """Takes rows in, gives events out; all of it in PLC time, so a replay gives the same."""
+    """Turns rows into events; all in PLC time, so a replay gives the same."""
 
     settings: MonitorSettings
     theta: Theta
-    teller: Teller | None = None  # of key figures, for what is said of each cycle
+    teller: Teller | None = None  # source of key figures for the event of each cycle
     active: str = ""  # the standing alarm's effect, or UNKNOWN; empty while there is none
     isolation: "Isolation | None" = None
     clocks: ClockWatch | None = field(default_factory=ClockWatch)  # None: the PLC has none
-    reports: ReportWatch | None = None  # of signals beside pressure and commands
-    judges: bool = True  # cycles; not where nobody recorded the commands
+    reports: ReportWatch | None = None  # checks signals beside pressure and commands
+    judges: bool = True  # judge cycles; not if the commands were not recorded
     _cutter: CycleCutter = field(default_factory=CycleCutter)
     _before: Cycle | None = None
-    _cycles: int = 0  # that were judged, and how long they took (s)
+    _cycles: int = 0  # judged so far, and their duration (s)
     _seconds: float = 0.0
-    _sought: Mapping[str, float] = field(default_factory=dict)  # figures, as the cause was sought
-    _mixed: int | None = None  # the cycle in which something may have begun, not yet named
+    _diagnosed: Mapping[str, float] = field(
+        default_factory=dict
+    )  # figures at the last search for the cause
+    _mixed_cycle: int | None = None  # cycle in which something may have begun, not yet named
     _rival: tuple[str, int] = ("", 0)  # another name for the standing alarm, cycles that gave it
-    _farthest: float = 0.0  # sigmas by which a cycle was out since the alarm was raised
+    _farthest: float = 0.0  # largest excess (sigmas) of a cycle since the alarm was raised
     _quiet_cycles: int = 0
     _last: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # row of the stream
-    _fresh: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # the last that was
-    _silences: set[int] = field(default_factory=set)  # told of, by PLC time of the row before
-    _unfit: int = 0  # quality bits that stand
-    _baseline: "Baseline" = field(init=False)  # what each figure is in healthy cycles
+    _fresh: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # the last fresh row
+    _silences: set[int] = field(default_factory=set)  # reported, by PLC time of the row before
+    _unfit: int = 0  # quality bits that are set now
+    _baseline: "Baseline" = field(init=False)  # figures of healthy cycles
 
     def __post_init__(self) -> None:
-        """Have what is compiled at hand, not to fall into a block."""
+        """Compile now, so that no block has to wait for it."""
         from twin.monitor import naming  # noqa: PLC0415 - with SciPy
         from twin.monitor.baseline import Baseline  # noqa: PLC0415 - with SciPy
 
@@ -146,32 +148,32 @@ class Monitor:
         naming.compiled_for(nothing)
 
     def update(self, samples: Samples, ticks: Ticks) -> list[Event]:
-        """Take rows with the twin's ticks; give what they make happen."""
+        """Take rows with the twin's ticks; give their events."""
         return [event for _, _, events in self.over(samples, ticks) for event in events]
 
     def over(
         self, samples: Samples, ticks: Ticks, happened: Sequence[Event] = ()
     ) -> Iterator[tuple[Samples, Ticks, list[Event]]]:
-        """Take rows with the twin's ticks; give them with what they make happen, in order of time.
+        """Take rows with the twin's ticks; give them in parts with their events, in order of time.
 
-        Each part is of one PLC time: what a row with another one ends comes with the rows before
-        it. ``happened`` is what is known already since the rows of the last call. The last part
-        may be empty.
+        Each part has one PLC time: if a row begins a new time, events of the old one come with the
+        rows before it. ``happened`` are other events since the last call. The last part may be
+        empty.
         """
         events, part = [*happened], 0
         new_time = np.flatnonzero(samples["quality"] & NEW_TIME)
         breaks = np.flatnonzero(samples["quality"] & BREAK)
         bounds = {0, *breaks.tolist(), *(new_time + 1).tolist(), len(samples)}
         for begin, end in pairwise(sorted(bounds)):
-            found = self._watch(samples[begin:end], ticks[begin:end])
+            new_events = self._watch(samples[begin:end], ticks[begin:end])
             if samples["quality"][begin] & NEW_TIME:  # then it is this row alone
                 now_ns = int(samples["time_ns"][begin])
-                events += [event for event in found if event.time_ns != now_ns]
+                events += [event for event in new_events if event.time_ns != now_ns]
                 if events or part < begin:
                     yield samples[part:begin], ticks[part:begin], in_order(events)
-                events, part = [event for event in found if event.time_ns == now_ns], begin
+                events, part = [event for event in new_events if event.time_ns == now_ns], begin
             else:
-                events += found
+                events += new_events
         yield samples[part:], ticks[part:], in_order(events)
         if self.teller:
             self.teller.ahead(*self._cutter.begun)
@@ -179,30 +181,30 @@ class Monitor:
             self.isolation.ahead(*self._cutter.begun)
 
     def _watch(self, samples: Samples, ticks: Ticks) -> list[Event]:
-        """What rows make happen; a break may stand before the first one only."""
-        found = list(self._stream_events(samples))
-        silent = any(event.kind is Kind.PLC_BACK for event in found)
+        """Events of rows; only the first row may have a break before it."""
+        events = list(self._stream_events(samples))
+        silent = any(event.kind is Kind.PLC_BACK for event in events)
         silent |= bool(samples["quality"][0] & Quality.OURS)
-        found += self._judge(list(self._cutter.push(samples, ticks)), silent)
-        return found + (self.clocks.push(samples) if self.clocks else [])
+        events += self._judge(list(self._cutter.push(samples, ticks)), silent)
+        return events + (self.clocks.push(samples) if self.clocks else [])
 
     def silent(self, last: np.void, listened_ns: int) -> list[Event]:
-        """PLC_STALE, once, if the twin has listened too long since the ``last`` fresh row (ns)."""
+        """PLC_STALE, once, if the twin has listened too long (ns) since the ``last`` fresh row."""
         if self.is_stale(last) or listened_ns <= self.stale_ns:
             return []
         return [self._stale(int(last["time_ns"]))]
 
     def is_stale(self, last: np.void) -> bool:
-        """Whether PLC_STALE was said after this fresh row."""
+        """Whether PLC_STALE was reported after this fresh row."""
         return int(last["time_ns"]) in self._silences
 
     @property
     def stale_ns(self) -> int:
-        """How long nothing fresh may come."""
+        """Longest time (ns) without a fresh row."""
         return round(self.settings.stale_ms * 1e6)
 
     def close(self) -> list[Event]:
-        """Judge the cycle that the end cut off, and say what is still to be said of the clocks."""
+        """Judge the cycle that the end cut off, and report the clocks."""
         stale = bool(self._silences)
         events = self._judge(list(self._cutter.flush()), stale)
         return events + (self.clocks.close() if self.clocks else [])
@@ -210,10 +212,10 @@ class Monitor:
     # --- the stream -----------------------------------------------------------------------------
 
     def _stream_events(self, samples: Samples) -> Iterator[Event]:
-        """Find the rows at which something happened to the stream; most blocks have none."""
+        """Events of the stream itself; most blocks have none."""
         if not len(samples):
             return
-        if self._nothing_happens(samples):
+        if self._is_uneventful(samples):
             self._last = self._fresh = samples[-1:].copy()
             return
         rows = joined(self._fresh, self._last, samples)
@@ -226,31 +228,31 @@ class Monitor:
         before = np.concatenate([[-1], latest[:-1]])  # the last fresh row before each
         silent = rows["host_ns"] - rows["host_ns"][before] > self.stale_ns
         silent &= (quality & Quality.OURS) == 0
-        silent |= np.isin(rows["time_ns"][before], list(self._silences))  # it was said while it was
+        silent |= np.isin(rows["time_ns"][before], list(self._silences))  # reported while it lasted
         silent &= before >= 0
         changes |= silent & (fresh | ~np.concatenate([[False], (silent & ~fresh)[:-1]]))
         for row in np.flatnonzero(changes):
             if row >= first:
-                heard = rows[before[row]] if silent[row] else None
-                yield from self._row_events(rows[row - 1] if row else None, rows[row], heard)
+                last_fresh = rows[before[row]] if silent[row] else None
+                yield from self._row_events(rows[row - 1] if row else None, rows[row], last_fresh)
         self._last = rows[-1:].copy()
         self._fresh = rows[fresh][-1:].copy()
 
-    def _nothing_happens(self, samples: Samples) -> bool:
-        """Whether rows are all good, and all came since the last fresh one without a silence."""
+    def _is_uneventful(self, samples: Samples) -> bool:
+        """Whether all rows are good, and there was no silence since the last fresh one."""
         if self._unfit or self._silences or samples["quality"].any():
             return False
         came = np.concatenate([self._fresh["host_ns"], samples["host_ns"]])
         return int(np.diff(came).max(initial=0)) <= self.stale_ns
 
     def _row_events(
-        self, before: np.void | None, row: np.void, heard: np.void | None
+        self, before: np.void | None, row: np.void, last_fresh: np.void | None
     ) -> list[Event]:
-        """What a row brings; ``heard`` is the last fresh one, if that was too long ago."""
+        """Events of a row; ``last_fresh`` is the last fresh row if that was too long ago."""
         time_ns, quality = int(row["time_ns"]), int(row["quality"])
         events = []
-        if heard is not None:
-            events += self._silence_events(row, heard)
+        if last_fresh is not None:
+            events += self._silence_events(row, last_fresh)
         if quality & Quality.RESTART:
             text = f"the PLC restarted; its sequence goes on at {int(row['sequence'])}"
             events.append(Event(time_ns, Kind.PLC_RESTARTED, text))
@@ -262,19 +264,25 @@ class Monitor:
             events.append(gap_event(before, row))
         if (quality ^ self._unfit) & _UNFIT:
             self._unfit = quality & _UNFIT
-            what = str(Quality(self._unfit).name).lower().replace("_", " ").replace("|", ", ")
+            quality_text = (
+                str(Quality(self._unfit).name).lower().replace("_", " ").replace("|", ", ")
+            )
             kind = Kind.SIGNAL_BAD if self._unfit else Kind.SIGNAL_GOOD
-            text = f"pressure signal: {what}" if self._unfit else "pressure signal is good again"
+            text = (
+                f"pressure signal: {quality_text}"
+                if self._unfit
+                else "pressure signal is good again"
+            )
             events.append(Event(time_ns, kind, text, {"quality": self._unfit}))
         return events
 
-    def _silence_events(self, row: np.void, heard: np.void) -> list[Event]:
-        """One that it is stale, unless that was told, and one that it is back, once it is."""
-        since_ns = int(heard["time_ns"])
+    def _silence_events(self, row: np.void, last_fresh: np.void) -> list[Event]:
+        """PLC_STALE, unless reported already, and PLC_BACK if the row is fresh."""
+        since_ns = int(last_fresh["time_ns"])
         events = [] if since_ns in self._silences else [self._stale(since_ns)]
         if not row["quality"] & Quality.STALE:
             self._silences.remove(since_ns)
-            silence_ns = max(_apart_ns(heard, row), self.stale_ns)
+            silence_ns = max(_silence_ns(last_fresh, row), self.stale_ns)
             silence_ms = silence_ns * NS * 1e3
             text = f"the PLC is back after {silence_ms / 1e3:.2f} s"
             data = {"silence_ms": silence_ms}
@@ -292,195 +300,216 @@ class Monitor:
     # --- the cycles -----------------------------------------------------------------------------
 
     def _judge(self, cycles: Sequence[Cycle], silent: bool) -> list[Event]:
-        """Their figures, and alarms; none of one that a ``silent`` PLC cut off.
+        """Events of cycles: figures and alarms; no alarm for one that a ``silent`` PLC cut off.
 
-        Each step is taken for all of them before the next one. So its code stays in the processor's
-        caches, and what a cycle costs while a log is replayed is a third less.
+        Each step is taken for all cycles before the next step. So its code stays in the processor's
+        caches, and the time for a cycle in a replay is a third less.
         """
-        looks = [self._look(cycle, silent and cycle.cut_short) for cycle in cycles]
-        told = [self.teller.take(one) if self.teller else None for one in cycles]
-        heard = self.isolation.hear(looks) if self.isolation else [None] * len(cycles)
-        found = map(self._conclude, looks, told, heard)
-        checked = [[*self.reports.take(one)] if self.reports else [] for one in cycles]
+        views = [self._view(cycle, silent and cycle.cut_short) for cycle in cycles]
+        key_figures = [self.teller.take(cycle) if self.teller else None for cycle in cycles]
+        scores = self.isolation.hear(views) if self.isolation else [None] * len(cycles)
+        concluded = map(self._conclude, views, key_figures, scores)
+        checked = [[*self.reports.take(cycle)] if self.reports else [] for cycle in cycles]
         return [
-            one for some in zip(found, checked, strict=True) for events in some for one in events
+            event
+            for event_lists in zip(concluded, checked, strict=True)
+            for events in event_lists
+            for event in events
         ]
 
-    def _look(self, cycle: Cycle, silent: bool) -> CycleView:
-        """Its figures, and whether it can be judged."""
+    def _view(self, cycle: Cycle, silent: bool) -> CycleView:
+        """The figures of a cycle, and whether it can be judged."""
         before, self._before = self._before, cycle
         whole = cycle.complete or len(cycle.samples) >= LONGEST_PIECE
         stale = silent or cycle.stale or (before is not None and before.stale)
         fit = (
             self.judges and whole and cycle.settled and cycle.coverage >= FEWEST_SHARE and not stale
         )
-        found = figures(cycle, following(self.theta, cycle.samples))
-        if not self.judges:  # what hangs on the model
-            found = {name: value for name, value in found.items() if name in MEASURED}
-        return CycleView(cycle, before, found, fit)
+        cycle_figures = figures(cycle, following(self.theta, cycle.samples))
+        if not self.judges:  # leave out figures that depend on the model
+            cycle_figures = {
+                name: value for name, value in cycle_figures.items() if name in MEASURED
+            }
+        return CycleView(cycle, before, cycle_figures, fit)
 
-    def _conclude(self, look: CycleView, told: Told | None, heard: "Heard | None") -> list[Event]:
-        """What there is to say of a cycle, and an alarm if it is one."""
-        cycle, before, found, judged = look
-        worst, is_out = self._worst(cycle, found) if judged else (None, False)
+    def _conclude(
+        self, view: CycleView, key_figures: Told | None, scores: "Heard | None"
+    ) -> list[Event]:
+        """Events of a cycle: its summary, and its alarm or clearing."""
+        cycle, before, cycle_figures, judged = view
+        worst, is_out = self._worst(cycle, cycle_figures) if judged else (None, False)
         far = abs(worst.sigmas) if worst else 0.0
         begins = is_out and self._begins(cycle, far)
-        verdict = self._isolate(heard, far if is_out else 0.0, begins)
-        events = [_summary(cycle, found, told, verdict)] if cycle.complete or told else []
+        verdict = self._isolate(scores, far if is_out else 0.0, begins)
+        events = (
+            [_summary(cycle, cycle_figures, key_figures, verdict)]
+            if cycle.complete or key_figures
+            else []
+        )
         if not judged or (worst is None and verdict is None):
             return events
         quiet, self._quiet_cycles = self._quiet_cycles, 0
         if worst and is_out:
             if begins:
-                events.append(self._begin(worst, cycle))
-            elif not self._stands(cycle, worst, found, verdict):
-                self._sought = found
+                events.append(self._raise_unnamed(worst, cycle))
+            elif not self._stands(cycle, worst, cycle_figures, verdict):
+                self._diagnosed = cycle_figures
                 events += self._deviation(worst, before, cycle, verdict)
-        elif verdict and self._is_to_tell(verdict):
-            events.append(self._change(cycle, verdict))
+        elif verdict and self._raises_or_names(verdict):
+            events.append(self._raise_by_cycles(cycle, verdict))
         elif self.active and not self._is_far(worst) and not self._differs:
             self._quiet_cycles = quiet + 1
             if self._quiet_cycles >= self.settings.clear_cycles:
                 events.append(self._cleared(cycle))
                 self.active, self._rival = "", ("", 0)
         if not is_out:
-            self._mixed = None
+            self._mixed_cycle = None
         self._farthest = max(self._farthest, far) if self.active else 0.0
         return events
 
     def _cleared(self, cycle: Cycle) -> Event:
-        was = f"it had looked like {self.active}"
+        name_text = f"it had looked like {self.active}"
         if self.active == UNKNOWN:
-            was = "its cause was not named"
-        text = f"measurement and model agree again; {was}"
+            name_text = "its cause was not named"
+        text = f"measurement and model agree again; {name_text}"
         return Event(cycle.end_ns, Kind.DEVIATION_CLEARED, text, {"effect": self.active})
 
     def _begins(self, cycle: Cycle, far: float) -> bool:
-        """Whether something begins with a cycle that is ``far`` out (sigma).
+        """Whether something new begins with a cycle that is ``far`` out (sigma).
 
-        So it does where none stands, and where it is much farther out than any since. After the
-        cycle in which it began the next one may be, for that one had a part of it only.
+        It does if no alarm stands, or if the cycle is much farther out than all since the alarm.
+        The cycle after the first one does not count, as the first showed only a part of the change.
         """
         if not self.active:
             return True
         grew = far > GREW * max(self._farthest, LARGE)
-        return grew and self._mixed is None and not cycle.cut_short
+        return grew and self._mixed_cycle is None and not cycle.cut_short
 
-    def _is_to_tell(self, verdict: "Verdict") -> bool:
-        """Whether the isolation has an alarm to raise, or a name for one that has none."""
+    def _raises_or_names(self, verdict: "Verdict") -> bool:
+        """Whether the isolation raises an alarm, or names one that has no name."""
         if not self.active:
             return verdict.raised and bool(verdict.causes)
-        return self.active == UNKNOWN and _names(verdict)
+        return self.active == UNKNOWN and _has_name(verdict)
 
     @property
     def _is_commissioned(self) -> bool:
-        """Whether the twin is near enough to the unit that what it gets wrong names a cause."""
+        """Whether the twin is fitted to the unit, so that deviations can name a cause."""
         return self.settings.healthy.is_known
 
     @property
     def _differs(self) -> bool:
-        """Whether cycles differ together, if no single one does."""
+        """Whether the isolation finds that cycles differ together."""
         return self.isolation is not None and self.isolation.stands
 
-    def _isolate(self, heard: "Heard | None", far: float, begins: bool) -> "Verdict | None":
-        """What the isolation holds; it does not learn what is usual from what is far out."""
-        if self.isolation is None or heard is None:
+    def _isolate(self, scores: "Heard | None", far: float, begins: bool) -> "Verdict | None":
+        """The isolation's verdict; it learns no cycle that is far out."""
+        if self.isolation is None or scores is None:
             return None
-        verdict = self.isolation.judge(heard, far, begins=begins)
+        verdict = self.isolation.judge(scores, far, begins=begins)
         return verdict if self._is_commissioned or verdict is None else verdict.unnamed()
 
-    def _worst(self, cycle: Cycle, found: Mapping[str, float]) -> tuple[Outlier | None, bool]:
-        """The figure that is farthest from healthy, and whether this alone is an alarm.
+    def _worst(
+        self, cycle: Cycle, cycle_figures: Mapping[str, float]
+    ) -> tuple[Outlier | None, bool]:
+        """The figure that is farthest from healthy, and whether it alone is an alarm.
 
-        An alarm that stands without a name is named by less.
+        The limit is lower while an alarm without a name stands.
         """
         self._cycles, self._seconds = self._cycles + 1, self._seconds + cycle.seconds
-        normal = self._baseline.normal(found, self.settings.smallest_mbar)
-        excess = self._baseline.excess(found)
+        normal = self._baseline.normal(cycle_figures, self.settings.smallest_mbar)
+        excess = self._baseline.excess(cycle_figures)
         sigmas = excess / self._baseline.sigma
         columns = zip(self._baseline.names, excess, sigmas, normal, strict=True)
         outliers = [
-            Outlier(name, *map(float, numbers)) for name, *numbers in columns if name in found
+            Outlier(name, *map(float, numbers))
+            for name, *numbers in columns
+            if name in cycle_figures
         ]
         if not outliers:
             return None, False
         seconds = max(self._seconds / self._cycles, SHORTEST_S)
         limit = self._baseline.limit(self.settings.false_alarm_days, seconds, len(outliers))
-        worst = max(outliers, key=lambda one: _weight(one, limit))
+        worst = max(outliers, key=lambda outlier: _ranking_key(outlier, limit))
         if not self.active:
-            self._baseline.learn(found, normal)
+            self._baseline.learn(cycle_figures, normal)
         return worst, abs(worst.normal) >= (CLEARS if self.active == UNKNOWN else limit)
 
     def _is_far(self, worst: Outlier | None) -> bool:
-        """Whether one figure of a cycle keeps an alarm from being over."""
+        """Whether one figure of a cycle prevents the clearing of an alarm."""
         return worst is not None and abs(worst.normal) >= CLEARS
 
-    def _change(self, cycle: Cycle, verdict: "Verdict") -> Event:
-        """Raise the alarm for what no single cycle shows, or name the one that stands."""
-        self.active, self._sought = verdict.causes[0].effect, {}
-        what = f"{verdict.since} cycles: {abs(verdict.sigmas):.1f} sigma off in each"
+    def _raise_by_cycles(self, cycle: Cycle, verdict: "Verdict") -> Event:
+        """Raise the alarm for a change that no single cycle shows, or name the standing one."""
+        self.active, self._diagnosed = verdict.causes[0].effect, {}
+        observation = f"{verdict.since} cycles: {abs(verdict.sigmas):.1f} sigma off in each"
         measured: dict[str, float | int | str] = {"figure": "cycles", "cycles": verdict.since}
         measured["sigma"] = verdict.sigmas
-        return self._raised(cycle, what, measured, verdict.causes)
+        return self._raised(cycle, observation, measured, verdict.causes)
 
-    def _begin(self, worst: Outlier, cycle: Cycle) -> Event:
+    def _raise_unnamed(self, worst: Outlier, cycle: Cycle) -> Event:
         """Raise the alarm with the first cycle that shows it.
 
-        It has no name: nobody knows when in this cycle it began.
+        It has no name, as the time in the cycle at which it began is unknown.
         """
-        self.active, self._mixed, self._sought = UNKNOWN, cycle.index, {}
-        what = (
+        self.active, self._mixed_cycle, self._diagnosed = UNKNOWN, cycle.index, {}
+        observation = (
             f"something has changed, most in {worst.phase}:"
             f" {worst.excess:+.1f} mbar from healthy ({worst.sigmas:+.0f} sigma)"
         )
-        return self._raised(cycle, what, worst.plain(), [Likeness(UNKNOWN, None, "", 1.0)])
+        return self._raised(cycle, observation, worst.plain(), [Likeness(UNKNOWN, None, "", 1.0)])
 
     def _stands(
-        self, cycle: Cycle, worst: Outlier, found: Mapping[str, float], verdict: "Verdict | None"
+        self,
+        cycle: Cycle,
+        worst: Outlier,
+        cycle_figures: Mapping[str, float],
+        verdict: "Verdict | None",
     ) -> bool:
-        """Whether the standing alarm holds for a cycle without its cause being sought again.
+        """Whether the standing alarm holds for a cycle without a new search for its cause.
 
-        So it does in one that was cut short, and in one that is off as that was in which it was
-        last sought: no other would be found, and to seek it takes long. What the isolation says is
-        there already. The first cycle that is off in another way may be off in a part of it only:
-        the cause is sought in the next one.
+        It holds for a cycle that was cut short, and for one with figures like those of the last
+        search: the result would be the same, and a search takes long. The isolation's verdict costs
+        nothing, so it is used first. A cycle that differs in another way may show only a part of
+        the change: the cause is searched in the next one.
         """
-        if cycle.cut_short or cycle.index == self._mixed:
+        if cycle.cut_short or cycle.index == self._mixed_cycle:
             return True
-        if self._small(verdict) or self._rival[1]:
+        if self._small_causes(verdict) or self._rival[1]:
             return False
-        if found.keys() == self._sought.keys():
-            names = [name for name in self.settings.healthy.figures if name in found]
-            moved = max(abs(found[name] - self._sought[name]) for name in names)
+        if cycle_figures.keys() == self._diagnosed.keys():
+            names = [name for name in self.settings.healthy.figures if name in cycle_figures]
+            moved = max(abs(cycle_figures[name] - self._diagnosed[name]) for name in names)
             if moved < ALIKE * abs(worst.excess):
-                self._mixed = None
+                self._mixed_cycle = None
                 return True
-        if self._mixed is not None:
+        if self._mixed_cycle is not None:
             return False
-        self._mixed = cycle.index
+        self._mixed_cycle = cycle.index
         return True
 
     def _deviation(
         self, worst: Outlier, before: Cycle | None, cycle: Cycle, verdict: "Verdict | None"
     ) -> list[Event]:
-        """Name the alarm, or name it anew when another cause than the standing one fits."""
+        """Name the alarm, or rename it if another cause than the standing one fits."""
         if not self._is_commissioned:
             return []
-        ranking = self._name(worst, before, cycle, verdict)
-        self._mixed = None
+        ranking = self._rank_causes(worst, before, cycle, verdict)
+        self._mixed_cycle = None
         if not ranking:
             self._rival = ("", 0)
             return []
         if not self._is_renamed(ranking):
             return []
         self.active = ranking[0].effect
-        what = f"{worst.place}: {worst.excess:+.1f} mbar from healthy ({worst.sigmas:+.0f} sigma)"
-        return [self._raised(cycle, what, worst.plain(), ranking)]
+        observation = (
+            f"{worst.place}: {worst.excess:+.1f} mbar from healthy ({worst.sigmas:+.0f} sigma)"
+        )
+        return [self._raised(cycle, observation, worst.plain(), ranking)]
 
-    def _small(self, verdict: "Verdict | None") -> Sequence[Likeness]:
-        """Causes by the isolation, if the foremost is as small as its signatures are and suits.
+    def _small_causes(self, verdict: "Verdict | None") -> Sequence[Likeness]:
+        """Causes by the isolation, if the first one is small enough for signatures, and suits.
 
-        None against another name that stands: of something large they say nothing.
+        Empty if the alarm has another name: signatures do not hold for large causes.
         """
         if not verdict or not verdict.causes or not verdict.causes[0].is_small:
             return ()
@@ -491,11 +520,13 @@ class Monitor:
     def _is_renamed(self, ranking: Sequence[Likeness]) -> bool:
         """Whether the best of a ranking becomes the alarm's name.
 
-        The first name does at once. Another one does after ``RENAMED`` cycles in a row in which
-        the standing name is improbable, so that a single odd cycle changes nothing.
+        The first name does at once. Another name needs ``RENAMED`` cycles in a row in which the
+        standing name is improbable, so that a single odd cycle changes nothing.
         """
         best = ranking[0]
-        standing = max((one.share for one in ranking if one.effect == self.active), default=0.0)
+        standing = max(
+            (likeness.share for likeness in ranking if likeness.effect == self.active), default=0.0
+        )
         if standing >= RIVAL and self.active != UNKNOWN:
             self._rival = ("", 0)
             return False
@@ -509,34 +540,38 @@ class Monitor:
     def _raised(
         self,
         cycle: Cycle,
-        what: str,
+        observation: str,
         measured: Mapping[str, float | int | str],
         causes: Sequence[Likeness],
     ) -> Event:
-        """The alarm: ``what`` is off, and what fits it, the most probable first."""
-        best, *others = causes
-        also = [one.effect for one in others if one.effect != UNKNOWN and one.share >= RIVAL]
-        why = best.words if self._is_commissioned else NOT_COMMISSIONED
-        text = "; ".join([what, why]) + "".join(f", or {', '.join(also)}" for _ in also[:1])
-        data = {"cycle": cycle.index, **measured, **best.plain(), "also": ",".join(also)}
+        """The alarm: the observation, and the causes that fit, the most probable first."""
+        best, *rivals = causes
+        rival_names = [
+            rival.effect for rival in rivals if rival.effect != UNKNOWN and rival.share >= RIVAL
+        ]
+        cause_text = best.words if self._is_commissioned else NOT_COMMISSIONED
+        text = "; ".join([observation, cause_text]) + "".join(
+            f", or {', '.join(rival_names)}" for _ in rival_names[:1]
+        )
+        data = {"cycle": cycle.index, **measured, **best.plain(), "also": ",".join(rival_names)}
         if not self._is_commissioned:
             data["commissioned"] = False
         return Event(cycle.end_ns, Kind.DEVIATION, text, data)
 
-    def _name(
+    def _rank_causes(
         self, worst: Outlier, before: Cycle | None, cycle: Cycle, verdict: "Verdict | None"
     ) -> Sequence[Likeness]:
-        """Rank the causes of a cycle's deviation; the cycle before lets the model swing in.
+        """Rank the causes of a cycle's deviation; the model settles in the cycle before.
 
-        Empty where nothing in the table fits.
+        Empty if nothing in the table fits.
         """
         from twin.inference.unmodelled import MOST_SURE  # noqa: PLC0415 - with SciPy
         from twin.monitor.naming import likenesses  # noqa: PLC0415 - with SciPy
 
-        if small := self._small(verdict):
+        if small := self._small_causes(verdict):
             return small
-        if worst.figure.endswith("_level"):  # and nothing else: only the thresholds moved
-            if verdict is not None and _names(verdict):
+        if worst.figure.endswith("_level"):  # only the thresholds moved
+            if verdict is not None and _has_name(verdict):
                 return verdict.where_changed().causes
             shift = EFFECTS["threshold_drift"].parameters[0]
             size = shift.reported(worst.excess, self.theta)
@@ -545,56 +580,59 @@ class Monitor:
         samples = np.concatenate([part.samples for part in parts])
         ticks = np.concatenate([part.ticks for part in parts])
         begin = len(samples) - len(cycle.samples)
-        known = self.isolation.known if self.isolation else ()
+        known_effects = self.isolation.known if self.isolation else ()
         theta = following(self.theta, samples)
-        return likenesses(theta, self.settings.healthy, samples, ticks, begin, known)
+        return likenesses(theta, self.settings.healthy, samples, ticks, begin, known_effects)
 
 
-def _weight(outlier: Outlier, limit: float) -> tuple[bool, float]:
-    """Sensors move the levels too, and say more about themselves in the course."""
+def _ranking_key(outlier: Outlier, limit: float) -> tuple[bool, float]:
+    """Rank of an outlier: levels count a third, as sensors move them too, and the course more."""
     far = abs(outlier.sigmas)
     level = outlier.figure.endswith("_level")
     return abs(outlier.normal) >= limit, far / 3.0 if level else far
 
 
-def _names(verdict: "Verdict | None") -> bool:
-    """Whether the isolation has a name for what differs."""
+def _has_name(verdict: "Verdict | None") -> bool:
+    """Whether the isolation names a cause."""
     return bool(verdict and verdict.causes and verdict.causes[0].effect != UNKNOWN)
 
 
 def in_order(events: Iterable[Event]) -> list[Event]:
-    """Events of one PLC time in the order of time; of the same moment, as they came."""
+    """Events of one PLC time in order of time; the sort is stable."""
     return sorted(events, key=lambda event: event.time_ns)
 
 
-def _apart_ns(heard: np.void, row: np.void) -> int:
-    """Time between the receipts of two rows.
+def _silence_ns(last_fresh: np.void, row: np.void) -> int:
+    """Time (ns) between the receipts of two rows.
 
-    A wall clock that was set between them shows as far more, or less, than PLC time ran on: then
-    PLC time it is, less what a ring kept.
+    If the wall clock was set between them, that differs from the PLC time between them by more than
+    a ring can explain. Then the PLC time counts.
     """
-    by_receipt, by_plc = (int(row[name]) - int(heard[name]) for name in ("host_ns", "time_ns"))
+    by_receipt, by_plc = (int(row[name]) - int(last_fresh[name]) for name in ("host_ns", "time_ns"))
     was_set = not 0 <= by_receipt - by_plc <= LONGEST_RING_NS
     runs_on = not row["quality"] & NEW_TIME
     return by_plc if was_set and runs_on else by_receipt
 
 
 def _summary(
-    cycle: Cycle, found: Mapping[str, float], told: Told | None, verdict: "Verdict | None"
+    cycle: Cycle,
+    cycle_figures: Mapping[str, float],
+    key_figures: Told | None,
+    verdict: "Verdict | None",
 ) -> Event:
-    """What there is to say of a cycle; in the words of who tells most of it."""
+    """The event of a cycle, with the text of the key figures if there are any."""
     data: dict[str, Any] = {"cycle": cycle.index}
-    data |= {name: round(value, 3) for name, value in found.items()}
+    data |= {name: round(value, 3) for name, value in cycle_figures.items()}
     if verdict is not None:
         data["probabilities"] = verdict.plain()
-    if told is not None:
-        if not cycle.complete:  # a piece's own figures are not the cycle's
+    if key_figures is not None:
+        if not cycle.complete:  # figures of a piece are not those of the cycle
             data = {}
         data = {name: value for name, value in data.items() if not name.startswith("t0_")}
-        return Event(told.end_ns, Kind.CYCLE, told.words, data | told.plain())
+        return Event(key_figures.end_ns, Kind.CYCLE, key_figures.words, data | key_figures.plain())
     text = f"cycle {cycle.index}"
-    if "t0_measured" in found:
-        text += f": evacuated to H2 in {found['t0_measured']:.0f} ms"
-        if "t0_expected" in found:
-            text += f" (expected {found['t0_expected']:.0f} ms)"
+    if "t0_measured" in cycle_figures:
+        text += f": evacuated to H2 in {cycle_figures['t0_measured']:.0f} ms"
+        if "t0_expected" in cycle_figures:
+            text += f" (expected {cycle_figures['t0_expected']:.0f} ms)"
     return Event(cycle.end_ns, Kind.CYCLE, text, data)

@@ -1,11 +1,11 @@
-"""When the air saving switched the nozzle, from commands and pressure of a whole record.
+"""Switchings of the nozzle by the air saving, from commands and pressure of a whole record.
 
-A suction begins with the nozzle on: the pressure falls. Where the fall ends for good, or until the
-pressure turns again, the nozzle went off; where a fall as slow as the first begins, it went on.
-Nothing is known of the system, not even whether it saves air. The levels at which it switches are
-alike in all suctions: learned in a first pass, they decide where one alone is in doubt.
+A suction begins with the nozzle on: the pressure falls. The nozzle went off where the fall ends,
+for good or until the pressure turns again. It went on where a fall as slow as the first begins. No
+model of the system is used, and it may have no air saving. The switching levels are similar in all
+suctions: a first pass learns them, and they decide doubtful cases in the second.
 
-Where the ejector reports its nozzle, that says how often it switched; the pressure says when.
+If the ejector reports its nozzle, the report says how often it switched; the pressure says when.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -32,56 +32,56 @@ from twin.monitor.breakpoints import (
 )
 from twin.signals import MBAR, MS, NS, UNUSABLE, Phase, Reported, Samples
 
-LONGEST_GAP, GAP_ROWS = 20.0 * MS, 5.0  # without a reading; beyond it a suction is in two parts
+LONGEST_GAP, GAP_ROWS = 20.0 * MS, 5.0  # without a reading; a longer gap splits a suction
 LEAST_VACUUM, LEAST_NOISE, LEAST_ROWS = 20.0 * MBAR, 10.0, 12  # less shows nothing
-# A turn is one by so many sigmas of the smoothed pressure, and this share of the vacuum.
+# Least height of a turn: sigmas of the smoothed pressure, and share of the vacuum.
 TURN, TURN_SHARE = 12.0, 0.015
 HALFWAY = 0.5  # of the vacuum; before it the nozzle does not go off
-RETURN = 0.25  # of its rise: so near the level where the nozzle went off a fall must come again
-SPEED = 0.4  # as slow as the first fall over the same levels; a line that rings is faster
-LIKE_OTHERS, MOST = 0.5, 0.8  # of the hysteresis; quantile of all rises that is taken for it
-# Where a fall is looked at, in shares of it from its end, for the first of a suction and for later
-# ones. The time from one to the other is its scale.
+RETURN = 0.25  # of the rise: a new fall must come as near to the level where the nozzle went off
+SPEED = 0.4  # least duration of a new fall over that of the first; a line that rings is faster
+LIKE_OTHERS, MOST = 0.5, 0.8  # least rise over the hysteresis; quantile of rises taken for that
+# Levels between which a fall's scale is timed, as shares from its end: for the first fall of a
+# suction, and for later ones.
 FIRST_FALL, LATER_FALL = (0.16, 0.06), (0.5, 0.2)
-NEAR_THE_END = 0.06, 0.15  # of a fall: the nozzle goes off there
+NEAR_THE_END = 0.06, 0.15  # share of a fall, from its end, in which the nozzle goes off
 BINS = 32  # in a fall's scale
 BEFORE, AFTER = (0.25, 0.5, 1.0, 2.0), (1.0, 0.5, 0.25)  # windows: of the scale, and of that before
-FALLING, RISING = 0.05, 0.1  # of the fall's slope: before the break, or after it
-ENDED = 0.35  # of the slope before it
-# The slope breaks by this share of the fall's own; by less where it is as clear as that, or where
-# the pressure then rises by that share of the vacuum (a supply that wanders moves it less), or at
-# the level of the others.
+FALLING, RISING = 0.05, 0.1  # least slopes over the fall's: before the break, or after it
+ENDED = 0.35  # largest slope after the break, over that before it
+# Least break of the slope, over the fall's slope. It is lower if the break is clearer than CLEARLY
+# (sigmas), if the pressure then rises by RISES of the vacuum (a wandering supply moves it less), or
+# at the level of the other suctions.
 BREAKS, BREAKS_CLEARLY, BREAKS_AS_KNOWN, CLEARLY, RISES = 0.32, 0.2, 0.1, 100.0, 0.012
-# Sigmas: in the first pass, then at the level of others, and where no others say so.
+# Least significance (sigmas): in the first pass, then at the known level, and away from it.
 CLEAR, CLEAR_AT_LEVEL, CLEAR_ALONE = 8.0, 5.0, 16.0
-OTHERS = 1.0 / 3.0  # of the suctions must show it go off for its levels to be known
-SIGMAS_OF_LEVEL, SHARE_OF_LEVEL = 5.0, 0.02  # as near to it
-# A reported switching shows within so long of its report (a valve, and a slow IO-Link cycle); share
-# of the readings in suction that must have a report.
+OTHERS = 1.0 / 3.0  # share of the suctions that must show a switching for its level to be known
+SIGMAS_OF_LEVEL, SHARE_OF_LEVEL = 5.0, 0.02  # largest distance from it: sigmas, or of the vacuum
+# Longest time from a report to its switching in the pressure (a valve, and a slow IO-Link cycle);
+# share of the readings in suction that must have a report.
 TOLD_WITHIN, MOST_TOLD = 50.0 * MS, 0.98
-ON_WITHIN, ON_WINDOW = 20.0 * MS, 40  # about the turn; rows on either side that show the slopes
+ON_WITHIN, ON_WINDOW = 20.0 * MS, 40  # search about the turn; rows on either side for the slopes
 
 
 class Switching(NamedTuple):
-    """The air saving has switched the nozzle."""
+    """A switching of the nozzle by the air saving."""
 
-    row: int  # from which on it shows
+    row: int  # first row after it
     on: bool
     time: float  # s, since the record began
 
 
 @dataclass(frozen=True)
 class Levels:
-    """At which pressures (Pa) the nozzle switches in a record."""
+    """Pressures (Pa) at which the nozzle switches in a record."""
 
-    off: float = np.nan  # where few suctions show it
+    off: float = np.nan  # NaN if few suctions show it
     sigma: float = np.nan
-    hysteresis: float = 0.0  # where few suctions show it go on again
-    held: float = -np.inf  # up to which it stays off
+    hysteresis: float = 0.0  # 0 if few suctions show the nozzle go on again
+    held: float = -np.inf  # pressure up to which the nozzle stays off
 
     @classmethod
     def of(cls, knees: Sequence[Knee], suctions: int) -> "Levels":
-        """Those of the knees that were found so far, in so many suctions."""
+        """Levels of the breakpoints found so far, in so many suctions."""
         offs = np.array([knee.level for knee in knees if not knee.on])
         if len(offs) <= OTHERS * suctions:
             return cls()
@@ -97,7 +97,7 @@ class Levels:
 
 
 def noise_of(samples: Samples, phase: npt.NDArray[np.uint8]) -> Noise:
-    """How the readings of a record scatter; ``phase`` as in ``switchings``."""
+    """Noise of a record's readings; ``phase`` as in ``switchings``."""
     time, pressure, sucks, rows = _readings(samples, phase)
     period = float(np.median(np.diff(time))) if len(time) > 1 else 1.0 * MS
     falls = _falls(pressure, _suctions(time, sucks, period))
@@ -105,57 +105,60 @@ def noise_of(samples: Samples, phase: npt.NDArray[np.uint8]) -> Noise:
 
 
 def switchings(samples: Samples, phase: npt.NDArray[np.uint8], noise: Noise) -> list[Switching]:
-    """Find all in ``samples``; ``phase`` is what commands alone make of each row."""
+    """Find all switchings in ``samples``; ``phase`` of each row is by commands alone."""
     time, pressure, sucks, rows = _readings(samples, phase)
     if np.count_nonzero(sucks) < LEAST_ROWS:
         return []
     course = Course(time, pressure, noise)
     suctions = list(_suctions(time, sucks, noise.period))
-    said = samples["reported"][rows]
-    knees = _found(course, suctions)
-    found = [(knee.time, knee.on) for knee in knees]
-    if reports_nozzle(said[sucks]):
-        found = sorted(_told(time, suctions, knees, (said & np.uint8(Reported.NOZZLE)) != 0))
-    return [Switching(int(rows[np.searchsorted(time, when)]), on, when) for when, on in found]
+    reported = samples["reported"][rows]
+    knees = _all_knees(course, suctions)
+    switch_times = [(knee.time, knee.on) for knee in knees]
+    if reports_nozzle(reported[sucks]):
+        switch_times = sorted(
+            _reported_switchings(time, suctions, knees, (reported & np.uint8(Reported.NOZZLE)) != 0)
+        )
+    return [Switching(int(rows[np.searchsorted(time, at)]), on, at) for at, on in switch_times]
 
 
-def reports_nozzle(said: npt.NDArray[np.uint8]) -> bool:
+def reports_nozzle(reported: npt.NDArray[np.uint8]) -> bool:
     """Whether the ejector reports its nozzle in rows whose ``reported`` these are."""
-    return bool(np.mean((said & np.uint8(Reported.NOZZLE_KNOWN)) != 0) > MOST_TOLD)
+    return bool(np.mean((reported & np.uint8(Reported.NOZZLE_KNOWN)) != 0) > MOST_TOLD)
 
 
 def told_edges(on: npt.NDArray[np.bool_]) -> list[int]:
     """Rows of a suction at which the nozzle is reported to switch; it begins on.
 
-    What is reported may be late, so a nozzle that is off as suction begins goes on with it.
+    A report may be late, so a nozzle that is reported off as suction begins goes on with it.
     """
     edges = (np.flatnonzero(np.diff(on)) + 1).tolist()
     return edges if not len(on) or on[0] else edges[1:]
 
 
-def _told(
+def _reported_switchings(
     time: Floats, suctions: Sequence[Rows], shown: Sequence[Knee], on: npt.NDArray[np.bool_]
 ) -> Iterator[tuple[float, bool]]:
-    """When (s) the nozzle switched for each report of it, and whether it went on.
+    """Time (s) of each reported switching, and whether the nozzle went on.
 
-    That is when the pressure shows it; where it does not, as long after the report as elsewhere.
+    The time is that of the breakpoint in the pressure. If there is none, it is the time of the
+    report with the median delay of the others.
     """
     rows = np.array([a + row for a, b in suctions for row in told_edges(on[a:b])], np.int64)
     for opens in (False, True):
         reported = time[rows[on[rows] == opens]]
-        late = np.array([[knee.time for knee in shown if knee.on == opens]]) - reported[:, None]
-        late = np.column_stack([late, np.full(len(reported), np.inf)])  # there may be none
-        late = late[np.arange(len(reported)), np.abs(late).argmin(axis=1)]
-        shows = np.abs(late) < TOLD_WITHIN
-        usual = float(np.median(late[shows])) if shows.any() else 0.0
-        for when in (reported + np.where(shows, late, usual)).tolist():
-            yield min(when, float(time[-1])), opens
+        delays = np.array([[knee.time for knee in shown if knee.on == opens]]) - reported[:, None]
+        delays = np.column_stack([delays, np.full(len(reported), np.inf)])  # there may be none
+        delays = delays[np.arange(len(reported)), np.abs(delays).argmin(axis=1)]
+        is_shown = np.abs(delays) < TOLD_WITHIN
+        median_delay = float(np.median(delays[is_shown])) if is_shown.any() else 0.0
+        for at in (reported + np.where(is_shown, delays, median_delay)).tolist():
+            yield min(at, float(time[-1])), opens
 
 
 def _readings(
     samples: Samples, phase: npt.NDArray[np.uint8]
 ) -> tuple[Floats, Floats, npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
-    """Time (s) and pressure (Pa) of readings that can be used, if suction is on, and their rows."""
+    """Time (s) and pressure (Pa) of usable readings, whether suction is on, and their rows."""
     rows = np.flatnonzero(((samples["quality"] & UNUSABLE) == 0) & np.isfinite(samples["pressure"]))
     time = (samples["time_ns"][rows] - samples["time_ns"][:1]) * NS
     return time, samples["pressure"][rows].astype(np.float64), phase[rows] == Phase.SUCTION, rows
@@ -163,8 +166,8 @@ def _readings(
 
 def _suctions(time: Floats, sucks: npt.NDArray[np.bool_], period: float) -> Iterator[Rows]:
     """Stretches of suction without a gap."""
-    apart = np.diff(time)
-    gap = (apart > max(LONGEST_GAP, GAP_ROWS * period)) | (apart <= 0.0)
+    intervals = np.diff(time)
+    gap = (intervals > max(LONGEST_GAP, GAP_ROWS * period)) | (intervals <= 0.0)
     edges = np.flatnonzero(gap | np.diff(sucks)) + 1
     for first, last in pairwise([0, *edges.tolist(), len(time)]):
         if sucks[first]:
@@ -181,8 +184,8 @@ def _falls(pressure: Floats, suctions: Iterable[Rows]) -> Floats:
     return np.concatenate(parts)
 
 
-def _found(course: Course, suctions: Sequence[Rows]) -> list[Knee]:
-    """All knees that the pressure of a record shows, in order of time."""
+def _all_knees(course: Course, suctions: Sequence[Rows]) -> list[Knee]:
+    """All breakpoints that the pressure of a record shows, in order of time."""
     levels: Levels | None = None
     knees = list[Knee]()
     for _ in range(2):
@@ -195,14 +198,14 @@ def _found(course: Course, suctions: Sequence[Rows]) -> list[Knee]:
 
 @dataclass(frozen=True)
 class _Suction:
-    """One suction, and the levels of others, if they are known."""
+    """One suction, and the levels of all suctions if they are known."""
 
     course: Course
     rows: Rows
     levels: Levels | None
 
     def knees(self) -> Iterator[Knee]:
-        """Its knees in order: off, on, off, and so on."""
+        """Breakpoints of the suction in order: off, on, off, and so on."""
         first, last = self.rows
         if last - first < LEAST_ROWS:
             return
@@ -210,7 +213,7 @@ class _Suction:
         depth = float(smooth[0] - smooth.min())
         if depth < max(LEAST_VACUUM, LEAST_NOISE * self.course.noise.single):
             return
-        edges = [0, *self._goes_on(smooth, depth), len(smooth)]
+        edges = [0, *self._restarts(smooth, depth), len(smooth)]
         room = first
         for begin, end in pairwise(edges):
             again = end < len(smooth)
@@ -228,46 +231,48 @@ class _Suction:
             yield on
             room = self.course.row(on.time, on.rows)
 
-    def _goes_on(self, smooth: Floats, depth: float) -> list[int]:
-        """Rows at which a fall begins again that is the nozzle's."""
+    def _restarts(self, smooth: Floats, depth: float) -> list[int]:
+        """Rows at which the pressure falls again because the nozzle went on."""
         least = max(TURN * self.course.noise.quiet, TURN_SHARE * depth)
-        known = LIKE_OTHERS * self.levels.hysteresis if self.levels else 0.0
+        least_rise = LIKE_OTHERS * self.levels.hysteresis if self.levels else 0.0
         off_until = self.levels.held - least if self.levels else -np.inf
         begin = int((smooth < smooth[0] - HALFWAY * depth).argmax())
         rows = [begin + row for row in turns(smooth[begin:], least)]
         lows, highs = rows[0::2], rows[1::2]
         lowest = np.minimum.accumulate(smooth)
-        found = [0]
+        restarts = [0]
         for number, high in enumerate(highs):
-            ends = number + 1 == len(lows)  # suction does, before the nozzle goes off
+            ends = number + 1 == len(lows)  # suction ends before the nozzle goes off
             low = high + int(smooth[high:].argmin()) if ends else lows[number + 1]
-            rise = float(smooth[high] - smooth[found[-1] : high].min())
+            rise = float(smooth[high] - smooth[restarts[-1] : high].min())
             fall = float(smooth[high] - smooth[low])
-            comes_back = ends or smooth[low] <= smooth[high] - (1.0 - RETURN) * rise
-            too_low = rise < known or smooth[high] < off_until
-            if min(fall, rise) < least or too_low or not comes_back:
+            returns = ends or smooth[low] <= smooth[high] - (1.0 - RETURN) * rise
+            too_low = rise < least_rise or smooth[high] < off_until
+            if min(fall, rise) < least or too_low or not returns:
                 continue
             between = smooth[high] - 0.25 * fall, smooth[high] - 0.75 * fall
-            slow = _lasts(smooth[high:], *between) + 1 >= SPEED * _lasts(lowest, *between)
-            if known or slow:
-                found.append(high)
-        return found[1:]
+            slow = _rows_between(smooth[high:], *between) + 1 >= SPEED * _rows_between(
+                lowest, *between
+            )
+            if least_rise or slow:
+                restarts.append(high)
+        return restarts[1:]
 
     def _off(self, smooth: Floats, first: int, last: int, again: bool) -> Knee | None:
-        """Where the nozzle goes off in one fall and what follows it.
+        """The breakpoint at which the nozzle goes off in one fall; None if it does not.
 
-        If it goes on ``again`` it did. None if it did not.
+        If it goes on ``again``, it must have gone off.
         """
         course = self.course
         later = first > self.rows[0]
         lowest = float(smooth.min())
         depth = float(smooth[0]) - lowest
         high, low = LATER_FALL if later else FIRST_FALL
-        begin = _passes(smooth, lowest + high * depth, 0)
-        rows = max(_passes(smooth, lowest + low * depth, len(smooth)) - begin, 4)
+        begin = _first_below(smooth, lowest + high * depth, 0)
+        rows = max(_first_below(smooth, lowest + low * depth, len(smooth)) - begin, 4)
         scale = rows * course.period
         slope = (high - low) * depth / scale
-        best = self._clearest(_Fall(first, last, begin, rows, slope, lowest, depth, later))
+        best = self._clearest_break(_Fall(first, last, begin, rows, slope, lowest, depth, later))
         if not again:
             if best is None:
                 return None
@@ -277,89 +282,97 @@ class _Suction:
         row = best.row if best else first + int(smooth.argmin())
         jump = max(best.share if best else 1.0, 0.2) * slope
         window = max(best.window if best else rows // 4, 6)
-        beside = first + max(begin - rows, 0), last
-        row, window = closer(course, beside, row, window, jump)
-        near = placed(course, beside, row, max(window // 2, 3), max(rows, 8), jump)
-        row = course.row(near.time, beside) if near else row
-        at_step = stepped(course, beside, row, max(window, rows // 4, 12), jump)
-        found = at_step or near
-        time, level = (found.time, found.level) if found else (float(course.time[row]), lowest)
-        if first_swing := rung(course, beside, time, scale):
+        rows_around = first + max(begin - rows, 0), last
+        row, window = closer(course, rows_around, row, window, jump)
+        placed_break = placed(course, rows_around, row, max(window // 2, 3), max(rows, 8), jump)
+        row = course.row(placed_break.time, rows_around) if placed_break else row
+        stepped_break = stepped(course, rows_around, row, max(window, rows // 4, 12), jump)
+        best_break = stepped_break or placed_break
+        time, level = (
+            (best_break.time, best_break.level) if best_break else (float(course.time[row]), lowest)
+        )
+        if first_swing := rung(course, rows_around, time, scale):
             time, level = first_swing.time, first_swing.level
-            at_step = first_swing
-        jump = near.jump if near and not at_step else jump
-        return Knee(False, time, level, (first, last), jump, scale, at_step is not None)
+            stepped_break = first_swing
+        jump = placed_break.jump if placed_break and not stepped_break else jump
+        return Knee(False, time, level, (first, last), jump, scale, stepped_break is not None)
 
-    def _is_off(self, best: "_Clear", rise: float, depth: float) -> bool:
-        """Whether the slope breaks clearly enough, here or at the level where it does elsewhere."""
+    def _is_off(self, best: "_SlopeBreak", rise: float, depth: float) -> bool:
+        """Whether a break is clear enough; limits are lower at the level of the other suctions."""
         least, at_level = CLEAR, False
         if self.levels:
-            near = max(SIGMAS_OF_LEVEL * self.levels.sigma, SHARE_OF_LEVEL * depth)
-            at_level = abs(best.level - self.levels.off) < near
+            tolerance = max(SIGMAS_OF_LEVEL * self.levels.sigma, SHARE_OF_LEVEL * depth)
+            at_level = abs(best.level - self.levels.off) < tolerance
             least = CLEAR_AT_LEVEL if at_level else CLEAR_ALONE
         share = BREAKS_CLEARLY if best.clear >= CLEARLY else BREAKS
         share = BREAKS_AS_KNOWN if at_level or rise >= RISES * depth else share
         return best.clear >= least and best.share >= share
 
-    def _clearest(self, fall: "_Fall") -> "_Clear | None":
-        """Where the slope breaks most clearly as it does when the nozzle goes off."""
+    def _clearest_break(self, fall: "_Fall") -> "_SlopeBreak | None":
+        """The most significant break of the slope that is like that of the nozzle going off."""
         course = self.course
-        many = max(1, fall.scale // BINS)
-        lasts = many * course.period
-        count = (fall.last - fall.first) // many
-        means = course.pressure[fall.first : fall.first + count * many]
-        means = means.reshape(count, many).mean(axis=1)
+        rows_per_bin = max(1, fall.scale // BINS)
+        bin_time = rows_per_bin * course.period
+        count = (fall.last - fall.first) // rows_per_bin
+        means = course.pressure[fall.first : fall.first + count * rows_per_bin]
+        means = means.reshape(count, rows_per_bin).mean(axis=1)
         level = np.convolve(means, np.ones(3) / 3.0, "same")
-        sigma = np.sqrt(course.noise.at(fall.slope) / lasts)
-        side = int(np.ceil(course.noise.side / lasts))
-        windows = {max(int(fall.scale / many * one), side, 4) for one in BEFORE}
+        sigma = np.sqrt(course.noise.at(fall.slope) / bin_time)
+        side = int(np.ceil(course.noise.side / bin_time))
+        windows = {max(int(fall.scale / rows_per_bin * width), side, 4) for width in BEFORE}
         best = None
         for before, after in sorted(
-            {(one, max(int(one * share), side, 4)) for one in windows for share in AFTER}
+            {(width, max(int(width * share), side, 4)) for width in windows for share in AFTER}
         ):
             if count < before + after + 1:
                 continue
-            places = np.arange(before, count - after)
+            bins = np.arange(before, count - after)
             filter_ = hinge(before, after)
-            breaks = np.correlate(means, filter_, "valid") / lasts  # Pa/s
+            breaks = np.correlate(means, filter_, "valid") / bin_time  # Pa/s
             line = np.arange(after + 1.0) - 0.5 * after
-            slopes = np.correlate(means, line / (line @ line), "valid") / lasts
-            left, right = slopes[places - after], slopes[places]
-            may_be = (places >= fall.begin // many) & (breaks > 0.0)
-            may_be &= (places - before) * many >= fall.begin - max(fall.scale, side * many)
-            may_be &= level[places] <= fall.lowest + NEAR_THE_END[fall.later] * fall.depth
-            may_be &= (left < -FALLING * fall.slope) | (right > RISING * fall.slope)
-            may_be &= right > ENDED * left
-            clear = np.where(may_be, breaks * lasts / (sigma * np.linalg.norm(filter_)), 0.0)
-            at = int(clear.argmax())
-            if clear[at] > (best.clear if best else 0.0):
-                best = _Clear(
-                    fall.first + int(places[at]) * many + many // 2,
-                    float(clear[at]),
-                    float(breaks[at]) / fall.slope,
-                    float(means[places[at]]),
-                    min(before, after) * many,
+            slopes = np.correlate(means, line / (line @ line), "valid") / bin_time
+            left, right = slopes[bins - after], slopes[bins]
+            is_candidate = (bins >= fall.begin // rows_per_bin) & (breaks > 0.0)
+            is_candidate &= (bins - before) * rows_per_bin >= fall.begin - max(
+                fall.scale, side * rows_per_bin
+            )
+            is_candidate &= level[bins] <= fall.lowest + NEAR_THE_END[fall.later] * fall.depth
+            is_candidate &= (left < -FALLING * fall.slope) | (right > RISING * fall.slope)
+            is_candidate &= right > ENDED * left
+            clear = np.where(
+                is_candidate, breaks * bin_time / (sigma * np.linalg.norm(filter_)), 0.0
+            )
+            clearest = int(clear.argmax())
+            if clear[clearest] > (best.clear if best else 0.0):
+                best = _SlopeBreak(
+                    fall.first + int(bins[clearest]) * rows_per_bin + rows_per_bin // 2,
+                    float(clear[clearest]),
+                    float(breaks[clearest]) / fall.slope,
+                    float(means[bins[clearest]]),
+                    min(before, after) * rows_per_bin,
                 )
         return best
 
     def _on(self, off: Knee, row: int) -> Knee:
-        """Where the nozzle goes on about the turn at ``row``."""
+        """The breakpoint at which the nozzle goes on, about the turn at ``row``."""
         course = self.course
         first = course.row(off.time, (off.rows[0], row))
         last = self.rows[1]
         since = max(row - first, 6)
         half = max(min(since // 2, ON_WINDOW), 2)
         before, after = max(row - half, 0), min(row + half, last - 1)
-        here = float(course.pressure[row])
-        jump = max(here - float(course.pressure[before]), 0.0) / (half * course.period)
-        jump += max(here - float(course.pressure[after]), 0.0) / (half * course.period)
+        turn_pressure = float(course.pressure[row])
+        jump = max(turn_pressure - float(course.pressure[before]), 0.0) / (half * course.period)
+        jump += max(turn_pressure - float(course.pressure[after]), 0.0) / (half * course.period)
         jump = max(jump, 1e-3)
         reach = max(3, min(since // 4, int(ON_WITHIN / course.period)))
-        near = placed(course, (first + 1, last), row, reach, max(since, 8), -jump)
+        placed_break = placed(course, (first + 1, last), row, reach, max(since, 8), -jump)
         scale = since * course.period
-        if near is None:
-            return Knee(True, float(course.time[row]), here, (first, last), jump, scale)
-        return Knee(True, near.time, near.level, (first, last), near.jump, scale)
+        if placed_break is None:
+            return Knee(True, float(course.time[row]), turn_pressure, (first, last), jump, scale)
+        return Knee(
+            True, placed_break.time, placed_break.level, (first, last), placed_break.jump, scale
+        )
 
 
 class _Fall(NamedTuple):
@@ -367,16 +380,16 @@ class _Fall(NamedTuple):
 
     first: int  # row
     last: int  # exclusive
-    begin: int  # rows after the first, from which on the nozzle may go off
+    begin: int  # rows after the first from which the nozzle may go off
     scale: int  # rows
-    slope: float  # Pa/s, that it falls by over its scale
+    slope: float  # Pa/s, mean of the fall over its scale
     lowest: float  # Pa
     depth: float  # Pa
     later: bool  # not the first of its suction
 
 
-class _Clear(NamedTuple):
-    """The clearest break of the slope in a fall."""
+class _SlopeBreak(NamedTuple):
+    """The most significant break of the slope in a fall."""
 
     row: int
     clear: float  # sigmas
@@ -388,25 +401,25 @@ class _Clear(NamedTuple):
 def turns(smooth: Floats, least: float) -> list[int]:
     """Rows of lows and highs in turn, a low first, between which it moves by ``least`` or more.
 
-    It begins by falling. A last one that nothing follows is none.
+    ``smooth`` begins by falling. A last turn that nothing follows does not count.
     """
-    found, falling, best, value_there = list[int](), True, 0, float(smooth[0])
+    rows, falling, best, best_value = list[int](), True, 0, float(smooth[0])
     for row, value in enumerate(smooth.tolist()):
-        if (value < value_there) if falling else (value > value_there):
-            best, value_there = row, value
-        elif abs(value - value_there) >= least:
-            found.append(best)
-            falling, best, value_there = not falling, row, value
-    return found
+        if (value < best_value) if falling else (value > best_value):
+            best, best_value = row, value
+        elif abs(value - best_value) >= least:
+            rows.append(best)
+            falling, best, best_value = not falling, row, value
+    return rows
 
 
-def _passes(falling: Floats, level: float, otherwise: int) -> int:
-    """The first row at or below ``level``."""
+def _first_below(falling: Floats, level: float, default: int) -> int:
+    """The first row at or below ``level``, or the default."""
     below = falling <= level
     row = int(below.argmax())
-    return row if below[row] else otherwise
+    return row if below[row] else default
 
 
-def _lasts(falling: Floats, begin: float, end: float) -> int:
-    """Rows from one level down to the other."""
-    return _passes(falling, end, len(falling)) - _passes(falling, begin, 0)
+def _rows_between(falling: Floats, begin: float, end: float) -> int:
+    """Rows from one level down to another."""
+    return _first_below(falling, end, len(falling)) - _first_below(falling, begin, 0)

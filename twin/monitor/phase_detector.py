@@ -1,13 +1,13 @@
-"""Phases found from commands and pressure, with the air-saving switches nobody tells us about.
+"""Phases from commands and pressure, with the switchings of the air saving that nobody reports.
 
 A compact ejector switches its nozzle off at H1 and on again below it by itself; the PLC does not
-see it. It shows as a knee in the pressure: the slope breaks. The finder looks for knees with a
-straight line on each side, so where there may be one it is a lag behind the measurement; behind it
-everything is known when the model steps, and the model is synchronised on the measured level at
-each knee. Rows that cannot be at a knee are given out at once.
+see it. It shows as a breakpoint, or knee, in the pressure: the slope breaks. The finder fits a
+straight line on each side, so it lags behind the measurement where there may be a knee. The model
+steps only over rows whose phase is known, and is synchronised to the measured level at each knee.
+Rows that cannot be at a knee are given out at once.
 
-Where the ejector reports its nozzle, knees are looked for about what it reports and nowhere else.
-One that it reports and the pressure does not show is where the valve must have acted.
+If the ejector reports its nozzle, knees are searched about its reports and nowhere else. If the
+pressure does not show a reported switching, it is placed where the valve must have acted.
 """
 
 import math
@@ -25,18 +25,18 @@ from twin.signals import BREAK, MS, NS, SAMPLE, UNUSABLE, Phase, Reported, Sampl
 IDLE_ROWS = 20  # rows of idle that give the level before a cycle
 FEWEST_IDLE_ROWS = 5
 SIGNIFICANT = 7.0  # sigmas of slope difference that make a knee
-JUMP = 8.0  # times the noise, from one row to the next: knees are rounder
-ALONE = 2.0  # times the changes before and after it: a line that rings rises as fast, but longer
+JUMP = 8.0  # times the noise, from one row to the next: a larger change is no knee
+ALONE = 2.0  # a jump over the changes before and after it: a ringing line rises for longer
 SHORTEST_WINDOW = 8  # rows
 MOST_MISSING = 0.5  # of a line's rows
 
-# What the finder remembers from row to row.
-# Ages are in rows; suction's runs anew from a knee, and is −1 while suction is not commanded.
-# The level of the last knee is NaN before a suction's first.
+# Indices of the finder's state.
+# Ages are in rows; that of suction restarts at a knee, and is −1 while suction is not commanded.
+# The level of the last knee is NaN before the first of a suction.
 _NOZZLE, _AGE, _BEST, _BEST_AGE, _BEST_LEVEL, _KNEE_LEVEL = range(6)
 _IDLE_AGE, _IDLE_SUM, _ANCHORED = range(6, 9)
-# Of this suction: knees, rows since it began; switchings that were reported long ago, and how the
-# nozzle was said to be then (1 on, 0 off, -1 not yet).
+# In this suction: knees, rows since it began, reported switchings that are overdue, and the nozzle
+# as reported then (1 on, 0 off, -1 not yet).
 _SWITCHED, _SINCE, _REPORTS, _SAID = range(9, 13)
 _BEGINNING = (0.0, -1.0, 0.0, 0.0, 0.0, math.nan, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)
 _KNOWN, _ON = int(Reported.NOZZLE_KNOWN), int(Reported.NOZZLE_KNOWN | Reported.NOZZLE)
@@ -45,14 +45,14 @@ _IDLE, _SUCTION, _HOLD, _BLOW_OFF = (int(phase) for phase in Phase)
 
 @dataclass(frozen=True)
 class Knees:
-    """How knees look in this system: rows of the window, noise (Pa), rows from valve to knee.
+    """Properties of knees in this system: rows of the window, noise (Pa), rows from valve to knee.
 
     Rows come each ``period`` (s). The nozzle's closing shows ``off_shift`` rows later, its opening
-    ``on_shift``. No knee is looked for in the rows until suction has ``settled``, nor in those
-    until one can follow ``again``, nor until the pressure is ``apart`` (Pa) from where the last
-    was. A window of more than ``longest`` rows could take the way to the end pressure for a knee.
-    Where the ejector reports its nozzle, a knee is within ``about`` rows of that, and the valve,
-    closing and opening, ``acts`` rows after.
+    ``on_shift``. No knee is searched in the first ``settled`` rows of suction. The next knee is at
+    least ``again`` rows after the last one, and ``apart`` (Pa) from it. A window of more
+    than ``longest`` rows could take the approach of the end pressure for a knee. If the ejector
+    reports its nozzle, a knee is within ``about`` rows of the report, and the valve acts ``acts``
+    rows after it (closing, opening).
     """
 
     window: int
@@ -70,20 +70,20 @@ class Knees:
 
     @property
     def settles(self) -> int:
-        """Rows that must follow a knee for its peak to be seen whole."""
+        """Rows that must follow a knee to show its whole peak."""
         return self.window + self.window // 2
 
     @property
     def lag(self) -> int:
-        """Rows the finder is behind at most: half a window to see the peak, and the way back."""
+        """Largest lag of the finder in rows: to see the peak, and to reach back by the shift."""
         return self.settles + max(self.off_shift, self.on_shift) + 1
 
 
 @per_row
 def _line(pressure, start, rows):  # type: ignore[no-untyped-def]
-    """Slope (Pa per row) and middle of a straight line through ``rows`` values from ``start``.
+    """Slope (Pa per row) and mean of a straight line through ``rows`` values from ``start``.
 
-    A few that are not usable (NaN) are left out; too many make it NaN.
+    Unusable values (NaN) are left out; with too many of them the result is NaN.
     """
     total, moment, missing = 0.0, 0.0, 0
     middle, half = 0.5 * (rows - 1), rows // 2
@@ -103,24 +103,26 @@ def _line(pressure, start, rows):  # type: ignore[no-untyped-def]
             moment += (i - middle) * pressure[start + i]
     if missing > MOST_MISSING * rows:
         return math.nan, math.nan
-    places, squares = 0.0, 0.0  # of those that are there, about the middle
+    offset_sum, offset_squares = 0.0, 0.0  # of usable rows, about the middle
     for i in range(rows):
         if not math.isnan(pressure[start + i]):
-            places += i - middle
-            squares += (i - middle) ** 2
-    there = rows - missing
-    slope = (there * moment - places * total) / (there * squares - places * places)
-    return slope, (total - slope * places) / there
+            offset_sum += i - middle
+            offset_squares += (i - middle) ** 2
+    usable = rows - missing
+    slope = (usable * moment - offset_sum * total) / (
+        usable * offset_squares - offset_sum * offset_sum
+    )
+    return slope, (total - slope * offset_sum) / usable
 
 
 @compiled
 def _greatest_jump(pressure, first, last):  # type: ignore[no-untyped-def]
-    """Row after which pressure jumps most (Pa): far more than before and after, and that."""
+    """Row after the largest isolated jump of the pressure, and its height (Pa)."""
     row, greatest = first, 0.0
     before, change, at = 0.0, 0.0, first
     for i in range(first, last + 1):
         after = pressure[i + 1] - pressure[i] if i < last else 0.0
-        if after == 0.0 and i < last:  # a sensor that is slower than the rows holds its reading
+        if after == 0.0 and i < last:  # a sensor slower than the rows holds its reading
             continue
         jump = abs(change - 0.5 * (before + after))
         alone = abs(change) > ALONE * max(abs(before), abs(after))
@@ -132,7 +134,7 @@ def _greatest_jump(pressure, first, last):  # type: ignore[no-untyped-def]
 
 @compiled
 def _bends_at(pressure, first, jump, last, noise):  # type: ignore[no-untyped-def]
-    """Significance of a difference in slope before and after a jump, which is in neither."""
+    """Significance of the difference in slope before and after a jump, without the jump."""
     before, after = jump + 1 - first, last - jump
     if min(before, after) < SHORTEST_WINDOW // 2:
         return 0.0
@@ -143,15 +145,15 @@ def _bends_at(pressure, first, jump, last, noise):  # type: ignore[no-untyped-de
 
 @per_row
 def _break_at(pressure, row, window, noise, nozzle_on):  # type: ignore[no-untyped-def]
-    """Significance of the slope's break at ``row`` and the level there; 0 where it is no knee.
+    """Significance of the slope's break at ``row`` and the level there; 0 if it is no knee.
 
-    Nozzle off: pressure fell and now does not fall any more. Nozzle on: it did not fall, now does.
-    Slopes across a jump (a sensor that has come loose) differ as well.
+    Nozzle going off: the pressure fell, and stops falling. Nozzle going on: it begins to fall.
+    Slopes also differ across a jump (a loose sensor), so that is excluded.
     """
     sigma = noise * math.sqrt(12.0 / float(window + 1) ** 3)
     right, _ = _line(pressure, row, window + 1)
     may_follow = right > -3.0 * sigma if nozzle_on else right < -3.0 * sigma
-    if not may_follow:  # so it is on nearly all rows: what was before need not be known
+    if not may_follow:  # true for nearly all rows: the line before is not needed
         return 0.0, math.nan
     left, left_mean = _line(pressure, row - window, window + 1)
     significance = (right - left) / (math.sqrt(2.0) * sigma)
@@ -160,7 +162,7 @@ def _break_at(pressure, row, window, noise, nozzle_on):  # type: ignore[no-untyp
     else:
         significance = -significance
         is_knee = left > -3.0 * sigma
-    level = left_mean + left * window / 2.0  # what follows may ring
+    level = left_mean + left * window / 2.0  # by the line before, as the pressure after may ring
     if not is_knee or significance < SIGNIFICANT:
         return 0.0, level
     jump, height = _greatest_jump(pressure, row - window, row + window)
@@ -172,14 +174,14 @@ def _break_at(pressure, row, window, noise, nozzle_on):  # type: ignore[no-untyp
 
 
 @compiled
-def _find(state, pressure, reported, commands, first, look, phase, level):  # type: ignore[no-untyped-def]
-    """Fill ``phase`` and ``level`` from ``first`` on; gives the row that needs later ones.
+def _find(state, pressure, reported, commands, first, settings, phase, level):  # type: ignore[no-untyped-def]
+    """Fill ``phase`` and ``level`` from ``first`` on; returns the first row that needs later ones.
 
-    ``look`` = window, noise, off shift, on shift, settled, again, apart, about, acts (2); window 0
-    looks for no knees (at the end of a stretch, where the rows after are missing). A knee reaches
-    back by its shift.
+    ``settings`` = window, noise, off shift, on shift, settled, again, apart, about, acts (2).
+    Window 0 searches no knees (at the end of a stretch, where the rows after are missing). A knee
+    changes phases back by its shift.
     """
-    window, settled = int(look[0]), look[4]
+    window, settled = int(settings[0]), settings[4]
     end = first  # of the rows with the same command
     for row in range(first, len(pressure)):
         if row == end:
@@ -188,7 +190,9 @@ def _find(state, pressure, reported, commands, first, look, phase, level):  # ty
         starts = suction and state[_AGE] < 0.0
         may_bend = suction and window > 0 and state[_AGE] >= settled + window
         same = end - row - 1
-        later = max(window, int(look[7])) if reported[row] & _KNOWN else window  # rows to be known
+        later = (
+            max(window, int(settings[7])) if reported[row] & _KNOWN else window
+        )  # rows to be known
         if may_bend and same < later and end == len(commands):
             return row
         if suction:
@@ -207,9 +211,9 @@ def _find(state, pressure, reported, commands, first, look, phase, level):  # ty
                 phase[row] = _SUCTION
         if suction and window > 0:
             looks = may_bend and same >= window
-            _look(state, pressure, reported[:end], row, look, looks, phase, level)
+            _track_break(state, pressure, reported[:end], row, settings, looks, phase, level)
             if reported[row] & _KNOWN:
-                _follow(state, pressure, reported, row, look, phase, level)
+                _follow_report(state, pressure, reported, row, settings, phase, level)
     return len(pressure)
 
 
@@ -226,7 +230,7 @@ def _start(state, pressure, row, level):  # type: ignore[no-untyped-def]
 
 @compiled
 def _end_of(commands, row):  # type: ignore[no-untyped-def]
-    """The first row after ``row`` that has not its command."""
+    """The first row after ``row`` with another command."""
     end = row + 1
     while end < len(commands) and commands[end] == commands[row]:
         end += 1
@@ -234,21 +238,21 @@ def _end_of(commands, row):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _unsettled(state, look):  # type: ignore[no-untyped-def]
-    """How many of the rows that are through the search a knee may still change."""
-    if state[_AGE] < 0.0 or look[0] == 0.0:
+def _unsettled(state, settings):  # type: ignore[no-untyped-def]
+    """Number of searched rows that a knee may still change."""
+    if state[_AGE] < 0.0 or settings[0] == 0.0:
         return 0
-    reach = int(look[2] if state[_NOZZLE] > 0.0 else look[3])
+    reach = int(settings[2] if state[_NOZZLE] > 0.0 else settings[3])
     reach += int(state[_BEST_AGE]) + 1 if state[_BEST] > 0.0 else 0
-    return max(reach, _overdue(look)) if state[_SINCE] >= 0.0 else reach
+    return max(reach, _overdue(settings)) if state[_SINCE] >= 0.0 else reach
 
 
 @per_row
 def _idle(state, pressure, row, level):  # type: ignore[no-untyped-def]
-    """Keep the mean of the last idle rows; the first of a stretch anchor the model."""
+    """Keep the mean of the last idle rows; the first mean of a stretch sets the model."""
     if math.isnan(pressure[row]):
         return
-    if state[_IDLE_AGE] >= IDLE_ROWS:  # let the oldest go
+    if state[_IDLE_AGE] >= IDLE_ROWS:  # drop the oldest row
         state[_IDLE_SUM] -= state[_IDLE_SUM] / state[_IDLE_AGE]
         state[_IDLE_AGE] -= 1.0
     state[_IDLE_SUM] += pressure[row]
@@ -260,7 +264,7 @@ def _idle(state, pressure, row, level):  # type: ignore[no-untyped-def]
 
 @compiled
 def _idle_level(state, pressure, row):  # type: ignore[no-untyped-def]
-    """Pressure (Pa) to which the idle rows before ``row`` lead: a closed vessel may still cool."""
+    """Pressure (Pa) at ``row`` by a line through the idle rows: a closed vessel may still cool."""
     mean = state[_IDLE_SUM] / state[_IDLE_AGE]
     if state[_IDLE_AGE] < IDLE_ROWS or row < IDLE_ROWS:
         return mean
@@ -270,98 +274,104 @@ def _idle_level(state, pressure, row):  # type: ignore[no-untyped-def]
 
 
 @per_row
-def _look(state, pressure, reported, row, look, may_bend, phase, level):  # type: ignore[no-untyped-def]
-    """Follow the break's significance over the rows and settle on its peak."""
-    window, noise, nozzle_on = int(look[0]), look[1], state[_NOZZLE] > 0.0
-    significance, here = 0.0, 0.0
+def _track_break(state, pressure, reported, row, settings, may_bend, phase, level):  # type: ignore[no-untyped-def]
+    """Track the break's significance over the rows, and set a knee at its peak."""
+    window, noise, nozzle_on = int(settings[0]), settings[1], state[_NOZZLE] > 0.0
+    significance, break_level = 0.0, 0.0
     if may_bend:
-        significance, here = _break_at(pressure, row, window, noise, nozzle_on)
-        since = here - state[_KNEE_LEVEL]  # up while the nozzle is off, down while it is on
-        if (-since if nozzle_on else since) < look[6]:  # a line that rings
+        significance, break_level = _break_at(pressure, row, window, noise, nozzle_on)
+        level_change = (
+            break_level - state[_KNEE_LEVEL]
+        )  # up while the nozzle is off, down while it is on
+        if (-level_change if nozzle_on else level_change) < settings[6]:  # a line that rings
             significance = 0.0
-        if significance > SIGNIFICANT and _denied(state, reported, row, look):
+        if significance > SIGNIFICANT and _is_denied(state, reported, row, settings):
             significance = 0.0
     if significance > max(state[_BEST], SIGNIFICANT):
-        state[_BEST], state[_BEST_AGE], state[_BEST_LEVEL] = significance, 0.0, here
+        state[_BEST], state[_BEST_AGE], state[_BEST_LEVEL] = significance, 0.0, break_level
         return
     if state[_BEST] == 0.0:
         return
     state[_BEST_AGE] += 1.0
     if state[_BEST_AGE] >= window // 2:
         knee = row - int(state[_BEST_AGE])
-        shift = int(look[2] if nozzle_on else look[3])
+        shift = int(settings[2] if nozzle_on else settings[3])
         level[knee] = state[_KNEE_LEVEL] = state[_BEST_LEVEL]
         phase[knee - shift : row + 1] = _HOLD if nozzle_on else _SUCTION
         state[_NOZZLE], state[_BEST] = 0.0 if nozzle_on else 1.0, 0.0
         state[_SWITCHED] += 1.0
-        state[_AGE] = state[_BEST_AGE] + window + look[4] - look[5]  # the valve has acted already
+        state[_AGE] = (
+            state[_BEST_AGE] + window + settings[4] - settings[5]
+        )  # the valve has acted already
 
 
 @per_row
-def _told(reported, first, last, begin, about, on):  # type: ignore[no-untyped-def]
-    """How often the ejector says in some rows that its nozzle switched, and how it is then.
+def _reported_switches(reported, first, last, begin, about, on):  # type: ignore[no-untyped-def]
+    """Number of switchings that the ejector reports in some rows, and the nozzle after them.
 
-    ``on`` is how it was before: 1 on, 0 off; -1 as suction begins at ``begin``, until it is on, as
-    what is reported may be late.
+    ``on`` is the nozzle before: 1 on, 0 off; -1 from the beginning of suction at ``begin`` until it
+    is reported on, as reports may be late.
     """
     count = 0
     for row in range(max(first, 0), last):
-        said = reported[row] & _ON
-        if said & _KNOWN == 0:
+        report = reported[row] & _ON
+        if report & _KNOWN == 0:
             continue
         if on < 0.0:
-            on = 1.0 if said == _ON or row - begin >= about else on
-        if on >= 0.0 and (said == _ON) != (on > 0.0):
+            on = 1.0 if report == _ON or row - begin >= about else on
+        if on >= 0.0 and (report == _ON) != (on > 0.0):
             count += 1
             on = 1.0 - on
     return count, on
 
 
 @compiled
-def _denied(state, reported, row, look):  # type: ignore[no-untyped-def]
-    """Whether the ejector reports no switching about a row that is not taken for another's."""
+def _is_denied(state, reported, row, settings):  # type: ignore[no-untyped-def]
+    """Whether the ejector reports no switching about a row that belongs to no other knee."""
     if reported[row] & _KNOWN == 0:
         return False
-    about, begin = int(look[7]), row - int(state[_SINCE])
-    first = max(row - _overdue(look), begin)
-    more, _ = _told(
+    about, begin = int(settings[7]), row - int(state[_SINCE])
+    first = max(row - _overdue(settings), begin)
+    new_reports, _ = _reported_switches(
         reported, first, min(row + about + 1, len(reported)), begin, about, state[_SAID]
     )
-    return state[_REPORTS] + more <= state[_SWITCHED]
+    return state[_REPORTS] + new_reports <= state[_SWITCHED]
 
 
 @per_row
-def _overdue(look):  # type: ignore[no-untyped-def]
-    """Rows after which a reported switching that does not show never will."""
-    return int(look[7]) + int(look[0]) // 2
+def _overdue(settings):  # type: ignore[no-untyped-def]
+    """Rows after which a reported switching that has not shown will not show."""
+    return int(settings[7]) + int(settings[0]) // 2
 
 
 @per_row
-def _follow(state, pressure, reported, row, look, phase, level):  # type: ignore[no-untyped-def]
-    """Take what was reported some time ago; where no knee has shown it, go by that alone."""
+def _follow_report(state, pressure, reported, row, settings, phase, level):  # type: ignore[no-untyped-def]
+    """Take an overdue report; if no knee has shown it, set one by the report alone."""
     state[_SINCE] += 1.0
-    said_at, begin = row - _overdue(look), row - int(state[_SINCE])
-    if said_at < begin or said_at < 0:
+    report_row, begin = row - _overdue(settings), row - int(state[_SINCE])
+    if report_row < begin or report_row < 0:
         return
-    more, state[_SAID] = _told(reported, said_at, said_at + 1, begin, look[7], state[_SAID])
-    state[_REPORTS] += more
-    if more == 0 or state[_REPORTS] <= state[_SWITCHED]:
+    new_reports, state[_SAID] = _reported_switches(
+        reported, report_row, report_row + 1, begin, settings[7], state[_SAID]
+    )
+    state[_REPORTS] += new_reports
+    if new_reports == 0 or state[_REPORTS] <= state[_SWITCHED]:
         return
-    nozzle_on, window = state[_NOZZLE] > 0.0, int(look[0])
-    knee = said_at + int(min(look[8] if nozzle_on else look[9], look[7]))
+    nozzle_on, window = state[_NOZZLE] > 0.0, int(settings[0])
+    knee = report_row + int(min(settings[8] if nozzle_on else settings[9], settings[7]))
     slope, middle = _line(pressure, max(knee - SHORTEST_WINDOW + 1, 0), SHORTEST_WINDOW)
     level[knee] = state[_KNEE_LEVEL] = middle + 0.5 * (SHORTEST_WINDOW - 1) * slope
     phase[knee : row + 1] = _HOLD if nozzle_on else _SUCTION
     state[_NOZZLE], state[_BEST] = 0.0 if nozzle_on else 1.0, 0.0
     state[_SWITCHED] += 1.0
-    state[_AGE] = (row - knee) + window + look[4] - look[5]  # as after a knee that shows
+    state[_AGE] = (row - knee) + window + settings[4] - settings[5]  # as after a knee that shows
 
 
 Found = tuple[Samples, npt.NDArray[np.uint8], npt.NDArray[np.float64]]
 
 
 def commanded(samples: Samples, blow_off: tuple[float, float]) -> Found:
-    """What commands alone make of a whole record: its phases, and levels before its cycles.
+    """Phases of a whole record by commands alone, and levels before its cycles.
 
     ``blow_off`` is the ejector's own, as in ``Knees``.
     """
@@ -376,16 +386,18 @@ def commanded(samples: Samples, blow_off: tuple[float, float]) -> Found:
 
 @dataclass
 class PhaseFinder:
-    """Takes blocks in, gives them out a little later with phase and synchronisation level."""
+    """Gives blocks back a little later, with phases and synchronisation levels."""
 
     knees: Knees
     _state: npt.NDArray[np.float64] = field(default_factory=lambda: np.array(_BEGINNING))
     _rows: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))
-    _told: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, "u1"))  # the valves
+    _valve_commands: npt.NDArray[np.uint8] = field(
+        default_factory=lambda: np.empty(0, "u1")
+    )  # of each row
     _timer: npt.NDArray[np.float64] = field(default_factory=new_timer)  # of the blow-off
     _phase: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, "u1"))
     _level: npt.NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
-    _seen: int = 0  # rows of _rows that are through the search
+    _seen: int = 0  # rows of _rows that were searched
     _given: int = 0  # rows of _rows that were given out and stay as context
 
     def push(self, block: Samples) -> Found:
@@ -400,52 +412,60 @@ class PhaseFinder:
         return joined(*samples), np.concatenate(phase), np.concatenate(level)
 
     def flush(self) -> Found:
-        """Give all rows that are left, and begin anew: what follows does not belong to them."""
+        """Give all remaining rows, and begin anew: rows after a break are independent."""
         self._run(window=0)
-        rest = slice(self._given, None)
-        given = self._rows[rest], self._phase[rest], self._level[rest]
+        remaining_rows = slice(self._given, None)
+        remaining = (
+            self._rows[remaining_rows],
+            self._phase[remaining_rows],
+            self._level[remaining_rows],
+        )
         self._state, self._rows = np.array(_BEGINNING), np.empty(0, SAMPLE)
-        self._told, self._timer = np.empty(0, "u1"), new_timer()
+        self._valve_commands, self._timer = np.empty(0, "u1"), new_timer()
         self._phase, self._level = np.empty(0, "u1"), np.empty(0)
         self._seen = self._given = 0
-        return given
+        return remaining
 
     def _search(self, stretch: Samples) -> Found:
-        self._told = np.concatenate([self._told, self._what_valves_are_told(stretch)])
+        self._valve_commands = np.concatenate([self._valve_commands, self._timed_commands(stretch)])
         self._rows = joined(self._rows, stretch)
         self._phase = np.concatenate([self._phase, np.zeros(len(stretch), "u1")])
         self._level = np.concatenate([self._level, np.full(len(stretch), np.nan)])
         settled = self._run(self.knees.window)
         ready = slice(self._given, max(settled, self._given))
-        given = self._rows[ready], self._phase[ready], self._level[ready]
+        settled_rows = self._rows[ready], self._phase[ready], self._level[ready]
         self._given = ready.stop
-        looked_at = self.knees.window + self.knees.lag + self.knees.about
-        context = max(looked_at, IDLE_ROWS)  # how far later rows look back
+        reach = self.knees.window + self.knees.lag + self.knees.about
+        context = max(reach, IDLE_ROWS)  # rows that later rows need
         drop = min(max(self._seen - context, 0), self._given)
         self._rows, self._phase = self._rows[drop:], self._phase[drop:]
-        self._level, self._told = self._level[drop:], self._told[drop:]
+        self._level, self._valve_commands = self._level[drop:], self._valve_commands[drop:]
         self._seen -= drop
         self._given -= drop
-        return given
+        return settled_rows
 
-    def _what_valves_are_told(self, stretch: Samples) -> npt.NDArray[np.uint8]:
-        """Commands as the ejector acts on them: its blow-off timer adds and ends pulses."""
+    def _timed_commands(self, stretch: Samples) -> npt.NDArray[np.uint8]:
+        """Commands to the valves: the ejector's blow-off timer adds and ends pulses."""
         times = np.concatenate([self._rows["time_ns"][-1:], stretch["time_ns"]])
         dt = np.diff(times, prepend=times[:1])[-len(stretch) :] * NS
-        told = np.empty(len(stretch), "u1")
+        valve_commands = np.empty(len(stretch), "u1")
         timed(
-            self._timer, np.ascontiguousarray(stretch["commands"]), dt, *self.knees.blow_off, told
+            self._timer,
+            np.ascontiguousarray(stretch["commands"]),
+            dt,
+            *self.knees.blow_off,
+            valve_commands,
         )
-        return told
+        return valve_commands
 
     def _run(self, window: int) -> int:
-        """Search as far as the rows reach; gives the first row that may still change."""
+        """Search as far as the rows reach; returns the first row that may still change."""
         pressure = self._rows["pressure"].astype(np.float64)
         pressure[(self._rows["quality"] & UNUSABLE) != 0] = np.nan
         knees = self.knees
         shifts = knees.off_shift, knees.on_shift
         again = max(knees.again, window)
-        look = np.array(
+        settings = np.array(
             [
                 *(window, knees.noise, *shifts, knees.settled, again),
                 *(knees.apart, knees.about, *knees.acts),
@@ -453,6 +473,6 @@ class PhaseFinder:
             np.float64,
         )
         reported = np.ascontiguousarray(self._rows["reported"])
-        rows = pressure, reported, self._told
-        self._seen = _find(self._state, *rows, self._seen, look, self._phase, self._level)
-        return self._seen - int(_unsettled(self._state, look))
+        rows = pressure, reported, self._valve_commands
+        self._seen = _find(self._state, *rows, self._seen, settings, self._phase, self._level)
+        return self._seen - int(_unsettled(self._state, settings))

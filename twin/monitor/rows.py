@@ -1,4 +1,4 @@
-"""Rows of a stream: the time between them, and which of them suffice to draw a curve."""
+"""Rows of a stream: the time between them, and subsampled rows for interpolation."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from twin.signals import BREAK, NS, Samples, Ticks
 
 
 def time_steps(samples: Samples, before_ns: int | None) -> Floats:
-    """Seconds from row to row, −1 where time does not run on; ``before_ns`` is the row before."""
+    """Seconds from row to row, −1 at a break; ``before_ns`` is the time of the row before."""
     dt = np.empty(len(samples))
     if len(dt):
         _time_steps(samples, int(samples["time_ns"][0]) if before_ns is None else before_ns, dt)
@@ -24,9 +24,9 @@ def _time_steps(samples, before_ns, dt):  # type: ignore[no-untyped-def]
 
 
 def drawn_rows(samples: Samples, ticks: Ticks) -> Ints:
-    """Rows that suffice to draw what is expected: every one where something changes."""
+    """Subsampled rows for interpolation of the expected pressure, denser after each change."""
     begins = np.diff(ticks["phase"], prepend=255) != 0
     begins |= np.isfinite(ticks["level"])
-    known = np.isfinite(ticks["expected"])
-    begins |= np.diff(known, prepend=False) != 0
+    is_expected = np.isfinite(ticks["expected"])
+    begins |= np.diff(is_expected, prepend=False) != 0
     return drawn(time_steps(samples, None), begins)

@@ -1,7 +1,7 @@
-"""How the air saving's switching would be seen: the model runs free, and its knees are looked for.
+"""Simulated detection of the air saving's switching: free runs of the model, and their knees.
 
-A knee is found where lines on either side of it meet. A slow sensor rounds it, so it is seen later
-and at another level than it happened; all that is the same here as in the log.
+A knee is found where lines on either side of it meet. A slow sensor rounds it, so it shows later
+and at another level than it happened. The simulation has the same errors as the log.
 """
 
 from collections.abc import Sequence
@@ -20,17 +20,17 @@ from twin.monitor.phase_detector import Knees, PhaseFinder
 from twin.signals import MBAR, MS, SAMPLE, Command, Phase, Samples
 
 IDLE_ROWS = 50  # before the cycle
-FALLS = 3.0  # times the noise: so far back a reading comes where a line rings
+FALLS = 3.0  # times the noise: a reading falls back by more while a line rings
 Bytes = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class Seen:
-    """Vacuum (mbar) at which the nozzle was seen to go off and on; NaN where it did not switch.
+    """Vacuum (mbar) at which the nozzle was seen to go off and on; NaN if it did not switch.
 
-    Rows from when the valve acted until it was seen, and how much (Pa) the level found was above
-    what the sensor read then; 0 where it did not switch. How high (Pa) above its reading as the
-    valve closed the line still rang; 0 where the pressure only rose.
+    ``*_rows`` are rows from the valve's action until the knee shows. ``*_above`` is the level found
+    less the sensor's reading then (Pa). Both are 0 if it did not switch. ``rings`` is the height
+    (Pa) of the line's ringing above the reading as the valve closed; 0 without ringing.
     """
 
     off: float
@@ -40,72 +40,74 @@ class Seen:
     off_above: float = 0.0
     on_above: float = 0.0
     rings: float = 0.0
-    thresholds: tuple[float, float] = (np.nan, np.nan)  # mbar, what is read at them
+    thresholds: tuple[float, float] = (
+        np.nan,
+        np.nan,
+    )  # mbar, readings at H1 and where it goes on again
 
     @property
     def levels(self) -> tuple[float, float]:
-        """Vacuum (mbar) of either switching.
-
-        Where the pressure does not come there, what is read at the threshold.
-        """
+        """Vacuum (mbar) of either switching; the reading at the threshold if it did not switch."""
         off, on = self.thresholds
         return off if np.isnan(self.off) else self.off, on if np.isnan(self.on) else self.on
 
 
 def seen(thetas: Sequence[Theta], rows: int, knees: Knees) -> list[Seen]:
-    """Command suction for ``rows`` from rest, let the model run free and look for its knees.
+    """Simulate suction for ``rows`` from rest with the model running free, and find its knees.
 
-    The model runs each millisecond, as the control of an ejector does; rows are as far apart as
-    those of ``knees``.
+    The model has steps of a millisecond, as the control of an ejector; rows have the period of
+    ``knees``.
     """
-    every = max(round(knees.period / MS), 1)
-    commands = np.full((IDLE_ROWS + rows) * every, Command.SUCTION, np.uint8)
-    commands[: IDLE_ROWS * every] = 0
+    steps_per_row = max(round(knees.period / MS), 1)
+    commands = np.full((IDLE_ROWS + rows) * steps_per_row, Command.SUCTION, np.uint8)
+    commands[: IDLE_ROWS * steps_per_row] = 0
     dt = np.full(len(commands), MS)
     samples = np.zeros(IDLE_ROWS + rows, SAMPLE)
     samples["sequence"] = np.arange(len(samples))
-    samples["time_ns"] = np.arange(len(samples)) * every * 1_000_000
-    samples["commands"] = commands[::every]
-    found = []
+    samples["time_ns"] = np.arange(len(samples)) * steps_per_row * 1_000_000
+    samples["commands"] = commands[::steps_per_row]
+    switchings = []
     for theta in thetas:
         phase, expected = strides.simulate(theta, dt, commands)
-        run = _Run(theta, phase[::every], expected[::every], knees.period)
-        found.append(_seen(samples, run, knees))
-    return found
+        run = _Run(theta, phase[::steps_per_row], expected[::steps_per_row], knees.period)
+        switchings.append(_detect(samples, run, knees))
+    return switchings
 
 
 class _Run(NamedTuple):
-    """A free run of the model, as rows would show it."""
+    """A free run of the model, sampled in rows."""
 
     theta: Theta
     phase: Bytes
-    expected: Floats  # Pa, what is read
+    expected: Floats  # Pa, readings of the sensor
     period: float  # s, from row to row
 
     def rows(self, coefficient: int) -> int:
-        """A time among the coefficients in rows."""
+        """A coefficient that is a time, in rows."""
         return round(float(self.theta[coefficient]) / self.period)
 
 
-def _seen(samples: Samples, run: _Run, knees: Knees) -> Seen:
+def _detect(samples: Samples, run: _Run, knees: Knees) -> Seen:
     samples["pressure"] = run.expected
     finder = PhaseFinder(knees)
     (_, early, low), (_, late, high) = finder.push(samples), finder.flush()
-    found, level = np.concatenate([early, late]), np.concatenate([low, high])
-    off = _one(run, found, level, Phase.HOLD)
-    on = _one(run, found, level, Phase.SUCTION)
+    detected, level = np.concatenate([early, late]), np.concatenate([low, high])
+    off = _first_switching(run, detected, level, Phase.HOLD)
+    on = _first_switching(run, detected, level, Phase.SUCTION)
     rings = _rings(run, FALLS * knees.noise)
     thresholds = _read_at(run.theta, c.H1), _read_at(run.theta, c.H1_LOW)
     return Seen(off[0], on[0], off[1], on[1], off[2], on[2], rings, thresholds)
 
 
-def _one(run: _Run, found: Bytes, level: Floats, name: Phase) -> tuple[float, int, float]:
+def _first_switching(
+    run: _Run, detected: Bytes, level: Floats, name: Phase
+) -> tuple[float, int, float]:
     """Vacuum, rows and level above the reading, for the first switching into ``name``."""
     phase, expected = run.phase, run.expected
     before = Phase.SUCTION if name == Phase.HOLD else Phase.HOLD
     switched = np.flatnonzero((phase[1:] == name) & (phase[:-1] == before)) + 1
-    knees = np.flatnonzero(np.isfinite(level) & (found == name))
-    knees = knees[np.isin(found[knees - 1], (before, name)) & (knees > IDLE_ROWS + 1)]
+    knees = np.flatnonzero(np.isfinite(level) & (detected == name))
+    knees = knees[np.isin(detected[knees - 1], (before, name)) & (knees > IDLE_ROWS + 1)]
     if not len(switched) or not len(knees):
         return np.nan, 0, 0.0
     response = run.rows(c.RESPONSE_OFF if name == Phase.HOLD else c.RESPONSE)
@@ -115,9 +117,9 @@ def _one(run: _Run, found: Bytes, level: Floats, name: Phase) -> tuple[float, in
 
 
 def _rings(run: _Run, falls: float) -> float:
-    """How high (Pa) the line still rings above the reading as the valve first closed.
+    """Height (Pa) of the line's ringing above the reading as the valve first closed.
 
-    It rings as long as the reading comes back by more than ``falls`` (Pa).
+    The line rings as long as the reading falls back by more than ``falls`` (Pa).
     """
     off = run.phase == Phase.HOLD
     if not off.any():
@@ -131,9 +133,9 @@ def _rings(run: _Run, falls: float) -> float:
 
 
 def _read_at(theta: Theta, threshold: int) -> float:
-    """Vacuum (mbar) that is read where the control switches."""
+    """Vacuum (mbar) that the sensor reads when the control switches."""
     vacuum = float(theta[threshold])
     if theta[c.CONTROL_SENSOR] == c.OWN:
-        at = float(theta[c.AMBIENT]) - vacuum
-        vacuum = float(theta[c.AMBIENT_NOMINAL]) - reading_of(at, theta)
+        pressure = float(theta[c.AMBIENT]) - vacuum
+        vacuum = float(theta[c.AMBIENT_NOMINAL]) - reading_of(pressure, theta)
     return vacuum / MBAR

@@ -1,7 +1,7 @@
-"""One clock decides what is stale: the time that the twin has listened without hearing anything.
+"""Staleness by one clock: the time that the twin has listened without a fresh row.
 
-It runs on evenly, whatever happens to the wall clock. It stands while the twin does something
-else. Rows carry what it decides (``Quality.OURS``), so that a replay decides the same.
+The clock is monotonic, whatever happens to the wall clock. It stops while the twin is busy with
+something else. Rows carry the decision (``Quality.OURS``), so that a replay decides the same.
 """
 
 import time
@@ -17,45 +17,45 @@ from twin.events import Event, Kind
 from twin.monitor.monitor import Monitor
 from twin.signals import NS, Quality, Samples
 
-LONGEST_WAIT_NS = 500_000_000  # a driver gives a block at least this often: longer, we slept too
-ONCE_NS = 60_000_000_000  # a twin that is late again within this time has said so
-MOST_NOTICES = 100  # that may wait for the loop
+LONGEST_WAIT_NS = 500_000_000  # drivers give a block at least this often: else the host slept
+ONCE_NS = 60_000_000_000  # a twin that is late again within this time does not report it again
+MOST_NOTICES = 100  # notices that may wait for the loop
 NO_DATA: Mapping[str, Any] = MappingProxyType({})
 
 
 @dataclass
 class Notices:
-    """What threads beside the loop have to tell; the loop takes it, in the PLC's time."""
+    """Notices of threads beside the loop, which the loop takes with the PLC's time."""
 
-    _told: deque[tuple[Kind, str, Mapping[str, Any]]] = field(
+    _pending: deque[tuple[Kind, str, Mapping[str, Any]]] = field(
         default_factory=lambda: deque(maxlen=MOST_NOTICES)
     )
 
     def tell(self, kind: Kind, text: str, data: Mapping[str, Any] = NO_DATA) -> None:
-        """Have it said; any thread may, and none waits."""
-        self._told.append((kind, text, data))
+        """Add a notice; any thread may call this, and it does not block."""
+        self._pending.append((kind, text, data))
 
     def taken(self, time_ns: int) -> list[Event]:
-        """What was told since the last time, as events at ``time_ns``."""
-        told = [self._told.popleft() for _ in range(len(self._told))]
-        return [Event(time_ns, kind, text, dict(data)) for kind, text, data in told]
+        """Notices since the last call, as events at ``time_ns``."""
+        notices = [self._pending.popleft() for _ in range(len(self._pending))]
+        return [Event(time_ns, kind, text, dict(data)) for kind, text, data in notices]
 
 
 @dataclass
 class Listening:
     """Times the blocks of a live source; a replay needs none of it."""
 
-    clock: Callable[[], int] = time.perf_counter_ns  # runs on evenly
+    clock: Callable[[], int] = time.perf_counter_ns  # monotonic
     notices: Notices = field(default_factory=Notices)
     _last: Samples | None = None  # the last fresh row, as an array of one
-    _heard_ns: int = 0  # when that was, by ``clock``
+    _heard_ns: int = 0  # its time of receipt, by ``clock``
     _listened_ns: int = 0  # since then
-    _late_ns: int | None = field(default=None)  # when the twin was late, by ``clock``
+    _late_ns: int | None = field(default=None)  # last time at which the twin was late, by ``clock``
 
     def over(
         self, source: Iterable[Samples], monitor: Monitor
     ) -> Iterator[tuple[Samples, list[Event]]]:
-        """The blocks, with what the time they took makes happen, in the PLC's time before them."""
+        """The blocks, each with the events of its delay, at the PLC's time before it."""
         blocks = iter(source)
         asked_ns = self.clock()
         while (block := next(blocks, None)) is not None:
@@ -84,7 +84,7 @@ class Listening:
         return block, events
 
     def _late(self, time_ns: int, now_ns: int, stale_ns: int) -> list[Event]:
-        """Say that the twin was late, unless it said so a short time ago."""
+        """TWIN_LATE if the twin was late, unless reported a short time ago."""
         late_ns = now_ns - self._heard_ns
         if late_ns <= stale_ns:
             return []

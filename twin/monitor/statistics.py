@@ -1,7 +1,7 @@
-"""What one cycle says of every suspect: one whitened number each, of sigma 1 in healthy cycles.
+"""Scores of one cycle: one whitened number for each suspect, of sigma 1 in healthy cycles.
 
-The deviation is averaged into bins, the levels at which the air saving switched are put beside it,
-and both are held against each suspect's signature, weighed by what healthy cycles scatter.
+The deviation is averaged into bins, and the switching levels of the air saving are appended. Both
+are projected on each suspect's signature, whitened by the scatter of healthy cycles.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,55 +35,57 @@ from twin.signals import MBAR
 
 PER_UNIT = 2  # bins in each unit of warped time
 LEVELS = ("h1_level", "h1_low_level")
-PLACES = 8  # that are remembered: of a program or two, with what jitters
-SUCTION = 4.0  # s, commanded to see where each suspect switches
-# Sigmas² of a step: nothing in the cycle depends on it. Hypotheses that are stepped apart from each
-# other are a pascal apart, which looks like some 0.002; the least that depends has 3.
+PLACES = 8  # cached layouts of bins: of a program or two, with their jitter
+SUCTION = 4.0  # s, simulated to find the switching levels with each suspect
+# Sigmas² of a step below which a cycle does not depend on it. Hypotheses that are stepped
+# separately differ by a pascal, which is some 0.002; the weakest real dependence has 3.
 WEAK = 0.01
 
 
 @dataclass(frozen=True)
 class CycleResidual:
-    """What a cycle says, place by place: a bin at the same time in every cycle, or a level."""
+    """Residuals of a cycle by place: a bin at the same time in every cycle, or a level."""
 
-    place: Ints  # no two the same
+    place: Ints  # unique
     kind: Ints  # of stretch, of each place; below zero for a level
     time: Floats  # warped, since the stretch began
     off: Floats  # mbar, measured less expected
     signatures: Floats  # mbar, by each suspect's step, (places, suspects)
-    larger: Floats  # mbar, by the larger sizes of what delays, (places, DELAYS · LARGER)
-    unsure: Floats  # mbar, by which that of a low supply may be another, (places, ways)
-    alone: Floats  # mbar², covariance of what differs from cycle to cycle
-    common: Floats  # mbar, one sigma of what is off in all cycles
+    larger: Floats  # mbar, by the larger sizes of delays, (places, DELAYS · LARGER)
+    unsure: Floats  # mbar, one sigma of the signature of a low supply, (places, coefficients)
+    alone: Floats  # mbar², covariance of differences between cycles
+    common: Floats  # mbar, one sigma of the error common to all cycles
 
     def at(self, places: npt.NDArray[np.bool_]) -> "CycleResidual":
-        """What it says of some places."""
+        """The residuals at some places."""
         columns = {
-            one.name: getattr(self, one.name)[places] for one in fields(self) if one.name != "alone"
+            attribute.name: getattr(self, attribute.name)[places]
+            for attribute in fields(self)
+            if attribute.name != "alone"
         }
         return CycleResidual(alone=self.alone[np.ix_(places, places)], **columns)
 
     def scores(self) -> Floats:
-        """How many sigmas of each signature there are; NaN for what this cycle does not show."""
+        """Significance (sigmas) of each signature; NaN if this cycle does not show it."""
         off, signatures, power = self._whitened()
         scores: Floats = off @ signatures / np.sqrt(np.where(power > 0.0, power, np.nan))
         return scores
 
     def sizes(self) -> Floats:
-        """Steps of each suspect that fit best, were nothing else wrong; NaN as in ``scores``."""
+        """Best size (steps) of each suspect by itself; NaN as in ``scores``."""
         off, signatures, power = self._whitened()
         sizes: Floats = off @ signatures / np.where(power > 0.0, power, np.nan)
         return sizes
 
     def alike(self) -> Floats:
-        """Cosines between the signatures, whitened; 0 for what this cycle does not show."""
+        """Cosines between the whitened signatures; 0 if this cycle does not show one."""
         _, signatures, power = self._whitened()
         unit = 1.0 / np.sqrt(np.where(power > 0.0, power, np.inf))
         cosines: Floats = signatures.T @ signatures * np.outer(unit, unit)
         return cosines
 
     def _whitened(self) -> tuple[Floats, Floats, Floats]:
-        """What is off and the signatures, and the sigmas² of each of these; 0 where none are."""
+        """Whitened residuals and signatures, and the sigmas² of each signature; 0 if weak."""
         white = Covariance.of(self.alone).white(np.column_stack([self.off, self.signatures]))
         off, signatures = white[:, 0], white[:, 1:]
         power = np.einsum("ij,ij->j", signatures, signatures)
@@ -93,70 +95,80 @@ class CycleResidual:
 
 @dataclass
 class ScoreExtractor:
-    """Makes statistics of cycles."""
+    """Computes the residuals of cycles."""
 
     theta: Theta
     healthy: Healthy
     noise: float  # mbar, of a row
     knees: Knees
     suspects: Sequence[Suspect] = SUSPECTS
-    _levels: Floats = field(init=False)  # mbar, by which each level moves, (levels, hypotheses)
+    _levels: Floats = field(init=False)  # mbar, change of each level, (levels, hypotheses)
     _means: Floats = field(init=False)  # mbar, of each level in healthy cycles
     _sigmas: Floats = field(init=False)
-    _seen: dict[bytes, "_Places"] = field(default_factory=dict)  # by where the bins are
+    _seen: dict[bytes, "_Places"] = field(default_factory=dict)  # by layout of the bins
 
     @classmethod
     def of(cls, data: DataSet, healthy: Healthy) -> "ScoreExtractor":
-        """The one for cycles beside the twin of a data set."""
+        """The extractor for cycles with the twin of a data set."""
         theta, noise = coefficients(data), data.sensor.noise_mbar
         return cls(theta, healthy, noise, knees_of(data), suspects_of(data, theta))
 
     def __post_init__(self) -> None:
-        looked = hypotheses(self.theta, self.suspects)
-        found = seen(looked, round(SUCTION / self.knees.period), self.knees)
-        vacuum = np.array([one.levels for one in found]).T
+        thetas = hypotheses(self.theta, self.suspects)
+        runs = seen(thetas, round(SUCTION / self.knees.period), self.knees)
+        vacuum = np.array([scatter.levels for scatter in runs]).T
         self._levels = np.nan_to_num(derivatives(vacuum)[1])
-        known = [self.healthy.figures.get(name) for name in LEVELS]
-        means = [one.mean if one else at for one, at in zip(known, vacuum[:, 0], strict=True)]
+        scatters = [self.healthy.figures.get(name) for name in LEVELS]
+        means = [
+            scatter.mean if scatter else expected_level
+            for scatter, expected_level in zip(scatters, vacuum[:, 0], strict=True)
+        ]
         self._means = np.nan_to_num(np.array(means))
         self._sigmas = np.array(
-            [one.sigma if one else self.healthy.unseen_level_mbar for one in known]
+            [scatter.sigma if scatter else self.healthy.unseen_level_mbar for scatter in scatters]
         )
 
     def hear(
         self, cycle: Cycle, drawn: Ints, expected: Floats, figures: Mapping[str, float]
     ) -> CycleResidual | None:
-        """What a whole cycle says; ``drawn`` rows and ``expected`` (Pa) there are the bank's.
+        """Residuals of a whole cycle; None without bins.
 
-        ``figures`` are the monitor's.
+        Rows ``drawn`` and ``expected`` (Pa) there are the bank's; ``figures`` are the monitor's.
         """
-        bins, off, through = averaged(cycle.ticks["phase"], cycle.off, drawn, expected, PER_UNIT)
+        bins, off, bin_means = averaged(cycle.ticks["phase"], cycle.off, drawn, expected, PER_UNIT)
         if not len(off):
             return None
-        shown = [number for number, name in enumerate(LEVELS) if name in figures]
-        level = np.array([figures[LEVELS[number]] for number in shown]) - self._means[shown]
-        at = self._places(bins, shown)
-        through = through[at.first]
-        moved = np.concatenate([derivatives(through / MBAR)[1], self._levels[shown]])
+        shown_levels = [number for number, name in enumerate(LEVELS) if name in figures]
+        level = (
+            np.array([figures[LEVELS[number]] for number in shown_levels])
+            - self._means[shown_levels]
+        )
+        cells = self._places(bins, shown_levels)
+        bin_means = bin_means[cells.first]
+        changes = np.concatenate([derivatives(bin_means / MBAR)[1], self._levels[shown_levels]])
         count = len(self.suspects)
-        suspects, larger, ways = np.split(moved, (count, count + len(DELAYS) * LARGER), axis=1)
-        moves = self._moves(suspects[: len(at.first)])
-        covariance = from_cycle_to_cycle(bins, at.first, at.goes_on, moves, self.noise)
+        suspects, larger, supply_variants = np.split(
+            changes, (count, count + len(DELAYS) * LARGER), axis=1
+        )
+        moves = self._moves(suspects[: len(cells.first)])
+        covariance = from_cycle_to_cycle(bins, cells.first, cells.goes_on, moves, self.noise)
         return CycleResidual(
-            at.place,
-            at.kind,
-            at.time,
-            np.concatenate([off[at.first], level]),
+            cells.place,
+            cells.kind,
+            cells.time,
+            np.concatenate([off[cells.first], level]),
             suspects,
             larger,
-            ways - suspects[:, UNSURE_OF : UNSURE_OF + 1],
-            _beside(covariance * self.healthy.leftover**2, self._sigmas[shown] ** 2),
-            at.common,
+            supply_variants - suspects[:, UNSURE_OF : UNSURE_OF + 1],
+            _block_diagonal(covariance * self.healthy.leftover**2, self._sigmas[shown_levels] ** 2),
+            cells.common,
         )
 
     def _places(self, bins: Bins, shown: Sequence[int]) -> "_Places":
-        """Where a cycle says something, with what follows from it; most say it at the same."""
-        key = b"".join(of.tobytes() for of in (bins.stretch, bins.kind, bins.since)) + bytes(shown)
+        """The places of a cycle, cached: most cycles have the same."""
+        key = b"".join(
+            column.tobytes() for column in (bins.stretch, bins.kind, bins.since)
+        ) + bytes(shown)
         if key not in self._seen:
             if len(self._seen) == PLACES:
                 self._seen.clear()
@@ -164,37 +176,37 @@ class ScoreExtractor:
         return self._seen[key]
 
     def _moves(self, signatures: Floats) -> Floats:
-        """By how much (mbar) what scatters moves each bin, one sigma of it, (bins, scatters)."""
+        """Changes (mbar) of each bin by one sigma of each scattering suspect, (bins, scatters)."""
         numbers, sigmas = self._scatters
         moves: Floats = signatures[:, numbers] * sigmas
         return moves
 
     @cached_property
     def _scatters(self) -> tuple[list[int], list[float]]:
-        """Which suspects scatter in healthy cycles, and one sigma of each in its steps."""
+        """Numbers of the suspects that scatter in healthy cycles, and their sigmas in steps."""
         numbers, sigmas = [], []
-        for number, one in enumerate(self.suspects):
-            parameter, usual = SCATTER.get(one.effect, ("", 0.0))
-            if parameter == one.parameter.name:
+        for number, suspect in enumerate(self.suspects):
+            parameter, default = SCATTER.get(suspect.effect, ("", 0.0))
+            if parameter == suspect.parameter.name:
                 numbers.append(number)
-                sigmas.append(self.healthy.scatter.get(one.effect, usual) / one.step)
+                sigmas.append(self.healthy.scatter.get(suspect.effect, default) / suspect.step)
         return numbers, sigmas
 
 
 @dataclass(frozen=True)
 class _Places:
-    """Where the bins of a cycle are, and what is the same for all that have theirs there."""
+    """Places of a cycle's bins and levels, and covariances that depend only on them."""
 
-    first: Ints  # bins; what comes again counts once
-    place: Ints  # of those and of the levels, as are all of these
+    first: Ints  # bins; a repeated place counts once
+    place: Ints  # of these bins, then of the levels, as for kind, time and common
     kind: Ints
     time: Floats
-    common: Floats  # mbar, by which the model is off in all cycles
-    goes_on: Floats  # mbar², covariance of bins: what does so for a while, and differs by cycle
+    common: Floats  # mbar, sigma of the error common to all cycles
+    goes_on: Floats  # mbar², covariance of bins by errors that persist, differing by cycle
 
     @classmethod
     def of(cls, bins: Bins, shown: Sequence[int], sigmas: Floats, healthy: Healthy) -> "_Places":
-        """Those of bins and of the levels ``shown``, whose ``sigmas`` (mbar) are given."""
+        """Places of bins and of the levels ``shown``, which have ``sigmas`` (mbar)."""
         place, first = np.unique(bins.place, return_index=True)
         kind, time = bins.kind[first], bins.time[first]
         common, alone = model_error(healthy.error, kind, time)
@@ -209,10 +221,10 @@ class _Places:
         )
 
 
-def _beside(covariance: Floats, variances: Floats) -> Floats:
-    """The covariance together with what varies by itself."""
+def _block_diagonal(covariance: Floats, variances: Floats) -> Floats:
+    """The covariance, with independent variances appended on the diagonal."""
     count = len(covariance)
-    whole = np.zeros((count + len(variances), count + len(variances)))
-    whole[:count, :count] = covariance
-    np.fill_diagonal(whole[count:, count:], variances)
-    return whole
+    joint = np.zeros((count + len(variances), count + len(variances)))
+    joint[:count, :count] = covariance
+    np.fill_diagonal(joint[count:, count:], variances)
+    return joint

@@ -1,8 +1,8 @@
-"""Ambient pressure and temperature as a barometer and a thermometer tell them: followed here alone.
+"""Ambient pressure and temperature by a barometer and a thermometer; only this module follows them.
 
-A data set has what they were when its unit was calibrated. What they are now changes the model's
-surroundings and nothing else, as the effect ``ambient_pressure`` does. The twin follows at each
-suction edge, the monitor cycle by cycle, a diagnosis log by log.
+A data set has their values at the calibration of its unit. Present values change the model's
+surroundings and nothing else, as the effect ``ambient_pressure`` does. The twin follows them at
+each suction edge, the monitor cycle by cycle, a diagnosis log by log.
 """
 
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ COLUMNS = (("ambient", c.AMBIENT), ("temperature", c.TEMPERATURE))
 
 @compiled
 def are_told(samples):  # type: ignore[no-untyped-def]
-    """Whether any row tells of the surroundings; nearly always none does."""
+    """Whether any row has ambient pressure or temperature; nearly always none has."""
     for row in range(len(samples)):
         if samples[row].ambient > 0.0 or samples[row].temperature > 0.0:
             return True
@@ -28,44 +28,44 @@ def are_told(samples):  # type: ignore[no-untyped-def]
 
 
 def told(samples: Samples) -> dict[str, float]:
-    """Medians (Pa, K) of what is told, by column; what nobody tells is left out."""
-    found = {}
+    """Medians (Pa, K) of the measured surroundings, by column; unmeasured ones are left out."""
+    medians = {}
     for column, _ in COLUMNS:
         values = samples[column][samples[column] > 0.0]
         if len(values):
-            found[column] = float(np.median(values))
-    return found
+            medians[column] = float(np.median(values))
+    return medians
 
 
 def following(theta: Theta, samples: Samples) -> Theta:
-    """Coefficients with the surroundings that rows tell of; the same ones where they tell none."""
+    """Coefficients with the surroundings that rows have measured; ``theta`` itself if none."""
     if not are_told(samples):
         return theta
-    found = told(samples)
+    medians = told(samples)
     theta = theta.copy()
     for column, coefficient in COLUMNS:
-        theta[coefficient] = found.get(column, theta[coefficient])
+        theta[coefficient] = medians.get(column, theta[coefficient])
     return theta
 
 
 def taken_in(data: DataSet, samples: Samples) -> DataSet:
-    """A data set as a record was taken: how often, and in which surroundings if it tells them."""
-    found, ambient = told(samples), data.ambient
-    if "ambient" in found:
-        ambient = ambient.model_copy(update={"pressure_mbar": round(found["ambient"] / MBAR, 1)})
-    if "temperature" in found:
-        celsius = round(found["temperature"] - ZERO_C, 1)
+    """A data set with the sampling of a record, and with its surroundings if measured."""
+    medians, ambient = told(samples), data.ambient
+    if "ambient" in medians:
+        ambient = ambient.model_copy(update={"pressure_mbar": round(medians["ambient"] / MBAR, 1)})
+    if "temperature" in medians:
+        celsius = round(medians["temperature"] - ZERO_C, 1)
         ambient = ambient.model_copy(update={"temperature_c": celsius})
     sensor = data.sensor.model_copy(update={"sampling_ms": sampling_ms(samples)})
-    taken = data.model_copy(update={"ambient": ambient, "sensor": sensor})
-    return DataSet.model_validate(taken.model_dump())
+    updated = data.model_copy(update={"ambient": ambient, "sensor": sensor})
+    return DataSet.model_validate(updated.model_dump())
 
 
 def stretches(samples: Samples, ticks: Ticks, before: int) -> Iterator[tuple[slice, Samples]]:
-    """Rows in which the surroundings are taken not to change, and those that tell them.
+    """Slices of rows with constant surroundings, and the row that measured them.
 
-    They begin at a suction edge, with the row that tells them; the first ones go on as the rows
-    before did, of which the last had the phase ``before``, and nothing tells them anew.
+    A slice begins at a suction edge, with that row. The first slice continues the surroundings of
+    the rows before, so it has no such row; ``before`` is the phase of the last of these.
     """
     phase = np.concatenate([[np.uint8(before)], ticks["phase"]])
     before_suction = np.isin(phase[:-1], (Phase.IDLE, Phase.BLOW_OFF))
