@@ -1,6 +1,6 @@
-"""A diagnosis in a process of its own: the question on stdin, the answer as JSON on stdout.
+"""A diagnosis in its own process: the question on stdin, the answer as JSON on stdout.
 
-Where the question names a file for it, the answer is drawn there as well.
+If the question names a file for the report, the report is written there as well.
 """
 
 import json
@@ -12,7 +12,7 @@ from pathlib import Path
 from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.errors import TwinError
 
-MOST_REPORTS = 100  # that a folder keeps, the newest
+MOST_REPORTS = 100  # newest reports that a folder keeps
 
 
 def main() -> None:
@@ -24,19 +24,19 @@ def main() -> None:
         sys.exit(str(error))
     json.dump(diagnosis.json, sys.stdout)
     if report is not None and diagnosis.json["verdict"] in ("explained", "unlisted"):
-        with suppress(OSError, TwinError):  # the answer matters more
+        with suppress(OSError, TwinError):  # the answer must not fail with its report
             keep(diagnosis, report)
 
 
 def keep(diagnosis: Diagnosis, report: Path) -> None:
-    """Draw it, whole or not at all; the oldest of too many go."""
-    from twin.diagnosis.report import write_report  # noqa: PLC0415  # it takes long to come
+    """Write the report atomically, and delete the oldest of too many."""
+    from twin.diagnosis.report import write_report  # noqa: PLC0415  # its import takes long
 
     report.parent.mkdir(parents=True, exist_ok=True)
     part = report.with_suffix(".part")
     write_report(diagnosis, part)
     part.rename(report)
-    kept = sorted(report.parent.glob(f"*{report.suffix}"), key=lambda one: one.stat().st_mtime_ns)
+    kept = sorted(report.parent.glob(f"*{report.suffix}"), key=lambda path: path.stat().st_mtime_ns)
     for old in kept[:-MOST_REPORTS]:
         old.unlink()
 

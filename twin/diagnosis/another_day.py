@@ -1,10 +1,10 @@
-"""What another day does to a rig, as far as the model does not know.
+"""Uncertainty of the model on another day than that of the calibration.
 
-The model takes over ambient pressure and temperature, and real ejectors scatter about what it then
-expects. Their end pressure follows ambient in proportion, as the model's does, or in full, where
-the jet makes a vacuum of its own. Flows go with density, sonic ones with the root of temperature,
-or with neither. So the farther a day is from the calibration's, the less sure is what to expect of
-a healthy rig. Where nobody measures temperature, it is unknown besides.
+The model takes over ambient pressure and temperature, and real ejectors scatter about its
+prediction. Their end pressure follows ambient in proportion, as in the model, or one to one if the
+jet makes a vacuum of its own. Flows go with density, sonic ones with the root of temperature, or
+with neither. So uncertainty grows with the distance to the day of the calibration. Temperature is
+unknown as well if nobody measures it.
 """
 
 import math
@@ -17,12 +17,12 @@ from twin.signals import MBAR
 Way = tuple[Theta, Theta]  # coefficients one sigma to either side
 
 BAROMETER = 2.0 * MBAR  # Pa, one sigma; cheap ones are within 3 or 4 mbar
-# Pa, one sigma, of the pressure sensor's zero beside it: where no barometer was there, an opened
-# system's calibration has taken it for ambient.
+# Pa, one sigma of the pressure sensor's zero: without a barometer, the calibration of an opened
+# system has taken the sensor's reading for ambient.
 ZERO = 2.0 * MBAR
-HALL_K = 10.0  # one sigma, where nobody measures it: 15 °C and 35 °C are both within a year's two
-SMALLEST = 1e-4  # relative change that is worth a way of its own
-# What flows alike: the ejector's own, through valves, through leaks; and friction in the line.
+HALL_K = 10.0  # one sigma if not measured: 15 °C and 35 °C are both within a year's two sigmas
+SMALLEST = 1e-4  # a smaller relative change is left out
+# Coefficients that vary together: suction, flows of valves, of leaks, and friction in the line.
 ALIKE = (
     (c.SUCTION,),
     (c.BLOW_OFF, c.RELIEF, c.EXHAUST),
@@ -32,52 +32,52 @@ ALIKE = (
 
 
 def unsure(
-    calibrated: Theta, here: Theta, ambient: float, told: frozenset[str], gauge: bool
+    calibrated: Theta, present: Theta, ambient: float, measured: frozenset[str], gauge: bool
 ) -> Iterator[Way]:
-    """Ways in which a healthy rig may differ ``here`` (coefficients of the day) from the model.
+    """Coefficients one sigma to either side, for each way in which a healthy rig may differ.
 
-    ``ambient`` is the pressure (Pa) that a hypothesis has there; ``told`` are the surroundings that
-    somebody measures, ``ambient`` or ``temperature``; ``gauge`` says that the pressure sensor
-    counts from ambient.
+    ``present`` are the coefficients of the day, ``ambient`` (Pa) is that of a hypothesis.
+    ``measured`` are measured surroundings, ``ambient`` or ``temperature``. ``gauge``: the pressure
+    sensor counts from ambient.
     """
-    if "ambient" in told:
-        yield in_air_of(here, BAROMETER, gauge), in_air_of(here, -BAROMETER, gauge)
-        yield _changed(here, c.SENSOR_OFFSET, ZERO), _changed(here, c.SENSOR_OFFSET, -ZERO)
-    if "temperature" not in told:
-        yield _changed(here, c.TEMPERATURE, HALL_K), _changed(here, c.TEMPERATURE, -HALL_K)
-    yield from _of_the_day(calibrated, here, ambient)
+    if "ambient" in measured:
+        yield in_air_of(present, BAROMETER, gauge), in_air_of(present, -BAROMETER, gauge)
+        yield _changed(present, c.SENSOR_OFFSET, ZERO), _changed(present, c.SENSOR_OFFSET, -ZERO)
+    if "temperature" not in measured:
+        yield _changed(present, c.TEMPERATURE, HALL_K), _changed(present, c.TEMPERATURE, -HALL_K)
+    yield from _of_the_day(calibrated, present, ambient)
 
 
 def in_air_of(theta: Theta, shift: float, gauge: bool) -> Theta:
-    """The same in ambient pressure that differs by ``shift`` (Pa) from what is told or assumed.
+    """``theta`` with ambient pressure shifted by ``shift`` (Pa) from the measured or assumed one.
 
-    A ``gauge`` sensor's readings have been counted from that: they are off by as much.
+    Readings of a ``gauge`` sensor were counted from that, so they shift as well.
     """
     theta = _changed(theta, c.AMBIENT, shift)
     return _changed(theta, c.SENSOR_OFFSET, -shift) if gauge else theta
 
 
-def _of_the_day(calibrated: Theta, here: Theta, ambient: float) -> Iterator[Way]:
-    """What the day's difference from that of the calibration leaves open, in proportion to it."""
+def _of_the_day(calibrated: Theta, present: Theta, ambient: float) -> Iterator[Way]:
+    """Ways that grow in proportion to the day's difference from that of the calibration."""
     higher = ambient - float(calibrated[c.AMBIENT])
     denser = math.log(ambient / calibrated[c.AMBIENT])
-    warmer = math.log(here[c.TEMPERATURE] / calibrated[c.TEMPERATURE])
-    follows = (1.0 - float(here[c.END_RATIO])) * higher / ambient
+    warmer = math.log(present[c.TEMPERATURE] / calibrated[c.TEMPERATURE])
+    follows = (1.0 - float(present[c.END_RATIO])) * higher / ambient
     if abs(follows) > SMALLEST:
-        yield _changed(here, c.END_RATIO, follows), _changed(here, c.END_RATIO, -follows)
+        yield _changed(present, c.END_RATIO, follows), _changed(present, c.END_RATIO, -follows)
     size = math.hypot(denser, warmer / 2.0)
     if size > SMALLEST:
-        for some in ALIKE:
-            yield _scaled(here, some, size), _scaled(here, some, -size)
+        for group in ALIKE:
+            yield _scaled(present, group, size), _scaled(present, group, -size)
 
 
-def _changed(theta: Theta, place: int, change: float) -> Theta:
+def _changed(theta: Theta, coefficient: int, change: float) -> Theta:
     theta = theta.copy()
-    theta[place] += change
+    theta[coefficient] += change
     return theta
 
 
-def _scaled(theta: Theta, places: tuple[int, ...], size: float) -> Theta:
+def _scaled(theta: Theta, coefficients: tuple[int, ...], size: float) -> Theta:
     theta = theta.copy()
-    theta[list(places)] *= math.exp(size)
+    theta[list(coefficients)] *= math.exp(size)
     return theta

@@ -1,4 +1,4 @@
-"""How the extended model does on another log, which nothing was fitted to or chosen on."""
+"""Judge the extended model on another log, on which nothing was fitted or chosen."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -17,18 +17,18 @@ from twin.signals import Samples
 def judged_on(
     diagnosis: Diagnosis, config: Config, log: str, blocks: Iterable[Samples]
 ) -> dict[str, Any] | None:
-    """The twin as it stands and with what was found beside ``log``; None where nothing is to judge.
+    """Figures of the twin as it stands and of the extended model on ``log``; None without one.
 
-    All its whole cycles count, whatever their program. What comes and goes is not carried over.
-    SourceError where the log has no cycle to judge by.
+    All whole cycles of the log count, whatever their program. Intermittent causes are left out.
+    Raises SourceError if the log has no cycle to judge by.
     """
-    known = extended(diagnosis, config)
-    if known is None:
+    extended_model = extended(diagnosis, config)
+    if extended_model is None:
         return None
-    monitor = config.monitor.model_copy(update={"healthy": known.healthy})
+    monitor = config.monitor.model_copy(update={"healthy": extended_model.healthy})
     blocks = list(blocks)
     before = collect(config, blocks)
-    after = collect(replace(config, data=known.data, monitor=monitor), blocks)
+    after = collect(replace(config, data=extended_model.data, monitor=monitor), blocks)
     cycles = sorted({*before.judged} & {*after.judged})
     if reason := insufficient(before) or insufficient(after):
         raise SourceError(f"{log}: nothing can be judged on it: {reason}")

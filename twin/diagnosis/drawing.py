@@ -1,4 +1,4 @@
-"""How pictures look, and how one becomes SVG text that needs nothing from outside."""
+"""Style of pictures, and their conversion to self-contained SVG text."""
 
 import html
 import io
@@ -29,12 +29,12 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "svg.fonttype": "none",  # text stays text: small, selectable, in the reader's own font
 }
-ANONYMOUS = dict.fromkeys(("Creator", "Date", "Format", "Type"))  # the same input, the same bytes
+ANONYMOUS = dict.fromkeys(("Creator", "Date", "Format", "Type"))  # output must be reproducible
 
 
 @contextmanager
 def empty(name: str, height: float) -> Iterator[Figure]:
-    """Give an empty figure; ``name`` keeps the marks in it apart from those of other pictures."""
+    """Give an empty figure; ``name`` makes the ids in it unique among pictures."""
     with mpl.rc_context({**STYLE, "svg.hashsalt": name}):
         yield Figure(figsize=(WIDTH, height), layout="constrained")
 
@@ -44,7 +44,9 @@ def as_svg(figure: Figure, alt: str) -> str:
     text = io.StringIO()
     figure.savefig(text, format="svg", metadata=ANONYMOUS)
     svg = text.getvalue()
-    svg = re.sub(r'<g id="[^"]*"', "<g", svg[svg.index("<svg") :])  # unique in one picture only
+    svg = re.sub(
+        r'<g id="[^"]*"', "<g", svg[svg.index("<svg") :]
+    )  # ids are unique within one picture only
     return svg.replace("<svg", f'<svg role="img" aria-label="{html.escape(alt)}"', 1)
 
 
@@ -61,7 +63,7 @@ def legend(figure: Figure, panels: Iterable[Axes]) -> None:
 
 
 def logarithmic(axes: Axes, marked: Sequence[float] = (1.0,)) -> None:
-    """Make the x axis logarithmic, with plain numbers at ``marked`` and their tenfold."""
+    """Make the x axis logarithmic, with plain numbers at ``marked`` in each decade."""
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(LogLocator(subs=marked))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))

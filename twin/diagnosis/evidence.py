@@ -1,8 +1,8 @@
-"""What a log has to say: its complete cycles, and how far any hypothesis is from them.
+"""Evidence of a log: its complete cycles, and the residuals of any hypothesis in them.
 
-A hypothesis is a set of causes; the calibrated twin as it stands is the empty one. Its residual is
-measured minus expected pressure, averaged over short bins, and the vacuum at which the air saving
-switched against the vacuum at which the hypothesis would.
+A hypothesis is a set of causes; the calibrated twin as it stands is the empty one. Its residuals
+are measured minus expected pressure, averaged over short bins, and measured minus expected vacuum
+at the switchings of the air saving.
 """
 
 import math
@@ -53,68 +53,68 @@ from twin.signals import (
 )
 
 CORES: ContextVar[int] = ContextVar("CORES", default=2)  # on which a diagnosis runs
-LATER, LONGEST_SUCTION = 1.3, 10_000  # cycles' suction, rows: until when H1 may be reached
+LATER, LONGEST_SUCTION = 1.3, 10_000  # simulated suction over that of cycles, and at most (rows)
 
-# How suction and end pressure follow the supply is the type's; of its value, one sigma.
+# Relative sigmas of how suction and end pressure follow the supply; the values are the type's.
 SUPPLY_UNKNOWN = {"end_pressure_slope": 0.5, "curvature": 0.5, "optimum_bar": 0.03}
 
 Hypothesis = tuple[Cause, ...]
 HEALTHY: Hypothesis = ()
-OF_THE_WAY = 0.9  # to its bound, at most, an uncertain value is moved
+OF_THE_WAY = 0.9  # largest change of an uncertain value, over its distance to the bound
 _BOUNDS = ("ge", "gt", "le", "lt")
-One = TypeVar("One")
-Other = TypeVar("Other")
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
-def at_once(run: Callable[[One], Other], over: Sequence[One]) -> list[Other]:
-    """What ``run`` gives for each, in order; on several cores, as compiled code lets others run."""
+def at_once(run: Callable[[Item], Result], over: Sequence[Item]) -> list[Result]:
+    """Results of ``run`` for each, in order; in threads, as compiled code releases the lock."""
     if len(over) < 2 or CORES.get() == 1:
-        return [run(one) for one in over]
+        return [run(item) for item in over]
     with ThreadPoolExecutor(CORES.get()) as pool:
         return list(pool.map(run, over))
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """The complete cycles of a log in one stretch of rows, with all that judges a hypothesis."""
+    """The complete cycles of a log in one stretch of rows, and all that judges a hypothesis."""
 
     theta: Theta  # of the calibrated twin as it stands, in the surroundings of the log
-    begin_ns: int  # PLC time of the first row here
+    begin_ns: int  # PLC time of the first of these rows
     before_s: float  # of the log, before that row
     samples: Samples
     ticks: Ticks
     starts: Ints  # first row of each cycle, and the row after the last one
     numbers: Ints  # of the cycles in the log
-    judged: list[int]  # positions of those that count; in the others the model still swings in
+    judged: list[int]  # positions of cycles that count; in the others the model still settles
     figures: list[dict[str, float]]  # of each cycle
     healthy: Healthy
     noise: float  # mbar
     bins: Bins
-    terms: tuple[Term, ...]  # that data gave the data set
-    knees: Knees  # how they were looked for
-    uncertain: tuple[tuple[Theta, Theta], ...]  # a sigma either way where no log decided
-    rows: Ints  # that suffice to draw what is expected
-    calibrated: Theta  # the same in those of its calibration
+    terms: tuple[Term, ...]  # of the data set, learned from data
+    knees: Knees  # settings with which they were found
+    uncertain: tuple[tuple[Theta, Theta], ...]  # one sigma to either side, for each uncertainty
+    rows: Ints  # subsampled for interpolation of the expected pressure
+    calibrated: Theta  # ``theta`` in the surroundings of the calibration
     gauge: bool  # the pressure sensor counts from ambient
-    told: frozenset[str] = frozenset()  # surroundings that somebody measures
-    another_day: bool = True  # than that of the calibration
-    catalogue: Mapping[str, CatalogueEffect] = field(default_factory=dict)  # known beside the table
+    told: frozenset[str] = frozenset()  # measured surroundings
+    another_day: bool = True  # the log is of another day than the calibration
+    catalogue: Mapping[str, CatalogueEffect] = field(default_factory=dict)  # beside the table
     _seen: dict[bytes, Seen] = field(default_factory=dict)  # by coefficients
 
     @property
     def cycles(self) -> int:
-        """How many complete cycles there are."""
+        """Number of complete cycles."""
         return len(self.starts) - 1
 
     @cached_property
     def effects(self) -> list[Effect]:
-        """What can act: of the table, and of what was found before."""
-        known = effects_in(self.catalogue)
-        return [*acting_on(self.theta), *(one for one in known if one.acts(self.theta))]
+        """Effects that can act: of the table, and of the catalogue."""
+        stored = effects_in(self.catalogue)
+        return [*acting_on(self.theta), *(effect for effect in stored if effect.acts(self.theta))]
 
     @cached_property
     def seconds(self) -> Floats:
-        """Time (s) of each row since the first one here."""
+        """Time (s) of each row since the first one."""
         times: Floats = (self.samples["time_ns"] - self.begin_ns) * NS
         return times
 
@@ -125,7 +125,7 @@ class Evidence:
 
     @cached_property
     def _times(self) -> Floats:
-        """The same as the kernel counts it: less by 1 where time does not run on."""
+        """Cumulative time (s) as the kernel uses it; −1 s marks a break."""
         return np.cumsum(time_steps(self.samples, None))
 
     @cached_property
@@ -134,13 +134,13 @@ class Evidence:
         return self.bins.mean(self.samples["pressure"].astype(np.float64))
 
     def course(self, hypothesis: Hypothesis, base: Theta | None = None) -> Schedule:
-        """The coefficients under a hypothesis, from which row on which."""
+        """Schedule of coefficients under a hypothesis: first row, and coefficients from there."""
         base = self.theta if base is None else base
         course = schedule(base, hypothesis, self.seconds, self.cycle_of_row)
         return [(row, self._as_read(theta, base)) for row, theta in course]
 
     def _as_read(self, theta: Theta, base: Theta) -> Theta:
-        """Readings of a gauge sensor were counted from the ambient pressure that was assumed."""
+        """Shift the sensor's offset: gauge readings were counted from the assumed ambient."""
         shift = float(theta[c.AMBIENT] - base[c.AMBIENT])
         if not self.gauge or shift == 0.0:
             return theta
@@ -163,15 +163,15 @@ class Evidence:
     ) -> Floats:
         """Measured minus expected pressure (mbar) in each bin, (bins, hypotheses).
 
-        ``bases`` are the coefficients that each hypothesis changes, where not the twin's own;
-        ``late`` by how many rows its knees are later than they were found.
+        ``bases`` are the coefficients that each hypothesis changes, by default the twin's;
+        ``late`` are rows by which its knees are later than they were found.
         """
         bases = [self.theta] * len(hypotheses) if bases is None else bases
         pairs = list(zip(bases, hypotheses, strict=True))
-        courses = [self.course(one, base) for base, one in pairs]
+        courses = [self.course(hypothesis, base) for base, hypothesis in pairs]
         sensing = self._sensing(bases, courses)
         if late is not None:
-            sensing = [_later(*both) for both in zip(sensing, late, strict=True)]
+            sensing = [_later(*pair) for pair in zip(sensing, late, strict=True)]
         lanes = [slice(i, i + kernel.LANES) for i in range(0, len(courses), kernel.LANES)]
 
         def run(lane: slice) -> Floats:
@@ -181,14 +181,14 @@ class Evidence:
             off: Floats = (self._measured[:, None] - self.bins.through(rows, expected)) / MBAR
             return off
 
-        found = np.empty((len(self.bins.count), len(courses)))
+        deviations = np.empty((len(self.bins.count), len(courses)))
         for lane, off in zip(lanes, at_once(run, lanes), strict=True):
-            found[:, lane] = off
-        return found
+            deviations[:, lane] = off
+        return deviations
 
     def _drawn(self, courses: Sequence[Schedule], phase: npt.NDArray[np.uint8]) -> Ints:
-        """Rows that suffice to draw what these courses expect."""
-        if self.terms:  # they count rows
+        """Subsampled rows for interpolation of the pressure expected by these courses."""
+        if self.terms:  # they need every row
             return np.arange(len(phase))
         changes = np.concatenate(
             [
@@ -211,63 +211,68 @@ class Evidence:
         phase, level = phase[rows], level[rows]
         expected = np.empty((len(rows), len(courses)))
         state, before = kernel.new_state(len(courses)), None
-        for first, last, theta in _together(courses, len(self.samples)):
+        for first, last, theta in _constant_stretches(courses, len(self.samples)):
             part = slice(*np.searchsorted(rows, (first, last)))
             if before is not None:
                 kernel.take_over(state, before, theta)
             before = theta
             driven = dt[part], phase[part], level[part]
             kernel.advance(state, theta, *driven, expected[part], tolerance=tolerance)
-        for phases, one in zip(np.broadcast_to(phase, expected.shape).T, expected.T, strict=True):
-            Terms(self.terms, float(self.theta[c.AMBIENT])).add(phases, one)
+        for phases, pressure in zip(
+            np.broadcast_to(phase, expected.shape).T, expected.T, strict=True
+        ):
+            Terms(self.terms, float(self.theta[c.AMBIENT])).add(phases, pressure)
         return expected
 
     def _sensing(
         self, bases: Sequence[Theta], courses: Sequence[Schedule]
     ) -> list[tuple["Sensing", ...]]:
-        """How much earlier than it is seen the nozzle switches, and what that does to the level.
+        """Shifts of the nozzle's time and of the level at a knee, against the calibrated twin.
 
-        It is the same for all coefficients but those of jet, line and sensor.
+        They depend only on coefficients of jet, line and sensor.
         """
-        stretches = [self._alike(base, course) for base, course in zip(bases, courses, strict=True)]
-        self.look([*bases, *(alike for some in stretches for _, alike in some)])
+        stretches = [
+            self._sensing_stretches(base, course)
+            for base, course in zip(bases, courses, strict=True)
+        ]
+        self.look([*bases, *(theta for stretch in stretches for _, theta in stretch)])
         return [
-            tuple(Sensing.of(row, self.seen(alike), self.seen(base)) for row, alike in some)
-            for base, some in zip(bases, stretches, strict=True)
+            tuple(Sensing.of(row, self.seen(theta), self.seen(base)) for row, theta in stretch)
+            for base, stretch in zip(bases, stretches, strict=True)
         ]
 
-    def _alike(self, base: Theta, course: Schedule) -> Schedule:
-        """Coefficients of a course that hold at knees, with jet, line and sensor alone changed."""
+    def _sensing_stretches(self, base: Theta, course: Schedule) -> Schedule:
+        """Coefficients at the knees, with only jet, line and sensor as in a course."""
         if all((theta[_SENSING] == base[_SENSING]).all() for _, theta in course):
             return []
-        begins, found = [row for row, _ in course], []
+        begins, stretches = [row for row, _ in course], []
         for number in np.unique(np.searchsorted(begins, self._knees, "right") - 1):
             row, theta = course[number]
-            alike = base.copy()
-            alike[_SENSING] = theta[_SENSING]
-            found.append((row, alike))
-        return found
+            changed = base.copy()
+            changed[_SENSING] = theta[_SENSING]
+            stretches.append((row, changed))
+        return stretches
 
     def _switched(
         self, courses: Sequence[Schedule], sensing: Sequence[tuple["Sensing", ...]]
     ) -> tuple[npt.NDArray[np.uint8], Floats]:
-        """Phases and levels as the nozzle must have switched to be seen as it was.
+        """Phases and levels for which the nozzle would be seen to switch as it was.
 
-        Both are (rows, n), or (rows, 1) where they are the same for all.
+        Both are (rows, n), or (rows, 1) if they are the same for all.
         """
         changed, moved = any(len(course) > 1 for course in courses), any(sensing)
         phase = np.repeat(self.ticks["phase"][:, None], len(sensing) if moved else 1, axis=1)
         width = len(sensing) if changed or moved else 1
         level = np.repeat(self.ticks["level"].astype(np.float64)[:, None], width, axis=1)
-        for i, (course, some) in enumerate(zip(courses, sensing, strict=True)):
-            if some:
-                self._move(phase[:, i], level[:, i], some)
+        for i, (course, shifts) in enumerate(zip(courses, sensing, strict=True)):
+            if shifts:
+                self._move(phase[:, i], level[:, i], shifts)
             if len(course) > 1:
                 self._read_anew(level[:, i], course)
         return phase, level
 
     def _read_anew(self, level: Floats, course: Schedule) -> None:
-        """Where coefficients change at a cycle's start, the level is what was read before that."""
+        """Correct levels at a cycle's start for coefficients of the sensor that change there."""
         for (_, before), (row, after) in pairwise(course):
             if np.isfinite(level[row]) and self.ticks["phase"][row - 1] == Phase.IDLE:
                 level[row] = reading_of(sensed_of(level[row], before), after)
@@ -276,16 +281,16 @@ class Evidence:
         self, phase: npt.NDArray[np.uint8], level: Floats, sensing: Sequence["Sensing"]
     ) -> None:
         """Move the switching of one hypothesis, in place."""
-        begins = [one.row for one in sensing]
+        begins = [part.row for part in sensing]
         for knee in self._knees:
-            here = sensing[np.searchsorted(begins, knee, "right") - 1]
+            shift = sensing[np.searchsorted(begins, knee, "right") - 1]
             name = Phase(int(self.ticks["phase"][knee]))
             closing = name == Phase.HOLD
-            earlier = here.off if closing else here.on
-            known = self.knees.off_shift if closing else self.knees.on_shift
-            level[knee] -= here.off_above if closing else here.on_above
-            acts = max(knee - known - earlier, 0)
-            phase[max(knee - known, 0) : knee] = _OTHER[name]
+            earlier = shift.off if closing else shift.on
+            known_shift = self.knees.off_shift if closing else self.knees.on_shift
+            level[knee] -= shift.off_above if closing else shift.on_above
+            acts = max(knee - known_shift - earlier, 0)
+            phase[max(knee - known_shift, 0) : knee] = _OTHER[name]
             phase[acts:knee] = name
             late = phase[knee : max(knee, acts)]
             late[late == name] = _OTHER[name]
@@ -300,18 +305,18 @@ class Evidence:
         return rows[np.isin(phase[rows], inside) & np.isin(phase[rows - 1], inside)]
 
     def knee(self, cycle: int, into: Phase) -> int:
-        """First row of a cycle at which the air saving was seen to switch into a phase."""
+        """First row of a cycle at which the air saving was seen to switch to a phase."""
         knees = self._knees[self._knees >= self.starts[cycle]]
         return int(knees[self.ticks["phase"][knees] == into][0])
 
     def seen(self, theta: Theta) -> Seen:
-        """How the air saving would be seen to switch, by the finder that found it in the log."""
+        """Simulated detection of the switching, by the same finder as in the log; cached."""
         if theta.tobytes() not in self._seen:
             self.look([theta])
         return self._seen[theta.tobytes()]
 
     def look(self, thetas: Iterable[Theta]) -> None:
-        """Find out for many how the air saving would be seen to switch."""
+        """Simulate the detection of the switching for many coefficients, and cache it."""
         new = {theta.tobytes(): theta for theta in thetas}
         new = {key: theta for key, theta in new.items() if key not in self._seen}
         if not new:
@@ -321,29 +326,29 @@ class Evidence:
         rows = min(int(LATER * suction), LONGEST_SUCTION)
         thetas = list(new.values())
         lanes = [thetas[i : i + kernel.LANES] for i in range(0, len(thetas), kernel.LANES)]
-        found = at_once(lambda lane: seen(lane, rows, self.knees), lanes)
-        self._seen.update(zip(new, chain.from_iterable(found), strict=True))
+        seen_by_lane = at_once(lambda lane: seen(lane, rows, self.knees), lanes)
+        self._seen.update(zip(new, chain.from_iterable(seen_by_lane), strict=True))
 
 
 @dataclass(frozen=True)
 class Sensing:
-    """How much earlier than in the calibrated twin the nozzle switches to be seen when it was."""
+    """Shifts against the calibrated twin for which the switching shows when it did."""
 
-    row: int  # from which on
-    off: int  # rows, closing
-    on: int  # rows, opening
-    off_above: float  # Pa, by how much more the level found is above what is read there
+    row: int  # from which they hold
+    off: int  # rows by which the nozzle closes earlier
+    on: int  # rows by which it opens earlier
+    off_above: float  # Pa, increase of the level found over the reading there
     on_above: float
 
     @classmethod
-    def of(cls, row: int, here: Seen, as_it_is: Seen) -> "Sensing":
+    def of(cls, row: int, changed: Seen, calibrated: Seen) -> "Sensing":
         """Compare with the calibrated twin."""
         return cls(
             row,
-            here.off_rows - as_it_is.off_rows,
-            here.on_rows - as_it_is.on_rows,
-            here.off_above - as_it_is.off_above,
-            here.on_above - as_it_is.on_above,
+            changed.off_rows - calibrated.off_rows,
+            changed.on_rows - calibrated.on_rows,
+            changed.off_above - calibrated.off_above,
+            changed.on_above - calibrated.on_above,
         )
 
 
@@ -353,21 +358,24 @@ _SENSING += [c.NEAR_RESISTANCE, c.RESISTANCE, c.PLACE]  # a drop along the line 
 
 
 def _later(sensing: tuple[Sensing, ...], rows: int) -> tuple[Sensing, ...]:
-    """The same with knees later by so many rows."""
+    """``sensing`` with knees later by ``rows``."""
     if not rows:
         return sensing
-    some = sensing or (Sensing(0, 0, 0, 0.0, 0.0),)
-    return tuple(replace(one, off=one.off - rows, on=one.on - rows) for one in some)
+    shifts = sensing or (Sensing(0, 0, 0, 0.0, 0.0),)
+    return tuple(replace(shift, off=shift.off - rows, on=shift.on - rows) for shift in shifts)
 
 
-def _together(courses: Sequence[Schedule], rows: int) -> Iterator[tuple[int, int, Theta]]:
-    """Stretches of rows in which no course changes, with the coefficients of all, (·, courses)."""
+def _constant_stretches(courses: Sequence[Schedule], rows: int) -> Iterator[tuple[int, int, Theta]]:
+    """Stretches of rows in which no course changes, with coefficients (·, courses)."""
     changes = sorted({row for course in courses for row, _ in course})
-    now = [course[0][1] for course in courses]
-    at = [dict(course) for course in courses]
+    current = [course[0][1] for course in courses]
+    changes_by_row = [dict(course) for course in courses]
     for first, last in zip(changes, [*changes[1:], rows], strict=True):
-        now = [changed.get(first, before) for changed, before in zip(at, now, strict=True)]
-        yield first, last, np.stack(now, axis=1)
+        current = [
+            changed.get(first, previous)
+            for changed, previous in zip(changes_by_row, current, strict=True)
+        ]
+        yield first, last, np.stack(current, axis=1)
 
 
 def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
@@ -399,75 +407,77 @@ def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
     return of_log(nothing, blocks)
 
 
-def of_log(beside: Evidence, blocks: Iterable[Samples]) -> Evidence:
-    """What another log says beside the same twin."""
+def of_log(base: Evidence, blocks: Iterable[Samples]) -> Evidence:
+    """Evidence of another log for the same twin."""
     blocks = list(bridged(blocks))
     rows = joined(np.empty(0, SAMPLE), *(block for block in blocks if are_told(block)))
-    uncertain = tuple((following(up, rows), following(down, rows)) for up, down in beside.uncertain)
-    theta = following(beside.theta, rows)
-    beside = replace(beside, theta=theta, uncertain=uncertain, told=frozenset(told(rows)))
-    knees = as_wide_as_needed(beside.knees, blocks)
-    cycles = whole(Twin(beside.theta, knees, beside.terms).over(blocks))
+    uncertain = tuple((following(up, rows), following(down, rows)) for up, down in base.uncertain)
+    theta = following(base.theta, rows)
+    base = replace(base, theta=theta, uncertain=uncertain, told=frozenset(told(rows)))
+    knees = as_wide_as_needed(base.knees, blocks)
+    cycles = whole(Twin(base.theta, knees, base.terms).over(blocks))
     samples = np.concatenate([np.empty(0, SAMPLE), *(cycle.samples for cycle in cycles)])
     ticks = np.concatenate([np.empty(0, TICK), *(cycle.ticks for cycle in cycles)])
     starts = np.cumsum([0, *(len(cycle.samples) for cycle in cycles)])
     judged = [number for number, cycle in enumerate(cycles) if cycle.settled]
     return replace(
-        beside,
+        base,
         begin_ns=next((int(block["time_ns"][0]) for block in blocks if len(block)), 0),
         samples=samples,
         ticks=ticks,
         starts=starts,
         numbers=np.arange(len(cycles)),
         judged=judged,
-        figures=[figures(cycle, beside.theta) for cycle in cycles],
+        figures=[figures(cycle, base.theta) for cycle in cycles],
         bins=_binned(samples, ticks, starts, judged, knees),
         rows=drawn_rows(samples, ticks),
         knees=knees,
-        _seen={},  # by a finder with other knees
+        _seen={},  # depends on the settings of the finder
     )
 
 
 def _uncertain(config: Config) -> Iterator[tuple[Theta, Theta]]:
-    """Coefficients one sigma to either side, each way that calibration left the data set open.
+    """Coefficients one sigma to either side, for each uncertainty of the calibration.
 
-    And each that calibration says nothing about: only one supply was ever measured.
+    The response to the supply comes first: calibration measured only one supply.
     """
     for key, share in SUPPLY_UNKNOWN.items():
-        known = getattr(config.data.supply, key)
-        yield _aside(config.data, {f"supply.{key}": share * known})
+        value = getattr(config.data.supply, key)
+        yield _both_sides(config.data, {f"supply.{key}": share * value})
     rows = config.monitor.healthy.uncertain
-    for way in range(len(rows)):
-        yield _aside(config.data, {name: row[way] for name, row in list(rows.items())[way:]})
+    for column in range(len(rows)):
+        yield _both_sides(
+            config.data, {name: row[column] for name, row in list(rows.items())[column:]}
+        )
 
 
-def _aside(data: DataSet, changes: Mapping[str, float]) -> tuple[Theta, Theta]:
-    """Coefficients with values (``table.key``) changed by so much, and by as much less."""
+def _both_sides(data: DataSet, changes: Mapping[str, float]) -> tuple[Theta, Theta]:
+    """Coefficients with values (``table.key``) changed up and down by ``changes``."""
     up, down = (_changed(data, changes, sign) for sign in (1.0, -1.0))
     return coefficients(up), coefficients(down)
 
 
 def _changed(data: DataSet, changes: Mapping[str, float], sign: float) -> DataSet:
-    """A data set, unchecked as a whole: it need be no ejector. Each value keeps to its bounds."""
+    """A data set with changed values within their bounds; the set as a whole is unchecked."""
     for name, change in changes.items():
         table, key = name.split(".")
         part = getattr(data, table)
-        value = _kept(type(part).model_fields[key], getattr(part, key), sign * change)
+        value = _within_bounds(type(part).model_fields[key], getattr(part, key), sign * change)
         data = data.model_copy(update={table: part.model_copy(update={key: value})})
     return data
 
 
-def _kept(field_info: FieldInfo, value: float, change: float) -> float:
-    """A value changed, but at most by OF_THE_WAY to a bound: no flow or volume is negative."""
-    bounds = (getattr(one, name, None) for one in field_info.metadata for name in _BOUNDS)
-    for bound in (one for one in bounds if one is not None):
+def _within_bounds(field_info: FieldInfo, value: float, change: float) -> float:
+    """A changed value, at most OF_THE_WAY to a bound: no flow or volume becomes negative."""
+    bounds = (getattr(limit, name, None) for limit in field_info.metadata for name in _BOUNDS)
+    for bound in (limit for limit in bounds if limit is not None):
         if (bound - value) * change > 0.0:
             change = math.copysign(min(abs(change), OF_THE_WAY * abs(bound - value)), change)
     return value + change
 
 
 def thinned(evidence: Evidence, cycles: Sequence[int], most: int) -> Evidence:
-    """The same with at most about ``most`` of its judged ``cycles``, evenly spread in pairs."""
+    """Evidence of about ``most`` of the judged ``cycles`` at most, evenly spread in pairs."""
     if len(cycles) <= most:
         return of_cycles(evidence, cycles)
     first = np.linspace(0, len(cycles) - 2, most // 2).astype(int)
@@ -475,8 +485,8 @@ def thinned(evidence: Evidence, cycles: Sequence[int], most: int) -> Evidence:
 
 
 def of_cycles(evidence: Evidence, cycles: Sequence[int]) -> Evidence:
-    """The same with only some cycles and the one before each, in which the model swings in."""
-    kept = sorted({near for cycle in cycles for near in (cycle - 1, cycle) if near >= 0})
+    """Evidence of some cycles and the one before each, in which the model settles."""
+    kept = sorted({number for cycle in cycles for number in (cycle - 1, cycle) if number >= 0})
     rows = np.concatenate([np.arange(evidence.starts[k], evidence.starts[k + 1]) for k in kept])
     starts = np.cumsum([0, *(evidence.starts[k + 1] - evidence.starts[k] for k in kept)])
     judged = [kept.index(cycle) for cycle in cycles]
@@ -506,15 +516,15 @@ def _binned(
 
 
 def _unsettled(phase: npt.NDArray[np.uint8], knees: Knees) -> npt.NDArray[np.bool_]:
-    """Rows after a knee that suction's end followed too soon for it to be found well.
+    """Rows after a knee that was too close to the end of suction to be found well.
 
-    And the blow-off or idle after them, which begins at a pressure that nobody can tell.
+    Rows of the blow-off or idle after them count as well: its initial pressure is unknown.
     """
     begins = np.flatnonzero(np.diff(phase, prepend=255))
     lengths = np.diff(begins, append=len(phase))
     kind = phase[begins]
     before = np.concatenate([[255], kind[:-1]])
-    sucks, sucked = (np.isin(one, [Phase.SUCTION, Phase.HOLD]) for one in (kind, before))
+    sucks, sucked = (np.isin(phases, [Phase.SUCTION, Phase.HOLD]) for phases in (kind, before))
     after_knee = lengths - np.where(kind == Phase.SUCTION, knees.on_shift, knees.off_shift)
     soon = sucks & sucked & (after_knee < knees.settles)
     soon[1:] |= soon[:-1] & ~sucks[1:]

@@ -1,7 +1,7 @@
-"""The next measurement: which recording would part what this log cannot tell apart.
+"""The next measurement: the recording that would separate causes this log cannot tell apart.
 
-Each test that a rig engineer can do is simulated as if the causes found were true; then every
-look-alike is fitted to it as to a log. What is left of it, in sigmas, is how far they would part.
+Each test that a rig engineer can do is simulated with the causes found; then every look-alike is
+fitted to it as to a log. Its residual, in sigmas, is the separation that the test would give.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,8 +20,8 @@ from twin.model.courses import Cause, schedule
 from twin.model.theta import Theta
 from twin.signals import BAR, MS, SAMPLE, Command, Samples
 
-ENOUGH = 5.0  # sigmas that part two causes for good
-REPEATS = 4  # of a test: the first one lets the model swing in
+ENOUGH = 5.0  # sigmas that separate two causes for certain
+REPEATS = 4  # of a test: the model settles in the first
 MOST_RIVALS = 3
 SUPPLY_STEP = 1.0 * BAR
 
@@ -31,7 +31,7 @@ Program = Sequence[tuple[int, int]]  # command, ms
 
 @dataclass(frozen=True)
 class Test:
-    """What can be recorded, in words; a program of commands, and what is set otherwise."""
+    """A possible recording: text, program of commands, and changed settings."""
 
     words: str
     program: Program
@@ -80,71 +80,85 @@ TESTS = (
 def next_experiment(
     evidence: Evidence, searched: Search, mechanism: Explained | None = None
 ) -> str | None:
-    """What to record so that causes this log cannot tell apart come apart; None if none are.
+    """What to record to separate causes that this log cannot tell apart; None without rivals.
 
-    Where a ``mechanism`` acts, so that it comes apart from what else it may be.
+    With a ``mechanism``, what separates that from its rivals.
     """
     if mechanism is not None:
-        others = [(*mechanism.beside, one) for one in mechanism.rivals[:1]]  # the nearest
-        found = mechanism.fitted.hypothesis
-        return _recording(evidence, found, others, "the mechanism", "what else it may be")
+        alternatives = [(*mechanism.beside, rival) for rival in mechanism.rivals[:1]]  # the nearest
+        hypothesis = mechanism.fitted.hypothesis
+        return _recording(
+            evidence, hypothesis, alternatives, "the mechanism", "what else it may be"
+        )
     if searched.found is None:
         return None
-    rivals = [one for some in searched.rivals for one in some][:MOST_RIVALS]
+    rivals = [rival for rivals_of_cause in searched.rivals for rival in rivals_of_cause][
+        :MOST_RIVALS
+    ]
     names = ", ".join(
-        dict.fromkeys(e for one in rivals for e in one.effects if e not in searched.found.effects)
+        dict.fromkeys(
+            e for rival in rivals for e in rival.effects if e not in searched.found.effects
+        )
     )
-    this, found = " and ".join(searched.found.effects), searched.found.hypothesis
-    return _recording(evidence, found, [one.hypothesis for one in rivals], this, names)
+    text, hypothesis = " and ".join(searched.found.effects), searched.found.hypothesis
+    return _recording(evidence, hypothesis, [rival.hypothesis for rival in rivals], text, names)
 
 
 def _recording(
-    evidence: Evidence, found: Hypothesis, rivals: Sequence[Hypothesis], this: str, names: str
+    evidence: Evidence, hypothesis: Hypothesis, rivals: Sequence[Hypothesis], text: str, names: str
 ) -> str | None:
-    """The cheapest test that parts what was found from its rivals, else the one that does most."""
+    """The cheapest test that separates what was found from its rivals, or the best one."""
     if not rivals:
         return None
-    settled, others = _settled(evidence, found), [_settled(evidence, one) for one in rivals]
-    parted = []
+    settled, settled_rivals = (
+        _settled(evidence, hypothesis),
+        [_settled(evidence, candidate) for candidate in rivals],
+    )
+    results = []
     for test in TESTS:
-        apart = _apart(evidence, settled, others[:MOST_RIVALS], test)
-        parted.append((test, apart))
-        if apart >= ENOUGH:
+        sigmas = _separation(evidence, settled, settled_rivals[:MOST_RIVALS], test)
+        results.append((test, sigmas))
+        if sigmas >= ENOUGH:
             break
-    test, apart = parted[-1] if parted[-1][1] >= ENOUGH else max(parted, key=lambda one: one[1])
-    if apart < 2.0:
+    test, sigmas = (
+        results[-1]
+        if results[-1][1] >= ENOUGH
+        else max(results, key=lambda candidate: candidate[1])
+    )
+    if sigmas < 2.0:
         return (
-            f"no recording of this sensor is predicted to part {this} from {names}"
-            f" (at most {apart:.1f} sigma): measure one of them by other means"
+            f"no recording of this sensor is predicted to part {text} from {names}"
+            f" (at most {sigmas:.1f} sigma): measure one of them by other means"
         )
-    return f"record {test.words}: {this} and {names} are predicted to part by {apart:.0f} sigma"
+    return f"record {test.words}: {text} and {names} are predicted to part by {sigmas:.0f} sigma"
 
 
 def _settled(evidence: Evidence, hypothesis: Hypothesis) -> Hypothesis:
-    """Causes as they are at the end of the log, from then on constant."""
+    """Causes with their sizes at the end of the log, constant from then on."""
     last, end = int(evidence.numbers[-1]), float(evidence.seconds[-1])
     return tuple(
-        Cause(one.effect, one.at(evidence.theta, end, last) or one.values) for one in hypothesis
+        Cause(cause.effect, cause.at(evidence.theta, end, last) or cause.values)
+        for cause in hypothesis
     )
 
 
-def _apart(
-    evidence: Evidence, found: Hypothesis, rivals: Sequence[Hypothesis], test: Test
+def _separation(
+    evidence: Evidence, hypothesis: Hypothesis, rivals: Sequence[Hypothesis], test: Test
 ) -> float:
-    """By how many sigmas a test would part the causes found from the nearest of their rivals."""
+    """Sigmas by which a test would separate the causes found from their nearest rival."""
     theta = evidence.theta.copy()
     test.change(theta)
-    beside = replace(evidence, theta=theta, uncertain=(), _seen={})
-    recorded = of_log(beside, [_simulated(theta, found, test.program)])
+    base = replace(evidence, theta=theta, uncertain=(), _seen={})
+    recorded = of_log(base, [_simulated(theta, hypothesis, test.program)])
     if len(recorded.judged) < 2:
         return 0.0
-    weights = covariance(recorded, found).of(recorded.judged)
-    fitted = fit(recorded, weights, [found, *rivals])
-    return float(np.sqrt(max(min(one.chi2 for one in fitted[1:]) - fitted[0].chi2, 0.0)))
+    weights = covariance(recorded, hypothesis).of(recorded.judged)
+    fitted = fit(recorded, weights, [hypothesis, *rivals])
+    return float(np.sqrt(max(min(rival.chi2 for rival in fitted[1:]) - fitted[0].chi2, 0.0)))
 
 
 def _simulated(theta: Theta, hypothesis: Hypothesis, program: Program) -> Samples:
-    """What the PLC would record of a program, free of noise."""
+    """Simulated record of a program, without noise."""
     commands = np.concatenate(
         [np.zeros(300, np.uint8)]
         + [np.full(ms, command, np.uint8) for command, ms in program] * REPEATS

@@ -1,4 +1,4 @@
-"""The extended model: a data set with what a diagnosis found in it, kept as that of a unit."""
+"""The extended model: a data set with the findings of a diagnosis, stored for a unit."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,16 +36,16 @@ Sizes = Mapping[str, float]
 
 
 def extended(diagnosis: Diagnosis, config: Config) -> Known | None:
-    """The data set of ``config`` with what was found, and what healthy cycles are like with it.
+    """The data set of ``config`` with the findings, and its healthy cycles.
 
-    None if nothing was found that is always there. ConfigError where an effect together with what
-    the data set has of it already is beyond what the model can do.
+    None if nothing lasting was found. Raises ConfigError if an effect, together with its size in
+    the data set, is beyond its bounds.
     """
     data, terms = config.data, diagnosis.terms
-    found = dict(_always(diagnosis))
-    if not found and not terms:
+    sizes_by_effect = dict(_lasting_causes(diagnosis))
+    if not sizes_by_effect and not terms:
         return None
-    for effect, sizes in found.items():
+    for effect, sizes in sizes_by_effect.items():
         law = effect_of(effect).law
         if law and law.name in sizes:
             ejector = data.ejector.model_copy(update={law.name: sizes[law.name]})
@@ -59,7 +59,7 @@ def extended(diagnosis: Diagnosis, config: Config) -> Known | None:
 
 
 def remarks(diagnosis: Diagnosis) -> Iterator[str]:
-    """What an extended model does not have, or only as it is now; a line each."""
+    """Findings that the extended model lacks, or has only as they are now; a line each."""
     for cause, answer in zip(diagnosis.hypothesis, diagnosis.json["causes"], strict=True):
         name = spoken(cause.effect)
         if cause.course == Course.INTERMITTENT:
@@ -74,7 +74,7 @@ def remarks(diagnosis: Diagnosis) -> Iterator[str]:
 
 
 def nothing(diagnosis: Diagnosis) -> str:
-    """Why there is no extended model."""
+    """The reason why there is no extended model."""
     return {
         "consistent": "the data set there is fits already",
         "insufficient": "the log cannot answer",
@@ -83,24 +83,24 @@ def nothing(diagnosis: Diagnosis) -> str:
 
 
 def store(
-    known: Known, diagnosis: Diagnosis, config: Config, unit: str, assets: str, log: Path
+    extended_model: Known, diagnosis: Diagnosis, config: Config, unit: str, assets: str, log: Path
 ) -> tuple[Record, str]:
     """Add an extended model as the data set of ``unit``; give the record and the database's name.
 
-    It holds from when everything that was found was there.
+    It is valid from the time at which all findings were present.
     """
     record = Record(
         kind="instance",
         name=unit,
         type=config.asset.type,
-        data=known.data.model_dump(mode="json"),
-        healthy=known.healthy.model_dump(mode="json"),
+        data=extended_model.data.model_dump(mode="json"),
+        healthy=extended_model.healthy.model_dump(mode="json"),
         provenance=provenance.of_log(log)
         | {
             "cycles": diagnosis.evidence.cycles,
             "extends": f"{config.asset.id or config.asset.type}, data set {diagnosis.data_set}",
             "from": config.origin,
-            "causes": [cause.effect for cause in diagnosis.acting if _is_always(cause)],
+            "causes": [cause.effect for cause in diagnosis.acting if _is_lasting(cause)],
             "terms": len(diagnosis.terms),
         },
         valid_from_ns=provenance.valid_from(_since(diagnosis)),
@@ -113,46 +113,46 @@ def store(
 # --- sizes ----------------------------------------------------------------------------------------
 
 
-def _is_always(cause: Cause) -> bool:
+def _is_lasting(cause: Cause) -> bool:
     return cause.course != Course.INTERMITTENT
 
 
-def _always(diagnosis: Diagnosis) -> Iterator[tuple[str, Sizes]]:
-    """What was found that goes on: laws and sizes at the end, but of what nothing depends on."""
+def _lasting_causes(diagnosis: Diagnosis) -> Iterator[tuple[str, Sizes]]:
+    """Lasting causes with laws and sizes at the end, without sizes that the log does not show."""
     evidence = diagnosis.evidence
     at_end = float(evidence.seconds[-1]), int(evidence.numbers[-1])
     for cause, answer in zip(diagnosis.acting, diagnosis.told, strict=True):
         sizes = cause.at(evidence.theta, *at_end)
-        known = {name: sizes[name] for name in answer["parameters"] if _is_always(cause)}
+        known_sizes = {name: sizes[name] for name in answer["parameters"] if _is_lasting(cause)}
         mechanism = mechanism_of(cause.effect)
-        if mechanism in MECHANISMS and sizes and _is_always(cause):
-            yield mechanism, sizes  # its times are needed, known well or not
-        elif known:
-            yield cause.effect, {**cause.law(), **known}
+        if mechanism in MECHANISMS and sizes and _is_lasting(cause):
+            yield mechanism, sizes  # its times are needed even if poorly known
+        elif known_sizes:
+            yield cause.effect, {**cause.law(), **known_sizes}
 
 
-def _joined(data: DataSet, effect: str, found: Sizes) -> dict[str, float]:
-    """Sizes that alone do what those of the data set and those found do one after the other."""
+def _joined(data: DataSet, effect: str, new_sizes: Sizes) -> dict[str, float]:
+    """Sizes equivalent to those of the data set and those found, applied in turn."""
     before = data.effects.get(effect, {})
     if effect in MECHANISMS:
-        sizes = {one.name for one in MECHANISMS[effect].place.parameters}
+        sizes = {p.name for p in MECHANISMS[effect].place.parameters}
         return {
             name: float(f"{value + before.get(name, 0.0) * (name in sizes):.6g}")
-            for name, value in found.items()
+            for name, value in new_sizes.items()
         }
-    goal = apply(coefficients(data), effect, found)
-    together = dict(before)
+    goal = apply(coefficients(data), effect, new_sizes)
+    joined = dict(before)
     for parameter in effect_of(effect).parameters:
         name = parameter.name
-        if name in before and name in found:
-            together[name] = _solved(data, effect, parameter, goal)
-        elif name in found:
-            together[name] = found[name]
-    return {name: float(f"{value:.6g}") for name, value in together.items()}
+        if name in before and name in new_sizes:
+            joined[name] = _solved(data, effect, parameter, goal)
+        elif name in new_sizes:
+            joined[name] = new_sizes[name]
+    return {name: float(f"{value:.6g}") for name, value in joined.items()}
 
 
 def _solved(data: DataSet, effect: str, parameter: Parameter, goal: Floats) -> float:
-    """The value of one parameter that brings the data set's coefficients to the goal."""
+    """The value of one parameter for which the data set's coefficients reach the goal."""
 
     def at(value: float) -> Floats:
         effects = {**data.effects, effect: {**data.effects[effect], parameter.name: value}}
@@ -161,51 +161,51 @@ def _solved(data: DataSet, effect: str, parameter: Parameter, goal: Floats) -> f
     low, high = at(parameter.low), at(parameter.high)
     with np.errstate(invalid="ignore"):
         moves = np.nan_to_num(np.abs(high - low) / (np.abs(high) + np.abs(low)))  # unused: 0/0
-    which = int(np.argmax(moves))
-    if not min(low[which], high[which]) <= goal[which] <= max(low[which], high[which]):
+    index = int(np.argmax(moves))
+    if not min(low[index], high[index]) <= goal[index] <= max(low[index], high[index]):
         raise ConfigError(
             f"{effect}: what the data set has of it and what was found are together beyond"
             f" {parameter.low:g} to {parameter.high:g} {parameter.unit}",
             "repair first, or calibrate the unit anew: twin calibrate",
         )
-    scale = abs(high[which] - low[which])
-    found = brentq(lambda v: (at(v)[which] - goal[which]) / scale, parameter.low, parameter.high)
-    return float(found)
+    scale = abs(high[index] - low[index])
+    root = brentq(lambda v: (at(v)[index] - goal[index]) / scale, parameter.low, parameter.high)
+    return float(root)
 
 
 # --- what healthy cycles are like with it ---------------------------------------------------------
 
 
 def _healthy(diagnosis: Diagnosis, data: DataSet) -> Healthy:
-    """Healthy figures with what was found: levels move, and all are less sure than they were."""
-    evidence, found = diagnosis.evidence, _now(diagnosis)
+    """Healthy figures with the findings: levels shift, and all sigmas are wider."""
+    evidence, hypothesis = diagnosis.evidence, _now(diagnosis)
     doubts = list(_doubts(diagnosis))
-    wider = _wider(evidence, found, doubts)
-    known = {
-        name: _widened(usual, wider.get(name.rsplit("_", 1)[0], 0.0))
-        for name, usual in evidence.healthy.figures.items()
+    wider = _wider(evidence, hypothesis, doubts)
+    by_name = {
+        name: _widened(scatter, wider.get(name.rsplit("_", 1)[0], 0.0))
+        for name, scatter in evidence.healthy.figures.items()
     }
     before, after = evidence.seen(evidence.theta), evidence.seen(coefficients(data))
-    others = [evidence.seen(evidence.course(doubt)[0][1]) for doubt in doubts]
+    doubted = [evidence.seen(evidence.course(doubt)[0][1]) for doubt in doubts]
     for name, end in (("h1_level", "off"), ("h1_low_level", "on")):
-        if name in known:
-            usual = known.pop(name)
-            here = getattr(after, end)
-            unsure = np.nansum([(getattr(other, end) - here) ** 2 for other in others])
-            move = here - getattr(before, end)
-            if np.isfinite(move):  # else it does not switch with one of them: nobody knows
-                moved = usual.model_copy(update={"mean": usual.mean + float(move)})
-                known[name] = _widened(moved, float(unsure))
-    return evidence.healthy.model_copy(update={"figures": known})
+        if name in by_name:
+            scatter = by_name.pop(name)
+            level = getattr(after, end)
+            variance = np.nansum([(getattr(switching, end) - level) ** 2 for switching in doubted])
+            shift = level - getattr(before, end)
+            if np.isfinite(shift):  # else one of them does not switch, and the level is unknown
+                moved = scatter.model_copy(update={"mean": scatter.mean + float(shift)})
+                by_name[name] = _widened(moved, float(variance))
+    return evidence.healthy.model_copy(update={"figures": by_name})
 
 
 def _learned(diagnosis: Diagnosis, data: DataSet, healthy: Healthy) -> Healthy:
-    """Figures as they are in this log: terms that data gave say nothing of what they leave."""
+    """Figures as in this log: learned terms do not predict their residuals."""
     cycles = whole(Twin.of(data).over([diagnosis.evidence.samples]))
-    found = [figures(one, diagnosis.evidence.theta) for one in cycles if one.settled]
+    by_cycle = [figures(cycle, diagnosis.evidence.theta) for cycle in cycles if cycle.settled]
     learned = dict(healthy.figures)
     for name, usual in diagnosis.evidence.healthy.figures.items():
-        values = [one[name] for one in found if name in one]
+        values = [cycle_figures[name] for cycle_figures in by_cycle if name in cycle_figures]
         if len(values) > 1:
             sigma = math.hypot(usual.sigma, float(np.std(values, ddof=1)))
             mean = float(np.mean(values))
@@ -218,57 +218,61 @@ def _widened(usual: Scatter, variance: float) -> Scatter:
 
 
 def _now(diagnosis: Diagnosis) -> Hypothesis:
-    """What was found, as it was at the end and from now on."""
-    return tuple(Cause(effect, sizes) for effect, sizes in _always(diagnosis))
+    """The lasting causes with their sizes at the end, constant."""
+    return tuple(Cause(effect, sizes) for effect, sizes in _lasting_causes(diagnosis))
 
 
 def _doubts(diagnosis: Diagnosis) -> Iterator[Hypothesis]:
-    """The same with one size after the other a sigma away."""
+    """``_now`` with each size in turn moved by one sigma."""
     names = [mechanism_of(cause.effect) for cause in diagnosis.acting]
     parameters = [answer["parameters"] for answer in diagnosis.told]
     answers = dict(zip(names, parameters, strict=True))
     now = _now(diagnosis)
     for number, cause in enumerate(now):
         for p in effect_of(cause.effect).parameters:
-            value, known = cause.values.get(p.name, 0.0), answers[cause.effect].get(p.name)
-            if value and known:  # of a ramp they are rates
+            value, estimate = cause.values.get(p.name, 0.0), answers[cause.effect].get(p.name)
+            if value and estimate:  # of a ramp they are rates
                 sigma = abs(
-                    value * (known["high95"] - known["low95"]) / (2 * SIGMAS_95 * known["value"])
+                    value
+                    * (estimate["high95"] - estimate["low95"])
+                    / (2 * SIGMAS_95 * estimate["value"])
                 )
                 moved = value + sigma if value + sigma <= p.high else value - sigma
-                other = replace(cause, values={**cause.values, p.name: moved})
-                yield (*now[:number], other, *now[number + 1 :])
+                moved_cause = replace(cause, values={**cause.values, p.name: moved})
+                yield (*now[:number], moved_cause, *now[number + 1 :])
 
 
-def _wider(evidence: Evidence, found: Hypothesis, doubts: Sequence[Hypothesis]) -> dict[str, float]:
-    """Variance (mbar²) that the figures of each phase have beyond that of healthy cycles.
+def _wider(
+    evidence: Evidence, hypothesis: Hypothesis, doubts: Sequence[Hypothesis]
+) -> dict[str, float]:
+    """Variance (mbar²) of the figures of each phase in excess of healthy cycles.
 
-    What differs from cycle to cycle acts otherwise where a cause is there (a scatter of supply that
-    does nothing at the optimum does much below it), and sizes are known only so well.
+    Scatter has another response with a cause (that of the supply does nothing at the optimum, and
+    much below it), and sizes are uncertain.
     """
     scatter = [Cause(name, {SCATTER[name][0]: s}) for name, s in evidence.healthy.scatter.items()]
-    usual = _squares(evidence, HEALTHY, [(one,) for one in scatter])
-    here = _squares(evidence, found, [(*found, one) for one in scatter])
-    more = np.maximum(here - usual, 0.0).sum(axis=1)
-    more += _squares(evidence, found, doubts).sum(axis=1)
-    return {phase.name.lower(): float(more[phase]) for phase in Phase}
+    without_cause = _squares(evidence, HEALTHY, [(cause,) for cause in scatter])
+    with_cause = _squares(evidence, hypothesis, [(*hypothesis, cause) for cause in scatter])
+    excess = np.maximum(with_cause - without_cause, 0.0).sum(axis=1)
+    excess += _squares(evidence, hypothesis, doubts).sum(axis=1)
+    return {phase.name.lower(): float(excess[phase]) for phase in Phase}
 
 
 def _squares(evidence: Evidence, about: Hypothesis, moved: Sequence[Hypothesis]) -> Floats:
-    """By how much hypotheses differ from one, mean square in mbar², (phases, hypotheses)."""
+    """Mean square difference (mbar²) of hypotheses from one, (phases, hypotheses)."""
     squares = derivatives(evidence.off([about, *moved]))[1] ** 2
     bins = evidence.bins
     phase = np.where(bins.kind == AGAIN, Phase.SUCTION, bins.kind)
-    found = np.zeros((len(Phase), len(moved)))
-    for one in Phase:
-        there = phase == one
-        if there.any():
-            found[one] = np.average(squares[there], axis=0, weights=bins.count[there])
-    return found
+    means = np.zeros((len(Phase), len(moved)))
+    for kind in Phase:
+        in_phase = phase == kind
+        if in_phase.any():
+            means[kind] = np.average(squares[in_phase], axis=0, weights=bins.count[in_phase])
+    return means
 
 
 def _since(diagnosis: Diagnosis) -> int:
-    """When (ns) the rows were received from which on all that was found is there."""
+    """Host time (ns) of the first row at which all findings are present."""
     evidence = diagnosis.evidence
     timed = (Course.STEP, Course.RAMP)
     onsets = [cause.onset_s for cause in diagnosis.acting if cause.course in timed]

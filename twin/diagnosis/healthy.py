@@ -1,4 +1,4 @@
-"""What healthy cycles are like: how far the model is off in them, and what scatters by how much."""
+"""Learn the model's error and the scatter from healthy cycles."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,145 +14,154 @@ from twin.monitor.scatter_covariance import FIRST_ERROR, SCATTER
 from twin.signals import MS
 
 ROUNDS = 3
-FEWEST = 6  # cycles, to judge on others what was learned from some
+FEWEST = 6  # cycles, to learn from one half and judge on the other
 LEAST_COMMON, LEAST_ALONE = 0.15, 0.1  # mbar
-ODD = 3.0  # times the median of cycles' chi-square, beyond which one is odd and counts no more
-HIDDEN = 1.3  # the error over what is left of it once the data set was fitted to the same cycles
-LEAST_SCATTER, MOST_SCATTER = 0.2, 5.0  # of what is usual
+ODD = 3.0  # times the median of cycles' chi-square, at which a cycle's chi-square is clipped
+HIDDEN = 1.3  # model error before the fit, over the residual that the fit leaves of it
+LEAST_SCATTER, MOST_SCATTER = 0.2, 5.0  # bounds, over the usual size
 
 
 @dataclass(frozen=True)
-class _Healthy:
-    """How far the twin is off in healthy cycles (mbar), and what moves that, (bins, ·)."""
+class _HealthyDeviation:
+    """Deviation of the twin in healthy cycles (mbar), and its changes, (bins, ·)."""
 
     evidence: Evidence
     off: Floats
     moves: Floats  # by the usual size of each scatter
-    left_open: Floats  # by each way that the data set is uncertain
+    left_open: Floats  # by each uncertainty of the data set
 
     def by(self, healthy: Healthy) -> Covariance:
-        """What bins have in common by what was learned."""
+        """Covariance of bins with the learned error and scatter."""
         evidence = replace(self.evidence, healthy=healthy)
         _, moves, _ = moved(evidence, HEALTHY, scatter(evidence))
         return Covariance(evidence, np.zeros_like(self.off), moves, self.left_open)
 
 
 def learned(evidence: Evidence) -> Healthy:
-    """Learn the model's error and the scatter from healthy cycles; the rest stays as it is."""
+    """``evidence.healthy`` with the model's error and the scatter learned from its cycles."""
     evidence = replace(evidence, another_day=False)
-    seen = _Healthy(evidence, *moved(evidence, HEALTHY, SCATTER, evidence.uncertain))
+    deviation = _HealthyDeviation(evidence, *moved(evidence, HEALTHY, SCATTER, evidence.uncertain))
     judged = evidence.judged
     halves = [(judged[::2], judged[1::2]), (judged[1::2], judged[::2])]
     if len(judged) < FEWEST:
         halves = [(judged, judged)]
-    left = [_left(seen, _learned(seen, here), there) for here, there in halves]
-    return _learned(seen, judged).model_copy(
-        update={"leftover": usual_leftover(np.concatenate(left))}
+    chi2 = [
+        _chi2_by_cycle(deviation, _learned(deviation, learned_cycles), judged_cycles)
+        for learned_cycles, judged_cycles in halves
+    ]
+    return _learned(deviation, judged).model_copy(
+        update={"leftover": usual_leftover(np.concatenate(chi2))}
     )
 
 
-def _left(seen: _Healthy, healthy: Healthy, cycles: Sequence[int]) -> Floats:
-    """Chi-square per residual that each cycle has by what was learned from others."""
-    weights = seen.by(healthy).of(cycles)
-    white = weights.white(seen.off[:, None])[: len(weights.bins), 0]
-    return left_in_each(seen.evidence, weights, white)
+def _chi2_by_cycle(deviation: _HealthyDeviation, healthy: Healthy, cycles: Sequence[int]) -> Floats:
+    """Chi-square per residual of each cycle, with ``healthy`` learned from others."""
+    weights = deviation.by(healthy).of(cycles)
+    white = weights.white(deviation.off[:, None])[: len(weights.bins), 0]
+    return left_in_each(deviation.evidence, weights, white)
 
 
 def left_in_each(evidence: Evidence, weights: Weights, white: Floats) -> Floats:
-    """Chi-square per residual in each cycle of ``weights``, from ``white`` ones.
+    """Chi-square per residual in each cycle of ``weights``, from whitened residuals.
 
-    They are of bins, or of bins and then levels.
+    ``white`` has bins, or bins and then levels.
     """
     cycle = np.concatenate([evidence.bins.cycle[weights.bins], weights.level_cycles])
     cycle, squares = cycle[: len(white)], white**2
-    return np.array([np.mean(squares[cycle == one]) for one in weights.cycles if one in cycle])
+    return np.array(
+        [np.mean(squares[cycle == number]) for number in weights.cycles if number in cycle]
+    )
 
 
-def usual_leftover(left: Floats) -> float:
-    """Sigmas that cycles have by what was learned from others; one odd cycle is not all of them.
+def usual_leftover(chi2: Floats) -> float:
+    """Rms of whitened residuals of cycles, from chi-square in each; odd cycles are clipped.
 
-    What is learned in the end has seen that one as well.
+    The final healthy data include the odd cycles as well.
     """
-    return float(np.sqrt(np.mean(np.minimum(left, ODD * np.median(left)))))
+    return float(np.sqrt(np.mean(np.minimum(chi2, ODD * np.median(chi2)))))
 
 
-def are_odd(left: Floats) -> Bools:
-    """Which cycles are off by far more than most, from chi-square in each."""
-    return left > ODD * np.median(left)
+def are_odd(chi2: Floats) -> Bools:
+    """Odd cycles: those whose chi-square is far above the median."""
+    return chi2 > ODD * np.median(chi2)
 
 
-def _learned(seen: _Healthy, cycles: Sequence[int]) -> Healthy:
-    """What some cycles say."""
-    evidence = seen.evidence
-    found = evidence.healthy.model_copy(
+def _learned(deviation: _HealthyDeviation, cycles: Sequence[int]) -> Healthy:
+    """Error and scatter learned from some cycles."""
+    evidence = deviation.evidence
+    healthy = evidence.healthy.model_copy(
         update={"error": dict.fromkeys(KINDS, FIRST_ERROR), "scatter": {}, "leftover": 1.0}
     )
     for _ in range(ROUNDS):
-        amplitudes, spread = _amplitudes(seen, found, cycles)
-        left = seen.off - np.einsum("bs,bs->b", seen.moves, amplitudes[evidence.bins.cycle])
+        amplitudes, spread = _amplitudes(deviation, healthy, cycles)
+        residual = deviation.off - np.einsum(
+            "bs,bs->b", deviation.moves, amplitudes[evidence.bins.cycle]
+        )
         sizes = np.sqrt(amplitudes[cycles].var(axis=0, ddof=1) + spread[cycles].mean(axis=0))
         sizes = np.clip(sizes[: len(SCATTER)], LEAST_SCATTER, MOST_SCATTER)
-        found = found.model_copy(
+        healthy = healthy.model_copy(
             update={
-                "error": _errors(evidence, left, cycles),
+                "error": _errors(evidence, residual, cycles),
                 "scatter": {
-                    name: float(size * times)
-                    for (name, (_, size)), times in zip(SCATTER.items(), sizes, strict=True)
+                    name: float(size * factor)
+                    for (name, (_, size)), factor in zip(SCATTER.items(), sizes, strict=True)
                 },
             }
         )
-    return found
+    return healthy
 
 
-def _amplitudes(seen: _Healthy, healthy: Healthy, cycles: Sequence[int]) -> tuple[Floats, Floats]:
-    """What scattered in each cycle, in its usual sizes, and with what variance that is known."""
-    evidence, moves = replace(seen.evidence, healthy=healthy), seen.moves
+def _amplitudes(
+    deviation: _HealthyDeviation, healthy: Healthy, cycles: Sequence[int]
+) -> tuple[Floats, Floats]:
+    """Amplitude of each scatter in each cycle, in its usual size, and its variance."""
+    evidence, moves = replace(deviation.evidence, healthy=healthy), deviation.moves
     size = (evidence.cycles, moves.shape[1])
-    found, spread = np.zeros(size), np.zeros(size)
-    known = Covariance(evidence, np.zeros_like(seen.off), moves, seen.left_open)
+    amplitudes, spread = np.zeros(size), np.zeros(size)
+    model = Covariance(evidence, np.zeros_like(deviation.off), moves, deviation.left_open)
     known_sizes = [healthy.scatter.get(name, size) / size for name, (_, size) in SCATTER.items()]
     prior = np.ones(moves.shape[1])
     prior[: len(known_sizes)] = known_sizes
     for cycle in cycles:
-        alone = known.of([cycle], scattered=False)
-        both = alone.white(np.column_stack([seen.off, moves]))
-        information = both[:, 1:].T @ both[:, 1:] + np.diag(prior**-2.0)
+        weights = model.of([cycle], scattered=False)
+        white = weights.white(np.column_stack([deviation.off, moves]))
+        information = white[:, 1:].T @ white[:, 1:] + np.diag(prior**-2.0)
         variance = np.linalg.inv(information)
-        found[cycle] = variance @ both[:, 1:].T @ both[:, 0]
+        amplitudes[cycle] = variance @ white[:, 1:].T @ white[:, 0]
         spread[cycle] = np.diag(variance)
-    return found, spread
+    return amplitudes, spread
 
 
-def _errors(evidence: Evidence, left: Floats, cycles: Sequence[int]) -> dict[str, ModelError]:
-    """How far the model is off in some cycles, by kind of stretch and time since it began."""
-    found, bins = {}, evidence.bins
+def _errors(evidence: Evidence, residual: Floats, cycles: Sequence[int]) -> dict[str, ModelError]:
+    """The model's error in some cycles, by kind of stretch and time since it began."""
+    errors, bins = {}, evidence.bins
     for kind, name in enumerate(KINDS):
-        here = np.flatnonzero((bins.kind == kind) & np.isin(bins.cycle, cycles))
-        if len(here):
-            found[name] = _error(evidence, left, here)
-    return found
+        rows = np.flatnonzero((bins.kind == kind) & np.isin(bins.cycle, cycles))
+        if len(rows):
+            errors[name] = _error(evidence, residual, rows)
+    return errors
 
 
-def _error(evidence: Evidence, left: Floats, here: Ints) -> ModelError:
-    unit = np.floor(evidence.bins.time[here]).astype(np.int64)
-    noise = evidence.noise**2 / evidence.bins.count[here]
+def _error(evidence: Evidence, residual: Floats, rows: Ints) -> ModelError:
+    unit = np.floor(evidence.bins.time[rows]).astype(np.int64)
+    noise = evidence.noise**2 / evidence.bins.count[rows]
     after, common, alone = [], [], []
-    for one in np.unique(unit):
-        at = here[unit == one]
-        apart = _apart(evidence, left, at)
-        after.append(float(unwarped(np.array(one + 0.5)) / MS))
-        noisy = float(np.mean(noise[unit == one]))
-        common.append(float(np.sqrt(max(HIDDEN**2 * (apart[0] - apart[1]), LEAST_COMMON**2))))
-        alone.append(float(np.sqrt(max(apart[2] - noisy, LEAST_ALONE**2))))
+    for step in np.unique(unit):
+        step_rows = rows[unit == step]
+        parts = _variance_parts(evidence, residual, step_rows)
+        after.append(float(unwarped(np.array(step + 0.5)) / MS))
+        noise_variance = float(np.mean(noise[unit == step]))
+        common.append(float(np.sqrt(max(HIDDEN**2 * (parts[0] - parts[1]), LEAST_COMMON**2))))
+        alone.append(float(np.sqrt(max(parts[2] - noise_variance, LEAST_ALONE**2))))
     return ModelError(after_ms=tuple(after), common_mbar=tuple(common), alone_mbar=tuple(alone))
 
 
-def _apart(evidence: Evidence, left: Floats, at: Ints) -> tuple[float, float, float]:
-    """Mean square of bins' means over cycles, what of it is chance, and the variance about them."""
-    place = evidence.bins.place[at]
+def _variance_parts(evidence: Evidence, residual: Floats, rows: Ints) -> tuple[float, float, float]:
+    """Mean square of bins' means over cycles, the part due to chance, and the variance within."""
+    place = evidence.bins.place[rows]
     squares, chance, within = [], [], []
-    for one in np.unique(place):
-        values = left[at[place == one]]
+    for cell in np.unique(place):
+        values = residual[rows[place == cell]]
         variance = float(np.var(values, ddof=1)) if len(values) > 1 else 0.0
         squares.append(float(np.mean(values)) ** 2)
         chance.append(variance / len(values))

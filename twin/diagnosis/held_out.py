@@ -1,4 +1,4 @@
-"""How far measurement and a model part on cycles that no size was fitted to."""
+"""Deviation of a model on held-out cycles, to which no size was fitted."""
 
 import math
 from collections.abc import Sequence
@@ -16,21 +16,21 @@ from twin.monitor.bins import Floats, Ints
 from twin.monitor.cycles import PAPER_VACUUM, time_to_vacuum
 from twin.signals import MBAR, MS
 
-FEWEST = 5  # held-out cycles, to tell from how they differ how sure a gain is
-LITTLE = 1.25  # times the usual deviation: cycles differ by as much
+FEWEST = 5  # held-out cycles, for an interval of the gain
+LITTLE = 1.25  # times the usual deviation: the scatter of cycles
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A hypothesis beside the held-out cycles."""
+    """A hypothesis, judged on held-out cycles."""
 
     expected: Floats  # Pa, of each row of the log
     off: Floats  # mbar, of each bin
     squares: Floats  # mean square deviation of each held-out cycle, mbar²
     leftover: float  # sigmas
-    steady: float  # sigmas, where one odd cycle counts little
+    steady: float  # sigmas, robust against one odd cycle
     usual: float  # mbar rms, of healthy cycles like these
-    unmeasured: float  # mbar rms, that may be left of what no healthy cycle can have shown
+    unmeasured: float  # mbar rms, uncertainty that no healthy cycle can have shown
     figures: dict[str, float | None]
 
     @property
@@ -40,14 +40,14 @@ class Judged:
 
 
 def judge(evidence: Evidence, weights: Weights, hypothesis: Hypothesis) -> Judged:
-    """Deviation, evacuation times and what is left in sigmas on the cycles of ``weights``."""
+    """Deviation, errors of evacuation times and whitened rms on the cycles of ``weights``."""
     expected = evidence.expected(hypothesis)
     off = evidence.bins.mean(evidence.samples["pressure"] - expected) / MBAR
     level = levels(evidence, weights.cycles, [hypothesis])
     white = weights.white(off[:, None], level)
     rows = [_rows(evidence, cycle) for cycle in weights.cycles]
-    deviations = [(evidence.samples["pressure"][one] - expected[one]) / MBAR for one in rows]
-    squares = np.array([float(np.mean(one**2)) for one in deviations])
+    deviations = [(evidence.samples["pressure"][part] - expected[part]) / MBAR for part in rows]
+    squares = np.array([float(np.mean(deviation**2)) for deviation in deviations])
     binned = off[np.isin(evidence.bins.cycle, weights.cycles)]
     leftover = float(np.sqrt(np.mean(white**2)))
     h2 = float(evidence.theta[c.H2])
@@ -67,15 +67,15 @@ def judge(evidence: Evidence, weights: Weights, hypothesis: Hypothesis) -> Judge
         usual_leftover(left_in_each(evidence, weights, white[:, 0])),
         weights.usual,
         weights.unmeasured,
-        {name: None if one is None else rounded(one) for name, one in figures.items()},
+        {name: None if value is None else rounded(value) for name, value in figures.items()},
     )
 
 
 def gain(before: Judged, after: Judged) -> dict[str, float | None]:
-    """Reduction of the rms deviation (%), its 95 % interval, its share of what could be reached.
+    """Reduction of the rms deviation (%), its 95 % interval, its share of the achievable one.
 
-    Healthy cycles are not without deviation either. The interval is None where held-out cycles are
-    too few to tell, or do not differ.
+    Healthy cycles have a deviation as well. The interval is None if held-out cycles are too few,
+    or do not differ.
     """
     low, high = _interval(before.squares, after.squares)
     return {
@@ -89,14 +89,14 @@ def gain(before: Judged, after: Judged) -> dict[str, float | None]:
 def _interval(before: Floats, after: Floats) -> tuple[float | None, float | None]:
     """95 % interval (%) of the reduction, from mean squares by cycle; rounded outward.
 
-    That of a ratio of means, linearised in its logarithm, by Student's t: few cycles show their
-    spread only roughly, and resampling them would not tell.
+    It is that of a ratio of means, linearised in its logarithm, by Student's t. A few cycles show
+    their spread only roughly, which resampling would ignore.
     """
     cycles = len(before)
     if cycles < FEWEST:
         return None, None
-    each = after / after.mean() - before / before.mean()
-    sigma = float(np.std(each, ddof=1)) / math.sqrt(cycles)
+    changes = after / after.mean() - before / before.mean()
+    sigma = float(np.std(changes, ddof=1)) / math.sqrt(cycles)
     if sigma == 0.0:
         return None, None
     reach = float(student.ppf(UPPER_95, cycles - 1)) * sigma / 2.0  # of the rms, not its square
@@ -106,7 +106,7 @@ def _interval(before: Floats, after: Floats) -> tuple[float | None, float | None
 
 
 def _share(before: float, after: float, usual: float) -> float:
-    """Share of the achievable reduction; all of it where hardly anything could be reduced."""
+    """Share of the achievable reduction; 1 if hardly anything could be reduced."""
     if before < LITTLE * usual:
         return float(after < LITTLE * usual)
     return min((before - after) / (before - usual), 1.0)
@@ -120,19 +120,21 @@ def _rows(evidence: Evidence, cycle: int) -> Ints:
 def _time_error(
     evidence: Evidence, expected: Floats, cycles: Sequence[int], vacuum: float
 ) -> float | None:
-    """Mean error of the evacuation time to ``vacuum`` (Pa), %; None where it is not reached."""
+    """Mean error of the evacuation time to ``vacuum`` (Pa), %; None if it is not reached."""
     ambient = float(evidence.theta[c.AMBIENT])
     errors = []
     for cycle in cycles:
         rows = _rows(evidence, cycle)
         times = evidence.samples["time_ns"][rows]
         measured = evidence.samples["pressure"][rows].astype(np.float64)
-        found = [time_to_vacuum(vacuum, p, times, ambient) for p in (measured, expected[rows])]
-        if found[0] > MS and math.isfinite(found[1]):
-            errors.append(100.0 * abs(found[1] / found[0] - 1.0))
+        times_to_vacuum = [
+            time_to_vacuum(vacuum, p, times, ambient) for p in (measured, expected[rows])
+        ]
+        if times_to_vacuum[0] > MS and math.isfinite(times_to_vacuum[1]):
+            errors.append(100.0 * abs(times_to_vacuum[1] / times_to_vacuum[0] - 1.0))
     return float(np.mean(errors)) if errors else None
 
 
 def rounded(value: float) -> float:
-    """Four significant digits: more would be a claim."""
+    """Round to four significant digits: more would suggest a precision that is not there."""
     return float(f"{value:.4g}")

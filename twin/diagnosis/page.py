@@ -1,6 +1,6 @@
 """Parts of the report's page: one HTML file that needs no network, with its style inside.
 
-Everything that comes in as text is escaped; pictures come in as SVG.
+All text is escaped; pictures are SVG.
 """
 
 import html
@@ -77,19 +77,19 @@ def section(title: str, body: str) -> str:
 
 
 def picture(title: str, svg: str, caption: str) -> str:
-    """A picture under a heading that says what to conclude."""
+    """A picture under a heading that states the conclusion."""
     caption = f"<figcaption>{html.escape(caption)}</figcaption>"
     return section(title, f"<figure>{svg}{caption}</figure>")
 
 
 def card(title: str, sentence: str, rows: Iterable[tuple[str, str]]) -> str:
-    """One thing found, with what is known of it."""
+    """One finding, with its details."""
     top = f"<h3>{html.escape(title)}</h3>\n<p>{html.escape(sentence)}</p>"
     return f"<article>{top}\n{pairs(rows)}</article>"
 
 
 def box(title: str, text: str) -> str:
-    """Something to do."""
+    """A box with an action."""
     return f"<aside><h3>{html.escape(title)}</h3><p>{html.escape(text)}</p></aside>"
 
 
@@ -99,15 +99,18 @@ def paragraph(text: str) -> str:
 
 
 def pairs(rows: Iterable[tuple[str, str]]) -> str:
-    """What and which, side by side."""
-    said = (f"<dt>{html.escape(what)}</dt><dd>{html.escape(which)}</dd>" for what, which in rows)
-    return f"<dl>{''.join(said)}</dl>"
+    """A list of terms and descriptions."""
+    items = (
+        f"<dt>{html.escape(term)}</dt><dd>{html.escape(description)}</dd>"
+        for term, description in rows
+    )
+    return f"<dl>{''.join(items)}</dl>"
 
 
 def table(
     caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Iterable[int] = ()
 ) -> str:
-    """Return a table; the columns ``numbers`` are set to the right."""
+    """Return a table; the columns ``numbers`` are right-aligned."""
     right = set(numbers)
     style = [' class="number"' if i in right else "" for i in range(len(head))]
     top = "".join(
@@ -122,5 +125,5 @@ def table(
 
 def _row(cells: Sequence[str], style: Sequence[str]) -> str:
     first, *rest = map(html.escape, cells)
-    others = "".join(f"<td{s}>{one}</td>" for one, s in zip(rest, style[1:], strict=True))
-    return f'<th scope="row">{first}</th>{others}'
+    data_cells = "".join(f"<td{s}>{cell}</td>" for cell, s in zip(rest, style[1:], strict=True))
+    return f'<th scope="row">{first}</th>{data_cells}'

@@ -1,4 +1,4 @@
-"""What the report draws from, and its pictures of one cycle and of the ranking."""
+"""Data of the report, and its pictures of one cycle and of the ranking."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ from twin.model.term import Term
 from twin.monitor.bins import Floats, Ints
 from twin.signals import MBAR, MS, NS, Phase
 
-POINTS = 1000  # of a line; more cannot be seen
+POINTS = 1000  # of a line; more do not show
 MOST_RANKED = 12
 WIDE, NARROW = (1.0, 2.0, 3.0, 5.0), (1.0, 1.1, 1.2, 1.3, 1.5, 2.0, 2.5, 3.0, 5.0, 7.0)  # labels
 LABELLED = 0.06  # of a picture's width: a narrower phase has no room for its name
@@ -44,15 +44,15 @@ SHADES = {
 
 @dataclass(frozen=True)
 class Found:
-    """A diagnosis that came to an answer: what all the pictures draw from.
+    """A diagnosis with an answer: the data of all pictures.
 
-    Cycles are positions in the evidence; people are told their ``numbers`` in the log.
+    Cycles are positions in the evidence; people see their ``numbers`` in the log.
     """
 
     evidence: Evidence
     search: Search
-    causes: Hypothesis  # and the mechanism beside them, where there is one
-    terms: Sequence[Term]  # that data gave for what no listed effect explains
+    causes: Hypothesis  # and the mechanism, if there is one
+    terms: Sequence[Term]  # fitted to what no listed effect explains
     before: Judged
     after: Judged
     held_out: Sequence[int]
@@ -78,7 +78,7 @@ class Found:
 
     @property
     def extended(self) -> bool:
-        """Whether the extended model is another than the twin as it stands."""
+        """Whether the extended model differs from the twin as it stands."""
         return bool(self.causes or self.terms)
 
     @property
@@ -88,7 +88,7 @@ class Found:
 
     @property
     def name(self) -> str:
-        """What the extended model has, short."""
+        """Short text of what the extended model adds."""
         names = [spoken(cause.effect) for cause in self.listed]
         if len(names) > 1:
             names = ["all causes"]
@@ -101,30 +101,30 @@ class Found:
 
 
 def spread(cycles: Sequence[int], most: int) -> Ints:
-    """As many cycles as can be shown, evenly spread."""
+    """At most ``most`` of the cycles, evenly spread."""
     return np.array(cycles)[np.unique(np.linspace(0, len(cycles) - 1, most).astype(np.int64))]
 
 
-def worst_cycle(found: Found) -> int:
-    """The held-out cycle in which the twin as it stands is furthest off."""
-    return found.held_out[int(np.argmax(found.before.squares))]
+def worst_cycle(diagnosed: Found) -> int:
+    """The held-out cycle with the largest deviation of the twin as it stands."""
+    return diagnosed.held_out[int(np.argmax(diagnosed.before.squares))]
 
 
-def draw_cycle(found: Found, cycle: int, alt: str) -> str:
-    """Draw vacuum measured and expected over one cycle, and the deviation below."""
-    evidence = found.evidence
+def draw_cycle(diagnosed: Found, cycle: int, alt: str) -> str:
+    """Draw measured and expected vacuum over one cycle, and the deviation below."""
+    evidence = diagnosed.evidence
     first, last = evidence.starts[cycle], evidence.starts[cycle + 1]
     rows = np.unique(np.linspace(first, last - 1, POINTS).astype(np.int64))
     times = evidence.samples["time_ns"]
     ms = (times[rows] - times[first]) * (NS / MS)
-    known = evidence.bins.number[rows] >= 0
-    measured = np.where(known, evidence.samples["pressure"][rows], np.nan)
+    comparable = evidence.bins.number[rows] >= 0
+    measured = np.where(comparable, evidence.samples["pressure"][rows], np.nan)
     with empty("cycle", 5.2) as figure:
         above, below = figure.subplots(2, sharex=True, height_ratios=(2, 1))
         _shade(above, below, ms, evidence.ticks["phase"][rows])
         ambient = float(evidence.theta[c.AMBIENT])
         above.plot(ms, (ambient - measured) / MBAR, color=MEASURED, lw=2.2, label="measured")
-        for judged, colour, style, label in _models(found):
+        for judged, colour, style, label in _models(diagnosed):
             expected = judged.expected[rows]
             above.plot(ms, (ambient - expected) / MBAR, style, color=colour, lw=1.4, label=label)
             below.plot(ms, (measured - expected) / MBAR, style, color=colour, lw=1.4)
@@ -136,15 +136,15 @@ def draw_cycle(found: Found, cycle: int, alt: str) -> str:
         return as_svg(figure, alt)
 
 
-def _models(found: Found) -> list[tuple[Judged, str, str, str]]:
-    before = (found.before, BEFORE, "--", "expected: twin as it stands")
-    if not found.extended:
+def _models(diagnosed: Found) -> list[tuple[Judged, str, str, str]]:
+    before = (diagnosed.before, BEFORE, "--", "expected: twin as it stands")
+    if not diagnosed.extended:
         return [before]
-    return [before, (found.after, AFTER, "-", f"expected with {found.name}")]
+    return [before, (diagnosed.after, AFTER, "-", f"expected with {diagnosed.name}")]
 
 
 def _shade(above: Axes, below: Axes, ms: Floats, phase: npt.NDArray[np.uint8]) -> None:
-    """Tint the phases, and name those that have room for it."""
+    """Shade the phases, and label those that are wide enough."""
     edges = [0, *(np.flatnonzero(np.diff(phase)) + 1), len(phase) - 1]
     for first, last in pairwise(edges):
         name = Phase(phase[first])
@@ -152,23 +152,23 @@ def _shade(above: Axes, below: Axes, ms: Floats, phase: npt.NDArray[np.uint8]) -
             axes.axvspan(ms[first], ms[last], color=SHADES[name], lw=0, zorder=0)
         if ms[last] - ms[first] > LABELLED * ms[-1]:
             middle = (ms[first] + ms[last]) / 2.0
-            where = above.get_xaxis_transform()
-            above.text(middle, 1.02, spoken(name.name.lower()), transform=where, ha="center")
+            transform = above.get_xaxis_transform()
+            above.text(middle, 1.02, spoken(name.name.lower()), transform=transform, ha="center")
     above.set_xlim(0.0, ms[-1])
 
 
-def draw_ranking(found: Found, alt: str) -> str:
-    """Draw what each fitted hypothesis leaves on the fitted cycles, the best on top."""
-    rows = _ranked(found)
+def draw_ranking(diagnosed: Found, alt: str) -> str:
+    """Draw the residual of each fitted hypothesis on the fitted cycles, the best on top."""
+    rows = _ranked(diagnosed)
     names, leftovers, colours = zip(*reversed(rows), strict=True)
     with empty("ranking", 1.0 + 0.27 * len(rows)) as figure:
         axes = figure.subplots()
-        at = np.arange(len(rows))
-        axes.hlines(at, 1.0, leftovers, color=PALE, lw=1.0)
-        axes.scatter(leftovers, at, c=colours, s=60, edgecolors="#444444", zorder=3)
-        for x, y in zip(leftovers, at, strict=True):
+        positions = np.arange(len(rows))
+        axes.hlines(positions, 1.0, leftovers, color=PALE, lw=1.0)
+        axes.scatter(leftovers, positions, c=colours, s=60, edgecolors="#444444", zorder=3)
+        for x, y in zip(leftovers, positions, strict=True):
             axes.annotate(f"{x:.2f}", (x, y), (8, 0), textcoords="offset points", va="center")
-        axes.set_yticks(at, names)
+        axes.set_yticks(positions, names)
         logarithmic(axes, WIDE if max(leftovers) > 3.0 * min(1.0, *leftovers) else NARROW)
         axes.axvline(1.0, color=MEASURED, lw=1.2, ls="--")
         axes.text(1.0, 1.01, "healthy", transform=axes.get_xaxis_transform(), ha="center")
@@ -177,24 +177,24 @@ def draw_ranking(found: Found, alt: str) -> str:
         return as_svg(figure, alt)
 
 
-def _ranked(found: Found) -> list[tuple[str, float, str]]:
-    """Name, leftover and colour of what was found, its rivals, other causes and none at all."""
-    best, search = found.search.found, found.search
-    rivals = [one for some in search.rivals for one in some]
-    known = {_key(one) for one in rivals}
+def _ranked(diagnosed: Found) -> list[tuple[str, float, str]]:
+    """Name, leftover and colour of what was found, its rivals, other causes, and no cause."""
+    best, search = diagnosed.search.found, diagnosed.search
+    rivals = [fitted for fits in search.rivals for fitted in fits]
+    shown = {_key(fitted) for fitted in rivals}
     rows = [] if best is None else [(f"▶ {_named(best)}", best.leftover, AFTER)]
-    rows += [(f"≈ {_named(one)} (look-alike)", one.leftover, "#9cc4e4") for one in rivals]
-    known |= {_key(best)} if best else set()
-    others = [one for one in search.ranking if _key(one) not in known]
-    rows += [(_named(one), one.leftover, PALE) for one in others[:MOST_RANKED]]
+    rows += [(f"≈ {_named(fitted)} (look-alike)", fitted.leftover, "#9cc4e4") for fitted in rivals]
+    shown |= {_key(best)} if best else set()
+    rest = [fitted for fitted in search.ranking if _key(fitted) not in shown]
+    rows += [(_named(fitted), fitted.leftover, PALE) for fitted in rest[:MOST_RANKED]]
     count = search.ranking[0].count
     none = float(np.sqrt(search.healthy / count))
     return [*rows, ("no cause: the twin as it stands", none, "#ffffff")]
 
 
-def _key(one: Fitted) -> tuple[str, ...]:
-    return tuple(sorted(one.effects))
+def _key(fitted: Fitted) -> tuple[str, ...]:
+    return tuple(sorted(fitted.effects))
 
 
-def _named(one: Fitted) -> str:
-    return " + ".join(spoken(effect) for effect in one.effects)
+def _named(fitted: Fitted) -> str:
+    return " + ".join(spoken(effect) for effect in fitted.effects)

@@ -1,8 +1,7 @@
-"""The diagnosis beside the live loop: of the last cycles, once an alarm is raised.
+"""Diagnosis of the last cycles beside the live loop, once an alarm is raised.
 
-It runs in a process of its own at low priority (``__main__.py``), so that the loop never waits for
-it. Its answer comes back as an event. One at a time, and only when there are enough cycles to
-answer.
+It runs in its own process at low priority (``__main__.py``), so that the loop never waits for it.
+Its answer comes back as an event. Only one runs at a time, and only with enough cycles.
 """
 
 import json
@@ -30,29 +29,30 @@ from twin.instants import SECOND_NS
 from twin.model.effects import effect_of
 from twin.signals import NEW_TIME, SAMPLE, Samples
 
-CYCLES = 13  # that are kept: all but the first are judged, in which the model swings in
-MOST_ROWS = 300_000  # that are kept, however long cycles are
-FEWEST = 7  # cycles before the first try
-DEVIATING = 3  # of them since the alarm was raised, its own one included
-PATIENCE_S = 300.0  # with one answer
+CYCLES = 13  # kept cycles: all are judged but the first, in which the model settles
+MOST_ROWS = 300_000  # kept rows, however long cycles are
+FEWEST = 7  # cycles before the first attempt
+DEVIATING = 3  # of them since the alarm was raised, its own cycle included
+PATIENCE_S = 300.0  # longest time for one answer
 POLL_S = 0.05
-NICE = 10  # beyond the loop's own
+NICE = 10  # added to the loop's niceness
 COMMAND = (sys.executable, "-m", "twin.diagnosis")
 
 REPORT = ".html"
 
-# Rows, whose log, where to draw the answer, and how much of the log there is before the rows (s).
+# Configuration, rows, name of the log, path of the report, and duration of the log before the
+# rows (s).
 Question = tuple[Config, Samples, str, Path | None, float]
 Clock = Callable[[], float]
 Status = Callable[[], AbstractContextManager[Callable[[str], None]]]
 
 
 class LiveDiagnosis:
-    """Follows the live loop, and has each alarm diagnosed (``twin.live.EventEnricher``).
+    """Follows the live loop, and diagnoses each alarm (``twin.live.EventEnricher``).
 
-    Alarms of a unit that is not commissioned are not: their causes are not named.
-    ``status`` gives a function that says what is waited for at the end, until ``stopped`` says that
-    nobody wants to wait. ``reports`` is a folder that keeps the page of each answer.
+    Alarms of a unit that is not commissioned are not diagnosed: their causes are not named.
+    ``status`` gives a function that shows the wait at the end; ``stopped`` ends that wait.
+    ``reports`` is a folder for the report of each answer.
     """
 
     def __init__(
@@ -68,50 +68,50 @@ class LiveDiagnosis:
         self._stopped, self._status, self._clock = stopped, status, clock
         self._recent = Recent()
         self._now_ns = 0  # of the last row, PLC time
-        self._first_ns: int | None = None  # when the first row of all was received
-        self._begin_ns = 0  # PLC time at which the log began, as the PLC counts now
+        self._first_ns: int | None = None  # host time of the first row
+        self._begin_ns = 0  # begin of the log in present PLC time
         self._alarm: Event | None = None  # that waits for its diagnosis
         self._since = 0  # cycles since it was raised, its own one included
-        self._wanted = DEVIATING  # of these, before the next try
+        self._wanted = DEVIATING  # of these, before the next attempt
         self._asked: Asked | None = None
 
     def follow(self, samples: Samples, events: Sequence[Event]) -> list[Event]:
-        """Take rows and what happened; give the answer that has come by now."""
+        """Take rows and events; give the answer if it has arrived."""
         self._recent.add(samples, sum(_is_whole_cycle(event) for event in events))
         if len(samples):
-            self._count(samples)
+            self._track_time(samples)
         for event in events:
-            self._note(event)
+            self._track(event)
         if self._asked is not None:
-            return self._heard(self._asked)
+            return self._collect(self._asked)
         if self._alarm and self._since >= self._wanted and self._recent.cycles >= FEWEST:
             return self._ask(self._alarm)
         return []
 
     def finish(self) -> list[Event]:
-        """Wait for the answer under way; an alarm that still waits is diagnosed with what is there.
+        """Wait for the running diagnosis; an alarm that still waits is diagnosed first.
 
-        An interrupt, and ``PATIENCE_S``, end the waiting.
+        An interrupt ends the wait, and so does ``PATIENCE_S``.
         """
-        told: list[Event] = []
+        events: list[Event] = []
         if self._asked is None and self._alarm and self._since and not self._stopped():
-            told = self._ask(self._alarm)
+            events = self._ask(self._alarm)
         if self._asked is None:
-            return told
+            return events
         with self._status() as say:
             say(f"diagnosing the last {self._asked.cycles} cycles (Ctrl-C leaves it)")
-            while not (heard := self._heard(self._asked)) and not self._stopped():
+            while not (answer := self._collect(self._asked)) and not self._stopped():
                 self._asked.wait(POLL_S)
-        return told + (heard or [self._failed(self._asked.alarm, "the run was interrupted")])
+        return events + (answer or [self._failed(self._asked.alarm, "the run was interrupted")])
 
     def close(self) -> None:
-        """End what is under way."""
+        """End the running diagnosis."""
         if self._asked is not None:
             self._asked.close()
             self._asked = None
 
-    def _count(self, samples: Samples) -> None:
-        """Know when the log began in PLC time, also after that was set or began anew."""
+    def _track_time(self, samples: Samples) -> None:
+        """Track the begin of the log in PLC time, also when that is set or restarts."""
         self._now_ns = int(samples["time_ns"][-1])
         if self._first_ns is None:
             self._first_ns, self._begin_ns = (
@@ -121,7 +121,7 @@ class LiveDiagnosis:
             since_ns = int(samples["host_ns"][row]) - self._first_ns
             self._begin_ns = int(samples["time_ns"][row]) - since_ns
 
-    def _note(self, event: Event) -> None:
+    def _track(self, event: Event) -> None:
         if _is_whole_cycle(event):
             self._since += 1
         elif event.kind is Kind.DEVIATION and self._config.monitor.healthy.is_known:
@@ -137,42 +137,42 @@ class LiveDiagnosis:
         cycles, deadline = min(self._recent.cycles, CYCLES), self._clock() + PATIENCE_S
         try:
             self._asked = Asked(question, alarm, cycles, deadline)
-        except Exception as error:  # no processes or memory left: no reason to end the loop
+        except Exception as error:  # such as no processes or memory left: the loop must go on
             self._alarm = None
-            why = getattr(error, "strerror", None) or in_words(error)
-            return [self._failed(alarm, f"it could not be started: {why}")]
+            reason = getattr(error, "strerror", None) or in_words(error)
+            return [self._failed(alarm, f"it could not be started: {reason}")]
         return []
 
-    def _heard(self, asked: "Asked") -> list[Event]:
-        """What came back, maybe nothing yet."""
-        late = self._clock() > asked.deadline
-        if not late and not asked.ended():
+    def _collect(self, running: "Asked") -> list[Event]:
+        """The event of a diagnosis that has ended or timed out; else nothing."""
+        is_late = self._clock() > running.deadline
+        if not is_late and not running.ended():
             return []
-        answer = "it took too long" if late else asked.answer()
+        answer = "it took too long" if is_late else running.answer()
         self.close()
         if isinstance(answer, str):
-            self._settle(asked.alarm)
-            return [self._failed(asked.alarm, answer)]
-        if answer["verdict"] == "insufficient":  # asked again later
+            self._settle(running.alarm)
+            return [self._failed(running.alarm, answer)]
+        if answer["verdict"] == "insufficient":  # try again later
             self._since, self._wanted = 0, 2 * self._wanted
         else:
-            self._settle(asked.alarm)
-        data = {"alarm_ns": asked.alarm.time_ns, "begin_ns": self._begin_ns, "answer": answer}
-        data |= {"report": asked.report.stem} if asked.report else {}
+            self._settle(running.alarm)
+        data = {"alarm_ns": running.alarm.time_ns, "begin_ns": self._begin_ns, "answer": answer}
+        data |= {"report": running.report.stem} if running.report else {}
         return [Event(self._now_ns, Kind.DIAGNOSIS, in_a_line(answer), data)]
 
     def _settle(self, alarm: Event) -> None:
-        """The alarm waits no longer; another one may have been raised since."""
+        """Forget the alarm, unless another one was raised since."""
         if self._alarm is alarm:
             self._alarm = None
 
-    def _failed(self, alarm: Event, why: str) -> Event:
-        text = f"no diagnosis: {why}; twin diagnose LOG does it afterwards"
+    def _failed(self, alarm: Event, reason: str) -> Event:
+        text = f"no diagnosis: {reason}; twin diagnose LOG does it afterwards"
         return Event(self._now_ns, Kind.DIAGNOSIS, text, {"alarm_ns": alarm.time_ns})
 
 
 def _is_whole_cycle(event: Event) -> bool:
-    """Whether a cycle has ended that was not cut off."""
+    """Whether the event is that of a complete cycle."""
     return event.kind is Kind.CYCLE and bool(event.data.get("complete", True))
 
 
@@ -180,12 +180,12 @@ def _is_whole_cycle(event: Event) -> bool:
 class Recent:
     """The rows of the last cycles."""
 
-    cycles: int = 0  # that have ended since the beginning
-    _blocks: deque[tuple[int, Samples]] = field(default_factory=deque)  # with ``cycles`` by then
+    cycles: int = 0  # ended since the beginning
+    _blocks: deque[tuple[int, Samples]] = field(default_factory=deque)  # with ``cycles`` then
     _rows: int = 0
 
     def add(self, samples: Samples, ended: int) -> None:
-        """Take rows, with which some cycles ended; forget those that are too old."""
+        """Take rows, in which ``ended`` cycles ended; forget those that are too old."""
         self.cycles += ended
         if not len(samples):
             return
@@ -200,53 +200,53 @@ class Recent:
 
 
 class Asked:
-    """A diagnosis under way in another process; OSError where there can be none."""
+    """A running diagnosis in another process; raises OSError if that cannot start."""
 
     def __init__(self, question: Question, alarm: Event, cycles: int, deadline: float) -> None:
         self.alarm, self.cycles, self.deadline = alarm, cycles, deadline
         self.report = question[3]
         with ExitStack() as opened:
-            asking, self._said, self._complaint = (
+            question_file, self._output, self._errors = (
                 opened.enter_context(tempfile.TemporaryFile()) for _ in range(3)
             )
-            pickle.dump(question, asking)
-            asking.seek(0)
+            pickle.dump(question, question_file)
+            question_file.seek(0)
             self._process = subprocess.Popen(  # noqa: S603  # our own program
                 COMMAND,
-                stdin=asking,
-                stdout=self._said,
-                stderr=self._complaint,
-                start_new_session=True,  # a Ctrl-C is the loop's to answer
+                stdin=question_file,
+                stdout=self._output,
+                stderr=self._errors,
+                start_new_session=True,  # Ctrl-C is for the loop
             )
             self._opened = opened.pop_all()
-        with suppress(OSError):  # where that is not allowed it runs as it is
+        with suppress(OSError):  # without permission it runs at the same priority
             own = os.getpriority(os.PRIO_PROCESS, 0)
             os.setpriority(os.PRIO_PROCESS, self._process.pid, own + NICE)
 
     def ended(self) -> bool:
-        """Whether there is an answer, or will never be one."""
+        """Whether the process has ended, with an answer or without."""
         return self._process.poll() is not None
 
     def wait(self, seconds: float) -> None:
-        """Until it has ended, but no longer."""
+        """Wait until it has ended, at most ``seconds``."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(seconds)
 
     def answer(self) -> dict[str, Any] | str:
-        """The answer of one that has ended, or why there is none."""
+        """The answer of a diagnosis that has ended, or the reason why there is none."""
         if self._process.returncode == 0:
-            self._said.seek(0)
+            self._output.seek(0)
             try:
-                found: dict[str, Any] = json.load(self._said)
+                answer: dict[str, Any] = json.load(self._output)
             except ValueError:
                 return "its answer cannot be read"
-            return found
-        self._complaint.seek(0)
-        *_, last = [b"it was killed", *self._complaint.read().splitlines()]
+            return answer
+        self._errors.seek(0)
+        *_, last = [b"it was killed", *self._errors.read().splitlines()]
         return last.decode(errors="replace")
 
     def close(self) -> None:
-        """End it, if it has not ended."""
+        """End the process if it still runs."""
         self._process.kill()
         self._process.wait()
         self._opened.close()
@@ -256,15 +256,15 @@ class Asked:
 
 
 def in_a_line(answer: Mapping[str, Any]) -> str:
-    """The answer in a line that is kept: with dates and no ages, which would grow old."""
+    """The answer in one line to be stored: with dates instead of ages."""
     times = Times.of(answer, None)
-    found = "; and ".join(_cause(cause, times) for cause in answer["causes"])
+    causes = "; and ".join(_cause(cause, times) for cause in answer["causes"])
     match answer["verdict"]:
         case "explained":
-            return found
+            return causes
         case "unlisted":
-            rest = f"no listed effect explains what is left in {left_over(answer)}"
-            return f"{found}; and {rest}" if found else rest
+            unlisted = f"no listed effect explains what is left in {left_over(answer)}"
+            return f"{causes}; and {unlisted}" if causes else unlisted
         case "consistent":
             return f"the last {answer['cycles']['total']} cycles agree with the model after all"
     return f"no answer yet: {answer['next_experiment']}"

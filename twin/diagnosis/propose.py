@@ -1,6 +1,6 @@
-"""A mechanism that was found, as an entry for a catalogue of effects: a file that a person reads.
+"""A mechanism that was found, as a readable file with an entry for a catalogue of effects.
 
-The log that it was found in is its test: with the entry in the catalogue, a diagnosis of that log
+The log in which it was found is its test: with the entry in the catalogue, a diagnosis of that log
 must name it.
 """
 
@@ -21,8 +21,8 @@ from twin.model.mechanism import MECHANISMS, Mechanism
 from twin.settings import Document, Settings
 
 FORMAT = "ejector-twin-effect/1"
-# Times, by which what shapes an effect may differ on another unit. Chosen: a lip lifts off, water
-# boils and ice grows at other vacuums and paces on other machines, but not at any.
+# Factor by which shape parameters may differ on another unit. Chosen: a lip lifts off, water boils
+# and ice grows at other vacuums and rates on other machines, but not at arbitrary ones.
 OTHERWISE = 3.0
 INTRODUCTION = """\
 # An effect that is not in the table of effects, as twin diagnose found it in a log:
@@ -65,12 +65,12 @@ class Proposal(Settings):
 
 
 def proposed(diagnosis: Diagnosis, config: Config, log: Path, file: Path) -> str | None:
-    """The text of such a file for the mechanism that a diagnosis found; None if it found none."""
+    """The text of the file for the mechanism that a diagnosis found; None if it found none."""
     if diagnosis.mechanism is None:
         return None
     mechanism = MECHANISMS[diagnosis.mechanism.cause.effect]
     values = dict(diagnosis.mechanism.cause.values)
-    told = diagnosis.json["unlisted"]["mechanism"]["parameters"]
+    answered = diagnosis.json["unlisted"]["mechanism"]["parameters"]
     of_log = provenance.of_log(log)
     tables: dict[str, Any] = {
         "format": FORMAT,
@@ -82,20 +82,24 @@ def proposed(diagnosis: Diagnosis, config: Config, log: Path, file: Path) -> str
             "sentence": _sentence(mechanism),
             "look_at": CatalogueEffect.model_fields["look_at"].default,
             "parameters": {
-                one.name: _range(mechanism, one, values[one.name], told.get(one.name))
-                for one in mechanism.effect.parameters
+                parameter.name: _range(
+                    mechanism, parameter, values[parameter.name], answered.get(parameter.name)
+                )
+                for parameter in mechanism.effect.parameters
             },
             "found_in": {**of_log, "data_set": diagnosis.data_set},
         },
         "test": {"log": str(log.resolve()), "log_sha256": of_log["log_sha256"]},
     }
-    CatalogueEffect.model_validate(tables["effect"])  # what add would refuse is not proposed
-    said = diagnosis.json["unlisted"]["mechanism"]["sentence"]
-    return INTRODUCTION.format(sentence=said, file=file) + "\n" + tomli_w.dumps(tables)
+    CatalogueEffect.model_validate(
+        tables["effect"]
+    )  # never propose what ``effects add`` would refuse
+    sentence = diagnosis.json["unlisted"]["mechanism"]["sentence"]
+    return INTRODUCTION.format(sentence=sentence, file=file) + "\n" + tomli_w.dumps(tables)
 
 
 def named_on(proposal: Proposal, config: Config, log: Log, where: str) -> str:
-    """Why the test of an entry fails: what a diagnosis with it says; empty where it is named."""
+    """The diagnosis' answer if the test of an entry fails; empty if the effect is named."""
     catalogue = {**config.data.catalogue, proposal.name: proposal.effect}
     config = replace(config, data=config.data.model_copy(update={"catalogue": catalogue}))
     blocks = (rows for rows, _ in log.blocks())
@@ -115,25 +119,25 @@ def _can_be_a_name(name: str) -> bool:
 
 
 def _sentence(mechanism: Mechanism) -> str:
-    """What it does without the values that this log had."""
+    """The sentence of a mechanism, without the values of this log."""
     begin = mechanism.place.sentence
     return f"{begin[0].upper()}{begin[1:]}, {mechanism.when.briefly or mechanism.when.sentence}"
 
 
 def _range(
-    mechanism: Mechanism, one: Parameter, value: float, told: dict[str, Any] | None
+    mechanism: Mechanism, parameter: Parameter, value: float, answered: dict[str, Any] | None
 ) -> dict[str, float]:
-    """A size up to all that it can be that way; what shapes it about what was found.
+    """Range of a parameter: a size up to its bound in that direction, a shape about its value.
 
-    What the log does not tell is open as far as it can be.
+    If the log does not show a shape, its range is as wide as its bounds.
     """
-    if one in mechanism.place.parameters:
-        low, high = (0.0, one.high) if value >= 0.0 else (one.low, 0.0)
-    elif told is None or value <= 0.0:
-        low, high = one.low, one.high
+    if parameter in mechanism.place.parameters:
+        low, high = (0.0, parameter.high) if value >= 0.0 else (parameter.low, 0.0)
+    elif answered is None or value <= 0.0:
+        low, high = parameter.low, parameter.high
     else:
-        low = max(min(told["low95"], value / OTHERWISE), one.low)
-        high = min(max(told["high95"], value * OTHERWISE), one.high)
+        low = max(min(answered["low95"], value / OTHERWISE), parameter.low)
+        high = min(max(answered["high95"], value * OTHERWISE), parameter.high)
     rounded = Range(low=_short(low), high=_short(high), found=min(max(_short(value), low), high))
     return rounded.model_dump()
 

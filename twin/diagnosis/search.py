@@ -1,10 +1,10 @@
 """The search for causes: every effect with every course, alone and together, fitted and ranked.
 
-Forward: what the linear model promises is fitted in the non-linear one, singles and pairs side by
-side, because the members of a true pair may each look poor alone. What explains most is kept if it
-is worth its price, then the search begins anew about it. Backward: each cause must still be worth
-its price beside the others. Last, each must predict cycles that no size was fitted to; where the
-first one does not, the search begins again with the next.
+Forward: the best candidates of the linear model are fitted in the non-linear one. Singles and pairs
+compete, because the members of a true pair may each look poor alone. The best is kept if its gain
+exceeds its penalty, and the search starts again about it. Backward: each cause must still exceed
+its penalty beside the others. Last, each must predict held-out cycles; if the first one does not,
+the search starts again with the next.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -42,34 +42,32 @@ from twin.signals import MS
 
 MOST_CAUSES = 3
 MOST_ROUNDS = 4  # of adding and pruning
-SIGNIFICANT = 20.0  # chi-square, beyond its price, that a cause must gain before it is named
-SHARE = (
-    0.005  # of what is explained already, that one more cause must gain: else it mends the model
-)
-# Of an effect's typical size: less is within what calibration leaves, or beside another cause mends
-# what the model gets wrong about that.
+SIGNIFICANT = 20.0  # chi-square that a named cause must gain beyond its penalty
+SHARE = 0.005  # least gain of one more cause over what is explained: else it corrects the model
+# Of an effect's typical size: a smaller one is within the uncertainty of the calibration, or beside
+# another cause corrects the model's error of that.
 SMALLEST, SMALLEST_MORE = 0.2, 0.4
 LEAST_UNSEEN = (
-    1.0  # chi-square that it must surely gain on unseen cycles: what a size gains by chance
+    1.0  # lower limit of the chi-square gained on held-out cycles: a size gains it by chance
 )
-TRIED_FIRST = 3  # single causes to begin with, until one holds in cycles it was not fitted to
+TRIED_FIRST = 3  # single causes to start from, until one is confirmed on held-out cycles
 TRIED_ALONE = 5  # hypotheses that are compared with weights about themselves
 NEAR = 2.5  # times the least score, up to which they are
-QUIET = 1.2  # sigmas left, below which there is nothing to compare
-HOPEFUL = 5.0  # chi-square that the linear model must promise of one more cause
+QUIET = 1.2  # leftover (sigmas) below which no comparison is needed
+HOPEFUL = 5.0  # least gain (chi-square) of one more cause in the linear model
 TRIED_PAIRS, TRIED_MORE, TRIED_TIMES = 12, 8, 6
-# Sigmas that the best single cause leaves, above which sizes are so great that a linear model does
-# not tell courses apart. Chosen: in pairs of the second world's batteries one leaves up to 4.
+# Leftover (sigmas) of the best single cause above which sizes are too large for a linear model to
+# tell courses apart. Chosen: in pairs of the second world's batteries one leaves up to 4.
 GREAT = 10.0
 SECOND = 0.5  # of the best gain, above which an effect's second course is fitted as well
 NEARLY = 0.3  # of the best gain, above which an effect may turn out to be a rival
-START = np.array([0.4, 1.4, 4.0])  # typical sizes to begin a fit from
-START_OF_TIMES = np.array([0.4, 1.0, 1.7, 2.5, 3.5, 5.0])  # what moves an edge is far from linear
-MOST_FLIPS = 3  # rounds of looking for the cycles that something comes in
+START = np.array([0.4, 1.4, 4.0])  # typical sizes from which a fit starts
+START_OF_TIMES = np.array([0.4, 1.0, 1.7, 2.5, 3.5, 5.0])  # the same for delays, far from linear
+MOST_FLIPS = 3  # rounds of a search for the cycles of an intermittent cause
 WORTH_FLIPPING = 5.0  # chi-square that another set of cycles must gain
-ONSETS, MANY_ONSETS = 16, 64  # in a round of looking for when a step began
-ONSET_S = 0.01  # to which it is found at first
-FARTHEST_S = 4.0  # from an onset, that its interval may reach
+ONSETS, MANY_ONSETS = 16, 64  # tried in a round of a search for an onset
+ONSET_S = 0.01  # resolution of the first search for an onset
+FARTHEST_S = 4.0  # largest distance of an onset's interval from it
 
 Progress = Callable[[str], None]
 _NO_SIZES = np.empty(0), np.empty(0)
@@ -77,67 +75,69 @@ _NO_SIZES = np.empty(0), np.empty(0)
 
 @dataclass(frozen=True)
 class Search:
-    """What the search found: the causes with their rivals, judged alike."""
+    """Result of the search: the causes with their rivals, judged by the same weights."""
 
     known: Covariance  # about what was found
     healthy: float  # chi-square without any cause, of the fitted cycles
     found: Fitted | None
     ranking: list[Fitted]  # of all single causes, and of what was found
-    rivals: list[list[Fitted]]  # of each cause: what could stand in its place
+    rivals: list[list[Fitted]]  # of each cause: hypotheses with another in its place
     ends: tuple[Floats, Floats]  # of the 95 % interval of each size found
     onsets: list[tuple[float, float]]  # 95 % interval of each cause's onset
 
 
 def search(
-    evidence: Evidence, fitted: Sequence[int], known: Covariance, progress: Progress
+    evidence: Evidence, fitted: Sequence[int], healthy_covariance: Covariance, progress: Progress
 ) -> Search:
     """Find up to three causes; sizes and ranking of effects from the ``fitted`` cycles only.
 
-    When a cause acts (course, onset, which cycles) is taken from all of them: no other shows it.
-    ``known`` is about the healthy twin.
+    Times of causes (course, onset, cycles) come from all judged cycles, as others do not show
+    them. ``healthy_covariance`` is about the healthy twin.
     """
     progress("screening all effects and courses")
-    judged, weights = known.of(evidence.judged), known.of(fitted)
+    judged, weights = healthy_covariance.of(evidence.judged), healthy_covariance.of(fitted)
     alone = signatures(evidence, evidence.judged)
     tried = _fit_singles(evidence, judged, weights, alone, progress)
     singles = _ranked(evidence, judged, tried)
     healthy = _healthy(evidence, weights)
-    if not any(_worth(healthy, healthy, 0.0, one) for one in singles):
-        return Search(known, healthy, None, singles, [], _NO_SIZES, [])
+    if not any(_worth(healthy, healthy, 0.0, candidate) for candidate in singles):
+        return Search(healthy_covariance, healthy, None, singles, [], _NO_SIZES, [])
     firsts = _likeliest(evidence, fitted, tried, singles, progress)[:TRIED_FIRST]
     for first in firsts:
-        here = _about(evidence, fitted, first.hypothesis)
-        others = [one.hypothesis for one in singles if one.effects != first.effects]
-        rest = fit(evidence, here.weights, others, best_only=True)
-        ranked = [here.found, *sorted(rest, key=lambda one: one.score)]
-        here = _added(evidence, fitted, here, ranked, alone, progress)
+        current = _about(evidence, fitted, first.hypothesis)
+        alternatives = [
+            candidate.hypothesis for candidate in singles if candidate.effects != first.effects
+        ]
+        refitted = fit(evidence, current.weights, alternatives, best_only=True)
+        ranked = [current.found, *sorted(refitted, key=lambda candidate: candidate.score)]
+        current = _added(evidence, fitted, current, ranked, alone, progress)
         progress("asking cycles that nothing was fitted to")
-        confirmed = _confirmed(evidence, fitted, here)
-        none = healthy + weights.volume
-        if confirmed and _beats(none, confirmed, here.weights.volume):
+        confirmed = _confirmed(evidence, fitted, current)
+        chi2_without = healthy + weights.volume
+        if confirmed and _beats(chi2_without, confirmed, current.weights.volume):
             break
     else:
-        return Search(known, healthy, None, singles, [], _NO_SIZES, [])
+        return Search(healthy_covariance, healthy, None, singles, [], _NO_SIZES, [])
     singles = ranked
-    if confirmed is not here.found:
-        here = _about(evidence, fitted, confirmed.hypothesis)
+    if confirmed is not current.found:
+        current = _about(evidence, fitted, confirmed.hypothesis)
     progress("looking for what the log cannot tell apart")
-    beside = _beside_rivals(evidence, fitted, here, singles)
-    if beside is None:
-        return Search(known, healthy, None, singles, [], _NO_SIZES, [])
-    here, rivals = beside
-    found = here.found
+    with_rivals = _beside_rivals(evidence, fitted, current, singles)
+    if with_rivals is None:
+        return Search(healthy_covariance, healthy, None, singles, [], _NO_SIZES, [])
+    current, rivals = with_rivals
+    found = current.found
     onsets = [
-        _onset_interval(evidence, here.judged, found.hypothesis, number, found.leftover)
+        _onset_interval(evidence, current.judged, found.hypothesis, number, found.leftover)
         for number in range(len(found.hypothesis))
     ]
-    ends = _ends(evidence, here.weights, found)
-    return Search(here.known, here.healthy, found, singles, rivals, ends, onsets)
+    ends = _size_intervals(evidence, current.weights, found)
+    return Search(current.known, current.healthy, found, singles, rivals, ends, onsets)
 
 
 @dataclass(frozen=True)
 class _Found:
-    """Causes with the sizes that suit them best by weights about themselves."""
+    """Causes with their best sizes, by weights about themselves."""
 
     found: Fitted
     known: Covariance
@@ -147,104 +147,116 @@ class _Found:
 
 
 def _about(evidence: Evidence, fitted: Sequence[int], hypothesis: Hypothesis) -> _Found:
-    """A hypothesis fitted anew, weighed by what scatters and is uncertain about it."""
-    known = covariance(evidence, hypothesis)
-    weights = known.of(fitted)
+    """A hypothesis refitted with the covariance about itself."""
+    residual_covariance = covariance(evidence, hypothesis)
+    weights = residual_covariance.of(fitted)
     (found,) = fit(evidence, weights, [hypothesis])
-    return _Found(found, known, known.of(evidence.judged), weights, _healthy(evidence, weights))
+    return _Found(
+        found,
+        residual_covariance,
+        residual_covariance.of(evidence.judged),
+        weights,
+        _healthy(evidence, weights),
+    )
 
 
 def _added(
     evidence: Evidence,
     fitted: Sequence[int],
-    here: _Found,
+    current: _Found,
     singles: Sequence[Fitted],
     alone: Signatures,
     progress: Progress,
 ) -> _Found:
-    """With more causes, while one more is worth its price; less those that no longer are."""
-    before: set[frozenset[tuple[str, Course]]] = set()
+    """Add causes while one more exceeds its penalty, and prune those that no longer do."""
+    visited: set[frozenset[tuple[str, Course]]] = set()
     for _ in range(MOST_ROUNDS):
-        found = here.found
-        # With other weights what was pruned comes back: then the search goes round.
-        if len(found.hypothesis) == MOST_CAUSES or found.kind in before:
+        found = current.found
+        # With other weights a pruned cause may come back: then the search would go in circles.
+        if len(found.hypothesis) == MOST_CAUSES or found.kind in visited:
             break
-        before.add(found.kind)
+        visited.add(found.kind)
         progress(f"looking for what else there is beside {', '.join(found.effects)}")
-        more = _best_addition(evidence, here, singles, alone)
-        if more is None:
+        addition = _best_addition(evidence, current, singles, alone)
+        if addition is None:
             break
-        here = _about(evidence, fitted, more.hypothesis)
-        pruned = _pruned(evidence, here.weights, here.found, here.healthy)
-        here = replace(here, found=pruned)
-    return here
+        current = _about(evidence, fitted, addition.hypothesis)
+        pruned = _pruned(evidence, current.weights, current.found, current.healthy)
+        current = replace(current, found=pruned)
+    return current
 
 
 def _beside_rivals(
-    evidence: Evidence, fitted: Sequence[int], here: _Found, singles: list[Fitted]
+    evidence: Evidence, fitted: Sequence[int], current: _Found, singles: list[Fitted]
 ) -> tuple[_Found, list[list[Fitted]]] | None:
-    """What was found and, for each of its causes, what could stand in its place.
+    """What was found and, for each of its causes, the rivals that fit in its place.
 
-    Where that is clearly better, the way there led past it: it takes the place of what was found.
-    Where that in turn does not hold in cycles that it was not fitted to, nothing listed is what
-    acts there, and neither stays. None if no cause does.
+    A rival that is clearly better was missed by the search: it replaces what was found. If it is
+    not confirmed on held-out cycles, no listed effect acts there, and both are dropped. None if no
+    cause remains.
     """
-    looked = set[frozenset[tuple[str, Course]]]()
+    visited = set[frozenset[tuple[str, Course]]]()
     while True:
-        if any(cause.course == Course.STEP for cause in here.found.hypothesis):
-            timed = _finely_timed(evidence, here.judged, here.found.hypothesis)
-            (found,) = fit(evidence, here.weights, [timed])
-            here = replace(here, found=found)
-        looked.add(here.found.kind)
-        rivals = _rivals(evidence, here.judged, here.weights, here.found, singles)
-        better = _overtaking(here.found, rivals)
-        if better is None or better.kind in looked:
+        if any(cause.course == Course.STEP for cause in current.found.hypothesis):
+            timed = _finely_timed(evidence, current.judged, current.found.hypothesis)
+            (found,) = fit(evidence, current.weights, [timed])
+            current = replace(current, found=found)
+        visited.add(current.found.kind)
+        rivals = _rivals(evidence, current.judged, current.weights, current.found, singles)
+        better = _overtaking(current.found, rivals)
+        if better is None or better.kind in visited:
             break
-        known = covariance(evidence, better.hypothesis)
-        confirmed = _confirmed(evidence, fitted, replace(here, found=better, known=known))
-        if confirmed is better:
-            here = _about(evidence, fitted, better.hypothesis)
-            continue
-        if confirmed and stranger(better, here.found) in confirmed.effects:
-            break
-        place = next(number for number, some in enumerate(rivals) if _has(some, better))
-        others = here.found.hypothesis[:place] + here.found.hypothesis[place + 1 :]
-        if not others:
-            return None
-        here = _about(evidence, fitted, others)
-    if here.found.effects == (WEATHER,):  # it may have come first by its prior alone
-        found, *rivals[0] = sorted(
-            [here.found, *rivals[0]],
-            key=lambda one: score_with_tempered_prior(evidence, one.score, one.hypothesis),
+        residual_covariance = covariance(evidence, better.hypothesis)
+        confirmed = _confirmed(
+            evidence, fitted, replace(current, found=better, known=residual_covariance)
         )
-        if found is not here.found:
-            here = replace(here, found=found, known=covariance(evidence, found.hypothesis))
-    return here, rivals
+        if confirmed is better:
+            current = _about(evidence, fitted, better.hypothesis)
+            continue
+        if confirmed and stranger(better, current.found) in confirmed.effects:
+            break
+        number = next(
+            number for number, rivals_of_cause in enumerate(rivals) if _has(rivals_of_cause, better)
+        )
+        remaining = current.found.hypothesis[:number] + current.found.hypothesis[number + 1 :]
+        if not remaining:
+            return None
+        current = _about(evidence, fitted, remaining)
+    if current.found.effects == (WEATHER,):  # it may be first by its prior alone
+        found, *rivals[0] = sorted(
+            [current.found, *rivals[0]],
+            key=lambda candidate: score_with_tempered_prior(
+                evidence, candidate.score, candidate.hypothesis
+            ),
+        )
+        if found is not current.found:
+            current = replace(current, found=found, known=covariance(evidence, found.hypothesis))
+    return current, rivals
 
 
-def _has(some: Sequence[Fitted], one: Fitted) -> bool:
-    return any(other is one for other in some)
+def _has(fits: Sequence[Fitted], candidate: Fitted) -> bool:
+    return any(element is candidate for element in fits)
 
 
 def stranger(rival: Fitted, found: Fitted) -> str:
     """The effect of a rival that is not among those found."""
-    return next(one for one in rival.effects if one not in found.effects)
+    return next(effect for effect in rival.effects if effect not in found.effects)
 
 
-def _ends(evidence: Evidence, weights: Weights, found: Fitted) -> tuple[Floats, Floats]:
-    """95 % interval of each size, by whichever law of a cause the log cannot reject."""
+def _size_intervals(evidence: Evidence, weights: Weights, found: Fitted) -> tuple[Floats, Floats]:
+    """95 % interval of each size, over all laws of a cause that the log cannot reject."""
     low, high = interval(evidence, weights, found)
-    others = [
-        other
-        for place in range(len(found.hypothesis))
-        for other in by_each_law(found.hypothesis, place)
-        if other != found.hypothesis
+    alternatives = [
+        alternative
+        for number in range(len(found.hypothesis))
+        for alternative in by_each_law(found.hypothesis, number)
+        if alternative != found.hypothesis
     ]
     worst = found.chi2 + CHI2_95 * max(found.leftover**2, 1.0)
-    for other in fit(evidence, weights, others) if others else []:
-        if other.chi2 < worst:
-            also = interval(evidence, weights, other)
-            low, high = np.minimum(low, also[0]), np.maximum(high, also[1])
+    for alternative in fit(evidence, weights, alternatives) if alternatives else []:
+        if alternative.chi2 < worst:
+            alternative_ends = interval(evidence, weights, alternative)
+            low, high = np.minimum(low, alternative_ends[0]), np.maximum(high, alternative_ends[1])
     return low, high
 
 
@@ -256,15 +268,20 @@ def _healthy(evidence: Evidence, weights: Weights) -> float:
 def _ranked(evidence: Evidence, judged: Weights, found: Sequence[Fitted]) -> list[Fitted]:
     """The best course of each set of effects, the best first.
 
-    All cycles choose the course: in which of them an effect acts does not show in the fitted ones.
+    All judged cycles choose the course, as the fitted ones do not show in which an effect acts.
     """
-    residual = white(evidence, judged, [one.hypothesis for one in found])
+    residual = white(evidence, judged, [candidate.hypothesis for candidate in found])
     best: dict[tuple[str, ...], tuple[float, Fitted]] = {}
-    for one, chi2 in zip(found, np.sum(residual**2, axis=0), strict=True):
-        key, score = tuple(sorted(one.effects)), float(chi2) + one.score - one.chi2
+    for candidate, chi2 in zip(found, np.sum(residual**2, axis=0), strict=True):
+        key, score = (
+            tuple(sorted(candidate.effects)),
+            float(chi2) + candidate.score - candidate.chi2,
+        )
         if key not in best or score < best[key][0]:
-            best[key] = score, one
-    return sorted((one for _, one in best.values()), key=lambda one: one.score)
+            best[key] = score, candidate
+    return sorted(
+        (candidate for _, candidate in best.values()), key=lambda candidate: candidate.score
+    )
 
 
 def _fit_singles(
@@ -273,20 +290,23 @@ def _fit_singles(
     """Fit every effect with its most promising courses."""
     linear = columns(evidence, judged, alone)
     promised = promises(evidence, judged, linear, each=2)
-    first = {one.hypothesis[0].effect: one for one in reversed(promised)}
+    first = {promise.hypothesis[0].effect: promise for promise in reversed(promised)}
     hypotheses = [
-        one.hypothesis
-        for one in promised
-        if one is first[one.hypothesis[0].effect] or one.gain > SECOND * promised[0].gain
+        promise.hypothesis
+        for promise in promised
+        if promise is first[promise.hypothesis[0].effect]
+        or promise.gain > SECOND * promised[0].gain
     ]
     progress("fitting single causes")
     started = _started(evidence, judged, hypotheses)
     tried = fit(evidence, weights, _timed(evidence, judged, started))
-    if min(one.leftover for one in tried) < GREAT:
+    if min(candidate.leftover for candidate in tried) < GREAT:
         return tried
     progress("what acts is great: fitting each cause with every course")
-    more = [one.hypothesis for one in promises(evidence, judged, linear, each=len(Course))]
-    started = _started(evidence, judged, [one for one in more if one not in hypotheses])
+    more = [promise.hypothesis for promise in promises(evidence, judged, linear, each=len(Course))]
+    started = _started(
+        evidence, judged, [hypothesis for hypothesis in more if hypothesis not in hypotheses]
+    )
     return tried + fit(evidence, weights, _timed(evidence, judged, started))
 
 
@@ -297,60 +317,66 @@ def _likeliest(
     singles: Sequence[Fitted],
     progress: Progress,
 ) -> list[Fitted]:
-    """Single causes, the likeliest first, each with weights about itself; wide ones cost.
+    """Single causes, the likeliest first, each with weights about itself and their log-determinant.
 
-    What scatters moves with the causes: about the healthy twin, a valve's half millisecond is not
-    where a delay of ten has put its edge. All cycles choose the course, the fitted ones the effect.
-    Weather that the log cannot reject beside the best comes first: it changes every week.
+    Scatter moves with the causes: a valve's half millisecond acts where a delay of ten has put the
+    edge. All judged cycles choose the course, the fitted ones the effect. Weather comes first if
+    the log cannot reject it against the best: it changes every week.
     """
     if not (singles[0].leftover > QUIET or _weather(evidence, singles)):
         return list(singles)
     progress("comparing the best, each with its own weights")
-    ranked = sorted(tried, key=lambda one: one.score)
-    near = [one for one in ranked if one.score < NEAR * ranked[0].score][:TRIED_ALONE]
-    near += [one for one in _weather(evidence, ranked) if not _has(near, one)]
+    ranked = sorted(tried, key=lambda candidate: candidate.score)
+    nearest = [candidate for candidate in ranked if candidate.score < NEAR * ranked[0].score][
+        :TRIED_ALONE
+    ]
+    nearest += [
+        candidate for candidate in _weather(evidence, ranked) if not _has(nearest, candidate)
+    ]
 
     def alone(first: Fitted) -> tuple[float, float, Fitted]:
-        known = covariance(evidence, first.hypothesis, both_ways=False)
-        judged, weights = known.of(evidence.judged), known.of(fitted)
-        (one,) = fit(evidence, weights, [first.hypothesis])
-        chi2 = float(np.sum(white(evidence, judged, [one.hypothesis]) ** 2))
-        price = one.score - one.chi2
-        return chi2 + judged.volume + price, one.score + weights.volume, one
+        residual_covariance = covariance(evidence, first.hypothesis, both_ways=False)
+        judged, weights = residual_covariance.of(evidence.judged), residual_covariance.of(fitted)
+        (candidate,) = fit(evidence, weights, [first.hypothesis])
+        chi2 = float(np.sum(white(evidence, judged, [candidate.hypothesis]) ** 2))
+        price = candidate.score - candidate.chi2
+        return chi2 + judged.volume + price, candidate.score + weights.volume, candidate
 
     best: dict[tuple[str, ...], tuple[float, float, Fitted]] = {}
-    for each in at_once(alone, near):
-        everywhere, _, one = each
-        if one.effects not in best or everywhere < best[one.effects][0]:
-            best[one.effects] = each
-    _, least, found = min(best.values(), key=lambda each: each[1])
-    order = [one for *_, one in sorted(best.values(), key=lambda each: each[1])]
+    for entry in at_once(alone, nearest):
+        score, _, candidate = entry
+        if candidate.effects not in best or score < best[candidate.effects][0]:
+            best[candidate.effects] = entry
+    _, least, best_fit = min(best.values(), key=lambda entry: entry[1])
+    order = [candidate for *_, candidate in sorted(best.values(), key=lambda entry: entry[1])]
     for weather in _weather(evidence, order):
-        if best[weather.effects][1] < least + CHI2_999 * max(found.leftover**2, 1.0):
-            return [weather, *(one for one in order if one is not weather)]
+        if best[weather.effects][1] < least + CHI2_999 * max(best_fit.leftover**2, 1.0):
+            return [weather, *(candidate for candidate in order if candidate is not weather)]
     return order
 
 
 def _weather(evidence: Evidence, ranked: Sequence[Fitted]) -> list[Fitted]:
-    """Of fits, those by another ambient pressure, where nobody measures it.
+    """Fits by another ambient pressure, if that is not measured.
 
-    What ejectors do in it is not known well. So they are compared with weights about themselves,
-    though they look poor by those of the calibration's day.
+    Its response is uncertain. So they are compared with weights about themselves, though they look
+    poor by those of the calibration's day.
     """
     if "ambient" in evidence.told:
         return []
-    return [one for one in ranked if one.effects == (WEATHER,)]
+    return [candidate for candidate in ranked if candidate.effects == (WEATHER,)]
 
 
 def _started(
     evidence: Evidence, judged: Weights, hypotheses: Sequence[Hypothesis]
 ) -> list[Hypothesis]:
-    """The same with the last cause at the best of some sizes, by each law that it may act by.
+    """Hypotheses with the last cause at the best of some sizes, by each law that it may act by.
 
-    A delay moves what is sharp: from far away a step towards its true size does not seem to help.
+    A delay shifts edges: far from its true size, a step towards it does not reduce the misfit.
     """
     tried: list[list[Hypothesis]] = []
-    for hypothesis in chain.from_iterable(by_each_law(one, len(one) - 1) for one in hypotheses):
+    for hypothesis in chain.from_iterable(
+        by_each_law(start, len(start) - 1) for start in hypotheses
+    ):
         low, high = bounds(evidence, hypothesis)
         x = sizes(evidence, hypothesis)
         last = len(x) - len(parameters(hypothesis[-1:]))
@@ -359,193 +385,203 @@ def _started(
         for size in (*-tried_sizes, *tried_sizes):
             if low[last] < size < high[last]:
                 around.append(np.concatenate([x[:last], [size], x[last + 1 :]]))
-        tried.append([sized(evidence, hypothesis, one) for one in around])
-    every = [one for some in tried for one in some]
-    chi2 = np.sum(white(evidence, judged, every) ** 2, axis=0)
+        tried.append([sized(evidence, hypothesis, point) for point in around])
+    all_variants = [variant for variants in tried for variant in variants]
+    chi2 = np.sum(white(evidence, judged, all_variants) ** 2, axis=0)
     best, first = [], 0
-    for some in tried:
-        best.append(some[int(np.argmin(chi2[first : first + len(some)]))])
-        first += len(some)
+    for variants in tried:
+        best.append(variants[int(np.argmin(chi2[first : first + len(variants)]))])
+        first += len(variants)
     return best
 
 
 def _best_addition(
-    evidence: Evidence, here: _Found, singles: Sequence[Fitted], alone: Signatures
+    evidence: Evidence, current: _Found, singles: Sequence[Fitted], alone: Signatures
 ) -> Fitted | None:
-    """What is found with one more cause, or a pair in its place; None if not worth it."""
-    found, judged, weights = here.found, here.judged, here.weights
-    about = found.hypothesis
-    beside = signatures(evidence, judged.cycles, about)
-    promised = promises(evidence, judged, columns(evidence, judged, beside), each=2)
-    new = [one for one in promised if _can_join(evidence, one.hypothesis[0], about)]
-    new = [one for one in new[:TRIED_MORE] if one.gain > HOPEFUL]
-    candidates = _started(evidence, judged, [(*about, *one.hypothesis) for one in new])
-    if len(about) == 1:
+    """The best hypothesis with one more cause, or a pair in its place; None if none is worth it."""
+    found, judged, weights = current.found, current.judged, current.weights
+    hypothesis = found.hypothesis
+    moved = signatures(evidence, judged.cycles, hypothesis)
+    promised = promises(evidence, judged, columns(evidence, judged, moved), each=2)
+    new = [
+        candidate
+        for candidate in promised
+        if _can_join(evidence, candidate.hypothesis[0], hypothesis)
+    ]
+    new = [candidate for candidate in new[:TRIED_MORE] if candidate.gain > HOPEFUL]
+    candidates = _started(
+        evidence, judged, [(*hypothesis, *candidate.hypothesis) for candidate in new]
+    )
+    if len(hypothesis) == 1:
         candidates += _linear_pairs(evidence, judged, columns(evidence, judged, alone))
         candidates += _fitted_pairs(evidence, weights, singles[:TRIED_PAIRS], found)
     candidates = _timed(evidence, judged, candidates)
     tried = _ranked(evidence, judged, fit(evidence, weights, candidates, best_only=True))
-    for one in tried:
-        if _worth(here.healthy, found.chi2, found.chi2 - found.score, one):
-            return one
+    for candidate in tried:
+        if _worth(current.healthy, found.chi2, found.chi2 - found.score, candidate):
+            return candidate
     return None
 
 
 def _can_join(evidence: Evidence, cause: Cause, others: Hypothesis) -> bool:
-    """Whether a cause can act beside others: another one, and the model has room for it."""
-    names = [one.effect for one in others]
+    """Whether a cause can be added to others: it is a new one, and the model has room for it."""
+    names = [other.effect for other in others]
     return cause.effect not in names and has_room(evidence.theta, (*names, cause.effect))
 
 
 def _linear_pairs(evidence: Evidence, judged: Weights, alone: Columns) -> list[Hypothesis]:
     """Pairs that explain more than any single cause in the linear model."""
     singles = promises(evidence, judged, alone, each=2)
-    two = pairs(evidence, judged, alone, singles)[:TRIED_PAIRS]
-    return [one.hypothesis for one in two if one.gain > singles[0].gain + HOPEFUL]
+    best_pairs = pairs(evidence, judged, alone, singles)[:TRIED_PAIRS]
+    return [
+        promise.hypothesis for promise in best_pairs if promise.gain > singles[0].gain + HOPEFUL
+    ]
 
 
 def _fitted_pairs(
     evidence: Evidence, weights: Weights, singles: Sequence[Fitted], found: Fitted
 ) -> list[Hypothesis]:
-    """Pairs of single causes, each as it was fitted: delays are far from linear."""
-    both = [
-        (*one.hypothesis, *two.hypothesis)
-        for one, two in combinations(singles, 2)
-        if has_room(evidence.theta, (*one.effects, *two.effects))
+    """Pairs of single causes as they were fitted: delays are far from linear."""
+    combined = [
+        (*first.hypothesis, *second.hypothesis)
+        for first, second in combinations(singles, 2)
+        if has_room(evidence.theta, (*first.effects, *second.effects))
     ]
-    chi2 = np.sum(white(evidence, weights, both) ** 2, axis=0)
+    chi2 = np.sum(white(evidence, weights, combined) ** 2, axis=0)
     best = np.argsort(chi2)[:TRIED_MORE]
-    return [both[i] for i in best if chi2[i] < found.chi2]
+    return [combined[i] for i in best if chi2[i] < found.chi2]
 
 
 def _worth(healthy: float, chi2: float, paid: float, fitted: Fitted) -> bool:
-    """Whether a hypothesis gains enough over a smaller one, and all its causes are big enough."""
+    """Whether a hypothesis gains enough over a smaller one, and all its causes are large enough."""
     scale = max(fitted.leftover**2, 1.0)
     gain = (chi2 - fitted.chi2) / scale - (fitted.score - fitted.chi2 + paid)
     enough = max(SIGNIFICANT, SHARE * (healthy - chi2) / scale)
     least = SMALLEST if len(fitted.hypothesis) == 1 else SMALLEST_MORE
-    return gain > enough and _smallest(fitted) >= least
+    return gain > enough and _smallest_size(fitted) >= least
 
 
 def _beats(alone: float, found: Fitted, volume: float) -> bool:
-    """Whether causes are big enough and explain more than none, each by weights about itself.
+    """Whether causes are large enough and explain more than none, each by its own weights.
 
-    ``alone`` is the chi-square without any, with the volume of its weights.
+    ``alone`` is the chi-square without causes, with the log-determinant of its weights.
     """
     gain = (alone - found.chi2 - volume) / max(found.leftover**2, 1.0)
-    return gain - (found.score - found.chi2) > SIGNIFICANT and _smallest(found) >= SMALLEST
+    return gain - (found.score - found.chi2) > SIGNIFICANT and _smallest_size(found) >= SMALLEST
 
 
-def _smallest(fitted: Fitted) -> float:
+def _smallest_size(fitted: Fitted) -> float:
     """The size of the smallest cause, in typical ones."""
     return min(_sizes_of_causes(fitted))
 
 
 def _sizes_of_causes(fitted: Fitted) -> list[float]:
-    """The size of each cause, in typical ones: of the parameter that is farthest from neutral."""
+    """The size of each cause, in typical ones: that of its parameter farthest from neutral."""
     first, sizes = 0, []
     for cause in fitted.hypothesis:
-        own = parameters((cause,))
-        much = [not one.shapes for one in own]
-        sizes.append(float(np.abs(fitted.x[first : first + len(own)][much]).max()))
-        first += len(own)
+        cause_parameters = parameters((cause,))
+        is_size = [not parameter.shapes for parameter in cause_parameters]
+        sizes.append(float(np.abs(fitted.x[first : first + len(cause_parameters)][is_size]).max()))
+        first += len(cause_parameters)
     return sizes
 
 
 def _pruned(evidence: Evidence, weights: Weights, found: Fitted, healthy: float) -> Fitted:
-    """Without the causes that are not worth their price beside the others."""
+    """``found`` without the causes that do not exceed their penalty beside the others."""
     while len(found.hypothesis) > 1:
         without = [
-            tuple(c for i, c in enumerate(found.hypothesis) if i != left)
-            for left in range(len(found.hypothesis))
+            tuple(c for i, c in enumerate(found.hypothesis) if i != left_out)
+            for left_out in range(len(found.hypothesis))
         ]
-        best = min(fit(evidence, weights, without), key=lambda one: one.score)
+        best = min(fit(evidence, weights, without), key=lambda candidate: candidate.score)
         if _worth(healthy, best.chi2, best.chi2 - best.score, found):
             break
         found = best
     return found
 
 
-def _confirmed(evidence: Evidence, fitted: Sequence[int], here: _Found) -> Fitted | None:
-    """Without causes that are too small or do not predict cycles they were not fitted to.
+def _confirmed(evidence: Evidence, fitted: Sequence[int], current: _Found) -> Fitted | None:
+    """Causes without those that are too small or do not predict held-out cycles.
 
-    None if none is left. Each is left out in turn and the others are fitted anew. The least certain
-    goes first.
+    None if none is left. Each is left out in turn, and the others are refitted. The least certain
+    is dropped first.
     """
-    held_out = [one for one in evidence.judged if one not in fitted]
-    found, weights, known = here.found, here.weights, here.known
+    held_out = [cycle for cycle in evidence.judged if cycle not in fitted]
+    found, weights, residual_covariance = current.found, current.weights, current.known
     while True:
-        unseen = known.of(held_out)
+        unseen = residual_covariance.of(held_out)
         without = [
-            tuple(c for i, c in enumerate(found.hypothesis) if i != left)
-            for left in range(len(found.hypothesis))
+            tuple(c for i, c in enumerate(found.hypothesis) if i != left_out)
+            for left_out in range(len(found.hypothesis))
         ]
-        others = fit(evidence, weights, without) if without[0] else []
-        without = [one.hypothesis for one in others] or [HEALTHY]
-        gains = [held_out_gain(evidence, unseen, one, found.hypothesis) for one in without]
-        least = min(range(len(gains)), key=lambda left: gains[left][0])
+        alternatives = fit(evidence, weights, without) if without[0] else []
+        without = [alternative.hypothesis for alternative in alternatives] or [HEALTHY]
+        gains = [held_out_gain(evidence, unseen, fewer, found.hypothesis) for fewer in without]
+        weakest = min(range(len(gains)), key=lambda left_out: gains[left_out][0])
         sizes_found = _sizes_of_causes(found)
-        if others and min(sizes_found) < SMALLEST_MORE:  # beside the others it became too small
-            least = sizes_found.index(min(sizes_found))
-        elif gains[least][0] > LEAST_UNSEEN:
+        if (
+            alternatives and min(sizes_found) < SMALLEST_MORE
+        ):  # beside the others it became too small
+            weakest = sizes_found.index(min(sizes_found))
+        elif gains[weakest][0] > LEAST_UNSEEN:
             return found
-        if not others:
+        if not alternatives:
             return None
-        found = others[least]
-        known = covariance(evidence, found.hypothesis)
+        found = alternatives[weakest]
+        residual_covariance = covariance(evidence, found.hypothesis)
 
 
 def held_out_gain(
     evidence: Evidence, unseen: Weights, without: Hypothesis, hypothesis: Hypothesis
 ) -> tuple[float, float]:
-    """95 % interval of the chi-square that a hypothesis takes away from another on unseen cycles.
+    """95 % interval of the chi-square that a hypothesis gains over another on unseen cycles.
 
-    Where both predict r and r + d, |r + d|² − |r|² = |d|² + 2·d·r, and d·r scatters by |d| times
-    the sigmas that are left: that holds with one cycle as well.
+    The residuals are r and r + d: |r + d|² − |r|² = |d|² + 2·d·r. The sigma of d·r is |d| times
+    that of the residuals. This holds with a single cycle as well.
     """
     before, after = white(evidence, unseen, [without, hypothesis]).T
-    left = max(float(np.sqrt(np.mean(after**2))), 1.0)
+    sigma = max(float(np.sqrt(np.mean(after**2))), 1.0)
     gain = float(before @ before - after @ after)
-    reach = SIGMAS_95 * 2.0 * float(np.linalg.norm(before - after)) * left
+    reach = SIGMAS_95 * 2.0 * float(np.linalg.norm(before - after)) * sigma
     return gain - reach, gain + reach
 
 
 def _overtaking(found: Fitted, rivals: Sequence[Sequence[Fitted]]) -> Fitted | None:
-    """What stands better in place of a cause found; the way there did not lead past it."""
-    best = min(chain.from_iterable(rivals), key=lambda one: one.score, default=found)
+    """The best rival if it is clearly better than what was found."""
+    best = min(chain.from_iterable(rivals), key=lambda candidate: candidate.score, default=found)
     return best if best.score < found.score - CHI2_999 * max(best.leftover**2, 1.0) else None
 
 
 def _rivals(
     evidence: Evidence, judged: Weights, weights: Weights, found: Fitted, singles: list[Fitted]
 ) -> list[list[Fitted]]:
-    """For each cause: what fits as well in its place, re-fitted with the others.
+    """For each cause: rivals that fit as well in its place, refitted with the others.
 
-    A log rejects a rival by what it shows, not by how seldom that comes.
+    A rival is rejected by the log alone, without the prior frequency of its effects.
     """
     worst = score_without_prior(evidence, found.score, found.hypothesis)
     worst += CHI2_999 * max(found.leftover**2, 1.0)
 
-    def instead_of(left: int) -> list[Fitted]:
-        others = tuple(c for i, c in enumerate(found.hypothesis) if i != left)
-        if others:
-            beside = columns(evidence, judged, signatures(evidence, judged.cycles, others))
-            promised = promises(evidence, judged, beside, each=1)
+    def instead_of(left_out: int) -> list[Fitted]:
+        remaining = tuple(c for i, c in enumerate(found.hypothesis) if i != left_out)
+        if remaining:
+            linear = columns(evidence, judged, signatures(evidence, judged.cycles, remaining))
+            promised = promises(evidence, judged, linear, each=1)
             tried = [
-                (*others, *one.hypothesis)
-                for one in promised
-                if one.hypothesis[0].effect not in found.effects
-                and _can_join(evidence, one.hypothesis[0], others)
-                and one.gain > NEARLY * promised[0].gain
+                (*remaining, *candidate.hypothesis)
+                for candidate in promised
+                if candidate.hypothesis[0].effect not in found.effects
+                and _can_join(evidence, candidate.hypothesis[0], remaining)
+                and candidate.gain > NEARLY * promised[0].gain
             ][:TRIED_PAIRS]
             timed = _timed(evidence, judged, tried)
             fitted = _ranked(evidence, judged, fit(evidence, weights, timed))
         else:
-            fitted = [one for one in singles if one.effects != found.effects]
+            fitted = [candidate for candidate in singles if candidate.effects != found.effects]
         return [
-            one
-            for one in fitted
-            if score_without_prior(evidence, one.score, one.hypothesis) < worst
+            candidate
+            for candidate in fitted
+            if score_without_prior(evidence, candidate.score, candidate.hypothesis) < worst
         ]
 
     return at_once(instead_of, range(len(found.hypothesis)))
@@ -557,12 +593,12 @@ def _rivals(
 def _timed(
     evidence: Evidence, judged: Weights, hypotheses: Sequence[Hypothesis]
 ) -> list[Hypothesis]:
-    """The same; of the first few the onset within its cycle, or the cycles, where they fit best."""
+    """Hypotheses; the first few have their onset within a cycle, or their cycles, fitted."""
     result, timed = [], 0
     for hypothesis in hypotheses:
-        place = _PLACED.get(hypothesis[-1].course)
-        if place is not None and timed < TRIED_TIMES:
-            result.append(place(evidence, judged, hypothesis))
+        adjust = _PLACED.get(hypothesis[-1].course)
+        if adjust is not None and timed < TRIED_TIMES:
+            result.append(adjust(evidence, judged, hypothesis))
             timed += 1
         else:
             result.append(hypothesis)
@@ -570,42 +606,44 @@ def _timed(
 
 
 def _with_onset(evidence: Evidence, judged: Weights, hypothesis: Hypothesis) -> Hypothesis:
-    """The last cause's onset where it explains most, about a cycle about where it is."""
+    """A hypothesis with the best onset of its last cause, within a cycle of the present one."""
     *others, cause = hypothesis
-    return (*others, _begun(evidence, judged, tuple(others), cause, ONSETS, ONSET_S))
+    return (*others, _with_best_onset(evidence, judged, tuple(others), cause, ONSETS, ONSET_S))
 
 
 def _with_cycles(evidence: Evidence, judged: Weights, hypothesis: Hypothesis) -> Hypothesis:
-    """The last cause in those cycles in which it explains most: each tried in or out.
+    """A hypothesis with the best cycles of its last cause: each is tried in and out.
 
-    Also those that are not judged: what acts there shows in the gas of the one after.
+    Unjudged cycles are tried as well: a cause in them affects the gas of the next cycle.
     """
     *others, cause = hypothesis
     units = tried_in_or_out(evidence)
-    cause = replace(cause, cycles=_union(one for one in units if max(one) in cause.cycles))
+    cause = replace(cause, cycles=_union(unit for unit in units if max(unit) in cause.cycles))
     for _ in range(MOST_FLIPS):
-        tried = [cause, *(replace(cause, cycles=cause.cycles ^ one) for one in units)]
-        chi2 = np.sum(white(evidence, judged, [(*others, one) for one in tried]) ** 2, axis=0)
+        tried = [cause, *(replace(cause, cycles=cause.cycles ^ unit) for unit in units)]
+        chi2 = np.sum(white(evidence, judged, [(*others, trial) for trial in tried]) ** 2, axis=0)
         gains = chi2[0] - chi2[1:]
         better = _union(
-            one for one, gain in zip(units, gains, strict=True) if gain > WORTH_FLIPPING
+            unit for unit, gain in zip(units, gains, strict=True) if gain > WORTH_FLIPPING
         )
         if not better:
             break
-        together = replace(cause, cycles=cause.cycles ^ better)
-        both = [together, tried[int(np.argmin(chi2))]]
-        chi2 = np.sum(white(evidence, judged, [(*others, one) for one in both]) ** 2, axis=0)
-        cause = both[int(np.argmin(chi2))]
+        combined = replace(cause, cycles=cause.cycles ^ better)
+        finalists = [combined, tried[int(np.argmin(chi2))]]
+        chi2 = np.sum(
+            white(evidence, judged, [(*others, finalist) for finalist in finalists]) ** 2, axis=0
+        )
+        cause = finalists[int(np.argmin(chi2))]
     return (*others, cause)
 
 
 def tried_in_or_out(evidence: Evidence) -> list[frozenset[int]]:
-    """Each cycle; in part of a log with the one before it, in which the model only swings in."""
+    """Sets of cycles to flip: each cycle, after a gap with the one in which the model settles."""
     numbers = [int(number) for number in evidence.numbers]
     units, before = [], frozenset[int]()
-    for place, number in enumerate(numbers):
-        follows_a_gap = place > 0 and number > numbers[place - 1] + 1
-        if follows_a_gap and place not in evidence.judged:
+    for position, number in enumerate(numbers):
+        follows_a_gap = position > 0 and number > numbers[position - 1] + 1
+        if follows_a_gap and position not in evidence.judged:
             before = frozenset({number})
         else:
             units.append(before | {number})
@@ -621,19 +659,19 @@ _PLACED = {Course.STEP: _with_onset, Course.INTERMITTENT: _with_cycles}
 
 
 def _finely_timed(evidence: Evidence, judged: Weights, hypothesis: Hypothesis) -> Hypothesis:
-    """The onset of every step to the row, looked for anew now that the sizes are known."""
+    """A hypothesis with the onset of every step searched to the row, with known sizes."""
     for number, cause in enumerate(hypothesis):
         if cause.course == Course.STEP:
             others = (*hypothesis[:number], *hypothesis[number + 1 :])
-            begun = _begun(evidence, judged, others, cause, MANY_ONSETS, MS)
+            begun = _with_best_onset(evidence, judged, others, cause, MANY_ONSETS, MS)
             hypothesis = (*hypothesis[:number], begun, *hypothesis[number + 1 :])
     return hypothesis
 
 
-def _begun(
+def _with_best_onset(
     evidence: Evidence, judged: Weights, others: Hypothesis, cause: Cause, count: int, fine: float
 ) -> Cause:
-    """A cause with its onset where it explains most, within a cycle: ``count`` tried at first."""
+    """A cause with its best onset, within a cycle of the present one; ``count`` in round one."""
     cycle = float(np.median(np.diff(evidence.seconds[evidence.starts[:-1]])))
     low, high = cause.onset_s - cycle, cause.onset_s + cycle
     while (high - low) / count > fine:
@@ -646,57 +684,57 @@ def _begun(
 
 
 def sharpened(whole: Evidence, part: Evidence, searched: Search) -> Search:
-    """What was found in ``part`` of a log with the onsets of steps as all of its cycles tell."""
+    """The result for ``part`` of a log, with onsets of steps from all its cycles."""
     found, onsets = searched.found, list(searched.onsets)
     assert found is not None
     for number, cause in enumerate(found.hypothesis):
         if cause.course == Course.STEP:
             hypothesis, onsets[number] = _sharp_onset(whole, part, found, number)
             found = replace(found, hypothesis=hypothesis)
-    known = covariance(part, found.hypothesis)
-    return replace(searched, known=known, found=found, onsets=onsets)
+    residual_covariance = covariance(part, found.hypothesis)
+    return replace(searched, known=residual_covariance, found=found, onsets=onsets)
 
 
 def _sharp_onset(
     whole: Evidence, part: Evidence, found: Fitted, number: int
 ) -> tuple[Hypothesis, tuple[float, float]]:
-    """A hypothesis with the onset of one of its causes looked for, and its interval."""
+    """A hypothesis with the best onset of one of its causes, and the onset's interval."""
     cause, hypothesis = found.hypothesis[number], found.hypothesis
     others = (*hypothesis[:number], *hypothesis[number + 1 :])
     begins = whole.seconds[whole.starts[:-1]]
-    near = part.seconds[part.starts[part.judged]]
-    here = int(np.searchsorted(near, cause.onset_s))
-    low = near[here - 2] if here >= 2 else begins[whole.judged[0]]
-    high = near[here + 1] if here + 1 < len(near) else np.inf
+    cycle_starts = part.seconds[part.starts[part.judged]]
+    index = int(np.searchsorted(cycle_starts, cause.onset_s))
+    low = cycle_starts[index - 2] if index >= 2 else begins[whole.judged[0]]
+    high = cycle_starts[index + 1] if index + 1 < len(cycle_starts) else np.inf
     while True:
-        inside = [one for one in whole.judged if low <= begins[one] <= high]
-        looked = thinned(whole, inside, ONSETS)
-        judged = covariance(looked, (*others, cause)).of(looked.judged)
-        tried = looked.seconds[looked.starts[looked.judged]]
-        best = int(np.argmin(_misfits(looked, judged, others, cause, tried)))
+        inside = [cycle for cycle in whole.judged if low <= begins[cycle] <= high]
+        selected = thinned(whole, inside, ONSETS)
+        judged = covariance(selected, (*others, cause)).of(selected.judged)
+        tried = selected.seconds[selected.starts[selected.judged]]
+        best = int(np.argmin(_misfits(selected, judged, others, cause, tried)))
         cause = replace(cause, onset_s=float(tried[best]))
         if len(inside) <= ONSETS:
             break
         low, high = tried[max(best - 2, 0)], tried[min(best + 2, len(tried) - 1)]
-    cause = _with_onset(looked, judged, (*others, cause))[-1]
+    cause = _with_onset(selected, judged, (*others, cause))[-1]
     hypothesis = (*hypothesis[:number], cause, *hypothesis[number + 1 :])
-    return hypothesis, _onset_interval(looked, judged, hypothesis, number, found.leftover)
+    return hypothesis, _onset_interval(selected, judged, hypothesis, number, found.leftover)
 
 
 def _misfits(
     evidence: Evidence, judged: Weights, others: Hypothesis, cause: Cause, onsets: Floats
 ) -> Floats:
     tried = [(*others, replace(cause, onset_s=float(onset))) for onset in onsets]
-    found: Floats = np.sum(white(evidence, judged, tried) ** 2, axis=0)
-    return found
+    chi2: Floats = np.sum(white(evidence, judged, tried) ** 2, axis=0)
+    return chi2
 
 
 def _onset_interval(
     evidence: Evidence, judged: Weights, hypothesis: Hypothesis, number: int, leftover: float
 ) -> tuple[float, float]:
-    """95 % interval (s) of a step's onset, from how the misfit grows about it.
+    """95 % profile-likelihood interval (s) of a step's onset.
 
-    Each onset has the sizes that suit it best.
+    Sizes are fitted for each onset.
     """
     cause = hypothesis[number]
     if cause.course != Course.STEP:

@@ -1,8 +1,8 @@
-"""What no listed effect explains: where it is, on what it depends, and a term that takes it away.
+"""Residuals that no listed effect explains: phase, dependence, and a term that removes them.
 
-Straight lines between knots, over the time since a switching or over the vacuum, are fitted to what
-is left on the fitted cycles. Where they take much away on the held-out ones something is there that
-comes again in every cycle; where much is left all the same, it follows a time of its own.
+Terms are straight lines between knots, over the time since a switching or over the vacuum. They are
+fitted to the residual of the fitted cycles. If they remove much of it on the held-out cycles, the
+unlisted effect repeats in every cycle; if much remains, it has its own course in time.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,12 +23,12 @@ from twin.signals import MBAR, MS
 Over = Literal["time", "vacuum"]
 OVER: Mapping[Over, str] = {"time": "time in the cycle", "vacuum": "vacuum"}
 _ALL = range(len(KINDS))
-STRANGE = 0.4  # chi-square per residual that terms must take away on cycles they have not seen
+STRANGE = 0.4  # chi-square per residual that terms must remove on held-out cycles
 DROP_BAR = 0.1
-TERM_MBAR = 30.0  # how large a term may be, one sigma
+TERM_MBAR = 30.0  # prior sigma of a term
 KNOT_MBAR = 60.0  # between knots over vacuum
-FEWEST = 3  # cycles that a kind of stretch must be in
-SURE = 0.9  # correlation above which what is left follows the measured supply
+FEWEST = 3  # cycles that must have a kind of stretch
+SURE = 0.9  # correlation above which the residual follows the measured supply
 
 
 @dataclass(frozen=True)
@@ -37,26 +37,26 @@ class Unlisted:
 
     where: str  # idle, suction, hold or blow_off
     depends_on: str  # vacuum, time in the cycle, absolute time or supply
-    terms: tuple[Term, ...]  # what takes it away; none where it does not come again in every cycle
-    gain: float  # in chi-square that terms have on the held-out cycles, per residual
+    terms: tuple[Term, ...]  # that remove it; empty if it does not repeat in every cycle
+    gain: float  # of terms on the held-out cycles, in chi-square per residual
 
     @property
     def shape(self) -> str:
-        """Its shape in words."""
-        mine = [term for term in self.terms if _phase(term.where) == self.where]
-        if not mine:
+        """Its shape as text."""
+        terms_there = [term for term in self.terms if _phase(term.where) == self.where]
+        if not terms_there:
             return "another one in each cycle: no term of the model can take it away"
-        term = max(mine, key=lambda one: max(map(abs, one.mbar)))
+        term = max(terms_there, key=lambda candidate: max(map(abs, candidate.mbar)))
         most = int(np.argmax(np.abs(term.mbar)))
-        place = f"{term.at[most]:.0f} " + (
+        place_text = f"{term.at[most]:.0f} " + (
             "ms after it begins" if term.over == "time" else "mbar vacuum"
         )
-        return f"up to {term.mbar[most]:+.1f} mbar of pressure, at {place}"
+        return f"up to {term.mbar[most]:+.1f} mbar of pressure, at {place_text}"
 
 
 @dataclass(frozen=True)
-class _Left:
-    """What a hypothesis leaves on some cycles: bins in mbar, and whitened with the levels."""
+class _Residual:
+    """Residual of a hypothesis on some cycles: bins in mbar, and whitened with the levels."""
 
     weights: Weights
     off: Floats
@@ -64,62 +64,72 @@ class _Left:
 
 
 def look(
-    known: Covariance,
+    residual_covariance: Covariance,
     hypothesis: Hypothesis,
     fitted: Sequence[int],
     held_out: Sequence[int],
     least: float = STRANGE,
 ) -> Unlisted:
-    """Fit terms to what a hypothesis leaves on the fitted cycles; judge on the others.
+    """Fit terms to the residual of a hypothesis on the fitted cycles; judge on the others.
 
-    ``known`` is about the same hypothesis. Terms must take away the ``least`` there (chi-square
-    per residual). Over what they run the fitted cycles say among themselves: the held-out ones
-    choose nothing.
+    ``residual_covariance`` is about the same hypothesis. Terms must remove at least ``least`` there
+    (chi-square per residual). The fitted cycles alone choose time or vacuum, by cross-validation:
+    the held-out ones choose nothing.
     """
-    evidence = known.evidence
+    evidence = residual_covariance.evidence
     off = evidence.off([hypothesis])
 
-    def left(cycles: Sequence[int]) -> _Left:
-        weights = known.of(cycles)
+    def residual_of(cycles: Sequence[int]) -> _Residual:
+        weights = residual_covariance.of(cycles)
         level = levels(evidence, cycles, [hypothesis])
-        return _Left(weights, off[:, 0], weights.white(off, level)[:, 0])
+        return _Residual(weights, off[:, 0], weights.white(off, level)[:, 0])
 
-    here, there = left(fitted), left(held_out)
-    some, others = (left(fitted[i::2]) for i in (0, 1)) if len(fitted) > 1 else (here, here)
-    over = max(OVER, key=lambda one: _tried(evidence, some, others, one).gain)
-    best = _tried(evidence, here, there, over)
+    fitted_residual, held_out_residual = residual_of(fitted), residual_of(held_out)
+    first_half, second_half = (
+        (residual_of(fitted[i::2]) for i in (0, 1))
+        if len(fitted) > 1
+        else (fitted_residual, fitted_residual)
+    )
+    over = max(OVER, key=lambda variable: _tried(evidence, first_half, second_half, variable).gain)
+    best = _tried(evidence, fitted_residual, held_out_residual, over)
     if best.gain >= least:
         return best
-    return Unlisted(_worst(evidence, there), _driver(evidence, off[:, 0]), (), best.gain)
+    return Unlisted(
+        _worst(evidence, held_out_residual), _driver(evidence, off[:, 0]), (), best.gain
+    )
 
 
-def _tried(evidence: Evidence, here: _Left, there: _Left, over: Over) -> Unlisted:
-    """Terms over time or vacuum."""
-    shapes = smooth(evidence, here.off, over)
+def _tried(evidence: Evidence, fitted: _Residual, held_out: _Residual, over: Over) -> Unlisted:
+    """Fit terms over time or vacuum on one residual, and judge them on another."""
+    shapes = smooth(evidence, fitted.off, over)
     knots, hats = (
         {name: at for name, (at, _) in shapes.items()},
-        [one for _, one in shapes.values()],
+        [block for _, block in shapes.values()],
     )
-    columns = here.weights.white(np.concatenate(hats, axis=1))
+    columns = fitted.weights.white(np.concatenate(hats, axis=1))
     prior = np.eye(columns.shape[1]) / TERM_MBAR**2
-    size = np.linalg.solve(columns.T @ columns + prior, columns.T @ here.white)
+    size = np.linalg.solve(columns.T @ columns + prior, columns.T @ fitted.white)
     parts = np.split(size, np.cumsum([len(at) for at in knots.values()])[:-1])
-    taken = [there.weights.white(one) @ part for one, part in zip(hats, parts, strict=True)]
-    after = there.white - np.sum(taken, axis=0)
-    alone = [float(np.sum((after + one) ** 2)) for one in taken]  # without each of them
+    contributions = [
+        held_out.weights.white(block) @ part for block, part in zip(hats, parts, strict=True)
+    ]
+    after = held_out.white - np.sum(contributions, axis=0)
+    chi2_without = [
+        float(np.sum((after + block) ** 2)) for block in contributions
+    ]  # without each of them
     names = list(knots)
     terms = tuple(
         _term(name, over, at, part) for (name, at), part in zip(knots.items(), parts, strict=True)
     )
-    gain = float(there.white @ there.white - after @ after) / len(after)
-    where = _phase(names[int(np.argmax(alone))])
+    gain = float(held_out.white @ held_out.white - after @ after) / len(after)
+    where = _phase(names[int(np.argmax(chi2_without))])
     return Unlisted(where, OVER[over], terms, gain)
 
 
 def smooth(evidence: Evidence, off: Floats, over: Over) -> dict[str, tuple[Floats, Floats]]:
     """Knots of each kind of stretch, and the share of each in each bin, (bins, knots).
 
-    ``off`` is what a hypothesis leaves (mbar), which tells the vacuum that it expects.
+    ``off`` is the residual of a hypothesis (mbar), from which the expected vacuum follows.
     """
     bins, values = evidence.bins, _over(evidence, off, over)
     knots = {name: _knots(bins, values, kind, over) for kind, name in enumerate(KINDS)}
@@ -132,16 +142,18 @@ def _term(name: str, over: Over, at: Floats, sizes: Floats) -> Term:
     return Term(where=name, over=over, at=short[0], mbar=short[1])
 
 
-def _worst(evidence: Evidence, left: _Left) -> str:
-    """The phase in which most is left."""
-    kind = evidence.bins.kind[left.weights.bins]
-    white = left.white[: len(kind)]
-    most = [float(np.mean(white[kind == k] ** 2)) if (kind == k).any() else 0.0 for k in _ALL]
-    return _phase(KINDS[int(np.argmax(most))])
+def _worst(evidence: Evidence, residual: _Residual) -> str:
+    """The phase with the largest residual."""
+    kind = evidence.bins.kind[residual.weights.bins]
+    white = residual.white[: len(kind)]
+    mean_squares = [
+        float(np.mean(white[kind == k] ** 2)) if (kind == k).any() else 0.0 for k in _ALL
+    ]
+    return _phase(KINDS[int(np.argmax(mean_squares))])
 
 
 def _driver(evidence: Evidence, off: Floats) -> str:
-    """What something follows that differs from cycle to cycle: the measured supply, or time."""
+    """What an effect that differs from cycle to cycle follows: the measured supply, or time."""
     drop = (Cause("supply_pressure_drop", {"drop": DROP_BAR}),)
     moves = np.diff(evidence.off([HEALTHY, drop]), axis=1)[:, 0]
     sizes, supplies = [], []
@@ -160,7 +172,7 @@ def _phase(name: str) -> str:
 
 
 def _over(evidence: Evidence, off: Floats, over: Over) -> Floats:
-    """What terms run over, in each bin: warped time, or the vacuum that is expected (mbar)."""
+    """Independent variable of terms in each bin: warped time, or expected vacuum (mbar)."""
     if over == "time":
         return evidence.bins.time
     measured = evidence.bins.mean(evidence.samples["pressure"].astype(np.float64))
@@ -169,14 +181,14 @@ def _over(evidence: Evidence, off: Floats, over: Over) -> Floats:
 
 
 def _knots(bins: Bins, values: Floats, kind: int, over: Over) -> Floats:
-    """Knots of a kind of stretch, each with bins about it; none where it is too rare."""
-    here = values[bins.kind == kind]
+    """Knots of a kind of stretch, each with bins about it; empty if the kind is too rare."""
+    of_kind = values[bins.kind == kind]
     if len(np.unique(bins.cycle[bins.kind == kind])) < FEWEST:
         return np.empty(0)
     if over == "time":
-        return knots_over(here)
-    count = max(int(np.ptp(here) / KNOT_MBAR), 1) + 1
-    spread: Floats = np.quantile(here, np.linspace(0.0, 1.0, count))
+        return knots_over(of_kind)
+    count = max(int(np.ptp(of_kind) / KNOT_MBAR), 1) + 1
+    spread: Floats = np.quantile(of_kind, np.linspace(0.0, 1.0, count))
     return spread[np.diff(spread, prepend=-np.inf) > KNOT_MBAR / 4.0]
 
 
@@ -187,5 +199,5 @@ def _hats(bins: Bins, values: Floats, name: str, knots: Floats) -> Floats:
 
 
 def extended(evidence: Evidence, terms: Sequence[Term]) -> Evidence:
-    """The same beside a twin that has terms more."""
+    """Evidence for a twin with further terms."""
     return replace(evidence, terms=(*evidence.terms, *terms))

@@ -1,4 +1,4 @@
-"""What a cause leaves, and how well that suits something that nobody listed."""
+"""The residual of a cause, and how well an unlisted effect explains it."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,21 +16,21 @@ from twin.monitor.bins import Floats
 
 @dataclass(frozen=True)
 class Unmodelled:
-    """What could be left of something unlisted, beside a hypothesis."""
+    """Likelihoods of an unlisted effect, given a hypothesis."""
 
     evidence: Evidence
     weights: Weights  # about the hypothesis
     found: Hypothesis
 
     @cached_property
-    def _left(self) -> Floats:
-        """Residual (sigmas), and what it is without each cause in turn, (residuals, 1 + causes)."""
+    def _residuals(self) -> Floats:
+        """Residual (sigmas), then that without each cause in turn, (residuals, 1 + causes)."""
         without = [tuple(c for c in self.found if c is not cause) for cause in self.found]
         return white(self.evidence, self.weights, [self.found, *without])
 
     @cached_property
     def _courses(self) -> list[Floats]:
-        """Smooth courses that come again in every cycle, over time and over vacuum."""
+        """Smooth courses that repeat in every cycle, over time and over vacuum."""
         off = self.evidence.off([self.found])[:, 0]
         return [
             np.hstack([hats for _, hats in smooth(self.evidence, off, over).values()])
@@ -38,31 +38,38 @@ class Unmodelled:
         ]
 
     def odds(self, number: int) -> Odds:
-        """For the cause of this number, among those found."""
-        left, explained = self._left[:, 0], self._left[:, 1 + number] - self._left[:, 0]
-        scale = max(float(np.mean(left**2)), 1.0)
+        """Odds for the cause of this number, among those found."""
+        residual, explained = (
+            self._residuals[:, 0],
+            self._residuals[:, 1 + number] - self._residuals[:, 0],
+        )
+        scale = max(float(np.mean(residual**2)), 1.0)
         acts = _acts(self.evidence, self.found[number])[self.evidence.bins.cycle]
         logs = np.array(
             [
-                log_likelihoods(self.weights.white(course * acts[:, None]), left, explained, scale)
+                log_likelihoods(
+                    self.weights.white(course * acts[:, None]), residual, explained, scale
+                )
                 for course in self._courses
             ]
         )
         return Odds.of(logs)
 
     def alone(self) -> float:
-        """Probability that something unlisted acts, where no cause was found.
+        """Probability that something unlisted acts if no cause was found.
 
-        What is left is as wide as it is: one odd cycle is no course that comes again.
+        The residual's own width counts as noise: one odd cycle is no course that repeats.
         """
-        left, noise = self._left[:, 0], np.ones(len(self._left))
-        scale = max(float(np.mean(left**2)), 1.0)
+        residual, noise = self._residuals[:, 0], np.ones(len(self._residuals))
+        scale = max(float(np.mean(residual**2)), 1.0)
         courses = [self.weights.white(course) for course in self._courses]
-        return alone(np.array([log_likelihoods(one, left, noise, scale) for one in courses]))
+        return alone(
+            np.array([log_likelihoods(course, residual, noise, scale) for course in courses])
+        )
 
 
 def _acts(evidence: Evidence, cause: Cause) -> Floats:
-    """By how much of its size a cause acts in each cycle, by its end."""
+    """Share of its size with which a cause acts at the end of each cycle."""
     ends = evidence.seconds[evidence.starts[1:] - 1]
     if cause.course == Course.STEP:
         return np.asarray(ends > cause.onset_s, np.float64)
