@@ -70,7 +70,9 @@ def test_an_advisory_holds_for_the_versions_that_it_says(
     affected: dict[str, Any], versions: list[str]
 ) -> None:
     every = ("1.0", "1.4.9", "1.5rc1", "1.5", "2.0", "3.0")
-    found = [one for one in every if audit.looked_up([advisory(**affected)], {"mid": one})]
+    found = [
+        one for one in every if audit.matching_advisories([advisory(**affected)], {"mid": one})
+    ]
     assert found == versions
 
 
@@ -80,14 +82,14 @@ def test_others_and_withdrawn_ones_do_not_count() -> None:
     crates = advisory(**everything)
     crates["affected"][0]["package"]["ecosystem"] = "crates.io"
     records = [withdrawn, crates, advisory("other", **everything)]
-    assert audit.looked_up(records, {"mid": "1.0"}) == []
+    assert audit.matching_advisories(records, {"mid": "1.0"}) == []
 
 
 def test_an_export_of_advisories_is_read_and_told(tmp_path: Path) -> None:
     affected = between({"introduced": "0"}, {"fixed": "1.5"})
     with zipfile.ZipFile(tmp_path / "all.zip", "w") as archive:
         archive.writestr("GHSA-1.json", json.dumps(advisory("Mid", **affected)))
-    found = audit.looked_up(audit.advisories(tmp_path / "all.zip"), {"mid": "1.0"})
+    found = audit.matching_advisories(audit.advisories(tmp_path / "all.zip"), {"mid": "1.0"})
     assert found == [audit.Vulnerability("mid", "1.0", "GHSA-1", "1.5", "bad")]
     document = {"components": [component("Mid", scope="optional")]}
     told = audit.report(found, "OSV's advisories in all.zip", document)
@@ -101,6 +103,6 @@ def test_no_answer_is_not_taken_for_a_good_one() -> None:
     mid = {"name": "mid", "version": "1.0", "vulns": [vulnerable]}
     ours = {"name": "ejector-twin", "skip_reason": "not found on PyPI"}
     found = audit.Vulnerability("mid", "1.0", "PYSEC-1", "2.0", "Summary")
-    assert audit.heard([mid, ours]) == [found]
+    assert audit.vulnerabilities_in([mid, ours]) == [found]
     with pytest.raises(audit.Unreachable, match="about 1 packages: other"):
-        audit.heard([mid, ours, ours | {"name": "other"}])
+        audit.vulnerabilities_in([mid, ours, ours | {"name": "other"}])

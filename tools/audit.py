@@ -49,7 +49,7 @@ class Vulnerability(NamedTuple):
 
 
 class Unreachable(Exception):  # noqa: N818 - says what happened
-    """Nobody could be asked about vulnerabilities."""
+    """No source of vulnerabilities could be reached."""
 
 
 # --- what is installed --------------------------------------------------------------------------
@@ -59,12 +59,14 @@ def bill_of_materials() -> dict[str, Any]:
     """The CycloneDX document of this environment, each component with its scope."""
     command = [TOOLS / "cyclonedx-py", "environment", sys.executable, "--output-reproducible"]
     project = ["--pyproject", ROOT / "pyproject.toml"]
-    done = subprocess.run([*command, *project], check=True, capture_output=True)
-    found: dict[str, Any] = json.loads(done.stdout)
+    process = subprocess.run([*command, *project], check=True, capture_output=True)
+    document: dict[str, Any] = json.loads(process.stdout)
     tables = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    extras = [one for of in tables["optional-dependencies"].values() for one in of]
-    scoped(found, tables["dependencies"], extras, needs_of)
-    return found
+    extras = [
+        requirement for group in tables["optional-dependencies"].values() for requirement in group
+    ]
+    scoped(document, tables["dependencies"], extras, needs_of)
+    return document
 
 
 def scoped(
@@ -72,30 +74,33 @@ def scoped(
 ) -> None:
     """Write each component's scope: reached from the base, from an extra, or from neither."""
     required, optional = reached(base, needs), reached(extras, needs)
-    for one in document["components"]:
-        name = canonicalize_name(one["name"])
+    for component in document["components"]:
+        name = canonicalize_name(component["name"])
         is_optional = "optional" if name in optional else "excluded"
-        one["scope"] = "required" if name in required else is_optional
+        component["scope"] = "required" if name in required else is_optional
 
 
 def reached(requirements: Iterable[str], needs: Needs) -> set[str]:
-    """The packages that these ask for, directly or not, here and with these extras."""
-    waiting, seen = [Requirement(one) for one in requirements], set[tuple[str, str]]()
+    """Packages that these require, directly or not, in this environment and with these extras."""
+    waiting, seen = (
+        [Requirement(requirement) for requirement in requirements],
+        set[tuple[str, str]](),
+    )
     while waiting:
-        wanted = waiting.pop()
-        name = canonicalize_name(wanted.name)
-        for extra in {"", *wanted.extras} - {extra for of, extra in seen if of == name}:
+        needed = waiting.pop()
+        name = canonicalize_name(needed.name)
+        for extra in {"", *needed.extras} - {extra for package, extra in seen if package == name}:
             seen.add((name, extra))
             waiting += [
-                one
-                for one in map(Requirement, needs(name))
-                if one.marker is None or one.marker.evaluate({"extra": extra})
+                requirement
+                for requirement in map(Requirement, needs(name))
+                if requirement.marker is None or requirement.marker.evaluate({"extra": extra})
             ]
     return {name for name, _ in seen}
 
 
 def needs_of(name: str) -> list[str]:
-    """What an installed package says that it needs; nothing of one that is not here."""
+    """Requirements of an installed package; empty if it is not installed."""
     try:
         return requires(name) or []
     except PackageNotFoundError:
@@ -103,25 +108,28 @@ def needs_of(name: str) -> list[str]:
 
 
 def licence(component: Mapping[str, Any]) -> str:
-    """What a component says of its licence, SPDX before classifiers before names."""
+    """The stated licence of a component: SPDX before classifiers before names."""
     stated = component.get("licenses", [])
-    expressions = [one["expression"] for one in stated if "expression" in one]
-    entries = [one["license"] for one in stated if "license" in one]
-    spdx = [one["id"] for one in entries if "id" in one]
-    others = [one["name"].rpartition(" :: ")[2] for one in entries if "name" in one]
-    return "; ".join(expressions or spdx or others) or UNSTATED
+    expressions = [entry["expression"] for entry in stated if "expression" in entry]
+    entries = [entry["license"] for entry in stated if "license" in entry]
+    spdx = [entry["id"] for entry in entries if "id" in entry]
+    classifiers = [entry["name"].rpartition(" :: ")[2] for entry in entries if "name" in entry]
+    return "; ".join(expressions or spdx or classifiers) or UNSTATED
 
 
 def licences(document: Mapping[str, Any]) -> str:
     """The licence list as Markdown, by scope."""
     lines = ["# Licences", ""]
-    for scope, why in SCOPES.items():
-        lines += [f"## {scope.capitalize()}: {why}", "", "| package | version | licence |"]
+    for scope, description in SCOPES.items():
+        lines += [f"## {scope.capitalize()}: {description}", "", "| package | version | licence |"]
         lines += ["| --- | --- | --- |"]
         lines += [
-            f"| {one['name']} | {one['version']} | {licence(one).replace('|', '/')} |"
-            for one in sorted(document["components"], key=lambda one: one["name"].lower())
-            if one["scope"] == scope
+            f"| {component['name']} | {component['version']} |"
+            f" {licence(component).replace('|', '/')} |"
+            for component in sorted(
+                document["components"], key=lambda component: component["name"].lower()
+            )
+            if component["scope"] == scope
         ]
         lines.append("")
     return "\n".join(lines)
@@ -130,42 +138,42 @@ def licences(document: Mapping[str, Any]) -> str:
 # --- what is wrong with it ----------------------------------------------------------------------
 
 
-def asked() -> list[Vulnerability]:
-    """What pip-audit hears from PyPI; Unreachable where it does not."""
-    where = ["--path", sysconfig.get_path("purelib"), "--format", "json", "--desc", "on"]
-    command = [TOOLS / "pip-audit", *where, "--progress-spinner", "off"]
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
+def query_pypi() -> list[Vulnerability]:
+    """Vulnerabilities by pip-audit from PyPI; raises Unreachable without an answer."""
+    options = ["--path", sysconfig.get_path("purelib"), "--format", "json", "--desc", "on"]
+    command = [TOOLS / "pip-audit", *options, "--progress-spinner", "off"]
+    process = subprocess.run(command, check=False, capture_output=True, text=True)
     try:
-        packages = json.loads(done.stdout)["dependencies"]
+        packages = json.loads(process.stdout)["dependencies"]
     except (ValueError, KeyError):
-        raise Unreachable(f"pip-audit: {done.stderr.strip()[-300:]}") from None
-    return heard(packages)
+        raise Unreachable(f"pip-audit: {process.stderr.strip()[-300:]}") from None
+    return vulnerabilities_in(packages)
 
 
-def heard(packages: Iterable[Mapping[str, Any]]) -> list[Vulnerability]:
-    """What pip-audit's answer says; Unreachable where it skipped a package that is not ours."""
-    known, skipped = [], []
-    for one in packages:
-        (skipped if "skip_reason" in one else known).append(one)
-    unasked = sorted({one["name"] for one in skipped} - {"ejector-twin"})
+def vulnerabilities_in(packages: Iterable[Mapping[str, Any]]) -> list[Vulnerability]:
+    """Vulnerabilities in pip-audit's answer; Unreachable if it skipped a package of others."""
+    checked, skipped = [], []
+    for package in packages:
+        (skipped if "skip_reason" in package else checked).append(package)
+    unasked = sorted({package["name"] for package in skipped} - {"ejector-twin"})
     if unasked:
-        few = ", ".join(unasked[:3])
-        raise Unreachable(f"pip-audit could not ask PyPI about {len(unasked)} packages: {few} …")
+        names = ", ".join(unasked[:3])
+        raise Unreachable(f"pip-audit could not ask PyPI about {len(unasked)} packages: {names} …")
     return [
         Vulnerability(
-            one["name"],
-            one["version"],
-            of["id"],
-            ", ".join(of["fix_versions"]),
-            first_line(of.get("description", "")),
+            package["name"],
+            package["version"],
+            vulnerability["id"],
+            ", ".join(vulnerability["fix_versions"]),
+            first_line(vulnerability.get("description", "")),
         )
-        for one in known
-        for of in one["vulns"]
+        for package in checked
+        for vulnerability in package["vulns"]
     ]
 
 
 def first_line(text: str) -> str:
-    """The first line that says something, without Markdown's marks."""
+    """The first line that is not empty, without Markdown's marks."""
     return next((line.strip("# ") for line in text.splitlines() if line.strip("# ")), "")
 
 
@@ -177,11 +185,11 @@ def advisories(path: Path) -> Iterator[dict[str, Any]]:
                 yield json.loads(archive.read(name))
 
 
-def looked_up(
+def matching_advisories(
     records: Iterable[Mapping[str, Any]], installed: Mapping[str, str]
 ) -> list[Vulnerability]:
-    """Which advisories are about what is installed: versions by canonical name."""
-    found = []
+    """Advisories that affect the ``installed`` versions, by canonical name."""
+    vulnerabilities = []
     for record in records:
         for affected in () if "withdrawn" in record else record.get("affected", ()):
             package = affected.get("package", {})
@@ -192,25 +200,25 @@ def looked_up(
             if is_affected(affected, version):
                 summary = record.get("summary") or first_line(record.get("details", ""))
                 fixed = ", ".join(dict.fromkeys(_events(affected, "fixed")))
-                found.append(Vulnerability(name, version, record["id"], fixed, summary))
-    return found
+                vulnerabilities.append(Vulnerability(name, version, record["id"], fixed, summary))
+    return vulnerabilities
 
 
 def is_affected(affected: Mapping[str, Any], installed: str) -> bool:
     """Whether a version is listed, or lies in a range; as OSV's schema evaluates them."""
     version = Version(installed)
-    if any(_version(one) == version for one in affected.get("versions", [])):
+    if any(_version(listed) == version for listed in affected.get("versions", [])):
         return True
-    for of in affected.get("ranges", []):
+    for version_range in affected.get("ranges", []):
         inside = False
-        events = [item for event in of["events"] for item in event.items()]
-        if of["type"] == "ECOSYSTEM":
+        events = [item for event in version_range["events"] for item in event.items()]
+        if version_range["type"] == "ECOSYSTEM":
             for kind, text in sorted(events, key=lambda item: _version(item[1])):
-                at = _version(text)
-                if kind == "introduced" and version >= at:
+                bound = _version(text)
+                if kind == "introduced" and version >= bound:
                     inside = True
-                elif (kind == "fixed" and version >= at) or (
-                    kind == "last_affected" and version > at
+                elif (kind == "fixed" and version >= bound) or (
+                    kind == "last_affected" and version > bound
                 ):
                     inside = False
         if inside:
@@ -219,60 +227,65 @@ def is_affected(affected: Mapping[str, Any], installed: str) -> bool:
 
 
 def _events(affected: Mapping[str, Any], kind: str) -> Iterator[str]:
-    for of in affected.get("ranges", []):
-        if of["type"] == "ECOSYSTEM":
-            yield from (event[kind] for event in of["events"] if kind in event)
+    for version_range in affected.get("ranges", []):
+        if version_range["type"] == "ECOSYSTEM":
+            yield from (event[kind] for event in version_range["events"] if kind in event)
 
 
 def _version(text: str) -> Version:
     try:
         return Version(text)
-    except InvalidVersion:  # of long ago; before all that count
+    except InvalidVersion:  # old versions; they sort before all others
         return Version("0.dev0")
 
 
-def report(found: Iterable[Vulnerability], source: str, document: Mapping[str, Any]) -> str:
-    """The vulnerabilities as Markdown, and who was asked."""
-    scopes = {canonicalize_name(one["name"]): one["scope"] for one in document["components"]}
+def report(
+    vulnerabilities: Iterable[Vulnerability], source: str, document: Mapping[str, Any]
+) -> str:
+    """The vulnerabilities as Markdown, with their source."""
+    scopes = {canonicalize_name(entry["name"]): entry["scope"] for entry in document["components"]}
     lines = ["# Known vulnerabilities", "", f"Asked: {source}.", ""]
     rows = [
-        f"| {one.package} | {one.version} | {scopes.get(canonicalize_name(one.package), '')} "
-        f"| {one.name} | {one.fixed or 'none'} | {one.summary.replace('|', '/')} |"
-        for one in sorted(found)
+        f"| {entry.package} | {entry.version} | {scopes.get(canonicalize_name(entry.package), '')} "
+        f"| {entry.name} | {entry.fixed or 'none'} | {entry.summary.replace('|', '/')} |"
+        for entry in sorted(vulnerabilities)
     ]
     head = ["| package | version | scope | advisory | fixed in | what |", "|" + " --- |" * 6]
     return "\n".join([*lines, *([*head, *rows] if rows else ["None."]), ""])
 
 
 def main() -> int:
-    """Write the three files; 1 for bad news."""
+    """Write the three files; 1 if something is vulnerable or unknown."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--advisories", type=Path)
-    wanted = parser.parse_args()
-    wanted.folder.mkdir(parents=True, exist_ok=True)
+    arguments = parser.parse_args()
+    arguments.folder.mkdir(parents=True, exist_ok=True)
     document = bill_of_materials()
-    write(wanted.folder / "sbom.json", json.dumps(document, indent=2) + "\n")
-    write(wanted.folder / "licences.md", licences(document))
-    installed = {canonicalize_name(one["name"]): one["version"] for one in document["components"]}
+    write(arguments.folder / "sbom.json", json.dumps(document, indent=2) + "\n")
+    write(arguments.folder / "licences.md", licences(document))
+    installed = {
+        canonicalize_name(component["name"]): component["version"]
+        for component in document["components"]
+    }
     try:
-        if wanted.advisories:
-            source = f"OSV's advisories in {wanted.advisories.name}"
-            found = looked_up(advisories(wanted.advisories), installed)
+        if arguments.advisories:
+            source = f"OSV's advisories in {arguments.advisories.name}"
+            vulnerabilities = matching_advisories(advisories(arguments.advisories), installed)
         else:
-            source, found = "PyPI, by pip-audit", asked()
+            source, vulnerabilities = "PyPI, by pip-audit", query_pypi()
     except Unreachable as error:
         print(f"Vulnerabilities are not audited. {error}.", file=sys.stderr)
         print("Give an export of OSV's advisories: make audit ADVISORIES=all.zip", file=sys.stderr)
-        (wanted.folder / "vulnerabilities.md").unlink(missing_ok=True)
+        (arguments.folder / "vulnerabilities.md").unlink(missing_ok=True)
         return 1
-    write(wanted.folder / "vulnerabilities.md", report(found, source, document))
-    print(f"{len(found)} known vulnerabilities in {len(installed)} packages ({source})")
-    return 1 if found else 0
+    write(arguments.folder / "vulnerabilities.md", report(vulnerabilities, source, document))
+    print(f"{len(vulnerabilities)} known vulnerabilities in {len(installed)} packages ({source})")
+    return 1 if vulnerabilities else 0
 
 
 def write(path: Path, text: str) -> None:
-    """Write a file and say so."""
+    """Write a file and print its path."""
     path.write_text(text, encoding="utf-8")
     print(path)
 

@@ -247,9 +247,9 @@ BENCHMARKS = (
             ),
             Figure("log: an hour read", "s", "decompression alone", 2.5, limits_ratio=True),
             *(
-                Figure(f"{way}: {what}", unit, "our log")
-                for way in ("MCAP library", "Parquet")
-                for what, unit in (
+                Figure(f"{format_name}: {quantity}", unit, "our log")
+                for format_name in ("MCAP library", "Parquet")
+                for quantity, unit in (
                     ("size with model values", "bytes/sample"),
                     ("an hour written", "s"),
                     ("an hour read", "s"),
@@ -320,28 +320,28 @@ BENCHMARKS = (
 
 def main() -> int:
     """Measure, print, write; gives the exit code."""
-    given = _arguments()
-    # As after a first start, whatever this shell says: what is measured is not to be parsed anew.
+    arguments = _arguments()
+    # As after a first start, whatever this shell sets: modules must not be parsed anew.
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     before, load = machine.noise(), machine.Load.now()
     results, seconds = [], {}
     with tempfile.TemporaryDirectory(prefix="ejector-twin-bench-") as folder:
-        run = Run(given.long, Path(folder), _tell, given.seconds)
+        run = Run(arguments.long, Path(folder), _tell, arguments.seconds)
         for benchmark in BENCHMARKS:
-            if _wanted(benchmark, given):
+            if _wanted(benchmark, arguments):
                 begin = time.monotonic()
                 results += zip(benchmark.figures, benchmark.measure(run), strict=True)
                 seconds[benchmark.name] = time.monotonic() - begin
     _tell("")
     notes = [
-        _kind(given.long),
+        _kind(arguments.long),
         f"Machine: {machine.description()}; {machine.Load.now().since(load)}.",
         f"Noise: {before}; after the run {machine.noise()}.",
         f"Seconds: {', '.join(f'{name} {taken:.0f}' for name, taken in seconds.items())}.",
     ]
     print("\n".join(f"- {note}" for note in notes))
     print(f"\n{page.table(results)}")
-    if given.keep or not given.only:
+    if arguments.keep or not arguments.only:
         newer = page.Session(notes, results)
         page.write(page.with_newer(page.read(BENCHMARKS), newer), BENCHMARKS)
     return 0
@@ -357,12 +357,14 @@ def _arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _wanted(benchmark: Benchmark, given: argparse.Namespace) -> bool:
-    return benchmark.name in given.only if given.only else given.long or not benchmark.long
+def _wanted(benchmark: Benchmark, arguments: argparse.Namespace) -> bool:
+    return (
+        benchmark.name in arguments.only if arguments.only else arguments.long or not benchmark.long
+    )
 
 
 def _tell(text: str) -> None:
-    """Say on a terminal what is going on; a thread that draws would disturb what is measured."""
+    """Print progress on a terminal; a drawing thread would disturb the measurement."""
     if sys.stderr.isatty():
         print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
 

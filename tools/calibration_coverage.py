@@ -71,7 +71,7 @@ def drawn(plc: PlcSettings, seed: int) -> PlcSettings:
 
 
 def recorded(plc: PlcSettings, cycles: int, seed: int, faults: Sequence[Fault] = ()) -> Samples:
-    """Samples in which ``cycles`` count: not the first one, nor what is cut at the end."""
+    """Samples with ``cycles`` that count: without the first one and the one cut at the end."""
     program = plc.program.model_copy(update={"start_ms": 500.0})
     cycle = program.suction_ms + program.blow_off_ms + program.idle_ms
     seconds = (program.start_ms + (cycles + 1.2) * cycle) * MS
@@ -80,12 +80,12 @@ def recorded(plc: PlcSettings, cycles: int, seed: int, faults: Sequence[Fault] =
 
 
 def misses(fitted: Fitted, plc: PlcSettings) -> dict[str, float]:
-    """By how many of its standard deviations each comparable value misses the truth."""
-    found = {}
+    """Errors of comparable values, in their standard deviations."""
+    by_name = {}
     for name, true in TRUE.items():
         low, high = fitted.interval(name)
-        found[name] = ((low + high) / 2.0 - true(plc)) / ((high - low) / 2.0 / 1.96)
-    return found
+        by_name[name] = ((low + high) / 2.0 - true(plc)) / ((high - low) / 2.0 / 1.96)
+    return by_name
 
 
 def main() -> None:
@@ -94,28 +94,33 @@ def main() -> None:
     parser.add_argument("--rigs", type=int, default=40)
     parser.add_argument("--first", type=int, default=0, help="seed of the first rig")
     parser.add_argument("--cycles", type=int, default=8)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     documents = {name: shipped(name) for name in SYSTEMS}
     types = {name: as_type(document).data for name, document in documents.items()}
-    found: dict[str, list[dict[str, float]]] = {name: [] for name in SYSTEMS}
-    for seed in range(asked.first, asked.first + asked.rigs):
+    misses_by_system: dict[str, list[dict[str, float]]] = {name: [] for name in SYSTEMS}
+    for seed in range(arguments.first, arguments.first + arguments.rigs):
         name = SYSTEMS[seed % len(SYSTEMS)]
         plc = drawn(rig_of(documents[name]), seed)
         begin = time.perf_counter()
         fitted = fit(
-            recorded(plc, asked.cycles, seed), Space.of_type(types[name]), lambda _what: None
+            recorded(plc, arguments.cycles, seed), Space.of_type(types[name]), lambda _what: None
         )
-        found[name].append(misses(fitted, plc))
-        numbers = " ".join(f"{sigmas:6.2f}" for sigmas in found[name][-1].values())
+        misses_by_system[name].append(misses(fitted, plc))
+        numbers = " ".join(f"{sigmas:6.2f}" for sigmas in misses_by_system[name][-1].values())
         print(f"{name:<10}{seed:>4}  {numbers}  {time.perf_counter() - begin:.0f} s", flush=True)
-    _print_table(found)
+    _print_table(misses_by_system)
 
 
-def _print_table(found: Mapping[str, list[dict[str, float]]]) -> None:
-    print(f"\n{'holds the truth within 95 %':<34}" + "".join(f"{name:>12}" for name in found))
+def _print_table(misses_by_system: Mapping[str, list[dict[str, float]]]) -> None:
+    print(
+        f"\n{'holds the truth within 95 %':<34}"
+        + "".join(f"{name:>12}" for name in misses_by_system)
+    )
     for name in TRUE:
-        held = (np.abs([one[name] for one in rigs]) <= 1.96 for rigs in found.values())
-        print(f"{name:<34}" + "".join(f"{one.sum():>7}/{one.size}" for one in held))
+        held_values = (
+            np.abs([inside[name] for inside in rigs]) <= 1.96 for rigs in misses_by_system.values()
+        )
+        print(f"{name:<34}" + "".join(f"{inside.sum():>7}/{inside.size}" for inside in held_values))
 
 
 if __name__ == "__main__":

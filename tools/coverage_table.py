@@ -17,20 +17,20 @@ COLUMNS = "| module | lines | not run | branches | not taken | covered |"
 
 
 def table(report: Mapping[str, Any]) -> str:
-    """A coverage.json as Markdown: modules, all of it, and the ones below ENOUGH."""
-    files = {name: of["summary"] for name, of in sorted(report["files"].items())}
+    """A coverage.json as Markdown: modules, the total, and modules below ENOUGH."""
+    files = {name: summary["summary"] for name, summary in sorted(report["files"].items())}
     rows = [COLUMNS, "|" + " --- |" * 6]
-    rows += [row(name, of) for name, of in [*files.items(), ("all", report["totals"])]]
-    low = [(of["percent_covered"], name) for name, of in files.items()]
+    rows += [row(name, summary) for name, summary in [*files.items(), ("all", report["totals"])]]
+    low = [(summary["percent_covered"], name) for name, summary in files.items()]
     below = [f"- {name}: {share:.1f} %" for share, name in sorted(low) if share < ENOUGH]
     return "\n".join([*rows, "", f"Below {ENOUGH:.0f} %:", *(below or ["none"])])
 
 
-def row(name: str, of: Mapping[str, Any]) -> str:
+def row(name: str, summary: Mapping[str, Any]) -> str:
     """One line of the table."""
     counts = ("num_statements", "missing_lines", "num_branches", "missing_branches")
-    numbers = " | ".join(str(of[key]) for key in counts)
-    return f"| {name} | {numbers} | {of['percent_covered']:.1f} % |"
+    numbers = " | ".join(str(summary[key]) for key in counts)
+    return f"| {name} | {numbers} | {summary['percent_covered']:.1f} % |"
 
 
 if __name__ == "__main__":

@@ -23,21 +23,21 @@ class Cluster:
 
 @contextmanager
 def cluster(workers: int) -> Iterator[Cluster]:
-    """Start them, each a process with one thread."""
+    """Start a scheduler and workers, each a process with one thread."""
     with contextlib.ExitStack() as ending:
         scheduler = _start(ending, "scheduler", "--port", "0", *_QUIET)
         address = _read_until(scheduler, r"Scheduler at:\s+(tcp://\S+)")
-        some = [
+        processes = [
             _start(ending, "worker", address, "--nthreads", "1", "--no-nanny", *_QUIET)
             for _ in range(workers)
         ]
-        for one in some:
-            _read_until(one, r"Registered to:\s+(\S+)")
-        yield Cluster(address, some)
+        for worker in processes:
+            _read_until(worker, r"Registered to:\s+(\S+)")
+        yield Cluster(address, processes)
 
 
 def _start(ending: contextlib.ExitStack, *arguments: str) -> "subprocess.Popen[str]":
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # as Dask's nannies have it
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # as Dask's nannies set it
     process = subprocess.Popen(
         [*_DASK, *arguments], stderr=subprocess.PIPE, text=True, env=environment
     )
@@ -51,10 +51,10 @@ def _end(process: "subprocess.Popen[str]") -> None:
 
 
 def _read_until(process: "subprocess.Popen[str]", pattern: str) -> str:
-    said = []
+    output = []
     assert process.stderr is not None
     for line in process.stderr:
-        said.append(line)
-        if found := re.search(pattern, line):
-            return found[1]
-    raise RuntimeError(f"ended (exit code {process.wait()}):\n{''.join(said)}")
+        output.append(line)
+        if match := re.search(pattern, line):
+            return match[1]
+    raise RuntimeError(f"ended (exit code {process.wait()}):\n{''.join(output)}")

@@ -1,11 +1,11 @@
 """The demo: a live twin beside a simulated PLC, a leak that opens half-way, alarm and cause.
 
-Leaves ``demo/`` with the MCAP log, the diagnosis JSON and the HTML report. Exits with 0 only if
-the leak was flagged and named while the twin ran, nothing was called stale, no other cause was
-named, and both diagnoses name it with its onset: the live twin's, and the log's.
+It writes ``demo/`` with the MCAP log, the diagnosis JSON and the HTML report. Exit code 0 requires
+that the live twin raised and named the leak, and reported neither a stale PLC nor another cause.
+Both diagnoses, the live twin's and the log's, must name the leak with its onset.
 
-All of it is rehearsed first on simulated rows. So nothing has to be compiled while the PLC runs.
-What follows waits for what the programs say, not for times: a busy machine only takes longer.
+All steps are rehearsed first on simulated rows, so that nothing is compiled while the PLC runs.
+Each step waits for the output of the programs, not for times: a busy machine only takes longer.
 """
 
 import json
@@ -42,11 +42,11 @@ from twin.signals import NS
 ROOT = Path(__file__).parent.parent
 CONFIG = ROOT / "configs" / "test_rig.toml"
 FOLDER = ROOT / "demo"
-LEAK_S = 13  # after the PLC's start: three healthy cycles before, as many with the leak after it
+LEAK_S = 13  # after the PLC's start: three healthy cycles before it, three with the leak after
 LEAK = f"leakage=2.0@{LEAK_S}"  # sl/min
-REHEARSED_S = 26  # rows that are as many cycles as the live twin sees before it makes a diagnosis
+REHEARSED_S = 26  # of rows: as many cycles as the live twin sees before it makes a diagnosis
 LONGEST_S = 300  # with the PLC: a twin that makes no diagnosis is ended
-ONSET_S = 0.2  # the onset is to be told no worse than this
+ONSET_S = 0.2  # largest error of the onset
 
 
 def main() -> int:
@@ -67,7 +67,7 @@ def main() -> int:
 
 
 def _rehearse() -> None:
-    """Do on simulated rows all that follows: whatever has to be compiled is so before time counts.
+    """Run all steps on simulated rows first, so that everything is compiled before time counts.
 
     It takes minutes where nothing is compiled yet, and seconds later.
     """
@@ -85,11 +85,11 @@ def _rehearse() -> None:
 
 
 @contextmanager
-def _timed(what: str) -> Iterator[None]:
-    """Say what is ready, and how long it took."""
+def _timed(step: str) -> Iterator[None]:
+    """Print the step that is done, and how long it took."""
     begun = time.monotonic()
     yield
-    print(f"  {what} is ready ({time.monotonic() - begun:.0f} s)", flush=True)
+    print(f"  {step} is ready ({time.monotonic() - begun:.0f} s)", flush=True)
 
 
 def _twin(command: str) -> list[str]:
@@ -100,7 +100,7 @@ def _twin(command: str) -> list[str]:
 def _program(
     command: list[str], stderr: int | None = None
 ) -> Iterator[tuple["subprocess.Popen[str]", Iterable[str]]]:
-    """A program that runs meanwhile, with the lines that it says; it is ended at the end."""
+    """A program that runs in the background, with the lines that it prints; ended at the end."""
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stderr, text=True) as process:
         assert process.stdout is not None
         try:
@@ -117,12 +117,12 @@ def _run_both(log: Path) -> None:
     """
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = str(free.getsockname()[1])
-    at = ["--address", f"127.0.0.1:{port}", "--log", str(log), "--duration", str(LONGEST_S)]
-    with _program([*_twin("run"), str(CONFIG), *at], subprocess.STDOUT) as (live, lines):
+    options = ["--address", f"127.0.0.1:{port}", "--log", str(log), "--duration", str(LONGEST_S)]
+    with _program([*_twin("run"), str(CONFIG), *options], subprocess.STDOUT) as (live, lines):
         _show_until(WAITS, lines)
         of_plc = [*_twin("plc"), str(CONFIG), "--port", port, "--seed", "1", "--fault", LEAK]
-        with _program(of_plc) as (_, said):
-            if not any(line.startswith("listening") for line in said):
+        with _program(of_plc) as (_, plc_lines):
+            if not any(line.startswith("listening") for line in plc_lines):
                 sys.exit("the simulated PLC did not start; above it says why")
             _show_until(f"  {Kind.DIAGNOSIS}  ", lines)
             live.send_signal(signal.SIGINT)
@@ -131,18 +131,18 @@ def _run_both(log: Path) -> None:
                 sys.exit(f"the live twin failed with exit code {live.returncode}")
 
 
-def _show_until(what: str | None, lines: Iterable[str]) -> None:
-    """Show lines up to the first one with it; all that are left, if there is none."""
+def _show_until(text: str | None, lines: Iterable[str]) -> None:
+    """Print lines up to the first one with the text; all remaining lines without one."""
     for line in lines:
         print(f"  {line}", end="", flush=True)
-        if what is not None and what in line:
+        if text is not None and text in line:
             return
 
 
 def judged(
     events: Sequence[Event], answer: dict[str, Any], began_ns: int | None, opened_ns: int | None
 ) -> int:
-    """Say whether the demo showed what it is for; give its exit code.
+    """Print whether the demo reached its goals; give its exit code.
 
     ``events`` and ``answer`` (the diagnosis JSON) are of the log, which began at ``began_ns``; the
     leak opened at ``opened_ns`` (PLC time, None where the log does not hold it).
@@ -159,7 +159,7 @@ def judged(
 
 
 def _missed(events: Sequence[Event], answer: dict[str, Any], began_ns: int, opened_ns: int) -> str:
-    """What the demo did not show of what it is for; empty if it showed all."""
+    """The goals that the demo missed; empty if it reached all."""
     if any(event.kind is Kind.PLC_STALE for event in events):
         return "the PLC was called stale, and it was not"
     raised = [event for event in events if event.kind is Kind.DEVIATION]
@@ -173,25 +173,28 @@ def _missed(events: Sequence[Event], answer: dict[str, Any], began_ns: int, open
     live = [event for event in events if event.kind is Kind.DIAGNOSIS and "answer" in event.data]
     if not live:
         return "the live twin made no diagnosis"
-    found = (
+    diagnoses = (
         ("of the live twin", live[-1].data["answer"], int(live[-1].data["begin_ns"])),
         ("of the log", answer, began_ns),
     )
-    wrong = (_wrong(told, (opened_ns - begin) * NS, whose) for whose, told, begin in found)
-    return next(filter(None, wrong), "")
+    problems = (
+        _wrong(diagnosis, (opened_ns - begin) * NS, source)
+        for source, diagnosis, begin in diagnoses
+    )
+    return next(filter(None, problems), "")
 
 
-def _wrong(told: dict[str, Any], opened_s: float, whose: str) -> str:
-    """What is wrong with a diagnosis; ``opened_s`` is when the leak opened in its rows."""
-    causes = told["causes"]
+def _wrong(diagnosis: dict[str, Any], opened_s: float, source: str) -> str:
+    """Errors of a diagnosis; ``opened_s`` is the time of the leak in its rows."""
+    causes = diagnosis["causes"]
     if [cause["effect"] for cause in causes] != ["leakage"]:
         names = ", ".join(cause["effect"] for cause in causes) or "nothing"
-        return f"the diagnosis {whose} names {names}, not the leak"
+        return f"the diagnosis {source} names {names}, not the leak"
     onset_s = causes[0]["onset_s"]
     if onset_s is None:
-        return f"the diagnosis {whose} does not say since when the leak is there"
+        return f"the diagnosis {source} does not say since when the leak is there"
     off_s = onset_s - opened_s
-    return f"the onset {whose} is {off_s:+.2f} s off" if abs(off_s) > ONSET_S else ""
+    return f"the onset {source} is {off_s:+.2f} s off" if abs(off_s) > ONSET_S else ""
 
 
 def _times(log: Log) -> tuple[int | None, int | None]:

@@ -2,9 +2,9 @@
 
 Healthy cycles of the simulated gripper go through twin, monitor and isolation as in the loop. One
 false alarm in a month of 3 s cycles is one in 1.7 million of them. So the tail is measured in two
-ways. Sums over cycles run over blocks of these cycles drawn again and again, as many as are asked
-for, at the very limit that is set. For single cycles a generalised Pareto distribution is fitted to
-the farthest hundredth and followed to its limit.
+ways. Sums over cycles run over resampled blocks of these cycles, at the real limit. For single
+cycles a generalised Pareto distribution is fitted to the farthest hundredth and extrapolated to the
+limit.
 
     python -m tools.false_alarms [--devices 16] [--cycles 6000] [--drawn 30_000_000]
         [--write docs/isolation.md]
@@ -46,74 +46,76 @@ from twin.settings import Document
 Floats = npt.NDArray[np.float64]
 
 CONFIG = ROOT / "configs" / "gripper.toml"
-# Short, for many cycles; blow-off long enough that each part is released.
+# Short, to have many cycles; blow-off is long enough to release each part.
 PROGRAM = {"suction_ms": 800.0, "blow_off_ms": 220.0, "idle_ms": 250.0}
 CYCLE_S = 1.3
-DAYS, WANTED_CYCLE_S = 30.0, 3.0  # between false alarms; of the cycles that they are counted for
+DAYS, WANTED_CYCLE_S = 30.0, 3.0  # wanted time between false alarms; duration of a cycle for it
 BLOCK = 100  # cycles in a row that are drawn together: gas and walls keep some heat
 AT_ONCE = 2000  # devices
-FARTHEST = 0.01  # of single cycles, to which the tail is fitted
+FARTHEST = 0.01  # share of single cycles to which the tail is fitted
 BEGIN = "<!-- false alarms: python -m tools.false_alarms --write docs/isolation.md -->"
 END = "<!-- end -->"
 
 
 @dataclass(frozen=True)
 class Device:
-    """What a device's healthy cycles say, once it has learned what is usual."""
+    """Statistics of a device's healthy cycles after learning."""
 
     scores: Floats  # normal, (cycles, suspects)
     alike: Floats  # cosines between signatures
     farthest: Floats  # normal value of the figure that is farthest out, of each cycle
     shown: int  # figures
-    key_figures: Floats  # those that have limits, (cycles, figures)
-    limits: Floats  # (2, figures), infinite where there is none
+    key_figures: Floats  # those with limits, (cycles, figures)
+    limits: Floats  # (2, figures), infinite without a limit
 
 
 def device(seed: int, cycles: int) -> Device:
-    """Run one."""
+    """Run a device over healthy cycles."""
     document = Document.read(CONFIG)
     config, rig = Config.of(document), document.section(PlcSettings, "plc")
     rig = rig.model_copy(update={"program": rig.program.model_copy(update=PROGRAM)})
     healthy, smallest = config.monitor.healthy, config.monitor.smallest_mbar
     isolation, baseline = Isolation.of(config.data, healthy, days=1e9), Baseline(healthy)
     teller = KeyFigures(config.data, watch=config.monitor)
-    scores, farthest, alike, shown, told = [], [], np.eye(0), 0, []
+    scores, farthest, cosines, shown, key_figures = [], [], np.eye(0), 0, []
     for look in _looks(config, rig, (LEARNED + cycles) * CYCLE_S, seed):
-        if (one := teller.take(look.cycle)) is not None:
-            told.append([one.measured[name] for name in LIMITED])
-        (heard,) = isolation.hear([look])
-        if heard is None:
+        if (cycle_figures := teller.take(look.cycle)) is not None:
+            key_figures.append([cycle_figures.measured[name] for name in LIMITED])
+        (residual,) = isolation.hear([look])
+        if residual is None:
             continue
-        isolation.judge(heard)
-        said, normal = isolation.heard
-        alike = said.alike()
+        isolation.judge(residual)
+        scored, normal = isolation.heard
+        cosines = scored.alike()
         scores.append(normal)
         normal = baseline.normal(look.figures, smallest)
         baseline.learn(look.figures, normal)
         farthest.append(float(np.nanmax(np.abs(normal))))
         shown = int(np.isfinite(normal).sum())
-    found = np.array(scores[LEARNED:]), alike, np.array(farthest[LEARNED:]), shown
-    return Device(*found, np.array(told[LEARNED:]), _bounds(limits_of(config)))
+    learned = np.array(scores[LEARNED:]), cosines, np.array(farthest[LEARNED:]), shown
+    return Device(*learned, np.array(key_figures[LEARNED:]), _bounds(limits_of(config)))
 
 
-def _bounds(known: Limits) -> Floats:
-    """Lower and upper ones, as ``LIMITED`` has the figures."""
-    low, high = known.supply
+def _bounds(limits: Limits) -> Floats:
+    """Lower and upper limits, in the order of ``LIMITED``."""
+    low, high = limits.supply
     nowhere = np.inf
     lower = [-nowhere, -nowhere, -nowhere, low, -nowhere]
-    return np.array([lower, [known.t1, known.leakage, known.free_flow, nowhere, high]])
+    return np.array([lower, [limits.t1, limits.leakage, limits.free_flow, nowhere, high]])
 
 
 def _looks(config: Config, rig: PlcSettings, seconds: float, seed: int) -> Iterator[CycleView]:
     twin, cutter = Twin.of(config.data), CycleCutter()
     for block in blocks(rig, seconds, seed=seed, block=20_000):
-        for one in cutter.push(*twin.advance(block)):
-            yield CycleView(one, None, figures(one, twin.theta), one.complete and one.settled)
+        for cycle in cutter.push(*twin.advance(block)):
+            yield CycleView(
+                cycle, None, figures(cycle, twin.theta), cycle.complete and cycle.settled
+            )
 
 
 @dataclass(frozen=True)
 class Rate:
-    """False alarms over those that are wanted, with the 95 % interval."""
+    """False alarms over the wanted number, with the 95 % interval."""
 
     what: str
     share: float  # of all
@@ -124,7 +126,7 @@ class Rate:
 
 
 def of_sums(devices: Sequence[Device], drawn: int, seed: int) -> Rate:
-    """Sums over cycles that are drawn again, in blocks of one device each."""
+    """Sums over resampled cycles, in blocks of one device each."""
     wanted = cycles_between(DAYS, SUMS, WANTED_CYCLE_S)
     rng, changes = np.random.default_rng(seed), _changes(devices)
     alarms, cycles = 0, 0
@@ -152,12 +154,12 @@ def _changes(devices: Sequence[Device]) -> ChangeDetector:
 
 def _block(devices: Sequence[Device], rng: np.random.Generator) -> Floats:
     """Blocks of cycles for all devices at once, (cycles, devices, suspects)."""
-    which = rng.integers(len(devices), size=AT_ONCE)
+    device_numbers = rng.integers(len(devices), size=AT_ONCE)
     share = rng.random(AT_ONCE)
     parts = []
-    for number, place in zip(which, share, strict=True):
+    for number, position in zip(device_numbers, share, strict=True):
         scores = devices[number].scores
-        begin = int(place * (len(scores) - BLOCK))
+        begin = int(position * (len(scores) - BLOCK))
         parts.append(scores[begin : begin + BLOCK])
     return np.stack(parts, axis=1)
 
@@ -165,42 +167,53 @@ def _block(devices: Sequence[Device], rng: np.random.Generator) -> Floats:
 def of_single_cycles(devices: Sequence[Device], seed: int) -> Rate:
     """The tail of the figure that is farthest out, by extreme-value statistics."""
     wanted = cycles_between(DAYS, SINGLE_CYCLES, WANTED_CYCLE_S)
-    far = np.concatenate([one.farthest for one in devices])
-    at = normal_limit(wanted, devices[0].shown)
+    farthest = np.concatenate([tested.farthest for tested in devices])
+    limit = normal_limit(wanted, devices[0].shown)
     rng = np.random.default_rng(seed)
-    again = [_beyond(far[rng.integers(len(far), size=len(far))], at) for _ in range(200)]
-    low, high = np.quantile(again, (0.025, 0.975))
-    how = f"tail of {len(far):,} cycles, of which the farthest is {far.max():.1f} of {at:.1f} sigma"
-    times = np.array([_beyond(far, at), low, high]) * wanted
+    resampled = [
+        _beyond(farthest[rng.integers(len(farthest), size=len(farthest))], limit)
+        for _ in range(200)
+    ]
+    low, high = np.quantile(resampled, (0.025, 0.975))
+    how = (
+        f"tail of {len(farthest):,} cycles, of which the farthest is"
+        f" {farthest.max():.1f} of {limit:.1f} sigma"
+    )
+    times = np.array([_beyond(farthest, limit), low, high]) * wanted
     return Rate("single cycles", SINGLE_CYCLES, *times.tolist(), how)
 
 
 def of_limits(devices: Sequence[Device], seed: int) -> Rate:
-    """The same for the key figure that is nearest to its limit, in its standard deviations."""
+    """The tail of the key figure that is nearest to its limit, in its standard deviations."""
     wanted = cycles_between(DAYS, LIMITS, WANTED_CYCLE_S)
-    values = np.concatenate([one.key_figures for one in devices])
+    values = np.concatenate([tested.key_figures for tested in devices])
     shown = np.isfinite(values).any(axis=0)  # no part is open while it is sucked: no free flow
     values, (low, high) = values[:, shown], devices[0].limits[:, shown]
     sigma = np.nanstd(values, axis=0)
-    near = np.nanmax(np.maximum(values - high, low - values) / sigma, axis=1)
+    nearest = np.nanmax(np.maximum(values - high, low - values) / sigma, axis=1)
     rng = np.random.default_rng(seed)
-    again = [_beyond(near[rng.integers(len(near), size=len(near))], 0.0) for _ in range(200)]
-    how = f"tail of {len(near):,} cycles, of which the nearest is {-near.max():.0f} sigma from it"
-    times = np.array([_beyond(near, 0.0), *np.quantile(again, (0.025, 0.975))]) * wanted
+    resampled = [
+        _beyond(nearest[rng.integers(len(nearest), size=len(nearest))], 0.0) for _ in range(200)
+    ]
+    how = (
+        f"tail of {len(nearest):,} cycles, of which the nearest is"
+        f" {-nearest.max():.0f} sigma from it"
+    )
+    times = np.array([_beyond(nearest, 0.0), *np.quantile(resampled, (0.025, 0.975))]) * wanted
     return Rate("limits of key figures", LIMITS, *times.tolist(), how)
 
 
-def _beyond(far: Floats, at: float) -> float:
+def _beyond(values: Floats, limit: float) -> float:
     """Share of cycles beyond a limit, by a distribution fitted to the farthest."""
-    threshold = float(np.quantile(far, 1.0 - FARTHEST))
-    over = far[far > threshold] - threshold
+    threshold = float(np.quantile(values, 1.0 - FARTHEST))
+    over = values[values > threshold] - threshold
     shape, _, scale = genpareto.fit(over, floc=0.0)
-    return FARTHEST * float(genpareto.sf(at - threshold, shape, scale=scale))
+    return FARTHEST * float(genpareto.sf(limit - threshold, shape, scale=scale))
 
 
 def table(rates: Sequence[Rate], cycles: int) -> str:
-    """For the page."""
-    total = sum(one.share * one.times for one in rates)
+    """The rates as a table for the page."""
+    total = sum(rate.share * rate.times for rate in rates)
     lines = [
         f"**{commit()}, {cycles:,} simulated healthy cycles of the gripper: {total:.2f} times as"
         " many false alarms as are wanted.**",
@@ -208,40 +221,41 @@ def table(rates: Sequence[Rate], cycles: int) -> str:
         "| what | of the budget | found over wanted | 95 % | from |",
         "| --- | --- | --- | --- | --- |",
         *(
-            f"| {one.what} | {one.share:.0%} | {one.times:.2g} | {one.low:.2g} to {one.high:.2g} |"
-            f" {one.how} |"
-            for one in rates
+            f"| {rate.what} | {rate.share:.0%} | {rate.times:.2g} |"
+            f" {rate.low:.2g} to {rate.high:.2g} |"
+            f" {rate.how} |"
+            for rate in rates
         ),
     ]
     return "\n".join(lines)
 
 
 def main() -> int:
-    """Run from the command line; 1 where all together are wrong by more than a half."""
+    """Run from the command line; 1 if the total is wrong by more than a half."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--devices", type=int, default=16)
     parser.add_argument("--cycles", type=int, default=6000, help="of each device")
     parser.add_argument("--drawn", type=int, default=30_000_000, help="cycles that sums run over")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--write", type=Path, help="the page with a place for the table")
-    given = parser.parse_args()
-    seeds = range(given.seed, given.seed + given.devices)
+    arguments = parser.parse_args()
+    seeds = range(arguments.seed, arguments.seed + arguments.devices)
     with ProcessPoolExecutor(mp_context=get_context("spawn")) as workers:
-        devices = list(workers.map(device, seeds, [given.cycles] * given.devices))
+        devices = list(workers.map(device, seeds, [arguments.cycles] * arguments.devices))
     rates = [
-        of_sums(devices, given.drawn, given.seed),
-        of_single_cycles(devices, given.seed),
-        of_limits(devices, given.seed),
+        of_sums(devices, arguments.drawn, arguments.seed),
+        of_single_cycles(devices, arguments.seed),
+        of_limits(devices, arguments.seed),
     ]
-    found = table(rates, sum(len(one.scores) for one in devices))
-    print(found)
-    if given.write:
-        text = given.write.read_text(encoding="utf-8")
+    text_table = table(rates, sum(len(rate.scores) for rate in devices))
+    print(text_table)
+    if arguments.write:
+        text = arguments.write.read_text(encoding="utf-8")
         before, rest = text.split(BEGIN)
         after = rest.split(END, 1)[1]
-        text = f"{before}{BEGIN}\n{found}\n{END}{after}"
-        given.write.write_text(text, encoding="utf-8")
-    total = sum(one.share * one.times for one in rates)
+        text = f"{before}{BEGIN}\n{text_table}\n{END}{after}"
+        arguments.write.write_text(text, encoding="utf-8")
+    total = sum(rate.share * rate.times for rate in rates)
     return 0 if total < 1.5 else 1
 
 

@@ -1,12 +1,11 @@
 """A fault run: ``twin run`` beside the simulated PLC while everything that can go wrong does.
 
-Disturbances are drawn by seed; between the twin and the PLC stands a proxy that cuts, garbles,
-truncates, delays and lies. Strangers flood the port where results are served, that server is
-killed, and the clock here is set. The disk is full, and the folder of the log is deleted. The PLC
-keeps what it sampled, and the log is held against that: every sample is in it exactly once, bit for
-bit, or inside a recorded gap with the right bounds. Files that were deleted count with what the
-twin had written into them. The twin must be right again within a cycle, and its process must not
-grow.
+Disturbances are drawn by seed. A proxy between the twin and the PLC cuts, garbles, truncates,
+delays and lies. Strangers flood the port of the results, that server is killed, and the host's
+clock is set. The disk is full, and the folder of the log is deleted. The log is compared with the
+samples that the PLC keeps: every sample must be in it exactly once, bit for bit, or inside a
+recorded gap with the right bounds. Deleted files count with what the twin had written into them.
+The twin must be right again within a cycle, and its process must not grow.
 
     python tools/fault_run.py --protocol opcua --seconds 1200 --disturbances 40
 """
@@ -52,7 +51,7 @@ RIGHT_MBAR = 3.0  # rms of a cycle; healthy ones have 0.6
 SETTLED_S = 8.0  # from the end of a disturbance to the next
 GROWTH_MB = 12.0
 HEADER_BYTES = 9 + 2 * 12  # of an answer with the trace's header
-LIES = 0.2  # of the answers of a PLC that lies
+LIES = 0.2  # share of false answers of a PLC that lies
 MB = b"\0" * 1_000_000
 # The twin with a clock that signals set, as an operator or a time server would.
 CLOCK = """
@@ -75,7 +74,7 @@ START_S = 300.0  # the kernels may have to be compiled, on a busy machine
 
 
 class Proxy:
-    """Passes on what comes, and does to it what it is told."""
+    """Forwards data, and disturbs it as ``how`` says."""
 
     def __init__(self, random: np.random.Generator) -> None:
         self.target = 0
@@ -101,22 +100,22 @@ class Proxy:
             except (AssertionError, OSError):
                 client.close()
                 continue
-            for one in (client, server):
-                one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            for connection in (client, server):
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._pairs.append((client, server))
             for ends, answers in (((client, server), False), ((server, client), True)):
                 threading.Thread(target=self._pass, args=(*ends, answers), daemon=True).start()
 
-    def _pass(self, source: socket.socket, to: socket.socket, answers: bool) -> None:
+    def _pass(self, source: socket.socket, target: socket.socket, answers: bool) -> None:
         with suppress(OSError):
             while data := source.recv(65_536):
-                to.sendall(self._disturbed(data) if answers else data)
+                target.sendall(self._disturbed(data) if answers else data)
                 if answers and self.how == "truncate":
                     break
-        for one in (source, to):
+        for end in (source, target):
             with suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
-            one.close()
+                end.shutdown(socket.SHUT_RDWR)
+            end.close()
 
     def _disturbed(self, data: bytes) -> bytes:
         match self.how:
@@ -135,9 +134,9 @@ class Proxy:
     def hang_up(self) -> None:
         """Cut all connections."""
         pairs, self._pairs = self._pairs, []
-        for one in (end for pair in pairs for end in pair):
+        for end in (end for pair in pairs for end in pair):
             with suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
+                end.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
         """Take nobody any more."""
@@ -149,15 +148,15 @@ class Proxy:
 
 
 def lie_by_modbus(data: bytes, random: np.random.Generator) -> bytes:
-    """An answer that is wrong in a way that can be told; of a header often what it says."""
+    """An answer that is detectably wrong; in a header often a value."""
     if len(data) == HEADER_BYTES and random.random() < 0.7:
         lies = [
             (0, random.bytes(4)),  # the sequence
             (4, struct.pack(">q", 2**63 - 1)),  # the time
-            *((at, b"\0\5") for at in (14, 16, 18)),  # period, depth, words of a record
+            *((offset, b"\0\5") for offset in (14, 16, 18)),  # period, depth, words of a record
         ]
-        at, said = lies[int(random.integers(len(lies)))]
-        return data[: 9 + at] + said + data[9 + at + len(said) :]
+        offset, lie = lies[int(random.integers(len(lies)))]
+        return data[: 9 + offset] + lie + data[9 + offset + len(lie) :]
     match int(random.integers(3)):
         case 0:  # an exception
             code = bytes([data[7] | 0x80, int(random.integers(1, 12))])
@@ -183,15 +182,15 @@ LIAR = {"modbus": lie_by_modbus, "opcua": lie_by_opcua}
 
 @dataclass
 class Cell:
-    """PLC, proxy and twin, and what can be done to them."""
+    """PLC, proxy and twin, and the disturbances of them."""
 
     protocol: str
     folder: Path
     random: np.random.Generator
     rotate_mb: float = 64.0  # of a part of the log
     boots: list[Path] = field(default_factory=list)  # what each PLC sampled
-    seen: list[dict[str, float]] = field(default_factory=list)  # of the twin's process
-    deleted: dict[Path, BinaryIO] = field(default_factory=dict)  # logs, open to be read yet
+    seen: list[dict[str, float]] = field(default_factory=list)  # sizes of the twin's process
+    deleted: dict[Path, BinaryIO] = field(default_factory=dict)  # deleted logs, still open
 
     def __enter__(self) -> Self:
         self.proxy = Proxy(self.random)
@@ -243,7 +242,7 @@ class Cell:
         return path
 
     def start_plc(self) -> None:
-        """Start it, and have the proxy lead there."""
+        """Start the PLC, and direct the proxy to it."""
         self.boots.append(self.folder / f"boot{len(self.boots)}.bin")
         command = [sys.executable, "-m", "drivers.plc", str(self._plc_config), "--port", "0"]
         command += ["--seed", str(len(self.boots)), "--witness", str(self.boots[-1])]
@@ -256,15 +255,17 @@ class Cell:
 
     def results_server(self) -> psutil.Process:
         """The process that serves the results."""
-        (found,) = (one for one in self.twin.children() if "drivers.outputs.serve" in one.cmdline())
-        return found
+        (server,) = (
+            child for child in self.twin.children() if "drivers.outputs.serve" in child.cmdline()
+        )
+        return server
 
     def rows(self) -> int:
-        """Bytes of log by now, which grow while rows come."""
+        """Bytes of the log so far, which grow while rows arrive."""
         return self.log.stat().st_size if self.log.exists() else 0
 
     def delete_logs(self) -> None:
-        """Delete the folder of the log; what the twin yet writes into its files can be read."""
+        """Delete the folder of the log; its files stay open, so later rows can be read."""
         folder = self.log.parent
         while folder.exists():
             for path in folder.iterdir():
@@ -281,7 +282,7 @@ class Cell:
                 shutil.copyfileobj(file, restored)
 
     def watch(self) -> None:
-        """Take down how big the twin's process is."""
+        """Record the size of the twin's process."""
         if self.twin.status() == psutil.STATUS_STOPPED:
             return
         self.seen.append(
@@ -309,10 +310,10 @@ def _stop_client(cell: Cell, seconds: float) -> None:
     cell.twin.resume()
 
 
-def _through_proxy(how: str) -> Callable[[Cell, float], None]:
+def _through_proxy(disturbance: str) -> Callable[[Cell, float], None]:
     def disturb(cell: Cell, seconds: float) -> None:
-        cell.proxy.how = how
-        if how == "cut":
+        cell.proxy.how = disturbance
+        if disturbance == "cut":
             cell.proxy.hang_up()
         time.sleep(seconds)
         cell.proxy.how = "pass"
@@ -332,14 +333,14 @@ def _set_wall_clock(cell: Cell, _seconds: float) -> None:
 
 
 def _flood_results(cell: Cell, seconds: float) -> None:
-    """Chunks without an end, as fast as they are taken, and connections that say nothing."""
+    """Endless chunks, as fast as they are accepted, and silent connections."""
     end = time.monotonic() + seconds
-    there = "127.0.0.1", cell.results_port
+    address = "127.0.0.1", cell.results_port
     with ExitStack() as stack, suppress(OSError):
         for _ in range(50):
-            stack.enter_context(socket.create_connection(there, 1.0))
+            stack.enter_context(socket.create_connection(address, 1.0))
     while time.monotonic() < end:
-        with suppress(OSError), socket.create_connection(there, 1.0) as connection:
+        with suppress(OSError), socket.create_connection(address, 1.0) as connection:
             connection.sendall(b"HELF" + (0xFFFF_FFF0).to_bytes(4, "little"))
             while time.monotonic() < end:
                 connection.sendall(MB)
@@ -350,7 +351,7 @@ def _kill_results(cell: Cell, _seconds: float) -> None:
 
 
 def _fill_disk(cell: Cell, seconds: float) -> None:
-    """No file of the twin can grow, as on a full disk; its other processes still can write."""
+    """Keep files of the twin from growing, as on a full disk; its other processes can write."""
     no_limit = resource.RLIM_INFINITY
     resource.prlimit(cell.twin.pid, resource.RLIMIT_FSIZE, (0, no_limit))
     time.sleep(seconds)
@@ -380,13 +381,13 @@ DISTURBANCES: dict[str, Callable[[Cell, float], None]] = {
 
 
 def free_port() -> int:
-    """A port that nobody listens on."""
+    """A port without a listener."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         return int(listener.getsockname()[1])
 
 
 async def served(port: int) -> bool:
-    """Whether the results are there to be read, and fresh."""
+    """Whether the results can be read, and are fresh."""
     async with Client(f"opc.tcp://127.0.0.1:{port}") as client:
         index = await client.get_namespace_index("urn:ejector-twin:results")
         pressure = client.get_node(f"ns={index};s=rig-01.Meas.Pressure")
@@ -399,7 +400,7 @@ async def served(port: int) -> bool:
 
 @dataclass
 class Verdict:
-    """What is wrong, and what was counted."""
+    """Problems and counts."""
 
     problems: list[str] = field(default_factory=list)
     counts: dict[str, float] = field(default_factory=dict)
@@ -411,7 +412,7 @@ class Verdict:
 
 
 def judge(log: Path, boots: list[Path], verdict: Verdict) -> None:
-    """Hold the log against what the PLCs sampled."""
+    """Compare the log with what the PLCs sampled."""
     opened = open_log(log)
     pairs = [(np.empty(0, SAMPLE), np.empty(0, TICK)), *opened.blocks()]
     samples, ticks = (np.concatenate(column) for column in zip(*pairs, strict=True))
@@ -428,12 +429,12 @@ def judge(log: Path, boots: list[Path], verdict: Verdict) -> None:
             break
         _held_against(rows, sampled[boot], boot, verdict)
         boot += 1
-    told = sum(event.data["missing"] for event in events if event.kind is Kind.GAP)
-    told += lost
+    reported = sum(event.data["missing"] for event in events if event.kind is Kind.GAP)
+    reported += lost
     first = samples["quality"] & Quality.RESTART == 0
     steps = np.diff(samples["sequence"])
     missing = int((steps[first[1:]] - 1).sum()) if len(steps) else 0
-    verdict.check(told == missing, f"gaps say that {told} are missing, and {missing} are")
+    verdict.check(reported == missing, f"gaps say that {reported} are missing, and {missing} are")
     verdict.counts |= {"rows": len(samples), "restarts": len(starts), "missing": missing}
     verdict.counts["gaps"] = sum(event.kind is Kind.GAP for event in events)
     for kind in (Kind.PLC_LOST, Kind.RESULTS_DOWN, Kind.TWIN_LATE):
@@ -447,8 +448,9 @@ def judge(log: Path, boots: list[Path], verdict: Verdict) -> None:
 
 
 def _judge_outages(log: Log, events: list[Event], verdict: Verdict) -> int:
-    """Each unfinished part is told of, and the last one is finished; gives how many rows the log
-    says it has lost itself.
+    """Check that each unfinished part is reported, and that the last one is finished.
+
+    Returns the number of rows that the log reports as lost.
     """
     down = [event for event in events if event.kind is Kind.OUTPUT_DOWN]
     back = [event for event in events if event.kind is Kind.OUTPUT_BACK]
@@ -469,13 +471,13 @@ def _judge_outages(log: Log, events: list[Event], verdict: Verdict) -> int:
 
 
 def _boot_of(rows: Samples, sampled: list[npt.NDArray[np.void]], first: int) -> int:
-    """Which PLC these rows are of: the first from ``first`` on that sampled just that."""
-    some = rows[:50]
+    """Number of the PLC that sampled these rows: the first one from ``first`` on."""
+    beginning = rows[:50]
     for boot in range(first, len(sampled)):
-        theirs = sampled[boot]
-        if some["sequence"][-1] < len(theirs):
-            pressure = _pascal(theirs[some["sequence"]])
-            if np.array_equal(pressure, some["pressure"]):
+        sampled_rows = sampled[boot]
+        if beginning["sequence"][-1] < len(sampled_rows):
+            pressure = _pascal(sampled_rows[beginning["sequence"]])
+            if np.array_equal(pressure, beginning["pressure"]):
                 return boot
     return len(sampled)
 
@@ -487,36 +489,42 @@ def _pascal(sampled: npt.NDArray[np.void]) -> npt.NDArray[np.float32]:
 def _held_against(
     rows: Samples, sampled: npt.NDArray[np.void], boot: int, verdict: Verdict
 ) -> None:
-    """Bit for bit, in order, and each hole marked by a gap behind it."""
-    of = f"PLC {boot}"
+    """Check rows bit for bit, in order, and that each hole has a gap flag after it."""
+    source = f"PLC {boot}"
     sequence, quality = rows["sequence"], rows["quality"]
     steps = np.diff(sequence)
-    verdict.check(bool((steps > 0).all()), f"{of}: rows come twice, or out of order")
+    verdict.check(bool((steps > 0).all()), f"{source}: rows come twice, or out of order")
     if sequence[-1] >= len(sampled) or (steps <= 0).any():
-        verdict.problems.append(f"{of}: rows that were never sampled")
+        verdict.problems.append(f"{source}: rows that were never sampled")
         return
-    theirs = sampled[sequence]
-    verdict.check(bool((theirs["sequence"] == sequence).all()), f"{of}: its own count is broken")
-    verdict.check(np.array_equal(_pascal(theirs), rows["pressure"]), f"{of}: other pressures")
-    commands = theirs["status"] & 3
-    verdict.check(np.array_equal(commands, rows["commands"]), f"{of}: other commands")
+    sampled_rows = sampled[sequence]
+    verdict.check(
+        bool((sampled_rows["sequence"] == sequence).all()), f"{source}: its own count is broken"
+    )
+    verdict.check(
+        np.array_equal(_pascal(sampled_rows), rows["pressure"]), f"{source}: other pressures"
+    )
+    commands = sampled_rows["status"] & 3
+    verdict.check(np.array_equal(commands, rows["commands"]), f"{source}: other commands")
     marked = (quality[1:] & Quality.GAP) != 0
-    verdict.check(np.array_equal(marked, steps > 1), f"{of}: gaps are not where rows are missing")
+    verdict.check(
+        np.array_equal(marked, steps > 1), f"{source}: gaps are not where rows are missing"
+    )
     if boot:
         verdict.check(
             bool(quality[0] & Quality.GAP),
-            f"{of}: what is missing before its first row is not marked",
+            f"{source}: what is missing before its first row is not marked",
         )
-    off = np.abs(rows["time_ns"] - theirs["time_ns"]) * 1e-6
-    worst = float(off.max())
+    offset = np.abs(rows["time_ns"] - sampled_rows["time_ns"]) * 1e-6
+    worst = float(offset.max())
     verdict.counts["time_off_ms"] = max(verdict.counts.get("time_off_ms", 0.0), worst)
     # A clock that was set is seen with the next header; rows before it may have the new time.
-    set_late = float(np.mean(off > 200.0))
-    verdict.check(set_late < 0.05, f"{of}: {100 * set_late:.1f} % of the times are wrong")
+    set_late = float(np.mean(offset > 200.0))
+    verdict.check(set_late < 0.05, f"{source}: {100 * set_late:.1f} % of the times are wrong")
 
 
 def _judge_twin(samples: Samples, ticks: Ticks, verdict: Verdict) -> None:
-    """Each cycle that follows a whole one since the last break is expected right."""
+    """Check the expected pressure of each cycle that follows a whole one without a break."""
     suction = ticks["phase"] == Phase.SUCTION
     released = np.isin(ticks["phase"], (Phase.IDLE, Phase.BLOW_OFF))
     edges = np.flatnonzero(suction[1:] & released[:-1]) + 1
@@ -533,12 +541,15 @@ def _judge_twin(samples: Samples, ticks: Ticks, verdict: Verdict) -> None:
     verdict.check(worst < RIGHT_MBAR, f"a cycle after a whole one is {worst:.1f} mbar off")
 
 
-def judge_growth(seen: list[dict[str, float]], verdict: Verdict) -> None:
-    """The process at the end, quiet again, against the beginning."""
-    early, late = seen[: max(len(seen) // 5, 1)], seen[-max(len(seen) // 5, 1) :]
+def judge_growth(measurements: list[dict[str, float]], verdict: Verdict) -> None:
+    """Check that the process at the end is as small as at the beginning."""
+    early, late = (
+        measurements[: max(len(measurements) // 5, 1)],
+        measurements[-max(len(measurements) // 5, 1) :],
+    )
     for name, allowed in (("threads", 0.0), ("files", 0.0), ("sockets", 0.0), ("mb", GROWTH_MB)):
-        before = max(one[name] for one in early)
-        after = min(one[name] for one in late)
+        before = max(measurement[name] for measurement in early)
+        after = min(measurement[name] for measurement in late)
         verdict.counts[f"{name}_before"], verdict.counts[f"{name}_after"] = before, after
         verdict.check(after <= before + allowed, f"{name} grew from {before:g} to {after:g}")
 
@@ -549,17 +560,17 @@ def judge_growth(seen: list[dict[str, float]], verdict: Verdict) -> None:
 def run(
     protocol: str, seconds: float, disturbances: int, seed: int, folder: Path
 ) -> tuple[Verdict, list[str]]:
-    """Do it; gives the verdict and what was done."""
+    """Run it; gives the verdict and the disturbances."""
     random, verdict, done = np.random.default_rng(seed), Verdict(), list[str]()
-    # Each kind as often as any other, in an order of its own.
+    # Each kind equally often, in random order.
     kinds = [name for _ in range(disturbances) for name in DISTURBANCES]
     order = [str(name) for name in random.permutation(kinds[:disturbances])]
     with Cell(protocol, folder, random) as cell:
         until_logged(cell)
         end = time.monotonic() + seconds
         for number, name in enumerate(order):
-            rest = end - time.monotonic() - SETTLED_S * (len(order) - number)
-            pause = SETTLED_S + max(rest, 0.0) / (len(order) - number) * random.uniform(0.5, 1.0)
+            spare = end - time.monotonic() - SETTLED_S * (len(order) - number)
+            pause = SETTLED_S + max(spare, 0.0) / (len(order) - number) * random.uniform(0.5, 1.0)
             _quiet(cell, pause)
             lasts = float(random.uniform(0.3, 4.0))
             done.append(f"{name} ({lasts:.1f} s)")
@@ -570,8 +581,8 @@ def run(
         verdict.check(_is_served(cell), "the results are not served any more")
         cell.twin.send_signal(signal.SIGINT)
         verdict.check(cell.twin.wait(60) == 130, "the twin did not end as it should")
-        left = first_parts(cell.log.parent)
-        verdict.check(len(left) == 1, f"what was not deleted is not one log: {left}")
+        remaining = first_parts(cell.log.parent)
+        verdict.check(len(remaining) == 1, f"what was not deleted is not one log: {remaining}")
         cell.restore_logs()
     judge(cell.log, cell.boots, verdict)
     judge_growth(cell.seen, verdict)
@@ -579,12 +590,12 @@ def run(
 
 
 def until_logged(cell: Cell) -> None:
-    """Wait until the twin logs rows; SystemExit with what it said if it does not."""
+    """Wait until the twin logs rows; SystemExit with its output if it does not."""
     deadline = time.monotonic() + START_S
     while cell.rows() < 20_000:
         if time.monotonic() > deadline or cell.twin.poll() is not None:
-            said = (cell.folder / "twin.txt").read_text()
-            raise SystemExit(said or f"the twin logged nothing within {START_S:.0f} s")
+            output = (cell.folder / "twin.txt").read_text()
+            raise SystemExit(output or f"the twin logged nothing within {START_S:.0f} s")
         time.sleep(0.1)
 
 
@@ -596,7 +607,7 @@ def _is_served(cell: Cell) -> bool:
 
 
 def _quiet(cell: Cell, seconds: float) -> None:
-    """Let everything run, and take down how big the twin is once it is quiet."""
+    """Let everything run undisturbed, and record the size of the twin."""
     time.sleep(seconds)
     cell.watch()
 
@@ -609,12 +620,14 @@ def main() -> int:
     parser.add_argument("--disturbances", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--folder", type=Path, help="kept; else a temporary one")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     with ExitStack() as stack:
-        folder = given.folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        folder = arguments.folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         folder.mkdir(parents=True, exist_ok=True)
-        verdict, done = run(given.protocol, given.seconds, given.disturbances, given.seed, folder)
-    answer = {"disturbances": len(done), **verdict.counts, "problems": verdict.problems}
+        verdict, actions = run(
+            arguments.protocol, arguments.seconds, arguments.disturbances, arguments.seed, folder
+        )
+    answer = {"disturbances": len(actions), **verdict.counts, "problems": verdict.problems}
     print(json.dumps(answer, indent=1))
     return 1 if verdict.problems else 0
 

@@ -36,7 +36,7 @@ def main() -> None:
     document = Document.read(path)
     config = as_type(document)
     with Console(stderr=True).status("") as status:
-        found = calibrate(
+        calibration = calibrate(
             config, blocks(rig_of(document), duration_s=SECONDS, seed=7), status.update
         )
     unit = document.tables["asset"]
@@ -45,8 +45,8 @@ def main() -> None:
         "name": unit["id"],
         "type": unit["type"],
         "note": f"as the simulated PLC of configs/{path.name} has it",
-        "data": _rounded(found.fitted.data.model_dump(exclude_none=True)),
-        "healthy": _rounded(found.healthy.model_dump()),
+        "data": _rounded(calibration.fitted.data.model_dump(exclude_none=True)),
+        "healthy": _rounded(calibration.healthy.model_dump()),
     }
     file = UNITS / f"{unit['id']}.toml"
     text = HEAD.format(path=f"configs/{path.name}") + _rows_in_lines(tomli_w.dumps(tables))
@@ -56,14 +56,14 @@ def main() -> None:
 
 def _rounded(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _rounded(one) for key, one in value.items()}
+        return {key: _rounded(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_rounded(one) for one in value]
+        return [_rounded(item) for item in value]
     return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
 
 
 def _rows_in_lines(text: str) -> str:
-    """Numbers of one list in one line: a matrix is read by its rows."""
+    """Put the numbers of a list on one line, so that a matrix has a line for each row."""
     return re.sub(
         r"= \[\n([-\d.,\se]+)\]", lambda row: f"= [{' '.join(row[1].split()).rstrip(',')}]", text
     )

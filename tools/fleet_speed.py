@@ -24,15 +24,15 @@ COMMISSIONED = "commissioned.sqlite"  # the data sets of all units
 
 
 def answers(logs: Sequence[Path], scheduler: str, folder: Path, name: str) -> tuple[Any, float]:
-    """What was found in all logs, and in how many seconds."""
-    found = folder / f"{name}.json"
+    """Answers of all logs, and the seconds that they took."""
+    report = folder / f"{name}.json"
     answered = shutil.copy(folder / COMMISSIONED, folder / f"{name}.sqlite")
-    database = ["--assets", str(answered), "--json", str(found)]
+    database = ["--assets", str(answered), "--json", str(report)]
     on = ["--engine", "dask", "--scheduler", scheduler]
     begun = time.perf_counter()
     subprocess.run([*TWIN, "fleet", "diagnose", *map(str, logs), *database, *on], check=True)
     seconds = time.perf_counter() - begun
-    return [one["answer"] for one in json.loads(found.read_text())["logs"]], seconds
+    return [log["answer"] for log in json.loads(report.read_text())["logs"]], seconds
 
 
 def main() -> None:
@@ -40,28 +40,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--logs", type=int, default=40)
     parser.add_argument("--first", type=int, default=0, help="seed")
-    asked = parser.parse_args()
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
-        units = asked.logs + 4  # the last four warm up
-        faults = hidden(units, units // 2, asked.first)
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as directory:
+        folder = Path(directory)
+        units = arguments.logs + 4  # the last four warm up
+        faults = hidden(units, units // 2, arguments.first)
         for unit in range(units):
-            record(unit, faults, folder, asked.first)
+            record(unit, faults, folder, arguments.first)
         healthy = sorted(folder.glob("*-000.mcap"))
         into = ["--assets", str(folder / COMMISSIONED)]
         subprocess.run([*TWIN, "fleet", "calibrate", *map(str, healthy), *into], check=True)
         every = sorted(folder.glob(f"*-{TODAY:03d}.mcap"))
-        found, took = [], []
+        answers_by_workers, took = [], []
         for workers in (1, 2):
             with cluster(workers) as started:
                 answers(every[-4:], started.address, folder, f"warm{workers}")
-                one, seconds = answers(every[:-4], started.address, folder, f"on{workers}")
-            found.append(one)
+                result, seconds = answers(every[:-4], started.address, folder, f"on{workers}")
+            answers_by_workers.append(result)
             took.append(seconds)
-            print(f"{workers} of one thread: {seconds:.1f} s for {len(one)} logs", flush=True)
-    same, ratio = found[0] == found[1], took[0] / took[1]
-    print(f"{ratio:.2f} times as fast, answers {'the same' if same else 'NOT the same'}")
-    sys.exit(not same or ratio < ASKED)
+            print(f"{workers} of one thread: {seconds:.1f} s for {len(result)} logs", flush=True)
+    are_equal, ratio = answers_by_workers[0] == answers_by_workers[1], took[0] / took[1]
+    print(f"{ratio:.2f} times as fast, answers {'the same' if are_equal else 'NOT the same'}")
+    sys.exit(not are_equal or ratio < ASKED)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from twin.log.recorder import Recorder
 from twin.signals import MBAR, Samples
 
 CYCLES = 12
-LISTED, FOUND = 15, 11  # rows of the report, and how many of twelve faults are to be in them
+LISTED, FOUND = 15, 11  # rows of the report, and how many of twelve faults must be in them
 DAY_NS = 86_400 * 10**9
 NEW_NS = 1_767_225_600 * 10**9  # 2026-01-01
 TODAY = 120  # days later
@@ -38,7 +38,7 @@ TWIN = [sys.executable, "-c", "from twin.cli.main import main; main()"]
 def hidden(units: int, faults: int, seed: int) -> Mapping[int, str]:
     """Faults by unit, drawn by seed."""
     rng = np.random.default_rng([2027, seed])
-    found = {}
+    faults_by_unit = {}
     for unit in rng.choice(units, faults, replace=False).tolist():
         effect = str(rng.choice(list(SIZES)))
         low, high = SIZES[effect]
@@ -46,12 +46,12 @@ def hidden(units: int, faults: int, seed: int) -> Mapping[int, str]:
             low, high = ON_GRIPPER.get(effect, (low, high))
         size = float(np.exp(rng.uniform(np.log(low), np.log(high))))
         sign = float(rng.choice([-1.0, 1.0])) if effect in SIGNED else 1.0
-        found[unit] = f"{effect}={sign * size:.4g}"
-    return found
+        faults_by_unit[unit] = f"{effect}={sign * size:.4g}"
+    return faults_by_unit
 
 
 def record(unit: int, faults: Mapping[int, str], folder: Path, seed: int) -> None:
-    """Both logs of a unit, beside the twin of its type; those that are there stay."""
+    """Record both logs of a unit with the twin of its type; existing ones are kept."""
     document = shipped(_system(unit))
     config = Config.of(document, unit=_id(unit), own=_id(unit))  # nothing is known of it yet
     plc = drawn(rig_of(document), 10_000 * (1 + seed) + unit)
@@ -69,7 +69,7 @@ def record(unit: int, faults: Mapping[int, str], folder: Path, seed: int) -> Non
 
 
 def write_log(path: Path, config: Config, samples: Samples) -> None:
-    """A log of some rows beside the twin of a configuration."""
+    """Write a log of rows with the twin of a configuration."""
     header = LogHeader(
         config.asset.type,
         config.asset.id,
@@ -93,26 +93,28 @@ def _id(unit: int) -> str:
 
 
 def main() -> None:
-    """Record, have it reported, and print where the faults are listed."""
+    """Record the fleet, make its report, and print the ranks of the faults."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--units", type=int, default=500)
     parser.add_argument("--faults", type=int, default=12)
     parser.add_argument("--first", type=int, default=0, help="seed")
-    asked = parser.parse_args()
-    logs, database = asked.folder / "logs", asked.folder / "fleet.sqlite"
+    arguments = parser.parse_args()
+    logs, database = arguments.folder / "logs", arguments.folder / "fleet.sqlite"
     logs.mkdir(parents=True, exist_ok=True)
-    faults = hidden(asked.units, asked.faults, asked.first)
-    work = partial(record, faults=faults, folder=logs, seed=asked.first)
+    faults = hidden(arguments.units, arguments.faults, arguments.first)
+    work = partial(record, faults=faults, folder=logs, seed=arguments.first)
     with ProcessPoolExecutor(mp_context=get_context("spawn")) as workers:
-        for done, _ in enumerate(workers.map(work, range(asked.units)), 1):
-            print(f"\r{done} of {asked.units} units recorded", end="", file=sys.stderr, flush=True)
-    answer, page = asked.folder / "report.json", asked.folder / "report.html"
+        for done, _ in enumerate(workers.map(work, range(arguments.units)), 1):
+            print(
+                f"\r{done} of {arguments.units} units recorded", end="", file=sys.stderr, flush=True
+            )
+    answer, page = arguments.folder / "report.json", arguments.folder / "report.html"
     files = ["--json", str(answer), "--html", str(page)]
     command = [*TWIN, "fleet", "report", str(logs), "--assets", str(database), *files]
     subprocess.run(command, check=True)
-    rank = {one["id"]: one["rank"] for one in json.loads(answer.read_text())["units"]}
-    for unit, fault in sorted(faults.items(), key=lambda one: rank[_id(one[0])]):
+    rank = {entry["id"]: entry["rank"] for entry in json.loads(answer.read_text())["units"]}
+    for unit, fault in sorted(faults.items(), key=lambda entry: rank[_id(entry[0])]):
         print(f"{rank[_id(unit)]:>4}  {_id(unit)}  {_system(unit):<9} {fault}")
     first = sum(rank[_id(unit)] <= LISTED for unit in faults)
     print(f"{first} of {len(faults)} in the first {LISTED} rows")

@@ -1,4 +1,4 @@
-"""Take the founding paper's model as the nominal one, and find from cycles what it leaves out.
+"""Take the founding paper's model as the nominal one, and find from cycles what it lacks.
 
     python -m tools.founding_model
 
@@ -44,7 +44,7 @@ EXTENSIONS: Mapping[str, Sequence[str]] = {
 TOLD = ("system.film_coefficient", "ejector.suction_capacity_sl_min", "system.leak_sl_min")
 SEED = 7001  # of the test rig's record
 TANK = 113001  # of the second world's tank
-TIMES = 2.0  # as large as the vessel is another one
+TIMES = 2.0  # volume of another vessel over that of the first
 TITLE = (
     "Whole cycles show what evacuation times hide: nothing makes up for wall heat. With it and a\n"
     "bent characteristic 1 mbar is left (a cycle that nothing was fitted to)."
@@ -53,7 +53,7 @@ TITLE = (
 
 @dataclass(frozen=True)
 class Patient:
-    """A rig whose data set is the paper's model, with its records."""
+    """A rig with the paper's model as its data set, and its records."""
 
     name: str
     nominal: DataSet
@@ -72,8 +72,8 @@ def as_paper(data: DataSet) -> DataSet:
 
 
 def larger(data: DataSet) -> DataSet:
-    """The data set with a vessel ``TIMES`` as large, and a wall that grows as of the same shape."""
-    parts = tuple(_larger(one) if isinstance(one, Vessel) else one for one in data.system.parts)
+    """The data set with ``TIMES`` the volume of the vessel, and the wall of the same shape."""
+    parts = tuple(_larger(part) if isinstance(part, Vessel) else part for part in data.system.parts)
     return data.model_copy(update={"system": data.system.model_copy(update={"parts": parts})})
 
 
@@ -84,7 +84,7 @@ def _larger(vessel: Vessel) -> Vessel:
 
 
 def paper_rig() -> Patient:
-    """The shipped test rig, which the paper's has the shape of; its true wall heat is known."""
+    """The shipped test rig, which has the shape of the paper's; its true wall heat is known."""
     document = shipped("test_rig")
     plc = rig_of(document)
     rig = plc.rig.model_copy(
@@ -94,13 +94,13 @@ def paper_rig() -> Patient:
         }
     )
     program = plc.program.model_copy(update={"suction_ms": TIMES * plc.program.suction_ms})
-    other = plc.model_copy(update={"rig": rig, "program": program})
+    larger_plc = plc.model_copy(update={"rig": rig, "program": program})
     return Patient(
         "test rig, 0.75 l",
         as_paper(as_type(document).data),
         recorded(plc, CYCLES, SEED),
         recorded(plc, CYCLES, SEED + 1),
-        recorded(other, CYCLES, SEED + 2),
+        recorded(larger_plc, CYCLES, SEED + 2),
     )
 
 
@@ -108,9 +108,9 @@ def second_tank() -> Patient:
     """A tank of the tests' second world, which shares no equation with the model."""
     met = drawn(TANK, CADENCES)
     assert met is not None
-    found = commission(met.person.config, [_of(met, met.seed)], lambda _what: None)
+    commissioned = commission(met.person.config, [_of(met, met.seed)], lambda _what: None)
     vessel, program = met.rig.vessel, met.rig.program
-    more = replace(
+    larger_vessel = replace(
         vessel,
         rigid_volume=TIMES * vessel.rigid_volume,
         vessel_length=TIMES ** (1.0 / 3.0) * vessel.vessel_length,
@@ -119,13 +119,13 @@ def second_tank() -> Patient:
         vessel_wall_loss=TIMES ** (2.0 / 3.0) * vessel.vessel_wall_loss,
     )
     longer = replace(program, suction_s=TIMES * program.suction_s)
-    other = replace(met, rig=replace(met.rig, vessel=more, program=longer))
+    larger_met = replace(met, rig=replace(met.rig, vessel=larger_vessel, program=longer))
     return Patient(
         "tank of the second world",
-        as_paper(found.calibration.fitted.data),
+        as_paper(commissioned.calibration.fitted.data),
         _of(met, SEED),
         _of(met, SEED + 1),
-        _of(other, SEED + 2),
+        _of(larger_met, SEED + 2),
     )
 
 
@@ -134,13 +134,17 @@ def _of(met: Met, seed: int) -> Samples:
 
 
 def extended(patient: Patient, keys: Sequence[str]) -> Fitted:
-    """The nominal model fitted to the patient's cycles with ``keys`` free beside the rest."""
-    numbers = [n for n, one in enumerate(FREE) if one.key not in WITHOUT or one.key in keys]
-    ways, anywhere = directions(patient.nominal), np.full(len(numbers), np.inf)
+    """The nominal model fitted to the patient's cycles, with ``keys`` free as well."""
+    numbers = [
+        n
+        for n, parameter in enumerate(FREE)
+        if parameter.key not in WITHOUT or parameter.key in keys
+    ]
+    columns, anywhere = directions(patient.nominal), np.full(len(numbers), np.inf)
     space = Space(
         patient.nominal,
         tuple(FREE[n] for n in numbers),
-        ways[np.ix_(numbers, numbers)],
+        columns[np.ix_(numbers, numbers)],
         anywhere < 0.0,
         -anywhere,
         anywhere,
@@ -152,12 +156,13 @@ def off(data: DataSet, samples: Samples) -> Floats:
     """Measured minus expected pressure (mbar) in all rows of complete cycles."""
     cycles = complete(data, samples)
     return (
-        np.concatenate([one.samples["pressure"] - one.ticks["expected"] for one in cycles]) / MBAR
+        np.concatenate([cycle.samples["pressure"] - cycle.ticks["expected"] for cycle in cycles])
+        / MBAR
     )
 
 
 def rms(deviation: Floats) -> float:
-    """Root mean square of what is known."""
+    """Root mean square of the finite values."""
     return float(np.sqrt(np.nanmean(deviation**2)))
 
 
@@ -169,25 +174,25 @@ def rows(patient: Patient) -> Iterator[tuple[str, DataSet, Fitted | None]]:
         yield name, fitted.data, fitted
 
 
-def draw(patient: Patient, found: Mapping[str, DataSet]) -> None:
-    """Write the picture: a cycle that nothing was fitted to, and what each model leaves of it."""
+def draw(patient: Patient, models: Mapping[str, DataSet]) -> None:
+    """Write the picture: an unseen cycle, and the residual of each model in it."""
     with mpl.rc_context({**STYLE, "svg.hashsalt": "founding-model"}):
         figure = Figure(figsize=(10.0, 7.0), layout="constrained")
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.0, 1.3))
-        _draw_cycle(above, below, patient, found)
+        _draw_cycle(above, below, patient, models)
         figure.suptitle(TITLE, x=0.01, ha="left", fontsize=11)
         figure.savefig(PICTURE, metadata=ANONYMOUS)
 
 
-def _draw_cycle(above: Axes, below: Axes, patient: Patient, found: Mapping[str, DataSet]) -> None:
-    (paper, nominal), *fitted = found.items()
+def _draw_cycle(above: Axes, below: Axes, patient: Patient, models: Mapping[str, DataSet]) -> None:
+    (paper, nominal), *fitted = models.items()
     colours = (BEFORE, EACH[1], EACH[2], AFTER)
-    time, left, expected = _third_cycle(nominal, patient.unseen)
-    above.plot(time, expected + left, color=MEASURED, label="measured")
+    time, deviation, expected = _third_cycle(nominal, patient.unseen)
+    above.plot(time, expected + deviation, color=MEASURED, label="measured")
     above.plot(time, expected, color=QUIET, ls="--", label=f"{paper}, as it is")
     for (name, data), colour, line in zip(fitted, colours, ("-", "-", "--", "-"), strict=True):
-        time, left, _ = _third_cycle(data, patient.unseen)
-        below.plot(time, left, line, color=colour, label=name)
+        time, deviation, _ = _third_cycle(data, patient.unseen)
+        below.plot(time, deviation, line, color=colour, label=name)
     above.set_ylabel("pressure (mbar absolute)")
     below.set_ylabel("measured − expected (mbar)")
     below.set_xlabel("time since suction (s)")
@@ -196,7 +201,7 @@ def _draw_cycle(above: Axes, below: Axes, patient: Patient, found: Mapping[str, 
 
 
 def _third_cycle(data: DataSet, samples: Samples) -> tuple[Floats, Floats, Floats]:
-    """Time (s), what is left of a twin and what it expects (mbar) in a cycle of a record."""
+    """Time (s), residual of a twin and its expected pressure (mbar) in a cycle of a record."""
     cycle = complete(data, samples)[2]
     time = (cycle.samples["time_ns"] - cycle.samples["time_ns"][0]) * NS
     expected = cycle.ticks["expected"] / MBAR
@@ -206,26 +211,28 @@ def _third_cycle(data: DataSet, samples: Samples) -> tuple[Floats, Floats, Float
 def main() -> None:
     """Fit all, print the tables, write the picture."""
     for patient in (paper_rig(), second_tank()):
-        found = {}
+        models = {}
         print(
             f"\n{patient.name}: mbar rms of the cycles fitted, of unseen ones, of {TIMES:g} volumes"
         )
         for name, data, fitted in rows(patient):
-            found[name] = data
-            here = [rms(off(data, samples)) for samples in (patient.fitted, patient.unseen)]
-            there = rms(off(larger(data), patient.other_volume))
+            models[name] = data
+            deviations = [rms(off(data, samples)) for samples in (patient.fitted, patient.unseen)]
+            other_deviation = rms(off(larger(data), patient.other_volume))
             print(
-                f"{name:<20}{here[0]:8.2f}{here[1]:8.2f}{there:8.2f}  {_told(fitted)}", flush=True
+                f"{name:<20}{deviations[0]:8.2f}{deviations[1]:8.2f}{other_deviation:8.2f}"
+                f"  {_intervals_text(fitted)}",
+                flush=True,
             )
         if patient.name == "test rig, 0.75 l":
-            draw(patient, found)
+            draw(patient, models)
 
 
-def _told(fitted: Fitted | None) -> str:
-    """The values of interest with their 95 % intervals, where they were free."""
+def _intervals_text(fitted: Fitted | None) -> str:
+    """The values of interest with their 95 % intervals, if they were free."""
     if fitted is None:
         return ""
-    names = [one.name for one in fitted.free]
+    names = [parameter.name for parameter in fitted.free]
     ends = {name: fitted.interval(name) for name in TOLD if name in names}
     return ", ".join(f"{name} {low:.3g} to {high:.3g}" for name, (low, high) in ends.items())
 

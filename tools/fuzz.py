@@ -1,9 +1,9 @@
 """Fuzz what decodes bytes from elsewhere: whatever they are, there are rows or one clear error.
 
 Inputs are kept ones and pieces of them, changed at random. An input with a new outcome is kept in
-the corpus, and so is one that raises anything but an error for people or takes too long: those
-count as found. Each target gets the same time, so that a fast one takes more of the inputs. Ctrl-C
-ends it, and what was done until then is said. An input that ends the process stands in a file
+the corpus. An input that takes too long, or raises anything but an error for people, is kept as
+well and counts as found. Each target gets the same time, so that a fast one takes more of the
+inputs. Ctrl-C ends the run with a report. An input that ends the process is in the file
 ``under-way`` of its target's corpus.
 
     python -m tools.fuzz --inputs 10_000_000    # of all targets together: a night
@@ -28,40 +28,40 @@ from twin.errors import TwinError
 CORPUS = Path(__file__).resolve().parents[1] / "tests" / "corpus"
 LONGEST_S = 5.0  # for one input
 UNDER_WAY = "under-way"
-TURN_S = 0.2  # for a target, until it is the next one's turn
+TURN_S = 0.2  # for a target, before the next one has its turn
 
 
 def changed(data: bytes, others: list[bytes], random: np.random.Generator) -> bytes:
-    """The same with a few changes."""
+    """``data`` with a few random changes."""
     new = bytearray(data)
     for _ in range(int(random.integers(1, 5))):
-        at = int(random.integers(len(new) + 1))
+        position = int(random.integers(len(new) + 1))
         match int(random.integers(5)):
-            case 0 if at < len(new):
-                new[at] ^= 1 << int(random.integers(8))
+            case 0 if position < len(new):
+                new[position] ^= 1 << int(random.integers(8))
             case 1:
-                new[at:at] = random.bytes(int(random.integers(1, 9)))
+                new[position:position] = random.bytes(int(random.integers(1, 9)))
             case 2:
-                del new[at : at + int(random.integers(1, 9))]
+                del new[position : position + int(random.integers(1, 9))]
             case 3:
-                new[at : at + 8] = random.choice([b"\xff", b"\0", b"\x7f"]) * 8
+                new[position : position + 8] = random.choice([b"\xff", b"\0", b"\x7f"]) * 8
             case _:
-                other = others[int(random.integers(len(others)))]
-                new[at:] = other[int(random.integers(len(other) + 1)) :]
+                donor = others[int(random.integers(len(others)))]
+                new[position:] = donor[int(random.integers(len(donor) + 1)) :]
     return bytes(new)
 
 
 def place_of(error: BaseException) -> str:
-    """Where an error was raised, and where the one before it: a text would show the input."""
+    """Places of an error and of its causes; the text of an error would contain the input."""
     *_, last = traceback.walk_tb(error.__traceback__)
-    place = f"{type(error).__name__} at {Path(last[0].f_code.co_filename).name}:{last[1]}"
+    origin = f"{type(error).__name__} at {Path(last[0].f_code.co_filename).name}:{last[1]}"
     before = error.__cause__
-    return f"{place}, {place_of(before)}" if before is not None else place
+    return f"{origin}, {place_of(before)}" if before is not None else origin
 
 
 @dataclass
 class Campaign:
-    """The inputs that one target is given; ``found`` has what was, with the files that show it."""
+    """The inputs of one target; ``found`` has the problems, with the files that show them."""
 
     name: str
     corpus: Path
@@ -76,33 +76,35 @@ class Campaign:
         self._folder.mkdir(parents=True, exist_ok=True)
         if (self._folder / UNDER_WAY).exists():
             print(f"{self._folder / UNDER_WAY}: this ended the process", file=sys.stderr)
-        there = [path.read_bytes() for path in sorted(self._folder.iterdir())]
-        self._kept = seeds(self.name) + there
+        corpus = [path.read_bytes() for path in sorted(self._folder.iterdir())]
+        self._kept = seeds(self.name) + corpus
         self._first = [*self._kept]  # they come as they are
         self._outcomes = set[str]()
 
     def begin(self) -> None:
-        """Try what was kept."""
+        """Try the kept inputs."""
         with self._remembered() as remember:
             while self._first:
                 self._try(self._first.pop(0), remember)
 
     def go_on(self, inputs: int, seconds: float = float("inf")) -> None:
-        """Try so many more, but no longer than that."""
+        """Try more inputs, at most for ``seconds``."""
         begun = time.monotonic()
         with self._remembered() as remember:
             for _ in range(inputs):
                 if time.monotonic() - begun > seconds:
                     break
-                kept, random = self._kept, self._random
-                data = changed(kept[int(random.integers(len(kept)))], kept, random)
+                inputs_kept, random = self._kept, self._random
+                data = changed(
+                    inputs_kept[int(random.integers(len(inputs_kept)))], inputs_kept, random
+                )
                 self._try(data, remember)
                 self.inputs += 1
         self.seconds += time.monotonic() - begun
 
     @contextmanager
     def _remembered(self) -> Iterator[Callable[[bytes], None]]:
-        """What keeps an input in a file until the next; it goes if the process has not ended."""
+        """Keep each input in a file until the next; the file is deleted unless the process dies."""
         path = self._folder / UNDER_WAY
         with path.open("wb", buffering=0) as file:
 
@@ -139,7 +141,7 @@ class Campaign:
             self.found.append(f"{path}: {wrong} ({seconds:.1f} s)")
 
     def _is_quick_again(self, data: bytes) -> bool:
-        """Whether an input takes long the first time alone: something is loaded or compiled."""
+        """Whether an input is slow only the first time, as something is loaded or compiled."""
         begun = time.monotonic()
         with suppress(Exception):
             TARGETS[self.name](data)
@@ -147,7 +149,7 @@ class Campaign:
 
 
 def fuzz(name: str, inputs: int, corpus: Path, seed: int) -> list[str]:
-    """Try what was kept and so many more; gives what was found."""
+    """Try the kept inputs and so many more; gives the problems found."""
     campaign = Campaign(name, corpus, seed)
     campaign.begin()
     campaign.go_on(inputs)
@@ -155,18 +157,18 @@ def fuzz(name: str, inputs: int, corpus: Path, seed: int) -> list[str]:
 
 
 def share(campaigns: list[Campaign], inputs: int) -> None:
-    """Try so many of all together, each as long as the others."""
+    """Try so many inputs of all targets together, with equal time for each."""
     for campaign in campaigns:
         campaign.begin()
-    left = inputs
-    while left > 0:
+    remaining = inputs
+    while remaining > 0:
         for campaign in campaigns:
             before = campaign.inputs
-            campaign.go_on(left, TURN_S)
-            left -= campaign.inputs - before
+            campaign.go_on(remaining, TURN_S)
+            remaining -= campaign.inputs - before
             if sys.stderr.isatty():
-                told = f"\r{inputs - left:,} of {inputs:,}; {campaign.name:<10}"
-                print(told, end="", file=sys.stderr, flush=True)
+                text = f"\r{inputs - remaining:,} of {inputs:,}; {campaign.name:<10}"
+                print(text, end="", file=sys.stderr, flush=True)
 
 
 def main() -> int:
@@ -176,18 +178,18 @@ def main() -> int:
     parser.add_argument("--corpus", type=Path, default=CORPUS)
     parser.add_argument("--target", choices=sorted(TARGETS), action="append")
     parser.add_argument("--seed", type=int, default=1)
-    given = parser.parse_args()
-    chosen = given.target or TARGETS
-    campaigns = [Campaign(name, given.corpus, given.seed) for name in chosen]
+    arguments = parser.parse_args()
+    chosen = arguments.target or TARGETS
+    campaigns = [Campaign(name, arguments.corpus, arguments.seed) for name in chosen]
     try:
-        share(campaigns, given.inputs)
+        share(campaigns, arguments.inputs)
     except KeyboardInterrupt:
         print("interrupted: what was found until then is in the corpus", file=sys.stderr)
-    print(json.dumps({one.name: _told(one) for one in campaigns}, indent=1))
-    return 1 if any(one.found for one in campaigns) else 0
+    print(json.dumps({campaign.name: _summary(campaign) for campaign in campaigns}, indent=1))
+    return 1 if any(campaign.found for campaign in campaigns) else 0
 
 
-def _told(campaign: Campaign) -> dict[str, object]:
+def _summary(campaign: Campaign) -> dict[str, object]:
     speed = round(campaign.inputs / campaign.seconds) if campaign.seconds else 0
     return {"inputs": campaign.inputs, "inputs_per_s": speed, "found": campaign.found}
 

@@ -1,4 +1,4 @@
-"""What the fuzzer gives bytes to: each decoder of bytes from elsewhere, with whole examples.
+"""Targets of the fuzzer: each decoder of foreign bytes, with valid examples.
 
 A target returns what came of an input, in one of few texts: a new one makes the input worth
 keeping. A TwinError is an answer as good as any.
@@ -70,7 +70,7 @@ from twin.users import Role, Users
 
 NODE = Node("s=Fuzz")
 CONFIG = Document.read(Path(__file__).resolve().parents[1] / "configs" / "test_rig.toml")
-HEADER, RECORDS = 100, 1000  # where the trace lies, as CONFIG has it
+HEADER, RECORDS = 100, 1000  # addresses of the trace in CONFIG
 DEPTH_BLOCKS = 4  # readings of the ring with one input
 AMBIENT = 101_325.0  # Pa
 WORD, TOKEN = "correct horse", "t" * 43  # of a user, and of a session
@@ -86,7 +86,7 @@ LEVELS = "compact-ejector-35", "rig-01"  # of the topics of one ejector
 
 
 class Served:
-    """A link that answers from an input, again and again."""
+    """A link that answers from an input, cyclically."""
 
     def __init__(self, data: bytes) -> None:
         self._words = np.frombuffer(data[: len(data) // 2 * 2] or b"\0\0", ">u2").astype(np.uint16)
@@ -95,20 +95,20 @@ class Served:
     def read(self, address: Address, number: int) -> Words:
         """As ``Link.read``; an address that no request can hold is a mistake."""
         telegram.Request(address, number).question(1, 1)
-        places = np.arange(self._next, self._next + number) % len(self._words)
+        indices = np.arange(self._next, self._next + number) % len(self._words)
         self._next += number
-        return self._words[places]
+        return self._words[indices]
 
 
 @cache
 def _settings() -> ModbusSettings:
-    found = settings_of(CONFIG)
-    assert isinstance(found, ModbusSettings)
-    return found
+    settings = settings_of(CONFIG)
+    assert isinstance(settings, ModbusSettings)
+    return settings
 
 
 class Honest:
-    """A link to a PLC whose trace goes on with each look; it keeps what it answered."""
+    """A link to a PLC whose trace grows with each read; it keeps its answers."""
 
     def __init__(self) -> None:
         self.answers, self._newest = b"", 99
@@ -151,7 +151,7 @@ def _followed(link: object) -> int:
 
 
 def values(data: bytes) -> str:
-    """A value over OPC UA, as each kind that a node may be asked for."""
+    """A value over OPC UA, decoded as each kind that a node may have."""
     refuse_endless_arrays()
     try:
         value = from_binary(ua.DataValue, Buffer(data))
@@ -164,31 +164,31 @@ def values(data: bytes) -> str:
         opcua_values.numbers,
         opcua_values.wholes,
     ]
-    taken = ""
+    accepted = ""
     for kind in kinds:
         try:
             kind(value, NODE)
-            taken += kind.__name__ + " "
+            accepted += kind.__name__ + " "
         except SourceError:
             continue
     opcua_values.quality(opcua_values.code_of(value))
     opcua_values.time_ns(value)
-    return taken
+    return accepted
 
 
 class Wire:
-    """A socket that has an input to give, and then hangs up."""
+    """A socket that sends an input, and then closes."""
 
     def __init__(self, data: bytes) -> None:
         self._rest = data
 
     def sendall(self, _request: bytes) -> None:
-        """Nobody looks at what is asked."""
+        """Ignore the request."""
 
     def recv(self, size: int, _flags: int = 0) -> bytes:
         """The next bytes."""
-        taken, self._rest = self._rest[:size], self._rest[size:]
-        return taken
+        chunk, self._rest = self._rest[:size], self._rest[size:]
+        return chunk
 
     def close(self) -> None:
         """Hang up."""
@@ -213,16 +213,16 @@ def modbus(data: bytes) -> str:
 
 
 class Answering:
-    """A link that answers each request of polling from an input, again and again."""
+    """A link that answers each request of polling from an input, cyclically."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self._next = data or b"\0", 0
 
     def ask(self, request: telegram.Request) -> bytes:
         """As ``Link.ask``."""
-        places = (self._next + np.arange(request.size)) % len(self._data)
+        indices = (self._next + np.arange(request.size)) % len(self._data)
         self._next += request.size
-        return np.frombuffer(self._data, np.uint8)[places].tobytes()
+        return np.frombuffer(self._data, np.uint8)[indices].tobytes()
 
 
 @cache
@@ -256,11 +256,11 @@ def log(data: bytes) -> str:
 
 
 def head(data: bytes) -> str:
-    """What a log says of itself under a right checksum: configuration, data set, statistics."""
+    """The head of a log with a right checksum: configuration, data set, statistics."""
     config, stored, healthy, *_ = [*data.decode(errors="replace").split("\0"), "", ""]
     metadata = {"data": stored, "healthy": healthy}
-    found = Config.of_recorded(LogHeader("type", "id", "a.toml", config, metadata), "a.mcap")
-    return f"gauge {found.gauge}"
+    config_read = Config.of_recorded(LogHeader("type", "id", "a.toml", config, metadata), "a.mcap")
+    return f"gauge {config_read.gauge}"
 
 
 def _table(data: bytes, suffix: str) -> str:
@@ -300,7 +300,7 @@ def _packed(parts: dict[str, bytes]) -> bytes:
 
 
 def aasx(data: bytes) -> str:
-    """A package with shells; what is no ZIP file is the shells' part of one that is whole."""
+    """A package with shells; input that is no ZIP file becomes the shells of a valid package."""
     if not data.startswith(b"PK"):
         data = _packed({**_package(), _shells(): data})
     with _file(data, ".aasx") as path:
@@ -312,7 +312,7 @@ def _shells() -> str:
 
 
 def fmu(data: bytes) -> str:
-    """An FMU; what is no ZIP file is its description."""
+    """An FMU; input that is no ZIP file becomes its description."""
     if not data.startswith(b"PK"):
         data = _packed({DESCRIPTION: data})
     with _file(data, ".fmu") as path:
@@ -328,8 +328,8 @@ def assets(data: bytes) -> str:
 def users(data: bytes) -> str:
     """A file of users."""
     with _file(data, ".toml") as path:  # its owner's alone
-        found = Users(path, CHEAP)
-        return f"{_some(len(found.names))} users, {found.role('ann')} {bool(found.proof('ann'))}"
+        stored = Users(path, CHEAP)
+        return f"{_some(len(stored.names))} users, {stored.role('ann')} {bool(stored.proof('ann'))}"
 
 
 def mqtt(data: bytes) -> str:
@@ -340,21 +340,21 @@ def mqtt(data: bytes) -> str:
         topic, _, payload = line.partition(b" ")
         levels = topic.decode(errors="replace").split("/")
         hall.take(levels, payload, kept=False)
-    one = Unit(*LEVELS)
+    target = Unit(*LEVELS)
 
     def show(heard: Any, why: str, since: float) -> str:
         json.dumps(overview(heard, why, since, 1.8e9), allow_nan=False)
-        if (there := of_one(heard, one)) is None:
+        if (ejector := of_one(heard, target)) is None:
             return f"{_some(len(heard))} others"
-        told = details(there, why, 1.8e9)
-        json.dumps(told, allow_nan=False)
-        return " ".join(f"{_some(len(part))} {name}" for name, part in _lists(told).items())
+        page_details = details(ejector, why, 1.8e9)
+        json.dumps(page_details, allow_nan=False)
+        return " ".join(f"{_some(len(part))} {name}" for name, part in _lists(page_details).items())
 
     return f"{hall.look(show)}, {_some(hall.not_understood)} trouble"
 
 
-def _lists(told: dict[str, Any]) -> dict[str, list[Any]]:
-    return {name: part for name, part in told.items() if isinstance(part, list)}
+def _lists(page_details: dict[str, Any]) -> dict[str, list[Any]]:
+    return {name: part for name, part in page_details.items() if isinstance(part, list)}
 
 
 def upload(data: bytes) -> str:
@@ -363,7 +363,7 @@ def upload(data: bytes) -> str:
 
 
 class Deaf(Ejector):
-    """An ejector of a page, of which nothing is kept, and to which nobody listens."""
+    """An ejector of a page that stores nothing and has no listener."""
 
     def ask(self, alarm: str, deed: str, who: str, seconds: float) -> int:
         """As a database would take it."""
@@ -372,8 +372,8 @@ class Deaf(Ejector):
 
 def _ejector(folder: Path) -> Ejector:
     path = folder / "cell.toml"
-    kept = [f"[{name}]\nkeep = true\n" for name in ("alarms", "figures", "page")]
-    path.write_text("".join([CONFIG.text, *kept]))
+    tables = [f"[{name}]\nkeep = true\n" for name in ("alarms", "figures", "page")]
+    path.write_text("".join([CONFIG.text, *tables]))
     return Deaf(Config.of(Document.read(path), SHIPPED))
 
 
@@ -382,11 +382,11 @@ def _page() -> Any:
     """The page with a user who is logged in."""
     folder = Path(tempfile.mkdtemp(prefix="fuzz-page-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    known = Users(folder / "users.toml", CHEAP)
-    known.add("ann", WORD, Role.CONFIGURE)
-    sessions = Sessions(known, lambda: 0.0)
-    sessions._by_token[TOKEN] = Session("ann", known.proof("ann"), SESSION_S, TOKEN)
-    authenticator = Authenticator(known, Audit(folder, "page", print))
+    users_known = Users(folder / "users.toml", CHEAP)
+    users_known.add("ann", WORD, Role.CONFIGURE)
+    sessions = Sessions(users_known, lambda: 0.0)
+    sessions._by_token[TOKEN] = Session("ann", users_known.proof("ann"), SESSION_S, TOKEN)
+    authenticator = Authenticator(users_known, Audit(folder, "page", print))
     return Page([_ejector(folder)], authenticator, sessions, Access(), PlantOverview()).app()
 
 
@@ -430,11 +430,11 @@ def http(data: bytes) -> str:
     return f"status {statuses}"
 
 
-# --- whole examples -----------------------------------------------------------------------------
+# --- valid examples -----------------------------------------------------------------------------
 
 
 def seeds(name: str) -> list[bytes]:
-    """Whole examples for a target."""
+    """Valid examples for a target."""
     return SEEDS[name]()
 
 
@@ -444,7 +444,7 @@ def _values() -> list[bytes]:
         ua.Variant([1, 2, 3], ua.VariantType.UInt32, None, True),
         ua.Variant(datetime(2026, 1, 1, tzinfo=UTC), ua.VariantType.DateTime),
     ]
-    return [to_binary(ua.DataValue, ua.DataValue(one)) for one in numbers]
+    return [to_binary(ua.DataValue, ua.DataValue(target)) for target in numbers]
 
 
 def _traces() -> list[bytes]:
@@ -453,20 +453,20 @@ def _traces() -> list[bytes]:
 
 
 def _answers() -> list[bytes]:
-    """Whole answers, and one that refuses."""
-    unit, whole, refused = _settings().unit, b"", b""
+    """Valid answers, and one with an exception."""
+    unit, valid, refused = _settings().unit, b"", b""
     for number, request in enumerate(ASKED, 1):
         beginning = request.head(number, unit)
-        whole += beginning + (
+        valid += beginning + (
             request.echo if isinstance(request, telegram.Store) else bytes(request.size)
         )
         code = beginning[7] | telegram.REFUSAL
         refused += telegram.HEAD.pack(number, 0, 3, unit, code, 3)
-    return [whole, refused]
+    return [valid, refused]
 
 
 def _logs() -> list[bytes]:
-    """Whole logs of a few rows and an event."""
+    """Valid logs of a few rows and an event."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.mcap"
         with Recorder(path, LogHeader("type", "id", "a.toml", "[data]\n")) as recorder:
@@ -503,11 +503,11 @@ def _exports() -> list[bytes]:
 
 def _messages() -> list[bytes]:
     asset = asset_of(Unit(*LEVELS), "B7")
-    way = "/".join(LEVELS).encode()
+    prefix = "/".join(LEVELS).encode()
     measured = {"low": 0.5, "mean": 300.0, "high": 750.0}
     row = {"time_ns": 1, "measured_mbar": measured, "expected_mbar": {"mean": 301.0}}
     cycle = {"cycle": 1, "t0_measured": 189.0, "t0_expected": None}
-    told = {"period_s": 1.0, "rows": [row]}
+    live_rows = {"period_s": 1.0, "rows": [row]}
     alarm = {
         "format": "ejector-twin-alarm/1",
         "id": "1",
@@ -525,10 +525,10 @@ def _messages() -> list[bytes]:
     topics = {
         b"status": of_status(asset, "online", 10**18, "p"),
         b"cycle": beside("ejector-twin-cycle/1", asset, 10**18, cycle).body,
-        b"values": beside("ejector-twin-values/1", asset, 10**18, told).body,
+        b"values": beside("ejector-twin-values/1", asset, 10**18, live_rows).body,
         b"alarm/deviation_leakage": json_text(alarm),
     }
-    lines = [way + b"/" + topic + b" " + text.encode() for topic, text in topics.items()]
+    lines = [prefix + b"/" + topic + b" " + text.encode() for topic, text in topics.items()]
     return [*lines, b"\n".join(lines)]
 
 
@@ -539,22 +539,22 @@ def _asked() -> list[bytes]:
 
 def _requests() -> list[bytes]:
     host = "Host: 127.0.0.1:8420\r\nOrigin: http://127.0.0.1:8420\r\n"
-    own = f"{host}Cookie: {COOKIE}={TOKEN}\r\nX-CSRF-Token: {TOKEN}\r\n"
-    asked = '{"alarm": "deviation_leakage", "deed": "shelved", "seconds": 60}'
+    session_headers = f"{host}Cookie: {COOKIE}={TOKEN}\r\nX-CSRF-Token: {TOKEN}\r\n"
+    request = '{"alarm": "deviation_leakage", "deed": "shelved", "seconds": 60}'
     form = f"name=ann&password={WORD.replace(' ', '+')}"
 
     def post(path: str, headers: str, body: str) -> str:
         return f"POST {path} HTTP/1.1\r\n{headers}Content-Length: {len(body)}\r\n\r\n{body}"
 
     paths = ("/", "/api/me", "/login", "/static/page.js", "/api/all", "/api/ejectors/0/history")
-    gets = [f"GET {path}?days=7 HTTP/1.1\r\n{own}\r\n" for path in paths]
-    posts = post("/api/ejectors/0/requests", own, asked), post("/login", host, form)
-    return [one.encode() for one in (*gets, *posts)]
+    gets = [f"GET {path}?days=7 HTTP/1.1\r\n{session_headers}\r\n" for path in paths]
+    posts = post("/api/ejectors/0/requests", session_headers, request), post("/login", host, form)
+    return [target.encode() for target in (*gets, *posts)]
 
 
 TARGETS: dict[str, Callable[[bytes], str]] = {
-    one.__name__: one
-    for one in (
+    target.__name__: target
+    for target in (
         *(ring, modbus, poll, values),
         *(log, head, csv, parquet, assets, aasx, fmu, users),
         *(mqtt, upload, http),

@@ -3,10 +3,10 @@
     python -m tools.learned (--cases FILE.jsonl | --first SEED) [--units 10]
         [--features FILE.npz] [--training 2000] [--training-units 5] [--write docs/battery.md]
 
-FILE.jsonl holds what ``python -m tools.battery --world first --cases FILE.jsonl`` answered, and
---units is that run's; with --first the cases are answered now. Their records are drawn again, and
-the learned one answers them. It is trained on records of the same world with other seeds and other
-rigs. With --features what it sees of a record is kept, and a run that was cut goes on.
+FILE.jsonl has the answers of ``python -m tools.battery --world first --cases FILE.jsonl``, and
+--units is that of the run; with --first the cases are answered now. Their records are drawn again
+for the learned classifier. It is trained on records of the same world with other seeds and other
+rigs. With --features the features of records are kept, so that an interrupted run can continue.
 """
 
 import argparse
@@ -49,7 +49,7 @@ TOLD_EVERY = 100  # training records
 
 
 def answered(learned: Learned, records: RecordFile, case: Case, units: int) -> Case:
-    """A case of the battery as the learned one answers it."""
+    """A case of the battery with the answer of the learned classifier."""
     record = records.get(case.kind, case.seed, units)
     if record.trains:
         raise ValueError(f"{case.kind} {case.seed} may have been learned from: take a lower seed")
@@ -62,50 +62,54 @@ def answered(learned: Learned, records: RecordFile, case: Case, units: int) -> C
 
 
 def counted(case: Case) -> Outcomes:
-    """What an answer counts for."""
+    """The outcomes of an answer."""
     if case.kind != "single":
         return case.answer_outcomes
     return case.answer_outcomes | {"first": case.first == case.hidden[0].effect}
 
 
 def half_widths(cases: Sequence[Case]) -> list[float]:
-    """Of each interval that is compared with the truth: half of it over the size."""
-    found = []
+    """Half width over size, of each interval that is compared with the truth."""
+    widths = []
     for case in cases:
         if "covered" in case.answer_outcomes:
             (truth,) = case.hidden
-            cause = next(one for one in case.causes if one["effect"] == truth.effect)
+            cause = next(entry for entry in case.causes if entry["effect"] == truth.effect)
             if interval := stated_interval(cause, truth):
                 low, _, high = interval
-                found.append((high - low) / 2.0 / abs(truth.size))
-    return found
+                widths.append((high - low) / 2.0 / abs(truth.size))
+    return widths
 
 
 def figures(cases: Sequence[Case]) -> dict[str, str]:
-    """What the answers reach, by the words of the row."""
-    found, counts = dict[str, str](), [counted(one) for one in cases]
+    """Figures of the answers, by the words of the row."""
+    texts, counts = dict[str, str](), [counted(case) for case in cases]
     for name, words in COUNTED.items():
-        here = [np.atleast_1d(one[name]) for one in counts if name in one]
-        if here:
-            outcomes = np.concatenate(here)
-            found[words] = f"{outcomes.sum()} of {len(outcomes)} ({outcomes.mean():.0%})"
+        shown = [
+            np.atleast_1d(counts_of_case[name])
+            for counts_of_case in counts
+            if name in counts_of_case
+        ]
+        if shown:
+            outcomes = np.concatenate(shown)
+            texts[words] = f"{outcomes.sum()} of {len(outcomes)} ({outcomes.mean():.0%})"
     if widths := half_widths(cases):
-        found["half of that interval over the size, median"] = f"±{np.median(widths):.0%}"
-    if any(one.stated for one in cases):
-        found["expected calibration error"] = (
-            f"{calibration_error([each for one in cases for each in one.stated]):.3f}"
+        texts["half of that interval over the size, median"] = f"±{np.median(widths):.0%}"
+    if any(case.stated for case in cases):
+        texts["expected calibration error"] = (
+            f"{calibration_error([pair for case in cases for pair in case.stated]):.3f}"
         )
-    return found
+    return texts
 
 
 def compared(twin: Sequence[Case], learned: Sequence[Case]) -> str:
-    """Both answers to the same cases beside each other in Markdown, then who wins where."""
-    mine, other, rows = figures(twin), figures(learned), list[Sequence[str]]()
+    """A Markdown table of both answers to the same cases, then the winner of each row."""
+    twin_figures, learned_figures, rows = figures(twin), figures(learned), list[Sequence[str]]()
     only = {words: only_one_right(name, twin, learned) for name, words in COUNTED.items()}
-    for words in (words for words in mine if words in other):
-        apart = only.get(words)
-        right = "–" if apart is None else f"{apart[0]} : {apart[1]}"
-        rows.append((words, mine[words], other[words], right))
+    for words in (words for words in twin_figures if words in learned_figures):
+        counts = only.get(words)
+        right = "–" if counts is None else f"{counts[0]} : {counts[1]}"
+        rows.append((words, twin_figures[words], learned_figures[words], right))
     head = "what", TWIN, LEARNED, "cases that only one of them has right"
     return f"{table(head, iter(rows))}\n\n{who_wins(only)}"
 
@@ -113,25 +117,35 @@ def compared(twin: Sequence[Case], learned: Sequence[Case]) -> str:
 def only_one_right(
     name: str, twin: Sequence[Case], learned: Sequence[Case]
 ) -> tuple[int, int] | None:
-    """How many cases only the one, and only the other has right.
+    """Numbers of cases that only the first, and only the second has right.
 
-    None where it depends on the answer whether a case counts.
+    None if it depends on the answer whether a case counts.
     """
     if name not in OF_EACH_CASE:
         return None
-    both = [(counted(one), counted(other)) for one, other in zip(twin, learned, strict=True)]
-    pairs = [(one[name], other[name]) for one, other in both if name in one and name in other]
-    counts = sum(one > other for one, other in pairs), sum(one < other for one, other in pairs)
+    outcomes = [
+        (counted(twin_outcome), counted(learned_outcome))
+        for twin_outcome, learned_outcome in zip(twin, learned, strict=True)
+    ]
+    pairs = [
+        (twin_outcome[name], learned_outcome[name])
+        for twin_outcome, learned_outcome in outcomes
+        if name in twin_outcome and name in learned_outcome
+    ]
+    counts = (
+        sum(twin_outcome > learned_outcome for twin_outcome, learned_outcome in pairs),
+        sum(twin_outcome < learned_outcome for twin_outcome, learned_outcome in pairs),
+    )
     return counts[::-1] if name == "wrong" else counts
 
 
 def who_wins(only: Mapping[str, tuple[int, int] | None]) -> str:
-    """In one sentence who has more cases right than by chance."""
+    """One sentence on who has more cases right than by chance."""
     wins: dict[str, list[str]] = {TWIN: [], LEARNED: []}
-    for words, apart in only.items():
-        if apart and sum(apart) and binomtest(apart[0], sum(apart)).pvalue < CHANCE:
-            wins[TWIN if apart[0] > apart[1] else LEARNED].append(words)
-    parts = [f"{who} wins in: {', '.join(what)}" for who, what in wins.items() if what]
+    for words, counts in only.items():
+        if counts and sum(counts) and binomtest(counts[0], sum(counts)).pvalue < CHANCE:
+            wins[TWIN if counts[0] > counts[1] else LEARNED].append(words)
+    parts = [f"{who} wins in: {', '.join(rows)}" for who, rows in wins.items() if rows]
     return (
         f"{'; '.join(parts) or 'Neither wins in anything'}. Where nobody is said to win, so unequal"
         f" a count of cases comes about by chance more often than once in {1.0 / CHANCE:.0f} times."
@@ -143,38 +157,40 @@ def battery(cases: Path | None, first: int | None, units: int) -> tuple[str, lis
     if cases is None:
         counts = {kind: battery_first.COUNTS[kind] for kind in TRAINING}
         return commit(), list(first_world(CaseFile(None, {}), first or 0, counts, units))
-    run, kept = read_cases(cases)
-    here = [case for world, case in kept if world == battery_first.NAME and case.kind in TRAINING]
-    return str(run["commit"]), here
+    run, cases_read = read_cases(cases)
+    chosen = [
+        case for world, case in cases_read if world == battery_first.NAME and case.kind in TRAINING
+    ]
+    return str(run["commit"]), chosen
 
 
 def summary(measured: str, cases: Sequence[Case]) -> str:
-    """In one line what is compared."""
-    seeds, kinds = [one.seed for one in cases], Counter(one.kind for one in cases)
-    many = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
+    """One line on what is compared."""
+    seeds, kinds = [case.seed for case in cases], Counter(case.kind for case in cases)
+    numbers = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
     return (
         f"**{time.strftime('%Y-%m-%d')}, {TWIN} of commit {measured}, seeds {min(seeds)} to"
-        f" {max(seeds)}: {many}.**"
+        f" {max(seeds)}: {numbers}.**"
     )
 
 
 def trained(records: RecordFile, cases: int, units: int) -> tuple[Learned, str]:
-    """The learned one, and on what it was trained, with what it makes of unseen mechanisms."""
+    """The learned classifier, and text on its training and on unseen mechanisms."""
     keys = training_keys(TRAINING)[:cases]
-    known = []
+    training = []
     for number, key in enumerate(keys, 1):
-        known.append(records.get(*key, units))
+        training.append(records.get(*key, units))
         if number % TOLD_EVERY == 0:
             print(f"{number} of {len(keys)} training records", flush=True)
     records.write()
     begin = time.process_time()
-    learned = Learned.fit(known)
+    learned = Learned.fit(training)
     spent = time.process_time() - begin
-    unseen = unlisted_unseen(learned, known)
-    kinds = ", ".join(f"{what}: {kind}" for what, kind in learned.chosen.items())
-    drawn = sum(one.seconds for one in known) / 60.0
+    unseen = unlisted_unseen(learned, training)
+    kinds = ", ".join(f"{name}: {kind}" for name, kind in learned.chosen.items())
+    drawn = sum(record.seconds for record in training) / 60.0
     return learned, (
-        f"Trained on {len(known)} records of {2 * units} rigs, drawn in {drawn:.0f} min of the"
+        f"Trained on {len(training)} records of {2 * units} rigs, drawn in {drawn:.0f} min of the"
         f" processor and learned in {spent:.0f} s ({kinds}). Of {len(unseen)} records with an"
         f" unlisted mechanism that was left out of training it calls {sum(unseen)} unlisted."
     )
@@ -182,8 +198,8 @@ def trained(records: RecordFile, cases: int, units: int) -> tuple[Learned, str]:
 
 def written(page: str, part: str) -> str:
     """The page with this comparison in its place."""
-    place = marked(MARK, page)
-    return page.replace(place[0], f"{place[1]}{part}\n{place[3]}")
+    parts = marked(MARK, page)
+    return page.replace(parts[0], f"{parts[1]}{part}\n{parts[3]}")
 
 
 def main() -> None:
@@ -197,17 +213,17 @@ def main() -> None:
     parser.add_argument("--training", type=int, default=2000, help="records to learn from")
     parser.add_argument("--training-units", type=int, default=5, help="rigs of each system there")
     parser.add_argument("--write", type=Path, metavar="FILE", help="page whose table to replace")
-    asked = parser.parse_args()
-    records = RecordFile(asked.features)
-    learned, training = trained(records, asked.training, asked.training_units)
-    measured, twin = battery(asked.cases, asked.first, asked.units)
-    other = [answered(learned, records, case, asked.units) for case in twin]
+    arguments = parser.parse_args()
+    records = RecordFile(arguments.features)
+    learned, training = trained(records, arguments.training, arguments.training_units)
+    measured, twin = battery(arguments.cases, arguments.first, arguments.units)
+    learned_cases = [answered(learned, records, case, arguments.units) for case in twin]
     records.write()
-    part = f"{summary(measured, twin)}\n\n{compared(twin, other)}\n\n{training}"
+    part = f"{summary(measured, twin)}\n\n{compared(twin, learned_cases)}\n\n{training}"
     print(part)
-    if asked.write is not None:
-        page = asked.write.read_text(encoding="utf-8")
-        asked.write.write_text(written(page, part), encoding="utf-8")
+    if arguments.write is not None:
+        page = arguments.write.read_text(encoding="utf-8")
+        arguments.write.write_text(written(page, part), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""What a learned classifier sees of a record: numbers at fixed places, and what was hidden.
+"""Features of a record for a learned classifier: numbers at fixed places; and hidden causes.
 
-The deviation of the measurement from the calibrated twin in each cycle, over its sigma and whitened
-as the diagnosis does it, is averaged over PLACES of each kind of stretch. Over the cycles of a
-record each place has a mean, a spread, a contrast of late with early cycles, and its value in the
-cycle that is off most. Nothing here knows what is hidden.
+The deviation from the calibrated twin in each cycle is averaged over PLACES of each kind of
+stretch: over its sigma, and whitened as in the diagnosis. Over the cycles of a record each place
+has four numbers: mean, spread, contrast of late with early cycles, and value in the cycle with the
+largest deviation. Features do not depend on the hidden causes.
 """
 
 import json
@@ -32,7 +32,7 @@ from twin.signals import Samples
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
-# Seconds since a stretch began at which its places begin; the last one goes on to its end.
+# Seconds since a stretch began at which its places begin; the last one lasts to its end.
 BEGINS = (0.0, 0.005, 0.01, 0.02, 0.035, 0.06, 0.1, 0.15, 0.22, 0.3, 0.45, 0.7, 1.1, 2.0)
 PLACES = len(KINDS) * len(BEGINS)
 FIRST_SEED = 2_000_000  # of training cases; those of the battery are below
@@ -48,32 +48,32 @@ class Record:
     seed: int
     units: int  # rigs of each system that its own was drawn from
     hidden: Sequence[Hidden]  # one at most
-    rig: float  # its calibrated suction capacity (sl/min): no two have the same
+    rig: float  # its calibrated suction capacity (sl/min), which is unique
     features: Floats
     seconds: float  # of the processor
 
     @property
     def trains(self) -> bool:
-        """Whether it may be learned from; the others are judged."""
+        """Whether it is for training; the others are judged."""
         return self.seed >= FIRST_SEED
 
 
 class RecordFile:
-    """Records by kind, seed and units; those that a file keeps are not drawn again."""
+    """Records by kind, seed and units; those in the file are not drawn again."""
 
     def __init__(self, path: Path | None) -> None:
         self._path, self._new = path, 0
         self._records = dict[tuple[str, int, int], Record]()
         if path is not None and path.exists():
-            with np.load(path) as kept:
-                columns = [kept[one.name] for one in fields(Record)]
+            with np.load(path) as stored:
+                columns = [stored[column.name] for column in fields(Record)]
             for kind, seed, units, hidden, *rest in zip(*columns, strict=True):
-                known = [Hidden(**each) for each in json.loads(str(hidden))]
-                one = Record(str(kind), int(seed), int(units), known, *rest)
-                self._records[one.kind, one.seed, one.units] = one
+                causes = [Hidden(**cause) for cause in json.loads(str(hidden))]
+                record = Record(str(kind), int(seed), int(units), causes, *rest)
+                self._records[record.kind, record.seed, record.units] = record
 
     def get(self, kind: str, seed: int, units: int) -> Record:
-        """A record of the file, or drawn now: of a rig to learn from, if the seed is of these."""
+        """A record of the file, or a new one: of a training rig if the seed is for training."""
         key = kind, seed, units
         if key not in self._records:
             begin = time.process_time()
@@ -88,31 +88,33 @@ class RecordFile:
         return self._records[key]
 
     def write(self) -> None:
-        """Keep all in the file."""
+        """Write all records to the file."""
         if self._path is None or not self._new:
             return
         records = self._records.values()
         columns = {
-            one.name: np.array([getattr(each, one.name) for each in records])
-            for one in fields(Record)
-            if one.name != "hidden"
+            column.name: np.array([getattr(record, column.name) for record in records])
+            for column in fields(Record)
+            if column.name != "hidden"
         }
-        hidden = np.array([json.dumps([asdict(each) for each in one.hidden]) for one in records])
+        hidden = np.array(
+            [json.dumps([asdict(cause) for cause in record.hidden]) for record in records]
+        )
         np.savez_compressed(self._path, hidden=hidden, **columns)
 
 
 def training_keys(counts: Mapping[str, int]) -> list[tuple[str, int]]:
-    """Kind and seed of each training case, so mixed that any number of the first ones will do."""
+    """Kind and seed of each training case, mixed so that any number of the first is balanced."""
     keys = [
-        (number / many, kind, FIRST_SEED + number)
-        for kind, many in counts.items()
-        for number in range(many)
+        (number / count, kind, FIRST_SEED + number)
+        for kind, count in counts.items()
+        for number in range(count)
     ]
     return [(kind, seed) for _, kind, seed in sorted(keys)]
 
 
 def features(unit: Unit, samples: Samples) -> Floats:
-    """What a learned classifier sees of a record."""
+    """Features of a record."""
     evidence = collect(unit.config, [samples])
     cycles = np.hstack([in_places(evidence), levels_and_time(evidence)])
     return np.append(of_record(cycles), SYSTEMS.index(unit.name))
@@ -124,27 +126,27 @@ def in_places(evidence: Evidence) -> Floats:
     NaN where a cycle shows nothing of a place.
     """
     (off,) = evidence.off([HEALTHY]).T
-    # What a calibration leaves open differs from rig to rig: the training cases show it. Three
-    # quarters of the time would go into it.
-    known, bins = covariance(replace(evidence, uncertain=())), evidence.bins
-    place = np.searchsorted(warped(np.array(BEGINS)), bins.time, "right") - 1
-    place += bins.kind * len(BEGINS)
+    # The uncertainty of a calibration is left out: training cases of many rigs show it. It would
+    # take three quarters of the time.
+    model, bins = covariance(replace(evidence, uncertain=())), evidence.bins
+    places = np.searchsorted(warped(np.array(BEGINS)), bins.time, "right") - 1
+    places += bins.kind * len(BEGINS)
     rows = []
     for cycle in evidence.judged:
-        weights = known.of([cycle])
-        here, count = weights.bins, len(weights.bins)
+        weights = model.of([cycle])
+        cycle_bins, count = weights.bins, len(weights.bins)
         factor = weights.covariance.factor[:count, :count]
-        over_sigma = off[here] / np.sqrt(np.sum(factor**2, axis=1))
-        (white,) = Covariance(factor).white(off[here, None]).T
-        rows.append([mean_at(place[here], one) for one in (over_sigma, white)])
+        over_sigma = off[cycle_bins] / np.sqrt(np.sum(factor**2, axis=1))
+        (white,) = Covariance(factor).white(off[cycle_bins, None]).T
+        rows.append([mean_at(places[cycle_bins], values) for values in (over_sigma, white)])
     return np.array(rows).reshape(len(rows), 2 * PLACES)
 
 
-def mean_at(place: Ints, values: Floats) -> Floats:
-    """Mean of the values at each of PLACES; NaN where there is none."""
-    count, total = np.bincount(place, None, PLACES), np.bincount(place, values, PLACES)
-    found: Floats = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    return found
+def mean_at(places: Ints, values: Floats) -> Floats:
+    """Mean of the values at each of PLACES; NaN without one."""
+    count, total = np.bincount(places, None, PLACES), np.bincount(places, values, PLACES)
+    means: Floats = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return means
 
 
 def levels_and_time(evidence: Evidence) -> Floats:
@@ -153,7 +155,7 @@ def levels_and_time(evidence: Evidence) -> Floats:
     Shape (cycles, 3); NaN for what a cycle does not show.
     """
     expected, healthy = evidence.seen(evidence.theta).levels, evidence.healthy.figures
-    known = [
+    healthy_levels = [
         healthy.get(name) or Scatter(mean=level, sigma=UNSEEN_LEVEL_MBAR)
         for name, level in zip(LEVELS, expected, strict=True)
     ]
@@ -161,18 +163,19 @@ def levels_and_time(evidence: Evidence) -> Floats:
     for cycle in evidence.judged:
         shown = defaultdict(lambda: np.nan, evidence.figures[cycle])
         levels = [
-            (shown[name] - one.mean) / one.sigma for name, one in zip(LEVELS, known, strict=True)
+            (shown[name] - healthy_level.mean) / healthy_level.sigma
+            for name, healthy_level in zip(LEVELS, healthy_levels, strict=True)
         ]
         rows.append([*levels, shown["t0_measured"] - shown["t0_expected"]])
     return np.array(rows)
 
 
 def of_record(cycles: Floats) -> Floats:
-    """Four numbers for each column of the cycles, those that no cycle shows included (NaN)."""
+    """Four numbers for each column of the cycles; NaN if no cycle shows it."""
     third = max(len(cycles) // 3, 1)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # places that no cycle shows
         mean, spread = np.nanmean(cycles, axis=0), np.nanstd(cycles, axis=0)
         drift = np.nanmean(cycles[-third:], axis=0) - np.nanmean(cycles[:third], axis=0)
-        most = cycles[np.argmax(np.nanmean(cycles**2, axis=1))]
-    return np.concatenate([mean, spread, drift, most])
+        worst = cycles[np.argmax(np.nanmean(cycles**2, axis=1))]
+    return np.concatenate([mean, spread, drift, worst])

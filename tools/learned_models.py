@@ -1,4 +1,4 @@
-"""What learns names, courses and sizes of effects from features of records, and answers by them.
+"""Models that learn names, courses and sizes of effects from features of records.
 
 Each model is chosen by cross-validation on training records alone; no rig is on both sides of it.
 """
@@ -29,7 +29,7 @@ from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from tools.learned_features import Floats, Record
 
 NONE, UNLISTED = "none", "unlisted"  # beside the effects
-TOGETHER = 0.95  # of what effects have in all: a cause and its look-alikes have as much
+TOGETHER = 0.95  # share of the effects' probability that a cause and its look-alikes have
 COVERS = 0.95
 ENDS = ("low95", "high95")  # of an interval
 LEAST = 1e-6  # probability, where cross-entropies are compared
@@ -38,9 +38,9 @@ Names = npt.NDArray[np.str_]
 
 
 def squashed(features: Floats) -> Floats:
-    """Features whose logarithm counts where they are large; 0 for what a record does not show."""
-    found: Floats = np.nan_to_num(np.arcsinh(features))
-    return found
+    """Features compressed like a logarithm if large; 0 if a record does not show one."""
+    squashed_features: Floats = np.nan_to_num(np.arcsinh(features))
+    return squashed_features
 
 
 def _over(*steps: BaseEstimator) -> BaseEstimator:
@@ -75,7 +75,7 @@ REGRESSORS: Mapping[str, BaseEstimator] = {
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of one effect, with intervals as wide as cross-validation missed."""
+    """Sizes of one effect, with intervals from the errors of cross-validation."""
 
     model: BaseEstimator  # of the arcsinh of sizes in units of ``typical``
     typical: float
@@ -100,22 +100,24 @@ class Learned:
     @classmethod
     def fit(cls, records: Sequence[Record]) -> Self:
         """Choose models for training records and fit them."""
-        if strange := [one.seed for one in records if not one.trains]:
+        if strange := [record.seed for record in records if not record.trains]:
             raise ValueError(f"records to be judged are not learned from: seeds {strange}")
-        singles = [one for one in records if one.kind == "single"]
+        singles = [record for record in records if record.kind == "single"]
         with _unconverged():
-            effects, of_effect = _classifier(records, [label(one) for one in records])
-            courses, of_course = _classifier(singles, [one.hidden[0].course for one in singles])
+            effects, of_effect = _classifier(records, [label(record) for record in records])
+            courses, of_course = _classifier(
+                singles, [record.hidden[0].course for record in singles]
+            )
             sizes, of_size = _sizes(singles)
         chosen = {"effect": of_effect, "course": of_course, "size": of_size}
         return cls(effects, courses, sizes, chosen)
 
     def answer(self, features: Floats) -> dict[str, Any]:
-        """The answer to a record, in the form of a diagnosis as far as it goes."""
+        """The answer to a record, with the fields of a diagnosis that it can fill."""
         verdict, effects = named(self.effects, features)
         if verdict != "explained":
             return {"verdict": verdict, "causes": []}
-        (first, probability), *others = effects.items()
+        (first, probability), *look_alikes = effects.items()
         (course,) = self.courses.predict(features[None])
         size = self.sizes[first].of(features)
         if course == "ramp":
@@ -125,25 +127,25 @@ class Learned:
             "course": str(course),
             "parameters": {"size": size},
             "probability": probability,
-            "not_separable_from": [name for name, _ in others],
+            "not_separable_from": [name for name, _ in look_alikes],
         }
         return {"verdict": verdict, "causes": [cause]}
 
 
 def label(record: Record) -> str:
-    """What a classifier should say of a record: an effect, none or something unlisted."""
+    """The true class of a record: an effect, none or something unlisted."""
     if record.kind == "unlisted":
         return UNLISTED
     return record.hidden[0].effect if record.hidden else NONE
 
 
 def named(classifier: BaseEstimator, features: Floats) -> tuple[str, dict[str, float]]:
-    """Verdict on a record, and the effects that are told apart no further, likeliest first.
+    """Verdict on a record, and the effects that cannot be told apart, likeliest first.
 
-    They have TOGETHER of what all effects have.
+    They have the share TOGETHER of the effects' probability.
     """
-    found = zip(classifier.classes_, classifier.predict_proba(features[None])[0], strict=True)
-    probability = {str(name): float(one) for name, one in found}
+    predicted = zip(classifier.classes_, classifier.predict_proba(features[None])[0], strict=True)
+    probability = {str(name): float(share) for name, share in predicted}
     none, unlisted = (probability.pop(name, 0.0) for name in (NONE, UNLISTED))
     listed = sum(probability.values())
     if max(none, unlisted) > listed:
@@ -158,34 +160,38 @@ def named(classifier: BaseEstimator, features: Floats) -> tuple[str, dict[str, f
 
 
 def unlisted_unseen(learned: Learned, records: Sequence[Record]) -> list[bool]:
-    """Whether unlisted mechanisms are called so where no other record of them is learned from."""
-    found = []
-    mechanisms = {one.hidden[0].effect for one in records if one.kind == "unlisted"}
+    """Whether unlisted mechanisms are recognised if no record of them was in the training."""
+    called_unlisted = []
+    mechanisms = {record.hidden[0].effect for record in records if record.kind == "unlisted"}
     for mechanism in sorted(mechanisms):
-        mine = [bool(one.hidden) and one.hidden[0].effect == mechanism for one in records]
-        others = [one for one, here in zip(records, mine, strict=True) if not here]
+        has_mechanism = [
+            bool(record.hidden) and record.hidden[0].effect == mechanism for record in records
+        ]
+        training = [record for record, has in zip(records, has_mechanism, strict=True) if not has]
         with _unconverged():
-            model = clone(learned.effects).fit(_features(others), [label(one) for one in others])
-        here = [one for one, here in zip(records, mine, strict=True) if here]
-        found += [named(model, one.features)[0] == "unlisted" for one in here]
-    return found
+            model = clone(learned.effects).fit(
+                _features(training), [label(record) for record in training]
+            )
+        has = [record for record, has in zip(records, has_mechanism, strict=True) if has]
+        called_unlisted += [named(model, record.features)[0] == "unlisted" for record in has]
+    return called_unlisted
 
 
 @contextmanager
 def _unconverged() -> Iterator[None]:
-    """Take networks as they are when their time is over: they are judged by that."""
+    """Ignore warnings of networks that did not converge: they are judged as they are."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         yield
 
 
 def _features(records: Sequence[Record]) -> Floats:
-    return np.array([one.features for one in records])
+    return np.array([record.features for record in records])
 
 
 def _folds(records: Sequence[Record]) -> dict[str, Any]:
     """Cross-validation with each rig on one side."""
-    rigs = np.array([one.rig for one in records])
+    rigs = np.array([record.rig for record in records])
     return {"groups": rigs, "cv": GroupKFold(min(FOLDS, len(np.unique(rigs))))}
 
 
@@ -194,8 +200,10 @@ def _classifier(records: Sequence[Record], names: Sequence[str]) -> tuple[BaseEs
     features, losses = _features(records), dict[str, float]()
     true = np.searchsorted(np.unique(names), names)
     for kind, model in CLASSIFIERS.items():
-        given = cross_val_predict(model, features, names, method="predict_proba", **_folds(records))
-        of_true = given[np.arange(len(names)), true]
+        probabilities = cross_val_predict(
+            model, features, names, method="predict_proba", **_folds(records)
+        )
+        of_true = probabilities[np.arange(len(names)), true]
         losses[kind] = -float(np.log(np.maximum(of_true, LEAST)).mean())
     best = min(losses, key=losses.__getitem__)
     return clone(CLASSIFIERS[best]).fit(features, names), best
@@ -204,33 +212,35 @@ def _classifier(records: Sequence[Record], names: Sequence[str]) -> tuple[BaseEs
 def _sizes(singles: Sequence[Record]) -> tuple[dict[str, Sizes], str]:
     """Models of the sizes of each effect, of the kind that misses held-out rigs least."""
     by_effect = dict[str, list[Record]]()
-    for one in singles:
-        by_effect.setdefault(one.hidden[0].effect, []).append(one)
+    for single in singles:
+        by_effect.setdefault(single.hidden[0].effect, []).append(single)
     typical = {
-        name: float(np.median([abs(one.hidden[0].size) for one in mine]))
-        for name, mine in by_effect.items()
+        name: float(np.median([abs(single.hidden[0].size) for single in of_effect]))
+        for name, of_effect in by_effect.items()
     }
     misses = {
-        kind: {name: _misses(model, mine, typical[name]) for name, mine in by_effect.items()}
+        kind: {
+            name: _misses(model, of_effect, typical[name]) for name, of_effect in by_effect.items()
+        }
         for kind, model in REGRESSORS.items()
     }
     best = min(misses, key=lambda kind: np.square(np.concatenate([*misses[kind].values()])).mean())
     return {
         name: Sizes(
-            clone(REGRESSORS[best]).fit(_features(mine), _targets(mine, typical[name])),
+            clone(REGRESSORS[best]).fit(_features(of_effect), _targets(of_effect, typical[name])),
             typical[name],
             half_width(misses[best][name]),
         )
-        for name, mine in by_effect.items()
+        for name, of_effect in by_effect.items()
     }, best
 
 
 def _targets(records: Sequence[Record], typical: float) -> Floats:
-    return np.arcsinh(np.array([one.hidden[0].size for one in records]) / typical)
+    return np.arcsinh(np.array([record.hidden[0].size for record in records]) / typical)
 
 
 def _misses(model: BaseEstimator, records: Sequence[Record], typical: float) -> Floats:
-    """By how much sizes of held-out rigs are missed."""
+    """Errors of the sizes of held-out rigs."""
     targets = _targets(records, typical)
     held_out = cross_val_predict(model, _features(records), targets, **_folds(records))
     missed: Floats = np.abs(held_out - targets)
@@ -238,6 +248,6 @@ def _misses(model: BaseEstimator, records: Sequence[Record], typical: float) -> 
 
 
 def half_width(misses: Floats) -> float:
-    """What COVERS of future misses stay below: a little more than as many of these (conformal)."""
+    """Half width that covers the share COVERS of future errors (conformal prediction)."""
     rank = min(math.ceil((len(misses) + 1) * COVERS), len(misses))
     return float(np.sort(misses)[rank - 1])

@@ -2,9 +2,9 @@
 
     python -m tools.mechanism_trial [--first SEED] [--cases 10] [--write docs/mechanisms.md]
 
-Each mechanism of the first world's rig in turn, on one of two calibrated units drawn by seed, in a
-size drawn by seed, in a log of 12 cycles. The extended model is judged on logs that it has never
-seen: the same program, suction twice and half as long.
+Each mechanism of the first world's rig is hidden in turn in a log of 12 cycles. Its size, and one
+of two calibrated units, are drawn by seed. The extended model is judged on new logs: with the same
+program, and with suction twice and half as long.
 """
 
 import argparse
@@ -30,7 +30,7 @@ HEAD = "| unit | hidden | what the answer says | same program | suction twice | 
 
 @dataclass(frozen=True)
 class Extended:
-    """One mechanism that was hidden, what it was called, and rms (mbar) before and after."""
+    """A hidden mechanism, its name in the answer, and rms (mbar) before and after."""
 
     unit: str
     hidden: str
@@ -39,16 +39,17 @@ class Extended:
     seconds: float
 
     def row(self) -> str:
-        """As a line of the table."""
+        """The line of the table."""
         gains = (
-            "–" if one is None else f"{one[0]:.1f} → {one[1]:.1f}" for one in self.gains.values()
+            "–" if pair is None else f"{pair[0]:.1f} → {pair[1]:.1f}"
+            for pair in self.gains.values()
         )
         cells = [self.unit, self.hidden, self.named, *gains, f"{self.seconds:.0f}"]
         return f"| {' | '.join(cells)} |"
 
 
 def longer(plc: PlcSettings, times: float) -> PlcSettings:
-    """The same rig with another suction in its program."""
+    """The same rig with ``times`` the suction in its program."""
     program = plc.program.model_copy(update={"suction_ms": times * plc.program.suction_ms})
     return plc.model_copy(update={"program": program})
 
@@ -62,8 +63,10 @@ def trial(seed: int) -> Extended:
     rng = np.random.default_rng([31, seed])
     gains = {}
     for name, times in PROGRAMS.items():
-        there = fault(rng, longer(unit.plc, times), hidden)
-        log = recorded(longer(unit.plc, times), CYCLES - 1, int(rng.integers(1 << 30)), [there])
+        fault_there = fault(rng, longer(unit.plc, times), hidden)
+        log = recorded(
+            longer(unit.plc, times), CYCLES - 1, int(rng.integers(1 << 30)), [fault_there]
+        )
         gains[name] = _rms(judged_on(diagnosis, unit.config, name, [log]))
     size = f"{hidden.effect} {hidden.size:.3g}"
     return Extended(unit.name, size, _named(answer), gains, seconds)
@@ -79,20 +82,20 @@ def _named(answer: dict[str, Any]) -> str:
     causes = ", ".join(cause["effect"] for cause in answer["causes"])
     mechanism = (answer["unlisted"] or {}).get("mechanism")
     sentence = mechanism["sentence"] if mechanism else ""
-    return f"{answer['verdict']}: {'; '.join(one for one in (causes, sentence) if one) or '–'}"
+    return f"{answer['verdict']}: {'; '.join(part for part in (causes, sentence) if part) or '–'}"
 
 
-def table(found: Sequence[Extended]) -> str:
-    """All of them in Markdown."""
+def table(results: Sequence[Extended]) -> str:
+    """The results in Markdown."""
     rule = "|" + " --- |" * (HEAD.count("|") - 1)
-    return "\n".join([HEAD, rule, *(one.row() for one in found)])
+    return "\n".join([HEAD, rule, *(result.row() for result in results)])
 
 
 def _trials(first: int, cases: int) -> Iterator[Extended]:
     for seed in range(first, first + cases):
-        one = trial(seed)
-        print(one.row(), flush=True)
-        yield one
+        result = trial(seed)
+        print(result.row(), flush=True)
+        yield result
 
 
 def main() -> None:
@@ -101,13 +104,13 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=int(time.time()) % 1_000_000)
     parser.add_argument("--cases", type=int, default=2 * len(UNLISTED))
     parser.add_argument("--write", type=Path)
-    asked = parser.parse_args()
-    text = table(list(_trials(asked.first, asked.cases)))
-    if asked.write:
-        page = asked.write.read_text(encoding="utf-8")
+    arguments = parser.parse_args()
+    text = table(list(_trials(arguments.first, arguments.cases)))
+    if arguments.write:
+        page = arguments.write.read_text(encoding="utf-8")
         part = marked("mechanisms", page)
         page = page.replace(part[0], f"{part[1]}{text}\n{part[3]}")
-        asked.write.write_text(page, encoding="utf-8")
+        arguments.write.write_text(page, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Write the generated tables of README and documentation anew, from the code."""
+"""Generate the tables of README and documentation from the code."""
 
 import re
 from pathlib import Path
@@ -36,7 +36,7 @@ TABLES = {
 
 
 def filled(text: str) -> str:
-    """Return ``text`` with each marked table as the code has it."""
+    """Return ``text`` with each marked table generated anew."""
     for name, table in TABLES.items():
         marked = rf"(<!-- {name}: [^\n]*-->\n).*?(<!-- end -->)"
         text = re.sub(marked, lambda m, t=table: f"{m[1]}{t()}\n{m[2]}", text, flags=re.DOTALL)

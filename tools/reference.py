@@ -84,11 +84,11 @@ def configuration() -> str:
 
 
 def _tables(settings: type[BaseModel], name: str) -> Iterator[str]:
-    """Each kind of table below one of the configuration, with the places where it may stand."""
-    places: dict[type[BaseModel], list[str]] = {}
+    """Each kind of table below one of the configuration, with the paths that may have it."""
+    paths_by_kind: dict[type[BaseModel], list[str]] = {}
     for path, kind in tables_below(settings, (name,)):
-        places.setdefault(kind, []).append(".".join(path))
-    for kind, paths in places.items():
+        paths_by_kind.setdefault(kind, []).append(".".join(path))
+    for kind, paths in paths_by_kind.items():
         if paths != [name]:
             yield f"### {', '.join(f'`{_written(path)}`' for path in paths)}\n\n{_summary(kind)}\n"
         yield _rows(kind) + "\n"
@@ -108,10 +108,15 @@ def _rows(kind: type[BaseModel]) -> str:
     properties = definitions[_name_of(kind, definitions)]["properties"]
     comments = comments_of(kind)
     lines = ["| key | default | unit, range | what |", "| --- | --- | --- | --- |"]
-    for key, one in properties.items():
+    for key, value_schema in properties.items():
         if key not in UNWRITTEN:
-            what = _sentence(comments[key] or _inner(kind, key))
-            cells = (f"`{key}`", _default(kind, key), _range(key, one, definitions), what)
+            description = _sentence(comments[key] or _inner(kind, key))
+            cells = (
+                f"`{key}`",
+                _default(kind, key),
+                _range(key, value_schema, definitions),
+                description,
+            )
             lines.append(_row(cells))
     return "\n".join(lines)
 
@@ -125,9 +130,9 @@ def _sentence(text: str) -> str:
 
 
 def _inner(kind: type[BaseModel], key: str) -> str:
-    """What is said of the table that a key holds."""
+    """Summary of the table that a key holds."""
     tables = models_at(kind, (key,))
-    return next((_summary(one).partition(". ")[0] for one in tables), "")
+    return next((_summary(table).partition(". ")[0] for table in tables), "")
 
 
 def _name_of(kind: type[BaseModel], definitions: Mapping[str, Any]) -> str:
@@ -150,20 +155,23 @@ def _default(kind: type[BaseModel], key: str) -> str:
         return "-"
     if any(models_at(kind, (key,))) or (
         isinstance(field.default, tuple)
-        and any(isinstance(one, BaseModel) for one in field.default)
+        and any(isinstance(item, BaseModel) for item in field.default)
     ):
         return "*see there*"
     return f"`{json.dumps(value, ensure_ascii=False)}`"
 
 
 def _range(key: str, schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:
-    """Unit, bounds, choices or kind of what a key takes."""
+    """Unit, bounds, choices or kind of a key's value."""
     unit = next((unit for ending, unit in UNITS.items() if key.endswith(ending)), "")
-    texts = [_kind(one, definitions) for one in schema.get("anyOf", schema.get("oneOf", [schema]))]
-    what = " or ".join(dict.fromkeys(text for text in texts if text))
+    texts = [
+        _kind(alternative, definitions)
+        for alternative in schema.get("anyOf", schema.get("oneOf", [schema]))
+    ]
+    text = " or ".join(dict.fromkeys(text for text in texts if text))
     if not unit:
-        return what
-    return f"{unit}, {what.removeprefix('number').removeprefix(', ')}".removesuffix(", ")
+        return text
+    return f"{unit}, {text.removeprefix('number').removeprefix(', ')}".removesuffix(", ")
 
 
 def _kind(schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:
@@ -171,7 +179,7 @@ def _kind(schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:
         schema = definitions[schema["$ref"].rpartition("/")[2]]
     choices = schema.get("enum", [schema["const"]] if "const" in schema else [])
     if choices:
-        return ", ".join(f"`{json.dumps(one)}`" for one in choices)
+        return ", ".join(f"`{json.dumps(choice)}`" for choice in choices)
     kind = "path" if schema.get("format") == "path" else schema.get("type", "")
     signs = [f"{sign} {schema[name]:g}" for name, sign in BOUNDS.items() if name in schema]
     return ", ".join([KINDS[kind], *([" and ".join(signs)] if signs else [])])
@@ -186,7 +194,10 @@ def commands() -> str:
             parts.append(f"## twin {name}\n\n{_command(command)}\n")
             continue
         parts.append(f"## twin {name}\n\n{_plain(command.help)}\n")
-        parts += [f"### twin {name} {one}\n\n{_command(it)}\n" for one, it in _in_order(command)]
+        parts += [
+            f"### twin {name} {subname}\n\n{_command(subcommand)}\n"
+            for subname, subcommand in _in_order(command)
+        ]
     return "\n".join(parts)
 
 
@@ -196,21 +207,21 @@ def _in_order(group: Any) -> Iterator[tuple[str, Any]]:
 
 def _command(command: Any) -> str:
     lines = [_plain(command.help)]
-    rows = [_parameter(one) for one in command.params]
+    rows = [_parameter(parameter) for parameter in command.params]
     if rows:
         lines += ["", "| argument, option | default | what |", "| --- | --- | --- |", *rows]
     return "\n".join(lines)
 
 
-def _parameter(one: Any) -> str:
-    if one.param_type_name == "argument":
-        name = one.metavar or one.name.upper()
+def _parameter(parameter: Any) -> str:
+    if parameter.param_type_name == "argument":
+        name = parameter.metavar or parameter.name.upper()
     else:
-        name = ", ".join([*one.opts, *one.secondary_opts])
-        if not one.is_flag:
-            name += f" {one.metavar or one.display_type(None).strip('<>')}"
-    default = "*required*" if one.required else _given(one.default)
-    return _row((f"`{name}`", default, _plain(one.help)))
+        name = ", ".join([*parameter.opts, *parameter.secondary_opts])
+        if not parameter.is_flag:
+            name += f" {parameter.metavar or parameter.display_type(None).strip('<>')}"
+    default = "*required*" if parameter.required else _given(parameter.default)
+    return _row((f"`{name}`", default, _plain(parameter.help)))
 
 
 def _given(default: Any) -> str:

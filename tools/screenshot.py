@@ -22,11 +22,11 @@ SIZE = "1400x1000"
 TOP_BAR = 36  # pixels of menu and warnings about the software renderer, cut off
 COLOURS = 128
 LOADING_S = 30.0
-SETTLING_S = 2.0  # the plots are drawn some frames after the data is there
+SETTLING_S = 2.0  # the plots appear some frames after the data has arrived
 
 
 def main(recording: Path, picture: Path) -> None:
-    """Start a viewer on loopback, let it draw, take the picture, end it."""
+    """Start a viewer on loopback, wait until it has drawn, take the picture, end it."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     viewer = Path(rerun_cli.__file__).with_name("rerun")
@@ -42,7 +42,7 @@ def main(recording: Path, picture: Path) -> None:
 
 
 def drawn(address: str) -> bytes:
-    """Wait until the recording is loaded and drawn; what the viewer then shows, as PNG."""
+    """Wait until the recording is loaded and drawn; give the viewer's picture as PNG."""
     end = time.monotonic() + LOADING_S
     while True:
         try:
@@ -51,7 +51,7 @@ def drawn(address: str) -> bytes:
             if state.recordings and not state.loading:
                 break
         except (ConnectionError, RuntimeError):
-            pass  # it has not come up yet
+            pass  # the viewer has not started yet
         if time.monotonic() > end:
             sys.exit("the viewer did not load the recording")
         time.sleep(0.2)
@@ -61,7 +61,7 @@ def drawn(address: str) -> bytes:
 
 
 def shrink(png: bytes) -> bytes:
-    """Reduce it to a palette: a tenth of the size, and no difference to see in a plot."""
+    """Reduce it to a palette: a tenth of the size, without a visible difference in a plot."""
     out = io.BytesIO()
     image = Image.open(io.BytesIO(png)).convert("RGB")
     image = image.crop((0, TOP_BAR, *image.size))

@@ -37,14 +37,14 @@ from twin.signals import Command, Samples
 
 STRETCH_S = 600.0  # of the rig, over and over
 BLOCK = 1000  # rows
-SETTLED = 0.25  # of the run, and this long, before the line begins: caches and histories fill first
+SETTLED = 0.25  # share of the run, and this long, before the line begins: caches fill first
 SETTLED_H = 0.75
-JUDGED_H = 0.9  # a shorter run says nothing of memory
-POINTS = 20  # means of so many stretches make the line: what lies near is alike
-LEAST_S = 0.2  # between two looks
+JUDGED_H = 0.9  # a shorter run does not judge memory
+POINTS = 20  # the line is fitted to means of so many stretches: neighbours are correlated
+LEAST_S = 0.2  # between two measurements
 ROTATE_MB = 1.0  # of a part of the log: some minutes in real time
 ENDS_S = 120.0  # to end in order
-# What may grow in an hour of the PLC's time, by what was taken down.
+# Largest growth in an hour of the PLC's time, by measurement.
 ALLOWED = {
     "memory_mb": 0.1,  # a gigabyte in a year
     "threads": 0.0,
@@ -56,7 +56,7 @@ ALLOWED = {
 
 @dataclass(frozen=True)
 class Line:
-    """A straight line through what was taken down."""
+    """A straight line through a measurement."""
 
     slope: float  # in an hour
     low95: float
@@ -65,14 +65,14 @@ class Line:
 
     @property
     def is_good(self) -> bool:
-        """Whether it does not grow by more than is allowed, as far as can be told."""
+        """Whether growth beyond the allowed one is not certain."""
         return self.low95 <= self.allowed
 
 
 def fitted(hours: Sequence[float], values: Sequence[float], allowed: float) -> Line:
-    """The line through the means of stretches, the first of which do not count.
+    """The line through the means of stretches, without the first part of the run.
 
-    Of fewer than three looks nothing can be told: its interval has no end.
+    With fewer than three measurements its interval is infinite.
     """
     x, y = np.array(hours), np.array(values)
     span = x[-1] - x[0]
@@ -92,15 +92,15 @@ def fitted(hours: Sequence[float], values: Sequence[float], allowed: float) -> L
 
 
 def stretch(settings: PlcSettings) -> Samples:
-    """Whole cycles of the simulated rig, so that they can follow themselves."""
+    """Whole cycles of the simulated rig, so that they can be repeated."""
     samples = np.concatenate([*simulate.blocks(settings, STRETCH_S, seed=1)])
     on = (samples["commands"] & Command.SUCTION) != 0
     begins = np.flatnonzero(on[1:] & ~on[:-1]) + 1
     return samples[begins[1] : begins[-1]]  # each begins as the one before
 
 
-def endless(cycles: Samples, told: Callable[[float], None]) -> Iterator[Samples]:
-    """Blocks of it, for ever; ``told`` how many hours of them have been taken."""
+def endless(cycles: Samples, report_hours: Callable[[float], None]) -> Iterator[Samples]:
+    """Endless blocks of ``cycles``; ``report_hours`` gets the hours taken so far."""
     period_ns = int(cycles["time_ns"][1] - cycles["time_ns"][0])
     rounds = 0
     while True:
@@ -110,12 +110,12 @@ def endless(cycles: Samples, told: Callable[[float], None]) -> Iterator[Samples]
             for name in ("time_ns", "host_ns"):
                 block[name] += rounds * len(cycles) * period_ns
             yield block
-            told((rounds * len(cycles) + start + len(block)) * period_ns / 3.6e12)
+            report_hours((rounds * len(cycles) + start + len(block)) * period_ns / 3.6e12)
         rounds += 1
 
 
 def run_compressed(config: Path, log: Path, progress: Path) -> None:
-    """``twin run`` with these rows instead of a PLC's, in this process, until it is interrupted."""
+    """``twin run`` with these rows in place of a PLC, in this process, until interrupted."""
     from drivers import sources  # noqa: PLC0415 - of the child alone
     from twin.cli.main import main as run_command  # noqa: PLC0415
 
@@ -134,13 +134,13 @@ def run_compressed(config: Path, log: Path, progress: Path) -> None:
 
 @contextmanager
 def compressed(folder: Path) -> Iterator[tuple[psutil.Popen, Callable[[], float]]]:
-    """Its process, and what asks it for the hours so far."""
+    """The process, and a function that gives its hours so far."""
     progress, config = folder / "progress", folder / "soak.toml"
     config.write_text(tomli_w.dumps(configured()), encoding="utf-8")
     (folder / "logs").mkdir()
     command = [sys.executable, "-m", "tools.soak", "--child", str(folder)]
-    with (folder / "said.txt").open("w") as said:
-        process = psutil.Popen(command, cwd=ROOT, stdout=said, stderr=said)
+    with (folder / "said.txt").open("w") as output:
+        process = psutil.Popen(command, cwd=ROOT, stdout=output, stderr=output)
         try:
             yield process, lambda: float(progress.read_text() or 0) if progress.exists() else 0.0
         finally:
@@ -150,7 +150,7 @@ def compressed(folder: Path) -> Iterator[tuple[psutil.Popen, Callable[[], float]
 
 
 def configured() -> dict[str, Any]:
-    """The test rig's configuration, with all that is kept."""
+    """The test rig's configuration, with all stores on."""
     path = ROOT / "configs" / f"{CONFIGS['modbus']}.toml"
     tables: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
     return tables | {name: {"keep": True} for name in ("figures", "alarms", "page")}
@@ -161,8 +161,8 @@ def configured() -> dict[str, Any]:
 
 @contextmanager
 def real(folder: Path) -> Iterator[tuple[psutil.Popen, Callable[[], float]]]:
-    """The process beside a simulated PLC, and the hours so far."""
-    # Of each half second the writer keeps a place in the index until its part of the log ends.
+    """The process with a simulated PLC, and a function that gives its hours so far."""
+    # The writer keeps an index entry for each half second until its part of the log ends.
     with Cell("modbus", folder, np.random.default_rng(1), rotate_mb=ROTATE_MB) as cell:
         until_logged(cell)
         begun = time.monotonic()
@@ -173,47 +173,49 @@ def real(folder: Path) -> Iterator[tuple[psutil.Popen, Callable[[], float]]]:
 
 
 def looked_at(process: psutil.Popen, folder: Path) -> dict[str, float]:
-    """How big everything is now."""
+    """All measurements now."""
     with process.oneshot():
-        found = {
+        sizes = {
             "memory_mb": process.memory_info().rss / 1e6,
             "threads": float(process.num_threads()),
             "handles": float(process.num_fds()),
         }
     for name, pattern in (("log_mb", "logs/*.mcap"), ("database_mb", "*.sqlite*")):
-        found[name] = sum(path.stat().st_size for path in folder.glob(pattern)) / 1e6
-    return found
+        sizes[name] = sum(path.stat().st_size for path in folder.glob(pattern)) / 1e6
+    return sizes
 
 
 def soak(
     process: psutil.Popen, so_far: Callable[[], float], hours: float, folder: Path
 ) -> dict[str, list[float]]:
-    """Look until so many hours are over; then the process ends in order, or SystemExit says why."""
-    seen: dict[str, list[float]] = {name: [] for name in ("hours", *ALLOWED)}
+    """Measure for so many hours; then end the process in order, or raise SystemExit."""
+    measurements: dict[str, list[float]] = {name: [] for name in ("hours", *ALLOWED)}
     while (now := so_far()) < hours:
         if process.poll() is not None:
-            said = "\n".join(path.read_text() for path in folder.glob("*.txt"))
-            raise SystemExit(f"it ended before its time:\n{said}")
+            output = "\n".join(path.read_text() for path in folder.glob("*.txt"))
+            raise SystemExit(f"it ended before its time:\n{output}")
         time.sleep(LEAST_S)
-        if now and now != (seen["hours"] or [0.0])[-1]:
+        if now and now != (measurements["hours"] or [0.0])[-1]:
             for name, value in ({"hours": now} | looked_at(process, folder)).items():
-                seen[name].append(value)
+                measurements[name].append(value)
         if sys.stderr.isatty():
             print(f"\r{now:.2f} of {hours:g} h", end="", file=sys.stderr, flush=True)
     process.send_signal(signal.SIGINT)
     if (code := process.wait(ENDS_S)) != 130:
         raise SystemExit(f"it ended with {code}, and not with 130")
-    return seen
+    return measurements
 
 
-def judged(seen: dict[str, list[float]], folder: Path) -> dict[str, Any]:
-    """The lines, what the log holds, and what is wrong."""
-    lines = {name: fitted(seen["hours"], seen[name], ALLOWED[name]) for name in ALLOWED}
+def judged(measurements: dict[str, list[float]], folder: Path) -> dict[str, Any]:
+    """The lines, the content of the log, and the problems."""
+    lines = {
+        name: fitted(measurements["hours"], measurements[name], ALLOWED[name]) for name in ALLOWED
+    }
     problems = [
         f"{name} grows by {line.slope:.3g} an hour ({line.low95:.3g} to {line.high95:.3g}), and"
         f" {line.allowed:g} is allowed"
         for name, line in lines.items()
-        if not (line.is_good or (name == "memory_mb" and seen["hours"][-1] < JUDGED_H))
+        if not (line.is_good or (name == "memory_mb" and measurements["hours"][-1] < JUDGED_H))
     ]
     log = open_log(folder / "logs" / "run.mcap")
     rows, missing, last = 0, 0, None
@@ -226,10 +228,10 @@ def judged(seen: dict[str, list[float]], folder: Path) -> dict[str, Any]:
     problems += ["the log is not complete"] * (not log.complete)
     problems += [f"{missing} rows are missing in the log"] * bool(missing)
     return {
-        "hours": round(seen["hours"][-1], 3),
-        "looks": len(seen["hours"]),
+        "hours": round(measurements["hours"][-1], 3),
+        "looks": len(measurements["hours"]),
         "rows": rows,
-        "last": {name: seen[name][-1] for name in ALLOWED},
+        "last": {name: measurements[name][-1] for name in ALLOWED},
         "an_hour": {name: asdict(line) for name, line in lines.items()},
         "problems": problems,
     }
@@ -241,15 +243,15 @@ def main() -> int:
     parser.add_argument("--hours", type=float, default=24.0, help="compressed; 0: none")
     parser.add_argument("--real-hours", type=float, default=1.0, help="0: none")
     parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.child is not None:
-        folder = given.child
+    arguments = parser.parse_args()
+    if arguments.child is not None:
+        folder = arguments.child
         run_compressed(folder / "soak.toml", folder / "logs" / "run.mcap", folder / "progress")
         return 0
     answer = {}
     for name, hours, begin in (
-        ("compressed", given.hours, compressed),
-        ("real", given.real_hours, real),
+        ("compressed", arguments.hours, compressed),
+        ("real", arguments.real_hours, real),
     ):
         if not hours:
             continue
@@ -260,7 +262,7 @@ def main() -> int:
             answer[name] = judged(soak(process, so_far, hours, folder), folder)
             answer[name]["seconds"] = round(time.monotonic() - begun)
     print(json.dumps(answer, indent=1))
-    return 1 if any(one["problems"] for one in answer.values()) else 0
+    return 1 if any(result["problems"] for result in answer.values()) else 0
 
 
 if __name__ == "__main__":

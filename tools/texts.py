@@ -1,4 +1,4 @@
-"""Brings the catalogues in twin/locale to what the program says: new texts empty, stale ones gone.
+"""Update the catalogues in twin/locale from the code: add new texts empty, drop stale ones.
 
 ``python tools/texts.py`` does it to all of them, ``python tools/texts.py fr`` begins another
 language. Fill in each ``msgstr``; a text without one stays English.
@@ -28,12 +28,12 @@ from twin.page.app import MARKED
 ROOT = Path(__file__).resolve().parents[1]
 LOCALE = ROOT / "twin" / "locale"
 STATIC = ROOT / "twin" / "page" / "static"
-_OPTIONS = {"parse_template_string": True}  # scripts say some texts inside others
-Text = tuple[str, str]  # where it stands, and what it says
+_OPTIONS = {"parse_template_string": True}  # scripts nest some texts in others
+Text = tuple[str, str]  # location and text
 
 
 def texts() -> Iterator[Text]:
-    """Every text that is said in the language of who reads it."""
+    """Every text that is shown in the reader's language."""
     yield from _in_code(ROOT / "twin", "*.py", "python", "tr")
     yield from _in_code(STATIC, "*.js", "javascript", "t")
     for path in sorted(STATIC.glob("*.html")):
@@ -43,20 +43,20 @@ def texts() -> Iterator[Text]:
 
 
 def _in_code(folder: Path, pattern: str, method: str, keyword: str) -> Iterator[Text]:
-    """What is marked: ``tr("...")`` in Python, ``t("...")`` in scripts."""
+    """Marked texts: ``tr("...")`` in Python, ``t("...")`` in scripts."""
     for path in sorted(folder.rglob(pattern)):
-        for found in extract_from_file(method, path, {keyword: None}, options=_OPTIONS):
-            if isinstance(found[1], str):
-                yield _place(path), found[1]
+        for message in extract_from_file(method, path, {keyword: None}, options=_OPTIONS):
+            if isinstance(message[1], str):
+                yield _place(path), message[1]
 
 
 def _in_tables() -> Iterator[Text]:
-    """What stands in tables of the program and is said through them."""
+    """Texts in tables of the program."""
     for effect in EFFECTS.values():
         for text in (spoken(effect.name), effect.sentence, effect.look_at):
             yield "twin/model/effects.py", text
     for rule in by_cause(default_rules()):
-        yield from (("twin/alarms/default.toml", one) for one in (rule.consequence, rule.action))
+        yield from (("twin/alarms/default.toml", text) for text in (rule.consequence, rule.action))
         if not cause_of(rule.value):
             yield "twin/alarms/default.toml", light.spelt(rule.name)
     for figure in FIGURES.values():
@@ -65,7 +65,7 @@ def _in_tables() -> Iterator[Text]:
     yield "twin/monitor/healthy.py", NOT_COMMISSIONED
     yield "twin/alarms/text.py", COMMISSION
     for table in (light.WITHOUT, light.WORDS, light.STATES, light.PRIORITIES):
-        yield from (("twin/page/ejector_status.py", one) for one in table.values())
+        yield from (("twin/page/ejector_status.py", text) for text in table.values())
     for text in (*hall_words.WORDS.values(), hall_words.SILENT, hall_words.NOT_KNOWN):
         yield "twin/page/plant_overview_text.py", text
     for status in (400, 401, 403, 404, 503):
@@ -79,15 +79,15 @@ def _place(path: Path) -> str:
 
 
 def updated(code: str) -> Catalog:
-    """The catalogue of a language with each text once: what was translated, and what is new."""
+    """The catalogue of a language with each text once: translated and new ones."""
     path, before = LOCALE / f"{code}.po", Catalog(code)
     if path.exists():
         before = read_po(path.read_bytes().splitlines(keepends=True), locale=code)
     after = Catalog(code)
-    for place, text in texts():
-        known = before.get(text)
+    for location, text in texts():
+        translated = before.get(text)
         if text:
-            after.add(text, known.string if known else "", locations=[(place, None)])
+            after.add(text, translated.string if translated else "", locations=[(location, None)])
     return after
 
 
@@ -95,7 +95,7 @@ HEAD = "# Texts of the page and of alarms; python tools/texts.py keeps them up t
 
 
 def main() -> None:
-    """Write all catalogues, and the one that is begun."""
+    """Write all catalogues, and a new one if asked for."""
     codes = {path.stem for path in LOCALE.glob("*.po")} | set(sys.argv[1:])
     for code in sorted(codes):
         if not re.fullmatch(r"[A-Za-z]{2,3}(-[A-Za-z0-9]{2,8})*", code):
@@ -104,7 +104,7 @@ def main() -> None:
         with (LOCALE / f"{code}.po").open("wb") as file:
             file.write(HEAD.encode())
             write_po(file, catalogue, omit_header=True, width=98)
-        empty = sum(not one.string for one in catalogue if one.id)
+        empty = sum(not message.string for message in catalogue if message.id)
         print(f"{code}: {len(catalogue)} texts, {empty} of them not translated")
 
 

@@ -15,7 +15,7 @@ from tools.calibration_coverage import drawn, recorded, rig_of, shipped
 from twin.signals import BAR, MBAR, NS, Command, Samples
 
 CYCLES = 8
-AMBIENT = 1013.0  # mbar, as configs/test_rig.toml has it
+AMBIENT = 1013.0  # mbar, as in configs/test_rig.toml
 # Clear sizes of what may be hidden, in the unit of the effect's parameter.
 SIZES = {
     "leakage": (1.5, 4.0),
@@ -27,7 +27,7 @@ SIZES = {
 
 
 def write_data(folder: Path, seed: int) -> str:
-    """Write ``healthy.csv`` and ``today.csv``; gives what is hidden in the second."""
+    """Write ``healthy.csv`` and ``today.csv``; gives the cause hidden in the second."""
     rng = np.random.default_rng(seed)
     plc = drawn(rig_of(shipped("test_rig")), seed)
     effect = str(rng.choice(list(SIZES)))
@@ -38,7 +38,7 @@ def write_data(folder: Path, seed: int) -> str:
 
 
 def write_csv(path: Path, samples: Samples) -> None:
-    """As a PLC tool exports a trace."""
+    """Write samples as a PLC tool exports a trace."""
     since = (samples["time_ns"] - samples["time_ns"][0]) * NS
     columns = {
         "time_s": (since, "%.3f"),
@@ -53,16 +53,16 @@ def write_csv(path: Path, samples: Samples) -> None:
 
 
 def main() -> None:
-    """Write the files and say where they are."""
+    """Write the files and print their paths."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, nargs="?", default=Path())
     parser.add_argument("--seed", type=int, default=11)
     parser.add_argument("--tell", action="store_true", help="say what is hidden")
-    asked = parser.parse_args()
-    asked.folder.mkdir(parents=True, exist_ok=True)
-    hidden = write_data(asked.folder, asked.seed)
-    print(f"healthy.csv and today.csv are in {asked.folder.resolve()}")
-    if asked.tell:
+    arguments = parser.parse_args()
+    arguments.folder.mkdir(parents=True, exist_ok=True)
+    hidden = write_data(arguments.folder, arguments.seed)
+    print(f"healthy.csv and today.csv are in {arguments.folder.resolve()}")
+    if arguments.tell:
         print(hidden)
 
 

@@ -1,4 +1,4 @@
-"""Which commit a tool measures."""
+"""The commit that a tool measures."""
 
 import os
 import shutil
@@ -14,7 +14,7 @@ def commit() -> str:
     git = shutil.which("git", path=os.pathsep.join([os.environ.get("PATH", ""), os.defpath]))
     command = [git or "git", "describe", "--always", "--dirty", "--exclude=*"]
     try:
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+        process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
-    return done.stdout.strip()
+    return process.stdout.strip()
