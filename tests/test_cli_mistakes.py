@@ -38,6 +38,8 @@ NEEDED = {
     "assets import": ("here.json",),
     "assets export": (),
     "figures show": ("L",),
+    "figures costs": ("L",),
+    "figures savings": ("L",),
     "figures trend": (),
     "figures counters": (),
     "figures autoset": (),

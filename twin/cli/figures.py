@@ -1,5 +1,6 @@
 """``twin figures``: key figures of a log, and of the database."""
 
+import math
 import sys
 import time
 from functools import partial
@@ -9,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli.app import App, not_negative, read_config, say_if_cut
+from twin.cli.options import LogFile
+from twin.cli.options import UnitId as LogUnit
 from twin.errors import ConfigError, known_names
 from twin.files import require_writable, write_json
 
@@ -17,7 +20,8 @@ if TYPE_CHECKING:
 
     from twin.assets.unit import Unit
     from twin.config import Config
-    from twin.figures.cycle import KeyFigures
+    from twin.figures.costs import Tariff
+    from twin.figures.cycle import CycleFigures, KeyFigures
     from twin.figures.database import History, Store
     from twin.figures.settings import FigureSettings, Limits
     from twin.figures.table import Figure
@@ -46,7 +50,7 @@ JsonFile = Annotated[
 
 @figures_app.command()
 def show(
-    log: Annotated[Path, typer.Argument(metavar="LOG.mcap", help="A recorded log.")],
+    log: LogFile,
     config: ConfigFile = None,
     json_file: JsonFile = None,
     output: Annotated[
@@ -92,6 +96,72 @@ def show(
         with _open(figures, config, write=True) as store:
             count = store.add(unit, data_set, log.name, plain)
             print(f"{count} new of {len(plain)} cycles, in {store.name}")
+
+
+@figures_app.command()
+def costs(
+    log: LogFile,
+    config: ConfigFile = None,
+    unit: LogUnit = "",
+    json_file: JsonFile = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", metavar="FILE", help="*.csv, *.parquet or *.xlsx.")
+    ] = None,
+) -> None:
+    """Air, energy and money of each day of a log, and of a year at its rate."""
+    from twin.figures.costs import days, year
+    from twin.figures.costs_text import days_plain, days_table
+    from twin.figures.export import days_columns
+    from twin.tables.sheet import export as export_table
+
+    require_writable(json_file, output)
+    recorded, settings = _opened(log, config, unit)
+    tariff, cycles = _tariff(settings), _cycles(recorded, settings)
+    if recorded.header.derived:
+        print(f"twin: {recorded.header.derived}", file=sys.stderr)
+    by_day, whole = days(cycles), year(cycles, tariff)
+    print(days_table(by_day, whole, tariff))
+    if json_file is not None:
+        write_json(json_file, {"log": str(log), **days_plain(by_day, whole, tariff)})
+    if output is not None:
+        export_table(days_columns(by_day, tariff), output)
+
+
+@figures_app.command()
+def savings(
+    log: LogFile,
+    config: ConfigFile = None,
+    unit: LogUnit = "",
+    json_file: JsonFile = None,
+) -> None:
+    """What another H1, hysteresis or supply pressure would save, as the model predicts it."""
+    from twin.figures.savings import MOST_CYCLES
+    from twin.figures.savings import savings as predict
+    from twin.figures.savings_text import savings_plain, savings_table
+    from twin.figures.settings import FigureSettings
+    from twin.figures.simulated import Program, mean_cycle_time, spread, whole_cycles
+    from twin.figures.table import Unit
+
+    require_writable(json_file)
+    recorded, settings = _opened(log, config, unit)
+    recorded.header.require_commands(str(log))
+    cycles = spread(whole_cycles(recorded.blocks()), MOST_CYCLES)
+    if not cycles:
+        raise ConfigError(
+            f"{log}: no complete cycle, so no program to predict for",
+            "record suction, blow-off and the idle after it",
+        )
+    program, tariff = Program.of_cycles(cycles), _tariff(settings)
+    figure_settings = settings.document.section(FigureSettings, "figures")
+    ejector = Unit(settings.data, figure_settings.energy_kwh_m3)
+    predicted = predict(ejector, settings.monitor.healthy, program)
+    rate = tariff.cycles_a_year(mean_cycle_time(program.cycle_seconds))
+    air = [cycle.measured["air"] for cycle in _cycles(recorded, settings)]
+    measured = [value for value in air if math.isfinite(value)]
+    print(savings_table(predicted, rate, tariff, measured))
+    if json_file is not None:
+        plain = savings_plain(predicted, rate, tariff, measured)
+        write_json(json_file, {"log": str(log), **plain})
 
 
 @figures_app.command()
@@ -261,13 +331,42 @@ def _limits(config: Path | None) -> "Limits":
     return limits(FigureSettings(), DataSet(), MonitorSettings())
 
 
-def _of_log(recorded: "Log", log: Path, instead: Path | None) -> "Config":
-    """The configuration of a log with the data set of its recording, or another configuration."""
+def _of_log(recorded: "Log", log: Path, instead: Path | None, unit: str = "") -> "Config":
+    """The configuration of a log with the data set of its recording, or another one.
+
+    ``unit`` has the data set looked up that the asset database knows of it.
+    """
     from twin.config import Config
     from twin.settings import Document
 
     document = Document.read(instead) if instead is not None else None
-    return Config.of_recorded(recorded.header, str(log), document)
+    return Config.of_recorded(recorded.header, str(log), document, unit=unit)
+
+
+def _opened(log: Path, config: Path | None, unit: str) -> "tuple[Log, Config]":
+    """A log, and the configuration that it is read with; prints what is amiss with them."""
+    from twin.log.reader import open_log
+
+    recorded = open_log(log)
+    say_if_cut(recorded, log, "used")
+    settings = _of_log(recorded, log, config, unit)
+    if unit and settings.instead:
+        print(f"twin: {settings.instead}", file=sys.stderr)
+    return recorded, settings
+
+
+def _tariff(settings: "Config") -> "Tariff":
+    from twin.figures.costs import Tariff
+    from twin.figures.settings import FigureSettings
+
+    return Tariff.of(settings.document.section(FigureSettings, "figures"))
+
+
+def _cycles(recorded: "Log", settings: "Config") -> "list[CycleFigures]":
+    """The key figures of every cycle of a log."""
+    from twin.figures.read import of_log
+
+    return [cycle for cycle, _ in of_log(recorded, key_figures_of(settings))]
 
 
 def _chosen(store: "Store", config: Path | None, unit: str) -> "Unit":

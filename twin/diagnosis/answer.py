@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from twin.config import Config
+from twin.diagnosis.costs import costs
 from twin.diagnosis.covariance import Covariance, Weights, covariance
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, collect, thinned
 from twin.diagnosis.experiments import next_experiment
@@ -134,9 +135,13 @@ def diagnose(
     verdict = _verdict(found, before, after, left, strange, likely)
     known_by_now = _Found(verdict, searched, found, after, strange)
     it = _with_unlisted(evidence, fitted, held_out, healthy, before, known_by_now, progress)
+    causes = _causes(evidence, it.searched, odds, before) if it.found else []
+    for cause, cost in zip(causes, costs(config, evidence, it.found, causes), strict=False):
+        if cost is not None:  # there are none where no price is configured
+            cause["cost"] = cost
     answer = head | {
         "verdict": it.verdict,
-        "causes": _causes(evidence, it.searched, odds, before) if it.found else [],
+        "causes": causes,
         "runners_up": _runners_up(it.searched),
         "unmodelled_probability": _unmodelled(evidence, it.searched, odds, alone, it.verdict),
         "unlisted": _unlisted(evidence, it.strange, it.mechanism)

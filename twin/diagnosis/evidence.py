@@ -5,7 +5,6 @@ are measured minus expected pressure, averaged over short bins, and measured min
 at the switchings of the air saving.
 """
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
@@ -16,7 +15,6 @@ from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from pydantic.fields import FieldInfo
 
 from twin.config import Config
 from twin.live import Twin
@@ -24,7 +22,7 @@ from twin.model import kernel
 from twin.model import theta as c
 from twin.model.catalogue import CatalogueEffect, effects_in
 from twin.model.courses import Cause, Schedule, schedule
-from twin.model.dataset import DataSet, coefficients
+from twin.model.dataset import coefficients
 from twin.model.effects import Effect, acting_on
 from twin.model.plant import reading_of, sensed_of
 from twin.model.term import Term, Terms
@@ -37,6 +35,7 @@ from twin.monitor.phase_detector import Knees
 from twin.monitor.rows import drawn_rows, time_steps
 from twin.monitor.simulated_switching import Seen, seen
 from twin.monitor.surroundings import are_told, following, told
+from twin.monitor.uncertain_data import shifted
 from twin.signals import (
     MBAR,
     NS,
@@ -55,13 +54,8 @@ from twin.signals import (
 CORES: ContextVar[int] = ContextVar("CORES", default=2)  # on which a diagnosis runs
 LATER, LONGEST_SUCTION = 1.3, 10_000  # simulated suction over that of cycles, and at most (rows)
 
-# Relative sigmas of how suction and end pressure follow the supply; the values are the type's.
-SUPPLY_UNKNOWN = {"end_pressure_slope": 0.5, "curvature": 0.5, "optimum_bar": 0.03}
-
 Hypothesis = tuple[Cause, ...]
 HEALTHY: Hypothesis = ()
-OF_THE_WAY = 0.9  # largest change of an uncertain value, over its distance to the bound
-_BOUNDS = ("ge", "gt", "le", "lt")
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -399,7 +393,7 @@ def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
         rows=np.empty(0, np.int64),
         terms=config.data.terms,
         knees=knees,
-        uncertain=tuple(_uncertain(config)),
+        uncertain=tuple(shifted(config.data, config.monitor.healthy)),
         calibrated=theta,
         gauge=config.gauge,
         catalogue=config.data.catalogue,
@@ -434,46 +428,6 @@ def of_log(base: Evidence, blocks: Iterable[Samples]) -> Evidence:
         knees=knees,
         _seen={},  # depends on the settings of the finder
     )
-
-
-def _uncertain(config: Config) -> Iterator[tuple[Theta, Theta]]:
-    """Coefficients one sigma to either side, for each uncertainty of the calibration.
-
-    The response to the supply comes first: calibration measured only one supply.
-    """
-    for key, share in SUPPLY_UNKNOWN.items():
-        value = getattr(config.data.supply, key)
-        yield _both_sides(config.data, {f"supply.{key}": share * value})
-    rows = config.monitor.healthy.uncertain
-    for column in range(len(rows)):
-        yield _both_sides(
-            config.data, {name: row[column] for name, row in list(rows.items())[column:]}
-        )
-
-
-def _both_sides(data: DataSet, changes: Mapping[str, float]) -> tuple[Theta, Theta]:
-    """Coefficients with values (``table.key``) changed up and down by ``changes``."""
-    up, down = (_changed(data, changes, sign) for sign in (1.0, -1.0))
-    return coefficients(up), coefficients(down)
-
-
-def _changed(data: DataSet, changes: Mapping[str, float], sign: float) -> DataSet:
-    """A data set with changed values within their bounds; the set as a whole is unchecked."""
-    for name, change in changes.items():
-        table, key = name.split(".")
-        part = getattr(data, table)
-        value = _within_bounds(type(part).model_fields[key], getattr(part, key), sign * change)
-        data = data.model_copy(update={table: part.model_copy(update={key: value})})
-    return data
-
-
-def _within_bounds(field_info: FieldInfo, value: float, change: float) -> float:
-    """A changed value, at most OF_THE_WAY to a bound: no flow or volume becomes negative."""
-    bounds = (getattr(limit, name, None) for limit in field_info.metadata for name in _BOUNDS)
-    for bound in (limit for limit in bounds if limit is not None):
-        if (bound - value) * change > 0.0:
-            change = math.copysign(min(abs(change), OF_THE_WAY * abs(bound - value)), change)
-    return value + change
 
 
 def thinned(evidence: Evidence, cycles: Sequence[int], most: int) -> Evidence:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from twin.figures.money import Interval, interval_text, significant
 from twin.instants import SECOND_NS, dated, instant
 from twin.language import tr
 from twin.model.courses import Course
@@ -176,6 +177,8 @@ def about(cause: Answer, times: Times, *, sure: bool) -> Iterator[tuple[str, str
     yield "when", when(cause, times, interval=True)
     if sure:
         yield "how sure", certainty(cause)
+    if "cost" in cause:
+        yield "cost", cost(cause)
     yield "look at", effect_of(cause["effect"]).look_at
     for name in cause["not_separable_from"]:
         yield "or it may be", f"{spoken(name)}; then look at {effect_of(name).look_at}"
@@ -254,6 +257,20 @@ def certainty(cause: Answer) -> str:
     return tr("{percent}; this log cannot tell it from {alike}", percent=percent, alike=alike)
 
 
+def cost(cause: Answer) -> str:
+    """What a cause costs a year, or that the log cannot tell; only where a price is configured."""
+    told, name = cause["cost"], spoken(cause["effect"])
+    money = Interval(**told["money_per_year"])
+    basis = f"{told['operating_hours']:g} h of operation"
+    if not told["differs_from_zero"]:
+        text = interval_text(money, told["currency"])
+        return f"what this {name} costs cannot be told from zero: {text}, {basis}"
+    if money.value > 0.0:
+        return f"this {name} costs about {interval_text(money, told['currency'])}, {basis}"
+    less = Interval(-money.value, -money.high95, -money.low95)
+    return f"this {name} takes less air: about {interval_text(less, told['currency'])}, {basis}"
+
+
 # --- numbers and lists ----------------------------------------------------------------------------
 
 
@@ -289,7 +306,7 @@ def gain_interval(known: Answer, cycles: int, cycle: str = "cycle") -> str:
 
 def number(value: float | None, digits: int = 3) -> str:
     """Three significant digits, without an exponent."""
-    return "–" if value is None else f"{float(f'{value:.{digits}g}'):.10g}"
+    return "–" if value is None else significant(value, digits)
 
 
 def ends(low: float, high: float) -> tuple[str, str]:

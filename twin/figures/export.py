@@ -1,8 +1,11 @@
-"""Key figures as a table for other programs: a row for each cycle."""
+"""Key figures and costs as tables for other programs: a row for each cycle, or each day."""
+
+from collections.abc import Sequence
 
 import pyarrow as pa
 
 from twin.assets.unit import Unit
+from twin.figures.costs import Consumption, Tariff
 from twin.figures.database import SIDES, History
 from twin.figures.table import FIGURES
 
@@ -24,5 +27,23 @@ def to_table(history: History, unit: Unit) -> pa.Table:
     fields = [
         pa.field(name, column.type, metadata={"unit": UNITS[name]} if name in UNITS else None)
         for name, column in columns.items()
+    ]
+    return pa.table(list(columns.values()), pa.schema(fields))
+
+
+def days_columns(days: Sequence[Consumption], tariff: Tariff) -> pa.Table:
+    """The days as a table for other programs; without a price the column of costs is null."""
+    costs = [tariff.money(day.air) for day in days]
+    columns = {
+        ("day", ""): pa.array([day.name for day in days], pa.string()),
+        ("cycles", ""): pa.array([day.cycles for day in days], pa.int64()),
+        ("cycles_with_air", ""): pa.array([day.known for day in days], pa.int64()),
+        ("air", "Nl"): pa.array([day.air for day in days], pa.float64()),
+        ("energy", "kWh"): pa.array([tariff.energy(day.air) for day in days], pa.float64()),
+        ("cost", tariff.currency): pa.array(costs, pa.float64()),
+    }
+    fields = [
+        pa.field(name, column.type, metadata={"unit": unit} if unit else None)
+        for (name, unit), column in columns.items()
     ]
     return pa.table(list(columns.values()), pa.schema(fields))

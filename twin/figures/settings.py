@@ -32,6 +32,11 @@ class FigureSettings(DatabaseSettings):
     supply_low_bar: Annotated[float, Field(ge=0.0)] | None = None  # gauge, at the nozzle
     supply_high_bar: Positive | None = None  # both as the data set has it, and the tolerance
     energy_kwh_m3: Positive = 0.12  # to compress a standard cubic metre, whole compressor station
+    price_per_kwh: Positive | None = None  # of electric energy, in the currency; or price_per_m3
+    price_per_m3: Positive | None = None  # of compressed air, each 1000 Nl (ISO 8778); or the other
+    currency: Annotated[str, Field(min_length=1, max_length=8)] = "€"  # as it is written
+    # In a year, for costs a year: chosen, two shifts of 8 h on 250 days; a year has 8760.
+    operating_hours: Annotated[float, Field(gt=0.0, le=8784.0)] = 4000.0
     autoset_tolerance: Annotated[float, Field(ge=0.0, le=10.0)] = 0.25  # over the last good cycles
     keep: bool = False  # twin run adds its cycles to the database
 
@@ -40,6 +45,12 @@ class FigureSettings(DatabaseSettings):
         low, high = self.supply_low_bar, self.supply_high_bar
         if low is not None and high is not None and low >= high:
             raise ValueError("supply_low_bar must be below supply_high_bar")
+        return self
+
+    @model_validator(mode="after")
+    def _price_is_one(self) -> Self:
+        if self.price_per_kwh is not None and self.price_per_m3 is not None:
+            raise ValueError("set price_per_kwh or price_per_m3, not both")
         return self
 
 

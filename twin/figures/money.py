@@ -1,0 +1,46 @@
+"""Amounts of money for people, and their intervals."""
+
+from typing import NamedTuple
+
+EXACT_FROM = 10.0  # of a currency: larger amounts are told without decimals
+NOTHING = 1e-9  # of a currency: smaller amounts are what calculating leaves of zero
+
+
+class Interval(NamedTuple):
+    """A value with its 95 % interval."""
+
+    value: float
+    low95: float
+    high95: float
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether it surely differs from zero."""
+        return self.low95 > 0.0 or self.high95 < 0.0
+
+    def times(self, factor: float) -> "Interval":
+        """The same in another unit; ``factor`` is positive."""
+        return Interval(*(factor * part for part in self))
+
+
+def amount(money: float) -> str:
+    """An amount of money without its currency: with cents below EXACT_FROM, never just rounded off.
+
+    Amounts below a tenth have two significant digits.
+    """
+    if abs(money) < NOTHING:
+        return "0"
+    if abs(money) < 0.1:
+        return f"{money:.2g}"
+    return f"{money:.0f}" if abs(money) >= EXACT_FROM else f"{money:.2f}"
+
+
+def significant(value: float, digits: int = 3) -> str:
+    """A number with so many significant digits, without an exponent."""
+    return f"{float(f'{value:.{digits}g}'):.10g}"
+
+
+def interval_text(money: Interval, currency: str) -> str:
+    """An amount with its 95 % interval: "145 € a year (95 %: 110 to 180)"."""
+    low, high = amount(money.low95), amount(money.high95)
+    return f"{amount(money.value)} {currency} a year (95 %: {low} to {high})"
