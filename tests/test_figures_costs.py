@@ -142,10 +142,13 @@ def test_without_a_clock_days_count_from_the_first_cycle(cycles: list[CycleFigur
     assert [day.name for day in days(unset)] == ["day 1", "day 2"]
 
 
-def test_no_cycle_has_no_year() -> None:
+def test_why_a_year_is_not_told_is_said(cycles: list[CycleFigures]) -> None:
     assert days([]) == []
     text = days_table([], year([], tariff()), tariff())
-    assert "a year: not told, the log has too few complete cycles" in text
+    assert "a year: not told, the log has fewer than two cycles" in text
+    unknown = [replace(cycle, measured={"air": math.nan}) for cycle in cycles]
+    text = days_table(days(unknown), year(unknown, tariff()), tariff())
+    assert "a year: not told, no cycle's air is known" in text
 
 
 # The command.

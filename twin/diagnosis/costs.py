@@ -44,7 +44,7 @@ def costs(
 ) -> list[dict[str, Any] | None]:
     """The cost of each cause in the answer's form, in order; none where no price is configured.
 
-    It is None for a cause without sizes that are known. ``causes`` are those of ``hypothesis`` as
+    It is None for a cause of which no size is known. ``causes`` are those of ``hypothesis`` as
     the answer has them, with their 95 % intervals.
     """
     settings = config.document.section(FigureSettings, "figures")
@@ -54,17 +54,15 @@ def costs(
     unit = Unit(config.data, settings.energy_kwh_m3)
     program = Program.of(evidence.samples, evidence.starts)
     model = _Model(evidence, unit, program, _thetas(config.data, evidence))
-    return [
-        _plain(model.extra_air(hypothesis, place, cause), model.cycle_s, tariff)
-        if cause["parameters"]
-        else None
-        for place, cause in enumerate(causes)
-    ]
+    return [model.cost(hypothesis, place, tariff, cause) for place, cause in enumerate(causes)]
 
 
 def _thetas(data: DataSet, evidence: Evidence) -> list[Theta]:
     """Coefficients that the unit may have, in the surroundings of its log."""
-    rng, around = np.random.default_rng(SEED), evidence.theta - coefficients(data)
+    rng, base = np.random.default_rng(SEED), coefficients(data)
+    around = np.zeros(len(base))
+    differs = np.isfinite(base) & (evidence.theta != base)  # some are infinite or unset
+    around[differs] = evidence.theta[differs] - base[differs]
     return [drawn(data, evidence.healthy, rng) + around for _ in range(DRAWS)]
 
 
@@ -81,6 +79,16 @@ class _Model:
     def cycle_s(self) -> float:
         """Mean time of a cycle (s), as the log has it."""
         return mean_cycle_time(self.program.cycle_seconds)
+
+    def cost(
+        self, hypothesis: Hypothesis, place: int, tariff: Tariff, answer: Answer
+    ) -> dict[str, Any] | None:
+        """The cost of the cause at ``place`` in the answer's form, None where it is unknown."""
+        if not answer["parameters"]:
+            return None
+        extra = self.extra_air(hypothesis, place, answer)
+        is_known = all(map(math.isfinite, extra))  # the model of a data set drawn may break down
+        return _plain(extra, self.cycle_s, tariff) if is_known else None
 
     def extra_air(self, hypothesis: Hypothesis, place: int, answer: Answer) -> Interval:
         """Air (Nl) that one cause takes in a cycle in the mean, with its 95 % interval.

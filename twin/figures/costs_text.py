@@ -65,8 +65,13 @@ def _cells(name: str, cycles: int, air: float, tariff: Tariff) -> list[str]:
 
 def _year_line(whole: YearlyConsumption, tariff: Tariff) -> str:
     """A year in a sentence, or why it is not told."""
+    if not math.isfinite(whole.cycles):
+        return "a year: not told, the log has fewer than two cycles"
     if not math.isfinite(whole.air):
-        return "a year: not told, the log has too few complete cycles"
+        return (
+            "a year: not told, no cycle's air is known; record pressure and commands at least"
+            " every 10 ms"
+        )
     texts = [
         f"{significant(whole.cycles)} cycles",
         f"{significant(whole.air / NL_PER_M3)} m³ of air",
