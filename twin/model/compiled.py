@@ -13,8 +13,8 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -71,24 +71,55 @@ for _limit in ("runtime-memory-check-threshold", "vectorize-memory-check-thresho
     llvm.set_option("", f"--{_limit}=100000")
 
 
+class NotCachedError(Exception):
+    """Something is not in the cache, and the caller does not want it compiled here."""
+
+
 class _Waiting(event.Listener):
     """Says what a process waits for, the first time something is not found in the cache."""
 
     said = False
+    refused = False  # compiling, for the moment
 
     def on_start(self, event: object) -> None:
+        if self.refused:
+            raise NotCachedError
         if not self.said:
             self.said = True
             kept = f"and not kept: {_NO_CACHE}" if _NO_CACHE else "then kept"
             _log.warning(
-                "compiling what is not yet compiled for this processor: a minute at most, %s", kept
+                "compiling what is not yet compiled for this processor: 1 to 3 minutes, %s", kept
             )
 
     def on_end(self, event: object) -> None:
         pass
 
 
-event.register("numba:compile", _Waiting())  # type: ignore[no-untyped-call]
+_waiting = _Waiting()
+event.register("numba:compile", _waiting)  # type: ignore[no-untyped-call]
+
+
+@contextmanager
+def only_cached() -> Iterator[None]:
+    """Raise NotCachedError where the block needs something that is not in the cache.
+
+    For one thread, before there are others that may compile.
+    """
+    _waiting.refused = True
+    try:
+        yield
+    finally:
+        _waiting.refused = False
+
+
+def keeps() -> bool:
+    """Whether there is a cache: what another process compiles is then found by this one."""
+    return bool(_FOLDER)
+
+
+def expect_waiting() -> None:
+    """Say nothing when something is compiled: the caller has said what is waited for."""
+    _waiting.said = True
 
 
 class _InOwnFolder(CompileResultCacheImpl):
