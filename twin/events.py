@@ -25,6 +25,7 @@ class Kind(StrEnum):
     PLC_STALE = "plc_stale"
     PLC_BACK = "plc_back"
     TWIN_LATE = "twin_late"
+    NO_MODEL = "no_model"
     RESULTS_DOWN = "results_down"
     OUTPUT_DOWN = "output_down"
     OUTPUT_BACK = "output_back"
@@ -50,6 +51,7 @@ SEVERITY: dict[Kind, Severity] = {
     Kind.PLC_STALE: Severity.ALARM,
     Kind.PLC_BACK: Severity.INFO,
     Kind.TWIN_LATE: Severity.WARNING,
+    Kind.NO_MODEL: Severity.WARNING,  # rows were logged before it was compiled
     Kind.RESULTS_DOWN: Severity.WARNING,
     Kind.OUTPUT_DOWN: Severity.WARNING,  # a log, a console, a view
     Kind.OUTPUT_BACK: Severity.INFO,

@@ -1,13 +1,13 @@
 """The live loop: blocks pass through twin and monitor to the sinks. This module has all of it."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
-from twin.events import Event
+from twin.events import Event, Kind
 from twin.model import dense_solver as strides
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
@@ -21,7 +21,7 @@ from twin.monitor.phase_detector import Found, Knees, PhaseFinder
 from twin.monitor.rows import time_steps
 from twin.monitor.staleness import Listening
 from twin.monitor.surroundings import are_told, following, stretches
-from twin.signals import SAMPLE, TICK, Phase, Samples, Ticks
+from twin.signals import SAMPLE, TICK, Command, Phase, Samples, Ticks
 
 REPLAYED = 60_000  # rows that a replay takes at once: work on many cycles uses the caches well
 
@@ -135,14 +135,50 @@ def run(
     they follow.
     """
     stream = listening.over(source, monitor) if listening else ((block, []) for block in source)
-    with ExitStack() as closing:
-        for close in [sink.close for sink in sinks] + [adviser.close for adviser in advisers]:
-            closing.callback(close)
+    with closing_all(sinks, advisers):
         for samples, ticks, events in _monitored(stream, twin, monitor):
             dispatch(sinks, samples, ticks, _enriched(advisers, samples, events))
         no_rows = np.empty(0, SAMPLE), np.empty(0, TICK)
         if final_events := _final_events(advisers, no_rows[0]):
             dispatch(sinks, *no_rows, final_events)
+
+
+@contextmanager
+def closing_all(sinks: Sequence[Sink], advisers: Sequence[EventEnricher]) -> Iterator[None]:
+    """Close all of them at the end, also where one fails."""
+    with ExitStack() as closing:
+        for close in [sink.close for sink in sinks] + [adviser.close for adviser in advisers]:
+            closing.callback(close)
+        yield
+
+
+def dispatch_unmodelled(sinks: Sequence[Sink], blocks: Iterable[Samples], why: str) -> int:
+    """Give the sinks rows that the model has not seen; returns how many.
+
+    Their expected pressure is NaN, and with ``why`` an event goes with the first of them.
+    """
+    count = 0
+    for samples in blocks:
+        if not len(samples):
+            continue
+        time_ns = int(samples["time_ns"][0])
+        events = [Event(time_ns, Kind.NO_MODEL, why)] if why and not count else []
+        dispatch(sinks, samples, _unmodelled(samples), events)
+        count += len(samples)
+    return count
+
+
+def _unmodelled(samples: Samples) -> Ticks:
+    """Ticks without a model: nothing is expected, and phases are as commanded."""
+    ticks = np.zeros(len(samples), TICK)
+    ticks["expected"] = ticks["level"] = np.nan
+    blow_off, suction = (
+        samples["commands"] & np.uint8(bit) != 0 for bit in (Command.BLOW_OFF, Command.SUCTION)
+    )
+    ticks["phase"] = np.where(
+        blow_off, Phase.BLOW_OFF, np.where(suction, Phase.SUCTION, Phase.IDLE)
+    )
+    return ticks
 
 
 def _monitored(

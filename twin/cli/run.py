@@ -19,7 +19,7 @@ from twin.cli.figures import keeper_of
 from twin.cli.notifications import outlets_of
 from twin.cli.options import Address, AssetsUrl, ConfigFiles, FailOnAlarm, RrdFile, UnitId, ViewFlag
 from twin.cli.serve import live_rows_of, reports_of
-from twin.cli.setup import configured, pair_of
+from twin.cli.setup import configured
 from twin.cli.sinks import open_sinks, views_of
 from twin.cli.stopping import closed, leave, stop_on_signal, until
 from twin.errors import ConfigError, SourceError, TwinError
@@ -33,12 +33,17 @@ if TYPE_CHECKING:
 
     from drivers.outputs.state import Results
     from drivers.outputs.writer import Writer
+    from twin.acquisition import Acquisition
+    from twin.cli.compiling import Models
     from twin.cli.notifications import Begin, Standing
     from twin.config import Config
     from twin.live import EventEnricher, Sink
-    from twin.monitor.staleness import Notices
+    from twin.monitor.staleness import Listening, Notices
     from twin.signals import Samples
 
+POLL_S = 0.1  # between two looks whether the model is compiled
+TOO_MANY = "too many rows wait for the model: the oldest are logged without expected pressure"
+ENDED = "the run ended before the model was compiled: rows are logged without expected pressure"
 WAITS = "it is tried until it answers"  # said of a PLC that is off
 
 
@@ -76,8 +81,8 @@ def run(
     from drivers.modbus.connection_pool import ConnectionPool
     from drivers.outputs.open import open_results, open_writer
     from drivers.sources import open_source
+    from twin.cli.compiling import Models
     from twin.figures.table import FIGURES
-    from twin.live import run as run_loop
     from twin.run_many import run_together
     from twin.settings import Document
 
@@ -86,15 +91,11 @@ def run(
         _refuse_one_id(unit, len(configs))
     _require_writable_targets(log, rrd)  # the PLC may answer much later
     ejectors = _by_asset([configured(Document.read(path), assets, unit) for path in configs])
-    pairs = {
-        name: pair_of(settings) for name, settings in ejectors.items()
-    }  # compiled before time counts
     width = 0 if alone else max(map(len, ejectors))
     lines = ConnectionPool()
 
     def run_one(name: str, settings: "Config") -> None:
         label = "" if alone else name
-        twin, monitor = pairs[name]
         alarms, outlets = alarms_of(settings, complain), outlets_of(settings, complain)
         source_arguments = settings.document, address, lines if hil or not alone else None
         plc = _Plc(partial(open_source, *source_arguments), label, complain, once=once)
@@ -112,6 +113,11 @@ def run(
             # A mistake in [hil] is reported before a log begins, too.
             writer = closing.enter_context(open_writer(*source_arguments)) if hil else None
             file = _file_of(log, label, name)
+            # It begins with the newest row: rows that came during the start are not evaluated.
+            source = _answering(plc.blocks(), settings, writer) if writer else plc.blocks()
+            rows = closing.enter_context(
+                _acquired(until(stopped, source), models.compiling, plc.listening)
+            )
             # The log comes last: messages to people do not wait for the disk.
             opened = open_sinks(
                 {
@@ -136,14 +142,13 @@ def run(
             sinks, advisers = _supervised(
                 {**outlet_sinks, **opened}, enrichers, plc.listening.notices
             )
-            # It begins with the newest row: rows that came during the start are not evaluated.
-            source = _answering(plc.blocks(), settings, writer) if writer else plc.blocks()
-            with closed(source):
-                run_loop(until(stopped, source), twin, monitor, sinks, plc.listening, advisers)
+            _loop(name, models, rows, plc.listening, sinks, advisers, stopped)
 
     failed: list[str] = []
     units = {figure.name: figure.unit for figure in FIGURES.values()}
+    models = Models(ejectors, ahead=not hil)  # before time counts
     with (
+        closed(models),
         open_results([settings.document for settings in ejectors.values()], units) as show,
         views_of(ejectors, view, rrd) as view_of,
         stop_on_signal(duration) as stop,
@@ -377,11 +382,60 @@ def _outlet_sinks(
 
 
 @contextmanager
+def _acquired(
+    source: "Iterator[Samples]", ahead: bool, listening: "Listening"
+) -> "Iterator[Acquisition]":
+    """Acquires the rows of a run, ``ahead`` of its model; ``listening`` times them."""
+    from twin.acquisition import Acquisition
+
+    with closed(source):
+        rows = Acquisition(source, ahead=ahead)
+        listening.clock = rows.clock
+        with closed(rows):
+            yield rows
+
+
+def _loop(
+    name: str,
+    models: "Models",
+    rows: "Acquisition",
+    listening: "Listening",
+    sinks: "Sequence[Sink]",
+    advisers: "Sequence[EventEnricher]",
+    stopped: Callable[..., str],
+) -> None:
+    """Wait for the model of one ejector, and run the loop over all its rows.
+
+    Rows that find no room meanwhile are logged without the model. So are all that wait where it
+    does not come, as after an interrupt.
+    """
+    from twin.live import closing_all, dispatch_unmodelled, run
+
+    logged, pair = 0, None
+    try:
+        while not models.wait(POLL_S) and stopped(begun=False) != "interrupted":
+            logged += dispatch_unmodelled(sinks, rows.surplus(), "" if logged else TOO_MANY)
+        if models.wait(0.0):
+            pair = models.take(name)
+    finally:
+        if pair is None:
+            rows.close()
+            with closing_all(sinks, advisers):
+                dispatch_unmodelled(sinks, rows.waiting(), ENDED)
+    if pair is not None:
+        run(rows.blocks(), *pair, sinks, listening, advisers)
+
+
+@contextmanager
 def _gc_frozen() -> "Iterator[None]":
     """Exclude present objects from garbage collection: scanning them delays a block by 0.2 s."""
-    gc.collect()
-    gc.freeze()
+    _freeze()
     try:
         yield
     finally:
         gc.unfreeze()
+
+
+def _freeze() -> None:
+    gc.collect()
+    gc.freeze()

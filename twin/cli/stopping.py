@@ -1,6 +1,7 @@
 """The end of a command: by a signal or after a time, with an exit code, and everything closed."""
 
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -63,7 +64,13 @@ def until(stopped: Callable[[], str], source: "Iterable[Samples]") -> "Iterator[
 
 @contextmanager
 def heeded() -> Iterator[None]:
-    """Let Ctrl-C end this block: a compiler's callbacks swallow Python's exception."""
+    """Let Ctrl-C end this block: a compiler's callbacks swallow Python's exception.
+
+    In a thread beside the main one nothing changes: signals are the main one's.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
     interrupted = False
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
