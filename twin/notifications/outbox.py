@@ -95,20 +95,8 @@ class Outbox(Database):
 
     def put(self, messages: Iterable[tuple[str, Message]]) -> None:
         """Store messages, each with its destination."""
-        common: dict[str, Any] = {"asset_type": self._unit.type, "asset_id": self._unit.id}
-        common["made_ns"] = self._clock()
-        rows = [
-            {
-                **common,
-                "destination": destination,
-                "id": message.id,
-                "alarm": message.alarm,
-                "body": message.body,
-            }
-            for destination, message in messages
-        ]
         with self._writing() as connection:
-            connection.execute(OUTBOX.insert(), rows)
+            self._insert(connection, messages)
 
     def next(self, destination: str, most: int) -> list[Message]:
         """The oldest waiting messages, in order, at most ``most`` of them."""
@@ -124,7 +112,7 @@ class Outbox(Database):
     def delivered(self, destination: str, numbers: Collection[str]) -> None:
         """Delete messages that the destination has taken, by their IDs."""
         with self._writing() as connection:
-            connection.execute(OUTBOX.delete().where(*self._named(destination, numbers)))
+            self._delete(connection, destination, numbers)
 
     def refuse(self, destination: str, number: str, why: str) -> None:
         """Set a message aside that the destination refused."""
@@ -194,6 +182,24 @@ class Outbox(Database):
             count = int(connection.execute(statement).scalar_one())
             connection.execute(OUTBOX.delete().where(*condition, outdated))
         return count
+
+    def _insert(self, connection: Connection, messages: Iterable[tuple[str, Message]]) -> None:
+        common: dict[str, Any] = {"asset_type": self._unit.type, "asset_id": self._unit.id}
+        common["made_ns"] = self._clock()
+        rows = [
+            {
+                **common,
+                "destination": destination,
+                "id": message.id,
+                "alarm": message.alarm,
+                "body": message.body,
+            }
+            for destination, message in messages
+        ]
+        connection.execute(OUTBOX.insert(), rows)
+
+    def _delete(self, connection: Connection, destination: str, numbers: Collection[str]) -> None:
+        connection.execute(OUTBOX.delete().where(*self._named(destination, numbers)))
 
     def _of_destination(self, destination: str) -> tuple[ColumnElement[bool], ...]:
         return OUTBOX.c.destination == destination, *self._of_unit()
