@@ -83,6 +83,11 @@ def iso_time(ns: int) -> str:
     return instant.isoformat(timespec="microseconds").replace("+00:00", "Z")
 
 
+def ns_of(time: str) -> int:
+    """The ns of a time that ``iso_time`` has written."""
+    return (datetime.fromisoformat(time) - EPOCH) // timedelta(microseconds=1) * 1000
+
+
 def new_id() -> str:
     """A new unique ID."""
     return str(uuid.uuid4())

@@ -1,14 +1,15 @@
-"""The tables ``[mqtt]`` and ``[webhook]``: where alarms go, and what protects them on the way."""
+"""The tables of the outlets: where alarms go, and what protects them on the way."""
 
 import ipaddress
 import ssl
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 from urllib.parse import urlsplit
 
 from pydantic import Field, model_validator
 
 from twin.errors import ConfigError
+from twin.notifications.people import Address, Person
 from twin.secret import Say, Secret, refuse_secrets
 from twin.settings import Document, Settings
 
@@ -147,6 +148,71 @@ class OutletsSettings(Settings):
     upload: UploadSettings | None = None  # without it nobody can ask for logs
 
 
+class EmailSettings(Outlet):
+    """A mail server, and whom it sends to; none while ``host`` is empty."""
+
+    host: str = ""  # name or address of the mail server
+    port: int = Field(default=0, ge=0, le=65535)  # 0: 587 with starttls, 465 with tls, else 25
+    # "tls" from the first byte on, "starttls" after the greeting; without it nothing is sent
+    encryption: Literal["starttls", "tls", "none"] = "starttls"
+    tls: Tls = Tls()
+    user: str = ""  # name at the mail server
+    password: Secret | None = None
+    unprotected: bool = False  # a password without encryption beyond this machine all the same
+    sender: Address | None = None  # address that the mails come from
+    recipients: tuple[Address, ...] = ()  # addresses that get every alarm at any time
+    # a code such as "de", of a catalogue in twin/locale
+    language: str = Field(default="en", pattern=r"^[A-Za-z]{2,3}(-[A-Za-z0-9]{2,8})*$")
+    pause_min: float = Field(default=15.0, ge=0.0, le=1440.0)  # between two mails on one alarm
+    timeout_s: float = Field(default=10.0, gt=0.0, le=60.0)  # of each answer of the server
+    longest_days: float = Field(default=3.0, gt=0.0)  # that a mail waits
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> Self:
+        if self.host and self.sender is None:
+            raise ValueError("needs a sender, the address that the mails come from")
+        if (self.password is None) != (not self.user):
+            raise ValueError("user and password belong together")
+        in_the_clear = self.encryption == "none" and not _is_loopback(self.host)
+        if self.password is not None and in_the_clear and not self.unprotected:
+            raise ValueError(
+                f'"{self.host}" is beyond this machine, and a password is not sent in the clear:'
+                ' take encryption = "starttls" or "tls", or say unprotected = true'
+            )
+        return self
+
+
+class NotificationSettings(Settings):
+    """E-mail, and who is told when. Without people every mail goes to ``recipients``."""
+
+    email: EmailSettings = EmailSettings()
+    people: tuple[Person, ...] = ()  # who is told when, and by which step of escalation
+    # time without acknowledgement until the next step is told
+    escalate_after_min: float = Field(default=15.0, gt=0.0, le=1440.0)
+
+    @model_validator(mode="after")
+    def _fit(self) -> Self:
+        if not self.email.host:
+            if self.people:
+                raise ValueError("people are told by e-mail: [notifications.email] needs a host")
+            return self
+        if not (self.people or self.email.recipients):
+            raise ValueError(
+                "nobody gets the mails: write recipients under [notifications.email],"
+                " or [[notifications.people]]"
+            )
+        addresses = [*self.email.recipients, *(person.address for person in self.people)]
+        if several := sorted({one for one in addresses if addresses.count(one) > 1}):
+            raise ValueError(f"{', '.join(several)}: an address is to be written once")
+        return self
+
+    @property
+    def everybody(self) -> tuple[Person, ...]:
+        """The people and the recipients, who are told at once and at any time."""
+        recipients = (Person(name=one, address=one) for one in self.email.recipients)
+        return (*recipients, *self.people)
+
+
 def chosen(document: Document) -> tuple[MqttSettings, WebhookSettings]:
     """The settings of a configuration; ConfigError names file, line and key."""
     mqtt = document.section(MqttSettings, "mqtt")
@@ -158,6 +224,19 @@ def chosen(document: Document) -> tuple[MqttSettings, WebhookSettings]:
                 f"{document.name}: [{table}] has no {key}", "write where, or leave the table out"
             )
     return mqtt, webhook
+
+
+def chosen_notifications(document: Document) -> NotificationSettings | None:
+    """The e-mail settings, None without e-mail; ConfigError names file, line and key."""
+    if "notifications" not in document.tables:
+        return None
+    settings = document.section(NotificationSettings, "notifications")
+    if not settings.email.host:
+        raise ConfigError(
+            f"{document.name}: [notifications.email] has no host",
+            "write the mail server there, or leave [notifications] out",
+        )
+    return settings
 
 
 def chosen_upload(document: Document) -> UploadSettings | None:
