@@ -31,7 +31,12 @@ from twin.errors import ConfigError
 from twin.figures.settings import FigureSettings
 from twin.model.dataset import DataSet
 from twin.monitor.monitor import MonitorSettings
-from twin.notifications.settings import MqttSettings, OutletsSettings, WebhookSettings
+from twin.notifications.settings import (
+    MqttSettings,
+    NotificationSettings,
+    OutletsSettings,
+    WebhookSettings,
+)
 from twin.page.settings import PageSettings
 from twin.settings import Document, Settings
 from twin.tables.settings import ImportSettings
@@ -199,6 +204,7 @@ TABLES_OF: dict[str, type[Settings]] = {
     "log": LogSettings,
     "monitor": MonitorSettings,
     "mqtt": MqttSettings,
+    "notifications": NotificationSettings,
     "outlets": OutletsSettings,
     "page": PageSettings,
     "plc": PlcSettings,
@@ -318,6 +324,7 @@ def test_a_page_has_every_key_of_the_driver_with_its_default(page: str) -> None:
         ("docs/live-fleet.md docs/outlets.md", MqttSettings),
         ("docs/live-fleet.md docs/outlets.md", OutletsSettings),
         ("docs/outlets.md", WebhookSettings),
+        ("docs/outlets.md", NotificationSettings),
         ("docs/hil.md docs/connect-your-plc.md", hil_modbus.HilSettings),
         ("docs/hil.md docs/opcua.md", hil_opcua.HilSettings),
         ("docs/page.md", PageSettings),

@@ -30,6 +30,7 @@ UNITS = {
     "_days": "days",
     "_bar": "bar",
     "_cm2": "cm²",
+    "_min": "min",
     "_pct": "%",
     "_ms": "ms",
     "_mm": "mm",

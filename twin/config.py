@@ -46,6 +46,7 @@ TABLES = {
     "log",
     "monitor",
     "mqtt",
+    "notifications",
     "outlets",
     "page",
     "plc",

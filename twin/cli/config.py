@@ -61,7 +61,12 @@ def sections() -> "dict[str, dict[str, type[Settings]]]":
     from twin.figures.settings import FigureSettings
     from twin.model.dataset import DataSet
     from twin.monitor.monitor import MonitorSettings
-    from twin.notifications.settings import MqttSettings, OutletsSettings, WebhookSettings
+    from twin.notifications.settings import (
+        MqttSettings,
+        NotificationSettings,
+        OutletsSettings,
+        WebhookSettings,
+    )
     from twin.page.settings import PageSettings
     from twin.tables.settings import ImportSettings
 
@@ -77,6 +82,7 @@ def sections() -> "dict[str, dict[str, type[Settings]]]":
         "page": {"": PageSettings},
         "mqtt": {"": MqttSettings},
         "webhook": {"": WebhookSettings},
+        "notifications": {"": NotificationSettings},
         "outlets": {"": OutletsSettings},
         "results": {"": ResultsSettings},
         "assets": {"": AssetsSettings},
@@ -114,6 +120,7 @@ def _checks(document: "Document") -> Iterator[Callable[[], Any]]:
     from twin.alarms.settings import chosen_rules
     from twin.config import TABLES, Config
     from twin.notifications.settings import chosen, chosen_upload
+    from twin.page.alarm_mail import texts_of
 
     for name in document.tables:
         yield partial(document.refuse_unknown_tables, TABLES | set(document.tables) - {name})
@@ -132,6 +139,7 @@ def _checks(document: "Document") -> Iterator[Callable[[], Any]]:
     yield partial(chosen_rules, document)
     yield partial(chosen, document)
     yield partial(chosen_upload, document)
+    yield partial(texts_of, document)
 
 
 def _line(mistake: str) -> int:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from twin.notifications.data import Teller
     from twin.notifications.dispatch import Outlets
     from twin.notifications.sender import Channel, Lane
-    from twin.notifications.settings import MqttSettings, Outlet
+    from twin.notifications.settings import MqttSettings, NotificationSettings, Outlet
     from twin.notifications.uploader import Uploader
 
 Say = Callable[[str], None]
@@ -28,17 +28,18 @@ def outlets_of(settings: "Config", say: Say) -> Begin | None:
     from twin.alarms.database_url import place_of
     from twin.alarms.settings import AlarmSettings
     from twin.assets.unit import Unit
-    from twin.notifications.settings import chosen, chosen_upload
+    from twin.notifications.settings import chosen, chosen_notifications, chosen_upload
 
     document = settings.document
     mqtt, webhook = chosen(document)
     chosen_upload(document)
-    if not (mqtt.host or webhook.url):
+    notifications = chosen_notifications(document)
+    if not (mqtt.host or webhook.url or notifications):
         return None
     if not document.section(AlarmSettings, "alarms").keep:
         raise ConfigError(
-            f"{document.name}: [mqtt] and [webhook] keep what waits in the alarm database,"
-            " and [alarms] does not",
+            f"{document.name}: [mqtt], [webhook] and [notifications] keep what waits in the alarm"
+            " database, and [alarms] does not",
             "set keep = true under [alarms]",
         )
     from twin.notifications.dispatch import Outlets
@@ -56,15 +57,19 @@ def outlets_of(settings: "Config", say: Say) -> Begin | None:
         channels["mqtt"] = Mqtt(mqtt, unit, folder, say, batch=batch, hear_request=hear), mqtt
     if webhook.url:
         channels["webhook"] = Webhook(webhook, folder, say), webhook
+    if notifications:
+        channels["email"] = _email_of(settings, notifications, say), notifications.email
 
     def begin(standing: Standing) -> "Outlets":
         tellers = {"mqtt": _tellers_of(settings, mqtt)} if mqtt.host else {}
         lanes = {"mqtt": _lanes_of(mqtt)}
+        if notifications:
+            lanes["email"] = _mail_lanes_of(notifications)
         senders = [
             Sender(name, channel, outbox, limits, say, lanes=lanes.get(name, ()))
             for name, (channel, limits) in channels.items()
         ]
-        restating = [name for name in channels if name == "mqtt"]
+        restating = [name for name in channels if name != "webhook"]
         outlets = Outlets(
             unit,
             outbox,
@@ -78,6 +83,25 @@ def outlets_of(settings: "Config", say: Say) -> Begin | None:
         return outlets
 
     return begin
+
+
+def _email_of(settings: "Config", notifications: "NotificationSettings", say: Say) -> "Channel":
+    """E-mail to people, in the language of the configuration."""
+    from twin.alarms.database_url import place_of
+    from twin.alarms.settings import board_rules
+    from twin.assets.unit import Unit
+    from twin.notifications.call_store import open_calls
+    from twin.notifications.email import Email
+    from twin.notifications.mail_server import MailServer
+    from twin.page.alarm_mail import texts_of, writer
+
+    document, unit = settings.document, Unit(settings.asset.type, settings.asset.id)
+    return Email(
+        notifications,
+        MailServer(notifications.email, Path(document.name).parent, say),
+        partial(open_calls, place_of(document), unit),
+        writer(board_rules(document), texts_of(document)),
+    )
 
 
 def _uploader_of(settings: "Config", say: Say) -> "Uploader | None":
@@ -132,3 +156,12 @@ def _lanes_of(mqtt: "MqttSettings") -> "list[Lane]":
     answers = Lane(UPLOAD, "answers about uploads", mqtt.keep_hours, most=1000)
     labels = {CYCLE: "key figures", VALUES: "values"}
     return [answers, *(Lane(topic, label, mqtt.keep_hours) for topic, label in labels.items())]
+
+
+def _mail_lanes_of(notifications: "NotificationSettings") -> "list[Lane]":
+    """The lane in which mails wait."""
+    from twin.notifications.email import MAIL
+    from twin.notifications.sender import Lane
+
+    email = notifications.email
+    return [Lane(MAIL, "mails", 24.0 * email.longest_days, email.most_waiting)]
