@@ -1,8 +1,10 @@
 """E-mail through a real SMTP server over real sockets: protected, stored, sent again, readable."""
 
 import json
+import socket
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -384,6 +386,33 @@ def _has_call(folder: Path) -> bool:
 
     with open_calls(folder / "alarms.sqlite", UNIT) as store:
         return bool(store.calls())
+
+
+@pytest.mark.parametrize("drip", [b"", b"2", b"220-slow\r\n"])
+def test_a_server_that_does_not_come_to_an_end_is_lost(drip: bytes) -> None:
+    """A reply has its time as a whole, not each byte of it."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        over = threading.Event()
+
+        def drop() -> None:
+            client, _ = listener.accept()
+            with client, suppress(OSError):
+                while not over.wait(0.02):
+                    client.sendall(drip)
+
+        thread = threading.Thread(target=drop)
+        thread.start()
+        wanted = EmailSettings(
+            host="127.0.0.1",
+            port=listener.getsockname()[1],
+            encryption="none",
+            sender="twin@plant.example",
+            timeout_s=0.2,
+        )
+        sent = MailServer(wanted, Path(), pytest.fail).send([], 0)
+        over.set()
+        thread.join()
+    assert "timed out" in str(sent.lost)
 
 
 # --- configuration ------------------------------------------------------------------------------

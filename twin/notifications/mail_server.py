@@ -11,6 +11,7 @@ from email.utils import format_datetime
 from pathlib import Path
 from typing import NamedTuple, cast
 
+from twin.notifications.deadline import whole_within
 from twin.notifications.message import Message
 from twin.notifications.people import local_time
 from twin.notifications.sender import LostError, Sent
@@ -78,11 +79,11 @@ class MailServer:
         client: smtplib.SMTP | None = None
         try:
             if settings.encryption == "tls":
-                client = smtplib.SMTP_SSL(
+                client = _InTimeTls(
                     settings.host, self._port, timeout=settings.timeout_s, context=self._tls
                 )
             else:
-                client = smtplib.SMTP(settings.host, self._port, timeout=settings.timeout_s)
+                client = _InTime(settings.host, self._port, timeout=settings.timeout_s)
             if settings.encryption == "starttls":
                 client.starttls(context=self._tls)
             if settings.user:
@@ -144,6 +145,23 @@ class MailServer:
         mail["Auto-Submitted"] = "auto-generated"  # no automatic answers (RFC 3834)
         mail.set_content(letter.text, cte="quoted-printable")
         return mail
+
+
+class _InTime(smtplib.SMTP):
+    """A connection whose timeout limits each whole reply."""
+
+    def getreply(self) -> tuple[int, bytes]:
+        assert self.sock is not None
+        try:
+            with whole_within(self.sock, self.timeout):
+                return super().getreply()
+        except TimeoutError:
+            self.close()
+            raise
+
+
+class _InTimeTls(_InTime, smtplib.SMTP_SSL):
+    pass
 
 
 class _PutOffError(LostError):

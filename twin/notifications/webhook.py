@@ -1,9 +1,7 @@
 """Posts alarms as JSON to an address, one after the other."""
 
-import socket
 import threading
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -12,6 +10,7 @@ from urllib3.connection import HTTPConnection, HTTPSConnection
 from urllib3.response import HTTPResponse
 
 from twin.errors import ConfigError
+from twin.notifications.deadline import whole_within
 from twin.notifications.message import Message
 from twin.notifications.sender import ALARM, LostError, Sent
 from twin.notifications.settings import WebhookSettings
@@ -104,22 +103,8 @@ class _InTime(HTTPConnection):
     """A connection whose timeout limits the whole answer; the library's limits each piece."""
 
     def getresponse(self) -> HTTPResponse:  # type: ignore[override]  # as the library has it
-        sock, timed_out = self.sock, threading.Event()
-
-        def shut_down() -> None:
-            timed_out.set()
-            with suppress(OSError):  # it is closed already
-                sock.shutdown(socket.SHUT_RDWR)
-
-        timer = threading.Timer(self.timeout or 0.0, shut_down)
-        timer.start()
-        try:
+        with whole_within(self.sock, self.timeout or 0.0):
             return super().getresponse()
-        finally:
-            timer.cancel()
-            timer.join()
-            if timed_out.is_set():  # a truncated answer may look whole
-                raise TimeoutError("timed out")
 
 
 class _InTimeTls(_InTime, HTTPSConnection):
