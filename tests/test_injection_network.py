@@ -1,4 +1,4 @@
-"""Each network call of the Modbus driver and of the webhook fails in turn: nothing is lost.
+"""Each network call of driver, webhook and e-mail fails in turn: nothing is lost.
 
 A first run without faults counts the calls, so that new ones are covered by themselves.
 """
@@ -17,8 +17,11 @@ import numpy as np
 import psutil
 import pytest
 from modbus_server import ModbusServer, PlcTime, TracePlc
+from smtp_server import SmtpServer
+from test_alarms_loop import NONE
+from test_email import begun, configuration, leak, waiting
 from test_modbus_block import clock_of, settings_for
-from test_notifications import message
+from test_notifications import NO_TICKS, message, wait_until
 from test_webhook import At, Server
 
 from drivers.modbus.source import blocks
@@ -137,3 +140,41 @@ def test_whatever_network_call_of_the_webhook_fails_no_alarm_is_lost(
             taken, said = posted(number)
             assert list(dict.fromkeys(taken)) == ["0", "1", "2"], number  # at least once, in order
             assert len(said) in (0, 2), number  # lost and back, or not worth a word
+
+
+# --- e-mail -------------------------------------------------------------------------------------
+
+
+def test_whatever_network_call_of_the_mails_fails_no_mail_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sender, "FIRST_PAUSE_S", 0.001)
+    monkeypatch.setattr(sender, "LONGEST_PAUSE_S", 0.002)
+    network = Network(monkeypatch, lambda: threading.current_thread().name == "to email")
+    two = ["ann@plant.example", "bob@plant.example"]
+
+    def mailed(number: int | None) -> tuple[dict[str, set[str]], list[str]]:
+        """The IDs of the mails that each recipient has, and what was said."""
+        network.begin(number)
+        folder, said, server = tmp_path / f"{number}", list[str](), SmtpServer()
+        folder.mkdir()
+        outlets = begun(configuration(folder, server.port, recipients=two), said)
+        outlets.write(NONE, NO_TICKS, leak().said)
+        wait_until(lambda: {one for _, one in server.envelopes} == set(two))
+        wait_until(lambda: waiting(folder) == 0)
+        outlets.close()
+        server.close()
+        ids: dict[str, set[str]] = {}
+        for (_, recipient), mail in zip(server.envelopes, server.mails, strict=True):
+            ids.setdefault(recipient, set()).add(str(mail["Message-ID"]))
+        return ids, said
+
+    ids, said = mailed(None)
+    assert said == []
+    asked = network.asked
+    assert asked >= 10
+    with nothing_left():
+        for number in range(asked):
+            ids, said = mailed(number)
+            assert [len(ids[one]) for one in two] == [1, 1], number  # at least once, one ID
+            assert len(said) in (0, 2), number

@@ -14,7 +14,12 @@ from twin.assets.database_url import AssetsSettings, chosen
 from twin.assets.engine import ASSETS, Database, parse_url, shown
 from twin.errors import ConfigError
 from twin.figures.settings import FigureSettings
-from twin.notifications.settings import MqttSettings, OutletsSettings, WebhookSettings
+from twin.notifications.settings import (
+    EmailSettings,
+    MqttSettings,
+    OutletsSettings,
+    WebhookSettings,
+)
 from twin.notifications.webhook import Webhook
 from twin.secret import Secret
 from twin.settings import Document, Settings
@@ -51,6 +56,10 @@ def test_no_password_in_the_url_of_a_database(kind: type[Settings], url: str) ->
         ({"url": POSTGRES, "password": SECRET}, AlarmSettings),
         ({"host": "broker", "user": "ann", "password": SECRET}, MqttSettings),
         ({"url": "https://a", "headers": {"A": SECRET}}, WebhookSettings),
+        (
+            {"host": "mail", "sender": "a@b.example", "user": "ann", "password": SECRET},
+            EmailSettings,
+        ),
         ({"name": "ann", "password": SECRET}, User),
     ],
 )
