@@ -104,6 +104,7 @@ def test_a_mail_says_what_where_since_when_and_what_to_do(
     assert server.envelopes == [("twin@plant.example", ANN)]
     assert mail["Subject"] == "gripper-01: medium priority, Leakage"
     assert mail["From"] == "ejector-twin <twin@plant.example>"
+    assert mail["To"] == ANN
     assert mail["Auto-Submitted"] == "auto-generated"
     text = mail.get_content()
     for part in (
@@ -111,6 +112,7 @@ def test_a_mail_says_what_where_since_when_and_what_to_do(
         "Ejector: gripper-01 (compact-ejector-35)",
         "Where: hoses, fittings and cups",
         "Since: 2001-09-0",
+        "State: unacknowledged",
         "How sure: a first guess",
         "If nobody acts: The ejector does not do what it should",
         "What to do: Look at hoses, fittings and cups",

@@ -38,7 +38,7 @@ def person(name: str, **values: Any) -> dict[str, Any]:
 class Desk:
     """A loop's alarms, the escalation behind them, and a clock in minutes."""
 
-    def __init__(self, path: Path, *people: Mapping[str, Any], **email: Any) -> None:
+    def __init__(self, path: Path | str, *people: Mapping[str, Any], **email: Any) -> None:
         table = {"email": {**SERVER, **email}, "people": people, "escalate_after_min": 10}
         self.settings = NotificationSettings.model_validate(table)
         self.path, self.stream, self.minute = path, Stream(), 0.0
@@ -229,6 +229,17 @@ def test_a_clock_that_was_set_back_does_not_stop_escalation(desk: Desk) -> None:
     desk.raised()
     assert desk.at(-600) == []
     assert desk.at(-590) == ["bob escalated 1", "cem escalated 1"]
+
+
+def test_every_kind_of_database_keeps_who_was_told(url: str) -> None:
+    desk = Desk(url, *STEPS)
+    desk.raised()
+    desk.restart()
+    assert desk.at(10) == ["bob escalated 1", "cem escalated 1"]
+    desk.minute = 12
+    desk.asked(Deed.ACKNOWLEDGED)
+    desk.restart()
+    assert desk.at(40) == []
 
 
 # --- duty ---------------------------------------------------------------------------------------

@@ -138,7 +138,8 @@ class MailServer:
         mail = EmailMessage(policy=SMTP)
         sender = cast(str, self._settings.sender)
         mail["From"] = Address("ejector-twin", addr_spec=sender)
-        mail["To"] = Address(one_line(letter.name), addr_spec=letter.address)
+        name = "" if letter.name == letter.address else one_line(letter.name)
+        mail["To"] = Address(name, addr_spec=letter.address)
         mail["Subject"] = one_line(letter.subject)[:LONGEST_SUBJECT]
         mail["Date"] = format_datetime(local_time(now_ns, ""))
         mail["Message-ID"] = f"<{message.id}@{sender.rpartition('@')[2]}>"

@@ -14,7 +14,7 @@ from twin.notifications.mail_server import Letter
 from twin.notifications.message import ns_of
 from twin.notifications.people import local_time
 from twin.notifications.settings import chosen_notifications
-from twin.page.ejector_status import describe_alarm, facts, priority_words
+from twin.page.ejector_status import describe_alarm, facts, priority_words, state_words
 from twin.settings import Document
 
 Body = Mapping[str, Any]
@@ -108,6 +108,7 @@ def _where_and_when(mail: Body, location: str) -> Iterator[str]:
     if document["since"]:
         since = local_time(ns_of(document["since"]), mail["time_zone"])
         yield _labelled(tr("since"), _clock(since))
+    yield _labelled(tr("state"), state_words(document["state"]))
 
 
 def _labelled(name: str, text: str) -> str:
