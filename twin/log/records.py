@@ -151,7 +151,7 @@ def records(path: Path, damaged: Damaged) -> Iterator[McapRecord | memoryview]:
                     raise ValueError(f"{record.chunk_count - chunks} chunks are missing")
             except _DECODE_ERRORS as error:
                 chunks += 1
-                end = file.seek(_next_chunk(file, position + 1) or size)
+                end = file.seek(next_chunk(file, position + 1) or size)
                 torn = end >= size and not complete
                 damaged(Damage(path, position, end - position, _reason(error, torn), torn))
             else:
@@ -196,7 +196,7 @@ def _contents(chunk: Chunk, buffer: _DecompressionBuffer) -> memoryview:
     return contents
 
 
-def _next_chunk(file: BinaryIO, start: int) -> int | None:
+def next_chunk(file: BinaryIO, start: int) -> int | None:
     """Position of the next chunk's head at or after ``start``."""
     file.seek(start)
     window = b""
@@ -205,6 +205,30 @@ def _next_chunk(file: BinaryIO, start: int) -> int | None:
         if match := _CHUNK_MARK.search(window):
             return file.tell() - len(window) + match.start()
     return None
+
+
+class ChunkReader:
+    """Messages of single chunks of an open file that ``twin run`` wrote, in any order."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._buffer = _DecompressionBuffer()
+
+    def messages(self, position: int, topic: str) -> Iterator[memoryview]:
+        """Data of each message of ``topic`` in the chunk at ``position``, valid until the next one.
+
+        ValueError if there is no whole chunk.
+        """
+        self._file.seek(position)
+        try:
+            contents = _record(self._file, self._buffer)
+        except _DECODE_ERRORS as error:
+            raise ValueError(_reason(error, torn=False)) from error
+        if not isinstance(contents, memoryview):
+            raise ValueError("not a chunk")
+        names = {number: channel.topic for number, channel in CHANNELS.items()}
+        for _, packed in _chunk_messages(contents, names, (topic,)):
+            yield packed
 
 
 def messages(
