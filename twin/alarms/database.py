@@ -18,6 +18,7 @@ from sqlalchemy import (
     Row,
     Table,
     Text,
+    or_,
     select,
 )
 
@@ -177,6 +178,15 @@ class Store(Database):
             if episode.raised_ns < since_ns
         ]
         return [*earlier, *self.episodes(unit, since_ns)]
+
+    def episodes_within(self, unit: Unit, from_ns: int, to_ns: int) -> list[Episode]:
+        """Episodes of a unit that were raised, cleared or acknowledged within a range of time."""
+        times = (EPISODE.c.raised_ns, EPISODE.c.cleared_ns, EPISODE.c.acknowledged_ns)
+        statement = select(EPISODE).where(
+            *of_unit(EPISODE, unit), or_(*(column.between(from_ns, to_ns) for column in times))
+        )
+        with self._reading() as connection:
+            return [_episode(row) for row in connection.execute(statement.order_by("raised_ns"))]
 
     def comment(self, unit: Unit, comment: Comment) -> None:
         """Store a comment; ConfigError if the unit has no such episode."""

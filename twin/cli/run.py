@@ -124,7 +124,7 @@ def run(
                     "console": lambda: consoles[name],
                     "OPC UA results": (lambda: results) if results else None,
                     "key figures": keeper_of(settings, complain),
-                    "live page": live_rows_of(settings, complain),
+                    "live page": live_rows_of(settings, complain, file),
                     "view": view_of(name),
                     "log": partial(_recorder, file, settings, hil=hil) if file else None,
                 }

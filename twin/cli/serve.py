@@ -159,18 +159,32 @@ def _require_users(endpoint: "Place", users: "Users") -> None:
 
 
 def live_rows_of(
-    settings: "Config", say: "Callable[[str], None]"
+    settings: "Config", say: "Callable[[str], None]", log: Path | None = None
 ) -> "Callable[[], LiveRows] | None":
-    """A function that opens the sink of live rows; None unless ``[page]`` asks for it."""
+    """A function that opens the sink of live rows; None unless ``[page]`` asks for it.
+
+    It leaves word where the file ``log`` lies, so that the page finds what is older.
+    """
+    from twin.page.log_folders import remember
     from twin.page.ring import LiveRows
     from twin.page.settings import RING, PageSettings, folder_of
     from twin.signals import MBAR
 
     if not settings.document.section(PageSettings, "page").keep:
         return None
-    path = folder_of(settings.document, settings.asset) / RING
+    folder = folder_of(settings.document, settings.asset)
     ambient = settings.data.ambient.pressure_mbar * MBAR
-    return lambda: LiveRows(path, ambient, say, time.time_ns)
+
+    def opened() -> LiveRows:
+        live_rows = LiveRows(folder / RING, ambient, say, time.time_ns)
+        try:
+            if log is not None:
+                remember(folder, log.parent)
+        except OSError as error:
+            say(f"the page will not find the log: {folder}: {error.strerror}")
+        return live_rows
+
+    return opened
 
 
 def reports_of(settings: "Config") -> Path | None:

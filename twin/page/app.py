@@ -52,6 +52,8 @@ TOKEN = "x-csrf-token"  # noqa: S105  # a header's name
 LONGEST_COMMENT = 500  # letters
 MOST_BODY = 4096  # bytes of a request's body
 MOST_DAYS = 400.0
+LONGEST_S = 48 * 3600.0  # range of a curve: its bins fit into what is kept of them
+LATEST_S = 9e9  # its nanoseconds fit into 64 bits
 ROWS_S = 0.03  # interval of batches of live rows: a block of the loop, about 20 batches a second
 STATE_S = 1.0  # interval at which alarms are read
 MOST_DIGITS = 18  # of a number, so that it fits into a database
@@ -145,6 +147,7 @@ class Page:
         ]
         self._login_lock = asyncio.Lock()  # one at a time: its hash takes memory and time
         self._trend_lock = asyncio.Lock()
+        self._curve_lock = asyncio.Lock()
         files = resources.files("twin.page").joinpath("static")
         self._static = {name: files.joinpath(name).read_bytes() for name in STATIC}
         self._pages = {
@@ -167,6 +170,7 @@ class Page:
             Route("/api/statistics", self.statistics),
             Route(f"{ejector_path}/history", self.history),
             Route(f"{ejector_path}/trends/{{name}}", self.trend),
+            Route(f"{ejector_path}/curve", self.curve),
             Route(f"{ejector_path}/requests", self.ask, methods=["POST"]),
             Route(f"{ejector_path}/comments", self.comment, methods=["POST"]),
             Route(f"{ejector_path}/requests/{{request_number}}", self.answer),
@@ -394,6 +398,13 @@ class Page:
         ejector, name = self._ejector(request), request.path_params["name"]
         async with self._trend_lock:
             return JSONResponse(await run_sync(ejector.trend, name, _days(request)))
+
+    async def curve(self, request: Request) -> Response:
+        """The curve of a range of time; one request at a time, for about a second at most."""
+        self._require_sight(request)
+        ejector, (from_ns, to_ns) = self._ejector(request), _range(request)
+        async with self._curve_lock:
+            return JSONResponse(await run_sync(ejector.curve, from_ns, to_ns))
 
     async def ask(self, request: Request) -> Response:
         """Send a request about an alarm to the run; returns the number to get its answer by."""
@@ -627,6 +638,21 @@ def _days(request: Request) -> float:
     if not 0.0 < days <= MOST_DAYS:
         raise HTTPException(HTTPStatus.BAD_REQUEST, f"days: up to {MOST_DAYS:g}")
     return days
+
+
+def _range(request: Request) -> tuple[int, int]:
+    """The range of time (ns) that a request names by Unix seconds."""
+    try:
+        begin, end = (float(request.query_params.get(name, "")) for name in ("from", "to"))
+    except ValueError:
+        begin = end = -1.0
+    if not 0.0 <= begin < end <= LATEST_S:
+        hint = tr("a range of time has a beginning and, later, an end")
+        raise HTTPException(HTTPStatus.BAD_REQUEST, hint)
+    if end - begin > LONGEST_S:
+        hint = tr("a range of time is at most {hours} h", hours=round(LONGEST_S / 3600))
+        raise HTTPException(HTTPStatus.BAD_REQUEST, hint)
+    return round(begin * 1e9), round(end * 1e9)
 
 
 def _same(first: str, second: str) -> bool:

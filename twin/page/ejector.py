@@ -27,6 +27,8 @@ from twin.figures.trend import DAY_NS, Trend
 from twin.instants import zone
 from twin.language import tr
 from twin.page import ring
+from twin.page.bins import json_numbers
+from twin.page.curve import Curves, document_of
 from twin.page.ejector_status import (
     S_NS,
     WORDS,
@@ -41,7 +43,6 @@ from twin.page.ejector_status import (
 from twin.page.settings import REPORTS, RING, PageSettings, folder_of
 from twin.signals import BREAK, MBAR
 
-SHOWN_S = 10.0  # of live rows, at first
 MOST_EPISODES = 500
 MOST_POINTS = 600  # of a trend's cycles
 AHEAD = 0.25  # share of the record to extrapolate where no limit is reached
@@ -69,6 +70,7 @@ class Ejector:
         self._limits = limits_of(config)
         self._folder = folder_of(document, config.asset)
         self._unit = Unit(config.asset.type, config.asset.id)
+        self._curves = Curves(self._folder, (self._unit.type, self._unit.id))
         self._asked: set[int] = set()  # numbers of requests made through this page
 
     # --- status ---------------------------------------------------------------------------------
@@ -100,7 +102,7 @@ class Ejector:
 
     def history(self, days: float) -> list[dict[str, Any]]:
         """Episodes of the last days, the newest first."""
-        values = {rule.name: rule.value for rule in self._rules}
+        values = self._values()
         priorities = {rule.name: rule.priority.value for rule in self._rules}
         now = self._clock()
         since = now - round(days * DAY_NS)
@@ -126,7 +128,7 @@ class Ejector:
 
     def title(self, alarm: str) -> str:
         """The title of an alarm for people."""
-        values = {rule.name: rule.value for rule in self._rules}
+        values = self._values()
         return str(describe_alarm(alarm, values.get(alarm, ""))["what"])
 
     # --- requests -------------------------------------------------------------------------------
@@ -161,17 +163,14 @@ class Ejector:
     # --- live -----------------------------------------------------------------------------------
 
     def rows(self, since: int) -> dict[str, Any] | None:
-        """New rows since a row's number, vacuum in mbar; None if there are none.
-
-        A browser that is far behind gets only the last SHOWN_S.
-        """
+        """Stored rows since a row's number, vacuum in mbar; None if there are none."""
         live = ring.read(self._folder / RING, since)
         if live is None or live.next == since:
             return None
-        rows = live.rows[-round(SHOWN_S * S_NS / ring.ROW_NS) :]
+        rows = live.rows
         pressure = {"low": "high", "high": "low"}  # the lowest vacuum is the highest pressure
         vacuum = {
-            f"{side}_{end}": _plain((live.ambient - rows[f"{side}_{pressure[end]}"]) / MBAR)
+            f"{side}_{end}": json_numbers((live.ambient - rows[f"{side}_{pressure[end]}"]) / MBAR)
             for side in SIDES
             for end in pressure
         }
@@ -185,6 +184,35 @@ class Ejector:
             "broken": broken.astype(int).tolist(),
             **vacuum,
         }
+
+    # --- any time -------------------------------------------------------------------------------
+
+    def curve(self, from_ns: int, to_ns: int) -> dict[str, Any]:
+        """The curve of a range of time, with the alarms that fall into it."""
+        now = self._clock()
+        document = document_of(self._curves.read(from_ns, to_ns, now))
+        try:
+            with self._alarms() as store:
+                episodes = store.episodes_within(self._unit, from_ns, to_ns)
+        except TwinError as error:  # the curve is there without it
+            return document | {"alarms": [], "trouble": _with_hint(error)}
+        return document | {"alarms": [self._mark(one) for one in episodes[-MOST_EPISODES:]]}
+
+    def _mark(self, episode: Episode) -> dict[str, Any]:
+        """Title and times (Unix seconds) of an episode in a curve."""
+        entry = episode.evidence.get("taken_in")
+        times = {"raised": episode.raised_ns, "cleared": episode.cleared_ns}
+        times["seen"] = episode.acknowledged_ns
+        return {
+            "what": describe_alarm(episode.alarm, self._values().get(episode.alarm, ""), entry)[
+                "what"
+            ],
+            **{name: time_ns and time_ns / S_NS for name, time_ns in times.items()},
+        }
+
+    def _values(self) -> dict[str, str]:
+        """The value that each alarm's rule looks for, by alarm."""
+        return {rule.name: rule.value for rule in self._rules}
 
     # --- trends ---------------------------------------------------------------------------------
 
@@ -212,7 +240,9 @@ class Ejector:
         words = f"{title_of(name)}: {course_in_words(figure, trend, self._clock())}"
         document |= {"words": words, "limit": trend.limit, "every": stride}
         document |= {"time": (history.host_ns[::stride] / S_NS).tolist()}
-        document |= {side: _plain(history.values[f"{name}_{side}"][::stride]) for side in SIDES}
+        document |= {
+            side: json_numbers(history.values[f"{name}_{side}"][::stride]) for side in SIDES
+        }
         return document | _trend_curve(trend)
 
     # --- reports --------------------------------------------------------------------------------
@@ -249,11 +279,6 @@ def _with_hint(error: TwinError) -> str:
     return f"{error}: {error.hint}" if error.hint else str(error)
 
 
-def _plain(values: Any) -> list[float | None]:
-    """Numbers for JSON, to five digits; null if not finite."""
-    return [float(f"{value:.5g}") if math.isfinite(value) else None for value in values.tolist()]
-
-
 def _trend_curve(trend: Trend) -> dict[str, Any]:
     """The trend with its band for drawing, extrapolated to where it may reach its limit."""
     if trend.step is None and trend.line is None:
@@ -269,9 +294,9 @@ def _trend_curve(trend: Trend) -> dict[str, Any]:
         "step": step,
         "line": {
             "time": time.tolist(),
-            "middle": _plain(middle),
-            "low": _plain(middle - half),
-            "high": _plain(middle + half),
+            "middle": json_numbers(middle),
+            "low": json_numbers(middle - half),
+            "high": json_numbers(middle + half),
             "is_trend": trend.line is not None and trend.line.is_trend,
         },
     }

@@ -9,7 +9,7 @@ const ZOOM = 2; // by one press
 const DATES = LANGUAGE === "en" ? "en-GB" : LANGUAGE; // the day before the month, and 24 hours
 const DAY_S = 86400;
 const MONDAY_S = 4 * DAY_S; // the first one after 1970 began
-const STEPS_S = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200,
+const STEPS_S = [0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200,
   ...[1, 2, 7, 14, 28, 56].map((days) => days * DAY_S)];
 
 // --- ticks ---------------------------------------------------------------------------------------
@@ -44,8 +44,9 @@ function dateTicks(from, to, most) { // at full hours, days and Mondays of the s
 
 function dateText(tick, step) {
   const then = there(tick);
-  const midnight = then.getHours() === 0 && then.getMinutes() === 0 && then.getSeconds() === 0;
-  const seconds = step < 60 ? { second: "2-digit" } : {};
+  const midnight = step >= 1 && then.getHours() === 0 && then.getMinutes() === 0 && then.getSeconds() === 0;
+  const fraction = step < 1 ? { fractionalSecondDigits: 1 } : {};
+  const seconds = step < 60 ? { second: "2-digit", ...fraction } : {};
   return midnight ? then.toLocaleDateString(DATES, { day: "numeric", month: "short" })
     : then.toLocaleTimeString(DATES, { hour: "2-digit", minute: "2-digit", ...seconds });
 }
@@ -99,15 +100,15 @@ function runs(points) { // between gaps
 // --- the chart -----------------------------------------------------------------------------------
 
 /* Options. home: () => [from, to] in s, what is shown at first and which end moves on; all: () =>
-   [from, to], as far as it can be seen; least: s, the shortest stretch; values: (low, high) =>
+   [from, to], as far as it can be seen; least and most: s, the shortest and the longest stretch; values: (low, high) =>
    [low, high] of the axis, which are undefined where there is nothing; ticks: () => (from, to, most)
    => [{at, text}]; unit; tools: where buttons go; back: the text of one; bands: (from, to) => [{from,
    to, colour, text}]; marks: () => [{at, text, colour, dash, from, to}], from and to of when it may
-   have been; moved: called when another stretch is shown.
+   have been; moved: called when another stretch is shown; leave: called in place of going home.
    A series: {time, low, high, colour, width, dash, fill, dots}; high is low if it is not given. */
 class Chart {
   constructor(box, options) {
-    this.options = { bands: () => [], marks: () => [], moved: () => {}, unit: "", back: t("All"), ...options };
+    this.use(options);
     this.series = [];
     this.width = this.end = null; // s: what a person has chosen to see
     this.fingers = new Map();
@@ -121,6 +122,11 @@ class Chart {
       press("−", t("Zoom out"), () => this.zoom(ZOOM)), press("+", t("Zoom in"), () => this.zoom(1 / ZOOM)));
     this.listen(box);
     this.moved();
+  }
+
+  use(options) { // from now on; buttons stay as they were made
+    const common = { bands: () => [], marks: () => [], moved: () => {}, unit: "", back: t("All"), most: Infinity };
+    this.options = { ...common, ...options };
   }
 
   listen(box) {
@@ -178,7 +184,8 @@ class Chart {
   show(from, to) { // as far as there is something, and with the end that moves on if it is reached
     const [first, last] = this.options.all();
     const [, end] = this.options.home();
-    this.width = Math.max(Math.min(to - from, last - first), Math.min(this.options.least, last - first));
+    const most = Math.min(this.options.most, last - first);
+    this.width = Math.max(Math.min(to - from, most), Math.min(this.options.least, most));
     const shown = Math.min(Math.max(to, first + this.width), last);
     this.end = shown >= end - this.width / 1000 ? null : shown;
     this.moved();
@@ -198,12 +205,16 @@ class Chart {
   }
 
   goHome() {
+    if (this.options.leave) {
+      this.options.leave();
+      return;
+    }
     this.width = this.end = null;
     this.moved();
   }
 
   moved() {
-    this.home.disabled = this.isHome;
+    this.home.disabled = this.isHome && !this.options.leave;
     this.options.moved();
     this.update();
   }

@@ -41,8 +41,8 @@ function icon(name) {
 }
 
 function there(seconds) { // a date whose hours and days are those of the server's zone
-  const here = new Date(seconds * 1000);
-  return zone === null ? here : new Date((seconds + zone + here.getTimezoneOffset() * 60) * 1000);
+  const here = new Date(Math.round(seconds * 1000));
+  return zone === null ? here : new Date(here.getTime() + (zone + here.getTimezoneOffset() * 60) * 1000);
 }
 
 function number(value, digits) {

@@ -12,6 +12,15 @@ const KEPT_S = 300; // of them, to look back at
 const SHOWN = [t("size"), t("how sure")]; // of what speaks for an alarm, at first sight
 const LIGHTS = ["red", "grey", "yellow", "green"]; // the worst first
 const MOST_MARKS = 20; // of alarms in a trend
+const AROUND_S = 60; // that is shown before and after an alarm
+const LONGEST_ALARM_S = 600; // that is shown of one that lasts
+const LONGEST_S = 48 * 3600; // that the server gives at once
+const BACK_S = 400 * 86400; // as far as one can look back
+const FOLLOW_S = 2; // between looks at a range that ends now, at least
+const NO_CURVE = {
+  time: [], measured_low: [], measured_high: [], expected_low: [], expected_high: [],
+  phases: [], gaps: [], alarms: [], share: 1, damaged: 0, logged: true, trouble: "",
+};
 const QUIET = ["shelved", "suppressed", "out_of_service"];
 
 let me = { user: "", csrf: "", may: [], ejectors: [], figures: [] };
@@ -85,6 +94,7 @@ function showLights() {
 function choose(number, alone = false) { // its curves; with its alarms alone, or among all others
   if (alone && states.length > 1) $("whose").value = String(number);
   if (number !== chosen) {
+    past.leave();
     chosen = number;
     live.clear();
     watch();
@@ -216,11 +226,19 @@ function reportButton(of, { report, alarm }) {
   return element("button", { type: "button", "data-focus": `report ${of} ${alarm}`, onclick }, t("See diagnosis"));
 }
 
-function curveButton(alarm) {
-  if (alarm.of === chosen) return null;
-  return element("button", {
-    type: "button", "data-focus": `curve ${keyOf(alarm)}`, onclick: () => choose(alarm.of),
-  }, t("Show its curve"));
+function curveButton(alarm) { // the time around it; without a time it is that of its ejector, live
+  if (!alarm.raised && alarm.of === chosen) return null;
+  const onclick = () => (alarm.raised ? showAround(alarm) : choose(alarm.of));
+  return element("button", { type: "button", "data-focus": `curve ${keyOf(alarm)}`, onclick }, t("Show its curve"));
+}
+
+function showAround({ of, raised, cleared }) {
+  choose(of);
+  showTab("now");
+  const until = cleared ? cleared + AROUND_S / 2 : raised + AROUND_S;
+  past.open(raised - AROUND_S, Math.max(raised + AROUND_S, Math.min(until, raised + LONGEST_ALARM_S)));
+  document.querySelector(".live").scrollIntoView({ block: "nearest" });
+  $("plot").focus({ preventScroll: true });
 }
 
 function possible(alarm) {
@@ -325,8 +343,28 @@ const NO_ROWS = () => ({
   time: [], host: [], phase: [], measured_low: [], measured_high: [], expected_low: [], expected_high: [],
 });
 
+const VACUUM = { // what charts of it have in common
+  unit: "mbar",
+  values: (low = 0, high = 0) => [Math.min(low, -20), Math.max(high * 1.05, 100)],
+};
+
+function drawVacuum(rows) {
+  const side = (name) => ({ time: rows.time, low: rows[`${name}_low`], high: rows[`${name}_high`] });
+  live.chart.set([
+    { ...side("expected"), colour: "--orange", width: 3, dash: [8, 5] },
+    { ...side("measured"), colour: "--blue", width: 2, fill: 0.33 },
+  ]);
+}
+
+function headPlot(said) {
+  $("plot-head").textContent = states.length > 1 ? `${states[chosen].name}: ${said}` : said;
+}
+
+const phaseBand = (from, to, phase) => ({ from, to, phase, colour: PHASE_COLOURS[phase], text: PHASES[phase] });
+
 const live = {
   chart: null,
+  window: "10", // s, as it was chosen
   rows: NO_ROWS(),
   marks: new Map(), // alarms of the ejector that is shown, also those that are over
 
@@ -335,7 +373,7 @@ const live = {
     for (const id of ["measured", "expected", "difference", "phase"]) $(id).textContent = "–";
     this.marks = new Map();
     this.note();
-    if (this.chart) this.chart.goHome();
+    if (this.chart && !past.on) this.chart.goHome();
     this.show();
   },
 
@@ -380,30 +418,25 @@ const live = {
   },
 
   show() {
-    const { time } = this.rows;
-    const side = (name) => ({ time, low: this.rows[`${name}_low`], high: this.rows[`${name}_high`] });
-    if (!this.chart) this.begin();
-    this.chart.set([
-      { ...side("expected"), colour: "--orange", width: 3, dash: [8, 5] },
-      { ...side("measured"), colour: "--blue", width: 2, fill: 0.33 },
-    ]);
+    if (!this.chart) this.chart = new Chart($("plot"), this.options());
+    if (past.on) return;
+    drawVacuum(this.rows);
     this.head();
   },
 
-  begin() {
+  options() {
     const home = () => {
       const end = this.rows.time.length ? this.end() : 0;
-      return [end - Number($("window").value), end];
+      return [end - Number(this.window), end];
     };
-    this.chart = new Chart($("plot"), {
-      home, least: 0.5, unit: "mbar", tools: $("plot-tools"), back: t("Back to live"),
+    return {
+      ...VACUUM, home, least: 0.5, tools: $("plot-tools"), back: t("Back to live"),
       all: () => [Math.min(home()[0], this.rows.time[0] ?? 0), home()[1]],
-      values: (low = 0, high = 0) => [Math.min(low, -20), Math.max(high * 1.05, 100)],
       ticks: () => secondTicks(home()[1]),
       bands: (from, to) => this.phases(from, to),
       marks: () => this.alarms(),
       moved: () => this.head(),
-    });
+    };
   },
 
   head() {
@@ -411,9 +444,9 @@ const live = {
     const [from, to] = this.chart.range().map((time) => Math.max(0, this.end() - time));
     const brief = (seconds) => number(seconds, seconds < 10 && seconds % 1 > 0.05 ? 1 : 0);
     const said = this.chart.end === null || !this.rows.time.length
-      ? t("Vacuum, the last {from} s", { from: brief(this.rows.time.length ? from : Number($("window").value)) })
+      ? t("Vacuum, the last {from} s", { from: brief(this.rows.time.length ? from : Number(this.window)) })
       : t("Vacuum, {from} to {to} s ago", { from: brief(from), to: brief(to) });
-    $("plot-head").textContent = states.length > 1 ? `${states[chosen].name}: ${said}` : said;
+    headPlot(said);
   },
 
   phases(from, to) {
@@ -424,8 +457,7 @@ const live = {
       const last = bands[bands.length - 1];
       if (last) last.to = time[i];
       if (!last || last.phase !== phase[i]) {
-        const look = { colour: PHASE_COLOURS[phase[i]], text: PHASES[phase[i]] };
-        bands.push({ phase: phase[i], ...look, from: time[i], to: time[i] });
+        bands.push(phaseBand(time[i], time[i], phase[i]));
       }
     }
     return bands;
@@ -449,6 +481,134 @@ const live = {
     ]);
   },
 };
+
+// --- vacuum of any time --------------------------------------------------------------------------
+
+const past = { // takes the place of the live curve, by the clock of the run
+  on: false,
+  curve: NO_CURVE,
+  preset: null, // [value of the choice, its seconds] while that is what is shown
+  asked: 0,
+  timer: null,
+
+  options() {
+    return {
+      ...VACUUM, least: 0.5, most: LONGEST_S, leave: () => this.leave(),
+      home: () => [now() - AROUND_S, now()],
+      all: () => [now() - BACK_S, now()],
+      ticks: () => dateTicks,
+      bands: () => this.bands(),
+      marks: () => this.curve.alarms.flatMap(alarmMarks),
+      moved: () => this.moved(),
+    };
+  },
+
+  open(from, to, preset = null) {
+    this.preset = preset;
+    if (!this.on) {
+      this.on = true;
+      this.take(NO_CURVE);
+      live.chart.use(this.options());
+    }
+    live.chart.show(from, to);
+  },
+
+  choose(value) { // of the ranges that end now
+    const then = there(now());
+    const today = then.getHours() * 3600 + then.getMinutes() * 60 + then.getSeconds();
+    const seconds = value === "today" ? Math.max(today, AROUND_S) : Number(value);
+    this.open(now() - seconds, now(), [value, seconds]);
+  },
+
+  leave() {
+    if (!this.on) return;
+    this.on = false;
+    this.asked += 1; // what is on its way comes too late
+    clearTimeout(this.timer);
+    $("window").value = live.window;
+    $("curve-from").value = $("curve-to").value = "";
+    this.say("");
+    live.chart.use(live.options());
+    live.chart.goHome();
+    live.show();
+  },
+
+  get follows() { return live.chart.end === null; },
+
+  moved() {
+    const [from, to] = live.chart.range();
+    const isPreset = this.preset && this.follows && Math.abs(to - from - this.preset[1]) < 1;
+    $("window").value = isPreset ? this.preset[0] : "";
+    fillRange("curve", [from, to]);
+    this.head();
+    this.fetchSoon(100);
+  },
+
+  head() {
+    const [from, to] = live.chart.range().map(there);
+    const time = { hour: "2-digit", minute: "2-digit", second: "2-digit" };
+    const day = { day: "numeric", month: "short" };
+    const isOneDay = from.toDateString() === to.toDateString();
+    const begin = from.toLocaleString(DATES, { ...day, ...time });
+    headPlot(t("Vacuum, {from} to {to}", { from: begin, to: to.toLocaleString(DATES, isOneDay ? time : { ...day, ...time }) }));
+  },
+
+  fetchSoon(ms) {
+    clearTimeout(this.timer);
+    this.timer = setTimeout(() => this.fetch(), ms);
+  },
+
+  async fetch() {
+    this.asked += 1;
+    const turn = this.asked;
+    const [from, to] = live.chart.range();
+    let curve;
+    try {
+      curve = await get(`/api/ejectors/${chosen}/curve?from=${from}&to=${to}`);
+    } catch (error) {
+      curve = { ...NO_CURVE, trouble: error.message };
+    }
+    if (turn !== this.asked) return;
+    this.take(curve);
+    if (curve.share < 1) this.fetchSoon(20);
+    else if (this.follows) this.fetchSoon(1000 * Math.max(FOLLOW_S, (to - from) / 500));
+  },
+
+  take(curve) {
+    this.curve = curve;
+    drawVacuum(curve);
+    this.say(this.words(curve));
+    if (this.follows) this.head();
+  },
+
+  words({ share, logged, damaged, trouble }) {
+    if (trouble) return trouble;
+    if (share < 1) return t("Reading the logs: {percent} %", { percent: Math.round(100 * share) });
+    if (damaged) return t("Part of the logs cannot be read; twin log check says where.");
+    if (!logged) return t("There are no logs to look back in: twin run --log FOLDER writes them.");
+    return this.follows ? "" : t("The values above are the newest.");
+  },
+
+  say(words) {
+    $("curve-said").textContent = words;
+    $("curve-said").hidden = !words;
+    document.querySelector(".live").classList.toggle("past", this.on);
+  },
+
+  bands() {
+    const gaps = this.curve.gaps.map(([from, to]) => ({ from, to, colour: "--gap", text: t("nothing recorded") }));
+    return [...gaps, ...(this.curve.phases || []).map((one) => phaseBand(...one))];
+  },
+};
+
+function alarmMarks({ what, raised, cleared, seen }) {
+  const mark = (at, text, dash, colour = "--alarm") => (at ? [{ at, text, dash, colour }] : []);
+  return [
+    ...mark(raised, what, []),
+    ...mark(cleared, t("{alarm}: over", { alarm: what }), [2, 4]),
+    ...mark(seen, t("{alarm}: acknowledged", { alarm: what }), [8, 4], "--ink"),
+  ];
+}
 
 // --- trends --------------------------------------------------------------------------------------
 
@@ -486,10 +646,14 @@ function marksOf({ step }, raised) { // the step of a figure, and the newest ala
   return step ? [{ ...step, text: t("step"), colour: "--step" }, ...alarms] : alarms;
 }
 
-function showTrendRange() { // as the fields of a range have it, by the server's clock
-  const [from, to] = trendChart.range();
-  $("trend-from").value = fieldOf(from);
-  $("trend-to").value = fieldOf(to);
+function fillRange(name, [from, to]) { // as the fields of a range have it, by the server's clock
+  $(`${name}-from`).value = fieldOf(from);
+  $(`${name}-to`).value = fieldOf(to);
+}
+
+function rangeOf(name) { // what is typed there; null if it is none
+  const [from, to] = ["from", "to"].map((end) => secondsOf($(`${name}-${end}`).value));
+  return Number.isFinite(from) && Number.isFinite(to) && from < to ? [from, to] : null;
 }
 
 function fieldOf(seconds) {
@@ -500,9 +664,24 @@ function fieldOf(seconds) {
 }
 
 function chooseTrendRange() {
-  const [from, to] = ["trend-from", "trend-to"].map((id) => secondsOf($(id).value));
-  if (Number.isFinite(from) && Number.isFinite(to) && from < to) trendChart.show(from, to);
-  else showTrendRange();
+  const range = rangeOf("trend");
+  if (range) trendChart.show(...range);
+  else fillRange("trend", trendChart.range());
+}
+
+function chooseCurveRange() {
+  const range = rangeOf("curve");
+  if (range) past.open(...range);
+  else if (past.on) fillRange("curve", live.chart.range());
+}
+
+function chooseWindow() {
+  const { value } = $("window");
+  if (Number(value) <= KEPT_S) {
+    live.window = value;
+    past.leave();
+    live.chart?.goHome();
+  } else if (live.chart) past.choose(value);
 }
 
 function secondsOf(field) {
@@ -522,7 +701,7 @@ function drawTrend(trend) {
     trendChart = new Chart($("trend-plot"), {
       home: () => trendSpan, all: () => trendSpan, least: 10, tools: $("trend-tools"),
       values: (low = 0, high = 1) => roomy(low, high), ticks: () => dateTicks,
-      marks: () => trendMarks, moved: () => trendChart && showTrendRange(),
+      marks: () => trendMarks, moved: () => trendChart && fillRange("trend", trendChart.range()),
     });
   }
   trendChart.options.unit = trend.unit;
@@ -572,7 +751,7 @@ function episodeCard(one) {
       element("span", { class: "chip" }, one.priority_words)),
     rows([[t("raised"), one.times.raised], [t("ended"), end], [t("acknowledged"), seen], ...one.facts]),
     ...comments(one),
-    reportButton(chosen, one));
+    element("div", { class: "deeds" }, reportButton(chosen, one), curveButton({ ...one, of: chosen })));
 }
 
 // --- the connection ------------------------------------------------------------------------------
@@ -689,7 +868,8 @@ function listen() {
     $(`tab-${name}`).addEventListener("click", () => showTab(name));
     $(`tab-${name}`).addEventListener("keydown", (event) => moveTab(event, at));
   });
-  $("window").addEventListener("change", () => live.chart && live.chart.goHome());
+  $("window").addEventListener("change", chooseWindow);
+  for (const id of ["curve-from", "curve-to"]) $(id).addEventListener("change", chooseCurveRange);
   $("whose").addEventListener("change", () => ($("whose").value ? choose(Number($("whose").value)) : showStates()));
   for (const id of ["trend-from", "trend-to"]) $(id).addEventListener("change", chooseTrendRange);
   $("comment-cancel").addEventListener("click", () => $("comment").close());
