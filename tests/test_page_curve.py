@@ -13,6 +13,7 @@ from log_rows import HEADER, course
 from page_site import AMBIENT, NOW, Run, S, config, write_config
 
 from twin.alarms import writer as keeper_module
+from twin.cli.serve import live_rows_of
 from twin.events import Kind
 from twin.log.header import RECORDED, LogHeader
 from twin.log.index import read_index
@@ -24,6 +25,7 @@ from twin.page.curve import MOST_COLUMNS, Curve, Curves
 from twin.page.ejector import Ejector
 from twin.page.log_folders import remember, remembered
 from twin.page.recorded import RecordedRows
+from twin.page.settings import folder_of
 from twin.signals import Samples, Ticks
 
 UNIT = ("SCPSi 15", "robot 7, left")
@@ -227,6 +229,19 @@ def test_folders_of_logs_are_remembered_once_each_newest_last(tmp_path: Path) ->
         remember(tmp_path / "page", tmp_path / name)
     assert remembered(tmp_path / "page") == [tmp_path / "b", tmp_path / "a"]
     assert remembered(tmp_path / "nowhere") == []
+
+
+def test_a_run_says_where_its_log_lies(tmp_path: Path) -> None:
+    settings = config(write_config(tmp_path))
+    opened = live_rows_of(settings, pytest.fail, tmp_path / "logs" / "run.mcap")
+    assert opened is not None
+    opened().close()
+    folder = folder_of(settings.document, settings.asset)
+    assert remembered(folder) == [tmp_path / "logs"]
+    without = live_rows_of(settings, pytest.fail)
+    assert without is not None
+    without().close()
+    assert remembered(folder) == [tmp_path / "logs"]
 
 
 @pytest.fixture

@@ -160,6 +160,16 @@ def test_a_fresh_page_shows_the_whole_ring(site: Site) -> None:
     page.wait_for_function("() => live.rows.time.at(-1) - live.rows.time[0] > 58")
 
 
+def test_five_minutes_come_from_the_logs_where_the_browser_has_not_seen_them(logged: Site) -> None:
+    page = logged.open()
+    logged.run.suck(2.0)
+    expect(page.locator("#measured")).to_have_text("600")
+    page.select_option("#window", "300")
+    assert page.evaluate("past.on")
+    expect(page.locator("#window")).to_have_value("300")
+    assert span(page) == pytest.approx(300.0)
+
+
 def test_without_logs_the_page_says_how_to_have_some(site: Site) -> None:
     page = site.open()
     site.until_light(page, "green")

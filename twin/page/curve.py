@@ -45,6 +45,11 @@ class Curves:
         self._folder = folder
         self._recorded = RecordedRows(lambda: remembered(folder), unit)
 
+    @property
+    def logged(self) -> bool:
+        """Whether a run has ever said where its logs lie."""
+        return bool(remembered(self._folder))
+
     def read(self, from_ns: int, to_ns: int, now_ns: int) -> Curve:
         """The curve of a range of time; what is after ``now_ns`` is no gap."""
         width_ns = column_width(to_ns - from_ns)
@@ -58,7 +63,7 @@ class Curves:
             _gaps(columns, width_ns, from_ns, min(to_ns, now_ns)) if recorded.share == 1.0 else [],
             recorded.share,
             recorded.damaged,
-            logged=bool(remembered(self._folder)),
+            logged=self.logged,
         )
 
     def _with_live(self, bins: Bins, from_ns: int, to_ns: int) -> Bins:

@@ -83,6 +83,7 @@ class Ejector:
         document = {"name": self.name, "type": self.config.asset.type, "now": now / S_NS}
         document |= {"running": running, "last": live and live.last_ns / S_NS, "trouble": ""}
         document |= {"ended": bool(live and live.ended_ns), "zone": zone(now)}
+        document["logged"] = self._curves.logged
         document |= {"last_seen": instant_text(None if live is None else live.last_ns, now)}
         try:
             with self._alarms() as store:

@@ -8,7 +8,8 @@ const DEEDS = {
   out_of_service: t("Take out of service"), in_service: t("Return to service"),
 };
 const TIMES = [[900, t("15 minutes")], [3600, t("1 hour")], [4 * 3600, t("4 hours")], [8 * 3600, t("8 hours")]];
-const KEPT_S = 300; // of them, to look back at
+const KEPT_S = 300; // of rows, to look back at
+const RING_S = 60; // of rows that the server has; what is before them is in logs
 const SHOWN = [t("size"), t("how sure")]; // of what speaks for an alarm, at first sight
 const LIGHTS = ["red", "grey", "yellow", "green"]; // the worst first
 const MOST_MARKS = 20; // of alarms in a trend
@@ -507,8 +508,8 @@ const past = { // takes the place of the live curve, by the clock of the run
     this.preset = preset;
     if (!this.on) {
       this.on = true;
-      this.take(NO_CURVE);
       live.chart.use(this.options());
+      this.take({ ...NO_CURVE, share: 0 });
     }
     live.chart.show(from, to);
   },
@@ -677,7 +678,8 @@ function chooseCurveRange() {
 
 function chooseWindow() {
   const { value } = $("window");
-  if (Number(value) <= KEPT_S) {
+  const isKept = Number(value) <= Math.max(RING_S, live.end() - live.rows.time[0]);
+  if (Number(value) <= KEPT_S && (isKept || !states[chosen]?.logged)) {
     live.window = value;
     past.leave();
     live.chart?.goHome();
