@@ -50,7 +50,7 @@ from twin.events import Event, Kind
 from twin.exchange.aas import read_package, write_package
 from twin.exchange.fmu_file import DESCRIPTION, read_fmu
 from twin.files import json_text
-from twin.log.header import LogHeader
+from twin.log.header import RECORDED, LogHeader
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
 from twin.login import Authenticator
@@ -58,8 +58,10 @@ from twin.notifications.message import asset_of, beside, of_status
 from twin.notifications.upload_requests import REQUEST_FORMAT, parse
 from twin.page.app import COOKIE, Access, Page
 from twin.page.ejector import Ejector
+from twin.page.ejector_status import S_NS
 from twin.page.plant_overview import PlantOverview
 from twin.page.plant_overview_text import details, of_one, overview
+from twin.page.recorded import RecordedRows
 from twin.page.sessions import SESSION_S, Session, Sessions
 from twin.settings import Document
 from twin.signals import SAMPLE, TICK
@@ -253,6 +255,20 @@ def log(data: bytes) -> str:
         opened = open_log(path)
         rows = sum(len(samples) for samples, _ in opened.blocks(1000))
         return f"{_some(rows)} rows, {_some(len(list(opened.events())))} events"
+
+
+def curve(data: bytes) -> str:
+    """A log as the page reads it: by its index, some chunks at a time."""
+    with _file(data, ".mcap") as path:
+        logs = path.with_suffix("")
+        logs.mkdir()
+        try:
+            shutil.copyfile(path, logs / "a.mcap")
+            recorded = RecordedRows(lambda: [logs], ("type", "id"))
+            found = recorded.read(10**18 - S_NS, 10**18 + S_NS, 1_000_000)
+        finally:
+            shutil.rmtree(logs)
+    return f"{_some(len(found.bins))} bins, {_some(found.damaged)} damaged"
 
 
 def head(data: bytes) -> str:
@@ -465,11 +481,12 @@ def _answers() -> list[bytes]:
     return [valid, refused]
 
 
-def _logs() -> list[bytes]:
+def _logs(metadata: dict[str, str] | None = None) -> list[bytes]:
     """Valid logs of a few rows and an event."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.mcap"
-        with Recorder(path, LogHeader("type", "id", "a.toml", "[data]\n")) as recorder:
+        header = LogHeader("type", "id", "a.toml", "[data]\n", metadata or {})
+        with Recorder(path, header) as recorder:
             recorder.write(*_rows(), [Event(10**18, Kind.GAP, "gap", {"missing": 1})])
         return [b"\x89MCAP0\r\n" + bytes(40), path.read_bytes()]
 
@@ -546,8 +563,9 @@ def _requests() -> list[bytes]:
     def post(path: str, headers: str, body: str) -> str:
         return f"POST {path} HTTP/1.1\r\n{headers}Content-Length: {len(body)}\r\n\r\n{body}"
 
-    paths = ("/", "/api/me", "/login", "/static/page.js", "/api/all", "/api/ejectors/0/history")
-    gets = [f"GET {path}?days=7 HTTP/1.1\r\n{session_headers}\r\n" for path in paths]
+    ejector = [f"/api/ejectors/0/{name}" for name in ("history", "curve")]
+    paths = ("/", "/api/me", "/login", "/static/page.js", "/api/all", *ejector)
+    gets = [f"GET {path}?days=7&from=1&to=2 HTTP/1.1\r\n{session_headers}\r\n" for path in paths]
     posts = post("/api/ejectors/0/requests", session_headers, request), post("/login", host, form)
     return [target.encode() for target in (*gets, *posts)]
 
@@ -556,7 +574,7 @@ TARGETS: dict[str, Callable[[bytes], str]] = {
     target.__name__: target
     for target in (
         *(ring, modbus, poll, values),
-        *(log, head, csv, parquet, assets, aasx, fmu, users),
+        *(log, curve, head, csv, parquet, assets, aasx, fmu, users),
         *(mqtt, upload, http),
     )
 }
@@ -566,6 +584,7 @@ SEEDS: dict[str, Callable[[], list[bytes]]] = {
     "poll": lambda: [bytes(range(40)), struct.pack(">f", 900.0) * 4],
     "values": _values,
     "log": _logs,
+    "curve": lambda: _logs({RECORDED: "twin run"}),
     "head": _heads,
     "csv": lambda: [*_tables(".csv"), b"time_ms;vacuum_mbar\n0;1,5\n1;2,5\n"],
     "parquet": lambda: _tables(".parquet"),

@@ -29,7 +29,7 @@ _INDEX = struct.Struct("<QQQ")  # both times and the position, with which a chun
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, begin of summary and of its index, checksum
 _CHECKED = 25  # bytes of the footer that its checksum covers
 _OPCODES = frozenset(int(opcode) for opcode in Opcode)
-_LATEST_NS = 2**63 - 1
+_LATEST_NS = 2**63 - 1  # also of a position: there is nothing
 
 Places: TypeAlias = npt.NDArray[np.void]  # of PLACE
 _Place: TypeAlias = tuple[int, int, int]
@@ -93,7 +93,7 @@ def _summary_places(summary: bytes) -> Iterator[_Place]:
         opcode, length = _HEAD.unpack_from(summary, position)
         if opcode == Opcode.CHUNK_INDEX and length >= _INDEX.size:
             begin_ns, end_ns, at = _INDEX.unpack_from(summary, position + _HEAD.size)
-            yield at, min(begin_ns, _LATEST_NS), min(end_ns, _LATEST_NS)
+            yield min(at, _LATEST_NS), min(begin_ns, _LATEST_NS), min(end_ns, _LATEST_NS)
         position += _HEAD.size + length
 
 
