@@ -5,6 +5,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ from smtp_server import SmtpServer, certificate
 from test_alarms_loop import LEAK, NONE, UNIT, Stream, deviation, diagnosis
 from test_notifications import NO_TICKS, wait_until
 
+from twin.alarms.database import open_store
+from twin.alarms.loop import News
 from twin.alarms.settings import board_rules
 from twin.cli.notifications import outlets_of
 from twin.config import Config
@@ -381,6 +384,27 @@ def test_who_comes_on_duty_while_nothing_happens_is_told(
     outlets.close()
     assert "your duty began" in server.mails[0].get_content()
     assert str(server.mails[0]["To"]) == "Bob <bob@plant.example>"
+
+
+def test_who_is_told_later_reads_what_the_diagnosis_found_meanwhile(
+    tmp_path: Path, server: SmtpServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    on_duty = threading.Event()
+    monkeypatch.setattr("twin.notifications.people.Person.is_on_duty", lambda *_: on_duty.is_set())
+    stream = leak()
+    outlets = begun(configuration(tmp_path, server.port), [])
+    outlets.write(NONE, NO_TICKS, stream.said)
+    wait_until(lambda: _has_call(tmp_path))
+    (episode,) = stream.desk.before.going_on
+    later = {"probability": 0.93, "not_separable_from": []}
+    known = replace(episode, evidence={**episode.evidence, **later})
+    news = News(episodes={(episode.raised_ns, episode.raised_as): known})
+    with open_store(tmp_path / "alarms.sqlite") as store:
+        store.save(UNIT, news)
+    on_duty.set()
+    wait_until(lambda: len(server.mails) == 1)
+    outlets.close()
+    assert "diagnosed: 93 %" in server.mails[0].get_content()
 
 
 def _has_call(folder: Path) -> bool:

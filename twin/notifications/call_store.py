@@ -1,11 +1,15 @@
 """The calls of a unit (``twin.notifications.escalation``), kept in the alarm database."""
 
+import json
 import time
 from collections.abc import Callable, Collection
 from pathlib import Path
+from typing import Any
 
 from sqlalchemy import URL, Column, MetaData, Table, Text, select
 
+from twin.alarms.database import EPISODE
+from twin.alarms.database import metadata as alarm_metadata
 from twin.assets.unit import Unit, of_unit
 from twin.notifications.escalation import Call, Outcome
 from twin.notifications.outbox import Outbox
@@ -46,12 +50,22 @@ class CallStore(Outbox):
         """Create missing tables."""
         super().prepare()
         self._make_missing(metadata)
+        self._make_missing(alarm_metadata)
 
     def calls(self) -> dict[str, Call]:
         """All calls, by alarm."""
         with self._reading() as connection:
             rows = connection.execute(select(CALL).where(*of_unit(CALL, self._unit))).all()
         return {row.alarm: Call.from_json(row.call) for row in rows}
+
+    def evidence(self, episode: str) -> dict[str, Any] | None:
+        """What is known of an episode by now, by its ID in messages; None if it is not stored."""
+        raised_ns, _, raised_as = episode.partition(".")
+        key = EPISODE.c.raised_ns == int(raised_ns), EPISODE.c.raised_as == raised_as
+        statement = select(EPISODE.c.evidence).where(*of_unit(EPISODE, self._unit), *key)
+        with self._reading() as connection:
+            text = connection.execute(statement).scalar()
+        return None if text is None else dict(json.loads(text))
 
     def store(self, outcome: Outcome, box: str, source: str, taken: Collection[str]) -> None:
         """Store calls, put mails into ``box``, and remove what they follow from.

@@ -12,7 +12,7 @@ from typing import Any
 
 from twin.errors import in_words
 from twin.notifications.call_store import CallStore
-from twin.notifications.escalation import Escalation, Outcome
+from twin.notifications.escalation import Escalation, Outcome, Reason
 from twin.notifications.mail_server import Letter, MailServer
 from twin.notifications.message import Message
 from twin.notifications.sender import ALARM, Sent, box_of
@@ -94,13 +94,21 @@ class Email:
         self._store.store(outcome, box_of(EMAIL, MAIL), EMAIL, taken)
         self._escalation.accept(outcome)
 
+    def _with_news(self, mail: dict[str, Any]) -> dict[str, Any]:
+        """A mail about an alarm that stands for some time, with what the diagnosis found since."""
+        document = mail["document"]
+        if mail["reason"] == Reason.RAISED or not document["episode"] or self._store is None:
+            return mail
+        evidence = self._store.evidence(document["episode"]) or document["evidence"]
+        return {**mail, "document": {**document, "evidence": evidence}}
+
     def _send_mails(self, messages: Sequence[Message]) -> Sent:
         """Write and send mails. One that cannot be written is set aside."""
         letters: list[tuple[Message, Letter]] = []
         refused: dict[str, str] = {}
         for message in messages:
             try:
-                letters.append((message, self._write(json.loads(message.body))))
+                letters.append((message, self._write(self._with_news(json.loads(message.body)))))
             except Exception as error:  # the other mails must still go out, whatever the error
                 refused[message.id] = f"the mail cannot be written: {in_words(error)}"
         sent = self._server.send(letters, self._clock()) if letters else Sent()
