@@ -320,7 +320,11 @@ class Chart {
     for (const { at, text } of values) ctx.fillText(text, area.left - 8, y(at));
     ctx.textAlign = "center";
     ctx.textBaseline = "top";
-    for (const { at, text } of times) ctx.fillText(text, x(at), area.top + area.height + 8);
+    for (const { at, text } of times) { // whole, also at the edge
+      const half = ctx.measureText(text).width / 2;
+      const middle = Math.max(half, Math.min(x(at), area.left + area.width + SIDE_PX - half));
+      ctx.fillText(text, middle, area.top + area.height + 8);
+    }
     ctx.textAlign = "left";
     ctx.fillText(this.options.unit, 4, 4);
   }
