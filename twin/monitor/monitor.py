@@ -57,6 +57,9 @@ RIVAL = 0.05  # least probability to name another cause as well, or to keep a st
 # Probability of something unlisted above which a cause found by its signature does not suit: the
 # cause is then searched with its full size. If one suits, it is 0.01 to 0.05; else up to a third.
 UNSUITED = 0.1
+# Probability of a moved threshold where switching levels alone are off: of six drawn faults in two
+# worlds that were named so, four were one (tools.naming_trial).
+LEVELS_ALONE = 0.65
 ALIKE = 0.2  # largest change of figures, over the excess, without a new search for the cause
 RENAMED = 3  # cycles in a row that must agree on another name before a standing alarm gets it
 LONGEST_RING_NS = 120_000_000_000  # longest time of rows that a PLC keeps while nobody reads them
@@ -565,7 +568,6 @@ class Monitor:
 
         Empty if nothing in the table fits.
         """
-        from twin.inference.unmodelled import MOST_SURE  # noqa: PLC0415 - with SciPy
         from twin.monitor.naming import likenesses  # noqa: PLC0415 - with SciPy
 
         if small := self._small_causes(verdict):
@@ -575,7 +577,10 @@ class Monitor:
                 return verdict.where_changed().causes
             shift = EFFECTS["threshold_drift"].parameters[0]
             size = shift.reported(worst.excess, self.theta)
-            return [Likeness("threshold_drift", size, shift.unit, MOST_SURE)]
+            return [
+                Likeness("threshold_drift", size, shift.unit, LEVELS_ALONE),
+                Likeness(UNKNOWN, None, "", 1.0 - LEVELS_ALONE),
+            ]
         parts = [cycle] if before is None else [before, cycle]
         samples = np.concatenate([part.samples for part in parts])
         ticks = np.concatenate([part.ticks for part in parts])
