@@ -1,4 +1,4 @@
-"""The answer: what the simulation gets wrong, why, and what knowing it gains on unseen cycles."""
+"""The answer: what the simulation gets wrong, why, and the gain on held-out cycles."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -35,48 +35,48 @@ from twin.monitor.signal_checks import standing
 from twin.signals import Quality, Samples
 
 FORMAT = "ejector-twin-diagnosis/1"
-FEWEST_CYCLES = 3  # judged ones: two to fit on, one to judge by
-EXPLAINED = 1.2  # sigmas left up to which causes explain a deviation
-BEYOND = 1.8  # times the usual deviation, with a share of what was explained: more is left over
-ROUGH = 0.06  # of what was explained, that causes may be off
+FEWEST_CYCLES = 3  # judged cycles: two to fit on, one to judge by
+EXPLAINED = 1.2  # largest leftover, in sigmas, of an explanation
+BEYOND = 1.8  # times the usual deviation (see _verdict): a larger rest is unlisted
+ROUGH = 0.06  # share of the explained deviation by which causes may be off
 SEVERAL = 1.6  # sigmas that several causes may leave and still be sure,
-NEARLY_ALL = 0.1  # or this of chi-square beyond noise: gross effects leave many sigmas
-MOST_LEFT = 0.5  # of chi-square beyond noise, that a cause may leave and still be sure
+NEARLY_ALL = 0.1  # or share of chi-square beyond noise: gross effects leave many sigmas
+MOST_LEFT = 0.5  # share of chi-square beyond noise that a cause may leave and still be sure
 MOST_SATURATED = 0.05  # share of samples
-MOST_JUDGED = 24  # cycles of a long log that are looked at, evenly spread
-FEW = 0.25  # of the cycles, up to which odd ones are shared out by themselves
+MOST_JUDGED = 24  # cycles of a long log that are evaluated, evenly spread
+FEW = 0.25  # largest share of odd cycles that are split between fitted and held out separately
 MOST_NAMED = 4  # runners-up
-WIDEST = 0.9  # of a parameter's range: an interval as wide says nothing
-MIMICS = 1.6  # times the usual deviation: one cause that leaves more may mimic what nobody listed
-LIKELY = 0.5  # that something acts which nobody listed: more, and it is said
-# Of a size, that the data set's own scale is not known better: volume and suction; and how the
-# wall's heat is shared between vessel and line.
+WIDEST = 0.9  # share of a parameter's range: an interval as wide determines nothing
+MIMICS = 1.6  # times the usual deviation: a cause that leaves more may mimic an unlisted mechanism
+LIKELY = 0.5  # probability of something unlisted above which the verdict is "unlisted"
+# Relative error (1 sigma) of a size from the scale of the data set, that is, of volume and suction.
+# OF_HEAT: from how the wall's heat is shared between vessel and line.
 RELATIVE, OF_HEAT = 0.03, 0.1
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The answer with all that a report draws; ``json`` is the contract's form of it."""
+    """The answer with everything that a report draws; ``json`` is its stored form."""
 
     evidence: Evidence
     data_set: str  # content hash of the calibrated twin's
     search: Search | None
-    hypothesis: Hypothesis  # the causes found
-    terms: tuple[Term, ...]  # what data gave where no mechanism is known either
+    hypothesis: Hypothesis  # the causes
+    terms: tuple[Term, ...]  # curves from data, if no mechanism was found
     before: Judged | None
     after: Judged | None
     held_out: list[int]
     json: dict[str, Any]
-    mechanism: Explained | None = None  # what acts beside the causes that nobody listed
+    mechanism: Explained | None = None  # unlisted, acts beside the causes
 
     @property
     def acting(self) -> Hypothesis:
-        """All that the extended model has: the causes, then the mechanism."""
+        """Everything in the extended model: the causes, then the mechanism."""
         return (*self.hypothesis, *((self.mechanism.cause,) if self.mechanism else ()))
 
     @property
     def told(self) -> list[dict[str, Any]]:
-        """What the answer tells of each of them."""
+        """The answer's entry for each item of ``acting``."""
         return [
             *self.json["causes"],
             *([self.json["unlisted"]["mechanism"]] if self.mechanism else []),
@@ -93,9 +93,9 @@ def diagnose(
 ) -> Diagnosis:
     """Diagnose a log, or the part of it that begins ``before_s`` into it.
 
-    ``derived`` says how its commands were, where nobody recorded them: then it cannot answer.
-    Onsets in the answer count from the log's begin. Without a calibrated twin the answer is
-    ``insufficient``: its causes would be those of the data set, not of the ejector.
+    ``derived`` says how commands were derived if nobody recorded them; then the answer is
+    ``insufficient``. Onsets in the answer count from the beginning of the log. The answer is also
+    ``insufficient`` without a calibrated twin: its causes would be errors of the data set.
     """
     progress("running the twin over the log")
     blocks = [block for block in blocks if len(block)]
@@ -112,82 +112,91 @@ def diagnose(
     if reason := unrecorded or _not_commissioned(config) or insufficient(evidence):
         answer = head | _insufficient(evidence, part, reason)
         return Diagnosis(evidence, config.data.hash, None, HEALTHY, (), None, None, [], answer)
-    whole, evidence = evidence, thinned(evidence, evidence.judged, MOST_JUDGED)
+    whole_log, evidence = evidence, thinned(evidence, evidence.judged, MOST_JUDGED)
     healthy = covariance(evidence)
     fitted, held_out = split(evidence, healthy)
     searched = search(evidence, fitted, healthy, progress)
-    if searched.found and whole.cycles > evidence.cycles:
+    if searched.found and whole_log.cycles > evidence.cycles:
         progress("looking for when it began")
-        searched = sharpened(whole, evidence, searched)
-    found = searched.found.hypothesis if searched.found else HEALTHY
+        searched = sharpened(whole_log, evidence, searched)
+    hypothesis = searched.found.hypothesis if searched.found else HEALTHY
     progress("judging on the cycles it has not seen")
-    known = searched.known
+    searched_covariance = searched.known
     before = judge(evidence, healthy.of(held_out), HEALTHY)
-    after = judge(evidence, known.of(held_out), found)
+    after = judge(evidence, searched_covariance.of(held_out), hypothesis)
     progress("looking for what nobody listed")
-    beside = Unmodelled(evidence, known.of(evidence.judged), found)
-    odds = [beside.odds(number) for number in range(len(found))]
-    alone = 0.0 if found else beside.alone()
-    likely = any(one.of_unlisted(len(found)) > LIKELY for one in odds) or alone > LIKELY
-    strange = look(known, found, fitted, held_out, least=0.0 if likely else STRANGE)
-    # Where nothing was fitted, all cycles are unseen.
-    left = after.leftover if found else _left_in_all(evidence, healthy.of(evidence.judged))
-    verdict = _verdict(found, before, after, left, strange, likely)
-    known_by_now = _Found(verdict, searched, found, after, strange)
-    it = _with_unlisted(evidence, fitted, held_out, healthy, before, known_by_now, progress)
-    causes = _causes(evidence, it.searched, odds, before) if it.found else []
-    for cause, cost in zip(causes, costs(config, evidence, it.found, causes), strict=False):
-        if cost is not None:  # there are none where no price is configured
+    beside = Unmodelled(evidence, searched_covariance.of(evidence.judged), hypothesis)
+    odds = [beside.odds(number) for number in range(len(hypothesis))]
+    probability_alone = 0.0 if hypothesis else beside.alone()
+    likely = (
+        any(cause_odds.of_unlisted(len(hypothesis)) > LIKELY for cause_odds in odds)
+        or probability_alone > LIKELY
+    )
+    strange = look(
+        searched_covariance, hypothesis, fitted, held_out, least=0.0 if likely else STRANGE
+    )
+    # If nothing was fitted, all cycles count as held out.
+    leftover = after.leftover if hypothesis else _left_in_all(evidence, healthy.of(evidence.judged))
+    verdict = _verdict(hypothesis, before, after, leftover, strange, likely)
+    listed_findings = _Findings(verdict, searched, hypothesis, after, strange)
+    findings = _with_unlisted(
+        evidence, fitted, held_out, healthy, before, listed_findings, progress
+    )
+    causes = _causes(evidence, findings.searched, odds, before) if findings.causes else []
+    for cause, cost in zip(causes, costs(config, evidence, findings.causes, causes), strict=False):
+        if cost is not None:  # a price is configured, and a size is known
             cause["cost"] = cost
     answer = head | {
-        "verdict": it.verdict,
+        "verdict": findings.verdict,
         "causes": causes,
-        "runners_up": _runners_up(it.searched),
-        "unmodelled_probability": _unmodelled(evidence, it.searched, odds, alone, it.verdict),
-        "unlisted": _unlisted(evidence, it.strange, it.mechanism)
-        if it.verdict == "unlisted"
+        "runners_up": _runners_up(findings.searched),
+        "unmodelled_probability": _unmodelled(
+            evidence, findings.searched, odds, probability_alone, findings.verdict
+        ),
+        "unlisted": _unlisted(evidence, findings.strange, findings.mechanism)
+        if findings.verdict == "unlisted"
         else None,
         "cycles": {
-            "total": whole.cycles,
-            "fitted": [int(evidence.numbers[one]) for one in fitted],
-            "held_out": [int(evidence.numbers[one]) for one in held_out],
+            "total": whole_log.cycles,
+            "fitted": [int(evidence.numbers[cycle]) for cycle in fitted],
+            "held_out": [int(evidence.numbers[cycle]) for cycle in held_out],
             **part,
         },
         "baseline": before.figures,
-        "extended": it.after.figures,
-        "gain": gain(before, it.after),
-        "next_experiment": next_experiment(evidence, it.searched, it.mechanism),
+        "extended": findings.after.figures,
+        "gain": gain(before, findings.after),
+        "next_experiment": next_experiment(evidence, findings.searched, findings.mechanism),
     }
     return Diagnosis(
         evidence,
         config.data.hash,
-        it.searched,
-        it.found,
-        it.terms,
+        findings.searched,
+        findings.causes,
+        findings.terms,
         before,
-        it.after,
+        findings.after,
         held_out,
         answer,
-        it.mechanism,
+        findings.mechanism,
     )
 
 
 @dataclass(frozen=True)
-class _Found:
-    """What is known of a log: the causes, what they leave, and what acts beside them."""
+class _Findings:
+    """Findings about a log: the causes, what they leave, and what acts beside them."""
 
     verdict: str
     searched: Search
-    found: Hypothesis
+    causes: Hypothesis
     after: Judged
     strange: Unlisted
     terms: tuple[Term, ...] = ()
     mechanism: Explained | None = None
 
     @property
-    def without_causes(self) -> "_Found":
-        """The same where the causes do not stand."""
-        return replace(self, searched=replace(self.searched, found=None), found=HEALTHY)
+    def without_causes(self) -> "_Findings":
+        """The same with the causes withdrawn."""
+        return replace(self, searched=replace(self.searched, found=None), causes=HEALTHY)
 
 
 def _with_unlisted(
@@ -196,110 +205,124 @@ def _with_unlisted(
     held_out: Sequence[int],
     healthy: Covariance,
     before: Judged,
-    it: _Found,
+    findings: _Findings,
     progress: Callable[[str], None],
-) -> _Found:
-    """With what nobody listed: a mechanism, or a term from data where there is none.
+) -> _Findings:
+    """The findings with something unlisted: a mechanism, or a term from data without one.
 
-    Causes that leave more than cycles differ by may mimic a mechanism, and do not stand beside one
-    that alone does better.
+    Causes that leave more than the scatter between cycles may mimic a mechanism. They are withdrawn
+    if a mechanism alone does better.
     """
-    little = MIMICS if len(it.found) == 1 else LITTLE
-    if it.verdict == "explained" and it.after.rms > little * before.usual:
-        alone = explain_alone(evidence, fitted, it.found, progress)
-        mechanism, mended = _on_unseen(evidence, alone, it.after, held_out)
+    limit = MIMICS if len(findings.causes) == 1 else LITTLE
+    if findings.verdict == "explained" and findings.after.rms > limit * before.usual:
+        mechanism_alone = explain_alone(evidence, fitted, findings.causes, progress)
+        mechanism, mended = _on_unseen(evidence, mechanism_alone, findings.after, held_out)
         if mechanism is None:
-            return it
+            return findings
         strange = look(healthy, HEALTHY, fitted, held_out)
-        it = replace(it, verdict="unlisted", strange=strange)
-    elif it.verdict == "unlisted":
-        if not _sure(it.found, before, it.after):
+        findings = replace(findings, verdict="unlisted", strange=strange)
+    elif findings.verdict == "unlisted":
+        if not _sure(findings.causes, before, findings.after):
             strange = look(healthy, HEALTHY, fitted, held_out)
-            it = replace(it.without_causes, strange=strange, after=before)
-        explained = explain(evidence, fitted, it.found, progress)
-        mechanism, mended = _on_unseen(evidence, explained, it.after, held_out)
+            findings = replace(findings.without_causes, strange=strange, after=before)
+        explained = explain(evidence, fitted, findings.causes, progress)
+        mechanism, mended = _on_unseen(evidence, explained, findings.after, held_out)
     else:
-        return it
+        return findings
     if mechanism and not mechanism.beside:
-        it = it.without_causes
+        findings = findings.without_causes
     if mended is None:
-        strange, mended = _term_found(evidence, it.found, it.after, it.strange, held_out)
-        it = replace(it, strange=strange, terms=strange.terms)
-    return replace(it, after=mended or it.after, mechanism=mechanism)
+        strange, mended = _term_found(
+            evidence, findings.causes, findings.after, findings.strange, held_out
+        )
+        findings = replace(findings, strange=strange, terms=strange.terms)
+    return replace(findings, after=mended or findings.after, mechanism=mechanism)
 
 
 def _on_unseen(
-    evidence: Evidence, one: Explained | None, after: Judged, held_out: Sequence[int]
+    evidence: Evidence, explained: Explained | None, after: Judged, held_out: Sequence[int]
 ) -> tuple[Explained | None, Judged | None]:
-    """A mechanism, where it brings the twin nearer to unseen cycles than ``after``."""
-    if one is None:
+    """The mechanism and its judgement on held-out cycles; None if rms is not below ``after``."""
+    if explained is None:
         return None, None
-    hypothesis = one.fitted.hypothesis
+    hypothesis = explained.fitted.hypothesis
     mended = judge(evidence, covariance(evidence, hypothesis).of(held_out), hypothesis)
-    return (one, mended) if mended.rms < after.rms else (None, None)
+    return (explained, mended) if mended.rms < after.rms else (None, None)
 
 
 def _term_found(
     evidence: Evidence,
-    found: Hypothesis,
+    causes: Hypothesis,
     after: Judged,
     strange: Unlisted,
     held_out: Sequence[int],
 ) -> tuple[Unlisted, Judged | None]:
-    """The term from data, where it brings the twin nearer; it holds for this program only."""
+    """``strange`` with its term and the judgement; no term and None if rms is not below ``after``.
+
+    A term holds for this program of commands only.
+    """
     with_terms = extended(evidence, strange.terms)
-    mended = judge(with_terms, covariance(with_terms, found).of(held_out), found)
+    mended = judge(with_terms, covariance(with_terms, causes).of(held_out), causes)
     if mended.rms < after.rms:
         return strange, mended
-    return replace(strange, terms=()), None  # less in sigmas, but not in mbar, is no better model
+    return replace(strange, terms=()), None  # lower in sigmas only: no better model
 
 
 def _signals(evidence: Evidence) -> list[dict[str, str]]:
-    """What the ejector reports, or somebody measures, that the pressure contradicts."""
+    """Reported or measured signals that contradict the pressure."""
     bounds = pairwise(evidence.starts.tolist())
     cycles = (
         Cycle(number, evidence.samples[first:last], evidence.ticks[first:last], complete=True)
         for number, (first, last) in enumerate(bounds)
     )
-    against = standing(cycles, evidence.theta, evidence.knees)
-    return [{"signal": one.signal, "what": one.what, "do": one.action} for one in against]
+    contradictions = standing(cycles, evidence.theta, evidence.knees)
+    return [
+        {"signal": contradiction.signal, "what": contradiction.what, "do": contradiction.action}
+        for contradiction in contradictions
+    ]
 
 
 def _left_in_all(evidence: Evidence, weights: Weights) -> float:
-    """Sigmas left of the twin without a cause in all cycles; one odd one counts little."""
+    """Leftover (sigmas) of the twin without causes over all cycles; an odd cycle counts little."""
     residuals = white(evidence, weights, [HEALTHY])[: len(weights.bins), 0]
     return usual_leftover(left_in_each(evidence, weights, residuals))
 
 
 def _verdict(
-    found: Hypothesis, before: Judged, after: Judged, left: float, strange: Unlisted, likely: bool
+    causes: Hypothesis,
+    before: Judged,
+    after: Judged,
+    leftover: float,
+    strange: Unlisted,
+    likely: bool,
 ) -> str:
-    """Consistent, explained, or something real is left: in sigmas, in mbar, or of a kind.
+    """The verdict: ``consistent``, ``explained`` or ``unlisted``.
 
-    Or it is ``likely``, from what is left, that something acts which nobody listed. In mbar only
-    what causes leave counts: rows of steep edges are off by much in healthy cycles too.
+    It is ``unlisted`` if too much is left in sigmas or in mbar, if an unlisted pattern gains
+    enough, or if ``likely``. Millibars count only with causes: steep edges deviate in healthy
+    cycles too.
     """
     usual = math.hypot(before.usual, ROUGH * before.rms, after.unmeasured)
-    beyond = bool(found) and after.rms > BEYOND * usual
-    if left > EXPLAINED or beyond or likely or strange.gain >= STRANGE:
+    beyond = bool(causes) and after.rms > BEYOND * usual
+    if leftover > EXPLAINED or beyond or likely or strange.gain >= STRANGE:
         return "unlisted"
-    return "explained" if found else "consistent"
+    return "explained" if causes else "consistent"
 
 
-def _sure(found: Hypothesis, before: Judged, after: Judged) -> bool:
-    """Whether causes stand although something is left: they take away nearly all of it.
+def _sure(causes: Hypothesis, before: Judged, after: Judged) -> bool:
+    """Whether causes stand although something is left, because they take away nearly all of it.
 
-    Several together can look like something nobody listed, so little may be left of them, in
-    sigmas or beside what they take away. One odd cycle, as where the nozzle went on once more,
-    counts little.
+    Several causes together can imitate something unlisted, so they may leave only little, in sigmas
+    or relative to what they take away. One odd cycle counts little, such as one in which the nozzle
+    went on once more.
     """
-    left = after.steady
-    share = (left**2 - 1.0) / max(before.steady**2 - 1.0, 1e-9)
-    return share < MOST_LEFT and (len(found) == 1 or left < SEVERAL or share < NEARLY_ALL)
+    leftover = after.steady
+    share = (leftover**2 - 1.0) / max(before.steady**2 - 1.0, 1e-9)
+    return share < MOST_LEFT and (len(causes) == 1 or leftover < SEVERAL or share < NEARLY_ALL)
 
 
 def _not_commissioned(config: Config) -> str:
-    """What to do first where nobody knows what this unit's healthy cycles are like."""
+    """What to do first if this unit's healthy scatter is unknown; else empty."""
     if config.monitor.healthy.is_known:
         return ""
     run = f"twin commission HEALTHY.mcap --id {config.asset.id or 'ID'}"
@@ -327,32 +350,36 @@ def insufficient(evidence: Evidence) -> str:
 
 
 def split(evidence: Evidence, healthy: Covariance) -> tuple[list[int], list[int]]:
-    """Cycles to fit on and to judge by, about half of each, in Thue and Morse's order.
+    """Fitted and held-out cycles, about half of each, in the order of the Thue–Morse sequence.
 
-    That has no period: what comes in every second or third cycle falls into both. Where few cycles
-    are odd they come first, so that what acts in them alone falls into both as well. One alone
-    cannot, and stays where it is: a nozzle that went on once more is no cause to be fitted.
+    The sequence has no period, so an effect in every second or third cycle falls into both halves.
+    If few cycles are odd, they are split first, so an effect in them alone falls into both as well.
+    A single odd cycle keeps its place: a nozzle that went on once more is no cause to fit.
     """
-    alone = [white(evidence, healthy.of([one]), [HEALTHY]) for one in evidence.judged]
-    odd = are_odd(np.array([np.mean(of**2) for of in alone]))
+    residuals = [white(evidence, healthy.of([cycle]), [HEALTHY]) for cycle in evidence.judged]
+    odd = are_odd(np.array([np.mean(cycle_residuals**2) for cycle_residuals in residuals]))
     if not 2 <= np.count_nonzero(odd) <= FEW * len(odd):
         odd[:] = False
-    odd_first = [one for first in (True, False) for one in np.array(evidence.judged)[odd == first]]
-    held_out = {int(one) for place, one in enumerate(odd_first) if (place + 3).bit_count() % 2}
-    return [one for one in evidence.judged if one not in held_out], sorted(held_out)
+    odd_first = [
+        cycle for first in (True, False) for cycle in np.array(evidence.judged)[odd == first]
+    ]
+    held_out = {
+        int(cycle) for position, cycle in enumerate(odd_first) if (position + 3).bit_count() % 2
+    }
+    return [cycle for cycle in evidence.judged if cycle not in held_out], sorted(held_out)
 
 
 def _runners_up(searched: Search) -> list[dict[str, Any]]:
     if searched.found is None:
         return []
-    others = [one for one in searched.ranking if one.effects != searched.found.effects]
+    runners_up = [fit for fit in searched.ranking if fit.effects != searched.found.effects]
     return [
         {
-            "effect": one.effects[0],
-            "course": str(one.hypothesis[0].course),
-            "leftover_sigma": rounded(one.leftover),
+            "effect": fit.effects[0],
+            "course": str(fit.hypothesis[0].course),
+            "leftover_sigma": rounded(fit.leftover),
         }
-        for one in others[:MOST_NAMED]
+        for fit in runners_up[:MOST_NAMED]
     ]
 
 
@@ -363,32 +390,32 @@ def _causes(
     evidence: Evidence, searched: Search, odds: Sequence[Odds], before: Judged
 ) -> list[dict[str, Any]]:
     assert searched.found is not None
-    found, first, result = searched.found, 0, []
-    for number, cause in enumerate(found.hypothesis):
+    best, first, result = searched.found, 0, []
+    for number, cause in enumerate(best.hypothesis):
         count = len(parameters((cause,)))
         part = slice(first, first + count)
         rivals = searched.rivals[number]
-        low, high = (of[part] for of in searched.ends)
-        values = _parameters(evidence, cause, found.x[part], low, high)
+        low, high = (end[part] for end in searched.ends)
+        values = _parameters(evidence, cause, best.x[part], low, high)
         entry: dict[str, Any] = {
             "effect": cause.effect,
             "course": str(cause.course),
             "onset_s": _rounded_onset(evidence, cause),
             "parameters": values,
             "probability": round(
-                odds[number].of_cause(len(found.hypothesis), _weight(evidence, found, rivals)),
+                odds[number].of_cause(len(best.hypothesis), _weight(evidence, best, rivals)),
                 3,
             ),
-            "not_separable_from": [stranger(one, found) for one in rivals],
+            "not_separable_from": [stranger(rival, best) for rival in rivals],
             "why": _why(evidence, cause, values, before),
         }
         if cause.course == Course.STEP:
             entry["onset_low95_s"], entry["onset_high95_s"] = (
-                round(evidence.before_s + one, 3) for one in searched.onsets[number]
+                round(evidence.before_s + onset_s, 3) for onset_s in searched.onsets[number]
             )
         if cause.course == Course.INTERMITTENT:
             entry["cycles"] = sorted(cause.cycles)
-            judged = {int(evidence.numbers[one]) for one in evidence.judged}
+            judged = {int(evidence.numbers[cycle]) for cycle in evidence.judged}
             entry["share_pct"] = rounded(100.0 * len(cause.cycles & judged) / len(judged))
         result.append(entry)
         first += count
@@ -398,46 +425,47 @@ def _causes(
 def _unmodelled(
     evidence: Evidence, searched: Search, odds: Sequence[Odds], alone: float, verdict: str
 ) -> float:
-    """Probability of something unlisted in place of the first cause; ``alone`` where none stands.
+    """Probability of something unlisted instead of the first cause; from ``alone`` without causes.
 
-    With the probability of that cause and those of its rivals it sums to one. Where more is left
-    than noise it is likelier than not, whatever its course: no smooth one has to come again.
+    It sums to one with the probabilities of that cause and its rivals. Without causes, under the
+    verdict ``unlisted``, it is at least LIKELY, whatever its course: a smooth one need not recur.
     """
     if searched.found is None:
         return round(max(alone, LIKELY) if verdict == "unlisted" else alone, 3)
-    found = searched.found
-    rivals = _weight(evidence, found, searched.rivals[0])
-    return round(odds[0].instead(len(found.hypothesis), rivals), 3)
+    best = searched.found
+    rivals = _weight(evidence, best, searched.rivals[0])
+    return round(odds[0].instead(len(best.hypothesis), rivals), 3)
 
 
-def _weight(evidence: Evidence, found: Fitted, rivals: Sequence[Fitted]) -> float:
-    """What rivals weigh beside a cause.
+def _weight(evidence: Evidence, best: Fitted, rivals: Sequence[Fitted]) -> float:
+    """Weight of the rivals relative to the cause.
 
-    Of how often listed effects come only what is known counts.
+    Of prior frequencies of listed effects only the known part counts.
     """
     scores = [
-        score_with_tempered_prior(evidence, one.score, one.hypothesis) for one in (found, *rivals)
+        score_with_tempered_prior(evidence, candidate.score, candidate.hypothesis)
+        for candidate in (best, *rivals)
     ]
-    temper = 2.0 * max(found.leftover, 1.0) ** 2
-    return sum(math.exp(min((scores[0] - one) / temper, 50.0)) for one in scores[1:])
+    temper = 2.0 * max(best.leftover, 1.0) ** 2
+    return sum(math.exp(min((scores[0] - score) / temper, 50.0)) for score in scores[1:])
 
 
 def _rounded_onset(evidence: Evidence, cause: Cause) -> float | None:
-    """When a step or ramp began, s since the log did."""
+    """Onset of a step or ramp, in s from the beginning of the log; None for other courses."""
     timed = cause.course in (Course.STEP, Course.RAMP)
     return round(evidence.before_s + cause.onset_s, 3) if timed else None
 
 
 def _part(blocks: Sequence[Samples], before_s: float) -> dict[str, Any]:
-    """Where in the log the cycles begin, and when the log began by the clock here (UTC, ns).
+    """Where in the log the cycles begin (s), and the host time of the log's beginning (UTC, ns).
 
-    None for a log of times that no clock gave, such as a table that counts from 0.
+    The latter is None if no clock gave the times, as in a table that counts from 0.
     """
     first_ns = int(blocks[0]["host_ns"][0]) if blocks else 0
-    known = first_ns >= CALENDAR_NS
+    is_dated = first_ns >= CALENDAR_NS
     return {
         "begin_s": round(before_s, 3),
-        "log_begin_ns": first_ns - round(before_s * SECOND_NS) if known else None,
+        "log_begin_ns": first_ns - round(before_s * SECOND_NS) if is_dated else None,
     }
 
 
@@ -448,27 +476,27 @@ def _parameters(
     lowest: Floats,
     highest: Floats,
 ) -> dict[str, dict[str, Any]]:
-    """Values with intervals; a ramp's are rates, and what they have come to at the log's end."""
-    found, theta = {}, evidence.theta
+    """Values with 95 % intervals; for a ramp the rates, and the values at the log's end."""
+    entries, theta = {}, evidence.theta
     sized = zip(effect_of(cause.effect).parameters, x, lowest, highest, strict=True)
     for p, size, below, above in sized:
-        whole = p.steps_to(p.high, theta) - p.steps_to(p.low, theta)
-        if not above - below < WIDEST * whole:
-            continue  # nothing in this log depends on it
+        full_range = p.steps_to(p.high, theta) - p.steps_to(p.low, theta)
+        if not above - below < WIDEST * full_range:
+            continue  # the log does not determine it
         ramp = cause.course == Course.RAMP and not p.shapes
         at_neutral = p.neutral(theta)
         neutral = 0.0 if ramp else at_neutral
-        value, least, most = (
-            one * p.typical if ramp else p.after(one, theta)
-            for one in map(float, (size, below, above))
+        value, lower, upper = (
+            steps * p.typical if ramp else p.after(steps, theta)
+            for steps in map(float, (size, below, above))
         )
         scale = OF_HEAT if cause.effect == "heat_exchange" else RELATIVE
-        unsure = SIGMAS_95 * scale * value
-        down, up = (math.hypot(end - value, unsure) for end in (least, most))
-        shift = at_neutral - neutral  # of a ramp these are changes, and the bounds are not
+        scale_error = SIGMAS_95 * scale * value
+        down, up = (math.hypot(end - value, scale_error) for end in (lower, upper))
+        shift = at_neutral - neutral  # a ramp's values are changes, its bounds are not
         low, high = max(value - down, p.low - shift), min(value + up, p.high - shift)
         per_hour = 1.0 / hours(evidence, cause) if ramp else 1.0
-        found[p.name] = {
+        entries[p.name] = {
             "value": rounded(value * per_hour),
             "unit": f"{p.unit}/h" if ramp else p.unit,
             "low95": rounded(low * per_hour),
@@ -476,8 +504,8 @@ def _parameters(
         }
         if ramp:
             for name, change in (("at_end", value), ("at_end_low95", low), ("at_end_high95", high)):
-                found[p.name][name] = rounded(at_neutral + change)
-    return found
+                entries[p.name][name] = rounded(at_neutral + change)
+    return entries
 
 
 def _why(
@@ -485,9 +513,9 @@ def _why(
 ) -> str:
     effect = effect_of(cause.effect)
     size = ", ".join(
-        f"{name.replace('_', ' ')} {one.get('at_end', one['value']):.3g}"
-        f" {one['unit'].removesuffix('/h')}"
-        for name, one in values.items()
+        f"{name.replace('_', ' ')} {entry.get('at_end', entry['value']):.3g}"
+        f" {entry['unit'].removesuffix('/h')}"
+        for name, entry in values.items()
     )
     when = {
         Course.CONSTANT: "",
@@ -501,30 +529,30 @@ def _why(
     )
 
 
-# --- what is left ---------------------------------------------------------------------------------
+# --- what is unlisted -----------------------------------------------------------------------------
 
 
-def _unlisted(evidence: Evidence, strange: Unlisted, one: Explained | None) -> dict[str, Any]:
-    """Where something is that no listed effect explains, on what it depends, and what it may be."""
+def _unlisted(evidence: Evidence, strange: Unlisted, explained: Explained | None) -> dict[str, Any]:
+    """Where something unlisted acts, on what it depends, its shape, and its mechanism."""
     return {
         "where": strange.where,
         "depends_on": [strange.depends_on],
         "shape": strange.shape,
-        "mechanism": _mechanism(evidence, one) if one else None,
+        "mechanism": _mechanism(evidence, explained) if explained else None,
     }
 
 
-def _mechanism(evidence: Evidence, one: Explained) -> dict[str, Any]:
-    """A mechanism in words, as a formula and with intervals, and what it is not told from."""
-    mechanism, first = MECHANISMS[one.cause.effect], len(parameters(one.beside))
-    low, high = (end[first:] for end in one.ends)
+def _mechanism(evidence: Evidence, explained: Explained) -> dict[str, Any]:
+    """A mechanism in words, as a formula and with intervals, and its look-alikes."""
+    mechanism, first = MECHANISMS[explained.cause.effect], len(parameters(explained.beside))
+    low, high = (end[first:] for end in explained.ends)
     return {
         "name": mechanism.name,
-        "sentence": mechanism.sentence(one.cause.values),
-        "formula": mechanism.formula(one.cause.values),
-        "parameters": _parameters(evidence, one.cause, one.fitted.x[first:], low, high),
+        "sentence": mechanism.sentence(explained.cause.values),
+        "formula": mechanism.formula(explained.cause.values),
+        "parameters": _parameters(evidence, explained.cause, explained.fitted.x[first:], low, high),
         "not_separable_from": [
-            MECHANISMS[rival.effect].sentence(rival.values) for rival in one.rivals
+            MECHANISMS[rival.effect].sentence(rival.values) for rival in explained.rivals
         ],
     }
 

@@ -1,7 +1,7 @@
-"""What a cause costs: the compressed air that the model takes with it, less that without it.
+"""Cost of a cause: the model's compressed air with the cause, less that without it.
 
-The model runs the log's own commands. Each other cause that is always there stays in it, so the
-cost is what is saved where this one alone is put right.
+The model runs the log's own commands. Other causes stay in it, except intermittent ones. So the
+cost is the saving if this cause alone is put right.
 """
 
 import math
@@ -27,13 +27,13 @@ from twin.model.theta import Theta
 from twin.monitor.bins import Floats
 from twin.monitor.uncertain_data import drawn
 
-# Of each half of an interval. The nozzle switches a whole number of times in a cycle, so that air
-# runs in steps over a size: the ends alone would miss some.
+# Sampled shares of each half of an interval. The nozzle switches a whole number of times in a
+# cycle, so air over size has steps: the ends alone would miss some.
 SHARES = (1.0 / 3.0, 2.0 / 3.0, 1.0)
-# Data sets that the unit may have, drawn with the scatter of cycles: in a machine not all cycles
-# switch as often, and their mean is what counts.
+# Data sets drawn from the unit's uncertainty and the scatter of cycles. Cycles of a machine differ
+# in their number of switchings, and their mean counts.
 DRAWS = 12
-SEED = 1  # of these draws: the same log gives the same answer
+SEED = 1  # of the draws, so that the same log gives the same answer
 
 Values = Mapping[str, float]
 Answer = Mapping[str, Any]
@@ -42,10 +42,10 @@ Answer = Mapping[str, Any]
 def costs(
     config: Config, evidence: Evidence, hypothesis: Hypothesis, causes: Sequence[Answer]
 ) -> list[dict[str, Any] | None]:
-    """The cost of each cause in the answer's form, in order; none where no price is configured.
+    """The cost of each cause for the answer, in order; empty if no price is configured.
 
-    It is None for a cause of which no size is known. ``causes`` are those of ``hypothesis`` as
-    the answer has them, with their 95 % intervals.
+    An entry is None for a cause without a known size. ``causes`` are the answer's entries for those
+    of ``hypothesis``, with 95 % intervals.
     """
     settings = config.document.section(FigureSettings, "figures")
     tariff = Tariff.of(settings)
@@ -54,16 +54,16 @@ def costs(
     unit = Unit(config.data, settings.energy_kwh_m3)
     program = Program.of(evidence.samples, evidence.starts)
     model = _Model(evidence, unit, program, _thetas(config.data, evidence))
-    return [model.cost(hypothesis, place, tariff, cause) for place, cause in enumerate(causes)]
+    return [model.cost(hypothesis, index, tariff, cause) for index, cause in enumerate(causes)]
 
 
 def _thetas(data: DataSet, evidence: Evidence) -> list[Theta]:
-    """Coefficients that the unit may have, in the surroundings of its log."""
+    """Drawn coefficients of the unit, in the surroundings of its log."""
     rng, base = np.random.default_rng(SEED), coefficients(data)
-    around = np.zeros(len(base))
+    shift = np.zeros(len(base))
     differs = np.isfinite(base) & (evidence.theta != base)  # some are infinite or unset
-    around[differs] = evidence.theta[differs] - base[differs]
-    return [drawn(data, evidence.healthy, rng) + around for _ in range(DRAWS)]
+    shift[differs] = evidence.theta[differs] - base[differs]
+    return [drawn(data, evidence.healthy, rng) + shift for _ in range(DRAWS)]
 
 
 @dataclass(frozen=True)
@@ -73,43 +73,44 @@ class _Model:
     evidence: Evidence
     unit: Unit
     program: Program
-    thetas: Sequence[Theta]  # that the unit may have
+    thetas: Sequence[Theta]  # drawn coefficients of the unit
 
     @property
     def cycle_s(self) -> float:
-        """Mean time of a cycle (s), as the log has it."""
+        """Mean time of a cycle (s) of the log."""
         return mean_cycle_time(self.program.cycle_seconds)
 
     def cost(
-        self, hypothesis: Hypothesis, place: int, tariff: Tariff, answer: Answer
+        self, hypothesis: Hypothesis, index: int, tariff: Tariff, answer: Answer
     ) -> dict[str, Any] | None:
-        """The cost of the cause at ``place`` in the answer's form, None where it is unknown."""
+        """The cost of the cause at ``index`` for the answer; None if it is unknown."""
         if not answer["parameters"]:
             return None
-        extra = self.extra_air(hypothesis, place, answer)
-        is_known = all(map(math.isfinite, extra))  # the model of a data set drawn may break down
+        extra = self.extra_air(hypothesis, index, answer)
+        is_known = all(map(math.isfinite, extra))  # the model may fail on a drawn data set
         return _plain(extra, self.cycle_s, tariff) if is_known else None
 
-    def extra_air(self, hypothesis: Hypothesis, place: int, answer: Answer) -> Interval:
-        """Air (Nl) that one cause takes in a cycle in the mean, with its 95 % interval.
+    def extra_air(self, hypothesis: Hypothesis, index: int, answer: Answer) -> Interval:
+        """Mean extra air (Nl) of a cycle because of one cause, with its 95 % interval.
 
-        The interval is of the cause's size and of the data set. An intermittent cause counts with
-        its share of the cycles.
+        The interval includes the uncertainty of the cause's size and of the data set. An
+        intermittent cause counts with its share of the cycles.
         """
-        others = [
+        other_causes = [
             (cause.effect, self._at_end(cause))
             for number, cause in enumerate(hypothesis)
-            if number != place and cause.course != Course.INTERMITTENT
+            if number != index and cause.course != Course.INTERMITTENT
         ]
-        cause = hypothesis[place]
+        cause = hypothesis[index]
         sizes = self._at_end(cause)
-        without = self._air(others)
-        at_size = self._air([*others, (cause.effect, sizes)]) - without
+        without = self._air(other_causes)
+        at_size = self._air([*other_causes, (cause.effect, sizes)]) - without
         extra = float(at_size.mean())
         down = up = SIGMAS_95 * float(at_size.std(ddof=1))
-        for ways in _ways(sizes, cause.effect, answer["parameters"]):
+        for variants in _ways(sizes, cause.effect, answer["parameters"]):
             air = [
-                float(np.mean(self._air([*others, (cause.effect, way)]) - without)) for way in ways
+                float(np.mean(self._air([*other_causes, (cause.effect, variant)]) - without))
+                for variant in variants
             ]
             down = math.hypot(down, max(extra - min(air), 0.0))
             up = math.hypot(up, max(max(air) - extra, 0.0))
@@ -117,12 +118,12 @@ class _Model:
         return Interval(extra, extra - down, extra + up).times(share)
 
     def _at_end(self, cause: Cause) -> Values:
-        """Values of a cause at the end of the log, where it acts."""
+        """Values of a cause in the last cycle of the log in which it acts."""
         number = max(cause.cycles, default=int(self.evidence.numbers[-1]))
         return cause.at(self.evidence.theta, float(self.evidence.seconds[-1]), number)
 
     def _air(self, causes: Sequence[tuple[str, Values]]) -> Floats:
-        """Mean air (Nl) of a cycle under some causes, for each of ``thetas``."""
+        """Mean air (Nl) of a cycle with ``causes``, for each of ``thetas``."""
         return np.array(at_once(partial(self._air_of, causes), self.thetas))
 
     def _air_of(self, causes: Sequence[tuple[str, Values]], theta: Theta) -> float:
@@ -132,12 +133,12 @@ class _Model:
 
 
 def _ways(sizes: Values, effect: str, parameters: Mapping[str, Answer]) -> Iterator[list[Values]]:
-    """For each parameter with an interval the sizes over it, the others as they are."""
+    """For each parameter with an interval: sizes sampled over it, other parameters unchanged."""
     for parameter in effect_of(effect).parameters:
         if parameter.name in parameters:
-            known = parameters[parameter.name]
-            low = known.get("at_end_low95", known["low95"])
-            high = known.get("at_end_high95", known["high95"])
+            interval = parameters[parameter.name]
+            low = interval.get("at_end_low95", interval["low95"])
+            high = interval.get("at_end_high95", interval["high95"])
             value = sizes[parameter.name]
             over = [value + share * (end - value) for end in (low, high) for share in SHARES]
             inside = np.clip(over, parameter.low, parameter.high).tolist()
@@ -145,7 +146,7 @@ def _ways(sizes: Values, effect: str, parameters: Mapping[str, Answer]) -> Itera
 
 
 def _plain(extra: Interval, cycle_s: float, tariff: Tariff) -> dict[str, Any]:
-    """The cost in the answer's form: air in Nl a cycle, money a year."""
+    """The cost as JSON: air in Nl a cycle, money a year."""
     assert tariff.per_m3 is not None
     cycles = tariff.cycles_a_year(cycle_s)
     money = Interval(*(cycles * (tariff.money(air) or 0.0) for air in extra))

@@ -1,9 +1,8 @@
-"""What nobody listed, as physics: where it acts on the plant, when and how, fitted and compared.
+"""Mechanisms for something unlisted: where it acts on the plant, when and how.
 
-Every mechanism that can be made of a place and a way of acting is tried in the same model as the
-listed effects, alone and beside the causes that were found. A small size of each tells how well it
-suits; the best are fitted with all that they leave open and compared by what they leave and how
-much they need for it. Nothing here has seen the held-out cycles.
+Each combination of a place and a way of acting is tried in the same model as the listed effects,
+alone and beside the causes. A linear screening with a small size ranks them. The best are fitted
+with all their parameters and compared by misfit plus penalty. Held-out cycles are not used.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -26,44 +25,44 @@ from twin.monitor.bins import Floats
 
 Progress = Callable[[str], None]
 
-TRIED_LARGER, FITTED = 40, 8  # starts that are tried at their size, mechanisms that are fitted
-# Typical sizes that a start is run with; the larger one where the twin is off by more than so many
-# sigmas, as what acts there is far from linear.
+TRIED_LARGER, FITTED = 40, 8  # starts tried at their linear size, mechanisms fitted
+# Sizes of the linear screening, in typical ones. The larger one is added if the deviation exceeds
+# GROSS sigmas (rms), since the response is then far from linear.
 PROBES, GROSS = (1.0, 5.0), 5.0
-AROUND = (0.5, 1.0, 2.0)  # times the size that the linear model promises
-# Of what is off beyond healthy cycles, in sigmas and in mbar (squares), on the cycles that it is
-# fitted to: a mechanism that leaves more is not what acts. Chosen: effects of the other world leave
-# up to a tenth of their own.
+AROUND = (0.5, 1.0, 2.0)  # times the size from the linear screening
+# Largest share of the squared deviation beyond healthy cycles, in sigmas and in mbar, that a
+# mechanism may leave on fitted cycles. Chosen: effects of the second world leave up to a tenth.
 MOST_LEFT = 0.3
-# Of what listed causes leave (mbar, squares), below which a mechanism alone takes their place.
-# Chosen: icing leaves 0.53 of what an end vacuum loss with a porous leak does that mimic it.
+# A mechanism alone replaces listed causes if it leaves less than this share of what they leave
+# (mbar², beyond healthy cycles). Chosen: icing leaves 0.53 of what end vacuum loss with a porous
+# leak leaves, which mimic it.
 DISPLACES = 0.6
-# Chi-square, by weights about each, and share of mbar (squares): by so much a mechanism must do
-# better where listed causes leave no more than healthy cycles have, and it is told from how it
-# does. Chosen: a lip that lifts is 115 better than the porous leak that mimics it, with 0.24.
+# If listed causes leave no more than healthy cycles have, a mechanism replaces them only if it is
+# better by LIKELIER in chi-square (each with its own weights) and leaves less than HALF of their
+# mbar². Chosen: a lifting lip is 115 better than the porous leak that mimics it, with 0.24.
 LIKELIER, HALF = 30.0, 0.5
-# Of the usual deviation (mbar rms), by which mechanisms must differ to be told apart. Chosen: of a
-# lip that lifts, an opening above some vacuum is 0.26 and 0.35 from seepage and an inflow above it,
-# and 0.54 to 0.6 from one that gathers; one calibration has the opening first, another the seepage.
+# Share of the usual deviation (mbar rms) by which mechanisms must differ to be told apart. Chosen
+# on a lifting lip: an opening above some vacuum is 0.26 from seepage and 0.35 from an inflow above
+# it, and 0.54 to 0.6 from one that gathers. Calibrations differ in whether opening or seepage wins.
 APART = 0.5
-# A level is passed between two rows, so that the misfit over it has steps, and a fit ends at one.
-# Typical changes of levels that are tried from there, and how often.
+# A level is crossed between two rows, so the misfit has steps over it, and a fit stops at a step.
+# Changes of levels (in typical ones) that are tried from there, and how often.
 AFAR, LEAPS = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0), 4
-# Coefficients that say the same of a plant: what flows in, and what narrows its line.
+# Groups of coefficients with the same meaning for a plant: inflows, and resistances of the line.
 ALIKE = ({c.LEAK, c.LAMINAR_LEAK, c.INFLOW}, {c.NEAR_RESISTANCE, c.RESISTANCE})
 
 
 @dataclass(frozen=True)
 class Explained:
-    """A mechanism that explains what no listed effect does, with the causes that stand beside."""
+    """A mechanism that explains what no listed effect does, with the causes beside it."""
 
     fitted: Fitted  # the causes beside it, then the mechanism
-    ends: tuple[Floats, Floats]  # 95 % interval of each of its sizes
-    rivals: tuple[Cause, ...]  # other mechanisms that the log does not tell from it
+    ends: tuple[Floats, Floats]  # low and high ends of the 95 % interval of each size
+    rivals: tuple[Cause, ...]  # other mechanisms that the log cannot tell from it
 
     @property
     def cause(self) -> Cause:
-        """The mechanism with what was found of it."""
+        """The mechanism with its fitted sizes."""
         return self.fitted.hypothesis[-1]
 
     @property
@@ -73,120 +72,130 @@ class Explained:
 
 
 def explain(
-    evidence: Evidence, fitted: Sequence[int], found: Hypothesis, progress: Progress
+    evidence: Evidence, fitted: Sequence[int], causes: Hypothesis, progress: Progress
 ) -> Explained | None:
-    """The mechanism that suits the ``fitted`` cycles best, by itself or beside what was ``found``.
+    """The best mechanism for the ``fitted`` cycles, by itself or beside the listed ``causes``.
 
-    Listed causes stand unless a mechanism alone leaves far less than they do: then they mimic it.
-    None where none explains most of what is off, beside them of what they leave.
+    Causes stand unless a mechanism alone leaves far less than they do: then they only mimic it.
+    None if no mechanism explains most of the deviation, or most of what the causes leave.
     """
-    alone = explain_alone(evidence, fitted, found, progress)
-    names = [cause.effect for cause in found]
-    if alone or not found or not has_room(evidence.theta, names, more=1):
-        return alone
-    return _explained(evidence, fitted, found, _best(evidence, fitted, found, progress))
+    by_itself = explain_alone(evidence, fitted, causes, progress)
+    names = [cause.effect for cause in causes]
+    if by_itself or not causes or not has_room(evidence.theta, names, more=1):
+        return by_itself
+    return _explained(evidence, fitted, causes, _best(evidence, fitted, causes, progress))
 
 
 def explain_alone(
-    evidence: Evidence, fitted: Sequence[int], found: Hypothesis, progress: Progress
+    evidence: Evidence, fitted: Sequence[int], causes: Hypothesis, progress: Progress
 ) -> Explained | None:
-    """The mechanism that suits best by itself; None if it does not displace what was ``found``."""
+    """The best mechanism by itself; None if it does not displace the ``causes``."""
     if not has_room(evidence.theta, (), more=1):
         return None
     progress("trying mechanisms")
     ranked = _best(evidence, fitted, HEALTHY, progress)
-    if any(is_a_course_of(evidence.theta, ranked[0].hypothesis[-1], cause) for cause in found):
+    if any(is_a_course_of(evidence.theta, ranked[0].hypothesis[-1], cause) for cause in causes):
         return None
-    alone = _explained(evidence, fitted, HEALTHY, ranked)
-    displaces = alone and (not found or _displaces(evidence, fitted, alone, found))
-    return alone if displaces else None
+    by_itself = _explained(evidence, fitted, HEALTHY, ranked)
+    displaces = by_itself and (not causes or _displaces(evidence, fitted, by_itself, causes))
+    return by_itself if displaces else None
 
 
 def is_a_course_of(theta: Theta, mechanism: Cause, cause: Cause) -> bool:
-    """Whether a mechanism is a listed cause that only comes in another way as time goes on.
+    """Whether a mechanism is a listed cause with another course in time.
 
-    It acts at all times, on what that cause acts on. What flows in is one, and so is a line.
+    It then acts at all times, on coefficients that the cause acts on. Those of a group of ALIKE
+    count as the same.
     """
-    known, effect = MECHANISMS[mechanism.effect], effect_of(cause.effect)
-    if known.when.code != ALWAYS:
+    definition, effect = MECHANISMS[mechanism.effect], effect_of(cause.effect)
+    if definition.when.code != ALWAYS:
         return False
     moved = theta.copy()
     effect.act(moved, *(p.after(1.0, theta) for p in effect.parameters))
     changed = set(np.flatnonzero(moved != theta).tolist())
-    alike = set(known.place.coefficients)
-    for some in ALIKE:
-        alike |= some if alike & some else set()
-    return not changed.isdisjoint(alike)
+    similar = set(definition.place.coefficients)
+    for group in ALIKE:
+        similar |= group if similar & group else set()
+    return not changed.isdisjoint(similar)
 
 
 def _displaces(
-    evidence: Evidence, fitted: Sequence[int], alone: Explained, found: Hypothesis
+    evidence: Evidence, fitted: Sequence[int], single: Explained, causes: Hypothesis
 ) -> bool:
-    """Whether a mechanism leaves so much less than causes that they mimic it.
+    """Whether a mechanism leaves so much less than the causes that they only mimic it.
 
-    In mbar, or where that is no more than healthy cycles have, in how likely the log is.
+    Compared in mbar; if the causes leave no more mbar than healthy cycles have, also in likelihood.
     """
-    weights, mechanism = covariance(evidence, both_ways=False).of(fitted), alone.fitted.hypothesis
-    before, after = _squares(evidence, weights, found, mechanism)
+    weights, mechanism = covariance(evidence, both_ways=False).of(fitted), single.fitted.hypothesis
+    before, after = _squares(evidence, weights, causes, mechanism)
     if before > weights.usual**2:
-        return _left_in_mbar(evidence, weights, found, mechanism) < DISPLACES
+        return _left_in_mbar(evidence, weights, causes, mechanism) < DISPLACES
     return after < HALF * before and _unlikely(evidence, fitted, mechanism) + LIKELIER < _unlikely(
-        evidence, fitted, found
+        evidence, fitted, causes
     )
 
 
 def _unlikely(evidence: Evidence, fitted: Sequence[int], hypothesis: Hypothesis) -> float:
-    """Chi-square of a hypothesis with its price, by weights about itself; wide ones cost."""
+    """Penalised chi-square of a hypothesis, with its own weights and their log-determinant."""
     weights = covariance(evidence, hypothesis).of(fitted)
-    (found,) = fit(evidence, weights, [hypothesis])
-    return found.score + weights.volume
+    (best,) = fit(evidence, weights, [hypothesis])
+    return best.score + weights.volume
 
 
 def _best(
     evidence: Evidence, fitted: Sequence[int], causes: Hypothesis, progress: Progress
 ) -> list[Fitted]:
-    """Mechanisms beside some causes, the best first: fitted with weights about what is best."""
+    """Mechanisms beside some causes, the best first, fitted with the weights of the best one."""
     weights = covariance(evidence, causes, both_ways=False).of(fitted)
     starts = _promising(evidence, weights, causes)
     progress(f"fitting {len(starts)} mechanisms")
     ranked = _ranked(fit(evidence, weights, starts, best_only=True))
-    known = covariance(evidence, ranked[0].hypothesis, both_ways=False).of(fitted)
-    again = [one.hypothesis for one in ranked if one.score < 2.0 * ranked[0].score]
-    return _ranked(_fit_with_leaps(evidence, known, again))
+    weights_about_best = covariance(evidence, ranked[0].hypothesis, both_ways=False).of(fitted)
+    hypotheses = [
+        candidate.hypothesis for candidate in ranked if candidate.score < 2.0 * ranked[0].score
+    ]
+    return _ranked(_fit_with_leaps(evidence, weights_about_best, hypotheses))
 
 
 def _fit_with_leaps(
     evidence: Evidence, weights: Weights, hypotheses: Sequence[Hypothesis]
 ) -> list[Fitted]:
-    """Fit hypotheses that end with a mechanism, again from farther off while that is better."""
-    done, going = list[Fitted](), fit(evidence, weights, hypotheses)
+    """Fit hypotheses that end with a mechanism; refit from leaps of its levels while that helps."""
+    finished, improving = list[Fitted](), fit(evidence, weights, hypotheses)
     for _ in range(LEAPS):
-        if not going:
+        if not improving:
             break
-        better = _farther_off(evidence, weights, going)
-        done += [one for one, leap in zip(going, better, strict=True) if leap is None]
-        again = fit(evidence, weights, [leap for leap in better if leap is not None])
-        before = [one for one, leap in zip(going, better, strict=True) if leap is not None]
-        going = [min(pair, key=lambda one: one.score) for pair in zip(before, again, strict=True)]
-    return done + going
+        leaps = _farther_off(evidence, weights, improving)
+        finished += [
+            candidate for candidate, leap in zip(improving, leaps, strict=True) if leap is None
+        ]
+        refitted = fit(evidence, weights, [leap for leap in leaps if leap is not None])
+        before = [
+            candidate for candidate, leap in zip(improving, leaps, strict=True) if leap is not None
+        ]
+        improving = [
+            min(pair, key=lambda candidate: candidate.score)
+            for pair in zip(before, refitted, strict=True)
+        ]
+    return finished + improving
 
 
 def _farther_off(
     evidence: Evidence, weights: Weights, fits: Sequence[Fitted]
 ) -> list[Hypothesis | None]:
-    """The best leap from each fit; None where all are worse than the fit."""
-    leaps = [list(_leaps(evidence, one.hypothesis)) for one in fits]
-    every = [leap for some in leaps for leap in some]
-    chi2 = np.sum(white(evidence, weights, every) ** 2, axis=0) if every else np.empty(0)
-    ends, found = np.cumsum([len(some) for some in leaps])[:-1], list[Hypothesis | None]()
-    for one, some, misfits in zip(fits, leaps, np.split(chi2, ends), strict=True):
-        least = int(np.argmin(misfits)) if some else 0
-        found.append(some[least] if some and misfits[least] < one.chi2 else None)
-    return found
+    """The best leap from each fit; None if no leap improves on the fit."""
+    leaps = [list(_leaps(evidence, candidate.hypothesis)) for candidate in fits]
+    all_leaps = [leap for own_leaps in leaps for leap in own_leaps]
+    chi2 = np.sum(white(evidence, weights, all_leaps) ** 2, axis=0) if all_leaps else np.empty(0)
+    ends, best = np.cumsum([len(own_leaps) for own_leaps in leaps])[:-1], list[Hypothesis | None]()
+    for candidate, own_leaps, misfits in zip(fits, leaps, np.split(chi2, ends), strict=True):
+        index = int(np.argmin(misfits)) if own_leaps else 0
+        best.append(own_leaps[index] if own_leaps and misfits[index] < candidate.chi2 else None)
+    return best
 
 
 def _leaps(evidence: Evidence, hypothesis: Hypothesis) -> Iterator[Hypothesis]:
-    """The same with the levels at which its mechanism begins and ends changed by much."""
+    """Variants of a hypothesis with one level of its mechanism changed by a step of AFAR."""
     *beside, last = hypothesis
     when = MECHANISMS[last.effect].when
     for p in when.parameters if when.code == ABOVE else ():
@@ -197,15 +206,19 @@ def _leaps(evidence: Evidence, hypothesis: Hypothesis) -> Iterator[Hypothesis]:
 
 
 def _ranked(fits: Sequence[Fitted]) -> list[Fitted]:
-    return sorted(fits, key=lambda one: one.score)
+    return sorted(fits, key=lambda candidate: candidate.score)
 
 
 def _promising(evidence: Evidence, weights: Weights, causes: Hypothesis) -> list[Hypothesis]:
-    """One start of each of the mechanisms that promise most, at its sizes."""
-    starts = [_Start(one, shape) for one in MECHANISMS.values() for shape in one.when.starts]
-    left = white(evidence, weights, [causes])[:, 0]
-    probes = PROBES if float(np.mean(left**2)) > GROSS**2 else PROBES[:1]
-    gains, sizes = _linear(evidence, weights, left, causes, starts * len(probes), probes)
+    """One start, with sizes, for each of the FITTED mechanisms with the lowest misfit."""
+    starts = [
+        _Start(mechanism, shape)
+        for mechanism in MECHANISMS.values()
+        for shape in mechanism.when.starts
+    ]
+    residuals = white(evidence, weights, [causes])[:, 0]
+    probes = PROBES if float(np.mean(residuals**2)) > GROSS**2 else PROBES[:1]
+    gains, sizes = _linear(evidence, weights, residuals, causes, starts * len(probes), probes)
     starts *= len(probes)
     order = np.argsort(-gains)[:TRIED_LARGER]
     tried = [(*causes, starts[i].cause(times * sizes[i])) for i in order for times in AROUND]
@@ -215,99 +228,110 @@ def _promising(evidence: Evidence, weights: Weights, causes: Hypothesis) -> list
         name = hypothesis[-1].effect
         if name not in best or misfit < best[name][0]:
             best[name] = float(misfit), hypothesis
-    return [one for _, one in sorted(best.values(), key=lambda some: some[0])[:FITTED]]
+    return [
+        hypothesis for _, hypothesis in sorted(best.values(), key=lambda entry: entry[0])[:FITTED]
+    ]
 
 
 @dataclass(frozen=True)
 class _Start:
-    """A mechanism with values of what is to be known beside its sizes."""
+    """A mechanism with values of its parameters other than sizes."""
 
     mechanism: Mechanism
     shape: tuple[float, ...]
 
     def cause(self, sizes: Floats) -> Cause:
-        """The same with its ``sizes``, in typical ones, kept within their bounds."""
+        """The mechanism with ``sizes`` (in typical ones), clipped to their bounds."""
         place, when = self.mechanism.place, self.mechanism.when
         values = {
-            one.name: float(np.clip(size * one.typical, one.low, one.high))
-            for one, size in zip(place.parameters, sizes, strict=True)
+            parameter.name: float(np.clip(size * parameter.typical, parameter.low, parameter.high))
+            for parameter, size in zip(place.parameters, sizes, strict=True)
         }
-        shape = zip((one.name for one in when.parameters), self.shape, strict=True)
+        shape = zip((parameter.name for parameter in when.parameters), self.shape, strict=True)
         return Cause(self.mechanism.name, values | dict(shape))
 
 
 def _linear(
     evidence: Evidence,
     weights: Weights,
-    left: Floats,
+    residuals: Floats,
     causes: Hypothesis,
     starts: Sequence[_Start],
     probes: Sequence[float],
 ) -> tuple[Floats, list[Floats]]:
-    """Chi-square that each start would gain were it linear in its sizes, and these sizes.
+    """Gain in chi-square of each start in a linear model, and its sizes there.
 
-    How it moves the pressure is a secant to so many typical sizes as its part of ``probes``.
+    The response to a size is a secant of as many typical sizes as the start's value of ``probes``.
     """
-    each = np.repeat(probes, len(starts) // len(probes))
+    start_probes = np.repeat(probes, len(starts) // len(probes))
     units = [
-        probe * np.eye(len(one.mechanism.place.parameters))
-        for one, probe in zip(starts, each, strict=True)
+        probe * np.eye(len(start.mechanism.place.parameters))
+        for start, probe in zip(starts, start_probes, strict=True)
     ]
     tried = [
-        (*causes, one.cause(unit)) for one, some in zip(starts, units, strict=True) for unit in some
+        (*causes, start.cause(unit))
+        for start, start_units in zip(starts, units, strict=True)
+        for unit in start_units
     ]
-    moves = white(evidence, weights, tried) - left[:, None]
-    ends = np.cumsum([len(some) for some in units])[:-1]
+    moves = white(evidence, weights, tried) - residuals[:, None]
+    ends = np.cumsum([len(start_units) for start_units in units])[:-1]
     gains, sizes = [], []
-    for start, probe, some in zip(starts, each, np.split(moves, ends, axis=1), strict=True):
+    for start, probe, secants in zip(
+        starts, start_probes, np.split(moves, ends, axis=1), strict=True
+    ):
         table = start.mechanism.place.parameters
-        low = np.array([one.low / one.typical for one in table]) / probe
-        high = np.array([one.high / one.typical for one in table]) / probe
-        size = lsq_linear(some, -left, (low, high)).x
+        low = np.array([parameter.low / parameter.typical for parameter in table]) / probe
+        high = np.array([parameter.high / parameter.typical for parameter in table]) / probe
+        size = lsq_linear(secants, -residuals, (low, high)).x
         sizes.append(size * probe)
-        gains.append(float(left @ left - np.sum((left + some @ size) ** 2)))
+        gains.append(float(residuals @ residuals - np.sum((residuals + secants @ size) ** 2)))
     return np.array(gains), sizes
 
 
 def _explained(
     evidence: Evidence, fitted: Sequence[int], causes: Hypothesis, ranked: Sequence[Fitted]
 ) -> Explained | None:
-    """The best mechanism beside some causes, where it takes most of what they leave."""
+    """The best mechanism beside some causes; None if it leaves more than MOST_LEFT of theirs."""
     best = ranked[0]
-    known = covariance(evidence, best.hypothesis)
-    weights = known.of(fitted)
+    best_covariance = covariance(evidence, best.hypothesis)
+    weights = best_covariance.of(fitted)
     (best,) = fit(evidence, weights, [best.hypothesis])
     before = float(np.sum(white(evidence, weights, [causes]) ** 2))
-    left = (best.chi2 - best.count) / max(before - best.count, 1.0)
-    left = max(left, _left_in_mbar(evidence, weights, causes, best.hypothesis))
-    if left > MOST_LEFT:
+    share_left = (best.chi2 - best.count) / max(before - best.count, 1.0)
+    share_left = max(share_left, _left_in_mbar(evidence, weights, causes, best.hypothesis))
+    if share_left > MOST_LEFT:
         return None
-    rivals = tuple(one.hypothesis[-1] for one in _not_told_from(evidence, weights, ranked))
+    rivals = tuple(
+        candidate.hypothesis[-1] for candidate in _not_told_from(evidence, weights, ranked)
+    )
     return Explained(best, interval(evidence, weights, best), rivals)
 
 
 def _not_told_from(
     evidence: Evidence, weights: Weights, ranked: Sequence[Fitted]
 ) -> Iterator[Fitted]:
-    """Those that suit as well as the best, or go where it goes.
+    """Fits that are about as good as the best, or nearly the same in mbar.
 
-    What differs from it by far less than the twin is off in healthy cycles (mbar) may be what acts,
-    as the order of both hangs on what the twin is off by.
+    A fit that differs from the best by far less than the healthy deviation may be the true one:
+    the twin's own error decides the order of both.
     """
-    best, *others = ranked
-    near = best.score + CHI2_999 * max(best.leftover**2, 1.0)
-    off = evidence.off([one.hypothesis for one in ranked])[weights.bins]
+    best, *rivals = ranked
+    limit = best.score + CHI2_999 * max(best.leftover**2, 1.0)
+    deviations = evidence.off([candidate.hypothesis for candidate in ranked])[weights.bins]
     count = evidence.bins.count[weights.bins]
-    apart = np.average((off - off[:, :1]) ** 2, axis=0, weights=count)
-    for one, square in zip(others, apart[1:], strict=True):
-        if one.score < near or square < (APART * weights.usual) ** 2:
-            yield one
+    apart = np.average((deviations - deviations[:, :1]) ** 2, axis=0, weights=count)
+    for candidate, square in zip(rivals, apart[1:], strict=True):
+        if candidate.score < limit or square < (APART * weights.usual) ** 2:
+            yield candidate
 
 
 def _left_in_mbar(
     evidence: Evidence, weights: Weights, causes: Hypothesis, hypothesis: Hypothesis
 ) -> float:
-    """Share of the mean square deviation of causes, beyond healthy cycles', that another leaves."""
+    """Mean square deviation of a hypothesis over that of causes, both less that of healthy cycles.
+
+    1 if the causes leave no more than healthy cycles have.
+    """
     before, after = _squares(evidence, weights, causes, hypothesis)
     usual = weights.usual**2
     return float((after - usual) / max(before - usual, 1e-9)) if before > usual else 1.0
@@ -317,6 +341,6 @@ def _squares(
     evidence: Evidence, weights: Weights, causes: Hypothesis, hypothesis: Hypothesis
 ) -> tuple[float, float]:
     """Mean square deviation (mbar²) of two hypotheses."""
-    off = evidence.off([causes, hypothesis])[weights.bins]
-    before, after = np.average(off**2, axis=0, weights=evidence.bins.count[weights.bins])
+    deviations = evidence.off([causes, hypothesis])[weights.bins]
+    before, after = np.average(deviations**2, axis=0, weights=evidence.bins.count[weights.bins])
     return float(before), float(after)

@@ -1,4 +1,4 @@
-"""The answer for people: a few lines for the terminal, and a page that can be kept and printed."""
+"""The answer as text for the terminal, and as a page that can be stored and printed."""
 
 import html
 import time
@@ -59,8 +59,8 @@ from twin.signals import BAR, MBAR, ML, SL_MIN
 
 Clock = Callable[[], int]  # UTC, ns
 
-RECORD = ("next", "next recording")  # of what is to be done: boxes of their own
-# Colour, mark and words of each verdict's banner.
+RECORD = ("next", "next recording")  # steps that get a box each
+# Colour, mark and text of each verdict's banner.
 BANNER = {
     "consistent": ("#1b6e2e", "✔", "Nothing wrong"),
     "explained": ("#a31515", "✖", "Cause found"),
@@ -81,7 +81,7 @@ def write_report(diagnosis: Diagnosis, path: Path) -> None:
 
 def _page(diagnosis: Diagnosis) -> str:
     answer, received = diagnosis.json, diagnosis.evidence.samples["host_ns"]
-    now_ns = int(received[-1]) if len(received) else 0  # a page is read when ages are others
+    now_ns = int(received[-1]) if len(received) else 0  # ages would be wrong when the page is read
     colour, mark, verdict = BANNER[answer["verdict"]]
     asset = f"{answer['asset']['type']} {answer['asset']['id']}"
     times = Times.of(answer, now_ns)
@@ -103,12 +103,12 @@ def _page(diagnosis: Diagnosis) -> str:
 
 
 def _steps(answer: Answer, times: Times) -> Iterator[str]:
-    """A card for each cause and for what is unknown, a box for what to record next."""
+    """A card for each cause and for something unlisted, boxes for signals and recordings."""
     sure = answer["verdict"] == "explained"
     for cause in answer["causes"]:
         title = spoken(cause["effect"]).capitalize()
-        known = [row for row in about(cause, times, sure=sure) if row[1] != spoken(cause["effect"])]
-        yield page.card(title, f"{effect_of(cause['effect']).sentence}.", known)
+        rows = [row for row in about(cause, times, sure=sure) if row[1] != spoken(cause["effect"])]
+        yield page.card(title, f"{effect_of(cause['effect']).sentence}.", rows)
     steps = [step for step in to_do(answer) if step[0] not in RECORD]
     if answer["verdict"] == "unlisted":
         title, text = "Something that no listed cause explains", f"Left in {left_over(answer)}."
@@ -116,8 +116,11 @@ def _steps(answer: Answer, times: Times) -> Iterator[str]:
             title, text = "What suits best, though nobody listed it", f"{mechanism['sentence']}."
             steps = [step for step in steps if step[0] != "mechanism"]
         yield page.card(title, text, steps)
-    for one in signals(answer):
-        yield page.box(f"The signal {one['signal']}", f"{one['what']}: {one['do']}.")
+    for contradiction in signals(answer):
+        yield page.box(
+            f"The signal {contradiction['signal']}",
+            f"{contradiction['what']}: {contradiction['do']}.",
+        )
     for title, text in to_do(answer):
         if title in RECORD:
             yield page.box(title.capitalize(), f"{text[:1].upper()}{text[1:]}.")
@@ -128,19 +131,19 @@ def _steps(answer: Answer, times: Times) -> Iterator[str]:
 # --- pictures -------------------------------------------------------------------------------------
 
 
-def _pictures(found: Found, times: Times) -> Iterator[str]:
-    yield _cycle_picture(found)
-    yield _log_picture(found, times)
-    yield _phases_picture(found)
-    if found.answer["unlisted"]:
-        yield _left_picture(found)
-    if found.answer["verdict"] != "consistent":
-        yield _ranking_picture(found)
+def _pictures(diagnosed: Found, times: Times) -> Iterator[str]:
+    yield _cycle_picture(diagnosed)
+    yield _log_picture(diagnosed, times)
+    yield _phases_picture(diagnosed)
+    if diagnosed.answer["unlisted"]:
+        yield _left_picture(diagnosed)
+    if diagnosed.answer["verdict"] != "consistent":
+        yield _ranking_picture(diagnosed)
 
 
-def _cycle_picture(found: Found) -> str:
-    answer, worst = found.answer, worst_cycle(found)
-    (cycle,) = found.numbers([worst])
+def _cycle_picture(diagnosed: Found) -> str:
+    answer, worst = diagnosed.answer, worst_cycle(diagnosed)
+    (cycle,) = diagnosed.numbers([worst])
     title = _verdict_in_numbers(answer)
     alt = f"{title}. Vacuum in cycle {cycle}, measured and expected, and the deviation, over time."
     caption = (
@@ -148,13 +151,13 @@ def _cycle_picture(found: Found) -> str:
         " fit, the one furthest off. The rms is over all held-out cycles. A deviation above zero is"
         " too little vacuum."
     )
-    return page.picture(title, draw_cycle(found, worst, alt), caption)
+    return page.picture(title, draw_cycle(diagnosed, worst, alt), caption)
 
 
-def _log_picture(found: Found, times: Times) -> str:
-    answer = found.answer
-    said = [f"{spoken(cause['effect'])} {when(cause, times)}" for cause in answer["causes"]]
-    title = f"Over time: {'; '.join(said) or 'no cause comes or goes'}"
+def _log_picture(diagnosed: Found, times: Times) -> str:
+    answer = diagnosed.answer
+    parts = [f"{spoken(cause['effect'])} {when(cause, times)}" for cause in answer["causes"]]
+    title = f"Over time: {'; '.join(parts) or 'no cause comes or goes'}"
     alt = f"{title}. Rms deviation of each cycle, before and after, and the size of each cause."
     caption = (
         "A filled mark is a cycle that was fitted, an empty one was held out to judge by. Cycles in"
@@ -162,42 +165,43 @@ def _log_picture(found: Found, times: Times) -> str:
     )
     if answer["causes"]:
         caption += " Below: the size of each cause with its 95 % interval; dotted: as it should be."
-    return page.picture(title, draw_log(found, alt), caption)
+    return page.picture(title, draw_log(diagnosed, alt), caption)
 
 
-def _phases_picture(found: Found) -> str:
-    laid = laid_over(found.evidence, acting(found))
-    title = _where(found, laid)
+def _phases_picture(diagnosed: Found) -> str:
+    laid = laid_over(diagnosed.evidence, acting(diagnosed))
+    title = _where(diagnosed, laid)
     alt = f"{title}. Mean deviation over the time since each phase began."
     caption = (
-        f"Mean over the cycles {some(found.numbers(laid.cycles))}: {_which(found, laid)}. A"
+        f"Mean over the cycles {some(diagnosed.numbers(laid.cycles))}: {_which(diagnosed, laid)}. A"
         " deviation above zero is too little vacuum. The band is where 95 % of such means of"
         " healthy cycles lie."
     )
-    return page.picture(title, draw_phases(found, laid, alt), caption)
+    return page.picture(title, draw_phases(diagnosed, laid, alt), caption)
 
 
-def _left_picture(found: Found) -> str:
-    laid = laid_over(found.evidence, unseen(found))
-    title = f"What no listed cause explains: {left_over(found.answer)}"
+def _left_picture(diagnosed: Found) -> str:
+    laid = laid_over(diagnosed.evidence, unseen(diagnosed))
+    title = f"What no listed cause explains: {left_over(diagnosed.answer)}"
     alt = f"{title}. Mean deviation left over time since the phase began and over vacuum."
     caption = (
-        f"The held-out cycles {some(found.numbers(laid.cycles))} laid over each other. On what it"
-        " depends, over that the dots form one curve. A deviation above zero is too little vacuum."
+        f"The held-out cycles {some(diagnosed.numbers(laid.cycles))} laid over each other. On what"
+        " it depends, over that the dots form one curve. A deviation above zero is too little"
+        " vacuum."
     )
-    if found.terms:
+    if diagnosed.terms:
         caption += " Dashed: the term that takes it away in the extended model."
-    return page.picture(title, draw_left(found, laid, alt), caption)
+    return page.picture(title, draw_left(diagnosed, laid, alt), caption)
 
 
-def _ranking_picture(found: Found) -> str:
-    title = _ranked(found.answer)
+def _ranking_picture(diagnosed: Found) -> str:
+    title = _ranked(diagnosed.answer)
     alt = f"{title}. Sigmas left by each cause that was fitted, best first."
     caption = (
         "Each cause was fitted with its own size and course. The nearer to the dashed line, the"
         " better it explains the log; a look-alike is one that this log cannot reject."
     )
-    return page.picture(title, draw_ranking(found, alt), caption)
+    return page.picture(title, draw_ranking(diagnosed, alt), caption)
 
 
 def _verdict_in_numbers(answer: Answer) -> str:
@@ -207,26 +211,28 @@ def _verdict_in_numbers(answer: Answer) -> str:
         by = "the mechanism" if mechanism_of(answer) else "a term from data"
         term = f" with {by}" if extended(answer) else ""
         return f"The twin as it stands {'fits' if fits else 'does not fit'}: {rms}{term}"
-    said = listed([sized(cause) for cause in answer["causes"]])
-    one = len(answer["causes"]) == 1
-    does = "explains" if one else "explain"
+    causes = listed([sized(cause) for cause in answer["causes"]])
+    is_single = len(answer["causes"]) == 1
+    does = "explains" if is_single else "explain"
     if answer["verdict"] != "explained":
         does += " only a part of"
-    return f"{said[:1].upper()}{said[1:]} {does} the deviation: {rms}"
+    return f"{causes[:1].upper()}{causes[1:]} {does} the deviation: {rms}"
 
 
-def _which(found: Found, laid: Laid) -> str:
+def _which(diagnosed: Found, laid: Laid) -> str:
     which = (
-        "held out from the fit" if set(laid.cycles.tolist()) <= set(found.held_out) else "fitted"
+        "held out from the fit"
+        if set(laid.cycles.tolist()) <= set(diagnosed.held_out)
+        else "fitted"
     )
-    return f"{which}, with the cause at work" if found.causes else which
+    return f"{which}, with the cause at work" if diagnosed.causes else which
 
 
-def _where(found: Found, laid: Laid) -> str:
-    if found.answer["verdict"] == "consistent":
+def _where(diagnosed: Found, laid: Laid) -> str:
+    if diagnosed.answer["verdict"] == "consistent":
         return "Every phase is as in healthy cycles"
-    kind, before, after = worst_kind(found, laid)
-    rms = f"{number(before)} → {number(after)}" if found.extended else number(before)
+    kind, before, after = worst_kind(diagnosed, laid)
+    rms = f"{number(before)} → {number(after)}" if diagnosed.extended else number(before)
     return f"The deviation is largest in {spoken(kind)}: {rms} mbar rms in the mean"
 
 
@@ -235,8 +241,8 @@ def _ranked(answer: Answer) -> str:
         return "No listed cause is worth naming"
     for cause in answer["causes"]:
         if cause["not_separable_from"]:
-            alike = listed([spoken(name) for name in cause["not_separable_from"]], "or")
-            return f"This log cannot tell {spoken(cause['effect'])} from {alike}"
+            rivals = listed([spoken(name) for name in cause["not_separable_from"]], "or")
+            return f"This log cannot tell {spoken(cause['effect'])} from {rivals}"
     name = listed([spoken(cause["effect"]) for cause in answer["causes"]])
     leave = "leaves" if len(answer["causes"]) == 1 else "leave"
     yet = "" if answer["verdict"] == "explained" else ", but more than healthy cycles have"
@@ -258,8 +264,8 @@ def _tables(answer: Answer, times: Times) -> Iterator[str]:
 
 
 def _runners_up(answer: Answer) -> Iterator[tuple[str, ...]]:
-    for one in answer["runners_up"]:
-        yield spoken(one["effect"]), one["course"], number(one["leftover_sigma"])
+    for runner_up in answer["runners_up"]:
+        yield spoken(runner_up["effect"]), runner_up["course"], number(runner_up["leftover_sigma"])
 
 
 def _parameters(answer: Answer, times: Times) -> Iterator[tuple[str, ...]]:
@@ -275,7 +281,7 @@ def _parameters(answer: Answer, times: Times) -> Iterator[tuple[str, ...]]:
 
 
 def _gain_table(answer: Answer) -> str:
-    """The figures on the held-out cycles, before and after if there is an after."""
+    """The figures on held-out cycles, before and, with an extended model, after."""
     columns, caption = {"baseline": "twin as it stands"}, "Held-out cycles"
     if extended(answer):
         columns, caption = {"baseline": "before", "extended": "after"}, "Gain on held-out cycles"
@@ -321,7 +327,7 @@ def _footer(diagnosis: Diagnosis, times: Times) -> str:
 
 
 def _data_set(theta: Theta) -> str:
-    """What the twin was calibrated to, as far as one can compare it with a nameplate."""
+    """Calibrated values that a nameplate or a setting shows."""
     volume = theta[[c.PORT_VOLUME, c.LINE_VOLUME, c.VOLUME]].sum()
     numbers = (
         ("suction capacity", theta[c.SUCTION] / SL_MIN, "sl/min"),

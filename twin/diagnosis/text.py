@@ -1,6 +1,6 @@
-"""The answer in words: what people read on the terminal, beside an alarm and on the page.
+"""The answer in words: for the terminal, beside an alarm and on the page.
 
-All of it is read from the answer as the contract has it, which may come from another process.
+The text comes from the stored form of the answer only, which may come from another process.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,12 +14,12 @@ from twin.model.courses import Course
 from twin.model.effects import effect_of
 
 Answer = Mapping[str, Any]
-MOST_LISTED = 12  # cycles named one by one
-MOST_FINER = 3  # digits more than usual, to tell the ends of an interval apart
-LONG_S = 120.0  # from here on times are said in minutes
+MOST_LISTED = 12  # cycles listed by number
+MOST_FINER = 3  # extra digits at most, to tell the ends of an interval apart
+LONG_S = 120.0  # from here on times are in minutes
 COUNTED = ("No", "One", "Two", "Three")
 
-# Key in the answer, what it is, in few words, unit.
+# Key in the answer, name, short name, unit.
 FIGURES = (
     ("rms_mbar", "rms deviation", "rms", "mbar"),
     ("max_mbar", "largest deviation", "max", "mbar"),
@@ -28,25 +28,25 @@ FIGURES = (
     ("level_rms_mbar", "rms error of the switching levels", "switching levels off by", "mbar"),
     ("leftover_sigma", "leftover (healthy: about 1)", "leftover", "sigma"),
 )
-# What of a course no cycle shows but the one that has it.
+# Properties of a course that are read from held-out cycles as well, since no other cycle has them.
 _READ_FROM_ALL = {Course.STEP: "when it began", Course.INTERMITTENT: "in which it acts"}
 
 
 @dataclass(frozen=True)
 class Times:
-    """What the onsets of an answer are, as people read them at ``now_ns`` (UTC).
+    """Turns onsets of an answer into text for a reader at ``now_ns`` (UTC).
 
-    ``log_begin_ns`` is by the clock here; None where no clock gave the times of the log. Text that
-    is kept, to be read at any time, has the date in place of an age: its ``now_ns`` is None.
+    ``log_begin_ns`` is host time; None if no clock gave the times of the log. With ``now_ns`` None
+    the text has a date instead of an age, for text that is stored and read at any time.
     """
 
-    begin_s: float  # of the log, before what was looked at
+    begin_s: float  # where in the log the diagnosed part begins
     log_begin_ns: int | None
     now_ns: int | None
 
     @classmethod
     def of(cls, answer: Answer, now_ns: int | None) -> "Times":
-        """Those of an answer."""
+        """The times of an answer."""
         cycles = answer["cycles"]
         return cls(cycles.get("begin_s", 0.0), cycles.get("log_begin_ns"), now_ns)
 
@@ -62,16 +62,19 @@ class Times:
 
 def lines(answer: Answer, now_ns: int) -> str:
     """The answer in a few lines of plain text."""
-    said = [f"{answer['verdict']}: {headline(answer, now_ns)}"]
-    said += [f"  {label:<14} {text}" for label, text in _facts(answer, now_ns)]
-    said += [f"  {one['signal']:<14} {one['what']}: {one['do']}" for one in signals(answer)]
-    return "\n".join(said)
+    rows = [f"{answer['verdict']}: {headline(answer, now_ns)}"]
+    rows += [f"  {label:<14} {text}" for label, text in _facts(answer, now_ns)]
+    rows += [
+        f"  {contradiction['signal']:<14} {contradiction['what']}: {contradiction['do']}"
+        for contradiction in signals(answer)
+    ]
+    return "\n".join(rows)
 
 
 def signals(answer: Answer) -> Sequence[Answer]:
-    """What is reported and contradicts the pressure; nearly always nothing."""
-    found: Sequence[Answer] = answer.get("signals", ())
-    return found
+    """Reported signals that contradict the pressure; nearly always none."""
+    contradictions: Sequence[Answer] = answer.get("signals", ())
+    return contradictions
 
 
 def headline(answer: Answer, now_ns: int) -> str:
@@ -79,19 +82,24 @@ def headline(answer: Answer, now_ns: int) -> str:
     causes, times = answer["causes"], Times.of(answer, now_ns)
     match answer["verdict"]:
         case "consistent":
-            left = number(answer["baseline"]["rms_mbar"])
-            return f"The ejector does what its twin expects; {left} mbar rms left over are healthy."
+            rms = number(answer["baseline"]["rms_mbar"])
+            return f"The ejector does what its twin expects; {rms} mbar rms left over are healthy."
         case "explained" if len(causes) == 1:
             (cause,) = causes
             return f"{effect_of(cause['effect']).sentence} – {size(cause)}, {when(cause, times)}."
         case "explained":
-            each = (f"{size(cause)}, {when(cause, times)}" for cause in causes)
+            sizes = (f"{size(cause)}, {when(cause, times)}" for cause in causes)
             names = (spoken(cause["effect"]) for cause in causes)
-            named = listed([f"{name} ({one})" for name, one in zip(names, each, strict=True)])
+            named = listed(
+                [
+                    f"{name} ({size_and_time})"
+                    for name, size_and_time in zip(names, sizes, strict=True)
+                ]
+            )
             return f"{COUNTED[len(causes)]} causes together: {named}."
         case "unlisted" if mechanism := mechanism_of(answer):
-            known = f"{_known(causes)} {spoken(answer['unlisted']['where'])}"
-            return f"{known}. What suits best: {_small(mechanism['sentence'])}."
+            opening = f"{_known(causes)} {spoken(answer['unlisted']['where'])}"
+            return f"{opening}. What suits best: {_small(mechanism['sentence'])}."
         case "unlisted":
             return f"{_known(causes)} {left_over(answer)}."
     return f"The log cannot answer: {answer['next_experiment']}."
@@ -106,23 +114,23 @@ def _known(causes: Sequence[Answer]) -> str:
 
 
 def mechanism_of(answer: Answer) -> Answer | None:
-    """What nobody listed, as physics; None where it is a curve or nothing is left."""
+    """The mechanism of something unlisted; None if it is a curve or nothing is left."""
     unlisted: Answer = answer["unlisted"] or {}
-    found: Answer | None = unlisted.get("mechanism")
-    return found
+    mechanism: Answer | None = unlisted.get("mechanism")
+    return mechanism
 
 
-def _mechanism(found: Answer) -> Iterator[tuple[str, str]]:
-    """What is known of a mechanism."""
-    yield "mechanism", found["sentence"]
-    yield "in the model", found["formula"]
-    yield "sizes", "; ".join(_sizes(found))
-    for other in found["not_separable_from"]:
-        yield "or it may be", other
+def _mechanism(mechanism: Answer) -> Iterator[tuple[str, str]]:
+    """Labelled lines on a mechanism."""
+    yield "mechanism", mechanism["sentence"]
+    yield "in the model", mechanism["formula"]
+    yield "sizes", "; ".join(_sizes(mechanism))
+    for rival in mechanism["not_separable_from"]:
+        yield "or it may be", rival
 
 
 def left_over(answer: Answer) -> str:
-    """Where something unknown remains, and of what shape."""
+    """Where something unlisted acts, and its shape."""
     unlisted = answer["unlisted"]
     return f"{spoken(unlisted['where'])}: {unlisted['shape']}"
 
@@ -146,7 +154,7 @@ def _facts(answer: Answer, now_ns: int) -> Iterator[tuple[str, str]]:
 
 
 def on_another_log(answer: Answer, nothing: str) -> str:
-    """How much is gained on the log of ``judged_on``; else why there is ``nothing`` to judge."""
+    """The gain on the log of ``judged_on``; without one, ``nothing`` says why."""
     judged = answer["judged_on"]
     if judged is None:
         return f"  {'another log':<14} nothing is judged on it: {nothing}"
@@ -155,23 +163,23 @@ def on_another_log(answer: Answer, nothing: str) -> str:
         f"{short} {number(before[key])} → {number(after[key])} {unit}"
         for key, _, short, unit in FIGURES
     )
-    less = f"{number(judged['gain']['rms_reduction_pct'])} % less rms deviation"
+    reduction = f"{number(judged['gain']['rms_reduction_pct'])} % less rms deviation"
     return (
         f"  {'another log':<14} {judged['log']}, {cycles} cycles on which nothing was chosen:"
-        f" {figures}\n  {'gain there':<14} {less} ({gain_interval(judged['gain'], cycles)})"
+        f" {figures}\n  {'gain there':<14} {reduction} ({gain_interval(judged['gain'], cycles)})"
     )
 
 
 def held_out_cycles(answer: Answer) -> str:
-    """The held-out cycles, and what of the causes was read from them as well."""
+    """The held-out cycles, and which properties of causes were read from them as well."""
     courses = {cause["course"] for cause in answer["causes"]}
-    read = [what for course, what in _READ_FROM_ALL.items() if str(course) in courses]
+    read = [reading for course, reading in _READ_FROM_ALL.items() if str(course) in courses]
     exception = f", but for {listed(read)}, read from all" if read else ""
     return some(answer["cycles"]["held_out"]) + exception
 
 
 def about(cause: Answer, times: Times, *, sure: bool) -> Iterator[tuple[str, str]]:
-    """What is known of one cause, and where to look for it."""
+    """Labelled lines on one cause: size, course, certainty, cost and where to look."""
     yield "cause" if sure else "a part of it", spoken(cause["effect"])
     yield "size", "; ".join(_sizes(cause))
     yield "when", when(cause, times, interval=True)
@@ -186,13 +194,13 @@ def about(cause: Answer, times: Times, *, sure: bool) -> Iterator[tuple[str, str
 
 def to_do(answer: Answer) -> Iterator[tuple[str, str]]:
     """What to find out and to record next."""
-    if found := mechanism_of(answer):
-        yield from _mechanism(found)
+    if mechanism := mechanism_of(answer):
+        yield from _mechanism(mechanism)
     if answer["verdict"] == "unlisted":
         where, depends = spoken(answer["unlisted"]["where"]), answer["unlisted"]["depends_on"]
         yield "find out", f"what in {where} differs from when the twin was calibrated"
         if depends:
-            yield "it depends on", listed([spoken(one) for one in depends])
+            yield "it depends on", listed([spoken(quantity) for quantity in depends])
     if answer["verdict"] == "insufficient":
         yield "next", "put this right, record again and diagnose the new log"
     elif answer["next_experiment"]:
@@ -203,17 +211,17 @@ def to_do(answer: Answer) -> Iterator[tuple[str, str]]:
 
 
 def sized(cause: Answer) -> str:
-    """The cause with its size, short."""
+    """Name and size of a cause."""
     return f"{spoken(cause['effect'])} ({size(cause)})"
 
 
 def size(cause: Answer) -> str:
-    """How big it is, or has become by the end of the log."""
-    known = cause["parameters"]
+    """Size of a cause; of a ramp at the end of the log."""
+    parameters = cause["parameters"]
     return ", ".join(
-        (f"{spoken(name)} " if len(known) > 1 else "")
+        (f"{spoken(name)} " if len(parameters) > 1 else "")
         + f"{number(p.get('at_end', p['value']))} {p['unit'].removesuffix('/h')}"
-        for name, p in known.items()
+        for name, p in parameters.items()
     )
 
 
@@ -227,12 +235,12 @@ def _sizes(cause: Answer) -> Iterator[str]:
 
 
 def when(cause: Answer, times: Times, *, interval: bool = False) -> str:
-    """How it runs in time; with the ``interval`` of an onset and the cycles where it is there."""
+    """When a cause acts; with ``interval`` also that of its onset, and its cycles."""
     match Course(cause["course"]):
         case Course.STEP:
             low, high = _clocks(cause["onset_low95_s"], cause["onset_high95_s"])
-            known = f" (95 %: {low} to {high})" if interval else ""
-            return f"since {times.at(cause['onset_s'])}{known}"
+            ends_text = f" (95 %: {low} to {high})" if interval else ""
+            return f"since {times.at(cause['onset_s'])}{ends_text}"
         case Course.RAMP if cause["onset_s"] > times.begin_s:
             return f"growing since {times.at(cause['onset_s'])}"
         case Course.RAMP:
@@ -243,13 +251,13 @@ def when(cause: Answer, times: Times, *, interval: bool = False) -> str:
     return _all_of_it(times, "in all of the log")
 
 
-def _all_of_it(times: Times, whole: str) -> str:
-    """How long what was there all the time has been: by a part of a log at least that long."""
-    return f"since {times.at(times.begin_s)}, or longer" if times.begin_s > 0.0 else whole
+def _all_of_it(times: Times, otherwise: str) -> str:
+    """When a cause acts that is present throughout: ``otherwise`` if the whole log is diagnosed."""
+    return f"since {times.at(times.begin_s)}, or longer" if times.begin_s > 0.0 else otherwise
 
 
 def certainty(cause: Answer) -> str:
-    """How sure it is, beside other listed causes and what nobody listed."""
+    """Probability of a cause, compared with its look-alikes and something unlisted."""
     alike = listed([tr(spoken(name)) for name in cause["not_separable_from"]], tr("or"))
     percent = f"{100.0 * cause['probability']:.0f} %"
     if not alike:
@@ -258,48 +266,48 @@ def certainty(cause: Answer) -> str:
 
 
 def cost(cause: Answer) -> str:
-    """What a cause costs a year, or that the log cannot tell; only where a price is configured."""
-    told, name = cause["cost"], spoken(cause["effect"])
-    money = Interval(**told["money_per_year"])
-    basis = f"{told['operating_hours']:g} h of operation"
-    if not told["differs_from_zero"]:
-        text = interval_text(money, told["currency"])
+    """Cost of a cause a year, or that it cannot be told from zero; needs a configured price."""
+    entry, name = cause["cost"], spoken(cause["effect"])
+    money = Interval(**entry["money_per_year"])
+    basis = f"{entry['operating_hours']:g} h of operation"
+    if not entry["differs_from_zero"]:
+        text = interval_text(money, entry["currency"])
         return f"what this {name} costs cannot be told from zero: {text}, {basis}"
     if money.value > 0.0:
-        return f"this {name} costs about {interval_text(money, told['currency'])}, {basis}"
-    less = Interval(-money.value, -money.high95, -money.low95)
-    return f"this {name} takes less air: about {interval_text(less, told['currency'])}, {basis}"
+        return f"this {name} costs about {interval_text(money, entry['currency'])}, {basis}"
+    saving = Interval(-money.value, -money.high95, -money.low95)
+    return f"this {name} takes less air: about {interval_text(saving, entry['currency'])}, {basis}"
 
 
 # --- numbers and lists ----------------------------------------------------------------------------
 
 
 def change(answer: Answer, key: str) -> str:
-    """A figure of the twin as it stands, and with the causes if there are any."""
+    """A figure of the twin as it stands, and of the extended model if there is one."""
     before, after = (number(answer[part][key]) for part in ("baseline", "extended"))
     return f"{before} → {after}" if extended(answer) else before
 
 
 def extended(answer: Answer) -> bool:
-    """Whether there is a model that is not just the twin as it stands."""
+    """Whether there is an extended model."""
     return bool(answer["causes"]) or answer["extended"] != answer["baseline"]
 
 
 def gain(answer: Answer) -> str:
-    """How much less deviation there is, and what share of what can be gained at all."""
-    known = answer["gain"]
+    """Reduction of the deviation with its interval, and its share of the achievable gain."""
+    figures = answer["gain"]
     held_out = len(answer["cycles"]["held_out"])
-    interval = gain_interval(known, held_out, "held-out cycle")
-    less = f"{number(known['rms_reduction_pct'])} % less rms deviation ({interval})"
-    return f"{less}, {number(known['share_of_achievable_pct'])} % of what can be gained"
+    interval = gain_interval(figures, held_out, "held-out cycle")
+    reduction = f"{number(figures['rms_reduction_pct'])} % less rms deviation ({interval})"
+    return f"{reduction}, {number(figures['share_of_achievable_pct'])} % of what can be gained"
 
 
-def gain_interval(known: Answer, cycles: int, cycle: str = "cycle") -> str:
-    """The interval of a gain on so many cycles, or why there is none."""
-    if known["low95"] is not None:
-        low, high = ends(known["low95"], known["high95"])
+def gain_interval(figures: Answer, cycles: int, cycle: str = "cycle") -> str:
+    """The 95 % interval of a gain on ``cycles`` cycles, or why there is none."""
+    if figures["low95"] is not None:
+        low, high = ends(figures["low95"], figures["high95"])
         return f"95 %: {low} to {high}"
-    if known["rms_reduction_pct"] == 0.0:
+    if figures["rms_reduction_pct"] == 0.0:
         return "no cause changes the pressure between switchings"
     return f"{cycles} {cycle}{'s' * (cycles != 1)} cannot tell how sure that is"
 
@@ -310,12 +318,12 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def ends(low: float, high: float) -> tuple[str, str]:
-    """Both ends of an interval, with as many digits as tell them apart."""
+    """Both ends of an interval, with enough digits to tell them apart."""
     return _apart(lambda finer: (number(low, 3 + finer), number(high, 3 + finer)))
 
 
 def clock(seconds: float, finer: int = 0) -> str:
-    """A time in the log; with ``finer`` more decimals."""
+    """A time in the log, with ``finer`` extra decimals."""
     if seconds < LONG_S:
         return f"{seconds:.{1 + finer}f} s"
     minutes, rest = divmod(round(seconds, finer), 60)
@@ -326,27 +334,27 @@ def _clocks(low: float, high: float) -> tuple[str, str]:
     return _apart(lambda finer: (clock(low, finer), clock(high, finer)))
 
 
-def _apart(spelt: Callable[[int], tuple[str, str]]) -> tuple[str, str]:
-    """The first spelling in which two values differ."""
-    every = [spelt(finer) for finer in range(MOST_FINER + 1)]
-    return next((both for both in every if both[0] != both[1]), every[-1])
+def _apart(spell: Callable[[int], tuple[str, str]]) -> tuple[str, str]:
+    """The first pair of texts that differ, with as few extra digits as possible."""
+    spellings = [spell(finer) for finer in range(MOST_FINER + 1)]
+    return next((pair for pair in spellings if pair[0] != pair[1]), spellings[-1])
 
 
 def some(cycles: Sequence[int]) -> str:
-    """Cycles by number, as many as one reads."""
+    """Numbers of cycles; shortened if they are more than MOST_LISTED."""
     if len(cycles) <= MOST_LISTED:
         return ", ".join(map(str, cycles))
     return f"{', '.join(map(str, cycles[:3]))} … {cycles[-1]} ({len(cycles)} cycles)"
 
 
 def listed(parts: Sequence[str], last: str = "and") -> str:
-    """A list as people say it."""
+    """A list in words, with ``last`` before its last part."""
     *first, end = parts or [""]
     return f"{', '.join(first)} {last} {end}" if first else end
 
 
 def spoken(name: str) -> str:
-    """A name as people say it."""
+    """A name in words."""
     return name.replace("blow_off", "blow-off").replace("_", " ")
 
 

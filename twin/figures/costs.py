@@ -1,4 +1,4 @@
-"""What compressed air costs: of cycles, a day and a year."""
+"""Cost of compressed air: of cycles, a day and a year."""
 
 import math
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ class Tariff:
     energy_kwh_m3: float  # to compress a standard m³
     per_m3: float | None  # money for a standard m³; None without a price
     currency: str
-    hours: float  # of operation a year
+    hours: float  # operating hours a year
 
     @classmethod
     def of(cls, settings: FigureSettings) -> Self:
@@ -43,34 +43,34 @@ class Tariff:
         return air / NL_PER_M3 * self.energy_kwh_m3
 
     def money(self, air: float) -> float | None:
-        """What ``air`` (Nl) costs, in the currency; None without a price."""
+        """Cost of ``air`` (Nl) in the currency; None without a price."""
         return None if self.per_m3 is None else air / NL_PER_M3 * self.per_m3
 
     def cycles_a_year(self, cycle_s: float) -> float:
-        """Cycles in a year, each ``cycle_s`` long."""
+        """Number of cycles in a year, each ``cycle_s`` long."""
         return self.hours * HOUR_S / cycle_s
 
 
 @dataclass(frozen=True)
 class Consumption:
-    """What some cycles took."""
+    """Air consumption of the cycles of a day."""
 
     name: str  # of the day
     cycles: int
     known: int  # cycles whose air is known
-    air: float  # Nl, of those
+    air: float  # Nl, of the known cycles
 
 
 @dataclass(frozen=True)
 class YearlyConsumption:
-    """What a year of cycles like those of a log takes; NaN where the log does not tell."""
+    """Consumption of a year of cycles like those of a log; NaN if the log does not tell."""
 
     cycles: float
     air: float  # Nl
 
 
 def days(cycles: Sequence[CycleFigures]) -> list[Consumption]:
-    """The cycles of each day in order, by the clock here; without one, days since the first."""
+    """Consumption of each day in order, by host time; without a set clock, days since the first."""
     first_ns = cycles[0].host_ns if cycles else 0
     return [
         _consumption(name, list(of_day))
@@ -93,7 +93,7 @@ def _consumption(name: str, cycles: Sequence[CycleFigures]) -> Consumption:
 
 
 def _day(host_ns: int, first_ns: int) -> str:
-    """The date of an instant; of a clock that was never set, the day since the first cycle."""
+    """The date of an instant; if the clock was never set, the day since the first cycle."""
     if host_ns >= CALENDAR_NS:
         return dated(host_ns)[:10]
     return f"day {1 + (host_ns - first_ns) // DAY_NS}"

@@ -1,4 +1,4 @@
-"""Costs for people, and for JSON."""
+"""Costs as text, and for JSON."""
 
 import math
 from collections.abc import Sequence
@@ -14,20 +14,20 @@ from twin.figures.costs import (
 from twin.figures.money import amount, significant
 
 
-def days_table(days: Sequence[Consumption], whole: YearlyConsumption, tariff: Tariff) -> str:
-    """A line for each day, then a year; and what is missing."""
+def days_table(days: Sequence[Consumption], yearly: YearlyConsumption, tariff: Tariff) -> str:
+    """A table with a line for each day, then a year and remarks on what is missing."""
     head = ["day", "cycles", "air (Nl)", "energy (kWh)", f"cost ({tariff.currency})"]
     rows = [_cells(day.name, day.cycles, day.air, tariff) for day in days]
     if tariff.per_m3 is None:
         head, rows = head[:-1], [row[:-1] for row in rows]
-    lines = [aligned([head, *rows]), _year_line(whole, tariff)]
+    lines = [aligned([head, *rows]), _year_line(yearly, tariff)]
     return "\n".join([*lines, *_remarks(days, tariff)])
 
 
 def days_plain(
-    days: Sequence[Consumption], whole: YearlyConsumption, tariff: Tariff
+    days: Sequence[Consumption], yearly: YearlyConsumption, tariff: Tariff
 ) -> dict[str, Any]:
-    """The same for JSON; null where it is unknown."""
+    """The same for JSON; null if unknown."""
     return {
         "currency": tariff.currency,
         "operating_hours": tariff.hours,
@@ -41,12 +41,12 @@ def days_plain(
             }
             for day in days
         ],
-        "year": {"cycles": finite(whole.cycles), **_plain(whole.air, tariff)},
+        "year": {"cycles": finite(yearly.cycles), **_plain(yearly.air, tariff)},
     }
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of cells as a table, columns flush right but for the first one."""
+    """Rows of cells as a table; all columns but the first are flush right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join(
         "  ".join(
@@ -63,21 +63,21 @@ def _cells(name: str, cycles: int, air: float, tariff: Tariff) -> list[str]:
     return [name, str(cycles), significant(air, 4), significant(tariff.energy(air)), cost]
 
 
-def _year_line(whole: YearlyConsumption, tariff: Tariff) -> str:
-    """A year in a sentence, or why it is not told."""
-    if not math.isfinite(whole.cycles):
+def _year_line(yearly: YearlyConsumption, tariff: Tariff) -> str:
+    """A year in a sentence, or why it is unknown."""
+    if not math.isfinite(yearly.cycles):
         return "a year: not told, the log has fewer than two cycles"
-    if not math.isfinite(whole.air):
+    if not math.isfinite(yearly.air):
         return (
             "a year: not told, no cycle's air is known; record pressure and commands at least"
             " every 10 ms"
         )
     texts = [
-        f"{significant(whole.cycles)} cycles",
-        f"{significant(whole.air / NL_PER_M3)} m³ of air",
-        f"{significant(tariff.energy(whole.air))} kWh",
+        f"{significant(yearly.cycles)} cycles",
+        f"{significant(yearly.air / NL_PER_M3)} m³ of air",
+        f"{significant(tariff.energy(yearly.air))} kWh",
     ]
-    if (money := tariff.money(whole.air)) is not None:
+    if (money := tariff.money(yearly.air)) is not None:
         texts.append(f"{amount(money)} {tariff.currency}")
     return f"a year of {tariff.hours:g} h at this rate: {', '.join(texts)}"
 
@@ -106,5 +106,5 @@ def _plain(air: float, tariff: Tariff) -> dict[str, float | None]:
 
 
 def finite(value: float) -> float | None:
-    """Six significant digits; None where it is unknown."""
+    """A value to six significant digits; None if it is not finite."""
     return float(f"{value:.6g}") if math.isfinite(value) else None

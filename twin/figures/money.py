@@ -1,9 +1,9 @@
-"""Amounts of money for people, and their intervals."""
+"""Amounts of money as text, and their intervals."""
 
 from typing import NamedTuple
 
-EXACT_FROM = 10.0  # of a currency: larger amounts are told without decimals
-NOTHING = 1e-9  # of a currency: smaller amounts are what calculating leaves of zero
+EXACT_FROM = 10.0  # of a currency: amounts from here on have no decimals
+NOTHING = 1e-9  # of a currency: smaller amounts are rounding errors of zero
 
 
 class Interval(NamedTuple):
@@ -15,7 +15,7 @@ class Interval(NamedTuple):
 
     @property
     def is_sure(self) -> bool:
-        """Whether it surely differs from zero."""
+        """Whether the interval excludes zero."""
         return self.low95 > 0.0 or self.high95 < 0.0
 
     def times(self, factor: float) -> "Interval":
@@ -24,9 +24,9 @@ class Interval(NamedTuple):
 
 
 def amount(money: float) -> str:
-    """An amount of money without its currency: with cents below EXACT_FROM, never just rounded off.
+    """An amount of money without its currency, with cents below EXACT_FROM.
 
-    Amounts below a tenth have two significant digits.
+    Amounts below a tenth have two significant digits, so none is rounded to zero.
     """
     if abs(money) < NOTHING:
         return "0"
@@ -36,7 +36,7 @@ def amount(money: float) -> str:
 
 
 def significant(value: float, digits: int = 3) -> str:
-    """A number with so many significant digits, without an exponent."""
+    """A number with ``digits`` significant digits, without an exponent."""
     return f"{float(f'{value:.{digits}g}'):.10g}"
 
 

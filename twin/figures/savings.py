@@ -1,6 +1,6 @@
-"""What other settings of an ejector would save: air of the log's own program, as the model has it.
+"""Air that other settings of an ejector would save, predicted by the model for the log's program.
 
-A setting is offered only where the hold stays above H2 with its uncertainty, and H1 and H2 are
+A setting is offered only if the hold stays above H2, uncertainty included, and if H1 and H2 are
 reached as before.
 """
 
@@ -25,13 +25,13 @@ from twin.monitor.healthy import Healthy
 from twin.monitor.uncertain_data import drawn
 from twin.signals import MBAR
 
-MOST_CYCLES = 12  # of a log that the model runs
-DRAWS = 24  # data sets from which an interval is told: its width is then known to a seventh
-SEED = 1  # of these draws: the same log gives the same answer
-# mbar that must stay above H2. Chosen: 1 % of a vacuum switch's range of 1 bar, as it is off by.
+MOST_CYCLES = 12  # of a log, simulated
+DRAWS = 24  # data sets for an interval: its width is then known to a seventh
+SEED = 1  # of the draws, so that the same log gives the same answer
+# mbar that the hold must stay above H2. Chosen: the error of a vacuum switch, 1 % of 1 bar.
 LEAST_MARGIN = 10.0
-# Changes of H1 and of its hysteresis (mbar) and of the supply (bar) that are tried. Where both
-# levels change alike, the nozzle goes on again at the same vacuum as before.
+# Changes of H1 and of its hysteresis (mbar) and of the supply (bar) that are tried. If H1 and
+# hysteresis change alike, the nozzle goes on again at the same vacuum as before.
 TRIED = (
     (-20.0, 0.0, 0.0),
     (-40.0, 0.0, 0.0),
@@ -61,7 +61,7 @@ class Setting:
         return cls(ejector.h1_mbar, ejector.h1_hysteresis_mbar, data.supply.pressure_bar)
 
     def act(self, theta: Theta, now: "Setting") -> Theta:
-        """Coefficients with this setting, of those with the setting there is ``now``."""
+        """Coefficients with this setting; ``theta`` has the setting ``now``."""
         drop = now.supply - self.supply
         theta = apply(theta, "supply_pressure_drop", {"drop": drop}) if drop else theta.copy()
         theta[c.H1] += (self.h1 - now.h1) * MBAR
@@ -71,11 +71,11 @@ class Setting:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What the model predicts of one setting; means over cycles where nothing else is said."""
+    """Prediction for one setting; means over cycles unless stated otherwise."""
 
     setting: Setting
     air: float  # Nl a cycle
-    saved: Interval  # Nl a cycle less than now; the interval is NaN where none is known
+    saved: Interval  # Nl a cycle less than now; the interval is NaN if unknown
     t0: float  # ms, NaN if H2 is not reached
     t1: float  # ms, NaN if H1 is not reached
     margin: Interval  # mbar that the lowest hold stays above H2
@@ -84,7 +84,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Savings:
-    """The setting there is, and what others would save."""
+    """Predictions for the present setting and for others."""
 
     now: Prediction
     others: list[Prediction]
@@ -92,22 +92,22 @@ class Savings:
 
     @property
     def offered(self) -> list[Prediction]:
-        """Those that keep H2 and the hold, the greatest saving first."""
+        """Settings that keep H2 and the hold, the greatest saving first."""
         kept = [prediction for prediction in self.others if not prediction.refused]
         return sorted(kept, key=lambda prediction: -prediction.saved.value)
 
     @property
     def refused(self) -> list[Prediction]:
-        """Those that do not."""
+        """Settings that do not."""
         return [prediction for prediction in self.others if prediction.refused]
 
 
 def savings(unit: Unit, healthy: Healthy, program: Program) -> Savings:
     """Predict what the settings of TRIED save over the commands of a program.
 
-    The uncertainty is that which ``healthy`` tells of the data set and of cycles, with what one
-    supply cannot tell of others; none is known of a unit that was not calibrated. ConfigError where
-    the program does not reach H2 as it is.
+    The uncertainty is that of the data set and of cycles in ``healthy``, and that of the response
+    to the supply. It is unknown if the unit was not calibrated. Raises ConfigError if the present
+    setting does not reach H2 in the program.
     """
     rng = np.random.default_rng(SEED)
     count = DRAWS if healthy.uncertain else 0
@@ -124,7 +124,7 @@ def savings(unit: Unit, healthy: Healthy, program: Program) -> Savings:
 
 
 def _settings(data: DataSet) -> Iterator[Setting]:
-    """The settings to try; H1 and its hysteresis change nothing where the air saving is off."""
+    """The settings to try; without air saving only the supply, as H1 then changes nothing."""
     now, saves = Setting.of(data), data.ejector.air_saving != "off"
     for h1, hysteresis, supply in TRIED:
         other = Setting(now.h1 + h1, now.hysteresis + hysteresis, now.supply + supply)
@@ -134,7 +134,7 @@ def _settings(data: DataSet) -> Iterator[Setting]:
 
 
 class _Predictor:
-    """Runs settings under a data set and under others that it may be, the same for each setting."""
+    """Runs settings with the data set and with drawn ones, the same for each setting."""
 
     def __init__(self, unit: Unit, program: Program, thetas: Sequence[Theta]) -> None:
         self._unit, self._program, self._thetas = unit, program, thetas
@@ -193,9 +193,9 @@ class _Predictor:
 
 
 def _interval(values: Floats) -> Interval:
-    """The mean of draws with a 95 % interval; without any the first value, its interval unknown.
+    """The mean of the draws with a 95 % interval; without draws the first value without one.
 
-    Draws are behind the first value, which is that of the data set itself.
+    The first value is that of the data set itself, and the draws follow it.
     """
     if len(values) == 1:
         return Interval(float(values[0]), math.nan, math.nan)

@@ -1,4 +1,4 @@
-"""Savings for people, and for JSON."""
+"""Savings as text, and for JSON."""
 
 import math
 from collections.abc import Sequence
@@ -20,42 +20,47 @@ NOT_KNOWN = (
 
 
 def savings_table(
-    found: Savings, cycles_a_year: float, tariff: Tariff, measured: Sequence[float]
+    savings: Savings, cycles_a_year: float, tariff: Tariff, measured: Sequence[float]
 ) -> str:
-    """The settings that may be chosen, the greatest saving first; why others may not; how sure.
+    """The settings on offer, the greatest saving first; why others are refused; how sure.
 
     ``measured`` are the known air consumptions (Nl) of the log's cycles.
     """
     head = ["setting", "air (Nl a cycle)", f"saves ({_unit(tariff)} a year)", "t0 (ms)", "t1 (ms)"]
     head.append("above H2 (mbar)")
-    rows = [_cells(one, cycles_a_year, tariff) for one in (found.now, *found.offered)]
+    rows = [
+        _cells(prediction, cycles_a_year, tariff) for prediction in (savings.now, *savings.offered)
+    ]
     rows[0][0], rows[0][2] = f"now: {rows[0][0]}", ""
-    refused = [f"not offered: {in_words(one.setting)}: {one.refused}" for one in found.refused]
-    remarks = [_model_error(found.now.air, measured), _basis(cycles_a_year, tariff)]
-    remarks.append(UNCERTAIN if found.is_uncertainty_known else NOT_KNOWN)
+    refused = [
+        f"not offered: {in_words(prediction.setting)}: {prediction.refused}"
+        for prediction in savings.refused
+    ]
+    remarks = [_model_error(savings.now.air, measured), _basis(cycles_a_year, tariff)]
+    remarks.append(UNCERTAIN if savings.is_uncertainty_known else NOT_KNOWN)
     remarks += [NO_PRICE] if tariff.per_m3 is None else []
     return "\n".join([aligned([head, *rows]), *refused, *remarks])
 
 
 def savings_plain(
-    found: Savings, cycles_a_year: float, tariff: Tariff, measured: Sequence[float]
+    savings: Savings, cycles_a_year: float, tariff: Tariff, measured: Sequence[float]
 ) -> dict[str, Any]:
-    """The same for JSON; null where it is unknown. Amounts are of a year, air is of a cycle."""
+    """The same for JSON; null if unknown. Amounts are a year's, air is a cycle's."""
     return {
         "currency": tariff.currency,
         "price_per_m3": tariff.per_m3,
         "operating_hours": tariff.hours,
         "cycles_per_year": finite(cycles_a_year),
         "measured_air_nl": finite(_mean(measured)),
-        "uncertainty_is_known": found.is_uncertainty_known,
-        "now": _plain(found.now, cycles_a_year, tariff),
-        "offered": [_plain(one, cycles_a_year, tariff) for one in found.offered],
-        "refused": [_plain(one, cycles_a_year, tariff) for one in found.refused],
+        "uncertainty_is_known": savings.is_uncertainty_known,
+        "now": _plain(savings.now, cycles_a_year, tariff),
+        "offered": [_plain(prediction, cycles_a_year, tariff) for prediction in savings.offered],
+        "refused": [_plain(prediction, cycles_a_year, tariff) for prediction in savings.refused],
     }
 
 
 def in_words(setting: Setting) -> str:
-    """A setting for people."""
+    """A setting as text."""
     return f"H1 {setting.h1:g}, hysteresis {setting.hysteresis:g} mbar, {setting.supply:g} bar"
 
 
@@ -64,18 +69,18 @@ def _unit(tariff: Tariff) -> str:
 
 
 def _of_a_year(air: Interval, cycles_a_year: float, tariff: Tariff) -> Interval:
-    """Air (Nl) of a cycle as money of a year; without a price as m³ of air."""
+    """Air (Nl) of a cycle as money a year; without a price as m³ of air a year."""
     return air.times(cycles_a_year / NL_PER_M3 * (tariff.per_m3 or 1.0))
 
 
-def _cells(one: Prediction, cycles_a_year: float, tariff: Tariff) -> list[str]:
+def _cells(prediction: Prediction, cycles_a_year: float, tariff: Tariff) -> list[str]:
     return [
-        in_words(one.setting),
-        f"{one.air:.3g}",
-        _with_ends(_of_a_year(one.saved, cycles_a_year, tariff)),
-        _time(one.t0),
-        _time(one.t1),
-        f"{one.margin.value:.0f}",
+        in_words(prediction.setting),
+        f"{prediction.air:.3g}",
+        _with_ends(_of_a_year(prediction.saved, cycles_a_year, tariff)),
+        _time(prediction.t0),
+        _time(prediction.t1),
+        f"{prediction.margin.value:.0f}",
     ]
 
 
@@ -91,7 +96,7 @@ def _time(milliseconds: float) -> str:
 
 
 def _model_error(air: float, measured: Sequence[float]) -> str:
-    """How far the model is off the log in the air that is there now."""
+    """The model's air with the present setting, relative to the log's own."""
     mean = _mean(measured)
     if not mean > 0.0:
         return "the log does not tell its own air: the model cannot be compared with it"
@@ -112,20 +117,20 @@ def _mean(values: Sequence[float]) -> float:
     return math.fsum(values) / len(values) if values else math.nan
 
 
-def _plain(one: Prediction, cycles_a_year: float, tariff: Tariff) -> dict[str, Any]:
+def _plain(prediction: Prediction, cycles_a_year: float, tariff: Tariff) -> dict[str, Any]:
     priced = tariff.per_m3 is not None
-    money = _of_a_year(one.saved, cycles_a_year, tariff) if priced else None
+    money = _of_a_year(prediction.saved, cycles_a_year, tariff) if priced else None
     return {
-        "h1_mbar": one.setting.h1,
-        "h1_hysteresis_mbar": one.setting.hysteresis,
-        "supply_bar": one.setting.supply,
-        "air_nl": finite(one.air),
-        "saved_nl": _interval_plain(one.saved),
+        "h1_mbar": prediction.setting.h1,
+        "h1_hysteresis_mbar": prediction.setting.hysteresis,
+        "supply_bar": prediction.setting.supply,
+        "air_nl": finite(prediction.air),
+        "saved_nl": _interval_plain(prediction.saved),
         "saved_money": None if money is None else _interval_plain(money),
-        "t0_ms": finite(one.t0),
-        "t1_ms": finite(one.t1),
-        "margin_mbar": _interval_plain(one.margin),
-        **({"why_not": one.refused} if one.refused else {}),
+        "t0_ms": finite(prediction.t0),
+        "t1_ms": finite(prediction.t1),
+        "margin_mbar": _interval_plain(prediction.margin),
+        **({"why_not": prediction.refused} if prediction.refused else {}),
     }
 
 

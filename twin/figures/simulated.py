@@ -1,6 +1,6 @@
-"""The key figures of cycles that the model runs: the commands of a log under another data set.
+"""Key figures of simulated cycles: the commands of a log with another data set.
 
-The commands stay as they were recorded. A PLC whose program waits for a vacuum would send others.
+The commands stay as recorded. A PLC whose program waits for a vacuum would send others.
 """
 
 import math
@@ -20,13 +20,13 @@ from twin.monitor.bins import Ints
 from twin.monitor.cycles import Cycle, cut
 from twin.signals import BAR, MBAR, MS, NS, SAMPLE, Phase, Samples, Ticks, joined, unbroken
 
-LONGEST_STEP = 20.0  # usual steps; a longer one is a gap in the record, and taken for a usual one
-LONGEST_PAUSE = 10.0  # median cycles; in a longer cycle production stood still
+LONGEST_STEP = 20.0  # median steps; a longer one is a gap, and is replaced by the median
+LONGEST_PAUSE = 10.0  # median cycles; a longer cycle contains a pause of production
 
 
 @dataclass(frozen=True)
 class Program:
-    """The commands of whole cycles, one after the other, with a row at least each millisecond."""
+    """The commands of consecutive whole cycles, with a row at least each millisecond."""
 
     steps: Floats  # (rows) s since the row before, not negative
     commands: Bytes  # (rows) bits of ``Command``
@@ -36,7 +36,7 @@ class Program:
     def of(cls, samples: Samples, starts: Sequence[int] | Ints) -> "Program":
         """The commands of rows (at least two) in cycles that begin at ``starts``.
 
-        Gaps, and steps from a cycle to one that did not follow it, become usual steps.
+        Gaps become median steps, and so do steps between cycles that were not consecutive.
         """
         steps = np.diff(samples["time_ns"], prepend=samples["time_ns"][0]) * NS
         usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else MS
@@ -55,23 +55,23 @@ class Program:
 
     @property
     def cycle_seconds(self) -> Floats:
-        """How long each cycle takes (s)."""
+        """Duration of each cycle (s)."""
         return np.add.reduceat(self.steps, self.starts[:-1])
 
 
 @dataclass(frozen=True)
 class SimulatedCycle:
-    """One cycle of the model: its key figures, and the vacuum that is left while it holds."""
+    """One simulated cycle: its key figures, and the lowest vacuum of its hold."""
 
     figures: Mapping[str, float]  # by name, in the figures' units; NaN if unknown
     held: float  # mbar: lowest vacuum from the first switching-off on; without one the highest
 
 
 def simulated(theta: Theta, unit: Unit, program: Program) -> list[SimulatedCycle]:
-    """The cycles of a program as the model runs them with coefficients ``theta``.
+    """Simulate the cycles of a program with coefficients ``theta``.
 
-    ``unit`` has the levels that they are judged by. The first cycle starts from rest, unlike those
-    of a running machine, and is left out if there are others.
+    ``unit`` has the levels for the key figures. The first cycle starts from rest, unlike those of a
+    running machine, and is left out if there are others.
     """
     phase, pressure = dense_solver.simulate(theta, program.steps, program.commands)
     Terms(unit.data.terms, float(theta[c.AMBIENT])).add(phase, pressure)
@@ -85,7 +85,7 @@ def simulated(theta: Theta, unit: Unit, program: Program) -> list[SimulatedCycle
 
 
 def mean_air(cycles: Sequence[SimulatedCycle]) -> float:
-    """Air (Nl) of a cycle in the mean."""
+    """Mean air (Nl) of a cycle."""
     return float(np.mean([cycle.figures["air"] for cycle in cycles]))
 
 
@@ -102,7 +102,7 @@ def mean_cycle_time(seconds: Sequence[float] | Floats) -> float:
 
 
 def whole_cycles(blocks: Iterable[tuple[Samples, Ticks]]) -> Iterator[Cycle]:
-    """The complete cycles of rows, one after the other, none in pieces."""
+    """The complete cycles of rows in order, each in one piece."""
     return (cycle for cycle in cut(unbroken(blocks), math.inf) if cycle.complete)
 
 

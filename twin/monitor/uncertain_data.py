@@ -1,4 +1,4 @@
-"""The data set of a unit as it may be: shifted by one sigma, drawn, or as cycles scatter."""
+"""Uncertainty of a unit's data set: shifted by one sigma, drawn, or scattered as cycles are."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -11,16 +11,16 @@ from twin.model.effects import apply, effect_of
 from twin.model.theta import Theta
 from twin.monitor.healthy import Healthy
 
-# How suction and end pressure follow the supply is the type's; of its value, one sigma.
+# One sigma, relative, of the type's values for how suction and end pressure follow the supply.
 SUPPLY_UNKNOWN = {"end_pressure_slope": 0.5, "curvature": 0.5, "optimum_bar": 0.03}
-OF_THE_WAY = 0.9  # to its bound, at most, an uncertain value is moved
+OF_THE_WAY = 0.9  # largest share of the way to its bound by which a value is moved
 _BOUNDS = ("ge", "gt", "le", "lt")
 
 
 def shifted(data: DataSet, healthy: Healthy) -> Iterator[tuple[Theta, Theta]]:
-    """Coefficients one sigma to either side, each way that calibration left the data set open.
+    """Coefficients one sigma to either side, for each independent uncertainty of the data set.
 
-    And each that calibration says nothing about: only one supply was ever measured.
+    Those of calibration come with those of SUPPLY_UNKNOWN, since only one supply was measured.
     """
     for key, share in SUPPLY_UNKNOWN.items():
         value = getattr(data.supply, key)
@@ -31,7 +31,7 @@ def shifted(data: DataSet, healthy: Healthy) -> Iterator[tuple[Theta, Theta]]:
 
 
 def drawn(data: DataSet, healthy: Healthy, rng: np.random.Generator) -> Theta:
-    """Coefficients drawn from all ways of ``shifted`` at once, which scatter as cycles do."""
+    """Coefficients drawn from all uncertainties of ``shifted`` at once, scattered as a cycle."""
     rows = list(healthy.uncertain.items())
     sigmas = rng.standard_normal(len(rows))
     changes = {name: float(np.dot(row, sigmas[: len(row)])) for name, row in rows}
@@ -42,10 +42,10 @@ def drawn(data: DataSet, healthy: Healthy, rng: np.random.Generator) -> Theta:
 
 
 def scattered(theta: Theta, healthy: Healthy, rng: np.random.Generator) -> Theta:
-    """Coefficients of one cycle, drawn from how healthy ones scatter.
+    """Coefficients of one cycle, drawn from the scatter of healthy cycles.
 
-    Effects have one sign only. Here they act either way, in proportion to their coefficients, and
-    none of these gets negative that is not so already.
+    Effects have one sign only. Here they act in both directions, linearly in the coefficients. No
+    coefficient turns negative.
     """
     for name, sigma in healthy.scatter.items():
         parameter = effect_of(name).parameters[0]
@@ -56,13 +56,13 @@ def scattered(theta: Theta, healthy: Healthy, rng: np.random.Generator) -> Theta
 
 
 def _both_sides(data: DataSet, changes: Mapping[str, float]) -> tuple[Theta, Theta]:
-    """Coefficients with values (``table.key``) changed by so much, and by as much less."""
+    """Coefficients with values (``table.key``) changed by ``changes``, and by their negatives."""
     up, down = (_changed(data, changes, sign) for sign in (1.0, -1.0))
     return coefficients(up), coefficients(down)
 
 
 def _changed(data: DataSet, changes: Mapping[str, float], sign: float) -> DataSet:
-    """A data set, unchecked as a whole: it need be no ejector. Each value keeps to its bounds."""
+    """A changed data set; each value keeps its bounds, but the whole is not validated."""
     for name, change in changes.items():
         table, key = name.split(".")
         part = getattr(data, table)
@@ -72,9 +72,11 @@ def _changed(data: DataSet, changes: Mapping[str, float], sign: float) -> DataSe
 
 
 def _within(field_info: FieldInfo, value: float, change: float) -> float:
-    """A value changed, but at most by OF_THE_WAY to a bound: no flow or volume is negative."""
-    bounds = (getattr(one, name, None) for one in field_info.metadata for name in _BOUNDS)
-    for bound in (one for one in bounds if one is not None):
+    """The changed value, at most OF_THE_WAY towards a bound: no flow or volume turns negative."""
+    bounds = (
+        getattr(constraint, name, None) for constraint in field_info.metadata for name in _BOUNDS
+    )
+    for bound in (limit for limit in bounds if limit is not None):
         if (bound - value) * change > 0.0:
             change = math.copysign(min(abs(change), OF_THE_WAY * abs(bound - value)), change)
     return value + change
