@@ -5,13 +5,12 @@
         [--rigs 60] [--cadences 1 2 5 10] [--records 6] [--write docs/battery.md]
 
 The first world is the rig behind the simulated PLC, calibrated from its type's data. The second
-one (tests/second_world) shares no equation with the model: each drawn rig is commissioned from a
-record and what a person reads off it, then effects are hidden in further records.
+one (tests/second_world) shares no equation with the model. Each drawn rig is commissioned from a
+record and from what a person reads off it. Then effects are hidden in further records.
 
-Without --first the seeds are some that nobody has looked at. With --cases each case is kept in
-FILE as soon as it is answered, and a run that was cut goes on where it ended. Prints a line for
-each case and the tables, which --write puts into the page; exits with 1 where a figure is below
-what is asked for.
+Without --first the first seed is drawn at random. With --cases each case is stored in FILE as soon
+as it is answered, and an interrupted run resumes. Prints a line for each case, and the tables.
+--write puts the tables into the page. Exits with 1 if a figure misses its target.
 """
 
 import argparse
@@ -27,14 +26,14 @@ from tools.battery_cases import Case, CaseFile, first_of
 from tools.battery_page import all_kept, summary, tables, with_run
 from tools.version import commit
 
-SEEDS = 1_000_000  # among which a run that is given none begins
+SEEDS = 1_000_000  # without --first, the first seed is drawn below this
 WORLDS = (battery_first.NAME, battery_second.NAME)
 
 
 def first_world(
     file: CaseFile, first: int, counts: Mapping[str, int], units: int
 ) -> Iterator[Case]:
-    """Each case of the first world, answered now unless it is kept already."""
+    """Each case of the first world; it is diagnosed unless the file has its answer."""
     for kind, seed in battery_first.keys(first, counts):
         case = file.get(battery_first.NAME, (kind, seed, 0))
         yield case or file.add(battery_first.NAME, battery_first.answered(kind, seed, units))
@@ -43,34 +42,37 @@ def first_world(
 def second_world(
     file: CaseFile, seeds: range, cadences: Sequence[int], records: int
 ) -> Iterator[Case]:
-    """Each case of the second world: rig after rig, and ``records`` more if it was commissioned."""
+    """Each case of the second world: of each rig its commissioning, then up to ``records`` more.
+
+    A rig that is not commissioned has no more cases.
+    """
     name = battery_second.NAME
     for seed in seeds:
-        met = battery_second.drawn(seed, cadences)
-        if met is None:
+        drawn = battery_second.drawn(seed, cadences)
+        if drawn is None:
             continue
-        kept = file.get(name, ("commissioning", seed, 0))
-        begun = kept or file.add(name, battery_second.commissioned(met))
-        yield begun
-        unit = battery_second.with_unit(met, begun)
-        for kind, number, hidden in islice(battery_second.cases(met), records if unit else 0):
+        answered = file.get(name, ("commissioning", seed, 0))
+        commissioning = answered or file.add(name, battery_second.commissioned(drawn))
+        yield commissioning
+        unit = battery_second.with_unit(drawn, commissioning)
+        for kind, number, hidden in islice(battery_second.cases(drawn), records if unit else 0):
             case = file.get(name, (kind, seed, number))
             yield case or file.add(name, battery_second.diagnosed(unit, kind, number, hidden))
 
 
 def line(case: Case) -> str:
-    """A case for people."""
+    """A case as one line of text."""
     hidden = " + ".join(map(str, case.hidden)) or "healthy"
-    told = case.error.strip().splitlines()[-1] if case.error else f"{case.verdict} {case.named}"
+    answer = case.error.strip().splitlines()[-1] if case.error else f"{case.verdict} {case.named}"
     outcome = "ok" if case.found else "MISSED"
     return (
-        f"{outcome:<7}{case.kind} {case.seed} {case.system}: {hidden} -> {told}"
+        f"{outcome:<7}{case.kind} {case.seed} {case.system}: {hidden} -> {answer}"
         f" ({case.seconds:.0f} s)"
     )
 
 
 def main() -> int:
-    """Run the battery; give its exit code."""
+    """Run the battery; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--world", choices=("both", *WORLDS), default="both")
     parser.add_argument("--first", type=int, help="seed of the first case of each kind")
@@ -93,34 +95,35 @@ def main() -> int:
         "--records", type=int, default=battery_second.RECORDS, help="after a commissioning there"
     )
     parser.add_argument("--write", type=Path, metavar="FILE", help="page whose tables to replace")
-    asked = parser.parse_args()
-    first = first_of(asked.cases) if asked.first is None else asked.first
+    arguments = parser.parse_args()
+    first = first_of(arguments.cases) if arguments.first is None else arguments.first
     first = secrets.randbelow(SEEDS) if first is None else first
-    when, measured = time.strftime("%Y-%m-%d"), commit()  # others may commit while it runs
-    file = CaseFile(asked.cases, {"first": first, "commit": measured})
-    counts = {kind: getattr(asked, kind) for kind in battery_first.COUNTS}
+    when, measured = time.strftime("%Y-%m-%d"), commit()  # before the run, which takes long
+    file = CaseFile(arguments.cases, {"first": first, "commit": measured})
+    counts = {kind: getattr(arguments, kind) for kind in battery_first.COUNTS}
     runs = {
-        battery_first.NAME: first_world(file, first, counts, asked.units),
+        battery_first.NAME: first_world(file, first, counts, arguments.units),
         battery_second.NAME: second_world(
-            file, range(first, first + asked.rigs), asked.cadences, asked.records
+            file, range(first, first + arguments.rigs), arguments.cadences, arguments.records
         ),
     }
     reached = True
-    for world in WORLDS if asked.world == "both" else (asked.world,):
-        found = []
+    for world in WORLDS if arguments.world == "both" else (arguments.world,):
+        cases = []
         for case in runs[world]:
-            found.append(case)
+            cases.append(case)
             print(line(case), flush=True)
-        if not found:
+        if not cases:
             continue
-        reached &= all_kept(found)
-        head, run = summary(world, found, when, measured), tables(found)
+        reached &= all_kept(cases)
+        head, run = summary(world, cases, when, measured), tables(cases)
         print(f"\n{head}\n\n{run}\n")
-        if asked.write is not None:
-            page = asked.write.read_text(encoding="utf-8")
-            asked.write.write_text(with_run(page, world, head, run), encoding="utf-8")
-    if asked.write is not None and asked.cases is not None:
-        asked.cases.rename(asked.cases.with_stem(f"{asked.cases.stem}-{first}"))  # it is done
+        if arguments.write is not None:
+            page = arguments.write.read_text(encoding="utf-8")
+            arguments.write.write_text(with_run(page, world, head, run), encoding="utf-8")
+    if arguments.write is not None and arguments.cases is not None:
+        # The run is complete, so its file must not be resumed.
+        arguments.cases.rename(arguments.cases.with_stem(f"{arguments.cases.stem}-{first}"))
     return 0 if reached else 1
 
 

@@ -1,7 +1,7 @@
 """Cases of the first world: the rigs behind the simulated PLC, about the shipped configurations.
 
-Each case has a rig of its own (true values about those of a shipped configuration), calibrated on a
-healthy record of its own; then effect, course and size are drawn.
+Each case has a rig with true values about those of a shipped configuration. It is calibrated on its
+own healthy record. Then effect, course and size are drawn.
 """
 
 import math
@@ -24,8 +24,8 @@ from twin.signals import MS, Samples
 
 NAME = "first"
 CYCLES = 12
-# Sizes from just isolable to gross, in the unit of the effect's parameter; drawn evenly in their
-# logarithm. The gripper's volume is a sixth of the tank's, its wall takes up less heat.
+# Sizes from just isolable to gross, in the unit of the effect's parameter, drawn log-uniformly.
+# The gripper's volume is a sixth of the tank's, and its wall takes up less heat.
 SIZES = {
     "leakage": (0.4, 8.0),
     "porous_leakage": (0.4, 6.0),
@@ -76,29 +76,29 @@ class Unit:
 
 @cache
 def unit(name: str, seed: int) -> Unit:
-    """A rig with true values of its own, calibrated on its own healthy record."""
+    """A rig with drawn true values, calibrated on its own healthy record."""
     document = shipped(name)
     plc, config = drawn(rig_of(document), 1000 + seed), as_type(document)
-    found = calibrate(config, [recorded(plc, 10, 5000 + seed)], _quiet)
-    monitor = config.monitor.model_copy(update={"healthy": found.healthy})
-    return Unit(name, plc, replace(config, data=found.fitted.data, monitor=monitor))
+    calibrated = calibrate(config, [recorded(plc, 10, 5000 + seed)], _quiet)
+    monitor = config.monitor.model_copy(update={"healthy": calibrated.healthy})
+    return Unit(name, plc, replace(config, data=calibrated.fitted.data, monitor=monitor))
 
 
 def _quiet(_what: str) -> None:
-    """Take progress and say nothing."""
+    """Ignore progress."""
 
 
 def draw_size(rng: np.random.Generator, name: str, effect: str, least: float = 0.0) -> float:
-    """Size of an effect on a system; ``least`` is the share of its range to begin at."""
+    """A drawn size of an effect on a system; ``least`` is the share of its range to start from."""
     table = {**SIZES, **(ON_GRIPPER if name == "gripper" else {}), **UNLISTED}
-    low, high = (math.log(one) for one in table[effect])
+    low, high = (math.log(end) for end in table[effect])
     size = math.exp(rng.uniform(low + least * (high - low), high))
     down = effect in NEGATIVE or (effect in SIGNED and rng.random() < 0.5)
     return -size if down else size
 
 
 def fault(rng: np.random.Generator, plc: PlcSettings, hidden: Hidden) -> Fault:
-    """The rig's fault for what is hidden; when and in which cycles is drawn."""
+    """The rig's fault for a hidden effect; its onset or its cycles are drawn."""
     program = plc.program
     cycle = (program.suction_ms + program.blow_off_ms + program.idle_ms) * MS
     text = f"{hidden.effect}={hidden.size:.4f}"
@@ -114,37 +114,37 @@ def fault(rng: np.random.Generator, plc: PlcSettings, hidden: Hidden) -> Fault:
 def drawn_case(
     kind: str, seed: int, units: int, first_unit: int = 0
 ) -> tuple[Unit, list[Hidden], Samples]:
-    """One of the units from the first one on, what is hidden, and the log."""
+    """One of ``units`` rigs from ``first_unit`` on, the hidden effects, and the log."""
     rng = np.random.default_rng([2026, seed, sorted(COUNTS).index(kind)])
     name = SYSTEMS[int(rng.integers(len(SYSTEMS)))]
-    one = unit(name, first_unit + int(rng.integers(units)))
+    rig = unit(name, first_unit + int(rng.integers(units)))
     hidden: list[Hidden] = []
     if kind == "single":
         effect = list(SIZES)[seed % len(SIZES)]
         course = str(rng.choice(list(COURSES), p=list(COURSES.values())))
         hidden = [Hidden(effect, course, draw_size(rng, name, effect))]
     elif kind == "pair":
-        two = rng.choice(list(SIZES), 2, replace=False)
-        hidden = [Hidden(str(e), "constant", draw_size(rng, name, str(e), 0.4)) for e in two]
+        effects = rng.choice(list(SIZES), 2, replace=False)
+        hidden = [Hidden(str(e), "constant", draw_size(rng, name, str(e), 0.4)) for e in effects]
     elif kind == "unlisted":
         effect = list(UNLISTED)[seed % len(UNLISTED)]
         hidden = [Hidden(effect, "constant", draw_size(rng, name, effect))]
-    faults = [fault(rng, one.plc, what) for what in hidden]
-    return one, hidden, recorded(one.plc, CYCLES - 1, int(rng.integers(1 << 30)), faults)
+    faults = [fault(rng, rig.plc, entry) for entry in hidden]
+    return rig, hidden, recorded(rig.plc, CYCLES - 1, int(rng.integers(1 << 30)), faults)
 
 
 def answered(kind: str, seed: int, units: int) -> Case:
     """Draw a case of a kind and diagnose it."""
-    one, hidden, samples = drawn_case(kind, seed, units)
+    rig, hidden, samples = drawn_case(kind, seed, units)
     begin, answer, error = time.process_time(), None, ""
     try:
-        answer = diagnose(one.config, [samples], "battery", _quiet).json
+        answer = diagnose(rig.config, [samples], "battery", _quiet).json
     except TwinError as refusal:
         error = str(refusal)
-    spent = round(time.process_time() - begin, 2)
-    return Case(kind, seed, one.name, hidden, answer, error=error, seconds=spent)
+    seconds = round(time.process_time() - begin, 2)
+    return Case(kind, seed, rig.name, hidden, answer, error=error, seconds=seconds)
 
 
 def keys(first: int, counts: dict[str, int]) -> Iterator[tuple[str, int]]:
     """Kind and seed of each case of a run."""
-    return ((kind, seed) for kind, many in counts.items() for seed in range(first, first + many))
+    return ((kind, seed) for kind, count in counts.items() for seed in range(first, first + count))

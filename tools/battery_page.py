@@ -1,4 +1,4 @@
-"""What the battery writes: tables of its newest run in each world, a line for each older one."""
+"""The battery's page: tables of the newest run in each world, a line for each older run."""
 
 import re
 from collections import Counter
@@ -12,14 +12,14 @@ from scipy.stats import binomtest, kstest
 
 from tools.battery_cases import FOUND, MOST_LEFT, SURE, Case, of_kind, spread
 
-MORE = 3  # kinds of answer told of an effect that was not named first
-WHOLE = ("gain",)  # each a share already
+MORE = 3  # most answers listed for an effect that was not named first
+WHOLE = ("gain",)  # targets whose outcomes are shares
 WORST = "the worst phase"
-STATED = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 1.01)  # probabilities that are counted together
+STATED = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 1.01)  # bounds of the groups of probabilities
 
 
 class Asked(NamedTuple):
-    """What is asked for: in words, and the least share; the most for what must not be."""
+    """A target in words, with the least share; with the largest share if ``most``."""
 
     words: str
     share: float
@@ -49,33 +49,33 @@ ASKED = {
 
 
 def kept(cases: Sequence[Case], name: str) -> bool:
-    """Whether what is asked for is reached."""
-    share, asked = float(np.mean(spread(cases, name))), ASKED[name]
-    return share <= asked.share if asked.most else share >= asked.share
+    """Whether a target is reached."""
+    share, target = float(np.mean(spread(cases, name))), ASKED[name]
+    return share <= target.share if target.most else share >= target.share
 
 
 def all_kept(cases: Sequence[Case]) -> bool:
-    """Whether all that is asked for is reached."""
+    """Whether all targets that have outcomes are reached."""
     return all(kept(cases, name) for name in ASKED if spread(cases, name))
 
 
 def likely(cases: Sequence[Case], name: str) -> float:
-    """How likely so bad a count is by chance where what is asked for holds just so."""
-    outcomes, asked = spread(cases, name), ASKED[name]
-    side = "greater" if asked.most else "less"
-    return float(binomtest(round(sum(outcomes)), len(outcomes), asked.share, side).pvalue)
+    """Probability of a count at least this bad if the true share equals the target."""
+    outcomes, target = spread(cases, name), ASKED[name]
+    side = "greater" if target.most else "less"
+    return float(binomtest(round(sum(outcomes)), len(outcomes), target.share, side).pvalue)
 
 
 def summary(world: str, cases: Sequence[Case], when: str, commit: str) -> str:
-    """The run in one line: when, of which commit, on which seeds, and what was found."""
-    seeds = [one.seed for one in cases]
-    found = []
+    """The run in one line: date, commit, seeds, and how many answers of each kind were right."""
+    seeds = [case.seed for case in cases]
+    counts = []
     for kind, name in FOUND.items():
         if outcomes := spread(cases, name):
-            found.append(f"{sum(outcomes):.0f} of {len(outcomes)} {_PLURAL.get(kind, kind)}")
+            counts.append(f"{sum(outcomes):.0f} of {len(outcomes)} {_PLURAL.get(kind, kind)}")
     return (
         f"{when}, {world} world, commit {commit}, seeds {min(seeds)} to {max(seeds)}:"
-        f" found {', '.join(found)}."
+        f" found {', '.join(counts)}."
     )
 
 
@@ -83,7 +83,7 @@ _PLURAL = {"commissioning": "commissioned"}
 
 
 def tables(cases: Sequence[Case]) -> str:
-    """What was reached, what was named for what, and what was not found, in Markdown."""
+    """Targets reached, names given for each effect, and missed cases, in Markdown."""
     parts = [
         table(("what", "reached", "by chance", "asked for", "kept"), _figures(cases)),
         *commissionings(list(of_kind(cases, "commissioning"))),
@@ -101,7 +101,7 @@ def tables(cases: Sequence[Case]) -> str:
         ),
         table(
             ("not found", "seed", "system", "hidden", "verdict", "named", "sigmas left"),
-            _missed([one for one in cases if not one.found and one.kind != "commissioning"]),
+            _missed([case for case in cases if not case.found and case.kind != "commissioning"]),
         ),
         *reliability(cases),
         table(("processor time of", "cases", "median", "95 %", "most"), _seconds(cases)),
@@ -110,9 +110,9 @@ def tables(cases: Sequence[Case]) -> str:
 
 
 def reliability(cases: Sequence[Case]) -> Iterator[str]:
-    """How often causes act that were stated with some probability; how far that is off in all."""
-    yield from by_probability([each for one in cases for each in one.stated])
-    ranks = [one.rank for one in cases if one.rank is not None]
+    """How often stated causes act, by probability, and whether sizes scatter as stated."""
+    yield from by_probability([statement for case in cases for statement in case.stated])
+    ranks = [case.rank for case in cases if case.rank is not None]
     if ranks:
         test = kstest(ranks, "uniform")
         yield (
@@ -123,42 +123,42 @@ def reliability(cases: Sequence[Case]) -> Iterator[str]:
 
 
 def by_probability(stated: Sequence[tuple[float, bool]]) -> Iterator[str]:
-    """The table of probabilities stated and how often they are right, and the mean error."""
+    """A table of stated probabilities and how often they are right, then the mean error."""
     rows = list[Sequence[str]]()
-    for low, high, here in _by_probability(stated):
-        said, acts = here.mean(axis=0)
-        ends = binomtest(int(here[:, 1].sum()), len(here)).proportion_ci(0.95)
+    for low, high, group in _by_probability(stated):
+        mean, acts = group.mean(axis=0)
+        ends = binomtest(int(group[:, 1].sum()), len(group)).proportion_ci(0.95)
         chance = f"{ends.low:.0%} to {ends.high:.0%}"
-        said_of = f"{low:.0%} to {min(high, 1.0):.0%}"
-        rows.append((said_of, str(len(here)), f"{said:.1%}", f"{acts:.1%}", chance))
+        bounds = f"{low:.0%} to {min(high, 1.0):.0%}"
+        rows.append((bounds, str(len(group)), f"{mean:.1%}", f"{acts:.1%}", chance))
     if rows:
         yield table(("probability stated", "causes", "mean", "act", "by chance"), iter(rows))
-        off = calibration_error(stated)
-        yield f"Expected calibration error: {off:.3f}, over {len(stated)} causes."
+        error = calibration_error(stated)
+        yield f"Expected calibration error: {error:.3f}, over {len(stated)} causes."
 
 
 def calibration_error(stated: Sequence[tuple[float, bool]]) -> float:
-    """By how much causes act more or less often than stated, mean over all; NaN without any."""
-    groups = [here for _, _, here in _by_probability(stated)]
+    """Mean difference between stated probability and observed share; NaN without statements."""
+    groups = [group for _, _, group in _by_probability(stated)]
     if not groups:
         return float("nan")
-    off = [abs(float(np.diff(here.mean(axis=0))[0])) for here in groups]
-    return float(np.average(off, weights=[len(here) for here in groups]))
+    errors = [abs(float(np.diff(group.mean(axis=0))[0])) for group in groups]
+    return float(np.average(errors, weights=[len(group) for group in groups]))
 
 
 def _by_probability(
     stated: Sequence[tuple[float, bool]],
 ) -> Iterator[tuple[float, float, npt.NDArray[np.float64]]]:
-    """Causes stated with a probability from a bound to the next: probability, and 1 if it acts."""
+    """Both bounds of each group of STATED, and its causes: probability, and 1 if it acts."""
     pairs = np.array(stated, np.float64).reshape(-1, 2)
     for low, high in pairwise(STATED):
-        here = pairs[(pairs[:, 0] >= low) & (pairs[:, 0] < high)]
-        if len(here):
-            yield low, high, here
+        group = pairs[(pairs[:, 0] >= low) & (pairs[:, 0] < high)]
+        if len(group):
+            yield low, high, group
 
 
 def commissionings(cases: Sequence[Case]) -> Iterator[str]:
-    """Verdicts by kind of rig, what is left by phase, parameters, and reasons of refusals."""
+    """Verdicts by kind of rig, residuals by phase, parameters, and reasons of refusals."""
     yield table(("rigs", "drawn", "good", "usable", "refused", "error"), _verdicts(cases))
     yield table(("left over floor", "rigs", "median", "90 %", "most"), _phases(cases))
     yield table(
@@ -169,7 +169,7 @@ def commissionings(cases: Sequence[Case]) -> Iterator[str]:
 
 
 def with_run(page: str, world: str, line: str, run: str) -> str:
-    """The page with a world's new run; the line of the one that it replaces goes to the older."""
+    """The page with a world's new run; the line of the run it replaces moves to the older runs."""
     newest, older = marked(f"newest run of the {world} world", page), marked("older runs", page)
     before = newest[2].strip().split("\n", 1)[0].strip("*")
     if before:
@@ -178,15 +178,15 @@ def with_run(page: str, world: str, line: str, run: str) -> str:
 
 
 def marked(name: str, page: str) -> re.Match[str]:
-    """The part of a page of some name: the mark it begins with, what it holds, its end."""
-    found = re.search(rf"(<!-- {name}: [^\n]*-->\n)(.*?)(<!-- end -->)", page, re.DOTALL)
-    if found is None:
+    """The named part of a page as groups: opening mark, content, closing mark."""
+    match = re.search(rf"(<!-- {name}: [^\n]*-->\n)(.*?)(<!-- end -->)", page, re.DOTALL)
+    if match is None:
         raise ValueError(f'the page has no part between "<!-- {name}: … -->" and "<!-- end -->"')
-    return found
+    return match
 
 
 def _figures(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
-    for name, asked in ASKED.items():
+    for name, target in ASKED.items():
         if outcomes := spread(cases, name):
             count, share = len(outcomes), f"{np.mean(outcomes):.0%}"
             reached, chance = share, "–"
@@ -194,59 +194,64 @@ def _figures(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
                 reached = f"{sum(outcomes):.0f} of {count} ({share})"
                 ends = binomtest(round(sum(outcomes)), count).proportion_ci(0.95)
                 chance = f"{ends.low:.0%} to {ends.high:.0%}"
-            word = "at most" if asked.most else "at least"
+            word = "at most" if target.most else "at least"
             yes = "yes" if kept(cases, name) else "**no**"
-            yield asked.words, reached, chance, f"{word} {asked.share:.0%}", yes
+            yield target.words, reached, chance, f"{word} {target.share:.0%}", yes
 
 
 def _verdicts(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
     names = ("good", "usable", "refused", "error")
-    for system in [*dict.fromkeys(sorted(one.system for one in cases)), ""]:
-        mine = [one for one in cases if one.system == system or not system]
-        counts = Counter(one.verdict for one in mine)
-        if mine:
-            yield system or "all", str(len(mine)), *(str(counts[name] or "–") for name in names)
+    for system in [*dict.fromkeys(sorted(case.system for case in cases)), ""]:
+        selected = [case for case in cases if case.system == system or not system]
+        counts = Counter(case.verdict for case in selected)
+        if selected:
+            yield system or "all", str(len(selected)), *(str(counts[name] or "–") for name in names)
 
 
 def _phases(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
-    left: dict[str, list[float]] = {}
-    for one in cases:
-        residuals = one.answer["residual"] if one.answer else {}
-        times = {phase: each["times"] for phase, each in residuals.items()}
-        for phase, each in times.items():
-            left.setdefault(phase, []).append(each)
+    ratios: dict[str, list[float]] = {}
+    for case in cases:
+        residuals = case.answer["residual"] if case.answer else {}
+        times = {phase: residual["times"] for phase, residual in residuals.items()}
+        for phase, ratio in times.items():
+            ratios.setdefault(phase, []).append(ratio)
         if times:
-            left.setdefault(WORST, []).append(max(times.values()))
-    for phase in [name for name in left if name != WORST] + [WORST] * (WORST in left):
-        yield phase, str(len(left[phase])), *_quantiles(left[phase], "{:.2f}")
+            ratios.setdefault(WORST, []).append(max(times.values()))
+    for phase in [name for name in ratios if name != WORST] + [WORST] * (WORST in ratios):
+        yield phase, str(len(ratios[phase])), *_quantiles(ratios[phase], "{:.2f}")
 
 
 def _quantiles(values: Sequence[float], form: str) -> Iterator[str]:
-    return (form.format(one) for one in (*np.quantile(values, (0.5, 0.9)), max(values)))
+    return (form.format(value) for value in (*np.quantile(values, (0.5, 0.9)), max(values)))
 
 
 def _parameters(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
-    found: dict[str, list[Mapping[str, float]]] = {}
-    for one in cases:
-        if one.found and one.answer is not None:
-            for name, each in one.answer["covered"].items():
-                found.setdefault(name, []).append(each)
-    for name, rigs in found.items():
-        held = sum(one["holds"] for one in rigs)
-        off = np.median([abs(one["value"] / one["true"] - 1.0) for one in rigs])
-        half = np.median([(one["high95"] - one["low95"]) / 2.0 / abs(one["value"]) for one in rigs])
-        yield f"`{name}`", str(len(rigs)), str(held), f"{off:.0%}", f"±{half:.0%}"
+    by_name: dict[str, list[Mapping[str, float]]] = {}
+    for case in cases:
+        if case.found and case.answer is not None:
+            for name, parameter in case.answer["covered"].items():
+                by_name.setdefault(name, []).append(parameter)
+    for name, rigs in by_name.items():
+        held = sum(parameter["holds"] for parameter in rigs)
+        error = np.median([abs(parameter["value"] / parameter["true"] - 1.0) for parameter in rigs])
+        half = np.median(
+            [
+                (parameter["high95"] - parameter["low95"]) / 2.0 / abs(parameter["value"])
+                for parameter in rigs
+            ]
+        )
+        yield f"`{name}`", str(len(rigs)), str(held), f"{error:.0%}", f"±{half:.0%}"
 
 
 def _reasons(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
-    for reason, mine in _grouped(cases, _reason):
-        true = {one.outcomes.get("true") for one in mine}
+    for reason, group in _grouped(cases, _reason):
+        true = {case.outcomes.get("true") for case in group}
         word = "yes" if true == {True} else "**no**" if true == {False} else "some"
-        yield reason, str(len(mine)), word, ", ".join(str(one.seed) for one in mine)
+        yield reason, str(len(group)), word, ", ".join(str(case.seed) for case in group)
 
 
 def _reason(case: Case) -> str | None:
-    """Why a rig has no twin, numbers left out."""
+    """Why a rig has no twin, with numbers replaced by "…"; None if it has one."""
     if case.found:
         return None
     if case.answer is not None:
@@ -257,43 +262,59 @@ def _reason(case: Case) -> str | None:
 
 
 def _grouped(
-    cases: Sequence[Case], of: Callable[[Case], str | None]
+    cases: Sequence[Case], key: Callable[[Case], str | None]
 ) -> list[tuple[str, list[Case]]]:
     groups: dict[str, list[Case]] = {}
-    for one in cases:
-        if (name := of(one)) is not None:
-            groups.setdefault(name, []).append(one)
+    for case in cases:
+        if (name := key(case)) is not None:
+            groups.setdefault(name, []).append(case)
     return sorted(groups.items(), key=lambda group: -len(group[1]))
 
 
 def _effects(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
-    for effect in dict.fromkeys(one.hidden[0].effect for one in cases):
-        mine = [one for one in cases if one.hidden[0].effect == effect]
-        first = [one for one in mine if one.first == effect]
-        others = Counter(one.first or one.verdict for one in mine if one.first != effect)
-        told = ", ".join(f"{name} {count}" for name, count in others.most_common(MORE))
-        counts = (len(mine), len(first), sum(one.alone for one in first))
-        explained = sum(one.verdict == "explained" for one in mine)
-        left = f"{np.nanmax([0.0, *(one.left for one in mine)]):.2f}"
-        yield f"`{effect}`", *map(str, counts), told or "–", str(explained), left
+    for effect in dict.fromkeys(case.hidden[0].effect for case in cases):
+        selected = [case for case in cases if case.hidden[0].effect == effect]
+        first = [case for case in selected if case.first == effect]
+        other_names = Counter(
+            case.first or case.verdict for case in selected if case.first != effect
+        )
+        names = ", ".join(f"{name} {count}" for name, count in other_names.most_common(MORE))
+        counts = (len(selected), len(first), sum(case.alone for case in first))
+        explained = sum(case.verdict == "explained" for case in selected)
+        leftover = f"{np.nanmax([0.0, *(case.left for case in selected)]):.2f}"
+        yield f"`{effect}`", *map(str, counts), names or "–", str(explained), leftover
 
 
 def _missed(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
-    for one in cases:
-        hidden = " + ".join(map(str, one.hidden)) or "healthy"
-        left = "–" if np.isnan(one.left) else f"{one.left:.2f}"
-        yield one.kind, str(one.seed), one.system, hidden, one.verdict, one.named or "–", left
+    for case in cases:
+        hidden = " + ".join(map(str, case.hidden)) or "healthy"
+        leftover = "–" if np.isnan(case.left) else f"{case.left:.2f}"
+        yield (
+            case.kind,
+            str(case.seed),
+            case.system,
+            hidden,
+            case.verdict,
+            case.named or "–",
+            leftover,
+        )
 
 
 def _seconds(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
     for kind in FOUND:
-        if spent := [one.seconds for one in of_kind(cases, kind)]:
-            middle, high = np.quantile(spent, (0.5, 0.95))
-            yield kind, str(len(spent)), f"{middle:.1f} s", f"{high:.1f} s", f"{max(spent):.1f} s"
+        if seconds := [case.seconds for case in of_kind(cases, kind)]:
+            middle, high = np.quantile(seconds, (0.5, 0.95))
+            yield (
+                kind,
+                str(len(seconds)),
+                f"{middle:.1f} s",
+                f"{high:.1f} s",
+                f"{max(seconds):.1f} s",
+            )
 
 
 def table(heads: Sequence[str], rows: Iterator[Sequence[str]]) -> str:
-    """A table, or nothing where it has no row."""
+    """A Markdown table; empty without rows."""
     lines = [" | ".join(row) for row in rows]
     head = [" | ".join(heads), " | ".join("---" for _ in heads)]
     return "\n".join(f"| {line} |" for line in (*head, *lines)) if lines else ""

@@ -1,8 +1,8 @@
-"""Cases of the second world: rigs that share no equation with the model, commissioned from afar.
+"""Cases of the second world: rigs that share no equation with the model, commissioned first.
 
-Each rig is met as a person meets it: a healthy record comes in as `twin import` takes it, beside a
-configuration that `twin init` wrote from what can be read off, a fifth off or unknown, and is
-commissioned by the code of `twin commission`. Only then are effects hidden in further records.
+Each rig is known only as a person knows it. A healthy record is read as by `twin import`. The
+configuration is that of `twin init` from values read off, a fifth off or unknown. The code of
+`twin commission` commissions the rig. Only then are effects hidden in further records.
 """
 
 import math
@@ -46,15 +46,15 @@ NAME = "second"
 RIGS = 60
 CYCLES = 12
 CADENCES = (1, 2, 5, 10)  # ms
-SINGLES, PAIRS, UNLISTED = 3, 1, 1  # records of each rig, beside a second healthy one
+SINGLES, PAIRS, UNLISTED = 3, 1, 1  # records of each rig, in addition to a second healthy one
 RECORDS = 1 + SINGLES + PAIRS + UNLISTED
-LONG_WAY = 0.4  # of an effect's range, at which each of a pair begins
+LONG_WAY = 0.4  # share of an effect's range from which on sizes of pairs are drawn
 COURSES = {"constant": 0.4, "step": 0.25, "ramp": 0.15, "intermittent": 0.2}
 CRASHED = "crashed: "
 
 
 class Range(NamedTuple):
-    """Sizes of an effect: from just isolable to gross, times what is usual on a rig."""
+    """Sizes of an effect, from just isolable to gross, in units of a quantity of the rig."""
 
     low: float
     high: float
@@ -68,12 +68,12 @@ def _flow(rig: Rig) -> float:
 
 
 def _vessel(rig: Rig) -> float:
-    """What is evacuated, ml."""
+    """Evacuated volume, ml."""
     return (rig.vessel.rigid_volume + rig.vessel.cup_volume) / ML
 
 
 def _slow(rig: Rig) -> float:
-    """How much later a delay shows than on a rig that is evacuated in 0.8 s; at most tenfold."""
+    """Evacuation time over 0.8 s, from 1 to 10: on slow rigs only longer delays show."""
     return min(max(rig.evacuation_s / 0.8, 1.0), 10.0)
 
 
@@ -116,9 +116,9 @@ OUTSIDE = {
 }
 OF_AIR_SAVING = {"threshold_drift", "check_valve_leak"}
 OF_CUPS = {"cup_compliance", "creeping_cup", "cup_backlash", "lifting_lip"}
-MOST = {"cup_compliance": 90.0, "added_volume": 4000.0}  # ml that their effects go up to
-# Sizes that mean the same in both worlds. Those of flows and volumes follow the vessel's volume,
-# which a person tells a fifth off.
+MOST = {"cup_compliance": 90.0, "added_volume": 4000.0}  # ml, bounds of the effects
+# Effects whose sizes mean the same in both worlds. Sizes of flows and volumes scale with the
+# configured volume of the vessel, which is up to a fifth off.
 COMPARABLE = {
     "suction_loss",
     "end_vacuum_loss",
@@ -137,38 +137,38 @@ OF_VOLUME = {"leakage", "porous_leakage", "check_valve_leak", "added_volume"}
 
 @dataclass(frozen=True)
 class Person:
-    """What somebody reads off a rig: the configuration, and how records reach the twin."""
+    """What a person reads off a rig: its configuration, and how its records are imported."""
 
     config: Config
 
     @classmethod
-    def at(cls, told: Mapping[str, Any], name: str) -> "Person":
-        """As ``twin init`` asks; ``told`` has what could be read, or "unknown"."""
+    def at(cls, readable: Mapping[str, Any], name: str) -> "Person":
+        """The answers to ``twin init``; ``readable`` has values as read off, or "unknown"."""
 
         def known(key: str, factor: float = 1.0) -> float | None:
-            return None if told[key] == "unknown" else round(float(told[key]) * factor, 4)
+            return None if readable[key] == "unknown" else round(float(readable[key]) * factor, 4)
 
-        released = told["part_released"]
+        released = readable["part_released"]
         system = System(
             known("hose_length_m", 1e3),
             known("hose_diameter_mm"),
             End.CUPS if released else End.VESSEL,
             known("vessel_ml"),
-            Place.EJECTOR if told["sensor_place"] == "ejector" else Place.END,
+            Place.EJECTOR if readable["sensor_place"] == "ejector" else Place.END,
             Answer.YES if released else Answer.NO,
             known("supply_bar"),
         )
-        gauge = told["sensor_reference"] == "gauge"
+        gauge = readable["sensor_reference"] == "gauge"
         kind = Reference.VACUUM if gauge else Reference.ABSOLUTE
         sensor = Sensor(Unit.MBAR, kind, None)
         text = configuration(Path(f"{name}.toml"), (name, ""), None, sensor, system, ())
-        if (ambient := known("ambient_mbar")) is not None:  # where a barometer hangs
+        if (ambient := known("ambient_mbar")) is not None:  # there is a barometer
             text += f"\n[data.ambient]\npressure_mbar = {ambient}\n"
         config = Config.of(Document.parse(text, name), calibrated=False)
         return cls(replace(config, gauge=gauge))
 
     def samples(self, logged: Record) -> Samples:
-        """A record as ``twin import`` takes it in, gaps marked."""
+        """A record as ``twin import`` reads it, gaps marked."""
         columns = logged.columns()
         if not self.config.gauge:
             columns["pressure_mbar"] = logged.pressure_pa / MBAR
@@ -183,7 +183,7 @@ class Person:
 
 @dataclass(frozen=True)
 class Met:
-    """A drawn rig with what a person reads off it; ``unit`` is None until it is commissioned."""
+    """A drawn rig with what a person reads off it; ``unit`` is None before commissioning."""
 
     seed: int
     rig: Rig
@@ -192,17 +192,17 @@ class Met:
 
     @property
     def name(self) -> str:
-        """Of the rig, for people."""
+        """Name of the rig: its kind and seed."""
         return f"{self.rig.kind}-{self.seed}"
 
 
 def drawn(seed: int, cadences: Sequence[int]) -> Met | None:
-    """The rig of a seed; None where its cadence is not among those asked for."""
+    """The rig of a seed; None if its cadence (ms) is not among ``cadences``."""
     rig = draw_rig(seed)
     if rig.sensor.cadence_ms not in cadences:
         return None
-    told = record(rig, seed, 1).truth.readable
-    return Met(seed, rig, Person.at(told, f"{rig.kind}-{seed}"))
+    readable = record(rig, seed, 1).truth.readable
+    return Met(seed, rig, Person.at(readable, f"{rig.kind}-{seed}"))
 
 
 # --- commissioning --------------------------------------------------------------------------------
@@ -222,7 +222,7 @@ def commissioned(met: Met) -> Case:
 
 
 def is_true(error: str, rig: Rig) -> bool:
-    """Whether a refusal names something that the healthy record of a rig really has."""
+    """Whether a refusal gives a reason that is true of the rig's healthy record."""
     return "gaps" in error and rig.sensor.missing > 0.0
 
 
@@ -234,43 +234,45 @@ def _answered(
     answer: Callable[[], Mapping[str, Any]],
     more: Mapping[str, Any],
 ) -> Case:
-    """A case with its answer, the error that came in place of it, and how long either took."""
-    begin, found, error = time.process_time(), None, ""
+    """A case with its answer or its error, and the processor time spent (s)."""
+    begin, result, error = time.process_time(), None, ""
     try:
-        found = answer()
+        result = answer()
     except TwinError as refusal:
         error = str(refusal)
         if refusal.__cause__ is not None:
             more = {**more, "cause": str(refusal.__cause__)}
     except Exception:  # a crash is a finding of its own
         error = CRASHED + traceback.format_exc()
-    spent = round(time.process_time() - begin, 2)
-    return Case(kind, met.seed, met.rig.kind, hidden, found, number, error, spent, more)
+    seconds = round(time.process_time() - begin, 2)
+    return Case(kind, met.seed, met.rig.kind, hidden, result, number, error, seconds, more)
 
 
-def _as_answer(met: Met, found: Commissioned) -> dict[str, Any]:
-    told = commissioned_as_json(found, met.person.config.asset, None)
-    line = {key: told[key] for key in ("verdict", "residual", "contradicts", "assumed", "data")}
-    line["healthy"] = found.calibration.healthy.model_dump(mode="json")
-    line["reason"] = headline(found.verdict)
-    line["scale"] = scale = _told_volume(found.calibration.fitted.data) / _true_volume(met.rig)
-    line["covered"] = {}
+def _as_answer(met: Met, outcome: Commissioned) -> dict[str, Any]:
+    as_json = commissioned_as_json(outcome, met.person.config.asset, None)
+    answer = {
+        key: as_json[key] for key in ("verdict", "residual", "contradicts", "assumed", "data")
+    }
+    answer["healthy"] = outcome.calibration.healthy.model_dump(mode="json")
+    answer["reason"] = headline(outcome.verdict)
+    answer["scale"] = scale = _told_volume(outcome.calibration.fitted.data) / _true_volume(met.rig)
+    answer["covered"] = {}
     for name, true in truths(met, scale).items():
-        low, high = found.calibration.fitted.interval(name)
+        low, high = outcome.calibration.fitted.interval(name)
         value = 0.5 * (low + high)
-        line["covered"][name] = {
+        answer["covered"][name] = {
             "true": true,
             "value": value,
             "low95": low,
             "high95": high,
-            "determined": name not in found.assumed,
+            "determined": name not in outcome.assumed,
             "holds": bool(low <= true <= high),
         }
-    return line
+    return answer
 
 
 def _told_volume(data: DataSet) -> float:
-    """All that the fitted twin evacuates (m³)."""
+    """Volume (m³) that the fitted twin evacuates."""
     return sum(volume(part) for part in data.system.parts) + data.ejector.port_volume_ml * ML
 
 
@@ -280,28 +282,28 @@ def _true_volume(rig: Rig) -> float:
 
 
 def truths(met: Met, scale: float) -> dict[str, float]:
-    """Parameters that mean the same in rig and model, in the model's units, as the sensor reads.
+    """True values of parameters that rig and model share, in the model's units.
 
-    Flows follow from the volume, of which a person tells a rough value: they are compared as they
-    are beside that value; ``scale`` is told over true volume.
+    Pressures are as the sensor reads them. Flows scale with the configured volume, which is a rough
+    value, so they are multiplied by ``scale``: configured over true volume.
     """
     rig = met.rig
     fed = _as_fed(rig)
     opening = rig.ejector.check_opening if rig.ejector.has_check_valve else 0.0
     end = _end_pressure(fed) + opening
-    found = {
+    parameters = {
         "ejector.suction_capacity_sl_min": scale * _capacity(fed) / SL_MIN,
         "ejector.end_pressure_mbar": _as_read(met, end) / MBAR,
     }
     if not rig.vessel.porous:
-        found["system.leak_sl_min"] = scale * rig.vessel.leak / SL_MIN
-    return found
+        parameters["system.leak_sl_min"] = scale * rig.vessel.leak / SL_MIN
+    return parameters
 
 
 def _as_fed(rig: Rig) -> Rig:
-    """The rig with the supply that its regulator and its suction valve leave its nozzle."""
-    here, supply = rig.surroundings, rig.supply
-    ambient, t = here.ambient_pressure, here.ambient_temperature
+    """The rig with the supply pressure at its nozzle, behind regulator and suction valve."""
+    surroundings, supply = rig.surroundings, rig.supply
+    ambient, t = surroundings.ambient_pressure, surroundings.ambient_temperature
     low, high = 0.0, supply.supply_gauge
     for _ in range(40):
         middle = 0.5 * (low + high)
@@ -309,28 +311,30 @@ def _as_fed(rig: Rig) -> Rig:
         flow = _primary(fed)
         sag = supply.supply_droop * flow + supply.supply_resistance * flow**2
         before = ambient + supply.supply_gauge - sag
-        through = orifice.py_func(
+        valve_flow = orifice.py_func(
             supply.valve_conductance, CRITICAL_VALVE, before, ambient + middle, t
         )
-        low, high = (middle, high) if through > flow else (low, middle)
+        low, high = (middle, high) if valve_flow > flow else (low, middle)
     return fed
 
 
 def _capacity(rig: Rig) -> float:
-    """Flow (kg/s) into the port at ambient pressure: behind it lies the check valve."""
+    """Flow (kg/s) into the port at ambient pressure, through the check valve if there is one."""
     ambient, t = rig.surroundings.ambient_pressure, rig.surroundings.ambient_temperature
     if not rig.ejector.has_check_valve:
         return _sucked(rig, ambient)
     low, high = 0.7 * ambient, ambient
     for _ in range(30):
         middle = 0.5 * (low + high)
-        through = orifice.py_func(rig.ejector.check_conductance, CRITICAL_VALVE, ambient, middle, t)
-        low, high = (middle, high) if through > _sucked(rig, middle) else (low, middle)
+        valve_flow = orifice.py_func(
+            rig.ejector.check_conductance, CRITICAL_VALVE, ambient, middle, t
+        )
+        low, high = (middle, high) if valve_flow > _sucked(rig, middle) else (low, middle)
     return _sucked(rig, low)
 
 
 def _sucked(rig: Rig, pressure: float) -> float:
-    """Flow (kg/s) that is sucked at a chamber pressure (Pa), its own back pressure included."""
+    """Suction flow (kg/s) at a chamber pressure (Pa), with the back pressure that it causes."""
     flow, extra = 0.0, 0.0
     for _ in range(10):
         flow = faults.sucked_at(rig, pressure, extra)
@@ -340,16 +344,19 @@ def _sucked(rig: Rig, pressure: float) -> float:
 
 def _primary(rig: Rig) -> float:
     """Flow (kg/s) through the nozzle."""
-    here = rig.surroundings
-    pressure = here.ambient_pressure + rig.supply.supply_gauge
+    surroundings = rig.surroundings
+    pressure = surroundings.ambient_pressure + rig.supply.supply_gauge
     flow = nozzle_flow.py_func(
-        rig.ejector.nozzle_area, pressure, here.ambient_pressure, here.ambient_temperature
+        rig.ejector.nozzle_area,
+        pressure,
+        surroundings.ambient_pressure,
+        surroundings.ambient_temperature,
     )
     return float(flow)
 
 
 def _end_pressure(rig: Rig) -> float:
-    """Pressure (Pa) in the chamber at which nothing is sucked any more."""
+    """Chamber pressure (Pa) at which the suction flow ends."""
     low, high = 0.0, rig.surroundings.ambient_pressure
     for _ in range(40):
         middle = 0.5 * (low + high)
@@ -358,14 +365,14 @@ def _end_pressure(rig: Rig) -> float:
 
 
 def _as_read(met: Met, pressure: float) -> float:
-    """What the twin gets for a pressure (Pa): through the sensor, and the configured ambient."""
+    """The twin's reading of a pressure (Pa), with sensor errors and the configured ambient."""
     sensor, true = met.rig.sensor, met.rig.surroundings.ambient_pressure
     zero = met.person.config.data.ambient.pressure_mbar * MBAR if sensor.gauge else true
     return zero - ((true - pressure) * (1.0 + sensor.gain_error) - sensor.offset)
 
 
 def with_unit(met: Met, case: Case) -> Met | None:
-    """The rig with the unit that a commissioning stored; None where nothing was."""
+    """The rig with the unit that its commissioning stored; None if it stored nothing."""
     if case.answer is None or case.verdict not in STORED:
         return None
     config = met.person.config
@@ -378,7 +385,7 @@ def with_unit(met: Met, case: Case) -> Met | None:
 
 
 def cases(met: Met) -> Iterator[tuple[str, int, list[Hidden]]]:
-    """Kind, number and what is hidden, of each record of a rig after its commissioning."""
+    """Kind, number and hidden effects of each record of a rig after its commissioning."""
     seed, rig = met.seed, met.rig
     yield "healthy", 0, []
     listed = [effect for effect in SIZES if applies(rig, effect)]
@@ -390,11 +397,14 @@ def cases(met: Met) -> Iterator[tuple[str, int, list[Hidden]]]:
         yield "single", number, [Hidden(effect, course, draw_size(rng, rig, effect))]
     for number in range(PAIRS):
         rng = np.random.default_rng([seed, 12, number])
-        two = [str(one) for one in rng.choice(listed, 2, replace=False)]
+        effects = [str(effect) for effect in rng.choice(listed, 2, replace=False)]
         yield (
             "pair",
             number,
-            [Hidden(effect, "constant", draw_size(rng, rig, effect, LONG_WAY)) for effect in two],
+            [
+                Hidden(effect, "constant", draw_size(rng, rig, effect, LONG_WAY))
+                for effect in effects
+            ],
         )
     for number in range(UNLISTED):
         rng = np.random.default_rng([seed, 13, number])
@@ -412,7 +422,7 @@ def applies(rig: Rig, effect: str) -> bool:
 
 
 def draw_size(rng: np.random.Generator, rig: Rig, effect: str, least: float = 0.0) -> float:
-    """Size of an effect on a rig; ``least`` is the share of its range to begin at."""
+    """A drawn size of an effect on a rig; ``least`` is the share of its range to start from."""
     sizes = (SIZES | OUTSIDE)[effect]
     low, high = math.log(sizes.low), math.log(sizes.high)
     size = math.exp(rng.uniform(low + least * (high - low), high)) * sizes.of(rig)
@@ -422,7 +432,7 @@ def draw_size(rng: np.random.Generator, rig: Rig, effect: str, least: float = 0.
 
 
 def fault(hidden: Hidden, rng: np.random.Generator, seconds: float) -> Fault:
-    """The world's fault for what is hidden in a record of so many seconds."""
+    """The second world's fault for an effect hidden in a record of this many seconds."""
     name = next(iter(faults.EVERYTHING[hidden.effect]))
     sizes = {name: hidden.size}
     if hidden.course == "step":
@@ -438,7 +448,10 @@ def fault(hidden: Hidden, rng: np.random.Generator, seconds: float) -> Fault:
 def stepped(
     met: Met, hidden: Hidden, seed: int, cycles: tuple[int, int], rng: np.random.Generator
 ) -> Record:
-    """A record of some cycles without a fault and some with it; it begins anywhere within one."""
+    """A record of healthy cycles, then cycles with a fault that begins anywhere within a cycle.
+
+    ``cycles`` counts both.
+    """
     before, after = cycles
     plan = plan_cycles(met.rig, seed, before + after)
     onset_ms = rng.uniform(plan[before].suction_on, plan[before].end)
@@ -455,7 +468,7 @@ def diagnosed(met: Met, kind: str, number: int, hidden: Sequence[Hidden]) -> Cas
     clean = record(met.rig, seed, CYCLES)
     rng = np.random.default_rng([seed, 14])
     seconds = float(clean.time_ns[-1]) * 1e-9
-    logged = record(met.rig, seed, CYCLES, [fault(one, rng, seconds) for one in hidden])
+    logged = record(met.rig, seed, CYCLES, [fault(effect, rng, seconds) for effect in hidden])
     samples = met.person.samples(logged)
     moved = float(np.sqrt(np.mean((logged.pressure_pa - clean.pressure_pa) ** 2))) / MBAR
 
@@ -471,4 +484,4 @@ def diagnosed(met: Met, kind: str, number: int, hidden: Sequence[Hidden]) -> Cas
 
 
 def _quiet(_what: str) -> None:
-    """Take progress and say nothing."""
+    """Ignore progress."""

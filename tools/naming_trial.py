@@ -43,12 +43,12 @@ from twin.settings import Document
 from twin.signals import Samples, Ticks
 
 ROOT = Path(__file__).parents[1]
-SEEDS = 1_000_000  # among which a run that is given none begins
+SEEDS = 1_000_000  # without --first, the first seed is drawn below this
 CYCLE_S = {"test_rig": 3.2, "gripper": 2.3}  # at most
-BEGINS, LASTS = 18, 12  # cycles: the first of a fault, and how many are watched
+BEGINS, LASTS = 18, 12  # cycles: the first with the fault, and how many from there on
 MODEST, GROSS = (0.5, 5.0), (5.0, 25.0)  # times typical
 SIGNED = ("sensor_offset", "sensor_gain", "ambient_pressure", "threshold_drift")
-MOST = {  # of each fault, in its unit: beyond, the rig has no cycles any more
+MOST = {  # largest size of each fault, in its unit: beyond it the rig completes no cycle
     "ambient_pressure": 60.0,
     "threshold_drift": 60.0,
     "sensor_gain": 25.0,
@@ -61,42 +61,42 @@ MOST = {  # of each fault, in its unit: beyond, the rig has no cycles any more
     "supply_pressure_drop": 3.5,
     "cup_compliance": 90.0,
 }
-ANY = 300.0  # the same of all others
+ANY = 300.0  # the same for all other faults
 LEAST = -150.0
-STRANGE = 2  # of the turns, beside one for each effect, are effects that nobody listed
-ROWS = 50  # of a second world's record that come at once
+STRANGE = 2  # turns of unlisted effects, in addition to one turn for each listed effect
+ROWS = 50  # rows of a second world's record in one block
 
 
 @dataclass(frozen=True)
 class Watched:
-    """What was hidden in a run, and the names that its alarm had, one after the other."""
+    """The fault of a run, and the names that its alarms gave, in order."""
 
     world: str
     system: str
     seed: int
     fault: str
     effect: str
-    alarms: int  # told, with a name or without
+    alarms: int  # raised, with a name or without
     names: Sequence[str]
-    probabilities: Sequence[float]  # told with each name
+    probabilities: Sequence[float]  # of each name
 
     @property
     def changes(self) -> int:
-        """How often the name was replaced by another one."""
-        return sum(one != other for one, other in pairwise(self.names))
+        """How often the name changed."""
+        return sum(name != next_name for name, next_name in pairwise(self.names))
 
     @property
     def stated(self) -> list[tuple[float, bool]]:
-        """Probability that came with the first name, and whether that acts; empty without one."""
-        told = zip(self.probabilities, self.names, strict=True)
-        return [(p, name == self.effect) for p, name in told][:1]
+        """Probability of the first name, and whether that effect acts; empty without a name."""
+        named = zip(self.probabilities, self.names, strict=True)
+        return [(p, name == self.effect) for p, name in named][:1]
 
 
 # --- the first world ------------------------------------------------------------------------------
 
 
 def watched(seed: int, sizes: tuple[float, float], ramp_s: float) -> Watched:
-    """One run: effect by turns, size, sign and time drawn by seed."""
+    """One run: effects take turns; size, sign and time are drawn by seed."""
     rng = np.random.default_rng(seed)
     system = list(CYCLE_S)[seed % 2]
     effect = _turn(seed // 2, list(EFFECTS), list(UNLISTED))
@@ -109,7 +109,7 @@ def watched(seed: int, sizes: tuple[float, float], ramp_s: float) -> Watched:
     if effect in SIGNED and rng.random() < 0.5:
         size = -size
     size = float(np.clip(size, LEAST, MOST.get(effect, ANY)))
-    if effect == "heat_exchange":  # replaces what the rig has
+    if effect == "heat_exchange":  # the fault replaces the rig's own value
         size += rig.rig.vessel_film
     begin_s = CYCLE_S[system] * (BEGINS + rng.random())
     fault = f"{effect}={size:.5g}@{begin_s:.4f}" + (f"/ramp:{ramp_s:g}" if ramp_s else "")
@@ -119,57 +119,61 @@ def watched(seed: int, sizes: tuple[float, float], ramp_s: float) -> Watched:
 
 
 def _turn(number: int, listed: Sequence[str], outside: Sequence[str]) -> str:
-    """The effect whose turn it is: each of those listed, then some that nobody listed."""
-    around, turn = divmod(number, len(listed) + STRANGE)
+    """The effect for a number: each listed effect in turn, then STRANGE unlisted ones."""
+    round_number, turn = divmod(number, len(listed) + STRANGE)
     if turn < len(listed):
         return listed[turn]
-    return outside[(around * STRANGE + turn - len(listed)) % len(outside)]
+    return outside[(round_number * STRANGE + turn - len(listed)) % len(outside)]
 
 
 # --- the second world -----------------------------------------------------------------------------
 
 
 def watched_rig(seed: int, faults: int) -> list[Watched]:
-    """Faults by turns on one rig, each in a record of its own; none if it is not commissioned."""
-    met = battery_second.drawn(seed, battery_second.CADENCES)
-    assert met is not None
-    ready = battery_second.with_unit(met, battery_second.commissioned(met))
-    if ready is None or ready.unit is None:
+    """One run for each fault on one rig, each with its own record; none if it is refused."""
+    drawn = battery_second.drawn(seed, battery_second.CADENCES)
+    assert drawn is not None
+    commissioned = battery_second.with_unit(drawn, battery_second.commissioned(drawn))
+    if commissioned is None or commissioned.unit is None:
         return []
-    found = []
+    runs = []
     for number in range(seed * faults, (seed + 1) * faults):
         rng = np.random.default_rng([seed, number, 15])
-        listed = [one for one in battery_second.SIZES if battery_second.applies(met.rig, one)]
-        outside = [one for one in battery_second.OUTSIDE if battery_second.applies(met.rig, one)]
+        listed = [
+            effect for effect in battery_second.SIZES if battery_second.applies(drawn.rig, effect)
+        ]
+        outside = [
+            effect for effect in battery_second.OUTSIDE if battery_second.applies(drawn.rig, effect)
+        ]
         effect = _turn(number, listed, outside)
-        hidden = Hidden(effect, "step", battery_second.draw_size(rng, met.rig, effect))
-        logged = battery_second.stepped(met, hidden, SEEDS + number, (BEGINS, LASTS), rng)
-        rows = met.person.samples(logged)
+        hidden = Hidden(effect, "step", battery_second.draw_size(rng, drawn.rig, effect))
+        logged = battery_second.stepped(drawn, hidden, SEEDS + number, (BEGINS, LASTS), rng)
+        rows = drawn.person.samples(logged)
         parts = (rows[at : at + ROWS] for at in range(0, len(rows), ROWS))
-        told = _deviations(ready.unit, parts)
-        found.append(_watched("second", met.name, seed, str(hidden), effect, told))
-    return found
+        alarms = _deviations(commissioned.unit, parts)
+        runs.append(_watched("second", drawn.name, seed, str(hidden), effect, alarms))
+    return runs
 
 
 # --- both -----------------------------------------------------------------------------------------
 
 
 class _Alarms:
-    """A sink that keeps the alarms, with a name or without."""
+    """An output that keeps alarms, with a name or without."""
 
     def __init__(self) -> None:
         self.raised = list[Event]()
 
     def write(self, samples: Samples, ticks: Ticks, events: Sequence[Event]) -> None:
-        """Keep those among ``events``."""
+        """Keep the alarms among ``events``."""
         self.raised += [event for event in events if event.kind is Kind.DEVIATION]
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: nothing is open."""
 
 
 def _deviations(config: Config, parts: Iterable[Samples]) -> list[Event]:
-    """The alarms that rows make a commissioned twin raise."""
+    """The alarms that a commissioned twin raises on these rows."""
     alarms = _Alarms()
     isolation = Isolation.of(config.data, config.monitor.healthy, config.monitor.false_alarm_days)
     monitor = Monitor(config.monitor, coefficients(config.data), isolation=isolation)
@@ -178,30 +182,30 @@ def _deviations(config: Config, parts: Iterable[Samples]) -> list[Event]:
 
 
 def _watched(
-    world: str, system: str, seed: int, fault: str, effect: str, told: Sequence[Event]
+    world: str, system: str, seed: int, fault: str, effect: str, alarms: Sequence[Event]
 ) -> Watched:
-    named = [event.data for event in told if event.data["effect"] != UNKNOWN]
-    names = [str(one["effect"]) for one in named]
-    shares = [round(float(one["share"]), 4) for one in named]
-    return Watched(world, system, seed, fault, effect, len(told), names, shares)
+    named = [event.data for event in alarms if event.data["effect"] != UNKNOWN]
+    names = [str(data["effect"]) for data in named]
+    shares = [round(float(data["share"]), 4) for data in named]
+    return Watched(world, system, seed, fault, effect, len(alarms), names, shares)
 
 
-def _found(asked: argparse.Namespace) -> Iterator[Watched]:
-    """Each run, on all processors, in order."""
-    first = secrets.randbelow(SEEDS) if asked.first is None else asked.first
+def _found(arguments: argparse.Namespace) -> Iterator[Watched]:
+    """All runs in order, computed on all processors."""
+    first = secrets.randbelow(SEEDS) if arguments.first is None else arguments.first
     with ProcessPoolExecutor(None, get_context("spawn")) as workers:
-        if asked.world == "second":
-            each_rig = partial(watched_rig, faults=asked.faults)
-            for some in workers.map(each_rig, range(first, first + asked.rigs)):
-                yield from some
+        if arguments.world == "second":
+            watch_rig = partial(watched_rig, faults=arguments.faults)
+            for runs in workers.map(watch_rig, range(first, first + arguments.rigs)):
+                yield from runs
         else:
-            sizes = GROSS if asked.gross else MODEST
-            each = partial(watched, sizes=sizes, ramp_s=asked.ramp)
-            yield from workers.map(each, range(first, first + asked.draws))
+            sizes = GROSS if arguments.gross else MODEST
+            watch = partial(watched, sizes=sizes, ramp_s=arguments.ramp)
+            yield from workers.map(watch, range(first, first + arguments.draws))
 
 
 def main() -> None:
-    """Print each run whose name changes, and how many of all do."""
+    """Print each run whose name changes, and how many do."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--world", choices=("first", "second"), default="first")
     parser.add_argument("--draws", type=int, default=6 * (len(EFFECTS) + STRANGE))
@@ -211,21 +215,22 @@ def main() -> None:
     parser.add_argument("--gross", action="store_true")
     parser.add_argument("--ramp", type=float, default=0.0, metavar="SECONDS")
     parser.add_argument("--keep", type=Path, metavar="FILE.jsonl")
-    asked = parser.parse_args()
-    found = []
-    for one in _found(asked):
-        found.append(one)
-        if one.changes:
-            print(f"{one.system}: {one.fault}: {', '.join(one.names)}", flush=True)
-        if asked.keep:
-            with asked.keep.open("a", encoding="utf-8") as file:
-                file.write(json.dumps({"commit": commit(), **asdict(one)}) + "\n")
-    named = [one for one in found if one.names]
+    arguments = parser.parse_args()
+    trials = []
+    for trial in _found(arguments):
+        trials.append(trial)
+        if trial.changes:
+            print(f"{trial.system}: {trial.fault}: {', '.join(trial.names)}", flush=True)
+        if arguments.keep:
+            with arguments.keep.open("a", encoding="utf-8") as file:
+                file.write(json.dumps({"commit": commit(), **asdict(trial)}) + "\n")
+    named = [trial for trial in trials if trial.names]
     print(
-        f"{len(found)} draws: {sum(one.alarms > 0 for one in found)} with an alarm,"
-        f" {len(named)} named, {sum(one.names[0] == one.effect for one in named)} rightly at first"
-        f" and {sum(one.names[-1] == one.effect for one in named)} at last;"
-        f" the name changed in {sum(one.changes > 0 for one in found)}"
+        f"{len(trials)} draws: {sum(trial.alarms > 0 for trial in trials)} with an alarm,"
+        f" {len(named)} named,"
+        f" {sum(trial.names[0] == trial.effect for trial in named)} rightly at first"
+        f" and {sum(trial.names[-1] == trial.effect for trial in named)} at last;"
+        f" the name changed in {sum(trial.changes > 0 for trial in trials)}"
     )
 
 
