@@ -1,7 +1,7 @@
-"""What ``tools/bench.py`` measures, and the floors it measures beside it."""
+"""The benchmarks of ``tools/bench.py``, and their floors."""
 
 import os
 
-# As the command line has it, read when NumPy is imported: on the one core that the twin's part is
-# measured on, threads of OpenBLAS would wait for each other most of the time.
+# Same value as on the command line; NumPy reads it on import. The twin's part is measured on one
+# core, where threads of OpenBLAS would mostly wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

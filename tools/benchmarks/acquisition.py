@@ -1,4 +1,4 @@
-"""Block mode: what the live twin loses and costs beside a PLC in another process."""
+"""Block mode: samples lost and CPU used by the live twin, with the PLC in another process."""
 
 import signal
 import socket
@@ -20,14 +20,14 @@ from twin.log.reader import open_log
 
 SLICE_S, SHORT_SLICE_S = 10.0, 5.0
 BARE_S = 2.0
-STOP_S = 0.3  # SIGSTOP at the beginning of each slice: a client that does not get to run
+STOP_S = 0.3  # of a SIGSTOP at the beginning of each slice: the client does not get to run
 INTERVAL_S = 0.03  # between blocks, as configs/test_rig.toml has it
 HEADER, RING, DEPTH = (100, 12), 1000, 4096  # of the PLC's trace; a record has 4 words
 RECORDS_AT_ONCE = 31
 
 
 def steady(run: Run) -> Sequence[Measured]:
-    """Lost samples, CPU share and bytes per sample, nobody in the way."""
+    """Lost samples, CPU share and bytes per sample, without disturbance."""
     return _acquire(run, "acquisition", [SLICE_S if run.long else SHORT_SLICE_S] * 3, stop_s=0.0)
 
 
@@ -36,16 +36,16 @@ def stopped(run: Run) -> Sequence[Measured]:
     return _acquire(run, "acquisition with stops", [SLICE_S] * (60 if run.long else 3), STOP_S)[:2]
 
 
-def _acquire(run: Run, what: str, slices: Sequence[float], stop_s: float) -> Sequence[Measured]:
-    log = run.folder / f"{what}.mcap"
+def _acquire(run: Run, name: str, slices: Sequence[float], stop_s: float) -> Sequence[Measured]:
+    log = run.folder / f"{name}.mcap"
     with plc() as port:
-        run.tell(f"{what}: the floor")
+        run.tell(f"{name}: the floor")
         with on_core(TWIN_CORE):
             floors = [bare_share(port) for _ in range(3)]
         with live(log, port=port) as process:
             shares = []
             for number, slice_s in enumerate(slices):
-                run.tell(f"{what}: slice {number + 1} of {len(slices)}")
+                run.tell(f"{name}: slice {number + 1} of {len(slices)}")
                 shares.append(_share(process, slice_s, stop_s))
     missing, rows = lost(log)
     note = f"of {rows:,} samples"
@@ -73,7 +73,7 @@ def _share(process: "subprocess.Popen[bytes]", slice_s: float, stop_s: float) ->
 
 
 def lost(log: Path) -> tuple[int, int]:
-    """Sequence numbers that are missing in the log, and its rows; a repeated one is an error."""
+    """Number of missing sequence numbers and of rows; a repeated sequence number is an error."""
     sequence = np.concatenate([samples["sequence"] for samples, _ in open_log(log).blocks()])
     steps = np.diff(sequence)
     assert (steps > 0).all(), "the log has a sample twice"
@@ -81,7 +81,7 @@ def lost(log: Path) -> tuple[int, int]:
 
 
 def bare_share(port: int) -> float:
-    """CPU time (% of a core) of a bare socket that fetches the same registers as often."""
+    """CPU time (% of a core) of a bare socket that fetches the same registers at the same rate."""
     with connected(port) as connection:
         begin, cpu = time.monotonic(), time.process_time()
         fetch(partial(read, connection), BARE_S)
@@ -97,7 +97,7 @@ def connected(port: int) -> Iterator[socket.socket]:
 
 
 def fetch(words: Callable[[int, int], bytes], seconds: float) -> int:
-    """Fetch the ring as the driver does, by a function that reads registers; gives the records."""
+    """Fetch the ring as the driver does; ``words`` reads registers. Returns the record count."""
     first = seen = _newest(words)
     end = time.monotonic() + seconds
     while time.monotonic() < end:
@@ -116,7 +116,7 @@ def _newest(words: Callable[[int, int], bytes]) -> int:
 
 
 def read(connection: socket.socket, address: int, words: int) -> bytes:
-    """Words of holding registers, as they come."""
+    """Bytes of ``words`` holding registers from ``address`` on."""
     connection.sendall(struct.pack(">HHHBBHH", 1, 0, 6, 1, 3, address, words))
     answer = connection.recv(9 + 2 * words, socket.MSG_WAITALL)
     assert answer[7] == 3, "the PLC refused the request"

@@ -12,23 +12,23 @@ from twin.config import Config
 from twin.settings import Document
 from twin.signals import MS, Samples
 
-CYCLES = 12  # that count: the first and the last do not
+CYCLES = 12  # complete ones: the first and the last do not count
 REPEATS = 3
 
 
 def from_cycles(run: Run) -> Sequence[Measured]:
-    """Time (s) in which the rig's healthy cycles become a data set, on all cores there are."""
+    """Time (s) of a calibration on the rig's healthy cycles, on all cores."""
     run.tell("calibration: simulating the rig")
     document = Document.read(CONFIG)
     config, samples = Config.of(document), _healthy(document.section(PlcSettings, "plc"))
-    calibrate(config, samples, run.tell)  # compiles what is not compiled yet
+    calibrate(config, samples, run.tell)  # compiles first
     times = []
     for number in range(REPEATS):
         run.tell(f"calibration: {number + 1} of {REPEATS}")
         begin = time.perf_counter()
-        found = calibrate(config, samples, lambda _: None)
+        calibrated = calibrate(config, samples, lambda _: None)
         times.append(time.perf_counter() - begin)
-    return (Measured(times, note=f"for {found.cycles} cycles"),)
+    return (Measured(times, note=f"for {calibrated.cycles} cycles"),)
 
 
 def _healthy(rig: PlcSettings) -> list[Samples]:

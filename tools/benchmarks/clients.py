@@ -1,6 +1,7 @@
-"""The driver alone beside other clients that fetch the same: CPU of a core, nothing else done.
+"""CPU share of the driver alone, beside other clients that fetch the same data.
 
-Each takes turns of some seconds at the simulated PLC, 1 000 samples a second, one turn each 30 ms.
+Clients take turns of TURN_S at the simulated PLC with 1 000 samples a second. Each fetches a block
+every 30 ms.
 """
 
 import ctypes
@@ -27,56 +28,58 @@ from twin.signals import Samples
 
 TURNS, LONG_TURNS = 3, 12
 TURN_S = 1.5
-ENOUGH = 0.9  # of the samples there are in a turn: a client that gets fewer does something else
+ENOUGH = 0.9  # least share of a turn's samples: a client with fewer does not do the same work
 RATE = 1000.0  # samples a second
 
-Fetch = Callable[[float], int]  # for so many seconds; gives the samples it got
+Fetch = Callable[[float], int]  # fetches for a number of seconds, returns the sample count
 Client = Callable[[], AbstractContextManager[Fetch]]  # connects
 
 
 def modbus(run: Run) -> Sequence[Measured]:
-    """The driver beside a bare socket in C; then that in Python, pymodbus and libmodbus, by it."""
-    with plc() as port, connected(port) as line, connected(port) as other:
-        ways = {
+    """The driver over a bare socket in C; then Python, pymodbus and libmodbus over the driver."""
+    with plc() as port, connected(port) as native_line, connected(port) as python_line:
+        clients = {
             "driver": partial(_driver, Document.read(CONFIG), port),
-            "C": _native(run.folder, port, line),
-            "Python": lambda: nullcontext(partial(fetch, partial(read, other))),
+            "C": _native(run.folder, port, native_line),
+            "Python": lambda: nullcontext(partial(fetch, partial(read, python_line))),
             "pymodbus": partial(_pymodbus, port),
             "libmodbus": _libmodbus(run.folder, port),
         }
-        shares = _by_turns(run, {name: way for name, way in ways.items() if way is not None})
-    ours, bare = shares["driver"], shares.get("C", [])
-    others = [shares.get(name) for name in ("Python", "pymodbus", "libmodbus")]
+        shares = _by_turns(
+            run, {name: client for name, client in clients.items() if client is not None}
+        )
+    driver, bare = shares["driver"], shares.get("C", [])
+    other_shares = [shares.get(name) for name in ("Python", "pymodbus", "libmodbus")]
     return (
-        Measured(ours, bare, note="" if bare else "no C compiler"),
-        *(_beside(ours, other) for other in others),
+        Measured(driver, bare, note="" if bare else "no C compiler"),
+        *(_beside(driver, shares_of_client) for shares_of_client in other_shares),
     )
 
 
 def over_opcua(run: Run) -> Sequence[Measured]:
-    """The OPC UA driver beside asyncua that reads the same arrays."""
+    """The OPC UA driver, with asyncua reading the same arrays as the floor."""
     document = Document.read(opcua.CONFIG)
     with opcua.plc(run.folder) as port:
-        ways = {"OPC UA": partial(_driver, document, port)}
+        clients = {"OPC UA": partial(_driver, document, port)}
         ours, bare = [], []
         for _ in range(LONG_TURNS if run.long else TURNS):
-            ours += _by_turns(run, ways, 1)["OPC UA"]
+            ours += _by_turns(run, clients, 1)["OPC UA"]
             with on_core(TWIN_CORE):
                 bare.append(opcua.bare_share(port, TURN_S))
     return (Measured(ours, bare),)
 
 
-def _beside(ours: Sequence[float], other: Sequence[float] | None) -> Measured:
-    return Measured(other, ours) if other else Measured([float("nan")], note="not installed")
+def _beside(ours: Sequence[float], theirs: Sequence[float] | None) -> Measured:
+    return Measured(theirs, ours) if theirs else Measured([float("nan")], note="not installed")
 
 
-def _by_turns(run: Run, ways: dict[str, Client], turns: int = 0) -> dict[str, list[float]]:
-    """CPU times (% of a core), of each client in its turns."""
+def _by_turns(run: Run, clients: dict[str, Client], turns: int = 0) -> dict[str, list[float]]:
+    """CPU times (% of a core) of each client, a value for each of its turns."""
     turns = turns or (LONG_TURNS if run.long else TURNS)
-    shares: dict[str, list[float]] = {name: [] for name in ways}
+    shares: dict[str, list[float]] = {name: [] for name in clients}
     with on_core(TWIN_CORE):
         for turn in range(turns):
-            for name, client in ways.items():
+            for name, client in clients.items():
                 run.tell(f"clients: {name}, turn {turn + 1} of {turns}")
                 shares[name].append(_share(name, client))
     return shares
@@ -109,7 +112,7 @@ def _taken(source: Iterator[Samples], seconds: float) -> int:
 
 @contextmanager
 def _pymodbus(port: int) -> Iterator[Fetch]:
-    """The client of pymodbus, which gives registers as numbers."""
+    """The client of pymodbus, which returns registers as numbers."""
     with ModbusTcpClient("127.0.0.1", port=port) as client:
 
         def words(address: int, count: int) -> bytes:
@@ -119,22 +122,22 @@ def _pymodbus(port: int) -> Iterator[Fetch]:
         yield partial(fetch, words)
 
 
-def _native(folder: Path, port: int, line: socket.socket) -> Client | None:
+def _native(folder: Path, port: int, connection: socket.socket) -> Client | None:
     compiled = library("fetch", folder)
     if compiled is None:
         return None
-    return lambda: nullcontext(partial(_in_c, compiled, port, line.fileno()))
+    return lambda: nullcontext(partial(_in_c, compiled, port, connection.fileno()))
 
 
 def _libmodbus(folder: Path, port: int) -> Client | None:
-    """The same around libmodbus; None where its headers are not there (libmodbus-dev)."""
+    """A C client with libmodbus; None without its headers (libmodbus-dev)."""
     if shutil.which("pkg-config") is None:
         return None
-    asked = ["pkg-config", "--cflags", "--libs", "libmodbus"]
-    found = subprocess.run(asked, capture_output=True, text=True, check=False)
-    if found.returncode != 0:
+    command = ["pkg-config", "--cflags", "--libs", "libmodbus"]
+    flags = subprocess.run(command, capture_output=True, text=True, check=False)
+    if flags.returncode != 0:
         return None
-    compiled = library("fetch", folder, [*PLAIN, "-DLIBMODBUS"], found.stdout.split())
+    compiled = library("fetch", folder, [*PLAIN, "-DLIBMODBUS"], flags.stdout.split())
     if compiled is None:
         return None
     return lambda: nullcontext(partial(_in_c, compiled, port, -1))

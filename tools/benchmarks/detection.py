@@ -1,10 +1,9 @@
-"""Detection by sums over cycles: how often wrong, and how late beside a CUSUM that knows more.
+"""Change detection over cycles: false alarms, and delay compared with an optimal CUSUM.
 
-Healthy cycles of the simulated rig go through twin, bank and isolation as they do in the loop. A
-change of so many sigmas is put into the scores of the same cycles, drawn at random: into an
-effect's own, and by the cosine of their signatures into those of the others. It is put in after so
-many healthy cycles that the sums are what they usually are, and into sums that begin with it; the
-optimum is told of the same.
+Healthy cycles of the simulated rig go through twin, bank and isolation as in the loop. Then a shift
+(sigmas) is added to scores of these cycles, drawn at random. The effect's own score gets all of it,
+other scores get it times the cosine of their signatures. The change begins either in settled sums,
+after RUN_IN healthy cycles, or in fresh sums. The optimum is computed for the same case.
 """
 
 import os
@@ -32,114 +31,114 @@ Floats = npt.NDArray[np.float64]
 CONFIG = ROOT / "configs" / "gripper.toml"
 PROGRAM = {"suction_ms": 900.0, "blow_off_ms": 150.0, "idle_ms": 250.0}  # short, for many cycles
 CYCLE_S = 1.3
-DEVICES, LONG_DEVICES, CYCLES = 4, 40, 2600  # of each device
-SETTLED = 200  # cycles after which a device's scores are what they stay
+DEVICES, LONG_DEVICES, CYCLES = 4, 40, 2600  # cycles of each device
+SETTLED = 200  # cycles after which a device's scores are stationary
 ASKED = (1000.0, 10_000.0)  # cycles to a false alarm
-MONTH = 30 * 86_400.0 / 3.0  # the same in 30 days of 3 s cycles
+MONTH = 30 * 86_400.0 / 3.0  # cycles to a false alarm: 30 days of 3 s cycles
 SHIFTS = (0.5, 1.0, 2.0)  # sigmas a cycle
 EFFECTS = ("leakage", "suction_loss", "filter_clogging", "threshold_drift", "sensor_lag")
 DRAWS = 1000
-RUN_IN = 300  # healthy cycles, after which sums are what they usually are
-APART = 20  # further ones between the beginnings of two changes
+RUN_IN = 300  # healthy cycles after which sums are stationary
+APART = 20  # healthy cycles between the beginnings of two changes
 NEVER = 4000  # cycles
 
 
 def sums(run: Run) -> Sequence[Measured]:
     """False alarms at two wanted rates, and delays for three sizes, beside the optimum.
 
-    Delays are told of sums that run already first, then of such that begin with the change.
+    First the delays of settled sums, then those of sums that begin with the change.
     """
     devices = LONG_DEVICES if run.long else DEVICES
-    scores, alike = _simulated(run, devices)
-    false = [_false_alarms(scores, alike, cycles) for cycles in ASKED]
-    pool = np.concatenate([one[SETTLED:] for one in scores])
+    scores, cosines = _simulated(run, devices)
+    false = [_false_alarms(scores, cosines, cycles) for cycles in ASKED]
+    pool = np.concatenate([device_scores[SETTLED:] for device_scores in scores])
     run.tell("detection: delays")
-    running, fresh = _running(pool, alike), [_changes(alike)] * DRAWS
-    late = [_late(pool, alike, shift, running, RUN_IN) for shift in SHIFTS]
-    later = [_late(pool, alike, shift, fresh, 0) for shift in SHIFTS]
+    running, fresh = _running(pool, cosines), [_changes(cosines)] * DRAWS
+    late = [_late(pool, cosines, shift, running, RUN_IN) for shift in SHIFTS]
+    later = [_late(pool, cosines, shift, fresh, 0) for shift in SHIFTS]
     return (*false, *late, *later)
 
 
 def _simulated(run: Run, devices: int) -> tuple[list[Floats], Floats]:
     """Standard normal scores of each device's cycles, and the cosines between signatures."""
-    found = []
+    results = []
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as workers:
-        for one in workers.map(_device, range(devices)):
-            found.append(one)
-            run.tell(f"detection: {len(found)} of {devices} devices")
-    return [scores for scores, _ in found], found[0][1]
+        for result in workers.map(_device, range(devices)):
+            results.append(result)
+            run.tell(f"detection: {len(results)} of {devices} devices")
+    return [scores for scores, _ in results], results[0][1]
 
 
 def _device(seed: int) -> tuple[Floats, Floats]:
-    """Scores of one device's cycles, (cycles, suspects), and the cosines of the last one."""
+    """Scores of one device's cycles, (cycles, suspects), and the cosines of the last cycle."""
     document = Document.read(CONFIG)
     config, rig = Config.of(document), document.section(PlcSettings, "plc")
     rig = rig.model_copy(update={"program": rig.program.model_copy(update=PROGRAM)})
-    scores, alike = [], np.eye(len(SUSPECTS))
-    for said, normal in heard(config, rig, CYCLES * CYCLE_S, seed):
+    scores, cosines = [], np.eye(len(SUSPECTS))
+    for residual, normal in heard(config, rig, CYCLES * CYCLE_S, seed):
         scores.append(normal)
-        alike = said.alike()
-    return np.array(scores), alike
+        cosines = residual.alike()
+    return np.array(scores), cosines
 
 
-def _changes(alike: Floats) -> ChangeDetector:
-    changes = looked_for()
-    changes.weigh(alike)
-    return changes
+def _changes(cosines: Floats) -> ChangeDetector:
+    detector = looked_for()
+    detector.weigh(cosines)
+    return detector
 
 
-def _false_alarms(devices: Sequence[Floats], alike: Floats, asked: float) -> Measured:
-    """False alarms over those that were asked for."""
+def _false_alarms(devices: Sequence[Floats], cosines: Floats, wanted: float) -> Measured:
+    """False alarms over the wanted number; ``wanted`` is in cycles to a false alarm."""
     alarms, cycles = 0, 0
     for scores in devices:
-        changes = _changes(alike)
+        detector = _changes(cosines)
         for normal in scores:
-            changes.take(normal)
-            if changes.log_sum >= limit(asked):
+            detector.take(normal)
+            if detector.log_sum >= limit(wanted):
                 alarms += 1
-                changes.begin()
+                detector.begin()
         cycles += len(scores)
     note = f"({alarms} in {cycles:,} cycles)"
-    return Measured([alarms * asked / cycles], note=note)
+    return Measured([alarms * wanted / cycles], note=note)
 
 
-def _running(pool: Floats, alike: Floats) -> list[ChangeDetector]:
-    """Sums in healthy cycles, as they are when a change begins; an alarm begins them anew."""
-    changes, found, rng = _changes(alike), [], np.random.default_rng(0)
+def _running(pool: Floats, cosines: Floats) -> list[ChangeDetector]:
+    """Settled sums of healthy cycles at which a change may begin; an alarm restarts the sums."""
+    detector, detectors, rng = _changes(cosines), [], np.random.default_rng(0)
     for cycle in range(1, RUN_IN + APART * DRAWS):
-        changes.take(pool[rng.integers(len(pool))])
-        if changes.log_sum >= limit(MONTH):
-            changes.begin()
+        detector.take(pool[rng.integers(len(pool))])
+        if detector.log_sum >= limit(MONTH):
+            detector.begin()
         if cycle >= RUN_IN and (cycle - RUN_IN) % APART == 0:
-            found.append(deepcopy(changes))
-    return found
+            detectors.append(deepcopy(detector))
+    return detectors
 
 
 def _late(
-    pool: Floats, alike: Floats, shift: float, begins: Sequence[ChangeDetector], healthy: int
+    pool: Floats, cosines: Floats, shift: float, begins: Sequence[ChangeDetector], healthy: int
 ) -> Measured:
-    """Mean of the effects' median delays, and the mean delay of a CUSUM for one of them alone."""
-    names = [one.effect for one in SUSPECTS]
+    """Mean of the effects' median delays, with the mean delay of a CUSUM for one known effect."""
+    names = [suspect.effect for suspect in SUSPECTS]
     medians = []
     for effect in EFFECTS:
-        added = shift * alike[names.index(effect)]
+        added = shift * cosines[names.index(effect)]
         rng = np.random.default_rng(names.index(effect))
         delays = [_delay(pool, deepcopy(begin), added, rng) for begin in begins]
         medians.append(float(np.median(delays)))
-    note = f"({', '.join(f'{one:g}' for one in medians)})"
+    note = f"({', '.join(f'{median:g}' for median in medians)})"
     return Measured([float(np.mean(medians))], [_optimum(shift, healthy)], note=note)
 
 
-def _delay(pool: Floats, changes: ChangeDetector, added: Floats, rng: np.random.Generator) -> int:
+def _delay(pool: Floats, detector: ChangeDetector, added: Floats, rng: np.random.Generator) -> int:
     for cycle in range(1, NEVER):
-        changes.take(pool[rng.integers(len(pool))] + added)
-        if changes.log_sum >= limit(MONTH):
+        detector.take(pool[rng.integers(len(pool))] + added)
+        if detector.log_sum >= limit(MONTH):
             return cycle
     return NEVER
 
 
 def _optimum(shift: float, healthy: int) -> float:
-    """Mean delay of the CUSUM for one known shift, upwards; its limit after Siegmund."""
+    """Mean delay of a one-sided CUSUM for a known shift, with its limit after Siegmund."""
     k = 0.5 * shift
     height = brentq(lambda h: _run_length(k, h) - MONTH, 0.1, 100.0)
     rng, delays = np.random.default_rng(1), []
@@ -152,13 +151,13 @@ def _optimum(shift: float, healthy: int) -> float:
 
 
 def _above(steps: Floats) -> Floats:
-    """The sums of steps, from zero on and never below it."""
+    """Cumulative sums of steps that start at zero and are reset to zero when negative."""
     total = np.concatenate([[0.0], np.cumsum(steps)])
     result: Floats = total - np.minimum.accumulate(total)
     return result
 
 
 def _run_length(k: float, height: float) -> float:
-    """Cycles to a false alarm (Siegmund): of a CUSUM with reference value k and this limit."""
+    """Cycles to a false alarm of a CUSUM with reference value k and limit ``height`` (Siegmund)."""
     b = height + 1.166
     return float((np.exp(2 * k * b) - 2 * k * b - 1) / (2 * k * k))

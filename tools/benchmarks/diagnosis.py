@@ -1,4 +1,4 @@
-"""Diagnosis from end to end: a log in, a cause out; beside a fit of that alone, and a replay."""
+"""Diagnosis from end to end, beside a fit of its cause alone and a replay."""
 
 import json
 import time
@@ -27,17 +27,17 @@ def end_to_end(run: Run) -> Sequence[Measured]:
     """Time (s) and peak memory (MB) for 12 cycles, then for an hour."""
     run.tell("diagnosis: simulating the rig")
     short = recorded(SHORT_S, [f"{LEAK}={SIZE}"])
-    few = log.keep(run.folder / "leak.mcap", short)
-    many = log.keep(
+    short_log = log.keep(run.folder / "leak.mcap", short)
+    hour_log = log.keep(
         run.folder / "leak in an hour.mcap",
         recorded(HOUR_S, [f"{LEAK}={SIZE}@{HOUR_S / 2}"]),
     )
-    return (*_cycles(run, few, short), *_hour(run, many))
+    return (*_cycles(run, short_log, short), *_hour(run, hour_log))
 
 
 def _cycles(run: Run, path: Path, recording: Recording) -> tuple[Measured, Measured]:
-    """Beside a fit of the leak alone, and the memory of a replay."""
-    _diagnosed(run, path)  # compiles what is not compiled yet
+    """Time beside a fit of the leak alone, and memory beside that of a replay."""
+    _diagnosed(run, path)  # compiles first
     ours, replays, fits = [], [], []
     repeats = LONG_REPEATS if run.long else REPEATS
     for number in range(repeats):
@@ -50,7 +50,7 @@ def _cycles(run: Run, path: Path, recording: Recording) -> tuple[Measured, Measu
 
 
 def _hour(run: Run, path: Path) -> tuple[Measured, Measured]:
-    """Beside the replay of an hour without the leak."""
+    """Time and memory beside the replay of an hour without the leak."""
     floor, ours = replay.replays(run, 60), []
     for number in range(REPEATS):
         run.tell(f"diagnosis: an hour, {number + 1} of {REPEATS}")
@@ -60,7 +60,7 @@ def _hour(run: Run, path: Path) -> tuple[Measured, Measured]:
 
 
 def _diagnosed(run: Run, path: Path) -> tuple[float, float]:
-    """Time (s) and peak memory (MB) of a diagnosis, which has to be right."""
+    """Time (s) and peak memory (MB) of a diagnosis; a wrong answer is an error."""
     answer = run.folder / "answer.json"
     used = usage([TWIN, "diagnose", path, "--json", answer])
     named = [cause["effect"] for cause in json.loads(answer.read_text())["causes"]]
@@ -69,13 +69,13 @@ def _diagnosed(run: Run, path: Path) -> tuple[float, float]:
 
 
 def _fit(path: Path, recording: Recording) -> float:
-    """Time (s) to read the log and to fit the leak, nothing else being tried."""
+    """Time (s) to read the log and to fit the leak alone."""
     begin = time.perf_counter()
     measured = np.concatenate([rows["pressure"] for rows, _ in open_log(path).blocks()])
     rows = first_rows(recording, len(measured))
-    found = least_squares(_off, [0.5 * SIZE], args=(recording, rows, measured), diff_step=1e-3)
-    assert found.success
-    assert abs(found.x[0] / SIZE - 1.0) < 0.5, f"least squares found {found.x[0]:.2f}"
+    fit = least_squares(_off, [0.5 * SIZE], args=(recording, rows, measured), diff_step=1e-3)
+    assert fit.success
+    assert abs(fit.x[0] / SIZE - 1.0) < 0.5, f"least squares found {fit.x[0]:.2f}"
     return time.perf_counter() - begin
 
 
@@ -85,6 +85,6 @@ def _off(
     rows: Driven,
     measured: npt.NDArray[np.float32],
 ) -> npt.NDArray[np.float64]:
-    """Deviations (Pa) with a leak of so much."""
+    """Deviations (Pa) with a leak of size ``x``."""
     theta = apply(recording.theta, LEAK, {PARAMETER: float(x[0])})
     return np.nan_to_num(measured - timed(kernel.advance, theta, rows)[1])

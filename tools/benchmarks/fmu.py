@@ -1,4 +1,4 @@
-"""The model in another program: its FMU simulated by FMPy, beside the twin's own kernel."""
+"""The model as an FMU, simulated by FMPy, beside the twin's own kernel."""
 
 import shutil
 import time
@@ -37,14 +37,14 @@ def in_fmpy(run: Run) -> Sequence[Measured]:
     path = run.folder / made.name
     path.write_bytes(made.content)
     folder = fmpy.extract(str(path), str(run.folder / "fmu"))
-    _by_model(data)  # compiles what is not compiled yet
+    _by_model(data)  # compiles first
     with on_core(TWIN_CORE):
         pairs = [(_by_fmpy(folder), _by_model(data)) for _ in range(REPEATS)]
-    (_, found), (_, expected) = pairs[0]
-    off = float(np.max(np.abs(found - expected)))
-    assert off < AGREE_PA, f"the FMU is another model: {off:.3g} Pa"
-    theirs, ours = ([one[0] for one in each] for each in zip(*pairs, strict=True))
-    return (Measured(theirs, ours, note=f"within {off:.1g} Pa of it"),)
+    (_, from_fmu), (_, expected) = pairs[0]
+    difference = float(np.max(np.abs(from_fmu - expected)))
+    assert difference < AGREE_PA, f"the FMU is another model: {difference:.3g} Pa"
+    theirs, ours = ([result[0] for result in column] for column in zip(*pairs, strict=True))
+    return (Measured(theirs, ours, note=f"within {difference:.1g} Pa of it"),)
 
 
 def _commands() -> Bytes:
@@ -67,8 +67,8 @@ def _by_fmpy(folder: str) -> tuple[float, Floats]:
     rows["time"] = np.arange(len(commands)) * MS
     for name, command in names.items():
         rows[name] = commands & command
-    # It says which inputs keep their start. Given as columns they would take as long again.
-    with redirect_stdout(StringIO()) as said:
+    # FMPy prints which inputs keep their start values. As columns they would double the time.
+    with redirect_stdout(StringIO()) as output:
         begin = time.thread_time()
         result = fmpy.simulate_fmu(
             folder,
@@ -79,6 +79,6 @@ def _by_fmpy(folder: str) -> tuple[float, Floats]:
             output=["sensor.pressure"],
         )
         spent = 1e9 * (time.thread_time() - begin) / len(commands)
-    others = [line for line in said.getvalue().splitlines() if "missing input" not in line]
-    assert not others, f"FMPy says: {others}"
+    complaints = [line for line in output.getvalue().splitlines() if "missing input" not in line]
+    assert not complaints, f"FMPy says: {complaints}"
     return spent, result["sensor.pressure"]

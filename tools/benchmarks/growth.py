@@ -1,4 +1,4 @@
-"""How cost grows: with the length of a log, the number of hypotheses, the number of ejectors."""
+"""Growth of cost with the length of a log, the number of hypotheses and of ejectors."""
 
 import subprocess
 import sys
@@ -23,9 +23,9 @@ from twin.model import kernel as model
 REPEATS = 3
 MINUTES = (5, 20, 60)
 DAY_H = 24
-MOST_MB = 500.0  # that a replay may have
+MOST_MB = 500.0  # limit on the memory of a replay
 HYPOTHESES = (8, 16, 32, 64)
-A_ROW_NS = 1e6  # there are, if the bank is to keep up
+A_ROW_NS = 1e6  # time for a row if the bank is to keep up
 EJECTORS = (1, 4, 8)
 SLICE_S, SLICES = 4.0, 3
 IMPORTS = (sys.executable, "-c", "import numba, numpy, pydantic, typer")
@@ -45,32 +45,40 @@ def _grown(
 def length(run: Run) -> Sequence[Measured]:
     """Time and peak memory of replays of logs of several lengths, and of one of a day."""
     hours = [minutes / 60.0 for minutes in MINUTES]
-    each = [replay.replays(run, minutes) for minutes in MINUTES]
+    results = [replay.replays(run, minutes) for minutes in MINUTES]
     times, floors, memories = (
         list(zip(*columns, strict=True))
-        for columns in zip(*((one.times, one.floors, one.memories) for one in each), strict=True)
+        for columns in zip(
+            *((result.times, result.floors, result.memories) for result in results), strict=True
+        )
     )
     time_line = Line("replay, s", "hours of log", hours, medians(times))
-    sizes, costs = hours[1:], [list(one[1:]) for one in memories]  # the first has not settled
+    # Memory has not settled at the first size.
+    sizes, costs = hours[1:], [list(run_memories[1:]) for run_memories in memories]
     most, note = None, "by the line, which an hour and less make too steep"
     with on_core(TWIN_CORE):
         imports = [usage(IMPORTS)[1] for _ in range(REPEATS)]
         if run.long:
             run.tell("length: a day")
             day, note = _replay_of_a_day(run.folder)
-            sizes, costs, most = [*sizes, DAY_H], [[*one, day] for one in costs], MOST_MB
+            sizes, costs, most = [*sizes, DAY_H], [[*before, day] for before in costs], MOST_MB
     line = Line("replay, MB", "hours of log", sizes, medians(costs), most, f"{MOST_MB:g} MB")
     if not run.long:
         day = line.rest + DAY_H * line.slope
     return (
-        _grown(hours, times, time_line, [Line("", "", hours, one).slope for one in floors]),
+        _grown(
+            hours,
+            times,
+            time_line,
+            [Line("", "", hours, run_floors).slope for run_floors in floors],
+        ),
         _grown(sizes, costs, line, ()),
         Measured([day], imports, note=note, valid=run.long),
     )
 
 
 def _replay_of_a_day(folder: Path) -> tuple[float, str]:
-    """Peak memory (MB) of it, and how long it took."""
+    """Peak memory (MB) of the replay of a day, and how long it took in words."""
     path, again = _day(folder / "day.mcap"), folder / "day again.mcap"
     seconds, most = usage([TWIN, "replay", path, "-o", again])
     path.unlink()
@@ -79,7 +87,7 @@ def _replay_of_a_day(folder: Path) -> tuple[float, str]:
 
 
 def _day(path: Path) -> Path:
-    """The hour again and again, its clock and numbers running on."""
+    """A log of the hour repeated DAY_H times, with clock and sequence numbers running on."""
     rows = len(hour().samples)
     with Recorder(path, hour().config.log_header()) as recorder:
         for number in range(DAY_H):
@@ -106,8 +114,8 @@ def hypotheses(run: Run) -> Sequence[Measured]:
     with on_core(TWIN_CORE):
         kernel.timed(model.advance, together[0], rows)
         for _ in range(REPEATS):
-            each = [kernel.timed(model.advance, theta, rows)[0] for theta in together]
-            times.append([n * ns for n, ns in zip(HYPOTHESES, each, strict=True)])
+            row_times = [kernel.timed(model.advance, theta, rows)[0] for theta in together]
+            times.append([n * ns for n, ns in zip(HYPOTHESES, row_times, strict=True)])
             if vectors is not None:
                 floors.append(_slope_in_c(vectors, banks, rows))
     memories = [[_memory(theta, rows) for theta in together]]
@@ -122,13 +130,13 @@ def _slope_in_c(
 ) -> float:
     times = []
     for bank in banks:
-        each = [kernel.timed(vectors, lanes, rows)[0] for lanes in kernel.in_lanes(bank)]
-        times.append(sum(each) * model.LANES)
+        row_times = [kernel.timed(vectors, lanes, rows)[0] for lanes in kernel.in_lanes(bank)]
+        times.append(sum(row_times) * model.LANES)
     return Line("", "", HYPOTHESES, times).slope
 
 
 def _memory(theta: kernel.Theta, rows: kernel.Driven) -> float:
-    """Peak memory (MB) of what a call is given and gives."""
+    """Peak memory (MB) of a call's inputs and outputs."""
     tracemalloc.start()
     kernel.timed(model.advance, theta, rows)
     most = tracemalloc.get_traced_memory()[1]
@@ -140,10 +148,10 @@ def _memory(theta: kernel.Theta, rows: kernel.Driven) -> float:
 
 
 def ejectors(run: Run) -> Sequence[Measured]:
-    """Lost samples and CPU share of the most ejectors; CPU and memory of one more."""
+    """Lost samples and CPU share of max(EJECTORS); CPU and memory of one more ejector."""
     shares, memories = [], []
-    with ExitStack() as open_now:
-        ports = [open_now.enter_context(plc()) for _ in range(max(EJECTORS))]
+    with ExitStack() as stack:
+        ports = [stack.enter_context(plc()) for _ in range(max(EJECTORS))]
         for count in EJECTORS:
             with plant.together(run, ports[:count]) as (process, logs):
                 run.tell(f"together: {count}")
@@ -151,14 +159,14 @@ def ejectors(run: Run) -> Sequence[Measured]:
                 memories.append(psutil.Process(process.pid).memory_info().rss * 1e-6)
         with on_core(TWIN_CORE):
             floors = [bare_share(ports[0]) for _ in range(SLICES)]
-    found = [lost(one) for one in logs]
+    losses = [lost(log) for log in logs]
     runs = list(zip(*shares, strict=True))
     line = Line("CPU, %", "ejectors", EJECTORS, medians(runs), 100.0, "a core")
     memory = Line("memory, MB", "ejectors", EJECTORS, memories)
     return (
         Measured(
-            [sum(missing for missing, _ in found)],
-            note=f"of {sum(rows for _, rows in found):,} samples",
+            [sum(missing for missing, _ in losses)],
+            note=f"of {sum(rows for _, rows in losses):,} samples",
         ),
         Measured(shares[-1]),
         _grown(EJECTORS, runs, line, floors),

@@ -1,8 +1,8 @@
-"""Isolation while the loop runs: whether the right cause is told soon after it began.
+"""Isolation in the loop: whether the right cause is named soon after its onset.
 
 A simulated rig with one effect that begins at a known cycle goes through twin, bank and monitor as
-in the loop. The size is twice the least that could be told within three cycles: that a CUSUM which
-looks for nothing else finds by then, and that is apart from every other effect, re-fitted.
+in the loop. The size is twice the smallest that can be isolated within three cycles. That one is
+detected by then by a CUSUM for this effect alone, and differs from every other re-fitted effect.
 """
 
 import os
@@ -34,19 +34,19 @@ from twin.settings import Document
 SYSTEMS = ("test_rig", "gripper")
 RUNS = 60
 BEGINS, WITHIN = 30, 3  # cycles
-HEALTHY = 60  # cycles, of which it is learned how they scatter
-APART = 100_000  # between the seeds of these and of those with the effect
+HEALTHY = 60  # cycles from which scatter is learned
+APART = 100_000  # between the seeds of healthy cycles and of those with the effect
 CYCLE_S = {"test_rig": 3.2, "gripper": 2.3}  # at most
-FOUND = 3.2  # sigmas a cycle, that the best CUSUM for one false alarm in 30 days finds by then
-REJECTED = 10.8  # chi-square at which one of a thousand says so by chance
-TIMES = 2.0  # the least size that can be told
+FOUND = 3.2  # sigmas a cycle that the best CUSUM for one false alarm in 30 days detects by then
+REJECTED = 10.8  # chi-square that chance exceeds once in a thousand
+TIMES = 2.0  # times the smallest size that can be isolated
 MOST_NAMED = 3
 FIRST_SEED = 6000
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What was hidden in a run, and what was told of it: the foremost first."""
+    """The hidden effect of a run, and the effects named, the most probable first."""
 
     system: str
     effect: str
@@ -56,20 +56,22 @@ class Outcome:
 
     @property
     def right(self) -> bool:
-        """Whether the cause is among those told, and these are few enough."""
+        """Whether the effect is among at most MOST_NAMED named ones."""
         return self.effect in self.told and len(self.told) <= MOST_NAMED
 
 
 def causes(run: Run) -> Sequence[Measured]:
-    """Of all runs, those in which the right cause is named within three cycles."""
+    """Share (%) of runs in which the right cause is not named within three cycles."""
     outcomes = []
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as workers:
-        for one in workers.map(outcome, range(FIRST_SEED, FIRST_SEED + RUNS)):
-            outcomes.append(one)
+        for result in workers.map(outcome, range(FIRST_SEED, FIRST_SEED + RUNS)):
+            outcomes.append(result)
             run.tell(f"isolation: {len(outcomes)} of {RUNS} runs")
-    right = [one for one in outcomes if one.right]
-    alone = sum(len(one.told) == 1 for one in right)
-    missed = ", ".join(f"{one.effect} ({one.system})" for one in outcomes if not one.right)
+    right = [result for result in outcomes if result.right]
+    alone = sum(len(result.told) == 1 for result in right)
+    missed = ", ".join(
+        f"{result.effect} ({result.system})" for result in outcomes if not result.right
+    )
     note = f"({alone} alone; not: {missed or 'none'})"
     return [Measured([100.0 * (1.0 - len(right) / RUNS)], note=note)]
 
@@ -79,13 +81,13 @@ def outcome(seed: int) -> Outcome:
     rng = np.random.default_rng(seed)
     system = SYSTEMS[int(rng.integers(len(SYSTEMS)))]
     effect = EFFECTS[str(rng.choice(list(EFFECTS)))]
-    number = next(i for i, one in enumerate(SUSPECTS) if one.effect == effect.name)
+    number = next(i for i, candidate in enumerate(SUSPECTS) if candidate.effect == effect.name)
     suspect = SUSPECTS[number]
     document = Document.read(ROOT / "configs" / f"{system}.toml")
     config, rig = Config.of(document), document.section(PlcSettings, "plc")
     sign = rng.choice([-1.0, 1.0]) if suspect.both_ways else 1.0
     healthy = heard(config, rig, CYCLE_S[system] * HEALTHY, seed + APART)
-    steps = sign * TIMES * least([said for said, _ in healthy], number)
+    steps = sign * TIMES * least([residual for residual, _ in healthy], number)
     parameter = suspect.parameter
     healthy_is = 0.0 if parameter.coefficient is None else rig.rig.vessel_film
     size = healthy_is + steps * suspect.step
@@ -96,56 +98,56 @@ def outcome(seed: int) -> Outcome:
 
 
 def least(healthy: Sequence[CycleResidual], number: int) -> float:
-    """Steps of a suspect that some cycles can show and tell from every other effect."""
+    """Smallest size of a suspect, in its steps, that is isolated WITHIN cycles."""
     effect = SUSPECTS[number].effect
-    others = [i for i, one in enumerate(SUSPECTS) if one.effect != effect]
+    others = [i for i, suspect in enumerate(SUSPECTS) if suspect.effect != effect]
     last = healthy[-1]
     signature = last.signatures[:, number]
     power = float(signature @ np.linalg.solve(_unknown(last, number), signature))
-    scatter = float(np.nanstd([one.scores()[number] for one in healthy]))
+    scatter = float(np.nanstd([residual.scores()[number] for residual in healthy]))
     nearest = float(np.max(np.abs(last.alike()[number, others])))
     apart = np.sqrt(REJECTED / WITHIN / (1.0 - nearest**2))
     return max(FOUND, float(apart)) * scatter / np.sqrt(power)
 
 
-def _unknown(said: CycleResidual, number: int) -> Floats:
-    """Covariance (mbar²) of what a suspect is to be told from; a low supply may be another."""
-    ways = said.unsure if number == UNSURE_OF else said.unsure[:, :0]
-    covariance: Floats = said.alone + ways @ ways.T
+def _unknown(residual: CycleResidual, number: int) -> Floats:
+    """Covariance (mbar²) for a suspect; for UNSURE_OF with its uncertain response."""
+    ways = residual.unsure if number == UNSURE_OF else residual.unsure[:, :0]
+    covariance: Floats = residual.alone + ways @ ways.T
     return covariance
 
 
 def heard(
     config: Config, rig: PlcSettings, seconds: float, seed: int
 ) -> Iterator[tuple[CycleResidual, Floats]]:
-    """What each cycle of a healthy rig says, and its scores as standard normal variables."""
+    """The residual of each cycle of a healthy rig, and its scores as standard normal variables."""
     twin, cutter = Twin.of(config.data), CycleCutter()
     isolation = Isolation.of(config.data, config.monitor.healthy, days=1e9)
     for block in blocks(rig, seconds, seed=seed, block=20_000):
         rows, ticks = twin.advance(block)
-        looks = [
-            CycleView(one, None, figures(one, twin.theta), one.complete and one.settled)
-            for one in cutter.push(rows, ticks)
+        views = [
+            CycleView(cycle, None, figures(cycle, twin.theta), cycle.complete and cycle.settled)
+            for cycle in cutter.push(rows, ticks)
         ]
-        for said in isolation.hear(looks):
-            if said and isolation.judge(said) is not None:
+        for residual in isolation.hear(views):
+            if residual and isolation.judge(residual) is not None:
                 yield isolation.heard
 
 
 def _watched(
     config: Config, rig: PlcSettings, seconds: float, fault: str, seed: int
 ) -> list[Event]:
-    """All that is told of a rig with a fault."""
-    twin, told = Twin.of(config.data), []
+    """All events of a rig with a fault."""
+    twin, events = Twin.of(config.data), []
     isolation = Isolation.of(config.data, config.monitor.healthy, config.monitor.false_alarm_days)
     monitor = Monitor(config.monitor, coefficients(config.data), isolation=isolation)
     for block in blocks(rig, seconds, [parse_fault(fault)], seed=seed):
-        told += monitor.update(*twin.advance(block))
-    return told
+        events += monitor.update(*twin.advance(block))
+    return events
 
 
 def _told(events: Sequence[Event]) -> list[str]:
-    """The effects named within the cycles after the change, once there is an alarm."""
+    """Effects named within WITHIN cycles of the onset; empty without an alarm."""
     last = BEGINS + WITHIN - 1
     since = [event for event in events if BEGINS <= event.data.get("cycle", -1) <= last]
     alarms = [event for event in since if event.kind is Kind.DEVIATION]
@@ -153,6 +155,6 @@ def _told(events: Sequence[Event]) -> list[str]:
         return []
     shares = [event.data["probabilities"] for event in since if "probabilities" in event.data]
     if shares:
-        likely = sorted(shares[-1].items(), key=lambda one: -one[1])
+        likely = sorted(shares[-1].items(), key=lambda item: -item[1])
         return [effect for effect, share in likely if effect != "none" and share >= RIVAL]
     return [alarms[-1].data["effect"], *filter(None, alarms[-1].data["also"].split(","))]

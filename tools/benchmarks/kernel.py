@@ -1,4 +1,4 @@
-"""The compiled model beside the same scheme in C, one hypothesis and many, and beside SciPy."""
+"""The compiled model beside the same scheme in C, for one hypothesis and for many."""
 
 import ctypes
 import time
@@ -29,9 +29,9 @@ BANK_REPEATS = 5
 CUT_ROWS = 10_000
 CUTS = (1, 2, 5, 10, 20, 50)  # rows of a call
 CUT_REPEATS = 9
-SIZES = (1.0, 0.5, 2.0, 4.0)  # of an effect, in its typical size
+SIZES = (1.0, 0.5, 2.0, 4.0)  # of an effect, in typical sizes
 AGREE = 1e-9  # relative
-# Not even now does gcc make vectors of the loop unless values stay where they are used.
+# Without -fno-tree-pre gcc moves values out of the loop and then does not vectorise it.
 VECTORS = ("-O3", "-march=native", "-fopenmp-simd", "-fno-math-errno", "-fno-trapping-math")
 VECTORS += ("-fno-tree-pre", f"-DLANES={kernel.LANES}")
 
@@ -42,33 +42,33 @@ Driven = tuple[Floats, Bytes, Floats]  # time steps, phases, levels
 
 
 def speed(run: Run) -> Sequence[Measured]:
-    """Processor time (ns) of a row: from row to row, in strides, for each of 64 together.
+    """Processor time (ns) of a row: row by row, with dense output, and for 64 hypotheses at once.
 
-    The last beside each alone in C, and beside as many at once in C. Then that (µs) of a call
-    beyond its rows.
+    The floors of the last are C for each alone, and C for several at once. Then the time (µs) of a
+    call beyond its rows.
     """
     run.tell("kernel: simulating the rig")
     theta, bank = hour().theta, hypotheses(hour().theta)
-    one, few = first_rows(hour(), ROWS), first_rows(hour(), BANK_ROWS)
+    single_rows, bank_rows = first_rows(hour(), ROWS), first_rows(hour(), BANK_ROWS)
     native, vectors = in_c(run.folder), in_c(run.folder, VECTORS)
     with on_core(TWIN_CORE):
         run.tell("kernel: one hypothesis")
-        single = _one(theta, one, native)
+        single = _one(theta, single_rows, native)
         run.tell(f"kernel: {HYPOTHESES} hypotheses")
-        many = _many(bank, few, native, vectors)
+        together = _many(bank, bank_rows, native, vectors)
         run.tell("kernel: strides, and calls of few rows")
         return (
             single,
-            _strided(theta, one, native),
-            *many,
+            _strided(theta, single_rows, native),
+            *together,
             _calls(theta, first_rows(hour(), CUT_ROWS)),
         )
 
 
 def hypotheses(theta: Theta, count: int = HYPOTHESES) -> list[Theta]:
-    """The data set with each effect of the table at its typical size, then at other sizes."""
-    every = (_changed(theta, effect, size) for size in SIZES for effect in EFFECTS.values())
-    return list(islice(every, count))
+    """Coefficients with each effect of the table at its typical size, then at other sizes."""
+    variants = (_changed(theta, effect, size) for size in SIZES for effect in EFFECTS.values())
+    return list(islice(variants, count))
 
 
 def _changed(theta: Theta, effect: Effect, size: float) -> Theta:
@@ -94,7 +94,7 @@ def _one(theta: Theta, driven: Driven, native: Advance | None) -> Measured:
 
 
 def _strided(theta: Theta, driven: Driven, native: Advance | None) -> Measured:
-    """One hypothesis as the twin goes, beside the C from row to row."""
+    """One hypothesis with dense output, as in the twin, beside the C that goes row by row."""
     expected, row_by_row = (timed(way, theta, driven)[1] for way in (_in_strides, kernel.advance))
     note = f"within {np.nanmax(np.abs(expected - row_by_row)):.1g} Pa of the kernel's"
     ours, c = [], []
@@ -111,7 +111,7 @@ def _in_strides(_: Floats, *given: Any) -> None:
 def _many(
     bank: Sequence[Theta], rows: Driven, native: Advance | None, vectors: Advance | None
 ) -> tuple[Measured, Measured]:
-    """All of ``bank`` in one call by turns with the C: one after another, then in its lanes."""
+    """All of ``bank`` in one call, by turns with C: one hypothesis at a time, then in lanes."""
     together = np.ascontiguousarray(np.transpose(bank))
     expected = timed(kernel.advance, together, rows)[1]
     alone = np.transpose([timed(kernel.advance, theta, rows)[1] for theta in bank])
@@ -121,18 +121,18 @@ def _many(
         return Measured(ours, note=f"{note}; no C compiler"), Measured(ours)
     _compared(alone, np.transpose([timed(native, theta, rows)[1] for theta in bank]))
     lanes = in_lanes(bank)
-    in_c_at_once = np.hstack([timed(vectors, some, rows)[1] for some in lanes])
+    in_c_at_once = np.hstack([timed(vectors, lane, rows)[1] for lane in lanes])
     at_once = _compared(expected, in_c_at_once[:, : len(bank)])
     ours, c, simd = [], [], []
     for _ in range(BANK_REPEATS):
         ours.append(timed(kernel.advance, together, rows)[0])
         c.append(float(np.mean([timed(native, theta, rows)[0] for theta in bank])))
-        simd.append(float(np.mean([timed(vectors, some, rows)[0] for some in lanes])))
+        simd.append(float(np.mean([timed(vectors, lane, rows)[0] for lane in lanes])))
     return Measured(ours, c, note), Measured(ours, simd, at_once)
 
 
 def _calls(theta: Theta, driven: Driven) -> Measured:
-    """What a call costs (µs) beyond its rows: the same rows, cut into calls of several lengths."""
+    """Time (µs) of a call beyond its rows, from the same rows cut into calls of several lengths."""
     whole = timed(kernel.advance, theta, driven)[1]
     runs = [[_cut(theta, driven, rows, whole) for rows in CUTS] for _ in range(CUT_REPEATS)]
     rests = [Line("", "", CUTS, run).rest for run in runs]
@@ -141,7 +141,7 @@ def _calls(theta: Theta, driven: Driven) -> Measured:
 
 
 def _cut(theta: Theta, driven: Driven, rows: int, whole: Floats) -> float:
-    """Processor time (µs) of a call of so many rows; they give what they give in one call."""
+    """Processor time (µs) of a call of ``rows`` rows; results must equal those of one call."""
     state, expected, signals = kernel.new_state(), np.empty_like(whole), np.empty(len(whole), "u1")
     parts = [slice(at, at + rows) for at in range(0, len(whole), rows)]
     dt, phase, level = driven
@@ -155,9 +155,9 @@ def _cut(theta: Theta, driven: Driven, rows: int, whole: Floats) -> float:
 
 
 def in_lanes(bank: Sequence[Theta]) -> list[Theta]:
-    """Hypotheses as the C takes them that runs many at once: (coefficients, lanes) each.
+    """Hypotheses in groups for the C that runs many at once: (coefficients, lanes) each.
 
-    The last lanes are copies of the last hypothesis where there are fewer.
+    Copies of the last hypothesis fill the last group.
     """
     whole = [*bank, *[bank[-1]] * (-len(bank) % kernel.LANES)]
     starts = range(0, len(whole), kernel.LANES)
@@ -165,7 +165,10 @@ def in_lanes(bank: Sequence[Theta]) -> list[Theta]:
 
 
 def _compared(expected: Floats, native: Floats) -> str:
-    """Say whether the C is still the same scheme: a difference far below AGREE may be a change."""
+    """Agreement with the C in words; a difference above AGREE is an error.
+
+    A difference far below AGREE may still be a change of the scheme.
+    """
     np.testing.assert_allclose(native, expected, rtol=AGREE, err_msg="kernel.c is another scheme")
     if np.array_equal(native, expected, equal_nan=True):
         return "with the C's results to the last bit"
@@ -176,7 +179,7 @@ def _compared(expected: Floats, native: Floats) -> str:
 def in_c(folder: Path, options: Sequence[str] = PLAIN) -> Advance | None:
     """``kernel.advance`` in C for one hypothesis, or for ``LANES`` with VECTORS.
 
-    None where there is no compiler.
+    None without a compiler.
     """
     compiled = library("kernel", folder, options)
     return None if compiled is None else partial(_advance, compiled)
@@ -190,9 +193,9 @@ def first_rows(recording: Recording, rows: int) -> Driven:
 
 
 def timed(advance: Advance, theta: Theta, driven: Driven) -> tuple[float, Floats]:
-    """Processor time (ns) per row and hypothesis of a fresh model, and what it expects (Pa).
+    """Processor time (ns) per row and hypothesis of a fresh model, and its expected pressure (Pa).
 
-    Both only compute, so the time that others take on the machine can be left out.
+    The model only computes, so processor time leaves out the time that other processes take.
     """
     many = theta.shape[1:]
     shape = (len(driven[0]), *many)

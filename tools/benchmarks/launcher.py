@@ -1,6 +1,6 @@
 """Run as a program: runs a command; prints its time (s), its peak memory (MB) and its exit code.
 
-A process is given the memory of the one that started it as its own peak, so that has to be small.
+A process inherits the memory of its parent as its own peak, so the parent has to be small.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""The log: its size, and an hour written and read, beside bare rows through zstd."""
+"""The log: its size, and the time to write and read an hour, beside bare rows through zstd."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -25,14 +25,14 @@ REPEATS = 5
 
 
 class _Way(NamedTuple):
-    """One way to keep the hour: how it is written to a path, and read from it."""
+    """One way to store the hour: functions that write it to a path and read it."""
 
     write: Callable[[Path], object]
     read: Callable[[Path], object]
 
 
 class _Taken(NamedTuple):
-    """Repetitions of one way: bytes per sample, time (s) to write and to read."""
+    """Repetitions of one way: bytes per sample, time (s) to write, time (s) to read."""
 
     sizes: list[float]
     written: list[float]
@@ -40,20 +40,20 @@ class _Taken(NamedTuple):
 
 
 def files(run: Run) -> Sequence[Measured]:
-    """Bytes per sample, time (s) to write an hour and to read it; the same of other ways."""
+    """Bytes per sample, time (s) to write an hour and to read it; the same for other ways."""
     run.tell("log: simulating the rig")
     log = part_log(run.folder)
-    read(log)  # loads what is compiled
+    read(log)  # loads compiled code first
     chunks = packed(log)
     ours, bare = _by_turns(run, _Way(write, read), _Way(write_bare, lambda _: unpack(chunks)))
-    messages, table = _messages(log), _table()  # 200 MB, beside which nothing of ours is measured
+    messages, table = _messages(log), _table()  # 200 MB, made only after our own log is measured
     others = _by_turns(
         run,
         _Way(lambda path: _write_by_library(path, messages), _read_by_library),
         _Way(lambda path: _write_parquet(path, table), _read_parquet),
     )
-    pairs = [(ours, bare), *((other, ours) for other in others)]
-    return [Measured(*both) for pair in pairs for both in zip(*pair, strict=True)]
+    pairs = [(ours, bare), *((theirs, ours) for theirs in others)]
+    return [Measured(*repetitions) for pair in pairs for repetitions in zip(*pair, strict=True)]
 
 
 def _by_turns(run: Run, *ways: _Way) -> list[_Taken]:
@@ -71,7 +71,7 @@ def _by_turns(run: Run, *ways: _Way) -> list[_Taken]:
 
 
 def part_log(folder: Path, minutes: int = 60) -> Path:
-    """A log of the hour, or of its first minutes; written when it is first asked for."""
+    """A log of the hour, or of its first minutes; written on the first call."""
     path = folder / f"{minutes} min.mcap"
     return path if path.exists() else keep(path, hour(), minutes * MINUTE)
 
@@ -95,21 +95,21 @@ def read(path: Path) -> None:
 
 
 def packed(path: Path) -> list[tuple[bytes, int]]:
-    """The chunks of a log as they lie in it, with the size they unpack to."""
+    """The compressed chunks of a log, each with its uncompressed size."""
     with path.open("rb") as file:
         records = StreamReader(file, emit_chunks=True).records
         return [(r.data, r.uncompressed_size) for r in records if isinstance(r, Chunk)]
 
 
 def unpack(chunks: list[tuple[bytes, int]]) -> None:
-    """Decompress, and nothing else."""
+    """Decompress the chunks only."""
     decompressor = zstandard.ZstdDecompressor()
     for data, size in chunks:
         decompressor.decompress(data, max_output_size=size)
 
 
 def write_bare(path: Path, rows: int | None = None) -> None:
-    """The rows as they lie in memory, or about the first ``rows``, through zstd to the file."""
+    """Write the rows, or about the first ``rows``, through zstd with their layout in memory."""
     compressor = zstandard.ZstdCompressor()
     with path.open("wb") as file:
         for samples, ticks in hour().blocks()[: rows and rows // BLOCK]:
@@ -144,7 +144,7 @@ def _read_by_library(path: Path) -> None:
 
 
 def _table() -> pa.Table:
-    """The hour as columns, which are the same bytes."""
+    """The hour as columns with the same values."""
     samples, ticks = hour().samples, hour().ticks
     names = [(rows, name) for rows in (samples, ticks) for name in rows.dtype.names]
     return pa.table({name: np.ascontiguousarray(rows[name]) for rows, name in names})

@@ -1,4 +1,4 @@
-"""The machine that it ran on: what it is, how noisy, which cores we may have."""
+"""The machine of a run: description, noise, and the cores that may be used."""
 
 import os
 import platform
@@ -16,7 +16,7 @@ SPIN = 100_000  # additions, some milliseconds
 
 
 def cores() -> list[int]:
-    """Cores this process may run on; empty where that cannot be asked."""
+    """Cores this process may run on; empty if the system cannot tell."""
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 
 
@@ -24,7 +24,7 @@ PLC_CORE, TWIN_CORE = 0, -1  # indices into ``cores()``
 
 
 def can_pin() -> bool:
-    """Whether processes may be bound to cores, and there are two to keep apart."""
+    """Whether processes can be bound to cores, and at least two are available."""
     try:
         os.sched_setaffinity(0, cores())
     except (AttributeError, OSError):
@@ -34,7 +34,7 @@ def can_pin() -> bool:
 
 @contextmanager
 def on_core(index: int) -> Iterator[None]:
-    """Run what is inside, and the processes and threads it starts, on one core where we may."""
+    """Run the block, with its new processes and threads, on one core if that is possible."""
     allowed = cores()
     pinned = can_pin()
     if pinned:
@@ -47,7 +47,7 @@ def on_core(index: int) -> Iterator[None]:
 
 
 def spins() -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Time (ms) of the same additions again and again: on a quiet machine always the same."""
+    """Times (ms) of SPINS repetitions of the same additions; on a quiet machine all are equal."""
     times = []
     with on_core(TWIN_CORE):
         for _ in range(SPINS):
@@ -69,7 +69,7 @@ def noise() -> str:
 
 @dataclass(frozen=True)
 class Load:
-    """Seconds of the cores so far: all there were, what others used, what the host took away."""
+    """Core seconds so far: in total, used by other processes, and stolen by the host."""
 
     total: float
     others: float
@@ -77,7 +77,7 @@ class Load:
 
     @classmethod
     def now(cls) -> "Load":
-        """Processes that we started count as ours once they have ended."""
+        """The load so far; our child processes count as ours only after they have ended."""
         machine = psutil.cpu_times()
         ours = psutil.Process().cpu_times()
         used = ours.user + ours.system + ours.children_user + ours.children_system
@@ -86,9 +86,9 @@ class Load:
         return cls(total, busy - used, getattr(machine, "steal", 0.0))
 
     def since(self, before: "Load") -> str:
-        """What the cores did beside us since ``before``, in a sentence."""
+        """Share of other processes and of the host since ``before``, in a sentence."""
         total = (self.total - before.total) / 100.0
-        # Counted in ticks: on a quiet machine ours may come to more than all there was.
+        # Times count in ticks: on a quiet machine ours may exceed the total of all processes.
         others = max(self.others - before.others, 0.0)
         stolen = self.stolen - before.stolen
         return (
@@ -98,7 +98,7 @@ class Load:
 
 
 def description() -> str:
-    """Processor, cores, system and Python in a line."""
+    """Processor, cores, system and Python in one line."""
     return (
         f"{_processor()}, {psutil.cpu_count()} cores, {platform.system()} {platform.release()}, "
         f"Python {platform.python_version()}"

@@ -1,4 +1,4 @@
-"""The floors written in C, compiled when they are needed."""
+"""Compiles and loads the floors that are written in C."""
 
 import ctypes
 import shutil
@@ -13,14 +13,14 @@ PLAIN = ("-O2",)
 def library(
     name: str, folder: Path, options: Sequence[str] = PLAIN, libraries: Sequence[str] = ()
 ) -> ctypes.CDLL | None:
-    """Compile ``name``.c into ``folder`` and load it; None where there is no compiler.
+    """Compile ``name``.c into ``folder`` and load it; None without a compiler.
 
-    A library that is linked to has to be there.
+    Libraries to link must be installed.
     """
     compiler = shutil.which("gcc") or shutil.which("cc")
     if compiler is None:
         return None
-    target = folder / f"{name}{len(list(folder.glob(f'{name}*.so')))}.so"  # never one that is open
+    target = folder / f"{name}{len(list(folder.glob(f'{name}*.so')))}.so"  # none that is loaded
     always = ["-ffp-contract=off", "-shared", "-fPIC", "-o", target]
     sources = [HERE / f"{name}.c", *libraries, "-lm"]
     subprocess.run([compiler, *options, *always, *sources], check=True)

@@ -1,6 +1,6 @@
-"""Block mode over OPC UA: what the live twin loses, costs and how late it is, stopped or not.
+"""Block mode over OPC UA: lost samples, CPU share and delay of the live twin, with stops.
 
-The PLC is the simulated one, or node-opcua's server in front of cycles of the simulated rig.
+The PLC is the simulated one, or node-opcua's server that replays cycles of the simulated rig.
 """
 
 import asyncio
@@ -40,21 +40,21 @@ from twin.signals import MBAR, Command, Samples
 CONFIG = ROOT / "configs" / "test_rig_opcua.toml"
 PEERS = ROOT / "tests" / "peers"
 SLICE_S = 10.0
-STOP_S = 0.3  # SIGSTOP at the beginning of each slice: a client that does not get to run
+STOP_S = 0.3  # of a SIGSTOP at the beginning of each slice: the client does not get to run
 BARE_S = 3.0
 LONG_S, SHORT_S = 600.0, 30.0
-SIGNAL_S = 65.0  # of the rig's cycles, which node-opcua serves over and over
+SIGNAL_S = 65.0  # of the rig's cycles, which node-opcua repeats
 LATE = 99  # percentile
 LINE = re.compile(rb"\d\d:\d\d:\d\d\.\d{3}  ")
 
 
 def ours(run: Run) -> Sequence[Measured]:
-    """Beside the simulated PLC."""
+    """Lost samples, CPU share and delays with the simulated PLC."""
     return _acquire(run, "OPC UA, our PLC", plc(run.folder))
 
 
 def other(run: Run) -> Sequence[Measured]:
-    """Beside node-opcua."""
+    """Lost samples, CPU share and delays with node-opcua."""
     return _acquire(run, "OPC UA, node-opcua", _node_opcua(run.folder))
 
 
@@ -63,7 +63,7 @@ def other(run: Run) -> Sequence[Measured]:
 
 @contextmanager
 def plc(folder: Path) -> Iterator[int]:
-    """Run the simulated PLC; gives the port of its OPC UA server."""
+    """Run the simulated PLC; yields the port of its OPC UA server."""
     tables = tomllib.loads(CONFIG.read_text(encoding="utf-8"))
     tables["plc"]["opcua"]["port"] = 0
     config = folder / "plc.toml"
@@ -75,17 +75,19 @@ def plc(folder: Path) -> Iterator[int]:
 
 @contextmanager
 def _node_opcua(folder: Path) -> Iterator[int]:
-    """Run node-opcua's server with the rig's cycles; gives its port."""
+    """Run node-opcua's server with the rig's cycles; yields its port."""
     certificates.make(folder / "theirs", "plc")
     own = certificates.own(folder / "theirs", datetime.now(UTC))
-    told = {"port": 0, "folder": str(folder), "uri": own.uri, "signal": str(_signal(folder))}
-    told |= {"certificate": str(own.path), "key": str(own.key)}
-    with _serving(["node", PEERS / "opcua_server.js", json.dumps(told)], "listening on ") as port:
+    settings = {"port": 0, "folder": str(folder), "uri": own.uri, "signal": str(_signal(folder))}
+    settings |= {"certificate": str(own.path), "key": str(own.key)}
+    with _serving(
+        ["node", PEERS / "opcua_server.js", json.dumps(settings)], "listening on "
+    ) as port:
         yield port
 
 
 def _signal(folder: Path) -> Path:
-    """Whole cycles of the simulated rig in a file, from the end of one idle phase to another's."""
+    """A file with whole cycles of the simulated rig, from one suction edge to another."""
     plc = Document.read(CONFIG).section(PlcSettings, "plc")
     samples = np.concatenate(list(blocks(plc, SIGNAL_S)))
     edges = np.flatnonzero(np.diff(samples["commands"] & Command.SUCTION) == 1) + 1
@@ -101,7 +103,7 @@ def _signal(folder: Path) -> Path:
 
 @contextmanager
 def _serving(command: Sequence[str | Path], says: str) -> Iterator[int]:
-    """Run it once it says where it listens, at the end of a line that begins with ``says``."""
+    """Run a server; yields its port, which ends the first line that begins with ``says``."""
     with on_core(PLC_CORE):
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     with process:
@@ -120,14 +122,14 @@ def _serving(command: Sequence[str | Path], says: str) -> Iterator[int]:
 
 @dataclass
 class _Heard:
-    """What ``twin run`` said on the console, and when."""
+    """Lines that ``twin run`` printed, and when."""
 
     process: "subprocess.Popen[bytes]"
     at_ns: list[int] = field(default_factory=list)
     lines: list[bytes] = field(default_factory=list)
 
     def listen(self) -> threading.Thread:
-        """Take lines in until there are no more."""
+        """Start a thread that reads lines until the output ends."""
         thread = threading.Thread(target=self._listen)
         thread.start()
         return thread
@@ -145,12 +147,12 @@ Integers = npt.NDArray[np.int64]
 Floats = npt.NDArray[np.float64]
 
 
-def _acquire(run: Run, what: str, server: AbstractContextManager[int]) -> Sequence[Measured]:
-    log = run.folder / f"{what}.mcap"
+def _acquire(run: Run, name: str, server: AbstractContextManager[int]) -> Sequence[Measured]:
+    log = run.folder / f"{name}.mcap"
     seconds = run.seconds or (LONG_S if run.long else SHORT_S)
     slices = max(round(seconds / SLICE_S), 1)
     with server as port:
-        run.tell(f"{what}: the floor")
+        run.tell(f"{name}: the floor")
         with on_core(TWIN_CORE):
             floors = [bare_share(port) for _ in range(3)]
         with live(log, [CONFIG], port=port, stdout=subprocess.PIPE) as process:
@@ -159,13 +161,13 @@ def _acquire(run: Run, what: str, server: AbstractContextManager[int]) -> Sequen
             shares, stops = [], []
             begin_ns = time.time_ns()
             for number in range(slices):
-                run.tell(f"{what}: slice {number + 1} of {slices}")
+                run.tell(f"{name}: slice {number + 1} of {slices}")
                 share, stop = _slice(process)
                 shares.append(share)
                 stops.append(stop)
             end_ns = time.time_ns()
         listening.join()
-    # What comes before and after belongs to the start and to the end.
+    # Times before and after the slices belong to start and end of the run.
     spoilt = [(0, begin_ns), *stops, (end_ns, time.time_ns())]
     samples, lost = _rows(log)
     waits, lags = _waits(samples, spoilt), _lags(log, heard, spoilt)
@@ -177,9 +179,9 @@ def _acquire(run: Run, what: str, server: AbstractContextManager[int]) -> Sequen
     )
 
 
-def _late(ms: Floats, what: str) -> Measured:
-    """The latest but one in a hundred, and in words the median."""
-    note = f"of {len(ms):,} {what}, median {np.median(ms):.0f} ms"
+def _late(ms: Floats, items: str) -> Measured:
+    """The 99th percentile of delays (ms), with the median in its note."""
+    note = f"of {len(ms):,} {items}, median {np.median(ms):.0f} ms"
     return Measured([np.percentile(ms, LATE)], note=note)
 
 
@@ -200,7 +202,7 @@ def _slice(process: "subprocess.Popen[bytes]") -> tuple[float, Span]:
 
 
 def _rows(log: Path) -> tuple[Samples, int]:
-    """All rows, and how many numbers are missing; one that comes twice is an error."""
+    """All rows, and the number of missing ones; a repeated sequence number is an error."""
     samples = np.concatenate([samples for samples, _ in open_log(log).blocks()])
     steps = np.diff(samples["sequence"])
     assert (steps > 0).all(), "the log has a sample twice"
@@ -208,13 +210,13 @@ def _rows(log: Path) -> tuple[Samples, int]:
 
 
 def _waits(samples: Samples, spoilt: Sequence[Span]) -> Floats:
-    """From each sample to its receipt, ms, but for those that were under way in a spoilt span."""
+    """Time (ms) from each sample to its receipt, without those that overlap a spoilt span."""
     begin, end = samples["time_ns"], samples["host_ns"]
     return _apart(begin, end, spoilt)
 
 
 def _lags(log: Path, heard: _Heard, spoilt: Sequence[Span]) -> Floats:
-    """From the sample of each event to its line on the console, ms, with the same exception."""
+    """Time (ms) from an event's sample to its line on the console, without spoilt spans."""
     events = list(open_log(log).events())
     for event, line in zip(events, heard.lines, strict=True):
         assert event.text.encode() in line, "the console says other things than the log"
@@ -222,7 +224,7 @@ def _lags(log: Path, heard: _Heard, spoilt: Sequence[Span]) -> Floats:
 
 
 def _apart(begin: Integers, end: Integers, spoilt: Sequence[Span]) -> Floats:
-    """From ``begin`` to ``end`` (ns), in ms, of what has nothing of a spoilt span in it."""
+    """Times (ms) from ``begin`` to ``end`` (ns), of those that overlap no spoilt span."""
     fair = np.ones(len(begin), bool)
     for first, last in spoilt:
         fair &= (begin >= last) | (end <= first)
@@ -233,7 +235,7 @@ def _apart(begin: Integers, end: Integers, spoilt: Sequence[Span]) -> Floats:
 
 
 def bare_share(port: int, seconds: float = BARE_S) -> float:
-    """CPU time (% of a core) of asyncua alone, reading the same nodes by the same requests."""
+    """CPU time (% of a core) of asyncua alone, reading the same nodes with the same requests."""
     return asyncio.run(_bare(port, seconds))
 
 
@@ -251,7 +253,7 @@ async def _bare(port: int, seconds: float) -> float:
 
 
 def _request(nodes: Sequence[Node], index: int) -> ua.ReadParameters:
-    """What reads ``nodes``, which are in the namespace of this index."""
+    """The request to read ``nodes``, which are in the namespace with this index."""
     ids = [ua.NodeId.from_string(f"ns={index};{node.identifier}") for node in nodes]
-    wanted = [ua.ReadValueId(one, ua.AttributeIds.Value) for one in ids]
+    wanted = [ua.ReadValueId(node_id, ua.AttributeIds.Value) for node_id in ids]
     return ua.ReadParameters(NodesToRead=wanted)

@@ -1,4 +1,4 @@
-"""What the bench writes: docs/bench.json, and from it docs/bench.md with a picture of its lines."""
+"""The bench's output: docs/bench.json, and from it docs/bench.md with a picture of its lines."""
 
 import json
 from collections import Counter
@@ -25,7 +25,7 @@ Result = tuple[Figure, Measured]
 
 @dataclass(frozen=True)
 class Session:
-    """One run of the bench: under which circumstances it measured which figures."""
+    """One run of the bench: its circumstances and its figures."""
 
     circumstances: Sequence[str]
     results: Sequence[Result]
@@ -41,15 +41,15 @@ def write(sessions: Sequence[Session], benchmarks: Sequence[Benchmark]) -> None:
 
 
 def read(benchmarks: Sequence[Benchmark]) -> list[Session]:
-    """The runs that stand in docs/bench.json; figures that the bench no longer has are left out."""
-    figures = {_key(figure): figure for one in benchmarks for figure in one.figures}
+    """The runs in docs/bench.json, without figures that the bench no longer has."""
+    figures = {_key(figure): figure for benchmark in benchmarks for figure in benchmark.figures}
     return [
         Session(
             run["circumstances"],
             [
-                (figures[key], _measured(one))
-                for one in run["figures"]
-                if (key := (one["name"], one["floor"])) in figures
+                (figures[key], _measured(entry))
+                for entry in run["figures"]
+                if (key := (entry["name"], entry["floor"])) in figures
             ],
         )
         for run in json.loads(DATA.read_text(encoding="utf-8"))["runs"]
@@ -57,14 +57,15 @@ def read(benchmarks: Sequence[Benchmark]) -> list[Session]:
 
 
 def with_newer(sessions: Sequence[Session], newer: Session) -> list[Session]:
-    """A newer run before the others, which keep what it has not measured, and go if that is none.
+    """A newer run before the others, which keep only figures that it did not measure.
 
-    What was judged is not replaced by what cannot be.
+    A run without figures is dropped. A figure that was judged is not replaced by one that cannot be
+    judged.
     """
     judged = {
         _key(figure)
-        for one in sessions
-        for figure, measured in one.results
+        for session in sessions
+        for figure, measured in session.results
         if kept(figure, measured) is not None
     }
     newest = [
@@ -74,10 +75,15 @@ def with_newer(sessions: Sequence[Session], newer: Session) -> list[Session]:
     ]
     taken = {_key(figure) for figure, _ in newest}
     older = [
-        Session(one.circumstances, [both for both in one.results if _key(both[0]) not in taken])
-        for one in sessions
+        Session(
+            session.circumstances,
+            [result for result in session.results if _key(result[0]) not in taken],
+        )
+        for session in sessions
     ]
-    return [one for one in (Session(newer.circumstances, newest), *older) if one.results]
+    return [
+        session for session in (Session(newer.circumstances, newest), *older) if session.results
+    ]
 
 
 def page(sessions: Sequence[Session], benchmarks: Sequence[Benchmark]) -> str:
@@ -91,21 +97,23 @@ def page(sessions: Sequence[Session], benchmarks: Sequence[Benchmark]) -> str:
         "the same run as the figure beside it, on the same machine: use the ratios. Figures are"
     ]
     lines += ["medians of the repetitions, least to most in brackets.", ""]
-    for one in sessions:
-        lines += [*_circumstances(one, benchmarks), ""]
+    for session in sessions:
+        lines += [*_circumstances(session, benchmarks), ""]
     lines += [table(results), ""]
     if _lines(results):
         lines += [f"![Costs against sizes, with straight lines]({PICTURE})", ""]
     lines += ["## How it is measured", ""]
-    lines += [*(f"- **{one.name}**: {one.how}" for one in benchmarks), ""]
+    lines += [*(f"- **{benchmark.name}**: {benchmark.how}" for benchmark in benchmarks), ""]
     return "\n".join(lines)
 
 
 def _circumstances(session: Session, benchmarks: Sequence[Benchmark]) -> list[str]:
-    """Which benchmarks a run stands for, and how it was."""
+    """The benchmarks of a run, and its circumstances."""
     measured = {_key(figure) for figure, _ in session.results}
     names = [
-        one.name for one in benchmarks if any(_key(figure) in measured for figure in one.figures)
+        benchmark.name
+        for benchmark in benchmarks
+        if any(_key(figure) in measured for figure in benchmark.figures)
     ]
     return [
         f"Measured in this run: {', '.join(names)}.",
@@ -115,24 +123,26 @@ def _circumstances(session: Session, benchmarks: Sequence[Benchmark]) -> list[st
 
 
 def _newest(sessions: Sequence[Session], benchmarks: Sequence[Benchmark]) -> list[Result]:
-    """Each figure of the bench with what was last measured, in the bench's order."""
-    found = {_key(figure): one for session in sessions[::-1] for figure, one in session.results}
+    """Each figure of the bench with its newest measurement, in the bench's order."""
+    newest = {
+        _key(figure): measured for session in sessions[::-1] for figure, measured in session.results
+    }
     figures = [figure for benchmark in benchmarks for figure in benchmark.figures]
-    return [(figure, found.get(_key(figure), NEVER)) for figure in figures]
+    return [(figure, newest.get(_key(figure), NEVER)) for figure in figures]
 
 
 def _key(figure: Figure) -> tuple[str, str]:
-    """What tells a figure from the others: some have two floors."""
+    """Key of a figure; name and floor, as some names have two floors."""
     return figure.name, figure.floor
 
 
 def _runs(sessions: Sequence[Session]) -> list[dict[str, Any]]:
     return [
         {
-            "circumstances": one.circumstances,
-            "figures": [asdict(figure) | asdict(measured) for figure, measured in one.results],
+            "circumstances": session.circumstances,
+            "figures": [asdict(figure) | asdict(measured) for figure, measured in session.results],
         }
-        for one in sessions
+        for session in sessions
     ]
 
 
@@ -142,28 +152,32 @@ def _measured(entry: Mapping[str, Any]) -> Measured:
 
 
 def _summary(results: Sequence[Result]) -> list[str]:
-    """How many limits are kept; which are not, and by how much; which could not be judged."""
+    """How many limits are kept, which are not and by how much, and which were not judged."""
     verdicts = [
-        (figure, one, kept(figure, one)) for figure, one in results if figure.limit is not None
+        (figure, measured, kept(figure, measured))
+        for figure, measured in results
+        if figure.limit is not None
     ]
     good = sum(verdict is True for *_, verdict in verdicts)
     judged = sum(verdict is not None for *_, verdict in verdicts)
     lines = [f"**{good} of the {judged} limits that were judged are kept.**", ""]
-    broken = [(figure, one) for figure, one, verdict in verdicts if verdict is False]
-    lines += [f"- Not kept: {figure.name}, {_beyond(figure, one)}." for figure, one in broken]
+    broken = [(figure, measured) for figure, measured, verdict in verdicts if verdict is False]
+    lines += [
+        f"- Not kept: {figure.name}, {_beyond(figure, measured)}." for figure, measured in broken
+    ]
     untold: dict[str, Counter[str]] = {}
-    for figure, one, verdict in verdicts:
+    for figure, measured, verdict in verdicts:
         if verdict is None:
-            of = figure.name.partition(":")[0]
-            untold.setdefault(one.note or "no floor", Counter())[of] += 1
+            group = figure.name.partition(":")[0]
+            untold.setdefault(measured.note or "no floor", Counter())[group] += 1
     for why, counts in untold.items():
-        names = (f"{count} of {of}" for of, count in counts.items())
+        names = (f"{count} of {group}" for group, count in counts.items())
         lines.append(f"- Not judged ({why}): {'; '.join(names)}.")
     return lines
 
 
 def _beyond(figure: Figure, measured: Measured) -> str:
-    """A figure and its limit."""
+    """A broken limit in words: the measured value and the limit."""
     if figure.limits_ratio and measured.ratio is not None:
         return f"{measured.ratio:.2f} × {figure.floor}, limit {figure.limit:g} ×"
     return f"{_spread(measured.values, figure.unit)}, limit {figure.limit:g} {figure.unit}".strip()
@@ -189,7 +203,7 @@ def _row(figure: Figure, measured: Measured) -> str:
 
 
 def _spread(values: Sequence[float], unit: str) -> str:
-    """Median, and from least to most where there are several; nothing of none."""
+    """Median with unit, and the range of several values; empty without values."""
     if not values:
         return ""
     spread = f" ({_number(min(values))}–{_number(max(values))})" if len(values) > 1 else ""
@@ -205,7 +219,7 @@ def _lines(results: Sequence[Result]) -> list[Line]:
 
 
 def growth(lines: Sequence[Line]) -> str:
-    """How cost grows, a line each: by what, how straight, and where it ends."""
+    """Growth of cost in Markdown: points, straight line, largest distance, and limit."""
     rows = ["## How cost grows", "", "| cost | measured | straight line | furthest off | ends at |"]
     rows += ["|" + " --- |" * 5]
     for line in lines:
@@ -220,8 +234,8 @@ def growth(lines: Sequence[Line]) -> str:
 def _draw(lines: Sequence[Line]) -> None:
     rows = ceil(len(lines) / COLUMNS)
     picture = Picture(figsize=(3.2 * COLUMNS, 2.6 * rows), layout="constrained")
-    for place, line in enumerate(lines):
-        axes = picture.add_subplot(rows, COLUMNS, place + 1)
+    for position, line in enumerate(lines):
+        axes = picture.add_subplot(rows, COLUMNS, position + 1)
         ends = [0.0, max(line.sizes)]
         axes.plot(ends, [line.rest + line.slope * size for size in ends], color="0.6")
         axes.plot(line.sizes, line.costs, "o", color="C0")

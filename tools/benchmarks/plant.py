@@ -1,4 +1,4 @@
-"""What a plant has: one ejector with everything on and its page open, several in one process."""
+"""Loads of a plant: one ejector with everything on and its page open, several in one process."""
 
 import json
 import subprocess
@@ -23,33 +23,33 @@ KEPT = {"figures": {"keep": True}, "alarms": {"keep": True}, "page": {"keep": Tr
 
 
 def watched(run: Run) -> Sequence[Measured]:
-    """CPU shares of a run that keeps everything, and of its page with one browser."""
-    with ExitStack() as open_now:
-        config = _config(run.folder / "watched", "rig-01", open_now.enter_context(plc()), KEPT)
-        process = open_now.enter_context(live(run.folder / "watched.mcap", [config]))
-        page = open_now.enter_context(_page(config))
+    """CPU shares of a run that stores everything, and of its page with one browser."""
+    with ExitStack() as stack:
+        config = _config(run.folder / "watched", "rig-01", stack.enter_context(plc()), KEPT)
+        process = stack.enter_context(live(run.folder / "watched.mcap", [config]))
+        page = stack.enter_context(_page(config))
         shares = _shares(run, "a page open", [process.pid, page])
-    return tuple(Measured(one) for one in zip(*shares, strict=True))
+    return tuple(Measured(series) for series in zip(*shares, strict=True))
 
 
 @contextmanager
 def together(
     run: Run, ports: Sequence[int]
 ) -> Iterator[tuple["subprocess.Popen[bytes]", list[Path]]]:
-    """One process with an ejector for each of these PLCs; gives it, and their logs."""
+    """Run one process with an ejector for each of these PLCs; yields it and the logs."""
     names = [f"rig-{number + 1:02}" for number in range(len(ports))]
     folder = run.folder / f"{len(ports)} together"
     log = folder / "log.mcap"
     pairs = zip(names, ports, strict=True)
     configs = [_config(folder / name, name, port, {}) for name, port in pairs]
-    # One alone is called as it is told.
+    # A single ejector's log has the given name.
     logs = [log.with_suffix(f".{name}.mcap") for name in names] if len(ports) > 1 else [log]
     with live(log, configs, logs) as process:
         yield process, logs
 
 
 def _config(folder: Path, name: str, port: int, more: dict[str, dict[str, bool]]) -> Path:
-    """The test rig's configuration for another ejector, in a folder of its own."""
+    """The test rig's configuration for another ejector, in a new folder."""
     tables = tomllib.loads(CONFIG.read_text(encoding="utf-8")) | more
     tables["asset"]["id"], tables["driver"]["port"] = name, port
     folder.mkdir(parents=True)
@@ -58,23 +58,23 @@ def _config(folder: Path, name: str, port: int, more: dict[str, dict[str, bool]]
     return path
 
 
-def _shares(run: Run, what: str, numbers: Sequence[int]) -> list[list[float]]:
+def _shares(run: Run, name: str, numbers: Sequence[int]) -> list[list[float]]:
     """CPU times (% of a core) of some processes over each slice."""
     slices, slice_s = (LONG_SLICES, SLICE_S) if run.long else (SLICES, SHORT_SLICE_S)
     processes = [psutil.Process(number) for number in numbers]
-    found = []
+    shares = []
     for number in range(slices):
-        run.tell(f"{what}: slice {number + 1} of {slices}")
+        run.tell(f"{name}: slice {number + 1} of {slices}")
         for process in processes:
             process.cpu_percent()
         time.sleep(slice_s)
-        found.append([process.cpu_percent() for process in processes])
-    return found
+        shares.append([process.cpu_percent() for process in processes])
+    return shares
 
 
 @contextmanager
 def _page(config: Path) -> Iterator[int]:
-    """``twin serve`` with somebody who takes all it tells; gives its process."""
+    """Run ``twin serve`` with a client that reads everything; yields its process number."""
     command = [TWIN, "serve", "--port", "0", "--config", config]
     with on_core(PLC_CORE):
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
@@ -95,7 +95,7 @@ def _page(config: Path) -> Iterator[int]:
 
 
 def _take(browser: ClientConnection) -> None:
-    """All that comes, until the connection is closed."""
+    """Read and drop messages until the connection closes."""
     with suppress(ConnectionClosed):
         for _ in browser:
             pass

@@ -1,4 +1,4 @@
-"""Poll mode: slots that the driver misses, beside bare pollers that take turns with it."""
+"""Poll mode: missed slots of the driver, beside bare pollers that take turns with it."""
 
 import ctypes
 import socket
@@ -17,28 +17,28 @@ from drivers.sources import open_source
 from twin.settings import Document
 
 TURNS, LONG_TURNS = 20, 30
-SLOTS = 2000  # in a turn: short, so that what else goes on meets all alike
-BUSY = 3.0  # %; a bare poller that misses more says that the machine had no time, nothing of ours
+SLOTS = 2000  # in a turn, which is short so that other load affects all pollers alike
+BUSY = 3.0  # %; if the bare poller misses more, the machine was too busy to judge the driver
 SLOT_NS = 1_000_000
 SPIN_NS = 60_000  # the driver's
-# Input registers 1 to 4, pressure, supply and commands, in one request: what the driver asks for.
+# The driver's request: input registers 1 to 4, with pressure, supply and commands.
 REQUEST = struct.pack(">HHHBBHH", 1, 0, 6, 1, 4, 1, 4)
 ANSWER_SIZE = 9 + 2 * 4
 
 
 def missed(run: Run) -> Sequence[Measured]:
-    """Missed slots (%) of the driver against the poller in Python, then against that in C."""
+    """Missed slots (%) of the driver beside the poller in Python, then beside that in C."""
     turns = LONG_TURNS if run.long else TURNS
     native = library("poll", run.folder)
-    ways = [_driver, _in_python]
+    pollers = [_driver, _in_python]
     if native is not None:
-        ways.append(partial(_in_c, native))
-    shares: list[list[float]] = [[] for _ in ways]
+        pollers.append(partial(_in_c, native))
+    shares: list[list[float]] = [[] for _ in pollers]
     with plc() as port, on_core(TWIN_CORE):
         for turn in range(turns):
             run.tell(f"polling: turn {turn + 1} of {turns}")
-            for way in range(turn, turn + len(ways)):  # each comes first as often
-                shares[way % len(ways)].append(ways[way % len(ways)](port))
+            for index in range(turn, turn + len(pollers)):  # each poller is first equally often
+                shares[index % len(pollers)].append(pollers[index % len(pollers)](port))
     ours, python, c = shares if native is not None else [*shares, []]
     note = f"{turns} turns of {SLOTS} slots"
     return _judged(ours, python, note), _judged(ours, c, "" if native else "no C compiler")

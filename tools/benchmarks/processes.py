@@ -1,4 +1,4 @@
-"""The processes that the benchmarks start: simulated PLC and live twin, each on its own core."""
+"""Processes of the benchmarks: simulated PLC and live twin, each on its own core."""
 
 import signal
 import subprocess
@@ -22,7 +22,7 @@ START_S = 300.0  # the kernels may have to be compiled, on a busy machine
 
 @contextmanager
 def plc() -> Iterator[int]:
-    """Run the simulated PLC; gives its port on 127.0.0.1."""
+    """Run the simulated PLC; yields its port on 127.0.0.1."""
     command = [sys.executable, "-m", "drivers.plc", CONFIG, "--port", "0"]
     with on_core(PLC_CORE):
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
@@ -45,10 +45,10 @@ def live(
     port: int | None = None,
     stdout: int | IO[bytes] = subprocess.DEVNULL,
 ) -> Iterator["subprocess.Popen[bytes]"]:
-    """Run ``twin run``, logging; given once samples are logged.
+    """Run ``twin run`` with a log; yields the process once samples are logged.
 
-    ``port`` is that of the PLC, where the configuration has another one; ``logs`` what several
-    ejectors' logs are called.
+    ``port`` is that of the PLC if it differs from the configuration. ``logs`` are the paths of the
+    logs of several ejectors.
     """
     address = [] if port is None else ["--address", f"127.0.0.1:{port}"]
     command = [TWIN, "run", *configs, *address, "--log", log]
@@ -56,29 +56,29 @@ def live(
         process = subprocess.Popen(command, stdout=stdout)
     with process:
         try:
-            for one in logs or [log]:
-                _wait_for_samples(process, one)
+            for path in logs or [log]:
+                _wait_for_samples(process, path)
             yield process
         finally:
             process.send_signal(signal.SIGINT)
-            process.wait()  # leaving it closes what it still writes to
+            process.wait()  # before Popen's exit closes the pipe that it still writes to
     if process.returncode != INTERRUPTED:
         sys.exit(f"twin run ended with exit code {process.returncode}")
 
 
 def usage(command: Sequence[str | Path]) -> tuple[float, float]:
-    """Run a command to its end: time (s), and the most memory it had resident (MB)."""
-    told = subprocess.run(
+    """Run a command to its end; returns its time (s) and peak resident memory (MB)."""
+    output = subprocess.run(
         [sys.executable, "-S", LAUNCHER, *command], stdout=subprocess.PIPE, text=True, check=True
     )
-    seconds, most, code = told.stdout.split()
+    seconds, most, code = output.stdout.split()
     if code != "0":
         sys.exit(f"{command[0]} {command[1]} ended with exit code {code}")
     return float(seconds), float(most)
 
 
 def _wait_for_samples(process: "subprocess.Popen[bytes]", log: Path) -> None:
-    """Return when the log grows; a log's head alone comes in one go."""
+    """Return when the log grows; its head alone is written at once."""
     end = time.monotonic() + START_S
     sizes: set[int] = set()
     while len(sizes) < 3:

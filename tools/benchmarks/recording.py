@@ -1,4 +1,4 @@
-"""An hour of the test rig, simulated, with what the twin says to it: made once, used by many."""
+"""A simulated hour of the test rig with the twin's rows, made once for several benchmarks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ LIVE_BLOCK = 30  # rows that a live driver receives at once
 
 @dataclass(frozen=True)
 class Recording:
-    """Rows of SAMPLE and TICK, and what they were made with."""
+    """Rows of SAMPLE and TICK, with the configuration and coefficients behind them."""
 
     config: Config
     theta: Theta
@@ -44,12 +44,12 @@ def new_twin(config: Config) -> Twin:
 
 @cache
 def hour() -> Recording:
-    """3.6 million rows, received as a live driver would: in blocks, a little late."""
+    """An hour, 3.6 million rows, received as by a live driver: in blocks, a little late."""
     return recorded(HOUR_S)
 
 
 def recorded(seconds: float, faults: Sequence[str] = ()) -> Recording:
-    """The same for another while, with faults."""
+    """A recording of ``seconds`` of the test rig with faults."""
     document = Document.read(CONFIG)
     config = Config.of(document)
     rig = document.section(PlcSettings, "plc")
@@ -66,7 +66,7 @@ def recorded(seconds: float, faults: Sequence[str] = ()) -> Recording:
 def _received(
     time_ns: np.ndarray[tuple[int], np.dtype[np.int64]],
 ) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    """When a live driver has the rows: all of a block at once, some 0.2 to 3 ms after its last."""
+    """Host times of rows in a live driver: a block at once, 0.2 to 3 ms after its last row."""
     last = np.arange(len(time_ns)) // LIVE_BLOCK * LIVE_BLOCK + LIVE_BLOCK - 1
     random = np.random.default_rng(1)
     late = random.uniform(0.2 * MS, 3.0 * MS, len(time_ns) // LIVE_BLOCK + 1) / NS

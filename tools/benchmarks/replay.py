@@ -1,4 +1,4 @@
-"""Replay from end to end and by parts, and how long the command line takes to start."""
+"""Replay from end to end and by parts, and start times of the command line."""
 
 import subprocess
 import sys
@@ -22,12 +22,12 @@ from twin.signals import Samples, Ticks
 REPEATS = 3
 STARTS = 5
 HOUR_MIN = 60
-PART_MIN = 10  # over which the parts of a replay are measured, and the model in C
+PART_MIN = 10  # length over which parts of a replay and the model in C are measured
 
 
 @dataclass(frozen=True)
 class Replays:
-    """Repeated replays of one log: time (s), the floor of it (s), and peak memory (MB)."""
+    """Repeated replays of one log: time (s), its floor (s), and peak memory (MB)."""
 
     times: Sequence[float]
     floors: Sequence[float]
@@ -59,14 +59,14 @@ def end_to_end(run: Run) -> Sequence[Measured]:
 def replays(run: Run, minutes: int) -> Replays:
     """``twin replay`` of the hour's first minutes into a new log, by turns with its floor.
 
-    Done once, whoever asks for it.
+    The result is cached.
     """
     run.tell("replay: simulating the rig")
     path, native = log.part_log(run.folder, minutes), in_c(run.folder)
     rows, packed, again = minutes * MINUTE, log.packed(path), run.folder / "again.mcap"
     times, floors, memories = [], [], []
     with on_core(TWIN_CORE):
-        usage([TWIN, "replay", log.part_log(run.folder, 1)])  # compiles what is not compiled yet
+        usage([TWIN, "replay", log.part_log(run.folder, 1)])  # compiles first
         for number in range(REPEATS):
             run.tell(f"replay: {minutes} minutes, {number + 1} of {REPEATS}")
             seconds, most = usage([TWIN, "replay", path, "-o", again])
@@ -83,7 +83,7 @@ def replays(run: Run, minutes: int) -> Replays:
 
 
 def _in_c(native: Advance, minutes: int) -> float:
-    """Processor time (s) of the model in C for so many minutes, told from some."""
+    """Processor time (s) of the model in C for ``minutes``, scaled from at most PART_MIN."""
     rows = first_rows(hour(), min(minutes, PART_MIN) * MINUTE)
     return timed(native, hour().theta, rows)[0] * 1e-9 * minutes * MINUTE
 
@@ -98,7 +98,7 @@ def _expect(blocks: Sequence[tuple[Samples, Ticks]]) -> float:
 
 
 def _monitor(blocks: Sequence[tuple[Samples, Ticks]]) -> float:
-    """Time (s) of the monitor, with all that a replay has it do."""
+    """Time (s) of the monitor, configured as in a replay."""
     monitor = pair_of(hour().config)[1]
     begin = time.perf_counter()
     for samples, ticks in blocks:

@@ -1,4 +1,4 @@
-"""The model beside SciPy's solver, which one would take otherwise: the same equations, plainly."""
+"""The model beside SciPy's solver, the usual alternative, with the same equations."""
 
 import runpy
 import time
@@ -19,10 +19,10 @@ from twin.model.theta import Theta
 from twin.settings import Document
 from twin.signals import MS, Phase
 
-EQUATIONS = ROOT / "tests" / "radau.py"  # they stand there once more, for the tests
+EQUATIONS = ROOT / "tests" / "radau.py"  # a second implementation, for the tests
 ROWS = 300  # of suction from rest, before the air saving switches
 REPEATS = 3
-RELATIVE = 1e-6  # tolerance, with which it is as near to the truth as the model
+RELATIVE = 1e-6  # tolerance at which SciPy is as accurate as the model
 AGREE_PA = 5.0
 
 
@@ -30,16 +30,16 @@ def evacuation(run: Run) -> Sequence[Measured]:
     """Processor time (ns) of a row of 1 ms by Radau, and by the compiled model."""
     run.tell("solver")
     theta = new_twin(Config.of(Document.read(CONFIG))).theta
-    known = runpy.run_path(str(EQUATIONS))
-    _by_model(theta)  # compiles what is not compiled yet
+    equations = runpy.run_path(str(EQUATIONS))
+    _by_model(theta)  # compiles first
     with on_core(TWIN_CORE):
-        pairs = [(_by_scipy(theta, known), _by_model(theta)) for _ in range(REPEATS)]
-    (_, expected), (_, found) = pairs[0][1], pairs[0][0]
-    off = float(np.max(np.abs(found - expected)))
-    assert off < AGREE_PA, f"SciPy solves other equations: {off:.3g} Pa"
+        pairs = [(_by_scipy(theta, equations), _by_model(theta)) for _ in range(REPEATS)]
+    (_, expected), (_, by_scipy) = pairs[0][1], pairs[0][0]
+    difference = float(np.max(np.abs(by_scipy - expected)))
+    assert difference < AGREE_PA, f"SciPy solves other equations: {difference:.3g} Pa"
     ours = [model[0] for _, model in pairs]
     theirs = [scipy[0] for scipy, _ in pairs]
-    return (Measured(theirs, ours, note=f"within {off:.1g} Pa of it"),)
+    return (Measured(theirs, ours, note=f"within {difference:.1g} Pa of it"),)
 
 
 def _by_model(theta: Theta) -> tuple[float, Floats]:
@@ -52,26 +52,26 @@ def _by_model(theta: Theta) -> tuple[float, Floats]:
     return 1e9 * (time.thread_time() - begin) / ROWS, expected[1:]
 
 
-def _by_scipy(theta: Theta, known: dict[str, object]) -> tuple[float, Floats]:
-    """In two parts: the valve opens a response after the command."""
-    times, y, rows = np.arange(1, ROWS + 1) * MS, known["at_rest"](theta), []
+def _by_scipy(theta: Theta, equations: dict[str, object]) -> tuple[float, Floats]:
+    """Two parts: the valve opens one response delay after the command."""
+    times, y, rows = np.arange(1, ROWS + 1) * MS, equations["at_rest"](theta), []
     opens = float(theta[c.RESPONSE])
     begin = time.thread_time()
     for nozzle, first, last in ((0.0, 0.0, opens), (1.0, opens, times[-1])):
-        valves = known["Valves"](first, nozzle, 0.0, 0.0)
+        valves = equations["Valves"](first, nozzle, 0.0, 0.0)
         wanted = np.unique(np.append(times[(times > first) & (times <= last)], last))
-        found = solve_ivp(
-            known["rates"],
+        solution = solve_ivp(
+            equations["rates"],
             (first, last),
             y,
             "Radau",
             wanted,
             rtol=RELATIVE,
-            atol=RELATIVE * known["SIZES"],
+            atol=RELATIVE * equations["SIZES"],
             args=(theta, valves),
         )
-        assert found.success
-        rows += [one for t, one in zip(found.t, found.y.T, strict=True) if t in times]
-        y = found.y[:, -1]
+        assert solution.success
+        rows += [values for t, values in zip(solution.t, solution.y.T, strict=True) if t in times]
+        y = solution.y[:, -1]
     spent = 1e9 * (time.thread_time() - begin) / ROWS
     return spent, np.array(rows)[:, -1]
