@@ -12,7 +12,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from playwright.sync_api import Browser, expect, sync_playwright
 from plc_process import PlcProcess, start_plc
 from postgres import make_schema, postgres_server
 
+from twin.cli.figures import figures_app
 from twin.cli.setup import pair_of
 
 _ME = psutil.Process()
@@ -207,3 +208,17 @@ def browser() -> Iterator[Browser]:
 def compiled_once() -> None:
     """Compile before a child process has to: tests wait for what it does, not for a compiler."""
     pair_of(rigs.config("gripper"))  # all that a live loop needs
+
+
+@pytest.fixture
+def figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., str]:
+    """Run a command of `twin figures` in an empty folder; gives what it printed."""
+    monkeypatch.chdir(tmp_path)
+
+    def command(*arguments: str | Path) -> str:
+        figures_app([str(argument) for argument in arguments], standalone_mode=False)
+        return capsys.readouterr().out
+
+    return command

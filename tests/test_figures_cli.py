@@ -37,18 +37,6 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run a command in an empty folder; gives what it printed."""
-    monkeypatch.chdir(tmp_path)
-
-    def command(*arguments: str | Path) -> str:
-        figures_app([str(one) for one in arguments], standalone_mode=False)
-        return capsys.readouterr().out
-
-    return command
-
-
 def fill(days: float, count: int, unit: Unit = UNIT, **values: float) -> None:
     """A database in this folder with cycles over days, whose leakage rises by 5 mbar/s a day."""
     rng = np.random.default_rng(1)
@@ -84,8 +72,8 @@ def test_a_log_that_was_cut_off_is_shown_and_said_to_be(
     assert f"twin: {cut} is not complete; what can be read is used" in capsys.readouterr().err
 
 
-def test_a_log_is_shown_with_what_was_expected(run: Run, log: Path) -> None:
-    cycles, curve = run("show", log).split("\n\n")
+def test_a_log_is_shown_with_what_was_expected(figures: Run, log: Path) -> None:
+    cycles, curve = figures("show", log).split("\n\n")
     head, *rows = cycles.splitlines()
     assert curve.startswith("read off the curve, without a model; vacuum counts from the record's")
     assert head.split()[:3] == ["cycle", "t0", "(ms)"]
@@ -94,9 +82,9 @@ def test_a_log_is_shown_with_what_was_expected(run: Run, log: Path) -> None:
     assert rows[3].split()[1:3] == ["189", "(189)"]
 
 
-def test_a_log_as_json_and_as_tables(run: Run, log: Path) -> None:
-    run("show", log, "--json", "f.json", "-o", "f.csv")
-    run("show", log, "-o", "f.parquet")
+def test_a_log_as_json_and_as_tables(figures: Run, log: Path) -> None:
+    figures("show", log, "--json", "f.json", "-o", "f.csv")
+    figures("show", log, "-o", "f.parquet")
     cycles = json.loads(Path("f.json").read_text())["cycles"]
     with Path("f.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -111,20 +99,20 @@ def test_a_log_as_json_and_as_tables(run: Run, log: Path) -> None:
             assert (float(row[name]) if row[name] else None) == cycle.get(name)
 
 
-def test_another_suffix_is_refused(run: Run, log: Path) -> None:
+def test_another_suffix_is_refused(figures: Run, log: Path) -> None:
     with pytest.raises(ConfigError, match=r"f\.txt: cannot tell what to write"):
-        run("show", log, "-o", "f.txt")
+        figures("show", log, "-o", "f.txt")
 
 
-def test_a_log_is_kept_once(run: Run, log: Path) -> None:
-    assert run("show", log, "--keep").splitlines()[-1].startswith("10 new of 10 cycles, in ")
-    assert run("show", log, "--keep").splitlines()[-1].startswith("0 new of 10 cycles, in ")
-    assert counted(run("counters")) == [["10", "10"], ["10", "10"], ["0", "0"]]
+def test_a_log_is_kept_once(figures: Run, log: Path) -> None:
+    assert figures("show", log, "--keep").splitlines()[-1].startswith("10 new of 10 cycles, in ")
+    assert figures("show", log, "--keep").splitlines()[-1].startswith("0 new of 10 cycles, in ")
+    assert counted(figures("counters")) == [["10", "10"], ["10", "10"], ["0", "0"]]
 
 
-def test_trends_are_said_drawn_and_written(run: Run) -> None:
+def test_trends_are_said_drawn_and_written(figures: Run) -> None:
     fill(10, 2000)
-    out = run("trend", "leakage", "t1", "--json", "t.json")
+    out = figures("trend", "leakage", "t1", "--json", "t.json")
     rising, flat = out.splitlines()
     assert rising.startswith(("leakage: 149.9 mbar/s, +", "leakage: 150 mbar/s, +"))
     assert "its limit of 250 mbar/s in 20.0 days (" in rising
@@ -133,86 +121,88 @@ def test_trends_are_said_drawn_and_written(run: Run) -> None:
     assert leakage["line"]["is_trend"]
     assert leakage["days_to_limit"]["low95"] < 20 < leakage["days_to_limit"]["high95"]
     assert t1["days_to_limit"] is None
-    run("trend", "leakage", "--picture", "t.png")
+    figures("trend", "leakage", "--picture", "t.png")
     assert Path("t.png").stat().st_size > 10_000
-    assert len(run("trend").splitlines()) == len(VALUES) // 2
+    assert len(figures("trend").splitlines()) == len(VALUES) // 2
 
 
-def test_a_limit_too_far_to_be_dated_is_drawn_all_the_same(run: Run, tmp_path: Path) -> None:
+def test_a_limit_too_far_to_be_dated_is_drawn_all_the_same(figures: Run, tmp_path: Path) -> None:
     fill(10, 500)
     config = tmp_path / "cell.toml"
     text = rigs.path_of("gripper").read_text()
     text = text.replace('id = "gripper-01"', 'id = "cell-1"')
     config.write_text(text + "\n[data.ejector]\npermitted_leakage_mbar_s = 900.0\n")
-    out = run("trend", "leakage", "--config", config, "--id", "gripper-01", "--picture", "t.svg")
+    out = figures(
+        "trend", "leakage", "--config", config, "--id", "gripper-01", "--picture", "t.svg"
+    )
     assert out.rstrip().endswith("its limit of 900 mbar/s is more than 29.8 days away")
     assert b"</svg>" in Path("t.svg").read_bytes()
 
 
-def test_a_picture_is_of_one_figure_and_there_must_be_such(run: Run) -> None:
+def test_a_picture_is_of_one_figure_and_there_must_be_such(figures: Run) -> None:
     fill(10, 100)
     with pytest.raises(ConfigError, match="--picture draws one figure"):
-        run("trend", "--picture", "t.png")
+        figures("trend", "--picture", "t.png")
     with pytest.raises(ConfigError, match="no figure is called leak"):
-        run("trend", "leak")
+        figures("trend", "leak")
     with pytest.raises(SourceError, match=r"t\.xyz: cannot be written"):
-        run("trend", "leakage", "--picture", "t.xyz")
+        figures("trend", "leakage", "--picture", "t.xyz")
 
 
-def test_only_the_last_days(run: Run) -> None:
+def test_only_the_last_days(figures: Run) -> None:
     fill(10, 100)
     with pytest.raises(ConfigError, match="no cycles of gripper-01 in that time"):
-        run("trend", "--days", "1")
+        figures("trend", "--days", "1")
 
 
-def test_counters_are_erased(run: Run) -> None:
+def test_counters_are_erased(figures: Run) -> None:
     fill(1, 50)
-    assert counted(run("counters")) == [["50", "50"], ["50", "50"], ["0", "0"]]
-    assert counted(run("counters", "--erase")) == [["50", "0"], ["50", "0"], ["0", "0"]]
+    assert counted(figures("counters")) == [["50", "50"], ["50", "50"], ["0", "0"]]
+    assert counted(figures("counters", "--erase")) == [["50", "0"], ["50", "0"], ["0", "0"]]
 
 
-def test_autoset_gives_what_stands_in_a_configuration(run: Run) -> None:
+def test_autoset_gives_what_stands_in_a_configuration(figures: Run) -> None:
     fill(10, 100)
-    text = run("autoset")
+    text = figures("autoset")
     table = tomllib.loads(text)["figures"]
     assert text.startswith("# from the last 5 good cycles of gripper-01\n")
     assert table["permitted_leakage_mbar_s"] == pytest.approx(150 * 1.25, abs=3)
     assert table["permitted_t1_ms"] == pytest.approx(250 * 1.25, abs=4)
-    more = tomllib.loads(run("autoset", "--tolerance", "0.5"))["figures"]
+    more = tomllib.loads(figures("autoset", "--tolerance", "0.5"))["figures"]
     assert more["permitted_leakage_mbar_s"] == pytest.approx(150 * 1.5, abs=3)
-    assert tomllib.loads(run("autoset", "--tolerance", "0"))["figures"]["permitted_t1_ms"] > 290
+    assert tomllib.loads(figures("autoset", "--tolerance", "0"))["figures"]["permitted_t1_ms"] > 290
 
 
-def test_autoset_learns_from_good_cycles_only(run: Run) -> None:
+def test_autoset_learns_from_good_cycles_only(figures: Run) -> None:
     fill(1, 20, warnings=["leakage_over_limit"])  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="no good cycle is stored"):
-        run("autoset")
+        figures("autoset")
 
 
-def test_kept_cycles_are_exported(run: Run) -> None:
+def test_kept_cycles_are_exported(figures: Run) -> None:
     fill(10, 100)
-    assert run("export", "-o", "f.parquet") == "100 cycles in f.parquet\n"
+    assert figures("export", "-o", "f.parquet") == "100 cycles in f.parquet\n"
     assert parquet.read_table("f.parquet")["leakage_measured"][-1].as_py() == pytest.approx(
         150, abs=4
     )
     with pytest.raises(SourceError, match="there is already a file of that name"):
-        run("export", "-o", "f.parquet")
+        figures("export", "-o", "f.parquet")
 
 
-def test_of_several_units_one_is_named(run: Run, tmp_path: Path) -> None:
+def test_of_several_units_one_is_named(figures: Run, tmp_path: Path) -> None:
     fill(1, 20)
     fill(1, 30, Unit("compact-ejector-35", "rig-01"))
     with pytest.raises(ConfigError, match="2 units") as caught:
-        run("counters")
+        figures("counters")
     assert caught.value.hint == "choose with --id; known: gripper-01, rig-01"
-    assert "30" in run("counters", "--id", "rig-01")
+    assert "30" in figures("counters", "--id", "rig-01")
     where = ("--figures", tmp_path / "figures.sqlite", "--config", rigs.path_of("gripper"))
-    assert "20" in run("counters", *where)
+    assert "20" in figures("counters", *where)
     with pytest.raises(ConfigError, match="0 units 'nobody'"):
-        run("counters", "--id", "nobody")
+        figures("counters", "--id", "nobody")
 
 
-def test_without_a_database_there_is_nothing_to_read(run: Run) -> None:
+def test_without_a_database_there_is_nothing_to_read(figures: Run) -> None:
     with pytest.raises(SourceError, match=r"figures\.sqlite: no such figure database"):
-        run("trend")
+        figures("trend")
     assert not Path("figures.sqlite").exists()

@@ -12,7 +12,6 @@ import pytest
 import rigs
 from pyarrow import parquet
 
-from twin.cli.figures import figures_app
 from twin.config import Config
 from twin.errors import ConfigError
 from twin.figures.costs import DAY_NS, NO_PRICE, Tariff, days, year
@@ -59,17 +58,6 @@ def logged(path: Path, extra: str = PRICE) -> Path:
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return logged(tmp_path_factory.mktemp("log") / "run.mcap")
-
-
-@pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    monkeypatch.chdir(tmp_path)
-
-    def command(*arguments: str | Path) -> str:
-        figures_app([str(argument) for argument in arguments], standalone_mode=False)
-        return capsys.readouterr().out
-
-    return command
 
 
 # Prices.
@@ -154,10 +142,10 @@ def test_why_a_year_is_not_told_is_said(cycles: list[CycleFigures]) -> None:
 # The command.
 
 
-def test_a_log_costs_what_its_cycles_do(run: Run, log: Path) -> None:
-    out = run("costs", log, "--json", "c.json", "-o", "c.csv")
-    run("costs", log, "-o", "c.parquet")
-    run("show", log, "--json", "f.json")
+def test_a_log_costs_what_its_cycles_do(figures: Run, log: Path) -> None:
+    out = figures("costs", log, "--json", "c.json", "-o", "c.csv")
+    figures("costs", log, "-o", "c.parquet")
+    figures("show", log, "--json", "f.json")
     shown = json.loads(Path("f.json").read_text())["cycles"]
     air = sum(cycle.get("air_measured", 0.0) for cycle in shown)
     content = json.loads(Path("c.json").read_text())
@@ -175,9 +163,9 @@ def test_a_log_costs_what_its_cycles_do(run: Run, log: Path) -> None:
     assert FIGURES["air"].unit.encode() == table.schema.field("air").metadata[b"unit"]
 
 
-def test_without_a_price_the_key_to_set_is_named(run: Run, tmp_path: Path) -> None:
+def test_without_a_price_the_key_to_set_is_named(figures: Run, tmp_path: Path) -> None:
     log = logged(tmp_path / "free.mcap", "")
-    out = run("costs", log, "--json", "c.json", "-o", "c.csv")
+    out = figures("costs", log, "--json", "c.json", "-o", "c.csv")
     assert out.splitlines()[-1] == NO_PRICE
     assert "price_per_kwh" in NO_PRICE
     assert "cost" not in out
@@ -188,15 +176,15 @@ def test_without_a_price_the_key_to_set_is_named(run: Run, tmp_path: Path) -> No
 
 
 def test_a_configuration_and_a_unit_take_the_place_of_the_logs(
-    run: Run, log: Path, tmp_path: Path
+    figures: Run, log: Path, tmp_path: Path
 ) -> None:
     config = tmp_path / "cell.toml"
     dearer = '\n[figures]\nprice_per_m3 = 0.072\ncurrency = "CHF"\n'
     config.write_text(rigs.path_of("gripper").read_text() + dearer)
-    run("costs", log, "--json", "a.json")
-    out = run("costs", log, "--config", config, "--id", "gripper-01", "--json", "b.json")
+    figures("costs", log, "--json", "a.json")
+    out = figures("costs", log, "--config", config, "--id", "gripper-01", "--json", "b.json")
     own, other = (json.loads(Path(name).read_text()) for name in ("a.json", "b.json"))
     assert "cost (CHF)" in out
     assert other["year"]["cost"] == pytest.approx(2.0 * own["year"]["cost"], rel=1e-4)
     with pytest.raises(ConfigError, match="no unit is called 'nobody'"):
-        run("costs", log, "--id", "nobody")
+        figures("costs", log, "--id", "nobody")

@@ -13,7 +13,6 @@ import rigs
 from nozzle_air import taken
 from test_figures_costs import PRICE, logged
 
-from twin.cli.figures import figures_app
 from twin.errors import ConfigError
 from twin.figures.costs import NO_PRICE, Tariff
 from twin.figures.savings import LEAST_MARGIN, MOST_CYCLES, Prediction, Savings, Setting, savings
@@ -171,19 +170,8 @@ def test_of_many_cycles_some_are_taken_evenly() -> None:
 # The command.
 
 
-@pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    monkeypatch.chdir(tmp_path)
-
-    def command(*arguments: str | Path) -> str:
-        figures_app([str(argument) for argument in arguments], standalone_mode=False)
-        return capsys.readouterr().out
-
-    return command
-
-
-def test_savings_are_told_with_how_sure_they_are(run: Run, tmp_path: Path) -> None:
-    out = run("savings", logged(tmp_path / "run.mcap", PRICE), "--json", "s.json")
+def test_savings_are_told_with_how_sure_they_are(figures: Run, tmp_path: Path) -> None:
+    out = figures("savings", logged(tmp_path / "run.mcap", PRICE), "--json", "s.json")
     head, now, *_ = out.splitlines()
     assert "saves (€ a year)" in head
     assert now.startswith("now: H1 750, hysteresis 150 mbar, 5 bar")
@@ -197,13 +185,13 @@ def test_savings_are_told_with_how_sure_they_are(run: Run, tmp_path: Path) -> No
     assert all(one["why_not"] for one in content["refused"])
 
 
-def test_without_a_price_savings_are_in_air(run: Run, tmp_path: Path) -> None:
-    out = run("savings", logged(tmp_path / "run.mcap", ""))
+def test_without_a_price_savings_are_in_air(figures: Run, tmp_path: Path) -> None:
+    out = figures("savings", logged(tmp_path / "run.mcap", ""))
     assert "saves (m³ a year)" in out
     assert out.splitlines()[-1] == NO_PRICE
 
 
-def test_a_log_without_a_complete_cycle_is_refused(run: Run, tmp_path: Path) -> None:
+def test_a_log_without_a_complete_cycle_is_refused(figures: Run, tmp_path: Path) -> None:
     from twin.live import run as run_loop
     from twin.log.recorder import Recorder
 
@@ -212,5 +200,5 @@ def test_a_log_without_a_complete_cycle_is_refused(run: Run, tmp_path: Path) -> 
     rows = rigs.recorded("gripper", 6.0)[0][:400]
     run_loop([rows], rigs.twin("gripper"), rigs.monitor("gripper"), sinks)
     with pytest.raises(ConfigError, match="no complete cycle"):
-        run("savings", path)
-    assert "a year: not told, the log has fewer than two cycles" in run("costs", path)
+        figures("savings", path)
+    assert "a year: not told, the log has fewer than two cycles" in figures("costs", path)

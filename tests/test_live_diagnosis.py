@@ -17,6 +17,7 @@ import rigs
 from command_line import twin
 from plc_process import PlcProcess, start_plc
 
+from twin import child_process
 from twin.diagnosis import process
 from twin.diagnosis.process import LiveDiagnosis, Recent, in_a_line
 from twin.events import Event, Kind, Severity
@@ -242,7 +243,7 @@ def test_one_for_which_there_is_no_memory_is_told(
     def full(*_: Any) -> None:
         raise MemoryError
 
-    monkeypatch.setattr(process.pickle, "dump", full)
+    monkeypatch.setattr(child_process.pickle, "dump", full)
     stream.cycles(7)
     stream.cycle(alarm=True)
     stream.cycles(5)

@@ -36,14 +36,15 @@ ALARM_DATABASE = Purpose("alarm database", "--alarms", "alarms")
 metadata = MetaData()
 
 
-def _unit_columns() -> tuple[Column[Any], Column[Any]]:
+def unit_columns() -> tuple[Column[Any], Column[Any]]:
+    """Columns that say whose rows they are (``twin.assets.unit.of_unit``)."""
     return Column("asset_type", Text, primary_key=True), Column("asset_id", Text, primary_key=True)
 
 
 STATE = Table(
     "alarm_state",
     metadata,
-    *_unit_columns(),
+    *unit_columns(),
     Column("alarm", Text, primary_key=True),
     Column("active", Boolean, nullable=False),
     Column("acknowledged", Boolean, nullable=False),
@@ -55,7 +56,7 @@ STATE = Table(
 EPISODE = Table(
     "alarm_episode",
     metadata,
-    *_unit_columns(),
+    *unit_columns(),
     Column("raised_ns", BigInteger, primary_key=True, autoincrement=False),
     Column("raised_as", Text, primary_key=True),  # its name then
     Column("alarm", Text, nullable=False),
@@ -95,7 +96,7 @@ COMMENT = Table(
 )
 
 # All units of which a run has kept alarms. They can be queried even if no alarm was ever raised.
-UNIT = Table("alarm_unit", metadata, *_unit_columns())
+UNIT = Table("alarm_unit", metadata, *unit_columns())
 
 
 def open_store(

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from twin.cli.app import App, audit_of, not_negative, read_config, user_here
-from twin.errors import ConfigError, known_names
+from twin.cli.app import App, audit_of, chosen_unit, not_negative, read_config, user_here
+from twin.errors import ConfigError
 from twin.files import write_json
 from twin.instants import instant
 
@@ -67,7 +67,7 @@ def list_(
     now_ns = time.time_ns()
     for config in configs or (None,):
         with _open(alarms, config) as store:
-            chosen = _chosen(store, config, unit)
+            chosen = chosen_unit(store, config, unit)
             shown, episodes = _standing(store, chosen, config)
         if configs and len(configs) > 1:
             print(f"{chosen.id or chosen.type}:")
@@ -97,7 +97,7 @@ def history(
     """
     since = None if days is None else time.time_ns() - round(days * 86_400e9)
     with _open(alarms, config) as store:
-        chosen = _chosen(store, config, unit)
+        chosen = chosen_unit(store, config, unit)
         episodes, comments = store.episodes(chosen, since), store.comments(chosen, since or 0)
     plain = []
     for episode in episodes:
@@ -136,7 +136,7 @@ def statistics(
     since_ns = now_ns - round(days * DAY_NS)
     for config in configs or (None,):
         with _open(alarms, config) as store:
-            chosen = _chosen(store, config, unit)
+            chosen = chosen_unit(store, config, unit)
             episodes = store.episodes_around(chosen, since_ns)
         named += [(chosen.id or chosen.type, episode) for episode in episodes]
     result = statistics_of(named, since_ns, now_ns)
@@ -160,7 +160,7 @@ def comment(
     from twin.audit import Act
 
     with _open(alarms, config) as store:
-        chosen = _chosen(store, config, unit)
+        chosen = chosen_unit(store, config, unit)
         standing = [
             candidate
             for candidate in store.episodes(chosen, only_going_on=True)
@@ -197,7 +197,7 @@ def export(
 
     since = None if days is None else time.time_ns() - round(days * 86_400e9)
     with _open(alarms, config) as store:
-        chosen = _chosen(store, config, unit)
+        chosen = chosen_unit(store, config, unit)
         if standing:
             shown, going_on = _standing(store, chosen, config)
             table = standing_table(shown, going_on, chosen)
@@ -279,7 +279,7 @@ def outbox(
     from twin.notifications.outbox import open_outbox
 
     with _open(alarms, config) as store:
-        chosen = _chosen(store, config, unit)
+        chosen = chosen_unit(store, config, unit)
     with open_outbox(alarms or place_of(_document(config)), chosen) as box:
         if again:
             print(f"{box.again()} that were refused wait again")
@@ -392,19 +392,6 @@ def _standing(
     return [*board.standing(), *board.quiet()], episodes
 
 
-def _chosen(store: "Store", config: Path | None, unit: str) -> "Unit":
-    """The chosen unit: the named one, else that of the configuration, else the only one."""
-    units = store.units()
-    document = _document(config)
-    requested = unit or (str(document.tables.get("asset", {}).get("id", "")) if document else "")
-    matches = [candidate for candidate in units if not requested or candidate.id == requested]
-    if len(matches) != 1:
-        hint = known_names(requested, (candidate.id or candidate.type for candidate in units))
-        problem = f"{len(matches)} units {requested!r}" if requested else f"{len(matches)} units"
-        raise ConfigError(f"{store.name}: {problem}", f"choose with --id; {hint}")
-    return matches[0]
-
-
 def _ask(
     names: list[str], deed: "Deed", by: str, selection: _Selection, seconds: float = 0.0
 ) -> None:
@@ -415,7 +402,7 @@ def _ask(
             list(board[name].shelve(0, seconds, by))  # refuses what a run would refuse
         board[name]
     with _open(selection.url, selection.config) as store:
-        chosen = _chosen(store, selection.config, selection.unit)
+        chosen = chosen_unit(store, selection.config, selection.unit)
         requests = dict[int, str]()
         for name in names:
             requests[store.ask(chosen, name, deed, by or user_here(), seconds)] = name

@@ -7,15 +7,19 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from twin.audit import Audit
+from twin.errors import ConfigError, known_names
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from twin.assets.unit import Unit
     from twin.fleet.runner import Wanted
     from twin.log.reader import Log
     from twin.settings import Document
@@ -138,6 +142,34 @@ def read_config(path: Path) -> "Document":
     document = Document.read(path)
     document.refuse_unknown_tables(TABLES)
     return document
+
+
+class Units(Protocol):
+    """A database that holds the rows of several units."""
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+
+    def units(self) -> "Sequence[Unit]":
+        """Those that have rows in it."""
+
+
+def chosen_unit(store: Units, config: Path | None, unit: str) -> "Unit":
+    """The chosen unit: the named one, else that of the configuration, else the only one.
+
+    ConfigError where that is none, or not one alone.
+    """
+    units = store.units()
+    requested = unit
+    if not requested and config:
+        requested = str(read_config(config).tables.get("asset", {}).get("id", ""))
+    matches = [candidate for candidate in units if not requested or candidate.id == requested]
+    if len(matches) != 1:
+        hint = known_names(requested, (candidate.id or candidate.type for candidate in units))
+        problem = f"{len(matches)} units {requested!r}" if requested else f"{len(matches)} units"
+        raise ConfigError(f"{store.name}: {problem}", f"choose with --id; {hint}")
+    return matches[0]
 
 
 def not_negative(value: float | None) -> float | None:

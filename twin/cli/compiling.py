@@ -5,14 +5,13 @@ all that they need in the cache.
 """
 
 import pickle
-import subprocess
 import sys
-import tempfile
 import threading
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from typing import TYPE_CHECKING, TypeAlias
 
+from twin.child_process import ChildProcess
 from twin.cli.console import complain
 from twin.cli.setup import pair_of
 
@@ -38,7 +37,7 @@ class Models:
     def __init__(self, ejectors: "Mapping[str, Config]", *, ahead: bool) -> None:
         self._ejectors = ejectors
         self._pairs: dict[str, Pair] = {}
-        self._child: Child | None = None
+        self._child: ChildProcess | None = None
         self._one_at_a_time = threading.Lock()  # who takes a pair, or looks for the child
         if not ahead:
             self._make_all()
@@ -55,8 +54,11 @@ class Models:
             return False
         with self._one_at_a_time:
             if self._child is not None:
-                if failure := self._child.failure():
-                    complain(f"{failure}; it is compiled in this process, which takes as long")
+                if self._child.answer() is None:
+                    complain(
+                        f"the process that compiles has failed ({self._child.complaint()});"
+                        " it is compiled in this process, which takes as long"
+                    )
                 self._close_child()
         return True
 
@@ -90,7 +92,7 @@ class Models:
         complain(COMPILING)
         expect_waiting()
         with suppress(OSError):  # no processes left: it is compiled here
-            self._child = Child([*self._ejectors.values()])
+            self._child = ChildProcess(COMMAND, [*self._ejectors.values()])
 
     def _close_child(self) -> None:
         if self._child is not None:
@@ -98,52 +100,12 @@ class Models:
             self._child = None
 
 
-class Child:
-    """A process that compiles what some configurations need; OSError where there can be none."""
-
-    def __init__(self, ejectors: "Sequence[Config]") -> None:
-        with ExitStack() as opened:
-            asking, self._complaint = (
-                opened.enter_context(tempfile.TemporaryFile()) for _ in range(2)
-            )
-            pickle.dump(ejectors, asking)
-            asking.seek(0)
-            self._process = subprocess.Popen(  # noqa: S603  # our own program
-                COMMAND,
-                stdin=asking,
-                stdout=subprocess.DEVNULL,
-                stderr=self._complaint,
-                start_new_session=True,  # a Ctrl-C is the run's to answer
-            )
-            self._opened = opened.pop_all()
-
-    def ended(self, seconds: float) -> bool:
-        """Whether it has ended within ``seconds``."""
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(seconds)
-        return self._process.poll() is not None
-
-    def failure(self) -> str:
-        """Why one that has ended has not compiled everything; empty if it has."""
-        if self._process.returncode == 0:
-            return ""
-        self._complaint.seek(0)
-        *_, last = [b"it was killed", *self._complaint.read().splitlines()]
-        return f"the process that compiles has failed ({last.decode(errors='replace')})"
-
-    def close(self) -> None:
-        """End it, if it has not ended."""
-        self._process.kill()
-        self._process.wait()
-        self._opened.close()
-
-
 def main() -> None:
     """Make the twin and the monitor of each configuration, and let them go."""
     from twin.model.compiled import expect_waiting
 
     expect_waiting()
-    for settings in pickle.load(sys.stdin.buffer):  # noqa: S301  # from Child
+    for settings in pickle.load(sys.stdin.buffer):  # noqa: S301  # from our parent
         pair_of(settings)
 
 

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.cli.app import App, not_negative, read_config, say_if_cut
+from twin.cli.app import App, chosen_unit, not_negative, read_config, say_if_cut
 from twin.cli.options import LogFile
 from twin.cli.options import UnitId as LogUnit
-from twin.errors import ConfigError, known_names
+from twin.errors import ConfigError
 from twin.files import require_writable, write_json
 
 if TYPE_CHECKING:
@@ -186,7 +186,7 @@ def trend(
     limits = _limits(config)
     with _open(figures, config, write=False) as store:
         columns = [f"{figure.name}_{side}" for figure in chosen_figures for side in SIDES]
-        history = _history(store, _chosen(store, config, unit), days, columns)
+        history = _history(store, chosen_unit(store, config, unit), days, columns)
     plain = []
     for figure in chosen_figures:
         course = trend_of_figure(history, figure, limits)
@@ -212,7 +212,7 @@ def counters(
 ) -> None:
     """Suction cycles, valve switchings and alarms: in all, and since they were erased."""
     with _open(figures, config, write=erase) as store:
-        chosen = _chosen(store, config, unit)
+        chosen = chosen_unit(store, config, unit)
         if erase:
             store.erase(chosen)
         total, erasable = store.counters(chosen), store.counters(chosen, erasable=True)
@@ -238,7 +238,7 @@ def autoset(
 
     share = _settings(config).autoset_tolerance if tolerance is None else tolerance
     with _open(figures, config, write=False) as store:
-        chosen = _chosen(store, config, unit)
+        chosen = chosen_unit(store, config, unit)
         permitted = teach(store.history(chosen), share)
     print(f"# from the last {permitted.cycles} good cycles of {chosen.id or chosen.type}")
     print(permitted.toml(), end="")
@@ -257,7 +257,7 @@ def export(
     from twin.tables.sheet import export as export_table
 
     with _open(figures, config, write=False) as store:
-        chosen = _chosen(store, config, unit)
+        chosen = chosen_unit(store, config, unit)
         table = to_table(_history(store, chosen, days), chosen)
     export_table(table, output)
     print(f"{table.num_rows} cycles in {output}")
@@ -367,20 +367,6 @@ def _cycles(recorded: "Log", settings: "Config") -> "list[CycleFigures]":
     from twin.figures.read import of_log
 
     return [cycle for cycle, _ in of_log(recorded, key_figures_of(settings))]
-
-
-def _chosen(store: "Store", config: Path | None, unit: str) -> "Unit":
-    """The chosen unit: the named one, else that of the configuration, else the only one."""
-    units = store.units()
-    requested = unit
-    if not requested and (document := _document(config)) is not None:
-        requested = str(document.tables.get("asset", {}).get("id", ""))
-    matches = [candidate for candidate in units if not requested or candidate.id == requested]
-    if len(matches) != 1:
-        hint = known_names(requested, (candidate.id or candidate.type for candidate in units))
-        problem = f"{len(matches)} units {requested!r}" if requested else f"{len(matches)} units"
-        raise ConfigError(f"{store.name}: {problem}", f"choose with --id; {hint}")
-    return matches[0]
 
 
 def _history(

@@ -6,14 +6,11 @@ Its answer comes back as an event. Only one runs at a time, and only with enough
 
 import json
 import os
-import pickle
-import subprocess
 import sys
-import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,6 +18,7 @@ from uuid import uuid4
 
 import numpy as np
 
+from twin.child_process import ChildProcess
 from twin.config import Config
 from twin.diagnosis.text import Times, certainty, left_over, listed, sized, when
 from twin.errors import in_words
@@ -101,7 +99,7 @@ class LiveDiagnosis:
         with self._status() as say:
             say(f"diagnosing the last {self._asked.cycles} cycles (Ctrl-C leaves it)")
             while not (answer := self._collect(self._asked)) and not self._stopped():
-                self._asked.wait(POLL_S)
+                self._asked.ended(POLL_S)
         return events + (answer or [self._failed(self._asked.alarm, "the run was interrupted")])
 
     def close(self) -> None:
@@ -205,51 +203,29 @@ class Asked:
     def __init__(self, question: Question, alarm: Event, cycles: int, deadline: float) -> None:
         self.alarm, self.cycles, self.deadline = alarm, cycles, deadline
         self.report = question[3]
-        with ExitStack() as opened:
-            question_file, self._output, self._errors = (
-                opened.enter_context(tempfile.TemporaryFile()) for _ in range(3)
-            )
-            pickle.dump(question, question_file)
-            question_file.seek(0)
-            self._process = subprocess.Popen(  # noqa: S603  # our own program
-                COMMAND,
-                stdin=question_file,
-                stdout=self._output,
-                stderr=self._errors,
-                start_new_session=True,  # Ctrl-C is for the loop
-            )
-            self._opened = opened.pop_all()
+        self._child = ChildProcess(COMMAND, question)
         with suppress(OSError):  # without permission it runs at the same priority
             own = os.getpriority(os.PRIO_PROCESS, 0)
-            os.setpriority(os.PRIO_PROCESS, self._process.pid, own + NICE)
+            os.setpriority(os.PRIO_PROCESS, self._child.pid, own + NICE)
 
-    def ended(self) -> bool:
-        """Whether the process has ended, with an answer or without."""
-        return self._process.poll() is not None
-
-    def wait(self, seconds: float) -> None:
-        """Wait until it has ended, at most ``seconds``."""
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(seconds)
+    def ended(self, seconds: float = 0.0) -> bool:
+        """Whether the process has ended within ``seconds``, with an answer or without."""
+        return self._child.ended(seconds)
 
     def answer(self) -> dict[str, Any] | str:
         """The answer of a diagnosis that has ended, or the reason why there is none."""
-        if self._process.returncode == 0:
-            self._output.seek(0)
-            try:
-                answer: dict[str, Any] = json.load(self._output)
-            except ValueError:
-                return "its answer cannot be read"
-            return answer
-        self._errors.seek(0)
-        *_, last = [b"it was killed", *self._errors.read().splitlines()]
-        return last.decode(errors="replace")
+        text = self._child.answer()
+        if text is None:
+            return self._child.complaint()
+        try:
+            answer: dict[str, Any] = json.loads(text)
+        except ValueError:
+            return "its answer cannot be read"
+        return answer
 
     def close(self) -> None:
         """End the process if it still runs."""
-        self._process.kill()
-        self._process.wait()
-        self._opened.close()
+        self._child.close()
 
 
 # --- in words -------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from typing import Any
 
 from sqlalchemy import URL, Column, MetaData, Table, Text, select
 
-from twin.alarms.database import EPISODE
+from twin.alarms.database import EPISODE, unit_columns
 from twin.alarms.database import metadata as alarm_metadata
 from twin.assets.unit import Unit, of_unit
 from twin.notifications.escalation import Call, Outcome
@@ -19,8 +19,7 @@ metadata = MetaData()
 CALL = Table(
     "alarm_call",
     metadata,
-    Column("asset_type", Text, primary_key=True),
-    Column("asset_id", Text, primary_key=True),
+    *unit_columns(),
     Column("alarm", Text, primary_key=True),
     Column("call", Text, nullable=False),  # JSON
 )
