@@ -119,7 +119,8 @@ def commanded(tutorial: Read) -> Path:
     The calibration itself is not made again: what it is made of has to be the same.
     """
     calibrated, healthy = tutorial.names["calibrated"], tutorial.names["healthy"]
-    begun = Config.of(Document.read(tutorial.folder / "cell.toml"), calibrated=False)
+    configured = Config.of(Document.read(tutorial.folder / "cell.toml"), calibrated=False)
+    begun = configured.with_sensor(is_gauge=True)  # the table has a vacuum
 
     def fitted(config: Config, blocks: Iterable[Samples], _say: object) -> object:
         assert (config.data, config.monitor, config.asset) == (
@@ -155,7 +156,7 @@ def test_a_calibration_is_made_of_what_the_command_makes_it_of(
     monkeypatch.setattr("twin.api.fit_unit", fitted)
     again = twin.calibrate(tutorial.names["healthy"])
     of_type = Config.of(Document.read(Path("cell.toml")), calibrated=False)
-    assert given["config"] == replace(of_type, gauge=True)  # the table has a vacuum
+    assert given["config"] == of_type.with_sensor(is_gauge=True)  # the table has a vacuum
     assert again.values == calibrated.values == told["parameters"]
     assert again.config.data.model_dump(mode="json") == told["data"]
     assert again.config.monitor.healthy.model_dump(mode="json") == told["healthy"]

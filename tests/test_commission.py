@@ -359,7 +359,7 @@ def test_a_gauge_sensor_counts_from_the_ambient_pressure_that_was_told() -> None
     of = logged(SEED, KIND)
     config = config_of(of.truth.readable)
     readings = replace(read(samples_of(of)), opened=False, barometer=np.nan)
-    gauge = replace(config, gauge=True)
+    gauge = config.with_sensor(is_gauge=True)
     assert free_of(gauge, readings) == FREE_IN_MARKET
 
 

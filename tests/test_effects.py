@@ -14,7 +14,9 @@ from stepping import PRESSURES, states, temperature
 from twin.errors import ConfigError
 from twin.model import kernel
 from twin.model import theta as c
+from twin.model.dataset import coefficients
 from twin.model.effects import EFFECTS, Law, apply, table
+from twin.model.plant import reading_of
 from twin.model.theta import Theta
 from twin.signals import BAR, MBAR, MS, Command, Phase
 
@@ -199,6 +201,16 @@ def test_losses_are_shares(name: str, coefficient: int) -> None:
 def test_heat_exchange_replaces_the_film_coefficient() -> None:
     theta = rigs.theta("test_rig")
     assert apply(theta, "heat_exchange", {"film_coefficient": 42.0})[c.FILM] == 42.0
+
+
+@pytest.mark.parametrize(("is_gauge", "moved"), [(False, -20.0), (True, 0.0)])
+def test_weather_moves_the_reading_of_an_open_system_unless_a_gauge_reads_it(
+    *, is_gauge: bool, moved: float
+) -> None:
+    healthy = coefficients(rigs.config("gripper").with_sensor(is_gauge=is_gauge).data)
+    lower = apply(healthy, "ambient_pressure", {"shift": -20.0})
+    change = reading_of(float(lower[c.AMBIENT]), lower) - float(healthy[c.AMBIENT])
+    assert change / MBAR == pytest.approx(moved, abs=1e-6)
 
 
 def test_clogging_costs_the_drop_it_says_at_nominal_suction() -> None:

@@ -182,5 +182,5 @@ def test_a_log_of_a_table_says_what_its_pressure_counts_from(
     assert command(monkeypatch, "import", file, "--config", config, "-o", log) == 0
     assert command(monkeypatch, "replay", log, "--config", config, "-o", again) == 0
     for one in (log, again):
-        assert Config.of_recorded(open_log(one).header, one.name).gauge == gauge
-    assert twin.open(file, config).config.gauge == gauge
+        assert Config.of_recorded(open_log(one).header, one.name).is_gauge == gauge
+    assert twin.open(file, config).config.is_gauge == gauge

@@ -261,6 +261,7 @@ def test_every_coefficient_is_filled_in() -> None:
         "INFLOW",
         "BACK_FLOW",
         "SENSOR_OFFSET",
+        "GAUGE",
         "SLOW_RAMP_UP",
         "EXHAUST_FOLLOWS",
         "FILTER_AT",

@@ -165,12 +165,12 @@ class Person:
         if (ambient := known("ambient_mbar")) is not None:  # there is a barometer
             text += f"\n[data.ambient]\npressure_mbar = {ambient}\n"
         config = Config.of(Document.parse(text, name), calibrated=False)
-        return cls(replace(config, gauge=gauge))
+        return cls(config.with_sensor(is_gauge=gauge))
 
     def samples(self, logged: Record) -> Samples:
         """A record as ``twin import`` reads it, gaps marked."""
         columns = logged.columns()
-        if not self.config.gauge:
+        if not self.config.is_gauge:
             columns["pressure_mbar"] = logged.pressure_pa / MBAR
             del columns["vacuum_mbar"]
         ambient = self.config.data.ambient.pressure_mbar * MBAR

@@ -276,7 +276,7 @@ def head(data: bytes) -> str:
     config, stored, healthy, *_ = [*data.decode(errors="replace").split("\0"), "", ""]
     metadata = {"data": stored, "healthy": healthy}
     config_read = Config.of_recorded(LogHeader("type", "id", "a.toml", config, metadata), "a.mcap")
-    return f"gauge {config_read.gauge}"
+    return f"gauge {config_read.is_gauge}"
 
 
 def _table(data: bytes, suffix: str) -> str:

@@ -240,7 +240,8 @@ def open(  # noqa: A001  (as a module's open is called)
     else:
         settings = _configured(config, assets, unit)
         source = _table(path, settings, derive_commands)
-        settings, notes = replace(settings, gauge=source.counts_from_ambient), source.notes
+        settings = settings.with_sensor(is_gauge=source.counts_from_ambient)
+        notes = source.notes
         remark = f"columns not taken: {', '.join(source.ignored)}" if source.ignored else ""
     log = Log(path, settings, assets, _source=source)
     substitution = settings.instead if unit else ""
@@ -286,7 +287,7 @@ def calibrate(log: Log, progress: Progress = _quiet) -> Calibrated:
     log._header.require_commands(str(log.path))
     document, unit = log.config.document, log.config.asset.id
     unit_config = Config.of(document, log.assets, unit, calibrated=False)
-    settings = replace(unit_config, gauge=log.config.gauge)
+    settings = unit_config.with_sensor(is_gauge=log.config.is_gauge)
     result = fit_unit(settings, log._samples(), progress)
     monitor = settings.monitor.model_copy(update={"healthy": result.healthy})
     fitted = replace(settings, data=result.fitted.data, monitor=monitor, origin=f"{log.path}")

@@ -102,7 +102,6 @@ class Config:
     log: LogSettings
     origin: str = HAND_WRITTEN  # origin of the data set, in words
     instead: str = ""  # what replaces the unit's missing data set, in words
-    gauge: bool = False  # whether the pressure sensor is known to count from ambient
 
     @classmethod
     def of(
@@ -190,8 +189,19 @@ class Config:
 
     def of_rows(self, header: LogHeader) -> "Config":
         """The configuration for the rows of a log, which say what their pressure counts from."""
-        gauge = self.gauge or header.metadata.get(COUNTED_FROM) == AMBIENT
-        return self if gauge == self.gauge else replace(self, gauge=gauge)
+        is_gauge = header.metadata.get(COUNTED_FROM) == AMBIENT
+        return self.with_sensor(is_gauge=True) if is_gauge else self
+
+    @property
+    def is_gauge(self) -> bool:
+        """Whether the pressure sensor counts from ambient."""
+        return self.data.sensor.reference == "gauge"
+
+    def with_sensor(self, *, is_gauge: bool) -> "Config":
+        """The configuration of a pressure sensor that counts from ambient, or from zero."""
+        if is_gauge == self.is_gauge:
+            return self
+        return replace(self, data=_with_sensor(self.data, is_gauge=is_gauge))
 
     def log_header(self, unmeasured: Mapping[str, str] | None = None) -> LogHeader:
         """The header with which a log of this unit can be replayed alone.
@@ -204,7 +214,7 @@ class Config:
             "origin": self.origin,
             "data": self.data.model_dump_json(),
             "healthy": self.monitor.healthy.model_dump_json(),
-            **({COUNTED_FROM: AMBIENT} if self.gauge else {}),
+            **({COUNTED_FROM: AMBIENT} if self.is_gauge else {}),
             **(unmeasured or {}),
         }
         return LogHeader(
@@ -234,20 +244,28 @@ class Config:
         monitor = document.section(MonitorSettings, "monitor")
         monitor = monitor.model_copy(update={"healthy": stored.healthy})
         log = document.section(LogSettings, "log")
-        gauge = _counts_from_ambient(document.tables)
-        return cls(document, asset, stored.data, monitor, log, origin, gauge=gauge)
+        data, is_gauge = stored.data, _counts_from_ambient(document.tables)
+        if is_gauge is not None:
+            data = _with_sensor(data, is_gauge=is_gauge)
+        return cls(document, asset, data, monitor, log, origin)
 
 
-def _counts_from_ambient(tables: Tables) -> bool:
-    """Whether the pressure's tag or column is configured to count from ambient."""
+def _with_sensor(data: DataSet, *, is_gauge: bool) -> DataSet:
+    reference = "gauge" if is_gauge else "absolute"
+    sensor = data.sensor.model_copy(update={"reference": reference})
+    return data.model_copy(update={"sensor": sensor})
+
+
+def _counts_from_ambient(tables: Tables) -> bool | None:
+    """Whether the pressure counts from ambient; None if no tag and no column says so."""
     with suppress(KeyError, TypeError):
         return bool(tables["driver"]["tags"]["pressure"]["reference"] in FROM_AMBIENT)
     with suppress(KeyError, TypeError):
         columns = tables["import"]["columns"]
         settings = columns.get("pressure")
         gauge = isinstance(settings, Mapping) and settings.get("reference") in FROM_AMBIENT
-        return gauge or any(str(name).startswith("vacuum") for name in columns)
-    return False
+        return gauge or any(str(name).startswith("vacuum") for name in columns) or None
+    return None
 
 
 def document_in(header: LogHeader) -> Document:

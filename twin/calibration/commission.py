@@ -431,7 +431,7 @@ def within(data: DataSet, ambient: Ambient) -> DataSet:
 
 def free_of(config: Config, readings: Readings) -> tuple[Free, ...]:
     """Free parameters of a fit: with ambient pressure if only the fit can determine it."""
-    if readings.opened or config.gauge or np.isfinite(readings.barometer):
+    if readings.opened or config.is_gauge or np.isfinite(readings.barometer):
         return FREE_IN_MARKET
     is_configured = config.data.ambient.pressure_mbar != Ambient().pressure_mbar
     return (*FREE_IN_MARKET, AMBIENT_TOLD if is_configured else AMBIENT)

@@ -3,7 +3,6 @@
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -77,7 +76,7 @@ def import_(
         import_settings = import_settings.model_copy(update={"time_zone": time_zone})
     ambient = settings.data.ambient.pressure_mbar * MBAR
     table = open_table(file, import_settings, ambient, derive=derive_commands)
-    settings = replace(settings, gauge=table.counts_from_ambient)
+    settings = settings.with_sensor(is_gauge=table.counts_from_ambient)
     for note in table.notes:
         print(f"twin: {file}: {note}", file=sys.stderr)
     if dry_run or output is None:

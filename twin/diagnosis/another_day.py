@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterator
 
 from twin.model import theta as c
+from twin.model.effects import apply
 from twin.model.theta import Theta
 from twin.signals import MBAR
 
@@ -32,29 +33,24 @@ ALIKE = (
 
 
 def unsure(
-    calibrated: Theta, present: Theta, ambient: float, measured: frozenset[str], gauge: bool
+    calibrated: Theta, present: Theta, ambient: float, measured: frozenset[str]
 ) -> Iterator[Way]:
     """Coefficients one sigma to either side, for each way in which a healthy rig may differ.
 
     ``present`` are the coefficients of the day, ``ambient`` (Pa) is that of a hypothesis.
-    ``measured`` are measured surroundings, ``ambient`` or ``temperature``. ``gauge``: the pressure
-    sensor counts from ambient.
+    ``measured`` are measured surroundings, ``ambient`` or ``temperature``.
     """
     if "ambient" in measured:
-        yield in_air_of(present, BAROMETER, gauge), in_air_of(present, -BAROMETER, gauge)
+        yield _in_air_of(present, BAROMETER), _in_air_of(present, -BAROMETER)
         yield _changed(present, c.SENSOR_OFFSET, ZERO), _changed(present, c.SENSOR_OFFSET, -ZERO)
     if "temperature" not in measured:
         yield _changed(present, c.TEMPERATURE, HALL_K), _changed(present, c.TEMPERATURE, -HALL_K)
     yield from _of_the_day(calibrated, present, ambient)
 
 
-def in_air_of(theta: Theta, shift: float, gauge: bool) -> Theta:
-    """``theta`` with ambient pressure shifted by ``shift`` (Pa) from the measured or assumed one.
-
-    Readings of a ``gauge`` sensor were counted from that, so they shift as well.
-    """
-    theta = _changed(theta, c.AMBIENT, shift)
-    return _changed(theta, c.SENSOR_OFFSET, -shift) if gauge else theta
+def _in_air_of(theta: Theta, shift: float) -> Theta:
+    """``theta`` with ambient pressure ``shift`` (Pa) above the measured or assumed one."""
+    return apply(theta, "ambient_pressure", {"shift": shift / MBAR})
 
 
 def _of_the_day(calibrated: Theta, present: Theta, ambient: float) -> Iterator[Way]:

@@ -123,8 +123,7 @@ def _another_day(evidence: Evidence, about: Hypothesis) -> list[tuple[Theta, The
     calibrated = float(evidence.calibrated[c.AMBIENT])
     ambient = [float(theta[c.AMBIENT]) for _, theta in evidence.course(about)]
     farthest = max(ambient, key=lambda pressure: abs(pressure - calibrated))
-    measured, gauge = evidence.told, evidence.gauge
-    return list(unsure(evidence.calibrated, evidence.theta, farthest, measured, gauge))
+    return list(unsure(evidence.calibrated, evidence.theta, farthest, evidence.told))
 
 
 def moved(

@@ -89,7 +89,6 @@ class Evidence:
     uncertain: tuple[tuple[Theta, Theta], ...]  # one sigma to either side, for each uncertainty
     rows: Ints  # subsampled for interpolation of the expected pressure
     calibrated: Theta  # ``theta`` in the surroundings of the calibration
-    gauge: bool  # the pressure sensor counts from ambient
     told: frozenset[str] = frozenset()  # measured surroundings
     another_day: bool = True  # the log is of another day than the calibration
     catalogue: Mapping[str, CatalogueEffect] = field(default_factory=dict)  # beside the table
@@ -130,17 +129,7 @@ class Evidence:
     def course(self, hypothesis: Hypothesis, base: Theta | None = None) -> Schedule:
         """Schedule of coefficients under a hypothesis: first row, and coefficients from there."""
         base = self.theta if base is None else base
-        course = schedule(base, hypothesis, self.seconds, self.cycle_of_row)
-        return [(row, self._as_read(theta, base)) for row, theta in course]
-
-    def _as_read(self, theta: Theta, base: Theta) -> Theta:
-        """Shift the sensor's offset: gauge readings were counted from the assumed ambient."""
-        shift = float(theta[c.AMBIENT] - base[c.AMBIENT])
-        if not self.gauge or shift == 0.0:
-            return theta
-        theta = theta.copy()
-        theta[c.SENSOR_OFFSET] -= shift
-        return theta
+        return schedule(base, hypothesis, self.seconds, self.cycle_of_row)
 
     def expected(self, hypothesis: Hypothesis) -> Floats:
         """Pressure (Pa) that the sensor should read at each row."""
@@ -395,7 +384,6 @@ def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
         knees=knees,
         uncertain=tuple(shifted(config.data, config.monitor.healthy)),
         calibrated=theta,
-        gauge=config.gauge,
         catalogue=config.data.catalogue,
     )
     return of_log(nothing, blocks)

@@ -181,6 +181,7 @@ class Wiring(Settings):
     lag_ms: float = Field(3.0, ge=0.5, le=500.0)  # of sensor and input, in two equal stages
     noise_mbar: float = Field(0.4, gt=0.0, le=50.0)  # one standard deviation, steps included
     sampling_ms: float = Field(1.0, ge=0.5, le=100.0)  # from row to row
+    reference: Literal["absolute", "gauge"] = "absolute"  # what it counts from: zero, or ambient
 
 
 class System(Settings):
@@ -289,6 +290,7 @@ def coefficients(data: DataSet) -> Theta:
     theta[[c.AMBIENT, c.AMBIENT_NOMINAL]] = ambient
     theta[c.TEMPERATURE] = temperature
     theta[[c.SENSOR_LAG, c.SENSOR_GAIN]] = data.sensor.lag_ms * MS / 2.0, 1.0
+    theta[c.GAUGE] = data.sensor.reference == "gauge"
     _set_supply(theta, data.supply)
     _set_ejector(theta, data.ejector, data.ejector.end_pressure_mbar * MBAR / ambient)
     _set_system(theta, data.system, data.ejector.port_volume_ml * ML)

@@ -198,6 +198,8 @@ def _sensor_lag(theta: Theta, time_constant: float) -> None:
 
 def _ambient_pressure(theta: Theta, shift: float) -> None:
     theta[c.AMBIENT] += shift * MBAR
+    # The absolute reading of a gauge sensor was calculated with the assumed ambient pressure.
+    theta[c.SENSOR_OFFSET] -= theta[c.GAUGE] * shift * MBAR
 
 
 _P = Parameter
