@@ -183,9 +183,24 @@ def test_one_odd_cycle_does_not_take_away_a_cause() -> None:
     assert before
     assert after
     hypothesis = with_leak().hypothesis
-    odd = replace(after, leftover=0.8 * before.leftover)
-    assert answer_module._sure(hypothesis, before, odd)
-    assert not answer_module._sure(hypothesis, before, replace(odd, steady=0.8 * before.steady))
+    one_odd = after.chi2.copy()
+    one_odd[0] = 0.9 * before.chi2[0]
+    assert answer_module._sure(hypothesis, before, replace(after, chi2=one_odd))
+    hardly_better = replace(after, chi2=0.8 * before.chi2)
+    assert not answer_module._sure(hypothesis, before, hardly_better)
+
+
+def test_a_cause_that_acts_in_the_last_cycles_only_is_not_taken_away() -> None:
+    before, after = with_leak().before, with_leak().after
+    assert before
+    assert after
+    late = before.chi2.copy()
+    late[:-1] = after.chi2[:-1]  # as if the leak had opened just before the last one
+    left = np.full(len(late), 1.6)
+    assert late[-1] > 10.0 * left[-1]
+    assert answer_module._sure(
+        with_leak().hypothesis, replace(before, chi2=late), replace(after, chi2=left)
+    )
 
 
 @pytest.mark.parametrize("cycles", [1, 4])

@@ -313,12 +313,13 @@ def _sure(causes: Hypothesis, before: Judged, after: Judged) -> bool:
     """Whether causes stand although something is left, because they take away nearly all of it.
 
     Several causes together can imitate something unlisted, so they may leave only little, in sigmas
-    or relative to what they take away. One odd cycle counts little, such as one in which the nozzle
-    went on once more.
+    or relative to what they take away. Odd cycles that the causes leave as they were do not count,
+    such as one in which the nozzle went on once more.
     """
-    leftover = after.steady
-    share = (leftover**2 - 1.0) / max(before.steady**2 - 1.0, 1e-9)
-    return share < MOST_LEFT and (len(causes) == 1 or leftover < SEVERAL or share < NEARLY_ALL)
+    is_odd = are_odd(after.chi2) & (after.chi2 > MOST_LEFT * before.chi2)
+    left, was = float(after.chi2[~is_odd].mean()), float(before.chi2[~is_odd].mean())
+    share = (left - 1.0) / max(was - 1.0, 1e-9)
+    return share < MOST_LEFT and (len(causes) == 1 or after.steady < SEVERAL or share < NEARLY_ALL)
 
 
 def _not_commissioned(config: Config) -> str:

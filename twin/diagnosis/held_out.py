@@ -28,7 +28,7 @@ class Judged:
     off: Floats  # mbar, of each bin
     squares: Floats  # mean square deviation of each held-out cycle, mbar²
     leftover: float  # sigmas
-    steady: float  # sigmas, robust against one odd cycle
+    chi2: Floats  # per residual, of each held-out cycle
     usual: float  # mbar rms, of healthy cycles like these
     unmeasured: float  # mbar rms, uncertainty that no healthy cycle can have shown
     figures: dict[str, float | None]
@@ -37,6 +37,11 @@ class Judged:
     def rms(self) -> float:
         """Deviation (mbar rms) over all held-out cycles."""
         return math.sqrt(float(self.squares.mean()))
+
+    @property
+    def steady(self) -> float:
+        """Leftover (sigmas), robust against one odd cycle."""
+        return usual_leftover(self.chi2)
 
 
 def judge(evidence: Evidence, weights: Weights, hypothesis: Hypothesis) -> Judged:
@@ -64,7 +69,7 @@ def judge(evidence: Evidence, weights: Weights, hypothesis: Hypothesis) -> Judge
         off,
         squares,
         leftover,
-        usual_leftover(left_in_each(evidence, weights, white[:, 0])),
+        left_in_each(evidence, weights, white[:, 0]),
         weights.usual,
         weights.unmeasured,
         {name: None if value is None else rounded(value) for name, value in figures.items()},
