@@ -9,7 +9,6 @@ import pytest
 import rigs
 
 from twin.config import Config
-from twin.diagnosis.another_day import unsure
 from twin.diagnosis.answer import diagnose
 from twin.diagnosis.covariance import covariance
 from twin.diagnosis.evidence import HEALTHY, Evidence, collect
@@ -19,6 +18,7 @@ from twin.model import theta as c
 from twin.model.courses import Cause
 from twin.model.effects import EFFECTS
 from twin.model.theta import Theta
+from twin.monitor.another_day import unsure
 from twin.monitor.detector_window import as_wide_as_needed, expected_knees
 from twin.monitor.phase_detector import PhaseFinder
 from twin.settings import Document

@@ -10,42 +10,33 @@ from tools import battery_first
 from twin.diagnosis.answer import diagnose
 from twin.inference import unmodelled
 from twin.inference.unmodelled import SHARES, Odds
+from twin.model.effects import EFFECTS
 from twin.monitor.bins import Floats
 
 RESIDUALS, WAYS = 60, 5
 
 
-def drawn(seed: int) -> tuple[Floats, Floats, Floats]:
-    """Smooth courses (whitened), what is left, and what was explained."""
+def drawn(seed: int) -> tuple[Floats, Floats]:
+    """Smooth courses (whitened), each as large as what is explained there, and what is left."""
     rng = np.random.default_rng(seed)
     courses = rng.normal(size=(RESIDUALS, WAYS)) * np.array([1.0, 0.5, 2.0, 3.0, 0.1])
-    return courses, rng.normal(size=RESIDUALS), 4.0 * rng.normal(size=RESIDUALS)
+    return courses, rng.normal(size=RESIDUALS)
 
 
-def odds(left: Floats, courses: Floats, explained: Floats) -> Odds:
-    return Odds.of(unmodelled.log_likelihoods(courses, left, explained, 1.0)[None])
+def odds(left: Floats, courses: Floats, effect: str = "leakage") -> Odds:
+    logs = unmodelled.log_likelihoods(courses, left)[None]
+    return Odds.of(logs, EFFECTS[effect], ambient_is_measured=False)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_ratio_is_that_of_two_normal_densities(seed: int) -> None:
-    courses, left, explained = drawn(seed)
+    courses, left = drawn(seed)
     scale = 1.7
-    found = unmodelled.log_likelihoods(courses, left, explained, scale)
+    ratios = unmodelled.log_likelihoods(courses, left, scale)
     alone = scale * np.eye(RESIDUALS)
-    for share, ratio in zip(SHARES, found, strict=True):
-        size = share**2 * (explained @ explained) / np.sum(courses**2)
-        both = multivariate_normal(cov=alone + size * courses @ courses.T)
+    for share, ratio in zip(SHARES, ratios, strict=True):
+        both = multivariate_normal(cov=alone + share**2 * courses @ courses.T)
         expected = both.logpdf(left) - multivariate_normal(cov=alone).logpdf(left)
-        assert ratio == pytest.approx(expected, abs=1e-8)
-
-
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_in_place_each_course_is_as_large_as_it_is(seed: int) -> None:
-    courses, left, _ = drawn(seed)
-    found = unmodelled.log_likelihoods_in_place(courses, left)
-    for share, ratio in zip(SHARES, found, strict=True):
-        both = multivariate_normal(cov=np.eye(RESIDUALS) + share**2 * courses @ courses.T)
-        expected = both.logpdf(left) - multivariate_normal(cov=np.eye(RESIDUALS)).logpdf(left)
         assert ratio == pytest.approx(expected, abs=1e-8)
 
 
@@ -66,27 +57,26 @@ def test_a_probability_is_one(ratio: float, causes: int, rivals: float) -> None:
 
 
 def test_what_explains_much_and_leaves_noise_is_surer_than_what_explains_little() -> None:
-    courses, left, explained = drawn(4)
-    sure, unsure = (odds(left, courses, size * explained) for size in (10.0, 0.1))
+    courses, left = drawn(4)
+    sure, unsure = (odds(left, size * courses) for size in (10.0, 0.1))
     assert 0.98 < sure.of_cause(1, 0.0) < 0.995
     assert unsure.of_cause(1, 0.0) < sure.of_cause(1, 0.0) - 0.03
     assert sure.of_cause(3, 0.0) < sure.of_cause(2, 0.0) < sure.of_cause(1, 0.0)
 
 
 def test_what_is_left_and_smooth_speaks_for_something_unlisted() -> None:
-    courses, left, explained = drawn(5)
-    strange = odds(left + courses @ np.array([4.0, -3.0, 2.0, 1.0, 5.0]), courses, explained)
+    courses, left = drawn(5)
+    strange = odds(left + courses @ np.array([4.0, -3.0, 2.0, 1.0, 5.0]), courses)
     assert strange.of_unlisted(1) > 0.99
     assert strange.of_cause(1, 0.0) < 0.7
 
 
 def test_of_noise_alone_something_unlisted_is_improbable_and_of_a_course_in_it_sure() -> None:
-    courses, left, _ = drawn(7)
-    noise = np.ones(RESIDUALS)
+    courses, left = drawn(7)
+    as_noise = courses * np.sqrt(RESIDUALS) / np.linalg.norm(courses)
 
     def probability(white: Floats) -> float:
-        logs = unmodelled.log_likelihoods(courses, white, noise, 1.0)
-        return unmodelled.alone(logs[None])
+        return unmodelled.alone(unmodelled.log_likelihoods(as_noise, white)[None])
 
     assert probability(left) < 0.1
     assert probability(left + 9.0 * courses @ np.ones(WAYS)) > 0.8
@@ -94,12 +84,22 @@ def test_of_noise_alone_something_unlisted_is_improbable_and_of_a_course_in_it_s
 
 def test_an_effect_that_is_off_by_a_little_of_much_is_still_itself() -> None:
     """A waveform that is off by a twentieth is the model's, not another effect's."""
-    courses, left, explained = drawn(6)
-    size = 40.0 * explained
-    way = courses[:, 3] / np.linalg.norm(courses[:, 3])
-    one = odds(left + 0.01 * np.linalg.norm(size) * way, courses, size)
+    courses, left = drawn(6)
+    large = 40.0 * courses
+    one = odds(left + 0.05 * large[:, 3], large)
     assert one.of_cause(1, 0.0) > 0.95
     assert one.of_unlisted(1) < 0.5
+
+
+def test_weather_leaves_more_than_a_fault_and_comes_more_often() -> None:
+    courses, left = drawn(6)
+    large = 40.0 * courses
+    left = left + large @ np.array([0.3, -0.3, 0.3, 0.3, -0.3])
+    fault, weather = odds(left, large), odds(left, large, "ambient_pressure")
+    assert weather.of_unlisted(1) < 0.5 < fault.of_unlisted(1)
+    logs = unmodelled.log_likelihoods(large, left)[None]
+    measured = Odds.of(logs, EFFECTS["ambient_pressure"], ambient_is_measured=True)
+    assert measured.of_cause(1, 0.0) < weather.of_cause(1, 0.0)  # it is followed
 
 
 @pytest.mark.parametrize("seed", [830022, 830010])

@@ -23,10 +23,10 @@ from twin.events import Event, Kind
 from twin.live import Twin
 from twin.model.dataset import coefficients
 from twin.model.effects import EFFECTS
-from twin.monitor.bins import Floats
+from twin.monitor.bins import Floats, Ints
 from twin.monitor.cycles import CycleCutter, CycleView, figures
 from twin.monitor.isolation import Isolation
-from twin.monitor.model_bank import SUSPECTS, UNSURE_OF
+from twin.monitor.model_bank import SUSPECTS, variants
 from twin.monitor.monitor import RIVAL, Monitor
 from twin.monitor.statistics import CycleResidual
 from twin.settings import Document
@@ -87,7 +87,9 @@ def outcome(seed: int) -> Outcome:
     config, rig = Config.of(document), document.section(PlcSettings, "plc")
     sign = rng.choice([-1.0, 1.0]) if suspect.both_ways else 1.0
     healthy = heard(config, rig, CYCLE_S[system] * HEALTHY, seed + APART)
-    steps = sign * TIMES * least([residual for residual, _ in healthy], number)
+    steps = (
+        sign * TIMES * least([residual for residual, _ in healthy], number, ways_of(config, number))
+    )
     parameter = suspect.parameter
     healthy_is = 0.0 if parameter.coefficient is None else rig.rig.vessel_film
     size = healthy_is + steps * suspect.step
@@ -97,24 +99,28 @@ def outcome(seed: int) -> Outcome:
     return Outcome(system, effect.name, size, parameter.unit, _told(events))
 
 
-def least(healthy: Sequence[CycleResidual], number: int) -> float:
-    """Smallest size of a suspect, in its steps, that is isolated WITHIN cycles."""
+def ways_of(config: Config, number: int) -> Ints:
+    """Columns of a residual's uncertain signatures that are those of a suspect."""
+    numbers = np.array([suspect for suspect, _ in variants(coefficients(config.data))])
+    return np.flatnonzero(numbers == number)
+
+
+def least(healthy: Sequence[CycleResidual], number: int, ways: Ints) -> float:
+    """Smallest size of a suspect, in its steps, that is isolated WITHIN cycles.
+
+    ``ways`` are the columns of what its law leaves open.
+    """
     effect = SUSPECTS[number].effect
     others = [i for i, suspect in enumerate(SUSPECTS) if suspect.effect != effect]
     last = healthy[-1]
     signature = last.signatures[:, number]
-    power = float(signature @ np.linalg.solve(_unknown(last, number), signature))
+    uncertain = last.unsure[:, ways]
+    unknown = last.alone + uncertain @ uncertain.T
+    power = float(signature @ np.linalg.solve(unknown, signature))
     scatter = float(np.nanstd([residual.scores()[number] for residual in healthy]))
     nearest = float(np.max(np.abs(last.alike()[number, others])))
     apart = np.sqrt(REJECTED / WITHIN / (1.0 - nearest**2))
     return max(FOUND, float(apart)) * scatter / np.sqrt(power)
-
-
-def _unknown(residual: CycleResidual, number: int) -> Floats:
-    """Covariance (mbar²) for a suspect; for UNSURE_OF with its uncertain response."""
-    ways = residual.unsure if number == UNSURE_OF else residual.unsure[:, :0]
-    covariance: Floats = residual.alone + ways @ ways.T
-    return covariance
 
 
 def heard(

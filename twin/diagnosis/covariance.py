@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag
 
-from twin.diagnosis.another_day import unsure
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.inference import covariance as parts
 from twin.inference.sensitivities import central, derivatives
@@ -19,6 +18,7 @@ from twin.inference.unmodelled import MISMATCH
 from twin.model import theta as c
 from twin.model.courses import Cause, Course, Schedule
 from twin.model.theta import Theta
+from twin.monitor.another_day import unsure
 from twin.monitor.bins import Floats, Ints
 from twin.monitor.healthy import UNSEEN_LEVEL_MBAR
 from twin.monitor.scatter_covariance import SCATTER, from_cycle_to_cycle, lasting, model_error

@@ -7,14 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from twin.diagnosis.evidence import Evidence, Hypothesis
+from twin.inference.priors import PRIOR_TEMPER
 from twin.model.courses import HOUR, Cause, Course
-from twin.model.effects import EFFECTS, Effect, Parameter, effect_of
+from twin.model.effects import EFFECTS, WEATHER, Effect, Parameter, effect_of
 from twin.monitor.bins import Floats
 
-WEATHER = "ambient_pressure"  # its typical size is one sigma of the weather
-# Exponent of the prior frequency of effects: a ratio of a thousand counts as ten, as sites differ.
-# Chosen.
-PRIOR_TEMPER = 1.0 / 3.0
 LOCAL_ONSETS = 20  # onsets in a cycle that can be told apart
 
 
@@ -86,9 +83,8 @@ def price(evidence: Evidence, hypothesis: Hypothesis) -> float:
 
 
 def often(evidence: Evidence, effect: Effect) -> float:
-    """Prior frequency of an effect; measured weather is followed, so it is hardly a cause."""
-    followed = effect.name == WEATHER and "ambient" in evidence.told
-    return min(effect.often, 1.0) if followed else effect.often
+    """Prior frequency of an effect, over that of wear."""
+    return effect.frequency(ambient_is_measured="ambient" in evidence.told)
 
 
 def rarity(evidence: Evidence, hypothesis: Hypothesis) -> float:

@@ -17,7 +17,6 @@ from twin.diagnosis.covariance import Covariance, Weights, covariance
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, at_once, thinned
 from twin.diagnosis.fit import Fitted, fit, interval, profiled, white
 from twin.diagnosis.hypotheses import (
-    WEATHER,
     bounds,
     by_each_law,
     parameters,
@@ -37,6 +36,7 @@ from twin.diagnosis.linear_screening import (
 from twin.inference.levels import CHI2_95, CHI2_999, SIGMAS_95
 from twin.model.catalogue import has_room
 from twin.model.courses import Cause, Course
+from twin.model.effects import WEATHER
 from twin.monitor.bins import Floats
 from twin.signals import MS
 

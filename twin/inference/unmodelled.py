@@ -14,6 +14,8 @@ import numpy as np
 from scipy.stats import t as student
 
 from twin.inference.covariance import Floats
+from twin.inference.priors import tempered
+from twin.model.effects import WEATHER, Effect
 
 MISMATCH = 0.08  # of what an effect explains, that its waveform is off
 # How probable things are beforehand, beside a single listed effect. Chosen: something that is not
@@ -38,33 +40,46 @@ MOST = 1e9  # beyond it nothing changes any more
 class Odds:
     """How well what is left of the data suits an effect that nobody listed.
 
-    ``ratio`` is its marginal likelihood beside that of a listed effect, from 0 to MOST.
+    ``ratio`` is its marginal likelihood beside that of a listed effect, from 0 to MOST, and
+    ``frequency`` how often that comes beside wear.
     """
 
     ratio: float
+    frequency: float = 1.0
 
     @classmethod
-    def of(cls, log_likelihoods: Floats) -> "Odds":
-        """From the log likelihoods with each of SHARES left, (·, shares): courses are averaged."""
-        return cls(_ratio(log_likelihoods, _LITTLE))
+    def of(cls, log_likelihoods: Floats, cause: Effect, *, ambient_is_measured: bool) -> "Odds":
+        """From the log likelihoods with each of SHARES left beside a cause, (·, shares).
+
+        Courses are averaged. Weather acts on everything, and no model's laws are quite those of the
+        rig: it leaves as much as a twin leaves on another day.
+        """
+        expected = _TWIN if cause.name == WEATHER else _LITTLE
+        frequency = tempered(cause, ambient_is_measured=ambient_is_measured)
+        return cls(_ratio(log_likelihoods, expected), frequency)
 
     def of_cause(self, causes: int, rivals: float) -> float:
         """Probability that a cause acts, one of so many; ``rivals`` weigh so much beside it."""
-        beside = BESIDE * self.ratio
+        beside = self._beside
         return (1.0 + beside) / (1.0 + rivals + beside + self._instead(causes))
 
     def instead(self, causes: int, rivals: float) -> float:
         """Probability that something unlisted acts in place of a cause, one of so many."""
         strange = self._instead(causes)
-        return strange / (1.0 + rivals + BESIDE * self.ratio + strange)
+        return strange / (1.0 + rivals + self._beside + strange)
 
     def of_unlisted(self, causes: int) -> float:
         """Probability that something acts that nobody listed, beside or instead of a cause."""
-        strange = BESIDE * self.ratio + self._instead(causes)
+        strange = self._beside + self._instead(causes)
         return strange / (1.0 + strange)
 
+    @property
+    def _beside(self) -> float:
+        """Weight of something unlisted beside a cause; healthy records have weather as well."""
+        return BESIDE * self.ratio / max(self.frequency, 1.0)
+
     def _instead(self, causes: int) -> float:
-        return UNLISTED * self.ratio / FURTHER ** (causes - 1)
+        return UNLISTED * self.ratio / self.frequency / FURTHER ** (causes - 1)
 
 
 def alone(log_likelihoods: Floats) -> float:
@@ -83,30 +98,15 @@ def _ratio(log_likelihoods: Floats, expected: Floats) -> float:
     return unlisted / max(usual, unlisted / MOST)
 
 
-def log_likelihoods(courses: Floats, left: Floats, explained: Floats, scale: float) -> Floats:
+def log_likelihoods(courses: Floats, left: Floats, scale: float = 1.0) -> Floats:
     """With each of SHARES left in smooth ``courses``, less that with none; all are whitened.
 
-    A share is of the root mean square; sizes of courses are normal. ``scale`` is the variance.
+    Each course is as large as what is explained in its place, and is left with a normal size.
+    ``scale`` is the variance of what is ``left``.
     """
-    sizes, power = _along(courses, left)
-    total = float(explained @ explained) / scale
-    normed = total / max(float(sizes @ sizes), 1e-12) * sizes**2
-    return _gained(SHARES[:, None] ** 2 * normed, power / scale)
-
-
-def log_likelihoods_in_place(courses: Floats, left: Floats) -> Floats:
-    """The same where each course is as large as what is explained in its place."""
-    sizes, power = _along(courses, left)
-    return _gained(SHARES[:, None] ** 2 * sizes**2, power)
-
-
-def _along(courses: Floats, left: Floats) -> tuple[Floats, Floats]:
-    """How large courses are along their principal directions, and the squares left in these."""
     directions, sizes, _ = np.linalg.svd(courses, full_matrices=False)
-    return sizes, (directions.T @ left) ** 2
-
-
-def _gained(variance: Floats, power: Floats) -> Floats:
+    variance = SHARES[:, None] ** 2 * sizes**2 / scale
+    power = (directions.T @ left) ** 2 / scale
     logs: Floats = 0.5 * (power * variance / (1.0 + variance) - np.log1p(variance)).sum(axis=1)
     return logs
 

@@ -16,6 +16,7 @@ from twin.signals import BAR, MBAR, ML, MS, SL_MIN
 FLATTEST = 0.9  # of the volume: cups that give way do not vanish
 # How often an effect comes, beside what wears: that is taken for once in two years.
 WEEKLY, SELDOM = 100.0, 0.1
+WEATHER = "ambient_pressure"  # its typical size is one sigma of the weather
 UNKNOWN = "unknown"  # stands for an effect where a deviation has no name yet
 
 
@@ -109,6 +110,11 @@ class Effect:
     def laws(self) -> list[dict[str, float]]:
         """The laws that it may act by, as values beside those of its parameters."""
         return [{self.law.name: value} for value in self.law.tried] if self.law else [{}]
+
+    def frequency(self, *, ambient_is_measured: bool) -> float:
+        """Prior frequency, over that of wear; measured weather is followed, so hardly a cause."""
+        is_followed = ambient_is_measured and self.name == WEATHER
+        return min(self.often, 1.0) if is_followed else self.often
 
 
 def _leakage(theta: Theta, flow: float) -> None:

@@ -45,7 +45,7 @@ def unsure(
         yield _changed(present, c.SENSOR_OFFSET, ZERO), _changed(present, c.SENSOR_OFFSET, -ZERO)
     if "temperature" not in measured:
         yield _changed(present, c.TEMPERATURE, HALL_K), _changed(present, c.TEMPERATURE, -HALL_K)
-    yield from _of_the_day(calibrated, present, ambient)
+    yield from of_the_day(calibrated, present, ambient)
 
 
 def _in_air_of(theta: Theta, shift: float) -> Theta:
@@ -53,8 +53,11 @@ def _in_air_of(theta: Theta, shift: float) -> Theta:
     return apply(theta, "ambient_pressure", {"shift": shift / MBAR})
 
 
-def _of_the_day(calibrated: Theta, present: Theta, ambient: float) -> Iterator[Way]:
-    """Ways that grow in proportion to the day's difference from that of the calibration."""
+def of_the_day(calibrated: Theta, present: Theta, ambient: float) -> Iterator[Way]:
+    """Ways that grow in proportion to the day's difference from that of the calibration.
+
+    ``ambient`` (Pa) is that of the day.
+    """
     higher = ambient - float(calibrated[c.AMBIENT])
     denser = math.log(ambient / calibrated[c.AMBIENT])
     warmer = math.log(present[c.TEMPERATURE] / calibrated[c.TEMPERATURE])

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from twin.inference.covariance import Covariance, fading, low_rank
+from twin.inference.priors import penalty
 from twin.inference.unmodelled import MISMATCH
 from twin.model.dataset import DataSet
 from twin.model.effects import EFFECTS, UNKNOWN, Effect, effect_of
@@ -37,9 +38,10 @@ from twin.monitor.cycles import Cycle, CycleView
 from twin.monitor.false_alarm_budget import SUMS, cycles_between
 from twin.monitor.healthy import Healthy
 from twin.monitor.likeness import Likeness
-from twin.monitor.model_bank import DELAY_STEPS, DELAYS, SUSPECTS, UNSURE_OF, ModelBank, Suspect
+from twin.monitor.model_bank import DELAY_STEPS, DELAYS, SUSPECTS, UNCERTAIN, ModelBank, Suspect
 from twin.monitor.naming import EXPLAINED, LEAST_SURE, listed_share
 from twin.monitor.statistics import CycleResidual, ScoreExtractor
+from twin.monitor.surroundings import told
 from twin.signals import SAMPLE, TICK, Samples, Ticks
 
 KEPT = 400  # cycles whose scores are remembered: a change is not sought further back
@@ -128,6 +130,7 @@ class Isolation:
         self._kept: deque[CycleResidual] = deque(maxlen=RECENT)  # some 40 kB each
         self._scored: deque[Floats] = deque(maxlen=KEPT)  # their normal scores, and of more cycles
         self._cycles, self._seconds = 0, 0.0
+        self._ambient_is_measured = False
         self._raised: tuple[int, float] | None = None  # suspect, and sigmas a cycle
         self._since = 0  # cycles since it began, while raised
         self._back = 0.0  # logarithm of the odds that it is as before
@@ -172,6 +175,7 @@ class Isolation:
     def hear(self, views: Sequence[CycleView]) -> list[Heard | None]:
         """Take cycles and pieces, in order, and what the monitor has of them; say what they say."""
         drawn = [self._bank.take(view.cycle) for view in views]
+        self._ambient_is_measured = any("ambient" in told(view.cycle.samples) for view in views)
         residuals = [
             self._listener.hear(view.cycle, *rows, view.figures)
             if view.fit and view.cycle.complete
@@ -301,19 +305,38 @@ class Isolation:
             grows, most = _grows(number, signatures, larger), float(self._bounds[number, 1])
             sizes[number], left[number] = _fitted_along(off, grows, most)
         left += known.log_pdet
-        # What a low supply does is not known well: in proportion to how low it is.
-        ways, low = sizes[UNSURE_OF] * mean.unsure, slice(UNSURE_OF, UNSURE_OF + 1)
-        wider = Covariance.of(covariance + low_rank(ways))
-        white = wider.white(np.column_stack([mean.off, mean.signatures[:, low]]))
-        sizes[low], left[low] = _fitted(white[:, :1], white[:, 1:], self._bounds[low])
-        left[low] += wider.log_pdet
+        # What a low supply or weather does is not known well: in proportion to its size.
+        wider = {}
+        for number in UNCERTAIN:
+            ways = sizes[number] * mean.unsure[:, self._listener.variant_of == number]
+            wider[number] = Covariance.of(covariance + low_rank(ways))
+            white = wider[number].white(np.column_stack([mean.off, mean.signatures[:, number]]))
+            here = slice(number, number + 1)
+            sizes[here], left[here] = _fitted(white[:, :1], white[:, 1:], self._bounds[here])
+            left[here] += wider[number].log_pdet
+        left += [
+            penalty(
+                effect_of(suspect.effect),
+                size * suspect.step / suspect.parameter.typical,
+                ambient_is_measured=self._ambient_is_measured,
+            )
+            for suspect, size in zip(self._suspects, sizes.tolist(), strict=True)
+        ]
         share = np.exp(0.5 * (left.min() - left))
         best = int(np.argmin(left))
-        suits = wider if best == UNSURE_OF else known
+        suits = wider.get(best, known)
         effect = _effect(best, float(sizes[best]), mean.signatures, mean.larger)
         if not _explains(suits, mean.off, effect):
             return [Likeness(UNKNOWN, None, "", changed)]
-        listed = changed * listed_share(suits, mean.off, effect, mean.kind, mean.time)
+        listed = changed * listed_share(
+            suits,
+            mean.off,
+            effect,
+            mean.kind,
+            mean.time,
+            effect_of(self._suspects[best].effect),
+            ambient_is_measured=self._ambient_is_measured,
+        )
         causes = self._by_effect(share * (listed / share.sum()), sizes)
         if causes[0].share < LEAST_SURE * changed:
             return [Likeness(UNKNOWN, None, "", changed)]

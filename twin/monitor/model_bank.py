@@ -16,8 +16,9 @@ from twin.model import theta as c
 from twin.model.catalogue import effects_in
 from twin.model.compiled import compiled
 from twin.model.dataset import DataSet
-from twin.model.effects import EFFECTS, Effect, Parameter, apply
+from twin.model.effects import EFFECTS, WEATHER, Effect, Parameter, apply
 from twin.model.theta import Theta
+from twin.monitor.another_day import of_the_day
 from twin.monitor.bins import Floats, Ints, sparse_rows
 from twin.monitor.cycles import Cycle
 from twin.monitor.prediction_cache import CachedPrediction, PredictionCache, Stretches
@@ -31,7 +32,7 @@ STEP = 0.25  # of a parameter's typical size
 DELAY_STEPS = (0.05, 0.25, 1.5)
 # Effects of weather or set-up, with nothing to mend: they are searched as well, but with a small
 # prior weight, so that all others are not found later.
-NO_WEAR = ("ambient_pressure", "heat_exchange")
+NO_WEAR = (WEATHER, "heat_exchange")
 SELDOM = 0.2
 NO_PHASE = 255  # before the first row
 
@@ -92,7 +93,8 @@ def suspects_of(data: DataSet, theta: Theta) -> Sequence[Suspect]:
 # since only one supply was measured; so the effect of a low supply is uncertain.
 UNSURE = {c.END_SLOPE: 0.5, c.SUPPLY_CURVATURE: 0.5, c.SUPPLY_OPTIMUM: 0.03}
 SUPPLY = "supply_pressure_drop"
-UNSURE_OF = next(i for i, suspect in enumerate(SUSPECTS) if suspect.effect == SUPPLY)
+UNCERTAIN_LAWS = (SUPPLY, WEATHER)
+UNCERTAIN = tuple(i for i, suspect in enumerate(SUSPECTS) if suspect.effect in UNCERTAIN_LAWS)
 DELAYS = tuple(i for i, suspect in enumerate(SUSPECTS) if suspect.delays)
 LARGER = len(DELAY_STEPS) - 1  # further sizes of a delay
 # With a step of these effects, a switching of the air saving shows a row later than it acts.
@@ -102,17 +104,38 @@ SEEN_LATER = {Phase.HOLD: ("sensor_lag",), Phase.SUCTION: ("sensor_lag", "slow_r
 def hypotheses(theta: Theta, suspects: Sequence[Suspect] = SUSPECTS) -> list[Theta]:
     """Coefficients: the unchanged data set, each suspect, and further hypotheses.
 
-    These are the larger sizes of delays, and a low supply with each uncertain coefficient changed.
+    These are the larger sizes of delays, and the ``variants`` of uncertain laws.
     """
-    low_supply = SUSPECTS[UNSURE_OF].of(theta)
-    uncertain_supplies = []
-    for number, share in UNSURE.items():
-        varied = low_supply.copy()
-        varied[number] *= 1.0 + share
-        uncertain_supplies.append(varied)
     steps = [size / DELAY_STEPS[0] for size in DELAY_STEPS[1:]]
     larger = [SUSPECTS[number].of(theta, factor) for number in DELAYS for factor in steps]
-    return [theta, *(suspect.of(theta) for suspect in suspects), *larger, *uncertain_supplies]
+    varied = [changed for _, changed in variants(theta)]
+    return [theta, *(suspect.of(theta) for suspect in suspects), *larger, *varied]
+
+
+def variants(theta: Theta) -> list[tuple[int, Theta]]:
+    """Numbers of the suspects whose law is uncertain, each with one way in which it may differ."""
+    return [
+        (number, changed)
+        for number in UNCERTAIN
+        for changed in ways(SUSPECTS[number].effect, theta, SUSPECTS[number].of(theta))
+    ]
+
+
+def ways(effect: str, theta: Theta, changed: Theta) -> list[Theta]:
+    """Coefficients ``changed`` by an effect, each off by one sigma of what its law leaves open.
+
+    Another ambient pressure changes the ratio of the supply to it, as a low supply does.
+    """
+    if effect not in UNCERTAIN_LAWS:
+        return []
+    varied = []
+    for number, share in UNSURE.items():
+        other = changed.copy()
+        other[number] *= 1.0 + share
+        varied.append(other)
+    if effect == WEATHER:
+        varied += [up for up, _ in of_the_day(theta, changed, float(changed[c.AMBIENT]))]
+    return varied
 
 
 class ModelBank:

@@ -6,13 +6,15 @@ size found. Covariance, alternative and priors are the same in both, and in the 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from twin.inference.covariance import Covariance, fading, low_rank
-from twin.inference.sensitivities import coefficients_at, derivatives, points
-from twin.inference.unmodelled import MISMATCH, Odds, hats, knots_over, log_likelihoods_in_place
+from twin.inference.gauss_newton import Descent, descend
+from twin.inference.priors import penalty
+from twin.inference.sensitivities import coefficients_at, derivatives
+from twin.inference.unmodelled import MISMATCH, Odds, hats, knots_over, log_likelihoods
 from twin.model import kernel
 from twin.model.effects import EFFECTS, UNKNOWN, Effect
 from twin.model.theta import Theta
@@ -20,15 +22,15 @@ from twin.monitor.bins import Bins, Floats, Ints, averaged
 from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import Healthy
 from twin.monitor.likeness import Likeness
-from twin.monitor.model_bank import SUPPLY, UNSURE
+from twin.monitor.model_bank import UNCERTAIN_LAWS, ways
 from twin.monitor.rows import drawn_rows, time_steps
 from twin.monitor.scatter_covariance import SCATTER, from_cycle_to_cycle, lasting, model_error
 from twin.monitor.statistics import PER_UNIT
+from twin.monitor.surroundings import told
 from twin.signals import MBAR, NS, Samples, Ticks, deviation
 
-LARGER = (2.5, 6.0, 15.0)  # typical sizes in which a fit begins as well
+STARTS = (1.0, 2.5, 6.0, 15.0)  # typical sizes in which a fit begins
 FINALISTS, ROUNDS = 8, 3  # effects that go on from the best of these, and for how many rounds
-NEARLY_NONE = 1e-3  # of a typical size, in place of none: slopes are over a size
 NOTHING = 0.02  # mbar rms: what moves the pressure by less in its typical size is not seen in it
 NOISE = 1.0  # mbar, of a row. Chosen: what is named here is far larger
 LEAST_SURE = 0.2  # a name that is right less than once in five is none
@@ -54,29 +56,41 @@ def likenesses(
     typical = np.array([first.typical for first in firsts])
     bounds = np.array([first.range(theta) for first in firsts]) / typical[:, None]
     expect = _Expected.of(theta, effects, samples, ticks, begin)
-    cycle = expect.at(np.ones(len(effects)))
+    cycle = expect.at(np.eye(len(effects)))
     if not len(cycle.off):
         return []
     covariance = cycle.covariance(healthy, effects, typical)
     known = Covariance.of(covariance)
-    fits = _Fits.of(known, cycle.off, bounds, np.ones(len(effects)), cycle.slopes)
-    fits.search(expect)
-    low = next(number for number, effect in enumerate(effects) if effect.name == SUPPLY)
-    wider = fits.widen(low, expect, covariance)
-    best = int(np.argmin(fits.left))
-    rest = cycle.squares(cycle.off - fits.does[:, best])
-    if rest > (1.0 - EXPLAINED) * cycle.squares(cycle.off):
+    fits = _fitted(known, cycle.off, bounds, expect)
+    is_measured = "ambient" in told(samples)
+    left, suits = np.zeros(len(fits)), [known] * len(fits)
+    for number, effect in enumerate(effects):
+        if effect.name in UNCERTAIN_LAWS:
+            suits[number] = _refit(fits, number, covariance, cycle.off, expect)
+        size = float(fits[number].x[0])
+        left[number] = fits[number].chi2 + suits[number].log_pdet
+        left[number] += penalty(effect, size, ambient_is_measured=is_measured)
+    best, sizes = int(np.argmin(left)), np.array([fit.x[0] for fit in fits])
+    moves = expect.at(np.diag(sizes)[:, [best]]).moves[:, 0]
+    if cycle.squares(cycle.off - moves) > (1.0 - EXPLAINED) * cycle.squares(cycle.off):
         return []
-    suits = wider if best == low else known
-    listed = listed_share(suits, cycle.off, fits.does[:, best], cycle.kind, cycle.time)
-    shares = np.exp(0.5 * (fits.left[best] - fits.left))
+    listed = listed_share(
+        suits[best],
+        cycle.off,
+        moves,
+        cycle.kind,
+        cycle.time,
+        effects[best],
+        ambient_is_measured=is_measured,
+    )
+    shares = np.exp(0.5 * (left[best] - left))
     shares *= listed / shares.sum()
     if shares[best] < LEAST_SURE:
         return []
     causes = [
         Likeness(effect.name, first.reported(size, theta), first.unit, share)
         for effect, first, size, share in zip(
-            effects, firsts, (fits.size * typical).tolist(), shares.tolist(), strict=True
+            effects, firsts, (sizes * typical).tolist(), shares.tolist(), strict=True
         )
     ]
     causes.sort(key=lambda likeness: -likeness.share)
@@ -89,8 +103,17 @@ def compiled_for(cycle: Cycle) -> None:
     averaged(cycle.ticks["phase"], cycle.off, rows, np.zeros((len(rows), 1)), PER_UNIT)
 
 
-def listed_share(known: Covariance, off: Floats, effect: Floats, kind: Ints, time: Floats) -> float:
-    """Probability that a listed effect acts, where the best of them does ``effect`` (mbar).
+def listed_share(
+    known: Covariance,
+    off: Floats,
+    moves: Floats,
+    kind: Ints,
+    time: Floats,
+    cause: Effect,
+    *,
+    ambient_is_measured: bool,
+) -> float:
+    """Probability that a listed effect acts, where the best, ``cause``, does ``moves`` (mbar).
 
     The alternative is something that nobody listed. Of what is explained in each place it leaves a
     share, smooth over the warped ``time`` of each ``kind`` of stretch. What is off elsewhere speaks
@@ -99,9 +122,10 @@ def listed_share(known: Covariance, off: Floats, effect: Floats, kind: Ints, tim
     courses = [np.zeros((len(kind), 0))]
     for number in np.unique(kind[kind >= 0]):
         here = kind == number
-        courses.append(hats(time, knots_over(time[here])) * (here * effect)[:, None])
-    white = known.white(np.column_stack([off - effect, *courses]))
-    return Odds.of(log_likelihoods_in_place(white[:, 1:], white[:, 0])[None]).of_cause(1, 0.0)
+        courses.append(hats(time, knots_over(time[here])) * (here * moves)[:, None])
+    white = known.white(np.column_stack([off - moves, *courses]))
+    logs = log_likelihoods(white[:, 1:], white[:, 0])[None]
+    return Odds.of(logs, cause, ambient_is_measured=ambient_is_measured).of_cause(1, 0.0)
 
 
 @dataclass(frozen=True)
@@ -111,7 +135,7 @@ class _Cycle:
     bins: Bins
     first: Ints  # bins; what comes again counts once
     off: Floats  # mbar, measured less expected
-    slopes: Floats  # mbar by the typical size of each effect, (places, effects)
+    moves: Floats  # mbar by each change of the coefficients, (places, changes)
 
     @property
     def kind(self) -> Ints:
@@ -128,7 +152,10 @@ class _Cycle:
         return float(np.sum(self.bins.count[self.first] * off**2))
 
     def covariance(self, healthy: Healthy, effects: Sequence[Effect], typical: Floats) -> Floats:
-        """Covariance (mbar²): healthy cycles scatter, and waveforms are a little wrong."""
+        """Covariance (mbar²): healthy cycles scatter, and waveforms are a little wrong.
+
+        ``moves`` are those of the ``typical`` size of each effect.
+        """
         common, alone = model_error(healthy.error, self.kind, self.time)
         scatter = np.array(
             [
@@ -136,7 +163,7 @@ class _Cycle:
                 for effect in effects
             ]
         )
-        moves = self.slopes * (scatter / typical)
+        moves = self.moves * (scatter / typical)
         goes_on = lasting(self.bins, self.first, alone)
         usual = from_cycle_to_cycle(self.bins, self.first, goes_on, moves, NOISE)
         own = np.hypot(common, MISMATCH * self.off)
@@ -162,17 +189,16 @@ class _Expected:
         return cls(theta, effects, samples, ticks, begin, drawn)
 
     def at(self, sizes: Floats) -> _Cycle:
-        """The cycle with each effect in a size, in typical ones; empty where nothing compares."""
-        return self._cycle(self._with(points(np.zeros(len(sizes)), sizes)), sizes)
+        """The cycle with sizes (effects, n), in typical ones; empty where nothing compares."""
+        return self._cycle(self._with(np.column_stack([np.zeros(len(sizes)), sizes])))
 
-    def unsure(self, size: float) -> Floats:
-        """What its law leaves open of the first effect, a low supply: mbar by one sigma each."""
+    def unsure(self, number: int, size: float) -> Floats:
+        """What its law leaves open of an effect in a size: mbar by one sigma each, (places, n)."""
         sizes = np.zeros((len(self.effects), 1))
-        sizes[0] = size
-        theta = np.repeat(self._with(sizes), 1 + len(UNSURE), axis=1)
-        for way, (coefficient, share) in enumerate(UNSURE.items(), start=1):
-            theta[coefficient, way] *= 1.0 + share
-        return self._cycle(theta, np.ones(len(UNSURE))).slopes
+        sizes[number] = size
+        changed = self._with(sizes)[:, 0]
+        off_by_one_sigma = ways(self.effects[number].name, self.theta, changed)
+        return self._cycle(np.stack([changed, *off_by_one_sigma], axis=1)).moves
 
     def _with(self, sizes: Floats) -> Floats:
         """Coefficients with so many typical sizes of each effect, (effects, n)."""
@@ -182,8 +208,8 @@ class _Expected:
         ]
         return coefficients_at(self.theta, changes, sizes)
 
-    def _cycle(self, theta: Floats, sizes: Floats) -> _Cycle:
-        """The cycle by the first coefficients, and slopes to the others, so far from it."""
+    def _cycle(self, theta: Floats) -> _Cycle:
+        """The cycle by the first coefficients, and what the others move it by."""
         here = self.drawn >= self.begin
         expected = self._expected(theta)[here] / MBAR
         expected = np.where(np.isfinite(expected), expected, expected[:, :1])  # it has no answer
@@ -193,7 +219,7 @@ class _Expected:
             phase, off, self.drawn[here] - self.begin, expected, PER_UNIT
         )
         first = np.unique(bins.place, return_index=True)[1]
-        return _Cycle(bins, first, mean[first], derivatives(through[first], sizes)[1])
+        return _Cycle(bins, first, mean[first], derivatives(through[first])[1])
 
     def _expected(self, theta: Theta) -> Floats:
         """Pressure (Pa) at the drawn rows, (rows, n); ``theta`` is (coefficients, n)."""
@@ -207,80 +233,73 @@ class _Expected:
         return expected
 
 
-@dataclass(frozen=True)
-class _Fits:
-    """Of each effect the size that fits best so far; sizes are in typical ones."""
+@dataclass
+class _SizeFit(Descent):
+    """A fit of the size of one effect, in typical ones."""
 
-    known: Covariance
-    off: Floats  # mbar
-    bounds: Floats
-    size: Floats
-    does: Floats  # mbar in that size, (places, effects)
-    left: Floats  # sigmas² that it leaves
-    wanted: Floats  # sizes to be tried next
-    hoped: Floats  # sigmas² that they would leave, were they in proportion
+    effect: int = 0
+    hoped: float = np.inf  # chi-square that the next size would have, were moves in proportion
 
-    @classmethod
-    def of(
-        cls, known: Covariance, off: Floats, bounds: Floats, sizes: Floats, slopes: Floats
-    ) -> "_Fits":
-        """With what each effect does in a size, by its ``slopes`` (mbar) for a typical one."""
-        left = np.full(len(sizes), float(np.sum(known.white(off[:, None]) ** 2)))
-        none = np.zeros(len(sizes))
-        does = np.zeros(slopes.shape)
-        fits = cls(known, off, bounds, none, does, left, none.copy(), left.copy())
-        fits._take(np.arange(len(sizes)), sizes, slopes)
-        return fits
+    def begin(self, size: float, moves: Floats, off: Floats) -> None:
+        """Consider a size that moves the cycle by ``moves``; both are whitened.
 
-    def search(self, expect: "_Expected") -> None:
-        """Begin in larger sizes as well, as what is late by much overlaps little with a bit of it.
-
-        Then go on with those effects that promise most.
+        The best one so far is kept, and the next one is where the best proportion would lead.
         """
-        every = np.arange(len(self.size))
-        for start in LARGER:
-            trial = np.clip(np.full(len(every), start), *self.bounds.T)
-            self._take(every, trial, expect.at(trial).slopes)
-        finalists = np.argsort(self.hoped)[:FINALISTS]
-        self._refine(finalists, replace(expect, effects=[expect.effects[i] for i in finalists]))
+        chi2 = float(np.sum((off - moves) ** 2))
+        if chi2 < self.chi2:
+            self.x, self.chi2 = np.array([size]), chi2
+        times = float(moves @ off) / float(moves @ moves)
+        wanted = float(np.clip(times * size, *self.low, *self.high))
+        hoped = float(np.sum((off - wanted / size * moves) ** 2))
+        if hoped < self.hoped:
+            self.next, self.hoped = np.array([wanted]), hoped
 
-    def widen(self, low: int, expect: "_Expected", covariance: Floats) -> Covariance:
-        """Fit a low supply again with what its law leaves open; give the covariance with that."""
-        alone, bounds = replace(expect, effects=[expect.effects[low]]), self.bounds[[low]]
-        size = np.clip(self.size[[low]], NEARLY_NONE, None)
-        wider = Covariance.of(covariance + low_rank(alone.unsure(float(size[0]))))
-        fits = _Fits.of(wider, self.off, bounds, size, alone.at(size).slopes)
-        fits._refine(np.zeros(1, np.int64), alone)
-        self.size[low], self.does[:, low] = fits.size[0], fits.does[:, 0]
-        self.left[low] = fits.left[0] + wider.log_pdet - self.known.log_pdet
-        return wider
 
-    def _refine(self, which: Ints, expect: "_Expected") -> None:
-        """Go on with some effects, which are those of ``expect``."""
-        for _ in range(ROUNDS):
-            trial = self.wanted[which]
-            trial = np.where(trial == 0.0, NEARLY_NONE, trial)
-            self._take(which, trial, expect.at(trial).slopes, back=True)
+def _fitted(known: Covariance, off: Floats, bounds: Floats, expect: _Expected) -> list[_SizeFit]:
+    """Fit the size of each effect; the few that promise most are refined.
 
-    def _take(self, which: Ints, trial: Floats, slopes: Floats, *, back: bool = False) -> None:
-        """Take what some effects do in sizes on trial, ``slopes`` (mbar) for each typical size.
+    Fits begin in larger sizes as well: what is late by much overlaps little with a bit of it.
+    """
+    white_off = known.white(off[:, None])[:, 0]
+    none = float(white_off @ white_off)
+    fits = [
+        _SizeFit(low, high, np.zeros(1), none, effect=number)
+        for number, (low, high) in enumerate(bounds[:, :, None])
+    ]
+    for start in STARTS:
+        sizes = np.clip(np.full(len(fits), start), *bounds.T)
+        moves = expect.at(np.diag(sizes)).moves
+        is_seen = np.sqrt(np.mean(moves**2, axis=0)) > NOTHING
+        white = known.white(moves)
+        for number in np.flatnonzero(is_seen).tolist():
+            fits[number].begin(float(sizes[number]), white[:, number], white_off)
+    finalists = sorted(fits, key=lambda fit: min(fit.hoped, fit.chi2))[:FINALISTS]
+    _refine(finalists, known, off, expect)
+    return fits
 
-        A size is taken only where it leaves less than that before, as an effect may set in
-        suddenly: that of a blow-off too weak to release a part. Where it does not, the next one is
-        half the way ``back``.
-        """
-        white = self.known.white(np.column_stack([slopes, self.off]))
-        white, off = white[:, :-1], white[:, -1:]
-        seen = np.sqrt(np.mean((slopes * trial) ** 2, axis=0)) > NOTHING
-        power = np.where(seen, np.sum(white**2, axis=0), np.inf)
-        best = np.clip(np.sum(white * off, axis=0) / power, *self.bounds[which].T) * seen
-        leaves = np.sum((off - trial * white) ** 2, axis=0)
-        hoped = np.sum((off - best * white) ** 2, axis=0)
-        better = (leaves < self.left[which]) & seen
-        self.size[which] = np.where(better, trial, self.size[which])
-        self.left[which] = np.where(better, leaves, self.left[which])
-        self.does[:, which] = np.where(better, trial * slopes, self.does[:, which])
-        further = better if back else hoped < self.hoped[which]
-        other = 0.5 * (self.size[which] + trial) if back else self.wanted[which]
-        self.wanted[which] = np.where(further, best, other)
-        self.hoped[which] = np.where(further, hoped, self.hoped[which])
+
+def _refit(
+    fits: list[_SizeFit], number: int, covariance: Floats, off: Floats, expect: _Expected
+) -> Covariance:
+    """Fit an effect again with what its law leaves open; give the covariance with that."""
+    before = fits[number]
+    wider = Covariance.of(covariance + low_rank(expect.unsure(number, float(before.x[0]))))
+    fits[number] = _SizeFit(before.low, before.high, before.x, effect=number)
+    _refine([fits[number]], wider, off, expect)
+    return wider
+
+
+def _refine(fits: Sequence[_SizeFit], known: Covariance, off: Floats, expect: _Expected) -> None:
+    """Go on with some fits for a few rounds."""
+
+    def residuals(requests: Sequence[tuple[_SizeFit, Floats]]) -> Floats:
+        sizes = np.zeros((len(expect.effects), len(requests)))
+        for column, (fit, x) in enumerate(requests):
+            sizes[fit.effect, column] = x[0]
+        return known.white(off[:, None] - expect.at(sizes).moves)
+
+    def give_up(round_number: int) -> None:
+        for fit in fits:
+            fit.done = fit.done or round_number == ROUNDS
+
+    descend(fits, residuals, give_up)

@@ -23,10 +23,10 @@ from twin.monitor.model_bank import (
     DELAYS,
     LARGER,
     SUSPECTS,
-    UNSURE_OF,
     Suspect,
     hypotheses,
     suspects_of,
+    variants,
 )
 from twin.monitor.phase_detector import Knees
 from twin.monitor.scatter_covariance import SCATTER, from_cycle_to_cycle, lasting, model_error
@@ -52,7 +52,7 @@ class CycleResidual:
     off: Floats  # mbar, measured less expected
     signatures: Floats  # mbar, by each suspect's step, (places, suspects)
     larger: Floats  # mbar, by the larger sizes of delays, (places, DELAYS · LARGER)
-    unsure: Floats  # mbar, one sigma of the signature of a low supply, (places, coefficients)
+    unsure: Floats  # mbar, one sigma of the signature of an uncertain law, (places, variants)
     alone: Floats  # mbar², covariance of differences between cycles
     common: Floats  # mbar, one sigma of the error common to all cycles
 
@@ -147,9 +147,7 @@ class ScoreExtractor:
         bin_means = bin_means[cells.first]
         changes = np.concatenate([derivatives(bin_means / MBAR)[1], self._levels[shown_levels]])
         count = len(self.suspects)
-        suspects, larger, supply_variants = np.split(
-            changes, (count, count + len(DELAYS) * LARGER), axis=1
-        )
+        suspects, larger, varied = np.split(changes, (count, count + len(DELAYS) * LARGER), axis=1)
         moves = self._moves(suspects[: len(cells.first)])
         covariance = from_cycle_to_cycle(bins, cells.first, cells.goes_on, moves, self.noise)
         return CycleResidual(
@@ -159,7 +157,7 @@ class ScoreExtractor:
             np.concatenate([off[cells.first], level]),
             suspects,
             larger,
-            supply_variants - suspects[:, UNSURE_OF : UNSURE_OF + 1],
+            varied - suspects[:, self.variant_of],
             _block_diagonal(covariance * self.healthy.leftover**2, self._sigmas[shown_levels] ** 2),
             cells.common,
         )
@@ -180,6 +178,11 @@ class ScoreExtractor:
         numbers, sigmas = self._scatters
         moves: Floats = signatures[:, numbers] * sigmas
         return moves
+
+    @cached_property
+    def variant_of(self) -> Ints:
+        """Numbers of the suspects of which the uncertain signatures are."""
+        return np.array([number for number, _ in variants(self.theta)])
 
     @cached_property
     def _scatters(self) -> tuple[list[int], list[float]]:

@@ -1,0 +1,20 @@
+"""How often each effect comes, as far as that counts in a probability: live and in a diagnosis."""
+
+import math
+
+from twin.model.effects import WEATHER, Effect
+
+# Exponent of the prior frequencies in a probability: a ratio of a thousand counts as ten, as sites
+# differ. Chosen.
+PRIOR_TEMPER = 1.0 / 3.0
+
+
+def tempered(effect: Effect, *, ambient_is_measured: bool) -> float:
+    """Prior frequency of an effect over that of wear, as far as it counts in a probability."""
+    return math.pow(effect.frequency(ambient_is_measured=ambient_is_measured), PRIOR_TEMPER)
+
+
+def penalty(effect: Effect, size: float, *, ambient_is_measured: bool) -> float:
+    """Prior penalty (chi-square) of an effect in ``size`` (in typical ones), beside wear."""
+    of_size = size**2 if effect.name == WEATHER else 0.0
+    return of_size - 2.0 * math.log(tempered(effect, ambient_is_measured=ambient_is_measured))
