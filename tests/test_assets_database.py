@@ -494,8 +494,9 @@ def test_an_empty_file_becomes_a_database_and_a_missing_one_only_if_asked(tmp_pa
     empty.touch()
     with open_assets(empty, create=False) as assets:
         assert assets.get(TYPE).used == "type"
-    with pytest.raises(SourceError, match="no such asset database"):
+    with pytest.raises(SourceError, match="no such asset database") as caught:
         open_assets(missing, create=False)
+    assert "twin commission" in caught.value.hint
     with pytest.raises(SourceError, match="unable to open") as caught:
         open_assets(tmp_path / "nowhere" / "assets.sqlite")
     assert "folder" in caught.value.hint

@@ -54,9 +54,8 @@ def open_assets(
     ConfigError for a URL of an unknown kind, a newer schema and another program's file; SourceError
     if the database cannot be reached, read or written, or stays locked.
     """
-    absent_hint = (
-        "" if create else "check --assets; twin calibrate, or twin assets add or import, makes one"
-    )
+    makers = "twin commission or calibrate, or twin assets add or import, makes one"
+    absent_hint = "" if create else f"check --assets; {makers}"
     assets = Assets(where, ASSETS, busy_s, clock, absent_hint)
     with assets.closed_on_error():
         assets.prepare(shipped=shipped)
