@@ -165,6 +165,7 @@ def test_the_sensor_is_found_between_the_ends_of_the_line(place: float) -> None:
         assert sensor_place(space.at(x)) == pytest.approx(end)
         x[number] += 0.1 if end == 0.0 else -0.1
         assert sensor_place(space.at(x)) != pytest.approx(end)
+    assert f"{space.free[number].low:g}" != "-0"
 
 
 @given(st.lists(st.floats(-3.0, 3.0), min_size=4, max_size=4))

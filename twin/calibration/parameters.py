@@ -267,10 +267,10 @@ class Space:
         system = self.data.system.model_copy(update={"sensor_shift": 0.0})
         configured_place = sensor_place(self.data.model_copy(update={"system": system}))
         number = [parameter.key for parameter in self.free].index("sensor_shift")
-        parameter = replace(self.free[number], low=-configured_place, high=1.0 - configured_place)
-        ends = np.array([parameter.low, parameter.high]) - parameter.of(self.data)
+        ends = np.array([0.0, 1.0]) - configured_place
+        parameter = replace(self.free[number], low=float(ends[0]), high=float(ends[1]))
         low, high = self.low.copy(), self.high.copy()
-        low[number], high[number] = ends / self.ways[number, number]
+        low[number], high[number] = (ends - parameter.of(self.data)) / self.ways[number, number]
         free = (*self.free[:number], parameter, *self.free[number + 1 :])
         return replace(self, free=free, low=low, high=high)
 
