@@ -1,6 +1,8 @@
 """``twin diagnose``: what it refuses or cannot answer is said, and nothing else happens."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -82,6 +84,18 @@ def test_a_disk_that_is_full_is_said(
         pytest.skip("needs a disk that is always full")
     assert twin(monkeypatch, "diagnose", log, "--json", "/dev/full") == 3
     assert "/dev/full: cannot be written: No space left" in capsys.readouterr().err
+
+
+def test_an_answer_without_a_report_needs_nothing_that_draws(log: Path) -> None:
+    """Importing Matplotlib takes longer than reading a short log."""
+    code = (
+        "import atexit, sys; from twin.cli.main import main;"
+        " atexit.register(lambda: print({'matplotlib', 'scipy.stats'} & sys.modules.keys()));"
+        f" sys.argv = ['twin', 'diagnose', {str(log)!r}]; main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("insufficient: ")
+    assert done.stdout.endswith("set()\n")
 
 
 # Logs that cannot answer.

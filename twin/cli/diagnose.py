@@ -1,5 +1,6 @@
 """``twin diagnose``: what the simulation gets wrong on a log, and why."""
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -40,11 +41,8 @@ def diagnose(
     ] = None,
 ) -> None:
     """Say what the simulation gets wrong on a log, why, and what knowing it gains."""
-    from twin.diagnosis.another_log import judged_on
     from twin.diagnosis.answer import diagnose as find_cause
-    from twin.diagnosis.extend import nothing
-    from twin.diagnosis.report import in_words, write_report
-    from twin.diagnosis.text import on_another_log
+    from twin.diagnosis.text import lines
     from twin.log.reader import open_log
 
     require_writable(json_file, report, propose)
@@ -62,15 +60,22 @@ def diagnose(
         blocks = (rows for rows, _ in recorded.blocks())
         diagnosis = find_cause(settings, blocks, str(log), say, derived=recorded.header.derived)
         if other_log is not None:
+            from twin.diagnosis.another_log import judged_on
+
             say(f"judging on {judge_on}")
             blocks = (rows for rows, _ in other_log.blocks())
             diagnosis.json["judged_on"] = judged_on(diagnosis, settings, str(judge_on), blocks)
-    print(in_words(diagnosis))
+    print(lines(diagnosis.json, time.time_ns()))
     if other_log is not None:
+        from twin.diagnosis.extend import nothing
+        from twin.diagnosis.text import on_another_log
+
         print(on_another_log(diagnosis.json, nothing(diagnosis)))
     if json_file is not None:
         write_json(json_file, diagnosis.json)
     if report is not None:
+        from twin.diagnosis.report import write_report  # with Matplotlib
+
         write_report(diagnosis, report)
     if save_as:
         _save(diagnosis, settings, save_as, assets, log)

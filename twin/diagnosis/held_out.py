@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from twin.diagnosis.covariance import Weights, levels
 from twin.diagnosis.evidence import Evidence, Hypothesis
@@ -104,7 +104,7 @@ def _interval(before: Floats, after: Floats) -> tuple[float | None, float | None
     sigma = float(np.std(changes, ddof=1)) / math.sqrt(cycles)
     if sigma == 0.0:
         return None, None
-    reach = float(student.ppf(UPPER_95, cycles - 1)) * sigma / 2.0  # of the rms, not its square
+    reach = float(stdtrit(cycles - 1, UPPER_95)) * sigma / 2.0  # of the rms, not its square
     ratio = math.sqrt(after.mean() / before.mean())
     low, high = (100.0 * (1.0 - ratio * math.exp(r)) for r in (reach, -reach))
     return math.floor(100.0 * low) / 100.0, math.ceil(100.0 * high) / 100.0

@@ -11,7 +11,6 @@ that is small.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student
 
 from twin.inference.covariance import Floats
 from twin.inference.priors import tempered
@@ -29,8 +28,9 @@ _ANY = np.diff(_EDGES)  # of an effect that nobody listed all shares are as prob
 _LITTLE = _ANY * np.exp(-0.5 * (SHARES / MISMATCH) ** 2)  # of one that is: as its waveform is off
 _LITTLE /= _LITTLE.sum()
 # Beside healthy cycles of another record a twin is off as well; by much on some rigs, as its
-# equations are not theirs: Student's t, on 16 records of rigs from another world.
-_TWIN = _ANY * student.pdf(SHARES / MISMATCH, 2)
+# equations are not theirs: Student's t with 2 degrees of freedom, on 16 records of rigs from
+# another world.
+_TWIN = _ANY * (2.0 + (SHARES / MISMATCH) ** 2) ** -1.5
 _TWIN /= _TWIN.sum()
 MOST_SURE = 0.99  # nobody knows the whole table, nor all that may not be in it
 MOST = 1e9  # beyond it nothing changes any more
