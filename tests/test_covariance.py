@@ -4,8 +4,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.linalg import block_diag
 
-from twin.inference.covariance import Covariance, add_independent, fading, low_rank
+from twin.inference.covariance import (
+    CoupledCovariance,
+    Covariance,
+    add_independent,
+    fading,
+    low_rank,
+)
 
 
 def test_whitened_columns_have_the_products_of_the_inverse_covariance() -> None:
@@ -53,3 +60,34 @@ def test_what_fades_is_a_covariance_wherever_it_is_seen(
     matrix = fading(np.ones(len(places)), time, group)
     np.testing.assert_array_equal(matrix, matrix.T)
     assert np.linalg.eigvalsh(matrix).min() > -1e-12
+
+
+def coupled(groups: int) -> tuple[CoupledCovariance, np.typing.NDArray[np.float64]]:
+    """A covariance of groups of 2, 5, 8, 2 ... residuals with 3 unknowns, and its whole matrix."""
+    random = np.random.default_rng(5)
+    sizes = [2 + 3 * (number % 3) for number in range(groups)]
+    halves = [random.normal(size=(size, size)) for size in sizes]
+    matrices = [half @ half.T + np.eye(len(half)) for half in halves]
+    moves, half = random.normal(size=(sum(sizes), 3)), random.normal(size=(3, 3))
+    prior = half @ half.T
+    whole = block_diag(*matrices) + moves @ prior @ moves.T
+    return CoupledCovariance.of(matrices, moves, prior), whole
+
+
+def test_coupled_groups_whiten_as_the_whole_matrix_does() -> None:
+    covariance, whole = coupled(7)
+    columns = np.random.default_rng(6).normal(size=(len(whole), 4))
+    at_once = Covariance.of(whole)
+    np.testing.assert_allclose(covariance.white(columns), at_once.white(columns), atol=1e-9)
+    assert covariance.log_pdet == pytest.approx(at_once.log_pdet, abs=1e-9)
+    variance = np.einsum("sr,rq,sq->s", columns.T, whole, columns.T)
+    np.testing.assert_allclose(covariance.sigma(columns.T), np.sqrt(variance), rtol=1e-9)
+
+
+def test_memory_of_coupled_groups_grows_with_their_number_not_its_square() -> None:
+    few, many = (
+        sum(part.factor.size for part in covariance.own)
+        + sum(part.size for part in (*covariance.moves, *covariance.learned))
+        for covariance, _ in map(coupled, (6, 24))
+    )
+    assert many == 4 * few

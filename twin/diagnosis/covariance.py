@@ -7,9 +7,9 @@ and does not. A share of what a hypothesis explains counts as its error as well.
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.inference import covariance as parts
@@ -19,7 +19,7 @@ from twin.model import theta as c
 from twin.model.courses import Cause, Course, Schedule
 from twin.model.theta import Theta
 from twin.monitor.another_day import unsure
-from twin.monitor.bins import Floats, Ints
+from twin.monitor.bins import Bins, Floats, Ints
 from twin.monitor.healthy import UNSEEN_LEVEL_MBAR
 from twin.monitor.scatter_covariance import SCATTER, from_cycle_to_cycle, lasting, model_error
 from twin.monitor.statistics import LEVELS
@@ -43,7 +43,7 @@ class Weights:
 
     cycles: tuple[int, ...]  # positions
     bins: Ints  # of these cycles
-    covariance: parts.Covariance  # of bins, then levels
+    covariance: parts.CoupledCovariance  # of bins, then levels
     usual: float  # rms (mbar) over rows of a model that is as good as in healthy cycles
     unmeasured: float  # rms (mbar) of uncertainty that no healthy cycle can have shown
     sigma: Floats  # of each level
@@ -73,26 +73,57 @@ class Covariance:
         """Weights of some cycles; not ``scattered``: without the scatter of effects."""
         evidence, bins = self.evidence, self.evidence.bins
         rows = np.flatnonzero(np.isin(bins.cycle, cycles))
-        kind, time = bins.kind[rows], bins.time[rows]
-        common, alone = model_error(evidence.healthy.error, kind, time)
+        common, alone = model_error(evidence.healthy.error, bins.kind[rows], bins.time[rows])
         common = np.hypot(common, self.mismatch[rows])
-        moves, left_open = self.moves[rows] * float(scattered), self.left_open[rows]
-        persistent = lasting(bins, rows, alone) + parts.low_rank(
-            moves[:, KNEES], bins.stretch[rows]
-        )
-        moves = np.delete(moves, KNEES, axis=1)
-        covariance = from_cycle_to_cycle(bins, rows, persistent, moves, evidence.noise)
-        covariance += parts.fading(common, time, kind)
-        usual = _row_rms(np.diag(covariance), bins.count[rows], evidence.noise)
-        unseen = left_open**2 * (left_open**2 > UNSEEN**2 * np.diag(covariance)[:, None])
+        scatter, left_open = self.moves[rows] * float(scattered), self.left_open[rows]
+        groups = [
+            self._of_cycle(rows[of_cycle], alone[of_cycle], scatter[of_cycle])
+            for of_cycle in _runs(bins.cycle[rows])
+        ]
+        variance = np.concatenate([np.empty(0), *map(np.diag, groups)]) + common**2
+        usual = _row_rms(variance, bins.count[rows], evidence.noise)
+        unseen = left_open**2 * (left_open**2 > UNSEEN**2 * variance[:, None])
         unmeasured = _row_rms(np.sum(unseen, axis=1), bins.count[rows], 0.0)
-        covariance += parts.low_rank(left_open)
+        moves, prior = _in_common(bins, rows, common, left_open)
+        groups = [group * evidence.healthy.leftover**2 for group in groups]
+        moves *= evidence.healthy.leftover
         sigma = _level_sigmas(evidence, cycles)
-        levels = np.diag(sigma**2) + _common_levels(evidence, cycles)
-        joint = block_diag(covariance * evidence.healthy.leftover**2, levels)
+        if len(sigma):  # no unknown of the bins moves the levels
+            groups.append(np.diag(sigma**2) + _common_levels(evidence, cycles))
+            moves = np.concatenate([moves, np.zeros((len(sigma), moves.shape[1]))])
         shown = np.array([cycle for cycle, _ in _shown(evidence, cycles)], np.int64)
-        factored = parts.Covariance.of(joint)
+        factored = parts.CoupledCovariance.of(groups, moves, prior)
         return Weights(tuple(cycles), rows, factored, usual, unmeasured, sigma, shown)
+
+    def _of_cycle(self, rows: Ints, alone: Floats, scatter: Floats) -> Floats:
+        """Covariance (mbar²) between bins of a cycle of what differs from cycle to cycle."""
+        bins, noise = self.evidence.bins, self.evidence.noise
+        knees = parts.low_rank(scatter[:, KNEES], bins.stretch[rows])
+        moves = np.delete(scatter, KNEES, axis=1)
+        return from_cycle_to_cycle(bins, rows, lasting(bins, rows, alone) + knees, moves, noise)
+
+
+def _runs(number: Ints) -> list[slice]:
+    """Slices of equal numbers."""
+    ends = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(number)]
+    return [slice(*pair) for pair in pairwise(ends) if pair[0] < pair[1]]
+
+
+def _in_common(bins: Bins, rows: Ints, common: Floats, left_open: Floats) -> tuple[Floats, Floats]:
+    """Changes of bins (mbar) by what all cycles have in common, and the covariance of that.
+
+    It is the model's error at each time since a stretch began, one sigma of it ``common``, and what
+    the calibration left open.
+    """
+    _, first, place = np.unique(
+        (bins.kind[rows] << 32) + bins.since[rows], return_index=True, return_inverse=True
+    )
+    at, unknowns = rows[first], len(first) + left_open.shape[1]
+    moves, prior = np.zeros((len(rows), unknowns)), np.eye(unknowns)
+    moves[np.arange(len(rows)), place], moves[:, len(first) :] = common, left_open
+    fading = parts.fading(np.ones(len(first)), bins.time[at], bins.kind[at])
+    prior[: len(first), : len(first)] = fading
+    return moves, prior
 
 
 def _row_rms(variance: Floats, count: Ints, noise: float) -> float:

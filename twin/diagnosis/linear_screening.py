@@ -112,12 +112,12 @@ def columns(evidence: Evidence, weights: Weights, moved: Signatures) -> Columns:
     """Whitened signatures, cycle by cycle."""
     names, off, level = moved.names, moved.off, moved.level
     base = weights.white(moved.healthy[:, None], moved.usual[:, None])[:, 0]
-    parts = []
-    for cycle in weights.cycles:
+    size = (len(names), len(weights.cycles))
+    signatures = np.empty((len(base), *size))  # (residuals, parameters, cycles)
+    for number, cycle in enumerate(weights.cycles):
         inside = (evidence.bins.cycle == cycle)[:, None]
-        parts.append(weights.white(off * inside, level * (weights.level_cycles == cycle)[:, None]))
-    signatures = np.stack(parts, axis=2)  # (residuals, parameters, cycles)
-    size = signatures.shape[1:]
+        of_cycle = level * (weights.level_cycles == cycle)[:, None]
+        signatures[:, :, number] = weights.white(off * inside, of_cycle)
     flat = signatures.reshape(len(base), -1)
     normal_matrix, gradient = flat.T @ flat, -(flat.T @ base)
     signs = [_sign(evidence, p) for _, p in names]

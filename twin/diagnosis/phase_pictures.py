@@ -86,11 +86,9 @@ def healthy_sigma(evidence: Evidence, laid: Laid) -> Floats:
     """One sigma (mbar) of the mean at each place, in the same number of healthy cycles."""
     part = of_cycles(evidence, laid.cycles.tolist())
     weights = covariance(part).of(part.judged)
-    share = np.zeros((len(laid.kind), len(laid.bins)))
+    share = np.zeros((len(laid.kind), len(laid.bins) + len(weights.sigma)))
     share[laid.place, np.arange(len(laid.bins))] = 1.0 / np.bincount(laid.place)[laid.place]
-    size = len(laid.bins)
-    sigma: Floats = np.sqrt(np.sum((share @ weights.covariance.factor[:size, :size]) ** 2, axis=1))
-    return sigma
+    return weights.covariance.sigma(share)
 
 
 def worst_kind(diagnosed: Found, laid: Laid) -> tuple[str, float, float]:
