@@ -1,13 +1,21 @@
 """What a log's evidence holds beside its cycles."""
 
+import tracemalloc
+from collections.abc import Iterator
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import rigs
 
-from twin.diagnosis.evidence import collect
+from twin.diagnosis.evidence import collect, read_cycles, thinned
 from twin.model import theta as c
 from twin.model.dataset import coefficients
+from twin.monitor.cycles import whole
+from twin.signals import Samples
+
+SECONDS = 60.0
+MOST_BYTES = 8  # of a row that is kept; one of SAMPLE and TICK has 61
 
 
 def test_a_value_that_is_open_by_more_than_itself_keeps_to_its_bounds() -> None:
@@ -24,3 +32,49 @@ def test_a_value_that_is_open_by_more_than_itself_keeps_to_its_bounds() -> None:
     up, down = evidence.uncertain[-1]
     assert up[c.RELIEF] == pytest.approx(4.0 * healthy_relief)
     assert 0.0 < down[c.RELIEF] < healthy_relief
+
+
+class Reread:
+    """Blocks of a log that are made anew by each iteration, as those of a file are."""
+
+    def __iter__(self) -> Iterator[Samples]:
+        samples, _ = rigs.recorded("test_rig", SECONDS)
+        return (block.copy() for block in rigs.cut(samples, 1000))
+
+
+def test_rows_of_a_log_are_kept_compressed_and_come_back_to_the_bit() -> None:
+    log = read_cycles(rigs.config("test_rig"), Reread())
+    twin = rigs.twin("test_rig")
+    cycles = whole(twin.over(Reread()))
+    assert log.cycles == len(cycles) > 15
+    for number, cycle in enumerate(cycles):
+        for kept, given in zip(log.rows(number), (cycle.samples, cycle.ticks), strict=True):
+            assert kept.tobytes() == given.tobytes()
+    rows = sum(len(cycle.samples) for cycle in cycles)
+    assert sum(map(len, log.packed)) < MOST_BYTES * rows
+    assert log.saturated == 0.0
+
+
+def test_reading_a_log_takes_no_memory_for_all_its_rows() -> None:
+    """Rows of one cycle and of some blocks at a time, in several passes."""
+    read_cycles(rigs.config("test_rig"), Reread())  # compiles first
+    samples, _ = rigs.recorded("test_rig", SECONDS)
+    tracemalloc.start()
+    read_cycles(rigs.config("test_rig"), Reread())
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < samples.nbytes
+
+
+def test_evidence_of_some_cycles_is_that_of_all_cut_down() -> None:
+    config = rigs.config("test_rig")
+    log, everything = read_cycles(config, Reread()), collect(config, iter(Reread()))
+    assert everything.judged == log.judged
+    np.testing.assert_array_equal(everything.seconds[everything.starts[:-1]], log.begins)
+    for source in (log, everything):
+        part = thinned(source, source.judged, 6)
+        assert len(part.judged) == 6
+        assert part.figures == [log.figures[number] for number in part.numbers]
+        rows = [log.rows(int(number)) for number in part.numbers]
+        assert part.samples.tobytes() == b"".join(samples.tobytes() for samples, _ in rows)
+        assert part.ticks.tobytes() == b"".join(ticks.tobytes() for _, ticks in rows)

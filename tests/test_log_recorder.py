@@ -51,6 +51,8 @@ def test_rows_come_back_in_order_to_the_bit(tmp_path: Path, block: int) -> None:
     assert log.complete
     assert rows_of(log) == (samples.tobytes(), ticks.tobytes())
     assert [len(rows) for rows, _ in log.blocks(7000)][:-1] == [7000] * (len(samples) // 7000)
+    for _ in range(2):  # they are read anew
+        assert b"".join(rows.tobytes() for rows in log.samples) == samples.tobytes()
 
 
 @settings(max_examples=25, deadline=None)

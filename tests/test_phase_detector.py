@@ -472,6 +472,7 @@ def test_where_a_sensor_is_too_slow_for_its_window_a_wider_one_sees_more(
     samples, _ = rigs.recorded(name, SECONDS, (f"sensor_lag={lag}",))
     wider = as_wide_as_needed(rigs.knees(name), [samples])
     assert rigs.knees(name).window < wider.window <= rigs.knees(name).longest
+    assert as_wide_as_needed(rigs.knees(name), rigs.cut(samples, 37)) == wider
     few, most = (
         int(np.count_nonzero((phase[1:] == Phase.HOLD) & (phase[:-1] == Phase.SUCTION)))
         for _, phase, _ in (find(samples, knees) for knees in (rigs.knees(name), wider))

@@ -18,7 +18,7 @@ from twin.diagnosis.evidence import collect
 from twin.events import Kind
 from twin.live import run
 from twin.model import theta as c
-from twin.monitor.surroundings import following, taken_in, told
+from twin.monitor.surroundings import following, medians_of, taken_in, told
 from twin.signals import MBAR, Samples, deviation
 
 WEATHER = ("ambient_pressure=-23",)  # mbar, beside the data set; and it is 35 °C instead of 20
@@ -82,6 +82,13 @@ def test_where_nobody_tells_them_the_data_set_says_what_they_are() -> None:
     assert following(theta, samples) is theta
     data = typed("gripper").data
     assert taken_in(data, samples) == data
+
+
+def test_a_stream_tells_the_same_surroundings_as_all_its_rows() -> None:
+    samples = another_day("gripper").copy()
+    samples["ambient"][:4000] = 0.0  # not measured yet
+    assert medians_of(rigs.cut(samples, 37)) == told(samples)
+    assert set(told(samples)) == {"ambient", "temperature"}
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -57,14 +57,14 @@ def diagnose(
     if not unit:
         settings.refuse_another(recorded.header, str(log))
     with status() as say:
-        blocks = (rows for rows, _ in recorded.blocks())
-        diagnosis = find_cause(settings, blocks, str(log), say, derived=recorded.header.derived)
+        derived = recorded.header.derived
+        diagnosis = find_cause(settings, recorded.samples, str(log), say, derived=derived)
         if other_log is not None:
             from twin.diagnosis.another_log import judged_on
 
             say(f"judging on {judge_on}")
-            blocks = (rows for rows, _ in other_log.blocks())
-            diagnosis.json["judged_on"] = judged_on(diagnosis, settings, str(judge_on), blocks)
+            rows = other_log.samples
+            diagnosis.json["judged_on"] = judged_on(diagnosis, settings, str(judge_on), rows)
     print(lines(diagnosis.json, time.time_ns()))
     if other_log is not None:
         from twin.diagnosis.extend import nothing

@@ -7,7 +7,7 @@ from typing import Any
 from twin.config import Config
 from twin.diagnosis.answer import Diagnosis, insufficient
 from twin.diagnosis.covariance import covariance
-from twin.diagnosis.evidence import HEALTHY, Evidence, collect
+from twin.diagnosis.evidence import HEALTHY, Evidence, read_again, read_cycles
 from twin.diagnosis.extend import extended
 from twin.diagnosis.held_out import Judged, gain, judge
 from twin.errors import SourceError
@@ -26,11 +26,12 @@ def judged_on(
     if extended_model is None:
         return None
     monitor = config.monitor.model_copy(update={"healthy": extended_model.healthy})
-    blocks = list(blocks)
-    before = collect(config, blocks)
-    after = collect(replace(config, data=extended_model.data, monitor=monitor), blocks)
+    blocks = read_again(blocks)
+    other_config = replace(config, data=extended_model.data, monitor=monitor)
+    read = [read_cycles(either, blocks) for either in (config, other_config)]
+    before, after = (cycles_read.whole() for cycles_read in read)
     cycles = sorted({*before.judged} & {*after.judged})
-    if reason := insufficient(before) or insufficient(after):
+    if reason := insufficient(read[0], before) or insufficient(read[1], after):
         raise SourceError(f"{log}: nothing can be judged on it: {reason}")
     as_it_stands, with_causes = _judged(before, cycles), _judged(after, cycles)
     return {

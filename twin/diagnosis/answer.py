@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,16 @@ import numpy as np
 from twin.config import Config
 from twin.diagnosis.costs import costs
 from twin.diagnosis.covariance import Covariance, Weights, covariance
-from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, collect, thinned
+from twin.diagnosis.evidence import (
+    HEALTHY,
+    Evidence,
+    Hypothesis,
+    LogCycles,
+    of_cycles,
+    read_again,
+    read_cycles,
+    thinned,
+)
 from twin.diagnosis.experiments import next_experiment
 from twin.diagnosis.fit import Fitted, white
 from twin.diagnosis.healthy import are_odd, left_in_each, usual_leftover
@@ -32,7 +40,7 @@ from twin.monitor.bins import Floats
 from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import NOT_COMMISSIONED
 from twin.monitor.signal_checks import standing
-from twin.signals import Quality, Samples
+from twin.signals import Samples
 
 FORMAT = "ejector-twin-diagnosis/1"
 FEWEST_CYCLES = 3  # judged cycles: two to fit on, one to judge by
@@ -98,21 +106,23 @@ def diagnose(
     ``insufficient`` without a calibrated twin: its causes would be errors of the data set.
     """
     progress("running the twin over the log")
-    blocks = [block for block in blocks if len(block)]
-    evidence = replace(collect(config, blocks), before_s=before_s)
+    blocks = read_again(blocks)
+    whole_log = read_cycles(config, blocks)
+    whole_log = replace(whole_log, base=replace(whole_log.base, before_s=before_s))
     head: dict[str, Any] = {
         "format": FORMAT,
         "log": log,
         "asset": {"type": config.asset.type, "id": config.asset.id},
     }
-    if against := _signals(evidence):
+    if against := _signals(whole_log):
         head["signals"] = against
     part = _part(blocks, before_s)
     unrecorded = f"{derived}: record the commands as well" if derived else None
-    if reason := unrecorded or _not_commissioned(config) or insufficient(evidence):
-        answer = head | _insufficient(evidence, part, reason)
-        return Diagnosis(evidence, config.data.hash, None, HEALTHY, (), None, None, [], answer)
-    whole_log, evidence = evidence, thinned(evidence, evidence.judged, MOST_JUDGED)
+    evidence = thinned(whole_log, whole_log.judged, MOST_JUDGED)
+    if reason := unrecorded or _not_commissioned(config) or insufficient(whole_log, evidence):
+        answer = head | _insufficient(whole_log, part, reason)
+        last_cycle = of_cycles(whole_log, range(whole_log.cycles)[-1:])
+        return Diagnosis(last_cycle, config.data.hash, None, HEALTHY, (), None, None, [], answer)
     healthy = covariance(evidence)
     fitted, held_out = split(evidence, healthy)
     searched = search(evidence, fitted, healthy, progress)
@@ -268,14 +278,10 @@ def _term_found(
     return replace(strange, terms=()), None  # lower in sigmas only: no better model
 
 
-def _signals(evidence: Evidence) -> list[dict[str, str]]:
+def _signals(log: LogCycles) -> list[dict[str, str]]:
     """Reported or measured signals that contradict the pressure."""
-    bounds = pairwise(evidence.starts.tolist())
-    cycles = (
-        Cycle(number, evidence.samples[first:last], evidence.ticks[first:last], complete=True)
-        for number, (first, last) in enumerate(bounds)
-    )
-    contradictions = standing(cycles, evidence.theta, evidence.knees)
+    cycles = (Cycle(number, *log.rows(number), complete=True) for number in range(log.cycles))
+    contradictions = standing(cycles, log.base.theta, log.base.knees)
     return [
         {"signal": contradiction.signal, "what": contradiction.what, "do": contradiction.action}
         for contradiction in contradictions
@@ -330,19 +336,18 @@ def _not_commissioned(config: Config) -> str:
     return f"{NOT_COMMISSIONED}; fit the twin first to a log of healthy cycles: {run}"
 
 
-def insufficient(evidence: Evidence) -> str:
-    """Why the log cannot answer; empty if it can."""
-    if not len(evidence.samples):
+def insufficient(log: LogCycles, evidence: Evidence) -> str:
+    """Why a log cannot answer by some evidence of it; empty if it can."""
+    if not log.cycles:
         return "the log has no complete cycle: record suction, blow-off and the idle after it"
-    saturated = np.mean((evidence.samples["quality"] & Quality.OVERFLOW) != 0)
-    if saturated > MOST_SATURATED:
+    if log.saturated > MOST_SATURATED:
         return (
-            f"the pressure input is saturated in {saturated:.0%} of the samples: check the sensor's"
-            " range and wiring, then record again"
+            f"the pressure input is saturated in {log.saturated:.0%} of the samples: check the"
+            " sensor's range and wiring, then record again"
         )
-    if len(evidence.judged) < FEWEST_CYCLES:
+    if len(log.judged) < FEWEST_CYCLES:
         return (
-            f"only {len(evidence.judged)} cycle{'s' * (len(evidence.judged) != 1)} can be judged:"
+            f"only {len(log.judged)} cycle{'s' * (len(log.judged) != 1)} can be judged:"
             f" record at least {FEWEST_CYCLES + 1} complete ones in a row"
         )
     if not len(evidence.bins.count):
@@ -457,12 +462,12 @@ def _rounded_onset(evidence: Evidence, cause: Cause) -> float | None:
     return round(evidence.before_s + cause.onset_s, 3) if timed else None
 
 
-def _part(blocks: Sequence[Samples], before_s: float) -> dict[str, Any]:
+def _part(blocks: Iterable[Samples], before_s: float) -> dict[str, Any]:
     """Where in the log the cycles begin (s), and the host time of the log's beginning (UTC, ns).
 
     The latter is None if no clock gave the times, as in a table that counts from 0.
     """
-    first_ns = int(blocks[0]["host_ns"][0]) if blocks else 0
+    first_ns = next((int(block["host_ns"][0]) for block in blocks if len(block)), 0)
     is_dated = first_ns >= CALENDAR_NS
     return {
         "begin_s": round(before_s, 3),
@@ -558,7 +563,7 @@ def _mechanism(evidence: Evidence, explained: Explained) -> dict[str, Any]:
     }
 
 
-def _insufficient(evidence: Evidence, part: dict[str, Any], reason: str) -> dict[str, Any]:
+def _insufficient(log: LogCycles, part: dict[str, Any], reason: str) -> dict[str, Any]:
     names = (
         "rms_mbar",
         "max_mbar",
@@ -574,7 +579,7 @@ def _insufficient(evidence: Evidence, part: dict[str, Any], reason: str) -> dict
         "runners_up": [],
         "unmodelled_probability": None,
         "unlisted": None,
-        "cycles": {"total": evidence.cycles, "fitted": [], "held_out": [], **part},
+        "cycles": {"total": log.cycles, "fitted": [], "held_out": [], **part},
         "baseline": nothing,
         "extended": nothing,
         "gain": None,

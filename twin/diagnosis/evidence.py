@@ -5,6 +5,8 @@ are measured minus expected pressure, averaged over short bins, and measured min
 at the switchings of the air saving.
 """
 
+import math
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
@@ -18,6 +20,7 @@ import numpy.typing as npt
 
 from twin.config import Config
 from twin.live import Twin
+from twin.log.columns import decode, encode
 from twin.model import kernel
 from twin.model import theta as c
 from twin.model.catalogue import CatalogueEffect, effects_in
@@ -28,13 +31,13 @@ from twin.model.plant import reading_of, sensed_of
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, binned
-from twin.monitor.cycles import figures, whole
+from twin.monitor.cycles import cut, figures
 from twin.monitor.detector_window import as_wide_as_needed, knees_of
 from twin.monitor.healthy import Healthy
 from twin.monitor.phase_detector import Knees
 from twin.monitor.rows import drawn_rows, time_steps
 from twin.monitor.simulated_switching import Seen, seen
-from twin.monitor.surroundings import are_told, following, told
+from twin.monitor.surroundings import medians_of, surrounded
 from twin.monitor.uncertain_data import shifted
 from twin.signals import (
     MBAR,
@@ -44,6 +47,7 @@ from twin.signals import (
     UNUSABLE,
     Command,
     Phase,
+    Quality,
     Samples,
     Ticks,
     bridged,
@@ -51,7 +55,9 @@ from twin.signals import (
     sampling_ms,
 )
 
+OVERFLOW = int(Quality.OVERFLOW)  # a plain number: NumPy compares bytes with it
 CORES: ContextVar[int] = ContextVar("CORES", default=2)  # on which a diagnosis runs
+FASTEST = 1  # of zlib's levels: a row takes 4 bytes
 LATER, LONGEST_SUCTION = 1.3, 10_000  # simulated suction over that of cycles, and at most (rows)
 
 Hypothesis = tuple[Cause, ...]
@@ -99,6 +105,17 @@ class Evidence:
         """Number of complete cycles."""
         return len(self.starts) - 1
 
+    def only(self, cycles: Sequence[int], judged: list[int]) -> "Evidence":
+        """Evidence of some of these cycles; ``judged`` are positions among them."""
+        parts = [slice(*self.starts[cycle : cycle + 2]) for cycle in cycles]
+        return _of_rows(
+            self,
+            [(self.samples[part], self.ticks[part]) for part in parts],
+            numbers=self.numbers[np.array(cycles, np.int64)],
+            judged=judged,
+            figures=[self.figures[cycle] for cycle in cycles],
+        )
+
     @cached_property
     def effects(self) -> list[Effect]:
         """Effects that can act: of the table, and of the catalogue."""
@@ -134,8 +151,8 @@ class Evidence:
     def expected(self, hypothesis: Hypothesis) -> Floats:
         """Pressure (Pa) that the sensor should read at each row."""
         course = self.course(hypothesis)
-        phase, level = self._switched([course], self._sensing([self.theta], [course]))
-        rows = np.arange(len(self.samples))
+        sensing, rows = self._sensing([self.theta], [course]), np.arange(len(self.samples))
+        phase, level = self._phases(sensing), self._levels(rows, [course], sensing)
         return self._run([course], phase, level, rows, kernel.TOLERANCE)[:, 0]
 
     def off(
@@ -158,9 +175,10 @@ class Evidence:
         lanes = [slice(i, i + kernel.LANES) for i in range(0, len(courses), kernel.LANES)]
 
         def run(lane: slice) -> Floats:
-            phase, level = self._switched(courses[lane], sensing[lane])
+            phase = self._phases(sensing[lane])
             rows = self._drawn(courses[lane], phase)
-            expected = self._run(courses[lane], phase, level, rows, kernel.ROUGHLY)
+            level = self._levels(rows, courses[lane], sensing[lane])
+            expected = self._run(courses[lane], phase[rows], level, rows, kernel.ROUGHLY)
             off: Floats = (self._measured[:, None] - self.bins.through(rows, expected)) / MBAR
             return off
 
@@ -189,9 +207,8 @@ class Evidence:
         rows: Ints,
         tolerance: float,
     ) -> Floats:
-        """Expected pressures (Pa) at ``rows``, (rows, courses)."""
+        """Expected pressures (Pa) at ``rows``, (rows, courses); the rest is given there."""
         dt = np.diff(self._times[rows], prepend=0.0)
-        phase, level = phase[rows], level[rows]
         expected = np.empty((len(rows), len(courses)))
         state, before = kernel.new_state(len(courses)), None
         for first, last, theta in _constant_stretches(courses, len(self.samples)):
@@ -236,47 +253,59 @@ class Evidence:
             stretches.append((row, changed))
         return stretches
 
-    def _switched(
-        self, courses: Sequence[Schedule], sensing: Sequence[tuple["Sensing", ...]]
-    ) -> tuple[npt.NDArray[np.uint8], Floats]:
-        """Phases and levels for which the nozzle would be seen to switch as it was.
+    def _phases(self, sensing: Sequence[tuple["Sensing", ...]]) -> npt.NDArray[np.uint8]:
+        """Phases of all rows for which the nozzle would be seen to switch as it was.
 
-        Both are (rows, n), or (rows, 1) if they are the same for all.
+        They are (rows, n), or (rows, 1) if they are the same for all.
         """
-        changed, moved = any(len(course) > 1 for course in courses), any(sensing)
-        phase = np.repeat(self.ticks["phase"][:, None], len(sensing) if moved else 1, axis=1)
-        width = len(sensing) if changed or moved else 1
-        level = np.repeat(self.ticks["level"].astype(np.float64)[:, None], width, axis=1)
+        width = len(sensing) if any(sensing) else 1
+        phase = np.repeat(self.ticks["phase"][:, None], width, axis=1)
+        for i, shifts in enumerate(sensing):
+            if shifts:
+                self._move(phase[:, i], shifts)
+        return phase
+
+    def _levels(
+        self, rows: Ints, courses: Sequence[Schedule], sensing: Sequence[tuple["Sensing", ...]]
+    ) -> Floats:
+        """Levels at ``rows``, as ``_phases``; all rows with a level have to be among them."""
+        changed = any(len(course) > 1 for course in courses)
+        width = len(sensing) if changed or any(sensing) else 1
+        level = np.repeat(self.ticks["level"][rows].astype(np.float64)[:, None], width, axis=1)
+        knees = np.searchsorted(rows, self._knees)
         for i, (course, shifts) in enumerate(zip(courses, sensing, strict=True)):
             if shifts:
-                self._move(phase[:, i], level[:, i], shifts)
+                level[knees, i] -= [self._shift_at(knee, shifts)[1] for knee in self._knees]
             if len(course) > 1:
-                self._read_anew(level[:, i], course)
-        return phase, level
+                self._read_anew(rows, level[:, i], course)
+        return level
 
-    def _read_anew(self, level: Floats, course: Schedule) -> None:
+    def _read_anew(self, rows: Ints, level: Floats, course: Schedule) -> None:
         """Correct levels at a cycle's start for coefficients of the sensor that change there."""
         for (_, before), (row, after) in pairwise(course):
-            if np.isfinite(level[row]) and self.ticks["phase"][row - 1] == Phase.IDLE:
-                level[row] = reading_of(sensed_of(level[row], before), after)
+            at = np.searchsorted(rows, row)
+            if np.isfinite(level[at]) and self.ticks["phase"][row - 1] == Phase.IDLE:
+                level[at] = reading_of(sensed_of(level[at], before), after)
 
-    def _move(
-        self, phase: npt.NDArray[np.uint8], level: Floats, sensing: Sequence["Sensing"]
-    ) -> None:
+    def _move(self, phase: npt.NDArray[np.uint8], sensing: Sequence["Sensing"]) -> None:
         """Move the switching of one hypothesis, in place."""
-        begins = [part.row for part in sensing]
         for knee in self._knees:
-            shift = sensing[np.searchsorted(begins, knee, "right") - 1]
             name = Phase(int(self.ticks["phase"][knee]))
-            closing = name == Phase.HOLD
-            earlier = shift.off if closing else shift.on
-            known_shift = self.knees.off_shift if closing else self.knees.on_shift
-            level[knee] -= shift.off_above if closing else shift.on_above
+            known_shift = self.knees.off_shift if name == Phase.HOLD else self.knees.on_shift
+            earlier, _ = self._shift_at(knee, sensing)
             acts = max(knee - known_shift - earlier, 0)
             phase[max(knee - known_shift, 0) : knee] = _OTHER[name]
             phase[acts:knee] = name
             late = phase[knee : max(knee, acts)]
             late[late == name] = _OTHER[name]
+
+    def _shift_at(self, knee: int, sensing: Sequence["Sensing"]) -> tuple[int, float]:
+        """Rows by which a switching acts earlier, and the level (Pa) by which it is seen higher."""
+        begins = [part.row for part in sensing]
+        shift = sensing[int(np.searchsorted(begins, knee, "right")) - 1]
+        if self.ticks["phase"][knee] == Phase.HOLD:
+            return shift.off, shift.off_above
+        return shift.on, shift.on_above
 
     @cached_property
     def _knees(self) -> Ints:
@@ -361,9 +390,55 @@ def _constant_stretches(courses: Sequence[Schedule], rows: int) -> Iterator[tupl
         yield first, last, np.stack(current, axis=1)
 
 
+@dataclass(frozen=True)
+class LogCycles:
+    """The complete cycles of a log, compressed, as an hour has 3.6 million rows.
+
+    Evidence is made of some of them at a time.
+    """
+
+    base: Evidence  # of none of them
+    begins: Floats  # time (s) of the first row of each, since the first row of the log
+    judged: list[int]  # as in Evidence
+    figures: list[dict[str, float]]
+    saturated: float  # share of their rows
+    packed: list[bytes]
+
+    @property
+    def cycles(self) -> int:
+        """Number of complete cycles."""
+        return len(self.packed)
+
+    def rows(self, cycle: int) -> tuple[Samples, Ticks]:
+        """Rows of a cycle."""
+        return decode(zlib.decompress(self.packed[cycle]))
+
+    def whole(self) -> Evidence:
+        """Evidence of all cycles: all rows are held in memory."""
+        return self.only(range(self.cycles), self.judged)
+
+    def only(self, cycles: Sequence[int], judged: list[int]) -> Evidence:
+        """Evidence of some cycles; ``judged`` are positions among them."""
+        return _of_rows(
+            self.base,
+            [self.rows(cycle) for cycle in cycles],
+            numbers=np.array(cycles, np.int64),
+            judged=judged,
+            figures=[self.figures[cycle] for cycle in cycles],
+        )
+
+
 def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
-    """Run the calibrated twin over a log and collect its complete cycles."""
-    blocks = list(blocks)
+    """Run the calibrated twin over a log and collect its complete cycles, with all their rows."""
+    return read_cycles(config, blocks).whole()
+
+
+def read_cycles(config: Config, blocks: Iterable[Samples]) -> LogCycles:
+    """Run the calibrated twin over a log and keep its complete cycles.
+
+    ``blocks`` are read several times; those of an iterator are kept meanwhile.
+    """
+    blocks = read_again(blocks)
     theta = coefficients(config.data)
     knees = knees_of(config.data, sampling_ms(max(blocks, key=len, default=np.empty(0, SAMPLE))))
     nothing = Evidence(
@@ -386,62 +461,96 @@ def collect(config: Config, blocks: Iterable[Samples]) -> Evidence:
         calibrated=theta,
         catalogue=config.data.catalogue,
     )
-    return of_log(nothing, blocks)
+    return _read(nothing, blocks)
+
+
+def read_again(blocks: Iterable[Samples]) -> Iterable[Samples]:
+    """Blocks that can be read again and again: those of an iterator are kept."""
+    return list(blocks) if isinstance(blocks, Iterator) else blocks
 
 
 def of_log(base: Evidence, blocks: Iterable[Samples]) -> Evidence:
     """Evidence of another log for the same twin."""
-    blocks = list(bridged(blocks))
-    rows = joined(np.empty(0, SAMPLE), *(block for block in blocks if are_told(block)))
-    uncertain = tuple((following(up, rows), following(down, rows)) for up, down in base.uncertain)
-    theta = following(base.theta, rows)
-    base = replace(base, theta=theta, uncertain=uncertain, told=frozenset(told(rows)))
-    knees = as_wide_as_needed(base.knees, blocks)
-    cycles = whole(Twin(base.theta, knees, base.terms).over(blocks))
-    samples = np.concatenate([np.empty(0, SAMPLE), *(cycle.samples for cycle in cycles)])
-    ticks = np.concatenate([np.empty(0, TICK), *(cycle.ticks for cycle in cycles)])
-    starts = np.cumsum([0, *(len(cycle.samples) for cycle in cycles)])
-    judged = [number for number, cycle in enumerate(cycles) if cycle.settled]
-    return replace(
+    return _read(base, read_again(blocks)).whole()
+
+
+def _read(base: Evidence, blocks: Iterable[Samples]) -> LogCycles:
+    """The complete cycles of a log for the twin of ``base``, in the log's surroundings."""
+    medians = medians_of(blocks)
+    theta = surrounded(base.theta, medians)
+    base = replace(
         base,
+        theta=theta,
+        uncertain=tuple(
+            (surrounded(up, medians), surrounded(down, medians)) for up, down in base.uncertain
+        ),
+        told=frozenset(medians),
+        knees=as_wide_as_needed(base.knees, _Bridged(blocks)),
         begin_ns=next((int(block["time_ns"][0]) for block in blocks if len(block)), 0),
-        samples=samples,
-        ticks=ticks,
-        starts=starts,
-        numbers=np.arange(len(cycles)),
-        judged=judged,
-        figures=[figures(cycle, base.theta) for cycle in cycles],
-        bins=_binned(samples, ticks, starts, judged, knees),
-        rows=drawn_rows(samples, ticks),
-        knees=knees,
         _seen={},  # depends on the settings of the finder
     )
+    begins, judged, packed = list[int](), list[int](), list[bytes]()
+    figures_of_cycles, rows, saturated = list[dict[str, float]](), 0, 0
+    twin = Twin(base.theta, base.knees, base.terms)
+    for cycle in cut(twin.over(_Bridged(blocks)), math.inf):
+        if not cycle.complete:
+            continue
+        if cycle.settled:
+            judged.append(len(packed))
+        begins.append(int(cycle.samples["time_ns"][0]))
+        figures_of_cycles.append(figures(cycle, theta))
+        packed.append(zlib.compress(encode(cycle.samples, cycle.ticks), FASTEST))
+        rows += len(cycle.samples)
+        saturated += int(np.count_nonzero(cycle.samples["quality"] & OVERFLOW))
+    seconds = (np.array(begins, np.int64) - base.begin_ns).astype(np.float64) * NS
+    share = saturated / max(rows, 1)
+    return LogCycles(base, seconds, judged, figures_of_cycles, share, packed)
 
 
-def thinned(evidence: Evidence, cycles: Sequence[int], most: int) -> Evidence:
+@dataclass(frozen=True)
+class _Bridged:
+    """Blocks passed through a ``Bridge``, again and again."""
+
+    blocks: Iterable[Samples]
+
+    def __iter__(self) -> Iterator[Samples]:
+        return bridged(self.blocks)
+
+
+def thinned(source: Evidence | LogCycles, cycles: Sequence[int], most: int) -> Evidence:
     """Evidence of about ``most`` of the judged ``cycles`` at most, evenly spread in pairs."""
     if len(cycles) <= most:
-        return of_cycles(evidence, cycles)
+        return of_cycles(source, cycles)
     first = np.linspace(0, len(cycles) - 2, most // 2).astype(int)
-    return of_cycles(evidence, [cycles[i] for i in sorted({*first, *(first + 1)})])
+    return of_cycles(source, [cycles[i] for i in sorted({*first, *(first + 1)})])
 
 
-def of_cycles(evidence: Evidence, cycles: Sequence[int]) -> Evidence:
+def of_cycles(source: Evidence | LogCycles, cycles: Sequence[int]) -> Evidence:
     """Evidence of some cycles and the one before each, in which the model settles."""
     kept = sorted({number for cycle in cycles for number in (cycle - 1, cycle) if number >= 0})
-    rows = np.concatenate([np.arange(evidence.starts[k], evidence.starts[k + 1]) for k in kept])
-    starts = np.cumsum([0, *(evidence.starts[k + 1] - evidence.starts[k] for k in kept)])
-    judged = [kept.index(cycle) for cycle in cycles]
-    samples, ticks = evidence.samples[rows], evidence.ticks[rows]
+    return source.only(kept, [kept.index(cycle) for cycle in cycles])
+
+
+def _of_rows(
+    base: Evidence,
+    rows: Sequence[tuple[Samples, Ticks]],
+    numbers: Ints,
+    judged: list[int],
+    figures: list[dict[str, float]],
+) -> Evidence:
+    """Evidence of cycles whose rows are given, for the twin of ``base``."""
+    samples = joined(np.empty(0, SAMPLE), *(samples for samples, _ in rows))
+    ticks = joined(np.empty(0, TICK), *(ticks for _, ticks in rows))
+    starts = np.cumsum([0, *(len(samples) for samples, _ in rows)])
     return replace(
-        evidence,
+        base,
         samples=samples,
         ticks=ticks,
         starts=starts,
-        numbers=evidence.numbers[kept],
+        numbers=numbers,
         judged=judged,
-        figures=[evidence.figures[k] for k in kept],
-        bins=_binned(samples, ticks, starts, judged, evidence.knees),
+        figures=figures,
+        bins=_binned(samples, ticks, starts, judged, base.knees),
         rows=drawn_rows(samples, ticks),
     )
 

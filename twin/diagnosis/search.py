@@ -14,7 +14,14 @@ from itertools import chain, combinations
 import numpy as np
 
 from twin.diagnosis.covariance import Covariance, Weights, covariance
-from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, at_once, thinned
+from twin.diagnosis.evidence import (
+    HEALTHY,
+    Evidence,
+    Hypothesis,
+    LogCycles,
+    at_once,
+    thinned,
+)
 from twin.diagnosis.fit import Fitted, fit, interval, profiled, white
 from twin.diagnosis.hypotheses import (
     bounds,
@@ -683,7 +690,7 @@ def _with_best_onset(
     return cause
 
 
-def sharpened(whole: Evidence, part: Evidence, searched: Search) -> Search:
+def sharpened(whole: LogCycles, part: Evidence, searched: Search) -> Search:
     """The result for ``part`` of a log, with onsets of steps from all its cycles."""
     found, onsets = searched.found, list(searched.onsets)
     assert found is not None
@@ -696,12 +703,12 @@ def sharpened(whole: Evidence, part: Evidence, searched: Search) -> Search:
 
 
 def _sharp_onset(
-    whole: Evidence, part: Evidence, found: Fitted, number: int
+    whole: LogCycles, part: Evidence, found: Fitted, number: int
 ) -> tuple[Hypothesis, tuple[float, float]]:
     """A hypothesis with the best onset of one of its causes, and the onset's interval."""
     cause, hypothesis = found.hypothesis[number], found.hypothesis
     others = (*hypothesis[:number], *hypothesis[number + 1 :])
-    begins = whole.seconds[whole.starts[:-1]]
+    begins = whole.begins
     cycle_starts = part.seconds[part.starts[part.judged]]
     index = int(np.searchsorted(cycle_starts, cause.onset_s))
     low = cycle_starts[index - 2] if index >= 2 else begins[whole.judged[0]]

@@ -5,7 +5,7 @@ a worker that dies costs only its log.
 """
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -91,11 +91,11 @@ WORKS: Mapping[str, Callable[[Job], tuple[dict[str, Any], Record | None]]] = {
 }
 
 
-def _samples(job: Job) -> Iterator[Samples]:
+def _samples(job: Job) -> Iterable[Samples]:
     """The log's rows in blocks; ConfigError if nobody recorded the commands."""
     log = open_log(job.log)
     log.header.require_commands(str(job.log))
-    return (samples for samples, _ in log.blocks())
+    return log.samples
 
 
 def _no_progress(_what: str) -> None:

@@ -1,7 +1,7 @@
 """Reads a log from disk: its header, its rows in blocks, and its events."""
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,11 +46,24 @@ class Log:
         if len(samples):
             yield samples, ticks
 
+    @property
+    def samples(self) -> Iterable[Samples]:
+        """The same rows without ticks, read anew by each iteration."""
+        return _RowsOf(self)
+
     def events(self) -> Iterator[Event]:
         """Events in written order."""
         for part in self.parts:
             for _, packed in messages(part, (EVENTS.topic,), _refuse):
                 yield decode_event_message(part, packed)
+
+
+@dataclass(frozen=True)
+class _RowsOf:
+    log: Log
+
+    def __iter__(self) -> Iterator[Samples]:
+        return (samples for samples, _ in self.log.blocks())
 
 
 def _refuse(damage: Damage) -> None:

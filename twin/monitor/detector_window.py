@@ -1,10 +1,11 @@
 """Window of the phase detector: how wide a system's breakpoints need it, and how late they show."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients, swing
@@ -104,11 +105,11 @@ def _as_in_free_run(knees: Knees, theta: Theta, rows_to_h1: float) -> Knees:
     return replace(knees, again=again, apart=apart)
 
 
-def as_wide_as_needed(knees: Knees, blocks: Sequence[Samples]) -> Knees:
+def as_wide_as_needed(knees: Knees, blocks: Iterable[Samples]) -> Knees:
     """``knees`` with the window in which most suctions of a record show the nozzle go off.
 
     The narrowest such window. A wider one finds breakpoints that an unexpectedly slow sensor has
-    rounded, but it lags more and needs longer stretches.
+    rounded, but it lags more and needs longer stretches. ``blocks`` are read again for each window.
     """
     if knees.settled == NEVER:
         return knees
@@ -122,10 +123,23 @@ def as_wide_as_needed(knees: Knees, blocks: Sequence[Samples]) -> Knees:
     return best
 
 
-def _count_nozzle_off(knees: Knees, blocks: Sequence[Samples]) -> tuple[int, int]:
+def _count_nozzle_off(knees: Knees, blocks: Iterable[Samples]) -> tuple[int, int]:
     """Number of suctions in which the nozzle is seen to go off, and of all suctions."""
-    finder = PhaseFinder(knees)
-    phase = np.concatenate([*(finder.push(block)[1] for block in blocks), finder.flush()[1]])
-    inside = np.isin(phase, (Phase.SUCTION, Phase.HOLD))
-    number = np.cumsum(np.diff(inside, prepend=False) & inside)
-    return len(np.unique(number[phase == Phase.HOLD])), int(number[-1]) if len(number) else 0
+    suctions, nozzle_off, last_off, was_inside = 0, 0, 0, False
+    for phase in _phases(PhaseFinder(knees), blocks):
+        inside = np.isin(phase, (Phase.SUCTION, Phase.HOLD))
+        number = suctions + np.cumsum(np.diff(inside, prepend=was_inside) & inside)
+        with_hold = np.unique(number[phase == Phase.HOLD])
+        if len(with_hold):  # a suction may go on from the block before
+            nozzle_off += len(with_hold) - int(with_hold[0] == last_off)
+            last_off = int(with_hold[-1])
+        if len(phase):
+            suctions, was_inside = int(number[-1]), bool(inside[-1])
+    return nozzle_off, suctions
+
+
+def _phases(finder: PhaseFinder, blocks: Iterable[Samples]) -> Iterator[npt.NDArray[np.uint8]]:
+    """Phases of a stream, block by block."""
+    for block in blocks:
+        yield finder.push(block)[1]
+    yield finder.flush()[1]

@@ -5,9 +5,10 @@ surroundings and nothing else, as the effect ``ambient_pressure`` does. The twin
 each suction edge, the monitor cycle by cycle, a diagnosis log by log.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
+import numpy.typing as npt
 
 from twin.model import theta as c
 from twin.model.compiled import compiled
@@ -29,19 +30,29 @@ def are_told(samples):  # type: ignore[no-untyped-def]
 
 def told(samples: Samples) -> dict[str, float]:
     """Medians (Pa, K) of the measured surroundings, by column; unmeasured ones are left out."""
-    medians = {}
-    for column, _ in COLUMNS:
-        values = samples[column][samples[column] > 0.0]
-        if len(values):
-            medians[column] = float(np.median(values))
-    return medians
+    return medians_of([samples])
+
+
+def medians_of(blocks: Iterable[Samples]) -> dict[str, float]:
+    """The same for a stream, of which only what was measured is kept."""
+    values: dict[str, list[npt.NDArray[np.float32]]] = {column: [] for column, _ in COLUMNS}
+    for samples in blocks:
+        if are_told(samples):
+            for column, measured in values.items():
+                measured.append(samples[column][samples[column] > 0.0])
+    joined = {column: np.concatenate(measured) for column, measured in values.items() if measured}
+    return {column: float(np.median(all_of)) for column, all_of in joined.items() if len(all_of)}
 
 
 def following(theta: Theta, samples: Samples) -> Theta:
     """Coefficients with the surroundings that rows have measured; ``theta`` itself if none."""
-    if not are_told(samples):
+    return surrounded(theta, told(samples)) if are_told(samples) else theta
+
+
+def surrounded(theta: Theta, medians: Mapping[str, float]) -> Theta:
+    """Coefficients in surroundings as ``told`` gives them; ``theta`` itself if none are known."""
+    if not medians:
         return theta
-    medians = told(samples)
     theta = theta.copy()
     for column, coefficient in COLUMNS:
         theta[coefficient] = medians.get(column, theta[coefficient])
