@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from twin.exchange.c import INDEX, LANE, NUMBER, ROWS, WHOLE, Untranslatable
 from twin.exchange.translate import Program
 
 LOW, _STEEP = 2, 0.1
+Floats = npt.NDArray[np.float64]
 
 
 class Pair(NamedTuple):
@@ -21,17 +23,17 @@ class Pair(NamedTuple):
     two: float
 
 
-def precedence(a, b):  # type: ignore[no-untyped-def]
+def precedence(a: float, b: float) -> float:
     negative = -a
     twice = -(-negative)  # noqa: B002 - what C would take for a decrement
     return twice - (b - a) - a / (b / a) * -b + (a + b) * (a - b) ** 2 - abs(a - 3.0) ** (1.0 / 3.0)
 
 
-def extremes(a, b):  # type: ignore[no-untyped-def]
+def extremes(a: float, b: float) -> float:
     return min(a, b, 1.5) + 10.0 * max(a, b)
 
 
-def chosen(a, b):  # type: ignore[no-untyped-def]
+def chosen(a: float, b: float) -> float:
     large = a > b or (b > 2.0 and not a < 0.0)
     size = 2 if large else 0.5
     if a == b:
@@ -43,7 +45,7 @@ def chosen(a, b):  # type: ignore[no-untyped-def]
     return size / 3 if size >= LOW else size
 
 
-def swapped(a, b):  # type: ignore[no-untyped-def]
+def swapped(a: float, b: float) -> float:
     a, b = b, a
     pair = Pair(a, b)
     three = (pair.one, pair.two, a * b)
@@ -51,7 +53,7 @@ def swapped(a, b):  # type: ignore[no-untyped-def]
     return first + 2.0 * pair.two + 4.0 * three[1] + 8.0 * third
 
 
-def counted(a, b):  # type: ignore[no-untyped-def]
+def counted(a: float, b: float) -> float:
     total = 3
     total /= 2
     for n in range(1, 4):
@@ -63,13 +65,13 @@ def counted(a, b):  # type: ignore[no-untyped-def]
     return total
 
 
-def whole_numbers(a, b):  # type: ignore[no-untyped-def]
+def whole_numbers(a: float, b: float) -> float:
     bits = int(a) & 6 | (1 if b > 0.0 else 0)
     steps = min(max(math.ceil(abs(b)), 1), 5)
     return bits / steps + steps
 
 
-def logs(a, b):  # type: ignore[no-untyped-def]
+def logs(a: float, b: float) -> float:
     there = np.where(a > 0.0, math.sqrt(abs(a)), b).copy()
     return np.log(abs(b) + 1.0) + np.exp(-abs(there)) + (1.0 if math.isnan(a) else 0.0)
 
@@ -78,14 +80,14 @@ FUNCTIONS = (precedence, extremes, chosen, swapped, counted, whole_numbers, logs
 VALUES = [(1.0, 2.0), (2.5, -1.25), (3.0, 3.0), (-7.0, 0.3), (5.0, 2.5), (-0.1, 4.75)]
 
 
-def rows(state, k, i):  # type: ignore[no-untyped-def]
+def rows(state: Floats, k: Floats, i: int) -> None:
     """Every row over and over."""
     state[0, i] = state[1, i] = k[LOW, i]
     state[[2, 3]] += k[0, i]
     state[3 if k[1, i] > 0.0 else 2] *= 2.0
 
 
-def lanes(state, out):  # type: ignore[no-untyped-def]
+def lanes(state: Floats, out: Floats) -> None:
     for i in range(state.shape[1]):
         before = state[0].copy()
         if state[1, i] < 0.0:
@@ -147,39 +149,39 @@ def test_rows_are_written_and_lanes_are_one(library: ctypes.CDLL) -> None:
     assert out[0] == 14.0
 
 
-def _while(a):  # type: ignore[no-untyped-def]
+def _while(a: float) -> float:
     while a > 1.0:
         a -= 1.0
     return a
 
 
-def _text(a):  # type: ignore[no-untyped-def]
+def _text(a: float) -> str | float:
     return "more" if a > 0.0 else a
 
 
-def _floored(a):  # type: ignore[no-untyped-def]
+def _floored(a: float) -> float:
     return a // 2.0
 
 
-def _rounded(a):  # type: ignore[no-untyped-def]
+def _rounded(a: float) -> int:
     return round(a)
 
 
-def _chained(a):  # type: ignore[no-untyped-def]
+def _chained(a: float) -> float:
     return 1.0 if 0.0 < a < 1.0 else 2.0
 
 
-def _powered(a):  # type: ignore[no-untyped-def]
+def _powered(a: float) -> float:
     a **= 3.0
     return a
 
 
-def _strode(a):  # type: ignore[no-untyped-def]
+def _strode(a: float) -> float:
     for _ in range(1, 9, 2): a += 1.0  # noqa: E701  # fmt: skip
     return a
 
 
-def _skipped(a):  # type: ignore[no-untyped-def]
+def _skipped(a: float) -> float:
     for n in (1.0, 2.0):  # fmt: skip
         if a > n:
             continue
@@ -187,11 +189,11 @@ def _skipped(a):  # type: ignore[no-untyped-def]
     return a
 
 
-def _is(a):  # type: ignore[no-untyped-def]
+def _is(a: float) -> float:
     return 1.0 if a is None else a
 
 
-def _keyword(a):  # type: ignore[no-untyped-def]
+def _keyword(a: float) -> Pair:
     return Pair(one=a, two=a)
 
 
@@ -208,7 +210,7 @@ def test_what_has_no_translation_is_refused_with_its_place(function: Any) -> Non
 
 
 def test_a_name_holds_one_kind_of_thing() -> None:
-    def mixed(a):  # type: ignore[no-untyped-def]
+    def mixed(a: float) -> float:
         pair = (a, a)
         pair = 1.0
         return pair + a

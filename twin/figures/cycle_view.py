@@ -127,7 +127,9 @@ def measured(
 
 
 @compiled
-def _measured(samples, ticks, ambient):  # type: ignore[no-untyped-def]
+def _measured(
+    samples: Samples, ticks: Ticks, ambient: float
+) -> tuple[Floats, Floats, Floats, Bytes]:
     """Columns in the units of Rows."""
     count = len(samples)
     time, vacuum, supply = np.empty(count), np.empty(count), np.empty(count)
@@ -143,7 +145,15 @@ def _measured(samples, ticks, ambient):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _course(time, vacuum, supply, phase, ends_seen, lags, levels):  # type: ignore[no-untyped-def]
+def _course(
+    time: Floats,
+    vacuum: Floats,
+    supply: Floats,
+    phase: Bytes,
+    ends_seen: tuple[bool, bool],
+    lags: tuple[float, float],
+    levels: tuple[float, float],
+) -> Course:
     """The findings in rows; ``ends_seen``, ``lags`` and ``levels`` are pairs."""
     rows = _suction_rows(phase)
     suction_s = _at(time, rows)
@@ -160,7 +170,7 @@ def _course(time, vacuum, supply, phase, ends_seen, lags, levels):  # type: igno
 
 
 @compiled
-def _suction_rows(phase):  # type: ignore[no-untyped-def]
+def _suction_rows(phase: Bytes) -> int:
     """Number of rows with suction commanded, from the first on."""
     for row in range(len(phase)):
         if phase[row] != _SUCTION and phase[row] != _HOLD:
@@ -169,7 +179,7 @@ def _suction_rows(phase):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _stretch(phase, value, row):  # type: ignore[no-untyped-def]
+def _stretch(phase: Bytes, value: int, row: int) -> tuple[int, int]:
     """Begin and end of the next stretch of a phase from ``row`` on; equal if there is none."""
     while row < len(phase) and phase[row] != value:
         row += 1
@@ -180,7 +190,7 @@ def _stretch(phase, value, row):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _at(time, row):  # type: ignore[no-untyped-def]
+def _at(time: Floats, row: int) -> float:
     """Time of a row (s); the row after the last is extrapolated by the last step."""
     if row < len(time):
         return time[row]
@@ -188,7 +198,7 @@ def _at(time, row):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _edges(time, phase, end, lags):  # type: ignore[no-untyped-def]
+def _edges(time: Floats, phase: Bytes, end: float, lags: tuple[float, float]) -> Floats:
     """Times at which the nozzle was switched on and off in turn (s) under suction."""
     edges = np.empty(len(phase) + 1)
     count, latest = 0, 0.0  # no edge comes before suction's, which has no lag
@@ -204,7 +214,7 @@ def _edges(time, phase, end, lags):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _nozzle(edges, phase):  # type: ignore[no-untyped-def]
+def _nozzle(edges: Floats, phase: Bytes) -> Nozzle:
     """Switching of the nozzle by its edges; ``phase`` is that of the same rows."""
     on_s = 0.0
     for i in range(0, len(edges), 2):
@@ -217,7 +227,7 @@ def _nozzle(edges, phase):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _quick_switchings(edges, to_the_end):  # type: ignore[no-untyped-def]
+def _quick_switchings(edges: Floats, to_the_end: bool) -> int:
     """Most edges within the time of valve protection.
 
     Commanded edges do not count: the first one, and the last one if the nozzle was on
@@ -233,7 +243,7 @@ def _quick_switchings(edges, to_the_end):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _blow_off_s(time, phase):  # type: ignore[no-untyped-def]
+def _blow_off_s(time: Floats, phase: Bytes) -> float:
     """Total time of blow-off (s)."""
     total = 0.0
     begin, behind = _stretch(phase, _BLOW_OFF, 0)
@@ -244,7 +254,9 @@ def _blow_off_s(time, phase):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _vacuum(time, vacuum, phase, end, levels):  # type: ignore[no-untyped-def]
+def _vacuum(
+    time: Floats, vacuum: Floats, phase: Bytes, end: float, levels: tuple[float, float]
+) -> Vacuum:
     """The vacuum in the rows of suction, which ended at ``end`` (s)."""
     times, smooth, hole = _readings(time, vacuum, end)
     seamless = len(times) > 0 and hole <= LONGEST_HOLE
@@ -267,7 +279,7 @@ def _vacuum(time, vacuum, phase, end, levels):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _readings(time, vacuum, end):  # type: ignore[no-untyped-def]
+def _readings(time: Floats, vacuum: Floats, end: float) -> tuple[Floats, Floats, float]:
     """Times and smoothed readings, and the longest time without a reading to ``end`` (s)."""
     times, padded = np.empty(len(time)), np.empty(len(time) + 4)
     count, latest, hole = 0, 0.0, 0.0
@@ -282,7 +294,7 @@ def _readings(time, vacuum, end):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _smoothed(padded):  # type: ignore[no-untyped-def]
+def _smoothed(padded: Floats) -> Floats:
     """The median of five neighbours: it moves no edge, and a single spike has no effect.
 
     Of four values the least and the greatest cannot be the median. So it is the median of the other
@@ -298,7 +310,7 @@ def _smoothed(padded):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _reached(time, vacuum, level, longest):  # type: ignore[no-untyped-def]
+def _reached(time: Floats, vacuum: Floats, level: float, longest: float) -> float:
     """Time (s) at which the vacuum reaches ``level`` (mbar); NaN if it does not.
 
     It is also NaN after more than ``longest`` (s) without a reading.
@@ -316,7 +328,7 @@ def _reached(time, vacuum, level, longest):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _leakage(time, vacuum):  # type: ignore[no-untyped-def]
+def _leakage(time: Floats, vacuum: Floats) -> float:
     """Vacuum lost per time (mbar/s) in a stretch of hold; NaN if that is too short or empty."""
     if len(time) == 0:
         return math.nan
@@ -325,7 +337,7 @@ def _leakage(time, vacuum):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _line(time, values, first, last):  # type: ignore[no-untyped-def]
+def _line(time: Floats, values: Floats, first: float, last: float) -> tuple[float, float, float]:
     """A straight line through the readings from ``first`` to ``last`` (s).
 
     Mean, slope per second, and time of the last reading (minus infinity if there is none).
@@ -347,7 +359,7 @@ def _line(time, values, first, last):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _supply(supply, phase):  # type: ignore[no-untyped-def]
+def _supply(supply: Floats, phase: Bytes) -> Supply:
     """Mean, low and high end of the supply while the nozzle was on."""
     readings = np.empty(len(supply))
     count, beyond = 0, 0.0  # sum over the first reading: the mean of equal readings is exact

@@ -7,6 +7,7 @@ the coding.
 """
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +18,9 @@ from twin.model.compiled import compiled, per_row
 from twin.signals import EXTRA, SAMPLE, TICK, Samples, Ticks
 
 _Layout = npt.NDArray[np.int64]
+_Bytes = npt.NDArray[np.uint8]
+_Bools = npt.NDArray[np.bool_]
+_Steps = npt.NDArray[np.int32] | npt.NDArray[np.int64]
 
 _FIRST_ROW_BYTES = 8  # bytes of the first row's bits
 _MAX_PLANES = 8  # byte planes
@@ -84,7 +88,7 @@ def decode(packed: bytes | memoryview) -> tuple[Samples, Ticks]:
 
 
 @per_row
-def _read(raw, position, width):  # type: ignore[no-untyped-def]
+def _read(raw: _Bytes, position: np.uint64, width: int) -> np.uint64:
     """Bits of ``width`` little-endian bytes, without sign extension."""
     bits = np.uint64(0)
     for j in range(width):
@@ -93,7 +97,7 @@ def _read(raw, position, width):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _ends_in_zeros(rows, size, offset):  # type: ignore[no-untyped-def]
+def _ends_in_zeros(rows: _Bytes, size: int, offset: int) -> bool:
     """Whether all fields from ``offset`` on are zero in all rows, to the bit. It is a fast test."""
     any_bits = np.uint64(0)
     words = (size - offset) // 8
@@ -106,7 +110,7 @@ def _ends_in_zeros(rows, size, offset):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _is_zero(rows, size, offset, width):  # type: ignore[no-untyped-def]
+def _is_zero(rows: _Bytes, size: int, offset: int, width: int) -> bool:
     """Whether a field is zero in all rows, to the bit."""
     any_bits = np.uint64(0)
     for position in range(offset, len(rows), size):
@@ -115,7 +119,7 @@ def _is_zero(rows, size, offset, width):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _pack(rows, size, offset, width, packed):  # type: ignore[no-untyped-def]
+def _pack(rows: _Bytes, size: int, offset: int, width: int, packed: _Bytes) -> int:
     """Pack one field of all rows into the first bytes of ``packed``; returns their number."""
     n = len(rows) // size
     zigzag = np.empty(n, np.uint64)
@@ -147,9 +151,9 @@ def _pack(rows, size, offset, width, packed):  # type: ignore[no-untyped-def]
 
 
 @per_row
-def _varint(packed, position):  # type: ignore[no-untyped-def]
+def _varint(packed: _Bytes, position: int) -> tuple[int, int]:
     """A varint of protobuf and the position after it; past the end if the varint is cut off."""
-    number = np.int64(0)
+    number: Any = np.int64(0)
     for j in range(10):
         if position >= len(packed):
             break
@@ -162,7 +166,7 @@ def _varint(packed, position):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _parse_fields(packed, spans):  # type: ignore[no-untyped-def]
+def _parse_fields(packed: _Bytes, spans: _Layout) -> int:
     """Fill ``spans`` with begin and end of each field by its number.
 
     Returns the count of rows, or -1 if the message is no ``Samples``.
@@ -183,7 +187,7 @@ def _parse_fields(packed, spans):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _first_invalid_column(spans, count, is_optional):  # type: ignore[no-untyped-def]
+def _first_invalid_column(spans: _Layout, count: int, is_optional: _Bools) -> int:
     """The first column whose length does not fit whole planes; -1 if all columns fit."""
     for column in range(len(spans)):
         length = spans[column, 1] - spans[column, 0]
@@ -195,7 +199,7 @@ def _first_invalid_column(spans, count, is_optional):  # type: ignore[no-untyped
 
 
 @compiled
-def _decode_steps(packed, position, n, planes, steps):  # type: ignore[no-untyped-def]
+def _decode_steps(packed: _Bytes, position: int, n: int, planes: int, steps: _Steps) -> None:
     """Differences of some rows, the first at ``position`` in planes of ``n`` bytes.
 
     Works for one to four planes, which is nearly always. One instruction decodes several rows.
@@ -219,7 +223,7 @@ def _decode_steps(packed, position, n, planes, steps):  # type: ignore[no-untype
 
 
 @compiled
-def _decode_wide_steps(packed, position, n, planes, steps):  # type: ignore[no-untyped-def]
+def _decode_wide_steps(packed: _Bytes, position: int, n: int, planes: int, steps: _Steps) -> None:
     """As ``_decode_steps``, for any number of planes."""
     for i in range(len(steps)):
         z = np.uint64(0)
@@ -229,13 +233,15 @@ def _decode_wide_steps(packed, position, n, planes, steps):  # type: ignore[no-u
 
 
 @per_row
-def _write(bits, rows, position, width):  # type: ignore[no-untyped-def]
+def _write(bits: np.uint64, rows: _Bytes, position: np.uint64, width: int) -> None:
     for j in range(width):
         rows[position + np.uint64(j)] = np.uint8(bits >> np.uint64(8 * j))
 
 
 @compiled
-def _write_column(bits, steps, rows, size, position, width):  # type: ignore[no-untyped-def]
+def _write_column(
+    bits: np.uint64, steps: _Steps, rows: _Bytes, size: int, position: int | np.uint64, width: int
+) -> np.uint64:
     """Write one field of some rows, the first at ``position``, by adding up its differences.
 
     ``bits`` are those of the row before; returns those of the last row.
@@ -260,7 +266,7 @@ def _write_column(bits, steps, rows, size, position, width):  # type: ignore[no-
 
 
 @compiled
-def _unpack(packed, spans, layout, n, rows):  # type: ignore[no-untyped-def]
+def _unpack(packed: _Bytes, spans: _Layout, layout: _Layout, n: int, rows: _Bytes) -> None:
     """Fill ``n`` rows, each field from its packed column; a missing field stays zero."""
     size = len(rows) // n
     bits = np.zeros(len(layout), np.uint64)

@@ -45,6 +45,8 @@ _CHUNK_MARK = re.compile(rb"\x06.{36}(\x04\x00\x00\x00zstd|\x03\x00\x00\x00lz4)"
 _CHUNK_MARK_LENGTH = 45  # at most
 _PIECE = 1 << 20
 _OPCODES = frozenset(Opcode)
+_Bytes = npt.NDArray[np.uint8]
+_Bools = npt.NDArray[np.bool_]
 _RECORD_TYPES: dict[int, type[Any]] = {
     Opcode.ATTACHMENT: Attachment,
     Opcode.CHUNK: Chunk,
@@ -271,16 +273,16 @@ def _wanted(names: dict[int, str], topics: Collection[str]) -> npt.NDArray[np.bo
 
 
 @per_row
-def _span(records, position):  # type: ignore[no-untyped-def]
+def _span(records: _Bytes, position: int) -> tuple[int, int]:
     """Where the data of the record at ``position`` begins and ends."""
-    length = np.int64(0)
+    length: Any = np.int64(0)
     for j in range(8):
         length |= np.int64(records[position + 1 + j]) << (8 * j)
     return position + _HEAD_SIZE, position + _HEAD_SIZE + length
 
 
 @compiled
-def _is_whole(records):  # type: ignore[no-untyped-def]
+def _is_whole(records: _Bytes) -> bool:
     """Whether the records follow one another up to the end."""
     end = 0
     while end + _HEAD_SIZE <= len(records):
@@ -293,7 +295,7 @@ def _is_whole(records):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _next_record(records, position, wanted):  # type: ignore[no-untyped-def]
+def _next_record(records: _Bytes, position: int, wanted: _Bools) -> tuple[int, int, int, int]:
     """Opcode, channel id, begin and end of the next channel record or ``wanted`` message.
 
     If there is none, those of the last record.

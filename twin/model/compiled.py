@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, Protocol, TypeVar, cast
 
 import llvmlite.binding as llvm
 import numba
@@ -31,6 +31,8 @@ from twin.files import private_folder, user_cache
 DAY_S = 86_400.0
 SHARED = ("signals.py", "cpu_target.py")
 _log = logging.getLogger(__name__)
+P = ParamSpec("P")
+R_co = TypeVar("R_co", covariant=True)
 _PACKAGE = Path(__file__).parent.parent
 
 
@@ -148,21 +150,42 @@ class _Cache(FunctionCache):
 _with_arrays = njit(nogil=True, error_model="numpy", _nrt=True)  # type: ignore[call-overload]
 
 
-def compiled(function: Callable[..., Any]) -> Any:
+class Compiled(Protocol[P, R_co]):
+    """A compiled function, with the types of the Python function that it was made from."""
+
+    @property
+    def py_func(self) -> Callable[P, R_co]:
+        """The Python function, which runs without compiling anything."""
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R_co:
+        """Run what is compiled; compile it first where no call had such arguments."""
+
+
+def compiled(function: Callable[P, R_co]) -> Compiled[P, R_co]:
     """A function to be called from Python, or where inlining it is not worth it; kept on disk."""
     dispatcher = _with_arrays(function)
     if _FOLDER:
         with suppress(RuntimeError):  # the disk is full
             # What ``cache=True`` does with numba's own.
             dispatcher._cache = _Cache(function)  # type: ignore[no-untyped-call]
-    return dispatcher
+    return cast("Compiled[P, R_co]", dispatcher)
 
 
 # For functions called inside a loop: over hypotheses only one without calls is vectorised, and over
 # rows a call costs as much as a few lines.
-inlined = njit(forceinline=True, error_model="numpy")
+_inlined = njit(forceinline=True, error_model="numpy")
 
 # The same for what runs over rows, with no arrays of its own. It does not count the references to
 # those it is given: two atomic additions for each, at every row. Over hypotheses nothing is counted
 # in any case, and so compiled LLVM takes them one at a time.
-per_row = njit(forceinline=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
+_per_row = njit(forceinline=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
+
+
+def inlined(function: Callable[P, R_co]) -> Compiled[P, R_co]:
+    """A function that is part of its callers, inside a loop over hypotheses."""
+    return cast("Compiled[P, R_co]", _inlined(function))
+
+
+def per_row(function: Callable[P, R_co]) -> Compiled[P, R_co]:
+    """A function that is part of its callers, inside a loop over rows; it has no arrays."""
+    return cast("Compiled[P, R_co]", _per_row(function))

@@ -19,6 +19,9 @@ PROTECTED_SWITCHES = 6  # within ...
 PROTECTED_S = 3.0  # s, more of them end in continuous suction
 LEAK_SETTLE_S = 0.05  # s after the nozzle went off before leakage is judged
 
+Floats = npt.NDArray[np.float64]
+Bytes = npt.NDArray[np.uint8]
+
 # Rows of the control's state: whether air saving has the nozzle off, whether it has given up for
 # this cycle, time, when and at which vacuum the nozzle went off, and the last switchings.
 SAVING, CONTINUOUS, TIME, OFF_SINCE, OFF_VACUUM, SWITCHES = range(6)
@@ -30,24 +33,24 @@ _SUCTION, _BLOW_OFF = int(Command.SUCTION), int(Command.BLOW_OFF)
 
 
 @per_row
-def _two_point(before, vacuum, high, low):  # type: ignore[no-untyped-def]
+def _two_point(before: float, vacuum: float, high: float, low: float) -> float:
     return 1 if vacuum >= high else (0 if vacuum < low else before)
 
 
 @per_row
-def air_saving(before, vacuum, k, i):  # type: ignore[no-untyped-def]
+def air_saving(before: float, vacuum: float, k: c.Theta, i: int) -> float:
     """H1: reached from its switching point on, until vacuum is below it by the hysteresis."""
     return _two_point(before, vacuum, k[c.H1, i], k[c.H1_LOW, i])
 
 
 @per_row
-def part_present(before, vacuum, k, i):  # type: ignore[no-untyped-def]
+def part_present(before: float, vacuum: float, k: c.Theta, i: int) -> float:
     """H2: the part is there from the switching point on, with its hysteresis."""
     return _two_point(before, vacuum, k[c.H2, i], k[c.H2_LOW, i])
 
 
 @per_row
-def switch(control, asked, vacuum, dt, k, i):  # type: ignore[no-untyped-def]
+def switch(control: Floats, asked: bool, vacuum: float, dt: float, k: c.Theta, i: int) -> bool:
     """Say whether the nozzle is to be on: suction is ``asked`` for and air is not being saved.
 
     ``control`` is the state (``CONTROL`` values), ``vacuum`` (Pa) what its sensor says, ``dt`` the
@@ -75,7 +78,7 @@ def switch(control, asked, vacuum, dt, k, i):  # type: ignore[no-untyped-def]
 
 
 @per_row
-def _protect(control):  # type: ignore[no-untyped-def]
+def _protect(control: Floats) -> None:
     """Remember a switching; give up saving air when there were too many."""
     oldest = SWITCHES
     for one in range(SWITCHES + 1, CONTROL):
@@ -86,13 +89,13 @@ def _protect(control):  # type: ignore[no-untyped-def]
     control[oldest] = control[TIME]
 
 
-def new_timer() -> npt.NDArray[np.float64]:
+def new_timer() -> Floats:
     """Return the state of a blow-off timer that has seen nothing yet."""
     return np.zeros(2)
 
 
 @per_row
-def told(timer, commands, dt, mode, duration):  # type: ignore[no-untyped-def]
+def told(timer: Floats, commands: int, dt: float, mode: float, duration: float) -> int:
     """What the valves are told (``Command`` bits), as ``timed`` for one row."""
     command, before = commands & (_SUCTION | _BLOW_OFF), int(timer[_BEFORE])
     timer[_LEFT] -= max(dt, 0.0)
@@ -109,7 +112,9 @@ def told(timer, commands, dt, mode, duration):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def timed(timer, commands, dt, mode, duration, effective):  # type: ignore[no-untyped-def]
+def timed(
+    timer: Floats, commands: Bytes, dt: Floats, mode: float, duration: float, effective: Bytes
+) -> None:
     """Write into ``effective`` what the valves are told, given what the PLC commands, row by row.
 
     ``dt`` are seconds since the row before, ``mode`` the blow-off mode, ``duration`` its pulse (s).
@@ -118,7 +123,7 @@ def timed(timer, commands, dt, mode, duration, effective):  # type: ignore[no-un
         effective[row] = told(timer, int(commands[row]), dt[row], mode, duration)
 
 
-def nothing_done() -> npt.NDArray[np.float64]:
+def nothing_done() -> Floats:
     """Return a control's state that has not switched anything for long."""
     control = np.zeros(CONTROL)
     control[SWITCHES:] = -math.inf

@@ -37,7 +37,7 @@ from twin.model.kernel import (
     Floats,
     State,
 )
-from twin.model.plant import G, Gas, at_sensor, prepare, put
+from twin.model.plant import G, Gas, Prepared, at_sensor, prepare, put
 
 TOLERANCE = 0.05  # Pa, of a step: within 0.4 of the exact solution on the shipped rigs
 LONGEST_STEP = 15e-3  # s; the course between its ends does not follow further
@@ -122,12 +122,15 @@ def simulate(theta: c.Theta, dt: Floats, commands: Bytes) -> tuple[Bytes, Floats
     return phase, expected
 
 
-def _carried(strides: DenseSolver) -> tuple[State, State, State, Floats]:
+Carried = tuple[State, State, State, Floats]  # now, begin, end and clock of a DenseSolver
+
+
+def _carried(strides: DenseSolver) -> Carried:
     return strides.now, strides.begin, strides.end, strides.clock
 
 
 @per_row
-def _until_jump(state, k):  # type: ignore[no-untyped-def]
+def _until_jump(state: State, k: Prepared) -> float:
     """Seconds until the next valve acts, or the cups meet a part."""
     first = max(kernel._until_met(state, k, 0), 0.0) if state[OPEN, 0] > 0.0 else NEVER
     for position, response in ((NOZZLE, c.RESPONSE), (BLOW, c.BLOW_OFF_RESPONSE)):
@@ -138,7 +141,7 @@ def _until_jump(state, k):  # type: ignore[no-untyped-def]
 
 
 @per_row
-def _planned(begin, k, moving, before, tolerance):  # type: ignore[no-untyped-def]
+def _planned(begin: State, k: Prepared, moving: float, before: float, tolerance: float) -> float:
     """Length of the next step (s): smooth within, and ending where a valve acts.
 
     So it ends where blow-off brings the port, ``moving`` by so much (Pa/s), to the pressure at
@@ -163,7 +166,9 @@ def _planned(begin, k, moving, before, tolerance):  # type: ignore[no-untyped-de
 
 
 @compiled
-def _stride(begin, end, clock, k, longest, tolerance):  # type: ignore[no-untyped-def]
+def _stride(
+    begin: State, end: State, clock: Floats, k: Prepared, longest: float, tolerance: float
+) -> None:
     """Make a step of at most ``longest`` seconds from ``end`` on, which becomes its beginning.
 
     Where the gas stands at its first stage is guessed by going on as in the step before.
@@ -188,7 +193,7 @@ def _stride(begin, end, clock, k, longest, tolerance):  # type: ignore[no-untype
 
 
 @per_row
-def _moving(state, length, k):  # type: ignore[no-untyped-def]
+def _moving(state: State, length: float, k: Prepared) -> tuple[float, float]:
     """How the sensor's reading moves, and how that changes, for steps of ``length`` seconds.
 
     It follows, by way of what it feels, the pressure where it sits.
@@ -202,7 +207,7 @@ def _moving(state, length, k):  # type: ignore[no-untyped-def]
 
 
 @per_row
-def _drawn(begin, end, clock, k):  # type: ignore[no-untyped-def]
+def _drawn(begin: State, end: State, clock: Floats, k: Prepared) -> None:
     """Draw the course over a step of what is read: of fifth order, and straight at the port."""
     first, rise = begin[SENSED, 0], end[SENSED, 0] - begin[SENSED, 0]
     leaving, bends = _moving(begin, clock[_LENGTH], k)
@@ -215,7 +220,7 @@ def _drawn(begin, end, clock, k):  # type: ignore[no-untyped-def]
 
 
 @per_row
-def _on(carried, k, dt, tolerance):  # type: ignore[no-untyped-def]
+def _on(carried: Carried, k: Prepared, dt: float, tolerance: float) -> None:
     """Go on by ``dt`` seconds, and read."""
     now, begin, end, clock = carried
     clock[_SINCE] += dt
@@ -233,7 +238,7 @@ def _on(carried, k, dt, tolerance):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _arrive(carried, k, tolerance):  # type: ignore[no-untyped-def]
+def _arrive(carried: Carried, k: Prepared, tolerance: float) -> None:
     """Let all of the state stand at the newest row, by steps that end there."""
     now, begin, end, clock = carried
     signals, left = now[SIGNALS, 0], clock[_SINCE]
@@ -247,7 +252,7 @@ def _arrive(carried, k, tolerance):  # type: ignore[no-untyped-def]
 
 
 @per_row
-def _set_out(carried):  # type: ignore[no-untyped-def]
+def _set_out(carried: Carried) -> None:
     """Go on from where ``now`` was put, by the shortest steps first."""
     now, begin, end, clock = carried
     now[ROUGH, 0] = 0.0
@@ -258,7 +263,13 @@ def _set_out(carried):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _advance(carried, theta, driven, out, tolerance):  # type: ignore[no-untyped-def]
+def _advance(
+    carried: Carried,
+    theta: c.Theta,
+    driven: tuple[Floats, Bytes, Floats],
+    out: tuple[Floats, Bytes],
+    tolerance: float,
+) -> None:
     k, now = prepare(theta), carried[0]
     (dt, phase, level), (expected, signals) = driven, out
     said, handed = np.empty(1), np.empty(1, np.uint8)
@@ -278,7 +289,14 @@ def _advance(carried, theta, driven, out, tolerance):  # type: ignore[no-untyped
 
 
 @compiled
-def _run_on(carried, controls, theta, driven, out, tolerance):  # type: ignore[no-untyped-def]
+def _run_on(
+    carried: Carried,
+    controls: tuple[Floats, Floats],
+    theta: c.Theta,
+    driven: tuple[Floats, Bytes],
+    out: tuple[Bytes, Floats, Bytes],
+    tolerance: float,
+) -> None:
     k, now = prepare(theta), carried[0]
     (air_saving, timer), (dt, commands), (phase, expected, signals) = controls, driven, out
     told, mode, pulse = np.empty(len(dt), np.uint8), k[c.BLOW_OFF_MODE, 0], k[c.BLOW_OFF_TIME, 0]

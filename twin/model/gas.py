@@ -18,7 +18,7 @@ _PER_LAMINAR = 1.0 / (1.0 - LAMINAR_RATIO)
 
 
 @inlined
-def orifice(ratio, critical):  # type: ignore[no-untyped-def]
+def orifice(ratio: float, critical: float) -> tuple[float, float]:
     """Flow through an opening as a share of its sonic flow, and its slope over ``ratio``.
 
     ISO 6358-1 with a ``critical`` ratio; ``ratio`` is downstream over upstream absolute pressure,
@@ -33,7 +33,7 @@ def orifice(ratio, critical):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def opening(p, ambient, critical):  # type: ignore[no-untyped-def]
+def opening(p: float, ambient: float, critical: float) -> tuple[float, float]:
     """Flow from ambient into ``p`` through an opening, as a share of its sonic flow inwards.
 
     Negative outwards while ``p`` is above ambient. Also its slope over ``p`` (1/Pa).

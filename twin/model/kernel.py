@@ -50,6 +50,8 @@ from twin.model.plant import (
     UNMOVED,
     Gas,
     Lags,
+    Prepared,
+    Valves,
     derive,
     prepare,
     put,
@@ -188,14 +190,18 @@ def run_on(
     """
     if len(dt) == 0:
         return
-    phase, expected, signals = (one.reshape(len(dt), -1) for one in out)
+    phase, expected, signals = out
     run = _simulate_one if state[0].size == 1 else _simulate
     run(
         state.reshape(STATE, -1),
         (control.air_saving, control.timer),
         theta.reshape(len(c.COEFFICIENTS), -1),
         (dt, np.ascontiguousarray(commands)),
-        (phase, expected, signals),
+        (
+            phase.reshape(len(dt), -1),
+            expected.reshape(len(dt), -1),
+            signals.reshape(len(dt), -1),
+        ),
         tolerance,
     )
 
@@ -257,7 +263,7 @@ def _squeezed(vessel: State, yielded: State, joined: State, theta: c.Theta) -> S
 
 
 @inlined
-def _valve(state, position, h, k, response, i):  # type: ignore[no-untyped-def]
+def _valve(state: State, position: int, h: float, k: Prepared, response: int, i: int) -> float:
     """Mean position of a valve over a step of ``h``; it follows its command a response later.
 
     ``position`` indexes position, command and age in ``state``, ``response`` those for opening and
@@ -273,7 +279,7 @@ def _valve(state, position, h, k, response, i):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _release(state, k, h, i):  # type: ignore[no-untyped-def]
+def _release(state: State, k: Prepared, h: float, i: int) -> bool:
     """Whether blow-off lets the part go within about ``h``, or has just done so."""
     filling = -GAMMA * state[FAR, i] * state[VESSEL, i] / state[VESSEL_MASS, i]  # Pa/s, about
     left = k[c.AMBIENT, i] - state[VESSEL, i] - k[c.RELEASE, i]  # NaN where nothing is let go
@@ -282,14 +288,14 @@ def _release(state, k, h, i):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _until_met(state, k, i):  # type: ignore[no-untyped-def]
+def _until_met(state: State, k: Prepared, i: int) -> float:
     """Seconds until the cups meet the next part, below zero since; NEVER without suction."""
     left = k[c.CONTACT, i] - state[NOZZLE_AGE, i]
     return left if state[NOZZLE_COMMAND, i] > 0.5 else NEVER
 
 
 @inlined
-def _opened(before, gas, commanded, k, i):  # type: ignore[no-untyped-def]
+def _opened(before: float, gas: Gas, commanded: float, k: Prepared, i: int) -> float:
     """Cup after a step in which the vessel's pressure rose from ``before``: 0 if still closed.
 
     More than 1 by the share of the step that it was open already: the next one makes up for that.
@@ -300,7 +306,7 @@ def _opened(before, gas, commanded, k, i):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _jumps(state, k, h, i):  # type: ignore[no-untyped-def]
+def _jumps(state: State, k: Prepared, h: float, i: int) -> bool:
     """Whether a valve moves, a cup opens or meets a part within ``h``, or has just done so."""
     for position, response in ((NOZZLE, c.RESPONSE), (BLOW, c.BLOW_OFF_RESPONSE)):
         command = state[position + 1, i]
@@ -313,7 +319,7 @@ def _jumps(state, k, h, i):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _passes(state, k, h, i):  # type: ignore[no-untyped-def]
+def _passes(state: State, k: Prepared, h: float, i: int) -> bool:
     """Whether blow-off can bring the port within ``h`` to where the exhaust or the relief opens.
 
     The sensor's first stage follows it, so the distance between them tells how quickly it moves.
@@ -325,7 +331,7 @@ def _passes(state, k, h, i):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _finer(state, k, h, tolerance):  # type: ignore[no-untyped-def]
+def _finer(state: State, k: Prepared, h: float, tolerance: float) -> int:
     """In how many steps the next ``h`` is to be done, for the sake of any hypothesis."""
     rough = 0.0
     finest = math.ceil(FINEST * (TOLERANCE / tolerance) ** (1.0 / 3.0))
@@ -337,7 +343,7 @@ def _finer(state, k, h, tolerance):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _substep(state, k, h, guess):  # type: ignore[no-untyped-def]
+def _substep(state: State, k: Prepared, h: float, guess: int) -> None:
     """Advance every hypothesis by ``h`` seconds; this loop is run on several of them at once.
 
     From row ``guess`` on is the gas as it may be at the step's first stage: 0 is as it is now, and
@@ -382,7 +388,7 @@ def _substep(state, k, h, guess):  # type: ignore[no-untyped-def]
         before = gas.vessel
         open_cup = state[OPEN, i]
         open_cup = open_cup * max(left, 0.0) / h if left < h else open_cup
-        valves, passes = (nozzle, blow, open_cup), 1 if guess else 3
+        valves, passes = Valves(nozzle, blow, open_cup), 1 if guess else 3
         gas, lags, off = advance_gas(gas, lags, ahead, passes, h, valves, k, i)
         state[PORT, i], state[PORT_MASS, i] = gas.port, gas.port_mass
         state[VESSEL, i], state[VESSEL_MASS, i] = gas.vessel, gas.vessel_mass
@@ -398,7 +404,7 @@ def _substep(state, k, h, guess):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _drives(state, k, slot, i):  # type: ignore[no-untyped-def]
+def _drives(state: State, k: Prepared, slot: int, i: int) -> tuple[float, float]:
     """How strongly, 0 to 1, the mechanism of a slot is driven to set in, and to fade.
 
     A relay remembers whether its vacuum was reached.
@@ -424,7 +430,7 @@ def _drives(state, k, slot, i):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _set_in(state, k, slot, h, i):  # type: ignore[no-untyped-def]
+def _set_in(state: State, k: Prepared, slot: int, h: float, i: int) -> None:
     """Let the mechanism of a slot set in or fade for ``h`` seconds of drives that stay.
 
     It does so exponentially; meanwhile it acts as it does half-way.
@@ -441,7 +447,7 @@ def _set_in(state, k, slot, h, i):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _has_mechanism(k, i):  # type: ignore[no-untyped-def]
+def _has_mechanism(k: Prepared, i: int) -> bool:
     """Whether anything acts beside the effects of the table."""
     for slot in range(SLOTS):
         first = c.MECHANISMS + slot * WIDTH
@@ -451,7 +457,7 @@ def _has_mechanism(k, i):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _put_in(state, k, i):  # type: ignore[no-untyped-def]
+def _put_in(state: State, k: Prepared, i: int) -> float:
     """Let coefficients be what they are by what mechanisms make of them; give the vessel's room."""
     for slot in range(SLOTS):
         first, unmoved = c.MECHANISMS + slot * WIDTH, UNMOVED + 2 * slot
@@ -466,7 +472,7 @@ def _put_in(state, k, i):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _mechanisms(state, k, h):  # type: ignore[no-untyped-def]
+def _mechanisms(state: State, k: Prepared, h: float) -> None:
     """Let mechanisms act for the next ``h`` seconds as they do half-way; for 0 s as they did.
 
     Where walls give way the gas is squeezed.
@@ -484,7 +490,7 @@ def _mechanisms(state, k, h):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _step(state, k, dt, tolerance):  # type: ignore[no-untyped-def]
+def _step(state: State, k: Prepared, dt: float, tolerance: float) -> None:
     """Advance by ``dt`` seconds under the commands of the last sample."""
     count = max(math.ceil(dt / LONGEST_STEP - 1e-6), 1)
     h = dt / count
@@ -496,14 +502,14 @@ def _step(state, k, dt, tolerance):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _command(state, position, value, i):  # type: ignore[no-untyped-def]
+def _command(state: State, position: int, value: float, i: int) -> None:
     if state[position + 1, i] != value:
         state[position + 1, i] = value
         state[position + 2, i] = 0.0
 
 
 @compiled
-def _enter(state, phases, k):  # type: ignore[no-untyped-def]
+def _enter(state: State, phases: Bytes, k: Prepared) -> None:
     """Take over the phase of a sample: what it commands, and what was measured of the nozzle."""
     for i in range(state.shape[1]):
         before, phase = int(state[PHASE, i]), int(phases[i])
@@ -522,7 +528,7 @@ def _enter(state, phases, k):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _settle(state, k, i, pressure):  # type: ignore[no-untyped-def]
+def _settle(state: State, k: Prepared, i: int, pressure: float) -> None:
     """Let gas, sensor and supply stand at ``pressure``, as warm as the wall."""
     temperature = k[c.TEMPERATURE, i]
     shrunk, _ = shrinkage(pressure, k, i)
@@ -538,7 +544,7 @@ def _settle(state, k, i, pressure):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _rest(state, k):  # type: ignore[no-untyped-def]
+def _rest(state: State, k: Prepared) -> None:
     """Let all stand at ambient pressure, valves at rest for long, cups open."""
     for i in range(state.shape[1]):
         _settle(state, k, i, k[c.AMBIENT, i])
@@ -548,7 +554,7 @@ def _rest(state, k):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _shift(state, shift, i):  # type: ignore[no-untyped-def]
+def _shift(state: State, shift: float, i: int) -> None:
     """Move all pressures by ``shift`` Pa at the temperatures they have."""
     for node in (PORT, LINE, VESSEL):
         moved = max(state[node, i] + shift, 100.0)
@@ -559,7 +565,7 @@ def _shift(state, shift, i):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _synchronise(state, levels, k):  # type: ignore[no-untyped-def]
+def _synchronise(state: State, levels: Floats, k: Prepared) -> None:
     """Set the model onto a measured level (Pa); an open cup is at ambient whatever is read."""
     for i in range(state.shape[1]):
         level = levels[i]
@@ -581,7 +587,7 @@ def _synchronise(state, levels, k):  # type: ignore[no-untyped-def]
 
 
 @per_row
-def _read(state, k, expected, signals):  # type: ignore[no-untyped-def]
+def _read(state: State, k: Prepared, expected: Floats, signals: Bytes) -> None:
     """Write what each hypothesis expects, and the signals it hands out: none where it waits."""
     for i in range(state.shape[1]):
         known = state[VALID, i] > 0.0
@@ -594,7 +600,15 @@ def _read(state, k, expected, signals):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _together(state, all_k, driven, out, first, width, tolerance):  # type: ignore[no-untyped-def]
+def _together(
+    state: State,
+    all_k: Prepared,
+    driven: tuple[Floats, Bytes, Floats],
+    out: tuple[Floats, Bytes],
+    first: int,
+    width: int,
+    tolerance: float,
+) -> None:
     """Advance ``width`` hypotheses from ``first`` on; where there are fewer, copies of the last.
 
     Copied to where rows have a length that the compiler knows: it then sees that no two of them
@@ -629,20 +643,38 @@ def _together(state, all_k, driven, out, first, width, tolerance):  # type: igno
 
 # One hypothesis and many are compiled apart: who needs only one of them waits for no other.
 @compiled
-def _advance_one(state, theta, dt, phase, level, expected, signals, tolerance):  # type: ignore[no-untyped-def]
+def _advance_one(
+    state: State,
+    theta: c.Theta,
+    dt: Floats,
+    phase: Bytes,
+    level: Floats,
+    expected: Floats,
+    signals: Bytes,
+    tolerance: float,
+) -> None:
     driven, out = (dt, phase, level), (expected, signals)
     _together(state, prepare(theta), driven, out, 0, 1, tolerance)
 
 
 @compiled
-def _advance(state, theta, dt, phase, level, expected, signals, tolerance):  # type: ignore[no-untyped-def]
+def _advance(
+    state: State,
+    theta: c.Theta,
+    dt: Floats,
+    phase: Bytes,
+    level: Floats,
+    expected: Floats,
+    signals: Bytes,
+    tolerance: float,
+) -> None:
     k, driven, out = prepare(theta), (dt, phase, level), (expected, signals)
     for first in range(0, state.shape[1], LANES):
         _together(state, k, driven, out, first, LANES, tolerance)
 
 
 @per_row
-def _seen_by_control(state, k, i):  # type: ignore[no-untyped-def]
+def _seen_by_control(state: State, k: Prepared, i: int) -> float:
     """Vacuum (Pa) at the sensor that the ejector's own control acts on."""
     if k[c.CONTROL_SENSOR, i] == c.PLC:
         return k[c.AMBIENT_NOMINAL, i] - reading(state[SENSED, i], k, i)
@@ -650,7 +682,9 @@ def _seen_by_control(state, k, i):  # type: ignore[no-untyped-def]
 
 
 @per_row
-def _decide(state, controls, told, dt, k, phases):  # type: ignore[no-untyped-def]
+def _decide(
+    state: State, controls: Floats, told: Bytes, dt: float, k: Prepared, phases: Bytes
+) -> None:
     """Say which phases the ejectors' own controls make of what the valves are told."""
     for i in range(state.shape[1]):
         asked = told[i] == _SUCTION_COMMAND  # blow-off wins
@@ -659,7 +693,7 @@ def _decide(state, controls, told, dt, k, phases):  # type: ignore[no-untyped-de
 
 
 @compiled
-def _act(state, k, phases):  # type: ignore[no-untyped-def]
+def _act(state: State, k: Prepared, phases: Bytes) -> None:
     """Enter the phases that the ejectors' own controls made."""
     before = state[PHASE].copy()
     _enter(state, phases, k)
@@ -669,14 +703,24 @@ def _act(state, k, phases):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _control(state, controls, told, dt, k, phases):  # type: ignore[no-untyped-def]
+def _control(
+    state: State, controls: Floats, told: Bytes, dt: float, k: Prepared, phases: Bytes
+) -> None:
     """Let the ejectors' own controls switch the nozzle, and enter the phases that result."""
     _decide(state, controls, told, dt, k, phases)
     _act(state, k, phases)
 
 
 @inlined
-def _free(state, all_k, driven, out, first, width, tolerance):  # type: ignore[no-untyped-def]
+def _free(
+    state: State,
+    all_k: Prepared,
+    driven: tuple[Floats, Bytes, Floats, Floats],
+    out: tuple[Bytes, Floats, Bytes],
+    first: int,
+    width: int,
+    tolerance: float,
+) -> None:
     """Let ``width`` hypotheses from ``first`` on run free, copied as in ``_together``."""
     (dt, commands, control, timer), (phase, expected, signals) = driven, out
     last = state.shape[1] - 1
@@ -706,12 +750,26 @@ def _free(state, all_k, driven, out, first, width, tolerance):  # type: ignore[n
 
 
 @compiled
-def _simulate_one(state, control, theta, driven, out, tolerance):  # type: ignore[no-untyped-def]
+def _simulate_one(
+    state: State,
+    control: tuple[Floats, Floats],
+    theta: c.Theta,
+    driven: tuple[Floats, Bytes],
+    out: tuple[Bytes, Floats, Bytes],
+    tolerance: float,
+) -> None:
     _free(state, prepare(theta), driven + control, out, 0, 1, tolerance)
 
 
 @compiled
-def _simulate(state, control, theta, driven, out, tolerance):  # type: ignore[no-untyped-def]
+def _simulate(
+    state: State,
+    control: tuple[Floats, Floats],
+    theta: c.Theta,
+    driven: tuple[Floats, Bytes],
+    out: tuple[Bytes, Floats, Bytes],
+    tolerance: float,
+) -> None:
     k = prepare(theta)
     for first in range(0, state.shape[1], LANES):
         _free(state, k, driven + control, out, first, LANES, tolerance)

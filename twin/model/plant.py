@@ -13,6 +13,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from twin.model import theta as c
 from twin.model.compiled import compiled, inlined
@@ -36,6 +37,9 @@ from twin.model.theta import Theta
     _OPENS,
     _THINNER,
 ) = range(len(c.COEFFICIENTS), len(c.COEFFICIENTS) + 13)
+Floats = npt.NDArray[np.float64]
+Prepared = npt.NDArray[np.float64]  # PREPARED rows: coefficients, and what follows from them
+
 UNMOVED = len(c.COEFFICIENTS) + 13  # what each mechanism changes, as it is without it: two a slot
 PREPARED = UNMOVED + 2 * SLOTS
 
@@ -102,11 +106,19 @@ class Driven(NamedTuple):
     open: float  # 1 while the cup stands open
 
 
+class Valves(NamedTuple):
+    """Positions of the valves and of the cup during a step."""
+
+    nozzle: float  # 0 to 1
+    blow_off: float  # 0 to 1
+    open_cup: float  # 1 while the cup stands open
+
+
 ORDER = len(Gas._fields) + len(Lags._fields)
 
 
 @compiled
-def prepare_one(k, i):  # type: ignore[no-untyped-def]
+def prepare_one(k: Prepared, i: int) -> None:
     """Write what follows from the coefficients of hypothesis ``i`` below them.
 
     And what a coefficient is without the mechanism that changes it.
@@ -119,7 +131,7 @@ def prepare_one(k, i):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def derive(k, i):  # type: ignore[no-untyped-def]
+def derive(k: Prepared, i: int) -> None:
     """Write what follows from the coefficients of hypothesis ``i`` as they are now."""
     ambient, nominal = k[c.AMBIENT, i], k[c.AMBIENT_NOMINAL, i]
     off = k[c.SUPPLY_NOMINAL, i] / k[c.SUPPLY_OPTIMUM, i] - 1.0
@@ -144,7 +156,7 @@ def derive(k, i):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def put(to, i, source, j):  # type: ignore[no-untyped-def]
+def put(to: Floats, i: int, source: Floats, j: int) -> None:
     """Copy column ``j`` of ``source`` into column ``i``: the rows that both have.
 
     In a loop: for slices, numba compiles seconds' worth of what to say where they do not fit.
@@ -154,7 +166,7 @@ def put(to, i, source, j):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def prepare(theta):  # type: ignore[no-untyped-def]
+def prepare(theta: Theta) -> Prepared:
     """Coefficients, one column per hypothesis, with what follows from them alone below."""
     k = np.empty((PREPARED, theta.shape[1]))
     for i in range(theta.shape[1]):
@@ -164,7 +176,7 @@ def prepare(theta):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def at_supply(supply, k, i):  # type: ignore[no-untyped-def]
+def at_supply(supply: float, k: Prepared, i: int) -> tuple[float, float, float]:
     """Suction at ambient (kg/s), end pressure (Pa) and blow-off (kg/s) at a supply (Pa gauge).
 
     Suction capacity peaks at the optimum supply; end pressure rises as supply falls. Over ambient
@@ -183,7 +195,7 @@ def at_supply(supply, k, i):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def characteristic(x, k, i):  # type: ignore[no-untyped-def]
+def characteristic(x: float, k: Prepared, i: int) -> tuple[float, float]:
     """Suction flow as a share of its value at ambient, and its slope, over ``x``.
 
     ``x`` runs from 0 at end pressure to 1 at ambient. Straight (the founding paper's shape) where
@@ -211,14 +223,14 @@ def suction_at(theta: Theta, p: float) -> float:
 
 
 @compiled
-def _suction_at(k, p):  # type: ignore[no-untyped-def]
+def _suction_at(k: Prepared, p: float) -> float:
     suction, end, _ = at_supply(k[c.SUPPLY_NOMINAL, 0], k, 0)
     share, _ = characteristic((p - end) / (k[c.AMBIENT, 0] - end), k, 0)
     return suction * share
 
 
 @inlined
-def at_port(p, driven, k, i):  # type: ignore[no-untyped-def]
+def at_port(p: float, driven: Driven, k: Prepared, i: int) -> tuple[float, float, float, float]:
     """Flows out of and into the port (kg/s) at ``p``, as tangents: two each, level and slope.
 
     Out: the ejector's suction, and the exhaust where the port is far enough above ambient for the
@@ -251,7 +263,7 @@ def at_port(p, driven, k, i):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def at_vessel(p, driven, k, i):  # type: ignore[no-untyped-def]
+def at_vessel(p: float, driven: Driven, k: Prepared, i: int) -> tuple[float, float]:
     """Flow from ambient into the vessel (kg/s) at ``p``, as a tangent: level and slope.
 
     An opening, a porous part, the rim of a cup without a part, and what else flows in.
@@ -266,7 +278,15 @@ def at_vessel(p, driven, k, i):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def through(rest, fall, before, rise, quadratic, linear, pushed):  # type: ignore[no-untyped-def]
+def through(
+    rest: float,
+    fall: float,
+    before: float,
+    rise: float,
+    quadratic: float,
+    linear: float,
+    pushed: float,
+) -> float:
     """Flow w (kg/s) through a line between two pressures that are linear in it.
 
     From ``rest − fall w`` to ``before + rise w``, against friction and inertia; isothermal pipe
@@ -282,19 +302,19 @@ def through(rest, fall, before, rise, quadratic, linear, pushed):  # type: ignor
 
 
 @inlined
-def kept(mass, work):  # type: ignore[no-untyped-def]
+def kept(mass: float, work: float) -> float:
     """Mass (kg) within what pressure times volume (J) allows for."""
     return min(max(mass, work * _PER_HOTTEST), work * _PER_COLDEST)
 
 
 @inlined
-def per_joule(mass):  # type: ignore[no-untyped-def]
+def per_joule(mass: float) -> float:
     """How warm (K) gas of a mass is for each joule of pressure times volume."""
     return 1.0 / (R * mass)
 
 
 @inlined
-def shrinkage(vessel, k, i):  # type: ignore[no-untyped-def]
+def shrinkage(vessel: float, k: Prepared, i: int) -> tuple[float, float]:
     """By how much a vessel shrinks in the end at its vacuum (m³), and how much less so per Pa."""
     vacuum = k[c.AMBIENT, i] - vessel
     held = k[c.STIFF_UNTIL, i] / (abs(vacuum) + k[c.STIFF_UNTIL, i] + TINY)
@@ -305,14 +325,16 @@ def shrinkage(vessel, k, i):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def room(vessel, yielded, k, i):  # type: ignore[no-untyped-def]
+def room(vessel: float, yielded: float, k: Prepared, i: int) -> float:
     """Volume (m³) of a vessel that shrinks with vacuum, a share of it at once, the rest later."""
     shrunk, _ = shrinkage(vessel, k, i)
     return k[c.VOLUME, i] - (1.0 - k[c.CREEP, i]) * shrunk - yielded
 
 
 @inlined
-def walls(vessel, before, step, k, i):  # type: ignore[no-untyped-def]
+def walls(
+    vessel: float, before: float, step: float, k: Prepared, i: int
+) -> tuple[float, float, float, float, float]:
     """A vessel after ``step`` in which what comes later goes on from what had yielded ``before``.
 
     Its volume, what has yielded by then (m³), γ p dV/dp (m³) at once and of what comes later, and
@@ -328,7 +350,16 @@ def walls(vessel, before, step, k, i):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def temperatures(y, volume, known, step, entering, drawn, k, i):  # type: ignore[no-untyped-def]
+def temperatures(
+    y: Gas,
+    volume: float,
+    known: Gas,
+    step: float,
+    entering: float,
+    drawn: float,
+    k: Prepared,
+    i: int,
+) -> tuple[float, float, float]:
     """Gas temperatures (K) of port, line and vessel of a ``volume`` (m³), at which it leaves them.
 
     Port's and line's follow from their balances, the port's with what is ``entering`` and ``drawn``
@@ -348,7 +379,7 @@ def temperatures(y, volume, known, step, entering, drawn, k, i):  # type: ignore
 
 
 @inlined
-def convection(y, warmer, k, i):  # type: ignore[no-untyped-def]
+def convection(y: Gas, warmer: float, k: Prepared, i: int) -> float:
     """Film coefficient in the vessel, over that of the data set; its gas is ``warmer`` (K).
 
     Free convection along a wall is laminar in vessels of some litres: Nu in proportion to Ra^¼, so
@@ -360,7 +391,7 @@ def convection(y, warmer, k, i):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def solve(y, known, step, driven, k, i):  # type: ignore[no-untyped-def]
+def solve(y: Gas, known: Gas, step: float, driven: Driven, k: Prepared, i: int) -> Gas:
     """One pass over the balances of all nodes: ``y`` is the guess, ``known`` what came before.
 
     Mass and energy of an ideal gas: V dp/dt = γ R Σ w T + (γ − 1) Q, and with a volume that shrinks
@@ -434,20 +465,20 @@ def solve(y, known, step, driven, k, i):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def lag(known, target, step, slow):  # type: ignore[no-untyped-def]
+def lag(known: float, target: float, step: float, slow: float) -> float:
     """Implicit stage of a first-order lag with the time constant ``slow`` (s)."""
     return known + step / (slow + step) * (target - known)
 
 
 @inlined
-def drain(drained, valve, step, k, i):  # type: ignore[no-untyped-def]
+def drain(drained: float, valve: float, step: float, k: Prepared, i: int) -> float:
     """Implicit stage of the reservoir that a blow-off comes from: sonic out, and filled again."""
     rate = step * k[c.BLOW_OFF_DRAIN, i]
     return (drained + rate * valve) / (1.0 + rate * (valve + k[c.BLOW_OFF_REFILL, i]))
 
 
 @inlined
-def drawing(opening, k, i):  # type: ignore[no-untyped-def]
+def drawing(opening: float, k: Prepared, i: int) -> float:
     """Strength of the jet, 0 to 1, that a valve which opens slowly lets through at its opening.
 
     Valves are wider than the nozzle behind them, and a nozzle at half its pressure draws nearly as
@@ -462,22 +493,30 @@ def drawing(opening, k, i):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def at_sensor(port, vessel, k, i):  # type: ignore[no-untyped-def]
+def at_sensor(port: float, vessel: float, k: Prepared, i: int) -> float:
     """Pressure (Pa) where the sensor sits, between port and vessel."""
     return port + k[_PLACE, i] * (vessel - port)
 
 
 @inlined
-def stage(guess, known, lags, step, valves, passes, k, i):  # type: ignore[no-untyped-def]
+def stage(
+    guess: Gas,
+    known: Gas,
+    lags: Lags,
+    step: float,
+    valves: Valves,
+    passes: int,
+    k: Prepared,
+    i: int,
+) -> tuple[Gas, Lags]:
     """Solve one implicit stage of ``step`` seconds from ``known`` gas and ``lags``.
 
     A pass brings the guess nearer by about one order in the step. So for a scheme of third order
     one that is no more than where the step began takes three ``passes``, others two; or one, and
     another only where that moved a pressure by more than is ``CLOSE``.
-    ``valves`` are the positions of nozzle and blow-off valve and whether the cup stands open, each
-    0 to 1. The jet builds up in two stages: the valve opens, then the jet gathers strength.
+    The jet builds up in two stages: the valve opens, then the jet gathers strength.
     """
-    nozzle, blow, open_cup = valves
+    nozzle, blow = valves.nozzle, valves.blow_off
     rise, fall = k[c.RAMP_UP, i], k[c.RAMP_DOWN, i]
     first = rise + k[c.SLOW_RAMP_UP, i]
     rising = nozzle > lags.drive
@@ -488,7 +527,7 @@ def stage(guess, known, lags, step, valves, passes, k, i):  # type: ignore[no-un
     regulated = max(k[c.SUPPLY, i] - k[c.DROOP, i] * max(nozzle, blow), 0.0)
     supply = lag(lags.supply, regulated, step, k[c.SUPPLY_LAG, i])
     suction, end, blow_off = at_supply(supply, k, i)
-    driven = Driven(jet, suction, end, blow_off * valve * (1.0 - drained), open_cup)
+    driven = Driven(jet, suction, end, blow_off * valve * (1.0 - drained), valves.open_cup)
     gas = solve(guess, known, step, driven, k, i)
     moved = max(abs(gas.port - guess.port), abs(gas.vessel - guess.vessel))
     if passes > 1 or moved * step > CLOSE:
@@ -502,7 +541,7 @@ def stage(guess, known, lags, step, valves, passes, k, i):  # type: ignore[no-un
 
 
 @inlined
-def gas_on(start, begin, end, share):  # type: ignore[no-untyped-def]
+def gas_on(start: Gas, begin: Gas, end: Gas, share: float) -> Gas:
     """Go on from ``start`` by a ``share`` of the way from ``begin`` to ``end``."""
     return Gas(
         start.port + share * (end.port - begin.port),
@@ -518,7 +557,7 @@ def gas_on(start, begin, end, share):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def lags_on(start, begin, end, share):  # type: ignore[no-untyped-def]
+def lags_on(start: Lags, begin: Lags, end: Lags, share: float) -> Lags:
     """As ``gas_on``."""
     return Lags(
         start.drive + share * (end.drive - begin.drive),
@@ -532,7 +571,7 @@ def lags_on(start, begin, end, share):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def positive(gas):  # type: ignore[no-untyped-def]
+def positive(gas: Gas) -> Gas:
     """Gas that went on too far, brought back to where there is a pressure and a mass."""
     return Gas(
         max(gas.port, LOWEST),
@@ -548,7 +587,9 @@ def positive(gas):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def advance(gas, lags, guess, passes, h, valves, k, i):  # type: ignore[no-untyped-def]
+def advance(
+    gas: Gas, lags: Lags, guess: Gas, passes: int, h: float, valves: Valves, k: Prepared, i: int
+) -> tuple[Gas, Lags, float]:
     """Gas and lags after ``h`` seconds, and how far (Pa) a scheme of second order is from them.
 
     The stages stand at equal distances, so that is the second difference of what each adds.
@@ -573,7 +614,7 @@ def advance(gas, lags, guess, passes, h, valves, k, i):  # type: ignore[no-untyp
 
 
 @inlined
-def ended(lags):  # type: ignore[no-untyped-def]
+def ended(lags: Lags) -> Lags:
     """What has faded away, or a little beyond by the scheme's doing, is gone."""
     return Lags(
         lags.drive if lags.drive > FAINTEST else 0.0,
@@ -587,20 +628,20 @@ def ended(lags):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def bent(first, second, third):  # type: ignore[no-untyped-def]
+def bent(first: float, second: float, third: float) -> float:
     """Size of the second difference."""
     return abs(first - 2.0 * second + third)
 
 
 @inlined
-def reading(sensed, theta, i):  # type: ignore[no-untyped-def]
+def reading(sensed: float, theta: Theta, i: int) -> float:
     """Absolute pressure the PLC reads (Pa); span and offset errors act on what is sensed."""
     vacuum = theta[c.AMBIENT, i] - sensed
     return sensed - (theta[c.SENSOR_GAIN, i] - 1.0) * vacuum + theta[c.SENSOR_OFFSET, i]
 
 
 @inlined
-def sensed_at(value, theta, i):  # type: ignore[no-untyped-def]
+def sensed_at(value: float, theta: Theta, i: int) -> float:
     """Pressure (Pa) at the sensor when it reads ``value``: the inverse of ``reading``."""
     gain = theta[c.SENSOR_GAIN, i]
     return (value - theta[c.SENSOR_OFFSET, i] + (gain - 1.0) * theta[c.AMBIENT, i]) / gain
@@ -608,11 +649,9 @@ def sensed_at(value, theta, i):  # type: ignore[no-untyped-def]
 
 def reading_of(sensed: float, theta: Theta) -> float:
     """``reading`` for one hypothesis from Python, where nothing has to be compiled for it."""
-    found: float = reading.py_func(sensed, theta.reshape(-1, 1), 0)  # type: ignore[no-untyped-call]
-    return found
+    return reading.py_func(sensed, theta.reshape(-1, 1), 0)
 
 
 def sensed_of(value: float, theta: Theta) -> float:
     """As ``reading_of``."""
-    found: float = sensed_at.py_func(value, theta.reshape(-1, 1), 0)  # type: ignore[no-untyped-call]
-    return found
+    return sensed_at.py_func(value, theta.reshape(-1, 1), 0)

@@ -159,7 +159,7 @@ def lumped(
 
 def _share(vacuum: float, ambient: float, critical: float) -> float:
     """Flow through an opening into a ``vacuum`` (Pa) below ``ambient``, over its sonic flow."""
-    share, _ = orifice.py_func(1.0 - vacuum / ambient, critical)  # type: ignore[no-untyped-call]
+    share, _ = orifice.py_func(1.0 - vacuum / ambient, critical)
     return float(share)
 
 

@@ -115,8 +115,8 @@ def averaged(
     """
     number = np.empty(len(phase), np.int64)
     begins = _begins(len(phase) // ROWS + 1, per_unit)
-    columns, *means = _averaged(np.array(phase), off, drawn, expected, begins, number)
-    return Bins(number, *columns.T), *means
+    columns, mean, expected_mean = _averaged(np.array(phase), off, drawn, expected, begins, number)
+    return Bins(number, *columns.T), mean, expected_mean
 
 
 @lru_cache(maxsize=16)
@@ -127,7 +127,9 @@ def _begins(times: int, per_unit: int) -> Ints:
 
 
 @compiled
-def _averaged(phase, off, drawn, expected, begins, number):  # type: ignore[no-untyped-def]
+def _averaged(
+    phase: Bytes, off: Floats, drawn: Ints, expected: Floats, begins: Ints, number: Ints
+) -> tuple[Ints, Floats, Floats]:
     """Columns of the bins, and the means of deviation and expected values over each."""
     usable = _between(drawn, expected, off)
     columns = _number(phase, usable, np.zeros(1, np.int64), begins, number)
@@ -144,7 +146,7 @@ def _averaged(phase, off, drawn, expected, begins, number):  # type: ignore[no-u
 
 
 @compiled
-def _between(drawn, expected, off):  # type: ignore[no-untyped-def]
+def _between(drawn: Ints, expected: Floats, off: Floats) -> Bools:
     """Rows with a deviation and with known values at the drawn rows on either side."""
     usable = np.zeros(len(off), np.bool_)
     was_known, first = False, len(off)
@@ -161,7 +163,7 @@ def _between(drawn, expected, off):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _add_lines(number, drawn, values, sums):  # type: ignore[no-untyped-def]
+def _add_lines(number: Ints, drawn: Ints, values: Floats, sums: Floats) -> None:
     """Add the values of lines through ``values`` at each row to the sum of its bin."""
     for after in range(len(drawn)):
         before = max(after - 1, 0)
@@ -179,14 +181,14 @@ def _add_lines(number, drawn, values, sums):  # type: ignore[no-untyped-def]
 
 
 @per_row
-def _add(total, times, values):  # type: ignore[no-untyped-def]
+def _add(total: Floats, times: float, values: Floats) -> None:
     """Add ``times`` the values."""
     for i in range(len(total)):
         total[i] += times * values[i]
 
 
 @compiled
-def _number(phase, usable, starts, begins, number):  # type: ignore[no-untyped-def]
+def _number(phase: Bytes, usable: Bools, starts: Ints, begins: Ints, number: Ints) -> Ints:
     """Number the bin of each row, and give the columns of each bin, (bins, 6).
 
     Rows, cycle, stretch, its kind, rows since it began, and steps in warped time.
@@ -233,12 +235,11 @@ def sparse(begins: npt.NDArray[np.bool_], since: int = -1) -> Ints:
 
     The last breakpoint before the first row was ``since`` rows ago.
     """
-    kept: Ints = sparse_rows(np.ascontiguousarray(begins), since)
-    return kept
+    return sparse_rows(np.ascontiguousarray(begins), since)
 
 
 @compiled
-def sparse_rows(begins, since):  # type: ignore[no-untyped-def]
+def sparse_rows(begins: Bools, since: int) -> Ints:
     """``sparse``, compiled."""
     kept = np.empty(len(begins), np.int64)
     count, due = 0, 0  # kept rows; rows after a breakpoint at which the next one is due
@@ -257,6 +258,6 @@ def sparse_rows(begins, since):  # type: ignore[no-untyped-def]
 
 
 @per_row
-def _spacing(since):  # type: ignore[no-untyped-def]
+def _spacing(since: int) -> int:
     """Spacing of kept rows, ``since`` rows after a breakpoint."""
     return min(max(since // SPARSE, 1), FARTHEST)

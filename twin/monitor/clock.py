@@ -90,7 +90,7 @@ def slope_pm(x: Floats, y: Floats) -> float:
 
 
 @compiled
-def _slopes(x, y):  # type: ignore[no-untyped-def]
+def _slopes(x: Floats, y: Floats) -> Floats:
     """Slopes of the lines through all pairs of points."""
     slopes, first = np.empty(len(x) * (len(x) - 1) // 2), 0
     for i in range(len(x) - 1):
@@ -102,7 +102,7 @@ def _slopes(x, y):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _receipts(before, samples):  # type: ignore[no-untyped-def]
+def _receipts(before: Samples, samples: Samples) -> Integers:
     """The newest row of each receipt that another follows: PLC time, host time and sequence.
 
     ``before`` is the row before these, or empty. Rows whose host time is their PLC time are left
@@ -118,7 +118,9 @@ def _receipts(before, samples):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _first_plain(receipts, last, zero_ns, window, period, far):  # type: ignore[no-untyped-def]
+def _first_plain(
+    receipts: Integers, last: tuple[int, int], zero_ns: int, window: int, period: float, far: float
+) -> int:
     """Number of the first receipts that lie in a window and have no step of ``far`` (ns) or more.
 
     ``last`` is the receipt before: PLC time and sequence.

@@ -241,7 +241,9 @@ def figures(cycle: Cycle, theta: Theta) -> dict[str, float]:
 
 
 @compiled
-def _by_phase(off, ticks, ambient):  # type: ignore[no-untyped-def]
+def _by_phase(
+    off: npt.NDArray[np.float64], ticks: Ticks, ambient: float
+) -> npt.NDArray[np.float64]:
     """Sums by phase, (5, 256).
 
     Rows with a deviation, its sum and that of its squares; rows with a level, and the sum of their

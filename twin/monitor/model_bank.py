@@ -231,7 +231,9 @@ class ModelBank:
 
 
 @compiled
-def _analyse(samples, ticks, last_ns, phase, since):  # type: ignore[no-untyped-def]
+def _analyse(
+    samples: Samples, ticks: Ticks, last_ns: int, phase: int, since: int
+) -> tuple[Ints, bool, Ints, Floats, int]:
     """Subsampled rows, whether a row is odd, stretches between breakpoints, rows since the last.
 
     A stretch has its first row and its shape (``Stretches``). ``last_ns`` and ``phase`` are those

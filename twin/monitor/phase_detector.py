@@ -22,6 +22,9 @@ from twin.model.compiled import compiled, per_row
 from twin.model.control import new_timer, timed
 from twin.signals import BREAK, MS, NS, SAMPLE, UNUSABLE, Phase, Reported, Samples, joined
 
+_Floats = npt.NDArray[np.float64]
+_Bytes = npt.NDArray[np.uint8]
+
 IDLE_ROWS = 20  # rows of idle that give the level before a cycle
 FEWEST_IDLE_ROWS = 5
 SIGNIFICANT = 7.0  # sigmas of slope difference that make a knee
@@ -80,7 +83,7 @@ class Knees:
 
 
 @per_row
-def _line(pressure, start, rows):  # type: ignore[no-untyped-def]
+def _line(pressure: _Floats, start: int, rows: int) -> tuple[float, float]:
     """Slope (Pa per row) and mean of a straight line through ``rows`` values from ``start``.
 
     Unusable values (NaN) are left out; with too many of them the result is NaN.
@@ -116,7 +119,7 @@ def _line(pressure, start, rows):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _greatest_jump(pressure, first, last):  # type: ignore[no-untyped-def]
+def _greatest_jump(pressure: _Floats, first: int, last: int) -> tuple[int, float]:
     """Row after the largest isolated jump of the pressure, and its height (Pa)."""
     row, greatest = first, 0.0
     before, change, at = 0.0, 0.0, first
@@ -133,7 +136,7 @@ def _greatest_jump(pressure, first, last):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _bends_at(pressure, first, jump, last, noise):  # type: ignore[no-untyped-def]
+def _bends_at(pressure: _Floats, first: int, jump: int, last: int, noise: float) -> float:
     """Significance of the difference in slope before and after a jump, without the jump."""
     before, after = jump + 1 - first, last - jump
     if min(before, after) < SHORTEST_WINDOW // 2:
@@ -144,7 +147,9 @@ def _bends_at(pressure, first, jump, last, noise):  # type: ignore[no-untyped-de
 
 
 @per_row
-def _break_at(pressure, row, window, noise, nozzle_on):  # type: ignore[no-untyped-def]
+def _break_at(
+    pressure: _Floats, row: int, window: int, noise: float, nozzle_on: bool
+) -> tuple[float, float]:
     """Significance of the slope's break at ``row`` and the level there; 0 if it is no knee.
 
     Nozzle going off: the pressure fell, and stops falling. Nozzle going on: it begins to fall.
@@ -174,7 +179,16 @@ def _break_at(pressure, row, window, noise, nozzle_on):  # type: ignore[no-untyp
 
 
 @compiled
-def _find(state, pressure, reported, commands, first, settings, phase, level):  # type: ignore[no-untyped-def]
+def _find(
+    state: _Floats,
+    pressure: _Floats,
+    reported: _Bytes,
+    commands: _Bytes,
+    first: int,
+    settings: _Floats,
+    phase: _Bytes,
+    level: _Floats,
+) -> int:
     """Fill ``phase`` and ``level`` from ``first`` on; returns the first row that needs later ones.
 
     ``settings`` = window, noise, off shift, on shift, settled, again, apart, about, acts (2).
@@ -218,7 +232,7 @@ def _find(state, pressure, reported, commands, first, settings, phase, level):  
 
 
 @per_row
-def _start(state, pressure, row, level):  # type: ignore[no-untyped-def]
+def _start(state: _Floats, pressure: _Floats, row: int, level: _Floats) -> None:
     """Begin a suction, with the nozzle on."""
     state[_NOZZLE], state[_BEST], state[_KNEE_LEVEL] = 1.0, 0.0, math.nan
     state[_SWITCHED] = state[_REPORTS] = 0.0
@@ -229,7 +243,7 @@ def _start(state, pressure, row, level):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _end_of(commands, row):  # type: ignore[no-untyped-def]
+def _end_of(commands: _Bytes, row: int) -> int:
     """The first row after ``row`` with another command."""
     end = row + 1
     while end < len(commands) and commands[end] == commands[row]:
@@ -238,7 +252,7 @@ def _end_of(commands, row):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _unsettled(state, settings):  # type: ignore[no-untyped-def]
+def _unsettled(state: _Floats, settings: _Floats) -> int:
     """Number of searched rows that a knee may still change."""
     if state[_AGE] < 0.0 or settings[0] == 0.0:
         return 0
@@ -248,7 +262,7 @@ def _unsettled(state, settings):  # type: ignore[no-untyped-def]
 
 
 @per_row
-def _idle(state, pressure, row, level):  # type: ignore[no-untyped-def]
+def _idle(state: _Floats, pressure: _Floats, row: int, level: _Floats) -> None:
     """Keep the mean of the last idle rows; the first mean of a stretch sets the model."""
     if math.isnan(pressure[row]):
         return
@@ -263,7 +277,7 @@ def _idle(state, pressure, row, level):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _idle_level(state, pressure, row):  # type: ignore[no-untyped-def]
+def _idle_level(state: _Floats, pressure: _Floats, row: int) -> float:
     """Pressure (Pa) at ``row`` by a line through the idle rows: a closed vessel may still cool."""
     mean = state[_IDLE_SUM] / state[_IDLE_AGE]
     if state[_IDLE_AGE] < IDLE_ROWS or row < IDLE_ROWS:
@@ -274,7 +288,16 @@ def _idle_level(state, pressure, row):  # type: ignore[no-untyped-def]
 
 
 @per_row
-def _track_break(state, pressure, reported, row, settings, may_bend, phase, level):  # type: ignore[no-untyped-def]
+def _track_break(
+    state: _Floats,
+    pressure: _Floats,
+    reported: _Bytes,
+    row: int,
+    settings: _Floats,
+    may_bend: bool,
+    phase: _Bytes,
+    level: _Floats,
+) -> None:
     """Track the break's significance over the rows, and set a knee at its peak."""
     window, noise, nozzle_on = int(settings[0]), settings[1], state[_NOZZLE] > 0.0
     significance, break_level = 0.0, 0.0
@@ -306,7 +329,9 @@ def _track_break(state, pressure, reported, row, settings, may_bend, phase, leve
 
 
 @per_row
-def _reported_switches(reported, first, last, begin, about, on):  # type: ignore[no-untyped-def]
+def _reported_switches(
+    reported: _Bytes, first: int, last: int, begin: int, about: float, on: float
+) -> tuple[int, float]:
     """Number of switchings that the ejector reports in some rows, and the nozzle after them.
 
     ``on`` is the nozzle before: 1 on, 0 off; -1 from the beginning of suction at ``begin`` until it
@@ -326,7 +351,7 @@ def _reported_switches(reported, first, last, begin, about, on):  # type: ignore
 
 
 @compiled
-def _is_denied(state, reported, row, settings):  # type: ignore[no-untyped-def]
+def _is_denied(state: _Floats, reported: _Bytes, row: int, settings: _Floats) -> bool:
     """Whether the ejector reports no switching about a row that belongs to no other knee."""
     if reported[row] & _KNOWN == 0:
         return False
@@ -339,13 +364,21 @@ def _is_denied(state, reported, row, settings):  # type: ignore[no-untyped-def]
 
 
 @per_row
-def _overdue(settings):  # type: ignore[no-untyped-def]
+def _overdue(settings: _Floats) -> int:
     """Rows after which a reported switching that has not shown will not show."""
     return int(settings[7]) + int(settings[0]) // 2
 
 
 @per_row
-def _follow_report(state, pressure, reported, row, settings, phase, level):  # type: ignore[no-untyped-def]
+def _follow_report(
+    state: _Floats,
+    pressure: _Floats,
+    reported: _Bytes,
+    row: int,
+    settings: _Floats,
+    phase: _Bytes,
+    level: _Floats,
+) -> None:
     """Take an overdue report; if no knee has shown it, set one by the report alone."""
     state[_SINCE] += 1.0
     report_row, begin = row - _overdue(settings), row - int(state[_SINCE])

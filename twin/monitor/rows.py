@@ -16,7 +16,7 @@ def time_steps(samples: Samples, before_ns: int | None) -> Floats:
 
 
 @compiled
-def _time_steps(samples, before_ns, dt):  # type: ignore[no-untyped-def]
+def _time_steps(samples: Samples, before_ns: int, dt: Floats) -> None:
     for row in range(len(dt)):
         time_ns = samples[row].time_ns
         dt[row] = -1.0 if samples[row].quality & BREAK else (time_ns - before_ns) * NS

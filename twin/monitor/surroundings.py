@@ -20,7 +20,7 @@ COLUMNS = (("ambient", c.AMBIENT), ("temperature", c.TEMPERATURE))
 
 
 @compiled
-def are_told(samples):  # type: ignore[no-untyped-def]
+def are_told(samples: Samples) -> bool:
     """Whether any row has ambient pressure or temperature; nearly always none has."""
     for row in range(len(samples)):
         if samples[row].ambient > 0.0 or samples[row].temperature > 0.0:
