@@ -75,7 +75,7 @@ def standing(theta: Theta, pressure: float, warmer: float = 0.0) -> kernel.State
     state[MASSES] *= pressure / theta[c.AMBIENT]
     state[kernel.VESSEL_MASS] *= volume(theta, pressure) / theta[c.VOLUME]
     state[MASSES] *= theta[c.TEMPERATURE] / (theta[c.TEMPERATURE] + warmer)
-    state[[*PRESSURES, kernel.FELT, kernel.SENSED]] = pressure
+    state[[*PRESSURES, kernel.SENSOR_STAGE, kernel.SENSED]] = pressure
     state[kernel.OPEN] = 0.0
     return state
 

@@ -17,10 +17,10 @@ from twin.model.control import (
     LEAK_SETTLE_S,
     PROTECTED_S,
     PROTECTED_SWITCHES,
+    effective_commands,
     new_timer,
     nothing_done,
     switch,
-    timed,
 )
 from twin.model.theta import Theta
 from twin.signals import MBAR, MS, Command, Phase, Signal
@@ -42,7 +42,7 @@ def told(commands: Bytes, mode: int, duration: float = 0.2, blocks: int = 1) -> 
     timer, effective = new_timer(), np.empty_like(commands)
     for part in np.array_split(np.arange(len(commands)), blocks):
         found = np.empty(len(part), "u1")
-        timed(timer, commands[part], np.full(len(part), MS), mode, duration, found)
+        effective_commands(timer, commands[part], np.full(len(part), MS), mode, duration, found)
         effective[part] = found
     return effective
 

@@ -34,7 +34,7 @@ def test_few_rows_say_what_all_of_them_do(
     healthy = rigs.config(name).monitor.healthy
     few = {one.effect: one for one in likenesses(theta, healthy, samples, ticks, BEGIN)}
     monkeypatch.setattr(naming, "drawn_rows", lambda samples, _: np.arange(len(samples)))
-    monkeypatch.setattr(kernel, "ROUGHLY", kernel.TOLERANCE)
+    monkeypatch.setattr(kernel, "COARSE_TOLERANCE", kernel.TOLERANCE)
     every = {one.effect: one for one in likenesses(theta, healthy, samples, ticks, BEGIN)}
     assert few.keys() == every.keys() == {*EFFECTS, UNKNOWN}
     for effect, one in every.items():

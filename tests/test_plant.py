@@ -18,17 +18,17 @@ from twin.model.gas import GAMMA, R
 from twin.model.plant import (
     Driven,
     Gas,
-    at_port,
     at_supply,
-    at_vessel,
     characteristic,
     convection,
-    drain,
+    drain_stage,
+    leak_flow,
+    line_flow,
+    port_flows,
     prepare,
     reading,
     sensed_at,
     suction_at,
-    through,
 )
 from twin.model.theta import Theta
 from twin.signals import MBAR, ML, MS, SL_MIN, Phase
@@ -197,12 +197,12 @@ def driven(jet: float = 0.0, blow_off: float = 0.0, is_open: float = 0.0) -> Dri
 
 
 def flow_out(theta: Theta, p: float, jet: float) -> float:
-    out, slope, _, _ = at_port(p, driven(jet), one(theta), 0)
+    out, slope, _, _ = port_flows(p, driven(jet), one(theta), 0)
     return float(out + slope * p)
 
 
 def flow_in(theta: Theta, p: float, jet: float = 0.0, blow_off: float = 0.0) -> float:
-    _, _, blown, slope = at_port(p, driven(jet, blow_off), one(theta), 0)
+    _, _, blown, slope = port_flows(p, driven(jet, blow_off), one(theta), 0)
     return float(blown + slope * p)
 
 
@@ -247,7 +247,7 @@ def test_a_blow_off_drains_its_own_reservoir_and_that_fills_again() -> None:
     drained = [0.0]
     for row in range(30000):
         valve = 1.0 if row < 15000 else 0.0
-        drained.append(drain.py_func(drained[-1], valve, step, k, 0))
+        drained.append(drain_stage.py_func(drained[-1], valve, step, k, 0))
     assert drained[15000] == pytest.approx(0.8, rel=1e-3)
     assert drained[1600] == pytest.approx(0.8 * (1.0 - np.exp(-1.0)), rel=1e-3)
     assert drained[15000 + 8000] == pytest.approx(0.8 * np.exp(-1.0), rel=1e-3)
@@ -270,7 +270,7 @@ def test_a_vessel_is_leaked_into_by_hole_pore_and_rim() -> None:
     theta[c.HOLE] = 1.5 * SL_MIN
     opened = theta[c.OPENING] * 0.6 * ambient + theta[c.HOLE]
     for is_open, more in ((0.0, 0.0), (1.0, opened)):
-        level, slope = at_vessel(p, driven(is_open=is_open), one(theta), 0)
+        level, slope = leak_flow(p, driven(is_open=is_open), one(theta), 0)
         assert level + slope * p == pytest.approx(2 * SL_MIN + 1e-9 * 0.6 * ambient + more)
 
 
@@ -294,7 +294,7 @@ def test_flow_through_a_line_solves_its_equation(
     pushed: float,
 ) -> None:
     """p₁² − p₂² = K w |w| + L w − pushed, with both pressures linear in w."""
-    w = through(rest, fall, before, rise, quadratic, linear, pushed)
+    w = line_flow(rest, fall, before, rise, quadratic, linear, pushed)
     first, second = rest - fall * w, before + rise * w
     if first < 0.0 or second < 0.0:
         return  # such flows do not come from any state, and are cut off
@@ -304,8 +304,8 @@ def test_flow_through_a_line_solves_its_equation(
 
 
 def test_no_difference_no_flow() -> None:
-    assert through(1e5, 10.0, 1e5, 10.0, 1e14, 1e9, 0.0) == 0.0
-    assert through(1e5, 0.0, 1e5, 0.0, 0.0, 1e-9, 0.0) == 0.0
+    assert line_flow(1e5, 10.0, 1e5, 10.0, 1e14, 1e9, 0.0) == 0.0
+    assert line_flow(1e5, 0.0, 1e5, 0.0, 0.0, 1e-9, 0.0) == 0.0
 
 
 # The sensor.
@@ -334,7 +334,7 @@ def test_the_sensor_follows_in_two_stages() -> None:
     theta = closed()
     theta[[c.SENSOR_LAG, c.SLOW_SENSOR]] = 20 * MS, 0.0
     state = standing(theta, 0.5e5)
-    state[[kernel.FELT, kernel.SENSED]] = 0.6e5
+    state[[kernel.SENSOR_STAGE, kernel.SENSED]] = 0.6e5
     rows = states(theta, [(Phase.IDLE, 20)], state)
     assert rows[-1, kernel.SENSED] == pytest.approx(0.6e5 - 0.1e5 * (1 - 2 / np.e), rel=1e-5)
 

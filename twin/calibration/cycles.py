@@ -51,7 +51,7 @@ class Cycles:
         theta = coefficients(data)
         finder = PhaseFinder(as_wide_as_needed(knees_of(data), [samples]))
         early, late = finder.push(samples), finder.flush()
-        rows, phase = (np.concatenate([early[i], late[i]]) for i in (0, 1))
+        rows, phase = np.concatenate([early[0], late[0]]), np.concatenate([early[1], late[1]])
         level = np.concatenate([early[2], late[2]]).astype(np.float32).astype(np.float64)
         return cls._of(rows, phase, level, theta, quickly=False)
 
@@ -85,7 +85,7 @@ class Cycles:
         measured = bins.mean(rows["pressure"].astype(np.float64))
         # A fit from afar takes the quick way: it needs many runs, and its error is larger anyway.
         drawn = _drawn(dt, phase, level) if quickly else np.arange(len(dt))
-        tolerance = kernel.ROUGHLY if quickly else kernel.TOLERANCE
+        tolerance = kernel.COARSE_TOLERANCE if quickly else kernel.TOLERANCE
         unsure = np.empty((len(measured), 0))
         return cls(rows, dt, phase, level, bins, measured, drawn, tolerance, unsure=unsure)
 

@@ -178,7 +178,7 @@ class Evidence:
             phase = self._phases(sensing[lane])
             rows = self._drawn(courses[lane], phase)
             level = self._levels(rows, courses[lane], sensing[lane])
-            expected = self._run(courses[lane], phase[rows], level, rows, kernel.ROUGHLY)
+            expected = self._run(courses[lane], phase[rows], level, rows, kernel.COARSE_TOLERANCE)
             off: Floats = (self._measured[:, None] - self.bins.through(rows, expected)) / MBAR
             return off
 

@@ -17,11 +17,11 @@ from twin.model.control import new_timer, nothing_done
 # What component.h calls, with the kinds of the arguments.
 _CALLED = (
     (plant.prepare_one, ROWS, INDEX),
-    (kernel._rest, ROWS, ROWS),
-    (control.told, ROWS, WHOLE, NUMBER, NUMBER, NUMBER),
-    (kernel._control, ROWS, TABLES, LANE, NUMBER, ROWS, LANE),
+    (kernel._reset_to_ambient, ROWS, ROWS),
+    (control.effective_command, ROWS, WHOLE, NUMBER, NUMBER, NUMBER),
+    (kernel._run_controls, ROWS, TABLES, LANE, NUMBER, ROWS, LANE),
     (kernel._step, ROWS, ROWS, NUMBER, NUMBER),
-    (kernel._read, ROWS, ROWS, LANE, LANE),
+    (kernel._read_sensors, ROWS, ROWS, LANE, LANE),
     (kernel.take_over, ROWS, ROWS, ROWS),
 )
 # And the numbers it reads.

@@ -116,7 +116,7 @@ class Expectation:
             self._control = kernel.Control.anew()
         driven = self._theta, dt[free], samples["commands"][free]
         out = phase[free], pressure[free], signals[free]
-        dense_solver.run_on(model, self._control, *driven, out, kernel.ROUGHLY)
+        dense_solver.run_on(model, self._control, *driven, out, kernel.COARSE_TOLERANCE)
         self._terms.add(phase, pressure)
         return pressure, phase
 

@@ -1,7 +1,7 @@
-"""Effects that a diagnosis found and a person took in: mechanisms with a name of their own.
+"""Effects that a diagnosis has found and a person has accepted: mechanisms with their own names.
 
-They stand in a data set's ``catalogue``, so they come with a type or a unit wherever its data set
-goes. From then on the search for causes has them beside the table of effects.
+They are in the ``catalogue`` of a data set, so they go with a type or a unit wherever its data set
+goes. The search for causes then tries them beside the table of effects.
 """
 
 import re
@@ -18,11 +18,11 @@ from twin.settings import Settings
 
 Words = Annotated[str, StringConstraints(min_length=1, max_length=300, pattern=r"^[^\x00-\x1f]+$")]
 NAME = re.compile(r"[a-z][a-z0-9_]{2,40}")
-TAKEN = {UNKNOWN, "unlisted", "none", "healthy"}  # words that answers have for something else
+TAKEN = {UNKNOWN, "unlisted", "none", "healthy"}  # words with another meaning in answers
 
 
 class Range(Settings):
-    """One number of an effect that was taken in: from where to where, and what it was at first."""
+    """Bounds of one parameter of an accepted effect, and its value when it was found."""
 
     low: float  # the least that it can be, in the mechanism's unit
     high: float  # the most
@@ -38,7 +38,7 @@ class Range(Settings):
 
 
 class CatalogueEffect(Settings):
-    """A mechanism that was found, with words for people and the range of each of its numbers."""
+    """A mechanism that was found, with texts for people and the range of each parameter."""
 
     mechanism: str  # what acts where and when; docs/mechanisms.md lists them
     sentence: Words  # what it is, as answers say it
@@ -52,40 +52,42 @@ class CatalogueEffect(Settings):
             raise ValueError(
                 f"mechanism {self.mechanism!r} is none; {known_names(self.mechanism, MECHANISMS)}"
             )
-        table = {one.name: one for one in MECHANISMS[self.mechanism].effect.parameters}
+        table = {
+            parameter.name: parameter for parameter in MECHANISMS[self.mechanism].effect.parameters
+        }
         if self.parameters.keys() != table.keys():
             raise ValueError(f"{self.mechanism} needs the parameters {', '.join(table)}, no others")
-        sizes = {one.name for one in MECHANISMS[self.mechanism].place.parameters}
-        for name, mine in self.parameters.items():
+        sizes = {parameter.name for parameter in MECHANISMS[self.mechanism].place.parameters}
+        for name, bounds in self.parameters.items():
             widest = table[name]
-            if mine.low < widest.low or mine.high > widest.high:
+            if bounds.low < widest.low or bounds.high > widest.high:
                 raise ValueError(
                     f"{name} can be {widest.low:g} to {widest.high:g} {widest.unit} at most"
                 )
-            if name in sizes and not mine.low <= 0.0 <= mine.high:
+            if name in sizes and not bounds.low <= 0.0 <= bounds.high:
                 raise ValueError(f"{name} is a size: 0 must lie within low and high")
         return self
 
     @property
     def acts_as(self) -> Mechanism:
-        """What it is in the model."""
+        """The mechanism that it is in the model."""
         return MECHANISMS[self.mechanism]
 
     def effect(self, name: str) -> Effect:
-        """The same as an entry of the table of effects; what shapes it is near what was found."""
-        sizes = {one.name for one in self.acts_as.place.parameters}
+        """It as an effect with a name; values beside its sizes start from those found."""
+        sizes = {parameter.name for parameter in self.acts_as.place.parameters}
         parameters = tuple(
             Parameter(
-                one.name,
-                one.unit,
-                mine.low,
-                mine.high,
-                one.typical,
-                ratio=one.ratio,
-                usual=None if one.name in sizes else mine.found,
+                parameter.name,
+                parameter.unit,
+                bounds.low,
+                bounds.high,
+                parameter.typical,
+                ratio=parameter.ratio,
+                usual=None if parameter.name in sizes else bounds.found,
             )
-            for one in self.acts_as.effect.parameters
-            for mine in (self.parameters[one.name],)
+            for parameter in self.acts_as.effect.parameters
+            for bounds in (self.parameters[parameter.name],)
         )
         act = self.acts_as.effect.act
         return Effect(name, self.sentence, self.look_at, parameters, act, acts=_has_room)
@@ -99,7 +101,7 @@ _REGISTERED: dict[str, CatalogueEffect] = {}
 
 
 def refuse_name(name: str) -> None:
-    """ConfigError for what cannot be the name of an effect beside the table."""
+    """Raise ConfigError if the name of an effect beside the table is taken or malformed."""
     if name in EFFECTS or name in MECHANISMS or name in TAKEN:
         raise ConfigError(f"{name!r} is the name of something else", "twin effects lists the names")
     if not NAME.fullmatch(name):
@@ -110,28 +112,28 @@ def refuse_name(name: str) -> None:
 
 
 def effects_in(catalogue: Mapping[str, CatalogueEffect]) -> list[Effect]:
-    """The effects of a catalogue; from then on they are known by name in this process.
+    """The effects of a catalogue; this process then finds them by name.
 
-    ConfigError where a name stands for another mechanism already.
+    ConfigError if a name is already that of another mechanism.
     """
-    found = []
-    for name, one in catalogue.items():
-        if _REGISTERED.setdefault(name, one).mechanism != one.mechanism:
+    effects = []
+    for name, entry in catalogue.items():
+        if _REGISTERED.setdefault(name, entry).mechanism != entry.mechanism:
             raise ConfigError(
                 f"{name}: another catalogue has another mechanism under this name",
                 "give one of them another name: twin effects add",
             )
-        _REGISTERED[name] = one
-        found.append(one.effect(name))
-    add_beside({one.name: one for one in found})
-    return found
+        _REGISTERED[name] = entry
+        effects.append(entry.effect(name))
+    add_beside({entry.name: entry for entry in effects})
+    return effects
 
 
 def mechanism_of(name: str) -> str:
-    """The mechanism that an effect is in the model; the name itself where it is in the table."""
+    """Name of the mechanism of an effect; the name itself if the effect is in the table."""
     return _REGISTERED[name].mechanism if name in _REGISTERED else name
 
 
 def has_room(theta: Theta, effects: Iterable[str], more: int = 0) -> bool:
-    """Whether those of the effects that are beside the table, and so many more, can act at once."""
-    return more + sum(one not in EFFECTS for one in effects) <= free_slots(theta)
+    """Whether the effects beside the table, and ``more`` others, can all act at once."""
+    return more + sum(name not in EFFECTS for name in effects) <= free_slots(theta)

@@ -1,11 +1,11 @@
-"""The decorator for compiled functions, with a cache that never serves yesterday's physics.
+"""Decorators for compiled functions, with a cache that is never out of date.
 
-Numba caches each function by the time stamp of its own file, so a change in a function it calls in
-another file goes unnoticed. Here the cache lies in a folder named by all sources that are compiled
-or hold constants for it.
+Numba's own cache looks at the time stamp of a function's file, so it misses changes of a called
+function in another file. Here the cache is in a folder whose name is a hash of all sources that are
+compiled or hold their constants.
 
-Numba unpickles what it finds there, and that runs whatever stands in it. So the folder is the
-user's own, and where it is not there is no cache.
+Numba unpickles the cached files, and unpickling can run any code. So the folder must belong to the
+user alone; otherwise there is no cache.
 """
 
 import hashlib
@@ -45,8 +45,8 @@ def _folder_name() -> str:
     return f"compiled-{sources.hexdigest()[:12]}"
 
 
-def _forget_others(folder: Path) -> None:
-    """Delete what no version has used for a day; numba itself never does."""
+def _delete_unused(folder: Path) -> None:
+    """Delete folders that no version has used for a day; numba itself never does."""
     os.utime(folder)
     for other in folder.parent.glob("compiled-*"):
         if other != folder and time.time() - other.stat().st_mtime > DAY_S:
@@ -54,11 +54,11 @@ def _forget_others(folder: Path) -> None:
 
 
 def _cache_folder() -> tuple[str, str]:
-    """The folder, or nothing and why."""
+    """The folder and an empty text, or an empty text and the reason why there is none."""
     try:
         folder = private_folder(private_folder(user_cache()) / _folder_name())
-        with suppress(FileNotFoundError):  # another process forgets the same
-            _forget_others(folder)
+        with suppress(FileNotFoundError):  # another process has deleted the same folder
+            _delete_unused(folder)
     except TwinError as error:
         return "", f"{error}; {error.hint}"
     return str(folder), ""
@@ -67,27 +67,27 @@ def _cache_folder() -> tuple[str, str]:
 _FOLDER, _NO_CACHE = _cache_folder()
 numba.config.CACHE_DIR = _FOLDER  # type: ignore[attr-defined]
 
-# A loop over hypotheses reads and writes some fifty rows of three arrays. Whether rows overlap is
-# checked before such a loop is run four at a time, and by default LLVM balks at so many checks.
+# A loop over hypotheses reads and writes about fifty rows of three arrays. Before it runs a
+# vectorised loop, LLVM checks that no rows overlap. By default it permits fewer checks.
 for _limit in ("runtime-memory-check-threshold", "vectorize-memory-check-threshold"):
     llvm.set_option("", f"--{_limit}=100000")
 
 
 class NotCachedError(Exception):
-    """Something is not in the cache, and the caller does not want it compiled here."""
+    """A function is not in the cache, and the caller does not want it compiled here."""
 
 
-class _Waiting(event.Listener):
-    """Says what a process waits for, the first time something is not found in the cache."""
+class _CompileListener(event.Listener):
+    """Warns the first time that a function is not in the cache: compiling takes long."""
 
-    said = False
-    refused = False  # compiling, for the moment
+    has_warned = False
+    is_refused = False  # compiling, for the moment
 
     def on_start(self, event: object) -> None:
-        if self.refused:
+        if self.is_refused:
             raise NotCachedError
-        if not self.said:
-            self.said = True
+        if not self.has_warned:
+            self.has_warned = True
             kept = f"and not kept: {_NO_CACHE}" if _NO_CACHE else "then kept"
             _log.warning(
                 "compiling what is not yet compiled for this processor: 1 to 3 minutes, %s", kept
@@ -97,44 +97,44 @@ class _Waiting(event.Listener):
         pass
 
 
-_waiting = _Waiting()
-event.register("numba:compile", _waiting)  # type: ignore[no-untyped-call]
+_listener = _CompileListener()
+event.register("numba:compile", _listener)  # type: ignore[no-untyped-call]
 
 
 @contextmanager
 def only_cached() -> Iterator[None]:
-    """Raise NotCachedError where the block needs something that is not in the cache.
+    """Raise NotCachedError if the block needs a function that is not in the cache.
 
-    For one thread, before there are others that may compile.
+    Use it before other threads start that may compile.
     """
-    _waiting.refused = True
+    _listener.is_refused = True
     try:
         yield
     finally:
-        _waiting.refused = False
+        _listener.is_refused = False
 
 
 def keeps() -> bool:
-    """Whether there is a cache: what another process compiles is then found by this one."""
+    """Whether there is a cache, so that one process finds what another one has compiled."""
     return bool(_FOLDER)
 
 
 def expect_waiting() -> None:
-    """Say nothing when something is compiled: the caller has said what is waited for."""
-    _waiting.said = True
+    """Suppress the warning about compiling: the caller has given its own."""
+    _listener.has_warned = True
 
 
 class _InOwnFolder(CompileResultCacheImpl):
-    """Looks nowhere else: numba has folders to fall back on that nobody checks."""
+    """Restricts the cache to the checked folder: numba would fall back on others."""
 
     _locator_classes = [UserProvidedCacheLocator]  # noqa: RUF012 - as numba has it
 
 
 class _Cache(FunctionCache):
-    """Numba's cache; but what is found in it needs nothing of what numba can compile.
+    """Numba's cache, except that a hit does not initialise the compiler.
 
-    Numba gets all of that ready before it looks, a sixth of the time that a command takes to start.
-    Where nothing is found, its compiler does the same as it begins.
+    Numba would initialise it before the look-up, which is a sixth of the time that a command takes
+    to start. After a miss, the compiler initialises itself.
     """
 
     _impl_class = _InOwnFolder
@@ -145,8 +145,8 @@ class _Cache(FunctionCache):
             return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
 
 
-# Results stay the same to the last bit: no fast-math. Dividing by zero gives inf as in NumPy. What
-# is called from ``per_row`` may have arrays of its own (numba would pass that on).
+# No fast-math: results stay the same to the last bit. Division by zero gives inf, as in NumPy.
+# _nrt is set explicitly, since numba would inherit it from a caller that is ``per_row``.
 _with_arrays = njit(nogil=True, error_model="numpy", _nrt=True)  # type: ignore[call-overload]
 
 
@@ -156,36 +156,38 @@ class Compiled(Protocol[P, R_co]):
     @property
     def py_func(self) -> Callable[P, R_co]:
         """The Python function, which runs without compiling anything."""
+        ...
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R_co:
-        """Run what is compiled; compile it first where no call had such arguments."""
+        """Run it; compile it first if no call has had arguments of these types."""
+        ...
 
 
 def compiled(function: Callable[P, R_co]) -> Compiled[P, R_co]:
-    """A function to be called from Python, or where inlining it is not worth it; kept on disk."""
+    """Compile a function that Python calls, or that is not worth inlining; cached on disk."""
     dispatcher = _with_arrays(function)
     if _FOLDER:
         with suppress(RuntimeError):  # the disk is full
-            # What ``cache=True`` does with numba's own.
+            # As ``cache=True`` does with numba's own cache.
             dispatcher._cache = _Cache(function)  # type: ignore[no-untyped-call]
     return cast("Compiled[P, R_co]", dispatcher)
 
 
-# For functions called inside a loop: over hypotheses only one without calls is vectorised, and over
-# rows a call costs as much as a few lines.
+# For functions called in a loop. Over hypotheses, LLVM only vectorises a loop without calls; over
+# rows, a call costs as much as a few lines.
 _inlined = njit(forceinline=True, error_model="numpy")
 
-# The same for what runs over rows, with no arrays of its own. It does not count the references to
-# those it is given: two atomic additions for each, at every row. Over hypotheses nothing is counted
-# in any case, and so compiled LLVM takes them one at a time.
+# The same for loops over rows, in functions that create no arrays. Their arguments' references are
+# not counted, which saves two atomic additions for each array at every row. A loop over hypotheses
+# counts no references anyway, and with this option LLVM would not vectorise it.
 _per_row = njit(forceinline=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
 
 
 def inlined(function: Callable[P, R_co]) -> Compiled[P, R_co]:
-    """A function that is part of its callers, inside a loop over hypotheses."""
+    """Compile a function that is inlined into a loop over hypotheses."""
     return cast("Compiled[P, R_co]", _inlined(function))
 
 
 def per_row(function: Callable[P, R_co]) -> Compiled[P, R_co]:
-    """A function that is part of its callers, inside a loop over rows; it has no arrays."""
+    """Compile a function that is inlined into a loop over rows; it may create no arrays."""
     return cast("Compiled[P, R_co]", _per_row(function))

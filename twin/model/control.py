@@ -1,9 +1,10 @@
 """The compact ejector's own control: blow-off modes, and air saving with its safeguards.
 
-The field's modes. Air saving: off; on, where too frequent switching ends in continuous suction
-(valve protection); on with leak monitoring, where too much leakage does as well; on without
-continuous suction. Blow-off: external; internal, a timed pulse after suction; timed, a pulse
-started from outside. Blow-off wins over suction.
+Air saving has four modes: off; on, with continuous suction after too frequent switching (valve
+protection); on with leak monitoring, which also changes to continuous suction after too much
+leakage; on without continuous suction. Blow-off has three modes: external; internal, with a timed
+pulse after suction; timed, with a pulse that is started from outside. Blow-off has priority over
+suction.
 """
 
 import math
@@ -15,18 +16,19 @@ from twin.model import theta as c
 from twin.model.compiled import compiled, per_row
 from twin.signals import Command
 
-PROTECTED_SWITCHES = 6  # within ...
-PROTECTED_S = 3.0  # s, more of them end in continuous suction
-LEAK_SETTLE_S = 0.05  # s after the nozzle went off before leakage is judged
+PROTECTED_SWITCHES = 6  # more switchings than this within PROTECTED_S mean continuous suction
+PROTECTED_S = 3.0  # s
+LEAK_SETTLE_S = 0.05  # s from the nozzle's going off until leakage is judged
 
 Floats = npt.NDArray[np.float64]
 Bytes = npt.NDArray[np.uint8]
 
-# Rows of the control's state: whether air saving has the nozzle off, whether it has given up for
-# this cycle, time, when and at which vacuum the nozzle went off, and the last switchings.
+# Rows of the control's state: whether air saving has switched the nozzle off; whether suction is
+# continuous for the rest of the cycle; time (s); time (s) and vacuum (Pa) at which the nozzle went
+# off; times of the last switchings (s).
 SAVING, CONTINUOUS, TIME, OFF_SINCE, OFF_VACUUM, SWITCHES = range(6)
 CONTROL = SWITCHES + PROTECTED_SWITCHES
-# Rows of the blow-off timer's state: commands before, and what is left of the pulse.
+# Rows of the blow-off timer's state: commands of the row before, and remaining pulse (s).
 _BEFORE, _LEFT = range(2)
 
 _SUCTION, _BLOW_OFF = int(Command.SUCTION), int(Command.BLOW_OFF)
@@ -39,25 +41,25 @@ def _two_point(before: float, vacuum: float, high: float, low: float) -> float:
 
 @per_row
 def air_saving(before: float, vacuum: float, k: c.Theta, i: int) -> float:
-    """H1: reached from its switching point on, until vacuum is below it by the hysteresis."""
+    """Whether H1 is reached (0 or 1): from H1 on, until vacuum is below it by the hysteresis."""
     return _two_point(before, vacuum, k[c.H1, i], k[c.H1_LOW, i])
 
 
 @per_row
 def part_present(before: float, vacuum: float, k: c.Theta, i: int) -> float:
-    """H2: the part is there from the switching point on, with its hysteresis."""
+    """Whether the part is present (0 or 1): from H2 on, until vacuum is below it by h2."""
     return _two_point(before, vacuum, k[c.H2, i], k[c.H2_LOW, i])
 
 
 @per_row
-def switch(control: Floats, asked: bool, vacuum: float, dt: float, k: c.Theta, i: int) -> bool:
-    """Say whether the nozzle is to be on: suction is ``asked`` for and air is not being saved.
+def switch(control: Floats, suction_on: bool, vacuum: float, dt: float, k: c.Theta, i: int) -> bool:
+    """Whether the nozzle is to be on: suction is commanded, and air saving has not switched it off.
 
-    ``control`` is the state (``CONTROL`` values), ``vacuum`` (Pa) what its sensor says, ``dt`` the
-    seconds since it was asked last. ``i`` is the hypothesis.
+    ``control`` is the state (``CONTROL`` values), ``vacuum`` (Pa) the reading of its sensor, ``dt``
+    the seconds since the last call, ``i`` the hypothesis.
     """
     control[TIME] += dt
-    if not asked:
+    if not suction_on:
         control[SAVING] = control[CONTINUOUS] = 0.0
         return False
     mode = k[c.AIR_SAVING, i]
@@ -70,33 +72,35 @@ def switch(control: Floats, asked: bool, vacuum: float, dt: float, k: c.Theta, i
         control[OFF_SINCE], control[OFF_VACUUM] = control[TIME], vacuum
     if control[SAVING] != before and mode != c.WITHOUT_CONTINUOUS:
         _protect(control)
-    saved = control[TIME] - control[OFF_SINCE]
-    watched = mode == c.LEAK_MONITORING and control[SAVING] > 0.0 and saved > LEAK_SETTLE_S
-    if watched and control[OFF_VACUUM] - vacuum > k[c.PERMITTED_LEAKAGE, i] * saved:
+    off_time = control[TIME] - control[OFF_SINCE]
+    judges_leakage = (
+        mode == c.LEAK_MONITORING and control[SAVING] > 0.0 and off_time > LEAK_SETTLE_S
+    )
+    if judges_leakage and control[OFF_VACUUM] - vacuum > k[c.PERMITTED_LEAKAGE, i] * off_time:
         control[CONTINUOUS], control[SAVING] = 1.0, 0.0
     return control[SAVING] == 0.0
 
 
 @per_row
 def _protect(control: Floats) -> None:
-    """Remember a switching; give up saving air when there were too many."""
+    """Remember a switching; after too many, change to continuous suction."""
     oldest = SWITCHES
-    for one in range(SWITCHES + 1, CONTROL):
-        if control[one] < control[oldest]:
-            oldest = one
+    for entry in range(SWITCHES + 1, CONTROL):
+        if control[entry] < control[oldest]:
+            oldest = entry
     if control[TIME] - control[oldest] < PROTECTED_S:
         control[CONTINUOUS], control[SAVING] = 1.0, 0.0
     control[oldest] = control[TIME]
 
 
 def new_timer() -> Floats:
-    """Return the state of a blow-off timer that has seen nothing yet."""
+    """The state of a blow-off timer before its first row."""
     return np.zeros(2)
 
 
 @per_row
-def told(timer: Floats, commands: int, dt: float, mode: float, duration: float) -> int:
-    """What the valves are told (``Command`` bits), as ``timed`` for one row."""
+def effective_command(timer: Floats, commands: int, dt: float, mode: float, duration: float) -> int:
+    """Commands to the valves (``Command`` bits) at one row; see ``effective_commands``."""
     command, before = commands & (_SUCTION | _BLOW_OFF), int(timer[_BEFORE])
     timer[_LEFT] -= max(dt, 0.0)
     ended = mode == c.INTERNAL and before & _SUCTION and not command & _SUCTION
@@ -112,19 +116,20 @@ def told(timer: Floats, commands: int, dt: float, mode: float, duration: float) 
 
 
 @compiled
-def timed(
+def effective_commands(
     timer: Floats, commands: Bytes, dt: Floats, mode: float, duration: float, effective: Bytes
 ) -> None:
-    """Write into ``effective`` what the valves are told, given what the PLC commands, row by row.
+    """Write the commands to the valves (``Command`` bits) for the PLC's ``commands``, row by row.
 
-    ``dt`` are seconds since the row before, ``mode`` the blow-off mode, ``duration`` its pulse (s).
+    The ejector's blow-off timer adds and removes blow-off. ``dt`` is the time since the row before
+    (s), ``mode`` the blow-off mode, ``duration`` the length of its pulse (s).
     """
     for row in range(commands.shape[0]):
-        effective[row] = told(timer, int(commands[row]), dt[row], mode, duration)
+        effective[row] = effective_command(timer, int(commands[row]), dt[row], mode, duration)
 
 
 def nothing_done() -> Floats:
-    """Return a control's state that has not switched anything for long."""
+    """The state of a control that has not switched anything for a long time."""
     control = np.zeros(CONTROL)
     control[SWITCHES:] = -math.inf
     return control

@@ -1,7 +1,7 @@
 """How an effect runs in time: constant, step, ramp or intermittent, for every effect alike.
 
-A cause is an effect with a course. Causes turn into coefficients that hold from one row of a log on
-to the next change; the kernel itself knows no time.
+A cause is an effect with a course. Causes become coefficients that hold from one row of a log until
+the next change; the kernel itself has no time.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,9 +15,9 @@ from twin.model.effects import apply, effect_of
 from twin.model.theta import Theta
 
 HOUR = 3600.0  # s
-RAMP_STEP = 0.5  # s that a ramp's coefficients hold, as they are in the middle of it
+RAMP_STEP = 0.5  # s; the coefficients of a ramp change so often, to their values in mid-step
 
-# How coefficients run in time: from which row on which ones hold; the first at row 0.
+# Coefficients over time: pairs of a first row and the coefficients from it on, beginning at row 0.
 Schedule = list[tuple[int, Theta]]
 
 
@@ -40,7 +40,7 @@ MEANING = {
 
 @dataclass(frozen=True)
 class Cause:
-    """An effect of some size with its course; a ramp's ``values`` are its change per hour."""
+    """An effect with sizes and a course; the ``values`` of a ramp are changes per hour."""
 
     effect: str
     values: Mapping[str, float]
@@ -49,12 +49,12 @@ class Cause:
     cycles: frozenset[int] = frozenset()  # of an intermittent one
 
     def law(self) -> dict[str, float]:
-        """The law that it acts by, where that is told beside the sizes."""
+        """The value of the effect's law, if it is given beside the sizes."""
         law = effect_of(self.effect).law
         return {law.name: self.values[law.name]} if law and law.name in self.values else {}
 
     def at(self, theta: Theta, second: float, cycle: int) -> Mapping[str, float]:
-        """Values of the parameters at a time in a cycle; empty where it does not act."""
+        """Values of the parameters at a time (s) in a cycle; empty if the cause does not act."""
         if self.course == Course.INTERMITTENT:
             return self.values if cycle in self.cycles else {}
         if self.course == Course.CONSTANT:
@@ -63,14 +63,14 @@ class Cause:
             return {}
         if self.course == Course.STEP:
             return self.values
-        grown = self.law()
+        values = self.law()
         for parameter in effect_of(self.effect).parameters:
             neutral = parameter.neutral(theta)
-            told = self.values.get(parameter.name, neutral if parameter.shapes else 0.0)
-            grows = neutral + told * (second - self.onset_s) / HOUR
-            value = told if parameter.shapes else grows
-            grown[parameter.name] = min(max(value, parameter.low), parameter.high)
-        return grown
+            given = self.values.get(parameter.name, neutral if parameter.shapes else 0.0)
+            ramped = neutral + given * (second - self.onset_s) / HOUR
+            value = given if parameter.shapes else ramped
+            values[parameter.name] = min(max(value, parameter.low), parameter.high)
+        return values
 
 
 def schedule(
@@ -84,15 +84,15 @@ def schedule(
     ``seconds`` rise from 0. ConfigError for an unknown effect, parameter or course, and for a value
     out of bounds.
     """
-    found: Schedule = []
+    changes: Schedule = []
     for row in _changes(causes, seconds, cycles):
-        now = theta
+        changed = theta
         for cause in causes:
             ahead = RAMP_STEP / 2.0 if cause.course == Course.RAMP else 0.0
-            values = cause.at(now, float(seconds[row]) + ahead, int(cycles[row]))
-            now = apply(now, cause.effect, values)
-        found.append((row, now))
-    return found
+            values = cause.at(changed, float(seconds[row]) + ahead, int(cycles[row]))
+            changed = apply(changed, cause.effect, values)
+        changes.append((row, changed))
+    return changes
 
 
 def _changes(

@@ -1,8 +1,8 @@
 """The data set of an ejector and what hangs on it, in the field's units, and its SI form.
 
 An object-specific data set describes a type, an instance-specific one a single unit; both have this
-shape. ``coefficients`` turns it into the vector the compiled kernel works on: the one place where
-the model's units are converted.
+shape. ``coefficients`` converts it into the vector of the compiled kernel: the only place where the
+units of the model are converted.
 """
 
 import hashlib
@@ -28,12 +28,12 @@ from twin.signals import BAR, MBAR, ML, MS, SL_MIN
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 
-AFTER_BLOW_OFF = -5e5  # Pa of vacuum that no blow-off reaches: the part goes when it ends
-SHORTEST_SWING = 5e-3  # s, of a line's gas that can be seen at a sample each millisecond
-UNSEEN_SWING = 3.5e-3  # s, of one that cannot at all
-RIPPLE = 1e-3  # of suction capacity, from one hundredth of the range to the next: still monotonic
+AFTER_BLOW_OFF = -5e5  # Pa of vacuum, which no blow-off reaches: the part goes when it ends
+SHORTEST_SWING = 5e-3  # s, shortest period of a line that samples at 1 kHz show
+UNSEEN_SWING = 3.5e-3  # s, longest period of a line that they do not show at all
+RIPPLE = 1e-3  # of suction capacity: permitted fall from one hundredth of the range to the next
 
-# The modes of the configuration as the coefficients hold them.
+# Codes of the configured modes in the coefficients.
 AIR_SAVING_MODES = {
     "off": c.OFF,
     "on": c.ON,
@@ -62,7 +62,9 @@ class Supply(Settings):
     droop_bar: NotNegative = 0.0  # less at the nozzle while a valve is open
     lag_ms: float = Field(20.0, ge=1.0, le=1000.0)  # of the supply line
     # At which suction is greatest: an ejector is made for the pressure that it is run at.
-    optimum_bar: float = Field(default_factory=lambda told: told["pressure_bar"], gt=0.0, le=10.0)
+    optimum_bar: float = Field(
+        default_factory=lambda values: values["pressure_bar"], gt=0.0, le=10.0
+    )
     # Suction over its greatest is 1 − curvature · (supply / optimum − 1)².
     curvature: NotNegative = 1.0
     end_pressure_slope: NotNegative = 0.2  # relative rise of end pressure per bar missing
@@ -80,8 +82,10 @@ class Supply(Settings):
 
 
 def closing_stage(x: npt.NDArray[np.float64], at: float) -> npt.NDArray[np.float64]:
-    """Suction of a stage over its own at ambient, where it closes ``at``; as in the kernel."""
-    open_by, end, most = (np.hypot(one, c.KINK_WIDTH) + one for one in (x - at, -at, 1.0 - at))
+    """Suction of a stage that closes at ``at``, relative to ambient; the same as in the kernel."""
+    open_by, end, most = (
+        np.hypot(distance, c.KINK_WIDTH) + distance for distance in (x - at, -at, 1.0 - at)
+    )
     share: npt.NDArray[np.float64] = (open_by - end) / (most - end)
     return share
 
@@ -107,7 +111,9 @@ class Ejector(Settings):
     # From the end of the command to the valve's action.
     response_off_ms: float = Field(12.0, ge=0.0, le=500.0)
     ramp_up_ms: float = Field(8.0, ge=0.5, le=500.0)  # of the jet, in two equal stages
-    jet_full_at: float = Field(1.0, ge=0.02, le=1.0)  # of a slow valve's opening; see plant.drawing
+    jet_full_at: float = Field(
+        1.0, ge=0.02, le=1.0
+    )  # share of a slow valve's opening at which the jet is full
     ramp_down_ms: float = Field(4.0, ge=0.5, le=500.0)  # of the jet as it ends, in two equal stages
     jet_depth: float = Field(1.0, ge=0.0, le=1.0)  # how much less deep a weaker jet draws
     blow_off_sl_min: NotNegative = 100.0  # into ambient pressure
@@ -128,7 +134,7 @@ class Ejector(Settings):
     cracking_pressure_mbar: NotNegative = 0.0  # above ambient, where the check valve lets out
     # Above ambient, where the relief opens: with the check valve, or a valve of its own.
     relief_pressure_mbar: NotNegative = Field(
-        default_factory=lambda told: told["cracking_pressure_mbar"]
+        default_factory=lambda values: values["cracking_pressure_mbar"]
     )
     back_flow_sl_min: NotNegative = 0.0  # in through it while off, sonic; no check valve
     # Vacuum at which air saving switches the nozzle off.
@@ -193,7 +199,9 @@ class System(Settings):
         Vessel(kind="vessel", volume_ml=750.0),
     )
     film_coefficient: NotNegative = 10.0  # W/(m² K), of vessel and cups
-    free_convection: float = Field(0.0, ge=0.0, le=1.0)  # share of that, at FREE_AT
+    free_convection: float = Field(
+        0.0, ge=0.0, le=1.0
+    )  # share of that at 10 K between gas and wall
     forced_convection: NotNegative = 0.0  # how many times more while all blow-off enters
     tube_film_coefficient: NotNegative = 60.0  # W/(m² K)
     line_factor: NotNegative = 1.0  # flow resistance over what the parts add up to
@@ -233,7 +241,7 @@ class System(Settings):
 
 
 class DataSet(Settings):
-    """Everything the model knows of one type or one unit, and of what hangs on it."""
+    """All values of the model for one type or one unit, with its parts."""
 
     ambient: Ambient = Ambient()
     supply: Supply = Supply()
@@ -278,13 +286,13 @@ class DataSet(Settings):
 
     @property
     def hash(self) -> str:
-        """Content hash: two data sets with the same hash expect the same pressures."""
+        """Hash of the content: data sets with equal hashes give equal expected pressures."""
         expects = self.model_dump_json(exclude={"catalogue"})
         return hashlib.sha256(expects.encode()).hexdigest()[:16]
 
 
 def coefficients(data: DataSet) -> Theta:
-    """Turn a data set into the kernel's vector, in SI units."""
+    """The coefficients of a data set, in SI units."""
     theta = np.zeros(len(c.COEFFICIENTS))
     ambient, temperature = data.ambient.pressure_mbar * MBAR, data.ambient.temperature_c + 273.15
     theta[[c.AMBIENT, c.AMBIENT_NOMINAL]] = ambient
@@ -367,7 +375,7 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     if theta[c.BLOW_OFF] > 0.0:
         theta[c.FORCED_CONVECTION] = system.forced_convection**2 / theta[c.BLOW_OFF]
     theta[c.AREA] = total.vessel_area + ends * total.line_area
-    near = 0.5 * _swings(theta, inertance)
+    near = 0.5 * _inertia_weight(theta, inertance)
     theta[[c.NEAR_INERTANCE, c.INERTANCE]] = near * inertance
     for line, value in ((c.RESISTANCE, total.resistance), (c.LAMINAR, total.laminar)):
         theta[line] = (1.0 - near) * value * system.line_factor
@@ -387,22 +395,22 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
 
 
 def sensor_place(data: DataSet) -> float:
-    """Where along the line the sensor is: 0 at the port, 1 at the vessel."""
+    """Place of the sensor along the line: 0 at the port, 1 at the vessel."""
     theta = coefficients(data)
     line = float(theta[c.NEAR_RESISTANCE] + theta[c.RESISTANCE])
     return float(theta[c.PLACE]) / line if line > 0.0 else 0.0
 
 
 def swing(theta: Theta, inertance: float) -> float:
-    """Period (s) in which a line of ``inertance`` (1/m) swings against its and the port's gas."""
+    """Period (s) of a line with ``inertance`` (1/m); gas in the line and the port is the spring."""
     stored = (theta[c.PORT_VOLUME] + theta[c.LINE_VOLUME]) / (GAMMA * R * theta[c.TEMPERATURE])
     return 2.0 * math.pi * math.sqrt(inertance * float(stored))
 
 
-def _swings(theta: Theta, inertance: float) -> float:
-    """Whether the line's gas swings slowly enough to be seen; a shorter line is only friction.
+def _inertia_weight(theta: Theta, inertance: float) -> float:
+    """Weight (0 to 1) of the inertia of the line's gas; a line with a short period has none.
 
-    From 0 to 1 without a step: a fit that meets one goes no further.
+    The weight is continuous in the period, since a fit stops at a discontinuity.
     """
     share = (swing(theta, inertance) - UNSEEN_SWING) / (SHORTEST_SWING - UNSEEN_SWING)
     return min(max(share, 0.0), 1.0)

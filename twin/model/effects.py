@@ -379,10 +379,10 @@ def find_effect(name: str) -> Effect | None:
 
 def effect_of(name: str) -> Effect:
     """The effect of a name, of the table or beside it. ConfigError where there is none."""
-    found = find_effect(name)
-    if found is None:
+    effect = find_effect(name)
+    if effect is None:
         raise ConfigError(f"unknown effect {name!r}", "twin effects lists them")
-    return found
+    return effect
 
 
 def acting_on(theta: Theta) -> list[Effect]:
@@ -397,10 +397,10 @@ def apply(theta: Theta, name: str, values: Mapping[str, float]) -> Theta:
     Raises ConfigError for an unknown effect or parameter and for a value out of bounds.
     """
     effect = effect_of(name)
-    known = {parameter.name for parameter in effect.parameters}
-    known |= {effect.law.name} if effect.law else set()
-    if unknown := set(values) - known:
-        raise ConfigError(f"{name} has no parameter {', '.join(sorted(unknown))}", f"has {known}")
+    names = {parameter.name for parameter in effect.parameters}
+    names |= {effect.law.name} if effect.law else set()
+    if unknown := set(values) - names:
+        raise ConfigError(f"{name} has no parameter {', '.join(sorted(unknown))}", f"has {names}")
     for parameter in effect.parameters:
         value = values.get(parameter.name, parameter.neutral(theta))
         if not parameter.low <= value <= parameter.high:

@@ -1,7 +1,7 @@
 """Gas laws for dry air as an ideal gas, small enough to check against a textbook.
 
-All functions are compiled and work on scalars in SI units with absolute pressures. They are free of
-branches, so that the bank of hypotheses can run them on several at once.
+All functions are compiled and take scalars in SI units; pressures are absolute. They have no
+branches, so that a loop over hypotheses is vectorised.
 """
 
 import math
@@ -13,16 +13,16 @@ GAMMA = 1.4  # ratio of specific heats
 CP = GAMMA * R / (GAMMA - 1.0)  # J/(kg K)
 VISCOSITY = 1.82e-5  # Pa s, of air at 20 °C
 CRITICAL_RATIO = 0.528  # ISO 6358 critical pressure ratio of a well rounded opening
-LAMINAR_RATIO = 0.999  # above it ISO 6358 flow runs linearly to zero: no infinite slope, no chatter
+LAMINAR_RATIO = 0.999  # above it the flow is linear, which avoids an infinite slope at 1
 _PER_LAMINAR = 1.0 / (1.0 - LAMINAR_RATIO)
 
 
 @inlined
 def orifice(ratio: float, critical: float) -> tuple[float, float]:
-    """Flow through an opening as a share of its sonic flow, and its slope over ``ratio``.
+    """Flow through an opening relative to its sonic flow, and its slope over ``ratio``.
 
-    ISO 6358-1 with a ``critical`` ratio; ``ratio`` is downstream over upstream absolute pressure,
-    between 0 and 1.
+    ISO 6358-1 with the ``critical`` pressure ratio; ``ratio`` is downstream over upstream absolute
+    pressure (0 to 1).
     """
     steep = 1.0 / (1.0 - critical)
     below = max((min(ratio, LAMINAR_RATIO) - critical) * steep, 0.0)
@@ -34,9 +34,9 @@ def orifice(ratio: float, critical: float) -> tuple[float, float]:
 
 @inlined
 def opening(p: float, ambient: float, critical: float) -> tuple[float, float]:
-    """Flow from ambient into ``p`` through an opening, as a share of its sonic flow inwards.
+    """Flow from ambient to ``p`` (Pa) through an opening relative to its sonic flow, and its slope.
 
-    Negative outwards while ``p`` is above ambient. Also its slope over ``p`` (1/Pa).
+    The flow is negative (outwards) while ``p`` is above ambient; the slope is over ``p`` (1/Pa).
     """
     inwards = p <= ambient
     share, slope = orifice(p / ambient if inwards else ambient / p, critical)

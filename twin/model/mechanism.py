@@ -1,10 +1,10 @@
-"""What acts beside the table of effects: a coefficient that changes while something is the case.
+"""Mechanisms, which act beside the table of effects: coefficients that change under a condition.
 
-A mechanism says *where* it acts (a coefficient: a flow into the vessel, a share of suction, a
-volume, the sensor), *when* (always, while the nozzle runs, from a vacuum on, periodically) and
-*how* (at once, or setting in and fading with time constants: ice, water, warmth). It acts by a
-share from 0 to 1, ``set_in``; the coefficient is what it is without, plus ``SIZE`` times that
-share. So it has a state, and holds for every program of commands.
+A mechanism has a *place* (a coefficient: a flow into the vessel, a share of suction, a volume, the
+sensor), a *condition* (always, while the nozzle runs, above a vacuum, periodically) and a *speed*
+(at once, or setting in and fading with time constants, as ice, water and warmth do). Its share runs
+from 0 to 1; the coefficient changes by ``SIZE`` times the share. A mechanism has a state, and holds
+for every program of commands.
 """
 
 import math
@@ -17,13 +17,13 @@ from twin.model.effects import FLATTEST, Effect, Parameter, add_beside
 from twin.model.theta import Theta
 from twin.signals import BAR, MBAR, ML, SL_MIN
 
-SLOTS = 2  # mechanisms that can act at once
+SLOTS = 2  # number of mechanisms that can act at once
 # Coefficients of one mechanism, from ``c.MECHANISMS`` on; each has WIDTH of them.
 ON, SIZE, ALSO_ON, ALSO_SIZE, WHEN, BEGINS, ENDS, SETS_IN, FADES, PERIOD, SHIFT = range(11)
 WIDTH = (len(c.COEFFICIENTS) - c.MECHANISMS) // SLOTS
-# When it acts: always; while the nozzle runs, or does not; in blow-off; from a vacuum on, until it
-# is below another; the more the higher the vacuum is above one; gathered while the nozzle runs and
-# cleared by blow-off; all the time but where the vacuum used it up; to and fro.
+# When it acts: always; while the nozzle runs; while it does not; in blow-off; above one vacuum
+# until below another; in proportion to the vacuum above a threshold; gathered while the nozzle runs
+# and cleared by blow-off; renewed at ambient pressure and used up by vacuum; periodically.
 (
     ALWAYS,
     NOZZLE_ON,
@@ -39,11 +39,10 @@ WIDTH = (len(c.COEFFICIENTS) - c.MECHANISMS) // SLOTS
 
 @dataclass(frozen=True)
 class Place:
-    """Where a mechanism acts: coefficients, each with a size in the field's unit and its bounds.
+    """Where a mechanism acts: one or two coefficients, each with a size in the field's unit.
 
-    ``si`` turns a size into what is added to its coefficient; there is one, or two of them that
-    move together. ``sentence`` is completed by the sizes and by when it acts; ``words`` stand in a
-    formula.
+    ``si`` converts a size into the change of its coefficient (SI). ``sentence`` is completed by the
+    sizes and by the condition; ``words`` name the coefficients in a formula.
     """
 
     name: str
@@ -56,9 +55,9 @@ class Place:
 
 @dataclass(frozen=True)
 class When:
-    """When and how a mechanism acts: a code of the kernel, and what is to be known beside a size.
+    """When and how fast a mechanism acts: a code of the kernel, with parameters beside the sizes.
 
-    ``starts`` are values to begin a search from, one for each of the ``parameters``.
+    ``starts`` are starting points of a search, each with one value for each of the ``parameters``.
     """
 
     name: str
@@ -67,7 +66,7 @@ class When:
     starts: tuple[tuple[float, ...], ...]
     sentence: str  # with the parameters' values
     formula: str
-    briefly: str = ""  # the same without values, where the sentence has some
+    briefly: str = ""  # the sentence without values, if it has some
 
 
 _P = Parameter
@@ -307,10 +306,10 @@ WHENS = {
     )
 }
 _SIGNED = {c.INFLOW, c.SENSOR_OFFSET}  # coefficients that may be negative
-# What is combined with these places alone: others that act always are effects of the table, and
-# only these have a rhythm of their own, by a compressor or another consumer.
+# Conditions that only some places have. At other places, mechanisms that always act are effects of
+# the table; a period comes from a compressor or from another consumer.
 _ONLY = {"always": {"inflow"}, "swinging": {"supply", "inflow"}}
-# What a place is not combined with, as nothing would be seen of it.
+# Conditions that a place does not have, since nothing would show.
 _NOT = {
     "nozzle": {"nozzle_off", "in_blow_off"},
     "blow_off": {"nozzle_on", "nozzle_off", "nozzle_on_slowly", "above", "used_up"},
@@ -321,103 +320,109 @@ _NOT = {
 
 @dataclass(frozen=True)
 class Mechanism:
-    """A place with when it acts there: an effect beside the table."""
+    """A place with a condition: an effect beside the table."""
 
     place: Place
     when: When
 
     @property
     def name(self) -> str:
-        """As a data set and an answer have it."""
+        """Its name in data sets and answers."""
         return f"{self.place.name}_{self.when.name}"
 
     @property
-    def _begin(self) -> str:
+    def _capitalised_sentence(self) -> str:
         return self.place.sentence[0].upper() + self.place.sentence[1:]
 
     @property
     def effect(self) -> Effect:
-        """The effect that it is, with a size and what else is to be known."""
+        """It as an effect, with its sizes and its other parameters."""
         return Effect(
             self.name,
-            f"{self._begin}: {self.when.name}",
+            f"{self._capitalised_sentence}: {self.when.name}",
             "",
             (*self.place.parameters, *self.when.parameters),
             self._act,
         )
 
     def sentence(self, values: Mapping[str, float]) -> str:
-        """What it does, in words, with its values."""
-        sizes = ", ".join(_told(one, values) for one in self.place.parameters)
-        return f"{self._begin} ({sizes}), {self.when.sentence.format(**self._shown(values))}"
+        """What it does, as a sentence with its values."""
+        sizes = ", ".join(_value_text(parameter, values) for parameter in self.place.parameters)
+        condition = self.when.sentence.format(**self._value_texts(values))
+        return f"{self._capitalised_sentence} ({sizes}), {condition}"
 
     def formula(self, values: Mapping[str, float]) -> str:
-        """What it adds in the model, and how the share of that runs."""
+        """What it changes in the model, and the equation of its share."""
         added = "; ".join(
-            f"{words} changes by {_told(one, values)} times the share"
-            for words, one in zip(self.place.words, self.place.parameters, strict=True)
+            f"{words} changes by {_value_text(parameter, values)} times the share"
+            for words, parameter in zip(self.place.words, self.place.parameters, strict=True)
         )
-        return f"{added}; {self.when.formula.format(**self._shown(values))}"
+        return f"{added}; {self.when.formula.format(**self._value_texts(values))}"
 
-    def _shown(self, values: Mapping[str, float]) -> Mapping[str, str]:
-        return {one.name: f"{values[one.name]:.3g} {one.unit}" for one in self.when.parameters}
+    def _value_texts(self, values: Mapping[str, float]) -> Mapping[str, str]:
+        return {
+            parameter.name: f"{values[parameter.name]:.3g} {parameter.unit}"
+            for parameter in self.when.parameters
+        }
 
     def _act(self, theta: Theta, *values: float) -> None:
-        """Take the first slot that is free. ConfigError where there is none."""
-        first = next(_free(theta), None)
+        """Fill the first free slot. ConfigError if there is none."""
+        first = next(_free_slots(theta), None)
         if first is None:
             raise ConfigError(
                 f"{self.name}: {SLOTS} mechanisms act already, and more cannot act at once",
                 "calibrate the unit anew, or take one of them out of its data set",
             )
         sizes = zip(self.place.coefficients, self.place.si, values, strict=False)
-        told = dict(zip((one.name for one in self.effect.parameters), values, strict=True))
-        sets_in = told.get("sets_in", 0.0)
-        begin = told.get("begins", 0.0)
+        by_name = dict(
+            zip((parameter.name for parameter in self.effect.parameters), values, strict=True)
+        )
+        sets_in = by_name.get("sets_in", 0.0)
+        begin = by_name.get("begins", 0.0)
         for where, (coefficient, si, value) in zip((ON, ALSO_ON), sizes, strict=False):
             theta[first + where] = coefficient
-            theta[first + where + 1] = _kept(theta, coefficient, si(theta, value))
+            theta[first + where + 1] = _limited(theta, coefficient, si(theta, value))
         theta[first + WHEN] = self.when.code
         theta[first + BEGINS] = begin * MBAR
-        theta[first + ENDS] = max(begin - told.get("ends_below", 0.0), 1.0) * MBAR
+        theta[first + ENDS] = max(begin - by_name.get("ends_below", 0.0), 1.0) * MBAR
         theta[first + SETS_IN] = sets_in
-        theta[first + FADES] = told.get("fades", sets_in)
-        theta[first + PERIOD] = told.get("period", 1.0)
-        theta[first + SHIFT] = told.get("shift", 0.0)
+        theta[first + FADES] = by_name.get("fades", sets_in)
+        theta[first + PERIOD] = by_name.get("period", 1.0)
+        theta[first + SHIFT] = by_name.get("shift", 0.0)
 
 
-def _free(theta: Theta) -> Iterator[int]:
-    """Where the coefficients of each slot begin in which nothing acts."""
+def _free_slots(theta: Theta) -> Iterator[int]:
+    """Index of the first coefficient of each free slot."""
     for begin in range(c.MECHANISMS, len(c.COEFFICIENTS), WIDTH):
         if not theta[[begin + SIZE, begin + ALSO_SIZE]].any():
             yield begin
 
 
 def free_slots(theta: Theta) -> int:
-    """How many mechanisms more can act."""
-    return sum(1 for _ in _free(theta))
+    """Number of further mechanisms that can act."""
+    return sum(1 for _ in _free_slots(theta))
 
 
-def _kept(theta: Theta, coefficient: int, added: float) -> float:
-    """What may be added: no flow, share or volume is negative, and cups do not vanish."""
-    known = float(theta[coefficient])
+def _limited(theta: Theta, coefficient: int, added: float) -> float:
+    """Change of a coefficient, limited: no flow, share or volume is negative, no cup vanishes."""
+    present = float(theta[coefficient])
     if coefficient == c.COMPLIANCE:
-        added = min(added, FLATTEST * float(theta[c.VOLUME]) - known)
-    return added if coefficient in _SIGNED else max(added, -known)
+        added = min(added, FLATTEST * float(theta[c.VOLUME]) - present)
+    return added if coefficient in _SIGNED else max(added, -present)
 
 
-def _told(one: Parameter, values: Mapping[str, float]) -> str:
-    return f"{one.name.replace('_', ' ')} {values[one.name]:.3g} {one.unit}"
+def _value_text(parameter: Parameter, values: Mapping[str, float]) -> str:
+    return f"{parameter.name.replace('_', ' ')} {values[parameter.name]:.3g} {parameter.unit}"
 
 
 MECHANISMS = {
-    one.name: one
+    mechanism.name: mechanism
     for place in PLACES.values()
     for when in WHENS.values()
     if when.name not in _NOT.get(place.name, set()) and place.name in _ONLY.get(when.name, PLACES)
-    for one in (Mechanism(place, when),)
+    for mechanism in (Mechanism(place, when),)
 }
-add_beside({name: one.effect for name, one in MECHANISMS.items()})
+add_beside({name: mechanism.effect for name, mechanism in MECHANISMS.items()})
 
 
 def places_table() -> str:

@@ -1,8 +1,8 @@
-"""The components behind the ejector, and what they add up to: a line between two ends.
+"""The parts behind the ejector, and their sum: a line between two ends.
 
 ``[[data.system.parts]]`` lists them outwards from the ejector: tubes, T-pieces, filters, the vessel
-or the cups, and the sensor at its place. What stands along the line is given to its near or far end
-as the pressure between them falls.
+or the cups, and the sensor at its place. The volume of a part along the line is divided between the
+near and the far end in proportion to the pressure drop on either side.
 """
 
 import math
@@ -19,10 +19,10 @@ from twin.signals import MBAR, ML, SL_MIN
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 
-FRICTION = 0.03  # Darcy's, of a smooth tube at Reynolds numbers about 10⁴ (Blasius)
-TUBE_LOSS = 1.5  # velocity heads lost at the ends of a tube, inlet and outlet
+FRICTION = 0.03  # Darcy friction factor of a smooth tube at Reynolds numbers near 10⁴ (Blasius)
+TUBE_LOSS = 1.5  # velocity heads lost at inlet and outlet of a tube
 SPHERE: float = (36.0 * math.pi) ** (1.0 / 3.0)  # area of a sphere is this × volume^(2/3)
-BLUFF = 1.15  # a tank's area over a sphere's: a cylinder as long as it is wide
+BLUFF = 1.15  # area of a cylinder as long as it is wide, over that of a sphere of equal volume
 
 
 class Tube(Settings):
@@ -34,7 +34,7 @@ class Tube(Settings):
 
 
 class Tee(Settings):
-    """A T-piece: what its run loses, and a little volume."""
+    """A T-piece: the loss of its straight run, and its volume."""
 
     kind: Literal["tee"]  # a T-piece
     diameter_mm: Positive  # inside
@@ -67,7 +67,7 @@ class Vessel(Settings):
 
 
 class Cups(Settings):
-    """Suction cups, alike."""
+    """Suction cups of one kind."""
 
     kind: Literal["cups"]  # suction cups
     volume_ml: Positive  # of one, with its connection
@@ -91,9 +91,9 @@ Part = Annotated[Tube | Tee | Filter | Sensor | Vessel | Cups, Field(discriminat
 
 @dataclass(frozen=True)
 class Lumped:
-    """What a system adds up to, in SI units."""
+    """Sums of a system, in SI units."""
 
-    port_volume: float  # m³, of what stands at the port: sensor, filter, T-piece
+    port_volume: float  # m³, of sensor, filter and T-piece at the port
     port_area: float  # m²
     line_volume: float  # m³, of the tubes
     line_area: float  # m²
@@ -118,18 +118,18 @@ def lumped(
     temperature: float,
     critical: float = CRITICAL_RATIO,
 ) -> Lumped:
-    """Add up the parts for a nominal ``suction`` (kg/s) at ``ambient`` (Pa) and ``temperature``.
+    """Sum of the parts at nominal ``suction`` (kg/s), ``ambient`` (Pa) and ``temperature`` (K).
 
-    Rims that are openings are sonic up to the pressure ratio ``critical``.
+    The flow through a rim that is an opening is sonic up to the pressure ratio ``critical``.
     """
     drops = [drop(part, suction, ambient, temperature) for part in parts]
     total = sum(quadratic + linear for quadratic, linear in drops)
-    volumes, areas, place, before = np.zeros(3), np.zeros(3), 0.0, 0.0
+    volumes, areas, place, drop_before = np.zeros(3), np.zeros(3), 0.0, 0.0
     for part, (quadratic, linear) in zip(parts, drops, strict=True):
-        middle = before + (quadratic + linear) / 2.0
-        before += quadratic + linear
+        middle = drop_before + (quadratic + linear) / 2.0
+        drop_before += quadratic + linear
         if isinstance(part, Sensor):
-            place = before
+            place = drop_before
         near = 0.0 if isinstance(part, Vessel | Cups) or total == 0.0 else 1.0 - middle / total
         where = [0.0, 1.0, 0.0] if isinstance(part, Tube) else [near, 0.0, 1.0 - near]
         volumes += np.array(where) * volume(part)
@@ -150,9 +150,9 @@ def lumped(
         place=place / total if total > 0.0 else 0.0,
         shrinks=sum(cup.count * cup.shrinks_ml for cup in cups) * ML,
         leak=sum(cup.count * cup.lip_leak_sl_min for cup in cups) * SL_MIN,
-        opening=sum(cup.count * one for cup, one in zip(cups, rim, strict=True)),
-        open=sum(cup.open * one for cup, one in zip(cups, rim, strict=True)),
-        hole=sum(cup.count * one for cup, one in zip(cups, hole, strict=True)),
+        opening=sum(cup.count * conductance for cup, conductance in zip(cups, rim, strict=True)),
+        open=sum(cup.open * conductance for cup, conductance in zip(cups, rim, strict=True)),
+        hole=sum(cup.count * conductance for cup, conductance in zip(cups, hole, strict=True)),
         release=min((cup.release_mbar * MBAR for cup in cups), default=math.nan),
     )
 
@@ -164,10 +164,10 @@ def _share(vacuum: float, ambient: float, critical: float) -> float:
 
 
 def drop(part: Part, suction: float, ambient: float, temperature: float) -> tuple[float, float]:
-    """Difference of the squared pressures (Pa²) across a part at nominal suction.
+    """Difference of the squared pressures (Pa²) across a part at nominal ``suction`` (kg/s).
 
-    Two shares: what grows with the square of the flow (turbulent friction and losses) and what
-    grows with the flow (Hagen-Poiseuille); isothermal pipe flow.
+    It has two terms, for isothermal pipe flow: one quadratic in the flow (turbulent friction and
+    losses), and one linear in it (Hagen-Poiseuille).
     """
     gas = R * temperature
     if isinstance(part, Tube):
@@ -183,12 +183,12 @@ def drop(part: Part, suction: float, ambient: float, temperature: float) -> tupl
 
 
 def inertance(part: Part) -> float:
-    """Length over bore (1/m): by how much pressure must push to quicken the flow in a part."""
+    """Length over cross-section (1/m): pressure per rate of change of the flow in a part."""
     return part.length_mm * 1e-3 / _bore(part.diameter_mm * 1e-3) if isinstance(part, Tube) else 0.0
 
 
 def volume(part: Part) -> float:
-    """Volume of a part in m³, a cup's as it is at ambient pressure."""
+    """Volume of a part (m³); of a cup, at ambient pressure."""
     if isinstance(part, Tube):
         return _bore(part.diameter_mm * 1e-3) * part.length_mm * 1e-3
     if isinstance(part, Sensor):
@@ -199,7 +199,7 @@ def volume(part: Part) -> float:
 
 
 def area(part: Part) -> float:
-    """Inner wall of a part in m²."""
+    """Area of the inner wall of a part (m²)."""
     if isinstance(part, Tube):
         return math.pi * part.diameter_mm * part.length_mm * 1e-6
     if isinstance(part, Sensor):

@@ -1,7 +1,7 @@
-"""Terms that data gave: what the pressure has that no physics of the model gives it.
+"""Terms from data: parts of the pressure that the physics of the model does not explain.
 
-A term adds to the expected pressure in one kind of stretch, over the vacuum there or over the time
-since the stretch began. It has no cause; it takes away what nobody listed.
+A term adds to the expected pressure in one kind of stretch. It depends on the vacuum or on the time
+since the stretch began. It names no cause; it removes a deviation that is not in the table.
 """
 
 from collections.abc import Sequence
@@ -15,10 +15,10 @@ from pydantic import Field, model_validator
 from twin.settings import Settings
 from twin.signals import MBAR, MS, Phase
 
-# What a stretch of one phase is: after the air saving suction begins at another pressure.
+# Kinds of stretches. Suction after hold is a kind of its own: it begins at another pressure.
 KINDS = ("idle", "suction", "hold", "blow_off", "suction_again")
 AGAIN = KINDS.index("suction_again")
-_SUCTION, _HOLD = int(Phase.SUCTION), int(Phase.HOLD)  # plain: NumPy compares bytes with these
+_SUCTION, _HOLD = int(Phase.SUCTION), int(Phase.HOLD)  # NumPy compares bytes with plain integers
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -26,7 +26,7 @@ Bytes = npt.NDArray[np.uint8]
 
 
 class Term(Settings):
-    """What to add to the expected pressure (mbar) at each knot, straight lines between them."""
+    """Addition to the expected pressure (mbar) at each knot, linear between knots."""
 
     where: Literal[
         "idle", "suction", "hold", "blow_off", "suction_again"
@@ -45,14 +45,14 @@ class Term(Settings):
 
 
 def kinds(phase: Bytes, before: Bytes) -> Ints:
-    """What stretches are, by their phase and the one before: indices into KINDS."""
+    """Kinds of stretches by their phase and the phase before, as indices into KINDS."""
     again = (phase == _SUCTION) & (before == _HOLD)
     return np.where(again, AGAIN, phase).astype(np.int64)
 
 
 @dataclass
 class Terms:
-    """Adds terms to what is expected, block by block."""
+    """Adds terms to the expected pressure, block by block."""
 
     terms: Sequence[Term]
     ambient: float  # Pa
@@ -61,7 +61,7 @@ class Terms:
     _rows: int = 0  # since its stretch began
 
     def add(self, phase: Bytes, expected: Floats) -> None:
-        """Add to ``expected`` (Pa), (rows,) or (rows, hypotheses), in place."""
+        """Add to ``expected`` (Pa), of shape (rows,) or (rows, hypotheses), in place."""
         if not self.terms or not len(phase):
             return
         kind, since = self._where(phase)
@@ -82,4 +82,4 @@ class Terms:
         since = np.arange(len(phase)) - row[stretch]
         self._phase, self._kind = int(phase[-1]), int(kind[stretch[-1]])
         self._rows = int(since[-1]) + 1
-        return kind[stretch], since * MS * 1e3
+        return kind[stretch], since * MS * 1e3  # pyright: ignore[reportReturnType]

@@ -224,7 +224,7 @@ class ModelBank:
         phase = _phases(ticks["phase"][rows], after, self._theta.shape[1])
         level = ticks["level"][rows].astype(np.float64)
         kernel.advance(
-            self._state, self._theta, dt, phase, level, expected, tolerance=kernel.ROUGHLY
+            self._state, self._theta, dt, phase, level, expected, tolerance=kernel.COARSE_TOLERANCE
         )
         self._drawn_until_ns = int(samples["time_ns"][-1])
         self._expected = np.concatenate([self._expected, expected])

@@ -229,7 +229,7 @@ class _Expected:
         dt[:1] = 0.0
         driven = dt, self.ticks["phase"][rows], self.ticks["level"][rows].astype(np.float64)
         state, expected = kernel.new_state(theta.shape[1]), np.empty((len(rows), theta.shape[1]))
-        kernel.advance(state, theta, *driven, expected, tolerance=kernel.ROUGHLY)
+        kernel.advance(state, theta, *driven, expected, tolerance=kernel.COARSE_TOLERANCE)
         return expected
 
 

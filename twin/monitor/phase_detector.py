@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from twin.model import theta as c
 from twin.model.compiled import compiled, per_row
-from twin.model.control import new_timer, timed
+from twin.model.control import effective_commands, new_timer
 from twin.signals import BREAK, MS, NS, SAMPLE, UNUSABLE, Phase, Reported, Samples, joined
 
 _Floats = npt.NDArray[np.float64]
@@ -482,7 +482,7 @@ class PhaseFinder:
         times = np.concatenate([self._rows["time_ns"][-1:], stretch["time_ns"]])
         dt = np.diff(times, prepend=times[:1])[-len(stretch) :] * NS
         valve_commands = np.empty(len(stretch), "u1")
-        timed(
+        effective_commands(
             self._timer,
             np.ascontiguousarray(stretch["commands"]),
             dt,

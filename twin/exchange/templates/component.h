@@ -46,7 +46,7 @@ static void component_reset(struct Component *c) {
 static void component_outputs(struct Component *c, double drawn) {
     double *v = c->values, *s = c->state;
     double expected, signals;
-    kernel_read(s, c->k, &expected, &signals);
+    kernel_read_sensors(s, c->k, &expected, &signals);
     v[V_PORT_PRESSURE] = s[KERNEL_PORT];
     v[V_SENSOR_PRESSURE] = expected;
     v[V_SIGNAL_PART_PRESENT] = (whole(signals) & KERNEL_PART_PRESENT) != 0;
@@ -80,7 +80,7 @@ static void component_rest(struct Component *c) {
     coefficients(c->values, c->k);
     plant_prepare_one(c->k);
     memset(c->state, 0, sizeof c->state);
-    kernel_rest(c->state, c->k);
+    kernel_reset_to_ambient(c->state, c->k);
     memcpy(c->control, NOTHING_DONE, sizeof c->control);
     memset(c->timer, 0, sizeof c->timer);
     c->changed = 0.0;
@@ -105,9 +105,9 @@ static double component_row(struct Component *c, double dt) {
     int commands = 0;
     commands |= v[V_COMMAND_SUCTION] != 0.0 ? CONTROL_SUCTION : 0;
     commands |= v[V_COMMAND_BLOW_OFF] != 0.0 ? CONTROL_BLOW_OFF : 0;
-    told = control_told(c->timer, commands, c->asked, c->k[THETA_BLOW_OFF_MODE],
+    told = control_effective_command(c->timer, commands, c->asked, c->k[THETA_BLOW_OFF_MODE],
                         c->k[THETA_BLOW_OFF_TIME]);
-    kernel_control(c->state, c->control, &told, c->asked, c->k, &phase);
+    kernel_run_controls(c->state, c->control, &told, c->asked, c->k, &phase);
     component_vessel(c);
     before = c->state[KERNEL_VESSEL_MASS];
     kernel_step(c->state, c->k, dt, KERNEL_TOLERANCE);
