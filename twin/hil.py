@@ -78,7 +78,7 @@ def in_place(source: Iterable[Samples], plant: Plant, outputs: Outputs) -> Itera
             yield _with_model_pressure(block, plant, outputs) if len(block) else block
     finally:
         if hasattr(blocks, "close"):
-            blocks.close()
+            blocks.close()  # pyright: ignore[reportAttributeAccessIssue] - a generator has it
 
 
 def _with_model_pressure(block: Samples, plant: Plant, outputs: Outputs) -> Samples:

@@ -44,9 +44,11 @@ class EventEnricher(Protocol):
 
         After an exception the same rows may come again.
         """
+        ...
 
     def finish(self) -> list[Event]:
         """Return the remaining events after the last row; this may take a while."""
+        ...
 
     def close(self) -> None:
         """Release all resources; always called."""

@@ -229,7 +229,7 @@ def fit(samples: Samples, space: Space, progress: Callable[[str], None]) -> Fitt
         problem = Problem(space, cycles, weights)
         x = _solved(problem, x, MOST_STEPS, tolerance)
         best = space.at(x)
-    return _fitted(problem, x)
+    return _fitted(problem, x)  # pyright: ignore[reportPossiblyUnboundVariable] - there are rounds
 
 
 @dataclass(frozen=True)

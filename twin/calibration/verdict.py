@@ -77,7 +77,7 @@ def judge(cycles: Cycles, data: DataSet, noise: float) -> Verdict:
                 residual, place_number, bins.cycle[rows], bins.count[rows], noise
             )
             seconds = bins.since[rows] * float(np.median(cycles.dt))
-            residuals[phase] = Residual(rms, floor, *_largest_mean(residual, place_number, seconds))
+            residuals[phase] = Residual(rms, floor, *_largest_mean(residual, place_number, seconds))  # pyright: ignore[reportArgumentType]
     return Verdict(residuals)
 
 

@@ -363,7 +363,7 @@ def split(evidence: Evidence, healthy: Covariance) -> tuple[list[int], list[int]
     A single odd cycle keeps its place: a nozzle that went on once more is no cause to fit.
     """
     residuals = [white(evidence, healthy.of([cycle]), [HEALTHY]) for cycle in evidence.judged]
-    odd = are_odd(np.array([np.mean(cycle_residuals**2) for cycle_residuals in residuals]))
+    odd = are_odd(np.array([np.mean(cycle_residuals**2) for cycle_residuals in residuals]))  # pyright: ignore[reportArgumentType]
     if not 2 <= np.count_nonzero(odd) <= FEW * len(odd):
         odd[:] = False
     odd_first = [

@@ -68,7 +68,7 @@ def left_in_each(evidence: Evidence, weights: Weights, white: Floats) -> Floats:
     """
     cycle = np.concatenate([evidence.bins.cycle[weights.bins], weights.level_cycles])
     cycle, squares = cycle[: len(white)], white**2
-    return np.array(
+    return np.array(  # pyright: ignore[reportReturnType]
         [np.mean(squares[cycle == number]) for number in weights.cycles if number in cycle]
     )
 

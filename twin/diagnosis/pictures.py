@@ -149,11 +149,11 @@ def _shade(above: Axes, below: Axes, ms: Floats, phase: npt.NDArray[np.uint8]) -
     for first, last in pairwise(edges):
         name = Phase(phase[first])
         for axes in (above, below):
-            axes.axvspan(ms[first], ms[last], color=SHADES[name], lw=0, zorder=0)
+            axes.axvspan(ms[first], ms[last], color=SHADES[name], lw=0, zorder=0)  # pyright: ignore[reportArgumentType]
         if ms[last] - ms[first] > LABELLED * ms[-1]:
             middle = (ms[first] + ms[last]) / 2.0
             transform = above.get_xaxis_transform()
-            above.text(middle, 1.02, spoken(name.name.lower()), transform=transform, ha="center")
+            above.text(middle, 1.02, spoken(name.name.lower()), transform=transform, ha="center")  # pyright: ignore[reportArgumentType]
     above.set_xlim(0.0, ms[-1])
 
 

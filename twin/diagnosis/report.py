@@ -285,7 +285,7 @@ def _gain_table(answer: Answer) -> str:
     columns, caption = {"baseline": "twin as it stands"}, "Held-out cycles"
     if extended(answer):
         columns, caption = {"baseline": "before", "extended": "after"}, "Gain on held-out cycles"
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (name, *(number(answer[column][key]) for column in columns), unit)
         for key, name, _, unit in FIGURES
     ]

@@ -119,7 +119,8 @@ def _tried(evidence: Evidence, fitted: _Residual, held_out: _Residual, over: Ove
     ]  # without each of them
     names = list(knots)
     terms = tuple(
-        _term(name, over, at, part) for (name, at), part in zip(knots.items(), parts, strict=True)
+        _term(name, over, at, part)  # pyright: ignore[reportArgumentType]
+        for (name, at), part in zip(knots.items(), parts, strict=True)
     )
     gain = float(held_out.white @ held_out.white - after @ after) / len(after)
     where = _phase(names[int(np.argmax(chi2_without))])
@@ -139,7 +140,7 @@ def smooth(evidence: Evidence, off: Floats, over: Over) -> dict[str, tuple[Float
 def _term(name: str, over: Over, at: Floats, sizes: Floats) -> Term:
     ends = unwarped(at) / MS if over == "time" else at
     short = [tuple(float(f"{value:.4g}") for value in values) for values in (ends, sizes)]
-    return Term(where=name, over=over, at=short[0], mbar=short[1])
+    return Term(where=name, over=over, at=short[0], mbar=short[1])  # pyright: ignore[reportArgumentType]
 
 
 def _worst(evidence: Evidence, residual: _Residual) -> str:

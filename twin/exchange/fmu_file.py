@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 
-from lxml import etree
+from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] - without types
 
 from twin.errors import ConfigError, SourceError
 from twin.files import unzipped_within_budget

@@ -347,7 +347,10 @@ class _Body:
             return Value(f"{container.text}.a{index.value}", container.kind[index.value])
         if self._value(index).kind != INDEX:
             raise self._refused(node)
-        by_kind = {LANE: Value(f"{container.text}[0]", NUMBER), TABLES: Value(container.text, ROWS)}
+        by_kind: Mapping[object, Value] = {
+            LANE: Value(f"{container.text}[0]", NUMBER),
+            TABLES: Value(container.text, ROWS),
+        }
         return by_kind.get(container.kind, container)
 
     def _binary(self, node: ast.BinOp) -> Value:

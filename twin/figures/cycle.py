@@ -114,7 +114,7 @@ class KeyFigures:
 
     data: DataSet
     settings: FigureSettings = field(default_factory=FigureSettings)
-    watch: MonitorSettings = field(default_factory=MonitorSettings)
+    watch: MonitorSettings = field(default_factory=MonitorSettings)  # pyright: ignore[reportArgumentType]
     _pieces: list[Cycle] = field(default_factory=list)  # of a long cycle that is not over
     _index: int = -1  # of the cycle that was begun last
     _rows_run: int = 0  # rows of the next piece that the model has run over

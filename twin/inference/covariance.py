@@ -24,7 +24,7 @@ class Covariance:
     @classmethod
     def of(cls, matrix: Floats) -> "Covariance":
         """Factor a matrix. Raises LinAlgError if it is not positive definite."""
-        return cls(np.linalg.cholesky(matrix.astype(np.float64)))
+        return cls(np.linalg.cholesky(matrix.astype(np.float64)))  # pyright: ignore[reportArgumentType]
 
     @property
     def log_pdet(self) -> float:

@@ -359,7 +359,7 @@ def fits(x: Floats, y: Floats, places: Floats, *, step: bool) -> tuple[Floats, F
     transposed = basis.transpose(0, 2, 1)
     normal, moments = transposed @ basis, transposed @ y
     normal += OUTER * np.eye(len(columns))
-    coefficients: Floats = np.linalg.solve(normal, moments[..., None])[..., 0]
+    coefficients: Floats = np.linalg.solve(normal, moments[..., None])[..., 0]  # pyright: ignore[reportAssignmentType]
     rss: Floats = y @ y - np.sum(coefficients * moments, axis=1)
     return rss, coefficients
 

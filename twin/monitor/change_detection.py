@@ -175,7 +175,7 @@ class ChangeDetector:
 
     def weigh(self, cosines: Floats) -> None:
         """Share the weights by the cosines between signatures; a row of zeros is not shown."""
-        shares = _weights(self._signs, self._prior, cosines)[:, :, None] * SHARES
+        shares = _weights(self._signs, self._prior, cosines)[:, :, None] * SHARES  # pyright: ignore[reportArgumentType]
         self._weight = np.log(shares + np.finfo(float).tiny)
 
     def begin(self) -> None:

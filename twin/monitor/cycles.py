@@ -92,13 +92,16 @@ class Told(Protocol):
     @property
     def end_ns(self) -> int:
         """PLC time of its last row."""
+        ...
 
     @property
     def words(self) -> str:
         """One line for people."""
+        ...
 
     def plain(self) -> dict[str, Any]:
         """Its numbers for JSON."""
+        ...
 
 
 class Teller(Protocol):

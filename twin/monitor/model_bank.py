@@ -255,7 +255,7 @@ def _analyse(
         if count > 0:
             begin = first[count - 1]
             shapes[count - 1, 0] = i - begin
-            shapes[count - 1, 1] = (row.time_ns - samples[begin].time_ns) * (NS / MS)
+            shapes[count - 1, 1] = (row.time_ns - samples[begin].time_ns) * (NS / MS)  # pyright: ignore[reportAttributeAccessIssue]
         last_ns, phase = row.time_ns, row_phase
     return (
         sparse_rows(bends, since),

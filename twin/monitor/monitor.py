@@ -237,7 +237,7 @@ class Monitor:
         for row in np.flatnonzero(changes):
             if row >= first:
                 last_fresh = rows[before[row]] if silent[row] else None
-                yield from self._row_events(rows[row - 1] if row else None, rows[row], last_fresh)
+                yield from self._row_events(rows[row - 1] if row else None, rows[row], last_fresh)  # pyright: ignore[reportArgumentType]
         self._last = rows[-1:].copy()
         self._fresh = rows[fresh][-1:].copy()
 
