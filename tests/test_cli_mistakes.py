@@ -119,6 +119,7 @@ WRONG = {
     "--json": OUTPUTS,
     "--report": OUTPUTS,
     "--html": OUTPUTS,
+    "-o": (("new.pdf",), {USAGE}),
     "--address": (("nowhere", "127.0.0.1:0", "127.0.0.1:99999"), {USAGE}),
     "--port": (("70000", "-1", "x"), {USAGE}),
 }

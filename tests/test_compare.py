@@ -299,8 +299,8 @@ def test_the_command_says_writes_and_draws(
 def test_pictures_as_svg_are_the_same_every_time(
     logs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("1.svg", "2.svg"):
-        given = (logs["well"], logs["again"], "--picture", tmp_path / name)
+    for option, name in (("--picture", "1.svg"), ("-o", "2.svg")):
+        given = (logs["well"], logs["again"], option, tmp_path / name)
         assert twin(monkeypatch, "compare", *given) == 0
     text = (tmp_path / "1.svg").read_text()
     assert text == (tmp_path / "2.svg").read_text()
@@ -358,7 +358,13 @@ def test_a_log_without_a_whole_cycle_is_exit_code_3(
 
 @pytest.mark.parametrize(
     ("option", "name", "code"),
-    [("--picture", "c.pdf", 2), ("--json", "nowhere/c.json", 3), ("--picture", "nowhere/c.png", 3)],
+    [
+        ("--picture", "c.pdf", 2),
+        ("-o", "c.pdf", 2),
+        ("--json", "nowhere/c.json", 3),
+        ("--picture", "nowhere/c.png", 3),
+        ("-o", "nowhere/c.rrd", 3),
+    ],
 )
 def test_what_cannot_be_written_is_said_before_the_work(
     option: str, name: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -80,7 +80,7 @@ def test_a_mistyped_unit_is_refused_and_its_type_is_one_that_can_be_named(
     [
         ((), "of which ejector?"),
         (("--id", "nobody"), "no type or unit is called 'nobody'"),
-        (("--id", "paper-unit", "-o", "a.zip"), "neither an FMU nor an SSP"),
+        (("--id", "paper-unit", "-o", "a.zip"), "does not end in .fmu or .ssp"),
         (("--id", "paper-unit", "--fmi", "1"), "Invalid value for '--fmi'"),
     ],
 )

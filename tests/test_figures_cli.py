@@ -100,7 +100,7 @@ def test_a_log_as_json_and_as_tables(figures: Run, log: Path) -> None:
 
 
 def test_another_suffix_is_refused(figures: Run, log: Path) -> None:
-    with pytest.raises(ConfigError, match=r"f\.txt: cannot tell what to write"):
+    with pytest.raises(ConfigError, match=r"f\.txt: the name does not end in"):
         figures("show", log, "-o", "f.txt")
 
 

@@ -16,6 +16,7 @@ import rigs
 from twin.diagnosis import drawing
 from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.diagnosis.covariance import covariance
+from twin.diagnosis.drawing import as_svg
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, collect
 from twin.diagnosis.fit import Fitted
 from twin.diagnosis.held_out import Judged, judge
@@ -451,11 +452,11 @@ def test_a_report_that_cannot_be_written_is_an_error_for_people(tmp_path: Path) 
 def test_pictures_are_svg_with_a_text_alternative() -> None:
     one = found("explained")
     for svg in (
-        draw_cycle(one, 4, 'a "cycle"'),
-        draw_log(one, 'a "cycle"'),
-        draw_phases(one, laid("explained"), 'a "cycle"'),
-        draw_left(found("unlisted"), laid("unlisted"), 'a "cycle"'),
-        draw_ranking(one, 'a "cycle"'),
+        as_svg(draw_cycle(one, 4, 'a "cycle"')),
+        as_svg(draw_log(one, 'a "cycle"')),
+        as_svg(draw_phases(one, laid("explained"), 'a "cycle"')),
+        as_svg(draw_left(found("unlisted"), laid("unlisted"), 'a "cycle"')),
+        as_svg(draw_ranking(one, 'a "cycle"')),
     ):
         root = ET.fromstring(svg)
         assert root.get("role") == "img"
@@ -464,8 +465,8 @@ def test_pictures_are_svg_with_a_text_alternative() -> None:
 
 
 def test_cycle_is_drawn_before_and_after_with_a_cause_only() -> None:
-    assert "expected with leakage" in draw_cycle(found("explained"), 4, "")
-    healthy = draw_cycle(found("consistent"), 4, "")
+    assert "expected with leakage" in as_svg(draw_cycle(found("explained"), 4, ""))
+    healthy = as_svg(draw_cycle(found("consistent"), 4, ""))
     assert "expected: twin as it stands" in healthy
     assert "expected with" not in healthy
 
@@ -487,7 +488,7 @@ def test_rms_of_a_cycle_is_that_of_its_rows() -> None:
 
 
 def test_log_shows_fitted_and_held_out_and_how_each_cause_runs() -> None:
-    svg = draw_log(found("two"), "")
+    svg = as_svg(draw_log(found("two"), ""))
     for text in (
         "twin as it stands, fitted",
         "twin as it stands, held out",
@@ -498,13 +499,13 @@ def test_log_shows_fitted_and_held_out_and_how_each_cause_runs() -> None:
         "time in the log (s)",
     ):
         assert text in svg
-    healthy = draw_log(found("consistent"), "")
+    healthy = as_svg(draw_log(found("consistent"), ""))
     assert "with " not in healthy
     assert "begins" not in healthy
 
 
 def test_log_leaves_the_marks_of_held_out_cycles_empty() -> None:
-    svg = draw_log(replace(found("explained"), held_out=[2, 4]), "")
+    svg = as_svg(draw_log(replace(found("explained"), held_out=[2, 4]), ""))
     empty = [
         len(re.findall(f"fill: #ffffff; stroke: {colour}", svg))
         for colour in (drawing.BEFORE, drawing.AFTER)
@@ -514,7 +515,7 @@ def test_log_leaves_the_marks_of_held_out_cycles_empty() -> None:
 
 def test_log_marks_the_cycles_of_an_intermittent_cause() -> None:
     some = Found.of(diagnosis("some", answer(causes=[DELAY])))
-    assert "response delay is there" in draw_log(some, "")
+    assert "response delay is there" in as_svg(draw_log(some, ""))
 
 
 def test_a_long_log_is_drawn_over_minutes() -> None:
@@ -522,7 +523,7 @@ def test_a_long_log_is_drawn_over_minutes() -> None:
     slow = here.samples.copy()
     slow["time_ns"] = here.begin_ns + (slow["time_ns"] - here.begin_ns) * 10
     late = replace(found("explained"), evidence=replace(here, samples=slow))
-    assert "time in the log (min)" in draw_log(late, "")
+    assert "time in the log (min)" in as_svg(draw_log(late, ""))
 
 
 def size_of(cause: Cause, known: dict[str, Any]) -> tuple[Floats, Floats]:
@@ -600,9 +601,9 @@ def with_error(mbar: float) -> Evidence:
 
 def test_phases_show_the_signature_and_what_is_left_with_a_cause_only() -> None:
     marks = ("healthy (95 %)", "mean of 2 cycles", "signature of leakage", ">left with leakage<")
-    svg = draw_phases(found("explained"), laid("explained"), "")
+    svg = as_svg(draw_phases(found("explained"), laid("explained"), ""))
     assert [mark in svg for mark in marks] == [True, True, True, True]
-    svg = draw_phases(found("consistent"), laid("consistent"), "")
+    svg = as_svg(draw_phases(found("consistent"), laid("consistent"), ""))
     assert [mark in svg for mark in marks] == [True, False, False, False]
 
 
@@ -626,12 +627,12 @@ def test_running_only_the_cycles_drawn_tells_the_same() -> None:
 def test_what_is_left_is_drawn_over_time_and_vacuum_with_its_term() -> None:
     term = Term(where="blow_off", over="vacuum", at=(0.0, 700.0), mbar=(1.0, 20.0))
     other = Term(where="idle", over="vacuum", at=(0.0,), mbar=(1.0,))
-    plain = draw_left(found("unlisted"), laid("unlisted"), "")
+    plain = as_svg(draw_left(found("unlisted"), laid("unlisted"), ""))
     assert "left in blow-off" in plain
     assert "vacuum (mbar below ambient)" in plain
     assert "term in" not in plain
     with_term = replace(found("unlisted"), terms=[term, other])
-    svg = draw_left(with_term, laid("unlisted"), "")
+    svg = as_svg(draw_left(with_term, laid("unlisted"), ""))
     assert "term in blow-off" in svg
     assert "term in idle" not in svg
 
@@ -677,13 +678,13 @@ def test_people_are_told_the_cycles_numbers_in_the_log(tmp_path: Path) -> None:
 
 
 def test_ranking_marks_the_cause_and_its_look_alikes() -> None:
-    svg = draw_ranking(found("explained"), "")
+    svg = as_svg(draw_ranking(found("explained"), ""))
     for text in ("▶ leakage", "≈ porous leakage (look-alike)", ">sensor gain<", "no cause"):
         assert text in svg
     assert svg.count("porous leakage") == 1  # not once more among the others
     assert "3.00" in svg  # of no cause: 900 over 100 residuals
-    assert "▶" not in draw_ranking(found("consistent"), "")
-    assert "▶ leakage + weak blow-off" in draw_ranking(found("two"), "")
+    assert "▶" not in as_svg(draw_ranking(found("consistent"), ""))
+    assert "▶ leakage + weak blow-off" in as_svg(draw_ranking(found("two"), ""))
 
 
 # --- in words -------------------------------------------------------------------------------------

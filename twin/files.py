@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
 
-from twin.errors import SourceError
+from twin.errors import ConfigError, SourceError
 
 MOST_DEEP = 20  # levels of a JSON document; an answer of a diagnosis has eight
 LONGEST_BITS = 64  # of an integer in JSON; Python refuses to print very long ones
@@ -48,6 +48,23 @@ def require_writable(*paths: Path | None) -> None:
                 raise _unwritable(path, os.strerror(errno.EACCES))
         elif not os.access(path.parent, os.W_OK):
             raise _unwritable(path, "no folder to write to")
+
+
+def require_ending(path: Path, *endings: str) -> str:
+    """The ending of a new file's name, in small letters: it decides the format.
+
+    ConfigError unless it is one of ``endings``; call it before the work.
+    """
+    ending = path.suffix.lower()
+    if ending not in endings:
+        *some, last = endings
+        expected = f"{', '.join(some)} or {last}" if some else last
+        example = path.parent / f"{path.stem or 'file'}{endings[0]}"
+        raise ConfigError(
+            f"{path}: the name does not end in {expected}",
+            f"the ending decides the format, as in {example}",
+        )
+    return ending
 
 
 @contextmanager

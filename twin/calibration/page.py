@@ -1,24 +1,36 @@
 """The page of a commissioning: verdict, what to change, measured against fitted, values."""
 
+import html
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-from matplotlib.figure import Figure
-
+from twin.calibration.calibrate import Calibration
 from twin.calibration.commission import Commissioned
-from twin.calibration.report import headline, parameters
+from twin.calibration.picture import draw_fit
+from twin.calibration.report import calibration_headline, headline, parameters
 from twin.config import Asset
 from twin.diagnosis import page
-from twin.diagnosis.drawing import AFTER, MEASURED, as_svg, empty, legend
+from twin.diagnosis.drawing import as_svg
 from twin.files import write_text
-from twin.live import Twin
-from twin.model.dataset import DataSet
-from twin.monitor.cycles import Cycle, whole
-from twin.signals import MBAR, NS, Phase, Samples
+from twin.signals import MBAR, Samples
 
 MARKS = {"good": ("●", "#2e7d4f"), "usable": ("▲", "#b36b00"), "refused": ("■", "#b3261e")}
-HEIGHT = 5.0  # inches
+
+
+def summary(commissioned: Commissioned, asset: Asset) -> str:
+    """A commissioning as a part of a page: verdict, what to change, residuals, a small picture."""
+    mark, colour = MARKS[commissioned.verdict.word]
+    title = f"{mark} {asset.type} {asset.id}: {headline(commissioned.verdict)}"
+    parts = [*_remarks(commissioned), _residuals(commissioned)]
+    picture = draw_fit(commissioned.calibration.fitted.data, commissioned.samples)
+    return page.summary(title, parts, picture, colour)
+
+
+def calibration_summary(calibration: Calibration, asset: Asset, samples: Samples) -> str:
+    """A calibration as a part of a page: how close it is, its values, and a small picture."""
+    title = f"{asset.type} {asset.id}: {calibration_headline(calibration)}"
+    picture = draw_fit(calibration.fitted.data, samples)
+    return page.summary(title, [_parameters(calibration)], picture)
 
 
 def write_page(commissioned: Commissioned, asset: Asset, path: Path) -> None:
@@ -28,14 +40,14 @@ def write_page(commissioned: Commissioned, asset: Asset, path: Path) -> None:
         page.section("What to change", "\n".join(_remarks(commissioned))),
         _picture(commissioned),
         page.section("How close", _residuals(commissioned)),
-        page.section("What was found", _parameters(commissioned)),
+        page.section("What was found", _parameters(commissioned.calibration)),
     ]
     text = page.PAGE.substitute(
-        title=f"Commissioning of {asset.id}",
+        title=html.escape(f"Commissioning of {asset.id}"),
         colour=colour,
         mark=mark,
         verdict=commissioned.verdict.word,
-        headline=f"{asset.type} {asset.id}: {headline(commissioned.verdict)}",
+        headline=html.escape(f"{asset.type} {asset.id}: {headline(commissioned.verdict)}"),
         body="\n".join(parts),
         footer=f"{commissioned.calibration.cycles} cycles; pressures in mbar, intervals of 95 %",
     )
@@ -71,7 +83,7 @@ def _residuals(commissioned: Commissioned) -> str:
     return page.table(caption, head, rows, numbers=(1, 2, 3))
 
 
-def _parameters(commissioned: Commissioned) -> str:
+def _parameters(calibration: Calibration) -> str:
     head = ("value", "found", "from", "to", "unit", "known from")
     rows = (
         (
@@ -80,18 +92,15 @@ def _parameters(commissioned: Commissioned) -> str:
             parameter["unit"],
             "record" if parameter["determined"] else "assumed",
         )
-        for name, parameter in parameters(commissioned.calibration).items()
+        for name, parameter in parameters(calibration).items()
     )
     return page.table("Values of the data set, with intervals of 95 %", head, rows, (1, 2, 3))
 
 
 def _picture(commissioned: Commissioned) -> str:
     title = f"Measured against fitted: {_worst(commissioned)}"
-    alt = "Vacuum of one cycle, measured and fitted, and the deviation below it"
-    with empty("commissioning", HEIGHT) as figure:
-        _draw(figure, _typical(commissioned.calibration.fitted.data, commissioned.samples))
-        svg = as_svg(figure, alt)
-    return page.picture(title, svg, "The cycle whose deviation is the median of all.")
+    picture = draw_fit(commissioned.calibration.fitted.data, commissioned.samples)
+    return page.picture(title, as_svg(picture), "The cycle whose deviation is the median of all.")
 
 
 def _worst(commissioned: Commissioned) -> str:
@@ -99,29 +108,3 @@ def _worst(commissioned: Commissioned) -> str:
         return "the twin follows every phase"
     names = [phase.name.lower().replace("_", "-") for phase in commissioned.verdict.weak]
     return f"the twin is off in {' and '.join(names)}"
-
-
-def _typical(data: DataSet, samples: Samples) -> Cycle:
-    """The cycle with the median deviation."""
-    cycles = [cycle for cycle in whole(Twin.of(data).over([samples])) if cycle.settled]
-    cycles.sort(key=lambda cycle: float(np.nanmean(cycle.off**2)))
-    return cycles[len(cycles) // 2]
-
-
-def _draw(figure: Figure, cycle: Cycle) -> None:
-    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2.0, 1.0))
-    seconds = (cycle.samples["time_ns"] - cycle.samples["time_ns"][0]) * NS
-    measured = cycle.samples["pressure"].astype(float) / MBAR
-    fitted = cycle.ticks["expected"].astype(float) / MBAR
-    above.plot(seconds, measured, color=MEASURED, linewidth=1.6, label="measured")
-    above.plot(seconds, fitted, color=AFTER, linewidth=1.0, label="fitted")
-    above.set_ylabel("pressure, mbar absolute")
-    below.plot(seconds, cycle.off, color=AFTER, linewidth=0.8)
-    below.set_ylabel("measured less\nfitted, mbar")
-    below.set_xlabel("time since suction was commanded, s")
-    blown = cycle.ticks["phase"] == Phase.BLOW_OFF
-    for axes in (above, below):
-        axes.fill_between(
-            seconds, 0, 1, where=blown, transform=axes.get_xaxis_transform(), color="#eeeeee"
-        )
-    legend(figure, (above,))

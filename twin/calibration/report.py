@@ -14,7 +14,7 @@ def in_words(calibration: Calibration) -> str:
     """A table of the parameters: value, 95 % interval and source."""
     fitted = calibration.fitted
     lines = [
-        f"{calibration.cycles} healthy cycles; the model is {fitted.left / MBAR:.2f} mbar rms off",
+        calibration_headline(calibration),
         "",
         f"{'parameter':<34}{'value':>9}   {'95 % interval':<19}{'unit':<11}from",
     ]
@@ -27,6 +27,12 @@ def in_words(calibration: Calibration) -> str:
         )
     lines += ["", "healthy deviation, mbar rms: " + ", ".join(_scatter(calibration))]
     return "\n".join(lines)
+
+
+def calibration_headline(calibration: Calibration) -> str:
+    """How many cycles were fitted, and how close the model came."""
+    left = calibration.fitted.left / MBAR
+    return f"{calibration.cycles} healthy cycles; the model is {left:.2f} mbar rms off"
 
 
 def _scatter(calibration: Calibration) -> list[str]:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from twin.cli.app import App, audit_of, chosen_unit, not_negative, read_config, user_here
+from twin.cli.options import TABLES, JsonAlone
+from twin.cli.options import output as output_option
 from twin.errors import ConfigError
 from twin.files import write_json
 from twin.instants import instant
@@ -45,14 +47,11 @@ ConfigFiles = Annotated[
 ]
 UnitId = Annotated[str, typer.Option("--id", metavar="ID", help="Unit, where there are several.")]
 Who = Annotated[str, typer.Option("--by", metavar="NAME", help="Instead of the user's name.")]
-JsonFile = Annotated[
-    Path | None, typer.Option("--json", metavar="F", help="Write the same as JSON.")
-]
 
 
 @alarms_app.command("list")
 def list_(
-    configs: ConfigFiles = None, unit: UnitId = "", alarms: Url = "", json_file: JsonFile = None
+    configs: ConfigFiles = None, unit: UnitId = "", alarms: Url = "", json_file: JsonAlone = None
 ) -> None:
     """What a person is to look at, the most urgent first; then what is kept quiet.
 
@@ -89,7 +88,7 @@ def history(
     days: Annotated[
         float | None, typer.Option(metavar="N", callback=not_negative, help="Only the last N days.")
     ] = None,
-    json_file: JsonFile = None,
+    json_file: JsonAlone = None,
 ) -> None:
     """Every time an alarm was active: since when, how long, who acknowledged it, what spoke for it.
 
@@ -122,7 +121,7 @@ def statistics(
     days: Annotated[
         float, typer.Option(metavar="N", min=0.01, max=3650.0, help="Over the last N days.")
     ] = 30.0,
-    json_file: JsonFile = None,
+    json_file: JsonAlone = None,
 ) -> None:
     """How many alarms people get, after EEMUA 191: rate, floods, standing, chattering, top ten.
 
@@ -180,7 +179,7 @@ def comment(
 
 @alarms_app.command()
 def export(
-    output: Annotated[Path, typer.Option("-o", metavar="FILE", help="*.csv, *.parquet or *.xlsx.")],
+    output: Annotated[Path, output_option(*TABLES)],
     config: ConfigFile = None,
     unit: UnitId = "",
     alarms: Url = "",

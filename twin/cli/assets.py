@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from twin.cli.app import App, read_config, say_if_new
+from twin.cli.options import AASX, FMU, JSON, chosen, written_as
+from twin.cli.options import output as output_option
 from twin.errors import ConfigError, SourceError, known_names
 from twin.extras import install_hint
 from twin.files import write_whole
@@ -21,8 +23,6 @@ if TYPE_CHECKING:
     from twin.assets.database import Assets
     from twin.assets.record import Record
     from twin.exchange.fmu_file import Fmu
-
-AASX = ".aasx"
 
 assets_app = App("The asset database: type and ID to data sets.")
 
@@ -115,7 +115,10 @@ def add(
 def import_(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="What `export` wrote.")],
     fmu: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the FMU of an .aasx to a file.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", callback=written_as(FMU), help="Write the FMU of an .aasx to a file."
+        ),
     ] = None,
     assets: Url = "",
     config: ConfigFile = None,
@@ -141,12 +144,15 @@ def import_(
 
 @assets_app.command()
 def export(
-    output: Annotated[
-        Path | None, typer.Option("-o", metavar="FILE", help="Write to a file, not stdout.")
-    ] = None,
+    output: Annotated[Path | None, output_option(JSON, AASX)] = None,
     aasx: Annotated[
         Path | None,
-        typer.Option("--aasx", metavar="FILE.aasx", help="Write Asset Administration Shells."),
+        typer.Option(
+            "--aasx",
+            metavar="FILE.aasx",
+            callback=written_as(AASX),
+            help="Write Asset Administration Shells.",
+        ),
     ] = None,
     unit: Annotated[
         str, typer.Option("--id", metavar="ID", help="Only this unit and its type.")
@@ -158,7 +164,11 @@ def export(
     assets: Url = "",
     config: ConfigFile = None,
 ) -> None:
-    """Write the database as one JSON document, or as shells in an AASX package."""
+    """Write the database as one JSON document, or as shells in an AASX package.
+
+    Without a file it is JSON on stdout.
+    """
+    aasx, output = chosen(output, "--aasx", aasx, AASX), chosen(output, "-o", None, JSON)
     _require_options(output, aasx, unit, fmu, logs)
     with _open(assets, config, write=False) as database:
         records = _of_unit(database, unit) if unit else database.records()

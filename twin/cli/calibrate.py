@@ -8,7 +8,19 @@ import typer
 
 from twin.cli.app import say_if_cut, say_if_new
 from twin.cli.console import status
-from twin.cli.options import AssetsUrl, ConfigOption, JsonFile, LogFile, UnitId
+from twin.cli.options import (
+    JSON,
+    PAGE,
+    AssetsUrl,
+    ConfigOption,
+    JsonAlone,
+    JsonFile,
+    LogFile,
+    PageFile,
+    UnitId,
+    chosen,
+)
+from twin.cli.options import output as output_option
 from twin.cli.stopping import closed
 from twin.errors import ConfigError
 from twin.files import require_writable, write_json
@@ -23,7 +35,7 @@ def calibrate(
     config: Annotated[Path, typer.Option(help="TOML configuration of the unit and its system.")],
     unit: UnitId = "",
     assets: AssetsUrl = "",
-    json_file: JsonFile = None,
+    json_file: JsonAlone = None,
 ) -> None:
     """Fit the instance-specific data set of one unit to healthy cycles, and store it."""
     from twin.calibration.calibrate import calibrate as fit_unit
@@ -61,10 +73,9 @@ def commission(
         int, typer.Option(metavar="N", help="How many cycles to record from a PLC.")
     ] = 12,
     assets: AssetsUrl = "",
+    output: Annotated[Path | None, output_option(PAGE, JSON)] = None,
     json_file: JsonFile = None,
-    report: Annotated[
-        Path | None, typer.Option(metavar="F.html", help="One page for people.")
-    ] = None,
+    report: PageFile = None,
 ) -> None:
     """Fit a unit that nobody has seen before to a record of healthy cycles, and store it.
 
@@ -79,6 +90,8 @@ def commission(
     from twin.log.reader import open_log
     from twin.settings import Document
 
+    json_file = chosen(output, "--json", json_file, JSON)
+    report = chosen(output, "--report", report, PAGE)
     require_writable(json_file, report)
     recorded = None if source.suffix == ".toml" else open_log(source)
     if recorded is not None:

@@ -4,7 +4,7 @@ import os
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, TextIO, TypeVar
 
 from twin.events import Event, Severity
 from twin.instants import stamp
@@ -103,8 +103,18 @@ def _mute(stream: TextIO) -> None:
     os.close(nowhere)
 
 
-def progress(source: "Iterable[Samples]", label: str) -> "Iterator[Samples]":
-    """Show a count of samples on a terminal, nothing in a pipe."""
+Block = TypeVar("Block")
+
+
+def progress(
+    source: Iterable[Block],
+    label: str,
+    samples: Callable[[Block], int] = len,  # type: ignore[assignment]
+) -> Iterator[Block]:
+    """Show a count of samples on a terminal, nothing in a pipe.
+
+    ``samples`` gives the number of samples in a block.
+    """
     if not sys.stderr.isatty():
         yield from source
         return
@@ -115,8 +125,15 @@ def progress(source: "Iterable[Samples]", label: str) -> "Iterator[Samples]":
     with Progress(*columns, console=Terminal(stderr=True), transient=True) as progress:
         task = progress.add_task(f"{label} (samples)", total=None)
         for block in source:
-            progress.advance(task, len(block))
+            progress.advance(task, samples(block))
             yield block
+
+
+def rows_progress(
+    source: "Iterable[tuple[Samples, Ticks]]", label: str
+) -> "Iterator[tuple[Samples, Ticks]]":
+    """As ``progress``, for samples with their ticks."""
+    return progress(source, label, lambda rows: len(rows[0]))
 
 
 @contextmanager

@@ -8,7 +8,21 @@ import typer
 
 from twin.cli.app import say_if_cut, say_if_new
 from twin.cli.console import status
-from twin.cli.options import AsOf, AssetsUrl, ConfigOption, JsonFile, LogFile, UnitId
+from twin.cli.options import (
+    JSON,
+    PAGE,
+    TOML,
+    AsOf,
+    AssetsUrl,
+    ConfigOption,
+    JsonFile,
+    LogFile,
+    PageFile,
+    UnitId,
+    chosen,
+    written_as,
+)
+from twin.cli.options import output as output_option
 from twin.cli.setup import settings_of
 from twin.files import require_writable, write_json, write_whole
 
@@ -24,10 +38,9 @@ def diagnose(
     unit: UnitId = "",
     assets: AssetsUrl = "",
     as_of: AsOf = "",
+    output: Annotated[Path | None, output_option(PAGE, JSON)] = None,
     json_file: JsonFile = None,
-    report: Annotated[
-        Path | None, typer.Option(metavar="F.html", help="Write a page with pictures.")
-    ] = None,
+    report: PageFile = None,
     save_as: Annotated[
         str, typer.Option(metavar="NEWID", help="Keep the extended model as that of a unit.")
     ] = "",
@@ -37,7 +50,11 @@ def diagnose(
     ] = None,
     propose: Annotated[
         Path | None,
-        typer.Option(metavar="F.toml", help="Write what acts, unlisted, for twin effects add."),
+        typer.Option(
+            metavar="F.toml",
+            callback=written_as(TOML),
+            help="Write what acts, unlisted, for twin effects add.",
+        ),
     ] = None,
 ) -> None:
     """Say what the simulation gets wrong on a log, why, and what knowing it gains."""
@@ -45,6 +62,8 @@ def diagnose(
     from twin.diagnosis.text import lines
     from twin.log.reader import open_log
 
+    json_file = chosen(output, "--json", json_file, JSON)
+    report = chosen(output, "--report", report, PAGE)
     require_writable(json_file, report, propose)
     recorded = open_log(log)
     say_if_cut(recorded, log, "diagnosed")

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from twin.cli.options import FMU, SSP
+from twin.cli.options import output as output_option
 from twin.errors import ConfigError, known_names
 from twin.files import write_whole
 
 if TYPE_CHECKING:
     from twin.config import Config
     from twin.settings import Document
-
-PACKAGES = (".fmu", ".ssp")
 
 
 class Vessel(StrEnum):
@@ -42,12 +42,7 @@ def export_fmu(
     assets: Annotated[
         str, typer.Option("--assets", metavar="URL", help="Asset database, instead of the default.")
     ] = "",
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", metavar="FILE", help="*.fmu, or *.ssp with parameter sets. Default: ID.fmu"
-        ),
-    ] = None,
+    output: Annotated[Path | None, output_option(FMU, SSP)] = None,
     fmi: Annotated[Fmi, typer.Option(help="3.0, or 2.0 for older tools.")] = Fmi.THREE,
     vessel: Annotated[
         Vessel, typer.Option(help="Part of the FMU, or somebody else's at its port.")
@@ -56,7 +51,8 @@ def export_fmu(
 ) -> None:
     """Write an ejector as an FMU for co-simulation: C from the twin's model, no Python inside.
 
-    An .ssp has the FMU and two parameter sets: the type's, and over it what is the unit's own.
+    The default is ID.fmu. An .ssp has the FMU and two parameter sets: the type's, and over it what
+    is the unit's own.
     """
     from importlib.metadata import version
 
@@ -74,10 +70,8 @@ def export_fmu(
         component, name, settings.origin, program, int(fmi.value), compiled=not sources_only
     )
     target = output or Path(fmu.name)
-    if target.suffix not in PACKAGES:
-        raise ConfigError(f"{target}: neither an FMU nor an SSP", "call it *.fmu or *.ssp")
     content = fmu.content
-    if target.suffix == ".ssp":
+    if target.suffix.lower() == SSP:
         kind = Config.of(document, assets, requested, calibrated=False)
         content = make_ssp(fmu, name, component, Component.of(kind.data, vessel.value))
     write_whole(target, content)

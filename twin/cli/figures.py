@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli.app import App, chosen_unit, not_negative, read_config, say_if_cut
-from twin.cli.options import LogFile
+from twin.cli.options import JSON, PICTURES, TABLES, JsonAlone, JsonFile, LogFile, PictureFile
 from twin.cli.options import UnitId as LogUnit
+from twin.cli.options import chosen as chosen_file
+from twin.cli.options import output as output_option
 from twin.errors import ConfigError
 from twin.files import require_writable, write_json
 
@@ -43,9 +45,6 @@ UnitId = Annotated[str, typer.Option("--id", metavar="ID", help="Unit, where the
 Days = Annotated[
     float | None, typer.Option(metavar="N", callback=not_negative, help="Only the last N days.")
 ]
-JsonFile = Annotated[
-    Path | None, typer.Option("--json", metavar="F", help="Write the same as JSON.")
-]
 
 
 @figures_app.command()
@@ -53,9 +52,7 @@ def show(
     log: LogFile,
     config: ConfigFile = None,
     json_file: JsonFile = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", metavar="FILE", help="*.csv, *.parquet or *.xlsx.")
-    ] = None,
+    output: Annotated[Path | None, output_option(*TABLES, JSON)] = None,
     keep: Annotated[bool, typer.Option("--keep", help="Add them to the database.")] = False,
     figures: Url = "",
 ) -> None:
@@ -71,7 +68,9 @@ def show(
 
     if figures and not keep:
         raise ConfigError("--figures is for --keep", "say --keep as well, or leave it out")
-    require_writable(json_file, output)
+    json_file = chosen_file(output, "--json", json_file, JSON)
+    table = chosen_file(output, "", None, *TABLES)
+    require_writable(json_file, table)
     recorded = open_log(log)
     say_if_cut(recorded, log, "used")
     settings = _of_log(recorded, log, config)
@@ -88,10 +87,10 @@ def show(
         if recorded.header.derived:
             content["commands"] = recorded.header.derived
         write_json(json_file, content)
-    if output is not None:
+    if table is not None:
         with open_store("sqlite://") as store:
             store.add(unit, data_set, log.name, plain)
-            export_table(to_table(store.history(unit), unit), output)
+            export_table(to_table(store.history(unit), unit), table)
     if keep:
         with _open(figures, config, write=True) as store:
             count = store.add(unit, data_set, log.name, plain)
@@ -104,9 +103,7 @@ def costs(
     config: ConfigFile = None,
     unit: LogUnit = "",
     json_file: JsonFile = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", metavar="FILE", help="*.csv, *.parquet or *.xlsx.")
-    ] = None,
+    output: Annotated[Path | None, output_option(*TABLES, JSON)] = None,
 ) -> None:
     """Air, energy and money of each day of a log, and of a year at its rate."""
     from twin.figures.costs import days, year
@@ -114,7 +111,9 @@ def costs(
     from twin.figures.export import days_columns
     from twin.tables.sheet import export as export_table
 
-    require_writable(json_file, output)
+    json_file = chosen_file(output, "--json", json_file, JSON)
+    table = chosen_file(output, "", None, *TABLES)
+    require_writable(json_file, table)
     recorded, settings = _opened(log, config, unit)
     tariff, cycles = _tariff(settings), _cycles(recorded, settings)
     if recorded.header.derived:
@@ -123,8 +122,8 @@ def costs(
     print(days_table(by_day, whole, tariff))
     if json_file is not None:
         write_json(json_file, {"log": str(log), **days_plain(by_day, whole, tariff)})
-    if output is not None:
-        export_table(days_columns(by_day, tariff), output)
+    if table is not None:
+        export_table(days_columns(by_day, tariff), table)
 
 
 @figures_app.command()
@@ -132,7 +131,7 @@ def savings(
     log: LogFile,
     config: ConfigFile = None,
     unit: LogUnit = "",
-    json_file: JsonFile = None,
+    json_file: JsonAlone = None,
 ) -> None:
     """What another H1, hysteresis or supply pressure would save, as the model predicts it."""
     from twin.figures.savings import MOST_CYCLES
@@ -173,15 +172,17 @@ def trend(
     unit: UnitId = "",
     figures: Url = "",
     days: Days = None,
+    output: Annotated[Path | None, output_option(JSON, *PICTURES)] = None,
     json_file: JsonFile = None,
-    picture: Annotated[
-        Path | None, typer.Option(metavar="F.(png|svg)", help="Draw one figure.")
-    ] = None,
+    picture: PictureFile = None,
 ) -> None:
     """How figures run, whether they stepped or drift, and when they come to their limits."""
     from twin.figures.database import SIDES
     from twin.figures.text import in_words, trend_of_figure, trend_plain
 
+    json_file = chosen_file(output, "--json", json_file, JSON)
+    picture = chosen_file(output, "--picture", picture, *PICTURES)
+    require_writable(json_file, picture)
     chosen_figures = _chosen_figures(names, picture)
     limits = _limits(config)
     with _open(figures, config, write=False) as store:
@@ -246,7 +247,7 @@ def autoset(
 
 @figures_app.command()
 def export(
-    output: Annotated[Path, typer.Option("-o", metavar="FILE", help="*.csv, *.parquet or *.xlsx.")],
+    output: Annotated[Path, output_option(*TABLES)],
     config: ConfigFile = None,
     unit: UnitId = "",
     figures: Url = "",

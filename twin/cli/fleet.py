@@ -12,6 +12,9 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 from twin.cli.app import App, read_config, say_if_cut, say_if_new
+from twin.cli.options import JSON, PAGE, JsonAlone, JsonFile, written_as
+from twin.cli.options import chosen as chosen_file
+from twin.cli.options import output as output_option
 from twin.errors import ConfigError, SourceError
 from twin.files import require_writable, write_json
 
@@ -50,11 +53,11 @@ Scheduler = Annotated[
     str, typer.Option(metavar="ADDRESS", help="Where Dask's is: tcp://host:8786.")
 ]
 Workers = Annotated[int | None, typer.Option(min=1, help="Processes here; else one for each core.")]
-JsonFile = Annotated[
-    Path | None, typer.Option("--json", metavar="F", help="Write the answer as JSON.")
-]
 Page = Annotated[
-    Path | None, typer.Option("--html", metavar="F.html", help="Write a page with a picture.")
+    Path | None,
+    typer.Option(
+        "--html", metavar="F.html", callback=written_as(PAGE), help="Write a page with a picture."
+    ),
 ]
 
 # What a kind of work does with a log.
@@ -76,7 +79,7 @@ def _command(work: str) -> Callable[..., None]:
         engine: Engine = EngineName.LOCAL,
         scheduler: Scheduler = "",
         workers: Workers = None,
-        json_file: JsonFile = None,
+        json_file: JsonAlone = None,
     ) -> None:
         require_writable(json_file)
         files, workers_of = _files(logs), _Engine(engine, scheduler, workers)  # before a database
@@ -96,11 +99,13 @@ for _name, _help in _DESCRIPTIONS.items():
 @fleet_app.command()
 def report(
     logs: SomeLogs = None,
+    *,
     config: ConfigFile = None,
     assets: Assets = "",
     engine: Engine = EngineName.LOCAL,
     scheduler: Scheduler = "",
     workers: Workers = None,
+    output: Annotated[Path | None, output_option(PAGE, JSON)] = None,
     json_file: JsonFile = None,
     page: Page = None,
 ) -> None:
@@ -111,6 +116,8 @@ def report(
     from twin.fleet.results_database import open_store
     from twin.fleet.text import in_words, write_page
 
+    json_file = chosen_file(output, "--json", json_file, JSON)
+    page = chosen_file(output, "--html", page, PAGE)
     require_writable(json_file, page)
     files, workers_of = _files(logs or []), _Engine(engine, scheduler, workers)
     fleet = _Fleet.of(config, assets, to_store=bool(files))

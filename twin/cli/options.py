@@ -1,9 +1,18 @@
 """Arguments and options that several commands share."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+from twin.errors import ConfigError
+from twin.files import require_ending
+
+JSON, PAGE, RRD, AASX, TOML = ".json", ".html", ".rrd", ".aasx", ".toml"
+TABLES, PICTURES = (".csv", ".parquet", ".xlsx"), (".svg", ".png")
+LOG, FMU, SSP = ".mcap", ".fmu", ".ssp"
+ALL_ENDINGS = (JSON, PAGE, RRD, AASX, TOML, *TABLES, *PICTURES, LOG, FMU, SSP, ".pdf", ".txt")
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML configuration.")]
 ConfigFiles = Annotated[
@@ -19,9 +28,75 @@ AssetsUrl = Annotated[
 UnitId = Annotated[str, typer.Option("--id", metavar="ID", help="Unit, instead of [asset] id.")]
 ConfigOption = Annotated[Path | None, typer.Option(help="Instead of the one in the log.")]
 AsOf = Annotated[str, typer.Option(metavar="TIME", help="What the asset database knew then, UTC.")]
-JsonFile = Annotated[
-    Path | None, typer.Option("--json", metavar="F", help="Write the answer as JSON.")
-]
 ViewFlag = Annotated[bool, typer.Option("--view", help="Open the Rerun viewer.")]
-RrdFile = Annotated[Path | None, typer.Option(metavar="F.rrd", help="Write the view to a file.")]
 FailOnAlarm = Annotated[bool, typer.Option(help="Exit with 1 if an alarm was raised.")]
+
+
+def strictly(*endings: str) -> Callable[[Path | None], Path | None]:
+    """Callback of an option whose file's ending decides: ConfigError unless it is one of these."""
+
+    def checked(path: Path | None) -> Path | None:
+        if path is not None:
+            require_ending(path, *endings)
+        return path
+
+    return checked
+
+
+def output(*endings: str) -> Any:
+    """The option ``-o``: a file whose ending, one of ``endings``, decides the format."""
+    *some, last = (f"*{ending}" for ending in endings)
+    text = f"{', '.join(some)} or {last}: the ending decides." if some else f"{last}."
+    return typer.Option("-o", metavar="FILE", callback=strictly(*endings), help=text)
+
+
+def written_as(*endings: str) -> Callable[[Path | None], Path | None]:
+    """Callback of an option that names the format: ConfigError if the ending names another one.
+
+    Any other name is accepted: of a temporary file, or of a pipe.
+    """
+
+    def checked(path: Path | None) -> Path | None:
+        if path is not None and path.suffix.lower() in ALL_ENDINGS:
+            require_ending(path, *endings)
+        return path
+
+    return checked
+
+
+def chosen(output: Path | None, option: str, named: Path | None, *endings: str) -> Path | None:
+    """The file to write in a format: that of ``-o`` if it ends so, else the one of ``option``.
+
+    ConfigError if both name one.
+    """
+    if output is None or output.suffix.lower() not in endings:
+        return named
+    if named is not None:
+        raise ConfigError(f"-o {output} and {option} {named} are the same", "leave one of them out")
+    return output
+
+
+JsonFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--json", metavar="F", callback=written_as(JSON), help="Write the answer as JSON."
+    ),
+]
+JsonAlone = Annotated[  # of a command that writes no other file
+    Path | None,
+    typer.Option(
+        "--json", "-o", metavar="F", callback=written_as(JSON), help="Write the answer as JSON."
+    ),
+]
+RrdFile = Annotated[
+    Path | None,
+    typer.Option(metavar="F.rrd", callback=written_as(RRD), help="Write the view to a file."),
+]
+PageFile = Annotated[
+    Path | None,
+    typer.Option(metavar="F.html", callback=written_as(PAGE), help="Write a page with pictures."),
+]
+PictureFile = Annotated[
+    Path | None,
+    typer.Option(metavar="F.(svg|png)", callback=strictly(*PICTURES), help="Draw the curves."),
+]

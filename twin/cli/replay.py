@@ -13,6 +13,7 @@ from twin.cli.alarms import alarms_of
 from twin.cli.app import say_if_cut
 from twin.cli.console import Console, EventRecorder, progress
 from twin.cli.options import (
+    JSON,
     AsOf,
     AssetsUrl,
     ConfigOption,
@@ -21,6 +22,7 @@ from twin.cli.options import (
     RrdFile,
     UnitId,
     ViewFlag,
+    written_as,
 )
 from twin.cli.setup import pair_of, settings_of
 from twin.cli.sinks import open_sinks, views_of
@@ -39,7 +41,10 @@ def replay(
         Path | None, typer.Option("-o", metavar="OUT.mcap", help="Write a new log.")
     ] = None,
     json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="F", help="Write the events as JSON.")
+        Path | None,
+        typer.Option(
+            "--json", metavar="F", callback=written_as(JSON), help="Write the events as JSON."
+        ),
     ] = None,
     view: ViewFlag = False,
     rrd: RrdFile = None,

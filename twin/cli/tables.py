@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli.app import say_if_cut
-from twin.cli.console import Console, progress
+from twin.cli.console import Console, progress, rows_progress
 from twin.cli.options import AssetsUrl, LogFile, UnitId
+from twin.cli.options import output as output_option
 from twin.cli.setup import configured, pair_of
 from twin.cli.sinks import open_sinks
 from twin.cli.stopping import leave, stop_on_signal, until
@@ -133,7 +134,7 @@ def _complete_file(path: Path) -> Iterator[Path]:
 
 def export(
     log: LogFile,
-    output: Annotated[Path, typer.Option("-o", metavar="FILE", help="*.csv or *.parquet.")],
+    output: Annotated[Path, output_option(".csv", ".parquet")],
 ) -> None:
     """Write a log as a table for other programs, lossless."""
     from twin.log.reader import open_log
@@ -142,4 +143,5 @@ def export(
 
     recorded = open_log(log)
     say_if_cut(recorded, log, "exported")
-    write_table(recorded.blocks(ROWS), recorded.header, output)
+    rows = rows_progress(recorded.blocks(ROWS), "exporting")
+    write_table(rows, recorded.header, output)

@@ -9,6 +9,7 @@ import typer
 
 from twin.audit import Act, in_words, records
 from twin.cli.app import App, audit_of, read_config, user_here
+from twin.cli.options import JsonAlone
 from twin.errors import ConfigError, SourceError
 from twin.files import write_json
 
@@ -24,9 +25,6 @@ ConfigFile = Annotated[
 ]
 UsersFile = Annotated[
     Path | None, typer.Option("--users", metavar="FILE", help="Another file of users.")
-]
-JsonFile = Annotated[
-    Path | None, typer.Option("--json", metavar="F", help="Write the same as JSON.")
 ]
 ROLES = "look, acknowledge (alarms, and shelve them), configure (take them out of service)"
 
@@ -92,7 +90,7 @@ def remove(name: Name, config: ConfigFile = None, users: UsersFile = None) -> No
 
 
 @users_app.command()
-def audit(config: ConfigFile = None, users: UsersFile = None, json_file: JsonFile = None) -> None:
+def audit(config: ConfigFile = None, users: UsersFile = None, json_file: JsonAlone = None) -> None:
     """Print who logged in, failed to, acknowledged, shelved or changed users; times are UTC.
 
     The newest comes last. Acts of the page, the OPC UA servers and the commands with this --config.

@@ -3,27 +3,23 @@
 from pathlib import Path
 from textwrap import fill
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from twin.compare.compare import Comparison
 from twin.compare.side import BIN_S, LONGEST_S, Curve, Floats, Side
 from twin.compare.text import conclusion
-from twin.diagnosis.drawing import ANONYMOUS, STYLE
-from twin.files import said_plainly
+from twin.diagnosis.drawing import Picture, empty, write_picture
 from twin.inference.levels import SIGMAS_95
 
-FORMATS = {".svg": ANONYMOUS, ".png": {"Software": None}}
 COLOURS = {"A": "#0a62a8", "B": "#c8500a"}
 TITLE = 130  # characters in a line
 
 
-def draw(comparison: Comparison, path: Path) -> None:
-    """Write the picture, SVG or PNG as ``path`` ends; SourceError if it cannot be written."""
-    with mpl.rc_context({**STYLE, "svg.hashsalt": "compare"}):
-        figure = Figure(figsize=(10.0, 8.0), layout="constrained")
+def draw(comparison: Comparison) -> Picture:
+    """Draw both mean cycles, their difference, and the deviation of each from its twin."""
+    title = conclusion(comparison)
+    with empty("compare", 8.0, title, width=10.0) as figure:
         vacuum, difference, deviation = figure.subplots(
             3, 1, sharex=True, gridspec_kw={"height_ratios": [2.2, 1.2, 1.2]}
         )
@@ -36,9 +32,13 @@ def draw(comparison: Comparison, path: Path) -> None:
         _name(deviation, "deviation (mbar)")
         deviation.set_xlabel("time since the suction edge (s)")
         deviation.set_xlim(0.0, _end(comparison))
-        figure.suptitle(fill(conclusion(comparison), TITLE), x=0.01, ha="left", fontsize=10.5)
-        with said_plainly(path):
-            figure.savefig(path, metadata=FORMATS[path.suffix], dpi=110)
+        figure.suptitle(fill(title, TITLE), x=0.01, ha="left", fontsize=10.5)
+    return figure
+
+
+def write(comparison: Comparison, path: Path) -> None:
+    """Write the picture; errors as ``write_picture`` has them."""
+    write_picture(draw(comparison), path)
 
 
 def bins() -> Floats:

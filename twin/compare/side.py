@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +13,6 @@ from twin.errors import SourceError
 from twin.figures.curve import Stretch, readings, stretches, volume_of
 from twin.figures.cycle import MOST_PIECES, CycleFigures, KeyFigures
 from twin.log.header import LogHeader
-from twin.log.reader import Log
 from twin.model import theta as c
 from twin.model.dataset import coefficients
 from twin.model.theta import Theta
@@ -107,7 +108,22 @@ class Side:
         self.off.add(since, deviation(cycle.samples, cycle.ticks) / MBAR)
 
 
-def side_of(log: Log, settings: Config, key_figures: KeyFigures) -> Side:
+class Recording(Protocol):
+    """What is read of a log; each iteration begins anew."""
+
+    @property
+    def path(self) -> Path:
+        """Its file, which names it to people."""
+
+    @property
+    def header(self) -> LogHeader:
+        """What it says about all its rows."""
+
+    def blocks(self) -> Iterator[tuple[Samples, Ticks]]:
+        """Its rows in order."""
+
+
+def side_of(log: Recording, settings: Config, key_figures: KeyFigures) -> Side:
     """Read a whole log; SourceError if no cycle of it can be compared.
 
     The first cycle after the start or a break is left out: its gas, and the model's, is not yet as

@@ -19,6 +19,7 @@ FOLLOWS = (  # figures that follow from others; they come after them
     "switchings",
     "quick_switchings",
 )
+HEADER = ("figure", "unit", "A (expected)", "B (expected)", "B − A", "95 %", "")
 NO_DASH = {"-": "", "0 or 1": "", "0 to 3": ""}
 
 
@@ -28,11 +29,10 @@ def in_words(comparison: Comparison) -> str:
         f"{label}  {side.name}: {side.asset or 'no asset named'}, {_cycles(len(side.cycles))}"
         for label, side in (("A", comparison.a), ("B", comparison.b))
     ]
-    header = ("figure", "unit", "A (expected)", "B (expected)", "B − A", "95 %", "")
-    rows = [header, *map(_row, comparison.figures)]
+    rows = [HEADER, *map(row, comparison.figures)]
     deviations = [
         ("deviation", "unit", "A", "B", "B − A", "95 %", ""),
-        *map(_row, comparison.deviations),
+        *map(row, comparison.deviations),
     ]
     tables = [_table(rows), *([_table(deviations)] if comparison.deviations else [])]
     legend = "mean ± spread of a cycle; * differs beyond chance, all figures considered"
@@ -136,7 +136,8 @@ def _rounded(value: float) -> float | None:
     return round(value, 6) if math.isfinite(value) else None
 
 
-def _row(quantity: Quantity) -> Sequence[str]:
+def row(quantity: Quantity) -> Sequence[str]:
+    """A quantity in the columns of ``HEADER``: mean ± spread, difference, and a * if it differs."""
     finest = _finest(quantity)
     has_interval = math.isfinite(quantity.low)
     return (

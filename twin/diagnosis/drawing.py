@@ -5,6 +5,7 @@ import io
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -12,6 +13,8 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+from twin.files import require_ending, said_plainly
 
 WIDTH = 9.6  # inches
 MEASURED, BEFORE, AFTER, QUIET = "#1a1a1a", "#c8500a", "#0a62a8", "#8a8a8a"
@@ -28,26 +31,63 @@ STYLE: dict[Any, Any] = {
     "grid.linewidth": 0.6,
     "legend.frameon": False,
     "svg.fonttype": "none",  # text stays text: small, selectable, in the reader's own font
+    "text.parse_math": False,  # names of units and files may contain dollar signs
 }
 ANONYMOUS = dict.fromkeys(("Creator", "Date", "Format", "Type"))  # output must be reproducible
+FORMATS = {".svg": ANONYMOUS, ".png": {"Software": None}}  # of picture files, with their metadata
+
+
+class Picture(Figure):
+    """A figure in the style of all pictures, with a text alternative; notebooks show it as SVG.
+
+    ``name`` makes the ids in it unique among pictures; ``size`` is in inches.
+    """
+
+    def __init__(self, name: str, size: tuple[float, float], alt: str) -> None:
+        super().__init__(figsize=size, layout="constrained")
+        self.name, self.alt = name, alt
+
+    def savefig(self, *args: Any, **options: Any) -> None:
+        """Matplotlib's method, in the style of the picture: ticks are made only now."""
+        with _style(self.name):
+            super().savefig(*args, **options)
+
+    def _repr_svg_(self) -> str:
+        return as_svg(self)
 
 
 @contextmanager
-def empty(name: str, height: float) -> Iterator[Figure]:
-    """Give an empty figure; ``name`` makes the ids in it unique among pictures."""
+def empty(name: str, height: float, alt: str, width: float = WIDTH) -> Iterator[Picture]:
+    """Give an empty picture to draw in while the context lasts; see ``Picture``."""
+    with _style(name):
+        yield Picture(name, (width, height), alt)
+
+
+@contextmanager
+def _style(name: str) -> Iterator[None]:
     with mpl.rc_context({**STYLE, "svg.hashsalt": name}):
-        yield Figure(figsize=(WIDTH, height), layout="constrained")
+        yield
 
 
-def as_svg(figure: Figure, alt: str) -> str:
-    """The figure as an svg element with a text alternative."""
+def as_svg(picture: Picture) -> str:
+    """The picture as an svg element with its text alternative."""
     text = io.StringIO()
-    figure.savefig(text, format="svg", metadata=ANONYMOUS)
+    picture.savefig(text, format="svg", metadata=ANONYMOUS)
     svg = text.getvalue()
     svg = re.sub(
         r'<g id="[^"]*"', "<g", svg[svg.index("<svg") :]
     )  # ids are unique within one picture only
-    return svg.replace("<svg", f'<svg role="img" aria-label="{html.escape(alt)}"', 1)
+    return svg.replace("<svg", f'<svg role="img" aria-label="{html.escape(picture.alt)}"', 1)
+
+
+def write_picture(picture: Picture, path: Path) -> None:
+    """Write a picture, SVG or PNG as ``path`` ends.
+
+    ConfigError if it ends otherwise, SourceError if the file cannot be written.
+    """
+    require_ending(path, *FORMATS)
+    with said_plainly(path):
+        picture.savefig(path, metadata=FORMATS[path.suffix.lower()], dpi=110)
 
 
 def legend(figure: Figure, panels: Iterable[Axes]) -> None:

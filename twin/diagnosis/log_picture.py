@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from twin.diagnosis.drawing import AFTER, BEFORE, EACH, QUIET, as_svg, empty, legend
+from twin.diagnosis.drawing import AFTER, BEFORE, EACH, QUIET, Picture, empty, legend
 from twin.diagnosis.evidence import Evidence
 from twin.diagnosis.held_out import Judged
 from twin.diagnosis.pictures import Found, spread
@@ -18,11 +18,11 @@ from twin.signals import MBAR
 MOST_CYCLES = 200  # shown of a long log, evenly spread
 
 
-def draw_log(diagnosed: Found, alt: str) -> str:
+def draw_log(diagnosed: Found, alt: str) -> Picture:
     """Draw each cycle's rms deviation before and after, and below it the course of each cause."""
     causes = [(cause, answer) for cause, answer in _sized_causes(diagnosed) if answer["parameters"]]
     heights = [2.0, *[1.0] * len(causes)]
-    with empty("log", 1.1 + 1.1 * sum(heights)) as figure:
+    with empty("log", 1.1 + 1.1 * sum(heights), alt) as figure:
         panels = figure.subplots(len(heights), sharex=True, height_ratios=heights, squeeze=False)
         top, *cause_panels = panels[:, 0]
         _deviations(top, diagnosed)
@@ -33,7 +33,7 @@ def draw_log(diagnosed: Found, alt: str) -> str:
         top.set_xlim(*_into_log(diagnosed.evidence, diagnosed.evidence.seconds[[0, -1]]) / scale)
         panels[-1, 0].set_xlabel(f"time in the log ({unit})")
         legend(figure, [top])
-        return as_svg(figure, alt)
+        return figure
 
 
 def cycle_rms(evidence: Evidence, judged: Judged) -> Floats:

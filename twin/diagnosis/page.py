@@ -3,9 +3,13 @@
 All text is escaped; pictures are SVG.
 """
 
+import base64
 import html
+import io
 from collections.abc import Iterable, Sequence
 from string import Template
+
+from twin.diagnosis.drawing import FORMATS, Picture
 
 PAGE = Template("""<!DOCTYPE html>
 <html lang="en">
@@ -69,6 +73,47 @@ $footer
 </body>
 </html>
 """)
+
+SHARP = 130  # dots per inch of a picture in a summary, which is shown at about half its size
+
+# What a notebook shows of an object. Its style is below one class, so that no page loses its own.
+SUMMARY = Template("""<div class="twin-summary">
+<style>
+.twin-summary { font: 14px/1.4 system-ui, "Segoe UI", Roboto, "DejaVu Sans", Arial, sans-serif;
+  color: #1a1a1a; background: #fff; max-width: 46rem; padding: .4rem .8rem; }
+.twin-summary .headline { margin: 0 0 .4rem; padding-left: .6rem;
+  border-left: .3rem solid $colour; font-weight: 600; overflow-wrap: anywhere; }
+.twin-summary dl { display: grid; grid-template-columns: max-content 1fr; gap: 0 1.2rem;
+  margin: .3rem 0; }
+.twin-summary dt { color: #444; font-weight: 400; }
+.twin-summary dd { margin: 0; overflow-wrap: anywhere; }
+.twin-summary .wide { overflow-x: auto; }
+.twin-summary table { border-collapse: collapse; margin: .3rem 0; font-size: inherit; }
+.twin-summary caption { text-align: left; font-weight: 600; }
+.twin-summary :is(th, td) { text-align: left; padding: .1rem 1.2rem .1rem 0; border: 0;
+  border-bottom: 1px solid #ddd; font-weight: 400; background: none; }
+.twin-summary .number { text-align: right; font-variant-numeric: tabular-nums; }
+.twin-summary img { width: 100%; height: auto; display: block; }
+</style>
+<p class="headline">$headline</p>
+$body
+</div>""")
+
+
+def summary(
+    headline: str, parts: Iterable[str], picture: Picture | None = None, colour: str = "#0a62a8"
+) -> str:
+    """Parts of a page under a headline, and maybe a small picture, for a cell of a notebook."""
+    body = [*parts, *([_image(picture)] if picture else [])]
+    return SUMMARY.substitute(headline=html.escape(headline), colour=colour, body="\n".join(body))
+
+
+def _image(picture: Picture) -> str:
+    """The picture as PNG, whose size does not depend on how many points were drawn."""
+    content = io.BytesIO()
+    picture.savefig(content, format="png", metadata=FORMATS[".png"], dpi=SHARP)
+    data = base64.b64encode(content.getvalue()).decode()
+    return f'<img alt="{html.escape(picture.alt)}" src="data:image/png;base64,{data}">'
 
 
 def section(title: str, body: str) -> str:

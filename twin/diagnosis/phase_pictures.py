@@ -15,7 +15,7 @@ from twin.diagnosis.drawing import (
     EACH,
     MEASURED,
     QUIET,
-    as_svg,
+    Picture,
     empty,
     legend,
     logarithmic,
@@ -105,7 +105,7 @@ def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def draw_phases(diagnosed: Found, laid: Laid, alt: str) -> str:
+def draw_phases(diagnosed: Found, laid: Laid, alt: str) -> Picture:
     """Draw the deviation of each phase over the time since switching, with the causes' signature.
 
     If there are causes, the deviation from the extended model is below.
@@ -114,7 +114,7 @@ def draw_phases(diagnosed: Found, laid: Laid, alt: str) -> str:
     cause_curves = signatures(diagnosed, laid)
     kinds = np.unique(laid.kind[laid.enough]).tolist()
     rows = 2 if diagnosed.extended else 1
-    with empty("phases", 0.9 + 2.2 * rows) as figure:
+    with empty("phases", 0.9 + 2.2 * rows, alt) as figure:
         panels = figure.subplots(rows, len(kinds), sharex="col", sharey="row", squeeze=False)
         for column, kind in enumerate(kinds):
             chosen = (laid.kind == kind) & laid.enough
@@ -132,7 +132,7 @@ def draw_phases(diagnosed: Found, laid: Laid, alt: str) -> str:
             panels[1, 0].set_ylabel(f"left with {diagnosed.name}\n(mbar absolute)")
         figure.supxlabel("time since the phase began (ms)", fontsize=10)
         legend(figure, panels.flat)
-        return as_svg(figure, alt)
+        return figure
 
 
 def _band(axes: Axes, laid: Laid, chosen: npt.NDArray[np.bool_], reach: Floats) -> None:
@@ -181,7 +181,7 @@ def _since(evidence: Evidence) -> Floats:
     return since.astype(np.float64)
 
 
-def draw_left(diagnosed: Found, laid: Laid, alt: str) -> str:
+def draw_left(diagnosed: Found, laid: Laid, alt: str) -> Picture:
     """Draw the residual of the causes in the worst phase, over time and over vacuum.
 
     The terms fitted to it are drawn over it.
@@ -192,7 +192,7 @@ def draw_left(diagnosed: Found, laid: Laid, alt: str) -> str:
     vacuum = evidence.bins.mean(ambient - evidence.samples["pressure"])[laid.bins] / MBAR
     phase_name = diagnosed.answer["unlisted"]["where"]
     kinds = [kind for kind, name in enumerate(KINDS) if name.startswith(phase_name)]
-    with empty("left", 3.4) as figure:
+    with empty("left", 3.4, alt) as figure:
         panels = figure.subplots(1, 2, sharey=True)
         for axes, x, over in zip(panels, (laid.ms[laid.place], vacuum), OVER, strict=True):
             for kind, colour in zip(kinds, (MEASURED, BEFORE), strict=False):
@@ -207,7 +207,7 @@ def draw_left(diagnosed: Found, laid: Laid, alt: str) -> str:
         panels[0].set_ylabel("measured − expected\n(mbar absolute)")
         panels[1].set_xlabel("vacuum (mbar below ambient)")
         legend(figure, panels)
-        return as_svg(figure, alt)
+        return figure
 
 
 def _terms(axes: Axes, terms: Sequence[Term]) -> None:

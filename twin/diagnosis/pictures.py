@@ -2,22 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
-from matplotlib.axes import Axes
 
 from twin.diagnosis.answer import Diagnosis
+from twin.diagnosis.curves import Expected, draw_curves
 from twin.diagnosis.drawing import (
     AFTER,
     BEFORE,
     MEASURED,
     PALE,
-    QUIET,
-    as_svg,
+    Picture,
     empty,
-    legend,
     logarithmic,
 )
 from twin.diagnosis.evidence import Evidence, Hypothesis
@@ -27,19 +23,12 @@ from twin.diagnosis.search import Search
 from twin.diagnosis.text import Answer, spoken
 from twin.model import theta as c
 from twin.model.term import Term
-from twin.monitor.bins import Floats, Ints
-from twin.signals import MBAR, MS, NS, Phase
+from twin.monitor.bins import Ints
+from twin.signals import MBAR, MS, NS
 
 POINTS = 1000  # of a line; more do not show
 MOST_RANKED = 12
 WIDE, NARROW = (1.0, 2.0, 3.0, 5.0), (1.0, 1.1, 1.2, 1.3, 1.5, 2.0, 2.5, 3.0, 5.0, 7.0)  # labels
-LABELLED = 0.06  # of a picture's width: a narrower phase has no room for its name
-SHADES = {
-    Phase.IDLE: "#ffffff",
-    Phase.SUCTION: "#e6f0f8",
-    Phase.HOLD: "#f5f5f5",
-    Phase.BLOW_OFF: "#fdeee2",
-}
 
 
 @dataclass(frozen=True)
@@ -110,7 +99,7 @@ def worst_cycle(diagnosed: Found) -> int:
     return diagnosed.held_out[int(np.argmax(diagnosed.before.squares))]
 
 
-def draw_cycle(diagnosed: Found, cycle: int, alt: str) -> str:
+def draw_cycle(diagnosed: Found, cycle: int, alt: str) -> Picture:
     """Draw measured and expected vacuum over one cycle, and the deviation below."""
     evidence = diagnosed.evidence
     first, last = evidence.starts[cycle], evidence.starts[cycle + 1]
@@ -119,49 +108,30 @@ def draw_cycle(diagnosed: Found, cycle: int, alt: str) -> str:
     ms = (times[rows] - times[first]) * (NS / MS)
     comparable = evidence.bins.number[rows] >= 0
     measured = np.where(comparable, evidence.samples["pressure"][rows], np.nan)
-    with empty("cycle", 5.2) as figure:
-        above, below = figure.subplots(2, sharex=True, height_ratios=(2, 1))
-        _shade(above, below, ms, evidence.ticks["phase"][rows])
-        ambient = float(evidence.theta[c.AMBIENT])
-        above.plot(ms, (ambient - measured) / MBAR, color=MEASURED, lw=2.2, label="measured")
-        for judged, colour, style, label in _models(diagnosed):
-            expected = judged.expected[rows]
-            above.plot(ms, (ambient - expected) / MBAR, style, color=colour, lw=1.4, label=label)
-            below.plot(ms, (measured - expected) / MBAR, style, color=colour, lw=1.4)
-        above.set_ylabel("vacuum\n(mbar below ambient)")
-        below.set_ylabel("measured − expected\n(mbar absolute)")
-        below.axhline(0.0, color=QUIET, lw=0.8)
+    ambient = float(evidence.theta[c.AMBIENT])
+    models = [
+        Expected((ambient - judged.expected[rows]) / MBAR, label, colour, style)
+        for judged, label, colour, style in _models(diagnosed)
+    ]
+    with empty("cycle", 5.2, alt) as figure:
+        phase = evidence.ticks["phase"][rows]
+        below = draw_curves(figure, ms, (ambient - measured) / MBAR, models, phase)
         below.set_xlabel("time since the suction edge (ms)")
-        legend(figure, [above])
-        return as_svg(figure, alt)
+        return figure
 
 
 def _models(diagnosed: Found) -> list[tuple[Judged, str, str, str]]:
-    before = (diagnosed.before, BEFORE, "--", "expected: twin as it stands")
+    before = (diagnosed.before, "expected: twin as it stands", BEFORE, "--")
     if not diagnosed.extended:
         return [before]
-    return [before, (diagnosed.after, AFTER, "-", f"expected with {diagnosed.name}")]
+    return [before, (diagnosed.after, f"expected with {diagnosed.name}", AFTER, "-")]
 
 
-def _shade(above: Axes, below: Axes, ms: Floats, phase: npt.NDArray[np.uint8]) -> None:
-    """Shade the phases, and label those that are wide enough."""
-    edges = [0, *(np.flatnonzero(np.diff(phase)) + 1), len(phase) - 1]
-    for first, last in pairwise(edges):
-        name = Phase(phase[first])
-        for axes in (above, below):
-            axes.axvspan(ms[first], ms[last], color=SHADES[name], lw=0, zorder=0)  # pyright: ignore[reportArgumentType]
-        if ms[last] - ms[first] > LABELLED * ms[-1]:
-            middle = (ms[first] + ms[last]) / 2.0
-            transform = above.get_xaxis_transform()
-            above.text(middle, 1.02, spoken(name.name.lower()), transform=transform, ha="center")  # pyright: ignore[reportArgumentType]
-    above.set_xlim(0.0, ms[-1])
-
-
-def draw_ranking(diagnosed: Found, alt: str) -> str:
+def draw_ranking(diagnosed: Found, alt: str) -> Picture:
     """Draw the residual of each fitted hypothesis on the fitted cycles, the best on top."""
     rows = _ranked(diagnosed)
     names, leftovers, colours = zip(*reversed(rows), strict=True)
-    with empty("ranking", 1.0 + 0.27 * len(rows)) as figure:
+    with empty("ranking", 1.0 + 0.27 * len(rows), alt) as figure:
         axes = figure.subplots()
         positions = np.arange(len(rows))
         axes.hlines(positions, 1.0, leftovers, color=PALE, lw=1.0)
@@ -174,7 +144,7 @@ def draw_ranking(diagnosed: Found, alt: str) -> str:
         axes.text(1.0, 1.01, "healthy", transform=axes.get_xaxis_transform(), ha="center")
         axes.set_xlabel("leftover on the fitted cycles (sigma of what healthy cycles scatter)")
         axes.margins(x=0.1)
-        return as_svg(figure, alt)
+        return figure
 
 
 def _ranked(diagnosed: Found) -> list[tuple[str, float, str]]:

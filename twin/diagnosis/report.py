@@ -2,15 +2,15 @@
 
 import html
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
 from twin.diagnosis import page
 from twin.diagnosis.answer import Diagnosis
-from twin.diagnosis.log_picture import (
-    draw_log,
-)
+from twin.diagnosis.drawing import Picture, as_svg
+from twin.diagnosis.log_picture import draw_log
 from twin.diagnosis.phase_pictures import (
     Laid,
     acting,
@@ -49,6 +49,7 @@ from twin.diagnosis.text import (
     to_do,
     when,
 )
+from twin.errors import ConfigError, known_names
 from twin.files import write_text
 from twin.instants import dated
 from twin.model import theta as c
@@ -79,9 +80,32 @@ def write_report(diagnosis: Diagnosis, path: Path) -> None:
     write_text(path, _page(diagnosis))
 
 
+def summary(diagnosis: Diagnosis) -> str:
+    """The answer as a part of a page: headline, what to do, the gain, and a small picture."""
+    answer, now_ns = diagnosis.json, _received_ns(diagnosis)
+    colour, mark, verdict = BANNER[answer["verdict"]]
+    times, is_sure = Times.of(answer, now_ns), answer["verdict"] == "explained"
+    parts = [page.pairs(about(cause, times, sure=is_sure)) for cause in answer["causes"]]
+    parts.append(page.pairs(to_do(answer)))
+    if answer["verdict"] == "insufficient":
+        return page.summary(f"{mark} {headline(answer, now_ns)}", parts, colour=colour)
+    parts.append(_gain_table(answer))
+    return page.summary(
+        f"{mark} {verdict}: {headline(answer, now_ns)}",
+        parts,
+        draw(diagnosis, "cycle").picture,
+        colour,
+    )
+
+
+def _received_ns(diagnosis: Diagnosis) -> int:
+    """When the log's last row was received: ages count from it, not from when they are read."""
+    received = diagnosis.evidence.samples["host_ns"]
+    return int(received[-1]) if len(received) else 0
+
+
 def _page(diagnosis: Diagnosis) -> str:
-    answer, received = diagnosis.json, diagnosis.evidence.samples["host_ns"]
-    now_ns = int(received[-1]) if len(received) else 0  # ages would be wrong when the page is read
+    answer, now_ns = diagnosis.json, _received_ns(diagnosis)
     colour, mark, verdict = BANNER[answer["verdict"]]
     asset = f"{answer['asset']['type']} {answer['asset']['id']}"
     times = Times.of(answer, now_ns)
@@ -89,7 +113,9 @@ def _page(diagnosis: Diagnosis) -> str:
     if answer["verdict"] == "insufficient":
         parts.append(page.section("The log", page.pairs(_cycles(answer))))
     else:
-        parts += _pictures(Found.of(diagnosis), times)
+        diagnosed = Found.of(diagnosis)
+        shown = [PICTURES[name](diagnosed, times) for name in _of_verdict(answer)]
+        parts += [page.picture(s.title, as_svg(s.picture), s.caption) for s in shown]
         parts.append(page.section("Numbers", "\n".join(_tables(answer, times))))
     return page.PAGE.substitute(
         title=html.escape(f"Diagnosis of {asset}"),
@@ -131,17 +157,43 @@ def _steps(answer: Answer, times: Times) -> Iterator[str]:
 # --- pictures -------------------------------------------------------------------------------------
 
 
-def _pictures(diagnosed: Found, times: Times) -> Iterator[str]:
-    yield _cycle_picture(diagnosed)
-    yield _log_picture(diagnosed, times)
-    yield _phases_picture(diagnosed)
-    if diagnosed.answer["unlisted"]:
-        yield _left_picture(diagnosed)
-    if diagnosed.answer["verdict"] != "consistent":
-        yield _ranking_picture(diagnosed)
+@dataclass(frozen=True)
+class Shown:
+    """A picture with the conclusion to draw from it, and what else there is to know."""
+
+    title: str
+    picture: Picture
+    caption: str
 
 
-def _cycle_picture(diagnosed: Found) -> str:
+def draw(diagnosis: Diagnosis, name: str) -> Shown:
+    """Draw one of the report's ``PICTURES``.
+
+    ConfigError if there is none of that name, or none of this answer.
+    """
+    if name not in PICTURES:
+        raise ConfigError(f"no picture is called {name!r}", known_names(name, PICTURES))
+    pictures = _of_verdict(diagnosis.json)
+    if name not in pictures:
+        verdict = diagnosis.json["verdict"]
+        raise ConfigError(
+            f"an answer whose verdict is {verdict} has no picture {name!r}",
+            f"it has {listed(pictures)}" if pictures else str(diagnosis.json["next_experiment"]),
+        )
+    times = Times.of(diagnosis.json, _received_ns(diagnosis))
+    return PICTURES[name](Found.of(diagnosis), times)
+
+
+def _of_verdict(answer: Answer) -> list[str]:
+    """Names of the pictures that an answer has."""
+    if answer["verdict"] == "insufficient":
+        return []
+    left = ["left"] if answer["unlisted"] else []
+    ranking = ["ranking"] if answer["verdict"] != "consistent" else []
+    return ["cycle", "log", "phases", *left, *ranking]
+
+
+def _cycle_picture(diagnosed: Found, _times: Times) -> Shown:
     answer, worst = diagnosed.answer, worst_cycle(diagnosed)
     (cycle,) = diagnosed.numbers([worst])
     title = _verdict_in_numbers(answer)
@@ -151,10 +203,10 @@ def _cycle_picture(diagnosed: Found) -> str:
         " fit, the one furthest off. The rms is over all held-out cycles. A deviation above zero is"
         " too little vacuum."
     )
-    return page.picture(title, draw_cycle(diagnosed, worst, alt), caption)
+    return Shown(title, draw_cycle(diagnosed, worst, alt), caption)
 
 
-def _log_picture(diagnosed: Found, times: Times) -> str:
+def _log_picture(diagnosed: Found, times: Times) -> Shown:
     answer = diagnosed.answer
     parts = [f"{spoken(cause['effect'])} {when(cause, times)}" for cause in answer["causes"]]
     title = f"Over time: {'; '.join(parts) or 'no cause comes or goes'}"
@@ -165,10 +217,10 @@ def _log_picture(diagnosed: Found, times: Times) -> str:
     )
     if answer["causes"]:
         caption += " Below: the size of each cause with its 95 % interval; dotted: as it should be."
-    return page.picture(title, draw_log(diagnosed, alt), caption)
+    return Shown(title, draw_log(diagnosed, alt), caption)
 
 
-def _phases_picture(diagnosed: Found) -> str:
+def _phases_picture(diagnosed: Found, _times: Times) -> Shown:
     laid = laid_over(diagnosed.evidence, acting(diagnosed))
     title = _where(diagnosed, laid)
     alt = f"{title}. Mean deviation over the time since each phase began."
@@ -177,10 +229,10 @@ def _phases_picture(diagnosed: Found) -> str:
         " deviation above zero is too little vacuum. The band is where 95 % of such means of"
         " healthy cycles lie."
     )
-    return page.picture(title, draw_phases(diagnosed, laid, alt), caption)
+    return Shown(title, draw_phases(diagnosed, laid, alt), caption)
 
 
-def _left_picture(diagnosed: Found) -> str:
+def _left_picture(diagnosed: Found, _times: Times) -> Shown:
     laid = laid_over(diagnosed.evidence, unseen(diagnosed))
     title = f"What no listed cause explains: {left_over(diagnosed.answer)}"
     alt = f"{title}. Mean deviation left over time since the phase began and over vacuum."
@@ -191,17 +243,26 @@ def _left_picture(diagnosed: Found) -> str:
     )
     if diagnosed.terms:
         caption += " Dashed: the term that takes it away in the extended model."
-    return page.picture(title, draw_left(diagnosed, laid, alt), caption)
+    return Shown(title, draw_left(diagnosed, laid, alt), caption)
 
 
-def _ranking_picture(diagnosed: Found) -> str:
+def _ranking_picture(diagnosed: Found, _times: Times) -> Shown:
     title = _ranked(diagnosed.answer)
     alt = f"{title}. Sigmas left by each cause that was fitted, best first."
     caption = (
         "Each cause was fitted with its own size and course. The nearer to the dashed line, the"
         " better it explains the log; a look-alike is one that this log cannot reject."
     )
-    return page.picture(title, draw_ranking(diagnosed, alt), caption)
+    return Shown(title, draw_ranking(diagnosed, alt), caption)
+
+
+PICTURES: Mapping[str, Callable[[Found, Times], Shown]] = {
+    "cycle": _cycle_picture,
+    "log": _log_picture,
+    "phases": _phases_picture,
+    "left": _left_picture,
+    "ranking": _ranking_picture,
+}
 
 
 def _verdict_in_numbers(answer: Answer) -> str:

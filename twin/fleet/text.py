@@ -218,7 +218,7 @@ def _distance_picture(report: Report) -> list[str]:
         return []
     compared.sort(key=lambda pair: -pair[1])
     title = f"Furthest from the others: {_name(compared[0][0])}, by {compared[0][1]:.1f} sigma"
-    with empty("fleet", 3.6) as figure:
+    with empty("fleet", 3.6, title) as figure:
         axes = figure.subplots()
         for colour, label, is_outlier in (
             (BEFORE, "stands out", True),
@@ -235,7 +235,7 @@ def _distance_picture(report: Report) -> list[str]:
         axes.set_xlabel("rank")
         axes.set_ylabel("furthest from the others\n(sigmas of their scatter)")
         legend(figure, [axes])
-        svg = as_svg(figure, title)
+        svg = as_svg(figure)
     caption = (
         "Each unit by the effect in which it is furthest from the others of its type. The dashed"
         f" line is at {STANDS_OUT:g} sigma; a unit below it may stand out by its drift."

@@ -3,14 +3,10 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from twin.diagnosis.drawing import ANONYMOUS, MEASURED, STYLE
-from twin.errors import ConfigError
-from twin.files import said_plainly
+from twin.diagnosis.drawing import MEASURED, empty, write_picture
 from twin.paper.evacuation import (
     END_MBAR,
     INSTANCE_SL_MIN,
@@ -30,23 +26,16 @@ LONGEST_MS, HOLD_MS = 2000, 4000
 SHOWN = (0.0, 2.0, 10.0, 40.0)  # film coefficients
 TEXTBOOK = (("eq. (1)", "#7d3c98", (1, 1.2)), (f"eq. (2) × {SAFETY:g}", "#2e8b57", (1, 1.2)))
 COLOURS = ("#8a8a8a", "#3f9b8f", "#0a62a8", "#c8500a")
-FORMATS = {".svg": ANONYMOUS, ".png": {"Software": None}}
+TITLE = "Evacuation of the paper's test rig, and pairs of film coefficient and bulge"
 
 
 def draw(rows: Sequence[Row], separation: Separation, path: Path) -> None:
-    """Write the picture: SVG or PNG, as ``path`` ends.
-
-    ConfigError if it ends otherwise, SourceError if the file cannot be written.
-    """
-    if path.suffix not in FORMATS:
-        raise ConfigError(f"{path}: not a picture", f"let it end in {' or '.join(FORMATS)}")
-    with mpl.rc_context({**STYLE, "svg.hashsalt": "paper"}):
-        figure = Figure(figsize=(11.0, 4.9), layout="constrained")
+    """Write the picture; errors as ``write_picture`` has them."""
+    with empty("paper", 4.9, TITLE, width=11.0) as figure:
         left, right = figure.subplots(1, 2)
         _draw_tables(left, rows, separation)
         _draw_pairs(right, separation)
-        with said_plainly(path):
-            figure.savefig(path, metadata=FORMATS[path.suffix], dpi=110)
+    write_picture(figure, path)
 
 
 def _draw_tables(axes: Axes, rows: Sequence[Row], separation: Separation) -> None:

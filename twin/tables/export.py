@@ -11,7 +11,8 @@ import numpy.typing as npt
 import pyarrow as pa
 from pyarrow import csv, parquet
 
-from twin.errors import ConfigError, SourceError
+from twin.errors import SourceError
+from twin.files import require_ending
 from twin.log.header import LogHeader
 from twin.signals import (
     BAR,
@@ -119,10 +120,7 @@ def export(rows: Rows, header: LogHeader, path: Path) -> None:
     The file appears once it is complete, or not at all. ConfigError for another suffix,
     SourceError if there is a file of that name or it cannot be written.
     """
-    write = _KINDS.get(path.suffix.lower())
-    if write is None:
-        suffixes = " and ".join(_KINDS)
-        raise ConfigError(f"{path}: cannot tell what to write", f"{suffixes} files can be written")
+    write = _KINDS[require_ending(path, *_KINDS)]
     with complete_file(path) as file:
         write(rows, header, file)
 

@@ -14,6 +14,7 @@ from xlsxwriter.format import Format
 from xlsxwriter.worksheet import Worksheet
 
 from twin.errors import ConfigError
+from twin.files import require_ending
 from twin.tables.export import complete_file
 
 MOST_ROWS = 1_048_575  # of a sheet, below its header
@@ -29,11 +30,7 @@ def export(table: pa.Table, path: Path) -> None:
     The unit of a column is its field's metadata ``unit``. ConfigError for another suffix or too
     many rows, SourceError if there is a file of that name or it cannot be written.
     """
-    write = _KINDS.get(path.suffix.lower())
-    if write is None:
-        raise ConfigError(
-            f"{path}: cannot tell what to write", f"{', '.join(_KINDS)} files can be written"
-        )
+    write = _KINDS[require_ending(path, *_KINDS)]
     if write is _write_sheet and table.num_rows > MOST_ROWS:
         raise ConfigError(
             f"{path}: {table.num_rows} rows are more than a sheet holds ({MOST_ROWS})",
