@@ -1,11 +1,16 @@
 """``import twin``: the tutorial as it stands, and the same answers as the command line."""
 
+import base64
 import json
 import shlex
 import subprocess
 import sys
+import warnings
+import xml.etree.ElementTree as ET
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from html import unescape
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +24,17 @@ import twin
 from drivers.plc.faults import parse_fault
 from tools.tutorial_data import CYCLES, write_data
 from twin.assets.database import open_assets
+from twin.calibration.commission import Commissioned as Commissioning
+from twin.calibration.commission import Remark
+from twin.calibration.readings import read
+from twin.calibration.verdict import Residual, Verdict
 from twin.config import Config
+from twin.diagnosis.curves import outline
 from twin.figures.table import FIGURES
 from twin.hil import Plant
 from twin.log.reader import open_log
 from twin.settings import Document
-from twin.signals import MBAR, Samples
+from twin.signals import MBAR, Phase, Samples
 
 SEED = 11  # what the tutorial names is hidden with this one
 GRIPPER = rigs.path_of("gripper")
@@ -231,6 +241,266 @@ def test_without_pandas_it_says_what_to_install(
     with pytest.raises(twin.TwinError) as refused:
         tutorial.names["healthy"].frame()
     assert "[notebook]" in refused.value.hint
+
+
+# What a notebook shows.
+
+EVIL = '<script>alert("x")</script> Größe $1$ & Söhne'  # of an asset, as a stranger's log has it
+
+
+class Shown(HTMLParser):
+    """Tags, attributes and texts of a summary."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags, self.values, self.text = list[str](), list[str](), ""
+        self.feed(html)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.values += [value or "" for _, value in attrs]
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def renamed(config: Config) -> Config:
+    asset = config.asset.model_copy(update={"id": EVIL})
+    return replace(config, asset=asset)
+
+
+def evil_objects(tutorial: Read) -> dict[str, Any]:
+    """Everything a notebook shows, of an asset whose name is hostile."""
+    names = tutorial.names
+    log = replace(names["healthy"], config=renamed(names["healthy"].config))
+    today = replace(names["today"], config=renamed(names["today"].config), path=Path(EVIL))
+    diagnosis = names["answer"]._diagnosis
+    cause = diagnosis.json["causes"][0] | {"not_separable_from": ["porous_leakage"]}
+    evil = diagnosis.json | {"log": EVIL, "asset": {"type": EVIL, "id": EVIL}, "causes": [cause]}
+    calibrated = names["calibrated"]
+    return {
+        "log": log,
+        "columns": log.columns(1.0, 5.0),
+        "simulation": simulated(renamed(names["healthy"].config)),
+        "calibration": replace(calibrated, config=renamed(calibrated.config)),
+        "comparison": log.compare(today),
+        "answer": twin.Answer(replace(diagnosis, json=evil)),
+    }
+
+
+def simulated(config: Any, **options: Any) -> twin.Columns:
+    time = np.arange(0.0, 1.0, 1e-3)
+    return twin.simulate(config, time, time > 0.1, np.zeros(len(time)), **options)
+
+
+@pytest.fixture(scope="module")
+def evil(tutorial: Read) -> dict[str, Any]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tutorial.folder)
+        return evil_objects(tutorial)
+
+
+NAMED = ["log", "columns", "simulation", "calibration", "comparison"]  # with the asset's name
+KINDS = [*NAMED, "answer"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_summary_is_small_alone_and_harmless(kind: str, evil: dict[str, Any], here: Path) -> None:
+    html = evil[kind]._repr_html_()
+    shown = Shown(html)
+    assert len(html) < 400_000
+    assert "script" not in shown.tags
+    assert shown.tags.count("img") == 1
+    links = [value for value in shown.values if ":" in value and "data:image/png" not in value]
+    assert [value for value in links if "http" in value or "javascript" in value] == []
+    if kind in NAMED:
+        assert EVIL in shown.text  # also its umlauts, as they are
+    picture = base64.b64decode(html.partition("base64,")[2].partition('"')[0])
+    assert picture.startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_plot_is_a_figure_that_shows_itself(
+    kind: str, evil: dict[str, Any], here: Path, tmp_path: Path
+) -> None:
+    picture = evil[kind].plot()
+    root = ET.fromstring(picture._repr_svg_())
+    assert root.tag == "{http://www.w3.org/2000/svg}svg"
+    assert [tag for tag in root.iter() if tag.tag.endswith("script")] == []
+    if kind in ("log", "columns", "simulation"):
+        assert "Größe $1$ & Söhne" in str(root.get("aria-label"))
+    picture.savefig(tmp_path / "a.png")
+    assert "mbar" in "".join(root.itertext())
+
+
+def test_a_summary_says_what_matters(tutorial: Read, here: Path) -> None:
+    names = tutorial.names
+    healthy = Shown(names["healthy"]._repr_html_()).text
+    assert "compact-ejector-35 cell-3" in healthy
+    assert "mbar rms" in healthy
+    assert "8 healthy cycles" in Shown(names["calibrated"]._repr_html_()).text
+    answer = Shown(names["answer"]._repr_html_()).text
+    for text in ("Cause found: Air leaks in", "hoses, fittings and cups", "less rms deviation"):
+        assert text in answer
+
+
+def test_a_log_without_rows_has_a_summary(tutorial: Read, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = tutorial.names["healthy"]
+    monkeypatch.setattr(type(log), "_rows", lambda _: iter(()))
+    assert "no rows" in log._repr_html_()
+    with pytest.raises(twin.TwinError, match="no row lies between"):
+        log.plot()
+
+
+def test_a_summary_reads_the_beginning_of_a_log_alone(
+    tutorial: Read, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("twin.api.SHOWN_S", 2.0)
+    assert "0 to 2 s" in Shown(tutorial.names["healthy"]._repr_html_()).text
+
+
+def test_an_answer_has_the_pictures_of_its_report(tutorial: Read) -> None:
+    answer = tutorial.names["answer"]
+    alts = [answer.plot(name).alt for name in ("cycle", "log", "phases", "ranking")]
+    page = unescape((tutorial.folder / "today.html").read_text())
+    assert [alt for alt in alts if alt not in page] == []
+    with pytest.raises(twin.TwinError, match="no picture is called 'cylce'") as refused:
+        answer.plot("cylce")
+    assert "did you mean 'cycle'?" in refused.value.hint
+    with pytest.raises(twin.TwinError, match="whose verdict is explained has no picture 'left'"):
+        answer.plot("left")
+    insufficient = answer._diagnosis.json | {"verdict": "insufficient", "next_experiment": "record"}
+    silent = twin.Answer(replace(answer._diagnosis, json=insufficient))
+    with pytest.raises(twin.TwinError, match="insufficient has no picture 'cycle'"):
+        silent.plot()
+    assert "The log cannot answer: record." in Shown(silent._repr_html_()).text
+
+
+# Field units.
+
+
+def test_columns_are_in_mbar_and_ms_as_well(tutorial: Read, here: Path) -> None:
+    rows = tutorial.names["today"].columns()
+    ambient = tutorial.names["today"].config.data.ambient.pressure_mbar
+    for name, si, factor in (
+        ("time_ms", "time_s", 1e3),
+        ("pressure_mbar", "pressure_pa", 1e-2),
+        ("deviation_mbar", "deviation_pa", 1e-2),
+        ("supply_bar", "supply_pa", 1e-5),
+    ):
+        np.testing.assert_allclose(getattr(rows, name), rows[si] * factor)
+    np.testing.assert_allclose(rows.vacuum_mbar, ambient - rows.pressure_mbar, atol=1e-6)
+    off = rows.expected_vacuum_mbar - rows.vacuum_mbar
+    np.testing.assert_allclose(off, rows.deviation_mbar, atol=1e-3)
+    assert rows.suctions == 10
+    run = simulated(GRIPPER, effects={"ambient_pressure": {"shift": -20.0}})
+    assert run.vacuum_mbar[0] == pytest.approx(0.0, abs=0.01)  # counts from the ambient pressure
+
+
+def test_a_range_of_time_is_that_of_the_whole(tutorial: Read, here: Path) -> None:
+    log = tutorial.names["today"]
+    rows, some = log.columns(), log.columns(2.0, 4.5)
+    inside = (rows["time_s"] >= 2.0) & (rows["time_s"] <= 4.5)
+    for name, column in some.items():
+        assert np.array_equal(column, rows[name][inside], equal_nan=column.dtype.kind == "f"), name
+    assert "time (ms)" in log.plot(2.0, 4.5)._repr_svg_()
+    assert "time (s)" in log.plot()._repr_svg_()
+
+
+def test_a_calibration_has_its_values_in_the_fields_units(tutorial: Read) -> None:
+    calibrated = tutorial.names["calibrated"]
+    for name in ("ejector.suction_capacity_sl_min", "system.leak_sl_min"):
+        value = getattr(calibrated, name.partition(".")[2])
+        assert value == pytest.approx(calibrated.values[name]["value"])
+    assert f"{calibrated.rms_mbar:.2f} mbar rms off" in str(calibrated)
+
+
+def test_a_curve_keeps_its_peaks_however_long_it_is() -> None:
+    curve = np.zeros(1_000_000)
+    curve[123_457], curve[765_432], curve[500_000:500_100] = 5.0, -7.0, np.nan
+    rows = outline([curve])
+    assert len(rows) < 2000
+    assert {0, 123_457, 765_432, 999_999} <= set(rows.tolist())
+    assert len(outline([curve[:300], curve[:300]])) == 300
+
+
+# Commissioning.
+
+
+def verdict(times: float) -> Verdict:
+    return Verdict({phase: Residual(times * 100.0, 100.0) for phase in Phase})
+
+
+def commissioned(tutorial: Read, times: float = 1.0) -> twin.Commissioned:
+    """A commissioning of the healthy day; the fit itself is the calibration's."""
+    healthy = tutorial.names["healthy"]
+    samples = np.concatenate(list(healthy._samples()))
+    calibration, remark = tutorial.names["calibrated"]._calibration, Remark(EVIL, "volume_ml = 750")
+    found = Commissioning(calibration, read(samples), verdict(times), (remark,), (), samples)
+    given = dict[str, Any]()
+
+    def fit(config: Config, blocks: Iterable[Samples], _say: object) -> Commissioning:
+        given["config"], given["rows"] = config, np.concatenate(list(blocks))
+        return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tutorial.folder)
+        patch.setattr("twin.api.fit_unknown", fit)
+        result = twin.commission(healthy)
+        of_type = Config.of(Document.read(Path("cell.toml")), calibrated=False)
+    assert given["config"] == replace(of_type, gauge=True)  # as the command has it
+    assert given["rows"].tobytes() == samples.tobytes()
+    return result
+
+
+def test_a_commissioning_is_shown_and_kept(tutorial: Read, here: Path, tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'kept.sqlite'}"
+    unit = commissioned(tutorial)
+    unit = replace(unit, _log=replace(unit._log, assets=url))
+    assert unit.verdict == "good"
+    assert unit.remarks == [f"{EVIL}: volume_ml = 750"]
+    assert unit.values == tutorial.names["calibrated"].values
+    assert str(unit).startswith("good: the twin follows this record")
+    assert unit.config.data == tutorial.names["calibrated"].config.data
+    open_assets(url).close()
+    assert unit.save().name == "cell-3"
+    assert twin.open("today.csv", "cell.toml", assets=url).config.data == unit.config.data
+    assert "deviation" in unit.plot().alt
+
+
+def test_a_commissioning_of_a_hostile_name_is_harmless(
+    tutorial: Read, here: Path, tmp_path: Path
+) -> None:
+    unit = commissioned(tutorial)
+    unit = replace(unit, config=renamed(unit.config))
+    unit.report(tmp_path / "unit.html")
+    for html in (unit._repr_html_(), (tmp_path / "unit.html").read_text(encoding="utf-8")):
+        shown = Shown(html)
+        assert "script" not in shown.tags
+        assert EVIL in shown.text
+
+
+def test_a_refused_commissioning_is_not_kept(tutorial: Read, here: Path) -> None:
+    unit = commissioned(tutorial, times=100.0)
+    assert unit.verdict == "refused"
+    with pytest.raises(twin.TwinError, match="Nothing is stored"):
+        unit.save()
+
+
+# Comparison.
+
+
+def test_a_comparison_is_that_of_the_command(
+    commanded: Path, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert command(monkeypatch, "compare", "healthy.mcap", "today.mcap", "-o", "c.json") == 0
+        told = json.loads((commanded / "c.json").read_text())
+        compared = twin.open("healthy.mcap").compare(twin.open("today.mcap"))
+    assert compared.json == told
+    assert compared.conclusion == told["conclusion"]
+    assert compared.conclusion in str(compared)
 
 
 # Simulation.

@@ -1,7 +1,7 @@
 """A live digital twin of pneumatic vacuum ejectors.
 
-For notebooks: ``open`` a log, ``simulate``, ``calibrate``, ``diagnose``. They are loaded at their
-first use, so ``import twin`` costs nothing.
+For notebooks: ``open`` a log, ``simulate``, ``commission``, ``calibrate``, ``diagnose``. They are
+loaded at their first use, so ``import twin`` costs nothing.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -10,9 +10,13 @@ if TYPE_CHECKING:
     from twin.api import (
         Answer,
         Calibrated,
+        Columns,
+        Commissioned,
+        Compared,
         Log,
         TwinError,
         calibrate,
+        commission,
         diagnose,
         open,  # noqa: A004
         simulate,
@@ -21,9 +25,13 @@ if TYPE_CHECKING:
 __all__ = [
     "Answer",
     "Calibrated",
+    "Columns",
+    "Commissioned",
+    "Compared",
     "Log",
     "TwinError",
     "calibrate",
+    "commission",
     "diagnose",
     "open",
     "simulate",

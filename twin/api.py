@@ -1,10 +1,13 @@
 """What an analyst needs in a notebook: a log as columns, simulation, calibration, diagnosis.
 
-``import twin`` provides all of it. ``calibrate`` and ``diagnose`` give the same answers as the
-commands of the same name, without their files. Columns are in SI units, with which their names end.
-Key figures, sizes of causes and values of a data set are in the field's units, as everywhere.
+``import twin`` provides all of it. ``commission``, ``calibrate`` and ``diagnose`` give the same
+answers as the commands of the same name, without their files. Columns are in SI units, with which
+their names end. Key figures, sizes of causes and values of a data set are in the field's units, as
+everywhere; columns have properties in those units, too. A notebook shows each object as a summary
+with a small picture, and ``plot()`` gives the picture.
 """
 
+import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,14 +18,28 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.assets.record import Record
+from twin.calibration import page as calibration_page
 from twin.calibration import report as calibration_report
 from twin.calibration.calibrate import Calibration
 from twin.calibration.calibrate import calibrate as fit_unit
-from twin.calibration.save import store
+from twin.calibration.commission import Commissioned as Commissioning
+from twin.calibration.commission import commission as fit_unknown
+from twin.calibration.picture import draw_fit
+from twin.calibration.save import store, store_first
+from twin.columns import Columns as Columns  # noqa: PLC0414 (``import twin`` has it)
+from twin.columns import LogColumns
+from twin.compare import page as compare_page
+from twin.compare import picture as compare_picture
+from twin.compare import text as compare_text
+from twin.compare.compare import Comparison
+from twin.compare.compare import compare as compare_sides
+from twin.compare.side import side_of
 from twin.config import Config
+from twin.diagnosis import report as diagnosis_report
 from twin.diagnosis.answer import Diagnosis
 from twin.diagnosis.answer import diagnose as find_cause
-from twin.diagnosis.report import in_words, write_report
+from twin.diagnosis.drawing import Picture
+from twin.diagnosis.text import listed, spoken
 from twin.errors import ConfigError
 from twin.errors import TwinError as TwinError  # noqa: PLC0414 (``import twin`` has it)
 from twin.extras import install_hint
@@ -32,6 +49,7 @@ from twin.live import Twin
 from twin.log.header import DERIVED, LogHeader
 from twin.log.reader import Log as Recorded
 from twin.log.reader import open_log
+from twin.model import theta as c
 from twin.model.dataset import coefficients
 from twin.model.effects import apply
 from twin.monitor.cycles import cut
@@ -52,12 +70,12 @@ from twin.signals import (
 from twin.tables.reader import Table, open_table
 from twin.tables.settings import ImportSettings
 
-Columns = dict[str, npt.NDArray[Any]]
 Place = str | Path
 Progress = Callable[[str], None]
 Source = Recorded | Table
 
 MCAP = ".mcap"
+SHOWN_S = 60.0  # of a log, in its summary: a log may have days
 _COMMANDS = {"suction": Command.SUCTION, "blow_off": Command.BLOW_OFF}
 _SIGNALS = {"part_present": Signal.PART_PRESENT, "air_saving": Signal.AIR_SAVING}
 
@@ -79,20 +97,24 @@ class Log:
     _source: Source = field(kw_only=True)
 
     def __repr__(self) -> str:
-        asset = " ".join(filter(None, (self.config.asset.type, self.config.asset.id)))
-        return f"<Log {self.path} of {asset}>"
+        return f"<Log {self.path} of {_name(self.config)}>"
 
-    def columns(self) -> Columns:
-        """All rows, one array for each column: the measurement and the twin's expectation.
+    def _repr_html_(self) -> str:
+        facts = [("ejector", _name(self.config)), ("data set", self.config.origin)]
+        return self.columns(end_s=SHOWN_S).summary(facts)
 
-        A log's rows are as recorded; for a table the twin runs now.
+    def columns(self, begin_s: float = 0.0, end_s: float = math.inf) -> LogColumns:
+        """Rows, one array for each column: the measurement and the twin's expectation.
+
+        ``begin_s`` and ``end_s`` choose a range of time since the first row; default: all rows.
+        A log's rows are as recorded; for a table the twin runs now. Names end with SI units; the
+        columns as a whole have the same in mbar and ms, for example ``vacuum_mbar``.
         """
-        rows = list(self._rows())
-        samples = joined(np.empty(0, SAMPLE), *(block for block, _ in rows))
-        ticks = joined(np.empty(0, TICK), *(block for _, block in rows))
-        elapsed_ns = samples["time_ns"] - samples["time_ns"][:1]
-        return {
-            "time_s": elapsed_ns * NS,
+        blocks = list(self._rows_between(begin_s, end_s))
+        samples = joined(np.empty(0, SAMPLE), *(block for block, _, _ in blocks))
+        ticks = joined(np.empty(0, TICK), *(block for _, block, _ in blocks))
+        columns = {
+            "time_s": np.concatenate([np.empty(0), *(since for _, _, since in blocks)]),
             "time_ns": samples["time_ns"],
             "sequence": samples["sequence"],
             **_bit_columns(samples["commands"], _COMMANDS),
@@ -104,6 +126,22 @@ class Log:
             "phase": ticks["phase"],
             **_bit_columns(ticks["signals"], _SIGNALS),
         }
+        ambient = float(coefficients(self.config.data)[c.AMBIENT])
+        return LogColumns(columns, ambient, f"{self.path}: {_name(self.config)}")
+
+    def plot(self, begin_s: float = 0.0, end_s: float = math.inf) -> Picture:
+        """Draw measured and expected vacuum (mbar) over a range of time (s), and the deviation."""
+        return self.columns(begin_s, end_s).plot()
+
+    def compare(self, other: "Log") -> "Compared":
+        """Say what differs between this log and another one, like ``twin compare``.
+
+        SourceError if no cycle of one of them can be compared.
+        """
+        ours, theirs = (
+            side_of(log._recording(), log.config, key_figures(log.config)) for log in (self, other)
+        )
+        return Compared(compare_sides(ours, theirs))
 
     def frame(self) -> Any:
         """The columns as a ``pandas.DataFrame``; ConfigError if pandas is not installed."""
@@ -114,7 +152,7 @@ class Log:
                 f"a DataFrame needs pandas, which is not installed: {error}",
                 f"{install_hint('notebook')}, or take columns()",
             ) from error
-        return DataFrame(self.columns())
+        return DataFrame(dict(self.columns()))
 
     def cycles(self) -> list[dict[str, Any]]:
         """Key figures of every cycle, measured and expected, in the field's units.
@@ -145,6 +183,31 @@ class Log:
             return Twin.of(self.config.data).over(self._source.blocks())
         return self._source.blocks()
 
+    def _rows_between(
+        self, begin_s: float, end_s: float
+    ) -> Iterator[tuple[Samples, Ticks, npt.NDArray[np.floating]]]:
+        """Rows of a range of time, in blocks, with their time since the first row (s)."""
+        first_ns: np.int64 | None = None
+        for samples, ticks in self._rows():
+            first_ns = samples["time_ns"][0] if first_ns is None else first_ns
+            since = (samples["time_ns"] - first_ns) * NS
+            inside = (since >= begin_s) & (since <= end_s)
+            yield samples[inside], ticks[inside], since[inside]
+            if since[-1] > end_s:
+                return
+
+    def _recording(self) -> "_Recording":
+        return _Recording(self.path, self._header, self._rows)
+
+
+@dataclass(frozen=True)
+class _Recording:
+    """A log or a table as ``twin.compare`` reads it."""
+
+    path: Path
+    header: LogHeader
+    blocks: Callable[[], Iterator[tuple[Samples, Ticks]]]
+
 
 @dataclass(frozen=True)
 class Calibrated:
@@ -160,21 +223,117 @@ class Calibrated:
     def __str__(self) -> str:
         return calibration_report.in_words(self._calibration)
 
+    def _repr_html_(self) -> str:
+        asset = self.config.asset
+        return calibration_page.calibration_summary(self._calibration, asset, self._samples())
+
     @property
     def values(self) -> dict[str, dict[str, Any]]:
         """Each value by name, with unit, 95 % interval and whether the log determines it."""
         return calibration_report.parameters(self._calibration)
+
+    @property
+    def rms_mbar(self) -> float:
+        """Deviation (mbar, rms) that the fit leaves in the healthy cycles."""
+        return self._calibration.fitted.left / MBAR
+
+    @property
+    def suction_capacity_sl_min(self) -> float:
+        """Fitted suction capacity at ambient pressure, sl/min."""
+        return self._calibration.fitted.data.ejector.suction_capacity_sl_min
+
+    @property
+    def leak_sl_min(self) -> float:
+        """Fitted leak of the healthy system, sl/min."""
+        return self._calibration.fitted.data.system.leak_sl_min
+
+    def plot(self) -> Picture:
+        """Draw a typical healthy cycle (mbar, ms), measured and fitted, and the deviation."""
+        return draw_fit(self.config.data, self._samples())
 
     def save(self) -> Record:
         """Store it in the asset database as the unit's data set, like ``twin calibrate``.
 
         ConfigError if no unit is named.
         """
-        if not self.config.asset.id:
-            hint = "open the log with unit=ID, or say [asset] id in the configuration"
-            raise ConfigError("no unit is named", hint)
+        _require_unit(self.config)
         record, _ = store(self._calibration, self.config, self._log.assets, self._log.path)
         return record
+
+    def _samples(self) -> Samples:
+        return joined(np.empty(0, SAMPLE), *self._log._samples())
+
+
+@dataclass(frozen=True)
+class Commissioned(Calibrated):
+    """The data set fitted to a unit that nobody has seen before, with the verdict on the fit."""
+
+    _commissioning: Commissioning = field(repr=False)
+
+    def __str__(self) -> str:
+        return calibration_report.commissioned_in_words(self._commissioning)
+
+    def _repr_html_(self) -> str:
+        return calibration_page.summary(self._commissioning, self.config.asset)
+
+    @property
+    def verdict(self) -> str:
+        """Good, usable or refused."""
+        return self._commissioning.verdict.word
+
+    @property
+    def remarks(self) -> list[str]:
+        """What the record contradicts in the configuration, and the line to write instead."""
+        return [f"{remark.text}: {remark.line}" for remark in self._commissioning.remarks]
+
+    def report(self, path: Place) -> None:
+        """Write it with pictures as one HTML file; SourceError if it cannot be written."""
+        calibration_page.write_page(self._commissioning, self.config.asset, Path(path))
+
+    def save(self) -> Record:
+        """Store it in the asset database as the unit's data set, like ``twin commission``.
+
+        An unknown type is stored, too. ConfigError if no unit is named, or the fit is refused.
+        """
+        _require_unit(self.config)
+        if self.verdict == "refused":
+            verdict = calibration_report.headline(self._commissioning.verdict)
+            raise ConfigError(verdict, "correct the configuration, or record healthy cycles")
+        record, _ = store_first(self._calibration, self.config, self._log.assets, self._log.path)
+        return record
+
+    def _samples(self) -> Samples:
+        return self._commissioning.samples
+
+
+@dataclass(frozen=True)
+class Compared:
+    """What differs between two logs; ``str`` gives it as tables with a conclusion.
+
+    ``json`` is what ``twin compare --json`` writes.
+    """
+
+    _comparison: Comparison = field(repr=False)
+
+    def __str__(self) -> str:
+        return compare_text.in_words(self._comparison)
+
+    def _repr_html_(self) -> str:
+        return compare_page.summary(self._comparison)
+
+    @property
+    def conclusion(self) -> str:
+        """The answer in a sentence."""
+        return compare_text.conclusion(self._comparison)
+
+    @property
+    def json(self) -> dict[str, Any]:
+        """All figures of both logs, with their difference and its 95 % interval."""
+        return compare_text.plain(self._comparison)
+
+    def plot(self) -> Picture:
+        """Draw both mean cycles (mbar), their difference and their deviations, over time (s)."""
+        return compare_picture.draw(self._comparison)
 
 
 @dataclass(frozen=True)
@@ -187,7 +346,10 @@ class Answer:
     _diagnosis: Diagnosis = field(repr=False)
 
     def __str__(self) -> str:
-        return in_words(self._diagnosis)
+        return diagnosis_report.in_words(self._diagnosis)
+
+    def _repr_html_(self) -> str:
+        return diagnosis_report.summary(self._diagnosis)
 
     @property
     def json(self) -> dict[str, Any]:
@@ -204,9 +366,16 @@ class Answer:
         """Each cause with its effect, course, sizes and a sentence that says why; maybe none."""
         return list(self.json["causes"])
 
+    def plot(self, picture: str = "cycle") -> Picture:
+        """Draw a picture of the report (mbar, ms): cycle, log, phases, left or ranking.
+
+        ConfigError for another name, or if this answer has no such picture.
+        """
+        return diagnosis_report.draw(self._diagnosis, picture).picture
+
     def report(self, path: Place) -> None:
         """Write the answer with pictures as one HTML file; SourceError if it cannot be written."""
-        write_report(self._diagnosis, Path(path))
+        diagnosis_report.write_report(self._diagnosis, Path(path))
 
 
 def open(  # noqa: A001  (as a module's open is called)
@@ -262,7 +431,8 @@ def simulate(
     ``time_s`` (n) rises; ``suction`` and ``blow_off`` (n) are 0 or 1; the start is at ambient.
     ``effects`` are faults to simulate, in the field's units: ``{"leakage": {"sonic_flow": 2.0}}``.
     Returns ``time_s``, the commands, ``pressure_pa`` (absolute), ``part_present`` and
-    ``air_saving``. ConfigError for columns that do not fit.
+    ``air_saving``; also in ms and mbar as ``time_ms``, ``pressure_mbar`` and ``vacuum_mbar``.
+    ConfigError for columns that do not fit.
     """
     settings = _configured(config)
     samples = _command_rows(time_s, {"suction": suction, "blow_off": blow_off})
@@ -270,12 +440,25 @@ def simulate(
     for name, values in (effects or {}).items():
         theta = apply(theta, name, values)
     pressure, signals = Plant(theta, settings.data.terms).run(samples)
-    return {
-        "time_s": np.asarray(time_s, np.float64),
+    columns = {
+        "time_s": np.atleast_1d(np.asarray(time_s, np.float64)),
         **_bit_columns(samples["commands"], _COMMANDS),
         "pressure_pa": pressure,
         **_bit_columns(signals, _SIGNALS),
     }
+    faults = f" with {listed([spoken(name) for name in effects])}" if effects else ""
+    return Columns(columns, float(theta[c.AMBIENT]), f"Simulation of {_name(settings)}{faults}")
+
+
+def commission(log: Log, progress: Progress = _quiet) -> Commissioned:
+    """Fit a unit that nobody has seen before to a record of healthy cycles.
+
+    The configuration says roughly what hangs on the ejector; the record corrects it.
+    ``progress`` as in ``calibrate``. ConfigError if the record does not suffice.
+    """
+    settings = _uncalibrated(log)
+    result = fit_unknown(settings, log._samples(), progress)
+    return Commissioned(_fitted(settings, result.calibration, log), result.calibration, log, result)
 
 
 def calibrate(log: Log, progress: Progress = _quiet) -> Calibrated:
@@ -284,14 +467,9 @@ def calibrate(log: Log, progress: Progress = _quiet) -> Calibrated:
     ``progress`` is called with a text about each step: ``print``, for example. ConfigError if the
     log does not suffice, or is not that of a healthy unit.
     """
-    log._header.require_commands(str(log.path))
-    document, unit = log.config.document, log.config.asset.id
-    unit_config = Config.of(document, log.assets, unit, calibrated=False)
-    settings = unit_config.with_sensor(is_gauge=log.config.is_gauge)
+    settings = _uncalibrated(log)
     result = fit_unit(settings, log._samples(), progress)
-    monitor = settings.monitor.model_copy(update={"healthy": result.healthy})
-    fitted = replace(settings, data=result.fitted.data, monitor=monitor, origin=f"{log.path}")
-    return Calibrated(fitted, result, log)
+    return Calibrated(_fitted(settings, result, log), result, log)
 
 
 def diagnose(log: Log, progress: Progress = _quiet) -> Answer:
@@ -304,6 +482,32 @@ def diagnose(log: Log, progress: Progress = _quiet) -> Answer:
 
 
 # --- shared helpers -----------------------------------------------------------------------------
+
+
+def _name(config: Config) -> str:
+    """Type and unit of an ejector, for people."""
+    return " ".join(filter(None, (config.asset.type, config.asset.id)))
+
+
+def _require_unit(config: Config) -> None:
+    if not config.asset.id:
+        hint = "open the log with unit=ID, or say [asset] id in the configuration"
+        raise ConfigError("no unit is named", hint)
+
+
+def _uncalibrated(log: Log) -> Config:
+    """The configuration of a log's unit with the data set of its type."""
+    log._header.require_commands(str(log.path))
+    unit = log.config.asset.id
+    settings = Config.of(log.config.document, log.assets, unit, calibrated=False)
+    return settings.with_sensor(is_gauge=log.config.is_gauge)
+
+
+def _fitted(settings: Config, calibration: Calibration, log: Log) -> Config:
+    """The configuration with the data set that was fitted to a log."""
+    monitor = settings.monitor.model_copy(update={"healthy": calibration.healthy})
+    data = calibration.fitted.data
+    return replace(settings, data=data, monitor=monitor, origin=f"{log.path}")
 
 
 def _configured(config: Place | Config, assets: str = "", unit: str = "", own: str = "") -> Config:
@@ -332,7 +536,9 @@ def _table(path: Path, settings: Config, derive: bool) -> Table:
     return table.with_commands() if derive else table
 
 
-def _bit_columns(flags: npt.NDArray[np.uint8], bits: Mapping[str, int]) -> Columns:
+def _bit_columns(
+    flags: npt.NDArray[np.uint8], bits: Mapping[str, int]
+) -> dict[str, npt.NDArray[Any]]:
     """A Boolean column for each bit."""
     return {name: (flags & np.uint8(bit)) != 0 for name, bit in bits.items()}
 

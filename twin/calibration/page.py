@@ -62,7 +62,7 @@ def _remarks(commissioned: Commissioned) -> Iterator[str]:
             contradiction.what, f"{contradiction.action[0].upper()}{contradiction.action[1:]}."
         )
     if not commissioned.remarks and not commissioned.contradictions:
-        yield page.paragraph("Nothing: the record does not contradict the configuration.")
+        yield page.paragraph("Nothing to change: the record does not contradict the configuration.")
     if commissioned.unseen:
         yield page.paragraph(commissioned.unseen)
 
