@@ -1,11 +1,11 @@
-"""Connections that are retried for ever, as one stream of blocks, for any protocol."""
+"""Connections that are retried for ever, for any protocol, whether it reads or writes."""
 
 import errno
 import queue
 import socket
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sized
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
@@ -78,6 +78,8 @@ class Connection(Protocol):
 
 Away = Callable[[TwinError], None]  # receives why a PLC gives no rows, each reason once
 
+B = TypeVar("B", bound=Sized)
+C = TypeVar("C", bound=Connection)
 C_contra = TypeVar("C_contra", bound=Connection, contravariant=True)
 
 
@@ -99,9 +101,28 @@ def reconnecting(
 ) -> Generator[Samples, None, None]:
     """Samples of ``source`` over successive connections; empty blocks in between.
 
-    A PLC that is ``known``, or has given rows, is retried for ever: any error counts as a lost
-    connection. Before that, only LostError and AbsentError are retried, and only with ``away``;
-    other errors are raised. ``away`` receives each reason once until rows come. Closing hangs up.
+    As ``retrying``: before there are rows, and with ``away``, a PLC is retried that cannot be
+    reached or lacks an address.
+    """
+    may_pass = () if away is None else (LostError, AbsentError)
+    return retrying(source.samples, link, EMPTY, clock, away, known=known, may_pass=may_pass)
+
+
+def retrying(
+    work: Callable[[C], Iterator[B]],
+    link: C,
+    nothing: B,
+    clock: Clock,
+    away: Away | None,
+    *,
+    known: bool = False,
+    may_pass: tuple[type[SourceError], ...] = (),
+) -> Generator[B, None, None]:
+    """Results of ``work`` over successive connections, until it ends; ``nothing`` in between.
+
+    A PLC that is ``known``, or has given results that are not empty, is retried for ever: any error
+    counts as a lost connection. Before that, only errors that ``may_pass`` are retried; others are
+    raised. ``away`` receives each reason once until results come. Closing hangs up.
     """
     reasons = set[str]()  # already reported
     backoff = Backoff(RETRY_S, LONGEST_RETRY_S)
@@ -112,33 +133,33 @@ def reconnecting(
                 link.open()
                 connected = True
                 if known or reasons:
-                    yield EMPTY  # a connection is no answer yet
-                for block in source.samples(link):
-                    if len(block):
+                    yield nothing  # a connection is no answer yet
+                for result in work(link):
+                    if len(result):
                         known = True
                         backoff.reset()
                         reasons.clear()
-                    yield block
+                    yield result
+                return
             except TwinError as error:
-                may_pass = isinstance(error, LostError | AbsentError) and away is not None
-                if not known and not may_pass:
+                if not known and not isinstance(error, may_pass):
                     raise
                 if away is not None and str(error) not in reasons:
                     reasons.add(str(error))
                     away(error)
                 link.close()  # what it remembers of the PLC may no longer hold
                 # An absent PLC is retried at the shortest interval, so that no row is missed.
-                yield from _pause(clock, backoff.next_s() if connected else RETRY_S)
+                yield from _pause(clock, backoff.next_s() if connected else RETRY_S, nothing)
     finally:
         link.close()
 
 
-def _pause(clock: Clock, seconds: float) -> Iterator[Samples]:
-    """Empty blocks until the next attempt; the first before any wait."""
-    yield EMPTY
+def _pause(clock: Clock, seconds: float, nothing: B) -> Iterator[B]:
+    """``nothing`` until the next attempt; the first before any wait."""
+    yield nothing
     for _ in range(round(2 * seconds / RETRY_S)):
         clock.sleep(RETRY_S / 2)
-        yield EMPTY
+        yield nothing
 
 
 def in_thread(source: Generator[Samples, None, None]) -> Generator[Samples, None, None]:

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drivers.modbus import source as modbus
-from drivers.modbus.client import ModbusSettings
 from drivers.modbus.connection_pool import ConnectionPool
 from drivers.modbus.probe import probe
+from drivers.modbus.settings import ModbusSettings
 from drivers.probe import Line
 from drivers.reconnect import Away
 from twin.errors import ConfigError, SourceError

@@ -12,7 +12,8 @@ import rigs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.modbus.source import ModbusSettings, blocks
+from drivers.modbus.settings import ModbusSettings
+from drivers.modbus.source import blocks
 from drivers.reconnect import Away, Clock
 from tests.modbus_server import CUT, HALF, SILENT, ModbusServer, PlcTime, TracePlc
 from twin.errors import ConfigError, SourceError, TwinError

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.modbus.client import ModbusClient, ModbusSettings
 from drivers.modbus.plan import plan
 from drivers.modbus.poll import Poller
+from drivers.modbus.poll_socket import PollSocket
+from drivers.modbus.settings import ModbusSettings
 from drivers.modbus.source import blocks
 from drivers.reconnect import Clock, LostError
 from drivers.tags import Tag
@@ -59,7 +60,7 @@ class Rig:
         self.time = PlcTime(self.plc.scan)
         settings = settings_for(server, **changes)
         self.clock = Clock(self.time.wall_ns, self.time.now_ns, self.time.sleep)
-        self.link = ModbusClient(settings)
+        self.link = PollSocket(settings)
         self.poller = Poller(settings, self.clock)
 
     def take(self, count: int) -> Samples:

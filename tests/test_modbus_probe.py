@@ -10,8 +10,8 @@ import pytest
 import rigs
 from command_line import edited, twin
 
-from drivers.modbus.client import ModbusSettings
 from drivers.modbus.probe import probe, word_order_of
+from drivers.modbus.settings import ModbusSettings
 from drivers.probe import Line
 from drivers.reconnect import Clock
 from tests.modbus_server import SILENT, ModbusServer, PlcTime, TracePlc

@@ -15,8 +15,10 @@ from cryptography.hazmat.primitives.serialization import Encoding, load_pem_priv
 from independent import pem
 from pydantic import ValidationError
 
-from drivers.modbus.client import ModbusClient, ModbusSettings
-from drivers.modbus.pdu import Request
+from drivers.modbus.client import ModbusClient
+from drivers.modbus.plan import Request
+from drivers.modbus.poll_socket import head
+from drivers.modbus.settings import ModbusSettings
 from drivers.modbus.tls import Tls, secured
 from drivers.opcua import certificates
 from drivers.reconnect import LostError
@@ -27,7 +29,7 @@ from twin.settings import Document
 
 FOUR = Request(Address("input", 1), 4)
 TIMEOUT_MS = 100
-ANSWER = FOUR.head(1, 1) + bytes(range(8))
+ANSWER = head(FOUR, 1, 1, 4) + bytes(range(8))
 
 
 class Plc:
@@ -222,7 +224,7 @@ def test_our_own_files_that_are_of_no_use_are_named(tmp_path: Path) -> None:
             tls = Tls.model_validate({"trusted": tmp_path / certificates.OWN} | changes)
             connection = socket.create_connection(("127.0.0.1", port))
             with pytest.raises(ConfigError, match=f"{said} {broken}: cannot be used"):
-                secured(connection, tls, f"127.0.0.1:{port}", TIMEOUT_MS)
+                secured(connection, tls, f"127.0.0.1:{port}")
             assert connection.fileno() == -1  # it is closed
     with pytest.raises(ValidationError, match="certificate and key belong together"):
         Tls.model_validate({"trusted": broken, "key": broken})

@@ -69,8 +69,9 @@ def test_the_trace_comes_whole_and_is_the_one_that_modbus_serves(opcua: OpcuaPlc
 
 def by_modbus(opcua: OpcuaPlc, samples: Samples) -> Samples:
     """The same scans, from the registers of the ring."""
-    from drivers.modbus.client import ModbusClient, ModbusSettings
+    from drivers.modbus.client import ModbusClient
     from drivers.modbus.ring import Trace
+    from drivers.modbus.settings import ModbusSettings
 
     tags = {"pressure": {"address": "input:1", "type": "float32", "unit": "mbar"}}
     tags["pressure"]["reference"] = "absolute"

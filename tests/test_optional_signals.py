@@ -11,7 +11,7 @@ import pytest
 import tomli_w
 from modbus_server import ModbusServer, PlcTime, TracePlc
 
-from drivers.modbus.client import ModbusSettings
+from drivers.modbus.settings import ModbusSettings
 from drivers.modbus.source import blocks
 from drivers.opcua import source as opcua
 from drivers.opcua.settings import OpcuaSettings

@@ -29,7 +29,7 @@ from independent import (
 from plc_process import start_plc
 
 from drivers.modbus import source as modbus
-from drivers.modbus.client import ModbusSettings
+from drivers.modbus.settings import ModbusSettings
 from drivers.opcua import certificates
 from drivers.opcua import source as opcua
 from drivers.opcua.settings import OpcuaSettings

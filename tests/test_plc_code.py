@@ -16,8 +16,8 @@ import numpy.typing as npt
 import pytest
 from asyncua import ua
 
-from drivers.modbus.client import ModbusSettings
 from drivers.modbus.ring import Header, Trace
+from drivers.modbus.settings import ModbusSettings
 from drivers.opcua.settings import BIT_NODES, Node, OpcuaSettings
 from drivers.opcua.trace import NodeTrace
 from drivers.optional_signals import BITS

@@ -18,7 +18,7 @@ from typer import BadParameter
 from typer.main import get_command
 
 from drivers.modbus import hil as hil_modbus
-from drivers.modbus.client import ModbusSettings
+from drivers.modbus.settings import ModbusSettings
 from drivers.opcua import hil as hil_opcua
 from drivers.opcua.settings import OpcuaSettings
 from drivers.outputs.settings import ResultsSettings

@@ -22,8 +22,9 @@ from command_line import twin
 from modbus_server import CUT, SILENT, ModbusServer
 from plc_process import PlcProcess, start_plc
 
-from drivers.modbus.client import ModbusSettings
-from drivers.modbus.connection_pool import ConnectionPool, Line, PooledClient
+from drivers.modbus.client import ModbusClient
+from drivers.modbus.connection_pool import ConnectionPool, Line
+from drivers.modbus.settings import ModbusSettings
 from drivers.opcua.settings import TraceNodes
 from drivers.reconnect import LostError
 from drivers.tags import Address
@@ -74,9 +75,9 @@ def settings_for(server: ModbusServer, **changes: Any) -> ModbusSettings:
 
 
 @contextmanager
-def sharing(server: ModbusServer, count: int = 2) -> Iterator[list[PooledClient]]:
+def sharing(server: ModbusServer, count: int = 2) -> Iterator[list[ModbusClient]]:
     lines, settings = ConnectionPool(), settings_for(server)
-    links = [PooledClient(settings, lines.to(settings)) for _ in range(count)]
+    links = [ModbusClient(settings, lines.to(settings)) for _ in range(count)]
     try:
         for link in links:
             link.open()
@@ -104,7 +105,7 @@ def test_who_asks_the_same_plc_has_the_same_line(server: ModbusServer) -> None:
 def test_all_come_over_one_connection_and_each_gets_its_own_answer(server: ModbusServer) -> None:
     wrong: list[int] = []
 
-    def ask(link: PooledClient, first: int) -> None:
+    def ask(link: ModbusClient, first: int) -> None:
         for offset in range(first, first + 300):
             if link.read(Address("holding", offset), 3).tolist() != [
                 offset,

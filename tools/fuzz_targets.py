@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, MutableMapping
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
-from functools import cache
+from functools import cache, partial
 from io import BytesIO
 from itertools import count
 from pathlib import Path
@@ -28,11 +28,21 @@ from argon2 import PasswordHasher
 from asyncua import ua
 from asyncua.common.utils import Buffer
 from asyncua.ua.ua_binary import from_binary, to_binary
+from pymodbus.client import ModbusTcpClient
+from pymodbus.framer.socket import FramerSocket
+from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
+from pymodbus.pdu.bit_message import ReadCoilsResponse, WriteMultipleCoilsResponse
+from pymodbus.pdu.register_message import (
+    ReadHoldingRegistersResponse,
+    WriteMultipleRegistersResponse,
+)
 
-from drivers.modbus import pdu as telegram
-from drivers.modbus.client import ModbusClient, ModbusSettings
+from drivers.modbus.client import READING, ModbusClient
+from drivers.modbus.plan import Request
 from drivers.modbus.poll import Poller
+from drivers.modbus.poll_socket import PollSocket
 from drivers.modbus.ring import Trace
+from drivers.modbus.settings import ModbusSettings
 from drivers.opcua import values as opcua_values
 from drivers.opcua.bounds import refuse_endless_arrays
 from drivers.opcua.settings import Node
@@ -77,13 +87,8 @@ DEPTH_BLOCKS = 4  # readings of the ring with one input
 AMBIENT = 101_325.0  # Pa
 WORD, TOKEN = "correct horse", "t" * 43  # of a user, and of a session
 CHEAP = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
-ASKED = [  # over Modbus, one after the other
-    telegram.Request(Address("holding", 100), 2),
-    telegram.Request(Address("coil", 0), 9),
-    telegram.Store(Address("holding", 7), (1, 2)),
-    telegram.Request(Address("input", 4), 1),
-    telegram.Store(Address("coil", 3), (1, 0, 1)),
-]
+READS = [Request(Address("holding", 100), 2), Request(Address("coil", 0), 9)]
+WRITES = [(Address("holding", 7), (1, 2)), (Address("coil", 3), (1, 0, 1))]
 LEVELS = "compact-ejector-35", "rig-01"  # of the topics of one ejector
 
 
@@ -96,7 +101,7 @@ class Served:
 
     def read(self, address: Address, number: int) -> Words:
         """As ``Link.read``; an address that no request can hold is a mistake."""
-        telegram.Request(address, number).question(1, 1)
+        READING[address.area](1, 0, address.offset, number).encode()
         indices = np.arange(self._next, self._next + number) % len(self._words)
         self._next += number
         return self._words[indices]
@@ -197,21 +202,50 @@ class Wire:
         self._rest = b""
 
 
+class WiredClient(ModbusTcpClient):
+    """pymodbus' client on a wire that sends an input, answer by answer."""
+
+    def __init__(self, data: bytes) -> None:
+        super().__init__("", retries=0)
+        self._wire = Wire(data)
+        self.socket = self._wire  # type: ignore[assignment]
+
+    def send(self, request: bytes, addr: tuple[str, int] | None = None) -> int:
+        """Ignore the request."""
+        return len(request)
+
+    def recv(self, _size: int | None) -> bytes:
+        """The next answer, as long as its head says."""
+        head = self._wire.recv(6)
+        return head + self._wire.recv(int.from_bytes(head[4:6], "big"))
+
+
 def modbus(data: bytes) -> str:
-    """Answers over Modbus, as they come from the socket."""
+    """Answers over Modbus to reads and writes."""
     link = ModbusClient(_settings())
-    link._socket = Wire(data)  # type: ignore[assignment]
+    link._connection = link._line.connection = WiredClient(data)
     outcome = ""
-    for request in ASKED:
-        try:
-            if isinstance(request, telegram.Request):
-                link.read(request.address, request.count)
-            else:
-                link.write(request.address, request.values)
-            outcome += " answered"
-        except SourceError as error:
-            outcome += f" {type(error).__name__}"
+    for ask in (
+        *(partial(link.read, request.address, request.count) for request in READS),
+        *(partial(link.write, *write) for write in WRITES),
+    ):
+        outcome += _outcome(ask)
     return outcome
+
+
+def poll_socket(data: bytes) -> str:
+    """Answers over Modbus to reads, as they come from the socket of polling."""
+    link = PollSocket(_settings())
+    link._socket = Wire(data)  # type: ignore[assignment]
+    return "".join(_outcome(partial(link.ask, request)) for request in READS)
+
+
+def _outcome(ask: Callable[[], object]) -> str:
+    try:
+        ask()
+    except SourceError as error:
+        return f" {type(error).__name__}"
+    return " answered"
 
 
 class Answering:
@@ -220,7 +254,7 @@ class Answering:
     def __init__(self, data: bytes) -> None:
         self._data, self._next = data or b"\0", 0
 
-    def ask(self, request: telegram.Request) -> bytes:
+    def ask(self, request: Request) -> bytes:
         """As ``Link.ask``."""
         indices = (self._next + np.arange(request.size)) % len(self._data)
         self._next += request.size
@@ -469,16 +503,19 @@ def _traces() -> list[bytes]:
 
 
 def _answers() -> list[bytes]:
-    """Valid answers, and one with an exception."""
-    unit, valid, refused = _settings().unit, b"", b""
-    for number, request in enumerate(ASKED, 1):
-        beginning = request.head(number, unit)
-        valid += beginning + (
-            request.echo if isinstance(request, telegram.Store) else bytes(request.size)
-        )
-        code = beginning[7] | telegram.REFUSAL
-        refused += telegram.HEAD.pack(number, 0, 3, unit, code, 3)
-    return [valid, refused]
+    """Valid answers to reads and writes, and exceptions in their place."""
+    unit, encode = _settings().unit, FramerSocket(DecodePDU(is_server=True)).buildFrame
+    answers: list[ModbusPDU] = [
+        ReadHoldingRegistersResponse(unit, 1, registers=[1, 2]),
+        ReadCoilsResponse(unit, 2, bits=9 * [True]),
+        WriteMultipleRegistersResponse(unit, 3, 7, 2),
+        WriteMultipleCoilsResponse(unit, 4, 3, 3),
+    ]
+    exceptions = [
+        ExceptionResponse(answer.function_code, 3, unit, answer.transaction_id)
+        for answer in answers
+    ]
+    return [b"".join(map(encode, answers)), b"".join(map(encode, exceptions))]
 
 
 def _logs(metadata: dict[str, str] | None = None) -> list[bytes]:
@@ -573,7 +610,7 @@ def _requests() -> list[bytes]:
 TARGETS: dict[str, Callable[[bytes], str]] = {
     target.__name__: target
     for target in (
-        *(ring, modbus, poll, values),
+        *(ring, modbus, poll_socket, poll, values),
         *(log, curve, head, csv, parquet, assets, aasx, fmu, users),
         *(mqtt, upload, http),
     )
@@ -581,6 +618,7 @@ TARGETS: dict[str, Callable[[bytes], str]] = {
 SEEDS: dict[str, Callable[[], list[bytes]]] = {
     "ring": _traces,
     "modbus": _answers,
+    "poll_socket": _answers,
     "poll": lambda: [bytes(range(40)), struct.pack(">f", 900.0) * 4],
     "values": _values,
     "log": _logs,

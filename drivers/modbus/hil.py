@@ -4,14 +4,16 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from drivers.modbus.client import ModbusClient, ModbusSettings
-from drivers.modbus.connection_pool import ConnectionPool, PooledClient
-from drivers.modbus.pdu import MOST_STORED, STORING
+from drivers.modbus.client import ModbusClient
+from drivers.modbus.connection_pool import ConnectionPool
+from drivers.modbus.settings import ModbusSettings
 from drivers.outputs.writer import Outputs, Ranged, Writer, counted, refuse_empty, refuse_no_range
 from drivers.tags import CODE, Address, Pressure, Tag, words_of
 from twin.settings import Document, Settings
 from twin.signals import MBAR
 
+MOST_WRITTEN = 123  # words in one request that writes, by the protocol
+WRITABLE = ("coil", "holding")
 Group = tuple[Address, tuple[int, ...]]  # words, or bits, from there on
 
 
@@ -20,7 +22,7 @@ class Written(Tag):
 
     @model_validator(mode="after")
     def _can_be_written(self) -> Self:
-        if self.address.area not in STORING:
+        if self.address.area not in WRITABLE:
             raise ValueError(f"{self.address} cannot be written: holding registers and coils can")
         if self.bit is not None or self.type == "float32":
             raise ValueError("a signal that is written takes a coil, or a register of integer type")
@@ -94,7 +96,7 @@ class RegisterOutlet:
         joined: list[Group] = []
         for address, values in groups:
             start, words = joined[-1] if joined else (None, ())
-            fits = start is not None and len(words) + len(values) <= MOST_STORED
+            fits = start is not None and len(words) + len(values) <= MOST_WRITTEN
             if start is not None and fits and start + len(words) == address:
                 joined[-1] = start, (*words, *values)
             else:
@@ -111,6 +113,6 @@ def writer(
 ) -> Writer:
     """The writer to this PLC, over a shared connection where there are ``lines``."""
     settings = document.section(HilSettings, "hil")
-    link = ModbusClient(driver) if lines is None else PooledClient(driver, lines.to(driver))
+    link = ModbusClient(driver, None if lines is None else lines.to(driver))
     outlet = RegisterOutlet(link, driver, settings.tags)
     return Writer(outlet, driver.where, settings.min_interval_ms)

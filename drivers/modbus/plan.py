@@ -6,8 +6,28 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from drivers.modbus.pdu import MOST_WORDS, Request
-from drivers.tags import Tag, WordOrder, Words
+from drivers.tags import Address, Tag, WordOrder, Words
+
+MOST_WORDS = 125  # in one request, by the protocol
+
+
+@dataclass(frozen=True)
+class Request:
+    """Words or bits to read at once."""
+
+    address: Address
+    count: int
+
+    @property
+    def size(self) -> int:
+        """Bytes of data in the answer."""
+        return 2 * self.count if self.address.of_words else (self.count + 7) // 8
+
+    def words(self, data: npt.NDArray[np.uint8]) -> Words:
+        """Words, or bits as 0 and 1, (rows, count) from the data of answers (rows, size)."""
+        if self.address.of_words:
+            return np.ascontiguousarray(data).view(">u2").astype(np.uint16)
+        return np.unpackbits(data, axis=1, count=self.count, bitorder="little").astype(np.uint16)
 
 
 def plan(tags: Iterable[Tag], most: int = MOST_WORDS) -> list[Request]:

@@ -5,14 +5,15 @@ missing number. The time of a sample is the middle of its request, by this machi
 """
 
 from collections.abc import Iterator
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from drivers.modbus.client import ModbusClient, ModbusSettings
-from drivers.modbus.plan import Answers, holds, plan
+from drivers.modbus.plan import Answers, Request, holds, plan
+from drivers.modbus.settings import ModbusSettings
 from drivers.optional_signals import BITS, VALUES, ambient_of, put_bits, put_values
-from drivers.reconnect import Clock
+from drivers.reconnect import Clock, Connection
 from drivers.tags import Flags
 from twin.errors import SourceError
 from twin.signals import MBAR, SAMPLE, Command, Quality, Samples
@@ -20,6 +21,14 @@ from twin.signals import MBAR, SAMPLE, Command, Quality, Samples
 SLOT_NS = 1_000_000
 SPIN_NS = 60_000  # a sleeping thread wakes about this late; longer spinning won nothing
 HEARTBEAT_NS = 100_000_000  # unchanged for longer: the PLC's program stands still
+
+
+class Link(Connection, Protocol):
+    """A connection whose answers are taken as they come, and decoded later."""
+
+    def ask(self, request: Request) -> bytes:
+        """Data of the answer, ``request.size`` bytes; LostError or SourceError without one."""
+        ...
 
 
 class Poller:
@@ -40,12 +49,12 @@ class Poller:
         self._beat: np.generic | None = None
         self._beat_ns = 0
 
-    def samples(self, link: ModbusClient) -> Iterator[Samples]:
+    def samples(self, link: Link) -> Iterator[Samples]:
         """Blocks of the slots that were read; ends only by an exception."""
         while True:
             yield self._block(link)
 
-    def _block(self, link: ModbusClient) -> Samples:
+    def _block(self, link: Link) -> Samples:
         """Samples of one interval; if the connection breaks, those before that."""
         if self._failure is not None:
             failure, self._failure = self._failure, None
@@ -79,7 +88,7 @@ class Poller:
         while self._clock.now_ns() < due:
             pass
 
-    def _ask(self, link: ModbusClient) -> tuple[bytes, int, int]:
+    def _ask(self, link: Link) -> tuple[bytes, int, int]:
         """Data of all answers of a slot; request and arrival time of the last answer (ns)."""
         row, asked_ns = b"", 0
         for request in self._requests:

@@ -5,9 +5,10 @@ from functools import partial
 
 import numpy as np
 
-from drivers.modbus.client import ModbusClient, ModbusSettings
+from drivers.modbus.client import ModbusClient
 from drivers.modbus.plan import plan
 from drivers.modbus.ring import RECORDS_AT_ONCE, Trace
+from drivers.modbus.settings import ModbusSettings
 from drivers.probe import TIMES, Line, looked_at, watched
 from drivers.reconnect import REAL, Clock
 from drivers.tags import Address, Pressure, Tag, WordOrder, Words, numbers

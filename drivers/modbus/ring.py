@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from drivers.modbus.client import ModbusClient, ModbusSettings, span
+from drivers.modbus.client import ModbusClient
+from drivers.modbus.errors import span
 from drivers.modbus.plan import Answers, plan
+from drivers.modbus.settings import ModbusSettings
 from drivers.optional_signals import BITS, VALUES, ambient_of, once, put_bits, put_values
 from drivers.reconnect import Clock
 from drivers.tags import WordOrder, Words, numbers
@@ -145,9 +147,8 @@ class Trace(Follower[Header, ModbusClient]):
         """Present values that are not in the ring; they are read once a block."""
         if not self._values:
             return {}
-        answers = Answers.of(
-            self._requests, [b"".join(link.ask(request) for request in self._requests)]
-        )
+        words = [link.read(request.address, request.count) for request in self._requests]
+        answers = Answers(self._requests, [row[np.newaxis] for row in words])
         order = self._settings.word_order
         return {name: float(answers.floats(tag, order)[0]) for name, tag in self._values.items()}
 

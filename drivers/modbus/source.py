@@ -2,14 +2,14 @@
 
 from collections.abc import Generator
 
-from drivers.modbus.client import ModbusClient, ModbusSettings
-from drivers.modbus.connection_pool import ConnectionPool, PooledClient
+from drivers.modbus.client import ModbusClient
+from drivers.modbus.connection_pool import ConnectionPool
 from drivers.modbus.poll import Poller
+from drivers.modbus.poll_socket import PollSocket
 from drivers.modbus.ring import Trace
+from drivers.modbus.settings import ModbusSettings
 from drivers.reconnect import REAL, Away, Clock, in_thread, reconnecting
 from twin.signals import Samples
-
-__all__ = ["ModbusSettings", "blocks"]
 
 
 def blocks(
@@ -30,9 +30,8 @@ def blocks(
     for them.
     """
     if settings.mode == "poll":
-        return in_thread(
-            reconnecting(Poller(settings, clock), ModbusClient(settings), clock, away, known=known)
-        )
-    link = ModbusClient(settings) if lines is None else PooledClient(settings, lines.to(settings))
-    stream = reconnecting(Trace(settings, clock), link, clock, away, known=known)
+        link = PollSocket(settings) if settings.tls is None else ModbusClient(settings)
+        return in_thread(reconnecting(Poller(settings, clock), link, clock, away, known=known))
+    client = ModbusClient(settings, None if lines is None else lines.to(settings))
+    stream = reconnecting(Trace(settings, clock), client, clock, away, known=known)
     return stream if settings.tls is None else in_thread(stream)  # shaking hands takes time

@@ -5,9 +5,8 @@ The PLC proves itself by its own certificate or that of the authority that signe
 
 import socket
 import ssl
-import time
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from pydantic import model_validator
 
@@ -43,52 +42,7 @@ class Tls(Settings):
         return self.model_copy(update=resolved)
 
 
-class Secured(ssl.SSLSocket):
-    """A connection inside TLS; ``recv`` waits for all that is asked for, as MSG_WAITALL does."""
-
-    address = ""  # host:port, for messages
-    has_answered = False  # it has answered at least once
-
-    def recv(self, buflen: int = 1024, flags: int = 0) -> bytes:
-        """Exactly ``buflen`` bytes, or fewer if the PLC closes; OSError after the timeout.
-
-        SourceError if the PLC rejects our certificate, which TLS 1.3 reports only now; LostError
-        if it hangs up instead.
-        """
-        patience = self.gettimeout()
-        assert patience is not None
-        end = time.monotonic() + patience
-        data = bytearray()
-        try:
-            while len(data) < buflen:
-                self.settimeout(max(end - time.monotonic(), 1e-3))
-                if not (chunk := super().recv(buflen - len(data))):
-                    break
-                data += chunk
-        except (ssl.SSLError, ConnectionError) as error:
-            raise self._hung_up(error) from error
-        finally:
-            self.settimeout(patience)
-        if not data and not self.has_answered:
-            raise _unwanted(self.address, LostError)
-        self.has_answered = True
-        return bytes(data)
-
-    def sendall(self, data: Any, flags: int = 0) -> None:
-        """Send everything; errors as from ``recv``."""
-        try:
-            super().sendall(data, flags)
-        except (ssl.SSLError, ConnectionError) as error:
-            raise self._hung_up(error) from error
-
-    def _hung_up(self, error: OSError) -> Exception:
-        """The error to raise: right after the handshake it means that the PLC rejected us."""
-        if isinstance(error, ssl.SSLError) and _refuses(error):
-            return _unwanted(self.address)
-        return error if self.has_answered else _unwanted(self.address, LostError)
-
-
-def secured(connection: socket.socket, tls: Tls, address: str, timeout_ms: float) -> Secured:
+def secured(connection: socket.socket, tls: Tls, address: str) -> ssl.SSLSocket:
     """Do the TLS handshake on ``connection`` to ``address`` (host:port); closes it on failure.
 
     SourceError if the PLC's certificate is not trusted or the PLC rejects ours, LostError if it
@@ -97,17 +51,25 @@ def secured(connection: socket.socket, tls: Tls, address: str, timeout_ms: float
     try:
         context = _context(tls)
         connection.settimeout(HANDSHAKE_S)
-        inside = context.wrap_socket(connection, server_hostname=tls.name or _host(address))
+        return context.wrap_socket(connection, server_hostname=tls.name or _host(address))
     except OSError as error:
         connection.close()
         raise _explained(error, tls, address) from error
     except BaseException:
         connection.close()
         raise
-    assert isinstance(inside, Secured)
-    inside.address = address
-    inside.settimeout(timeout_ms * 1e-3)
-    return inside
+
+
+def rejection(error: Exception, address: str, *, has_answered: bool) -> SourceError | None:
+    """The error if the PLC rejects our certificate, which TLS 1.3 reports only after a request.
+
+    ``error`` is that of a lost connection. LostError if it was lost before the first answer without
+    a reason; None if it was lost later.
+    """
+    for cause in (error, error.__context__):  # pymodbus wraps errors of sending
+        if isinstance(cause, ssl.SSLError) and _refuses(cause):
+            return _unwanted(address)
+    return None if has_answered else _unwanted(address, LostError)
 
 
 def _host(address: str) -> str:
@@ -121,7 +83,6 @@ def _context(tls: Tls) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.minimum_version = ssl.TLSVersion.TLSv1_2  # as the protocol has it
     context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN  # the PLC's own certificate is enough
-    context.sslsocket_class = Secured
     try:
         context.load_verify_locations(cadata=_certificates(tls.trusted))
     except (OSError, ValueError) as error:

@@ -5,8 +5,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers.modbus.client import ModbusSettings
 from drivers.modbus.connection_pool import ConnectionPool
+from drivers.modbus.settings import ModbusSettings
 from drivers.outputs.settings import ResultsSettings
 from drivers.outputs.writer import Writer
 from drivers.sources import settings_of

@@ -7,13 +7,14 @@ Only tags under ``[hil.tags]`` are written, each within its range, and no more o
 import logging
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Protocol, Self
 
-from drivers.reconnect import RETRY_S, LostError
+from drivers.reconnect import Clock, Connection, LostError, retrying
 from drivers.tags import Quantity
-from twin.errors import SourceError
+from twin.errors import SourceError, TwinError
 from twin.signals import MBAR
 
 log = logging.getLogger(__name__)
@@ -28,14 +29,8 @@ class Outputs:
     air_saving: bool  # H1
 
 
-class Outlet(Protocol):
+class Outlet(Connection, Protocol):
     """Destination of outputs; ``watchdog`` counts them."""
-
-    def open(self) -> None:
-        """Connect, unless it is connected; LostError if that fails."""
-
-    def close(self) -> None:
-        """Hang up."""
 
     def write(self, outputs: Outputs, watchdog: int) -> None:
         """Write every tag that is listed; LostError if no answer comes, or SourceError."""
@@ -51,7 +46,7 @@ class Writer:
         self._changed = threading.Condition()
         self._failure: SourceError | None = None
         self._closed = False
-        self._accepted = False  # the PLC took outputs once: a later refusal may pass
+        self._away = False  # the PLC, which was reported
         outlet.open()
         self._thread = threading.Thread(target=self._run, name="hil writer")
         self._thread.start()
@@ -79,16 +74,34 @@ class Writer:
         self.close()
 
     def _run(self) -> None:
+        """Write until it is closed; a PLC that took outputs once is retried for ever."""
+        clock = Clock(sleep=self._pause)
+        writing = retrying(
+            self._written, self._outlet, b"", clock, self._warn, may_pass=(LostError,)
+        )
         try:
-            while (newest := self._take()) is not None:
-                started = time.monotonic()
-                self._write(*newest)
-                self._pause(started + self._interval_s - time.monotonic())
+            with closing(writing):
+                for _ in writing:
+                    if self._closed:
+                        return
         except SourceError as error:
             with self._changed:
                 self._failure = error
-        finally:
-            self._outlet.close()
+
+    def _written(self, outlet: Outlet) -> Iterator[bytes]:
+        """The watchdog's count of each outputs once they are written."""
+        while (newest := self._take()) is not None:
+            started = time.monotonic()
+            outlet.write(*newest)
+            self._away = False
+            yield newest[1].to_bytes(8)
+            self._pause(started + self._interval_s - time.monotonic())
+
+    def _warn(self, error: TwinError) -> None:
+        """Log the first reason of each loss."""
+        if not self._away:
+            self._away = True
+            log.warning("%s: nothing is written until it is back: %s", self._target, error)
 
     def _take(self) -> tuple[Outputs, int] | None:
         """The newest outputs once some are not yet written; None at the end."""
@@ -100,24 +113,6 @@ class Writer:
     def _pause(self, seconds: float) -> None:
         with self._changed:
             self._changed.wait_for(lambda: self._closed, max(seconds, 0.0))
-
-    def _write(self, outputs: Outputs, watchdog: int) -> None:
-        try:
-            self._outlet.write(outputs, watchdog)
-            self._accepted = True
-        except SourceError as error:
-            if not self._accepted and not isinstance(error, LostError):
-                raise
-            log.warning("%s: nothing is written until it is back: %s", self._target, error)
-            self._outlet.close()
-            self._reconnect()
-
-    def _reconnect(self) -> None:
-        while not self._closed:
-            self._pause(RETRY_S)
-            with suppress(SourceError):
-                self._outlet.open()
-                return
 
 
 class Ranged:

@@ -50,7 +50,7 @@ def schema() -> None:
 def sections() -> "dict[str, dict[str, type[Settings]]]":
     """The tables of a configuration by name, each with its settings by kind of driver or ""."""
     from drivers.modbus import hil as hil_modbus
-    from drivers.modbus.client import ModbusSettings
+    from drivers.modbus.settings import ModbusSettings
     from drivers.opcua import hil as hil_opcua
     from drivers.opcua.settings import OpcuaSettings
     from drivers.outputs.settings import ResultsSettings
