@@ -10,6 +10,8 @@ import pytest
 import rigs
 
 from twin.alarms.database import open_store
+from twin.alarms.limit_changes import LimitChanges
+from twin.alarms.limits import UnitLimits
 from twin.alarms.loop import Alarms
 from twin.alarms.settings import board_rules
 from twin.alarms.writer import Keeper
@@ -48,6 +50,7 @@ class Run:
     config: Config
     clock: Callable[[], int] = lambda: NOW
     alarms: Alarms = field(init=False)
+    limits: LimitChanges = field(init=False)
     live: LiveRows = field(init=False)
     _plc_ns: int = 0
 
@@ -57,6 +60,7 @@ class Run:
         keeper = Keeper(lambda: open_store(path), Unit(asset.type, asset.id), pytest.fail)
         before = keeper.begin()
         self.alarms = Alarms(board_rules(document), self.clock, before, keeper)
+        self.limits = LimitChanges(UnitLimits.of(self.config), keeper, self.clock)
         ring = folder_of(document, asset) / RING
         self.live = LiveRows(ring, AMBIENT, pytest.fail, self.clock)
 
@@ -71,6 +75,7 @@ class Run:
     def rest(self) -> None:
         """Nothing happens; what people have asked for is done."""
         self.alarms.follow(NONE, [])
+        self.limits.follow(NONE, [])
         self.live.write(NONE, NO_TICKS, [])
 
     def suck(

@@ -244,7 +244,7 @@ def test_tabs_go_by_keyboard_and_what_is_new_is_told_to_who_listens(site: Site) 
     page = site.open()
     site.until_light(page, "green")
     page.locator("#tab-now").focus()
-    for key, tab in (("ArrowRight", "trends"), ("End", "history"), ("ArrowRight", "now")):
+    for key, tab in (("ArrowRight", "trends"), ("End", "limits"), ("ArrowRight", "now")):
         page.keyboard.press(key)
         expect(page.locator(f"#tab-{tab}")).to_be_focused()
         expect(page.locator(f"#{tab}")).to_be_visible()
@@ -255,7 +255,7 @@ def test_tabs_go_by_keyboard_and_what_is_new_is_told_to_who_listens(site: Site) 
 
 
 def test_a_german_browser_reads_german(site: Site) -> None:
-    page = site.open(locale="de-DE")
+    page = site.open(size="phone", locale="de-DE")
     site.run.suck(1.0)
     site.run.leak()
     site.until_light(page, "red")
@@ -265,10 +265,11 @@ def test_a_german_browser_reads_german(site: Site) -> None:
     card(page).locator("summary").click()
     german = {str(one.string) for one in catalogue("de")}
     english = {text for _, text in texts()} - german
-    for tab in ("Trends", "Verlauf", "Jetzt"):
+    for tab in ("Trends", "Verlauf", "Grenzwerte", "Jetzt"):
         page.get_by_role("tab", name=tab).click()
         lines = page.locator("body").inner_text().splitlines()
         assert {one for one in lines if one.strip() in english} <= {""}
+        _is_fit(page)
     page.select_option("#language", "en")
     expect(page.get_by_role("tab", name="History")).to_be_visible()
 
@@ -657,6 +658,96 @@ def test_history_is_searched(site: Site) -> None:
     expect(episodes).to_contain_text("still active")
 
 
+# --- limits ---------------------------------------------------------------------------------------
+
+
+def limit(page: Page, title: str) -> Locator:
+    heading = page.get_by_role("heading", name=title, exact=True)
+    return page.locator("article.limit").filter(has=heading)
+
+
+def change_limit(site: Site, page: Page, title: str, value: str, reason: str) -> None:
+    """Change a limit as a person does, and wait until the run has answered."""
+    limit(page, title).get_by_role("button", name="Change").click()
+    page.get_by_label("New value in").fill(value)
+    page.get_by_label("Reason").fill(reason)
+    page.get_by_role("button", name="Save").click()
+    said = page.locator("#limits-said")
+    site.until(page, lambda: said.text_content() not in ("", None))
+
+
+@pytest.mark.parametrize("site", [2], indirect=True)
+def test_a_limit_is_changed_with_who_and_why_and_set_back(site: Site) -> None:
+    mine, theirs = site.open(), site.open()
+    site.log_in(mine)
+    for page in (mine, theirs):
+        page.get_by_role("tab", name="Limits").click()
+    usual = limit(theirs, "Longest t1").locator("b").text_content() or ""
+    change_limit(site, mine, "Longest t1", "700", "shorter <b>cycle</b>")
+    expect(mine.locator("#limits-said")).to_have_text("Longest t1: changed")
+    for page in (mine, theirs):
+        expect(limit(page, "Longest t1").locator("b")).to_have_text("700 ms")
+        expect(limit(page, "Longest t1")).to_contain_text(f"changed from {usual} to 700 ms by ann")
+        expect(limit(page, "Longest t1")).to_contain_text("shorter <b>cycle</b>")
+        expect(limit(page, "Longest t1")).to_contain_text(f"configured: {usual}")
+        expect(page.locator("article.change")).to_have_count(1)
+    expect(limit(theirs, "Longest t1").get_by_role("button")).to_have_count(0)
+    expect(theirs.locator("#limits-who")).to_contain_text("Who has the role configure")
+    mine.locator("#ejectors [data-number='1']").click()
+    expect(mine.locator("#limits-head")).to_have_text("Limits of gripper-02")
+    expect(limit(mine, "Longest t1").locator("b")).not_to_have_text("700 ms")
+    mine.locator("#ejectors [data-number='0']").click()
+    limit(mine, "Longest t1").get_by_role("button", name="Reset").click()
+    expect(mine.get_by_label("New value in")).to_be_hidden()
+    mine.get_by_label("Reason").fill("as it was")
+    mine.get_by_role("button", name="Save").click()
+    back = limit(mine, "Longest t1").locator("b")
+    site.until(mine, lambda: back.text_content() == usual)
+    expect(limit(mine, "Longest t1").get_by_role("button", name="Reset")).to_have_count(0)
+    expect(mine.locator("article.change")).to_have_count(2)
+
+
+def test_a_limit_is_changed_by_keyboard_and_a_wrong_one_is_not_sent(site: Site) -> None:
+    page = site.open(size="phone")
+    site.log_in(page)
+    page.locator("#tab-now").focus()
+    page.keyboard.press("End")
+    button = limit(page, "Longest t1").get_by_role("button", name="Change")
+    button.focus()
+    page.keyboard.press("Enter")
+    expect(page.get_by_label("New value in")).to_be_focused()
+    page.keyboard.press("Control+A")
+    page.keyboard.type("7")  # below what can be set
+    page.keyboard.press("Tab")
+    page.keyboard.type("shorter cycle")
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    expect(page.locator("#limit")).to_be_visible()  # the browser says why
+    page.keyboard.press("Escape")
+    expect(button).to_be_focused()
+    expect(page.locator("article.change")).to_have_count(0)
+
+
+def test_a_change_of_a_limit_waits_for_a_run_and_the_page_says_so(site: Site) -> None:
+    page = site.open()
+    site.log_in(page)
+    site.until_light(page, "green")
+    site.run.close()
+    expect(page.locator("#banner")).to_contain_text("Not running since")
+    page.get_by_role("tab", name="Limits").click()
+    limit(page, "Smallest deviation").get_by_role("button", name="Change").click()
+    page.get_by_label("New value in").fill("3.5")
+    page.get_by_label("Reason").fill("vibration")
+    page.get_by_role("button", name="Save").click()
+    expect(limit(page, "Smallest deviation")).to_contain_text(
+        "to 3.5 mbar: asked; waits for the next run"
+    )
+    site.runs[:] = [Run(site.run.config, time.time_ns)]
+    said = page.locator("#limits-said")
+    site.until(page, lambda: said.text_content() == "Smallest deviation: changed")
+    expect(limit(page, "Smallest deviation").locator("b")).to_have_text("3.5 mbar")
+
+
 def test_text_from_outside_is_text(site: Site) -> None:
     page = site.open()
     site.run.leak("<img src=x onerror=\"document.title='taken'\">")
@@ -724,10 +815,21 @@ def test_axe_finds_no_violation(site: Site, scheme: str) -> None:
     assert violations(page) == []
     card(page).locator("summary").click()
     assert violations(page) == []
-    for tab, seen in (("Trends", "#trend-plot canvas"), ("History", "#episodes article")):
+    tabs = {
+        "Trends": "#trend-plot canvas",
+        "History": "#episodes article",
+        "Limits": "article.limit >> nth=0",
+    }
+    for tab, seen in tabs.items():
         page.get_by_role("tab", name=tab).click()
         expect(page.locator(seen)).to_be_visible()
         assert violations(page) == []
+    change_limit(site, page, "Longest t1", "700", "shorter cycle")
+    expect(limit(page, "Longest t1")).to_contain_text("700 ms")
+    assert violations(page) == []
+    limit(page, "Longest t1").get_by_role("button", name="Reset").click()
+    assert violations(page) == []
+    page.keyboard.press("Escape")
     page.get_by_role("tab", name="Now").click()
     for button, dialog in (("Shelve", "#shelve"), ("Comment", "#comment")):
         card(page).get_by_role("button", name=button).click()
@@ -745,9 +847,12 @@ def test_gloves_find_everything_on_every_screen(site: Site, scheme: str) -> None
         _is_fit(page)
         site.log_in(page)
         site.until_light(page, "red")
-        for tab in ("Now", "Trends", "History"):
+        for tab in ("Now", "Trends", "History", "Limits"):
             page.get_by_role("tab", name=tab).click()
             _is_fit(page)
+        limit(page, "Longest t1").get_by_role("button", name="Change").click()
+        _is_fit(page)
+        page.keyboard.press("Escape")
         page.get_by_role("tab", name="Now").click()
         card(page).get_by_role("button", name="Shelve").click()
         _is_fit(page)
@@ -755,8 +860,17 @@ def test_gloves_find_everything_on_every_screen(site: Site, scheme: str) -> None
 
 
 def _is_fit(page: Page) -> None:
-    """All there is to press is 44 pixels high and wide, and nothing is beside the screen."""
+    """All there is to press is 44 pixels high and wide, and nothing is beside the screen.
+
+    No label runs into what is beside it.
+    """
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    spilt = page.evaluate(
+        """() => [...document.querySelectorAll("button, .button")]
+          .filter((one) => one.offsetParent !== null && one.scrollWidth > one.clientWidth + 1)
+          .map((one) => one.textContent)"""
+    )
+    assert spilt == []
     small = page.evaluate(
         """() => [...document.querySelectorAll("button, a, input, select, summary, textarea")]
           .filter((one) => one.offsetParent !== null)

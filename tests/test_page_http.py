@@ -125,6 +125,7 @@ SEEN = (
         "/api/me",
         "/api/statistics",
         "/api/ejectors/0/history",
+        "/api/ejectors/0/limits",
         "/api/ejectors/0/trends/leakage",
         "/api/ejectors/0/curve?from=1&to=2",
     ),
@@ -364,7 +365,15 @@ def test_who_is_logged_in_acknowledges(site: Site) -> None:
         (Role.ACKNOWLEDGE, ["acknowledged", "shelved", "unshelved", "commented"]),
         (
             Role.CONFIGURE,
-            ["acknowledged", "shelved", "unshelved", "commented", "out_of_service", "in_service"],
+            [
+                "acknowledged",
+                "shelved",
+                "unshelved",
+                "commented",
+                "out_of_service",
+                "in_service",
+                "limit_changed",
+            ],
         ),
     ],
 )
@@ -378,7 +387,7 @@ def test_a_user_may_do_what_the_role_says(site: Site, role: Role, allowed: list[
         assert answer.status_code == (202 if deed in allowed else 403)
         if deed not in allowed:
             assert "it needs the role" in answer.json()["error"]
-    asked = [one for one in allowed if one != "commented"]
+    asked = [one for one in allowed if one not in ("commented", "limit_changed")]
     assert sorted(one.deed.value for one in _asked(site)) == sorted(asked)
 
 
@@ -733,3 +742,120 @@ def test_only_who_may_acknowledge_comments(site: Site) -> None:
     site.users.set_role("ann", Role.LOOK)
     assert _comment(site, "what").status_code == 403
     assert site.ejector.state()["alarms"][0]["comments"] == []
+
+
+# --- limits ---------------------------------------------------------------------------------------
+
+LIMITS = "/api/ejectors/0/limits"
+CHANGE = {"limit": "permitted_t1_ms", "value": 700.0, "reason": "shorter cycle"}
+
+
+def _change(site: Site, change: Any = CHANGE, **headers: str) -> httpx2.Response:
+    csrf = site.client.get("/api/me").json().get("csrf", "")
+    headers = {"origin": OURS, "x-csrf-token": csrf, **headers}
+    return site.client.post(LIMITS, json=change, headers=headers)
+
+
+def _limit(site: Site, key: str = "permitted_t1_ms") -> dict[str, Any]:
+    limits = site.client.get(LIMITS).json()["limits"]
+    return next(limit for limit in limits if limit["key"] == key)
+
+
+def _applied(site: Site, number: int) -> None:
+    run = site.run or site.begin()
+
+    def answered() -> bool:
+        run.rest()
+        return site.client.get(f"{LIMITS}/{number}").json() == {"answer": ""}
+
+    _until(answered)
+
+
+def test_who_may_configure_changes_a_limit_and_everybody_sees_who_and_why(site: Site) -> None:
+    site.begin()
+    site.log_in()
+    usual = _limit(site)
+    changed = _change(site)
+    assert changed.status_code == 202
+    waiting = _limit(site)
+    assert (waiting["value"], waiting["is_changed"]) == (usual["value"], False)
+    assert waiting["asked"][0]["words"] == "to 700 ms"
+    _applied(site, changed.json()["request"])
+    limit = _limit(site)
+    assert (limit["value_words"], limit["asked"], limit["is_changed"]) == ("700 ms", [], True)
+    assert limit["configured_words"] == usual["value_words"]
+    words = f"changed from {usual['value_words']} to 700 ms"
+    newest = {name: limit["newest"][name] for name in ("words", "who", "reason")}
+    assert newest == {"words": words, "who": "ann", "reason": "shorter cycle"}
+    assert limit["newest"]["when"].endswith("0 s ago")
+    assert site.ejector._limits().t1 == 700.0  # of trends
+    reset = _change(site, CHANGE | {"value": None, "reason": "as it was"})
+    _applied(site, reset.json()["request"])
+    assert _limit(site)["is_changed"] is False
+    back, first = site.client.get(LIMITS).json()["changes"]
+    assert back["words"] == f"changed from 700 ms to {usual['value_words']}"
+    assert (back["reason"], first["words"]) == ("as it was", words)
+
+
+def test_the_trail_says_who_asked_for_which_limit(site: Site, tmp_path: Path) -> None:
+    site.begin()
+    site.log_in()
+    _change(site)
+    _change(site, CHANGE | {"value": None})
+    told = [one for one in records(tmp_path)[0] if one["what"] == "limit_changed"]
+    assert [(one["who"], one["limit"], one["value"], one["reason"]) for one in told] == [
+        ("ann", "permitted_t1_ms", "700", "shorter cycle"),
+        ("ann", "permitted_t1_ms", "configured", "shorter cycle"),
+    ]
+
+
+@pytest.mark.parametrize("role", [Role.LOOK, Role.ACKNOWLEDGE])
+def test_a_limit_is_changed_by_nobody_else(site: Site, role: Role) -> None:
+    site.begin()
+    assert _change(site).status_code == 401  # not logged in
+    site.log_in()
+    site.users.set_role("ann", role)
+    denied = _change(site)
+    assert denied.status_code == 403
+    assert "it needs the role configure" in denied.json()["error"]
+    assert site.client.get(LIMITS).json()["changes"] == []
+
+
+def test_a_limit_is_changed_from_the_page_alone(site: Site) -> None:
+    site.begin()
+    site.log_in()
+    for header in ({"x-csrf-token": "guess"}, {"origin": "http://evil.example"}):
+        assert _change(site, **header).status_code == 403
+    assert site.client.get(LIMITS).json()["changes"] == []
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (CHANGE | {"limit": "t1"}, "no limit is called"),
+        (CHANGE | {"value": 1.0}, "must be 10 ms to 60000 ms"),
+        (CHANGE | {"value": "nan"}, "must be 10 ms to 60000 ms"),
+        (CHANGE | {"value": "high"}, "not a change of a limit"),
+        (CHANGE | {"reason": "  "}, "a reason has 1 to 200 letters"),
+        (CHANGE | {"reason": "x" * 201}, "a reason has 1 to 200 letters"),
+        ({"limit": "permitted_t1_ms", "reason": "no value"}, "not a change of a limit"),
+        (CHANGE | {"limit": "supply_low_bar", "value": 16.0}, "must be below the highest"),
+        ([], "not a change of a limit"),
+    ],
+)
+def test_a_limit_that_cannot_be_is_refused_at_once(site: Site, change: Any, why: str) -> None:
+    site.begin()
+    site.log_in()
+    answer = _change(site, change)
+    assert answer.status_code == 400
+    assert why in answer.json()["error"]
+    assert site.client.get(LIMITS).json()["changes"] == []
+
+
+def test_beyond_loopback_limits_are_seen_after_the_login_only(abroad: Site) -> None:
+    abroad.begin()
+    assert abroad.client.get(LIMITS).status_code == 401
+    assert abroad.client.get(f"{LIMITS}/1").status_code == 401
+    abroad.log_in()
+    assert abroad.client.get(LIMITS).status_code == 200
+    assert abroad.client.get(f"{LIMITS}/1").status_code == 400  # nobody has asked for it here

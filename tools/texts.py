@@ -15,6 +15,7 @@ from babel.messages.extract import extract_from_file
 from babel.messages.pofile import read_po, write_po
 
 from twin.alarms.causes import cause_of
+from twin.alarms.limits import ADJUSTABLE
 from twin.alarms.rules import by_cause, default_rules
 from twin.alarms.text import COMMISSION
 from twin.diagnosis.text import spoken
@@ -40,6 +41,8 @@ def texts() -> Iterator[Text]:
         for text in MARKED.findall(path.read_text(encoding="utf-8")):
             yield _place(path), text
     yield from _in_tables()
+    for limit in ADJUSTABLE.values():
+        yield from (("twin/alarms/limits.py", text) for text in (limit.title, limit.what))
 
 
 def _in_code(folder: Path, pattern: str, method: str, keyword: str) -> Iterator[Text]:

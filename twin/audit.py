@@ -35,6 +35,7 @@ class Act(StrEnum):
     WRONG_PASSWORD = "wrong_password"  # noqa: S105
     THROTTLED = "throttled"  # tried again during the wait; only the first such try is recorded
     COMMENTED = "commented"  # an alarm
+    LIMIT_CHANGED = "limit_changed"  # asked for; the run applies it
     DENIED = "denied"  # the role does not allow it
 
 

@@ -40,6 +40,7 @@ class Kind(StrEnum):
     DIAGNOSIS = "diagnosis"
     ALARM = "alarm"
     ALARM_CHANGED = "alarm_changed"
+    LIMIT_CHANGED = "limit_changed"
 
 
 SEVERITY: dict[Kind, Severity] = {
@@ -66,6 +67,7 @@ SEVERITY: dict[Kind, Severity] = {
     Kind.DIAGNOSIS: Severity.WARNING,  # the alarm has been raised already; this says why
     Kind.ALARM: Severity.WARNING,  # notifies people; its trigger has its own severity
     Kind.ALARM_CHANGED: Severity.INFO,  # cleared, acknowledged, shelved and so on
+    Kind.LIMIT_CHANGED: Severity.INFO,  # by a person, who and why are said
 }
 
 

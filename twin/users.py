@@ -37,7 +37,7 @@ class Role(StrEnum):
 
     LOOK = "look"  # read
     ACKNOWLEDGE = "acknowledge"  # acknowledge, comment and shelve alarms
-    CONFIGURE = "configure"  # take alarms out of service, and back
+    CONFIGURE = "configure"  # take alarms out of service, and back; change limits
 
     def covers(self, needed: "Role") -> bool:
         """Whether it includes the rights of ``needed``."""

@@ -1,4 +1,4 @@
-"""The alarm database: present states, episodes, and people's requests and comments."""
+"""The alarm database: present states, episodes, and people's requests, comments and limits."""
 
 import json
 import time
@@ -24,7 +24,7 @@ from sqlalchemy import (
 
 from twin.alarms.board import Comment, Episode
 from twin.alarms.loop import Before, News
-from twin.alarms.requests import Request
+from twin.alarms.requests import LimitChange, Request
 from twin.alarms.state import Deed, Kept
 from twin.assets.engine import Database, Purpose
 from twin.assets.unit import Unit, of_unit
@@ -95,6 +95,24 @@ COMMENT = Table(
     Column("text", Text, nullable=False),
 )
 
+LIMIT = Table(  # changes of limits, by people
+    "alarm_limit",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("asset_type", Text, nullable=False),
+    Column("asset_id", Text, nullable=False),
+    Column("limit_key", Text, nullable=False),
+    Column("value", Double),  # none: back to the configured value
+    Column("who", Text, nullable=False),
+    Column("reason", Text, nullable=False),
+    Column("asked_ns", BigInteger, nullable=False),
+    Column("answered_ns", BigInteger),
+    Column("refusal", Text, nullable=False),  # empty: applied, once answered
+    Column("old", Double),  # values in force; none: no limit
+    Column("new", Double),
+    sqlite_autoincrement=True,
+)
+
 # All units of which a run has kept alarms. They can be queried even if no alarm was ever raised.
 UNIT = Table("alarm_unit", metadata, *unit_columns())
 
@@ -148,6 +166,11 @@ class Store(Database):
                 answered = {"answered_ns": self._clock(), "answer": answer}
                 connection.execute(REQUEST.update().where(REQUEST.c.id == number).values(answered))
 
+            for number, change in news.limits.items():
+                names = ("answered_ns", "refusal", "old", "new")
+                answered = {name: getattr(change, name) for name in names}
+                connection.execute(LIMIT.update().where(LIMIT.c.id == number).values(answered))
+
     def requests(self, unit: Unit) -> list[Request]:
         """The unanswered requests to a unit's alarms, in order."""
         statement = select(REQUEST).where(*of_unit(REQUEST, unit), REQUEST.c.answered_ns.is_(None))
@@ -170,6 +193,26 @@ class Store(Database):
         with self._reading() as connection:
             answered_ns, answer = connection.execute(statement).one()
         return None if answered_ns is None else str(answer)
+
+    def change_limit(
+        self, unit: Unit, limit: str, value: float | None, who: str, reason: str
+    ) -> int:
+        """Store a person's change of a limit for a run to apply; returns its number."""
+        values: dict[str, Any] = {"asset_type": unit.type, "asset_id": unit.id, "limit_key": limit}
+        values |= {"value": value, "who": who, "reason": reason, "refusal": ""}
+        values |= {"asked_ns": self._clock()}
+        with self._writing() as connection:
+            result = connection.execute(LIMIT.insert().values(values).returning(LIMIT.c.id))
+            return int(result.scalar_one())
+
+    def limit_changes(self, unit: Unit, after: int = 0) -> list[LimitChange]:
+        """The changes of a unit's limits with a number above ``after``, in their order."""
+        names = ("id", "limit_key", "value", "who", "reason", "asked_ns", "answered_ns", "refusal")
+        columns = [LIMIT.c[name] for name in (*names, "old", "new")]
+        statement = select(*columns).where(*of_unit(LIMIT, unit), LIMIT.c.id > after)
+        with self._reading() as connection:
+            rows = connection.execute(statement.order_by(LIMIT.c.id)).all()
+        return [LimitChange(*row) for row in rows]
 
     def episodes_around(self, unit: Unit, since_ns: int) -> list[Episode]:
         """Episodes of a unit raised since ``since_ns``, after earlier ones that are not over."""

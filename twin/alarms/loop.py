@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from twin.alarms.board import Board, Diary, Episode, merge_evidence
 from twin.alarms.causes import CAUSES, UNLISTED, catalogue_evidence, cause_or_unlisted, value_of
-from twin.alarms.requests import Request, grant
+from twin.alarms.requests import LimitChange, Request, grant
 from twin.alarms.rules import Rule
 from twin.alarms.state import Alarm, Change, Deed, Kept
 from twin.alarms.text import SUPPRESSIONS, event_of, is_reportable, plain
@@ -42,15 +42,17 @@ class News:
     states: dict[str, Kept] = field(default_factory=dict)
     episodes: dict[tuple[int, str], Episode] = field(default_factory=dict)
     answers: dict[int, str] = field(default_factory=dict)  # to requests; empty: done
+    limits: dict[int, LimitChange] = field(default_factory=dict)  # applied or refused, by ID
 
     def __bool__(self) -> bool:
-        return bool(self.states or self.episodes or self.answers)
+        return bool(self.states or self.episodes or self.answers or self.limits)
 
     def add(self, later: "News") -> None:
         """Merge later changes."""
         self.states |= later.states
         self.episodes |= later.episodes
         self.answers |= later.answers
+        self.limits |= later.limits
 
 
 class AlarmStorage(Protocol):
@@ -61,6 +63,9 @@ class AlarmStorage(Protocol):
 
     def asked(self) -> list[Request]:
         """People's requests since the last call."""
+
+    def limit_changes(self) -> list[LimitChange]:
+        """Changes of limits since the last call, first those of all earlier runs."""
 
     def close(self) -> None:
         """Finish; it is the last call."""
@@ -86,7 +91,7 @@ class Alarms:
         self.board.resume(before.states)
         self._stored_names = [name for name in before.states if name in self.board.alarms]
         self._diary = Diary(before.going_on)
-        self._clock, self._storage, self._steady = clock, storage, steady
+        self._clock, self.storage, self._steady = clock, storage, steady
         self._clock_offset: int | None = None  # host clock less the monotonic one, in ns
         self._evidence: dict[str, dict[str, Any]] = {  # by value
             self.board[episode.alarm].rule.value: dict(episode.evidence)
@@ -112,7 +117,7 @@ class Alarms:
         for event in events:
             self._pending_events += self._take(event, _received(samples, event.time_ns, now))
         self._pending_events += self._events_of(self.board.see(now, {}), self._plc_ns)
-        for request in self._storage.asked() if self._storage else ():
+        for request in self.storage.asked() if self.storage else ():
             self._pending_events += self._grant(request, now)
         self._hand_over()
         events_out, self._pending_events = self._pending_events, []
@@ -133,8 +138,8 @@ class Alarms:
 
     def close(self) -> None:
         """Close the database."""
-        if self._storage is not None:
-            self._storage.close()
+        if self.storage is not None:
+            self.storage.close()
 
     def _follow_clock(self) -> None:
         """Shift pending delays when the host's clock was set, so that they keep their length."""
@@ -317,8 +322,8 @@ class Alarms:
         self._news.states[alarm.rule.name] = alarm.keep()
 
     def _hand_over(self) -> None:
-        if self._storage is not None and self._news:
-            self._storage.take(self._news)
+        if self.storage is not None and self._news:
+            self.storage.take(self._news)
         self._news = News()
 
 

@@ -1,4 +1,4 @@
-"""People's requests to an alarm, from another program or page; and how a board grants them."""
+"""People's requests, from another program or page: to an alarm, and to change a limit."""
 
 from dataclasses import dataclass
 
@@ -25,6 +25,36 @@ class Request:
     who: str
     asked_ns: int
     seconds: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class LimitChange:
+    """One person's change of a limit, named by its key; without ``value`` back to the configured.
+
+    ``old`` and ``new`` are the values in force before and after a run applied it, in the limit's
+    unit; None where there is no limit.
+    """
+
+    id: int
+    limit: str
+    value: float | None
+    who: str
+    reason: str
+    asked_ns: int
+    answered_ns: int | None = None
+    refusal: str = ""  # why a run refused it
+    old: float | None = None
+    new: float | None = None
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether no run has applied or refused it yet."""
+        return self.answered_ns is None
+
+    @property
+    def is_applied(self) -> bool:
+        """Whether a run has applied it."""
+        return self.answered_ns is not None and not self.refusal
 
 
 def grant(board: Board, request: Request, now: int) -> list[Change]:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from twin.alarms.database import Store
 from twin.alarms.loop import Before, News
-from twin.alarms.requests import Request
+from twin.alarms.requests import LimitChange, Request
 from twin.assets.unit import Unit
 from twin.errors import TwinError, in_words
 
@@ -30,7 +30,9 @@ class Keeper:
         self._failed = False
         self._news: queue.SimpleQueue[News] = queue.SimpleQueue()
         self._requests: queue.SimpleQueue[Request] = queue.SimpleQueue()
+        self._limits: queue.SimpleQueue[LimitChange] = queue.SimpleQueue()
         self._passed_on = 0  # ID of the newest request handed to the loop
+        self._passed_limit = 0  # the same of changes of limits
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._work, name="alarms", daemon=True)
 
@@ -40,6 +42,7 @@ class Keeper:
         try:
             self._store = self._open_store()
             before = self._store.before(self._unit)
+            self._pass_on_limits(self._store)
         except TwinError as error:
             self._let_go()
             self._failed = True
@@ -54,6 +57,10 @@ class Keeper:
     def asked(self) -> list[Request]:
         """People's requests since the last call."""
         return [self._requests.get() for _ in range(self._requests.qsize())]
+
+    def limit_changes(self) -> list[LimitChange]:
+        """Changes of limits since the last call, first those of all earlier runs."""
+        return [self._limits.get() for _ in range(self._limits.qsize())]
 
     def close(self) -> None:
         """Write what is left; if the database cannot be reached, only one more attempt is made."""
@@ -80,6 +87,7 @@ class Keeper:
                 self._store.save(self._unit, self._waiting)
             self._waiting = News()
             self._pass_on(self._store.requests(self._unit))
+            self._pass_on_limits(self._store)
         except Exception as error:  # later changes must still be stored, whatever the error
             self._let_go()
             if not self._failed:
@@ -97,6 +105,12 @@ class Keeper:
             if request.id > self._passed_on:
                 self._passed_on = request.id
                 self._requests.put(request)
+
+    def _pass_on_limits(self, store: Store) -> None:
+        """Hand over each change of a limit once, in their order."""
+        for change in store.limit_changes(self._unit, self._passed_limit):
+            self._passed_limit = change.id
+            self._limits.put(change)
 
     def _let_go(self) -> None:
         if self._store is not None:

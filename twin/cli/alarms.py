@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from twin.alarms.board import Board, Comment, Episode
     from twin.alarms.database import Store
+    from twin.alarms.limit_changes import LimitChanges
     from twin.alarms.loop import Alarms
     from twin.alarms.state import Alarm, Deed
     from twin.assets.unit import Unit
@@ -331,6 +332,16 @@ def alarms_of(
     open_database = partial(open_chosen, "", document, write=True)
     keeper = Keeper(open_database, Unit(settings.asset.type, settings.asset.id), say)
     return lambda: Alarms(by_cause, time.time_ns, keeper.begin(), keeper, time.monotonic_ns)
+
+
+def limit_changes_of(settings: "Config", alarms: "Alarms") -> "LimitChanges | None":
+    """What applies people's changes of limits to a run; None if its alarms are not stored."""
+    from twin.alarms.limit_changes import LimitChanges
+    from twin.alarms.limits import UnitLimits
+
+    if alarms.storage is None:
+        return None
+    return LimitChanges(UnitLimits.of(settings), alarms.storage, time.time_ns)
 
 
 def asker_of(settings: "Config") -> "Callable[[str, str], None] | None":

@@ -320,15 +320,16 @@ def _settings(config: Path | None) -> "FigureSettings":
 
 
 def _limits(config: Path | None) -> "Limits":
-    """The limits of a configuration's unit; without a configuration the field's defaults."""
+    """The limits of a configuration's unit, with people's changes; else the field's defaults."""
+    from twin.alarms.limits import limits_in_force
     from twin.config import Config
-    from twin.figures.settings import FigureSettings, limits, limits_of
+    from twin.figures.settings import FigureSettings, limits
     from twin.model.dataset import DataSet
     from twin.monitor.monitor import MonitorSettings
 
     document = _document(config)
     if document:
-        return limits_of(Config.of(document))
+        return limits_in_force(Config.of(document)).limits
     return limits(FigureSettings(), DataSet(), MonitorSettings())
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.cli.alarms import alarms_of, asker_of
+from twin.cli.alarms import alarms_of, asker_of, limit_changes_of
 from twin.cli.app import not_negative
 from twin.cli.console import Console, no_status, printers, status
 from twin.cli.figures import keeper_of
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from drivers.outputs.state import Results
     from drivers.outputs.writer import Writer
     from twin.acquisition import Acquisition
+    from twin.alarms.limit_changes import LimitChanges
     from twin.cli.compiling import Models
     from twin.cli.notifications import Begin, Standing
     from twin.config import Config
@@ -138,11 +139,13 @@ def run(
             enrichers: dict[str, EventEnricher] = (
                 {} if hil else {"diagnosis": adviser, "alarms": (board := alarms())}
             )
+            limits = None if hil else limit_changes_of(settings, board)
+            enrichers |= {"limits": limits} if limits else {}
             outlet_sinks = {} if hil else _outlet_sinks(board.standing(), results, outlets)
             sinks, advisers = _supervised(
                 {**outlet_sinks, **opened}, enrichers, plc.listening.notices
             )
-            _loop(name, models, rows, plc.listening, sinks, advisers, stopped)
+            _loop(name, models, rows, plc.listening, sinks, advisers, stopped, limits)
 
     failed: list[str] = []
     units = {figure.name: figure.unit for figure in FIGURES.values()}
@@ -403,6 +406,7 @@ def _loop(
     sinks: "Sequence[Sink]",
     advisers: "Sequence[EventEnricher]",
     stopped: Callable[..., str],
+    limits: "LimitChanges | None",
 ) -> None:
     """Wait for the model of one ejector, and run the loop over all its rows.
 
@@ -423,6 +427,8 @@ def _loop(
             with closing_all(sinks, advisers):
                 dispatch_unmodelled(sinks, rows.waiting(), ENDED)
     if pair is not None:
+        if limits is not None:
+            limits.attach(pair[1])
         run(rows.blocks(), *pair, sinks, listening, advisers)
 
 

@@ -121,7 +121,7 @@ class KeyFigures:
 
     def __post_init__(self) -> None:
         self._unit = Unit(self.data, self.settings.energy_kwh_m3)
-        self._limits = limits(self.settings, self.data, self.watch)
+        self.limits = limits(self.settings, self.data, self.watch)  # a person may change them
         self._expectation = Expectation(self.data)
 
     def ahead(self, pieces: Sequence[tuple[Samples, Ticks]], at_edge: bool) -> None:
@@ -184,8 +184,8 @@ class KeyFigures:
             int(samples["host_ns"][0]),
             values,
             expected,
-            warnings(values, expected, self._limits),
-            self._limits,
+            warnings(values, expected, self.limits),
+            self.limits,
             ended,
         )
 

@@ -58,7 +58,7 @@ class FigureSettings(DatabaseSettings):
 class Limits:
     """The permitted values of one unit, all known, in the figures' units.
 
-    ``configured`` names the figures whose limit the configuration sets.
+    ``configured`` names the figures whose limit is set, and does not follow from the data set.
     """
 
     t1: float  # ms; infinite if no suction of the data set reaches H1
@@ -66,9 +66,12 @@ class Limits:
     free_flow: float  # mbar
     supply: tuple[float, float]  # bar gauge
     configured: frozenset[str] = frozenset()
+    changed: frozenset[str] = frozenset()  # figures whose limit a person has changed
 
     def source(self, figure: str) -> str:
         """Where the limit of a figure comes from, for people."""
+        if figure in self.changed:
+            return "changed by a person"
         return "set in [figures]" if figure in self.configured else "from the unit's data set"
 
 

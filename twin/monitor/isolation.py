@@ -118,7 +118,7 @@ class Isolation:
 
     def __init__(self, bank: ModelBank, listener: ScoreExtractor, days: float) -> None:
         self._bank, self._listener = bank, listener
-        self._days = days
+        self.days = days
         self._suspects, count = listener.suspects, len(listener.suspects)
         self._reference, self._usual = Reference.of(count), _Usual()
         self._normalizer = ScoreNormalizer(count)
@@ -230,7 +230,7 @@ class Isolation:
     ) -> Verdict:
         changes.take(normal, FARTHEST if far else MOST)
         log_sum = changes.log_sum
-        cycles = cycles_between(self._days, SUMS, self._seconds / self._cycles)
+        cycles = cycles_between(self.days, SUMS, self._seconds / self._cycles)
         log_odds = log_sum - math.log(cycles)  # a fault is as rare as a false alarm
         none = 1.0 / (1.0 + math.exp(min(log_odds, 700.0)))
         raised = self._raised is None and log_sum >= limit(cycles)

@@ -150,6 +150,12 @@ class Monitor:
         figures(nothing, self.theta)
         naming.compiled_for(nothing)
 
+    def adjust(self, settings: MonitorSettings) -> None:
+        """Judge by other settings from the next cycle on; ``healthy`` must be the same."""
+        self.settings = settings
+        if self.isolation:
+            self.isolation.days = settings.false_alarm_days
+
     def update(self, samples: Samples, ticks: Ticks) -> list[Event]:
         """Take rows with the twin's ticks; give their events."""
         return [event for _, _, events in self.over(samples, ticks) for event in events]

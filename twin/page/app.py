@@ -50,6 +50,7 @@ LANGUAGE_S = 365 * 86_400
 MARKED = re.compile(r"\{\{(.+?)\}\}")  # a text of a page to be translated
 TOKEN = "x-csrf-token"  # noqa: S105  # a header's name
 LONGEST_COMMENT = 500  # letters
+LONGEST_REASON = 200  # letters, of a change of a limit
 MOST_BODY = 4096  # bytes of a request's body
 MOST_DAYS = 400.0
 LONGEST_S = 48 * 3600.0  # range of a curve: its bins fit into what is kept of them
@@ -67,6 +68,7 @@ NEEDED: dict[str, Role] = {  # role that a request to an alarm needs
     Act.COMMENTED: Role.ACKNOWLEDGE,
     Deed.OUT_OF_SERVICE: Role.CONFIGURE,  # without a time limit, and for every shift
     Deed.IN_SERVICE: Role.CONFIGURE,
+    Act.LIMIT_CHANGED: Role.CONFIGURE,
 }
 
 STATIC = {
@@ -174,6 +176,9 @@ class Page:
             Route(f"{ejector_path}/requests", self.ask, methods=["POST"]),
             Route(f"{ejector_path}/comments", self.comment, methods=["POST"]),
             Route(f"{ejector_path}/requests/{{request_number}}", self.answer),
+            Route(f"{ejector_path}/limits", self.limits),
+            Route(f"{ejector_path}/limits", self.change_limit, methods=["POST"]),
+            Route(f"{ejector_path}/limits/{{request_number}}", self.limit_answer),
             Route("/reports/{number}/{name}", self.report),
             WebSocketRoute("/live", self.live),
         ]
@@ -444,6 +449,39 @@ class Page:
         self._require_sight(request)
         number = _number(request, "request_number")
         return JSONResponse({"answer": await run_sync(self._ejector(request).answer, number)})
+
+    # --- limits ---------------------------------------------------------------------------------
+
+    async def limits(self, request: Request) -> Response:
+        """The limits of an ejector, and who has changed them."""
+        self._require_sight(request)
+        return JSONResponse(await run_sync(self._ejector(request).limits))
+
+    async def change_limit(self, request: Request) -> Response:
+        """Ask the run to change a limit; returns the number to get its answer by."""
+        session = self._require_session(request)
+        ejector = self._ejector(request)
+        try:
+            body = json.loads(await _body(request))
+            limit, reason = str(body["limit"]), str(body["reason"]).strip()
+            value = None if body["value"] is None else float(body["value"])
+        except NO_REQUEST as error:
+            raise HTTPException(HTTPStatus.BAD_REQUEST, "not a change of a limit") from error
+        await self._require_role(request, session, Act.LIMIT_CHANGED)
+        if not 0 < len(reason) <= LONGEST_REASON:
+            hint = tr("a reason has 1 to {most} letters", most=LONGEST_REASON)
+            raise HTTPException(HTTPStatus.BAD_REQUEST, hint)
+        number = await run_sync(ejector.change_limit, limit, value, session.user, reason)
+        details = {"unit": ejector.name, "limit": limit, "reason": reason}
+        details["value"] = "configured" if value is None else f"{value:g}"
+        await self._record(request, Act.LIMIT_CHANGED, session.user, **details)
+        return JSONResponse({"request": number}, HTTPStatus.ACCEPTED)
+
+    async def limit_answer(self, request: Request) -> Response:
+        """The answer to a change: null while there is none, empty if it was applied."""
+        self._require_sight(request)
+        number = _number(request, "request_number")
+        return JSONResponse({"answer": await run_sync(self._ejector(request).limit_answer, number)})
 
     # --- live -----------------------------------------------------------------------------------
 

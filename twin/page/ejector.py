@@ -12,6 +12,7 @@ from typing import Any
 from twin.alarms.board import Board, Comment, Episode
 from twin.alarms.database import Store as AlarmStore
 from twin.alarms.database_url import open_chosen as open_alarms
+from twin.alarms.limits import UnitLimits
 from twin.alarms.requests import ASKABLE
 from twin.alarms.settings import AlarmSettings, board_rules
 from twin.alarms.state import Deed
@@ -20,7 +21,7 @@ from twin.config import Config
 from twin.errors import ConfigError, TwinError
 from twin.figures.database import SIDES
 from twin.figures.database_url import open_chosen as open_figures
-from twin.figures.settings import limits_of
+from twin.figures.settings import Limits
 from twin.figures.table import FIGURES, Figure
 from twin.figures.text import course_in_words, title_of, trend_of_figure
 from twin.figures.trend import DAY_NS, Trend
@@ -40,6 +41,7 @@ from twin.page.ejector_status import (
     light_of,
     priority_words,
 )
+from twin.page.limits import limits_document
 from twin.page.settings import REPORTS, RING, PageSettings, folder_of
 from twin.signals import BREAK, MBAR
 
@@ -67,11 +69,12 @@ class Ejector:
         self.config, self._clock = config, clock
         self.name = config.asset.id or config.asset.type
         self._rules = board_rules(document)
-        self._limits = limits_of(config)
+        self._configured = UnitLimits.of(config)
         self._folder = folder_of(document, config.asset)
         self._unit = Unit(config.asset.type, config.asset.id)
         self._curves = Curves(self._folder, (self._unit.type, self._unit.id))
         self._asked: set[int] = set()  # numbers of requests made through this page
+        self._changes: set[int] = set()  # the same of changes of limits
 
     # --- status ---------------------------------------------------------------------------------
 
@@ -161,6 +164,43 @@ class Ejector:
         with self._alarms() as store:
             store.comment(self._unit, Comment(raised_ns, raised_as, self._clock(), who, text))
 
+    # --- limits ---------------------------------------------------------------------------------
+
+    def limits(self) -> dict[str, Any]:
+        """The limits that people may change, with who has changed what."""
+        now = self._clock()
+        with self._alarms() as store:
+            changes = store.limit_changes(self._unit)
+        return limits_document(self._configured, changes, now)
+
+    def change_limit(self, limit: str, value: float | None, who: str, reason: str) -> int:
+        """Ask the run to change a limit, without ``value`` back to the configured one.
+
+        Returns the request's number; ConfigError for a change that no run would apply.
+        """
+        with self._alarms() as store:
+            in_force = self._configured.after(store.limit_changes(self._unit))
+            in_force.changed_to(limit, value)
+            number = store.change_limit(self._unit, limit, value, who, reason)
+        self._changes.add(number)
+        return number
+
+    def limit_answer(self, number: int) -> str | None:
+        """Why a change was refused, empty if it was applied; None while it waits."""
+        if number not in self._changes:
+            raise ConfigError(f"no limit was changed here with the number {number}")
+        with self._alarms() as store:
+            (change,) = store.limit_changes(self._unit, after=number - 1)[:1]
+        return None if change.is_waiting else change.refusal
+
+    def _limits(self) -> Limits:
+        """The limits of key figures in force, with people's changes where they can be read."""
+        try:
+            with self._alarms() as store:
+                return self._configured.after(store.limit_changes(self._unit)).limits
+        except TwinError:
+            return self._configured.limits
+
     # --- live -----------------------------------------------------------------------------------
 
     def rows(self, since: int) -> dict[str, Any] | None:
@@ -236,7 +276,7 @@ class Ejector:
         }
         if not len(history.cycle):
             return document | {"words": tr("no cycles in that time")}
-        trend = trend_of_figure(history, figure, self._limits)
+        trend = trend_of_figure(history, figure, self._limits())
         stride = max(1, math.ceil(len(history.cycle) / MOST_POINTS))
         words = f"{title_of(name)}: {course_in_words(figure, trend, self._clock())}"
         document |= {"words": words, "limit": trend.limit, "every": stride}

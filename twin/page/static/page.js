@@ -16,6 +16,7 @@ const MOST_MARKS = 20; // of alarms in a trend
 const AROUND_S = 60; // that is shown before and after an alarm
 const LONGEST_ALARM_S = 600; // that is shown of one that lasts
 const LONGEST_S = 48 * 3600; // that the server gives at once
+const LIMITS_MS = 2000; // between looks at the limits while they are shown
 const BACK_S = 400 * 86400; // as far as one can look back
 const FOLLOW_S = 2; // between looks at a range that ends now, at least
 const NO_CURVE = {
@@ -103,6 +104,7 @@ function choose(number, alone = false) { // its curves; with its alarms alone, o
   showStates();
   if (!$("trends").hidden) showTrend();
   if (!$("history").hidden) loadHistory();
+  loadLimits();
 }
 
 function showBanner() {
@@ -328,6 +330,98 @@ async function ask(alarm, deed, seconds = 0) {
     mine.set(key, `${DEEDS[deed]}: ${error.message}`);
   }
   showAlarms();
+}
+
+// --- limits --------------------------------------------------------------------------------------
+
+let limitsAsked = 0;
+
+async function loadLimits() {
+  if (chosen === null || $("limits").hidden) return;
+  const turn = ++limitsAsked;
+  const of = chosen;
+  let told;
+  try {
+    told = await get(`/api/ejectors/${of}/limits`);
+  } catch (error) {
+    $("limits-said").textContent = error.message;
+    return;
+  }
+  if (turn === limitsAsked && of === chosen) showLimits(told);
+}
+
+function showLimits({ limits, changes }) {
+  const may = me.may.includes("limit_changed");
+  $("limits-head").textContent = t("Limits of {ejector}", { ejector: states[chosen].name });
+  $("limits-who").textContent = may ? t("A change holds at once, and after a restart.")
+    : t("Who has the role configure may change limits.");
+  const key = JSON.stringify([chosen, may, states[chosen].running, limits, changes]);
+  if ($("limit-cards").dataset.key === key) return;
+  $("limit-cards").dataset.key = key;
+  const focused = document.activeElement && document.activeElement.dataset.focus;
+  $("limit-cards").replaceChildren(...limits.map((limit) => limitCard(limit, may)));
+  $("limit-changes").replaceChildren(...(changes.length ? changes.map(changeCard)
+    : [element("p", { class: "nothing" }, t("Nobody has changed a limit."))]));
+  const again = focused && $("limit-cards").querySelector(`[data-focus="${CSS.escape(focused)}"]`);
+  if (again) again.focus();
+}
+
+function limitCard(limit, may) {
+  const { newest } = limit;
+  const button = (text, focus, onclick) => element("button", { type: "button", "data-focus": `${focus} ${limit.key}`, onclick },
+    text, element("span", { class: "unseen" }, ` ${limit.title}`));
+  return element("article", { class: "limit", "data-limit": limit.key },
+    element("div", { class: "top" }, element("h3", {}, limit.title), element("b", {}, limit.value_words)),
+    element("p", { class: "dim" }, limit.what),
+    limit.is_changed ? element("p", {}, changeWords(newest)) : null,
+    limit.is_changed ? element("p", { class: "dim" }, t("configured: {value}", { value: limit.configured_words })) : null,
+    ...limit.asked.map(waitingChange),
+    may ? element("div", { class: "deeds" },
+      button(t("Change …"), "change", () => offerLimit(limit)),
+      limit.is_changed ? button(t("Reset …"), "reset", () => offerLimit(limit, true)) : null) : null);
+}
+
+const changeWords = ({ words, who, when, reason }) =>
+  t("{change} by {who}, {when}: {reason}", { change: words, who, when, reason });
+
+function waitingChange(change) {
+  const waits = states[chosen].running ? t("asked, a moment …") : t("asked; waits for the next run");
+  return element("p", { class: "asked" }, `${change.words}: ${waits} (${change.who})`);
+}
+
+function changeCard(change) {
+  return element("article", { class: "change" },
+    element("h3", {}, change.title),
+    element("p", {}, changeWords(change)),
+    change.refusal ? element("p", { class: "asked refused" }, t("refused. {why}", { why: change.refusal })) : null);
+}
+
+function offerLimit(limit, reset = false) {
+  const { title, value_words: value, range_words: range, configured_words: usual } = limit;
+  $("limit-title").textContent = reset ? t("Reset: {limit}", { limit: title }) : t("Change: {limit}", { limit: title });
+  $("limit-what").textContent = reset ? t("From {value} back to the configured {usual}.", { value, usual })
+    : t("Now {value}; {range} can be set.", { value, range });
+  $("limit-label").textContent = t("New value in {unit}", { unit: limit.unit });
+  $("limit-field").hidden = $("limit-value").disabled = reset;
+  Object.assign($("limit-value"), { min: limit.lowest, max: limit.highest, value: limit.value ?? "" });
+  $("limit-reason").value = "";
+  $("limit-form").onsubmit = () => changeLimit(limit, reset ? null : Number($("limit-value").value));
+  $("limit").showModal();
+}
+
+async function changeLimit(limit, value) {
+  const path = `/api/ejectors/${chosen}/limits`;
+  const say = (text) => { $("limits-said").textContent = text; };
+  say("");
+  try {
+    const { request } = await post(path, { limit: limit.key, value, reason: $("limit-reason").value });
+    await loadLimits();
+    const why = await answered(`${path}/${request}`);
+    say(why ? t("{limit}: refused. {why}", { limit: limit.title, why }) : t("{limit}: changed", { limit: limit.title }));
+  } catch (error) {
+    say(`${limit.title}: ${error.message}`);
+  }
+  loadLimits();
 }
 
 async function answered(path) {
@@ -829,7 +923,7 @@ function showConnection() {
 
 // --- the beginning -------------------------------------------------------------------------------
 
-const TABS = ["now", "trends", "history"];
+const TABS = ["now", "trends", "history", "limits"];
 
 function showTab(name) {
   for (const one of TABS) {
@@ -839,6 +933,7 @@ function showTab(name) {
   }
   if (name === "trends") showTrend();
   if (name === "history") loadHistory();
+  if (name === "limits") loadLimits();
 }
 
 async function begin() {
@@ -875,6 +970,7 @@ function listen() {
   $("whose").addEventListener("change", () => ($("whose").value ? choose(Number($("whose").value)) : showStates()));
   for (const id of ["trend-from", "trend-to"]) $(id).addEventListener("change", chooseTrendRange);
   $("comment-cancel").addEventListener("click", () => $("comment").close());
+  $("limit-cancel").addEventListener("click", () => $("limit").close());
   $("report-close").addEventListener("click", () => $("report").close());
   $("which").addEventListener("change", showAlarms);
   $("figure").addEventListener("change", showTrend);
@@ -885,6 +981,7 @@ function listen() {
   $("shelve-cancel").addEventListener("click", () => $("shelve").close());
   $("logout").addEventListener("click", async () => { await post("/api/logout", {}); location.reload(); });
   setInterval(showConnection, 1000);
+  setInterval(loadLimits, LIMITS_MS);
 }
 
 listen();
