@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from drivers.plc.settings import PlcSettings
 from tools import battery_first
 from tools.calibration_coverage import recorded
-from tools.mechanism_trial import longer
+from tools.mechanism_worlds import Change, changed_plc
 from twin.diagnosis.another_log import judged_on
 from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.diagnosis.extend import extended
@@ -199,7 +199,7 @@ def test_a_mechanism_holds_on_a_program_that_it_has_not_seen(times: float) -> No
     assert set(known.data.effects) >= {diagnosis.json["unlisted"]["mechanism"]["name"]}
     assert not known.data.terms
     assert coefficients(known.data)[c.MECHANISMS + m.SIZE] != 0.0
-    plc: PlcSettings = longer(unit.plc, times)
+    plc: PlcSettings = changed_plc(unit.plc, Change(suction=times))
     log = recorded(plc, 8, 17, [battery_first.fault(np.random.default_rng(1), plc, hidden)])
     judged = judged_on(diagnosis, unit.config, "other.mcap", [log])
     assert judged is not None

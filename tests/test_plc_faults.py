@@ -47,6 +47,13 @@ TYPICAL = [
     "condensate=1",
     "nozzle_icing=10",
     "sensor_backlash=5",
+    "creeping_cup=10",
+    "sticking_valve=20",
+    "blow_off_valve_leak=2",
+    "filling_silencer=40",
+    "second_ejector=0.5",
+    "adsorbed_moisture=1",
+    "sensor_thermal_drift=20",
 ]
 PARAMETERS = [(e, p) for e, effect in EFFECTS.items() for p in effect.parameters]
 
@@ -67,7 +74,7 @@ def changed(*texts, seconds=SECONDS):
 
 def test_every_effect_has_a_typical_size_here():
     assert {text.split("=")[0].split(".")[0] for text in TYPICAL} == set(EFFECTS)
-    assert len(EFFECTS) >= 19 + 4
+    assert len(EFFECTS) >= 19 + 12
 
 
 @pytest.mark.parametrize(("effect", "parameter"), PARAMETERS)
@@ -96,10 +103,23 @@ def test_a_typical_size_changes_the_trace(text):
     assert (given_trace["commands"] == HEALTHY["commands"]).all()
 
 
-@pytest.mark.parametrize("text", ["lip_lift.above=300", "supply_swing.period=0.5"])
+SECOND = [
+    "lip_lift.above=300",
+    "supply_swing.period=0.5",
+    "condensate.used_up_after=0.2",
+    "creeping_cup.time_constant=0.5",
+    "sticking_valve.stuck_strokes=100",
+    "filling_silencer.time_constant=0.3",
+    "second_ejector.period=0.7",
+    "adsorbed_moisture.time_constant=0.2",
+    "sensor_thermal_drift.time_constant=2",
+]
+
+
+@pytest.mark.parametrize("text", SECOND)
 def test_a_second_parameter_needs_the_first_and_changes_it(text):
     assert trace(text).tobytes() == HEALTHY.tobytes()
-    size = {"lip_lift": "lip_lift=2", "supply_swing": "supply_swing=0.5"}[text.split(".")[0]]
+    (size,) = (typical for typical in TYPICAL if typical.startswith(text.split(".")[0] + "="))
     assert trace(size, text).tobytes() != trace(size).tobytes()
 
 
@@ -116,6 +136,102 @@ def test_sensor_faults_leave_the_truth_alone():
         )
         for (_, healthy), (_, faulty) in parts:
             assert healthy.tobytes() == faulty.tobytes()
+
+
+# --- mechanisms outside the table: each acts as its physics say -----------------------------------
+
+# A closed tank without scatter, noise or air saving, evacuated for 3 s in cycles of 5 s.
+STEADY = PlcSettings.model_validate(
+    {
+        "control": {"air_saving": False},
+        "sensor": {"noise_mbar": 0, "supply_noise_mbar": 0},
+        "scatter": {"supply_bar": 0, "seal_leak_sl_min": 0, "valve_ms": 0},
+        "program": {"suction_ms": 3000, "blow_off_ms": 500, "idle_ms": 1500, "jitter_ms": 0},
+    }
+)
+ON, OFF, SECOND_ON = 500, 3500, 5500  # ms: suction begins, ends, and begins again
+
+
+def pressures(*texts, settings=STEADY, seconds=10.4):
+    """Reading and the vessel's true pressure (mbar), one row each ms."""
+    parts = list(with_truth(settings, seconds, [parse_fault(text) for text in texts]))
+    return np.concatenate([np.stack([s["pressure"], t["vessel"]]) / MBAR for s, t in parts], axis=1)
+
+
+def moved(*texts, settings=STEADY):
+    """Change (mbar) of the vessel's true pressure."""
+    return pressures(*texts, settings=settings)[1] - pressures(settings=settings)[1]
+
+
+def test_a_cup_that_creeps_gives_up_its_air_later_than_one_that_yields_at_once():
+    creeping, yielding = moved("creeping_cup=60"), moved("cup_compliance=60")
+    assert creeping[ON + 300] < 0.3 * yielding[ON + 300]
+    assert creeping[OFF - 1] > 0.0
+    fast = moved("creeping_cup=60", "creeping_cup.time_constant=0.05")
+    assert fast[ON + 1000] == pytest.approx(yielding[ON + 1000], abs=5.0)
+
+
+def test_a_valve_that_sticks_is_late_in_some_strokes_and_in_no_other():
+    short = STEADY.program.model_copy(
+        update={"suction_ms": 300, "blow_off_ms": 200, "idle_ms": 200}
+    )
+    quick = STEADY.model_copy(update={"program": short})
+
+    def strokes(*texts):
+        parts = with_truth(quick, 30, [parse_fault(text) for text in texts])
+        nozzle = np.concatenate([truth["nozzle"] for _, truth in parts]).astype(int)
+        return np.flatnonzero(np.diff(nozzle))
+
+    late = strokes("sticking_valve=40") - strokes()
+    assert set(late) == {0, 40}
+    assert 0.15 < np.mean(late == 40) < 0.5
+    assert set(strokes("sticking_valve=40", "sticking_valve.stuck_strokes=100") - strokes()) == {40}
+
+
+def test_a_leaking_blow_off_valve_feeds_the_port_also_without_vacuum():
+    change = moved("blow_off_valve_leak=3")
+    assert change[:ON].max() > 0.5  # a leak from ambient would do nothing
+    assert change[OFF - 1] > 20.0
+    low = {"ejector": STEADY.ejector.model_copy(update={"supply_bar": 3.0})}
+    weaker = moved("blow_off_valve_leak=3", settings=STEADY.model_copy(update=low))
+    assert weaker[:ON].max() < 0.8 * change[:ON].max()  # its flow follows the supply
+
+
+def test_exhaust_fills_the_silencer_while_the_nozzle_runs():
+    slow, fast = moved("filling_silencer=60"), moved("end_vacuum_loss=60")
+    assert slow[ON + 200] < 0.3 * fast[ON + 200]
+    assert slow[OFF - 1] == pytest.approx(fast[OFF - 1], rel=0.15)
+
+
+def test_a_second_ejector_lowers_the_supply_in_its_own_rhythm():
+    parts = list(with_truth(STEADY, 6, [parse_fault("second_ejector=0.8")]))
+    healthy = list(with_truth(STEADY, 6))
+    drop = np.concatenate(
+        [
+            clean["supply"] - less["supply"]
+            for (_, less), (_, clean) in zip(parts, healthy, strict=True)
+        ]
+    )
+    runs = (np.arange(6000) / 2900.0) % 1.0 < 0.4
+    assert np.mean(drop[runs]) == pytest.approx(0.8e5, rel=0.05)
+    assert np.mean(drop[~runs]) == pytest.approx(0.0, abs=0.02e5)
+
+
+def test_moisture_comes_off_the_walls_until_they_are_dry():
+    flow, leak = moved("adsorbed_moisture=3"), moved("porous_leakage=3")
+    assert flow[ON + 500 : OFF].max() > 5.0
+    assert flow[OFF - 1] < 0.5 * flow[ON:OFF].max()  # a leak goes on
+    assert leak[OFF - 1] > 0.9 * leak[ON:OFF].max()
+    again = flow[SECOND_ON : SECOND_ON + 3000].max()
+    assert again == pytest.approx(flow[ON:OFF].max(), rel=0.2)  # ambient air renewed it
+
+
+def test_a_sensor_drifts_as_it_warms_up_and_the_truth_does_not():
+    with_drift, without = pressures("sensor_thermal_drift=30"), pressures()
+    assert np.array_equal(with_drift[1], without[1])
+    drift = (with_drift - without)[0]
+    for row in (0, 5000, 10000):
+        assert drift[row] == pytest.approx(30.0 * (1.0 - np.exp(-row / 15000.0)), abs=0.15)
 
 
 def test_effects_add_up_and_stay_inside_their_bounds():

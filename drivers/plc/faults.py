@@ -133,6 +133,52 @@ EFFECTS: dict[str, Effect] = {
         "the PLC's sensor sticks until the pressure has moved by this much",
         (Parameter("width", "mbar", 0, 200),),
     ),
+    "creeping_cup": Effect(
+        "the cup's wall creeps under vacuum: the vessel shrinks over seconds",
+        (
+            Parameter("volume_at_full_vacuum", "ml", 0, 100),
+            Parameter("time_constant", "s", 0.05, 60, 1.5),
+        ),
+    ),
+    "sticking_valve": Effect(
+        "the suction valve sticks in some of its strokes, opening or closing",
+        (
+            Parameter("delay", "ms", 0, 500),
+            Parameter("stuck_strokes", "%", 0, 100, 33.0),
+        ),
+    ),
+    "blow_off_valve_leak": Effect(
+        "compressed air leaks through the seat of the blow-off valve into the port",
+        (Parameter("sonic_flow", "sl/min", 0, 50),),
+    ),
+    "filling_silencer": Effect(
+        "exhaust fills the silencer while the nozzle runs, and the end vacuum falls",
+        (
+            Parameter("back_pressure", "mbar", 0, 600),
+            Parameter("time_constant", "s", 0.05, 60, 1.0),
+        ),
+    ),
+    "second_ejector": Effect(
+        "another ejector takes air from the same supply, on for two fifths of its own period",
+        (
+            Parameter("drop", "bar", 0, 3),
+            Parameter("period", "s", 0.05, 3600, 2.9),
+        ),
+    ),
+    "adsorbed_moisture": Effect(
+        "walls give off moisture under vacuum until they are dry, and take it up at ambient",
+        (
+            Parameter("vapour_flow", "sl/min", 0, 20),
+            Parameter("time_constant", "s", 0.05, 60, 0.6),
+        ),
+    ),
+    "sensor_thermal_drift": Effect(
+        "the PLC's sensor reads more as it warms up after the start",
+        (
+            Parameter("offset", "mbar", -300, 300),
+            Parameter("time_constant", "s", 0.05, 3600, 15.0),
+        ),
+    ),
 }
 
 

@@ -134,7 +134,8 @@ def at_rest(p: Record, ambient: float) -> Record:
         state[f"{chamber}_mass"] = ambient * volume / (R_GAS * wall)
         state[f"{chamber}_energy"] = ambient * volume * CV / R_GAS
         state[f"{chamber}_pressure"] = ambient
-    state |= {"vessel_volume": float(p["vessel_volume"][0]), "added_volume": 0.0, "shrunk": 0.0}
+    state |= {"vessel_volume": float(p["vessel_volume"][0]), "added_volume": 0.0}
+    state |= {"shrunk": 0.0, "crept": 0.0, "filled": 0.0, "moisture": 1.0}
     state |= {"near_flow": 0.0, "far_flow": 0.0}  # port to line, line to vessel
     state |= {"supply": float(p["supply"][0]), "jet": 0.0, "jet_drive": 0.0, "ice": 0.0}
     state |= {"suction_wanted": 0.0, "suction_due": 0.0, "suction_open": 0.0}

@@ -34,6 +34,7 @@ WALL_LAG = 2e-3  # s, a cup's wall follows the pressure
 OPENING_LAG = 5e-3  # s, a part leaves or arrives
 OWN_LAG = 2e-3  # s, of the compact ejector's own sensor
 THAW = 0.5  # 1/s, ice in the nozzle recovers
+NEIGHBOUR_RUNS = 0.4  # share of its period in which a second ejector takes air
 NOISES = 5  # columns of normal draws: PLC sensor, own sensor, supply, suction and blow-off valve
 
 
@@ -76,7 +77,8 @@ def suction(p: Any, s: Any, row: Any, ambient: float) -> float:
     strength *= (1.0 - row.suction_loss_loss) * max(1.0 - s.ice, 0.0)
     reach = 1.0 - (1.3 if r < 1.0 else 0.15) * (1.0 - r) ** 2
     depth = ambient * (1.0 - p.end_fraction) * max(reach, 0.0)
-    depth = max(depth - row.end_vacuum_loss_end_pressure_rise, 10 * MBAR)
+    depth -= row.end_vacuum_loss_end_pressure_rise
+    depth = max(depth - row.filling_silencer_back_pressure * s.filled, 10 * MBAR)
     drawn = s.port_pressure - ambient
     first = bulging(s.jet + drawn / depth, p.bulge)
     second = bulging(s.jet + drawn / (depth * p.second_stage_depth), p.bulge)
@@ -133,6 +135,7 @@ def exchange_port(p: Any, s: Any, row: Any, ambient: float) -> None:
     back = row.check_valve_leak_sonic_flow / p.ambient * (1.0 - min(s.jet, 1.0))
     into = back * max(ambient, 0.0) * nozzle_ratio(min(s.port_pressure / ambient, 1.0))
     valve = p.blow_off * (1.0 - row.weak_blow_off_loss) * s.blow_off
+    valve += row.blow_off_valve_leak_sonic_flow / (p.optimum + p.ambient)
     into += max(orifice(valve, s.supply + ambient, s.port_pressure, 1.0), 0.0)
     s.port_mass += DT * (into - out)
     s.port_energy += DT * CP * (into * p.wall - out * temperature)
@@ -149,12 +152,37 @@ def vessel_inflow(p: Any, s: Any, row: Any, ambient: float) -> float:
     porous = row.porous_leakage_flow_at_600mbar * vacuum / (600 * MBAR)
     wet = math.exp(-s.suctioned / row.condensate_used_up_after)
     vapour = row.condensate_vapour_flow * wet * (max(vacuum, 0.0) / p.ambient) ** 2
+    vapour += row.adsorbed_moisture_vapour_flow * s.moisture * max(vacuum, 0.0) / p.ambient
     return float(orifice(hole / p.ambient, ambient, s.vessel_pressure, relative) + porous + vapour)
 
 
 @njit(cache=True)
+def shrink(p: Any, s: Any, row: Any, ambient: float) -> None:
+    """Step the vessel's walls, which give way at once or creep; both do work on the gas."""
+    vacuum = max(ambient - s.vessel_pressure, 0.0) / ambient
+    full = min(row.cup_compliance_volume_at_full_vacuum, 0.8 * p.vessel_volume)
+    change = (full * vacuum - s.shrunk) * DT / WALL_LAG
+    s.shrunk += change
+    slow = min(row.creeping_cup_volume_at_full_vacuum, 0.8 * p.vessel_volume - full)
+    crept = (slow * vacuum - s.crept) * DT / row.creeping_cup_time_constant
+    s.crept += crept
+    s.vessel_volume -= change + crept
+    s.vessel_energy += s.vessel_pressure * (change + crept)
+
+
+@njit(cache=True)
+def dry(s: Any, row: Any, ambient: float) -> None:
+    """Step the moisture on the vessel's walls: vacuum takes it, ambient air renews it.
+
+    Several layers of it adsorb at ambient humidity and hardly any in a deep vacuum.
+    """
+    held = min(s.vessel_pressure / ambient, 1.0) ** 3
+    s.moisture += (held - s.moisture) * DT / row.adsorbed_moisture_time_constant
+
+
+@njit(cache=True)
 def exchange_vessel(p: Any, s: Any, row: Any, ambient: float) -> None:
-    """Step the vessel's inflow and its volume; a shrinking wall does work on the gas."""
+    """Step the vessel's inflow, its volume and the moisture on its walls."""
     temperature = s.vessel_energy / (CV * s.vessel_mass)
     inflow = vessel_inflow(p, s, row, ambient)
     s.vessel_mass += DT * inflow
@@ -165,12 +193,8 @@ def exchange_vessel(p: Any, s: Any, row: Any, ambient: float) -> None:
         s.vessel_energy *= grown
         s.vessel_volume *= grown
         s.added_volume = row.added_volume_volume
-    full = min(row.cup_compliance_volume_at_full_vacuum, 0.8 * p.vessel_volume)
-    squeezed = full * max(ambient - s.vessel_pressure, 0.0) / ambient
-    change = (squeezed - s.shrunk) * DT / WALL_LAG
-    s.shrunk += change
-    s.vessel_volume -= change
-    s.vessel_energy += s.vessel_pressure * change
+    shrink(p, s, row, ambient)
+    dry(s, row, ambient)
 
 
 @njit(cache=True)
@@ -197,8 +221,11 @@ def drive(p: Any, s: Any, row: Any, time: float) -> None:
     swing = math.sin(2 * math.pi * time / row.supply_swing_period)
     supply = p.supply + row.supply_scatter - row.supply_pressure_drop_drop
     supply += row.supply_swing_amplitude * swing - p.droop * max(s.suction_open, s.blow_off_open)
+    beat = time / row.second_ejector_period
+    supply -= row.second_ejector_drop if beat - math.floor(beat) < NEIGHBOUR_RUNS else 0.0
     s.supply += (max(supply, 0.0) - s.supply) * DT / p.supply_lag
     s.ice += DT * (row.nozzle_icing_loss_rate * s.suction_open - THAW * s.ice)
+    s.filled += (s.suction_open - s.filled) * DT / row.filling_silencer_time_constant
     s.open += (s.open_wanted - s.open) * DT / OPENING_LAG
 
 
@@ -229,14 +256,26 @@ def save_air(p: Any, s: Any, row: Any, suctioning: bool, noise: float) -> None:
 
 
 @njit(cache=True)
+def normal_share(draw: float) -> float:
+    """Share of normal draws below ``draw``, 0 to 1."""
+    return 0.5 * (1.0 + math.erf(draw / math.sqrt(2.0)))
+
+
+@njit(cache=True)
 def switch_valves(p: Any, s: Any, row: Any, suctioning: bool, blow_off: bool, noise: Any) -> None:
-    """Give the valves their new positions, which they take after their delays."""
+    """Give the valves their new positions, which they take after their delays.
+
+    Whether a stroke sticks follows from the draw for the supply's reading: a column of its own
+    would change every other draw of a seed.
+    """
     nozzle = 1.0 if suctioning and s.saving == 0.0 else 0.0
     blown = 1.0 if blow_off else 0.0
     if nozzle != s.suction_wanted:
         delay = (p.suction_on if nozzle > 0.0 else p.suction_off) + p.valve_scatter * noise[3]
         s.suction_wanted = nozzle
         s.suction_due = s.scan * SCAN + delay + row.response_delay_delay
+        if normal_share(noise[2]) < row.sticking_valve_stuck_strokes:
+            s.suction_due += row.sticking_valve_delay
     if blown != s.blow_off_wanted:
         delay = (p.blow_off_on if blow_off else p.blow_off_off) + p.valve_scatter * noise[4]
         s.blow_off_wanted = blown
@@ -257,7 +296,9 @@ def handle_part(p: Any, s: Any, suctioning: bool, blow_off: bool, ambient: float
 def read(p: Any, s: Any, row: Any, noise: Any, reading: Any) -> None:
     """Sample the sensors as the PLC's input card does."""
     vacuum = (p.ambient - s.sensed) * (1.0 + row.sensor_gain_error)
-    value = p.ambient - vacuum + row.sensor_offset_offset + p.sensor_noise * noise[0]
+    warmth = 1.0 - math.exp(-s.scan * SCAN / row.sensor_thermal_drift_time_constant)
+    drift = row.sensor_offset_offset + row.sensor_thermal_drift_offset * warmth
+    value = p.ambient - vacuum + drift + p.sensor_noise * noise[0]
     reading.overflow = value > p.full_scale or value < 0.0
     clipped = min(max(value, 0.0), p.full_scale)
     reading.pressure = round(clipped / MBAR / p.sensor_step) * p.sensor_step * MBAR
