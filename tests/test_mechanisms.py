@@ -18,7 +18,7 @@ from tools.calibration_coverage import recorded
 from tools.mechanism_worlds import Change, changed_plc
 from twin.diagnosis.another_log import judged_on
 from twin.diagnosis.answer import Diagnosis, diagnose
-from twin.diagnosis.extend import extended
+from twin.diagnosis.extend import extended, remarks
 from twin.diagnosis.mechanisms import is_a_course_of
 from twin.diagnosis.propose import Proposal, proposed
 from twin.diagnosis.text import lines
@@ -235,6 +235,35 @@ def test_what_one_unit_had_is_named_on_another(tmp_path: Path) -> None:
     known = extended(told, another.config)
     assert known is not None
     assert list(known.data.effects) == [proposal.effect.mechanism]  # read without the catalogue
+
+
+@cache
+def swung() -> tuple[battery_first.Unit, battery_first.Hidden, Diagnosis]:
+    """A gripper's supply that swings as another consumer comes and goes, every 1.7 s."""
+    unit, (hidden,), samples = battery_first.drawn_case("unlisted", 900001, 2)
+    assert hidden.effect == "supply_swing"
+    return unit, hidden, diagnose(unit.config, [samples], "swing.mcap", lambda _: None)
+
+
+def test_a_supply_that_swings_is_named_with_its_period_and_its_size() -> None:
+    """The periods that a search began from missed it: the line is 0.04 Hz wide."""
+    _, hidden, diagnosis = swung()
+    mechanism = diagnosis.json["unlisted"]["mechanism"]
+    assert mechanism["name"] == "supply_swinging"
+    assert mechanism["parameters"]["period"]["value"] == pytest.approx(1.7, rel=0.01)
+    drop = mechanism["parameters"]["drop"]
+    assert drop["low95"] <= hidden.size <= drop["high95"]
+
+
+def test_what_swings_is_not_stored_and_is_judged_on_another_log_in_phase_with_that() -> None:
+    unit, hidden, diagnosis = swung()
+    assert extended(diagnosis, unit.config) is None
+    assert "begins anew in each recording" in next(remarks(diagnosis))
+    fault = battery_first.fault(np.random.default_rng(1), unit.plc, hidden)
+    late = recorded(unit.plc, 9, 5, [fault])[800:]  # half a period later
+    judged = judged_on(diagnosis, unit.config, "other.mcap", [late])
+    assert judged is not None
+    assert judged["extended"]["rms_mbar"] < 0.8 * judged["baseline"]["rms_mbar"]
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from twin.model.catalogue import mechanism_of
 from twin.model.courses import Cause, Course
 from twin.model.dataset import DataSet, coefficients
 from twin.model.effects import Parameter, apply, effect_of
-from twin.model.mechanism import MECHANISMS
+from twin.model.mechanism import MECHANISMS, SWINGING
 from twin.model.term import AGAIN
 from twin.monitor.bins import Floats
 from twin.monitor.cycles import figures, whole
@@ -67,6 +67,8 @@ def remarks(diagnosis: Diagnosis) -> Iterator[str]:
         elif cause.course == Course.RAMP:
             rates = (f"{p['value']:.3g} {p['unit']}" for p in answer["parameters"].values())
             yield f"{name} goes on growing ({', '.join(rates)}): it is stored as it was at the end"
+    if any(map(swings, diagnosis.acting)):
+        yield "what swings begins anew in each recording: it is not stored"
     if diagnosis.terms:
         yield "the term from data holds for this program of commands only"
     elif diagnosis.json["verdict"] == "unlisted" and not diagnosis.mechanism:
@@ -113,8 +115,14 @@ def store(
 # --- sizes ----------------------------------------------------------------------------------------
 
 
+def swings(cause: Cause) -> bool:
+    """Whether a cause has a rhythm of its own. Nobody knows its phase in another log."""
+    mechanism = MECHANISMS.get(mechanism_of(cause.effect))
+    return mechanism is not None and mechanism.when.code == SWINGING
+
+
 def _is_lasting(cause: Cause) -> bool:
-    return cause.course != Course.INTERMITTENT
+    return cause.course != Course.INTERMITTENT and not swings(cause)
 
 
 def _lasting_causes(diagnosis: Diagnosis) -> Iterator[tuple[str, Sizes]]:
