@@ -113,6 +113,18 @@ def test_so_it_is_where_blow_off_drains_a_reservoir_against_a_relief_valve(name:
     assert exact[:, kernel.DRAINED].max() > 0.3
 
 
+@pytest.mark.parametrize("shape", [-0.9, -0.4, 2.0])
+def test_a_blow_off_of_any_shape_is_followed_in_long_steps(shape: float) -> None:
+    theta = closed()
+    theta[[c.PORT_VOLUME, c.BLOW_OFF_SHAPE]] = 1.0 * ML, shape
+    advance(theta, [(BLOW_OFF, 30)], start := standing(theta, 0.3 * theta[c.AMBIENT]))
+    exact = advance(theta, [(BLOW_OFF, 200)], start.copy())[9::10]
+    expected = np.empty(20)
+    rows = np.full(20, 10.0 * MS), np.full(20, BLOW_OFF, "u1"), np.full(20, np.nan)
+    kernel.advance(start, theta, *rows, expected, tolerance=kernel.ROUGHLY)
+    assert np.abs(expected - exact).max() < 0.3 * MBAR
+
+
 @pytest.mark.parametrize("parts", [TANK, HOSE], ids=["tank", "hose"])
 def test_the_scheme_is_of_third_order(parts: object) -> None:
     theta = closed(parts, tube_film_coefficient=60.0, film_coefficient=10.0, leak_sl_min=0.3)

@@ -263,11 +263,14 @@ def port_flows(p: float, driven: Driven, k: Prepared, i: int) -> tuple[float, fl
     vent = k[c.EXHAUST, i]
     vent = vent if p > opens else 0.0
     fuller = driven.blow_off * k[c.BLOW_OFF_SHAPE, i]
+    blown = driven.blow_off + fuller * (1.0 - p / ambient) + back * share
+    # A slope above zero could make the port's balance negative: then the flow stays as it is at p.
+    blown_slope = min(back * rise - fuller / ambient, 0.0)
     return (
         out - relief * relieves - vent * (share - rise * p),
         out_slope + relief - vent * rise,
-        driven.blow_off + fuller + back * (share - rise * p),
-        back * rise - fuller / ambient,
+        blown - blown_slope * p,
+        blown_slope,
     )
 
 
