@@ -113,16 +113,34 @@ def test_so_it_is_where_blow_off_drains_a_reservoir_against_a_relief_valve(name:
     assert exact[:, kernel.DRAINED].max() > 0.3
 
 
+def in_long_steps(theta: Theta, phase: Phase, start: kernel.State) -> tuple[Rows, Rows]:
+    """Expected pressure of 20 rows of 10 ms as a fit from afar has it, and from rows of 1 ms."""
+    exact = advance(theta, [(phase, 200)], start.copy())[9::10]
+    rows = np.full(20, 10.0 * MS), np.full(20, phase, "u1"), np.full(20, np.nan)
+    kernel.advance(start, theta, *rows, expected := np.empty(20), tolerance=kernel.ROUGHLY)
+    return expected, exact
+
+
 @pytest.mark.parametrize("shape", [-0.9, -0.4, 2.0])
 def test_a_blow_off_of_any_shape_is_followed_in_long_steps(shape: float) -> None:
     theta = closed()
     theta[[c.PORT_VOLUME, c.BLOW_OFF_SHAPE]] = 1.0 * ML, shape
     advance(theta, [(BLOW_OFF, 30)], start := standing(theta, 0.3 * theta[c.AMBIENT]))
-    exact = advance(theta, [(BLOW_OFF, 200)], start.copy())[9::10]
-    expected = np.empty(20)
-    rows = np.full(20, 10.0 * MS), np.full(20, BLOW_OFF, "u1"), np.full(20, np.nan)
-    kernel.advance(start, theta, *rows, expected, tolerance=kernel.ROUGHLY)
-    assert np.abs(expected - exact).max() < 0.3 * MBAR
+    expected, exact = in_long_steps(theta, BLOW_OFF, start)
+    assert expected == pytest.approx(exact, abs=0.3 * MBAR)
+
+
+@pytest.mark.parametrize("warmth", [0.0, 1.0, 10.0, 100.0])  # W/K
+@pytest.mark.parametrize("node", ["LINE_HEAT", "PORT_HEAT"])
+def test_so_are_nodes_that_take_the_temperature_of_their_wall_within_a_step(
+    node: str, warmth: float
+) -> None:
+    theta = closed()
+    theta[getattr(c, node)] = warmth
+    start = switched_on(standing(theta, 0.9 * theta[c.AMBIENT]))
+    advance(theta, [(SUCTION, 60)], start)
+    expected, exact = in_long_steps(theta, SUCTION, start)
+    assert expected == pytest.approx(exact, abs=0.1 * MBAR)
 
 
 @pytest.mark.parametrize("parts", [TANK, HOSE], ids=["tank", "hose"])

@@ -429,13 +429,14 @@ def solve(y: Gas, base: Gas, step: float, driven: Driven, k: Prepared, i: int) -
     leak_t = outside if y.vessel <= ambient else vessel_t
 
     # Pressures as value without flow, and slope over the flow.
-    cooling = port_warmth * k[c.PORT_VOLUME, i] * per_joule(y.port_mass)
-    weight = 1.0 / (port_stored + out_slope * port_t - blown_slope * outside + cooling)
-    gained = port_stored * base.port + (blown + port_warmth) * outside - out * port_t
-    port_rest, port_rise = gained * weight, near_t * weight
-    cooling = line_warmth * k[c.LINE_VOLUME, i] * per_joule(y.line_mass)
-    weight = 1.0 / (line_stored + cooling)
-    line_rest = (line_stored * base.line + line_warmth * outside) * weight
+    # Heat comes by the temperatures that balance it: by pressures over masses of the pass before,
+    # passes would diverge where a small node's wall takes its warmth within a step.
+    weight = 1.0 / (port_stored + out_slope * port_t - blown_slope * outside)
+    gained = port_stored * base.port + blown * outside - out * port_t
+    gained += port_warmth * (outside - port_t)
+    port_rest, port_rise = max(gained * weight, LOWEST), near_t * weight
+    weight = 1.0 / line_stored
+    line_rest = max(base.line + line_warmth * (outside - line_t) * weight, LOWEST)
     line_fall, line_rise = near_t * weight, far_t * weight
     cooling = warmth * volume * per_joule(y.vessel_mass)
     weight = 1.0 / (vessel_stored - leak_slope * leak_t + cooling + creeping)
