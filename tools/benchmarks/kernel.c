@@ -176,11 +176,13 @@ INLINED Port at_port(double p, const Driven *driven, const double *k)
     back = p < ambient ? back : 0.0;
     double vent = p > opens ? K(EXHAUST) : 0.0;
     double fuller = driven->blow_off * K(BLOW_OFF_SHAPE);
+    double blown = driven->blow_off + fuller * (1.0 - p / ambient) + back * flow.level;
+    double blown_slope = min(back * flow.slope - fuller / ambient, 0.0);
     return (Port){
         out - relief * relieves - vent * (flow.level - flow.slope * p),
         out_slope + relief - vent * flow.slope,
-        driven->blow_off + fuller + back * (flow.level - flow.slope * p),
-        back * flow.slope - fuller / ambient,
+        blown - blown_slope * p,
+        blown_slope,
     };
 }
 
@@ -276,15 +278,14 @@ INLINED Gas solve(Gas y, const Gas *known, double step, const Driven *driven, co
     double leak_t = y.vessel <= ambient ? outside : vessel_t;
 
     /* Pressures as rest and slope over the flows. */
-    double cooling = port_warmth * K(PORT_VOLUME) * per_joule(y.port_mass);
-    double weight = 1.0 / (port_stored + out_slope * port_t - blown_slope * outside + cooling);
-    double gained = port_stored * known->port + (blown + port_warmth) * outside - out * port_t;
-    double port_rest = gained * weight, port_rise = near_t * weight;
-    cooling = line_warmth * K(LINE_VOLUME) * per_joule(y.line_mass);
-    weight = 1.0 / (line_stored + cooling);
-    double line_rest = (line_stored * known->line + line_warmth * outside) * weight;
+    double weight = 1.0 / (port_stored + out_slope * port_t - blown_slope * outside);
+    double gained = port_stored * known->port + blown * outside - out * port_t;
+    gained += port_warmth * (outside - port_t);
+    double port_rest = max(gained * weight, LOWEST), port_rise = near_t * weight;
+    weight = 1.0 / line_stored;
+    double line_rest = max(known->line + line_warmth * (outside - line_t) * weight, LOWEST);
     double line_fall = near_t * weight, line_rise = far_t * weight;
-    cooling = warmth * volume * per_joule(y.vessel_mass);
+    double cooling = warmth * volume * per_joule(y.vessel_mass);
     weight = 1.0 / (vessel_stored - leak_slope * leak_t + cooling + creeping);
     gained = vessel_stored * known->vessel + leak * leak_t + warmth * outside;
     gained += creeping * y.vessel + GAMMA * y.vessel * yields * per_pa;
