@@ -30,7 +30,7 @@ from twin.diagnosis.search import Search, search, sharpened, stranger
 from twin.diagnosis.unlisted import STRANGE, Unlisted, extended, look
 from twin.diagnosis.unmodelled import Unmodelled
 from twin.inference.levels import SIGMAS_95
-from twin.inference.unmodelled import Odds
+from twin.inference.unmodelled import LEAST_SURE, Odds
 from twin.instants import CALENDAR_NS, SECOND_NS
 from twin.model.courses import Cause, Course
 from twin.model.effects import effect_of
@@ -148,7 +148,10 @@ def diagnose(
     # If nothing was fitted, all cycles count as held out.
     leftover = after.leftover if hypothesis else _left_in_all(evidence, healthy.of(evidence.judged))
     verdict = _verdict(hypothesis, before, after, leftover, strange, likely)
-    listed_findings = _Findings(verdict, searched, hypothesis, after, strange)
+    is_doubtful = any(
+        cause_odds.of_cause(len(hypothesis), rivals=0.0) < LEAST_SURE for cause_odds in odds
+    )
+    listed_findings = _Findings(verdict, searched, hypothesis, after, strange, is_doubtful)
     findings = _with_unlisted(
         evidence, fitted, held_out, healthy, before, listed_findings, progress
     )
@@ -200,6 +203,7 @@ class _Findings:
     causes: Hypothesis
     after: Judged
     strange: Unlisted
+    is_doubtful: bool  # a cause is more likely something unlisted in its place, by far
     terms: tuple[Term, ...] = ()
     mechanism: Explained | None = None
 
@@ -232,7 +236,7 @@ def _with_unlisted(
         strange = look(healthy, HEALTHY, fitted, held_out)
         findings = replace(findings, verdict="unlisted", strange=strange)
     elif findings.verdict == "unlisted":
-        if not _sure(findings.causes, before, findings.after):
+        if findings.is_doubtful or not _sure(findings.causes, before, findings.after):
             strange = look(healthy, HEALTHY, fitted, held_out)
             findings = replace(findings.without_causes, strange=strange, after=before)
         explained = explain(evidence, fitted, findings.causes, progress)

@@ -33,6 +33,7 @@ _LITTLE /= _LITTLE.sum()
 _TWIN = _ANY * (2.0 + (SHARES / MISMATCH) ** 2) ** -1.5
 _TWIN /= _TWIN.sum()
 MOST_SURE = 0.99  # nobody knows the whole table, nor all that may not be in it
+LEAST_SURE = 0.2  # a name that is right less than once in five is none. Chosen
 MOST = 1e9  # beyond it nothing changes any more
 
 

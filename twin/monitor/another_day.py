@@ -56,7 +56,8 @@ def _in_air_of(theta: Theta, shift: float) -> Theta:
 def of_the_day(calibrated: Theta, present: Theta, ambient: float) -> Iterator[Way]:
     """Ways that grow in proportion to the day's difference from that of the calibration.
 
-    ``ambient`` (Pa) is that of the day.
+    ``ambient`` (Pa) is that of the day. The air saving switches at a vacuum, as in the model, or at
+    an absolute pressure: then its thresholds move with the weather.
     """
     higher = ambient - float(calibrated[c.AMBIENT])
     denser = math.log(ambient / calibrated[c.AMBIENT])
@@ -64,10 +65,15 @@ def of_the_day(calibrated: Theta, present: Theta, ambient: float) -> Iterator[Wa
     follows = (1.0 - float(present[c.END_RATIO])) * higher / ambient
     if abs(follows) > SMALLEST:
         yield _changed(present, c.END_RATIO, follows), _changed(present, c.END_RATIO, -follows)
+        yield _switched(present, higher), _switched(present, -higher)
     size = math.hypot(denser, warmer / 2.0)
     if size > SMALLEST:
         for group in ALIKE:
             yield _scaled(present, group, size), _scaled(present, group, -size)
+
+
+def _switched(theta: Theta, shift: float) -> Theta:
+    return _changed(_changed(theta, c.H1, shift), c.H1_LOW, shift)
 
 
 def _changed(theta: Theta, coefficient: int, change: float) -> Theta:

@@ -18,7 +18,7 @@ import numpy as np
 
 from twin.inference.covariance import Covariance, fading, low_rank
 from twin.inference.priors import penalty
-from twin.inference.unmodelled import MISMATCH
+from twin.inference.unmodelled import LEAST_SURE, MISMATCH
 from twin.model.dataset import DataSet
 from twin.model.effects import EFFECTS, UNKNOWN, Effect, effect_of
 from twin.model.term import KINDS
@@ -39,7 +39,7 @@ from twin.monitor.false_alarm_budget import SUMS, cycles_between
 from twin.monitor.healthy import Healthy
 from twin.monitor.likeness import Likeness
 from twin.monitor.model_bank import DELAY_STEPS, DELAYS, SUSPECTS, UNCERTAIN, ModelBank, Suspect
-from twin.monitor.naming import EXPLAINED, LEAST_SURE, listed_share
+from twin.monitor.naming import EXPLAINED, listed_share
 from twin.monitor.statistics import CycleResidual, ScoreExtractor
 from twin.monitor.surroundings import told
 from twin.signals import SAMPLE, TICK, Samples, Ticks

@@ -14,7 +14,7 @@ from twin.inference.covariance import Covariance, fading, low_rank
 from twin.inference.gauss_newton import Descent, descend
 from twin.inference.priors import penalty
 from twin.inference.sensitivities import coefficients_at, derivatives
-from twin.inference.unmodelled import MISMATCH, Odds, hats, knots_over, log_likelihoods
+from twin.inference.unmodelled import LEAST_SURE, MISMATCH, Odds, hats, knots_over, log_likelihoods
 from twin.model import kernel
 from twin.model.effects import EFFECTS, UNKNOWN, Effect
 from twin.model.theta import Theta
@@ -33,7 +33,6 @@ STARTS = (1.0, 2.5, 6.0, 15.0)  # typical sizes in which a fit begins
 FINALISTS, ROUNDS = 8, 3  # effects that go on from the best of these, and for how many rounds
 NOTHING = 0.02  # mbar rms: what moves the pressure by less in its typical size is not seen in it
 NOISE = 1.0  # mbar, of a row. Chosen: what is named here is far larger
-LEAST_SURE = 0.2  # a name that is right less than once in five is none
 EXPLAINED = 0.5  # of the squares, that a name takes away at least: more than it leaves
 
 
