@@ -29,7 +29,7 @@ from twin.settings import Document
 
 FOUR = Request(Address("input", 1), 4)
 TIMEOUT_MS = 100
-ANSWER = head(FOUR, 1, 1, 4) + bytes(range(8))
+ANSWER = head(FOUR.size, 1, 1, 4) + bytes(range(8))
 
 
 class Plc:

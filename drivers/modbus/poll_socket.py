@@ -12,7 +12,6 @@ from drivers.modbus.errors import lost, refused
 from drivers.modbus.plan import Request
 from drivers.modbus.settings import ModbusSettings
 from drivers.reconnect import LostError
-from twin.errors import SourceError
 
 QUESTION = struct.Struct(">HHHBBHH")  # transaction, protocol 0, length, unit, function, from, count
 # Transaction, protocol 0, length, unit, function, number of data bytes that follow. An exception
@@ -50,17 +49,20 @@ class PollSocket:
         if self._socket is None:
             raise self._lost(request, "the connection is closed")
         self._transaction = (self._transaction + 1) & 0xFFFF
-        function = READING[request.address.area].function_code
-        stamp = self._transaction, self._settings.unit, function
-        expected = head(request, *stamp)
+        stamp = self._transaction, self._settings.unit, READING[request.address.area].function_code
         try:
             self._socket.sendall(question(request, *stamp))
             received = self._received(HEAD.size)
-            if received == expected:
+            if received == head(request.size, *stamp):
                 return self._received(request.size)
         except OSError as error:
             raise self._lost(request, "no answer") from error
-        raise self._unexpected(request, received, expected)
+        if received[:-1] != exception_head(*stamp):
+            raise self._lost(request, "no answer")
+        refusal = refused(self._settings.where, request.address, request.count, received[-1])
+        if isinstance(refusal, LostError):
+            self.close()
+        raise refusal
 
     def _received(self, size: int) -> bytes:
         """Exactly ``size`` bytes, in however many pieces they come; OSError if they do not."""
@@ -69,18 +71,6 @@ class PollSocket:
         if len(data) < size:
             raise ConnectionError(f"{len(data)} of {size} bytes came")
         return data
-
-    def _unexpected(self, request: Request, received: bytes, expected: bytes) -> SourceError:
-        """The error for an answer with an unexpected head."""
-        if not belongs(received, expected):
-            return self._lost(request, "no answer")
-        code = exception(received)
-        if code is None:
-            return self._lost(request, "the answer has the wrong length")
-        error = refused(self._settings.where, request.address, request.count, code)
-        if isinstance(error, LostError):
-            self.close()
-        return error
 
     def _lost(self, request: Request, cause: str) -> LostError:
         """Close, and give the error: a late answer must not be taken for the next one."""
@@ -100,23 +90,11 @@ def question(request: Request, transaction: int, unit: int, function: int) -> by
     return QUESTION.pack(transaction, 0, 6, unit, function, request.address.offset, request.count)
 
 
-def head(request: Request, transaction: int, unit: int, function: int) -> bytes:
-    """The head of an answer that brings the data; only the data follow."""
-    return HEAD.pack(transaction, 0, 3 + request.size, unit, function, request.size)
+def head(size: int, transaction: int, unit: int, function: int) -> bytes:
+    """The head of an answer that brings ``size`` bytes of data; only the data follow."""
+    return HEAD.pack(transaction, 0, 3 + size, unit, function, size)
 
 
-def belongs(received: bytes, expected: bytes) -> bool:
-    """Whether the head ``received`` answers the request whose answer should begin as expected."""
-    *stamp, _, unit, function, _ = HEAD.unpack(received)
-    *expected_stamp, _, expected_unit, expected_function, _ = HEAD.unpack(expected)
-    return (stamp, unit, function & ~EXCEPTION) == (
-        expected_stamp,
-        expected_unit,
-        expected_function,
-    )
-
-
-def exception(received: bytes) -> int | None:
-    """Code of the exception in the head of an answer; None if it has none."""
-    *_, length, _, function, code = HEAD.unpack(received)
-    return code if function & EXCEPTION and length == 3 else None
+def exception_head(transaction: int, unit: int, function: int) -> bytes:
+    """The head of an answer that brings an exception, without its code."""
+    return HEAD.pack(transaction, 0, 3, unit, function | EXCEPTION, 0)[:-1]
