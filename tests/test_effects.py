@@ -18,6 +18,7 @@ from twin.model.dataset import coefficients
 from twin.model.effects import EFFECTS, Law, apply, table
 from twin.model.plant import reading_of
 from twin.model.theta import Theta
+from twin.monitor.model_bank import SUSPECTS
 from twin.signals import BAR, MBAR, MS, Command, Phase
 
 # What people, scripts and other systems hold on to.
@@ -345,3 +346,17 @@ def test_the_page_of_effects_has_their_laws() -> None:
             )
             tried = re.sub(r"\(.*?\)", "", row.split("|")[3])
             assert tuple(float(one) for one in tried.split(",")) == effect.law.tried
+
+
+def test_only_the_table_asks_whether_a_parameter_is_a_time() -> None:
+    asks = re.compile(r"""\.unit\s*[!=]=\s*["']|\.unit\s+in\b""")
+    files = sorted((Path(__file__).parent.parent / "twin").rglob("*.py"))
+    assert len(files) > 300
+    asking = {path.name for path in files if asks.search(path.read_text(encoding="utf-8"))}
+    assert asking == {"effects.py"}, "declare it in the Parameter"
+
+
+def test_weather_and_set_up_alone_cannot_be_mended() -> None:
+    fixed = {effect.name for effect in EFFECTS.values() if not effect.can_be_mended}
+    assert fixed == {"ambient_pressure", "heat_exchange"}
+    assert {suspect.effect for suspect in SUSPECTS if suspect.often < 1.0} == fixed

@@ -57,9 +57,6 @@ MOST_NAMED = 4  # runners-up
 WIDEST = 0.9  # share of a parameter's range: an interval as wide determines nothing
 MIMICS = 1.6  # times the usual deviation: a cause that leaves more may mimic an unlisted mechanism
 LIKELY = 0.5  # probability of something unlisted above which the verdict is "unlisted"
-# Relative error (1 sigma) of a size from the scale of the data set, that is, of volume and suction.
-# OF_HEAT: from how the wall's heat is shared between vessel and line.
-RELATIVE, OF_HEAT = 0.03, 0.1
 
 
 @dataclass(frozen=True)
@@ -500,8 +497,7 @@ def _parameters(
             steps * p.typical if ramp else p.after(steps, theta)
             for steps in map(float, (size, below, above))
         )
-        scale = OF_HEAT if cause.effect == "heat_exchange" else RELATIVE
-        scale_error = SIGMAS_95 * scale * value
+        scale_error = SIGMAS_95 * p.relative_error * value
         down, up = (math.hypot(end - value, scale_error) for end in (lower, upper))
         shift = at_neutral - neutral  # a ramp's values are changes, its bounds are not
         low, high = max(value - down, p.low - shift), min(value + up, p.high - shift)

@@ -95,7 +95,7 @@ def signatures(
         for law in effect.laws()
         for p in effect.parameters
         if not p.shapes
-        for share in (SHARES_OF_TIMES if p.unit == "ms" else SHARES)
+        for share in (SHARES_OF_TIMES if p.is_time else SHARES)
     ]
     names, shares = (
         [(cause, p) for cause, p, _ in variants],

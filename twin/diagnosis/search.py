@@ -388,7 +388,7 @@ def _started(
         x = sizes(evidence, hypothesis)
         last = len(x) - len(parameters(hypothesis[-1:]))
         around = [x]
-        tried_sizes = START_OF_TIMES if parameters(hypothesis[-1:])[0].unit == "ms" else START
+        tried_sizes = START_OF_TIMES if parameters(hypothesis[-1:])[0].is_time else START
         for size in (*-tried_sizes, *tried_sizes):
             if low[last] < size < high[last]:
                 around.append(np.concatenate([x[:last], [size], x[last + 1 :]]))

@@ -37,6 +37,13 @@ class Parameter:
     coefficient: int | None = None
     ratio: bool = False  # what matters is how many times as large it is: a time constant
     usual: float | None = None  # of what shapes an effect that was seen before
+    # Of an estimate, one sigma: from the scale of the data set, that is, of volume and suction.
+    relative_error: float = 0.03
+
+    @property
+    def is_time(self) -> bool:
+        """Whether it is a delay or a time constant: it shifts edges, and acts nonlinearly."""
+        return self.unit == "ms"
 
     @property
     def shapes(self) -> bool:
@@ -96,6 +103,7 @@ class Effect:
 
     ``sentence`` says what it is, ``look_at`` what to look at first, ``often`` how often it comes
     beside what wears: weather is weekly, a sensor of steel and silicon hardly ever drifts.
+    ``can_be_mended`` is False for weather and set-up: live, their prior weight is small.
     """
 
     name: str
@@ -106,6 +114,7 @@ class Effect:
     often: float = 1.0
     acts: Callable[[Theta], bool] = lambda _: True  # whether a unit has what it acts on
     law: Law | None = None
+    can_be_mended: bool = True
 
     def laws(self) -> list[dict[str, float]]:
         """The laws that it may act by, as values beside those of its parameters."""
@@ -284,8 +293,10 @@ _TABLE = (
         "heat_exchange",
         "Heat passes between gas and wall at another rate than the data set says",
         "what changed about the vessel; if nothing did, calibrate again",
-        (_P("film_coefficient", "W/(m²·K)", 0.0, 500.0, 5.0, coefficient=c.FILM),),
+        # How the heat of the wall is shared between vessel and line is uncertain.
+        (_P("film_coefficient", "W/(m²·K)", 0.0, 500.0, 5.0, c.FILM, relative_error=0.1),),
         _heat_exchange,
+        can_be_mended=False,
     ),
     Effect(
         "response_delay",
@@ -358,6 +369,7 @@ _TABLE = (
         (_P("shift", "mbar", -300.0, 100.0, 15.0),),
         _ambient_pressure,
         WEEKLY,
+        can_be_mended=False,
     ),
 )
 

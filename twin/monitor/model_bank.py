@@ -30,9 +30,8 @@ STEP = 0.25  # of a parameter's typical size
 # A delay shifts steep edges. The response is linear only while the shift is shorter than the edge,
 # so delays have a smaller step, and larger sizes in addition.
 DELAY_STEPS = (0.05, 0.25, 1.5)
-# Effects of weather or set-up, with nothing to mend: they are searched as well, but with a small
-# prior weight, so that all others are not found later.
-NO_WEAR = (WEATHER, "heat_exchange")
+# Prior weight of effects that nobody can mend: weather and set-up. It is small, so that finding the
+# others takes no longer.
 SELDOM = 0.2
 NO_PHASE = 255  # before the first row
 
@@ -45,6 +44,7 @@ class Suspect:
 
     effect: str
     parameter: Parameter
+    often: float = 1.0  # prior weight, relative to wear
 
     @property
     def both_ways(self) -> bool:
@@ -52,14 +52,9 @@ class Suspect:
         return self.parameter.low < 0.0 or self.parameter.coefficient is not None
 
     @property
-    def often(self) -> float:
-        """Prior weight, over that of wear."""
-        return SELDOM if self.effect in NO_WEAR else 1.0
-
-    @property
     def delays(self) -> bool:
-        """Whether it is a delay."""
-        return self.parameter.unit == "ms"
+        """Whether it is a delay or a time constant."""
+        return self.parameter.is_time
 
     @property
     def step(self) -> float:
@@ -74,7 +69,10 @@ class Suspect:
 
 def _suspects(effects: Iterable[Effect]) -> tuple[Suspect, ...]:
     return tuple(
-        Suspect(suspect.name, p) for suspect in effects for p in suspect.parameters if not p.shapes
+        Suspect(effect.name, p, 1.0 if effect.can_be_mended else SELDOM)
+        for effect in effects
+        for p in effect.parameters
+        if not p.shapes
     )
 
 
