@@ -18,8 +18,9 @@ from tools.calibration_coverage import recorded
 from tools.mechanism_worlds import Change, changed_plc
 from twin.diagnosis.another_log import judged_on
 from twin.diagnosis.answer import Diagnosis, diagnose
-from twin.diagnosis.extend import extended, remarks
-from twin.diagnosis.mechanisms import is_a_course_of
+from twin.diagnosis.evidence import HEALTHY, Evidence, collect
+from twin.diagnosis.extend import extended, nothing, remarks
+from twin.diagnosis.mechanisms import Explained, explain_alone, is_a_course_of
 from twin.diagnosis.propose import Proposal, proposed
 from twin.diagnosis.text import lines
 from twin.errors import ConfigError
@@ -238,30 +239,35 @@ def test_what_one_unit_had_is_named_on_another(tmp_path: Path) -> None:
 
 
 @cache
-def swung() -> tuple[battery_first.Unit, battery_first.Hidden, Diagnosis]:
-    """A gripper's supply that swings as another consumer comes and goes, every 1.7 s."""
-    unit, (hidden,), samples = battery_first.drawn_case("unlisted", 900001, 2)
-    assert hidden.effect == "supply_swing"
-    return unit, hidden, diagnose(unit.config, [samples], "swing.mcap", lambda _: None)
+def swung() -> tuple[Evidence, Explained]:
+    """A gripper's supply that swings by 0.7 bar as another consumer comes and goes, every 1.7 s."""
+    samples, _ = rigs.recorded("gripper", 24.0, ("supply_swing=0.7",), 3)
+    evidence = collect(rigs.config("gripper"), [samples])
+    explained = explain_alone(evidence, evidence.judged[::2], HEALTHY, lambda _: None)
+    assert explained is not None
+    return evidence, explained
 
 
 def test_a_supply_that_swings_is_named_with_its_period_and_its_size() -> None:
-    """The periods that a search began from missed it: the line is 0.04 Hz wide."""
-    _, hidden, diagnosis = swung()
-    mechanism = diagnosis.json["unlisted"]["mechanism"]
-    assert mechanism["name"] == "supply_swinging"
-    assert mechanism["parameters"]["period"]["value"] == pytest.approx(1.7, rel=0.01)
-    drop = mechanism["parameters"]["drop"]
-    assert drop["low95"] <= hidden.size <= drop["high95"]
+    """No fit reached it from periods a factor of 1.6 apart: the line is 0.04 Hz wide."""
+    _, explained = swung()
+    assert explained.cause.effect == "supply_swinging"
+    assert explained.cause.values["period"] == pytest.approx(1.7, rel=0.01)
+    assert abs(explained.cause.values["drop"]) == pytest.approx(0.7, rel=0.15)
 
 
 def test_what_swings_is_not_stored_and_is_judged_on_another_log_in_phase_with_that() -> None:
-    unit, hidden, diagnosis = swung()
-    assert extended(diagnosis, unit.config) is None
+    evidence, explained = swung()
+    config = rigs.config("gripper")
+    found = {"verdict": "unlisted", "causes": [], "unlisted": {"mechanism": {"parameters": {}}}}
+    diagnosis = Diagnosis(
+        evidence, config.data.hash, None, HEALTHY, (), None, None, [], found, explained
+    )
+    assert extended(diagnosis, config) is None
     assert "begins anew in each recording" in next(remarks(diagnosis))
-    fault = battery_first.fault(np.random.default_rng(1), unit.plc, hidden)
-    late = recorded(unit.plc, 9, 5, [fault])[800:]  # half a period later
-    judged = judged_on(diagnosis, unit.config, "other.mcap", [late])
+    assert "another phase" in nothing(diagnosis)
+    late, _ = rigs.recorded("gripper", 24.0, ("supply_swing=0.7",), 4)
+    judged = judged_on(diagnosis, config, "other.mcap", [late[850:]])  # half a period later
     assert judged is not None
     assert judged["extended"]["rms_mbar"] < 0.8 * judged["baseline"]["rms_mbar"]
 

@@ -77,6 +77,8 @@ def remarks(diagnosis: Diagnosis) -> Iterator[str]:
 
 def nothing(diagnosis: Diagnosis) -> str:
     """The reason why there is no extended model."""
+    if any(map(swings, diagnosis.acting)):
+        return "what swings has another phase in each recording"
     return {
         "consistent": "the data set there is fits already",
         "insufficient": "the log cannot answer",
