@@ -33,7 +33,7 @@ format: .venv/dev  ## format the code
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-docs: .venv/dev  ## the documentation as pages in site/
+docs: .venv/dev  ## the documentation as pages in site/, its notebooks run anew
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --fresh-env --quiet docs site
 	@echo "open site/index.html"
 

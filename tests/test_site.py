@@ -11,6 +11,14 @@ import rigs
 from playwright.sync_api import Browser, Page, expect
 
 PATIENCE_MS = 30_000
+pytestmark = pytest.mark.timeout(1200)  # the notebooks are run, and may have to compile first
+# What each notebook must show, found by the program as it is.
+SHOWN = {
+    "commission": ("good: the twin follows this record", "suction capacity", "mbar rms"),
+    "find-a-leak": ("Cause found: Air leaks in", "less rms deviation", "'leakage', 'step'"),
+    "compare-two-units": ("B against A: ", "Differs beyond chance", "cell-b, 7 cycles"),
+    "what-if": ("Simulation of compact-ejector-35", "part present after", "never a part present"),
+}
 
 
 @dataclass
@@ -53,6 +61,30 @@ def test_every_page_is_there(site: Path) -> None:
     assert [page for page in pages if not (site / page).with_suffix(".html").exists()] == []
 
 
+def test_every_notebook_is_in_the_gallery() -> None:
+    notebooks = {path.stem for path in (rigs.ROOT / "docs" / "notebooks").glob("*.md")}
+    assert notebooks == set(SHOWN)
+
+
+@pytest.mark.parametrize("name", SHOWN)
+def test_a_notebook_was_run_and_shows_what_it_found(name: str, reader: Reader) -> None:
+    reader.open(f"notebooks/{name}.html")
+    article = reader.page.locator("article")
+    for text in SHOWN[name]:
+        expect(article).to_contain_text(text)
+    expect(article.locator(".twin-summary img").first).to_be_visible()
+    expect(article).not_to_contain_text("Traceback")
+    pictures = article.locator("img")
+    assert pictures.count() > article.locator(".twin-summary").count()  # of plot(), too
+    for picture in pictures.all():
+        assert picture.get_attribute("alt") is not None
+        assert picture.evaluate("image => image.complete && image.naturalWidth") > 100
+    overflow = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+    assert reader.page.evaluate(overflow) <= 0
+    assert [url for url in reader.asked if not url.startswith(("file:", "data:"))] == []
+    assert reader.complaints == []
+
+
 def test_pages_ask_for_nothing_but_files(reader: Reader) -> None:
     for name in ("index.html", "tutorial.html", "api.html", "decisions/0008-assets-only-grow.html"):
         reader.open(name)
@@ -71,7 +103,7 @@ def test_a_reader_goes_from_the_first_page_to_the_tutorial(reader: Reader) -> No
 
 def test_the_reference_has_the_functions_with_what_they_take(reader: Reader) -> None:
     reader.open("api.html")
-    for name in ("open", "simulate", "calibrate", "diagnose"):
+    for name in ("open", "simulate", "commission", "calibrate", "diagnose"):
         signature = reader.page.locator(f"[id='twin.{name}']")
         expect(signature).to_contain_text(f"twin.{name}(")
 

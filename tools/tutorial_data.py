@@ -14,6 +14,7 @@ from drivers.plc.faults import parse_fault
 from tools.calibration_coverage import drawn, recorded, rig_of, shipped
 from twin.signals import BAR, MBAR, NS, Command, Samples
 
+CELL = Path(__file__).parents[1] / "configs" / "test_rig.toml"
 CYCLES = 8
 AMBIENT = 1013.0  # mbar, as in configs/test_rig.toml
 # Clear sizes of what may be hidden, in the unit of the effect's parameter.
@@ -35,6 +36,18 @@ def write_data(folder: Path, seed: int) -> str:
     write_csv(folder / "healthy.csv", recorded(plc, CYCLES, 2 * seed))
     write_csv(folder / "today.csv", recorded(plc, CYCLES, 2 * seed + 1, [parse_fault(hidden)]))
     return hidden
+
+
+def write_cell(folder: Path, unit: str, cycles: int, seed: int = 11, fault: str = "") -> None:
+    """Write the ``cell.toml`` of a unit, its ``healthy.csv`` and, with ``fault``, ``today.csv``."""
+    folder.mkdir(exist_ok=True)
+    text = CELL.read_text(encoding="utf-8").replace('"rig-01"', f'"{unit}"')
+    (folder / "cell.toml").write_text(text, encoding="utf-8")
+    plc = drawn(rig_of(shipped("test_rig")), seed)
+    write_csv(folder / "healthy.csv", recorded(plc, cycles, 2 * seed))
+    if fault:
+        faulty = recorded(plc, cycles, 2 * seed + 1, [parse_fault(fault)])
+        write_csv(folder / "today.csv", faulty)
 
 
 def write_csv(path: Path, samples: Samples) -> None:
