@@ -329,6 +329,9 @@ def test_a_plot_is_a_figure_that_shows_itself(
     assert [tag for tag in root.iter() if tag.tag.endswith("script")] == []
     if kind in ("log", "columns", "simulation"):
         assert "Größe $1$ & Söhne" in str(root.get("aria-label"))
+    shown = Shown(picture._repr_html_())
+    assert shown.tags == ["img"]
+    assert picture.alt in shown.values
     picture.savefig(tmp_path / "a.png")
     assert "mbar" in "".join(root.itertext())
 

@@ -1,5 +1,6 @@
 """Style of pictures, and their conversion to self-contained SVG text."""
 
+import base64
 import html
 import io
 import re
@@ -54,6 +55,12 @@ class Picture(Figure):
 
     def _repr_svg_(self) -> str:
         return as_svg(self)
+
+    def _repr_html_(self) -> str:
+        """An image with its text alternative, which notebooks do not take over from SVG."""
+        content = base64.b64encode(as_svg(self).encode()).decode()
+        source = f"data:image/svg+xml;base64,{content}"
+        return f'<img alt="{html.escape(self.alt)}" style="max-width: 100%" src="{source}">'
 
 
 @contextmanager
