@@ -172,11 +172,13 @@ class Config:
         If a database, a unit or a time is named, the data set is looked up anew, as in ``of``. A
         database that does not exist yet is not searched.
         """
-        from twin.assets.database_url import is_new
-
         with _log_errors(header.metadata, log):
             document = instead or document_in(header)
-        is_lookup = bool(assets) and not (to_store and is_new(assets, document))
+        is_lookup = bool(assets)
+        if is_lookup and to_store:
+            from twin.assets.database_url import is_new
+
+            is_lookup = not is_new(assets, document)
         if instead is not None or is_lookup or unit or as_of_ns is not None:
             own = header.asset_id
             config = cls.of(document, assets, unit, as_of_ns=as_of_ns, own=own, to_store=to_store)
