@@ -42,7 +42,11 @@ class Reread:
         return (block.copy() for block in rigs.cut(samples, 1000))
 
 
-def test_rows_of_a_log_are_kept_compressed_and_come_back_to_the_bit() -> None:
+@pytest.mark.parametrize("piece", [100_000, 700])
+def test_rows_of_a_log_are_kept_compressed_and_come_back_to_the_bit(
+    piece: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("twin.diagnosis.evidence.PIECE", piece)
     log = read_cycles(rigs.config("test_rig"), Reread())
     twin = rigs.twin("test_rig")
     cycles = whole(twin.over(Reread()))
@@ -51,7 +55,7 @@ def test_rows_of_a_log_are_kept_compressed_and_come_back_to_the_bit() -> None:
         for kept, given in zip(log.rows(number), (cycle.samples, cycle.ticks), strict=True):
             assert kept.tobytes() == given.tobytes()
     rows = sum(len(cycle.samples) for cycle in cycles)
-    assert sum(map(len, log.packed)) < MOST_BYTES * rows
+    assert sum(len(part) for parts in log.packed for part in parts) < MOST_BYTES * rows
     assert log.saturated == 0.0
 
 

@@ -57,7 +57,7 @@ from twin.signals import (
 
 OVERFLOW = int(Quality.OVERFLOW)  # a plain number: NumPy compares bytes with it
 CORES: ContextVar[int] = ContextVar("CORES", default=2)  # on which a diagnosis runs
-FASTEST = 1  # of zlib's levels: a row takes 4 bytes
+FASTEST, PIECE = 1, 100_000  # zlib's level, with which a row takes 4 bytes; rows of a piece
 LATER, LONGEST_SUCTION = 1.3, 10_000  # simulated suction over that of cycles, and at most (rows)
 
 Hypothesis = tuple[Cause, ...]
@@ -402,7 +402,7 @@ class LogCycles:
     judged: list[int]  # as in Evidence
     figures: list[dict[str, float]]
     saturated: float  # share of their rows
-    packed: list[bytes]
+    packed: list[list[bytes]]  # of each, in pieces
 
     @property
     def cycles(self) -> int:
@@ -411,7 +411,9 @@ class LogCycles:
 
     def rows(self, cycle: int) -> tuple[Samples, Ticks]:
         """Rows of a cycle."""
-        return decode(zlib.decompress(self.packed[cycle]))
+        pieces = [decode(zlib.decompress(piece)) for piece in self.packed[cycle]]
+        samples, ticks = (joined(*column) for column in zip(*pieces, strict=True))
+        return samples, ticks
 
     def whole(self) -> Evidence:
         """Evidence of all cycles: all rows are held in memory."""
@@ -489,7 +491,7 @@ def _read(base: Evidence, blocks: Iterable[Samples]) -> LogCycles:
         begin_ns=next((int(block["time_ns"][0]) for block in blocks if len(block)), 0),
         _seen={},  # depends on the settings of the finder
     )
-    begins, judged, packed = list[int](), list[int](), list[bytes]()
+    begins, judged, packed = list[int](), list[int](), list[list[bytes]]()
     figures_of_cycles, rows, saturated = list[dict[str, float]](), 0, 0
     twin = Twin(base.theta, base.knees, base.terms)
     for cycle in cut(twin.over(_Bridged(blocks)), math.inf):
@@ -499,12 +501,18 @@ def _read(base: Evidence, blocks: Iterable[Samples]) -> LogCycles:
             judged.append(len(packed))
         begins.append(int(cycle.samples["time_ns"][0]))
         figures_of_cycles.append(figures(cycle, theta))
-        packed.append(zlib.compress(encode(cycle.samples, cycle.ticks), FASTEST))
+        packed.append(_packed(cycle.samples, cycle.ticks))
         rows += len(cycle.samples)
         saturated += int(np.count_nonzero(cycle.samples["quality"] & OVERFLOW))
     seconds = (np.array(begins, np.int64) - base.begin_ns).astype(np.float64) * NS
     share = saturated / max(rows, 1)
     return LogCycles(base, seconds, judged, figures_of_cycles, share, packed)
+
+
+def _packed(samples: Samples, ticks: Ticks) -> list[bytes]:
+    """Rows compressed without loss, in pieces: a cycle may last a night."""
+    parts = [slice(first, first + PIECE) for first in range(0, len(samples), PIECE)]
+    return [zlib.compress(encode(samples[part], ticks[part]), FASTEST) for part in parts]
 
 
 @dataclass(frozen=True)
