@@ -135,9 +135,9 @@ def diagnose(
     beside = Unmodelled(evidence, searched_covariance.of(evidence.judged), hypothesis)
     odds = [beside.odds(number) for number in range(len(hypothesis))]
     probability_alone = 0.0 if hypothesis else beside.alone()
-    likely = (
-        any(cause_odds.of_unlisted(len(hypothesis)) > LIKELY for cause_odds in odds)
-        or probability_alone > LIKELY
+    likely = probability_alone > LIKELY or any(
+        beside.is_large(number) and cause_odds.of_unlisted(len(hypothesis)) > LIKELY
+        for number, cause_odds in enumerate(odds)
     )
     strange = look(
         searched_covariance, hypothesis, fitted, held_out, least=0.0 if likely else STRANGE
@@ -145,7 +145,7 @@ def diagnose(
     # If nothing was fitted, all cycles count as held out.
     leftover = after.leftover if hypothesis else _left_in_all(evidence, healthy.of(evidence.judged))
     verdict = _verdict(hypothesis, before, after, leftover, strange, likely)
-    is_doubtful = any(
+    is_doubtful = all(
         cause_odds.of_cause(len(hypothesis), rivals=0.0) < LEAST_SURE for cause_odds in odds
     )
     listed_findings = _Findings(verdict, searched, hypothesis, after, strange, is_doubtful)
@@ -200,7 +200,7 @@ class _Findings:
     causes: Hypothesis
     after: Judged
     strange: Unlisted
-    is_doubtful: bool  # a cause is more likely something unlisted in its place, by far
+    is_doubtful: bool  # each cause is by far more likely something unlisted in its place
     terms: tuple[Term, ...] = ()
     mechanism: Explained | None = None
 
@@ -222,13 +222,14 @@ def _with_unlisted(
     """The findings with something unlisted: a mechanism, or a term from data without one.
 
     Causes that leave more than the scatter between cycles may mimic a mechanism. They are withdrawn
-    if a mechanism alone does better.
+    if a mechanism alone does better, in mbar and in sigmas: what is known of a cause, such as how
+    far its waveform may be off, counts in sigmas alone.
     """
     limit = MIMICS if len(findings.causes) == 1 else LITTLE
     if findings.verdict == "explained" and findings.after.rms > limit * before.usual:
         mechanism_alone = explain_alone(evidence, fitted, findings.causes, progress)
         mechanism, mended = _on_unseen(evidence, mechanism_alone, findings.after, held_out)
-        if mechanism is None:
+        if mended is None or mended.leftover >= findings.after.leftover:
             return findings
         strange = look(healthy, HEALTHY, fitted, held_out)
         findings = replace(findings, verdict="unlisted", strange=strange)

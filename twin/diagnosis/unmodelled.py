@@ -8,10 +8,10 @@ from functools import cached_property
 import numpy as np
 
 from twin.diagnosis.covariance import Weights
-from twin.diagnosis.evidence import Evidence, Hypothesis
+from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.fit import white
 from twin.diagnosis.unlisted import OVER, smooth
-from twin.inference.unmodelled import Odds, alone, log_likelihoods
+from twin.inference.unmodelled import MISMATCH, Odds, alone, log_likelihoods
 from twin.model.effects import effect_of
 from twin.monitor.bins import Floats
 
@@ -26,9 +26,12 @@ class Unmodelled:
 
     @cached_property
     def _off(self) -> Floats:
-        """What is off (mbar), then that without each cause in turn, (bins, 1 + causes)."""
+        """What is off (mbar), then that without each cause in turn, and without any.
+
+        (bins, 2 + causes).
+        """
         without = [tuple(c for c in self.found if c is not cause) for cause in self.found]
-        return self.evidence.off([self.found, *without])
+        return self.evidence.off([self.found, *without, HEALTHY])
 
     @cached_property
     def _residual(self) -> Floats:
@@ -43,6 +46,14 @@ class Unmodelled:
             np.hstack([hats for _, hats in smooth(self.evidence, off, over).values()])
             for over in OVER
         ]
+
+    def is_large(self, number: int) -> bool:
+        """Whether a cause explains more than the waveforms of all are off by.
+
+        A smaller one may correct a waveform. So what suits its place speaks for nothing unlisted.
+        """
+        explained = np.sqrt(np.mean((self._off - self._off[:, :1]) ** 2, axis=0))
+        return bool(explained[1 + number] > MISMATCH * explained[-1])
 
     def odds(self, number: int) -> Odds:
         """Odds for the cause of this number, among those found.
