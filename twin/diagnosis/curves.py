@@ -88,10 +88,10 @@ def _shade(panels: set[Axes], labelled: Axes, time: Floats, phase: npt.NDArray[n
     if len(edges) > MOST_SHADED:
         return
     for first, last in pairwise(edges):
-        name = Phase(phase[first])
+        name, begin, end = Phase(phase[first]), float(time[first]), float(time[last])
         for axes in panels:
-            axes.axvspan(time[first], time[last], color=SHADES[name], lw=0, zorder=0)
-        if time[last] - time[first] > LABELLED * (time[-1] - time[0]):
-            middle = (time[first] + time[last]) / 2.0
+            axes.axvspan(begin, end, color=SHADES[name], lw=0, zorder=0)
+        if end - begin > LABELLED * (time[-1] - time[0]):
+            middle = (begin + end) / 2.0
             transform = labelled.get_xaxis_transform()
             labelled.text(middle, 1.02, spoken(name.name.lower()), transform=transform, ha="center")

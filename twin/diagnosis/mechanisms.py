@@ -345,7 +345,7 @@ def _rhythms(
     around = np.pad(gains, 1, constant_values=-np.inf)
     peaks = np.flatnonzero((gains >= around[:-2]) & (gains >= around[2:]))
     highest = peaks[np.argsort(-gains[peaks])[:PEAKS]]
-    return [_Start(mechanism, (1.0 / frequencies[i], shifts[i])) for i in highest]
+    return [_Start(mechanism, (1.0 / float(frequencies[i]), float(shifts[i]))) for i in highest]
 
 
 def _explained(
