@@ -451,7 +451,7 @@ def commissioned(tutorial: Read, times: float = 1.0) -> twin.Commissioned:
         patch.setattr("twin.api.fit_unknown", fit)
         result = twin.commission(healthy)
         of_type = Config.of(Document.read(Path("cell.toml")), calibrated=False)
-    assert given["config"] == replace(of_type, gauge=True)  # as the command has it
+    assert given["config"] == of_type.with_sensor(is_gauge=True)  # as the command has it
     assert given["rows"].tobytes() == samples.tobytes()
     return result
 
