@@ -145,7 +145,7 @@ def test_a_picture_is_of_one_figure_and_there_must_be_such(figures: Run) -> None
         figures("trend", "--picture", "t.png")
     with pytest.raises(ConfigError, match="no figure is called leak"):
         figures("trend", "leak")
-    with pytest.raises(SourceError, match=r"t\.xyz: cannot be written"):
+    with pytest.raises(ConfigError, match=r"t\.xyz: the name does not end in \.svg or \.png"):
         figures("trend", "leakage", "--picture", "t.xyz")
 
 

@@ -69,10 +69,15 @@ def likenesses(
         size = float(fits[number].x[0])
         left[number] = fits[number].chi2 + suits[number].log_pdet
         left[number] += penalty(effect, size, ambient_is_measured=is_measured)
-    best, sizes = int(np.argmin(left)), np.array([fit.x[0] for fit in fits])
-    moves = expect.at(np.diag(sizes)[:, [best]]).moves[:, 0]
-    if cycle.squares(cycle.off - moves) > (1.0 - EXPLAINED) * cycle.squares(cycle.off):
+    sizes = np.array([fit.x[0] for fit in fits])
+    moved = expect.at(np.diag(sizes)).moves
+    rest = np.array([cycle.squares(cycle.off - moves) for moves in moved.T])
+    # What a law leaves open must not do the explaining.
+    left[rest > (1.0 - EXPLAINED) * cycle.squares(cycle.off)] = np.inf
+    best = int(np.argmin(left))
+    if np.isinf(left[best]):
         return []
+    moves = moved[:, best]
     listed = listed_share(
         suits[best],
         cycle.off,
