@@ -189,6 +189,8 @@ class Log:
         """Rows of a range of time, in blocks, with their time since the first row (s)."""
         first_ns: np.int64 | None = None
         for samples, ticks in self._rows():
+            if not len(samples):
+                continue
             first_ns = samples["time_ns"][0] if first_ns is None else first_ns
             since = (samples["time_ns"] - first_ns) * NS
             inside = (since >= begin_s) & (since <= end_s)
