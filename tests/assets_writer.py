@@ -1,5 +1,6 @@
-"""A writer in a process of its own: says ready, waits for a line, adds, and tells every id."""
+"""A writer in a process of its own: for each number that it reads it adds as many, telling ids."""
 
+import itertools
 import sys
 
 import numpy as np
@@ -10,13 +11,14 @@ from twin.assets.record import Record
 TYPE = "compact-ejector-35"
 
 
-def main(url: str, unit: str, count: int) -> None:
+def main(url: str, unit: str) -> None:
+    numbers = itertools.count()
     with open_assets(url, busy_s=60.0) as assets:
         say("ready")
-        sys.stdin.readline()
-        for number in range(count):
-            data, arrays = {"number": number}, {"covariance": np.full((8, 8), number / 7)}
-            say(assets.add(Record("instance", unit, TYPE, data, arrays=arrays)).id)
+        for line in sys.stdin:
+            for number in itertools.islice(numbers, int(line)):
+                data, arrays = {"number": number}, {"covariance": np.full((8, 8), number / 7)}
+                say(assets.add(Record("instance", unit, TYPE, data, arrays=arrays)).id)
 
 
 def say(text: str) -> None:
@@ -25,4 +27,4 @@ def say(text: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2], int(sys.argv[3]))
+    main(sys.argv[1], sys.argv[2])

@@ -1,5 +1,6 @@
 """What acts beside the table of effects: in the model, found in a log, and on other programs."""
 
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -307,10 +308,11 @@ def test_one_listed_cause_that_mimics_a_mechanism_is_dropped() -> None:
     answer = diagnose(unit.config, [samples], "lip.mcap", lambda _: None).json
     assert (answer["verdict"], answer["causes"]) == ("unlisted", [])
     mechanism = answer["unlisted"]["mechanism"]
-    assert mechanism["name"] == "opening_above"
-    flow = mechanism["parameters"]["sonic_flow"]
-    assert flow["low95"] <= hidden.size <= flow["high95"]
-    # Where nearly the same flow may come in another way, as by another calibration it did.
-    alike = mechanism["not_separable_from"]
+    # Fitted from 20 starts each, an opening, an inflow and a seepage above 530 mbar are within 0.6
+    # of one another in chi-square: which comes first is chance. All three must stand there.
+    alike = [mechanism["sentence"], *mechanism["not_separable_from"]]
+    (opening,) = [one for one in alike if one.startswith("An opening to ambient")]
+    (flow,) = re.findall(r"sonic flow ([\d.]+) sl/min", opening)
+    assert float(flow) == pytest.approx(hidden.size, rel=0.05)
     assert any(one.startswith("Air seeps in") for one in alike)
     assert not any("gathers over" in one for one in alike)

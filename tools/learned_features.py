@@ -22,7 +22,6 @@ from tools.battery_first import Unit, drawn_case
 from tools.calibration_coverage import SYSTEMS
 from twin.diagnosis.covariance import covariance
 from twin.diagnosis.evidence import HEALTHY, Evidence, collect
-from twin.inference.covariance import Covariance
 from twin.model.term import KINDS
 from twin.monitor.bins import warped
 from twin.monitor.healthy import UNSEEN_LEVEL_MBAR, Scatter
@@ -134,10 +133,9 @@ def in_places(evidence: Evidence) -> Floats:
     rows = []
     for cycle in evidence.judged:
         weights = model.of([cycle])
-        cycle_bins, count = weights.bins, len(weights.bins)
-        factor = weights.covariance.factor[:count, :count]
-        over_sigma = off[cycle_bins] / np.sqrt(np.sum(factor**2, axis=1))
-        (white,) = Covariance(factor).white(off[cycle_bins, None]).T
+        cycle_bins, of_bins = weights.bins, weights.covariance.own[0]
+        over_sigma = off[cycle_bins] / np.sqrt(np.sum(of_bins.factor**2, axis=1))
+        (white,) = of_bins.white(off[cycle_bins, None]).T
         rows.append([mean_at(places[cycle_bins], values) for values in (over_sigma, white)])
     return np.array(rows).reshape(len(rows), 2 * PLACES)
 
